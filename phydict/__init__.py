@@ -1,0 +1,22 @@
+"""phydict: a 3D chest CT from a few X-rays, by a diffusion prior steered through a differentiable X-ray projector.
+
+    units, grid      HU, mu and the prior's range; where voxels are
+    xray             geometry, projector and its exact adjoint, simulation          physics
+    diffusion        noise schedule, sampling moves, denoisers                      mathematics
+    prior            3D UNet, report encoder, checkpoints                           networks
+    datasets         phantoms, CTs and X-ray files -> Cases                         files
+    posterior        likelihood steps, reward, samplers                             prior x X-rays
+    baselines        reconstruction without a prior                                 yardsticks
+    evaluation       metrics, tables, picture panels                                scores
+    methods          the named methods, and `reconstruct` in one call
+    training, inference, datamodule                                                 Lightning
+"""
+
+from phydict.grid import Grid
+from phydict.methods import METHODS, reconstruct
+from phydict.prior import load_prior, save_prior
+from phydict.units import HUWindow, hu_to_mu, mu_to_hu
+from phydict.xray import ConeBeam, Projector
+
+__all__ = ["METHODS", "ConeBeam", "Grid", "HUWindow", "Projector", "hu_to_mu", "load_prior", "mu_to_hu", "reconstruct",
+           "save_prior"]

@@ -1,0 +1,5 @@
+"""Reconstruction without a learnt prior."""
+
+from phydict.baselines.sirt import SIRT
+
+__all__ = ["SIRT"]

@@ -1,0 +1,118 @@
+"""Lightning data for training a prior: a user's CTs, phantoms, or both."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import lightning
+import numpy as np
+import torch
+from torch.utils.data import ConcatDataset, DataLoader, Dataset
+
+from phydict.datasets import CTCases, augment, find_cts, phantom_case
+from phydict.datasets.thorax import Thorax, report
+from phydict.grid import Grid
+from phydict.units import HUWindow
+
+HELD_OUT_PHANTOM = 1_000_000
+"""Phantoms with this seed and above are never trained on."""
+
+KEYS = ("volume", "masks", "has_masks", "report")
+"""The parts of a Case that training needs."""
+
+
+class CachedPhantoms(Dataset):
+    """Phantom cases of consecutive seeds, each built when first asked for and then kept as a file in `cache`."""
+
+    def __init__(self, first_seed: int, count: int, grid: Grid, window: HUWindow, cache: Path):
+        self.first_seed, self.count, self.grid, self.window = first_seed, count, grid, window
+        size = "x".join(map(str, grid.shape))
+        self.folder = cache / f"phantoms-{size}-{grid.spacing[0]:g}mm-{window.low:g}-{window.high:g}"
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, i: int) -> dict:
+        seed = self.first_seed + i
+        file = self.folder / f"{seed:07d}.npz"
+        if not file.exists():
+            case = phantom_case(seed, self.grid, self.window)
+            self.folder.mkdir(parents=True, exist_ok=True)
+            partial = file.with_suffix(f".{os.getpid()}.partial")
+            with partial.open("wb") as stream:
+                np.savez_compressed(stream, volume=case["volume"].numpy().astype(np.float16),
+                                    masks=(255 * case["masks"].numpy()).round().astype(np.uint8))
+            partial.replace(file)
+        with np.load(file) as stored:
+            masks = torch.from_numpy(stored["masks"].astype(np.float32) / 255)
+            return {"volume": torch.from_numpy(stored["volume"].astype(np.float32)), "masks": masks,
+                    "has_masks": torch.ones(len(masks)), "report": report(Thorax.draw(seed))}
+
+
+class MixedCases(Dataset):
+    """One epoch of deformed draws from CTs and phantoms; draw n of epoch e is the same on every machine."""
+
+    def __init__(self, cts: Sequence, phantoms: Sequence, ct_fraction: float, grid: Grid, window: HUWindow,
+                 length: int, epoch: int, seed: int):
+        self.cts, self.phantoms, self.ct_fraction, self.grid, self.window = cts, phantoms, ct_fraction, grid, window
+        self.length, self.epoch, self.seed = length, epoch, seed
+
+    def __len__(self) -> int:
+        return self.length
+
+    def __getitem__(self, i: int) -> dict:
+        draw = np.random.default_rng((self.seed, self.epoch, i))
+        from_ct = len(self.phantoms) == 0 or (len(self.cts) > 0 and draw.random() < self.ct_fraction)
+        source = self.cts if from_ct else self.phantoms
+        case = source[int(draw.integers(len(source)))]
+        return _training_parts(augment(case, int(draw.integers(2**31)), self.grid, self.window))
+
+
+class PriorData(lightning.LightningDataModule):
+    """Cases for training a prior.
+
+    cts: a NIfTI file or a folder of any depth (CT-RATE's layout or any other); reports, metadata, fixed, exclude: as
+    for `find_cts`; holdout: CTs whose id contains one of these words validate instead of training; phantoms: number
+    of different phantoms; ct_fraction: share of draws taken from the CTs; epoch_size: draws per epoch; cache: folder
+    for prepared cases, never inside the CTs' folder.
+    """
+
+    def __init__(self, cts: str | None = None, reports: str | None = None, metadata: str | None = None,
+                 fixed: bool = True, exclude: str | None = None, holdout: list[str] | None = None,
+                 phantoms: int = 2000, ct_fraction: float = 0.5, validation_phantoms: int = 6,
+                 epoch_size: int = 400, batch_size: int = 4, workers: int = 0, cache: str = "runs/cache",
+                 seed: int = 0, voxels: int = 64, side: float = 384.0, window: tuple[float, float] = (-1000.0, 1000.0)):
+        super().__init__()
+        if not cts and not phantoms:
+            raise ValueError("there is nothing to train on: give data.cts, or data.phantoms above 0")
+        window = HUWindow(*window)
+        self.grid, self.window = Grid.cube(voxels, side), window
+        self.phantoms = CachedPhantoms(0, phantoms, self.grid, window, Path(cache))
+        files = find_cts(cts, reports, metadata, fixed, exclude=exclude) if cts else []
+        held_out = [f for f in files if any(word in f.id for word in holdout or [])]
+        self.cts = CTCases([f for f in files if f not in held_out], cache, self.grid, window)
+        self.validation = ConcatDataset([
+            CachedPhantoms(HELD_OUT_PHANTOM, validation_phantoms, self.grid, window, Path(cache)),
+            CTCases(held_out, cache, self.grid, window)])
+        self.reports = [f.report for f in files if f.report]
+        self.reports += [report(Thorax.draw(s)) for s in range(min(phantoms, 1000))]
+        self.ct_fraction, self.epoch_size, self.seed = ct_fraction, epoch_size, seed
+        self.batch_size, self.workers = batch_size, workers
+
+    def train_dataloader(self) -> DataLoader:
+        epoch = MixedCases(self.cts, self.phantoms, self.ct_fraction, self.grid, self.window, self.epoch_size,
+                           self.trainer.current_epoch, self.seed)
+        return DataLoader(epoch, self.batch_size, num_workers=self.workers, drop_last=True)
+
+    def val_dataloader(self) -> DataLoader:
+        return DataLoader(self.validation, 1, collate_fn=_collate)
+
+
+def _training_parts(case: dict) -> dict:
+    return {key: case[key] for key in KEYS}
+
+
+def _collate(cases: list[dict]) -> dict:
+    return torch.utils.data.default_collate([_training_parts(case) for case in cases])

@@ -1,0 +1,141 @@
+"""Lung, airway and vessel masks of a chest CT by thresholds and connected components, without a network.
+
+    interior air   HU < -320, not joined to the sides of the field of view within its axial slice
+    lungs          interior air components of lung size inside the body that are not pure gas, without the airway,
+                   closed by 8 mm
+    airway         region growing from the trachea below -700 HU, stepped down to -940 HU until it does not leak
+    vessels        HU > -500 inside the closed lungs, 3 mm away from their surface
+
+-320 HU as the lung threshold follows the Hounsfield histogram's valley between lung and soft tissue
+(Hu, Hoffman, Reinhardt 2001, doi:10.1109/42.929615). Known limits: consolidations and nodules away from the pleura
+count as vessels, masses at the pleura are left out of the lungs, the airway ends at the segmental bronchi, and a lung
+that the field of view cuts open sideways is lost in those slices.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+MASKS = ("lung", "airway", "vessel")
+LUNG_BELOW, VESSEL_ABOVE = -320.0, -500.0
+AIRWAY_BELOW, TRACHEA_BELOW, GAS_MEDIAN = (-700.0, -740.0, -780.0, -820.0, -860.0, -900.0, -940.0), -900.0, -970.0
+LUNG_LITRES, AIRWAY_LITRES = 0.15, 0.1
+CLOSING_MM, SURFACE_MM, AXIS_MM = 8.0, 3.0, 45.0
+TRACHEA_MM2 = (50.0, 800.0)
+IN_PLANE = ndimage.generate_binary_structure(3, 1) & np.array([False, True, False])
+
+
+def segment(hu: np.ndarray, spacing) -> tuple[np.ndarray, np.ndarray]:
+    """Masks of lung, airway and vessels, and which of them are known.
+
+    hu: (X, Y, Z) Hounsfield units in RAS+ order, at 1 to 3 mm for good results. spacing: (x, y, z) mm.
+    Returns masks (3, X, Y, Z) float32 of 0 and 1 (the lung includes its vessels, not the airway), and known (3,) bool:
+    all False with zero masks where no lungs are found, the airway alone False where no trachea is found.
+    """
+    spacing = np.broadcast_to(np.asarray(spacing, float), 3)
+    masks, known = np.zeros((3, *hu.shape), np.float32), np.zeros(3, bool)
+    interior = _without_border(hu < LUNG_BELOW) & _body(hu, spacing)
+    lungs = _lung_components(interior, hu, spacing)
+    if not lungs.any():
+        return masks, known
+    box = _box(lungs, np.ceil(2 * CLOSING_MM / spacing).astype(int))
+    box = (*box[:2], slice(box[2].start, hu.shape[2]))  # the trachea continues above the lungs
+    hu, lungs = hu[box], lungs[box]
+    airway = _airway(interior[box], lungs, hu, spacing)
+    filled, vessel = _fill(lungs, airway, hu, spacing)
+    for mask, found in zip(masks, (filled, airway, vessel)):
+        mask[box] = found
+    known[:] = True, airway.any(), True
+    return masks, known
+
+
+def lung_box_centre(lung: np.ndarray, affine: np.ndarray) -> np.ndarray:
+    """World position (3,) in mm of the centre of the box around the mask `lung` (X, Y, Z), which must not be empty."""
+    middle = [(s.start + s.stop - 1) / 2 for s in _box(lung > 0.5, 0)]
+    return affine[:3, :3] @ middle + affine[:3, 3]
+
+
+def _without_border(air: np.ndarray) -> np.ndarray:
+    """Air that is not joined to the sides (x and y faces) within its own axial slice."""
+    labels, count = ndimage.label(air, IN_PLANE)
+    outside = np.zeros(count + 1, bool)
+    outside[0] = True
+    for face in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
+        outside[face] = True
+    return ~outside[labels]
+
+
+def _body(hu: np.ndarray, spacing: np.ndarray) -> np.ndarray:
+    """The largest piece of tissue, cut from the table by an opening of 4 mm, with its holes filled slice by slice."""
+    tissue = ndimage.binary_opening(hu > LUNG_BELOW, IN_PLANE, iterations=max(1, round(4 / spacing[:2].min())))
+    labels, _ = ndimage.label(tissue)
+    size = np.bincount(labels.ravel())
+    size[0] = 0
+    body = np.zeros(hu.shape, bool) if len(size) < 2 else labels == size.argmax()
+    for k in range(hu.shape[2]):
+        body[:, :, k] = ndimage.binary_fill_holes(ndimage.binary_dilation(body[:, :, k], iterations=2))
+    return body
+
+
+def _lung_components(interior: np.ndarray, hu: np.ndarray, spacing: np.ndarray) -> np.ndarray:
+    """Interior air components of lung size whose median is not that of pure gas (bowel, folds of the table)."""
+    labels, count = ndimage.label(interior)
+    litres = np.bincount(labels.ravel(), minlength=count + 1) * spacing.prod() / 1e6
+    litres[0] = 0
+    keep = litres > max(LUNG_LITRES, 0.05 * litres.max())
+    for label in np.flatnonzero(keep):
+        keep[label] = np.median(hu[labels == label]) > GAS_MEDIAN
+    return keep[labels]
+
+
+def _airway(interior: np.ndarray, lungs: np.ndarray, hu: np.ndarray, spacing: np.ndarray) -> np.ndarray:
+    """The trachea and bronchi grown from a tube of gas near the lungs' axis, or nothing where there is none."""
+    seed = _trachea(interior, lungs, hu, spacing)
+    for threshold in AIRWAY_BELOW if seed.any() else ():
+        grown = ndimage.binary_propagation(seed, mask=(interior & (hu < threshold)) | seed)
+        if grown.sum() * spacing.prod() / 1e6 < AIRWAY_LITRES:
+            return ndimage.binary_closing(grown)
+    return seed
+
+
+def _trachea(interior: np.ndarray, lungs: np.ndarray, hu: np.ndarray, spacing: np.ndarray) -> np.ndarray:
+    """The longest stack of trachea-sized gas discs near the lungs' axis, in and above their upper 40 %."""
+    x, _, z = _box(lungs, 0)
+    start = int(z.stop - 0.4 * (z.stop - z.start))
+    gas = interior & (hu < TRACHEA_BELOW)
+    gas[:, :, :start] = False
+    labels, count = ndimage.label(gas, IN_PLANE)
+    if not count:
+        return gas
+    index = np.arange(1, count + 1)
+    area = np.bincount(labels.ravel(), minlength=count + 1)[1:] * spacing[0] * spacing[1]
+    across = np.array(ndimage.center_of_mass(gas, labels, index))[:, 0]
+    near = abs(across - (x.start + x.stop - 1) / 2) * spacing[0] < AXIS_MM
+    disc = np.concatenate([[False], near & (area > TRACHEA_MM2[0]) & (area < TRACHEA_MM2[1])])
+    stacks, count = ndimage.label(disc[labels])
+    heights = [0.0] + [(s[2].stop - s[2].start) * spacing[2] for s in ndimage.find_objects(stacks)]
+    return (stacks == int(np.argmax(heights))) & (max(heights) > 15)
+
+
+def _fill(lungs: np.ndarray, airway: np.ndarray, hu: np.ndarray, spacing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The lungs without the airway and its wall, closed over their vessels; and the vessels."""
+    wall = ndimage.binary_dilation(airway, iterations=max(1, round(2 / spacing.min())))
+    lungs = ndimage.binary_opening(lungs & ~wall)
+    labels, _ = ndimage.label(lungs)
+    size = np.bincount(labels.ravel())
+    size[0] = 0
+    lungs = (size > 0.02 * size.sum())[labels]
+    grown = ndimage.distance_transform_edt(~lungs, spacing) <= CLOSING_MM
+    filled = ndimage.distance_transform_edt(grown, spacing) > CLOSING_MM
+    filled = ndimage.binary_fill_holes(filled | lungs) & ~airway
+    depth = ndimage.distance_transform_edt(filled | airway, spacing)
+    return filled, filled & (hu > VESSEL_ABOVE) & (depth > SURFACE_MM)
+
+
+def _box(mask: np.ndarray, margin) -> tuple[slice, slice, slice]:
+    """The slices of the box around a mask, widened by `margin` voxels (a number or one per axis)."""
+    margin = np.broadcast_to(margin, 3)
+    ends = [np.flatnonzero(mask.any(axis=tuple({0, 1, 2} - {a})))[[0, -1]] for a in range(3)]
+    return tuple(slice(max(0, int(low - m)), int(min(n, high + m + 1)))
+                 for (low, high), m, n in zip(ends, margin, mask.shape))

@@ -1,0 +1,291 @@
+"""From a CT file to a Case: reading, resampling by voxel averages, the HU window, and random deformation.
+
+Resampling: every new voxel is the exact mean, over its box, of the linear interpolation between the old voxels. It is
+anti-aliased when shrinking, smooth when enlarging, and every old voxel keeps its weight, so means are preserved.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import nibabel
+import numpy as np
+import torch
+from monai.data import MetaTensor
+from monai.transforms import Compose, EnsureChannelFirstd, LoadImaged, Orientationd
+from scipy import ndimage
+
+from phydict.datasets.anatomy import lung_box_centre, segment
+from phydict.grid import Grid
+from phydict.units import HUWindow
+
+AIR = -1000.0
+SEGMENTATION_MM = 2.0
+UNREADABLE = (OSError, EOFError, ValueError, RuntimeError, zlib.error, nibabel.filebasedimages.ImageFileError)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What the blank header of a CT-RATE v1 volume lacks, from its metadata table.
+
+    slope, intercept: HU = slope * stored + intercept. spacing: (columns, rows, slices) mm.
+    orientation: DICOM's row and column direction cosines; the stored axes are columns, rows, slices.
+    """
+
+    slope: float
+    intercept: float
+    spacing: tuple[float, float, float]
+    orientation: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+
+    def affine(self) -> np.ndarray:
+        """4x4 index -> RAS+ mm, origin at voxel (0, 0, 0)."""
+        columns, rows = np.asarray(self.orientation[:3], float), np.asarray(self.orientation[3:], float)
+        affine = np.eye(4)
+        affine[:3, :3] = np.diag([-1.0, -1.0, 1.0]) @ np.stack([columns, rows, np.cross(columns, rows)], 1)
+        affine[:3, :3] *= self.spacing
+        return affine
+
+
+def load_ct(path: str | Path, calibration: Calibration | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Read a NIfTI CT and turn its axes to RAS+.
+
+    calibration: for files without a usable header (CT-RATE v1) HU scale and spacing come from it instead.
+    Returns HU (X, Y, Z) float32 and the 4x4 index -> world mm affine.
+    Raises FileNotFoundError, and ValueError naming the file where it cannot be read, is not one 3D volume, has no
+    orientation or holds NaN or infinite values.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no CT file {path}; give a .nii or .nii.gz file that exists")
+    try:
+        header = nibabel.load(path).header
+    except UNREADABLE as error:
+        raise ValueError(f"{path} cannot be read as NIfTI ({error}); convert or download it again") from error
+    _check_header(path, header, calibration)
+    read = Compose([LoadImaged("ct", reader="NibabelReader", squeeze_non_spatial_dims=True),
+                    EnsureChannelFirstd("ct", channel_dim="no_channel")])
+    try:
+        image = read({"ct": str(path)})["ct"]
+    except UNREADABLE as error:
+        raise ValueError(f"the voxels of {path} cannot be read, the file seems truncated or damaged; "
+                         "download or convert it again") from error
+    if calibration is not None:
+        image = MetaTensor(image.as_tensor() * calibration.slope + calibration.intercept, affine=calibration.affine())
+    image = Orientationd("ct", axcodes="RAS", labels=None)({"ct": image})["ct"]
+    hu, affine = image.as_tensor()[0].numpy(), image.affine.numpy().astype(float)
+    bad = hu.size - int(np.isfinite(hu).sum())
+    if bad:
+        raise ValueError(f"{path} holds {bad} NaN or infinite voxels; replace them, by -1000 HU where there is no data")
+    return hu, affine
+
+
+def _check_header(path: Path, header, calibration: Calibration | None) -> None:
+    shape = header.get_data_shape()
+    while len(shape) > 3 and shape[-1] == 1:
+        shape = shape[:-1]
+    if len(shape) != 3:
+        raise ValueError(f"{path} is {len(shape)}D with shape {tuple(shape)}; give one 3D volume per file")
+    if min(shape) < 2:
+        raise ValueError(f"{path} is a single 2D slice with shape {tuple(shape)}; give a 3D volume")
+    if calibration is not None:
+        return
+    codes = [int(header[name]) for name in ("sform_code", "qform_code") if name in header]
+    if not any(codes):
+        raise ValueError(f"{path} does not say how the patient lies (neither sform nor qform is set); convert it from "
+                         "DICOM again, or read CT-RATE v1 files with fixed=False and their metadata table")
+    axes = header.get_best_affine()[:3, :3]
+    if not np.isfinite(axes).all() or abs(np.linalg.det(axes)) < 1e-6:
+        raise ValueError(f"{path} has voxels without volume (affine {axes.tolist()}); convert it from DICOM again")
+    if np.allclose(axes, np.eye(3)) and shape[0] >= 512:
+        warnings.warn(f"{path} has the blank header of CT-RATE v1 (1 mm voxels, identity axes); "
+                      "read such files with fixed=False and their metadata table", stacklevel=3)
+
+
+def check_hu(hu: np.ndarray, name: str) -> None:
+    """Warn where air is not near -1000 or hardly any tissue is left: the numbers are then hardly HU."""
+    sample = hu[::3, ::3, ::3].clip(AIR, 3000)
+    low = sample[sample < -300]
+    tissue = float((sample > -200).mean())
+    counts, edges = np.histogram(low, bins=35, range=(AIR, -300))
+    mode = edges[counts.argmax()] + 10
+    if not low.size or mode > -900:
+        found = f"the most frequent value below -300 is {mode:.0f}" if low.size else "no value lies below -300"
+        warnings.warn(f"{name} does not look like HU: {found}, but air should lie near -1000; check slope, intercept "
+                      "and whether `fixed` is right", stacklevel=3)
+    elif tissue < 0.01:
+        warnings.warn(f"{name} does not look like HU: only {100 * tissue:.1f} % of it lies above -200; it may have "
+                      "been rescaled twice, check whether `fixed` is right", stacklevel=3)
+
+
+def to_grid(volume: np.ndarray, affine: np.ndarray, grid: Grid, pad: float) -> np.ndarray:
+    """Resample a volume (X, Y, Z) with its 4x4 affine onto `grid` by voxel averages; `pad` lies outside.
+
+    Where the axes are parallel the averages are exact. Otherwise the volume is averaged along its own axes to half
+    the grid's spacing, interpolated linearly at eight points per new voxel, and those are averaged.
+    """
+    relative = np.linalg.inv(affine) @ grid.affine
+    scale = np.diag(relative)[:3]
+    slant = (np.abs(relative[:3, :3] - np.diag(scale)) @ np.asarray(grid.shape)).max()
+    if slant < 0.1:
+        return _average(volume, relative[:3, 3], scale, grid.shape, pad)
+    spacing = np.linalg.norm(affine[:3, :3], axis=0)
+    step = np.maximum(1.0, min(grid.spacing) / 2 / spacing)
+    shape = np.ceil(np.asarray(volume.shape) / step).astype(int) + 1
+    first = (np.asarray(volume.shape) - 1) / 2 - step * (shape - 1) / 2
+    volume = _average(volume, first, step, shape, pad)
+    half = np.eye(4)
+    half[:3, :3] /= 2
+    half[:3, 3] = -0.25
+    fine = relative @ half
+    fine[:3] /= step[:, None]
+    fine[:3, 3] -= first / step
+    fine = ndimage.affine_transform(volume, fine[:3, :3], fine[:3, 3], tuple(2 * n for n in grid.shape), order=1,
+                                    mode="constant", cval=pad)
+    x, y, z = grid.shape
+    return fine.reshape(x, 2, y, 2, z, 2).mean((1, 3, 5))
+
+
+def _average(volume, first, step, shape, pad: float) -> np.ndarray:
+    """Means over boxes of `step` old voxels, the first centred at the old index `first`, along the volume's axes."""
+    weights = [_weights(n, f, s, m) for n, f, s, m in zip(volume.shape, first, step, shape)]
+    inside = np.einsum("i,j,k->ijk", *(w.sum(1) for w in weights))
+    x, y, z = weights
+    volume = np.asarray(volume, np.float32)
+    volume = (volume.reshape(-1, volume.shape[2]) @ z.T).reshape(*volume.shape[:2], -1)
+    volume = y @ volume
+    volume = (x @ volume.reshape(volume.shape[0], -1)).reshape(inside.shape)
+    return volume + np.float32(pad) * (1 - inside)
+
+
+def _weights(old: int, first: float, step: float, new: int) -> np.ndarray:
+    """(new, old): the integral of each old voxel's hat function over each new voxel, over the new voxel's width."""
+    centre = first + step * np.arange(new)[:, None] - np.arange(old)
+    width = abs(step)
+
+    def integral(u):
+        u = u.clip(-1, 1)
+        return 0.5 + u - np.sign(u) * u**2 / 2
+
+    return ((integral(centre + width / 2) - integral(centre - width / 2)) / width).astype(np.float32)
+
+
+def covering_grid(shape, affine: np.ndarray, spacing: float) -> Grid:
+    """The grid along the world's axes with `spacing` mm that covers a volume of `shape` with its 4x4 affine."""
+    ends = np.stack(np.meshgrid(*[(-0.5, n - 0.5) for n in shape], indexing="ij"), -1).reshape(-1, 3)
+    corners = ends @ affine[:3, :3].T + affine[:3, 3]
+    low, high = corners.min(0), corners.max(0)
+    voxels = np.maximum(1, np.ceil((high - low) / spacing - 1e-6).astype(int))
+    cover = np.diag([spacing, spacing, spacing, 1.0])
+    cover[:3, 3] = (low + high) / 2 - spacing * (voxels - 1) / 2
+    return Grid(tuple(voxels), affine=cover)
+
+
+def case_id(path: str | Path) -> str:
+    """A file's name without .nii or .nii.gz."""
+    name = Path(path).name
+    for ending in (".nii.gz", ".nii"):
+        if name.lower().endswith(ending):
+            return name[: -len(ending)]
+    return name
+
+
+def prepare_ct(ct: str | Path | tuple[np.ndarray, np.ndarray], grid: Grid = Grid.cube(64),
+               window: HUWindow = HUWindow(), report: str = "", id: str | None = None,
+               calibration: Calibration | None = None) -> dict:
+    """A Case from a CT file, or from (hu, affine): the grid's box centred on the lungs, -1000 HU outside the scan.
+
+    Returns {"id", "volume" (1,X,Y,Z) in [-1,1], "masks" (3,X,Y,Z) in [0,1] for lung, airway, vessel, "has_masks" (3,),
+    "report", "affine" (4,4) float64: the voxels' place in the CT's own world, "centred_on": "lungs" or "volume"}.
+    Without lungs the box is centred on the scan, with a warning. Raises what `load_ct` raises.
+    """
+    hu, affine = ct if isinstance(ct, tuple) else load_ct(ct, calibration)
+    name = id or ("the CT" if isinstance(ct, tuple) else case_id(ct))
+    check_hu(hu, name)
+    hu = hu.clip(AIR)
+    work = covering_grid(hu.shape, affine, SEGMENTATION_MM)
+    masks, known = segment(to_grid(hu, affine, work, AIR), work.spacing)
+    if known[0]:
+        centre = lung_box_centre(masks[0], work.affine)
+    else:
+        centre = affine[:3, :3] @ ((np.asarray(hu.shape) - 1) / 2) + affine[:3, 3]
+        warnings.warn(f"no lungs were found in {name}; its volume is centred on the scan and its masks are unknown",
+                      stacklevel=2)
+    placed = grid.affine.copy()
+    placed[:3, 3] += centre - grid.centre
+    target = Grid(grid.shape, affine=placed)
+    volume = window.to_range(to_grid(hu, affine, target, AIR))
+    masks = np.stack([to_grid(m, work.affine, target, 0.0) for m in masks]).clip(0, 1)
+    return {"id": name, "volume": torch.from_numpy(volume.astype(np.float32))[None],
+            "masks": torch.from_numpy(masks.astype(np.float32)), "has_masks": torch.from_numpy(known),
+            "report": report, "affine": torch.from_numpy(placed), "centred_on": "lungs" if known[0] else "volume"}
+
+
+@dataclass(frozen=True)
+class Deformation:
+    """A small random change of a patient: pose, size, shape and HU, without mirroring.
+
+    rotation: (3,) radians about x, y, z. scale: (3,). shift: (3,) mm. waves: (3, 4, 4, 4) mm, amplitudes of cosines
+    of up to 1.5 periods over the grid. gain: factor of HU + 1000. offset: HU, in tissue only.
+    """
+
+    rotation: torch.Tensor
+    scale: torch.Tensor
+    shift: torch.Tensor
+    waves: torch.Tensor
+    gain: float
+    offset: float
+
+    @classmethod
+    def draw(cls, seed: int | torch.Generator) -> Deformation:
+        """Rotation <= 8 degrees, scale .9-1.1, shift <= 20 mm, waves of about 4 mm, gain .97-1.03, offset <= 20 HU."""
+        generator = seed if isinstance(seed, torch.Generator) else torch.Generator().manual_seed(int(seed))
+
+        def uniform(size, bound):
+            return (2 * torch.rand(size, generator=generator) - 1) * bound
+
+        waves = torch.randn((3, 4, 4, 4), generator=generator)
+        frequency = torch.stack(torch.meshgrid(*[torch.arange(4.0)] * 3, indexing="ij")).pow(2).sum(0)
+        waves = torch.where((frequency > 0) & (frequency <= 9), waves * 2.5 / (1 + frequency.sqrt()), 0.0)
+        return cls(uniform(3, math.radians(8) / math.sqrt(3)), 1 + uniform(3, 0.1), uniform(3, 20 / math.sqrt(3)),
+                   waves, 1 + float(uniform(1, 0.03)), float(uniform(1, 20.0)))
+
+    def sample_points(self, grid: Grid) -> torch.Tensor:
+        """(X, Y, Z, 3) mm from the grid's centre, along its axes: where the deformed voxels take their values."""
+        axes = [(torch.arange(n) - (n - 1) / 2) * s for n, s in zip(grid.shape, grid.spacing)]
+        points = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
+        a, b, c = self.rotation.tolist()
+        turn = torch.linalg.matrix_exp(torch.tensor([[0, -c, b], [c, 0, -a], [-b, a, 0]]))
+        cosines = [torch.cos(math.pi * torch.arange(4.0) * (torch.arange(n)[:, None] + 0.5) / n) for n in grid.shape]
+        waves = self.waves
+        for basis in cosines:
+            waves = torch.tensordot(waves, basis, dims=([1], [1]))
+        return (points @ turn.T) * self.scale + self.shift + waves.movedim(0, -1)
+
+    def apply(self, case: dict, grid: Grid, window: HUWindow) -> dict:
+        """The deformed Case; volume and masks are sampled at the same points, air and zeros outside."""
+        half = torch.tensor([n * s / 2 for n, s in zip(grid.shape, grid.spacing)])
+        points = (self.sample_points(grid) / half).flip(-1)[None]  # grid_sample wants z, y, x of the last axis first
+        air = float(window.to_range(torch.tensor(AIR)))
+        state = torch.cat([case["volume"] - air, case["masks"]])
+        state = torch.nn.functional.grid_sample(state[None], points, padding_mode="zeros", align_corners=False)[0]
+        hu = window.to_hu(state[:1] + air)
+        hu = AIR + self.gain * (hu - AIR) + self.offset * ((hu - AIR) / 200).clamp(0, 1)
+        moved = {key: value for key, value in case.items() if key not in ("affine", "centred_on")}
+        return moved | {"volume": window.to_range(hu), "masks": state[1:].clamp(0, 1)}
+
+
+def augment(case: dict, seed: int | torch.Generator, grid: Grid = Grid.cube(64), window: HUWindow = HUWindow()) -> dict:
+    """A Case deformed by `Deformation.draw(seed)`; the same integer seed gives the same Case.
+
+    The place in the source CT ("affine") is dropped. Raises ValueError for a Case on another grid or with X-rays.
+    """
+    if tuple(case["volume"].shape[1:]) != grid.shape:
+        raise ValueError(f"the case has {tuple(case['volume'].shape[1:])} voxels, but the grid {grid.shape} was given; "
+                         "give the grid the case was prepared on")
+    if "xrays" in case:
+        raise ValueError(f"case {case['id']} holds X-rays of the undeformed patient; deform it before projecting")
+    return Deformation.draw(seed).apply(case, grid, window)

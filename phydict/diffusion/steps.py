@@ -1,0 +1,30 @@
+"""The moves every sampler is made of.
+
+| here                      | paper                                    |
+|---------------------------|------------------------------------------|
+| ddim(z, x, t, s)          | Eq. 2, from time t to time s < t         |
+| renoise(x0, t, noise)     | forward diffusion, the start of EC       |
+"""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from phydict.diffusion.schedule import CosineSchedule
+
+
+def ddim(schedule: CosineSchedule, x0: Tensor, x: Tensor, t: float, s: float) -> Tensor:
+    """Deterministic DDIM move of the state x at time t to time s, given the clean estimate x0 (arXiv:2010.02502).
+
+    ddim(x0, x, t, t) = x; the noise is recomputed from the x0 that is given, so a changed x0 stays consistent.
+    """
+    signal_t, noise_t = schedule.scales(t)
+    signal_s, noise_s = schedule.scales(s)
+    eps = (x - signal_t.to(x) * x0) / noise_t.to(x)
+    return signal_s.to(x) * x0 + noise_s.to(x) * eps
+
+
+def renoise(schedule: CosineSchedule, x0: Tensor, t: float, noise: Tensor) -> Tensor:
+    """Forward diffusion of the clean state x0 to time t with the given standard normal noise."""
+    signal, sigma = schedule.scales(t)
+    return signal.to(x0) * x0 + sigma.to(x0) * noise

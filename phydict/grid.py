@@ -1,0 +1,82 @@
+"""Where the voxels of a volume are: shape, spacing and the index-to-world affine (RAS+, mm)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """A regular voxel grid in RAS+ world millimetres, voxel centres at integer indices.
+
+    shape: (X, Y, Z) voxels.
+    spacing: (x, y, z) mm; may be left out when `affine` is given.
+    affine: 4x4 index -> world mm. Left out, the grid's centre lies at the isocentre (0, 0, 0) and the axes
+        follow the world's. An affine with shear is refused.
+    """
+
+    shape: tuple[int, int, int]
+    spacing: tuple[float, float, float] | None = None
+    affine: np.ndarray | None = None
+
+    def __post_init__(self):
+        shape = tuple(int(n) for n in self.shape)
+        if len(shape) != 3 or min(shape) < 1:
+            raise ValueError(f"a grid needs three positive sizes (X, Y, Z), but {self.shape} was given")
+        if self.affine is None:
+            if self.spacing is None:
+                raise ValueError("a grid needs either its spacing in mm or its index-to-world affine")
+            spacing = np.broadcast_to(np.asarray(self.spacing, float), 3)
+            affine = np.diag([*spacing, 1.0])
+            affine[:3, 3] = -spacing * (np.asarray(shape) - 1) / 2
+        else:
+            affine = np.array(self.affine, float)
+            if affine.shape != (4, 4):
+                raise ValueError(f"a grid's affine is 4x4, but shape {affine.shape} was given")
+            spacing = np.linalg.norm(affine[:3, :3], axis=0)
+            if self.spacing is not None and not np.allclose(spacing, self.spacing, rtol=1e-4):
+                raise ValueError(f"spacing {tuple(self.spacing)} mm contradicts the affine's {tuple(spacing)} mm")
+        if not (np.isfinite(affine).all() and (spacing > 0).all()):
+            raise ValueError(f"a grid's spacing must be positive and finite, but {tuple(spacing)} mm was given")
+        axes = affine[:3, :3] / spacing
+        if not np.allclose(axes.T @ axes, np.eye(3), atol=1e-3):
+            raise ValueError("the affine has shear; resample the volume to an orthogonal grid first")
+        affine.setflags(write=False)
+        object.__setattr__(self, "shape", shape)
+        object.__setattr__(self, "spacing", tuple(float(s) for s in spacing))
+        object.__setattr__(self, "affine", affine)
+
+    @classmethod
+    def cube(cls, voxels: int, side: float = 384.0) -> Grid:
+        """`voxels`^3 voxels over a cube of `side` mm centred on the isocentre."""
+        return cls((voxels,) * 3, (side / voxels,) * 3)
+
+    @property
+    def centre(self) -> np.ndarray:
+        """World position (3,) in mm of the grid's centre."""
+        return self.affine[:3, :3] @ ((np.asarray(self.shape) - 1) / 2) + self.affine[:3, 3]
+
+    @property
+    def extent(self) -> np.ndarray:
+        """Edge lengths (3,) in mm of the box of voxels, from face to face."""
+        return np.asarray(self.shape) * self.spacing
+
+    def index(self, world) -> np.ndarray:
+        """Voxel indices (..., 3), fractional, of `world` points (..., 3) in mm."""
+        return (np.asarray(world, float) - self.affine[:3, 3]) @ np.linalg.inv(self.affine[:3, :3]).T
+
+    def corners(self) -> np.ndarray:
+        """World positions (8, 3) in mm of the box's corners (voxel faces, not centres)."""
+        ends = np.stack(np.meshgrid(*[(-0.5, n - 0.5) for n in self.shape], indexing="ij"), -1).reshape(-1, 3)
+        return ends @ self.affine[:3, :3].T + self.affine[:3, 3]
+
+    def same_as(self, other: Grid) -> bool:
+        """Whether both grids have the same voxels, to a thousandth of a voxel."""
+        return self.shape == other.shape and np.allclose(
+            self.affine, other.affine, atol=1e-3 * min(self.spacing))
+
+    def to_dict(self) -> dict:
+        """Plain lists, from which `Grid(**d)` builds the same grid."""
+        return {"shape": list(self.shape), "affine": self.affine.tolist()}

@@ -1,0 +1,282 @@
+"""Reconstruction with Lightning: pairs with infer.py.
+
+predict: X-ray folders -> volumes. test: CTs or phantoms -> simulated X-rays -> volumes -> scores.
+Each finished case is one folder of the output; a run that was stopped goes on where it was.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import resource
+import shutil
+import tempfile
+import zlib
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+
+import lightning
+import torch
+from lightning.pytorch.cli import LightningCLI
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
+
+from phydict.datasets import find_cts, find_xrays, load_xrays, phantom_case, prepare_ct
+from phydict.datamodule import HELD_OUT_PHANTOM
+from phydict.command_line import one_sentence_errors
+from phydict.evaluation import CaseMetrics, markdown, panel, rich_table, volume_metrics, write_csv
+from phydict.grid import Grid
+from phydict.methods import DEFAULT_PRIOR, binned, binning
+from phydict.posterior import Posterior, Sampler
+from phydict.prior import load_prior
+from phydict.reconstructor import Reconstruction, Reconstructor, describe
+from phydict.units import HUWindow
+from phydict.xray import ConeBeam, Ideal, Projector
+
+RECORD = "reconstruction.json"
+"""The file that marks a case as finished."""
+
+
+class Listed(Dataset):
+    """Cases made on demand: (id, function) pairs."""
+
+    def __init__(self, makers: list):
+        self.makers = makers
+
+    def __len__(self) -> int:
+        return len(self.makers)
+
+    def __getitem__(self, i: int) -> dict:
+        return {"id": self.makers[i][0], "index": i} | self.makers[i][1]()
+
+
+class ReconstructionData(lightning.LightningDataModule):
+    """What to reconstruct.
+
+    xrays: for predict, a folder of X-ray images with geometry.yaml, or a folder of such folders; geometry: a YAML
+    file used instead of theirs. cts: for test, a NIfTI file or a folder of CTs, or the word phantom; reports, metadata,
+    fixed: as for training; phantoms: how many phantoms; with_report: whether the cases' reports are used.
+    views, source_to_detector, source_to_isocentre (mm), detector (rows, columns), pixel (mm): the simulated orbit;
+    simulator: how X-rays are made of a CT; simulation_voxels: voxels per side of the volume they are made of (None:
+    the reconstruction's own grid, which is an inverse crime; more lessens it).
+    """
+
+    def __init__(self, xrays: str | None = None, geometry: str | None = None, cts: str | None = None,
+                 reports: str | None = None, metadata: str | None = None, fixed: bool = True, phantoms: int = 4,
+                 with_report: bool = True, views: int = 8, source_to_detector: float = 1020.0,
+                 source_to_isocentre: float = 740.0, detector: tuple[int, int] = (448, 448),
+                 pixel: tuple[float, float] = (1.25, 1.25), simulator: Ideal = Ideal(),
+                 simulation_voxels: int | None = None):
+        super().__init__()
+        self.xrays, self.geometry, self.cts, self.phantoms = xrays, geometry, cts, phantoms
+        self.tables = {"reports": reports, "metadata": metadata, "fixed": fixed}
+        self.with_report, self.simulator, self.simulation_voxels = with_report, simulator, simulation_voxels
+        self.beam = ConeBeam.orbit(views, source_to_detector, source_to_isocentre, detector, pixel)
+
+    def predict_dataloader(self) -> DataLoader:
+        if not self.xrays:
+            raise ValueError("predict needs data.xrays: a folder of X-ray images with geometry.yaml")
+        return self._loader([(folder.absolute().name, lambda f=folder: load_xrays(f, self.geometry))
+                             for folder in find_xrays(self.xrays)])
+
+    def test_dataloader(self) -> DataLoader:
+        if not self.cts:
+            raise ValueError("test needs data.cts: a NIfTI file, a folder of CTs, or the word phantom")
+        task = self.trainer.lightning_module
+        if self.cts == "phantom":
+            return self._loader([
+                (f"phantom-{seed:06d}", lambda s=seed: self._with_source(
+                    task, lambda grid: phantom_case(s, grid, task.window)))
+                for seed in range(HELD_OUT_PHANTOM, HELD_OUT_PHANTOM + self.phantoms)])
+        return self._loader([
+            (ct.id, lambda c=ct: self._with_source(task, lambda grid: prepare_ct(
+                c.path, grid, task.window, id=c.id, calibration=c.calibration)) | {"report": c.report})
+            for ct in find_cts(self.cts, **self.tables)])
+
+    def simulate(self, case: dict, seed: int, grid: Grid, window: HUWindow) -> Tensor:
+        """X-rays (K, V, U) of a CT case."""
+        source = case.get("source", case["volume"])
+        fine = Grid.cube(source.shape[-1], grid.extent[0])
+        return self.simulator(Projector(fine, self.beam), window.to_mu(source)[None], seed)[0]
+
+    def _with_source(self, task: ReconstructionTask, make: Callable[[Grid], dict]) -> dict:
+        """A case, and under "source" the volume its X-rays are simulated from where that is another one."""
+        if not self.simulation_voxels:
+            return make(task.grid)
+        return make(task.grid) | {"source": make(Grid.cube(self.simulation_voxels, task.grid.extent[0]))["volume"]}
+
+    def _loader(self, makers: list[tuple]) -> DataLoader:
+        return DataLoader(Listed(self.trainer.lightning_module.pending(makers)), None)
+
+
+class ReconstructionTask(lightning.LightningModule):
+    """Reconstructs every case with one method and writes it; in test, scores it against the CT it came from.
+
+    method: a Sampler (run with the prior) or a Reconstructor; name: what tables call it; prior: the prior's file;
+    guidance: classifier-free guidance when a report is given; out: output folder; overwrite: redo finished cases;
+    seed: with the case's id, the only source of randomness.
+    """
+
+    def __init__(self, method: Sampler | Reconstructor, name: str, prior: str = str(DEFAULT_PRIOR),
+                 guidance: float = 2.0, out: str = "runs/reconstructions", overwrite: bool = False, seed: int = 0):
+        super().__init__()
+        self.method_name, self.folder, self.overwrite, self.seed = name, Path(out) / name, overwrite, seed
+        check_writable(Path(out))
+        self.settings = {"name": name, "seed": seed, "method": describe(method)}
+        self.grid, self.window = Grid.cube(64), HUWindow()
+        if isinstance(method, Sampler):
+            self.prior = load_prior(prior)
+            self.grid, self.window = self.prior.grid, self.prior.window
+            self.settings |= {"prior": Path(prior).name, "prior_crc32": zlib.crc32(Path(prior).read_bytes()),
+                              "guidance": guidance}
+            method = Posterior(self.prior, method, guidance, name=name)
+        self.reconstructor: Reconstructor = method
+        self.metrics = CaseMetrics([name])
+        self.progress = Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
+                                 TimeElapsedColumn(), TimeRemainingColumn(), console=Console(stderr=True))
+
+    def pending(self, cases: list[tuple]) -> list[tuple]:
+        """The (id, loader) pairs that are not finished yet; a case finished with other settings is an error."""
+        if self.overwrite:
+            return cases
+        for name, _ in cases:
+            record = self.folder / name / RECORD
+            if record.exists() and json.loads(record.read_text())["settings"] != self._json(self.settings):
+                raise ValueError(f"{self.folder / name} was finished with other settings: "
+                                 "set model.overwrite to true, or give another model.out")
+        return [case for case in cases if not (self.folder / case[0] / RECORD).exists()]
+
+    def predict_step(self, case: dict, _=None) -> None:
+        self._finish(case, self._reconstruct(case))
+
+    def test_step(self, case: dict, _=None) -> None:
+        case["beam"] = self.trainer.datamodule.beam
+        case["xrays"] = self.trainer.datamodule.simulate(case, self._seed(case), self.grid, self.window)
+        case["report"] = case["report"] if self.trainer.datamodule.with_report else ""
+        result = self._reconstruct(case)
+        truth = self.window.to_hu(case["volume"])[None]
+        lung = case["masks"][None, :1] if bool(case["has_masks"][0]) else None
+        scores = volume_metrics(result.volume[None, None], truth, lung) | {"misfit": result.misfit}
+        self.metrics.update(case["index"], self.method_name, scores, seconds=sum(result.seconds.values()))
+        self._finish(case, result, scores, truth[0, 0])
+
+    def on_test_epoch_end(self) -> None:
+        self.log_dict(self.metrics.compute())
+
+    def on_predict_start(self) -> None:
+        self._start(self.trainer.num_predict_batches[0])
+
+    def on_test_start(self) -> None:
+        self._start(self.trainer.num_test_batches[0])
+
+    def on_predict_end(self) -> None:
+        self.progress.stop()
+        self.trainer.strategy.barrier()
+
+    def on_test_end(self) -> None:
+        self.on_predict_end()
+
+    def _start(self, cases: int) -> None:
+        self.progress.disable = not self.trainer.is_global_zero
+        self.case_bar = self.progress.add_task(self.method_name, total=cases)
+        self.step_bar = self.progress.add_task("steps", total=self.reconstructor.steps())
+        self.progress.start()
+
+    def _seed(self, case: dict) -> int:
+        return zlib.crc32(f"{self.seed}/{case['id']}".encode())
+
+    def _reconstruct(self, case: dict) -> Reconstruction:
+        beam = case["beam"]
+        beam.check(self.grid)
+        factor = binning(self.grid, beam)
+        self.progress.reset(self.step_bar, description=case["id"])
+        xrays = binned(case["xrays"], factor).to(self.device)
+        return self.reconstructor.reconstruct(
+            xrays, Projector(self.grid, beam.binned(factor)), case["report"], case.get("display", False),
+            self._seed(case), lambda: self.progress.advance(self.step_bar))
+
+    def _finish(self, case: dict, result: Reconstruction, scores: dict | None = None,
+                truth: Tensor | None = None) -> None:
+        """Writes a case's folder beside its place and moves it there when it is complete."""
+        final = self.folder / case["id"]
+        partial = self.folder / f".{case['id']}.{os.getpid()}.partial"
+        partial.mkdir(parents=True, exist_ok=True)
+        result.save_nifti(partial / "volume.nii.gz")
+        panel(partial / "panel.png", result.volume, result.grid, result.xrays, result.reprojection, truth,
+              title=f"{case['id']}: {self.method_name}")
+        record = {"case": case["id"], "method": self.method_name, "scores": scores, "misfit": result.misfit,
+                  "misfit_per_view": result.misfit_per_view, "seconds": result.seconds,
+                  "network_calls": result.network_calls, "projector_calls": result.projector_calls,
+                  "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+                  "views": len(result.xrays), "grid": result.grid.to_dict(), "seed": result.seed,
+                  "report": case["report"], "settings": self.settings, "versions": versions()}
+        (partial / RECORD).write_text(json.dumps(record, indent=1))
+        if final.exists():
+            shutil.rmtree(final)
+        partial.rename(final)
+        self.progress.advance(self.case_bar)
+
+    def summarise(self) -> list[dict]:
+        """Scores of all finished cases; written as results.csv and results.md and printed."""
+        rows = []
+        for record in sorted(self.folder.glob(f"*/{RECORD}")):
+            case = json.loads(record.read_text())
+            if case["scores"]:
+                rows.append({"case": case["case"], "method": case["method"], "views": case["views"],
+                             "grid": "x".join(map(str, case["grid"]["shape"]))} | case["scores"] | {
+                                 "seconds": sum(case["seconds"].values()), "network_calls": case["network_calls"],
+                                 "projector_calls": case["projector_calls"]})
+        if rows:
+            write_csv(self.folder / "results.csv", rows)
+            (self.folder / "results.md").write_text(markdown(rows))
+            Console().print(rich_table(rows))
+        return rows
+
+    @staticmethod
+    def _json(value: dict) -> dict:
+        return json.loads(json.dumps(value))
+
+
+def check_writable(folder: Path) -> None:
+    """Raises ValueError, in one sentence, unless files can be written at `folder` (which need not exist yet)."""
+    there = folder.absolute()
+    while not there.exists():
+        there = there.parent
+    try:
+        with tempfile.TemporaryFile(dir=there):
+            pass
+    except OSError as error:
+        reason = "is a file" if there.is_file() else f"cannot be written to ({error.strerror})"
+        raise ValueError(f"the output folder {folder} cannot be used because {there} {reason}: "
+                         "give another model.out") from error
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that a result depends on."""
+    return {"python": platform.python_version()} | {
+        name: version(name) for name in ("phydict", "torch", "lightning", "monai", "torchmetrics", "numpy")}
+
+
+class InferenceCLI(LightningCLI):
+    """predict and test only; no logs, no checkpoints, gradients allowed inside the steps."""
+
+    @staticmethod
+    def subcommands() -> dict[str, set[str]]:
+        return {name: {"model", "dataloaders", "datamodule"} for name in ("predict", "test")}
+
+
+def main(args: list[str] | None = None) -> None:
+    """Command line of inference: predict, test. A bad input ends in one sentence and exit code 2."""
+    with one_sentence_errors():
+        cli = InferenceCLI(
+            ReconstructionTask, ReconstructionData, args=args, seed_everything_default=0, save_config_callback=None,
+            trainer_defaults={"inference_mode": False, "logger": False, "enable_progress_bar": False,
+                              "enable_checkpointing": False, "enable_model_summary": False, "accelerator": "auto",
+                              "devices": 1})
+        if cli.trainer.is_global_zero:
+            cli.model.summarise()
+            print(f"results in {cli.model.folder}")

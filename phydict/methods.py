@@ -1,0 +1,82 @@
+"""The named reconstruction methods, and a reconstruction in one call."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from phydict.baselines import SIRT
+from phydict.grid import Grid
+from phydict.posterior import GradientSteps, Posterior, PriorOnly, ProximalCG, Reward, Sampler, SplitGibbs
+from phydict.prior import Prior, load_prior
+from phydict.reconstructor import Reconstruction, Reconstructor
+from phydict.xray import ConeBeam, Projector
+
+DEFAULT_PRIOR = Path(__file__).parents[1] / "data" / "prior" / "phydict_64.safetensors"
+"""The prior that comes with the project."""
+
+METHODS: dict[str, Sampler | Reconstructor] = {
+    "phydict_fast": SplitGibbs(iterations=20, warm_start=0.7, likelihood=ProximalCG(iterations=6),
+                               final_guided=True),
+    "phydict_paper": SplitGibbs(iterations=50, likelihood=GradientSteps(reward=Reward(lpips=1.0)), refine_from=0.8,
+                                refine_iterations=40),
+    "prior_only": PriorOnly(iterations=50),
+    "sirt": SIRT(iterations=300),
+}
+"""Settings by name; configs/reconstruct/<name>.yaml holds the same settings for the command line."""
+
+
+def reconstructor(method: str | Sampler | Reconstructor, prior: Prior | str | Path | None = None,
+                  guidance: float = 2.0) -> Reconstructor:
+    """A method ready to reconstruct: a name of METHODS, a sampler (which needs a prior), or a Reconstructor.
+
+    prior: a Prior or the file it is in; None for the shipped one. It is only loaded by methods that need it.
+    """
+    name = method if isinstance(method, str) else type(method).__name__
+    if isinstance(method, str):
+        if method not in METHODS:
+            raise ValueError(f"there is no method '{method}': use one of {', '.join(METHODS)}")
+        method = METHODS[method]
+    if isinstance(method, Reconstructor):
+        return method
+    prior = prior if isinstance(prior, Prior) else load_prior(prior or DEFAULT_PRIOR)
+    return Posterior(prior, method, guidance, name=name)
+
+
+def binning(grid: Grid, beam: ConeBeam) -> int:
+    """The largest whole factor by which the detector may be binned while its pixels, seen at the grid's centre, stay
+    below 0.7 voxels; finer pixels cost time and carry nothing that the grid can hold."""
+    to_detector = beam.detectors - beam.sources
+    depth = ((grid.centre - beam.sources) * to_detector).sum(1) / (to_detector**2).sum(1)
+    pixel = max(float((abs(step**2).sum(1) ** 0.5 * depth).max()) for step in (beam.u, beam.v))
+    limit = 0.7 * min(grid.spacing) / pixel
+    factors = [f for f in range(1, max(int(limit), 1) + 1) if all(n % f == 0 for n in beam.shape)]
+    return factors[-1]
+
+
+def binned(xrays: Tensor, factor: int) -> Tensor:
+    """X-rays (K, V, U) averaged over blocks of `factor`^2 pixels."""
+    return torch.nn.functional.avg_pool2d(xrays[None], factor)[0] if factor > 1 else xrays
+
+
+def reconstruct(xrays: Tensor, beam: ConeBeam, prior: Prior | str | Path | None = None,
+                method: str | Sampler | Reconstructor = "phydict_fast", report: str | None = None,
+                display: bool = False, seed: int = 0, guidance: float = 2.0, on_step=lambda: None) -> Reconstruction:
+    """A CT volume from X-rays (K, V, U) and their geometry.
+
+    xrays: line integrals; with display=True, display values with an unknown gain and offset per view.
+    prior: a Prior, a file, or None for the shipped one; report: radiology text, if any.
+    A detector finer than the grid can use is binned. Raises ValueError when X-rays, geometry and prior do not fit.
+    """
+    expected = (beam.views, *beam.shape)
+    if tuple(xrays.shape) != expected:
+        raise ValueError(f"the geometry describes {expected[0]} views of {expected[1]} x {expected[2]} pixels, but the "
+                         f"X-rays have shape {tuple(xrays.shape)}: give images and geometry that match")
+    ready = reconstructor(method, prior, guidance)
+    grid = ready.prior.grid if isinstance(ready, Posterior) else Grid.cube(64)
+    beam.check(grid)
+    factor = binning(grid, beam)
+    projector = Projector(grid, beam.binned(factor))
+    return ready.reconstruct(binned(xrays.float(), factor), projector, report or "", display, seed, on_step)

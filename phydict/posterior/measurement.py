@@ -1,0 +1,61 @@
+"""The X-rays of one case as a linear problem in the prior's range.
+
+mu = a x + b, so the projection of the CT channel is affine: P(x) = a A(x) + b A(1). Everything that does not depend
+on x is computed once.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from phydict.units import MU_WATER, HUWindow
+from phydict.xray import Projector
+from phydict.xray.calibration import match_views
+
+
+class Measurement:
+    """Line integrals y (1, K, V, U) and the affine operator P on CT volumes x (B, 1, X, Y, Z) in the prior's range.
+
+    calls: how many times A or its adjoint ran over all views.
+    """
+
+    def __init__(self, projector: Projector, xrays: Tensor, window: HUWindow, display: bool = False,
+                 mu_water: float = MU_WATER):
+        expected = (projector.beam.views, *projector.beam.shape)
+        if tuple(xrays.shape) != expected:
+            raise ValueError(f"the geometry describes {expected[0]} views of {expected[1]} x {expected[2]} pixels, "
+                             f"but the X-rays have shape {tuple(xrays.shape)}: give images and geometry that match")
+        if not torch.isfinite(xrays).all():
+            raise ValueError("the X-rays contain NaN or infinite pixels: repair or remove those views first")
+        self.projector, self.display = projector, xrays[None] if display else None
+        self.slope, offset = window.mu_affine(mu_water)
+        self.background = offset * projector(torch.ones(1, 1, *projector.grid.shape).to(xrays))
+        self.y = xrays[None]
+        self.views = expected[0]
+        self.calls = 1
+
+    def project(self, x: Tensor) -> Tensor:
+        """P(x): line integrals (B, K, V, U) of the CT x."""
+        self.calls += 1
+        return self.slope * self.projector(x) + self.background
+
+    def linear(self, d: Tensor) -> Tensor:
+        """The linear part of P, for differences d of CTs."""
+        self.calls += 1
+        return self.slope * self.projector(d)
+
+    def adjoint(self, r: Tensor) -> Tensor:
+        """The exact adjoint of `linear`: (B, K, V, U) -> (B, 1, X, Y, Z)."""
+        self.calls += 1
+        return self.slope * self.projector.T(r)
+
+    @property
+    def norm(self) -> float:
+        """Spectral norm of `linear`."""
+        return self.slope * self.projector.norm()
+
+    def calibrate(self, x: Tensor) -> None:
+        """Where the views are display values: refit their gain and offset to the projections of the CT x."""
+        if self.display is not None:
+            self.y = match_views(self.display, self.project(x))

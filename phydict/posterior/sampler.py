@@ -1,0 +1,53 @@
+"""What every sampler promises, and sampling the prior alone (Eqs. 1 and 2 without X-rays)."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from phydict.diffusion import Denoiser, ddim
+
+if TYPE_CHECKING:
+    from phydict.posterior.measurement import Measurement
+
+
+class Sampler(ABC):
+    """Settings of a sampling method; `sample` turns noise into a clean state."""
+
+    @abstractmethod
+    def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, draw: torch.Generator,
+               on_step: Callable[[], None] = lambda: None) -> Tensor:
+        """Noise x (B, C, X, Y, Z) at time 1 -> clean states; `draw` is the source of any further noise."""
+
+    @abstractmethod
+    def steps(self) -> int:
+        """How often `sample` calls on_step."""
+
+
+@dataclass(frozen=True)
+class PriorOnly(Sampler):
+    """A sample of the prior that ignores the X-rays: deterministic DDIM with `iterations` noise levels."""
+
+    iterations: int = 50
+
+    def steps(self) -> int:
+        return self.iterations
+
+    def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, draw: torch.Generator,
+               on_step: Callable[[], None] = lambda: None) -> Tensor:
+        return descend(denoiser, x, self.iterations, on_step=on_step)
+
+
+def descend(denoiser: Denoiser, x: Tensor, iterations: int, start: float = 1.0,
+            on_step: Callable[[], None] = lambda: None) -> Tensor:
+    """Deterministic descent of the state x from time `start` to its clean end, clipped to the prior's range."""
+    for t, s in denoiser.schedule.steps(iterations, start):
+        x0 = denoiser.denoise(x, t).clamp(-1, 1)
+        x = ddim(denoiser.schedule, x0, x, t, s)
+        on_step()
+    return x0

@@ -1,0 +1,85 @@
+"""One file per prior: weights as safetensors, and in its header everything needed to use them rightly."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from phydict.diffusion import CosineSchedule
+from phydict.grid import Grid
+from phydict.prior.prior import STATE, Prior
+from phydict.prior.text import TextEncoder
+from phydict.prior.unet import VolumeUNet
+from phydict.units import HUWindow
+
+FORMAT = 1
+
+
+def save_prior(prior: Prior, path: str | Path, training: dict | None = None, dtype: torch.dtype = torch.float16):
+    """Writes `prior` to one .safetensors file, replacing it only when complete.
+
+    training: what the header should say of how it was trained (data, steps, command); plain JSON values.
+    dtype: precision of the weights on disk.
+    """
+    header = {"phydict": json.dumps(describe(prior) | {"training": training or {}})}
+    weights = prior.state_dict()
+    if prior.text is not None and prior.text.source:  # a pretrained BERT is named, not copied
+        weights = {k: w for k, w in weights.items() if not k.startswith("text.")}
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_suffix(".partial")
+    save_file({k: w.detach().to("cpu", dtype).contiguous() for k, w in weights.items()}, partial, header)
+    partial.replace(path)
+
+
+def describe(prior: Prior) -> dict:
+    """What a prior is, as plain JSON values: from this and the weights `load_prior` builds it again."""
+    text = prior.text
+    if text is not None:
+        text = {"source": text.source, "length": text.length, "width": text.width,
+                "layers": text.bert.config.num_hidden_layers,
+                "vocabulary": None if text.source else text.vocabulary}
+    return {"format": FORMAT, "grid": prior.grid.to_dict(), "hu_window": [prior.window.low, prior.window.high],
+            "state": STATE[:prior.network.state_channels], "sigma_data": prior.sigma_data,
+            "schedule": vars(prior.schedule), "network": prior.network.settings, "text": text}
+
+
+def load_prior(path: str | Path, device: str = "cpu") -> Prior:
+    """The prior in a .safetensors file written by `save_prior`, ready to denoise (float32, evaluation mode).
+
+    The text encoder stays on disk until the first report. Raises FileNotFoundError when there is no file, ValueError
+    when it is truncated or is no phydict prior.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"no prior at '{path}': give the .safetensors file that training wrote")
+    try:
+        with safe_open(path, "pt", device=device) as file:
+            header = json.loads((file.metadata() or {}).get("phydict", "{}"))
+            weights = {k: file.get_tensor(k).float() for k in file.keys() if not k.startswith("text.")}
+    except (SafetensorError, OSError, ValueError) as error:
+        raise ValueError(f"'{path}' is truncated or not a safetensors file ({error}): "
+                         "copy it again or train anew") from error
+    if header.get("format") != FORMAT:
+        raise ValueError(f"'{path}' carries no phydict prior of format {FORMAT}: give a file that save_prior wrote")
+    prior = Prior(VolumeUNet(**header["network"]), Grid(**header["grid"]), HUWindow(*header["hu_window"]),
+                  schedule=CosineSchedule(**header["schedule"]), sigma_data=header["sigma_data"])
+    prior.load_state_dict(weights)
+    if header["text"]:
+        prior.load_text = lambda: _load_text(path, header["text"])
+    return prior.to(device).eval().requires_grad_(False)
+
+
+def _load_text(path: Path, text: dict) -> TextEncoder:
+    if text["source"]:
+        return TextEncoder.pretrained(text["source"], text["length"])
+    encoder = TextEncoder.small(text["vocabulary"], text["width"], text["layers"], text["length"])
+    with safe_open(path, "pt") as file:
+        encoder.load_state_dict(
+            {k.removeprefix("text."): file.get_tensor(k).float() for k in file.keys() if k.startswith("text.")})
+    encoder.trainable = False
+    return encoder.eval().requires_grad_(False)

@@ -1,0 +1,102 @@
+"""A text-conditioned diffusion prior of CT: network, text, schedule, and the grid and HU window it was trained on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from phydict.diffusion import CosineSchedule, guided
+from phydict.grid import Grid
+from phydict.prior.text import TextEncoder
+from phydict.prior.unet import VolumeUNet
+from phydict.units import HUWindow
+
+STATE = ("ct", "lung", "airway", "vessel")
+"""The channels of the state: the CT volume, then soft anatomy masks mapped to [-1, 1]."""
+
+
+class Prior(nn.Module):
+    """x0-predicting denoiser of the state (B, C, X, Y, Z), channel 0 the CT in the prior's range.
+
+    The network's output is preconditioned (Karras et al. 2022, arXiv:2206.00364, Table 1, written for x_t):
+    x0 = c_skip x_t + c_out F(c_in x_t, t, context), so that F has unit variance to predict at every noise level.
+
+    network: F; text: the report encoder, None for a prior without text, or a function that loads it when the first
+    report arrives; grid, window: where and in which HU range the volumes live; sigma_data: standard deviation of
+    the state.
+    """
+
+    def __init__(self, network: VolumeUNet, grid: Grid, window: HUWindow, text: TextEncoder | None = None,
+                 schedule: CosineSchedule = CosineSchedule(), sigma_data: float = 0.5,
+                 load_text: Callable[[], TextEncoder] | None = None):
+        super().__init__()
+        if any(n % network.divisor for n in grid.shape):
+            raise ValueError(f"this network needs sizes divisible by {network.divisor}, but the grid is {grid.shape}")
+        self.network, self.text, self.load_text = network, text, load_text
+        self.grid, self.window, self.schedule, self.sigma_data = grid, window, schedule, sigma_data
+        self.null = nn.Parameter(0.02 * torch.randn(1, 1, network.context_dim))
+
+    def context(self, reports: Sequence[str]) -> Tensor:
+        """Reports -> contexts (B, L, D); the learned null token stands for padding and for a report left empty.
+
+        Without any report the text encoder is not loaded and L is 1.
+        """
+        if not any(reports):
+            return self.null.expand(len(reports), 1, -1)
+        if self.text is None:
+            if self.load_text is None:
+                raise ValueError("this prior was trained without text, but a report was given: leave the report out")
+            self.text = self.load_text().to(self.null.device)
+        states, mask = self.text(list(reports))
+        mask = mask & torch.tensor([bool(r) for r in reports], device=mask.device)[:, None]
+        return torch.where(mask[..., None], states, self.null)
+
+    def forward(self, x: Tensor, t: Tensor, context: Tensor) -> Tensor:
+        """Clean estimate of the state x (B, C, X, Y, Z) at times t (B,), in x's dtype."""
+        a, s = (w.to(x.dtype).view(-1, 1, 1, 1, 1) for w in self.schedule.scales(t.double()))
+        scale = (s**2 + (a * self.sigma_data) ** 2).rsqrt()
+        skip = a * (self.sigma_data * scale) ** 2
+        out = s * self.sigma_data * scale
+        return skip * x + out * self.network(scale * x, t, context).to(x.dtype)
+
+    @torch.no_grad()
+    def bind(self, report: str = "", guidance: float = 1.0, bf16: bool | None = None) -> BoundPrior:
+        """The denoiser of one report, with classifier-free guidance of the given scale inside (1 = none)."""
+        if guidance < 0:
+            raise ValueError(f"the guidance scale is at least 0, but {guidance} was given")
+        context = self.context([report])
+        return BoundPrior(self, context, guidance if report else 1.0, bf16)
+
+
+@dataclass(frozen=True)
+class BoundPrior:
+    """A Denoiser: a prior with its context fixed. Two network calls per step when guidance is not 1."""
+
+    prior: Prior
+    context: Tensor
+    guidance: float
+    bf16: bool | None = None
+
+    @property
+    def schedule(self) -> CosineSchedule:
+        return self.prior.schedule
+
+    @property
+    def channels(self) -> int:
+        return self.prior.network.state_channels
+
+    @torch.no_grad()
+    def denoise(self, x: Tensor, t: float) -> Tensor:
+        """E[x_0 | x_t = x, report]; runs in bfloat16 where `bf16` says so (None: unless x is float64)."""
+        n, prior = len(x), self.prior
+        times = torch.full((n,), float(t), device=x.device)
+        low = x.dtype != torch.float64 if self.bf16 is None else self.bf16
+        with torch.autocast(x.device.type, torch.bfloat16, enabled=low):
+            conditional = prior(x, times, self.context.expand(n, -1, -1))
+            if self.guidance == 1.0:
+                return conditional
+            null = prior.null.expand(n, self.context.shape[1], -1)
+            return guided(conditional, prior(x, times, null), self.guidance)

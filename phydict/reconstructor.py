@@ -1,0 +1,103 @@
+"""What every reconstruction method promises, and what it returns."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
+
+import nibabel
+import numpy as np
+from torch import Tensor
+
+from phydict.grid import Grid
+from phydict.xray import Projector
+
+
+class Stopwatch:
+    """Seconds spent per named stage of a reconstruction."""
+
+    def __init__(self):
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A reconstructed CT volume and the figures that say how far to trust it.
+
+    volume: HU (X, Y, Z) on `grid`; misfit: relative residual |A mu - y| / |y| over all views, and misfit_per_view;
+    seconds: per stage; network_calls, projector_calls: denoiser evaluations and applications of A or A.T to all
+    views; xrays, reprojection: line integrals (K, V, U), measured (calibrated where they were display values) and
+    of the volume; masks: soft anatomy masks (M, X, Y, Z) in [0, 1] where the method gives them.
+    """
+
+    volume: Tensor
+    grid: Grid
+    method: str
+    seed: int
+    misfit: float
+    misfit_per_view: list[float]
+    seconds: dict[str, float]
+    xrays: Tensor
+    reprojection: Tensor
+    network_calls: int = 0
+    projector_calls: int = 0
+    masks: Tensor | None = None
+
+    def save_nifti(self, path: str | Path) -> None:
+        """Writes the volume as float32 HU with the grid's affine (RAS+ mm), replacing the file only when complete."""
+        save_nifti(path, self.volume.numpy(), self.grid)
+
+
+def save_nifti(path: str | Path, volume: np.ndarray, grid: Grid) -> None:
+    """Writes `volume` (X, Y, Z) on `grid` as NIfTI (.nii or .nii.gz), replacing the file only when complete."""
+    path = Path(path)
+    image = nibabel.Nifti1Image(np.asarray(volume, np.float32), grid.affine)
+    image.header.set_xyzt_units("mm", "sec")
+    image.set_sform(grid.affine, code="scanner")
+    image.set_qform(grid.affine, code="scanner")
+    partial = path.with_name("partial." + path.name)
+    nibabel.save(image, partial)
+    partial.replace(path)
+
+
+class Reconstructor(ABC):
+    """Turns X-rays into a CT volume. Implementations hold settings only; one object serves any number of cases."""
+
+    @abstractmethod
+    def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,
+                    seed: int = 0, on_step: Callable[[], None] = lambda: None) -> Reconstruction:
+        """Reconstruct one case.
+
+        xrays: line integrals (K, V, U), or, with display=True, values that are affine in them with an unknown gain
+        and offset per view. report: radiology text, "" for none. seed: the only source of randomness.
+        on_step: called once per step, `steps()` times in all. Raises ValueError when grid or views do not fit.
+        """
+
+    @abstractmethod
+    def steps(self) -> int:
+        """How often `reconstruct` calls on_step."""
+
+
+def misfits(reprojection: Tensor, xrays: Tensor) -> dict:
+    """Relative residual |P - y| / |y| of line integrals (K, V, U): over all views and per view."""
+    residual, size = (reprojection - xrays).flatten(1).norm(dim=1), xrays.flatten(1).norm(dim=1).clamp(min=1e-12)
+    return {"misfit": float(residual.norm() / size.norm()), "misfit_per_view": (residual / size).tolist()}
+
+
+def describe(settings) -> dict:
+    """A method's settings as plain JSON values: class name and fields, nested."""
+    return {"class": type(settings).__name__} | {
+        f.name: describe(value) if is_dataclass(value := getattr(settings, f.name)) else value
+        for f in fields(settings)}

@@ -1,0 +1,199 @@
+"""Where the X-ray sources and detectors are: the poses of a set of cone-beam views, in world millimetres."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from phydict.grid import Grid
+
+VECTOR_KEYS = ("sources", "detectors", "u", "v", "shape")
+ORBIT_KEYS = ("views", "source_to_detector", "source_to_isocentre", "shape", "pixel")
+ORBIT_OPTIONS = ("start_degrees", "arc_degrees")
+
+
+@dataclass(frozen=True, eq=False)
+class ConeBeam:
+    """K cone-beam views onto flat detectors of V rows and U columns, in RAS+ world millimetres.
+
+    sources, detectors: (K, 3) the focal spots and the detectors' centres.
+    u, v: (K, 3) the step from one column to the next and from one row to the next, perpendicular to each other.
+    shape: (V, U) pixels. Pixel (r, c) is centred on detector + (c - (U-1)/2) u + (r - (V-1)/2) v.
+    Raises ValueError for wrong shapes, non-finite numbers, degenerate detectors and a source in a detector's plane.
+    """
+
+    sources: np.ndarray
+    detectors: np.ndarray
+    u: np.ndarray
+    v: np.ndarray
+    shape: tuple[int, int]
+
+    def __post_init__(self):
+        shape = tuple(int(n) for n in np.atleast_1d(self.shape))
+        if len(shape) != 2 or min(shape) < 1:
+            raise ValueError(f"a detector needs two positive sizes (rows, columns), but {self.shape} was given")
+        object.__setattr__(self, "shape", shape)
+        for name in ("sources", "detectors", "u", "v"):
+            value = np.array(getattr(self, name), float) + 0.0  # no negative zeros
+            if value.ndim != 2 or value.shape[1] != 3 or len(value) < 1:
+                raise ValueError(f"a beam's {name} must be (views, 3) numbers in mm, but shape {value.shape} was given")
+            if len(value) != len(np.asarray(self.sources)):
+                raise ValueError(f"a beam has {len(self.sources)} sources, but {len(value)} rows in {name}; "
+                                 "give one row per view")
+            if not np.isfinite(value).all():
+                raise ValueError(f"a beam's {name} must be finite numbers in mm, but {value.tolist()} was given")
+            value.setflags(write=False)
+            object.__setattr__(self, name, value)
+        width, height = np.linalg.norm(self.u, axis=1), np.linalg.norm(self.v, axis=1)
+        if min(width.min(), height.min()) <= 0:
+            raise ValueError("a beam's u and v must be non-zero steps in mm, but a zero step was given")
+        slant = np.abs((self.u * self.v).sum(1)) / (width * height)
+        if slant.max() > 1e-4:
+            raise ValueError(f"view {slant.argmax()}: u must be perpendicular to v, but the cosine of their angle is "
+                             f"{slant.max():.2g}; give the steps along the rows and columns of a rectangular detector")
+        flat = np.abs(self.distances) < 1e-6 * np.linalg.norm(self.detectors - self.sources, axis=1) + 1e-9
+        if flat.any():
+            raise ValueError(f"view {flat.argmax()}: the source lies in the plane of its detector; check that sources, "
+                             "detectors, u and v are given in mm and in the same order")
+
+    @classmethod
+    def orbit(cls, views: int, source_to_detector: float, source_to_isocentre: float, shape: tuple[int, int],
+              pixel: float | tuple[float, float], start: float = 0.0, arc: float = 2 * math.pi) -> ConeBeam:
+        """Upright detectors on a circle about the superior axis: view k stands at start + arc k / views (radians).
+
+        Angle 0 is the PA view (source posterior, patient's right at the image's left, row 0 superior); at 90 degrees
+        the source is at the patient's left. Distances and pixel = (row height, column width) in mm.
+        Raises ValueError unless views >= 1 and 0 < source_to_isocentre < source_to_detector and pixel > 0.
+        """
+        if views != int(views) or views < 1:
+            raise ValueError(f"an orbit needs at least one view, but views={views} was given")
+        if not 0 < source_to_isocentre < source_to_detector:
+            raise ValueError(f"the isocentre must lie between source and detector, but source_to_isocentre="
+                             f"{source_to_isocentre} mm and source_to_detector={source_to_detector} mm were given")
+        height, width = np.broadcast_to(np.asarray(pixel, float), 2)
+        if not (height > 0 and width > 0):
+            raise ValueError(f"pixel must be (row height, column width) > 0 in mm, but {pixel} was given")
+        angle = start + arc * np.arange(int(views)) / int(views)
+        cos, sin = np.round(np.cos(angle), 15), np.round(np.sin(angle), 15)  # exact zeros at right angles
+        zero = np.zeros_like(angle)
+        towards = np.stack([sin, cos, zero], 1)
+        return cls(-source_to_isocentre * towards, (source_to_detector - source_to_isocentre) * towards,
+                   width * np.stack([-cos, sin, zero], 1), height * np.stack([zero, zero, zero - 1], 1), shape)
+
+    @property
+    def views(self) -> int:
+        return len(self.sources)
+
+    @property
+    def normals(self) -> np.ndarray:
+        """Unit vectors (K, 3) perpendicular to the detectors, pointing from source to detector."""
+        normal = np.cross(self.u, self.v)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        return normal * np.where(((self.detectors - self.sources) * normal).sum(1, keepdims=True) < 0, -1, 1)
+
+    @property
+    def distances(self) -> np.ndarray:
+        """Perpendicular distances (K,) in mm from each source to its detector's plane."""
+        return ((self.detectors - self.sources) * self.normals).sum(1)
+
+    def pixels(self) -> np.ndarray:
+        """World positions (K, V, U, 3) in mm of the pixels' centres."""
+        rows, columns = (np.arange(n) - (n - 1) / 2 for n in self.shape)
+        return (self.detectors[:, None, None] + columns[None, None, :, None] * self.u[:, None, None]
+                + rows[None, :, None, None] * self.v[:, None, None])
+
+    def select(self, views) -> ConeBeam:
+        """The beam with only `views` (indices, slice or mask), in the order given."""
+        index = np.atleast_1d(np.arange(self.views)[views])
+        return ConeBeam(self.sources[index], self.detectors[index], self.u[index], self.v[index], self.shape)
+
+    def binned(self, factor: int) -> ConeBeam:
+        """The beam whose pixels are blocks of factor x factor pixels; the field of view stays the same."""
+        if factor != int(factor) or factor < 1 or any(n % int(factor) for n in self.shape):
+            raise ValueError(f"a detector of {self.shape[0]} x {self.shape[1]} pixels cannot be binned by {factor}; "
+                             "give a positive whole number that divides both sizes")
+        factor = int(factor)
+        return ConeBeam(self.sources, self.detectors, factor * self.u, factor * self.v,
+                        (self.shape[0] // factor, self.shape[1] // factor))
+
+    def check(self, grid: Grid) -> None:
+        """Raise ValueError unless the whole box of voxels lies between every source and its detector's plane."""
+        depth = (grid.corners() @ self.normals.T) - (self.sources * self.normals).sum(1)  # (8, K) from source plane
+        centre = ((grid.centre - self.sources) * self.normals).sum(1)
+        for k, distance in enumerate(self.distances):
+            near, far = depth[:, k].min(), depth[:, k].max()
+            if near > 0 and far < distance:
+                continue
+            reach = f"reaches {centre[k] - near:.1f} mm"
+            culprit = "source" if near <= 0 else "detector"
+            raise ValueError(
+                f"view {k}: the {culprit} lies inside the volume or the volume extends behind it: "
+                f"source to volume centre is {centre[k]:.1f} mm and volume centre to detector is "
+                f"{distance - centre[k]:.1f} mm along the view, but the volume {reach} from its centre; "
+                "move the source or the detector, or give a smaller volume")
+
+    def same_as(self, other: ConeBeam, tolerance: float = 1e-6) -> bool:
+        """Whether both beams have the same poses to `tolerance` mm and the same detector shape."""
+        return self.shape == other.shape and self.views == other.views and all(
+            np.allclose(getattr(self, name), getattr(other, name), rtol=0, atol=tolerance)
+            for name in ("sources", "detectors", "u", "v"))
+
+    def to_dict(self) -> dict:
+        """Plain lists, from which `ConeBeam(**d)` builds the same beam."""
+        return {name: np.asarray(getattr(self, name)).tolist() for name in VECTOR_KEYS}
+
+    def save(self, path: str | Path) -> None:
+        """Write the beam as YAML in the vector form (keys sources, detectors, u, v in mm, shape)."""
+        Path(path).write_text(yaml.safe_dump(self.to_dict(), sort_keys=False, default_flow_style=None))
+
+    @classmethod
+    def load(cls, path: str | Path) -> ConeBeam:
+        """Read a beam from YAML: the vector form that `save` writes, or one mapping `orbit:`.
+
+        orbit: {views, source_to_detector, source_to_isocentre, shape: [rows, columns], pixel: [row mm, column mm]}
+        and optionally start_degrees (0) and arc_degrees (360).
+        Raises FileNotFoundError, and ValueError naming the file for unknown or missing keys and impossible geometry.
+        """
+        path = Path(path)
+        if not path.is_file():
+            raise FileNotFoundError(f"there is no geometry file {path}; write one with ConeBeam.save or by hand")
+        try:
+            content = yaml.safe_load(path.read_text())
+        except yaml.YAMLError as error:
+            raise ValueError(f"{path} is not valid YAML: {error}") from error
+        try:
+            return cls.from_dict(content)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
+
+    @classmethod
+    def from_dict(cls, content: dict) -> ConeBeam:
+        """The beam of a mapping in one of the two forms that `load` reads. Raises ValueError naming the key."""
+        try:
+            if not isinstance(content, dict) or "orbit" not in content:
+                _check_keys(content, VECTOR_KEYS, ())
+                return cls(**content)
+            _check_keys(content, ("orbit",), ())
+            orbit = content["orbit"]
+            _check_keys(orbit, ORBIT_KEYS, ORBIT_OPTIONS)
+            return cls.orbit(**{key: orbit[key] for key in ORBIT_KEYS},
+                             start=math.radians(orbit.get("start_degrees", 0.0)),
+                             arc=math.radians(orbit.get("arc_degrees", 360.0)))
+        except TypeError as error:
+            raise ValueError(f"a beam's values are numbers and lists of numbers ({error})") from error
+
+
+def _check_keys(content, required: tuple[str, ...], optional: tuple[str, ...]) -> None:
+    if not isinstance(content, dict):
+        raise ValueError(f"a mapping with the keys {', '.join(required)} was expected, but {content!r} was found")
+    allowed = ", ".join(required + optional)
+    for key in content:
+        if key not in required + optional:
+            raise ValueError(f"unknown key {key!r}; the keys are {allowed}")
+    for key in required:
+        if key not in content:
+            raise ValueError(f"missing key {key!r}; the keys are {allowed}")

@@ -1,0 +1,231 @@
+"""Laws of measured X-rays: what is written is read back, intensities mean what the YAML says, and misfits are named."""
+
+from __future__ import annotations
+
+import re
+
+import nibabel
+import numpy as np
+import pytest
+import torch
+import yaml
+from PIL import Image
+
+from phydict.datasets.radiographs import Intensity, find_xrays, load_xrays, save_xrays
+from phydict.xray.geometry import ConeBeam
+
+SHAPE = (6, 5)
+ORBIT = {"views": 2, "source_to_detector": 1020.0, "source_to_isocentre": 740.0, "shape": list(SHAPE),
+         "pixel": [70.0, 80.0]}
+
+
+def images(views=2, seed=0):
+    return np.random.default_rng(seed).uniform(0, 6, (views, *SHAPE)).astype(np.float32)
+
+
+def write(folder, arrays, ending="npy", name="view_{}", **blocks):
+    folder.mkdir(parents=True, exist_ok=True)
+    for k, array in enumerate(arrays):
+        file = folder / f"{name.format(k)}.{ending}"
+        if ending == "npy":
+            np.save(file, array)
+        elif ending == "png":
+            Image.fromarray(array).save(file)
+        else:
+            nibabel.save(nibabel.Nifti1Image(array.T, np.eye(4)), file)
+    (folder / "geometry.yaml").write_text(yaml.safe_dump(blocks or {"orbit": ORBIT}))
+    return folder
+
+
+def fails(sentence, folder, error=ValueError, **arguments):
+    with pytest.raises(error, match=sentence) as caught:
+        load_xrays(folder, **arguments)
+    assert "\n" not in str(caught.value)
+
+
+def test_saved_npy_is_read_back_exactly(tmp_path):
+    beam = ConeBeam.orbit(2, 1020, 740, SHAPE, 70)
+    save_xrays(tmp_path / "case", torch.from_numpy(images()), beam, "Findings: none.")
+    case = load_xrays(tmp_path / "case")
+    assert (case["xrays"].numpy() == images()).all() and case["beam"].same_as(beam)
+    assert (case["id"], case["report"], case["display"]) == ("case", "Findings: none.", False)
+
+
+def test_saved_png_is_read_back_to_half_a_step(tmp_path):
+    save_xrays(tmp_path, images() - 1, ConeBeam.orbit(2, 1020, 740, SHAPE, 70), png=True)
+    step = np.ptp(images()) / 65535
+    assert np.abs(load_xrays(tmp_path)["xrays"].numpy() - (images() - 1)).max() <= 0.51 * step
+
+
+def test_saving_again_leaves_no_old_report_and_refuses_to_mix_with_other_images(tmp_path):
+    beam = ConeBeam.orbit(2, 1020, 740, SHAPE, 70)
+    save_xrays(tmp_path, images(), beam, "old")
+    save_xrays(tmp_path, images(), beam)
+    assert load_xrays(tmp_path)["report"] == ""
+    with pytest.raises(FileExistsError, match="view_0.npy, view_1.npy"):
+        save_xrays(tmp_path, images(), beam, png=True)
+
+
+def test_saving_checks_the_xrays_against_the_beam(tmp_path):
+    with pytest.raises(ValueError, match=r"\(3, 6, 5\) were given for a beam .* \(2, 6, 5\)"):
+        save_xrays(tmp_path, images(3), ConeBeam.orbit(2, 1020, 740, SHAPE, 70))
+
+
+@pytest.mark.parametrize("blocks", [{"orbit": ORBIT}, {"beam": {"orbit": ORBIT}},
+                                    {"beam": ConeBeam.orbit(2, 1020, 740, SHAPE, (70, 80)).to_dict()}],
+                         ids=["plain", "beam: orbit", "beam: vectors"])
+def test_every_form_of_geometry_gives_the_same_beam(tmp_path, blocks):
+    case = load_xrays(write(tmp_path, images(), **blocks))
+    assert case["beam"].same_as(ConeBeam.orbit(2, 1020, 740, SHAPE, (70, 80)))
+
+
+def test_view_10_comes_after_view_9(tmp_path):
+    stack = np.arange(11, dtype=np.float32)[:, None, None] * np.ones((1, *SHAPE), np.float32)
+    case = load_xrays(write(tmp_path, stack, name="img_800.0_{}", orbit=ORBIT | {"views": 11}))
+    assert case["xrays"][:, 0, 0].tolist() == list(range(11))
+
+
+def test_npy_nifti_and_png_of_the_same_counts_agree(tmp_path):
+    counts = np.random.default_rng(1).integers(1, 60000, (2, *SHAPE)).astype(np.uint16)
+    block = {"orbit": ORBIT, "intensity": {"kind": "counts", "air": 60000}}
+    a, b, c = (load_xrays(write(tmp_path / e, counts, e, **block))["xrays"] for e in ("npy", "png", "nii.gz"))
+    np.testing.assert_allclose(a, np.log(60000 / counts), rtol=1e-5)
+    assert a.equal(b) and a.equal(c)
+
+
+def test_scale_and_offset_are_applied(tmp_path):
+    pixels = np.arange(60, dtype=np.uint8).reshape(2, *SHAPE)
+    block = {"orbit": ORBIT, "intensity": {"kind": "line_integrals", "scale": 0.1, "offset": -1.0}}
+    xrays = load_xrays(write(tmp_path, pixels, "png", **block))["xrays"]
+    np.testing.assert_allclose(xrays, 0.1 * pixels - 1, rtol=1e-5, atol=1e-6)
+
+
+def test_zero_counts_are_finite(tmp_path):
+    block = {"orbit": ORBIT, "intensity": {"kind": "counts", "air": 1000, "floor": 0.5}}
+    xrays = load_xrays(write(tmp_path, np.zeros((2, *SHAPE), np.uint16), **block))["xrays"]
+    assert xrays.numpy() == pytest.approx(np.log(2000))
+
+
+def test_display_images_grow_with_density_whatever_their_polarity(tmp_path):
+    pixels = np.arange(60, dtype=np.uint8).reshape(2, *SHAPE) * 4
+    bright, dark = (load_xrays(write(tmp_path / n, p, "png", orbit=ORBIT, intensity={
+        "kind": "display", "bright_is_dense": n == "bright"})) for n, p in (("bright", pixels), ("dark", 255 - pixels)))
+    assert bright["display"] and dark["display"]
+    torch.testing.assert_close(bright["xrays"], dark["xrays"])
+    assert 0 <= bright["xrays"].min() and bright["xrays"].max() <= 1
+    assert bright["xrays"][1, 5, 4] > bright["xrays"][0, 0, 0]
+
+
+def test_flips_turn_rows_and_columns(tmp_path):
+    case = load_xrays(write(tmp_path, images(), orbit=ORBIT, orientation={"flip_rows": True, "flip_columns": True}))
+    assert (case["xrays"].numpy() == images()[:, ::-1, ::-1]).all()
+    case = load_xrays(write(tmp_path, images(), orbit=ORBIT, orientation={"flip_rows": True}))
+    assert (case["xrays"].numpy() == images()[:, ::-1]).all()
+
+
+def test_rgba_with_equal_channels_is_grey(tmp_path):
+    grey = np.arange(60, dtype=np.uint8).reshape(2, *SHAPE)
+    rgba = np.concatenate([np.repeat(grey[..., None], 3, -1), np.full((2, *SHAPE, 1), 255, np.uint8)], -1)
+    block = {"orbit": ORBIT, "intensity": {"kind": "line_integrals"}}
+    assert (load_xrays(write(tmp_path / "a", rgba, "png", **block))["xrays"].numpy() == grey).all()
+    rgba[1, 2, 3, 0] += 1
+    fails("colour channels differ", write(tmp_path / "b", rgba, "png", **block))
+
+
+def test_a_shared_geometry_and_an_intensity_argument_replace_the_folders_own(tmp_path):
+    folder = write(tmp_path / "case", np.ones((2, *SHAPE), np.uint8), "png", nonsense=1)
+    shared = tmp_path / "shared.yaml"
+    shared.write_text(yaml.safe_dump({"orbit": ORBIT}))
+    case = load_xrays(folder, geometry=shared, intensity=Intensity("line_integrals", scale=2.0))
+    assert (case["xrays"] == 2).all()
+
+
+def test_find_xrays_takes_a_case_or_a_folder_of_cases(tmp_path):
+    for name in ("p10", "p9"):
+        write(tmp_path / name, images())
+    (tmp_path / "notes").mkdir()
+    assert [p.name for p in find_xrays(tmp_path)] == ["p9", "p10"]
+    assert find_xrays(tmp_path / "p9") == [tmp_path / "p9"]
+    with pytest.raises(FileNotFoundError, match="nor its subfolders hold geometry.yaml"):
+        find_xrays(tmp_path / "notes")
+    with pytest.raises(FileNotFoundError, match="there is no folder"):
+        find_xrays(tmp_path / "absent")
+
+
+def test_seven_images_for_eight_views(tmp_path):
+    fails("holds 7 images, but .* describes 8 views", write(tmp_path, images(7), orbit=ORBIT | {"views": 8}))
+
+
+def test_wrong_image_size_names_both(tmp_path):
+    fails("6 x 5 pixels .* detector of 5 x 6", write(tmp_path, images(), orbit=ORBIT | {"shape": [5, 6]}))
+
+
+def test_missing_things_are_named(tmp_path):
+    fails("there is no folder", tmp_path / "absent", FileNotFoundError)
+    folder = write(tmp_path / "case", images())
+    (folder / "geometry.yaml").unlink()
+    fails("there is no geometry file", folder, FileNotFoundError)
+    fails("holds no X-ray image", write(tmp_path / "empty", []), FileNotFoundError)
+
+
+@pytest.mark.parametrize(("blocks", "sentence"), [
+    ({"beam": {"orbit": ORBIT}, "colour": 1}, "unknown key 'colour'"),
+    ({"orbit": ORBIT, "colour": 1}, "unknown key 'colour'"),
+    ({"orbit": ORBIT | {"distance": 3}}, "unknown key 'distance'"),
+    ({"orbit": ORBIT, "intensity": {"kind": "counts", "aire": 5}}, "unknown 'aire' in `intensity:`"),
+    ({"orbit": ORBIT, "intensity": {"scale": 5}}, "needs `kind`"),
+    ({"orbit": ORBIT, "intensity": {"kind": "log"}}, "'log' is unknown; give one of"),
+    ({"orbit": ORBIT, "intensity": {"kind": "counts"}}, "counts need `air`"),
+    ({"orbit": ORBIT, "intensity": {"kind": "counts", "air": "many"}}, "a number for air, but 'many'"),
+    ({"orbit": ORBIT, "intensity": {"kind": "display"}}, "need `bright_is_dense`"),
+    ({"orbit": ORBIT, "orientation": {"flip": True}}, "unknown 'flip' in `orientation:`"),
+    ({"orbit": ORBIT, "orientation": {"flip_rows": "yes please"}}, "true or false"),
+])
+def test_a_wrong_geometry_file_is_explained(tmp_path, blocks, sentence):
+    fails(f"geometry.yaml.*{sentence}", write(tmp_path, images(), **blocks))
+
+
+def test_bad_pixels_are_counted(tmp_path):
+    bad = images()
+    bad[1, 2, 3] = np.nan
+    fails("view_1.npy holds 1 NaN", write(tmp_path / "nan", bad))
+    bad[1, 2, :3] = -1, -2, -0.5
+    bad[1, 2, 3] = 1
+    fails("3 pixels hold negative counts", write(tmp_path / "negative", bad),
+          intensity=Intensity("counts", air=100.0))
+
+
+def test_integer_images_need_a_stated_intensity(tmp_path):
+    fails("hold uint8 pixels and .* has no `intensity:`", write(tmp_path, np.ones((2, *SHAPE), np.uint8), "png"))
+
+
+def test_a_report_in_another_encoding_is_named(tmp_path):
+    (write(tmp_path, images()) / "report.txt").write_bytes("Röntgen".encode("latin-1"))
+    fails("report.txt is not UTF-8 text", tmp_path)
+
+
+def test_mixed_pixel_types_are_refused(tmp_path):
+    folder = write(tmp_path, np.ones((2, *SHAPE), np.uint8), "png")
+    np.save(folder / "view_1.npy", images()[1])
+    (folder / "view_1.png").unlink()
+    fails(re.escape("different pixel types (float32, uint8)"), folder)
+
+
+def test_unreadable_images_are_named(tmp_path):
+    for ending in ("png", "npy", "nii.gz"):
+        folder = write(tmp_path / ending, images())
+        (folder / "view_1.npy").unlink()
+        (folder / f"view_1.{ending}").write_bytes(b"not an image")
+        fails(f"view_1.{ending} cannot be read", folder)
+
+
+def test_a_truncated_png_is_named(tmp_path):
+    folder = write(tmp_path, np.random.default_rng(0).integers(0, 255, (2, *SHAPE)).astype(np.uint8), "png")
+    data = (folder / "view_0.png").read_bytes()
+    (folder / "view_0.png").write_bytes(data[: len(data) // 2])
+    fails("view_0.png cannot be read", folder)
+
+
+def test_a_stack_in_one_file_is_refused(tmp_path):
+    fails(re.escape("has shape (2, 6, 5); give one 2D image per view"),
+          write(tmp_path, [images()], orbit=ORBIT | {"views": 1}))

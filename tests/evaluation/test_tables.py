@@ -1,0 +1,149 @@
+"""The CSV loses nothing and is never half written; the Markdown table marks what is best."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+
+import pytest
+import torch
+from rich.console import Console
+
+from phydict.evaluation.metrics import MEASURES
+from phydict.evaluation.tables import markdown, read_csv, rich_table, summarise, write_csv
+from phydict.grid import Grid
+
+ROWS = [
+    {"case": "007", "method": "fdk", "ssim": 0.5, "psnr": 20.0, "mae_hu": 80.0, "seconds": 1.0},
+    {"case": "008", "method": "fdk", "ssim": 0.7, "psnr": 24.0, "mae_hu": 60.0, "seconds": 1.0},
+    {"case": "007", "method": "gibbs", "ssim": 0.8, "psnr": 27.0, "mae_hu": 30.0, "seconds": 90.0},
+    {"case": "008", "method": "gibbs", "ssim": 0.9, "psnr": 29.0, "mae_hu": 20.0, "seconds": 70.0},
+]
+
+
+def test_csv_round_trip_keeps_every_digit_and_kind(tmp_path):
+    rows = [{"case": "007", "method": "1", "psnr": 0.1 + 0.2, "seed": 3, "note": "a,\"b\"\nc", "code": "0012"},
+            {"case": "x", "method": "tv", "psnr": math.inf, "ssim": 1e-17}]
+    write_csv(tmp_path / "new" / "t.csv", rows)
+    assert read_csv(tmp_path / "new" / "t.csv") == rows
+
+
+def test_tensors_become_numbers_and_none_becomes_absent(tmp_path):
+    write_csv(tmp_path / "t.csv", [{"case": "a", "psnr": torch.tensor(1.5), "ssim": None, "lpips": math.nan}])
+    (row,) = read_csv(tmp_path / "t.csv")
+    assert row["psnr"] == 1.5 and "ssim" not in row and math.isnan(row["lpips"])
+
+
+def test_columns_are_the_union_with_case_and_method_first(tmp_path):
+    write_csv(tmp_path / "t.csv", [{"psnr": 1.0, "case": "a"}, {"ssim": 0.5, "method": "m", "case": "b"}])
+    assert (tmp_path / "t.csv").read_text().splitlines() == ["case,method,psnr,ssim", "a,,1.0,", "b,m,,0.5"]
+
+
+def test_appending_reads_the_old_rows_and_adds_columns(tmp_path):
+    path = tmp_path / "t.csv"
+    for row in ROWS + [{"case": "009", "method": "fdk", "lpips": 0.25}]:
+        write_csv(path, read_csv(path) + [row])
+    assert read_csv(path) == ROWS + [{"case": "009", "method": "fdk", "lpips": 0.25}]
+
+
+def test_a_truncated_file_is_named(tmp_path):
+    path = tmp_path / "t.csv"
+    write_csv(path, ROWS)
+    path.write_text(path.read_text()[:-12])
+    with pytest.raises(ValueError, match="line 5 .* cut off"):
+        read_csv(path)
+
+
+def test_an_error_while_writing_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
+    path = tmp_path / "t.csv"
+    write_csv(path, ROWS[:1])
+    monkeypatch.setattr(os, "replace", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        write_csv(path, ROWS)
+    assert read_csv(path) == ROWS[:1] and os.listdir(tmp_path) == ["t.csv"]
+
+
+def test_a_process_killed_while_writing_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "t.csv"
+    write_csv(path, ROWS[:1])
+    child = os.fork()
+    if child == 0:
+        os.fsync = lambda _: os.kill(os.getpid(), 9)
+        write_csv(path, ROWS)
+        os._exit(0)
+    assert os.WTERMSIG(os.waitpid(child, 0)[1]) == 9
+    assert read_csv(path) == ROWS[:1]
+
+
+def cells(table: str) -> dict[str, dict[str, str]]:
+    """{row name: {column name without its arrow: cell}} of a Markdown table."""
+    lines = [[c.strip() for c in line.strip("| ").split(" | ")] for line in table.splitlines() if line.startswith("|")]
+    names = [re.sub(" [↑↓]$", "", name) for name in lines[0]]
+    return {line[0]: dict(zip(names, line)) for line in lines[2:]}
+
+
+def test_bold_marks_the_best_in_the_right_direction():
+    table = cells(markdown(ROWS))
+    assert table["gibbs"]["SSIM"] == "**0.850 ± 0.071**" and table["fdk"]["SSIM"] == "0.600 ± 0.141"
+    assert table["gibbs"]["PSNR (dB)"] == "**28.00 ± 1.41**"
+    assert table["gibbs"]["MAE (HU)"] == "**25.0 ± 7.1**" and "**" not in table["fdk"]["MAE (HU)"]
+    assert table["fdk"]["time (s)"] == "**1.0 ± 0.0**" and "**" not in table["gibbs"]["time (s)"]
+
+
+@pytest.mark.parametrize("name", MEASURES)
+def test_every_known_metric_has_its_direction(name):
+    good_when_low = {"mae_hu", "mae_hu_lung", "misfit", "lpips", "fid", "fid_xy", "fid_yz", "fid_zx", "seconds"}
+    table = cells(markdown([{"case": "a", "method": "low", name: 1.0}, {"case": "a", "method": "high", name: 2.0}]))
+    best = "low" if name in good_when_low else "high"
+    assert [row for row, values in table.items() if "**" in list(values.values())[1]] == [best]
+
+
+def test_ties_share_the_place_and_failures_never_win():
+    rows = [{"case": "a", "method": m, "psnr": p} for m, p in
+            [("x", 20.001), ("y", 20.002), ("failed", math.nan), ("worse", 10.0)]]
+    table = cells(markdown(rows))
+    assert [m for m in table if "**" in table[m]["PSNR (dB)"]] == ["x", "y"]
+    assert table["failed"]["PSNR (dB)"] == "nan"
+
+
+def test_the_caption_states_range_grid_views_and_cases():
+    text = markdown(ROWS, grid=Grid.cube(64), views=8).splitlines()[-1]
+    for part in ("n = 2 cases", "[-1000, 1000]", "2000 HU", "64 x 64 x 64 voxels of 6 x 6 x 6 mm", "Views: 8"):
+        assert part in text
+    assert "Views: not stated" in markdown(ROWS)
+    assert "Views: 4, 8" in markdown([{**row, "views": v} for row in ROWS for v in (4, 8)], by="views")
+
+
+def test_the_caption_tells_when_methods_had_different_cases():
+    assert "n = 1 to 2 cases (not the same cases in every line)" in markdown(ROWS[:3])
+    assert "not the same" not in markdown(ROWS)
+
+
+def test_seeds_of_a_case_are_averaged_before_cases():
+    rows = [{"case": "a", "method": "m", "psnr": p} for p in (10.0, 10.0, 10.0)] + [
+        {"case": "b", "method": "m", "psnr": 20.0}]
+    got = summarise(rows)["m"]["psnr"]
+    assert (got.mean, got.cases) == (15, 2) and got.std == pytest.approx(50**0.5)
+
+
+def test_a_metric_that_a_method_lacks_is_a_dash():
+    table = cells(markdown(ROWS + [{"case": "007", "method": "tv", "psnr": 1.0}]))
+    assert table["tv"]["SSIM"] == "–" and table["tv"]["PSNR (dB)"] == "1.00"
+
+
+def test_the_console_table_says_the_same():
+    console = Console(width=200, record=True, file=open(os.devnull, "w"))
+    console.print(rich_table(ROWS, grid=Grid.cube(64), views=8))
+    text = console.export_text()
+    for part in ("0.850 ± 0.071", "25.0 ± 7.1", "MAE (HU) ↓", "[-1000, 1000]", "Views: 8"):
+        assert part in text
+
+
+def test_bad_requests_are_named():
+    with pytest.raises(ValueError, match="no rows"):
+        markdown([])
+    with pytest.raises(ValueError, match="'prior'"):
+        markdown(ROWS, by="prior")
+    with pytest.raises(ValueError, match="dice"):
+        markdown(ROWS, metrics=["dice"])

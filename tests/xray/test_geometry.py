@@ -1,0 +1,134 @@
+"""Where sources, detectors and pixels are, and what impossible geometry is told."""
+
+import numpy as np
+import pytest
+
+from phydict.xray import ConeBeam, Grid
+
+ORBIT = """orbit:
+  views: 4
+  source_to_detector: 1020
+  source_to_isocentre: 740
+  shape: [112, 96]
+  pixel: [5, 4]
+"""
+
+
+def orbit(views=4, shape=(112, 96), pixel=(5.0, 4.0), **angles):
+    return ConeBeam.orbit(views, 1020, 740, shape, pixel, **angles)
+
+
+def vectors(**changes):
+    return {**orbit(2, (4, 4)).to_dict(), **changes}
+
+
+def test_first_view_is_pa_and_second_of_four_comes_from_the_left():
+    beam = orbit()
+    np.testing.assert_allclose(beam.sources, [[0, -740, 0], [-740, 0, 0], [0, 740, 0], [740, 0, 0]], atol=1e-9)
+    np.testing.assert_allclose(beam.detectors, [[0, 280, 0], [280, 0, 0], [0, -280, 0], [-280, 0, 0]], atol=1e-9)
+    first = beam.pixels()[0, 0, 0]
+    np.testing.assert_allclose(first, [95 / 2 * 4, 280, 111 / 2 * 5])  # patient's right, superior
+    np.testing.assert_allclose(beam.pixels()[1, 0, -1], [280, 95 / 2 * 4, 111 / 2 * 5])  # anterior at the image's right
+
+
+def test_start_and_arc_place_the_same_views():
+    full = orbit(8)
+    assert orbit(4, start=np.pi, arc=np.pi).same_as(full.select(slice(4, 8)))
+    assert full.select([6, 1]).same_as(full.select([6]).select([0])) is False
+    assert full.select(np.arange(8) % 2 == 0).same_as(orbit(4))
+
+
+def test_binned_pixels_are_the_means_of_their_blocks():
+    beam = orbit()
+    blocks = beam.pixels().reshape(4, 28, 4, 24, 4, 3).mean((2, 4))
+    np.testing.assert_allclose(beam.binned(4).pixels(), blocks, atol=1e-9)
+    with pytest.raises(ValueError, match="112 x 96 pixels cannot be binned by 5"):
+        beam.binned(5)
+
+
+def test_distances_are_perpendicular_to_the_detector():
+    beam = orbit()
+    shifted = ConeBeam(beam.sources + 30 * beam.v, beam.detectors, beam.u, beam.v, beam.shape)
+    np.testing.assert_allclose(shifted.distances, 1020)
+
+
+@pytest.mark.parametrize("changes, sentence", [
+    ({"sources": [[0, 0, 0]]}, "1 sources, but 2 rows in detectors"),
+    ({"u": [[1, 0], [1, 0]]}, r"u must be \(views, 3\)"),
+    ({"detectors": [[0, float("nan"), 0], [0, 1, 0]]}, "detectors must be finite"),
+    ({"v": [[0, 0, 0], [0, 0, 1]]}, "zero step"),
+    ({"u": [[-4, 0, 1], [4, 0, 0]]}, "view 0: u must be perpendicular to v"),
+    ({"sources": [[10, 280, 0], [0, 740, 0]]}, "view 0: the source lies in the plane"),
+    ({"shape": [4]}, "two positive sizes"),
+    ({"shape": [4, 0]}, "two positive sizes"),
+])
+def test_bad_vectors_are_refused_with_a_reason(changes, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        ConeBeam(**vectors(**changes))
+
+
+@pytest.mark.parametrize("arguments, sentence", [
+    ((0, 1020, 740, (4, 4), 1), "at least one view"),
+    ((2, 740, 1020, (4, 4), 1), "must lie between source and detector"),
+    ((2, 1020, 740, (4, 4), (1, 0)), "row height, column width"),
+])
+def test_bad_orbits_are_refused_with_a_reason(arguments, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        ConeBeam.orbit(*arguments)
+
+
+def test_a_detector_inside_the_volume_is_refused_with_both_distances():
+    beam = ConeBeam.orbit(1, 1020, 950, (8, 8), 1)
+    with pytest.raises(ValueError, match=r"detector lies inside.*950\.0 mm.*70\.0 mm.*reaches 128\.0 mm"):
+        beam.check(Grid.cube(16, 256))
+    beam.check(Grid.cube(16, 138))
+    with pytest.raises(ValueError, match="view 1: the detector"):  # the corner reaches 97.6 mm at 45 degrees
+        ConeBeam.orbit(8, 1020, 950, (8, 8), 1).check(Grid.cube(16, 138))
+
+
+def test_a_source_inside_or_beside_the_volume_is_refused():
+    beam = ConeBeam.orbit(1, 500, 100, (8, 8), 1)
+    with pytest.raises(ValueError, match=r"source lies inside.*100\.0 mm.*400\.0 mm"):
+        beam.check(Grid.cube(16, 256))
+
+
+def test_the_default_geometry_clears_its_volume():
+    ConeBeam.orbit(8, 1020, 740, (448, 448), 1.25).check(Grid.cube(64))
+
+
+def test_yaml_round_trip_keeps_every_pose(tmp_path):
+    tilted = ConeBeam([[3, -700, 20]], [[1, 300, 4]], [[-2, 0.1, 0]], [[0.1, 2, -3]], (5, 6))
+    for beam in (tilted, orbit(3, start=0.1)):
+        beam.save(tmp_path / "beam.yaml")
+        assert ConeBeam.load(tmp_path / "beam.yaml").same_as(beam, tolerance=0)
+
+
+def test_yaml_orbit_is_read_in_degrees(tmp_path):
+    path = tmp_path / "beam.yaml"
+    path.write_text(ORBIT)
+    assert ConeBeam.load(path).same_as(orbit())
+    path.write_text(ORBIT + "  start_degrees: 90\n  arc_degrees: 180\n")
+    assert ConeBeam.load(path).same_as(orbit(start=np.pi / 2, arc=np.pi))
+
+
+@pytest.mark.parametrize("text, sentence", [
+    (ORBIT + "  angle: 3\n", "unknown key 'angle'"),
+    (ORBIT.replace("  views: 4\n", ""), "missing key 'views'"),
+    (ORBIT + "shape: [1, 1]\n", "unknown key 'shape'"),
+    (ORBIT.replace("740", "2000"), "must lie between"),
+    (ORBIT.replace("740", "far"), ""),
+    ("sources: [[0, -1, 0]]\n", "missing key 'detectors'"),
+    ("orbit: 3\n", "a mapping with the keys views"),
+    ("- 1\n", "a mapping with the keys sources"),
+    ("{", "not valid YAML"),
+])
+def test_bad_yaml_names_the_file_and_the_key(tmp_path, text, sentence):
+    path = tmp_path / "beam.yaml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=rf"beam\.yaml.*{sentence}"):
+        ConeBeam.load(path)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no geometry file .*nowhere.yaml"):
+        ConeBeam.load(tmp_path / "nowhere.yaml")

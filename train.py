@@ -1,0 +1,6 @@
+"""Train a prior: python train.py fit -c configs/prior/phantom.yaml"""
+
+from phydict.training import main
+
+if __name__ == "__main__":
+    main()

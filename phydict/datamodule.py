@@ -11,8 +11,7 @@ import numpy as np
 import torch
 from torch.utils.data import ConcatDataset, DataLoader, Dataset
 
-from phydict.datasets import CTCases, augment, find_cts, phantom_case
-from phydict.datasets.thorax import Thorax, report
+from phydict.datasets import CTCases, Thorax, augment, find_cts, phantom_case, report
 from phydict.grid import Grid
 from phydict.units import HUWindow
 

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset
 
-from phydict.datasets.report import read_calibrations, read_reports
+from phydict.datasets.ct_rate_tables import read_calibrations, read_reports
 from phydict.datasets.transforms import Calibration, case_id, prepare_ct
 from phydict.grid import Grid
 from phydict.units import HUWindow

@@ -15,8 +15,9 @@ import pytest
 import torch
 
 from phydict.datasets.ct_rate import CTCases, find_cts, patient_of, split_by_patient
-from phydict.datasets.report import join_report, read_reports
-from phydict.datasets.transforms import (AIR, Calibration, Deformation, augment, covering_grid, load_ct, prepare_ct,
+from phydict.datasets.ct_rate_tables import join_report, read_reports
+from phydict.datasets.augment import Deformation, augment
+from phydict.datasets.transforms import (AIR, Calibration, covering_grid, load_ct, prepare_ct,
                                          to_grid)
 from phydict.grid import Grid
 from phydict.units import HUWindow

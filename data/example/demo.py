@@ -1,0 +1,41 @@
+"""Reconstructs the example by three methods and compares them with the CT its X-rays were made of.
+
+    python data/example/demo.py
+"""
+
+from pathlib import Path
+
+import nibabel
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+import phydict
+from phydict.datasets import load_xrays
+from phydict.evaluation import method_panel, panel, rich_table, volume_metrics, write_csv
+
+METHODS = ("phydict_fast", "prior_only", "sirt")
+
+if __name__ == "__main__":
+    here, out = Path(__file__).parent, Path("runs/demo")
+    case, prior = load_xrays(here / "xrays"), phydict.load_prior("data/prior/phydict_64.safetensors")
+    truth = torch.from_numpy(nibabel.load(here / "truth.nii.gz").get_fdata(dtype="float32"))
+    out.mkdir(parents=True, exist_ok=True)
+    rows, volumes = [], {}
+    with Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()) as bar:
+        for method in METHODS:
+            steps = bar.add_task(method, total=phydict.METHODS[method].steps())
+            result = phydict.reconstruct(case["xrays"], case["beam"], prior, method, case["report"],
+                                         on_step=lambda: bar.advance(steps))
+            scores = volume_metrics(result.volume[None, None], truth[None, None])
+            rows.append({"case": "example", "method": method, "views": len(case["xrays"]), "grid": "64x64x64"} | scores
+                        | {"misfit": result.misfit, "seconds": sum(result.seconds.values())})
+            volumes[method] = result.volume
+            result.save_nifti(out / f"{method}.nii.gz")
+            panel(out / f"{method}.png", result.volume, result.grid, result.xrays, result.reprojection, truth,
+                  title=f"{method}: {case['report'].partition('Impression:')[2].strip()}")
+    captions = {row["method"]: f"{row['psnr']:.1f} dB, SSIM {row['ssim']:.2f}" for row in rows}
+    method_panel(out / "comparison.png", volumes, truth, prior.grid, captions)
+    write_csv(out / "results.csv", rows)
+    Console().print(rich_table(rows))
+    print(f"picture: {out / 'comparison.png'}\nvolumes, X-ray fits and results.csv: {out}")

@@ -47,7 +47,7 @@ class CachedPhantoms(Dataset):
         with np.load(file) as stored:
             masks = torch.from_numpy(stored["masks"].astype(np.float32) / 255)
             return {"volume": torch.from_numpy(stored["volume"].astype(np.float32)), "masks": masks,
-                    "has_masks": torch.ones(len(masks)), "report": report(Thorax.draw(seed))}
+                    "has_masks": torch.ones(len(masks), dtype=torch.bool), "report": report(Thorax.draw(seed))}
 
 
 class MixedCases(Dataset):
@@ -86,11 +86,19 @@ class PriorData(lightning.LightningDataModule):
         super().__init__()
         if not cts and not phantoms:
             raise ValueError("there is nothing to train on: give data.cts, or data.phantoms above 0")
+        if cts and Path(cache).resolve().is_relative_to(Path(cts).resolve()):
+            raise ValueError(f"data.cache {cache} lies inside data.cts {cts}: give a folder elsewhere")
         window = HUWindow(*window)
         self.grid, self.window = Grid.cube(voxels, side), window
         self.phantoms = CachedPhantoms(0, phantoms, self.grid, window, Path(cache))
         files = find_cts(cts, reports, metadata, fixed, exclude=exclude) if cts else []
+        for word in holdout or []:
+            if not any(word in f.id for f in files):
+                raise ValueError(f"data.holdout names '{word}', but no CT has that in its id"
+                                 + (f" (the first id is {files[0].id})" if files else "") + ": correct or remove it")
         held_out = [f for f in files if any(word in f.id for word in holdout or [])]
+        if len(held_out) == len(files) and not phantoms:
+            raise ValueError("there is nothing to train on: data.holdout holds out every CT, and data.phantoms is 0")
         self.cts = CTCases([f for f in files if f not in held_out], cache, self.grid, window)
         self.validation = ConcatDataset([
             CachedPhantoms(HELD_OUT_PHANTOM, validation_phantoms, self.grid, window, Path(cache)),
@@ -101,6 +109,10 @@ class PriorData(lightning.LightningDataModule):
         self.batch_size, self.workers = batch_size, workers
 
     def train_dataloader(self) -> DataLoader:
+        least = self.batch_size * self.trainer.world_size
+        if self.epoch_size < least:
+            raise ValueError(f"data.epoch_size is {self.epoch_size}, less than one batch on every device ({least}): "
+                             "raise it, or lower data.batch_size")
         epoch = MixedCases(self.cts, self.phantoms, self.ct_fraction, self.grid, self.window, self.epoch_size,
                            self.trainer.current_epoch, self.seed)
         return DataLoader(epoch, self.batch_size, num_workers=self.workers, drop_last=True)

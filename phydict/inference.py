@@ -14,6 +14,7 @@ import shutil
 import tempfile
 import zlib
 from collections.abc import Callable
+from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 
@@ -21,18 +22,18 @@ import lightning
 import torch
 from lightning.pytorch.cli import LightningCLI
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from phydict.datasets import find_cts, find_xrays, load_xrays, phantom_case, prepare_ct
+from phydict.command_line import one_sentence_errors, quiet
 from phydict.datamodule import HELD_OUT_PHANTOM
-from phydict.command_line import one_sentence_errors
+from phydict.datasets import find_cts, find_xrays, load_xrays, phantom_case, prepare_ct
 from phydict.evaluation import CaseMetrics, markdown, panel, rich_table, volume_metrics, write_csv
 from phydict.grid import Grid
 from phydict.methods import DEFAULT_PRIOR, binned, binning
 from phydict.posterior import Posterior, Sampler
 from phydict.prior import load_prior
+from phydict.progress import CaseProgress
 from phydict.reconstructor import Reconstruction, Reconstructor, describe
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Ideal, Projector
@@ -51,7 +52,8 @@ class Listed(Dataset):
         return len(self.makers)
 
     def __getitem__(self, i: int) -> dict:
-        return {"id": self.makers[i][0], "index": i} | self.makers[i][1]()
+        name, make = self.makers[i]
+        return make() | {"id": name, "index": i}
 
 
 class ReconstructionData(lightning.LightningDataModule):
@@ -76,11 +78,20 @@ class ReconstructionData(lightning.LightningDataModule):
         self.tables = {"reports": reports, "metadata": metadata, "fixed": fixed}
         self.with_report, self.simulator, self.simulation_voxels = with_report, simulator, simulation_voxels
         self.beam = ConeBeam.orbit(views, source_to_detector, source_to_isocentre, detector, pixel)
+        self.orbit = {"views": views, "source_to_detector": source_to_detector,
+                      "source_to_isocentre": source_to_isocentre, "detector": detector, "pixel": pixel}
+
+    def settings(self, stage: str) -> dict:
+        """What, beside the cases themselves, decides the X-rays that a stage (predict, test) reconstructs from."""
+        if stage == "predict":
+            return {"geometry": self.geometry}
+        return self.orbit | {"simulator": describe(self.simulator), "simulation_voxels": self.simulation_voxels,
+                             "with_report": self.with_report}
 
     def predict_dataloader(self) -> DataLoader:
         if not self.xrays:
             raise ValueError("predict needs data.xrays: a folder of X-ray images with geometry.yaml")
-        return self._loader([(folder.absolute().name, lambda f=folder: load_xrays(f, self.geometry))
+        return self._loader([(folder.resolve().name, lambda f=folder: load_xrays(f, self.geometry))
                              for folder in find_xrays(self.xrays)])
 
     def test_dataloader(self) -> DataLoader:
@@ -109,8 +120,13 @@ class ReconstructionData(lightning.LightningDataModule):
             return make(task.grid)
         return make(task.grid) | {"source": make(Grid.cube(self.simulation_voxels, task.grid.extent[0]))["volume"]}
 
+    def transfer_batch_to_device(self, batch: dict, device: torch.device, dataloader_idx: int) -> dict:
+        return batch  # a case holds its beam, which has no device; its X-rays are moved when they are reconstructed
+
     def _loader(self, makers: list[tuple]) -> DataLoader:
-        return DataLoader(Listed(self.trainer.lightning_module.pending(makers)), None)
+        cases = Listed(self.trainer.lightning_module.pending(makers))
+        self.trainer.strategy.barrier()  # every process has looked before any process finishes a case
+        return DataLoader(cases, None)
 
 
 class ReconstructionTask(lightning.LightningModule):
@@ -125,7 +141,7 @@ class ReconstructionTask(lightning.LightningModule):
                  guidance: float = 2.0, out: str = "runs/reconstructions", overwrite: bool = False, seed: int = 0):
         super().__init__()
         self.method_name, self.folder, self.overwrite, self.seed = name, Path(out) / name, overwrite, seed
-        check_writable(Path(out))
+        check_writable(self.folder)
         self.settings = {"name": name, "seed": seed, "method": describe(method)}
         self.grid, self.window = Grid.cube(64), HUWindow()
         if isinstance(method, Sampler):
@@ -136,8 +152,10 @@ class ReconstructionTask(lightning.LightningModule):
             method = Posterior(self.prior, method, guidance, name=name)
         self.reconstructor: Reconstructor = method
         self.metrics = CaseMetrics([name])
-        self.progress = Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
-                                 TimeElapsedColumn(), TimeRemainingColumn(), console=Console(stderr=True))
+        self.progress = CaseProgress()
+
+    def setup(self, stage: str) -> None:
+        self.settings["data"] = self.trainer.datamodule.settings(stage)
 
     def pending(self, cases: list[tuple]) -> list[tuple]:
         """The (id, loader) pairs that are not finished yet; a case finished with other settings is an error."""
@@ -158,8 +176,8 @@ class ReconstructionTask(lightning.LightningModule):
         case["xrays"] = self.trainer.datamodule.simulate(case, self._seed(case), self.grid, self.window)
         case["report"] = case["report"] if self.trainer.datamodule.with_report else ""
         result = self._reconstruct(case)
-        truth = self.window.to_hu(case["volume"])[None]
-        lung = case["masks"][None, :1] if bool(case["has_masks"][0]) else None
+        truth = self.window.to_hu(case["volume"])[None].cpu()
+        lung = case["masks"][None, :1].cpu() if bool(case["has_masks"][0]) else None
         scores = volume_metrics(result.volume[None, None], truth, lung) | {"misfit": result.misfit}
         self.metrics.update(case["index"], self.method_name, scores, seconds=sum(result.seconds.values()))
         self._finish(case, result, scores, truth[0, 0])
@@ -174,17 +192,13 @@ class ReconstructionTask(lightning.LightningModule):
         self._start(self.trainer.num_test_batches[0])
 
     def on_predict_end(self) -> None:
-        self.progress.stop()
         self.trainer.strategy.barrier()
 
     def on_test_end(self) -> None:
-        self.on_predict_end()
+        self.trainer.strategy.barrier()
 
     def _start(self, cases: int) -> None:
-        self.progress.disable = not self.trainer.is_global_zero
-        self.case_bar = self.progress.add_task(self.method_name, total=cases)
-        self.step_bar = self.progress.add_task("steps", total=self.reconstructor.steps())
-        self.progress.start()
+        self.progress.begin(self.method_name, cases, self.reconstructor.steps())
 
     def _seed(self, case: dict) -> int:
         return zlib.crc32(f"{self.seed}/{case['id']}".encode())
@@ -193,32 +207,42 @@ class ReconstructionTask(lightning.LightningModule):
         beam = case["beam"]
         beam.check(self.grid)
         factor = binning(self.grid, beam)
-        self.progress.reset(self.step_bar, description=case["id"])
+        self.progress.case(case["id"])
         xrays = binned(case["xrays"], factor).to(self.device)
         return self.reconstructor.reconstruct(
             xrays, Projector(self.grid, beam.binned(factor)), case["report"], case.get("display", False),
-            self._seed(case), lambda: self.progress.advance(self.step_bar))
+            self._seed(case), self.progress.advance)
 
     def _finish(self, case: dict, result: Reconstruction, scores: dict | None = None,
                 truth: Tensor | None = None) -> None:
         """Writes a case's folder beside its place and moves it there when it is complete."""
         final = self.folder / case["id"]
         partial = self.folder / f".{case['id']}.{os.getpid()}.partial"
-        partial.mkdir(parents=True, exist_ok=True)
-        result.save_nifti(partial / "volume.nii.gz")
-        panel(partial / "panel.png", result.volume, result.grid, result.xrays, result.reprojection, truth,
-              title=f"{case['id']}: {self.method_name}")
-        record = {"case": case["id"], "method": self.method_name, "scores": scores, "misfit": result.misfit,
-                  "misfit_per_view": result.misfit_per_view, "seconds": result.seconds,
-                  "network_calls": result.network_calls, "projector_calls": result.projector_calls,
-                  "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-                  "views": len(result.xrays), "grid": result.grid.to_dict(), "seed": result.seed,
-                  "report": case["report"], "settings": self.settings, "versions": versions()}
-        (partial / RECORD).write_text(json.dumps(record, indent=1))
-        if final.exists():
-            shutil.rmtree(final)
-        partial.rename(final)
-        self.progress.advance(self.case_bar)
+        try:
+            partial.mkdir(parents=True, exist_ok=True)
+            result.save_nifti(partial / "volume.nii.gz")
+            panel(partial / "panel.png", result.volume, result.grid, result.xrays, result.reprojection, truth,
+                  title=f"{case['id']}: {self.method_name}")
+            (partial / RECORD).write_text(json.dumps(self._record(case, result, scores), indent=1))
+            while partial.exists():  # another process may have finished the same case, with the same result
+                shutil.rmtree(final, ignore_errors=True)
+                with suppress(FileExistsError):
+                    partial.rename(final)
+        except OSError as error:
+            raise OSError(f"the case {final} could not be written ({error.strerror or error}): "
+                          "free some space, or give another model.out") from error
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+        self.progress.finished(f"{sum(result.seconds.values()):.1f} s, misfit {result.misfit:.4f}")
+
+    def _record(self, case: dict, result: Reconstruction, scores: dict | None) -> dict:
+        """All that is known of a finished case, as plain JSON values."""
+        return {"case": case["id"], "method": self.method_name, "scores": scores, "misfit": result.misfit,
+                "misfit_per_view": result.misfit_per_view, "seconds": result.seconds,
+                "network_calls": result.network_calls, "projector_calls": result.projector_calls,
+                "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+                "views": len(result.xrays), "grid": result.grid.to_dict(), "seed": result.seed,
+                "report": case["report"], "settings": self.settings, "versions": versions()}
 
     def summarise(self) -> list[dict]:
         """Scores of all finished cases; written as results.csv and results.md and printed."""
@@ -266,14 +290,26 @@ class InferenceCLI(LightningCLI):
 
     @staticmethod
     def subcommands() -> dict[str, set[str]]:
-        return {name: {"model", "dataloaders", "datamodule"} for name in ("predict", "test")}
+        unused = {"model", "dataloaders", "datamodule", "ckpt_path", "weights_only"}
+        return {"predict": unused | {"return_predictions"}, "test": unused | {"verbose"}}
+
+    def predict(self, model: ReconstructionTask, datamodule: ReconstructionData) -> None:
+        """Reconstruct X-rays."""
+        with model.progress:
+            self.trainer.predict(model, datamodule=datamodule, return_predictions=False)
+
+    def test(self, model: ReconstructionTask, datamodule: ReconstructionData) -> None:
+        """Simulate the X-rays of CTs, reconstruct and score them."""
+        with model.progress:
+            self.trainer.test(model, datamodule=datamodule, verbose=False)
 
 
 def main(args: list[str] | None = None) -> None:
     """Command line of inference: predict, test. A bad input ends in one sentence and exit code 2."""
-    with one_sentence_errors():
+    with one_sentence_errors(), quiet():
         cli = InferenceCLI(
             ReconstructionTask, ReconstructionData, args=args, seed_everything_default=0, save_config_callback=None,
+            parser_kwargs={"exit_on_error": False},
             trainer_defaults={"inference_mode": False, "logger": False, "enable_progress_bar": False,
                               "enable_checkpointing": False, "enable_model_summary": False, "accelerator": "auto",
                               "devices": 1})

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from pathlib import Path
+from pickle import UnpicklingError
 
 import lightning
 import torch
+from jsonargparse import auto_cli
 from lightning.pytorch.cli import LightningCLI
 from torch import Tensor
 
+from phydict.command_line import one_sentence_errors, quiet
 from phydict.datamodule import PriorData
 from phydict.diffusion import renoise
 from phydict.evaluation import method_panel
 from phydict.grid import Grid
 from phydict.posterior import descend
-from phydict.prior import Prior, TextEncoder, VolumeUNet, describe, learn_vocabulary
+from phydict.prior import Prior, TextEncoder, VolumeUNet, describe, learn_vocabulary, save_prior
+from phydict.prior.checkpoint import build_prior, build_text
 from phydict.units import HUWindow
 
 NOISE_LEVELS = (0.1, 0.3, 0.5, 0.7, 0.9)
@@ -33,8 +38,8 @@ class PriorTraining(lightning.LightningModule):
     """
 
     def __init__(self, network: VolumeUNet | None = None, text: str = "small", reports: list[str] | None = None,
-                 voxels: int = 64, side: float = 384.0, window: tuple[float, float] = (-1000.0, 1000.0), sigma_data: float = 0.5,
-                 text_dropout: float = 0.1, mask_weight: float = 0.1, learning_rate: float = 5e-4,
+                 voxels: int = 64, side: float = 384.0, window: tuple[float, float] = (-1000.0, 1000.0),
+                 sigma_data: float = 0.5, text_dropout: float = 0.1, mask_weight: float = 0.1, learning_rate: float = 5e-4,
                  weight_decay: float = 0.01, warmup: int = 100, decay_from: int = 0, decay_steps: int = 0,
                  montage_steps: int = 16, seed: int = 0):
         super().__init__()
@@ -51,7 +56,7 @@ class PriorTraining(lightning.LightningModule):
         self.text_dropout, self.mask_weight, self.montage_steps = text_dropout, mask_weight, montage_steps
         self.learning_rate, self.weight_decay = learning_rate, weight_decay
         self.warmup, self.decay_from, self.decay_steps = warmup, decay_from, decay_steps
-        self.seed, self.last_step_at = seed, None
+        self.seed, self.last_step_at, self.samples = seed, None, 0
 
     def training_step(self, batch: dict, _) -> Tensor:
         # Times and noise follow from seed and step alone, so that a resumed run repeats an uninterrupted one.
@@ -68,7 +73,8 @@ class PriorTraining(lightning.LightningModule):
         unit = (s**2 + (a * self.prior.sigma_data) ** 2) / (s * self.prior.sigma_data) ** 2
         loss = (unit * weight * error).sum() / (weight.expand_as(error).sum())
         self._log_speed(n)
-        self.log("loss", loss, prog_bar=True)
+        self.samples += n * self.trainer.world_size
+        self.log("loss", loss, prog_bar=True, batch_size=n)
         return loss
 
     def _state(self, batch: dict) -> tuple[Tensor, Tensor]:
@@ -82,7 +88,8 @@ class PriorTraining(lightning.LightningModule):
     def _log_speed(self, samples: int) -> None:
         now = time.perf_counter()
         if self.last_step_at is not None:
-            self.log("samples_per_s", samples * self.trainer.world_size / (now - self.last_step_at), prog_bar=True)
+            self.log("samples_per_s", samples * self.trainer.world_size / (now - self.last_step_at), prog_bar=True,
+                     batch_size=samples)
         self.last_step_at = now
 
     def validation_step(self, batch: dict, index: int) -> None:
@@ -94,8 +101,8 @@ class PriorTraining(lightning.LightningModule):
             denoiser = self.prior.bind(batch["report"][0] if self.prior.text is not None else "")
             estimate = denoiser.denoise(renoise(self.prior.schedule, x0, t, noise), t)
             errors.append((estimate - x0)[:, 0].square().mean().sqrt() * self.prior.window.half_width)
-            self.log(f"val/rmse_hu_t{t}", errors[-1], sync_dist=True)
-        self.log("val/rmse_hu", torch.stack(errors).mean(), prog_bar=True, sync_dist=True)
+            self.log(f"val/rmse_hu_t{t}", errors[-1], sync_dist=True, batch_size=len(x0))
+        self.log("val/rmse_hu", torch.stack(errors).mean(), prog_bar=True, sync_dist=True, batch_size=len(x0))
         if index < 4 and self.montage_steps and self.trainer.is_global_zero:
             sample = descend(denoiser, noise, self.montage_steps)
             folder = Path(self.trainer.log_dir or self.trainer.default_root_dir) / "samples"
@@ -116,20 +123,70 @@ class PriorTraining(lightning.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def on_save_checkpoint(self, checkpoint: dict) -> None:
-        checkpoint["phydict"] = describe(self.prior)
+        seen = {"steps": self.trainer.global_step, "samples": self.samples}
+        checkpoint["phydict"] = describe(self.prior) | {"training": seen}
+
+    def on_load_checkpoint(self, checkpoint: dict) -> None:
+        self.samples = checkpoint["phydict"].get("training", {}).get("samples", 0)
+
+
+def read_checkpoint(path: str | Path) -> dict:
+    """A checkpoint that training wrote. Raises FileNotFoundError, or ValueError when it is truncated or another's."""
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"there is no checkpoint {path}: give a .ckpt file that training wrote")
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    except (RuntimeError, EOFError, UnpicklingError) as error:
+        raise ValueError(f"the checkpoint {path} is truncated or damaged: copy it again, or train anew") from error
+    if not isinstance(checkpoint, dict) or "phydict" not in checkpoint:
+        raise ValueError(f"{path} is no checkpoint of a prior: give a .ckpt file that training wrote")
+    return checkpoint
+
+
+def export_prior(checkpoint: str, out: str) -> None:
+    """Write the averaged weights of a training checkpoint as a prior for reconstruction.
+
+    Args:
+        checkpoint: the .ckpt file that training wrote
+        out: the .safetensors file to write
+    """
+    if Path(out).suffix != ".safetensors":
+        raise ValueError(f"a prior is a .safetensors file, but {out} was given: give a name with that ending")
+    content = read_checkpoint(checkpoint)
+    header = content["phydict"]
+    weights = {k.removeprefix("prior."): w for k, w in content["state_dict"].items() if k.startswith("prior.")}
+    prior = build_prior(header, weights)
+    if header["text"]:
+        prior.text = build_text(header["text"], {k: w for k, w in weights.items() if k.startswith("text.")})
+    save_prior(prior, out, header.get("training", {"steps": content["global_step"]}))
+    print(f"prior in {out}")
 
 
 class PriorCLI(LightningCLI):
-    """Ties the data's grid and HU window to the model's."""
+    """fit and validate; ties the data's grid and HU window to the model's."""
+
+    @staticmethod
+    def subcommands() -> dict[str, set[str]]:
+        return {name: LightningCLI.subcommands()[name] for name in ("fit", "validate")}
 
     def add_arguments_to_parser(self, parser) -> None:
         for name in ("voxels", "side", "window"):
             parser.link_arguments(f"model.{name}", f"data.{name}")
         parser.link_arguments("data.reports", "model.reports", apply_on="instantiate")
 
+    def parse_arguments(self, parser, args) -> None:
+        super().parse_arguments(parser, args)
+        checkpoint = self.config[self.config.subcommand].ckpt_path
+        if checkpoint and checkpoint not in ("last", "best"):
+            read_checkpoint(checkpoint)
+
 
 def main(args: list[str] | None = None) -> None:
-    """Command line of training: fit, validate."""
-    PriorCLI(PriorTraining, PriorData, args=args, seed_everything_default=0,
-             save_config_kwargs={"overwrite": True},
-             parser_kwargs={"default_env": False})
+    """Command line of training: fit, validate, export. A bad input ends in one sentence and exit code 2."""
+    given = sys.argv[1:] if args is None else args
+    with one_sentence_errors(), quiet():
+        if given[:1] == ["export"]:
+            auto_cli(export_prior, args=given[1:], as_positional=False, exit_on_error=False)
+        else:
+            PriorCLI(PriorTraining, PriorData, args=args, seed_everything_default=0,
+                     save_config_kwargs={"overwrite": True}, parser_kwargs={"exit_on_error": False})

@@ -61,4 +61,4 @@ def typical_chest(projector: Projector) -> Tensor:
     x, y, _ = (index @ affine[:3, :3].T + affine[:3, 3] - torch.tensor(grid.centre)).unbind(-1)
     body = (x / 160) ** 2 + (y / 110) ** 2 < 1
     lungs = ((x.abs() - 75) / 55) ** 2 + (y / 80) ** 2 < 1
-    return (body - 0.75 * (body & lungs).double())[None, None].float()
+    return (body.float() - 0.75 * (body & lungs).float())[None, None]

@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
+from torch import Tensor
 
 from phydict.diffusion import CosineSchedule
 from phydict.grid import Grid
@@ -60,26 +61,45 @@ def load_prior(path: str | Path, device: str = "cpu") -> Prior:
     try:
         with safe_open(path, "pt", device=device) as file:
             header = json.loads((file.metadata() or {}).get("phydict", "{}"))
-            weights = {k: file.get_tensor(k).float() for k in file.keys() if not k.startswith("text.")}
+            weights = {k: file.get_tensor(k) for k in file.keys() if not k.startswith("text.")}
     except (SafetensorError, OSError, ValueError) as error:
-        raise ValueError(f"'{path}' is truncated or not a safetensors file ({error}): "
-                         "copy it again or train anew") from error
+        raise ValueError(f"'{path}' is truncated or not a safetensors file ({error}): copy it again, "
+                         "or export it from its training checkpoint") from error
     if header.get("format") != FORMAT:
         raise ValueError(f"'{path}' carries no phydict prior of format {FORMAT}: give a file that save_prior wrote")
-    prior = Prior(VolumeUNet(**header["network"]), Grid(**header["grid"]), HUWindow(*header["hu_window"]),
-                  schedule=CosineSchedule(**header["schedule"]), sigma_data=header["sigma_data"])
-    prior.load_state_dict(weights)
+    try:
+        prior = build_prior(header, weights)
+    except ValueError as error:
+        raise ValueError(f"'{path}' contradicts itself: {error}") from error
     if header["text"]:
         prior.load_text = lambda: _load_text(path, header["text"])
     return prior.to(device).eval().requires_grad_(False)
 
 
-def _load_text(path: Path, text: dict) -> TextEncoder:
+def build_prior(header: dict, weights: dict[str, Tensor]) -> Prior:
+    """The prior that `describe` described, with these weights; those of the text encoder ("text.") are left out.
+
+    Raises ValueError where header and weights do not fit together.
+    """
+    try:
+        prior = Prior(VolumeUNet(**header["network"]), Grid(**header["grid"]), HUWindow(*header["hu_window"]),
+                      schedule=CosineSchedule(**header["schedule"]), sigma_data=header["sigma_data"])
+        prior.load_state_dict({k: w.float() for k, w in weights.items() if not k.startswith("text.")})
+    except (KeyError, TypeError, RuntimeError) as error:
+        raise ValueError(f"the weights are not those of the network that the header describes ({error})") from error
+    return prior
+
+
+def build_text(text: dict, weights: dict[str, Tensor]) -> TextEncoder:
+    """The text encoder of a header's "text", frozen; `weights` ("text.") are used unless it is a pretrained one."""
     if text["source"]:
         return TextEncoder.pretrained(text["source"], text["length"])
     encoder = TextEncoder.small(text["vocabulary"], text["width"], text["layers"], text["length"])
-    with safe_open(path, "pt") as file:
-        encoder.load_state_dict(
-            {k.removeprefix("text."): file.get_tensor(k).float() for k in file.keys() if k.startswith("text.")})
+    encoder.load_state_dict({k.removeprefix("text."): w.float() for k, w in weights.items() if k.startswith("text.")})
     encoder.trainable = False
     return encoder.eval().requires_grad_(False)
+
+
+def _load_text(path: Path, text: dict) -> TextEncoder:
+    with safe_open(path, "pt") as file:
+        return build_text(text, {k: file.get_tensor(k) for k in file.keys() if k.startswith("text.")})

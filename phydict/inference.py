@@ -11,6 +11,7 @@ import os
 import platform
 import resource
 import shutil
+import sys
 import tempfile
 import zlib
 from collections.abc import Callable
@@ -91,7 +92,7 @@ class ReconstructionData(lightning.LightningDataModule):
     def predict_dataloader(self) -> DataLoader:
         if not self.xrays:
             raise ValueError("predict needs data.xrays: a folder of X-ray images with geometry.yaml")
-        return self._loader([(folder.resolve().name, lambda f=folder: load_xrays(f, self.geometry))
+        return self._loader([(Path(os.path.abspath(folder)).name, lambda f=folder: load_xrays(f, self.geometry))
                              for folder in find_xrays(self.xrays)])
 
     def test_dataloader(self) -> DataLoader:
@@ -166,7 +167,10 @@ class ReconstructionTask(lightning.LightningModule):
             if record.exists() and json.loads(record.read_text())["settings"] != self._json(self.settings):
                 raise ValueError(f"{self.folder / name} was finished with other settings: "
                                  "set model.overwrite to true, or give another model.out")
-        return [case for case in cases if not (self.folder / case[0] / RECORD).exists()]
+        left = [case for case in cases if not (self.folder / case[0] / RECORD).exists()]
+        if len(left) < len(cases) and self.trainer.is_global_zero:
+            print(f"{len(cases) - len(left)} of {len(cases)} cases are finished already and are kept", file=sys.stderr)
+        return left
 
     def predict_step(self, case: dict, _=None) -> None:
         self._finish(case, self._reconstruct(case))
@@ -257,7 +261,9 @@ class ReconstructionTask(lightning.LightningModule):
         if rows:
             write_csv(self.folder / "results.csv", rows)
             (self.folder / "results.md").write_text(markdown(rows))
-            Console().print(rich_table(rows))
+            console = Console()
+            console.width = max(console.width, 80 if console.is_terminal else 120)
+            console.print(rich_table(rows))
         return rows
 
     @staticmethod

@@ -39,9 +39,9 @@ class PriorTraining(lightning.LightningModule):
 
     def __init__(self, network: VolumeUNet | None = None, text: str = "small", reports: list[str] | None = None,
                  voxels: int = 64, side: float = 384.0, window: tuple[float, float] = (-1000.0, 1000.0),
-                 sigma_data: float = 0.5, text_dropout: float = 0.1, mask_weight: float = 0.1, learning_rate: float = 5e-4,
-                 weight_decay: float = 0.01, warmup: int = 100, decay_from: int = 0, decay_steps: int = 0,
-                 montage_steps: int = 16, seed: int = 0):
+                 sigma_data: float = 0.5, text_dropout: float = 0.1, mask_weight: float = 0.1,
+                 learning_rate: float = 5e-4, weight_decay: float = 0.01, warmup: int = 100, decay_from: int = 0,
+                 decay_steps: int = 0, montage_steps: int = 16, seed: int = 0):
         super().__init__()
         network = network or VolumeUNet()
         encoder = None
@@ -103,9 +103,9 @@ class PriorTraining(lightning.LightningModule):
             errors.append((estimate - x0)[:, 0].square().mean().sqrt() * self.prior.window.half_width)
             self.log(f"val/rmse_hu_t{t}", errors[-1], sync_dist=True, batch_size=len(x0))
         self.log("val/rmse_hu", torch.stack(errors).mean(), prog_bar=True, sync_dist=True, batch_size=len(x0))
-        if index < 4 and self.montage_steps and self.trainer.is_global_zero:
+        folder = Path(self.trainer.log_dir or self.trainer.default_root_dir) / "samples"  # asks every process
+        if index < 2 and self.montage_steps and self.trainer.is_global_zero:
             sample = descend(denoiser, noise, self.montage_steps)
-            folder = Path(self.trainer.log_dir or self.trainer.default_root_dir) / "samples"
             window = self.prior.window
             method_panel(folder / f"step{self.global_step:06d}_{index}.png",
                          {"prior sample": window.to_hu(sample[0, 0].cpu())}, window.to_hu(x0[0, 0].cpu()),

@@ -9,7 +9,8 @@ from phydict.grid import Grid
 
 TURNED = np.array([[0.0, -3.0, 0, 40], [2.0, 0, 0, -15], [0, 0, 5.0, 7], [0, 0, 0, 1]])
 LEFT_FIRST = np.array([[-3.0, 0, 0, 120], [0, -3.0, 0, 112], [0, 0, 5.0, -122], [0, 0, 0, 1]])
-GRIDS = [Grid.cube(8), Grid((4, 5, 6), (2.0, 3.0, 4.0)), Grid((4, 5, 6), affine=TURNED), Grid((7, 1, 3), affine=LEFT_FIRST)]
+GRIDS = [Grid.cube(8), Grid((4, 5, 6), (2.0, 3.0, 4.0)), Grid((4, 5, 6), affine=TURNED),
+         Grid((7, 1, 3), affine=LEFT_FIRST)]
 
 
 def centres(grid):
@@ -72,7 +73,8 @@ def test_shear_is_refused():
 @pytest.mark.parametrize("change, message", [
     ({"shape": (4, 5)}, "three positive sizes"), ({"shape": (4, 5, 0)}, "three positive sizes"),
     ({"spacing": None}, "either its spacing"), ({"spacing": (1.0, -1.0, 1.0)}, "positive and finite"),
-    ({"spacing": (1.0, 0.0, 1.0)}, "positive and finite"), ({"spacing": (1.0, float("inf"), 1.0)}, "positive and finite"),
+    ({"spacing": (1.0, 0.0, 1.0)}, "positive and finite"),
+    ({"spacing": (1.0, float("inf"), 1.0)}, "positive and finite"),
     ({"spacing": None, "affine": np.eye(3)}, "4x4"), ({"spacing": None, "affine": np.full((4, 4), np.nan)}, "finite")])
 def test_impossible_grids_are_refused(change, message):
     with np.errstate(all="ignore"), pytest.raises(ValueError, match=message):

@@ -1,0 +1,61 @@
+"""A measurement small enough to be a matrix, and the posterior of a Gaussian prior under it, in closed form."""
+
+from __future__ import annotations
+
+import torch
+from laws import random_like
+from torch import Tensor
+
+from phydict.diffusion import CosineSchedule, GaussianDenoiser
+
+SHAPE = (1, 1, 2, 3)
+N = 6
+FINE = CosineSchedule(offset=1e-3, floor=1e-6)
+"""A schedule whose ends are so close to pure state and pure noise that they do not show in the closed forms."""
+
+
+class DenseMeasurement:
+    """y = A x + background, on states (B, 1, 1, 2, 3); stands in for phydict.posterior.Measurement."""
+
+    def __init__(self, matrix: Tensor, y: Tensor, background: float = 0.0):
+        self.matrix, self.y, self.background, self.calls = matrix, y[None], background, 0
+
+    def project(self, x: Tensor) -> Tensor:
+        return self.linear(x) + self.background
+
+    def linear(self, d: Tensor) -> Tensor:
+        self.calls += 1
+        return d.flatten(1) @ self.matrix.to(d).T
+
+    def adjoint(self, r: Tensor) -> Tensor:
+        self.calls += 1
+        return (r @ self.matrix.to(r)).view(len(r), *SHAPE)
+
+    def calibrate(self, x: Tensor) -> None:
+        pass
+
+
+def measurement(rows: int = 4, background: float = 0.05) -> DenseMeasurement:
+    return DenseMeasurement(random_like((rows, N), seed=1), 0.2 * random_like((rows,), seed=2), background)
+
+
+def denoiser(variance: float = 0.04, schedule: CosineSchedule = FINE) -> GaussianDenoiser:
+    """A Gaussian prior whose samples stay well inside [-1, 1], so that clamping never acts."""
+    return GaussianDenoiser(0.1 * random_like((1, *SHAPE), seed=3), torch.tensor(variance).double(), schedule)
+
+
+def condition(m: DenseMeasurement, mean: Tensor, variance: float, noise: float) -> tuple[Tensor, Tensor]:
+    """Mean (N,) and covariance (N, N) of N(mean, variance I) given m, whose errors have standard deviation noise."""
+    precision = m.matrix.T @ m.matrix / noise**2 + torch.eye(N).double() / variance
+    shift = m.matrix.T @ (m.y[0] - m.background) / noise**2 + mean.flatten() / variance
+    return torch.linalg.solve(precision, shift), torch.linalg.inv(precision)
+
+
+def propagate(sample) -> tuple[Tensor, Tensor]:
+    """Mean (N,) and covariance (N, N) of sample(x), x ~ N(0, I), for an affine `sample`: exact, with no draws."""
+    starts = torch.cat([torch.zeros(1, N), torch.eye(N)]).double().view(N + 1, *SHAPE)
+    ends = torch.cat([sample(x[None]) for x in starts]).flatten(1)
+    both = sample((starts[1] - 2 * starts[2])[None]).flatten()
+    linear = (ends[1:] - ends[0]).T
+    torch.testing.assert_close(both, ends[0] + linear[:, 0] - 2 * linear[:, 1], atol=1e-8, rtol=0)
+    return ends[0], linear @ linear.T

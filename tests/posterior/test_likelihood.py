@@ -1,0 +1,138 @@
+"""The likelihood steps: one solves its normal equations, the other descends the paper's objective."""
+
+import numpy as np
+import pytest
+import torch
+from laws import random_like
+from scipy.optimize import lsq_linear
+
+from phydict.posterior import GradientSteps, ProximalCG, Reward
+from posterior.dense import N, SHAPE, DenseMeasurement, measurement
+
+X0 = 0.3 * random_like((1, *SHAPE), seed=20)
+
+
+def solved(m, x0, weight):
+    """The minimiser of |P z - y|^2 + weight |z - x0|^2."""
+    normal = m.matrix.T @ m.matrix + weight * torch.eye(N).double()
+    right = m.matrix.T @ (m.y[0] - m.background) + weight * x0.flatten()
+    return torch.linalg.solve(normal, right).view_as(x0)
+
+
+@pytest.mark.parametrize("rows", [1, 4, 9])
+@pytest.mark.parametrize("noise, spread", [(0.3, 0.2), (0.02, 0.5), (1.0, 0.01)])
+def test_conjugate_gradients_solve_the_normal_equations(rows, noise, spread):
+    m = measurement(rows)
+    z = ProximalCG(40, noise=noise, tolerance=1e-13)(m, X0, spread)
+    torch.testing.assert_close(z, solved(m, X0, (noise / spread) ** 2), atol=1e-8, rtol=0)
+
+
+def test_each_iteration_lowers_the_objective_and_as_many_as_unknowns_suffice():
+    m, noise, spread = measurement(9), 0.1, 0.5
+
+    def objective(z):
+        return float((m.project(z) - m.y).square().sum() / noise**2 + (z - X0).square().sum() / spread**2)
+
+    values = [objective(ProximalCG(k, 1, noise, 0.0)(m, X0, spread)) for k in range(N + 1)]
+    assert all(later < earlier for earlier, later in zip(values, values[1:]))
+    assert values[-1] == pytest.approx(objective(solved(m, X0, (noise / spread) ** 2)), rel=1e-9)
+    assert ProximalCG(0)(m, X0, spread).equal(X0)
+
+
+@pytest.mark.parametrize("rows", [3, 9])
+def test_where_the_bounds_act_the_step_is_the_bounded_least_squares_solution(rows):
+    m, weight = DenseMeasurement(measurement(rows).matrix, 8 * measurement(rows).y[0]), 0.04
+    stacked = np.concatenate([m.matrix.numpy(), weight**0.5 * np.eye(N)])
+    expected = lsq_linear(stacked, np.concatenate([m.y[0], weight**0.5 * X0.flatten()]), (-1, 1), tol=1e-14).x
+    assert (abs(expected) > 0.999).any() and (abs(expected) < 0.9).any()
+    z = ProximalCG(30, 20, 0.1, 1e-13)(m, X0, 0.5)
+    np.testing.assert_allclose(z.flatten(), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_with_bounds_the_default_restarts_never_leave_the_range_nor_raise_the_objective(seed):
+    m = DenseMeasurement(random_like((4, N), seed=100 + seed), 3 * random_like((4,), seed=200 + seed))
+    x0 = (0.8 * random_like((1, *SHAPE), seed=300 + seed)).clamp(-1, 1)
+
+    def objective(z):
+        return float((m.project(z) - m.y).square().sum() / 0.02**2 + (z - x0).square().sum() / 0.5**2)
+
+    steps = [ProximalCG(restarts=k)(m, x0, 0.5) for k in range(5)]
+    values = [objective(z) for z in steps]
+    assert all(z.abs().max() <= 1 for z in steps) and values[2] < values[0]
+    assert all(later <= earlier * (1 + 1e-6) for earlier, later in zip(values, values[1:]))
+
+
+@pytest.mark.parametrize("noise", [0.02, 0.0])
+def test_a_singular_operator_gives_a_finite_fit_and_leaves_what_it_cannot_see(noise):
+    matrix = torch.zeros(3, N).double()
+    matrix[0, 0] = matrix[1, 0] = 1.0  # one voxel seen twice, a ray that meets nothing, five voxels unseen
+    for dtype in (torch.float32, torch.float64):
+        m = DenseMeasurement(matrix, torch.tensor([0.4, 0.4, 0.9]).to(dtype))
+        z = ProximalCG(30, noise=noise)(m, X0.to(dtype), 0.5)
+        assert z.isfinite().all() and z.flatten()[1:].equal(X0.to(dtype).flatten()[1:])
+        assert float(z.flatten()[0]) == pytest.approx(0.4, abs=0.01)
+
+
+def test_an_operator_that_sees_nothing_changes_nothing():
+    m = DenseMeasurement(torch.zeros(3, N).double(), torch.ones(3).double())
+    assert ProximalCG(30)(m, X0, 0.5).equal(X0)
+
+
+def test_data_that_already_fit_change_nothing():
+    m = measurement()
+    m.y = m.project(X0)
+    assert ProximalCG(30)(m, X0, 0.5).equal(X0)
+
+
+def test_the_weight_of_the_data_runs_from_none_to_all():
+    m = measurement(4)
+    assert (ProximalCG(30, noise=1e6)(m, X0, 0.5) - X0).abs().max() < 1e-9
+    trusted = ProximalCG(30, noise=1e-6, tolerance=1e-13)(m, X0, 0.5)
+    torch.testing.assert_close(m.project(trusted), m.y, atol=1e-8, rtol=0)
+    null = torch.linalg.svd(m.matrix)[2][4:]  # directions that the data do not see stay the estimate's
+    torch.testing.assert_close(null @ trusted.flatten(), null @ X0.flatten(), atol=1e-8, rtol=0)
+
+
+def test_only_the_ratio_of_noise_and_spread_matters():
+    m = measurement(4)
+    torch.testing.assert_close(ProximalCG(6, noise=0.1)(m, X0, 0.5), ProximalCG(6, noise=0.2)(m, X0, 1.0))
+
+
+class Squares:
+    """-|P z - y|^2: the reward's data term for a measurement without views."""
+
+    def __call__(self, m, x):
+        return -(m.project(x) - m.y).square().sum(-1)
+
+
+@pytest.mark.parametrize("rate", [0.1, 0.02])
+def test_gradient_steps_lower_their_objective_and_move_a_voxel_by_at_most_the_rate_per_step(rate):
+    m, x0 = measurement(4), X0 + 0.8
+
+    def objective(z):
+        return float((m.project(z) - m.y).square().sum() + (z - x0).square().sum())
+
+    z = GradientSteps(2, rate, reward=Squares())(m, x0, 0.5)
+    assert objective(z) < objective(x0)
+    assert 0 < (z - x0).abs().max() <= 2 * rate * 1.001
+    torch.testing.assert_close((GradientSteps(1, rate, reward=Squares())(m, x0, 0.5) - x0).abs(),
+                               torch.full_like(x0, rate), rtol=1e-4, atol=0)  # Adam's first step is the sign
+
+
+def test_many_small_gradient_steps_reach_the_minimiser_that_rho_sets():
+    m, rho = measurement(4), 0.5
+    z = GradientSteps(3000, 0.003, rho, Squares())(m, X0, 0.5)
+    assert (z - solved(m, X0, 1 / rho)).abs().max() < 0.01
+
+
+def test_gradient_steps_leave_no_graph_and_work_where_gradients_are_off():
+    m = measurement(4)
+    with torch.no_grad():
+        z = GradientSteps(reward=Squares())(m, X0, 0.5)
+    assert not z.requires_grad and not torch.equal(z, X0) and not X0.requires_grad
+
+
+def test_the_default_is_the_papers_two_steps_without_lpips():
+    step = GradientSteps()
+    assert (step.steps, step.learning_rate, step.rho, step.reward) == (2, 0.1, 1.0, Reward(lpips=0.0))

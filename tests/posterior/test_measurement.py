@@ -1,0 +1,85 @@
+"""X-rays as a linear problem in the prior's range."""
+
+import pytest
+import torch
+from laws import assert_adjoint, assert_linear, random_like
+
+from phydict.grid import Grid
+from phydict.posterior import Measurement
+from phydict.units import HUWindow
+from phydict.xray import ConeBeam, Projector
+
+GRID = Grid.cube(6)
+BEAM = ConeBeam.orbit(3, 1020, 740, (7, 9), 60.0)
+PROJECTOR = Projector(GRID, BEAM)
+Y = random_like((3, 7, 9), seed=1).abs()
+SHAPE = (1, 1, 6, 6, 6)
+
+
+@pytest.mark.parametrize("window", [HUWindow(), HUWindow(-1000, 600)])
+def test_projecting_the_range_is_projecting_its_attenuation(window):
+    x = random_like(SHAPE, seed=2).clamp(-1, 1)
+    torch.testing.assert_close(Measurement(PROJECTOR, Y, window).project(x), PROJECTOR(window.to_mu(x)))
+    torch.testing.assert_close(Measurement(PROJECTOR, Y, window, mu_water=0.019).project(x),
+                               PROJECTOR(window.to_mu(x, 0.019)))
+
+
+def test_the_linear_part_is_linear_and_its_adjoint_exact():
+    m = Measurement(PROJECTOR, Y, HUWindow(-1000, 600))
+    assert_linear(m.linear, SHAPE)
+    assert_adjoint(m.linear, m.adjoint, SHAPE)
+    x, d = random_like(SHAPE, seed=3), random_like(SHAPE, seed=4)
+    torch.testing.assert_close(m.project(x + d) - m.project(x), m.linear(d))
+
+
+def test_the_norm_bounds_the_linear_part_and_is_reached():
+    m = Measurement(PROJECTOR, Y.float(), HUWindow(-1000, 600))
+    matrix = torch.cat([m.linear(e.view(SHAPE)).flatten(1) for e in torch.eye(216).double()]).T
+    assert m.norm == pytest.approx(float(torch.linalg.matrix_norm(matrix, 2)), rel=1e-3)
+
+
+def test_air_projects_to_nothing():
+    m = Measurement(PROJECTOR, Y, HUWindow())
+    assert m.project(torch.full(SHAPE, -1.0).double()).abs().max() < 1e-12
+
+
+def test_line_integrals_are_left_alone_and_display_values_take_the_references_contrast_view_by_view():
+    x = random_like(SHAPE, seed=5).clamp(-1, 1)
+    kept = Measurement(PROJECTOR, Y, HUWindow())
+    kept.calibrate(x)
+    assert torch.equal(kept.y[0], Y)
+    gains, offsets = torch.tensor([0.2, 3.0, 90.0]).view(3, 1, 1), torch.tensor([-7.0, 0.5, 100.0]).view(3, 1, 1)
+    truth = kept.project(x)[0]
+    shown = Measurement(PROJECTOR, gains * truth + offsets, HUWindow(), display=True)
+    shown.calibrate(x)
+    torch.testing.assert_close(shown.y[0], truth)
+    shown.calibrate(0.5 * x)  # always from the display values, never from the last guess
+    shown.calibrate(x)
+    torch.testing.assert_close(shown.y[0], truth)
+
+
+def test_a_flat_display_view_stays_finite():
+    m = Measurement(PROJECTOR, torch.full((3, 7, 9), 0.4).double(), HUWindow(), display=True)
+    m.calibrate(torch.zeros(SHAPE).double())
+    assert m.y.isfinite().all()
+
+
+@pytest.mark.parametrize("y", [Y[:2], Y[:, :6], Y[None]])
+def test_x_rays_that_do_not_fit_the_geometry_are_refused(y):
+    with pytest.raises(ValueError, match="3 views of 7 x 9"):
+        Measurement(PROJECTOR, y, HUWindow())
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_x_rays_that_are_not_finite_are_refused(bad):
+    y = Y.clone()
+    y[1, 2, 3] = bad
+    with pytest.raises(ValueError, match="NaN or infinite"):
+        Measurement(PROJECTOR, y, HUWindow())
+
+
+def test_every_use_of_the_operator_is_counted():
+    m = Measurement(PROJECTOR, Y, HUWindow())
+    before, d = m.calls, torch.zeros(SHAPE).double()
+    m.project(d), m.linear(d), m.adjoint(Y[None])
+    assert m.calls == before + 3

@@ -1,0 +1,190 @@
+"""Split Gibbs on a Gaussian prior and a linear measurement meets the closed-form posterior."""
+
+from dataclasses import dataclass
+
+import pytest
+import torch
+from laws import random_like
+
+from phydict.diffusion import CosineSchedule, GaussianDenoiser, renoise
+from phydict.posterior import LikelihoodStep, PriorOnly, ProximalCG, SplitGibbs, descend
+from posterior.dense import FINE, SHAPE, DenseMeasurement, condition, denoiser, measurement, propagate
+
+V, NOISE = 0.04, 0.3
+EXACT = ProximalCG(50, noise=NOISE, tolerance=1e-12)
+X = random_like((1, *SHAPE), seed=10)
+
+
+@dataclass(frozen=True)
+class NoData(LikelihoodStep):
+    """A likelihood that knows nothing."""
+
+    def __call__(self, measurement, x0, spread):
+        return x0
+
+
+def sampler(iterations=30, **settings):
+    return SplitGibbs(iterations, **{"likelihood": EXACT, "prior_std": V**0.5} | settings)
+
+
+def sample(settings, x=X, data=None, seed=0, prior=None):
+    return settings.sample(prior or denoiser(V), data or measurement(), x, torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize("t", [0.1, 0.5, 0.95])
+def test_one_likelihood_step_is_the_exact_posterior_mean_given_the_noisy_state_and_the_data(t):
+    prior, m = denoiser(V), measurement()
+    a, s = (float(w) for w in FINE.scales(t))
+    x = a * prior.mean + 0.2 * X
+    spread = sampler().spread(prior, t)
+    assert spread**2 == pytest.approx(V * s**2 / (a**2 * V + s**2))  # the variance of x_0 given x_t
+    z = EXACT(m, prior.denoise(x, t), spread)
+    # the same mean from one stacked observation of x_0: x_t = a x_0 + s eps, and y
+    precision = m.matrix.T @ m.matrix / NOISE**2 + torch.eye(6).double() * (1 / V + (a / s) ** 2)
+    shift = m.matrix.T @ (m.y[0] - m.background) / NOISE**2 + (prior.mean / V + a / s**2 * x).flatten()
+    torch.testing.assert_close(z.flatten(), torch.linalg.solve(precision, shift), atol=1e-8, rtol=0)
+
+
+@pytest.mark.parametrize("final_guided", [False, True])
+def test_the_samples_have_the_posteriors_mean_and_covariance_as_the_steps_grow(final_guided):
+    prior = denoiser(V)
+    mean, covariance = condition(measurement(), prior.mean, V, NOISE)
+    assert (covariance - V * torch.eye(6).double()).norm() > 0.5 * covariance.norm()  # the data say something
+    errors = []
+    for n in (50, 200):
+        found, spread = propagate(lambda x: sample(sampler(n, final_guided=final_guided), x))
+        errors.append(float((spread - covariance).norm() / covariance.norm()))
+        assert (found - mean).abs().max() < 0.2 / n
+    assert errors[1] < 0.05 and errors[0] / errors[1] > 3  # first order in the step
+
+
+def test_a_guided_last_estimate_fits_the_data_better_and_an_unguided_one_is_the_denoisers():
+    m, few = measurement(), 5
+    tight = {"likelihood": ProximalCG(50, noise=0.01, tolerance=1e-12)}
+    misfit = [float((m.project(sample(sampler(few, final_guided=g, **tight))) - m.y).norm()) for g in (False, True)]
+    assert misfit[1] < 0.2 * misfit[0]
+    once = sample(sampler(1, **tight))
+    torch.testing.assert_close(once, denoiser(V).denoise(X, 1.0))
+
+
+def test_data_without_weight_leave_the_prior():
+    expected = PriorOnly(30).sample(denoiser(V), None, X, None)
+    for likelihood in (ProximalCG(50, noise=1e6), NoData()):
+        found = sample(sampler(likelihood=likelihood, final_guided=True))
+        torch.testing.assert_close(found, expected, atol=1e-8, rtol=0)
+
+
+def test_exact_data_are_matched():
+    matrix = torch.eye(6).double()[[0, 3]]
+    m = DenseMeasurement(matrix, torch.tensor([0.3, -0.2]).double())
+    trusting = ProximalCG(50, noise=1e-6, tolerance=1e-12)
+    found = sample(sampler(30, likelihood=trusting, final_guided=True), data=m).flatten()
+    torch.testing.assert_close(found[[0, 3]], m.y[0], atol=1e-6, rtol=0)
+    free = PriorOnly(30).sample(denoiser(V), None, X, None).flatten()
+    rest = [1, 2, 4, 5]
+    torch.testing.assert_close(found[rest], free[rest], atol=1e-8, rtol=0)  # the others stay the prior's
+
+
+def test_only_the_ct_channel_meets_the_data():
+    x = random_like((1, 3, *SHAPE[1:]), seed=11)
+    prior = GaussianDenoiser(torch.zeros(()).double(), torch.tensor(V).double(), FINE)
+    found = sample(sampler(final_guided=True), x, prior=prior)
+    free = PriorOnly(30).sample(prior, None, x, None)
+    assert torch.equal(found[:, 1:], free[:, 1:]) and not torch.allclose(found[:, :1], free[:, :1])
+
+
+def test_estimates_stay_in_the_priors_range():
+    m = DenseMeasurement(torch.eye(6).double(), torch.full((6,), 7.0).double())
+    found = sample(sampler(likelihood=ProximalCG(50, noise=1e-4), final_guided=True), data=m)
+    assert found.max() == 1
+
+
+@pytest.mark.parametrize("warm_start", [0.4, 0.7])
+def test_a_warm_start_keeps_the_posterior_mean_and_counts_its_steps(warm_start):
+    warm = sampler(20, warm_start=warm_start, final_guided=True)
+    pairs = warm.times(denoiser())
+    assert len(pairs) == 20 and pairs[0] == (1.0, warm_start) and pairs[-1][1] == 0
+    assert [s for _, s in pairs[:-1]] == [t for t, _ in pairs[1:]]
+    mean, covariance = condition(measurement(), denoiser(V).mean, V, NOISE)
+    found, spread = propagate(lambda x: sample(warm, x))
+    torch.testing.assert_close(found, mean, atol=5e-3, rtol=0)
+    assert spread.trace() < covariance.trace()  # it starts at the mean: less spread, never more
+
+
+def test_a_warm_start_at_one_is_the_plain_descent():
+    assert torch.equal(sample(sampler(12, warm_start=1.0)), sample(sampler(12)))
+
+
+def test_refining_from_zero_is_the_identity():
+    assert torch.equal(sample(sampler(12, refine_from=0.0, refine_iterations=9)), sample(sampler(12)))
+
+
+def test_refining_a_little_keeps_the_sample_and_refining_from_near_one_forgets_it():
+    other = DenseMeasurement(measurement().matrix, -measurement().y[0])
+    plain = [sample(sampler(), data=m) for m in (measurement(), other)]
+    apart = (plain[0] - plain[1]).norm()
+
+    def refined(delta):
+        return [sample(sampler(refine_from=delta, refine_iterations=30), data=m) for m in (measurement(), other)]
+
+    little, much = refined(0.001), refined(0.999)
+    assert (little[0] - plain[0]).norm() < 0.15 * apart
+    assert (much[0] - much[1]).norm() < 0.01 * apart
+
+
+def test_refining_is_the_prior_seen_from_the_renoised_sample():
+    noise = torch.randn(X.shape, generator=torch.Generator().manual_seed(0), dtype=X.dtype)
+    start = renoise(FINE, sample(sampler()), 0.8, noise)
+    expected = descend(denoiser(V), start, 15, 0.8)
+    torch.testing.assert_close(sample(sampler(refine_from=0.8, refine_iterations=15)), expected)
+
+
+def test_without_churn_nothing_is_drawn_and_with_churn_the_draw_decides():
+    assert torch.equal(sample(sampler(), seed=1), sample(sampler(), seed=2))
+    churned = sampler(churn=0.3)
+    assert torch.equal(sample(churned, seed=1), sample(churned, seed=1))
+    assert not torch.allclose(sample(churned, seed=1), sample(churned, seed=2))
+
+
+@pytest.mark.parametrize("churn", [0.0, 0.3])
+def test_churn_keeps_the_priors_mean_and_as_the_steps_grow_its_variance(churn):
+    n, mean, variance = 48**3, 0.1, 0.02
+    x = random_like((1, 1, 48, 48, 48), torch.float32, seed=12)
+    prior = GaussianDenoiser(torch.tensor(mean), torch.tensor(variance))
+    missing = {}
+    for steps in (100, 400):
+        found = sample(sampler(steps, likelihood=NoData(), churn=churn), x, prior=prior)
+        assert float(found.mean()) == pytest.approx(mean, abs=4 * (variance / n) ** 0.5)
+        missing[steps] = 1 - float(found.var()) / variance
+    assert abs(missing[400]) < 0.07 and missing[400] < 0.5 * missing[100]
+
+
+@pytest.mark.parametrize("settings", [
+    sampler(9), sampler(9, warm_start=0.5), sampler(9, refine_from=0.4, refine_iterations=5)])
+def test_on_step_is_called_as_often_as_promised(settings):
+    calls = []
+    settings.sample(denoiser(V), measurement(), X, torch.Generator(), lambda: calls.append(1))
+    assert len(calls) == settings.steps()
+
+
+@pytest.mark.parametrize("settings, message", [
+    ({"iterations": 0}, "at least one iteration"), ({"warm_start": 0.0}, "warm_start"),
+    ({"warm_start": 1.2}, "warm_start"),
+    ({"refine_from": 1.0}, "refine_from"), ({"refine_from": -0.1}, "refine_from")])
+def test_impossible_settings_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        SplitGibbs(**settings)
+
+
+@pytest.mark.parametrize("settings", [
+    {"refine_from": 0.8, "refine_iterations": 0}, {"iterations": 1, "warm_start": 0.7},
+    {"churn": 1.5}, {"churn": -0.1}])
+def test_settings_that_contradict_each_other_are_refused_before_the_long_computation(settings):
+    with pytest.raises(ValueError):
+        SplitGibbs(**settings)
+
+
+def test_the_result_does_not_depend_on_the_default_schedules_ends():
+    coarse = GaussianDenoiser(denoiser().mean, torch.tensor(V).double(), CosineSchedule())
+    fine, wide = (sample(sampler(100, final_guided=True), prior=p) for p in (denoiser(V), coarse))
+    assert (fine - wide).abs().max() < 0.01

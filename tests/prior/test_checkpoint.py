@@ -1,0 +1,121 @@
+"""One file holds a prior: what is loaded denoises like what was saved, and a bad file ends in one sentence."""
+
+import json
+
+import pytest
+import torch
+from laws import random_like
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+from phydict.prior import TextEncoder, load_prior, save_prior
+from prior.tiny import REPORTS, tiny_prior
+
+X = random_like((1, 4, 16, 16, 16), torch.float32, seed=1)
+
+
+def estimates(prior):
+    return [prior.bind(report, 2.0, bf16=False).denoise(X, 0.5) for report in ("", REPORTS[0])]
+
+
+@pytest.fixture
+def file(tmp_path):
+    save_prior(tiny_prior(), tmp_path / "new" / "tiny.safetensors", {"steps": 12, "data": "phantoms"})
+    return tmp_path / "new" / "tiny.safetensors"
+
+
+def test_a_loaded_prior_denoises_like_the_saved_one_to_half_precision(file):
+    for found, expected in zip(estimates(load_prior(file)), estimates(tiny_prior())):
+        assert (found - expected).square().mean().sqrt() < 3e-3 * expected.std()
+
+
+def test_saved_in_full_precision_nothing_changes(tmp_path):
+    save_prior(tiny_prior(), tmp_path / "full.safetensors", dtype=torch.float32)
+    for found, expected in zip(estimates(load_prior(tmp_path / "full.safetensors")), estimates(tiny_prior())):
+        assert torch.equal(found, expected)
+
+
+def test_grid_window_schedule_and_training_come_along(file):
+    prior, saved = load_prior(file), tiny_prior()
+    assert prior.grid.same_as(saved.grid) and prior.window == saved.window
+    assert prior.schedule == saved.schedule and prior.sigma_data == saved.sigma_data
+    assert not prior.training and not any(w.requires_grad for w in prior.parameters())
+    with safe_open(file, "pt") as opened:
+        header = json.loads(opened.metadata()["phydict"])
+    assert header["training"] == {"steps": 12, "data": "phantoms"}
+    assert header["state"] == ["ct", "lung", "airway", "vessel"]
+
+
+def test_the_text_encoder_stays_on_disk_until_the_first_report(file):
+    prior = load_prior(file)
+    prior.bind("", 2.0).denoise(X, 0.5)
+    assert prior.text is None
+    prior.bind(REPORTS[0])
+    assert isinstance(prior.text, TextEncoder) and not prior.text.trainable
+    assert prior.text.vocabulary == tiny_prior().text.vocabulary
+
+
+@pytest.mark.parametrize("spoken", [False, True])
+def test_a_loaded_prior_can_be_saved_again_and_still_reads_reports(file, tmp_path, spoken):
+    prior = load_prior(file)
+    if spoken:
+        prior.bind(REPORTS[0])
+    save_prior(prior, tmp_path / "again.safetensors")
+    for found, expected in zip(estimates(load_prior(tmp_path / "again.safetensors")), estimates(load_prior(file))):
+        assert torch.equal(found, expected)
+
+
+def test_a_prior_without_text_survives_too(tmp_path):
+    save_prior(tiny_prior(text=False), tmp_path / "mute.safetensors")
+    prior = load_prior(tmp_path / "mute.safetensors")
+    assert prior.bind().denoise(X, 0.5).isfinite().all()
+    with pytest.raises(ValueError, match="without text"):
+        prior.bind(REPORTS[0])
+
+
+def test_saving_leaves_only_the_complete_file(file):
+    save_prior(tiny_prior(seed=1), file)
+    assert [f.name for f in file.parent.iterdir()] == ["tiny.safetensors"]
+    assert not torch.equal(estimates(load_prior(file))[0], estimates(tiny_prior())[0])
+
+
+def test_a_pretrained_encoder_is_named_and_not_copied(tmp_path):
+    prior, folder = tiny_prior(), tmp_path / "bert"
+    prior.text.bert.save_pretrained(folder)
+    (folder / "vocab.txt").write_text("\n".join(prior.text.vocabulary))
+    prior.text = TextEncoder.pretrained(folder, 24)
+    save_prior(prior, tmp_path / "named.safetensors")
+    with safe_open(tmp_path / "named.safetensors", "pt") as opened:
+        assert not any(key.startswith("text.") for key in opened.keys())
+    found = estimates(load_prior(tmp_path / "named.safetensors"))[1]
+    assert (found - estimates(prior)[1]).square().mean().sqrt() < 3e-3 * found.std()
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no prior at '.*nowhere.safetensors'"):
+        load_prior(tmp_path / "nowhere.safetensors")
+    with pytest.raises(FileNotFoundError, match="no prior at"):
+        load_prior(tmp_path)  # a folder
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.5, 0.999])
+def test_a_truncated_file_is_one_clear_sentence(file, share):
+    content = file.read_bytes()
+    file.write_bytes(content[:int(share * len(content))])
+    with pytest.raises(ValueError, match="truncated or not a safetensors file") as error:
+        load_prior(file)
+    assert str(file) in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("content", [b"PK\x03\x04 a zip archive" * 20, b"\xff" * 64, b"{}"])
+def test_another_kind_of_file_is_one_clear_sentence(tmp_path, content):
+    (tmp_path / "other.safetensors").write_bytes(content)
+    with pytest.raises(ValueError, match="truncated or not a safetensors file"):
+        load_prior(tmp_path / "other.safetensors")
+
+
+@pytest.mark.parametrize("metadata", [None, {"phydict": json.dumps({"format": 99})}, {"format": "pt"}])
+def test_safetensors_without_a_prior_of_this_format_are_refused(tmp_path, metadata):
+    save_file({"w": torch.zeros(2)}, tmp_path / "other.safetensors", metadata)
+    with pytest.raises(ValueError, match="no phydict prior of format 1"):
+        load_prior(tmp_path / "other.safetensors")

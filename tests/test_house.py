@@ -1,0 +1,153 @@
+"""How the house is built: imports run downward, Lightning lives on the top floor, every configuration works."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from prior.tiny import tiny_prior
+
+from phydict import training
+from phydict.grid import Grid
+from phydict.inference import InferenceCLI, ReconstructionData, ReconstructionTask
+from phydict.inference import main as infer
+from phydict.methods import METHODS
+from phydict.posterior import Posterior
+from phydict.prior import save_prior
+from phydict.xray import ConeBeam
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "phydict"
+FLOORS = {
+    "units": 0, "grid": 0, "command_line": 0, "progress": 0,
+    "xray": 1, "diffusion": 1,
+    "prior": 2, "datasets": 2, "reconstructor": 2,
+    "posterior": 3, "baselines": 3, "evaluation": 3,
+    "methods": 4, "datamodule": 4, "training": 4, "inference": 4}
+LIGHTNING = ("datamodule", "training", "inference")
+CONFIGS = {folder: sorted((ROOT / "configs" / folder).glob("*.yaml"))
+           for folder in ("prior", "reconstruct", "geometry")}
+
+
+def files():
+    return sorted(f for f in PACKAGE.rglob("*.py") if f != PACKAGE / "__init__.py")
+
+
+def part(file: Path) -> str:
+    """The part of the house that a file belongs to: a folder or a module of the package's top."""
+    return file.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+def imported(file: Path) -> list[str]:
+    """Full names of everything a file imports, anywhere in it."""
+    names = []
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert not node.level, f"{file} uses a relative import"
+            names += [f"{node.module}.{alias.name}" for alias in node.names]
+    return names
+
+
+@pytest.mark.parametrize("file", files(), ids=lambda f: str(f.relative_to(PACKAGE)))
+def test_a_file_imports_from_lower_floors_and_its_own_part_alone(file):
+    own = part(file)
+    for name in imported(file):
+        if name.split(".")[0] != "phydict":
+            continue
+        other = name.split(".")[1]
+        assert other in FLOORS, f"{file} imports {name}, which is on no floor"
+        beside = FLOORS[own] == 4 == FLOORS[other] and not (own == "methods" and other in LIGHTNING)
+        assert other == own or FLOORS[other] < FLOORS[own] or beside, f"{own} must not import {other} ({name})"
+
+
+@pytest.mark.parametrize("file", files(), ids=lambda f: str(f.relative_to(PACKAGE)))
+def test_lightning_is_imported_on_the_top_floor_alone(file):
+    found = [name for name in imported(file) if name.split(".")[0] in ("lightning", "pytorch_lightning")]
+    assert not found or part(file) in LIGHTNING
+
+
+def test_every_part_has_a_floor():
+    assert {part(f) for f in files()} == set(FLOORS)
+
+
+def test_everything_below_the_top_floor_runs_without_lightning():
+    modules = [".".join(f.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+               for f in files() if part(f) not in LIGHTNING]
+    assert "phydict.methods" in modules and "phydict.xray.siddon" in modules
+    code = f"import importlib, sys\nfor m in {modules!r}: importlib.import_module(m)\n" \
+           "print([m for m in sys.modules if m.split('.')[0] in ('lightning', 'pytorch_lightning')])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip().splitlines()[-1] == "[]"
+
+
+@pytest.fixture
+def inference(tmp_path, monkeypatch):
+    """Builds infer.py's command line from a configuration, with a tiny prior and nothing run."""
+    monkeypatch.chdir(tmp_path)
+    save_prior(tiny_prior(), "tiny.safetensors")
+    return lambda config: InferenceCLI(
+        ReconstructionTask, ReconstructionData, run=False, save_config_callback=None,
+        trainer_defaults={"logger": False, "accelerator": "cpu", "devices": 1, "enable_progress_bar": False,
+                          "enable_checkpointing": False, "enable_model_summary": False},
+        args=["--config", str(config), "--model.prior", "tiny.safetensors", "--model.out", "out"])
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_named_method_is_what_its_configuration_builds(inference, name):
+    model = inference(ROOT / "configs" / "reconstruct" / f"{name}.yaml").model
+    built = model.reconstructor.sampler if isinstance(model.reconstructor, Posterior) else model.reconstructor
+    assert built == METHODS[name]
+    assert model.method_name == name == model.reconstructor.name
+
+
+def test_every_reconstruction_configuration_is_a_named_method():
+    assert {file.stem for file in CONFIGS["reconstruct"]} == set(METHODS)
+
+
+@pytest.mark.parametrize("config", CONFIGS["prior"], ids=lambda f: f.stem)
+def test_every_prior_configuration_builds(tmp_path, monkeypatch, config):
+    monkeypatch.chdir(tmp_path)
+    cli = training.PriorCLI(
+        training.PriorTraining, training.PriorData, run=False, save_config_callback=None,
+        args=["--config", str(config), "--data.phantoms", "2", "--data.validation_phantoms", "1",
+              "--trainer.accelerator", "cpu"])
+    assert cli.model.prior.grid.same_as(cli.datamodule.grid) and cli.model.prior.window == cli.datamodule.window
+    assert cli.trainer.max_steps == yaml.safe_load(config.read_text())["trainer"]["max_steps"]
+
+
+@pytest.mark.parametrize("config", CONFIGS["geometry"], ids=lambda f: f.stem)
+def test_every_geometry_is_read_and_clear_of_the_default_volume(config):
+    ConeBeam.from_dict(yaml.safe_load(config.read_text())["beam"]).check(Grid.cube(64))
+
+
+@pytest.mark.parametrize("main, command", [(infer, "predict"), (training.main, "fit")], ids=["infer", "train"])
+@pytest.mark.parametrize("settings, key", [
+    ({"model": {"lerning_rate": 1}}, "lerning_rate"), ({"modle": {"seed": 1}}, "modle"),
+    ({"data": {"veiws": 3}}, "veiws"), ({"trainer": {"max_stpes": 3}}, "max_stpes")])
+def test_an_unknown_key_is_an_error_that_names_it(tmp_path, monkeypatch, capsys, main, command, settings, key):
+    monkeypatch.chdir(tmp_path)
+    good = CONFIGS["reconstruct" if main is infer else "prior"][0]
+    mixed = yaml.safe_load(good.read_text())
+    for section, values in settings.items():
+        mixed[section] = (mixed.get(section) or {}) | values
+    (tmp_path / "bad.yaml").write_text(yaml.safe_dump(mixed))
+    with pytest.raises(SystemExit) as stopped:
+        main([command, "--config", "bad.yaml"])
+    assert stopped.value.code not in (0, None)
+    assert key in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("settings", [{"iterations": 0}, {"warm_start": 2.0}])
+def test_an_impossible_setting_is_an_error_that_says_why(tmp_path, monkeypatch, capsys, settings):
+    monkeypatch.chdir(tmp_path)
+    method = {"class_path": "phydict.posterior.SplitGibbs", "init_args": settings}
+    (tmp_path / "bad.yaml").write_text(yaml.safe_dump({"model": {"name": "bad", "method": method}}))
+    with pytest.raises(SystemExit) as stopped:
+        infer(["predict", "--config", "bad.yaml"])
+    assert stopped.value.code not in (0, None)
+    assert next(iter(settings)).removesuffix("s") in capsys.readouterr().err

@@ -1,0 +1,451 @@
+"""The command line of reconstruction: what it writes, that it goes on after a stop, and how it refuses bad input."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import nibabel
+import numpy as np
+import pytest
+import torch
+import yaml
+from PIL import Image
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+from phydict.baselines import SIRT
+from phydict.datasets import load_xrays, phantom_case, save_xrays
+from phydict.evaluation import volume_metrics
+from phydict.grid import Grid
+from phydict.inference import main
+from phydict.methods import reconstruct, reconstructor
+from phydict.posterior import PriorOnly
+from phydict.prior import Prior, VolumeUNet, save_prior
+from phydict.units import HUWindow
+from phydict.xray import ConeBeam, Projector
+
+ROOT = Path(__file__).parents[1]
+CONFIGS = ROOT / "configs" / "reconstruct"
+BEAM = ConeBeam.orbit(3, 1020.0, 740.0, (24, 24), 24.0)
+ORBIT = ["--data.views=3", "--data.detector=[24,24]", "--data.pixel=[24,24]"]
+FILES = ["panel.png", "reconstruction.json", "volume.nii.gz"]
+
+
+def sirt(command: str, out: Path, *more: str) -> list[str]:
+    return [command, f"--config={CONFIGS / 'sirt.yaml'}", "--model.method.init_args.iterations=3",
+            f"--model.out={out}", "--trainer.accelerator=cpu", *more]
+
+
+def phantoms(out: Path, count: int, *more: str) -> list[str]:
+    return sirt("test", out, "--data.cts=phantom", f"--data.phantoms={count}", *ORBIT, *more)
+
+
+def with_prior(command: str, out: Path, prior: Path, *more: str) -> list[str]:
+    return [command, f"--config={CONFIGS / 'prior_only.yaml'}", "--model.method.init_args.iterations=2",
+            f"--model.prior={prior}", f"--model.out={out}", "--trainer.accelerator=cpu", *more]
+
+
+def record(folder: Path) -> dict:
+    return json.loads((folder / "reconstruction.json").read_text())
+
+
+def volume(folder: Path) -> np.ndarray:
+    return np.asarray(nibabel.load(folder / "volume.nii.gz").dataobj)
+
+
+def stamp(folder: Path) -> dict[str, int]:
+    return {name: (folder / name).stat().st_mtime_ns for name in FILES}
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def refusal(capsys, args: list[str]) -> str:
+    """The one sentence on stderr with which the command line refuses `args`."""
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as stopped:
+        main(args)
+    assert stopped.value.code == 2
+    said = capsys.readouterr().err
+    assert "Traceback" not in said and "usage:" not in said
+    lines = [line for line in said.splitlines() if line.startswith("error: ")]
+    assert lines == said.splitlines()[-1:], said
+    return lines[0]
+
+
+def write_ct(path: Path, seed: int, code: int = 1, change=lambda hu: hu) -> Path:
+    """A box of soft tissue in air, 20^3 voxels of 18 mm."""
+    hu = np.full((20, 20, 20), -1000, np.float32)
+    hu[4:16, 6:15] = 40 + 10 * np.random.default_rng(seed).standard_normal((12, 9, 20))
+    image = nibabel.Nifti1Image(change(hu), None)
+    image.header.set_zooms((18,) * image.ndim)
+    image.set_sform(np.diag([18.0, 18.0, 18.0, 1.0]), code=code)
+    image.set_qform(np.diag([18.0, 18.0, 18.0, 1.0]), code=code)
+    nibabel.save(image, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory) -> Path:
+    """Two folders of X-rays."""
+    root = tmp_path_factory.mktemp("measured")
+    for name, seed in (("anna", 1), ("bert", 2)):
+        truth = HUWindow().to_mu(phantom_case(seed, Grid.cube(64))["volume"])
+        save_xrays(root / name, Projector(Grid.cube(64), BEAM)(truth[None])[0], BEAM, report="No effusion.")
+    return root
+
+
+@pytest.fixture(scope="module")
+def prior(tmp_path_factory) -> Path:
+    """An untrained prior on 16^3 voxels."""
+    torch.manual_seed(0)
+    file = tmp_path_factory.mktemp("prior") / "tiny.safetensors"
+    save_prior(Prior(VolumeUNet(channels=(8, 8), attention=(False, True), head_channels=8), Grid.cube(16),
+                     HUWindow()), file)
+    return file
+
+
+@pytest.fixture(scope="module")
+def cts(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("cts")
+    for n, name in enumerate("ab"):
+        write_ct(folder / f"{name}.nii.gz", n)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scored(tmp_path_factory) -> Path:
+    """The finished test of SIRT on two phantoms."""
+    out = tmp_path_factory.mktemp("scored")
+    main(phantoms(out, 2))
+    return out / "sirt"
+
+
+def test_predict_writes_what_the_library_reconstructs(measured, tmp_path, capsys):
+    main(sirt("predict", tmp_path, f"--data.xrays={measured}", "--model.seed=7"))
+    folder = tmp_path / "sirt" / "anna"
+    assert names(tmp_path / "sirt") == ["anna", "bert"] and names(folder) == FILES
+    case = load_xrays(measured / "anna")
+    expected = reconstruct(case["xrays"], case["beam"], method=SIRT(iterations=3))
+    image = nibabel.load(folder / "volume.nii.gz")
+    np.testing.assert_array_equal(image.affine, Grid.cube(64).affine)
+    assert nibabel.aff2axcodes(image.affine) == ("R", "A", "S")
+    np.testing.assert_array_equal(volume(folder), expected.volume.numpy())
+    said = record(folder)
+    assert said["misfit"] == pytest.approx(expected.misfit) and len(said["misfit_per_view"]) == said["views"] == 3
+    assert set(said["seconds"]) == {"prepare", "sample", "score"} and said["peak_memory_mb"] > 100
+    assert said["settings"]["seed"] == 7 and said["settings"]["method"]["iterations"] == 3
+    assert said["settings"]["method"]["mu_water"] == 0.02  # also what the configuration left out
+    assert {"phydict", "torch", "python"} <= set(said["versions"]) and said["report"] == "No effusion."
+    assert isinstance(said["seed"], int) and said["scores"] is None
+    with Image.open(folder / "panel.png") as page:
+        assert min(page.size) > 300
+    out, err = capsys.readouterr()
+    assert out == f"results in {tmp_path / 'sirt'}\n"
+    assert [line.split(":")[0] for line in err.splitlines() if not line.startswith("Seed")] == ["sirt", "anna", "bert"]
+
+
+def test_one_folder_of_xrays_is_a_case(measured, tmp_path, monkeypatch):
+    monkeypatch.chdir(measured / "bert")
+    main(sirt("predict", tmp_path, "--data.xrays=../bert"))
+    assert names(tmp_path / "sirt") == ["bert"]
+
+
+def test_a_finished_case_is_kept_until_asked_otherwise(measured, tmp_path, capsys):
+    args = sirt("predict", tmp_path, f"--data.xrays={measured / 'anna'}")
+    folder = tmp_path / "sirt" / "anna"
+    main(args)
+    before = stamp(folder)
+    main(args)
+    assert stamp(folder) == before and "1 of 1 cases are finished already" in capsys.readouterr().err
+    for change in ("--model.seed=1", "--model.method.init_args.iterations=4", "--data.geometry=other.yaml"):
+        said = refusal(capsys, [*args, change])
+        assert "other settings" in said and "overwrite" in said
+    assert stamp(folder) == before
+    main([*args, "--model.overwrite=true", "--model.seed=1"])
+    assert all(stamp(folder)[name] > before[name] for name in FILES) and record(folder)["settings"]["seed"] == 1
+
+
+@pytest.mark.parametrize("stop", [KeyboardInterrupt, RuntimeError])
+def test_a_stopped_run_goes_on_where_it_was(measured, tmp_path, monkeypatch, stop):
+    args = sirt("predict", tmp_path, f"--data.xrays={measured}")
+    calls, whole = [], SIRT.reconstruct
+
+    def stopping(self, *given):
+        calls.append(given)
+        if len(calls) == 2:
+            raise stop
+        return whole(self, *given)
+
+    monkeypatch.setattr(SIRT, "reconstruct", stopping)
+    with pytest.raises(SystemExit if stop is KeyboardInterrupt else stop):
+        main(args)
+    assert names(tmp_path / "sirt") == ["anna"]
+    before = stamp(tmp_path / "sirt" / "anna")
+    main(args)
+    assert stamp(tmp_path / "sirt" / "anna") == before and len(calls) == 3
+    assert names(tmp_path / "sirt" / "bert") == FILES
+
+
+def test_a_partial_folder_is_never_a_finished_case(measured, scored, tmp_path):
+    for name in ("anna", ".anna.1234.partial"):  # a process killed while it wrote, and a folder without its record
+        (tmp_path / "sirt" / name).mkdir(parents=True)
+        (tmp_path / "sirt" / name / "volume.nii.gz").write_bytes(b"half")
+    main(sirt("predict", tmp_path, f"--data.xrays={measured / 'anna'}"))
+    assert names(tmp_path / "sirt" / "anna") == FILES and volume(tmp_path / "sirt" / "anna").shape == (64, 64, 64)
+
+
+def test_scores_are_those_of_the_written_volumes(scored):
+    with (scored / "results.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["case"] for row in rows] == ["phantom-1000000", "phantom-1000001"]
+    for row in rows:
+        truth = phantom_case(int(row["case"].split("-")[1]), Grid.cube(64))
+        written = torch.from_numpy(volume(scored / row["case"]))[None, None]
+        expected = volume_metrics(written, HUWindow().to_hu(truth["volume"])[None], truth["masks"][None, :1])
+        for name, value in expected.items():
+            assert float(row[name]) == pytest.approx(value, rel=1e-6), name
+        assert float(row["misfit"]) == record(scored / row["case"])["misfit"]
+    table = (scored / "results.md").read_text()
+    psnr = [float(row["psnr"]) for row in rows]
+    assert f"{np.mean(psnr):.2f} ± {np.std(psnr, ddof=1):.2f}" in table and "n = 2 cases" in table
+
+
+def test_a_second_test_scores_nothing_twice_and_shows_one_table(scored, capsys):
+    before = stamp(scored / "phantom-1000000"), (scored / "results.csv").read_text()
+    main(phantoms(scored.parent, 2))
+    assert (stamp(scored / "phantom-1000000"), (scored / "results.csv").read_text()) == before
+    out = capsys.readouterr().out
+    assert "n = 2 cases" in out and "Test metric" not in out and "Warning" not in out
+
+
+def test_a_case_depends_on_its_id_and_the_seed_alone(cts, tmp_path):
+    main(sirt("test", tmp_path / "both", f"--data.cts={cts}", *ORBIT))
+    main(sirt("test", tmp_path / "one", f"--data.cts={cts / 'b.nii.gz'}", *ORBIT))
+    main(sirt("test", tmp_path / "seed", f"--data.cts={cts / 'b.nii.gz'}", *ORBIT, "--model.seed=1"))
+    both, one, seed = (volume(tmp_path / name / "sirt" / "b") for name in ("both", "one", "seed"))
+    np.testing.assert_array_equal(both, one)
+    assert not np.array_equal(one, seed)  # other noise in the X-rays
+    assert "ssim_lung" not in record(tmp_path / "one" / "sirt" / "b")["scores"]  # no lungs, no score of them
+
+
+def test_a_sample_of_the_prior_depends_on_its_id_and_the_seed_alone(prior, measured, tmp_path):
+    main(with_prior("predict", tmp_path / "both", prior, f"--data.xrays={measured}", "--model.guidance=1"))
+    main(with_prior("predict", tmp_path / "one", prior, f"--data.xrays={measured / 'bert'}", "--model.guidance=1"))
+    both, one = (volume(tmp_path / name / "prior_only" / "bert") for name in ("both", "one"))
+    np.testing.assert_array_equal(both, one)
+    assert not np.array_equal(volume(tmp_path / "both" / "prior_only" / "anna"), one)
+    assert both.shape == (16, 16, 16)
+
+
+def test_the_default_method_reconstructs_with_a_prior(prior, measured, tmp_path):
+    main(["test", f"--config={CONFIGS / 'phydict_fast.yaml'}", "--model.method.init_args.iterations=3", *ORBIT,
+          f"--model.prior={prior}", f"--model.out={tmp_path}", "--data.cts=phantom", "--data.phantoms=1",
+          "--data.with_report=false", "--trainer.accelerator=cpu"])
+    said = record(tmp_path / "phydict_fast" / "phantom-1000000")
+    assert said["network_calls"] == 3 and said["grid"]["shape"] == [16, 16, 16] and said["report"] == ""
+    assert said["settings"]["prior"] == "tiny.safetensors" and said["settings"]["prior_crc32"]
+    assert said["misfit"] < 0.5
+
+
+def test_the_simulated_orbit_is_the_one_asked_for(scored, tmp_path):
+    case = "phantom-1000000"
+    main(phantoms(tmp_path / "five", 1, "--data.views=5"))
+    assert len(record(tmp_path / "five" / "sirt" / case)["misfit_per_view"]) == 5
+    main(phantoms(tmp_path / "same", 1, "--data.simulation_voxels=64"))
+    np.testing.assert_array_equal(volume(tmp_path / "same" / "sirt" / case), volume(scored / case))
+    main(phantoms(tmp_path / "finer", 1, "--data.simulation_voxels=80"))
+    assert not np.array_equal(volume(tmp_path / "finer" / "sirt" / case), volume(scored / case))
+
+
+def test_other_xrays_into_a_finished_folder_are_refused(scored, capsys):
+    for change in ("--data.views=4", "--data.simulation_voxels=80", "--data.simulator.noise=0.1"):
+        assert "other settings" in refusal(capsys, phantoms(scored.parent, 2, change))
+
+
+def test_two_processes_split_the_cases_and_agree_with_one(scored, tmp_path):
+    run = subprocess.run([sys.executable, str(ROOT / "infer.py"), *phantoms(tmp_path, 3, "--trainer.devices=2")],
+                         capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"}, timeout=150)
+    assert run.returncode == 0, run.stderr[-2000:]
+    with (tmp_path / "sirt" / "results.csv").open() as file:
+        assert [row["case"][-1] for row in csv.DictReader(file)] == ["0", "1", "2"]
+    assert [name for name in names(tmp_path / "sirt") if name.startswith(".")] == []
+    for case in ("phantom-1000000", "phantom-1000001"):
+        np.testing.assert_array_equal(volume(tmp_path / "sirt" / case), volume(scored / case))
+    assert run.stdout.count("results in") == 1 and run.stdout.count("n = 3 cases") == 1
+
+
+@pytest.mark.slow
+def test_two_processes_predict_every_case_once(measured, tmp_path):
+    args = sirt("predict", tmp_path, f"--data.xrays={measured}", "--trainer.devices=2")
+    run = subprocess.run([sys.executable, str(ROOT / "infer.py"), *args], capture_output=True, text=True, timeout=150)
+    assert run.returncode == 0, run.stderr[-2000:]
+    assert names(tmp_path / "sirt") == ["anna", "bert"]
+    assert sorted(line.split(":")[0] for line in run.stderr.splitlines() if "misfit" in line) == ["anna", "bert"]
+
+
+def xrays(folder: Path, beam: ConeBeam = BEAM) -> Path:
+    """A folder of X-rays of nothing."""
+    save_xrays(folder, np.ones((beam.views, *beam.shape), np.float32), beam)
+    return folder
+
+
+def rewritten(source: Path, target: Path, **changes) -> Path:
+    """A prior's file whose header says something else."""
+    with safe_open(source, "pt") as file:
+        header = json.loads(file.metadata()["phydict"]) | changes
+        weights = {key: file.get_tensor(key) for key in file.keys()}
+    save_file(weights, target, {"phydict": json.dumps(header)})
+    return target
+
+
+def wrong_size(folder: Path) -> Path:
+    np.save(xrays(folder) / "view_1.npy", np.ones((24, 20), np.float32))
+    return folder
+
+
+def one_missing(folder: Path) -> Path:
+    (xrays(folder, ConeBeam.orbit(8, 1020.0, 740.0, (24, 24), 24.0)) / "view_4.npy").unlink()
+    return folder
+
+
+def geometry_key(folder: Path) -> Path:
+    file = xrays(folder) / "geometry.yaml"
+    file.write_text(yaml.safe_dump(yaml.safe_load(file.read_text()) | {"betm": 1}))
+    return folder
+
+
+def no_air(hu: np.ndarray) -> np.ndarray:
+    hu[3, 4, 5] = np.nan
+    return hu
+
+
+BAD_XRAYS = {
+    "no folder": (lambda at: at / "nowhere", ["nowhere"]),
+    "empty folder": (lambda at: at, ["geometry.yaml"]),
+    "wrong size": (wrong_size, ["view_1.npy", "24 x 20", "24 x 24"]),
+    "seven for eight": (one_missing, ["7", "8"]),
+    "detector in the patient": (lambda at: xrays(at, ConeBeam.orbit(3, 800.0, 740.0, (24, 24), 24.0)), ["detector"]),
+    "unknown geometry key": (geometry_key, ["betm"]),
+}
+BAD_CTS = {
+    "no file": (lambda at: at / "nowhere.nii.gz", ["nowhere.nii.gz"]),
+    "no orientation": (lambda at: write_ct(at / "a.nii", 0, code=0), ["a.nii", "sform"]),
+    "2D": (lambda at: write_ct(at / "a.nii", 0, change=lambda hu: hu[:, :, 0]), ["a.nii", "2D"]),
+    "NaN": (lambda at: write_ct(at / "a.nii", 0, change=no_air), ["a.nii", "1 NaN"]),
+    "truncated": (lambda at: (at / "a.nii.gz", (at / "a.nii.gz").write_bytes(
+        write_ct(at / "b.nii.gz", 0).read_bytes()[:3000]))[0], ["a.nii.gz"]),
+    "a text": (lambda at: (at / "a.txt", (at / "a.txt").write_text("hello"))[0], ["a.txt"]),
+}
+BAD_PRIORS = {
+    "no file": (lambda at, good: at / "nowhere.safetensors", ["nowhere.safetensors"]),
+    "truncated": (lambda at, good: (at / "cut.safetensors", (at / "cut.safetensors").write_bytes(
+        good.read_bytes()[:5000]))[0], ["cut.safetensors", "truncated"]),
+    "impossible grid": (lambda at, good: rewritten(good, at / "p.safetensors", grid=Grid.cube(15).to_dict()),
+                        ["p.safetensors", "(15, 15, 15)", "divisible"]),
+    "other network": (lambda at, good: rewritten(good, at / "p.safetensors", network=VolumeUNet(
+        channels=(8, 16), attention=(False, True), head_channels=8).settings), ["p.safetensors", "network"]),
+    "others' file": (lambda at, good: rewritten(good, at / "p.safetensors", format=99), ["p.safetensors", "format"]),
+}
+
+
+@pytest.mark.parametrize("case", BAD_XRAYS)
+def test_bad_xrays_are_one_sentence(case, tmp_path, capsys):
+    make, words = BAD_XRAYS[case]
+    (tmp_path / "in").mkdir()
+    said = refusal(capsys, sirt("predict", tmp_path / "out", f"--data.xrays={make(tmp_path / 'in')}"))
+    assert all(word in said for word in words), said
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("case", BAD_CTS)
+def test_a_bad_ct_is_one_sentence(case, tmp_path, capsys):
+    make, words = BAD_CTS[case]
+    (tmp_path / "in").mkdir()
+    said = refusal(capsys, sirt("test", tmp_path / "out", f"--data.cts={make(tmp_path / 'in')}", *ORBIT))
+    assert all(word in said for word in words), said
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("case", BAD_PRIORS)
+def test_a_bad_prior_is_one_sentence(case, prior, measured, tmp_path, capsys):
+    make, words = BAD_PRIORS[case]
+    (tmp_path / "in").mkdir()
+    file = make(tmp_path / "in", prior)
+    said = refusal(capsys, with_prior("predict", tmp_path / "out", file, f"--data.xrays={measured}"))
+    assert all(word in said for word in words), said
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_report_for_a_prior_without_text_is_one_sentence(prior, measured, tmp_path, capsys):
+    said = refusal(capsys, with_prior("predict", tmp_path / "out", prior, f"--data.xrays={measured}"))
+    assert "without text" in said and not (tmp_path / "out").exists()
+
+
+def test_a_prior_refuses_xrays_of_another_grid(prior):
+    posterior = reconstructor(PriorOnly(iterations=1), prior)
+    with pytest.raises(ValueError, match="16.*64.*use the prior's grid"):
+        posterior.reconstruct(torch.ones(3, 24, 24), Projector(Grid.cube(64), BEAM))
+
+
+@pytest.mark.parametrize("change, words", [
+    (["--data.view=3"], ["data.view"]),
+    (["--data.views=0"], ["one view"]),
+    (["--data.views=some"], ["data.views", "some"]),
+    (["--model.method.init_args.iteration=3"], ["iteration"]),
+    (["--data.source_to_isocentre=2000"], ["isocentre"]),
+    (["--config=nowhere.yaml"], ["nowhere.yaml"]),
+], ids=lambda value: value[0] if value[0].startswith("--") else "")
+def test_a_bad_argument_is_one_sentence(change, words, tmp_path, capsys):
+    said = refusal(capsys, phantoms(tmp_path / "out", 1, *change))
+    assert all(word in said for word in words), said
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_unknown_key_of_a_config_file_is_named(tmp_path, capsys):
+    (tmp_path / "mine.yaml").write_text("model:\n  guidence: 2.0\n")
+    assert "model.guidence" in refusal(capsys, phantoms(tmp_path / "out", 1, f"--config={tmp_path / 'mine.yaml'}"))
+
+
+def test_an_impossible_setting_is_named_without_the_parsers_noise(prior, tmp_path, capsys):
+    said = refusal(capsys, ["test", f"--config={CONFIGS / 'phydict_fast.yaml'}", f"--model.prior={prior}",
+                            "--model.method.init_args.iterations=0"])
+    assert "at least one iteration, but 0" in said and "Union" not in said
+
+
+def test_an_output_folder_that_cannot_be_is_one_sentence(measured, tmp_path, capsys):
+    (tmp_path / "file").write_text("mine")
+    for out in (tmp_path / "file", tmp_path / "file" / "deeper", Path("/proc/phydict")):
+        said = refusal(capsys, sirt("predict", out, f"--data.xrays={measured}"))
+        assert str(out) in said and "model.out" in said
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_a_read_only_disk_is_one_sentence(measured, tmp_path, capsys, monkeypatch):
+    def refuse(**_):
+        raise OSError(30, "Read-only file system")
+
+    monkeypatch.setattr("phydict.inference.tempfile.TemporaryFile", refuse)
+    said = refusal(capsys, sirt("predict", tmp_path / "out", f"--data.xrays={measured}"))
+    assert "Read-only file system" in said and not (tmp_path / "out").exists()
+
+
+def test_a_disk_that_fills_up_leaves_no_case_that_looks_finished(measured, tmp_path, capsys):
+    args = sirt("predict", tmp_path, f"--data.xrays={measured}")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, hard))  # no file may grow beyond 50 kB
+    try:
+        said = refusal(capsys, args)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert "anna" in said and "could not be written" in said
+    assert names(tmp_path / "sirt") == []
+    main(args)
+    assert names(tmp_path / "sirt") == ["anna", "bert"]

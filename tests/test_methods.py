@@ -1,0 +1,133 @@
+"""The named methods, a reconstruction in one call, and the binning of detectors finer than the grid."""
+
+import numpy as np
+import pytest
+import torch
+from laws import random_like
+from prior.tiny import tiny_prior
+
+from phydict.baselines import SIRT
+from phydict.grid import Grid
+from phydict.methods import METHODS, binned, binning, reconstruct, reconstructor
+from phydict.posterior import Posterior, PriorOnly, ProximalCG, SplitGibbs
+from phydict.prior import save_prior
+from phydict.units import MU_WATER, hu_to_mu
+from phydict.xray import ConeBeam, Projector
+
+GRID = Grid.cube(64)
+DEFAULT = ConeBeam.orbit(8, 1020, 740, (448, 448), 1.25)
+
+
+def ball(beam: ConeBeam, radius: float) -> torch.Tensor:
+    """Exact line integrals (K, V, U) of a ball of water at the isocentre."""
+    ray = beam.pixels() - beam.sources[:, None, None]
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    along = -(ray * beam.sources[:, None, None]).sum(-1)
+    apart = (beam.sources**2).sum(-1)[:, None, None] - along**2
+    return torch.as_tensor(2 * MU_WATER * np.sqrt(np.clip(radius**2 - apart, 0, None)))
+
+
+def test_sirt_in_one_call_finds_the_ball_in_its_exact_line_integrals():
+    beam = ConeBeam.orbit(6, 1020, 740, (56, 56), 8.0)
+    result = reconstruct(ball(beam, 90.0), beam, method=SIRT(60))
+    assert result.misfit < 0.04
+    assert result.volume.shape == GRID.shape and result.grid.same_as(GRID)
+    mass = float(hu_to_mu(result.volume).sum()) * 6**3
+    assert mass == pytest.approx(MU_WATER * 4 / 3 * np.pi * 90**3, rel=0.1)
+    assert result.volume[26:38, 26:38, 26:38].mean() == pytest.approx(0, abs=100)
+
+
+def test_a_detector_finer_than_the_grid_can_use_is_binned():
+    beam = ConeBeam.orbit(3, 1020, 740, (112, 112), 4.0)
+    result = reconstruct(ball(beam, 90.0), beam, method=SIRT(2))
+    coarse = reconstruct(binned(ball(beam, 90.0), 1), beam, method=SIRT(2))
+    assert result.xrays.shape == (3, 112, 112) and torch.equal(result.volume, coarse.volume)
+    fine = ConeBeam.orbit(3, 1020, 740, (224, 224), 2.0)
+    assert binning(GRID, fine) == 2
+    assert reconstruct(ball(fine, 90.0), fine, method=SIRT(2)).xrays.shape == (3, 112, 112)
+
+
+@pytest.mark.parametrize("grid", [GRID, Grid.cube(128), Grid.cube(16), Grid((64, 64, 32), (6.0, 6.0, 12.0))])
+@pytest.mark.parametrize("beam", [
+    DEFAULT, ConeBeam.orbit(2, 1500, 1000, (450, 300), (1.0, 0.7)), ConeBeam.orbit(2, 1020, 740, (7, 7), 80.0),
+    ConeBeam.orbit(2, 1020, 740, (449, 449), 1.25)])
+def test_binned_pixels_stay_below_seven_tenths_of_a_voxel_at_the_isocentre_and_fill_the_detector(grid, beam):
+    factor = binning(grid, beam)
+    magnification = beam.distances / np.linalg.norm(beam.sources, axis=1)
+    largest = max(np.linalg.norm(step, axis=1).max() for step in (beam.u, beam.v)) / magnification.max()
+    assert all(n % factor == 0 for n in beam.shape)
+    beam.binned(factor)
+    assert factor == 1 or factor * largest <= 0.7 * min(grid.spacing) * (1 + 1e-9)
+    finer = [f for f in range(factor + 1, min(beam.shape) + 1) if all(n % f == 0 for n in beam.shape)]
+    assert all(f * largest > 0.7 * min(grid.spacing) for f in finer)  # and no larger factor would do
+
+
+def test_the_default_detector_is_binned_to_the_default_grid():
+    assert binning(GRID, DEFAULT) == 4
+    assert binning(GRID, DEFAULT.binned(4)) == 1
+
+
+def test_binning_looks_at_the_grids_centre():
+    moved = GRID.affine.copy()
+    moved[1, 3] -= 400  # nearer to the source of the PA view: more magnified, so finer pixels
+    beam = DEFAULT.select([0])
+    assert binning(Grid(GRID.shape, affine=moved), beam) > binning(GRID, beam)
+
+
+@pytest.mark.parametrize("factor", [1, 2, 4])
+def test_binning_keeps_the_mean_of_every_block(factor):
+    y = random_like((3, 8, 12), seed=1)
+    small = binned(y, factor)
+    assert small.shape == (3, 8 // factor, 12 // factor)
+    torch.testing.assert_close(small.mean((1, 2)), y.mean((1, 2)))
+    torch.testing.assert_close(small[1, 1, 2], y[1, factor:2 * factor, 2 * factor:3 * factor].mean())
+
+
+def test_binning_views_and_beam_together_measures_the_same():
+    grid = Grid.cube(16)
+    beam = ConeBeam.orbit(2, 1020, 740, (56, 56), 10.0)
+    mu = MU_WATER * random_like((1, 1, 16, 16, 16)).abs()
+    fine, coarse = Projector(grid, beam)(mu)[0], Projector(grid, beam.binned(2))(mu)[0]
+    assert (binned(fine, 2) - coarse).norm() < 0.02 * coarse.norm()
+
+
+def test_an_unknown_method_names_the_known_ones():
+    with pytest.raises(ValueError) as error:
+        reconstructor("phydict_fats")
+    assert "phydict_fats" in str(error.value) and all(name in str(error.value) for name in METHODS)
+    assert "\n" not in str(error.value)
+
+
+def test_sirt_needs_no_prior_and_a_sampler_says_which_one_is_missing(tmp_path):
+    assert reconstructor("sirt", tmp_path / "nowhere.safetensors") is METHODS["sirt"]
+    with pytest.raises(FileNotFoundError, match="nowhere.safetensors"):
+        reconstructor("phydict_fast", tmp_path / "nowhere.safetensors")
+
+
+def test_a_method_may_be_a_name_a_sampler_or_a_reconstructor(tmp_path):
+    prior = tiny_prior()
+    save_prior(prior, tmp_path / "tiny.safetensors")
+    named, made = reconstructor("phydict_fast", prior), reconstructor(METHODS["phydict_fast"], prior)
+    assert isinstance(named, Posterior) and named.sampler == made.sampler and named.prior is prior
+    assert (named.name, made.name) == ("phydict_fast", "SplitGibbs")
+    assert reconstructor("prior_only", tmp_path / "tiny.safetensors").prior.grid.same_as(prior.grid)
+    assert reconstructor(made) is made
+
+
+def test_one_call_takes_the_priors_grid_and_fits_the_views():
+    beam = ConeBeam.orbit(4, 1020, 740, (28, 28), 20.0)
+    method = SplitGibbs(6, ProximalCG(20), final_guided=True)
+    result = reconstruct(ball(beam, 120.0), beam, tiny_prior(), method, seed=2)
+    assert result.grid.same_as(Grid.cube(16)) and result.seed == 2
+    assert result.misfit < 0.5 * reconstruct(ball(beam, 120.0), beam, tiny_prior(), PriorOnly(6), seed=2).misfit
+
+
+def test_x_rays_and_geometry_that_do_not_match_are_refused_with_both_sizes():
+    with pytest.raises(ValueError, match=r"8 views of 448 x 448.*\(7, 448, 448\)"):
+        reconstruct(torch.zeros(7, 448, 448), DEFAULT, method="sirt")
+
+
+def test_a_source_inside_the_volume_is_refused():
+    beam = ConeBeam.orbit(2, 500, 150, (28, 28), 10.0)
+    with pytest.raises(ValueError, match="inside the volume"):
+        reconstruct(torch.zeros(2, 28, 28), beam, method="sirt")

@@ -1,0 +1,207 @@
+"""Training: the loss falls, a resumed run is the uninterrupted one, and a checkpoint becomes a prior."""
+
+from __future__ import annotations
+
+import csv
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import nibabel
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import default_collate
+
+from phydict.datamodule import PriorData
+from phydict.prior import load_prior
+from phydict.training import main
+
+CONFIG = Path(__file__).parents[1] / "configs" / "prior" / "phantom.yaml"
+TINY = ["--model.network.class_path=phydict.prior.VolumeUNet", "--model.network.init_args.channels=[8,8]",
+        "--model.network.init_args.attention=[false,true]", "--model.network.init_args.head_channels=8",
+        "--model.voxels=16", "--model.warmup=2", "--model.montage_steps=2", "--data.phantoms=4",
+        "--data.validation_phantoms=1", "--data.epoch_size=8", "--data.batch_size=2", "--trainer.accelerator=cpu",
+        "--trainer.devices=1", "--trainer.precision=32", "--trainer.max_steps=-1", "--trainer.log_every_n_steps=1",
+        "--trainer.check_val_every_n_epoch=1", "--trainer.enable_progress_bar=false",
+        "--trainer.enable_model_summary=false"]
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("cache")
+
+
+def arguments(folder: Path, cache: Path, *more: str) -> list[str]:
+    """`fit` of a tiny network on four phantoms, everything written below `folder`."""
+    return ["fit", f"--config={CONFIG}", *TINY, f"--data.cache={cache}", f"--trainer.default_root_dir={folder}",
+            f"--trainer.logger.init_args.save_dir={folder}", f"--trainer.callbacks.dirpath={folder}", *more]
+
+
+@pytest.fixture(scope="module")
+def straight(tmp_path_factory, cache) -> Path:
+    """The folder of an uninterrupted run of two epochs."""
+    folder = tmp_path_factory.mktemp("straight")
+    main(arguments(folder, cache, "--trainer.max_epochs=2"))
+    return folder
+
+
+def losses(folder: Path) -> dict[int, str]:
+    """Step -> loss as logged, from the last log that the run in `folder` wrote."""
+    log = max(folder.glob("logs/**/metrics.csv"), key=lambda path: path.stat().st_mtime_ns)
+    with log.open() as file:
+        return {int(row["step"]): row["loss"] for row in csv.DictReader(file) if row["loss"]}
+
+
+def refusal(capsys, args: list[str]) -> str:
+    """The one sentence on stderr with which the command line refuses `args`."""
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as stopped:
+        main(args)
+    assert stopped.value.code == 2
+    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+    assert len(said) == 1
+    return said[0]
+
+
+def checkpoint(folder: Path) -> dict:
+    return torch.load(folder / "last.ckpt", map_location="cpu", weights_only=True)
+
+
+def test_the_loss_falls(tmp_path, cache):
+    main(arguments(tmp_path, cache, "--trainer.max_epochs=12", "--model.learning_rate=5e-3",
+                   "--trainer.limit_val_batches=0"))
+    loss = [float(value) for _, value in sorted(losses(tmp_path).items())]
+    assert len(loss) == 48
+    assert np.mean(loss[-8:]) < 0.6 * np.mean(loss[:4])
+
+
+def test_a_killed_run_goes_on_as_if_it_had_not_been(tmp_path, straight, cache):
+    class Killed(BaseException):
+        pass
+
+    def kill(*_):
+        raise Killed
+
+    with pytest.MonkeyPatch.context() as patch:  # the process ends in the second epoch, after the first's checkpoint
+        patch.setattr("phydict.training.PriorTraining.on_train_epoch_start",
+                      lambda self: kill() if self.trainer.current_epoch == 1 else None)
+        with pytest.raises(Killed):
+            main(arguments(tmp_path, cache, "--trainer.max_epochs=2"))
+    assert checkpoint(tmp_path)["global_step"] == 4
+    torch.manual_seed(99)  # the new process knows nothing of the old one's random numbers
+    main(arguments(tmp_path, cache, "--trainer.max_epochs=2", f"--ckpt_path={tmp_path / 'last.ckpt'}",
+                   "--seed_everything=5"))
+    ours, theirs = checkpoint(tmp_path), checkpoint(straight)
+    for weights in ("state_dict", "current_model_state"):
+        assert ours[weights].keys() == theirs[weights].keys()
+        different = [name for name, weight in ours[weights].items() if not torch.equal(weight, theirs[weights][name])]
+        assert not different, weights
+    assert any(not torch.equal(w, ours["current_model_state"][k]) for k, w in ours["state_dict"].items())
+    resumed, expected = losses(tmp_path), losses(straight)
+    assert {step: resumed[step] for step in range(4, 8)} == {step: expected[step] for step in range(4, 8)}
+    assert ours["phydict"]["training"] == {"steps": 8, "samples": 16}
+
+
+def test_an_exported_checkpoint_is_a_prior_with_the_averaged_weights(tmp_path, straight, capsys):
+    file = tmp_path / "prior" / "tiny.safetensors"
+    main(["export", f"--checkpoint={straight / 'last.ckpt'}", "--out", str(file)])
+    assert str(file) in capsys.readouterr().out
+    prior = load_prior(file)
+    averaged = checkpoint(straight)["state_dict"]
+    for name, weight in prior.state_dict().items():
+        assert torch.equal(weight, averaged[f"prior.{name}"].half().float()), name
+    assert prior.grid.shape == (16, 16, 16) and prior.window.low == -1000
+    prior.bind("Large left pleural effusion.")  # loads the text encoder
+    for name, weight in prior.text.state_dict().items():
+        assert torch.equal(weight, averaged[f"prior.text.{name}"].half().float()), name
+
+
+def test_validation_logs_every_noise_level_and_paints_a_montage(straight):
+    log = next(straight.glob("logs/**/metrics.csv")).read_text().splitlines()[0].split(",")
+    assert {f"val/rmse_hu_t{t}" for t in (0.1, 0.3, 0.5, 0.7, 0.9)} | {"val/rmse_hu", "samples_per_s"} <= set(log)
+    assert [file.name for file in sorted(straight.glob("logs/**/samples/*.png"))] == [
+        "step000004_0.png", "step000008_0.png"]
+
+
+@pytest.fixture(scope="module")
+def cts(tmp_path_factory) -> Path:
+    """A folder of two small CTs."""
+    folder = tmp_path_factory.mktemp("cts")
+    for n in range(2):
+        hu = np.full((20, 20, 20), -1000, np.int16)
+        hu[4:16, 6:15, :] = 40 + n
+        image = nibabel.Nifti1Image(hu, np.diag([18.0, 18.0, 18.0, 1.0]))
+        image.set_sform(image.affine, code=1)
+        nibabel.save(image, folder / f"patient{n}.nii.gz")
+    return folder
+
+
+def test_held_out_cts_only_validate_and_draws_mix_cts_with_phantoms(cts, tmp_path):
+    data = PriorData(str(cts), holdout=["patient1"], phantoms=2, validation_phantoms=1, cache=str(tmp_path), voxels=16)
+    assert [ct.id for ct in data.cts.cts] == ["patient0"]
+    assert [ct.id for ct in data.validation.datasets[1].cts] == ["patient1"]
+    both = [{key: case[key] for key in ("volume", "masks", "has_masks")} for case in (data.phantoms[0], data.cts[0])]
+    for pair in (both, both[::-1]):  # in either order, as a loader process writes into the first case's dtype
+        assert default_collate(pair)["has_masks"].dtype == torch.bool
+
+
+@pytest.mark.parametrize("change, words", [
+    (["--data.phantoms=0"], ["nothing to train on"]),
+    (["--data.cts=/nowhere/at/all"], ["/nowhere/at/all"]),
+    (["--data.holdout=[nobody]", "--data.cts={cts}"], ["nobody", "patient0"]),
+    (["--data.holdout=[patient]", "--data.cts={cts}", "--data.phantoms=0"], ["nothing to train on"]),
+    (["--data.cts={cts}", "--data.cache={cts}/cache"], ["inside"]),
+    (["--data.epoch_size=1"], ["epoch_size", "batch"]),
+    (["--data.lungs=2"], ["data.lungs"]),
+    (["--model.voxels=15"], ["15", "divisible"]),
+    (["--ckpt_path=/nowhere/last.ckpt"], ["/nowhere/last.ckpt"]),
+    (["--ckpt_path={cut}"], ["cut.ckpt", "truncated"]),
+], ids=lambda value: value[0].split("=")[0].strip("-") if isinstance(value, list) and value[0][0] == "-" else "")
+def test_bad_input_is_one_sentence(change, words, cts, straight, cache, tmp_path, capsys):
+    whole = (straight / "last.ckpt").read_bytes()
+    (tmp_path / "cut.ckpt").write_bytes(whole[:len(whole) // 2])
+    change = [text.format(cts=cts, cut=tmp_path / "cut.ckpt") for text in change]
+    said = refusal(capsys, arguments(tmp_path / "run", cache, "--trainer.max_epochs=1", *change))
+    assert all(word in said for word in words), said
+    assert not list((tmp_path / "run").glob("*.ckpt"))
+
+
+def test_an_unknown_key_of_a_config_file_is_named(tmp_path, cache, capsys):
+    config = tmp_path / "mine.yaml"
+    config.write_text("model:\n  learning_rats: 1.0\n")
+    assert "model.learning_rats" in refusal(capsys, arguments(tmp_path, cache, f"--config={config}"))
+
+
+def test_a_loader_process_sends_the_message_too(cts, tmp_path, cache, capsys):
+    (tmp_path / "cts").mkdir()
+    (tmp_path / "cts" / "cut.nii.gz").write_bytes((cts / "patient0.nii.gz").read_bytes()[:200])
+    said = refusal(capsys, arguments(tmp_path, cache, "--trainer.max_epochs=1", f"--data.cts={tmp_path / 'cts'}",
+                                     "--data.phantoms=0", "--data.workers=1", "--model.text=none"))
+    assert "cut.nii.gz" in said and "Traceback" not in said
+
+
+@pytest.mark.parametrize("spoil, words", [
+    (lambda file, whole: file.write_bytes(whole[:-1000]), ["truncated"]),
+    (lambda file, whole: torch.save({"state_dict": {}}, file), ["no checkpoint of a prior"]),
+    (lambda file, whole: None, ["there is no checkpoint"]),
+])
+def test_what_cannot_be_exported_is_one_sentence(spoil, words, straight, tmp_path, capsys):
+    file, out = tmp_path / "spoilt.ckpt", tmp_path / "out.safetensors"
+    spoil(file, (straight / "last.ckpt").read_bytes())
+    said = refusal(capsys, ["export", f"--checkpoint={file}", f"--out={out}"])
+    assert all(word in said for word in [*words, "spoilt.ckpt"]), said
+    assert not out.exists()
+
+
+def test_two_processes_train_one_prior(tmp_path, cache, straight):
+    """Two processes see the same draws as one between them: as many samples in half the steps."""
+    args = arguments(tmp_path, cache, "--trainer.max_epochs=1", "--data.validation_phantoms=2", "--trainer.devices=2",
+                     "--trainer.strategy=ddp_find_unused_parameters_true")
+    done = subprocess.run([sys.executable, str(CONFIG.parents[2] / "train.py"), *args], capture_output=True, text=True,
+                          env=os.environ | {"OMP_NUM_THREADS": "1"}, timeout=150)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert checkpoint(tmp_path)["phydict"]["training"] == {"steps": 2, "samples": 8}
+    assert "val/rmse_hu_t0.5" in next(tmp_path.glob("logs/**/metrics.csv")).read_text()
+    assert list(tmp_path.glob("logs/**/samples/*.png"))

@@ -85,9 +85,9 @@ class ReconstructionData(lightning.LightningDataModule):
     def settings(self, stage: str) -> dict:
         """What, beside the cases themselves, decides the X-rays that a stage (predict, test) reconstructs from."""
         if stage == "predict":
-            return {"geometry": self.geometry}
-        return self.orbit | {"simulator": describe(self.simulator), "simulation_voxels": self.simulation_voxels,
-                             "with_report": self.with_report}
+            return {"with_report": self.with_report, "geometry": self.geometry}
+        return {"with_report": self.with_report, **self.orbit, "simulator": describe(self.simulator),
+                "simulation_voxels": self.simulation_voxels}
 
     def predict_dataloader(self) -> DataLoader:
         if not self.xrays:
@@ -178,7 +178,6 @@ class ReconstructionTask(lightning.LightningModule):
     def test_step(self, case: dict, _=None) -> None:
         case["beam"] = self.trainer.datamodule.beam
         case["xrays"] = self.trainer.datamodule.simulate(case, self._seed(case), self.grid, self.window)
-        case["report"] = case["report"] if self.trainer.datamodule.with_report else ""
         result = self._reconstruct(case)
         truth = self.window.to_hu(case["volume"])[None].cpu()
         lung = case["masks"][None, :1].cpu() if bool(case["has_masks"][0]) else None
@@ -210,6 +209,7 @@ class ReconstructionTask(lightning.LightningModule):
     def _reconstruct(self, case: dict) -> Reconstruction:
         beam = case["beam"]
         beam.check(self.grid)
+        case["report"] = case["report"] if self.trainer.datamodule.with_report else ""
         factor = binning(self.grid, beam)
         self.progress.case(case["id"])
         xrays = binned(case["xrays"], factor).to(self.device)

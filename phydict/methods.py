@@ -11,15 +11,14 @@ from phydict.baselines import SIRT
 from phydict.grid import Grid
 from phydict.posterior import GradientSteps, Posterior, PriorOnly, ProximalCG, Reward, Sampler, SplitGibbs
 from phydict.prior import Prior, load_prior
-from phydict.reconstructor import Reconstruction, Reconstructor
+from phydict.reconstructor import Reconstruction, Reconstructor, check_xrays
 from phydict.xray import ConeBeam, Projector
 
 DEFAULT_PRIOR = Path(__file__).parents[1] / "data" / "prior" / "phydict_64.safetensors"
 """The prior that comes with the project."""
 
 METHODS: dict[str, Sampler | Reconstructor] = {
-    "phydict_fast": SplitGibbs(iterations=20, warm_start=0.7, likelihood=ProximalCG(iterations=6),
-                               final_guided=True),
+    "phydict_fast": SplitGibbs(iterations=20, warm_start=0.7, final_guided=True),
     "phydict_paper": SplitGibbs(iterations=50, likelihood=GradientSteps(reward=Reward(lpips=1.0)), refine_from=0.8,
                                 refine_iterations=40),
     "prior_only": PriorOnly(iterations=50),
@@ -70,10 +69,7 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: Prior | str | Path | None 
     prior: a Prior, a file, or None for the shipped one; report: radiology text, if any.
     A detector finer than the grid can use is binned. Raises ValueError when X-rays, geometry and prior do not fit.
     """
-    expected = (beam.views, *beam.shape)
-    if tuple(xrays.shape) != expected:
-        raise ValueError(f"the geometry describes {expected[0]} views of {expected[1]} x {expected[2]} pixels, but the "
-                         f"X-rays have shape {tuple(xrays.shape)}: give images and geometry that match")
+    check_xrays(xrays, beam)
     ready = reconstructor(method, prior, guidance)
     grid = ready.prior.grid if isinstance(ready, Posterior) else Grid.cube(64)
     beam.check(grid)

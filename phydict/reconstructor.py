@@ -14,7 +14,7 @@ import numpy as np
 from torch import Tensor
 
 from phydict.grid import Grid
-from phydict.xray import Projector
+from phydict.xray import ConeBeam, Projector
 
 
 class Stopwatch:
@@ -88,6 +88,16 @@ class Reconstructor(ABC):
     @abstractmethod
     def steps(self) -> int:
         """How often `reconstruct` calls on_step."""
+
+
+def check_xrays(xrays: Tensor, beam: ConeBeam) -> None:
+    """Raises ValueError unless the X-rays (K, V, U) are finite and as many and as large as the beam's views."""
+    expected = (beam.views, *beam.shape)
+    if tuple(xrays.shape) != expected:
+        raise ValueError(f"the geometry describes {expected[0]} views of {expected[1]} x {expected[2]} pixels, "
+                         f"but the X-rays have shape {tuple(xrays.shape)}: give images and geometry that match")
+    if not xrays.isfinite().all():
+        raise ValueError("the X-rays contain NaN or infinite pixels: repair or remove those views first")
 
 
 def misfits(reprojection: Tensor, xrays: Tensor) -> dict:

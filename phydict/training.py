@@ -176,7 +176,8 @@ class PriorCLI(LightningCLI):
 
     def parse_arguments(self, parser, args) -> None:
         super().parse_arguments(parser, args)
-        checkpoint = self.config[self.config.subcommand].ckpt_path
+        command = self.config.get("subcommand")  # none where nothing is run
+        checkpoint = command and self.config[command].ckpt_path
         if checkpoint and checkpoint not in ("last", "best"):
             read_checkpoint(checkpoint)
 

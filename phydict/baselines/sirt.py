@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from phydict.reconstructor import Reconstruction, Reconstructor, Stopwatch, misfits
+from phydict.reconstructor import Reconstruction, Reconstructor, Stopwatch, check_xrays, misfits
 from phydict.units import MU_WATER, mu_to_hu
 from phydict.xray import Projector
 from phydict.xray.calibration import match_views
@@ -34,6 +34,7 @@ class SIRT(Reconstructor):
     def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,
                     seed: int = 0, on_step: Callable[[], None] = lambda: None) -> Reconstruction:
         watch, A = Stopwatch(), projector
+        check_xrays(xrays, A.beam)
         with watch.stage("prepare"):
             y = xrays[None]
             ones = torch.ones(1, 1, *A.grid.shape).to(xrays)

@@ -25,12 +25,12 @@ class LikelihoodStep(ABC):
 
 @dataclass(frozen=True)
 class ProximalCG(LikelihoodStep):
-    """argmin over z in [-1, 1] of |P(z) - y|^2 / noise^2 + |z - x0|^2 / spread^2, by conjugate gradients from x0.
+    """Towards argmin over z in [-1, 1] of |P(z) - y|^2 / noise^2 + |z - x0|^2 / spread^2, by conjugate gradients.
 
-    Each restart frees the voxels that are inside the range or pulled back into it, runs conjugate gradients on them
-    and clips: air stays air, which is worth more than many iterations without the bounds. With a Gaussian prior,
-    bounds that do not act and enough iterations this is exactly E[x_0 | x_t, y]; few iterations regularise, since
-    what the views see best is corrected first.
+    Starts at x0. Each restart frees the voxels that are inside the range or pulled back into it, runs conjugate
+    gradients on them and clips: air stays air, which is worth more than many iterations without the bounds. With a
+    Gaussian prior, bounds that do not act and enough iterations this is exactly E[x_0 | x_t, y]; few iterations
+    regularise, since what the views see best is corrected first.
 
     iterations: per restart, at most; restarts; noise: standard deviation of the line integrals' error (noise and
     model); tolerance: a restart ends once its residual has shrunk by this factor. Hestenes & Stiefel 1952,

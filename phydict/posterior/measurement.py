@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from phydict.reconstructor import check_xrays
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import Projector
 from phydict.xray.calibration import match_views
@@ -22,17 +23,11 @@ class Measurement:
 
     def __init__(self, projector: Projector, xrays: Tensor, window: HUWindow, display: bool = False,
                  mu_water: float = MU_WATER):
-        expected = (projector.beam.views, *projector.beam.shape)
-        if tuple(xrays.shape) != expected:
-            raise ValueError(f"the geometry describes {expected[0]} views of {expected[1]} x {expected[2]} pixels, "
-                             f"but the X-rays have shape {tuple(xrays.shape)}: give images and geometry that match")
-        if not torch.isfinite(xrays).all():
-            raise ValueError("the X-rays contain NaN or infinite pixels: repair or remove those views first")
+        check_xrays(xrays, projector.beam)
         self.projector, self.display = projector, xrays[None] if display else None
         self.slope, offset = window.mu_affine(mu_water)
         self.background = offset * projector(torch.ones(1, 1, *projector.grid.shape).to(xrays))
         self.y = xrays[None]
-        self.views = expected[0]
         self.calls = 1
 
     def project(self, x: Tensor) -> Tensor:

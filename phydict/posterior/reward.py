@@ -60,7 +60,9 @@ def load_lpips(backbone: str, random_backbone: bool) -> nn.Module:
     import lpips
 
     try:
-        network = lpips.LPIPS(net=backbone, pnet_rand=random_backbone, verbose=False)
+        with torch.random.fork_rng():  # an untrained backbone is the same in every process
+            torch.manual_seed(0)
+            network = lpips.LPIPS(net=backbone, pnet_rand=random_backbone, verbose=False)
     except OSError as error:
         raise FileNotFoundError(
             f"LPIPS needs the trained backbone {files[backbone]} in {torch.hub.get_dir()}/checkpoints and could not "

@@ -29,7 +29,7 @@ class SplitGibbs(Sampler):
     iterations: noise levels; likelihood: the step towards the X-rays; warm_start: the second noise level in (0, 1],
     so that below 1 the first estimate, the prior's mean moved onto the X-rays, starts the descent from there;
     final_guided: whether the last estimate (at the lowest noise) still takes a likelihood step;
-    churn: share of the noise that is drawn anew at each level (0: deterministic DDIM);
+    churn: 0 for deterministic DDIM, 1 for ancestral sampling, which draws most of the noise anew;
     prior_std: standard deviation of the state, which sets the spread of x0 at each time;
     refine_from: EC's delta in [0, 1), 0 for none; refine_iterations: its noise levels.
     """
@@ -50,6 +50,13 @@ class SplitGibbs(Sampler):
             raise ValueError(f"warm_start is a time in (0, 1], but {self.warm_start} was given")
         if not 0 <= self.refine_from < 1:
             raise ValueError(f"refine_from (the paper's delta) lies in [0, 1), but {self.refine_from} was given")
+        if self.refine_from and self.refine_iterations < 1:
+            raise ValueError(f"refining from {self.refine_from} needs refine_iterations of at least 1, but "
+                             f"{self.refine_iterations} was given")
+        if self.warm_start < 1 and self.iterations < 2:
+            raise ValueError("a warm_start below 1 needs at least 2 iterations, but 1 was given")
+        if not 0 <= self.churn <= 1:
+            raise ValueError(f"churn lies in [0, 1], but {self.churn} was given")
 
     def steps(self) -> int:
         return self.iterations + (self.refine_iterations if self.refine_from else 0)
@@ -72,7 +79,7 @@ class SplitGibbs(Sampler):
                 z = torch.cat([ct, x0[:, 1:]], 1)
             x = ddim(schedule, z, x, t, s)
             if self.churn and s > 0:
-                x = self._churned(schedule, x, z, s, draw)
+                x = self._churned(schedule, x, z, t, s, draw)
             on_step()
         if self.refine_from:
             x = renoise(schedule, z, self.refine_from, noise_like(z, draw))
@@ -84,10 +91,10 @@ class SplitGibbs(Sampler):
         a, s = (float(w) for w in denoiser.schedule.scales(t))
         return self.prior_std * s / (s**2 + (a * self.prior_std) ** 2) ** 0.5
 
-    def _churned(self, schedule, x: Tensor, z: Tensor, s: float, draw: torch.Generator) -> Tensor:
+    def _churned(self, schedule, x: Tensor, z: Tensor, t: float, s: float, draw: torch.Generator) -> Tensor:
         signal, noise = (w.to(x) for w in schedule.scales(s))
-        kept = (1 - self.churn) ** 0.5 * (x - signal * z)
-        return signal * z + kept + self.churn**0.5 * noise * noise_like(x, draw)
+        share = self.churn * (1 - float(schedule.sigma(s) / schedule.sigma(t)) ** 2)
+        return signal * z + (1 - share) ** 0.5 * (x - signal * z) + share**0.5 * noise * noise_like(x, draw)
 
 
 def noise_like(x: Tensor, draw: torch.Generator) -> Tensor:

@@ -26,6 +26,8 @@ def save_prior(prior: Prior, path: str | Path, training: dict | None = None, dty
     training: what the header should say of how it was trained (data, steps, command); plain JSON values.
     dtype: precision of the weights on disk.
     """
+    if prior.text is None and prior.load_text is not None:
+        prior.text = prior.load_text()
     header = {"phydict": json.dumps(describe(prior) | {"training": training or {}})}
     weights = prior.state_dict()
     if prior.text is not None and prior.text.source:  # a pretrained BERT is named, not copied

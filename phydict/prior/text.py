@@ -45,6 +45,9 @@ class TextEncoder(nn.Module):
             raise FileNotFoundError(
                 f"no BERT text encoder at '{source}': give a folder with config.json, model weights and vocabulary, "
                 f"or a hub id that can be downloaded ({str(error).splitlines()[0]})") from error
+        if len(tokenizer) <= len(tokenizer.all_special_tokens):
+            raise FileNotFoundError(f"no BERT text encoder at '{source}': its vocabulary is missing, give a folder "
+                                    "with config.json, model weights and vocabulary")
         return cls(tokenizer, bert, min(length, bert.config.max_position_embeddings), source=str(source))
 
     @classmethod

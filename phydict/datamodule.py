@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch.utils.data import ConcatDataset, DataLoader, Dataset
 
-from phydict.datasets import CTCases, Thorax, augment, find_cts, phantom_case, report
+from phydict.datasets import CTCases, Thorax, augment, find_cts, phantom_case, report, split_by_patient
 from phydict.grid import Grid
 from phydict.units import HUWindow
 
@@ -73,16 +73,17 @@ class PriorData(lightning.LightningDataModule):
     """Cases for training a prior.
 
     cts: a NIfTI file or a folder of any depth (CT-RATE's layout or any other); reports, metadata, fixed, exclude: as
-    for `find_cts`; holdout: CTs whose id contains one of these words validate instead of training; phantoms: number
-    of different phantoms; ct_fraction: share of draws taken from the CTs; epoch_size: draws per epoch; cache: folder
-    for prepared cases, never inside the CTs' folder.
+    for `find_cts`; holdout: CTs whose id contains one of these words validate instead of training, and so does
+    holdout_fraction of the patients; phantoms: number of different phantoms; ct_fraction: share of draws taken from
+    the CTs; epoch_size: draws per epoch; cache: folder for prepared cases, never inside the CTs' folder.
     """
 
     def __init__(self, cts: str | None = None, reports: str | None = None, metadata: str | None = None,
                  fixed: bool = True, exclude: str | None = None, holdout: list[str] | None = None,
-                 phantoms: int = 2000, ct_fraction: float = 0.5, validation_phantoms: int = 6,
-                 epoch_size: int = 400, batch_size: int = 4, workers: int = 0, cache: str = "runs/cache",
-                 seed: int = 0, voxels: int = 64, side: float = 384.0, window: tuple[float, float] = (-1000.0, 1000.0)):
+                 holdout_fraction: float = 0.0, phantoms: int = 2000, ct_fraction: float = 0.5,
+                 validation_phantoms: int = 6, epoch_size: int = 400, batch_size: int = 4, workers: int = 0,
+                 cache: str = "runs/cache", seed: int = 0, voxels: int = 64, side: float = 384.0,
+                 window: tuple[float, float] = (-1000.0, 1000.0)):
         super().__init__()
         if not cts and not phantoms:
             raise ValueError("there is nothing to train on: give data.cts, or data.phantoms above 0")
@@ -96,7 +97,8 @@ class PriorData(lightning.LightningDataModule):
             if not any(word in f.id for f in files):
                 raise ValueError(f"data.holdout names '{word}', but no CT has that in its id"
                                  + (f" (the first id is {files[0].id})" if files else "") + ": correct or remove it")
-        held_out = [f for f in files if any(word in f.id for word in holdout or [])]
+        _, validating = split_by_patient([f.id for f in files], holdout_fraction, seed)
+        held_out = [f for f in files if f.id in validating or any(word in f.id for word in holdout or [])]
         if len(held_out) == len(files) and not phantoms:
             raise ValueError("there is nothing to train on: data.holdout holds out every CT, and data.phantoms is 0")
         self.cts = CTCases([f for f in files if f not in held_out], cache, self.grid, window)

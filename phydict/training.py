@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+import warnings
 from pathlib import Path
 from pickle import UnpicklingError
 
@@ -28,13 +29,13 @@ NOISE_LEVELS = (0.1, 0.3, 0.5, 0.7, 0.9)
 
 
 class PriorTraining(lightning.LightningModule):
-    """Learns a Prior by denoising: squared error of x0, weighted to unit variance at every noise level.
+    """Learns a Prior by denoising: squared error of x0 at all noise levels, up to four times heavier at the low ones.
 
-    network: the UNet (None: the default VolumeUNet); text: "small" for a BERT that learns with the prior, a folder
-    or hub id for a frozen one, "none" for a prior without text; reports: texts the small BERT's vocabulary is learnt
-    from; text_dropout: share of reports replaced by the null context; mask_weight: weight of the anatomy masks'
-    error beside the CT's; warmup: steps over which the learning rate rises; decay_from, decay_steps: the step at
-    which a linear decay to zero begins, and its length (0: no decay).
+    network: the UNet (None: the default VolumeUNet); text: "small" for a BERT that learns with the prior (none where
+    the data have no reports), a folder or hub id for a frozen one, "none" for a prior without text; reports: texts
+    the small BERT's vocabulary is learnt from; text_dropout: share of reports replaced by the null context;
+    mask_weight: weight of the anatomy masks' error beside the CT's; warmup: steps over which the learning rate rises;
+    decay_from, decay_steps: the step at which a linear decay to zero begins, and its length (0: no decay).
     """
 
     def __init__(self, network: VolumeUNet | None = None, text: str = "small", reports: list[str] | None = None,
@@ -45,10 +46,9 @@ class PriorTraining(lightning.LightningModule):
         super().__init__()
         network = network or VolumeUNet()
         encoder = None
-        if text == "small":
-            if not reports:
-                raise ValueError("a small text encoder learns its vocabulary from reports, but the data have none: "
-                                 "give data with reports, or set model.text to none")
+        if text == "small" and not reports:
+            warnings.warn("the data have no reports: this prior will know no text")
+        elif text == "small":
             encoder = TextEncoder.small(learn_vocabulary(reports), network.context_dim)
         elif text != "none":
             encoder = TextEncoder.pretrained(text)
@@ -70,7 +70,7 @@ class PriorTraining(lightning.LightningModule):
         context = self.prior.context([r if k else "" for r, k in zip(reports, keep)])
         a, s = (w.float().view(-1, 1, 1, 1, 1) for w in self.prior.schedule.scales(t.double()))
         error = (self.prior(a * x0 + s * noise, t, context) - x0).square()
-        unit = (s**2 + (a * self.prior.sigma_data) ** 2) / (s * self.prior.sigma_data) ** 2
+        unit = self.prior.preconditioning(t)[1].clamp(min=0.25) ** -2
         loss = (unit * weight * error).sum() / (weight.expand_as(error).sum())
         self._log_speed(n)
         self.samples += n * self.trainer.world_size

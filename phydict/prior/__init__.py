@@ -5,4 +5,5 @@ from phydict.prior.prior import STATE, BoundPrior, Prior
 from phydict.prior.text import TextEncoder, learn_vocabulary
 from phydict.prior.unet import VolumeUNet
 
-__all__ = ["STATE", "BoundPrior", "Prior", "TextEncoder", "VolumeUNet", "describe", "learn_vocabulary", "load_prior", "save_prior"]
+__all__ = ["STATE", "BoundPrior", "Prior", "TextEncoder", "VolumeUNet", "describe", "learn_vocabulary",
+           "load_prior", "save_prior"]

@@ -47,7 +47,7 @@ def describe(prior: Prior) -> dict:
                 "layers": text.bert.config.num_hidden_layers,
                 "vocabulary": None if text.source else text.vocabulary}
     return {"format": FORMAT, "grid": prior.grid.to_dict(), "hu_window": [prior.window.low, prior.window.high],
-            "state": STATE[:prior.network.state_channels], "sigma_data": prior.sigma_data,
+            "state": STATE[:prior.network.state_channels], "sigma_data": prior.sigma_data, "skip_std": prior.skip_std,
             "schedule": vars(prior.schedule), "network": prior.network.settings, "text": text}
 
 
@@ -85,7 +85,8 @@ def build_prior(header: dict, weights: dict[str, Tensor]) -> Prior:
     """
     try:
         prior = Prior(VolumeUNet(**header["network"]), Grid(**header["grid"]), HUWindow(*header["hu_window"]),
-                      schedule=CosineSchedule(**header["schedule"]), sigma_data=header["sigma_data"])
+                      schedule=CosineSchedule(**header["schedule"]), sigma_data=header["sigma_data"],
+                      skip_std=header["skip_std"])
         prior.load_state_dict({k: w.float() for k, w in weights.items() if not k.startswith("text.")})
     except (KeyError, TypeError, RuntimeError) as error:
         raise ValueError(f"the weights are not those of the network that the header describes ({error})") from error

@@ -21,22 +21,25 @@ STATE = ("ct", "lung", "airway", "vessel")
 class Prior(nn.Module):
     """x0-predicting denoiser of the state (B, C, X, Y, Z), channel 0 the CT in the prior's range.
 
-    The network's output is preconditioned (Karras et al. 2022, arXiv:2206.00364, Table 1, written for x_t):
-    x0 = c_skip x_t + c_out F(c_in x_t, t, context), so that F has unit variance to predict at every noise level.
+    x0 = k x_t / a + c_out F(c_in x_t, t, context): the network F predicts the clean state, in units of its expected
+    size; only below the noise level `skip_std` does the input itself take over, k = skip_std^2 / (sigma^2 +
+    skip_std^2). (With Karras et al.'s larger skip, arXiv:2206.00364, F would have to carry the noise voxel by voxel
+    through its narrow top level, and removes none of it.)
 
     network: F; text: the report encoder, None for a prior without text, or a function that loads it when the first
     report arrives; grid, window: where and in which HU range the volumes live; sigma_data: standard deviation of
-    the state.
+    the state; skip_std: see above.
     """
 
     def __init__(self, network: VolumeUNet, grid: Grid, window: HUWindow, text: TextEncoder | None = None,
-                 schedule: CosineSchedule = CosineSchedule(), sigma_data: float = 0.5,
+                 schedule: CosineSchedule = CosineSchedule(), sigma_data: float = 0.5, skip_std: float = 0.1,
                  load_text: Callable[[], TextEncoder] | None = None):
         super().__init__()
         if any(n % network.divisor for n in grid.shape):
             raise ValueError(f"this network needs sizes divisible by {network.divisor}, but the grid is {grid.shape}")
         self.network, self.text, self.load_text = network, text, load_text
         self.grid, self.window, self.schedule, self.sigma_data = grid, window, schedule, sigma_data
+        self.skip_std = skip_std
         self.null = nn.Parameter(0.02 * torch.randn(1, 1, network.context_dim))
 
     def context(self, reports: Sequence[str]) -> Tensor:
@@ -57,10 +60,15 @@ class Prior(nn.Module):
     def forward(self, x: Tensor, t: Tensor, context: Tensor) -> Tensor:
         """Clean estimate of the state x (B, C, X, Y, Z) at times t (B,), in x's dtype."""
         a, s = (w.to(x.dtype).view(-1, 1, 1, 1, 1) for w in self.schedule.scales(t.double()))
-        scale = (s**2 + (a * self.sigma_data) ** 2).rsqrt()
-        skip = a * (self.sigma_data * scale) ** 2
-        out = s * self.sigma_data * scale
-        return skip * x + out * self.network(scale * x, t, context).to(x.dtype)
+        share, out = self.preconditioning(t)
+        inward = (s**2 + (a * self.sigma_data) ** 2).rsqrt()
+        return share * x / a + out * self.network(inward * x, t, context).to(x.dtype)
+
+    def preconditioning(self, t: Tensor) -> tuple[Tensor, Tensor]:
+        """At times t (B,): the share of x_t / a in the estimate, and the scale of the network's output."""
+        sigma = self.schedule.sigma(t.double()).float().view(-1, 1, 1, 1, 1)
+        share = self.skip_std**2 / (sigma**2 + self.skip_std**2)
+        return share, (((1 - share) * self.sigma_data) ** 2 + (share * sigma) ** 2).sqrt()
 
     @torch.no_grad()
     def bind(self, report: str = "", guidance: float = 1.0, bf16: bool | None = None) -> BoundPrior:

@@ -24,8 +24,8 @@ def untrained():
 
 
 @pytest.mark.parametrize("t", [0.0, 0.2, 0.6, 1.0])
-def test_an_untrained_prior_is_the_exact_denoiser_of_gaussian_noise_of_its_sigma(t):
-    expected = GaussianDenoiser(torch.zeros(()).double(), torch.tensor(0.4**2).double()).denoise(X, t)
+def test_an_untrained_prior_is_the_exact_denoiser_of_gaussian_detail_of_its_skip_std(t):
+    expected = GaussianDenoiser(torch.zeros(()).double(), torch.tensor(0.1**2).double()).denoise(X, t)
     torch.testing.assert_close(untrained().bind().denoise(X, t), expected, atol=1e-6, rtol=1e-6)
 
 

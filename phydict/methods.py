@@ -18,7 +18,8 @@ DEFAULT_PRIOR = Path(__file__).parents[1] / "data" / "prior" / "phydict_64.safet
 """The prior that comes with the project."""
 
 METHODS: dict[str, Sampler | Reconstructor] = {
-    "phydict_fast": SplitGibbs(iterations=20, warm_start=0.7, final_guided=True),
+    "phydict_fast": SplitGibbs(iterations=4, warm_start=0.3, last=0.15, fresh_noise=0.0,
+                               final_likelihood=ProximalCG(iterations=10, restarts=8)),
     "phydict_paper": SplitGibbs(iterations=50, likelihood=GradientSteps(reward=Reward(lpips=1.0)), refine_from=0.8,
                                 refine_iterations=40),
     "prior_only": PriorOnly(iterations=50),

@@ -116,7 +116,7 @@ def test_a_method_may_be_a_name_a_sampler_or_a_reconstructor(tmp_path):
 
 def test_one_call_takes_the_priors_grid_and_fits_the_views():
     beam = ConeBeam.orbit(4, 1020, 740, (28, 28), 20.0)
-    method = SplitGibbs(6, ProximalCG(20), final_guided=True)
+    method = SplitGibbs(6, ProximalCG(20), ProximalCG(20))
     result = reconstruct(ball(beam, 120.0), beam, tiny_prior(), method, seed=2)
     assert result.grid.same_as(Grid.cube(16)) and result.seed == 2
     assert result.misfit < 0.5 * reconstruct(ball(beam, 120.0), beam, tiny_prior(), PriorOnly(6), seed=2).misfit

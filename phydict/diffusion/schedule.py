@@ -41,11 +41,19 @@ class CosineSchedule:
         signal, noise = self.scales(t)
         return noise / signal
 
-    def steps(self, n: int, start: float = 1.0) -> Iterator[tuple[float, float]]:
-        """n time pairs (t, s) with start = t_1 > s_1 = t_2 > ... > s_n = 0, evenly spaced in t."""
+    def steps(self, n: int, start: float = 1.0, last: float | None = None) -> Iterator[tuple[float, float]]:
+        """n time pairs (t, s) with start = t_1 > s_1 = t_2 > ... > s_n = 0, evenly spaced in t.
+
+        last: t_n, from which the final pair goes to 0 at once; None spaces all of them evenly down to 0.
+        """
         if n < 1:
             raise ValueError(f"a sampler needs at least one step, but {n} was given")
         if not 0 < start <= 1:
             raise ValueError(f"sampling starts at a time in (0, 1], but {start} was given")
-        for i in range(n):
-            yield start * (n - i) / n, start * (n - i - 1) / n
+        if last is not None and not 0 < last <= start:
+            raise ValueError(f"the last time lies above 0 and not above the start {start}, but {last} was given")
+        if last is None:
+            times = [start * (n - i) / n for i in range(n)]
+        else:
+            times = [start + (last - start) * i / max(n - 1, 1) for i in range(n)]
+        yield from zip(times, [*times[1:], 0.0])

@@ -26,19 +26,22 @@ from phydict.posterior.sampler import Sampler, descend
 class SplitGibbs(Sampler):
     """Samples p(x | Y, report) with one denoiser call and one likelihood step per noise level.
 
-    iterations: noise levels; likelihood: the step towards the X-rays; warm_start: the second noise level in (0, 1],
-    so that below 1 the first estimate, the prior's mean moved onto the X-rays, starts the descent from there;
-    final_guided: whether the last estimate (at the lowest noise) still takes a likelihood step;
-    churn: 0 for deterministic DDIM, 1 for ancestral sampling, which draws most of the noise anew;
+    iterations: noise levels; likelihood: the step towards the X-rays; final_likelihood: the one at the last level,
+    None to return the denoiser's estimate there, as the paper does;
+    warm_start: below 1, the first estimate, the prior's mean moved onto the X-rays, is taken at once to this time;
+    last: the last level's time (None: levels evenly spaced down to 0);
+    fresh_noise: None for the paper's DDIM moves; else each level starts from the estimate with new noise of this
+    share of the level's own: 1 decouples the levels, 0 adds none and descends to a point estimate;
     prior_std: standard deviation of the state, which sets the spread of x0 at each time;
     refine_from: EC's delta in [0, 1), 0 for none; refine_iterations: its noise levels.
     """
 
     iterations: int = 50
     likelihood: LikelihoodStep = field(default_factory=ProximalCG)
+    final_likelihood: LikelihoodStep | None = None
     warm_start: float = 1.0
-    final_guided: bool = False
-    churn: float = 0.0
+    last: float | None = None
+    fresh_noise: float | None = None
     prior_std: float = 0.5
     refine_from: float = 0.0
     refine_iterations: int = 0
@@ -48,15 +51,17 @@ class SplitGibbs(Sampler):
             raise ValueError(f"split Gibbs sampling needs at least one iteration, but {self.iterations} was given")
         if not 0 < self.warm_start <= 1:
             raise ValueError(f"warm_start is a time in (0, 1], but {self.warm_start} was given")
+        if self.warm_start < 1 and self.iterations < 2:
+            raise ValueError("a warm_start below 1 needs at least 2 iterations, but 1 was given")
+        if self.last is not None and not 0 < self.last <= self.warm_start:
+            raise ValueError(f"last is a time above 0 and not above warm_start, but {self.last} was given")
+        if self.fresh_noise is not None and not 0 <= self.fresh_noise <= 1:
+            raise ValueError(f"fresh_noise is a share in [0, 1] or left out, but {self.fresh_noise} was given")
         if not 0 <= self.refine_from < 1:
             raise ValueError(f"refine_from (the paper's delta) lies in [0, 1), but {self.refine_from} was given")
         if self.refine_from and self.refine_iterations < 1:
             raise ValueError(f"refining from {self.refine_from} needs refine_iterations of at least 1, but "
                              f"{self.refine_iterations} was given")
-        if self.warm_start < 1 and self.iterations < 2:
-            raise ValueError("a warm_start below 1 needs at least 2 iterations, but 1 was given")
-        if not 0 <= self.churn <= 1:
-            raise ValueError(f"churn lies in [0, 1], but {self.churn} was given")
 
     def steps(self) -> int:
         return self.iterations + (self.refine_iterations if self.refine_from else 0)
@@ -64,8 +69,8 @@ class SplitGibbs(Sampler):
     def times(self, denoiser: Denoiser) -> list[tuple[float, float]]:
         """The pairs (t, s) of noise levels passed through."""
         if self.warm_start == 1.0:
-            return list(denoiser.schedule.steps(self.iterations))
-        return [(1.0, self.warm_start), *denoiser.schedule.steps(self.iterations - 1, self.warm_start)]
+            return list(denoiser.schedule.steps(self.iterations, last=self.last))
+        return [(1.0, self.warm_start), *denoiser.schedule.steps(self.iterations - 1, self.warm_start, self.last)]
 
     def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, draw: torch.Generator,
                on_step: Callable[[], None] = lambda: None) -> Tensor:
@@ -73,13 +78,14 @@ class SplitGibbs(Sampler):
         for t, s in self.times(denoiser):
             x0 = denoiser.denoise(x, t).clamp(-1, 1)
             measurement.calibrate(x0[:, :1])
-            z = x0
-            if s > 0 or self.final_guided:
-                ct = self.likelihood(measurement, x0[:, :1], self.spread(denoiser, t)).clamp(-1, 1)
+            z, step = x0, self.likelihood if s > 0 else self.final_likelihood
+            if step:
+                ct = step(measurement, x0[:, :1], self.spread(denoiser, t)).clamp(-1, 1)
                 z = torch.cat([ct, x0[:, 1:]], 1)
-            x = ddim(schedule, z, x, t, s)
-            if self.churn and s > 0:
-                x = self._churned(schedule, x, z, t, s, draw)
+            if self.fresh_noise is None:
+                x = ddim(schedule, z, x, t, s)
+            elif s > 0:
+                x = renoise(schedule, z, s, self.fresh_noise * noise_like(z, draw))
             on_step()
         if self.refine_from:
             x = renoise(schedule, z, self.refine_from, noise_like(z, draw))
@@ -90,11 +96,6 @@ class SplitGibbs(Sampler):
         """Standard deviation of x_0 given x_t under independent components of prior_std."""
         a, s = (float(w) for w in denoiser.schedule.scales(t))
         return self.prior_std * s / (s**2 + (a * self.prior_std) ** 2) ** 0.5
-
-    def _churned(self, schedule, x: Tensor, z: Tensor, t: float, s: float, draw: torch.Generator) -> Tensor:
-        signal, noise = (w.to(x) for w in schedule.scales(s))
-        share = self.churn * (1 - float(schedule.sigma(s) / schedule.sigma(t)) ** 2)
-        return signal * z + (1 - share) ** 0.5 * (x - signal * z) + share**0.5 * noise * noise_like(x, draw)
 
 
 def noise_like(x: Tensor, draw: torch.Generator) -> Tensor:

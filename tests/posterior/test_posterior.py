@@ -19,9 +19,9 @@ from prior.tiny import REPORTS, tiny_prior
 BEAM = ConeBeam.orbit(4, 1020, 740, (14, 14), 40.0)
 GRID = Grid.cube(16)
 PROJECTOR = Projector(GRID, BEAM)
-FAST = SplitGibbs(8, ProximalCG(4), warm_start=0.7, final_guided=True)
+FAST = SplitGibbs(8, ProximalCG(4), ProximalCG(4), warm_start=0.7)
 SAMPLERS = {
-    "fast": FAST, "churned": SplitGibbs(6, churn=0.2), "paper": SplitGibbs(
+    "fast": FAST, "noisy": SplitGibbs(6, fresh_noise=0.2), "paper": SplitGibbs(
         5, GradientSteps(), refine_from=0.5, refine_iterations=3), "prior": PriorOnly(5)}
 
 
@@ -48,7 +48,7 @@ def test_the_same_seed_gives_the_same_result_and_another_seed_another(prior, nam
 
 
 def test_a_result_does_not_depend_on_what_ran_before(prior):
-    method = Posterior(prior, SAMPLERS["churned"], guidance=2.0)
+    method = Posterior(prior, SAMPLERS["noisy"], guidance=2.0)
     first = method.reconstruct(views(), PROJECTOR, REPORTS[0], seed=5)
     torch.manual_seed(123)
     method.reconstruct(views(2), PROJECTOR, REPORTS[1], display=True, seed=6)
@@ -60,7 +60,7 @@ def test_a_result_does_not_depend_on_what_ran_before(prior):
 
 def test_a_reconstruction_draws_nothing_from_the_global_generator(prior):
     torch.manual_seed(1)
-    Posterior(prior, SAMPLERS["churned"]).reconstruct(views(), PROJECTOR)
+    Posterior(prior, SAMPLERS["noisy"]).reconstruct(views(), PROJECTOR)
     after = torch.rand(1)
     torch.manual_seed(1)
     assert torch.equal(after, torch.rand(1))
@@ -88,7 +88,7 @@ def test_the_x_rays_pull_the_sample_towards_them(prior):
 
 
 def test_more_conjugate_gradients_never_raise_the_misfit(prior):
-    methods = [Posterior(prior, SplitGibbs(6, ProximalCG(n), final_guided=True)) for n in (1, 4, 16)]
+    methods = [Posterior(prior, SplitGibbs(6, ProximalCG(n), ProximalCG(n))) for n in (1, 4, 16)]
     misfits = [method.reconstruct(views(), PROJECTOR).misfit for method in methods]
     assert misfits == sorted(misfits, reverse=True)
 
@@ -171,5 +171,5 @@ def test_settings_are_described_in_plain_json_that_tells_methods_apart(name):
 def test_the_window_of_the_prior_is_the_window_of_the_result(prior):
     x = random_like((1, 1, 16, 16, 16), torch.float32, seed=9).clamp(-1, 1)
     y = PROJECTOR(HUWindow(-1000, 600).to_mu(x))[0]
-    sampler = SplitGibbs(10, ProximalCG(60, noise=1e-3), final_guided=True)
+    sampler = SplitGibbs(10, ProximalCG(60, noise=1e-3), ProximalCG(60, noise=1e-3))
     assert Posterior(prior, sampler).reconstruct(y, PROJECTOR).misfit < 0.01

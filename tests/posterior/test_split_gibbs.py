@@ -45,14 +45,14 @@ def test_one_likelihood_step_is_the_exact_posterior_mean_given_the_noisy_state_a
     torch.testing.assert_close(z.flatten(), torch.linalg.solve(precision, shift), atol=1e-8, rtol=0)
 
 
-@pytest.mark.parametrize("final_guided", [False, True])
-def test_the_samples_have_the_posteriors_mean_and_covariance_as_the_steps_grow(final_guided):
+@pytest.mark.parametrize("final", [None, EXACT])
+def test_the_samples_have_the_posteriors_mean_and_covariance_as_the_steps_grow(final):
     prior = denoiser(V)
     mean, covariance = condition(measurement(), prior.mean, V, NOISE)
     assert (covariance - V * torch.eye(6).double()).norm() > 0.5 * covariance.norm()  # the data say something
     errors = []
     for n in (50, 200):
-        found, spread = propagate(lambda x: sample(sampler(n, final_guided=final_guided), x))
+        found, spread = propagate(lambda x: sample(sampler(n, final_likelihood=final), x))
         errors.append(float((spread - covariance).norm() / covariance.norm()))
         assert (found - mean).abs().max() < 0.2 / n
     assert errors[1] < 0.05 and errors[0] / errors[1] > 3  # first order in the step
@@ -60,8 +60,10 @@ def test_the_samples_have_the_posteriors_mean_and_covariance_as_the_steps_grow(f
 
 def test_a_guided_last_estimate_fits_the_data_better_and_an_unguided_one_is_the_denoisers():
     m, few = measurement(), 5
-    tight = {"likelihood": ProximalCG(50, noise=0.01, tolerance=1e-12)}
-    misfit = [float((m.project(sample(sampler(few, final_guided=g, **tight))) - m.y).norm()) for g in (False, True)]
+    step = ProximalCG(50, noise=0.01, tolerance=1e-12)
+    tight = {"likelihood": step}
+    misfit = [float((m.project(sample(sampler(few, final_likelihood=final, **tight))) - m.y).norm())
+              for final in (None, step)]
     assert misfit[1] < 0.2 * misfit[0]
     once = sample(sampler(1, **tight))
     torch.testing.assert_close(once, denoiser(V).denoise(X, 1.0))
@@ -70,7 +72,7 @@ def test_a_guided_last_estimate_fits_the_data_better_and_an_unguided_one_is_the_
 def test_data_without_weight_leave_the_prior():
     expected = PriorOnly(30).sample(denoiser(V), None, X, None)
     for likelihood in (ProximalCG(50, noise=1e6), NoData()):
-        found = sample(sampler(likelihood=likelihood, final_guided=True))
+        found = sample(sampler(likelihood=likelihood, final_likelihood=likelihood))
         torch.testing.assert_close(found, expected, atol=1e-8, rtol=0)
 
 
@@ -78,7 +80,7 @@ def test_exact_data_are_matched():
     matrix = torch.eye(6).double()[[0, 3]]
     m = DenseMeasurement(matrix, torch.tensor([0.3, -0.2]).double())
     trusting = ProximalCG(50, noise=1e-6, tolerance=1e-12)
-    found = sample(sampler(30, likelihood=trusting, final_guided=True), data=m).flatten()
+    found = sample(sampler(30, likelihood=trusting, final_likelihood=trusting), data=m).flatten()
     torch.testing.assert_close(found[[0, 3]], m.y[0], atol=1e-6, rtol=0)
     free = PriorOnly(30).sample(denoiser(V), None, X, None).flatten()
     rest = [1, 2, 4, 5]
@@ -88,20 +90,20 @@ def test_exact_data_are_matched():
 def test_only_the_ct_channel_meets_the_data():
     x = random_like((1, 3, *SHAPE[1:]), seed=11)
     prior = GaussianDenoiser(torch.zeros(()).double(), torch.tensor(V).double(), FINE)
-    found = sample(sampler(final_guided=True), x, prior=prior)
+    found = sample(sampler(final_likelihood=EXACT), x, prior=prior)
     free = PriorOnly(30).sample(prior, None, x, None)
     assert torch.equal(found[:, 1:], free[:, 1:]) and not torch.allclose(found[:, :1], free[:, :1])
 
 
 def test_estimates_stay_in_the_priors_range():
     m = DenseMeasurement(torch.eye(6).double(), torch.full((6,), 7.0).double())
-    found = sample(sampler(likelihood=ProximalCG(50, noise=1e-4), final_guided=True), data=m)
+    found = sample(sampler(likelihood=ProximalCG(50, noise=1e-4), final_likelihood=EXACT), data=m)
     assert found.max() == 1
 
 
 @pytest.mark.parametrize("warm_start", [0.4, 0.7])
 def test_a_warm_start_keeps_the_posterior_mean_and_counts_its_steps(warm_start):
-    warm = sampler(20, warm_start=warm_start, final_guided=True)
+    warm = sampler(20, warm_start=warm_start, final_likelihood=EXACT)
     pairs = warm.times(denoiser())
     assert len(pairs) == 20 and pairs[0] == (1.0, warm_start) and pairs[-1][1] == 0
     assert [s for _, s in pairs[:-1]] == [t for t, _ in pairs[1:]]
@@ -139,24 +141,24 @@ def test_refining_is_the_prior_seen_from_the_renoised_sample():
     torch.testing.assert_close(sample(sampler(refine_from=0.8, refine_iterations=15)), expected)
 
 
-def test_without_churn_nothing_is_drawn_and_with_churn_the_draw_decides():
-    assert torch.equal(sample(sampler(), seed=1), sample(sampler(), seed=2))
-    churned = sampler(churn=0.3)
-    assert torch.equal(sample(churned, seed=1), sample(churned, seed=1))
-    assert not torch.allclose(sample(churned, seed=1), sample(churned, seed=2))
+def test_without_fresh_noise_nothing_is_drawn_and_with_it_the_draw_decides():
+    for drawless in (sampler(), sampler(fresh_noise=0.0)):
+        torch.testing.assert_close(sample(drawless, seed=1), sample(drawless, seed=2), rtol=0, atol=1e-12)
+    noisy = sampler(fresh_noise=0.5)
+    assert torch.equal(sample(noisy, seed=1), sample(noisy, seed=1))
+    assert not torch.allclose(sample(noisy, seed=1), sample(noisy, seed=2))
 
 
-@pytest.mark.parametrize("churn", [0.0, 0.3])
-def test_churn_keeps_the_priors_mean_and_as_the_steps_grow_its_variance(churn):
-    n, mean, variance = 48**3, 0.1, 0.02
-    x = random_like((1, 1, 48, 48, 48), torch.float32, seed=12)
-    prior = GaussianDenoiser(torch.tensor(mean), torch.tensor(variance))
-    missing = {}
-    for steps in (100, 400):
-        found = sample(sampler(steps, likelihood=NoData(), churn=churn), x, prior=prior)
-        assert float(found.mean()) == pytest.approx(mean, abs=4 * (variance / n) ** 0.5)
-        missing[steps] = 1 - float(found.var()) / variance
-    assert abs(missing[400]) < 0.07 and missing[400] < 0.5 * missing[100]
+@pytest.mark.parametrize("path", [{}, {"warm_start": 0.4, "last": 0.2}])
+def test_a_descent_without_noise_ends_at_the_posterior_mean(path):
+    mean, _ = condition(measurement(), denoiser(V).mean, V, NOISE)
+    found = sample(sampler(20, fresh_noise=0.0, final_likelihood=EXACT, **path))
+    torch.testing.assert_close(found.flatten(), mean.flatten(), atol=2e-3, rtol=0)
+
+
+def test_the_last_level_is_where_the_settings_say():
+    times = sampler(5, warm_start=0.5, last=0.2).times(denoiser(V))
+    assert [t for t, _ in times] == pytest.approx([1.0, 0.5, 0.4, 0.3, 0.2]) and times[-1][1] == 0
 
 
 @pytest.mark.parametrize("settings", [
@@ -178,7 +180,7 @@ def test_impossible_settings_are_refused(settings, message):
 
 @pytest.mark.parametrize("settings", [
     {"refine_from": 0.8, "refine_iterations": 0}, {"iterations": 1, "warm_start": 0.7},
-    {"churn": 1.5}, {"churn": -0.1}])
+    {"fresh_noise": 1.5}, {"fresh_noise": -0.1}, {"last": 0.8, "warm_start": 0.5}])
 def test_settings_that_contradict_each_other_are_refused_before_the_long_computation(settings):
     with pytest.raises(ValueError):
         SplitGibbs(**settings)
@@ -186,5 +188,5 @@ def test_settings_that_contradict_each_other_are_refused_before_the_long_computa
 
 def test_the_result_does_not_depend_on_the_default_schedules_ends():
     coarse = GaussianDenoiser(denoiser().mean, torch.tensor(V).double(), CosineSchedule())
-    fine, wide = (sample(sampler(100, final_guided=True), prior=p) for p in (denoiser(V), coarse))
+    fine, wide = (sample(sampler(100, final_likelihood=EXACT), prior=p) for p in (denoiser(V), coarse))
     assert (fine - wide).abs().max() < 0.01

@@ -28,14 +28,13 @@ from torch import Tensor
 from phydict.command_line import one_sentence_errors, quiet
 from phydict.evaluation import CaseMetrics, markdown, panel, rich_table, volume_metrics, write_csv
 from phydict.grid import Grid
-from phydict.methods import DEFAULT_PRIOR, binned, binning
+from phydict.methods import DEFAULT_PRIOR, fit_to_grid
 from phydict.posterior import Posterior, Sampler
 from phydict.prior import load_prior
 from phydict.progress import CaseProgress
 from phydict.reconstruction_data import ReconstructionData
 from phydict.reconstructor import Reconstruction, Reconstructor, describe
 from phydict.units import HUWindow
-from phydict.xray import Projector
 
 RECORD = "reconstruction.json"
 """The file that marks a case as finished."""
@@ -120,15 +119,11 @@ class ReconstructionTask(lightning.LightningModule):
         return zlib.crc32(f"{self.seed}/{case['id']}".encode())
 
     def _reconstruct(self, case: dict) -> Reconstruction:
-        beam = case["beam"]
-        beam.check(self.grid)
         case["report"] = case["report"] if self.trainer.datamodule.with_report else ""
-        factor = binning(self.grid, beam)
+        xrays, projector = fit_to_grid(self.reconstructor, self.grid, case["xrays"], case["beam"])
         self.progress.case(case["id"])
-        xrays = binned(case["xrays"], factor).to(self.device)
-        return self.reconstructor.reconstruct(
-            xrays, Projector(self.grid, beam.binned(factor)), case["report"], case.get("display", False),
-            self._seed(case), self.progress.advance)
+        return self.reconstructor.reconstruct(xrays.to(self.device), projector, case["report"],
+                                              case.get("display", False), self._seed(case), self.progress.advance)
 
     def _finish(self, case: dict, result: Reconstruction, scores: dict | None = None,
                 truth: Tensor | None = None) -> None:

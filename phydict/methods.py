@@ -21,7 +21,7 @@ METHODS: dict[str, Sampler | Reconstructor] = {
     "phydict_fast": SplitGibbs(iterations=4, warm_start=0.3, last=0.15, fresh_noise=0.0,
                                final_likelihood=ProximalCG(iterations=10, restarts=8)),
     "phydict_paper": SplitGibbs(iterations=50, likelihood=GradientSteps(reward=Reward(lpips=1.0)), refine_from=0.8,
-                                refine_iterations=40),
+                                refine_iterations=40, full_detector=True),
     "prior_only": PriorOnly(iterations=50),
     "sirt": SIRT(iterations=300),
 }
@@ -61,6 +61,17 @@ def binned(xrays: Tensor, factor: int) -> Tensor:
     return torch.nn.functional.avg_pool2d(xrays[None], factor)[0] if factor > 1 else xrays
 
 
+def fit_to_grid(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam) -> tuple[Tensor, Projector]:
+    """X-rays (K, V, U), binned unless the method wants the full detector, and the projector that goes with them.
+
+    Raises ValueError where X-rays, geometry and grid do not fit.
+    """
+    check_xrays(xrays, beam)
+    beam.check(grid)
+    factor = 1 if ready.full_detector else binning(grid, beam)
+    return binned(xrays.float(), factor), Projector(grid, beam.binned(factor))
+
+
 def reconstruct(xrays: Tensor, beam: ConeBeam, prior: Prior | str | Path | None = None,
                 method: str | Sampler | Reconstructor = "phydict_fast", report: str | None = None,
                 display: bool = False, seed: int = 0, guidance: float = 2.0, on_step=lambda: None) -> Reconstruction:
@@ -70,10 +81,7 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: Prior | str | Path | None 
     prior: a Prior, a file, or None for the shipped one; report: radiology text, if any.
     A detector finer than the grid can use is binned. Raises ValueError when X-rays, geometry and prior do not fit.
     """
-    check_xrays(xrays, beam)
     ready = reconstructor(method, prior, guidance)
     grid = ready.prior.grid if isinstance(ready, Posterior) else Grid.cube(64)
-    beam.check(grid)
-    factor = binning(grid, beam)
-    projector = Projector(grid, beam.binned(factor))
-    return ready.reconstruct(binned(xrays.float(), factor), projector, report or "", display, seed, on_step)
+    xrays, projector = fit_to_grid(ready, grid, xrays, beam)
+    return ready.reconstruct(xrays, projector, report or "", display, seed, on_step)

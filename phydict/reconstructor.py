@@ -73,7 +73,12 @@ def save_nifti(path: str | Path, volume: np.ndarray, grid: Grid) -> None:
 
 
 class Reconstructor(ABC):
-    """Turns X-rays into a CT volume. Implementations hold settings only; one object serves any number of cases."""
+    """Turns X-rays into a CT volume. Implementations hold settings only; one object serves any number of cases.
+
+    full_detector: whether the method wants every pixel, instead of a detector binned to what the grid can hold.
+    """
+
+    full_detector = False
 
     @abstractmethod
     def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,

@@ -42,6 +42,10 @@ class Posterior(Reconstructor):
     mu_water: float = MU_WATER
     name: str = "phydict"
 
+    @property
+    def full_detector(self) -> bool:
+        return self.sampler.full_detector
+
     def steps(self) -> int:
         return self.sampler.steps()
 

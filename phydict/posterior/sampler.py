@@ -17,7 +17,12 @@ if TYPE_CHECKING:
 
 
 class Sampler(ABC):
-    """Settings of a sampling method; `sample` turns noise into a clean state."""
+    """Settings of a sampling method; `sample` turns noise into a clean state.
+
+    full_detector: as for a Reconstructor.
+    """
+
+    full_detector = False
 
     @abstractmethod
     def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, draw: torch.Generator,

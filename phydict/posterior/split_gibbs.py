@@ -33,7 +33,8 @@ class SplitGibbs(Sampler):
     fresh_noise: None for the paper's DDIM moves; else each level starts from the estimate with new noise of this
     share of the level's own: 1 decouples the levels, 0 adds none and descends to a point estimate;
     prior_std: standard deviation of the state, which sets the spread of x0 at each time;
-    refine_from: EC's delta in [0, 1), 0 for none; refine_iterations: its noise levels.
+    refine_from: EC's delta in [0, 1), 0 for none; refine_iterations: its noise levels;
+    full_detector: meet the X-rays pixel by pixel instead of binned to what the grid can hold.
     """
 
     iterations: int = 50
@@ -45,6 +46,7 @@ class SplitGibbs(Sampler):
     prior_std: float = 0.5
     refine_from: float = 0.0
     refine_iterations: int = 0
+    full_detector: bool = False
 
     def __post_init__(self):
         if self.iterations < 1:

@@ -110,6 +110,22 @@ class PriorData(lightning.LightningDataModule):
         self.ct_fraction, self.epoch_size, self.seed = ct_fraction, epoch_size, seed
         self.batch_size, self.workers = batch_size, workers
 
+    def labelled_reports(self, count: int = 6000) -> tuple[list[str], torch.Tensor]:
+        """Reports of phantoms and which findings (kind, side, lobe) each has: labels (N, F). None without phantoms."""
+        thoraxes = [Thorax.draw(seed) for seed in range(count if len(self.phantoms) else 0)]
+        findings = [{(f.kind, f.side, f.lobe) for f in thorax.findings} for thorax in thoraxes]
+        columns = sorted(set().union(*findings))
+        labels = torch.tensor([[float(column in own) for column in columns] for own in findings])
+        return [report(thorax) for thorax in thoraxes], labels
+
+    def coarse_cases(self, cells: int, most: int = 1000) -> tuple[list[str], torch.Tensor]:
+        """Training cases that have reports, at most so many: reports, and CTs averaged over cells (N, 1, cells^3)."""
+        sources = [(self.cts, i) for i, ct in enumerate(self.cts.cts) if ct.report]
+        sources = (sources + [(self.phantoms, i) for i in range(len(self.phantoms))])[:most]
+        cases = [source[i] for source, i in sources]
+        coarse = [torch.nn.functional.adaptive_avg_pool3d(case["volume"], cells) for case in cases]
+        return [case["report"] for case in cases], torch.stack(coarse)
+
     def train_dataloader(self) -> DataLoader:
         least = self.batch_size * self.trainer.world_size
         if self.epoch_size < least:

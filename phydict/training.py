@@ -12,6 +12,7 @@ import lightning
 import torch
 from jsonargparse import auto_cli
 from lightning.pytorch.cli import LightningCLI
+from lightning.pytorch.utilities import rank_zero_info
 from torch import Tensor
 
 from phydict.command_line import one_sentence_errors, quiet
@@ -20,8 +21,9 @@ from phydict.diffusion import renoise
 from phydict.evaluation import method_panel
 from phydict.grid import Grid
 from phydict.posterior import descend
-from phydict.prior import Prior, TextEncoder, VolumeUNet, describe, learn_vocabulary, save_prior
+from phydict.prior import Prior, TextEncoder, VolumeUNet, describe, learn_vocabulary, load_prior, save_prior
 from phydict.prior.checkpoint import build_prior, build_text
+from phydict.prior.report_training import learn_findings, learn_sketch
 from phydict.units import HUWindow
 
 NOISE_LEVELS = (0.1, 0.3, 0.5, 0.7, 0.9)
@@ -35,14 +37,17 @@ class PriorTraining(lightning.LightningModule):
     the data have no reports), a folder or hub id for a frozen one, "none" for a prior without text; reports: texts
     the small BERT's vocabulary is learnt from; text_dropout: share of reports replaced by the null context;
     mask_weight: weight of the anatomy masks' error beside the CT's; warmup: steps over which the learning rate rises;
-    decay_from, decay_steps: the step at which a linear decay to zero begins, and its length (0: no decay).
+    decay_from, decay_steps: the step at which a linear decay to zero begins, and its length (0: no decay);
+    text_steps: steps of each task by which a small BERT learns reports before denoising begins (0: it learns by
+    denoising); initial: a prior's file to go on from, which then decides network and text.
     """
 
     def __init__(self, network: VolumeUNet | None = None, text: str = "small", reports: list[str] | None = None,
                  voxels: int = 64, side: float = 384.0, window: tuple[float, float] = (-1000.0, 1000.0),
                  sigma_data: float = 0.5, text_dropout: float = 0.1, mask_weight: float = 0.1,
                  learning_rate: float = 5e-4, weight_decay: float = 0.01, warmup: int = 100, decay_from: int = 0,
-                 decay_steps: int = 0, montage_steps: int = 16, seed: int = 0):
+                 decay_steps: int = 0, text_steps: int = 600, montage_steps: int = 16, initial: str | None = None,
+                 seed: int = 0):
         super().__init__()
         network = network or VolumeUNet()
         encoder = None
@@ -53,10 +58,24 @@ class PriorTraining(lightning.LightningModule):
         elif text != "none":
             encoder = TextEncoder.pretrained(text)
         self.prior = Prior(network, Grid.cube(voxels, side), HUWindow(*window), encoder, sigma_data=sigma_data)
+        if initial:
+            self._start_from(load_prior(initial), initial)
         self.text_dropout, self.mask_weight, self.montage_steps = text_dropout, mask_weight, montage_steps
         self.learning_rate, self.weight_decay = learning_rate, weight_decay
         self.warmup, self.decay_from, self.decay_steps = warmup, decay_from, decay_steps
+        self.text_steps = text_steps
         self.seed, self.last_step_at, self.samples = seed, None, 0
+
+    def _start_from(self, prior: Prior, path: str) -> None:
+        if not prior.grid.same_as(self.prior.grid) or prior.window != self.prior.window:
+            raise ValueError(f"the prior {path} has another grid or HU window than this training: "
+                             "set model.voxels, model.side and model.window to its own")
+        if prior.load_text is not None:
+            prior.text = prior.load_text()
+            prior.text.trainable = prior.text.source is None
+        self.prior = prior.train().requires_grad_(True)
+        if prior.text is not None:
+            prior.text.requires_grad_(prior.text.trainable)
 
     def training_step(self, batch: dict, _) -> Tensor:
         # Times and noise follow from seed and step alone, so that a resumed run repeats an uninterrupted one.
@@ -76,6 +95,26 @@ class PriorTraining(lightning.LightningModule):
         self.samples += n * self.trainer.world_size
         self.log("loss", loss, prog_bar=True, batch_size=n)
         return loss
+
+    def learn_reports(self, data: PriorData) -> None:
+        """Teaches a small report encoder and the text map, once, before the first denoising step.
+
+        It belongs before `fit`, since distributed training watches every backward pass from there on.
+        """
+        text = self.prior.text
+        if text is None or not text.trainable or not self.text_steps:
+            return
+        reports, labels = data.labelled_reports()
+        if reports:
+            losses = learn_findings(text, reports, labels, self.text_steps, self.seed)
+            rank_zero_info(f"report encoder: findings told, loss {losses[0]:.3f} -> {losses[-1]:.3f}")
+        reports, coarse = data.coarse_cases(self.prior.network.text_map.cells)
+        losses = learn_sketch(self.prior, reports, coarse, self.text_steps, self.seed)
+        rank_zero_info(f"text map: coarse CT sketched, squared error {losses[0]:.3f} -> {losses[-1]:.3f}")
+
+    def on_fit_start(self) -> None:
+        if self.prior.text is not None and self.text_steps:
+            self.prior.text.trainable = False  # what it learnt stays, while the UNet learns to use it
 
     def _state(self, batch: dict) -> tuple[Tensor, Tensor]:
         """The clean state (B, C, X, Y, Z) of a batch and the weight of each channel's error (B, C, 1, 1, 1)."""
@@ -173,6 +212,10 @@ class PriorCLI(LightningCLI):
         for name in ("voxels", "side", "window"):
             parser.link_arguments(f"model.{name}", f"data.{name}")
         parser.link_arguments("data.reports", "model.reports", apply_on="instantiate")
+
+    def before_fit(self) -> None:
+        if not self.config.fit.ckpt_path:
+            self.model.learn_reports(self.datamodule)
 
     def parse_arguments(self, parser, args) -> None:
         super().parse_arguments(parser, args)

@@ -6,10 +6,40 @@ import torch
 from einops import rearrange
 from monai.networks.nets import DiffusionModelUNet
 from torch import Tensor, nn
+from torch.nn.functional import interpolate
+
+
+class TextMap(nn.Module):
+    """Where in the chest a report speaks of: learned positions attend to its tokens and answer with a coarse map.
+
+    context_dim: width D of the context; channels: of the map; cells: the map has cells^3 positions.
+    """
+
+    def __init__(self, context_dim: int, channels: int = 8, cells: int = 8, heads: int = 4):
+        super().__init__()
+        self.cells = cells
+        self.positions = nn.Parameter(0.02 * torch.randn(cells**3, context_dim))
+        self.attention = nn.MultiheadAttention(context_dim, heads, batch_first=True)
+        self.answer = nn.Sequential(nn.LayerNorm(context_dim), nn.Linear(context_dim, 2 * context_dim), nn.GELU(),
+                                    nn.Linear(2 * context_dim, channels))
+        self.to_sketch = nn.Conv3d(channels, 1, 1)
+
+    def forward(self, context: Tensor) -> Tensor:
+        """Context (B, L, D) -> map (B, channels, cells, cells, cells)."""
+        positions = self.positions.expand(len(context), -1, -1)
+        heard = positions + self.attention(positions, context, context, need_weights=False)[0]
+        return self.answer(heard).transpose(1, 2).unflatten(2, (self.cells,) * 3)
+
+    def sketch(self, context: Tensor) -> Tensor:
+        """The expected CT given the report, averaged over cells: (B, 1, cells, cells, cells) in the prior's range."""
+        return self.to_sketch(self(context))
 
 
 class VolumeUNet(nn.Module):
     """MONAI's DiffusionModelUNet run on blocks of `block`^3 voxels, conditioned on time and on a text context.
+
+    The text enters by cross-attention twice: in the UNet's attention levels, and as a TextMap laid over its input,
+    which tells it early and in place what the report says.
 
     The stem folds each block into channels (a 1x1x1 convolution follows), the last layer unfolds it: the expensive
     top level then runs on (X/block)^3 positions, which is what makes a 64^3 denoiser affordable on a CPU.
@@ -38,6 +68,8 @@ class VolumeUNet(nn.Module):
         self.block, self.context_dim, self.state_channels = block, context_dim, state_channels
         self.divisor = block * 2 ** (len(channels) - 1)
         self.fold = nn.Conv3d(state_channels * block**3, channels[0], 1)
+        self.text_map = TextMap(context_dim)
+        self.hint = nn.Conv3d(8, channels[0], 1)
         self.unet = DiffusionModelUNet(
             spatial_dims=3, in_channels=channels[0], out_channels=channels[0], channels=tuple(channels),
             attention_levels=tuple(attention), num_res_blocks=res_blocks, norm_num_groups=8,
@@ -48,6 +80,8 @@ class VolumeUNet(nn.Module):
         nn.init.xavier_uniform_(self.unet.out[-1].conv.weight)
         nn.init.zeros_(self.unfold.weight)
         nn.init.zeros_(self.unfold.bias)
+        nn.init.zeros_(self.hint.weight)
+        nn.init.zeros_(self.hint.bias)
         self.to(memory_format=torch.channels_last_3d)
 
     def forward(self, x: Tensor, t: Tensor, context: Tensor) -> Tensor:
@@ -55,5 +89,6 @@ class VolumeUNet(nn.Module):
         n = self.block
         h = rearrange(x, "b c (x i) (y j) (z k) -> b (c i j k) x y z", i=n, j=n, k=n)
         h = self.fold(h.contiguous(memory_format=torch.channels_last_3d))
+        h = h + interpolate(self.hint(self.text_map(context)), h.shape[2:], mode="trilinear")
         h = self.unfold(self.unet(h, 1000 * t, context=context))
         return rearrange(h, "b (c i j k) x y z -> b c (x i) (y j) (z k)", i=n, j=n, k=n)

@@ -22,12 +22,12 @@ def test_an_untrained_network_is_silent_and_yet_its_gradient_is_not():
 
 
 def test_each_voxel_comes_back_to_its_place():
-    net = network()
+    net = network(channels=(16, 16))
     net.unet = torch.nn.Module()
     net.unet.forward = lambda h, t, context: h
     net.fold = net.unfold = torch.nn.Identity()
     x = random_like((2, 2, 8, 12, 16), torch.float32)
-    assert torch.equal(net(x, torch.zeros(2), None), x)
+    assert torch.equal(net(x, torch.zeros(2), torch.zeros(2, 1, 16)), x)  # the untrained hint of the text is zero
 
 
 def test_a_block_holds_neighbours():

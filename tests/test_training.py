@@ -15,8 +15,9 @@ import torch
 from torch.utils.data import default_collate
 
 from phydict.datamodule import PriorData
-from phydict.prior import load_prior
-from phydict.training import main
+from phydict.prior import load_prior, save_prior
+from phydict.training import PriorTraining, main
+from prior.tiny import tiny_prior
 
 CONFIG = Path(__file__).parents[1] / "configs" / "prior" / "phantom.yaml"
 TINY = ["--model.network.class_path=phydict.prior.VolumeUNet", "--model.network.init_args.channels=[8,8]",
@@ -205,3 +206,16 @@ def test_two_processes_train_one_prior(tmp_path, cache, straight):
     assert checkpoint(tmp_path)["phydict"]["training"] == {"steps": 2, "samples": 8}
     assert "val/rmse_hu_t0.5" in next(tmp_path.glob("logs/**/metrics.csv")).read_text()
     assert list(tmp_path.glob("logs/**/samples/*.png"))
+
+
+def test_training_goes_on_from_a_prior_and_refuses_one_of_another_grid(tmp_path):
+    path = tmp_path / "prior.safetensors"
+    first = tiny_prior()
+    save_prior(first, path, dtype=torch.float32)
+    task = PriorTraining(initial=str(path), voxels=16, window=(-1000, 600), text="none")
+    x, t = torch.randn(1, 4, 16, 16, 16), torch.tensor([0.4])
+    reports = ["Pleural effusion (right), 12 mm."]
+    torch.testing.assert_close(task.prior(x, t, task.prior.context(reports)), first(x, t, first.context(reports)))
+    assert all(w.requires_grad for w in task.prior.parameters())
+    with pytest.raises(ValueError, match="another grid"):
+        PriorTraining(initial=str(path), voxels=32, window=(-1000, 600), text="none")

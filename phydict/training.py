@@ -12,7 +12,7 @@ import lightning
 import torch
 from jsonargparse import auto_cli
 from lightning.pytorch.cli import LightningCLI
-from lightning.pytorch.utilities import rank_zero_info
+from lightning.pytorch.utilities import rank_zero_only
 from torch import Tensor
 
 from phydict.command_line import one_sentence_errors, quiet
@@ -107,10 +107,10 @@ class PriorTraining(lightning.LightningModule):
         reports, labels = data.labelled_reports()
         if reports:
             losses = learn_findings(text, reports, labels, self.text_steps, self.seed)
-            rank_zero_info(f"report encoder: findings told, loss {losses[0]:.3f} -> {losses[-1]:.3f}")
+            _tell(f"report encoder learns findings: loss {losses[0]:.3f} -> {losses[-1]:.3f}")
         reports, coarse = data.coarse_cases(self.prior.network.text_map.cells)
         losses = learn_sketch(self.prior, reports, coarse, self.text_steps, self.seed)
-        rank_zero_info(f"text map: coarse CT sketched, squared error {losses[0]:.3f} -> {losses[-1]:.3f}")
+        _tell(f"text map learns coarse CTs: squared error {losses[0]:.3f} -> {losses[-1]:.3f}")
 
     def on_fit_start(self) -> None:
         if self.prior.text is not None and self.text_steps:
@@ -167,6 +167,11 @@ class PriorTraining(lightning.LightningModule):
 
     def on_load_checkpoint(self, checkpoint: dict) -> None:
         self.samples = checkpoint["phydict"].get("training", {}).get("samples", 0)
+
+
+@rank_zero_only
+def _tell(message: str) -> None:
+    print(message, file=sys.stderr)
 
 
 def read_checkpoint(path: str | Path) -> dict:

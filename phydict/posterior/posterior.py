@@ -33,7 +33,8 @@ class _Counted:
 class Posterior(Reconstructor):
     """Reconstructs by sampling p(x | Y, report) under a prior.
 
-    sampler: how; guidance: classifier-free guidance scale used when a report is given; mu_water: 1/mm.
+    sampler: how; guidance: classifier-free guidance scale used when a report is given; mu_water: 1/mm;
+    bf16: run the denoiser in bfloat16, which on most processors is twice as fast.
     """
 
     prior: Prior
@@ -41,6 +42,7 @@ class Posterior(Reconstructor):
     guidance: float = 1.0
     mu_water: float = MU_WATER
     name: str = "phydict"
+    bf16: bool = True
 
     @property
     def full_detector(self) -> bool:
@@ -58,7 +60,7 @@ class Posterior(Reconstructor):
                 f"the prior was trained on {prior.grid.shape} voxels of {prior.grid.spacing} mm, but the X-rays are "
                 f"projected from {projector.grid.shape} voxels of {projector.grid.spacing} mm: use the prior's grid")
         with watch.stage("prepare"):
-            denoiser = _Counted(prior.bind(report, self.guidance))
+            denoiser = _Counted(prior.bind(report, self.guidance, self.bf16))
             measurement = Measurement(projector, xrays, prior.window, display, self.mu_water)
             draw = torch.Generator().manual_seed(seed)
             state = torch.empty(1, prior.network.state_channels, *prior.grid.shape, device=xrays.device)

@@ -111,12 +111,12 @@ def test_a_report_changes_the_result(prior):
 
 
 def test_display_values_count_only_up_to_a_positive_gain_and_an_offset_per_view(prior):
-    method, y = Posterior(prior, FAST), views()
+    method, y = Posterior(prior, FAST, bf16=False), views()
     shown = method.reconstruct(y, PROJECTOR, display=True)
     scaled = method.reconstruct(torch.tensor([4.0, 0.5, 2.0, 64.0]).view(4, 1, 1) * y, PROJECTOR, display=True)
     assert torch.equal(scaled.volume, shown.volume)  # powers of two are exact
     moved = method.reconstruct(3.7 * y - torch.arange(4.0).view(4, 1, 1), PROJECTOR, display=True)
-    assert (moved.volume - shown.volume).square().mean().sqrt() < 5  # HU; rounding alone, in bfloat16
+    assert (moved.volume - shown.volume).square().mean().sqrt() < 1  # HU; rounding alone
     assert (method.reconstruct(3.7 * y, PROJECTOR).volume - shown.volume).square().mean().sqrt() > 50
     torch.testing.assert_close(moved.xrays, shown.xrays, atol=0.05, rtol=0.05)
 

@@ -22,6 +22,7 @@ import torch
 from torch.utils.data import Dataset
 
 from phydict.datasets.ct_rate_tables import read_calibrations, read_reports
+from phydict.datasets.natural_order import natural_order
 from phydict.datasets.transforms import Calibration, case_id, prepare_ct
 from phydict.grid import Grid
 from phydict.units import HUWindow
@@ -77,7 +78,7 @@ def find_cts(root: str | Path, reports: str | Path | None = None, metadata: str 
         files[id] = path
     for line in Path(exclude).read_text().split() if exclude else ():
         files.pop(case_id(line), None)
-    ids = sorted(files, key=_natural)
+    ids = sorted(files, key=natural_order)
     if first_reconstruction:
         ids = [id for n, id in enumerate(ids) if n == 0 or scan_of(ids[n - 1]) != scan_of(id)]
     if not ids:
@@ -123,10 +124,6 @@ def _id(path: Path, root: Path) -> str:
 
 def _is_fixed(path: Path) -> bool:
     return any(part.endswith("_fixed") for part in path.parts)
-
-
-def _natural(text: str) -> list:
-    return [(1, int(part), "") if part.isdigit() else (0, 0, part) for part in re.split(r"(\d+)", text)]
 
 
 def _beside(root: Path, name: str) -> Path | None:

@@ -13,7 +13,6 @@ natural order of their names: view_2 comes before view_10. Row 0 is superior onc
 
 from __future__ import annotations
 
-import re
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +23,7 @@ import torch
 import yaml
 from PIL import Image
 
+from phydict.datasets.natural_order import natural_order
 from phydict.xray.geometry import ConeBeam
 
 GEOMETRY, REPORT = "geometry.yaml", "report.txt"
@@ -88,7 +88,7 @@ def find_xrays(path: str | Path) -> list[Path]:
         raise FileNotFoundError(f"there is no folder {path}; give a folder of X-rays, or a folder of such folders")
     if _is_case(path):
         return [path]
-    found = sorted((p for p in path.iterdir() if p.is_dir() and _is_case(p)), key=lambda p: _natural(p.name))
+    found = sorted((p for p in path.iterdir() if p.is_dir() and _is_case(p)), key=lambda p: natural_order(p.name))
     if not found:
         raise FileNotFoundError(f"neither {path} nor its subfolders hold {GEOMETRY} or X-ray images "
                                 f"({', '.join(ENDINGS)}); give a folder of X-ray images")
@@ -187,11 +187,7 @@ def _is_case(folder: Path) -> bool:
 def _images(folder: Path) -> list[Path]:
     found = (p for p in folder.iterdir()
              if p.is_file() and not p.name.startswith(".") and p.name.lower().endswith(ENDINGS))
-    return sorted(found, key=lambda p: _natural(p.name))
-
-
-def _natural(text: str) -> list:
-    return [(1, int(part), "") if part.isdigit() else (0, 0, part) for part in re.split(r"(\d+)", text)]
+    return sorted(found, key=lambda p: natural_order(p.name))
 
 
 def _read_geometry(path: Path) -> tuple[ConeBeam, Intensity | None, bool, bool]:

@@ -92,10 +92,6 @@ class BoundPrior:
     def schedule(self) -> CosineSchedule:
         return self.prior.schedule
 
-    @property
-    def channels(self) -> int:
-        return self.prior.network.state_channels
-
     @torch.no_grad()
     def denoise(self, x: Tensor, t: float) -> Tensor:
         """E[x_0 | x_t = x, report]; runs in bfloat16 where `bf16` says so (None: unless x is float64)."""

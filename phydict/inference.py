@@ -28,8 +28,8 @@ from torch import Tensor
 from phydict.command_line import one_sentence_errors, quiet
 from phydict.evaluation import CaseMetrics, markdown, panel, rich_table, volume_metrics, write_csv
 from phydict.grid import Grid
-from phydict.methods import DEFAULT_PRIOR, fit_to_grid
-from phydict.posterior import Posterior, Sampler
+from phydict.methods import DEFAULT_PRIOR, fit_to_grid, reconstructor
+from phydict.posterior import Sampler
 from phydict.prior import load_prior
 from phydict.progress import CaseProgress
 from phydict.reconstruction_data import ReconstructionData
@@ -60,8 +60,7 @@ class ReconstructionTask(lightning.LightningModule):
             self.grid, self.window = self.prior.grid, self.prior.window
             self.settings |= {"prior": Path(prior).name, "prior_crc32": zlib.crc32(Path(prior).read_bytes()),
                               "guidance": guidance}
-            method = Posterior(self.prior, method, guidance, name=name)
-        self.reconstructor: Reconstructor = method
+        self.reconstructor = reconstructor(method, getattr(self, "prior", None), guidance, name)
         self.metrics = CaseMetrics([name])
         self.progress = CaseProgress()
 

@@ -29,12 +29,13 @@ METHODS: dict[str, Sampler | Reconstructor] = {
 
 
 def reconstructor(method: str | Sampler | Reconstructor, prior: Prior | str | Path | None = None,
-                  guidance: float = 2.0) -> Reconstructor:
+                  guidance: float = 2.0, name: str | None = None) -> Reconstructor:
     """A method ready to reconstruct: a name of METHODS, a sampler (which needs a prior), or a Reconstructor.
 
-    prior: a Prior or the file it is in; None for the shipped one. It is only loaded by methods that need it.
+    prior: a Prior or the file it is in; None for the shipped one. It is only loaded by methods that need it. name: what
+    the result calls the method (None: its own name).
     """
-    name = method if isinstance(method, str) else type(method).__name__
+    name = name or (method if isinstance(method, str) else type(method).__name__)
     if isinstance(method, str):
         if method not in METHODS:
             raise ValueError(f"there is no method '{method}': use one of {', '.join(METHODS)}")

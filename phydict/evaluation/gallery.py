@@ -12,6 +12,7 @@ from pathlib import Path
 
 import nibabel as nib
 import numpy as np
+import torch
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -19,6 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
 from phydict.grid import Grid
+from phydict.reconstructor import misfits
 
 DISPLAY = (-1000.0, 400.0)
 """HU shown as black and as white."""
@@ -156,6 +158,7 @@ def _show_xrays(figure, height: float, xrays, reprojection) -> None:
         if rendered.shape != measured.shape:
             raise ValueError(f"the re-projection has shape {rendered.shape}, but the X-rays have {measured.shape}")
         rows |= {"re-projected": rendered, "residual": rendered - measured}
+        per_view = misfits(torch.from_numpy(rendered), torch.from_numpy(measured))["misfit_per_view"]
     count = min(len(measured), MOST_VIEWS)
     views = np.linspace(0, len(measured) - 1, count).round().astype(int)
     low, high = _scale(np.concatenate([rows[name][views].ravel() for name in rows if name != "residual"]))
@@ -170,17 +173,12 @@ def _show_xrays(figure, height: float, xrays, reprojection) -> None:
             shown = ax.imshow(np.ma.masked_invalid(images[view]), SIGNED if signed else GREY, vmin=limits[0],
                               vmax=limits[1], interpolation="nearest")
             heading = f"view {view + 1} of {len(measured)}" if row == 0 else ""
-            _finish(ax, f"misfit {_misfit(images[view], measured[view]):.3g}" if signed else heading)
+            _finish(ax, f"misfit {per_view[view]:.3g}" if signed else heading)
             if column == 0:
                 ax.set_ylabel(name, fontsize=9)
         place = cells[row, count - 1].get_position(figure)
         bar = figure.add_axes((place.x1 + 0.015, place.y0, 0.012, place.height))
         figure.colorbar(shown, cax=bar).ax.tick_params(labelsize=7)
-
-
-def _misfit(residual: np.ndarray, measured: np.ndarray) -> float:
-    norm = np.linalg.norm(measured)
-    return float(np.linalg.norm(residual) / norm) if norm else float("nan")
 
 
 def _scale(values: np.ndarray) -> tuple[float, float]:

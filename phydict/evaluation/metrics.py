@@ -1,4 +1,4 @@
-"""SSIM, PSNR and MAE of one case in Hounsfield units, the X-ray misfit, and their statistics over cases.
+"""SSIM, PSNR and MAE of one case in Hounsfield units, and their statistics over cases.
 
 Range: both volumes are clipped to `RANGE` = [-1000, 1000] HU unless the caller says otherwise, and the data range
 is its width, 2000 HU. It is never inferred from the data. Every number here is per case; cases are averaged
@@ -17,7 +17,7 @@ offset.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import torch
@@ -113,27 +113,6 @@ def volume_metrics(hu: Tensor, true_hu: Tensor, lung: Tensor | None = None,
                    "psnr_lung": 10 * torch.log10((2 * window.half_width) ** 2 / (weight * error**2).sum()),
                    "mae_hu_lung": (weight * error.abs()).sum()}
     return {name: float(value) for name, value in result.items()}
-
-
-@torch.no_grad()
-def misfit(A: Callable[[Tensor], Tensor], mu: Tensor, xrays: Tensor) -> tuple[float, list[float]]:
-    """How far a volume's X-rays are from the measured ones: ||A mu - y|| / ||y||, over all views and for each view.
-
-    A: projector, mu -> X-rays. mu: (1, 1, X, Y, Z) in 1/mm. xrays: measured y, (1, K, V, U) line integrals.
-    0 means that the volume explains the measurement; an empty volume has 1. A view that is zero everywhere gives
-    inf or NaN in the list.
-    Raises ValueError when A mu does not have y's shape, when there is more than one case, or when y is all zero.
-    """
-    rendered = A(mu)
-    if rendered.shape != xrays.shape or xrays.ndim != 4 or len(xrays) != 1:
-        raise ValueError(f"misfit needs the measured X-rays of one case, (1, K, V, U), in the projector's shape, but "
-                         f"{tuple(xrays.shape)} was given and A mu has {tuple(rendered.shape)}")
-    measured = xrays.double().flatten(2)[0]
-    residual = rendered.double().flatten(2)[0] - measured
-    if not bool(measured.any()):
-        raise ValueError("the measured X-rays are zero everywhere, so a relative misfit is not defined; check them")
-    per_view = residual.norm(dim=1) / measured.norm(dim=1)
-    return float(residual.norm() / measured.norm()), per_view.tolist()
 
 
 class CaseMetrics(Metric):

@@ -45,11 +45,6 @@ class Measurement:
         self.calls += 1
         return self.slope * self.projector.T(r)
 
-    @property
-    def norm(self) -> float:
-        """Spectral norm of `linear`."""
-        return self.slope * self.projector.norm()
-
     def calibrate(self, x: Tensor) -> None:
         """Where the views are display values: refit their gain and offset to the projections of the CT x."""
         if self.display is not None:

@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.ndimage import correlate1d
 
-from phydict.evaluation.metrics import CaseMetrics, misfit, ssim_window, volume_metrics
+from phydict.evaluation.metrics import CaseMetrics, ssim_window, volume_metrics
 
 
 def smooth_case(seed: int, shape=(20, 18, 16)):
@@ -166,38 +166,6 @@ def test_nan_shows():
 def test_bad_input_is_named(hu, true_hu, lung, low, sentence):
     with pytest.raises(ValueError, match=sentence):
         volume_metrics(torch.zeros(hu), torch.zeros(true_hu), None if lung is None else torch.ones(lung), low=low)
-
-
-def sum_along_y(mu):
-    return mu.sum(3).movedim(1, 1).expand(-1, 2, -1, -1)
-
-
-def test_misfit_is_zero_for_the_truth_one_for_nothing_and_proportional_between():
-    mu = torch.rand(1, 1, 6, 6, 6) + 0.1
-    y = sum_along_y(mu)
-    assert misfit(sum_along_y, mu, y) == (0, [0, 0])
-    assert misfit(sum_along_y, 0 * mu, y) == (pytest.approx(1), [pytest.approx(1)] * 2)
-    assert misfit(sum_along_y, 1.1 * mu, y)[0] == pytest.approx(0.1, rel=1e-4)
-
-
-def test_misfit_of_views_combines_to_the_whole():
-    mu = torch.rand(1, 1, 6, 6, 6) + 0.1
-    y = sum_along_y(mu) * torch.tensor([1.0, 1.3])[None, :, None, None]
-    whole, views = misfit(sum_along_y, mu, y)
-    assert views == [pytest.approx(0, abs=1e-6), pytest.approx(0.3 / 1.3, rel=1e-4)]
-    norms = y.flatten(2).norm(dim=2)[0]
-    wanted = math.sqrt(sum((v * n) ** 2 for v, n in zip(views, norms.tolist()))) / float(norms.norm())
-    assert whole == pytest.approx(wanted, rel=1e-5)
-
-
-def test_misfit_names_bad_input():
-    mu = torch.ones(1, 1, 4, 4, 4)
-    with pytest.raises(ValueError, match="zero everywhere"):
-        misfit(sum_along_y, mu, torch.zeros(1, 2, 4, 4))
-    with pytest.raises(ValueError, match=r"A mu has \(1, 2, 4, 4\)"):
-        misfit(sum_along_y, mu, torch.ones(1, 3, 4, 4))
-    with pytest.raises(ValueError, match="one case"):
-        misfit(sum_along_y, mu.expand(2, -1, -1, -1, -1), torch.ones(2, 2, 4, 4))
 
 
 def test_statistics_are_means_of_case_values_and_not_pooled():

@@ -6,6 +6,7 @@ import torch
 from laws import assert_adjoint, assert_gradient_is_adjoint, assert_linear, random_like
 
 from phydict.xray import ConeBeam, Grid, Projector
+from phydict.xray.separable import Separable
 
 METHODS = ("separable", "siddon")
 BEAM = ConeBeam.orbit(3, 1020, 740, (14, 18), (31.0, 27.0), start=0.3)
@@ -48,16 +49,22 @@ def test_the_transpose_is_the_exact_adjoint_for_tilted_detectors():
     assert_adjoint(A, A.T, (1, 1, *A.grid.shape), torch.float64, 1e-10)
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_blocks_of_columns_do_not_show(method, monkeypatch):
+def test_slabs_do_not_show_in_siddon(monkeypatch):
     grid = GRIDS["anisotropic"]
-    whole = Projector(grid, BEAM, method)
-    monkeypatch.setattr("phydict.xray.separable.BLOCK_VALUES", 500)
+    A, y = Projector(grid, BEAM, "siddon"), random_like((1, 3, *BEAM.shape))
+    whole = A.T(y)
     monkeypatch.setattr("phydict.xray.siddon.SLAB", 3)
-    blocked = Projector(grid, BEAM, method)
-    mu, y = random_like((1, 1, *grid.shape)), random_like((1, 3, *BEAM.shape))
-    torch.testing.assert_close(blocked(mu), whole(mu), rtol=1e-12, atol=1e-12)
-    torch.testing.assert_close(blocked.T(y), whole.T(y), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(A.T(y), whole, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("grid", GRIDS.values(), ids=GRIDS.keys())
+def test_sparse_products_are_the_compiled_separable_operator(grid, monkeypatch):
+    monkeypatch.setattr("phydict.xray.separable_sparse.BLOCK_VALUES", 5000)
+    beam = ConeBeam.orbit(3, 1020, 740, (23, 71), (19.0, 7.0), start=0.3)
+    A = Separable(grid, beam)
+    mu, y = random_like((2, *grid.shape)), random_like((2, 3, *beam.shape))
+    torch.testing.assert_close(A.sparse.forward(mu), A.forward(mu), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(A.sparse.adjoint(y), A.adjoint(y), rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -94,14 +101,16 @@ def test_float32_agrees_with_float64(method):
     assert (A(mu.float()).double() - A(mu)).norm() < 1e-6 * A(mu).norm()
 
 
-def test_threads_do_not_change_siddon():
-    A, threads = Projector(GRIDS["cube"], BEAM, "siddon"), torch.get_num_threads()
-    y = random_like((1, 3, *BEAM.shape), torch.float32)
+@pytest.mark.parametrize("method", METHODS)
+def test_threads_change_nothing(method):
+    A, threads = Projector(GRIDS["fine slices"], BEAM, method), torch.get_num_threads()
+    mu, y = random_like((1, 1, *A.grid.shape), torch.float32), random_like((1, 3, *BEAM.shape), torch.float32)
     try:
         torch.set_num_threads(1)
-        one = A.T(y)
+        one = A(mu), A.T(y)
         torch.set_num_threads(2)
-        assert torch.equal(A.T(y), one)
+        assert torch.equal(A(mu), one[0])
+        assert torch.equal(A.T(y), one[1])
     finally:
         torch.set_num_threads(threads)
 

@@ -1,0 +1,23 @@
+"""Laws of what a reconstruction reports."""
+
+import pytest
+import torch
+
+from phydict.reconstructor import misfits
+
+Y = torch.rand(3, 5, 4, generator=torch.Generator().manual_seed(0)) + 0.1
+
+
+def test_misfit_is_zero_for_the_truth_one_for_nothing_and_proportional_between():
+    assert misfits(Y, Y) == {"misfit": 0, "misfit_per_view": [0, 0, 0]}
+    assert misfits(0 * Y, Y)["misfit"] == pytest.approx(1)
+    assert misfits(1.1 * Y, Y)["misfit"] == pytest.approx(0.1, rel=1e-4)
+
+
+def test_misfits_of_views_combine_to_the_whole():
+    scaled = Y * torch.tensor([1.0, 1.3, 0.9])[:, None, None]
+    said = misfits(Y, scaled)
+    assert said["misfit_per_view"] == pytest.approx([0, 0.3 / 1.3, 0.1 / 0.9], abs=1e-6, rel=1e-4)
+    sizes = scaled.flatten(1).norm(dim=1)
+    residuals = torch.tensor(said["misfit_per_view"]) * sizes
+    assert said["misfit"] == pytest.approx(float(residuals.norm() / sizes.norm()), rel=1e-5)

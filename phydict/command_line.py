@@ -6,10 +6,12 @@ import logging
 import os
 import re
 import sys
+import tempfile
 import warnings
 from argparse import ArgumentError
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 NOISE = (".*does not have many workers", ".*LeafSpec.*is deprecated", ".*is smaller than the logging interval",
          "Total length of `DataLoader` across ranks is zero", "Checkpoint directory .* exists and is not empty",
@@ -19,12 +21,19 @@ NOISE = (".*does not have many workers", ".*LeafSpec.*is deprecated", ".*is smal
 
 
 @contextmanager
-def one_sentence_errors() -> Iterator[None]:
-    """Prints bad arguments, ValueError and OSError as one sentence and exits with code 2; the environment variable
-    PHYDICT_TRACEBACK=1 shows the trace instead."""
+def one_sentence_errors(*also: type[Exception], to_go_on: str = "run the same command again") -> Iterator[None]:
+    """Prints bad arguments, ValueError, OSError and `also` as one sentence and exits with code 2; the environment
+    variable PHYDICT_TRACEBACK=1 shows the trace instead. A run that a signal stopped says how to go on and exits with
+    code 130 (SIGINT) or 143 (SIGTERM)."""
     try:
         yield
-    except (ValueError, OSError, ArgumentError) as error:
+    except (KeyboardInterrupt, SystemExit) as stop:  # Lightning exits with 1 on SIGINT and without a code on SIGTERM
+        interrupted = isinstance(stop, KeyboardInterrupt) or isinstance(stop.__context__, KeyboardInterrupt)
+        if not interrupted and stop.code is not None:
+            raise
+        print(f"stopped by a signal; to go on, {to_go_on}", file=sys.stderr)
+        raise SystemExit(130 if interrupted else 143) from None
+    except (ValueError, OSError, ArgumentError, *also) as error:
         if os.environ.get("PHYDICT_TRACEBACK"):
             raise
         print(f"error: {sentence(error)}", file=sys.stderr)
@@ -34,6 +43,23 @@ def one_sentence_errors() -> Iterator[None]:
             raise
         print("stopped, because another process of this run ended; its message says why", file=sys.stderr)
         raise SystemExit(2) from None
+
+
+def check_writable(path: Path, option: str, file: bool = False) -> None:
+    """Raises ValueError, in one sentence, unless a folder (or a file) can be written at `path`, which need not exist
+    yet; `option` is what the user should change."""
+    there = path.absolute()
+    if file and there.is_dir():
+        raise ValueError(f"{path} is a folder, but a file is to be written: give another {option}")
+    there = there.parent if file else there
+    while not there.exists():
+        there = there.parent
+    try:
+        with tempfile.TemporaryFile(dir=there):
+            pass
+    except OSError as error:
+        reason = "is a file" if there.is_file() else f"cannot be written to ({error.strerror})"
+        raise ValueError(f"{path} cannot be written because {there} {reason}: give another {option}") from error
 
 
 def sentence(error: Exception) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,8 +11,12 @@ import torch
 from torch.utils.data import ConcatDataset, DataLoader, Dataset
 
 from phydict.datasets import CTCases, Thorax, augment, find_cts, phantom_case, report, split_by_patient
+from phydict.datasets.cache import read_arrays, write_arrays
 from phydict.grid import Grid
 from phydict.units import HUWindow
+
+VERSION = 1
+"""Raised whenever a phantom of the same seed comes out differently, so that cached ones are made anew."""
 
 HELD_OUT_PHANTOM = 1_000_000
 """Phantoms with this seed and above are never trained on."""
@@ -28,7 +31,7 @@ class CachedPhantoms(Dataset):
     def __init__(self, first_seed: int, count: int, grid: Grid, window: HUWindow, cache: Path):
         self.first_seed, self.count, self.grid, self.window = first_seed, count, grid, window
         size = "x".join(map(str, grid.shape))
-        self.folder = cache / f"phantoms-{size}-{grid.spacing[0]:g}mm-{window.low:g}-{window.high:g}"
+        self.folder = cache / f"phantoms{VERSION}-{size}-{grid.spacing[0]:g}mm-{window.low:g}-{window.high:g}"
 
     def __len__(self) -> int:
         return self.count
@@ -36,18 +39,15 @@ class CachedPhantoms(Dataset):
     def __getitem__(self, i: int) -> dict:
         seed = self.first_seed + i
         file = self.folder / f"{seed:07d}.npz"
-        if not file.exists():
+        stored = read_arrays(file)
+        if stored is None:
             case = phantom_case(seed, self.grid, self.window)
-            self.folder.mkdir(parents=True, exist_ok=True)
-            partial = file.with_suffix(f".{os.getpid()}.partial")
-            with partial.open("wb") as stream:
-                np.savez_compressed(stream, volume=case["volume"].numpy().astype(np.float16),
-                                    masks=(255 * case["masks"].numpy()).round().astype(np.uint8))
-            partial.replace(file)
-        with np.load(file) as stored:
-            masks = torch.from_numpy(stored["masks"].astype(np.float32) / 255)
-            return {"volume": torch.from_numpy(stored["volume"].astype(np.float32)), "masks": masks,
-                    "has_masks": torch.ones(len(masks), dtype=torch.bool), "report": report(Thorax.draw(seed))}
+            stored = {"volume": case["volume"].numpy().astype(np.float16),
+                      "masks": (255 * case["masks"].numpy()).round().astype(np.uint8)}
+            write_arrays(file, stored)
+        masks = torch.from_numpy(stored["masks"].astype(np.float32) / 255)
+        return {"volume": torch.from_numpy(stored["volume"].astype(np.float32)), "masks": masks,
+                "has_masks": torch.ones(len(masks), dtype=torch.bool), "report": report(Thorax.draw(seed))}
 
 
 class MixedCases(Dataset):
@@ -87,6 +87,9 @@ class PriorData(lightning.LightningDataModule):
         super().__init__()
         if not cts and not phantoms:
             raise ValueError("there is nothing to train on: give data.cts, or data.phantoms above 0")
+        if phantoms < 0 or not 0 <= ct_fraction <= 1:
+            raise ValueError(f"data.phantoms must not be negative and data.ct_fraction lies in [0, 1], but {phantoms} and "
+                             f"{ct_fraction} were given")
         if cts and Path(cache).resolve().is_relative_to(Path(cts).resolve()):
             raise ValueError(f"data.cache {cache} lies inside data.cts {cts}: give a folder elsewhere")
         window = HUWindow(*window)
@@ -97,11 +100,12 @@ class PriorData(lightning.LightningDataModule):
             if not any(word in f.id for f in files):
                 raise ValueError(f"data.holdout names '{word}', but no CT has that in its id"
                                  + (f" (the first id is {files[0].id})" if files else "") + ": correct or remove it")
-        _, validating = split_by_patient([f.id for f in files], holdout_fraction, seed)
+        validating = set(split_by_patient([f.id for f in files], holdout_fraction, seed)[1])
         held_out = [f for f in files if f.id in validating or any(word in f.id for word in holdout or [])]
         if len(held_out) == len(files) and not phantoms:
             raise ValueError("there is nothing to train on: data.holdout holds out every CT, and data.phantoms is 0")
-        self.cts = CTCases([f for f in files if f not in held_out], cache, self.grid, window)
+        self.held_out = [f.id for f in held_out]
+        self.cts = CTCases([f for f in files if f.id not in set(self.held_out)], cache, self.grid, window)
         self.validation = ConcatDataset([
             CachedPhantoms(HELD_OUT_PHANTOM, validation_phantoms, self.grid, window, Path(cache)),
             CTCases(held_out, cache, self.grid, window)])

@@ -11,11 +11,14 @@ from pickle import UnpicklingError
 import lightning
 import torch
 from jsonargparse import auto_cli
+from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.cli import LightningCLI
+from lightning.pytorch.loggers import CSVLogger
 from lightning.pytorch.utilities import rank_zero_only
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from torch import Tensor
 
-from phydict.command_line import one_sentence_errors, quiet
+from phydict.command_line import check_writable, one_sentence_errors, quiet
 from phydict.datamodule import PriorData
 from phydict.diffusion import renoise
 from phydict.evaluation import method_panel
@@ -25,6 +28,9 @@ from phydict.prior import Prior, TextEncoder, VolumeUNet, describe, learn_vocabu
 from phydict.prior.checkpoint import build_prior, build_text
 from phydict.prior.report_training import learn_findings, learn_sketch
 from phydict.units import HUWindow
+
+CHECKPOINT, HELD_OUT = "last.ckpt", "held_out.txt"
+"""Files of a training's folder: what it can be resumed from, and the ids of the CTs that it never saw."""
 
 NOISE_LEVELS = (0.1, 0.3, 0.5, 0.7, 0.9)
 """Times t at which validation measures the denoising error."""
@@ -166,6 +172,11 @@ class PriorTraining(lightning.LightningModule):
         checkpoint["phydict"] = describe(self.prior) | {"training": seen}
 
     def on_load_checkpoint(self, checkpoint: dict) -> None:
+        theirs, ours = checkpoint["phydict"], describe(self.prior)
+        for key, own in ours.items():
+            if theirs[key] != own:
+                raise ValueError(f"the checkpoint's prior and this training's differ in '{key}': give the settings and "
+                                 "data that the checkpoint was trained with, or start anew with model.initial")
         self.samples = checkpoint["phydict"].get("training", {}).get("samples", 0)
 
 
@@ -196,6 +207,7 @@ def export_prior(checkpoint: str, out: str) -> None:
     """
     if Path(out).suffix != ".safetensors":
         raise ValueError(f"a prior is a .safetensors file, but {out} was given: give a name with that ending")
+    check_writable(Path(out), "--out", file=True)
     content = read_checkpoint(checkpoint)
     header = content["phydict"]
     weights = {k.removeprefix("prior."): w for k, w in content["state_dict"].items() if k.startswith("prior.")}
@@ -207,25 +219,49 @@ def export_prior(checkpoint: str, out: str) -> None:
 
 
 class PriorCLI(LightningCLI):
-    """fit and validate; ties the data's grid and HU window to the model's."""
+    """fit and validate; ties the data's grid and HU window to the model's, and writes everything below `out`."""
 
     @staticmethod
     def subcommands() -> dict[str, set[str]]:
         return {name: LightningCLI.subcommands()[name] for name in ("fit", "validate")}
 
     def add_arguments_to_parser(self, parser) -> None:
+        parser.add_argument("--out", default="runs/prior", help="folder for checkpoint, logs and samples")
+        parser.add_lightning_class_args(ModelCheckpoint, "checkpoint")
+        parser.set_defaults({"checkpoint.filename": "last", "checkpoint.enable_version_counter": False,
+                             "checkpoint.every_n_epochs": 1, "checkpoint.save_on_train_epoch_end": True})
+        parser.link_arguments("out", "checkpoint.dirpath")
+        parser.link_arguments("out", "trainer.default_root_dir")
         for name in ("voxels", "side", "window"):
             parser.link_arguments(f"model.{name}", f"data.{name}")
         parser.link_arguments("data.reports", "model.reports", apply_on="instantiate")
 
+    def instantiate_trainer(self, **kwargs) -> lightning.Trainer:
+        return super().instantiate_trainer(logger=CSVLogger(self._get(self.config, "out"), name="logs"), **kwargs)
+
     def before_fit(self) -> None:
-        if not self.config.fit.ckpt_path:
-            self.model.learn_reports(self.datamodule)
+        out = Path(self.config.fit.out)
+        if self.config.fit.ckpt_path:
+            return
+        if (out / CHECKPOINT).exists():
+            raise ValueError(f"{out} holds a training already: go on with --ckpt_path {out / CHECKPOINT}, or give "
+                             "another folder with --out")
+        if self.trainer.is_global_zero and self.datamodule.held_out:
+            out.mkdir(parents=True, exist_ok=True)
+            (out / HELD_OUT).write_text("".join(f"{case}\n" for case in self.datamodule.held_out))
+        self.model.learn_reports(self.datamodule)
+
+    def before_validate(self) -> None:
+        if not (self.config.validate.ckpt_path or self.config.validate.model.initial):
+            raise ValueError("validate needs trained weights: give --ckpt_path, or a prior's file as model.initial")
 
     def parse_arguments(self, parser, args) -> None:
         super().parse_arguments(parser, args)
         command = self.config.get("subcommand")  # none where nothing is run
-        checkpoint = command and self.config[command].ckpt_path
+        if not command:
+            return
+        check_writable(Path(self.config[command].out), "--out")
+        checkpoint = self.config[command].ckpt_path
         if checkpoint and checkpoint not in ("last", "best"):
             read_checkpoint(checkpoint)
 
@@ -233,7 +269,7 @@ class PriorCLI(LightningCLI):
 def main(args: list[str] | None = None) -> None:
     """Command line of training: fit, validate, export. A bad input ends in one sentence and exit code 2."""
     given = sys.argv[1:] if args is None else args
-    with one_sentence_errors(), quiet():
+    with one_sentence_errors(MisconfigurationException, to_go_on="add --ckpt_path and the run's last.ckpt"), quiet():
         if given[:1] == ["export"]:
             auto_cli(export_prior, args=given[1:], as_positional=False, exit_on_error=False)
         else:

@@ -6,6 +6,7 @@ import csv
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import nibabel
@@ -14,9 +15,11 @@ import pytest
 import torch
 from torch.utils.data import default_collate
 
-from phydict.datamodule import PriorData
+from phydict.datamodule import CachedPhantoms, PriorData
+from phydict.grid import Grid
 from phydict.prior import load_prior, save_prior
 from phydict.training import PriorTraining, main
+from phydict.units import HUWindow
 from prior.tiny import tiny_prior
 
 CONFIG = Path(__file__).parents[1] / "configs" / "prior" / "phantom.yaml"
@@ -36,8 +39,7 @@ def cache(tmp_path_factory) -> Path:
 
 def arguments(folder: Path, cache: Path, *more: str) -> list[str]:
     """`fit` of a tiny network on four phantoms, everything written below `folder`."""
-    return ["fit", f"--config={CONFIG}", *TINY, f"--data.cache={cache}", f"--trainer.default_root_dir={folder}",
-            f"--trainer.logger.init_args.save_dir={folder}", f"--trainer.callbacks.dirpath={folder}", *more]
+    return ["fit", f"--config={CONFIG}", *TINY, f"--data.cache={cache}", f"--out={folder}", *more]
 
 
 @pytest.fixture(scope="module")
@@ -169,6 +171,54 @@ def test_bad_input_is_one_sentence(change, words, cts, straight, cache, tmp_path
     assert not list((tmp_path / "run").glob("*.ckpt"))
 
 
+def test_a_second_training_never_overwrites_a_first(straight, cache, capsys):
+    before = (straight / "last.ckpt").read_bytes()
+    said = refusal(capsys, arguments(straight, cache, "--trainer.max_epochs=1"))
+    assert str(straight) in said and "--ckpt_path" in said and "--out" in said
+    assert (straight / "last.ckpt").read_bytes() == before
+
+
+@pytest.mark.parametrize("change, key", [(["--model.voxels=24"], "grid"), (["--model.text=none"], "text"),
+                                         (["--model.window=[-1000,600]"], "hu_window")])
+def test_a_checkpoint_is_resumed_only_as_what_it_is(change, key, straight, cache, tmp_path, capsys):
+    said = refusal(capsys, arguments(tmp_path, cache, "--trainer.max_epochs=3", f"--ckpt_path={straight / 'last.ckpt'}",
+                                     *change))
+    assert f"'{key}'" in said and not (tmp_path / "last.ckpt").exists()
+
+
+def test_validation_needs_trained_weights(cache, tmp_path, capsys):
+    args = [arg for arg in arguments(tmp_path, cache)[1:] if "max_steps" not in arg]
+    assert "--ckpt_path" in refusal(capsys, ["validate", *args])
+
+
+def test_the_held_out_cts_are_written_down(cts, cache, tmp_path):
+    main(arguments(tmp_path, cache, "--trainer.max_epochs=1", "--trainer.limit_train_batches=1",
+                   "--trainer.limit_val_batches=0", f"--data.cts={cts}", "--data.holdout=[patient1]"))
+    assert (tmp_path / "held_out.txt").read_text() == "patient1\n"
+
+
+def test_a_signal_is_no_success(cache, tmp_path):
+    train = subprocess.Popen(
+        [sys.executable, str(CONFIG.parents[2] / "train.py"), *arguments(tmp_path, cache, "--trainer.max_epochs=9999")],
+        stderr=subprocess.PIPE, text=True)
+    for _ in range(600):
+        if (tmp_path / "last.ckpt").exists():
+            break
+        time.sleep(0.1)
+    train.terminate()
+    _, said = train.communicate(timeout=60)
+    assert train.returncode == 143 and "--ckpt_path" in said.splitlines()[-1], said
+
+
+def test_a_damaged_phantom_in_the_cache_is_made_again(tmp_path):
+    phantoms = CachedPhantoms(0, 1, Grid.cube(16), HUWindow(), tmp_path)
+    with pytest.warns(match="prepared again"):
+        first, file = phantoms[0], next(tmp_path.rglob("*.npz"))
+        file.write_bytes(file.read_bytes()[:500])
+        again = phantoms[0]
+    assert torch.equal(first["volume"], again["volume"]) and torch.equal(first["masks"], again["masks"])
+
+
 def test_an_unknown_key_of_a_config_file_is_named(tmp_path, cache, capsys):
     config = tmp_path / "mine.yaml"
     config.write_text("model:\n  learning_rats: 1.0\n")
@@ -194,6 +244,15 @@ def test_what_cannot_be_exported_is_one_sentence(spoil, words, straight, tmp_pat
     said = refusal(capsys, ["export", f"--checkpoint={file}", f"--out={out}"])
     assert all(word in said for word in [*words, "spoilt.ckpt"]), said
     assert not out.exists()
+
+
+@pytest.mark.parametrize("out", ["folder.safetensors", "file/prior.safetensors"])
+def test_an_export_that_cannot_be_written_leaves_nothing(out, straight, tmp_path, capsys):
+    (tmp_path / "folder.safetensors").mkdir()
+    (tmp_path / "file").write_text("")
+    said = refusal(capsys, ["export", f"--checkpoint={straight / 'last.ckpt'}", f"--out={tmp_path / out}"])
+    assert out in said and "--out" in said
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["file", "folder.safetensors"]
 
 
 def test_two_processes_train_one_prior(tmp_path, cache, straight):

@@ -9,11 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import re
-import warnings
-import zipfile
-import zlib
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -21,6 +17,7 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset
 
+from phydict.datasets.cache import read_arrays, write_arrays
 from phydict.datasets.ct_rate_tables import read_calibrations, read_reports
 from phydict.datasets.natural_order import natural_order
 from phydict.datasets.transforms import Calibration, case_id, prepare_ct
@@ -167,12 +164,13 @@ class CTCases(Dataset):
 
     def __getitem__(self, index: int) -> dict:
         ct = self.cts[index]
-        file = None if self.cache is None else self.cache / f"{ct.id}-{self._key(ct)}.npz"
-        packed = _read(file)
+        file = self.cache and self.cache / f"{ct.id}-{self._key(ct)}.npz"
+        packed = file and read_arrays(file)
         if packed is None:
             case = prepare_ct(ct.path, self.grid, self.window, id=ct.id, calibration=ct.calibration)
             packed = _pack(case)
-            _write(file, packed)
+            if file:
+                write_arrays(file, packed)
         return _unpack(packed) | {"id": ct.id, "report": ct.report}
 
     def _key(self, ct: CTFile) -> str:
@@ -193,23 +191,3 @@ def _unpack(packed: dict[str, np.ndarray]) -> dict:
             "masks": torch.from_numpy(packed["masks"].astype(np.float32) / 255),
             "has_masks": torch.from_numpy(packed["has_masks"]), "affine": torch.from_numpy(packed["affine"]),
             "centred_on": str(packed["centred_on"])}
-
-
-def _write(file: Path | None, packed: dict[str, np.ndarray]) -> None:
-    """Write under a name of its own first, so that several workers never read half a file."""
-    if file is not None:
-        part = file.with_name(f"{file.stem}.{os.getpid()}.part")
-        with part.open("wb") as stream:
-            np.savez_compressed(stream, **packed)
-        part.replace(file)
-
-
-def _read(file: Path | None) -> dict[str, np.ndarray] | None:
-    if file is None or not file.is_file():
-        return None
-    try:
-        with np.load(file) as stored:
-            return {name: stored[name] for name in ("volume", "masks", "has_masks", "affine", "centred_on")}
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
-        warnings.warn(f"the cached case {file} cannot be read ({error}); it is prepared again", stacklevel=3)
-        return None

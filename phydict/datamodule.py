@@ -72,10 +72,25 @@ class MixedCases(Dataset):
 class PriorData(lightning.LightningDataModule):
     """Cases for training a prior.
 
-    cts: a NIfTI file or a folder of any depth (CT-RATE's layout or any other); reports, metadata, fixed, exclude: as
-    for `find_cts`; holdout: CTs whose id contains one of these words validate instead of training, and so does
-    holdout_fraction of the patients; phantoms: number of different phantoms; ct_fraction: share of draws taken from
-    the CTs; epoch_size: draws per epoch; cache: folder for prepared cases, never inside the CTs' folder.
+    Args:
+        cts: a NIfTI file, or a folder of any depth in CT-RATE's layout or any other
+        reports: CT-RATE's table of reports, or the folder it is in; none given: looked for beside the CTs
+        metadata: CT-RATE's metadata table, needed where headers are not fixed
+        fixed: whether the NIfTI headers are right (CT-RATE's *_fixed folders and ordinary archives)
+        exclude: a text file of case ids to leave out
+        holdout: CTs whose id contains one of these words validate instead of training
+        holdout_fraction: share of the patients that validate instead of training, in [0, 1]
+        phantoms: number of different phantoms
+        ct_fraction: share of draws taken from the CTs, in [0, 1]
+        validation_phantoms: phantoms, never trained on, that validate
+        epoch_size: draws per epoch
+        batch_size: draws per step on each device
+        workers: loader processes per device
+        cache: folder for prepared cases, never inside the CTs' folder
+        seed: of the draws and of the split into patients
+        voxels: tied to model.voxels
+        side: tied to model.side
+        window: tied to model.window
     """
 
     def __init__(self, cts: str | None = None, reports: str | None = None, metadata: str | None = None,

@@ -39,13 +39,27 @@ NOISE_LEVELS = (0.1, 0.3, 0.5, 0.7, 0.9)
 class PriorTraining(lightning.LightningModule):
     """Learns a Prior by denoising: squared error of x0 at all noise levels, up to four times heavier at the low ones.
 
-    network: the UNet (None: the default VolumeUNet); text: "small" for a BERT that learns with the prior (none where
-    the data have no reports), a folder or hub id for a frozen one, "none" for a prior without text; reports: texts
-    the small BERT's vocabulary is learnt from; text_dropout: share of reports replaced by the null context;
-    mask_weight: weight of the anatomy masks' error beside the CT's; warmup: steps over which the learning rate rises;
-    decay_from, decay_steps: the step at which a linear decay to zero begins, and its length (0: no decay);
-    text_steps: steps of each task by which a small BERT learns reports before denoising begins (0: it learns by
-    denoising); initial: a prior's file to go on from, which then decides network and text.
+    Args:
+        network: the UNet; none given: the default VolumeUNet
+        text: "small" for a BERT that learns reports first (none where the data have no reports), a folder or hub id
+            for a frozen one, "none" for a prior without text
+        reports: texts that the small BERT's vocabulary is learnt from (taken from the data)
+        voxels: voxels along each side of the cube
+        side: side of the cube in mm
+        window: HU that the prior's range [-1, 1] stands for
+        sigma_data: standard deviation of the data in the prior's range
+        text_dropout: share of reports replaced by the null context, in [0, 1]
+        mask_weight: weight of the anatomy masks' error beside the CT's
+        learning_rate: of AdamW
+        weight_decay: of AdamW
+        warmup: steps over which the learning rate rises
+        decay_from: step at which a linear decay of the learning rate to zero begins
+        decay_steps: length of that decay in steps; 0: no decay
+        text_steps: steps of each task by which a small BERT learns reports before denoising begins; 0: it learns by
+            denoising
+        montage_steps: noise levels of the samples that validation paints; 0: none
+        initial: a prior's file to go on from, which then decides network and text
+        seed: of times, noise and text dropout
     """
 
     def __init__(self, network: VolumeUNet | None = None, text: str = "small", reports: list[str] | None = None,
@@ -274,4 +288,6 @@ def main(args: list[str] | None = None) -> None:
             auto_cli(export_prior, args=given[1:], as_positional=False, exit_on_error=False)
         else:
             PriorCLI(PriorTraining, PriorData, args=args, seed_everything_default=0,
-                     save_config_kwargs={"overwrite": True}, parser_kwargs={"exit_on_error": False})
+                     save_config_kwargs={"overwrite": True}, parser_kwargs={"exit_on_error": False, "description": (
+                         "Train a prior of chest CT. A third command, `train.py export --checkpoint <last.ckpt> --out "
+                         "<prior.safetensors>`, writes what a training learnt as a prior for reconstruction.")})

@@ -89,12 +89,13 @@ def find_cts(root: str | Path, reports: str | Path | None = None, metadata: str 
 
 def _calibrated(cts: list[CTFile], metadata: str | Path | None) -> list[CTFile]:
     if metadata is None:
-        raise ValueError("fixed=False needs CT-RATE's metadata table, but none was given or found; give metadata=")
+        raise ValueError("headers that are not fixed need CT-RATE's metadata table, but none was given or found; "
+                             "give it as data.metadata")
     table = read_calibrations(metadata)
     missing = [ct.id for ct in cts if ct.id not in table]
     if missing:
         raise ValueError(f"{len(missing)} of {len(cts)} volumes are not in the metadata {metadata}, the first is "
-                         f"{missing[0]}; give the table of these volumes, or fixed=True if their headers are right")
+                         f"{missing[0]}; give the table of these volumes, or leave data.fixed true if their headers are right")
     return [replace(ct, calibration=table[ct.id]) for ct in cts]
 
 

@@ -8,7 +8,7 @@ from laws import assert_adjoint, assert_gradient_is_adjoint, assert_linear, rand
 from phydict.xray import ConeBeam, Grid, Projector
 from phydict.xray.separable import Separable
 
-METHODS = ("separable", "siddon")
+METHODS = ("separable", "siddon", "eq4", "joseph", "matrix")
 BEAM = ConeBeam.orbit(3, 1020, 740, (14, 18), (31.0, 27.0), start=0.3)
 
 

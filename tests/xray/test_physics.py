@@ -7,7 +7,7 @@ from laws import random_like
 
 from phydict.xray import ConeBeam, Grid, Projector
 
-METHODS = ("separable", "siddon")
+METHODS = ("separable", "siddon", "eq4", "joseph", "matrix")
 BEAM = ConeBeam.orbit(4, 1020, 740, (56, 56), 10.0, start=0.3)
 
 

@@ -55,8 +55,8 @@ class Projector:
         beam.check(grid)
         if not full_detector and (factor := binning(grid, beam)) > 1:
             warnings.warn(f"the detector's pixels are finer than this grid can resolve: beam.binned({factor}) and "
-                          f"phydict.xray.binned(xrays, {factor}) lose nothing and save time; full_detector=True keeps "
-                          "every pixel without this warning", stacklevel=2)
+                          f"phydict.xray.binned(xrays, {factor}) measure the same in less time; full_detector=True "
+                          "keeps every pixel without this warning", stacklevel=2)
         self.grid, self.beam = grid, beam
         self._engine = _engine(grid, beam, method, int(memory), torch.device(device or "cpu").type)
         self.method, self.reason = self._engine.method, self._engine.reason

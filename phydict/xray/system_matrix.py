@@ -66,8 +66,8 @@ class SystemMatrix:
     def _check(self, dtype: torch.dtype) -> None:
         needed = _table_bytes(self._crossed, math.prod(self.grid.shape), dtype)
         if needed > self.memory:
-            raise ValueError(f"the system matrix needs {needed:,} bytes in {str(dtype).removeprefix('torch.')}, but the "
-                             f"memory budget is {self.memory:,} bytes; use another method or raise memory")
+            raise ValueError(f"the system matrix needs {needed:,} bytes in {str(dtype).removeprefix('torch.')}, but "
+                             f"the memory budget is {self.memory:,} bytes; use another method or raise memory")
 
     @staticmethod
     def bytes_for(grid: Grid, beam: ConeBeam, dtype: torch.dtype) -> int:

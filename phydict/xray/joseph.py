@@ -90,16 +90,22 @@ class Joseph:
             for sweep in sweeps:
                 stack = _stack(mu, sweep.axis)
                 together = min(len(sweep.pixels), self._samples(xrays))
+                plane = together * self._sample(xrays) + 2 * stack[0].nbytes
                 for rays in _slices(len(sweep.pixels), together):
                     part = sweep.part(rays)
                     values = (images[:, k, part.pixels] * part.length)[None, :, None]
-                    for planes in _slices(len(stack), max(1, self._samples(xrays) // together)):
+                    for planes in _slices(len(stack), max(1, self.memory // plane)):
                         stack[planes] += _scatter(values, part.positions(planes, len(stack)), stack[planes])
         return mu
 
     def _samples(self, like: torch.Tensor) -> int:
-        """How many samples of every case fit the working memory: a position, its making, and the values."""
-        return max(1, self.memory // ((6 + 2 * len(like)) * like.itemsize))
+        """How many samples, of every case, fit the working memory."""
+        return max(1, self.memory // self._sample(like))
+
+    @staticmethod
+    def _sample(like: torch.Tensor) -> int:
+        """Bytes of a sample of every case: its position, the making of it, and the values."""
+        return (6 + 2 * len(like)) * like.itemsize
 
     def _on(self, like: torch.Tensor) -> list[list[Sweep]]:
         """The rays in the precision and on the device of `like`, made once."""

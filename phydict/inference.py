@@ -119,9 +119,9 @@ class ReconstructionTask(lightning.LightningModule):
 
     def _reconstruct(self, case: dict) -> Reconstruction:
         case["report"] = case["report"] if self.trainer.datamodule.with_report else ""
-        xrays, projector = fit_to_grid(self.reconstructor, self.grid, case["xrays"], case["beam"])
+        xrays, projector = fit_to_grid(self.reconstructor, self.grid, case["xrays"].to(self.device), case["beam"])
         self.progress.case(case["id"])
-        return self.reconstructor.reconstruct(xrays.to(self.device), projector, case["report"],
+        return self.reconstructor.reconstruct(xrays, projector, case["report"],
                                               case.get("display", False), self._seed(case), self.progress.advance)
 
     def _finish(self, case: dict, result: Reconstruction, scores: dict | None = None,

@@ -12,7 +12,7 @@ from phydict.grid import Grid
 from phydict.posterior import GradientSteps, Posterior, PriorOnly, ProximalCG, Reward, Sampler, SplitGibbs
 from phydict.prior import Prior, load_prior
 from phydict.reconstructor import Reconstruction, Reconstructor, check_xrays
-from phydict.xray import ConeBeam, Projector
+from phydict.xray import ConeBeam, Projector, binned, binning
 
 DEFAULT_PRIOR = Path(__file__).parents[1] / "data" / "prior" / "phydict_64.safetensors"
 """The prior that comes with the project."""
@@ -46,31 +46,16 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: Prior | str | Pa
     return Posterior(prior, method, guidance, name=name)
 
 
-def binning(grid: Grid, beam: ConeBeam) -> int:
-    """The largest whole factor by which the detector may be binned while its pixels, seen at the grid's centre, stay
-    below 0.7 voxels; finer pixels cost time and carry nothing that the grid can hold."""
-    to_detector = beam.detectors - beam.sources
-    depth = ((grid.centre - beam.sources) * to_detector).sum(1) / (to_detector**2).sum(1)
-    pixel = max(float((abs(step**2).sum(1) ** 0.5 * depth).max()) for step in (beam.u, beam.v))
-    limit = 0.7 * min(grid.spacing) / pixel
-    factors = [f for f in range(1, max(int(limit), 1) + 1) if all(n % f == 0 for n in beam.shape)]
-    return factors[-1]
-
-
-def binned(xrays: Tensor, factor: int) -> Tensor:
-    """X-rays (K, V, U) averaged over blocks of `factor`^2 pixels."""
-    return torch.nn.functional.avg_pool2d(xrays[None], factor)[0] if factor > 1 else xrays
-
-
 def fit_to_grid(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam) -> tuple[Tensor, Projector]:
-    """X-rays (K, V, U), binned unless the method wants the full detector, and the projector that goes with them.
+    """X-rays (K, V, U), binned unless the method wants the full detector, and the projector that goes with them on the
+    X-rays' device.
 
     Raises ValueError where X-rays, geometry and grid do not fit.
     """
     check_xrays(xrays, beam)
     beam.check(grid)
     factor = 1 if ready.full_detector else binning(grid, beam)
-    return binned(xrays.float(), factor), Projector(grid, beam.binned(factor))
+    return binned(xrays.float(), factor), Projector(grid, beam.binned(factor), device=xrays.device, full_detector=True)
 
 
 def reconstruct(xrays: Tensor, beam: ConeBeam, prior: Prior | str | Path | None = None,

@@ -89,7 +89,7 @@ class ReconstructionData(lightning.LightningDataModule):
         """X-rays (K, V, U) of a CT case."""
         source = case.get("source", case["volume"])
         fine = Grid.cube(source.shape[-1], grid.extent[0])
-        return self.simulator(Projector(fine, self.beam), window.to_mu(source)[None], seed)[0]
+        return self.simulator(Projector(fine, self.beam, full_detector=True), window.to_mu(source)[None], seed)[0]
 
     def _with_source(self, task: lightning.LightningModule, make: Callable[[Grid], dict]) -> dict:
         """A case, and under "source" the volume its X-rays are simulated from where that is another one."""

@@ -1,8 +1,9 @@
 """The physics: where the X-rays pass, what they measure, and the exact adjoint of measuring it."""
 
 from phydict.grid import Grid
+from phydict.xray.binning import binned, binning
 from phydict.xray.geometry import ConeBeam
 from phydict.xray.projector import Projector
 from phydict.xray.simulate import Ideal
 
-__all__ = ["ConeBeam", "Grid", "Ideal", "Projector"]
+__all__ = ["ConeBeam", "Grid", "Ideal", "Projector", "binned", "binning"]

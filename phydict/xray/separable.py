@@ -66,10 +66,13 @@ class Rays(NamedTuple):
         corners = np.einsum("kna,ka->kn", grid.corners() - beam.sources[:, None], beam.normals)
         half = np.ceil((np.ptp(corners, 1) / 2 + max(grid.spacing[:2])) / step)
         first = (corners.min(1) + corners.max(1)) / 2 + (0.5 - half) * step
+        behind = np.ceil((-first / step).clip(min=0))  # the volume reaches a voxel beyond its box, a ray to its ends
+        first = first + behind * step
+        count = np.minimum(2 * half - behind, np.floor((beam.distances - first) / step) + 1)
 
         squares = (column**2).sum(2) - (column @ axis)**2
         return Rays(grid.index(beam.sources), np.concatenate([in_plane, squares[..., None]], 2),
-                    np.stack([axial, height], 2), np.stack([first / beam.distances, step / beam.distances, 2 * half], 1))
+                    np.stack([axial, height], 2), np.stack([first / beam.distances, step / beam.distances, count], 1))
 
 
 class Separable:

@@ -6,11 +6,11 @@ whose intermediate (column, depth, axial) values fit the cache.
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 import torch
 from scipy.sparse import csr_array
+
+from phydict.xray.csr import csr_tensor
 
 BLOCK_VALUES = 2**20
 """Intermediate values per block of columns (4 MiB in float32)."""
@@ -54,8 +54,8 @@ class SparseFactors:
         key = like.dtype, like.device
         if key not in self._tables:
             self._tables[key] = [
-                ([(columns, _tensor(gather, like), _tensor(gather.T, like)) for columns, gather in blocks],
-                 _tensor(axial, like), _tensor(axial.T, like), torch.as_tensor(weight).to(like))
+                ([(columns, csr_tensor(gather, like), csr_tensor(gather.T, like)) for columns, gather in blocks],
+                 csr_tensor(axial, like), csr_tensor(axial.T, like), torch.as_tensor(weight).to(like))
                 for blocks, axial, weight in self._views]
         return self._tables[key]
 
@@ -97,13 +97,3 @@ def _matrix(rows: np.ndarray, entries: list[tuple[np.ndarray, np.ndarray]], shap
     weights = np.concatenate([weight.ravel() for _, weight in entries])
     kept = weights > 0
     return csr_array((weights[kept], (rows[kept], columns[kept])), shape=shape)
-
-
-def _tensor(matrix, like: torch.Tensor) -> torch.Tensor:
-    matrix = matrix.tocsr()
-    matrix.sort_indices()
-    index = [torch.as_tensor(part.astype(np.int32)) for part in (matrix.indptr, matrix.indices)]
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Sparse CSR tensor support is in beta state")
-        return torch.sparse_csr_tensor(*index, torch.as_tensor(matrix.data).to(like.dtype), matrix.shape,
-                                       device=like.device, check_invariants=False)

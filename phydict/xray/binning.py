@@ -1,0 +1,25 @@
+"""Detectors finer than a grid can use, and the binning that makes them fit."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from phydict.grid import Grid
+from phydict.xray.geometry import ConeBeam
+
+
+def binning(grid: Grid, beam: ConeBeam) -> int:
+    """The largest whole factor by which the detector may be binned while its pixels, seen at the grid's centre, stay
+    below 0.7 voxels; finer pixels cost time and carry nothing that the grid can hold."""
+    to_detector = beam.detectors - beam.sources
+    depth = ((grid.centre - beam.sources) * to_detector).sum(1) / (to_detector**2).sum(1)
+    pixel = max(float((abs(step**2).sum(1) ** 0.5 * depth).max()) for step in (beam.u, beam.v))
+    limit = 0.7 * min(grid.spacing) / pixel
+    factors = [f for f in range(1, max(int(limit), 1) + 1) if all(n % f == 0 for n in beam.shape)]
+    return factors[-1]
+
+
+def binned(xrays: Tensor, factor: int) -> Tensor:
+    """X-rays (K, V, U) averaged over blocks of `factor`^2 pixels."""
+    return torch.nn.functional.avg_pool2d(xrays[None], factor)[0] if factor > 1 else xrays

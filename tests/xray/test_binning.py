@@ -1,0 +1,56 @@
+"""Detectors finer than a grid can use: the binning that is suggested, and what it does to the views."""
+
+import numpy as np
+import pytest
+import torch
+from laws import random_like
+
+from phydict.units import MU_WATER
+from phydict.xray import ConeBeam, Grid, Projector, binned, binning
+
+GRID = Grid.cube(64)
+DEFAULT = ConeBeam.orbit(8, 1020, 740, (448, 448), 1.25)
+
+
+@pytest.mark.parametrize("grid", [GRID, Grid.cube(128), Grid.cube(16), Grid((64, 64, 32), (6.0, 6.0, 12.0))])
+@pytest.mark.parametrize("beam", [
+    DEFAULT, ConeBeam.orbit(2, 1500, 1000, (450, 300), (1.0, 0.7)), ConeBeam.orbit(2, 1020, 740, (7, 7), 80.0),
+    ConeBeam.orbit(2, 1020, 740, (449, 449), 1.25)])
+def test_binned_pixels_stay_below_seven_tenths_of_a_voxel_at_the_isocentre_and_fill_the_detector(grid, beam):
+    factor = binning(grid, beam)
+    magnification = beam.distances / np.linalg.norm(beam.sources, axis=1)
+    largest = max(np.linalg.norm(step, axis=1).max() for step in (beam.u, beam.v)) / magnification.max()
+    assert all(n % factor == 0 for n in beam.shape)
+    beam.binned(factor)
+    assert factor == 1 or factor * largest <= 0.7 * min(grid.spacing) * (1 + 1e-9)
+    finer = [f for f in range(factor + 1, min(beam.shape) + 1) if all(n % f == 0 for n in beam.shape)]
+    assert all(f * largest > 0.7 * min(grid.spacing) for f in finer)  # and no larger factor would do
+
+
+def test_the_default_detector_is_binned_to_the_default_grid():
+    assert binning(GRID, DEFAULT) == 4
+    assert binning(GRID, DEFAULT.binned(4)) == 1
+
+
+def test_binning_looks_at_the_grids_centre():
+    moved = GRID.affine.copy()
+    moved[1, 3] -= 400  # nearer to the source of the PA view: more magnified, so finer pixels
+    beam = DEFAULT.select([0])
+    assert binning(Grid(GRID.shape, affine=moved), beam) > binning(GRID, beam)
+
+
+@pytest.mark.parametrize("factor", [1, 2, 4])
+def test_binning_keeps_the_mean_of_every_block(factor):
+    y = random_like((3, 8, 12), seed=1)
+    small = binned(y, factor)
+    assert small.shape == (3, 8 // factor, 12 // factor)
+    torch.testing.assert_close(small.mean((1, 2)), y.mean((1, 2)))
+    torch.testing.assert_close(small[1, 1, 2], y[1, factor:2 * factor, 2 * factor:3 * factor].mean())
+
+
+def test_binning_views_and_beam_together_measures_the_same():
+    grid = Grid.cube(16)
+    beam = ConeBeam.orbit(2, 1020, 740, (56, 56), 10.0)
+    mu = MU_WATER * random_like((1, 1, 16, 16, 16)).abs()
+    fine, coarse = Projector(grid, beam, full_detector=True)(mu)[0], Projector(grid, beam.binned(2))(mu)[0]
+    assert (binned(fine, 2) - coarse).norm() < 0.02 * coarse.norm()

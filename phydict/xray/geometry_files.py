@@ -1,9 +1,9 @@
-"""Geometry files of other programs: RTK's XML, ASTRA's cone vectors and tables with named columns, to and from ConeBeam.
+"""Geometry files of other programs to and from ConeBeam: RTK's XML, ASTRA's cone vectors, tables with named columns.
 
     .yaml .yml   ours (ConeBeam.load)
     .xml         RTK's circular geometry (phydict.xray.rtk)
-    .npy         ASTRA's cone_vec, (views, 12): source, detector centre, u, v; u leads from one column to the next, v from
-                 one row to the next
+    .npy         ASTRA's cone_vec, (views, 12): source, detector centre, u, v; u leads from one column to the next, v
+                 from one row to the next
     .csv .txt    a header that names the columns of COLUMNS in any order, or without a header the numbers of cone_vec
 
 Vectors are taken as world millimetres, RAS+: where another program's axes differ, turn them first.
@@ -46,8 +46,8 @@ def read_beam(path: str | Path, shape: tuple[int, int] | None = None,
         return read_rtk(path, shape, pixel)
     vectors = _read_npy(path) if ending == ".npy" else _read_table(path)
     if vectors.ndim != 2 or vectors.shape[1] != 12 or not len(vectors):
-        raise ValueError(f"{path} holds numbers of shape {vectors.shape}, but 12 per view were expected: source, detector "
-                         "centre, u and v")
+        raise ValueError(f"{path} holds numbers of shape {vectors.shape}, but 12 per view were expected: source, "
+                         "detector centre, u and v")
     try:
         return ConeBeam(*np.split(vectors, 4, axis=1), shape)
     except ValueError as error:

@@ -100,8 +100,9 @@ def _pose(path, view: int, values: dict[str, float]) -> tuple[np.ndarray, ...]:
         raise ValueError(f"{path}: view {view} has no {', '.join(missing)}; state every distance and angle")
     isocentre, detector = (values[name] for name in NEEDED[:2])
     if not (isocentre > 0 and detector > 0):
-        raise ValueError(f"{path}: view {view} has SourceToIsocenterDistance {isocentre:g} and SourceToDetectorDistance "
-                         f"{detector:g} mm, but both must be positive; RTK's parallel geometry (0) is not supported")
+        raise ValueError(f"{path}: view {view} has SourceToIsocenterDistance {isocentre:g} mm and "
+                         f"SourceToDetectorDistance {detector:g} mm, but both must be positive; a parallel geometry, "
+                         "which RTK writes as 0, has no cone beam")
     axes = _rotation(values) @ FIXED_TO_RAS.T
     source = np.array([values["SourceOffsetX"], values["SourceOffsetY"], isocentre]) @ axes
     centre = np.array([values["ProjectionOffsetX"], values["ProjectionOffsetY"], isocentre - detector]) @ axes
@@ -123,8 +124,8 @@ def _parameters(beam: ConeBeam, k: int) -> tuple[dict[str, float], np.ndarray]:
     u, v = beam.u[k] / np.linalg.norm(beam.u[k]), beam.v[k] / np.linalg.norm(beam.v[k])
     normal = np.cross(u, v)
     if (beam.detectors[k] - beam.sources[k]) @ normal > 0:
-        raise ValueError(f"view {k}: u x v points away from the source, so its images are mirrored, which RTK's geometry "
-                         "cannot say; flip their columns and change the sign of u")
+        raise ValueError(f"view {k}: u x v points away from the source, so its images are mirrored, which RTK's "
+                         "geometry cannot say; flip their columns and change the sign of u")
     rotation = np.stack([u, v, normal]) @ FIXED_TO_RAS
     source, centre = (rotation @ FIXED_TO_RAS.T @ point for point in (beam.sources[k], beam.detectors[k]))
     out_of_plane = math.asin(np.clip(-rotation[2, 1], -1, 1))

@@ -11,7 +11,8 @@ import torch
 import yaml
 from PIL import Image
 
-from phydict.datasets.radiographs import Intensity, find_xrays, load_xrays, save_xrays
+from phydict.datasets.intensity import Intensity
+from phydict.datasets.radiographs import find_xrays, load_xrays, save_xrays
 from phydict.xray.geometry import ConeBeam
 
 SHAPE = (6, 5)

@@ -44,7 +44,9 @@ def agreement(xray: np.ndarray, thorax: np.ndarray) -> str:
     found = {name: _correlation(xray[::rows, ::columns], thorax) for name, (rows, columns) in FLIPS.items()}
     best = max(found, key=found.get)
     said = f"agreement {found['as it is']:.2f}"
-    return f"{said}, better ({found[best]:.2f}) by {best}" if found[best] > found["as it is"] + CLEAR else said
+    if found[best] <= found["as it is"] + CLEAR:
+        return said
+    return f"{said}, better ({found[best]:.2f}) with {best} changed"
 
 
 def geometry_page(path: str | Path, beam: ConeBeam, grid: Grid, xrays: np.ndarray, thorax: np.ndarray,
@@ -75,7 +77,7 @@ def geometry_page(path: str | Path, beam: ConeBeam, grid: Grid, xrays: np.ndarra
             ax.imshow(image, "gray", interpolation="nearest",
                       aspect=float(np.linalg.norm(beam.v[k]) / np.linalg.norm(beam.u[k])))
             ax.set(xticks=[], yticks=[])
-        bottom.set_xlabel(agreement(xrays[k], thorax[k]).replace(", ", ",\n").replace(" by ", "\nby "), fontsize=8)
+        bottom.set_xlabel(agreement(xrays[k], thorax[k]).replace(", ", ",\n").replace(" with ", "\nwith "), fontsize=8)
     cells[0, 0].set_ylabel("your X-rays", fontsize=9)
     cells[1, 0].set_ylabel("a standard thorax", fontsize=9)
     Path(path).parent.mkdir(parents=True, exist_ok=True)
@@ -98,7 +100,8 @@ def _draw(ax: Axes, beam: ConeBeam, grid: Grid, thorax_hu: np.ndarray, name: str
         ax.annotate(str(k + 1), beam.sources[k, seen], xytext=(5, 5), textcoords="offset points", fontsize=8)
     every = np.concatenate([beam.pixels()[:, ::max(rows - 1, 1), ::max(columns - 1, 1)].reshape(-1, 3), beam.sources,
                             grid.corners()])[:, seen]
-    (left, low), (right, high) = every.min(0) - 60, every.max(0) + 60
+    margin = 0.1 * np.ptp(every, axis=0).max()  # where the letters stand
+    (left, low), (right, high) = every.min(0) - margin, every.max(0) + margin
     ax.set(xlim=(right, left), ylim=(low, high), aspect="equal", xlabel="mm", ylabel="mm", title=name)
     ax.tick_params(labelsize=7)
     letters = PLANES[name][1]

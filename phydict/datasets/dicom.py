@@ -166,6 +166,8 @@ def _tags(dataset: pydicom.Dataset, frame: int, name: str) -> DicomTags:
         secondary = secondary or 0.0
     orientation = _find(dataset, frame, "PatientOrientation")
     sign = _number(dataset, frame, "PixelIntensityRelationshipSign", name)
+    if sign and (_number(dataset, frame, "RescaleSlope", name) or 1) < 0:
+        sign = -sign  # the tag speaks of stored values
     return DicomTags(
         name, to_detector, to_isocentre, None if pixel is None else tuple(float(p) for p in pixel), primary, secondary,
         None if orientation is None else tuple(str(o) for o in orientation), angiographic,
@@ -201,16 +203,25 @@ def _per_frame(overrides: dict, frames: int) -> dict[str, list]:
         raise ValueError(f"unknown key {', '.join(unknown)} in `dicom:`; the keys are {', '.join(OVERRIDES)}")
     stated = {}
     for name, value in overrides.items():
-        if name == "pixel":
-            values = np.broadcast_to(np.asarray(value, float), (frames, 2)).tolist()
-        elif isinstance(value, list):
-            values = value
-        else:
-            values = [value] * frames
+        alone = not isinstance(value, list) or (name == "pixel" and not any(isinstance(part, list) for part in value))
+        values = [value] * frames if alone else value
         if len(values) != frames:
             raise ValueError(f"`{name}` in `dicom:` has {len(values)} values for {frames} views; give one, or one each")
-        stated[name] = values
+        stated[name] = [_stated(name, value) for value in values]
     return stated
+
+
+def _stated(name: str, value):
+    """One frame's value of an override. Raises ValueError where it is of the wrong kind."""
+    if name == "patient_orientation":
+        if not isinstance(value, str):
+            raise ValueError(f"`{name}` in `dicom:` is a text such as 'L\\F', but {value!r} was given")
+        return value
+    try:
+        return tuple(np.broadcast_to(np.asarray(value, float), 2).tolist()) if name == "pixel" else float(value)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"`{name}` in `dicom:` needs {'[row height, column width]' if name == 'pixel' else 'a number'}, "
+                         f"but {value!r} was given") from error
 
 
 def _pose(tags: DicomTags, stated: dict, turned: bool) -> tuple[np.ndarray, ...]:

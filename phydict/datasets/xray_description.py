@@ -131,5 +131,7 @@ def _check_beam(path: Path, beam) -> None:
         unknown = [repr(name) for name in beam or {} if key in beam and name not in allowed]
         if unknown:
             raise ValueError(f"{path}: unknown key {', '.join(unknown)} in `beam:`; the keys are {', '.join(allowed)}")
+    if beam and not isinstance(beam.get("file", ""), str):
+        raise ValueError(f"{path}: `file:` is the name of a geometry file, but {beam['file']!r} was found")
     if beam and not isinstance(beam.get("dicom", {}), dict):
         raise ValueError(f"{path}: `dicom:` must be a mapping, but {beam['dicom']!r} was found")

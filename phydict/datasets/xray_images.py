@@ -26,6 +26,8 @@ def image_files(folder: Path) -> list[Path]:
 
 def is_dicom(path: Path) -> bool:
     """Whether a file's name or its first bytes say that it is DICOM."""
+    if path.name == "DICOMDIR":  # the index of a disc
+        return False
     if path.name.lower().endswith(DICOM):
         return True
     with path.open("rb") as stream:

@@ -43,7 +43,12 @@ def read_rtk(path: str | Path, shape: tuple[int, int], pixel: float | tuple[floa
     if root.tag != ROOT or root.get("version") not in ("2", "3"):
         raise ValueError(f"{path} holds <{root.tag} version={root.get('version')}>, but RTK's <{ROOT}> of version 2 or "
                          "3 was expected; write it again with a current RTK")
-    height, width = np.broadcast_to(np.asarray(pixel, float), 2)
+    try:
+        height, width = np.broadcast_to(np.asarray(pixel, float), 2)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"pixel must be (row height, column width) in mm, but {pixel} was given") from error
+    if not (height > 0 and width > 0):
+        raise ValueError(f"pixel must be (row height, column width) > 0 in mm, but {pixel} was given")
     stated = {name: 0.0 for name in PARAMETERS if name not in NEEDED}
     poses = []
     for element in root:

@@ -138,6 +138,8 @@ def test_geometry_yaml_overrides_tags_one_by_one_or_all(tmp_path):
     folder = described(one(tmp_path / "some", **angled(0.0)), beam={"dicom": {
         "source_to_isocentre": 700.0, "primary_degrees": [-90.0]}}, intensity={"kind": "line_integrals"})
     np.testing.assert_allclose(load_xrays(folder)["beam"].sources, [[-700, 0, 0]], atol=1e-9)
+    described(folder, beam={"dicom": {"pixel": [7, 8], "patient_orientation": "R\\F"}})
+    np.testing.assert_allclose(load_xrays(folder, intensity=LINES)["beam"].u, [[8, 0, 0]], atol=1e-9)
     beam = ConeBeam.orbit(1, 900, 600, SHAPE, 50)
     folder = described(one(tmp_path / "all"), beam=beam.to_dict(), intensity={"kind": "line_integrals"})
     assert load_xrays(folder)["beam"].same_as(beam)
@@ -227,6 +229,10 @@ def test_wrong_overrides_are_explained(tmp_path):
     fails("unknown key 'sod' in `dicom:`", described(folder, beam={"dicom": {"sod": 3}}), intensity=LINES)
     fails("`primary_degrees` in `dicom:` has 2 values for 1 views",
           described(folder, beam={"dicom": {"primary_degrees": [0, 1]}}), intensity=LINES)
+    fails("`source_to_detector` in `dicom:` needs a number, but 'far'",
+          described(folder, beam={"dicom": {"source_to_detector": "far"}}), intensity=LINES)
+    fails(r"`pixel` in `dicom:` needs .row height, column width., but",
+          described(folder, beam={"dicom": {"pixel": [1, 2, 3]}}), intensity=LINES)
     fails("unknown key 'orbit' in `beam:`", described(folder, beam={"dicom": {}, "orbit": {}}), intensity=LINES)
 
 
@@ -238,6 +244,12 @@ def test_files_that_are_no_grey_dicom_image_are_named(tmp_path):
     path.write_bytes(path.read_bytes()[:-20])
     fails("a.dcm cannot be read", tmp_path / "b", intensity=LINES)
     fails("3 colours", one(tmp_path / "c", **angled(0.0), SamplesPerPixel=3), intensity=LINES)
+
+
+def test_the_index_of_a_disc_is_no_view(tmp_path):
+    one(tmp_path, **angled(0.0))
+    (tmp_path / "DICOMDIR").write_bytes(bytes(128) + b"DICM")
+    assert len(load_xrays(tmp_path, intensity=LINES)["xrays"]) == 1
 
 
 def test_dicom_and_other_images_are_not_mixed(tmp_path):

@@ -150,6 +150,13 @@ def test_a_bad_table_is_explained(tmp_path, name, text, sentence):
         read_beam(tmp_path / name, SHAPE, PIXEL)
 
 
+@pytest.mark.parametrize("pixel", [(2.0, -3.0), 0.0, "small"])
+def test_an_impossible_pixel_size_is_refused(tmp_path, pixel):
+    write_beam(tmp_path / "beam.xml", orbit())
+    with pytest.raises(ValueError, match="pixel must be .row height, column width."):
+        read_beam(tmp_path / "beam.xml", SHAPE, pixel)
+
+
 def test_what_a_file_does_not_say_must_be_stated(tmp_path):
     write_beam(tmp_path / "beam.xml", orbit())
     with pytest.raises(ValueError, match="how many pixels.*`shape`"):

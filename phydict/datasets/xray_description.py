@@ -3,22 +3,24 @@
     beam: {orbit: {...}}                               ConeBeam's YAML, which may also stand at the top level
     beam: {file: geometry.xml, pixel: [1.25, 1.25]}    a file that phydict.xray.geometry_files reads, beside this one;
                                                        pixel is for RTK's XML alone
-    beam: {dicom: {source_to_isocentre: 765.0}}        values used instead of DICOM's tags; see phydict.datasets.dicom
+    beam: {dicom: {source_to_isocentre: 765.0}}        values used instead of tags; see phydict.datasets.dicom_beam
     intensity: {kind: counts, air: 50000}              see phydict.datasets.intensity
     orientation: {rotate_degrees: 0, flip_rows: false, flip_columns: false}
 
-Without `beam:` the tags of DICOM images decide. Rotation is clockwise, in quarters, and comes before the flips.
+Without `beam:` the tags of DICOM images decide. Rotation is clockwise, in quarters, and comes before the flips. The
+beam, wherever it comes from, is that of the images once they are turned.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import yaml
 
-from phydict.datasets.dicom import DicomTags, tags_beam
+from phydict.datasets.dicom import DicomTags
+from phydict.datasets.dicom_beam import tags_beam
 from phydict.datasets.intensity import KINDS, Intensity
 from phydict.xray.geometry import ConeBeam
 from phydict.xray.geometry_files import read_beam
@@ -63,7 +65,7 @@ class Description:
     source: Path
     beam: dict | None = None
     intensity: Intensity | None = None
-    orientation: Orientation = field(default_factory=Orientation)
+    orientation: Orientation = Orientation()
 
     def beam_of(self, shape: tuple[int, int], tags: list[DicomTags]) -> ConeBeam:
         """The beam for images of `shape` (V, U), turned, and their DICOM tags, if any. Raises ValueError."""

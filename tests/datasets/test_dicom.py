@@ -84,7 +84,7 @@ def test_the_detector_stands_where_the_positioner_angles_say(tmp_path, primary, 
 
 def test_files_of_single_frames_keep_their_own_angles_in_natural_order(tmp_path):
     for k, primary in enumerate(range(0, 330, 30)):
-        write_dicom(tmp_path / f"IM{k}", np.full(SHAPE, k, np.uint16), **angled(float(-primary)))  # names without ending
+        write_dicom(tmp_path / f"IM{k}", np.full(SHAPE, k, np.uint16), **angled(float(-primary)))  # no ending
     case = load_xrays(find_xrays(tmp_path)[0], intensity=LINES)
     assert case["xrays"][:, 0, 0].tolist() == list(range(11))
     assert case["beam"].same_as(ConeBeam.orbit(12, 1020, 740, SHAPE, PIXEL).select(slice(11)), 1e-6)
@@ -126,6 +126,14 @@ def test_a_radiograph_is_placed_by_view_position_and_patient_orientation(tmp_pat
     np.testing.assert_allclose(beam.sources[0], 1500 * np.array(source), atol=1e-9)  # 1800 mm / 1.2
     np.testing.assert_allclose(beam.u[0], 80 * np.array(u), atol=1e-9)
     np.testing.assert_allclose(beam.v[0], [0, 0, -70], atol=1e-9)
+
+
+def test_a_magnification_goes_with_a_stated_detector_distance(tmp_path):
+    tags = {name: value for name, value in DX.items() if name != "DistanceSourceToDetector"}
+    folder = one(tmp_path, None, "DX", **tags)
+    fails(r"a.dcm lacks DistanceSourceToDetector \(0018,1110\), so", folder, intensity=LINES)
+    described(folder, beam={"dicom": {"source_to_detector": 1200}})
+    np.testing.assert_allclose(load_xrays(folder, intensity=LINES)["beam"].sources, [[0, -1000, 0]], atol=1e-9)
 
 
 def test_a_turned_image_keeps_its_rows_and_columns(tmp_path):
@@ -171,8 +179,8 @@ def test_monochrome1_turns_what_is_shown_and_leaves_quantities_alone(tmp_path):
 
 @pytest.mark.parametrize("sign, photometric", [(-1, "MONOCHROME2"), (1, "MONOCHROME1"), (-1, "MONOCHROME1")])
 def test_log_images_are_display_values_that_grow_with_density(tmp_path, sign, photometric):
-    case = load_xrays(one(tmp_path, **angled(0.0), PixelIntensityRelationship="LOG", PixelIntensityRelationshipSign=sign,
-                          PhotometricInterpretation=photometric))
+    case = load_xrays(one(tmp_path, **angled(0.0), PixelIntensityRelationship="LOG",
+                          PixelIntensityRelationshipSign=sign, PhotometricInterpretation=photometric))
     stored = torch.from_numpy(counts()[0].astype(np.float32))
     assert case["display"]
     assert np.corrcoef(case["xrays"].flatten(), stored.flatten())[0, 1] == pytest.approx(-sign)  # sign 1: bright is air

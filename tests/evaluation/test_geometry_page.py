@@ -25,7 +25,8 @@ def thorax():
 
 @pytest.mark.parametrize("direction, said", [
     ((1, 0, 0), "right"), ((-3, 0, 0), "left"), ((0, 2, 0), "anterior"), ((0, -1, 0.2), "posterior"),
-    ((0, 0, 5), "superior"), ((0, 0, -1), "inferior"), ((-1, -2, 0), "posterior left"), ((0.5, 0.1, -1), "inferior right")])
+    ((0, 0, 5), "superior"), ((0, 0, -1), "inferior"), ((-1, -2, 0), "posterior left"),
+    ((0.5, 0.1, -1), "inferior right")])
 def test_a_direction_is_called_by_the_side_it_points_to(direction, said):
     assert body_side(direction) == said
 

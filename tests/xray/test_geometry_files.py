@@ -48,7 +48,8 @@ def test_what_is_written_is_read_back(tmp_path, make, ending):
 
 
 def test_rtk_gantry_angles_follow_iec_61217_for_a_supine_patient(tmp_path):
-    beam = read_beam(rtk(tmp_path, [f"<GantryAngle>{angle}</GantryAngle>" for angle in (0, 90, 180, 270)]), SHAPE, PIXEL)
+    views = [f"<GantryAngle>{angle}</GantryAngle>" for angle in (0, 90, 180, 270)]
+    beam = read_beam(rtk(tmp_path, views), SHAPE, PIXEL)
     anterior, left, posterior, right = [0, 740, 0], [-740, 0, 0], [0, -740, 0], [740, 0, 0]
     np.testing.assert_allclose(beam.sources, [anterior, left, posterior, right], atol=1e-9)
     np.testing.assert_allclose(beam.detectors, -280 / 740 * beam.sources, atol=1e-9)

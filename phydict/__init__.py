@@ -9,6 +9,7 @@
     baselines        reconstruction without a prior                                 yardsticks
     evaluation       metrics, tables, picture panels                                scores
     methods          the named methods, and `reconstruct` in one call
+    dry_run         geometry drawn before anything is reconstructed
     training, inference, datamodule                                                 Lightning
 """
 

@@ -1,6 +1,7 @@
 """Reconstruction with Lightning: pairs with infer.py.
 
-predict: X-ray folders -> volumes. test: CTs or phantoms -> simulated X-rays -> volumes -> scores.
+predict: X-ray folders -> volumes, or with --dry_run pages that show their geometry, and nothing else.
+test: CTs or phantoms -> simulated X-rays -> volumes -> scores.
 Each finished case is one folder of the output; a run that was stopped goes on where it was.
 """
 
@@ -26,6 +27,7 @@ from rich.console import Console
 from torch import Tensor
 
 from phydict.command_line import one_sentence_errors, quiet
+from phydict.dry_run import dry_run
 from phydict.evaluation import CaseMetrics, markdown, panel, rich_table, volume_metrics, write_csv
 from phydict.grid import Grid
 from phydict.methods import DEFAULT_PRIOR, fit_to_grid, reconstructor
@@ -52,6 +54,7 @@ class ReconstructionTask(lightning.LightningModule):
                  guidance: float = 2.0, out: str = "runs/reconstructions", overwrite: bool = False, seed: int = 0):
         super().__init__()
         self.method_name, self.folder, self.overwrite, self.seed = name, Path(out) / name, overwrite, seed
+        self.pages = Path(out) / "dry_run"
         check_writable(self.folder)
         self.settings = {"name": name, "seed": seed, "method": describe(method)}
         self.grid, self.window = Grid.cube(64), HUWindow()
@@ -206,8 +209,24 @@ class InferenceCLI(LightningCLI):
         unused = {"model", "dataloaders", "datamodule", "ckpt_path", "weights_only"}
         return {"predict": unused | {"return_predictions"}, "test": unused | {"verbose"}}
 
+    def _prepare_subcommand_parser(self, klass: type, subcommand: str, **kwargs):
+        parser = super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
+        if subcommand == "predict":
+            parser.add_argument("--dry_run", action="store_true",
+                                help="draw the geometry of every case and reconstruct nothing")
+        return parser
+
+    @property
+    def dry_run(self) -> bool:
+        """Whether the geometry is drawn and nothing reconstructed."""
+        return bool(self._get(self.config, "dry_run", False))
+
     def predict(self, model: ReconstructionTask, datamodule: ReconstructionData) -> None:
-        """Reconstruct X-rays."""
+        """Reconstruct X-rays, or draw their geometry."""
+        if self.dry_run:
+            for name, load in datamodule.xray_cases():
+                print(*dry_run(model.pages / f"{name}.png", load() | {"id": name}, model.grid), sep="\n")
+            return
         with model.progress:
             self.trainer.predict(model, datamodule=datamodule, return_predictions=False)
 
@@ -227,5 +246,8 @@ def main(args: list[str] | None = None) -> None:
                               "enable_checkpointing": False, "enable_model_summary": False, "accelerator": "auto",
                               "devices": 1})
         if cli.trainer.is_global_zero:
+            if cli.dry_run:
+                print(f"pages in {cli.model.pages}")
+                return
             cli.model.summarise()
             print(f"results in {cli.model.folder}")

@@ -54,6 +54,7 @@ def fit_to_grid(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam)
     """
     check_xrays(xrays, beam)
     beam.check(grid)
+    beam.check_scale(grid)
     factor = 1 if ready.full_detector else binning(grid, beam)
     return binned(xrays.float(), factor), Projector(grid, beam.binned(factor), device=xrays.device, full_detector=True)
 

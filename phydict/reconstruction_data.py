@@ -36,7 +36,7 @@ class Listed(Dataset):
 class ReconstructionData(lightning.LightningDataModule):
     """What to reconstruct.
 
-    xrays: for predict, a folder of X-ray images with geometry.yaml, or a folder of such folders; geometry: a YAML
+    xrays: for predict, a folder of X-ray images with geometry.yaml, or a folder of such folders; geometry: a geometry
     file used instead of theirs. cts: for test, a NIfTI file or a folder of CTs, or the word phantom; reports, metadata,
     fixed: as for training; phantoms: how many phantoms; with_report: whether the cases' reports are used.
     views, source_to_detector, source_to_isocentre (mm), detector (rows, columns), pixel (mm): the simulated orbit;
@@ -65,11 +65,15 @@ class ReconstructionData(lightning.LightningDataModule):
         return {"with_report": self.with_report, **self.orbit, "simulator": describe(self.simulator),
                 "simulation_voxels": self.simulation_voxels}
 
-    def predict_dataloader(self) -> DataLoader:
+    def xray_cases(self) -> list[tuple]:
+        """(id, function that loads the Case) of every folder of X-rays. Raises ValueError without data.xrays."""
         if not self.xrays:
             raise ValueError("predict needs data.xrays: a folder of X-ray images with geometry.yaml")
-        return self._loader([(Path(os.path.abspath(folder)).name, lambda f=folder: load_xrays(f, self.geometry))
-                             for folder in find_xrays(self.xrays)])
+        return [(Path(os.path.abspath(folder)).name, lambda f=folder: load_xrays(f, self.geometry))
+                for folder in find_xrays(self.xrays)]
+
+    def predict_dataloader(self) -> DataLoader:
+        return self._loader(self.xray_cases())
 
     def test_dataloader(self) -> DataLoader:
         if not self.cts:

@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
@@ -25,7 +26,7 @@ FLOORS = {
     "xray": 1, "diffusion": 1,
     "prior": 2, "datasets": 2, "reconstructor": 2,
     "posterior": 3, "baselines": 3, "evaluation": 3,
-    "methods": 4, "datamodule": 4, "reconstruction_data": 4, "training": 4, "inference": 4}
+    "methods": 4, "dry_run": 4, "datamodule": 4, "reconstruction_data": 4, "training": 4, "inference": 4}
 LIGHTNING = ("datamodule", "reconstruction_data", "training", "inference")
 CONFIGS = {folder: sorted((ROOT / "configs" / folder).glob("*.yaml"))
            for folder in ("prior", "reconstruct", "geometry")}
@@ -122,7 +123,11 @@ def test_every_prior_configuration_builds(tmp_path, monkeypatch, config):
 
 @pytest.mark.parametrize("config", CONFIGS["geometry"], ids=lambda f: f.stem)
 def test_every_geometry_is_read_and_clear_of_the_default_volume(config):
-    ConeBeam.from_dict(yaml.safe_load(config.read_text())["beam"]).check(Grid.cube(64))
+    beam = ConeBeam.from_dict(yaml.safe_load(config.read_text())["beam"])
+    beam.check(Grid.cube(64))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        beam.check_scale(Grid.cube(64))
 
 
 @pytest.mark.parametrize("main, command", [(infer, "predict"), (training.main, "fit")], ids=["infer", "train"])

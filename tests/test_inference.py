@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from dicom_files import orbit_tags, write_dicom
 from PIL import Image
 from safetensors import safe_open
 from safetensors.torch import save_file
@@ -29,6 +30,7 @@ from phydict.posterior import PriorOnly
 from phydict.prior import Prior, VolumeUNet, save_prior
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
+from phydict.xray.geometry_files import write_beam
 
 ROOT = Path(__file__).parents[1]
 CONFIGS = ROOT / "configs" / "reconstruct"
@@ -150,6 +152,54 @@ def test_predict_writes_what_the_library_reconstructs(measured, tmp_path, capsys
     out, err = capsys.readouterr()
     assert out == f"results in {tmp_path / 'sirt'}\n"
     assert [line.split(":")[0] for line in err.splitlines() if not line.startswith("Seed")] == ["sirt", "anna", "bert"]
+
+
+def test_a_dicom_run_gives_the_volume_of_its_npy_twin(measured, tmp_path):
+    xrays = load_xrays(measured / "anna")["xrays"].numpy().astype(np.float64)
+    slope = 2.0**-12  # exact in DICOM's decimal strings and in float32
+    stored = np.rint(xrays / slope).astype(np.uint16)
+    save_xrays(tmp_path / "in" / "npy", stored * slope, BEAM)
+    write_dicom(tmp_path / "in" / "dicom" / "run", stored, RescaleSlope=slope, RescaleIntercept=0.0,
+                **orbit_tags(3, 1020.0, 740.0, (24.0, 24.0)))
+    (tmp_path / "in" / "dicom" / "geometry.yaml").write_text("intensity: {kind: line_integrals}\n")
+    main(sirt("predict", tmp_path / "out", f"--data.xrays={tmp_path / 'in'}"))
+    dicom, npy = (volume(tmp_path / "out" / "sirt" / name) for name in ("dicom", "npy"))
+    assert np.ptp(npy) > 500  # HU
+    np.testing.assert_allclose(dicom, npy, atol=1e-2)
+
+
+def test_rtks_geometry_gives_the_volume_of_our_own(measured, tmp_path):
+    case = load_xrays(measured / "anna")
+    folder = tmp_path / "rtk"
+    save_xrays(folder, case["xrays"], case["beam"])
+    write_beam(folder / "geometry.xml", case["beam"])
+    (folder / "geometry.yaml").write_text("beam: {file: geometry.xml, pixel: [24, 24]}\n")
+    main(sirt("predict", tmp_path / "out", f"--data.xrays={folder}"))
+    expected = reconstruct(case["xrays"], case["beam"], method=SIRT(iterations=3))
+    np.testing.assert_allclose(volume(tmp_path / "out" / "sirt" / "rtk"), expected.volume.numpy(), atol=1e-2)
+
+
+def test_a_dry_run_draws_every_case_and_reconstructs_nothing(measured, tmp_path, capsys):
+    main(sirt("predict", tmp_path, f"--data.xrays={measured}", "--dry_run"))
+    assert names(tmp_path) == ["dry_run"] and names(tmp_path / "dry_run") == ["anna.png", "bert.png"]
+    with Image.open(tmp_path / "dry_run" / "anna.png") as page:
+        assert min(page.size) > 900
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 7 and lines[-1] == f"pages in {tmp_path / 'dry_run'}"
+    assert lines[0].startswith("anna view 1: source posterior, columns to left, rows to inferior; agreement 0.9")
+    assert not any("better" in line for line in lines)
+
+
+def test_a_dry_run_sees_images_that_lie_upside_down(measured, tmp_path, capsys):
+    case = load_xrays(measured / "anna")
+    save_xrays(tmp_path / "case", case["xrays"].flip(1), case["beam"])
+    main(sirt("predict", tmp_path / "out", f"--data.xrays={tmp_path / 'case'}", "--dry_run"))
+    lines = capsys.readouterr().out.splitlines()[:3]
+    assert all("with flip_rows changed" in line for line in lines), lines
+
+
+def test_a_dry_run_belongs_to_predict(tmp_path, capsys):
+    assert "dry_run" in refusal(capsys, phantoms(tmp_path / "out", 1, "--dry_run"))
 
 
 def test_one_folder_of_xrays_is_a_case(measured, tmp_path, monkeypatch):
@@ -323,6 +373,31 @@ def geometry_key(folder: Path) -> Path:
     return folder
 
 
+def change_geometry(folder: Path, **changes) -> Path:
+    """X-rays of nothing whose geometry.yaml holds an orbit, changed, and counts where `air` is given."""
+    orbit = {"views": 3, "source_to_detector": 1020.0, "source_to_isocentre": 740.0, "shape": [24, 24],
+             "pixel": [24.0, 24.0]}
+    air = changes.pop("air", None)
+    content = {"beam": {"orbit": orbit | changes}} | ({"intensity": {"kind": "counts", "air": air}} if air else {})
+    (xrays(folder) / "geometry.yaml").write_text(yaml.safe_dump(content))
+    return folder
+
+
+def one_pixel(folder: Path, value: float) -> Path:
+    """Counts of 1 below an air of 1, but for one pixel."""
+    image = np.ones((24, 24), np.float32)
+    image[3, 4] = value
+    np.save(change_geometry(folder, air=1) / "view_1.npy", image)
+    return folder
+
+
+def dicom_without_distance(folder: Path) -> Path:
+    tags = orbit_tags(3, 1020.0, 740.0, (24.0, 24.0))
+    del tags["DistanceSourceToDetector"]
+    write_dicom(folder / "run.dcm", np.ones((3, 24, 24), np.uint16), **tags)
+    return folder
+
+
 def no_air(hu: np.ndarray) -> np.ndarray:
     hu[3, 4, 5] = np.nan
     return hu
@@ -335,6 +410,14 @@ BAD_XRAYS = {
     "seven for eight": (one_missing, ["7", "8"]),
     "detector in the patient": (lambda at: xrays(at, ConeBeam.orbit(3, 800.0, 740.0, (24, 24), 24.0)), ["detector"]),
     "unknown geometry key": (geometry_key, ["betm"]),
+    "zero distance": (lambda at: change_geometry(at, source_to_detector=0.0), ["source_to_detector=0.0"]),
+    "pixels in cm": (lambda at: change_geometry(at, pixel=[2.4, 2.4]), ["times larger than the detector", "in mm"]),
+    "pixels in um": (lambda at: change_geometry(at, pixel=[240.0, 240.0]), ["times smaller", "in mm"]),
+    "NaN": (lambda at: one_pixel(at, np.nan), ["view_1.npy", "1 NaN"]),
+    "infinite": (lambda at: one_pixel(at, np.inf), ["view_1.npy", "1 NaN or infinite"]),
+    "negative counts": (lambda at: one_pixel(at, -1), ["1 pixels hold negative counts"]),
+    "counts above air": (lambda at: one_pixel(at, 7), ["1 pixels hold counts above air, up to 7 times"]),
+    "DICOM without distance": (dicom_without_distance, ["run.dcm", "DistanceSourceToDetector (0018,1110)"]),
 }
 BAD_CTS = {
     "no file": (lambda at: at / "nowhere.nii.gz", ["nowhere.nii.gz"]),

@@ -5,8 +5,9 @@ from phydict.datasets.augment import Deformation, augment
 from phydict.datasets.ct_rate import CTCases, CTFile, find_cts, patient_of, split_by_patient
 from phydict.datasets.ct_rate_tables import join_report, read_calibrations, read_reports
 from phydict.datasets.findings import Finding
+from phydict.datasets.intensity import Intensity
 from phydict.datasets.phantom import build, pathology_region, phantom_case
-from phydict.datasets.radiographs import Intensity, find_xrays, load_xrays, save_xrays
+from phydict.datasets.radiographs import find_xrays, load_xrays, save_xrays
 from phydict.datasets.thorax import Thorax, report, without, wrong_side
 from phydict.datasets.transforms import Calibration, load_ct, prepare_ct
 

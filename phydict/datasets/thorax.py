@@ -98,6 +98,16 @@ class Thorax:
             round_field=bool(rng.random() < 0.35), field=uniform(345, 470), scan=scan, noise=uniform(5, 25),
             findings=draw_findings(np.random.default_rng([seed, 2])))
 
+    @classmethod
+    def standard(cls) -> Thorax:
+        """The thorax of average size, healthy, without contrast agent, noise or table, scanned as a whole."""
+        return cls(
+            seed=0, offset=(0.0, 0.0, 0.0), width=132.0, depth=89.0, height=268.0, wall=17.0, back=16.0, fat=16.0,
+            dome=60.0, dome_step=12.0, heart=0.455, heart_turn=0.62, breast=0.0, arm_width=41.0, spine=17.2,
+            vertebra=23.0, rib_slope=1.0, aorta=13.8, trachea=8.8, parenchyma=-854.0, gravity=30.0, bone=175.0,
+            contrast=False, blood=(42.0, 42.0), liver_hu=55.0, gas=0.5, table=None, round_field=False, field=800.0,
+            scan=(-400.0, 400.0), noise=0.0)
+
     def level(self, z):
         """0 at the deepest recess of the lungs, 1 at the apices."""
         return z / self.height + 0.5

@@ -14,8 +14,8 @@ from pathlib import Path
 import nibabel
 import numpy as np
 import torch
-from monai.data import MetaTensor
-from monai.transforms import Compose, EnsureChannelFirstd, LoadImaged, Orientationd
+from monai.data import MetaTensor, NibabelReader
+from monai.transforms import Orientationd
 from scipy import ndimage
 
 from phydict.datasets.anatomy import lung_box_centre, segment
@@ -65,13 +65,13 @@ def load_ct(path: str | Path, calibration: Calibration | None = None) -> tuple[n
     except UNREADABLE as error:
         raise ValueError(f"{path} cannot be read as NIfTI ({error}); convert or download it again") from error
     _check_header(path, header, calibration)
-    read = Compose([LoadImaged("ct", reader="NibabelReader", squeeze_non_spatial_dims=True),
-                    EnsureChannelFirstd("ct", channel_dim="no_channel")])
+    reader = NibabelReader(squeeze_non_spatial_dims=True)
     try:
-        image = read({"ct": str(path)})["ct"]
+        stored, meta = reader.get_data(reader.read(path))
     except UNREADABLE as error:
         raise ValueError(f"the voxels of {path} cannot be read, the file seems truncated or damaged; "
                          "download or convert it again") from error
+    image = MetaTensor(torch.from_numpy(np.array(stored, np.float32))[None], affine=meta["affine"])
     if calibration is not None:
         image = MetaTensor(image.as_tensor() * calibration.slope + calibration.intercept, affine=calibration.affine())
     image = Orientationd("ct", axcodes="RAS", labels=None)({"ct": image})["ct"]

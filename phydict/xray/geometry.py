@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -135,6 +136,39 @@ class ConeBeam:
                 f"source to volume centre is {centre[k]:.1f} mm and volume centre to detector is "
                 f"{distance - centre[k]:.1f} mm along the view, but the volume {reach} from its centre; "
                 "move the source or the detector, or give a smaller volume")
+
+    def check_scale(self, grid: Grid) -> None:
+        """Look for lengths that are not in mm: compare the shadow of the box of voxels with the detectors.
+
+        Raises ValueError for a view of which no ray meets the box, and where both sides of a shadow differ from the
+        detector's by a factor of 6 or more; warns from a factor of 3. The box must lie between source and detector.
+        """
+        sides = np.stack([np.linalg.norm(self.v, axis=1), np.linalg.norm(self.u, axis=1)], 1) * self.shape  # (K, 2)
+        for k, (low, high) in enumerate(zip(*self._shadow(grid))):
+            if (low > sides[k] / 2).any() or (high < -sides[k] / 2).any():
+                raise ValueError(f"view {k}: no ray from the source to the detector meets the volume; check the view's "
+                                 "source, detector centre, u and v, and that the volume's centre is the isocentre")
+            ratio = (high - low) / sides[k]
+            factor = max(float(ratio.min()), 1 / float(ratio.max()))
+            if factor < 3:
+                continue
+            comparison = "larger" if ratio.min() > 1 else "smaller"
+            said = (f"view {k}: the volume's shadow is {factor:.1f} times {comparison} than the detector of "
+                    f"{sides[k][0]:.4g} x {sides[k][1]:.4g} mm; check that the pixel size and all distances are in mm, "
+                    "not in cm or m, and that the pixel size is that of these images")
+            if factor >= 6:
+                raise ValueError(said)
+            warnings.warn(said, stacklevel=2)
+            return
+
+    def _shadow(self, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+        """The ends (K, 2) in mm, along rows' and columns' direction from the detector's centre, of the box's shadow."""
+        rays = grid.corners() - self.sources[:, None]  # (K, 8, 3)
+        depth = (rays * self.normals[:, None]).sum(2, keepdims=True)
+        hits = self.sources[:, None] + rays * self.distances[:, None, None] / depth - self.detectors[:, None]
+        units = (step / np.linalg.norm(step, axis=1, keepdims=True) for step in (self.v, self.u))
+        places = np.stack([(hits * unit[:, None]).sum(2) for unit in units], 2)
+        return places.min(1), places.max(1)
 
     def same_as(self, other: ConeBeam, tolerance: float = 1e-6) -> bool:
         """Whether both beams have the same poses to `tolerance` mm and the same detector shape."""

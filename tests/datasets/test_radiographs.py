@@ -11,8 +11,10 @@ import torch
 import yaml
 from PIL import Image
 
-from phydict.datasets.radiographs import Intensity, find_xrays, load_xrays, save_xrays
+from phydict.datasets.intensity import Intensity
+from phydict.datasets.radiographs import find_xrays, load_xrays, save_xrays
 from phydict.xray.geometry import ConeBeam
+from phydict.xray.geometry_files import write_beam
 
 SHAPE = (6, 5)
 ORBIT = {"views": 2, "source_to_detector": 1020.0, "source_to_isocentre": 740.0, "shape": list(SHAPE),
@@ -29,7 +31,7 @@ def write(folder, arrays, ending="npy", name="view_{}", **blocks):
         file = folder / f"{name.format(k)}.{ending}"
         if ending == "npy":
             np.save(file, array)
-        elif ending == "png":
+        elif ending in ("png", "tif"):
             Image.fromarray(array).save(file)
         else:
             nibabel.save(nibabel.Nifti1Image(array.T, np.eye(4)), file)
@@ -85,12 +87,70 @@ def test_view_10_comes_after_view_9(tmp_path):
     assert case["xrays"][:, 0, 0].tolist() == list(range(11))
 
 
-def test_npy_nifti_and_png_of_the_same_counts_agree(tmp_path):
+def test_npy_nifti_png_and_tiff_of_the_same_counts_agree(tmp_path):
     counts = np.random.default_rng(1).integers(1, 60000, (2, *SHAPE)).astype(np.uint16)
     block = {"orbit": ORBIT, "intensity": {"kind": "counts", "air": 60000}}
-    a, b, c = (load_xrays(write(tmp_path / e, counts, e, **block))["xrays"] for e in ("npy", "png", "nii.gz"))
+    a, *others = (load_xrays(write(tmp_path / e, counts, e, **block))["xrays"] for e in ("npy", "png", "nii.gz", "tif"))
     np.testing.assert_allclose(a, np.log(60000 / counts), rtol=1e-5)
-    assert a.equal(b) and a.equal(c)
+    assert all(a.equal(other) for other in others)
+
+
+def test_floating_point_tiffs_are_line_integrals(tmp_path):
+    assert (load_xrays(write(tmp_path, images(), "tif"))["xrays"].numpy() == images()).all()
+
+
+def test_a_tiff_of_several_pages_is_refused(tmp_path):
+    folder = write(tmp_path, images(), "tif")
+    pages = [Image.fromarray(image) for image in images(3)]
+    pages[0].save(folder / "view_1.tif", save_all=True, append_images=pages[1:])
+    fails("view_1.tif cannot be read .it holds 3 pages", folder)
+
+
+def test_flat_and_dark_images_undo_gain_and_offset_of_every_pixel(tmp_path):
+    rng = np.random.default_rng(2)
+    y = rng.uniform(0, 5, (2, *SHAPE))
+    gain, dark = rng.uniform(2e4, 5e4, SHAPE), rng.uniform(50, 150, SHAPE)
+    folder = write(tmp_path, (gain * np.exp(-y) + dark).astype(np.float32), orbit=ORBIT,
+                   intensity={"kind": "counts", "flat": ["before.npy", "after.npy"], "dark": "dark.npy"})
+    for name, image in (("before", 0.9 * gain + dark), ("after", 1.1 * gain + dark), ("dark", dark)):
+        np.save(folder / f"{name}.npy", image.astype(np.float32))
+    np.testing.assert_allclose(load_xrays(folder)["xrays"], y, atol=1e-4)
+
+
+def test_a_constant_dark_value_is_taken_off_pixels_and_air(tmp_path):
+    y = np.random.default_rng(3).uniform(0, 5, (2, *SHAPE))
+    block = {"orbit": ORBIT, "intensity": {"kind": "counts", "air": 50100, "dark": 100}}
+    folder = write(tmp_path, (50000 * np.exp(-y) + 100).astype(np.float32), **block)
+    np.testing.assert_allclose(load_xrays(folder)["xrays"], y, atol=1e-4)
+
+
+def test_pixels_that_no_xray_reached_are_finite_and_densest(tmp_path):
+    stored = np.full((2, *SHAPE), 40000, np.uint16)
+    stored[0, 2, 3], stored[1, 1, 1] = 0, 100  # below and at the dark value
+    xrays = load_xrays(write(tmp_path, stored, orbit=ORBIT, intensity={"kind": "counts", "air": 40100, "dark": 100}))
+    assert xrays["xrays"].isfinite().all()
+    assert xrays["xrays"][0, 2, 3] == xrays["xrays"][1, 1, 1] == xrays["xrays"].max() == pytest.approx(np.log(1e5))
+
+
+def test_noise_above_air_is_kept_and_counts_far_above_it_are_refused(tmp_path):
+    block = {"orbit": ORBIT, "intensity": {"kind": "counts", "air": 1000}}
+    noisy = np.random.default_rng(4).poisson(1000, (2, *SHAPE)).astype(np.uint16)
+    assert load_xrays(write(tmp_path / "noise", noisy, **block))["xrays"].min() < 0
+    noisy[0, :2, 3] = 2000
+    fails("2 pixels hold counts above air, up to 2 times; correct `air`", write(tmp_path / "hot", noisy, **block))
+
+
+def test_bad_flats_are_named(tmp_path):
+    block = {"orbit": ORBIT, "intensity": {"kind": "counts", "flat": "flat.npy", "dark": 10}}
+    folder = write(tmp_path, np.full((2, *SHAPE), 20, np.uint16), **block)
+    with pytest.raises(FileNotFoundError, match="no image .*flat.npy, which `intensity:` names"):
+        load_xrays(folder)
+    np.save(folder / "flat.npy", np.ones((3, 3)))
+    fails("flat.npy has 3 x 3 pixels, but the views have 6 x 5", folder)
+    flat = np.full(SHAPE, 30.0)
+    flat[1, 1] = 10
+    np.save(folder / "flat.npy", flat)
+    fails("air is not above dark in 1 of 30 pixels", folder)
 
 
 def test_scale_and_offset_are_applied(tmp_path):
@@ -121,6 +181,27 @@ def test_flips_turn_rows_and_columns(tmp_path):
     assert (case["xrays"].numpy() == images()[:, ::-1, ::-1]).all()
     case = load_xrays(write(tmp_path, images(), orbit=ORBIT, orientation={"flip_rows": True}))
     assert (case["xrays"].numpy() == images()[:, ::-1]).all()
+
+
+@pytest.mark.parametrize("degrees", [90, 180, 270])
+def test_images_stored_on_their_side_are_turned_clockwise(tmp_path, degrees):
+    lying = np.rot90(images(), degrees // 90, axes=(1, 2))  # counter-clockwise
+    for name, flip in (("turned", False), ("flipped too", True)):
+        blocks = {"orbit": ORBIT, "orientation": {"rotate_degrees": degrees, "flip_columns": flip}}
+        case = load_xrays(write(tmp_path / name, lying, **blocks))
+        assert (case["xrays"].numpy() == images()[..., ::-1 if flip else 1]).all()
+
+
+@pytest.mark.parametrize("ending", ["xml", "npy", "csv"])
+def test_a_geometry_file_of_another_program_gives_the_same_beam(tmp_path, ending):
+    beam = ConeBeam.orbit(2, 1020, 740, SHAPE, (70, 80))
+    pixel = {"pixel": [70, 80]} if ending == "xml" else {}
+    folder = write(tmp_path / "case", images(), beam={"file": f"../beam.{ending}"} | pixel)
+    write_beam(tmp_path / f"beam.{ending}", beam)
+    assert load_xrays(folder)["beam"].same_as(beam)
+    if ending != "xml":  # whose pixel size only a YAML can state
+        (folder / "geometry.yaml").unlink()
+        assert load_xrays(folder, geometry=tmp_path / f"beam.{ending}")["beam"].same_as(beam)
 
 
 def test_rgba_with_equal_channels_is_grey(tmp_path):
@@ -179,6 +260,14 @@ def test_missing_things_are_named(tmp_path):
     ({"orbit": ORBIT, "intensity": {"kind": "counts", "air": "many"}}, "a number for air, but 'many'"),
     ({"orbit": ORBIT, "intensity": {"kind": "display"}}, "need `bright_is_dense`"),
     ({"orbit": ORBIT, "orientation": {"flip": True}}, "unknown 'flip' in `orientation:`"),
+    ({"orbit": ORBIT, "orientation": {"rotate_degrees": 45}}, "rotate_degrees is 0, 90, 180 or 270, but 45"),
+    ({"orbit": ORBIT | {"source_to_detector": 0.0}}, "source_to_detector=0.0 mm were given"),
+    ({"orbit": ORBIT, "intensity": {"kind": "counts", "air": 5, "flat": "a.png"}}, "both were given"),
+    ({"orbit": ORBIT, "intensity": {"kind": "counts", "flat": 5}}, "`flat` is the name of an image"),
+    ({"orbit": ORBIT, "intensity": {"kind": "display", "bright_is_dense": True, "air": 5}}, "`air` belongs to"),
+    ({"beam": {"file": "a.xml", "spacing": 1}}, "unknown key 'spacing' in `beam:`; the keys are file, pixel"),
+    ({"beam": {"dicom": {"pixel": [1, 1]}}}, "the images are not DICOM"),
+    ({"beam": 3}, "`beam:` must be a mapping"),
     ({"orbit": ORBIT, "orientation": {"flip_rows": "yes please"}}, "true or false"),
 ])
 def test_a_wrong_geometry_file_is_explained(tmp_path, blocks, sentence):

@@ -132,3 +132,38 @@ def test_bad_yaml_names_the_file_and_the_key(tmp_path, text, sentence):
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match="no geometry file .*nowhere.yaml"):
         ConeBeam.load(tmp_path / "nowhere.yaml")
+
+
+def test_a_volume_in_scale_with_its_detector_passes_without_a_word(recwarn):
+    for beam in (orbit(), orbit(pixel=(2.5, 2)), ConeBeam.orbit(4, 1020, 740, (1, 448), 1.25)):  # one is a fan beam
+        beam.check_scale(Grid.cube(64))
+    assert not recwarn.list
+
+
+@pytest.mark.parametrize("factor, comparison", [(10, "smaller"), (0.1, "larger"), (1000, "smaller")])
+def test_pixels_in_another_unit_are_refused_by_their_factor(factor, comparison):
+    side = 384 * 1020 / (740 - 192)  # of the shadow, which the box's near face casts
+    beam = orbit(pixel=(side / 112 * factor, side / 96 * factor))
+    with pytest.raises(ValueError, match=f"view 0: .* times {comparison} than the detector.*in mm") as caught:
+        beam.check_scale(Grid.cube(64))
+    said = float(str(caught.value).split(" times")[0].split()[-1])
+    assert said == pytest.approx(max(factor, 1 / factor), rel=0.01)
+
+
+def test_distances_in_another_unit_are_refused():
+    beam = ConeBeam.orbit(2, 10200, 7400, (112, 112), 0.5)
+    with pytest.raises(ValueError, match="times larger than the detector of 56 x 56 mm"):
+        beam.check_scale(Grid.cube(64))
+
+
+def test_a_small_field_of_view_is_a_warning():
+    with pytest.warns(UserWarning, match="view 0: the volume's shadow is 5.3 times larger"):
+        orbit(pixel=(1.2, 1.4)).check_scale(Grid.cube(64))
+
+
+def test_a_view_that_misses_the_volume_is_refused():
+    beam = orbit()
+    beside = ConeBeam(beam.sources, beam.detectors + [[0, 0, 0], [0, 0, 900], [0, 0, 0], [0, 0, 0]], beam.u, beam.v,
+                      beam.shape)
+    with pytest.raises(ValueError, match="view 1: no ray .* meets the volume"):
+        beside.check_scale(Grid.cube(64))

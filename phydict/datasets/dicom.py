@@ -1,0 +1,162 @@
+"""DICOM radiographs (CR, DX) and angiographic or fluoroscopic runs (XA, RF): images, and what their tags say.
+
+Pixels: rescale slope and intercept, or the modality LUT, are applied; the VOI window, a choice for the eye, never is.
+MONOCHROME1 says how values are shown, so it inverts display images alone. Tags are looked for in a frame's own
+functional groups, in the shared ones, and in the file. The beam they state is phydict.datasets.dicom_beam's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pydicom
+from pydicom.errors import InvalidDicomError
+from pydicom.pixels import apply_modality_lut
+
+from phydict.datasets.intensity import Intensity
+
+VIEW_POSITIONS = {"PA": 0.0, "LL": 90.0, "AP": 180.0, "RL": -90.0}
+UNREADABLE = (InvalidDicomError, OSError, EOFError, ValueError, AttributeError, NotImplementedError, RuntimeError)
+
+
+@dataclass(frozen=True)
+class DicomTags:
+    """What the tags of one frame say of its geometry and pixel values; None or "" where they are silent.
+
+    name: of file and frame. Lengths in mm, angles in degrees; pixel: (row height, column width); patient_orientation:
+    letters of the directions in which (columns, rows) run. magnification: of CR and DX, detector over isocentre
+    distance. inverted: MONOCHROME1. relationship, sign: PixelIntensityRelationship(Sign).
+    """
+
+    name: str
+    source_to_detector: float | None
+    source_to_isocentre: float | None
+    magnification: float | None
+    pixel: tuple[float, float] | None
+    primary_degrees: float | None
+    secondary_degrees: float | None
+    patient_orientation: tuple[str, str] | None
+    angiographic: bool
+    inverted: bool
+    relationship: str
+    sign: int | None
+
+
+def read_dicom(path: Path) -> list[tuple[np.ndarray, DicomTags]]:
+    """The frames of a DICOM file: pixels (V, U) float64 after the modality transform, and their tags.
+
+    Raises ValueError naming the file where it cannot be read or decoded, or is not grey.
+    """
+    try:
+        dataset = pydicom.dcmread(path)
+        if dataset.get("SamplesPerPixel", 1) != 1:
+            raise ValueError(f"it has {dataset.SamplesPerPixel} colours per pixel; export it as grey")
+        if "PixelData" not in dataset:
+            raise ValueError("it holds no image")
+        stored = dataset.pixel_array
+    except UNREADABLE as error:
+        raise ValueError(f"the DICOM file {path} cannot be read ({error}); export it again, uncompressed") from error
+    frames = stored[None] if stored.ndim == 2 else stored
+    several = len(frames) > 1
+    return [(_rescaled(frame, dataset, k), _tags(dataset, k, f"{path} frame {k + 1}" if several else str(path)))
+            for k, frame in enumerate(frames)]
+
+
+def tags_intensity(tags: list[DicomTags]) -> Intensity:
+    """What the pixel values mean by the tags alone: LOG images are display images of known polarity.
+
+    Raises ValueError where the tags do not suffice: linear images need the air value, which no tag holds.
+    """
+    first = tags[0]
+    if first.relationship == "LOG" and first.sign in (1, -1):
+        return Intensity("display", bright_is_dense=(first.sign == -1) != first.inverted)
+    advice = "state `intensity:` in geometry.yaml: kind line_integrals, counts or display"
+    if first.relationship == "LIN":
+        advice = "state `intensity: {kind: counts, air: ...}` in geometry.yaml, air being the value without a patient"
+    raise ValueError(f"{first.name} has PixelIntensityRelationship {first.relationship or 'unknown'}, from which line "
+                     f"integrals do not follow; {advice}")
+
+
+def shown(intensity: Intensity, tags: list[DicomTags]) -> Intensity:
+    """An intensity stated for the images as they are shown, for the values as they are stored.
+
+    Raises ValueError where counts are stated of images whose tags say that they are logarithmic or inverted.
+    """
+    for frame in tags:
+        if intensity.kind == "counts" and (frame.relationship == "LOG" or frame.sign == -1):
+            raise ValueError(f"{frame.name} is said to hold counts, but its PixelIntensityRelationship is "
+                             f"{frame.relationship or 'unknown'}, sign {frame.sign}: correct `intensity:`")
+    if intensity.kind != "display" or not tags[0].inverted:
+        return intensity
+    return Intensity("display", bright_is_dense=not intensity.bright_is_dense)
+
+
+def _find(dataset: pydicom.Dataset, frame: int, keyword: str):
+    """A tag's value for one frame: from its own functional groups, the shared ones, or the file; None if empty."""
+    groups = []
+    for name, index in (("PerFrameFunctionalGroupsSequence", frame), ("SharedFunctionalGroupsSequence", 0)):
+        sequence = dataset.get(name) or []
+        groups += [item[0] for element in (sequence[index] if index < len(sequence) else [])
+                   if (item := element.value) and element.VR == "SQ"]
+    for group in (*groups, dataset):
+        value = group.get(keyword)
+        if value is not None and value != "" and not (hasattr(value, "__len__") and len(value) == 0):
+            return value
+    return None
+
+
+def _rescaled(pixels: np.ndarray, dataset: pydicom.Dataset, frame: int) -> np.ndarray:
+    if "ModalityLUTSequence" in dataset:
+        return np.asarray(apply_modality_lut(pixels, dataset), np.float64)
+    slope, intercept = _find(dataset, frame, "RescaleSlope"), _find(dataset, frame, "RescaleIntercept")
+    return pixels * float(1 if slope is None else slope) + float(intercept or 0)
+
+
+def _tags(dataset: pydicom.Dataset, frame: int, name: str) -> DicomTags:
+    angiographic = dataset.get("Modality", "") in ("XA", "RF")
+    to_isocentre = magnification = None
+    if angiographic:
+        to_isocentre = _number(dataset, frame, "DistanceSourceToIsocenter", name)
+        if to_isocentre is None:
+            to_isocentre = _number(dataset, frame, "DistanceSourceToPatient", name)
+    else:
+        magnification = _number(dataset, frame, "EstimatedRadiographicMagnificationFactor", name)
+    pixel = _find(dataset, frame, "ImagerPixelSpacing")
+    primary = _angle(dataset, frame, "PositionerPrimaryAngle", name)
+    secondary = _angle(dataset, frame, "PositionerSecondaryAngle", name)
+    if primary is None and dataset.get("ViewPosition") in VIEW_POSITIONS:
+        primary = VIEW_POSITIONS[dataset.ViewPosition]
+        secondary = secondary or 0.0
+    orientation = _find(dataset, frame, "PatientOrientation")
+    sign = _number(dataset, frame, "PixelIntensityRelationshipSign", name)
+    if sign and (_number(dataset, frame, "RescaleSlope", name) or 1) < 0:
+        sign = -sign  # the tag speaks of stored values
+    return DicomTags(
+        name, _number(dataset, frame, "DistanceSourceToDetector", name), to_isocentre, magnification,
+        None if pixel is None else tuple(float(p) for p in pixel), primary, secondary,
+        None if orientation is None else tuple(str(o) for o in orientation), angiographic,
+        dataset.get("PhotometricInterpretation") == "MONOCHROME1",
+        str(_find(dataset, frame, "PixelIntensityRelationship") or ""), None if sign is None else int(sign))
+
+
+def _number(dataset: pydicom.Dataset, frame: int, keyword: str, name: str) -> float | None:
+    value = _find(dataset, frame, keyword)
+    try:
+        return None if value is None else float(value)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}: {keyword} must be a number, but {value!r} was found") from error
+
+
+def _angle(dataset: pydicom.Dataset, frame: int, keyword: str, name: str) -> float | None:
+    """A positioner angle with its increment: one value per frame counts from the first, a single one is the step."""
+    angle, steps = _number(dataset, frame, keyword, name), dataset.get(f"{keyword}Increment")
+    if angle is None or steps is None or steps == "":
+        return angle
+    steps = np.atleast_1d(np.asarray(steps, float))
+    if len(steps) == 1:
+        return angle + frame * float(steps[0])
+    if frame >= len(steps):
+        raise ValueError(f"{name}: {keyword}Increment holds {len(steps)} values; give one, or one per frame")
+    return angle + float(steps[frame])

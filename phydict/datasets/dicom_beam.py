@@ -1,0 +1,137 @@
+"""The beam that the tags of DICOM X-rays state.
+
+Positioner angles (DICOM PS3.3 C.8.7.5.1.2) say where the detector stands about the patient, whatever way the patient
+lies: PositionerPrimaryAngle P like longitude, 0 at the chest (a PA view), +90 at the patient's left (LAO), -90 at the
+right (RAO), 180 at the back; PositionerSecondaryAngle S like latitude, positive cranial, negative caudal. In RAS+ with
+the isocentre at the origin
+
+    detector = (SDD - SOD) d    source = -SOD d    d = (-sin P cos S, cos P cos S, sin S)
+
+SDD is DistanceSourceToDetector. SOD, to the isocentre, is DistanceSourceToPatient in XA and RF (in enhanced XA
+DistanceSourceToIsocenter). In CR and DX that tag reaches only the patient's support, so there SOD is SDD over
+EstimatedRadiographicMagnificationFactor. Without angles, ViewPosition PA, LL, AP, RL means P = 0, 90, 180, -90. The
+beam is taken as perpendicular to the detector and centred on it; pixels are ImagerPixelSpacing, never the calibrated
+PixelSpacing.
+
+Rows and columns: where PatientOrientation says what way they run, it is believed. Without it an XA or RF image is taken
+as head up and as seen from the detector (PS3.17 FFF.2.1.3), which shows the patient's right on the left in a PA view; a
+CR or DX image must have it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from pydicom.datadict import tag_for_keyword
+from pydicom.tag import Tag
+
+from phydict.datasets.dicom import DicomTags
+from phydict.xray.geometry import ConeBeam
+
+DIRECTIONS = {"R": (1, 0, 0), "L": (-1, 0, 0), "A": (0, 1, 0), "P": (0, -1, 0), "H": (0, 0, 1), "F": (0, 0, -1)}
+OVERRIDES = ("source_to_detector", "source_to_isocentre", "pixel", "primary_degrees", "secondary_degrees",
+             "patient_orientation")
+
+
+def tags_beam(tags: list[DicomTags], shape: tuple[int, int], overrides: dict | None = None,
+              turned: bool = False) -> ConeBeam:
+    """The beam of the frames whose tags are given, for images of `shape` (V, U).
+
+    overrides: values to use instead of the tags', one for all frames or a list with one per frame, by the names of
+    OVERRIDES. turned: the images were turned by a quarter since they were stored, so that rows have become columns.
+    Raises ValueError naming the frame and the tags that are missing, zero or contradictory.
+    """
+    stated = _per_frame(overrides or {}, len(tags))
+    poses = [_pose(frame, {name: values[k] for name, values in stated.items()}, turned)
+             for k, frame in enumerate(tags)]
+    return ConeBeam(*(np.stack(part) for part in zip(*poses)), shape)
+
+
+def _per_frame(overrides: dict, frames: int) -> dict[str, list]:
+    """Every override as a list with one value per frame."""
+    unknown = [repr(name) for name in overrides if name not in OVERRIDES]
+    if unknown:
+        raise ValueError(f"unknown key {', '.join(unknown)} in `dicom:`; the keys are {', '.join(OVERRIDES)}")
+    stated = {}
+    for name, value in overrides.items():
+        alone = not isinstance(value, list) or (name == "pixel" and not any(isinstance(part, list) for part in value))
+        values = [value] * frames if alone else value
+        if len(values) != frames:
+            raise ValueError(f"`{name}` in `dicom:` has {len(values)} values for {frames} views; give one, or one each")
+        stated[name] = [_stated(name, value) for value in values]
+    return stated
+
+
+def _stated(name: str, value):
+    """One frame's value of an override. Raises ValueError where it is of the wrong kind."""
+    if name == "patient_orientation":
+        if not isinstance(value, str):
+            raise ValueError(f"`{name}` in `dicom:` is a text such as 'L\\F', but {value!r} was given")
+        return value
+    try:
+        return tuple(np.broadcast_to(np.asarray(value, float), 2).tolist()) if name == "pixel" else float(value)
+    except (TypeError, ValueError) as error:
+        wanted = "[row height, column width]" if name == "pixel" else "a number"
+        raise ValueError(f"`{name}` in `dicom:` needs {wanted}, but {value!r} was given") from error
+
+
+def _pose(tags: DicomTags, stated: dict, turned: bool) -> tuple[np.ndarray, ...]:
+    """Source, detector's centre, u and v (3,) in RAS+ mm of one frame."""
+    values = {name: stated.get(name, getattr(tags, name)) for name in OVERRIDES}
+    if values["source_to_isocentre"] is None and tags.magnification and values["source_to_detector"] is not None:
+        values["source_to_isocentre"] = values["source_to_detector"] / tags.magnification
+    _check(tags, values)
+    p, s = math.radians(values["primary_degrees"]), math.radians(values["secondary_degrees"])
+    towards = np.array([-math.sin(p) * math.cos(s), math.cos(p) * math.cos(s), math.sin(s)])
+    right = np.array([-math.cos(p), -math.sin(p), 0.0])  # of a viewer at the detector, head up
+    columns, rows = right, np.cross(right, towards)
+    if values["patient_orientation"] is not None:
+        columns, rows = _oriented(tags.name, values["patient_orientation"], right, rows)
+    height, width = reversed(values["pixel"]) if turned else values["pixel"]
+    to_isocentre, to_detector = values["source_to_isocentre"], values["source_to_detector"]
+    return -to_isocentre * towards, (to_detector - to_isocentre) * towards, width * columns, height * rows
+
+
+def _check(tags: DicomTags, values: dict) -> None:
+    middle = "DistanceSourceToPatient" if tags.angiographic else "EstimatedRadiographicMagnificationFactor"
+    keywords = dict(zip(OVERRIDES, ("DistanceSourceToDetector", middle, "ImagerPixelSpacing", "PositionerPrimaryAngle",
+                                    "PositionerSecondaryAngle", "PatientOrientation")))
+    missing = [name for name in OVERRIDES if values[name] is None
+               and not (name == "patient_orientation" and tags.angiographic)
+               and not (name == "source_to_isocentre" and tags.magnification)]
+    if missing:
+        named = ", ".join(f"{keywords[name]} {_tag(keywords[name])}" for name in missing)
+        raise ValueError(f"{tags.name} lacks {named}, so its geometry is unknown; state `beam: {{dicom: "
+                         f"{{{', '.join(f'{name}: ...' for name in missing)}}}}}` in geometry.yaml")
+    for name in OVERRIDES[:3]:
+        numbers = np.asarray(values[name], float)
+        if not (np.isfinite(numbers).all() and (numbers > 0).all()):
+            raise ValueError(f"{tags.name}: {name} is {values[name]} (from {keywords[name]} or geometry.yaml), but it "
+                             f"must be positive; state `beam: {{dicom: {{{name}: ...}}}}` in mm in geometry.yaml")
+    near, far = values["source_to_isocentre"], values["source_to_detector"]
+    if not near < far:
+        raise ValueError(f"{tags.name}: the isocentre must lie between source and detector, but source_to_isocentre="
+                         f"{near:g} mm and source_to_detector={far:g} mm were found; correct them under "
+                         "`beam: {dicom: ...}` in geometry.yaml")
+
+
+def _tag(keyword: str) -> str:
+    tag = Tag(tag_for_keyword(keyword))
+    return f"({tag.group:04x},{tag.element:04x})"
+
+
+def _oriented(name: str, orientation, right: np.ndarray, down: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The unit steps of columns and rows that lie in the detector's plane and agree best with PatientOrientation."""
+    letters = orientation.split("\\") if isinstance(orientation, str) else list(orientation)
+    steps, along = [], []
+    for word in letters:
+        if not word or any(letter not in DIRECTIONS for letter in word):
+            raise ValueError(f"{name}: PatientOrientation {letters} must name directions by R, L, A, P, H, F")
+        wanted = sum(np.array(DIRECTIONS[letter], float) for letter in word)
+        steps.append(max((right, -right, down, -down), key=lambda step: step @ wanted))
+        along.append(steps[-1] @ wanted / max(np.linalg.norm(wanted), 1e-12))
+    if len(steps) != 2 or abs(steps[0] @ steps[1]) > 0.5 or min(along) < 0.3:
+        raise ValueError(f"{name}: PatientOrientation {letters} does not give two directions across this view; correct "
+                         "it or the positioner angles under `beam: {dicom: ...}` in geometry.yaml")
+    return steps[0], steps[1]

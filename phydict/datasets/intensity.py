@@ -1,0 +1,106 @@
+"""What the pixel values of X-ray images mean, and the line integrals they become.
+
+    {kind: line_integrals, scale: 1.0, offset: 0.0}     y = scale * pixel + offset
+    {kind: counts, air: 50000, dark: 100}               y = log((air - dark) / max(pixel - dark, floor))
+    {kind: counts, flat: flat.png, dark: dark.png}      the same with images; of a list of files the mean is taken
+    {kind: display, bright_is_dense: true}              y = gain * display + offset, both unknown per view
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+KINDS = ("line_integrals", "counts", "display")
+ABOVE_AIR = 1.5
+"""Counts above so many times the air value are no noise."""
+
+
+@dataclass(frozen=True)
+class Intensity:
+    """How pixel values become line integrals y; see the module's table. Raises ValueError for impossible values.
+
+    kind: "line_integrals", "counts" or "display". scale, offset: of line_integrals. Of counts: air, the value without a
+    patient, or flat, the name(s) of images without one; dark, the value without X-rays, or the name(s) of such images
+    (0 when left out); floor, the smallest count above dark that is believed, 1e-5 of air when left out.
+    bright_is_dense: display only, must be given.
+    """
+
+    kind: str
+    scale: float = 1.0
+    offset: float = 0.0
+    air: float | None = None
+    flat: str | list[str] | None = None
+    dark: float | str | list[str] | None = None
+    floor: float | None = None
+    bright_is_dense: bool | None = None
+
+    def __post_init__(self):
+        if self.kind not in KINDS:
+            raise ValueError(f"intensity kind {self.kind!r} is unknown; give one of {', '.join(KINDS)}")
+        for name in ("scale", "offset", "air", "floor"):
+            self._make_number(name)
+        if not _names(self.dark):
+            self._make_number("dark")
+        if self.flat is not None and not _names(self.flat):
+            raise ValueError(f"`flat` is the name of an image, or a list of names, but {self.flat!r} was given")
+        counts = [name for name in ("air", "flat", "dark", "floor") if getattr(self, name) is not None]
+        if self.kind != "counts" and counts:
+            raise ValueError(f"`{counts[0]}` belongs to the intensity kind counts, but the kind is {self.kind}")
+        if self.kind == "counts" and self.flat is None and not (self.air and self.air > 0):
+            raise ValueError(f"counts need `air`, the positive count without a patient, but air={self.air} was given; "
+                             "or give `flat`, an image without one")
+        if self.air is not None and self.flat is not None:
+            raise ValueError("counts are compared with `air` or with `flat`, but both were given; leave one out")
+        if self.floor is not None and not self.floor > 0:
+            raise ValueError(f"the floor of counts must be positive, but floor={self.floor} was given")
+        if self.kind == "display" and not isinstance(self.bright_is_dense, bool):
+            raise ValueError("display images need `bright_is_dense`: true where bone is bright, false where it is dark")
+
+    def _make_number(self, name: str) -> None:
+        value = getattr(self, name)
+        try:
+            object.__setattr__(self, name, value if value is None else float(value))
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"intensity needs a number for {name}, but {value!r} was given") from error
+
+    @property
+    def references(self) -> dict[str, list[str]]:
+        """The names of the images that `flat` and `dark` call for."""
+        return {name: _names(getattr(self, name)) for name in ("flat", "dark") if _names(getattr(self, name))}
+
+    def line_integrals(self, pixels: np.ndarray, full_scale: float,
+                       references: dict[str, np.ndarray] | None = None) -> np.ndarray:
+        """Line integrals of pixels (K, V, U); for display images values in [0, 1] that grow with density.
+
+        full_scale: the largest value the image format can hold. references: the images (V, U) of `references`.
+        Pixels that no X-ray reached take the floor, so that y is finite everywhere.
+        Raises ValueError for negative counts, counts far above air, and air that is not above dark.
+        """
+        if self.kind == "line_integrals":
+            return self.scale * pixels + self.offset
+        if self.kind == "display":
+            return pixels / full_scale if self.bright_is_dense else 1 - pixels / full_scale
+        references = references or {}
+        dark = references.get("dark", self.dark or 0.0)
+        air = np.asarray(references.get("flat", self.air) - dark)
+        if not (air > 0).all():
+            raise ValueError(f"air is not above dark in {int((~(air > 0)).sum())} of {air.size} pixels; check which "
+                             "image is which, and repair dead pixels")
+        negative = int((pixels < 0).sum())
+        if negative:
+            raise ValueError(f"{negative} pixels hold negative counts; give counts, or another intensity kind")
+        signal = pixels - dark
+        above = signal / air
+        if (above > ABOVE_AIR).any():
+            raise ValueError(f"{int((above > ABOVE_AIR).sum())} pixels hold counts above air, up to {above.max():.3g} "
+                             "times; correct `air` or `flat`, or repair hot pixels")
+        return np.log(air / np.maximum(signal, self.floor or 1e-5 * air))
+
+
+def _names(value) -> list[str]:
+    """File names: of one name or a list of them; none of anything else."""
+    if isinstance(value, str):
+        return [value]
+    return list(value) if isinstance(value, (list, tuple)) and all(isinstance(name, str) for name in value) else []

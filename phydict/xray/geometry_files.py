@@ -1,0 +1,109 @@
+"""Geometry files of other programs to and from ConeBeam: RTK's XML, ASTRA's cone vectors, tables with named columns.
+
+    .yaml .yml   ours (ConeBeam.load)
+    .xml         RTK's circular geometry (phydict.xray.rtk)
+    .npy         ASTRA's cone_vec, (views, 12): source, detector centre, u, v; u leads from one column to the next, v
+                 from one row to the next
+    .csv .txt    a header that names the columns of COLUMNS in any order, or without a header the numbers of cone_vec
+
+Vectors are taken as world millimetres, RAS+: where another program's axes differ, turn them first.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from phydict.xray.geometry import ConeBeam
+from phydict.xray.rtk import read_rtk, write_rtk
+
+VECTORS = ("source", "detector", "u", "v")
+COLUMNS = tuple(f"{vector}_{axis}" for vector in VECTORS for axis in "xyz")
+ENDINGS = (".yaml", ".yml", ".xml", ".npy", ".csv", ".txt")
+
+
+def read_beam(path: str | Path, shape: tuple[int, int] | None = None,
+              pixel: float | tuple[float, float] | None = None) -> ConeBeam:
+    """The beam of a geometry file of any of the module's kinds, told by its ending.
+
+    shape: (V, U) pixels, needed but for YAML. pixel: (row height, column width) in mm, needed for RTK's XML.
+    Raises FileNotFoundError, and ValueError naming the file for other endings, missing shape or pixel and bad content.
+    """
+    path = Path(path)
+    ending = _ending(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no geometry file {path}; give one of {', '.join(ENDINGS)}")
+    if ending in (".yaml", ".yml"):
+        return ConeBeam.load(path)
+    if shape is None:
+        raise ValueError(f"{path} does not say how many pixels the detector has; state its `shape`: [rows, columns]")
+    if ending == ".xml":
+        if pixel is None:
+            raise ValueError(f"{path} does not say how large the pixels are; state `pixel`: [row height, column width] "
+                             "in mm")
+        return read_rtk(path, shape, pixel)
+    vectors = _read_npy(path) if ending == ".npy" else _read_table(path)
+    if vectors.ndim != 2 or vectors.shape[1] != 12 or not len(vectors):
+        raise ValueError(f"{path} holds numbers of shape {vectors.shape}, but 12 per view were expected: source, "
+                         "detector centre, u and v")
+    try:
+        return ConeBeam(*np.split(vectors, 4, axis=1), shape)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def write_beam(path: str | Path, beam: ConeBeam) -> None:
+    """Write a beam as the kind of file that its ending names; `read_beam` reads it back.
+
+    Raises ValueError for other endings, and where RTK's XML cannot hold the beam.
+    """
+    ending = _ending(Path(path))
+    vectors = np.concatenate([beam.sources, beam.detectors, beam.u, beam.v], axis=1)
+    if ending in (".yaml", ".yml"):
+        beam.save(path)
+    elif ending == ".xml":
+        write_rtk(path, beam)
+    elif ending == ".npy":
+        np.save(path, vectors)
+    else:
+        lines = [",".join(COLUMNS), *(",".join(repr(float(value)) for value in row) for row in vectors)]
+        Path(path).write_text("\n".join(lines) + "\n")
+
+
+def _ending(path: Path) -> str:
+    ending = path.suffix.lower()
+    if ending not in ENDINGS:
+        raise ValueError(f"{path} is no known geometry file; its name must end in one of {', '.join(ENDINGS)}")
+    return ending
+
+
+def _read_npy(path: Path) -> np.ndarray:
+    try:
+        return np.load(path, allow_pickle=False).astype(float)
+    except (OSError, EOFError, ValueError) as error:
+        raise ValueError(f"{path} cannot be read as an array of numbers ({error}); save cone_vec with numpy.save"
+                         ) from error
+
+
+def _read_table(path: Path) -> np.ndarray:
+    try:
+        rows = [re.split(r"[,;\s]+", line.strip(" ,;\t")) for line in path.read_text(encoding="utf-8-sig").splitlines()
+                if line.strip() and not line.startswith("#")]
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path} is not UTF-8 text ({error}); save it as UTF-8") from error
+    columns = list(COLUMNS)
+    if rows and rows[0][0][:1].isalpha():
+        columns = [name.lower() for name in rows.pop(0)]
+        missing = [name for name in COLUMNS if name not in columns]
+        if missing:
+            raise ValueError(f"{path} has no column {', '.join(missing)}; the columns are {', '.join(COLUMNS)}")
+    for number, row in enumerate(rows):
+        if len(row) != len(columns):
+            raise ValueError(f"{path}: view {number} has {len(row)} values, but {len(columns)} were expected")
+    try:
+        table = np.array(rows, float).reshape(len(rows), len(columns))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}; give numbers in mm") from error
+    return table[:, [columns.index(name) for name in COLUMNS]]

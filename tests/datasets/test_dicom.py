@@ -1,0 +1,266 @@
+"""DICOM X-rays: tags give the beam that PS3.3 describes, values mean what their tags say, gaps are named."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pydicom
+import pytest
+import torch
+import yaml
+from dicom_files import orbit_tags, write_dicom
+from pydicom.dataset import Dataset
+from pydicom.sequence import Sequence
+
+from phydict.datasets.intensity import Intensity
+from phydict.datasets.radiographs import find_xrays, load_xrays
+from phydict.xray.geometry import ConeBeam
+
+SHAPE, PIXEL = (6, 5), (70.0, 80.0)
+XA = {"DistanceSourceToDetector": 1020.0, "DistanceSourceToPatient": 740.0, "ImagerPixelSpacing": list(PIXEL)}
+DX = {"DistanceSourceToDetector": 1800.0, "EstimatedRadiographicMagnificationFactor": 1.2,
+      "DistanceSourceToPatient": 1750.0, "ImagerPixelSpacing": list(PIXEL), "ViewPosition": "PA",
+      "PatientOrientation": ["L", "F"]}
+LINES = Intensity("line_integrals")
+
+
+def counts(views=1, seed=0):
+    return np.random.default_rng(seed).integers(1, 60000, (views, *SHAPE)).astype(np.uint16)
+
+
+def angled(primary, secondary=0.0):
+    return XA | {"PositionerPrimaryAngle": primary, "PositionerSecondaryAngle": secondary}
+
+
+def one(folder, stored=None, modality="XA", **tags):
+    """A folder with one single-frame file."""
+    write_dicom(folder / "a.dcm", counts()[0] if stored is None else stored, modality, **tags)
+    return folder
+
+
+def beam_of(folder, modality="XA", **tags):
+    return load_xrays(one(folder, None, modality, **tags), intensity=LINES)["beam"]
+
+
+def described(folder, **blocks):
+    (folder / "geometry.yaml").write_text(yaml.safe_dump(blocks))
+    return folder
+
+
+def fails(sentence, folder, **arguments):
+    with pytest.raises(ValueError, match=sentence) as caught:
+        load_xrays(folder, **arguments)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_run_around_the_patient_is_our_orbit(tmp_path):
+    write_dicom(tmp_path / "run.dcm", counts(8), **orbit_tags(8, 1020.0, 740.0, PIXEL))
+    case = load_xrays(tmp_path, intensity=LINES)
+    assert case["beam"].same_as(ConeBeam.orbit(8, 1020, 740, SHAPE, PIXEL), tolerance=1e-6)
+    assert (case["xrays"].numpy() == counts(8)).all()
+
+
+def test_one_increment_is_the_step_of_every_frame(tmp_path):
+    tags = orbit_tags(8, 1020.0, 740.0, PIXEL) | {"PositionerPrimaryAngleIncrement": -45.0}
+    write_dicom(tmp_path / "run.dcm", counts(8), **tags)
+    assert load_xrays(tmp_path, intensity=LINES)["beam"].same_as(ConeBeam.orbit(8, 1020, 740, SHAPE, PIXEL), 1e-6)
+
+
+@pytest.mark.parametrize("primary, secondary, detector", [
+    (0, 0, [0, 1, 0]), (90, 0, [-1, 0, 0]), (-90, 0, [1, 0, 0]), (180, 0, [0, -1, 0]),
+    (0, 90, [0, 0, 1]), (0, -90, [0, 0, -1]), (30, 0, [-0.5, 0.75**0.5, 0]), (0, 30, [0, 0.75**0.5, 0.5]),
+    (90, 30, [-(0.75**0.5), 0, 0.5])],
+    ids=["chest", "LAO 90", "RAO 90", "back", "cranial", "caudal", "LAO 30", "cranial 30", "LAO 90 cranial 30"])
+def test_the_detector_stands_where_the_positioner_angles_say(tmp_path, primary, secondary, detector):
+    beam = beam_of(tmp_path, **angled(primary, secondary))
+    np.testing.assert_allclose(beam.detectors[0], 280 * np.array(detector), atol=1e-9)
+    np.testing.assert_allclose(beam.sources[0], -740 * np.array(detector), atol=1e-9)
+    np.testing.assert_allclose(beam.distances, 1020)
+    assert beam.u[0] @ beam.v[0] == pytest.approx(0, abs=1e-9)
+    assert np.cross(beam.u[0], beam.v[0]) @ beam.sources[0] > 0  # seen from the detector
+    assert beam.u[0, 2] == 0 and beam.v[0, 2] <= 1e-9  # head up
+
+
+def test_files_of_single_frames_keep_their_own_angles_in_natural_order(tmp_path):
+    for k, primary in enumerate(range(0, 330, 30)):
+        write_dicom(tmp_path / f"IM{k}", np.full(SHAPE, k, np.uint16), **angled(float(-primary)))  # no ending
+    case = load_xrays(find_xrays(tmp_path)[0], intensity=LINES)
+    assert case["xrays"][:, 0, 0].tolist() == list(range(11))
+    assert case["beam"].same_as(ConeBeam.orbit(12, 1020, 740, SHAPE, PIXEL).select(slice(11)), 1e-6)
+
+
+def test_enhanced_xa_holds_its_angles_per_frame_and_the_rest_shared(tmp_path):
+    path = write_dicom(tmp_path / "run.dcm", counts(3))
+    dataset = pydicom.dcmread(path)
+    dataset.PerFrameFunctionalGroupsSequence = Sequence([
+        group(PositionerPositionSequence={"PositionerPrimaryAngle": -120.0 * k, "PositionerSecondaryAngle": 0.0})
+        for k in range(3)])
+    dataset.SharedFunctionalGroupsSequence = Sequence([group(
+        XRayGeometrySequence={"DistanceSourceToIsocenter": 740.0, "DistanceSourceToDetector": 1020.0},
+        FramePixelDataPropertiesSequence={"ImagerPixelSpacing": list(PIXEL)},
+        PixelValueTransformationSequence={"RescaleSlope": 0.5, "RescaleIntercept": 3.0})])
+    dataset.save_as(path)
+    case = load_xrays(tmp_path, intensity=LINES)
+    assert case["beam"].same_as(ConeBeam.orbit(3, 1020, 740, SHAPE, PIXEL), 1e-6)
+    np.testing.assert_allclose(case["xrays"], 0.5 * counts(3) + 3.0)
+
+
+def group(**sequences):
+    """One item of a functional groups sequence."""
+    item = Dataset()
+    for keyword, values in sequences.items():
+        inner = Dataset()
+        for name, value in values.items():
+            setattr(inner, name, value)
+        setattr(item, keyword, Sequence([inner]))
+    return item
+
+
+@pytest.mark.parametrize("position, orientation, source, u", [
+    ("PA", ["L", "F"], [0, -1, 0], [-1, 0, 0]), ("AP", ["L", "F"], [0, 1, 0], [-1, 0, 0]),
+    ("LL", ["A", "F"], [1, 0, 0], [0, 1, 0]), ("RL", ["A", "F"], [-1, 0, 0], [0, 1, 0]),
+    ("PA", ["R", "F"], [0, -1, 0], [1, 0, 0])], ids=str)
+def test_a_radiograph_is_placed_by_view_position_and_patient_orientation(tmp_path, position, orientation, source, u):
+    beam = beam_of(tmp_path, "DX", **DX | {"ViewPosition": position, "PatientOrientation": orientation})
+    np.testing.assert_allclose(beam.sources[0], 1500 * np.array(source), atol=1e-9)  # 1800 mm / 1.2
+    np.testing.assert_allclose(beam.u[0], 80 * np.array(u), atol=1e-9)
+    np.testing.assert_allclose(beam.v[0], [0, 0, -70], atol=1e-9)
+
+
+def test_a_magnification_goes_with_a_stated_detector_distance(tmp_path):
+    tags = {name: value for name, value in DX.items() if name != "DistanceSourceToDetector"}
+    folder = one(tmp_path, None, "DX", **tags)
+    fails(r"a.dcm lacks DistanceSourceToDetector \(0018,1110\), so", folder, intensity=LINES)
+    described(folder, beam={"dicom": {"source_to_detector": 1200}})
+    np.testing.assert_allclose(load_xrays(folder, intensity=LINES)["beam"].sources, [[0, -1000, 0]], atol=1e-9)
+
+
+def test_a_turned_image_keeps_its_rows_and_columns(tmp_path):
+    beam = beam_of(tmp_path, **angled(45) | {"PatientOrientation": ["F", "RA"]})
+    np.testing.assert_allclose(beam.u[0], [0, 0, -80], atol=1e-9)
+    np.testing.assert_allclose(beam.v[0], 70 * np.array([0.5**0.5, 0.5**0.5, 0]), atol=1e-9)
+
+
+def test_geometry_yaml_overrides_tags_one_by_one_or_all(tmp_path):
+    folder = described(one(tmp_path / "some", **angled(0.0)), beam={"dicom": {
+        "source_to_isocentre": 700.0, "primary_degrees": [-90.0]}}, intensity={"kind": "line_integrals"})
+    np.testing.assert_allclose(load_xrays(folder)["beam"].sources, [[-700, 0, 0]], atol=1e-9)
+    described(folder, beam={"dicom": {"pixel": [7, 8], "patient_orientation": "R\\F"}})
+    np.testing.assert_allclose(load_xrays(folder, intensity=LINES)["beam"].u, [[8, 0, 0]], atol=1e-9)
+    beam = ConeBeam.orbit(1, 900, 600, SHAPE, 50)
+    folder = described(one(tmp_path / "all"), beam=beam.to_dict(), intensity={"kind": "line_integrals"})
+    assert load_xrays(folder)["beam"].same_as(beam)
+
+
+def test_turned_images_turn_the_pixels_of_their_tags(tmp_path):
+    folder = described(one(tmp_path, **angled(0.0)), orientation={"rotate_degrees": 90},
+                       intensity={"kind": "line_integrals"})
+    case = load_xrays(folder)
+    assert (case["xrays"][0].numpy() == np.rot90(counts()[0], -1)).all()
+    assert case["beam"].shape == (5, 6) and np.linalg.norm(case["beam"].u) == pytest.approx(70)
+
+
+def test_rescaling_is_applied_and_the_window_is_not(tmp_path):
+    case = load_xrays(one(tmp_path, **angled(0.0), RescaleSlope=0.25, RescaleIntercept=-2.0, WindowCenter=3.0,
+                          WindowWidth=1.0), intensity=LINES)
+    np.testing.assert_allclose(case["xrays"][0], 0.25 * counts()[0] - 2, rtol=1e-6)
+
+
+def test_monochrome1_turns_what_is_shown_and_leaves_quantities_alone(tmp_path):
+    plain = one(tmp_path / "plain", **angled(0.0))
+    inverted = one(tmp_path / "inverted", **angled(0.0), PhotometricInterpretation="MONOCHROME1")
+    a, b = (load_xrays(folder, intensity=LINES)["xrays"] for folder in (plain, inverted))
+    assert a.equal(b)
+    bright, dark = (Intensity("display", bright_is_dense=value) for value in (True, False))
+    assert load_xrays(inverted, intensity=bright)["xrays"].equal(load_xrays(plain, intensity=dark)["xrays"])
+    assert load_xrays(inverted, intensity=bright)["display"]
+
+
+@pytest.mark.parametrize("sign, photometric", [(-1, "MONOCHROME2"), (1, "MONOCHROME1"), (-1, "MONOCHROME1")])
+def test_log_images_are_display_values_that_grow_with_density(tmp_path, sign, photometric):
+    case = load_xrays(one(tmp_path, **angled(0.0), PixelIntensityRelationship="LOG",
+                          PixelIntensityRelationshipSign=sign, PhotometricInterpretation=photometric))
+    stored = torch.from_numpy(counts()[0].astype(np.float32))
+    assert case["display"]
+    assert np.corrcoef(case["xrays"].flatten(), stored.flatten())[0, 1] == pytest.approx(-sign)  # sign 1: bright is air
+
+
+def test_linear_images_become_line_integrals_by_their_air(tmp_path):
+    folder = one(tmp_path, **angled(0.0), PixelIntensityRelationship="LIN", PixelIntensityRelationshipSign=1)
+    fails("PixelIntensityRelationship LIN.*air: ...", folder)
+    described(folder, intensity={"kind": "counts", "air": 60000})
+    np.testing.assert_allclose(load_xrays(folder)["xrays"], np.log(60000 / counts()), rtol=1e-5, atol=1e-6)
+
+
+def test_values_of_unknown_meaning_are_refused(tmp_path):
+    fails("PixelIntensityRelationship unknown.*`intensity:`", one(tmp_path / "a", **angled(0.0)))
+    fails("said to hold counts, but its PixelIntensityRelationship is LOG, sign -1", one(
+        tmp_path / "b", **angled(0.0), PixelIntensityRelationship="LOG", PixelIntensityRelationshipSign=-1),
+        intensity=Intensity("counts", air=60000))
+
+
+@pytest.mark.parametrize("absent, sentence", [
+    ("DistanceSourceToDetector", r"a.dcm lacks DistanceSourceToDetector \(0018,1110\).*source_to_detector: ..."),
+    ("DistanceSourceToPatient", r"lacks DistanceSourceToPatient \(0018,1111\).*source_to_isocentre: ..."),
+    ("ImagerPixelSpacing", r"lacks ImagerPixelSpacing \(0018,1164\).*pixel: ..."),
+    ("PositionerPrimaryAngle", r"lacks PositionerPrimaryAngle \(0018,1510\).*primary_degrees: ..."),
+])
+def test_missing_tags_are_named_with_what_to_write_instead(tmp_path, absent, sentence):
+    tags = angled(0.0)
+    del tags[absent]
+    fails(sentence, one(tmp_path, **tags), intensity=LINES)
+
+
+def test_a_radiographs_distance_to_the_table_is_not_taken_for_the_isocentre(tmp_path):
+    tags = {name: value for name, value in DX.items() if name != "EstimatedRadiographicMagnificationFactor"}
+    folder = one(tmp_path, None, "DX", **tags)
+    fails("lacks EstimatedRadiographicMagnificationFactor.*source_to_isocentre: ...", folder, intensity=LINES)
+    described(folder, beam={"dicom": {"source_to_isocentre": 1600}})
+    np.testing.assert_allclose(load_xrays(folder, intensity=LINES)["beam"].sources, [[0, -1600, 0]], atol=1e-9)
+
+
+@pytest.mark.parametrize("tags, sentence", [
+    ({"DistanceSourceToDetector": 0.0}, "source_to_detector is 0.0 .*must be positive"),
+    ({"DistanceSourceToPatient": 1100.0}, "between source and detector, but source_to_isocentre=1100 mm"),
+    ({"ImagerPixelSpacing": [0.0, 1.0]}, "pixel is .0.0, 1.0. .*must be positive"),
+    ({"PatientOrientation": ["A", "F"]}, "does not give two directions across this view"),
+    ({"PatientOrientation": ["L", "R"]}, "does not give two directions across this view"),
+    ({"PatientOrientation": ["X", "F"]}, "must name directions by R, L"),
+])
+def test_impossible_tags_are_explained(tmp_path, tags, sentence):
+    fails(sentence, one(tmp_path, **angled(0.0) | tags), intensity=LINES)
+
+
+def test_wrong_overrides_are_explained(tmp_path):
+    folder = one(tmp_path, **angled(0.0))
+    fails("unknown key 'sod' in `dicom:`", described(folder, beam={"dicom": {"sod": 3}}), intensity=LINES)
+    fails("`primary_degrees` in `dicom:` has 2 values for 1 views",
+          described(folder, beam={"dicom": {"primary_degrees": [0, 1]}}), intensity=LINES)
+    fails("`source_to_detector` in `dicom:` needs a number, but 'far'",
+          described(folder, beam={"dicom": {"source_to_detector": "far"}}), intensity=LINES)
+    fails(r"`pixel` in `dicom:` needs .row height, column width., but",
+          described(folder, beam={"dicom": {"pixel": [1, 2, 3]}}), intensity=LINES)
+    fails("unknown key 'orbit' in `beam:`", described(folder, beam={"dicom": {}, "orbit": {}}), intensity=LINES)
+
+
+def test_files_that_are_no_grey_dicom_image_are_named(tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "a.dcm").write_bytes(b"not DICOM")
+    fails("a.dcm cannot be read", tmp_path / "a", intensity=LINES)
+    path = one(tmp_path / "b", **angled(0.0)) / "a.dcm"
+    path.write_bytes(path.read_bytes()[:-20])
+    fails("a.dcm cannot be read", tmp_path / "b", intensity=LINES)
+    fails("3 colours", one(tmp_path / "c", **angled(0.0), SamplesPerPixel=3), intensity=LINES)
+
+
+def test_the_index_of_a_disc_is_no_view(tmp_path):
+    one(tmp_path, **angled(0.0))
+    (tmp_path / "DICOMDIR").write_bytes(bytes(128) + b"DICM")
+    assert len(load_xrays(tmp_path, intensity=LINES)["xrays"]) == 1
+
+
+def test_dicom_and_other_images_are_not_mixed(tmp_path):
+    folder = described(one(tmp_path, **angled(0.0)), beam=ConeBeam.orbit(2, 1020, 740, SHAPE, 70).to_dict())
+    np.save(folder / "b.npy", counts()[0])
+    fails(re.escape("DICOM files and others (b.npy)"), folder, intensity=LINES)

@@ -38,8 +38,8 @@ def volume_fractions(hu: torch.Tensor, ct_energy: float = 70.0, metal: float | N
     tissue = ((hu + 1000) / (own_hu("soft_tissue", ct_energy) + 1000)).clamp(0, 1)
     bone = ((hu - MIXED_HU) / (own_hu("bone", ct_energy) - MIXED_HU)).clamp(0, 1)
     implant = torch.zeros_like(hu) if metal is None else (hu >= metal).to(hu)
-    return torch.stack([1 - tissue, tissue - bone, bone, torch.zeros_like(hu)]) * (1 - implant) + torch.stack(
-        [torch.zeros_like(hu)] * 3 + [implant])
+    body = torch.stack([1 - tissue, tissue - bone, bone]) * (1 - implant)
+    return torch.cat([body, implant[None]])
 
 
 def partial_densities(hu: torch.Tensor, ct_energy: float = 70.0, metal: float | None = None) -> torch.Tensor:
@@ -48,9 +48,9 @@ def partial_densities(hu: torch.Tensor, ct_energy: float = 70.0, metal: float | 
     Except in metal, sum of density * mass attenuation at ct_energy = mu_water (1 + HU / 1000), not below 0.
     """
     fractions = volume_fractions(hu, ct_energy, metal)[1:]
-    pure = torch.tensor([float(attenuation(m, ct_energy)) for m in MATERIALS[1:]]).to(hu)
+    pure = hu.new_tensor([float(attenuation(m, ct_energy)) for m in MATERIALS[1:]])
     mixed = torch.einsum("m,m...->...", pure, fractions)
     meant = float(attenuation("water", ct_energy)) * (1 + hu / 1000).clamp(min=0)
     scale = torch.where((mixed > 0) & (fractions[-1] == 0), meant / mixed, torch.ones_like(hu))
-    densities = torch.tensor([DENSITIES[m] for m in MATERIALS[1:]]).to(hu)
+    densities = hu.new_tensor([DENSITIES[m] for m in MATERIALS[1:]])
     return densities.view(-1, *[1] * hu.ndim) * fractions * scale

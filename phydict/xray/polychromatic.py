@@ -34,8 +34,8 @@ class Polychromatic(Simulator):
     """X-rays of a tube at 70, 80, 100 or 120 kVp, read by an energy-integrating detector.
 
     kvp: the tube (Spectrum.tube); spectrum: used instead of it.
-    photons: photons per pixel that reach the detector without patient, None for no noise at all. At 120 kVp 27 uGy of
-        air kerma are a million on a pixel of 1.25 mm.
+    air_photons: photons per pixel that reach the detector without patient, None for no noise at all. At 120 kVp 27 uGy
+        of air kerma are a million on a pixel of 1.25 mm.
     readout: standard deviation of electronic noise, in detected photons.
     scintillator: mm of solid caesium iodide. A photon is absorbed with probability 1 - exp(-mu mm) and then gives
         light in proportion to its energy; fluorescence does not escape. None: every photon is absorbed. 0.45 mm are
@@ -52,7 +52,7 @@ class Polychromatic(Simulator):
     """
 
     kvp: int = 120
-    photons: float | None = 1e6
+    air_photons: float | None = 1e6
     readout: float = 3.0
     scintillator: float | None = 0.45
     scatter: float = 0.0
@@ -63,7 +63,7 @@ class Polychromatic(Simulator):
     spectrum: Spectrum | None = None
 
     def __post_init__(self):
-        check_photons(self.photons)
+        check_photons(self.air_photons)
         for name in ("readout", "scatter"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be finite and >= 0, 0 for none; {getattr(self, name)} was given")
@@ -115,8 +115,8 @@ class Polychromatic(Simulator):
         if self.scatter > 0:
             signal = signal + scatter_of(signal, projector.beam, self.scatter, self.scatter_width)
         floor = torch.finfo(signal.dtype).tiny
-        if self.photons is not None:
-            quantum, photon = quantum.double() / self.photons, float(photon) / self.photons
+        if self.air_photons is not None:
+            quantum, photon = quantum.double() / self.air_photons, float(photon) / self.air_photons
             signal = quantum * poisson(signal / quantum, generator) + self.readout * photon * normal(signal, generator)
             floor = photon / 2
         signal = signal.clamp(min=floor)

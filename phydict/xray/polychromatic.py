@@ -45,7 +45,8 @@ class Polychromatic(Simulator):
     scatter_width: standard deviation in mm on the detector of the scatter kernel.
     saturation: the largest signal that the detector can read, as a multiple of the signal without patient; None: no
         limit. Signals below half a detected photon read as half a photon, so that no pixel is infinite.
-    metal: HU from which voxels are titanium, None for never. CTs clipped to a prior's HU window hold no metal.
+    metal: HU from which voxels are titanium, None for never; 3000, say, for whole CTs. CTs clipped to a prior's HU window
+        hold no metal.
     ct_energy: effective energy in keV of the CT that the volume is from; 70 suits 120 kVp.
 
     Not modelled: heel effect, bow-tie filters, focal spot, blur of the detector, motion.
@@ -69,10 +70,10 @@ class Polychromatic(Simulator):
                 raise ValueError(f"{name} must be finite and >= 0, 0 for none; {getattr(self, name)} was given")
         for name in ("scintillator", "saturation", "scatter_width", "metal"):
             value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise ValueError(f"{name} must be > 0, but {value} was given; leave it out for the default")
-        attenuation("water", self.ct_energy)
-        mass_attenuation("water", self.beam_spectrum.energies)
+            if value is not None and not 0 < value < math.inf:
+                raise ValueError(f"{name} must be finite and > 0, but {value} was given; leave it out for the default")
+        for energies in (self.ct_energy, self.beam_spectrum.energies):
+            attenuation("water", energies)  # refuses energies off its table
 
     @property
     def beam_spectrum(self) -> Spectrum:
@@ -109,7 +110,10 @@ class Polychromatic(Simulator):
 
     def _measure(self, projector: Projector, mu: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
         densities = partial_densities(mu_to_hu(mu), self.ct_energy, self.metal)
-        paths = torch.cat([projector(density[None]) for density in densities])
+        paths = mu.new_zeros(len(densities), projector.beam.views, *projector.beam.shape)
+        for path, density in zip(paths, densities):
+            if density.any():
+                path.copy_(projector(density[None])[0])
         signal, quantum = self.primary(paths)
         _, photon = self.primary(paths.new_zeros(3))
         if self.scatter > 0:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -77,6 +78,6 @@ class Ideal(Simulator):
 
 
 def check_photons(photons: float | None) -> None:
-    """Raises ValueError unless `photons` is None or > 0."""
-    if photons is not None and not photons > 0:
+    """Raises ValueError unless `photons` is None or finite and > 0."""
+    if photons is not None and not 0 < photons < math.inf:
         raise ValueError(f"photons per pixel must be > 0, or None for no counting noise; {photons} was given")

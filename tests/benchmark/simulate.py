@@ -30,8 +30,8 @@ if __name__ == "__main__":
             for preset in PRESETS:
                 method = f"{preset}, {name}"
                 subprocess.run(
-                    [sys.executable, "infer.py", "test", "-c", f"configs/reconstruct/{preset}.yaml",
-                     "-c", f"configs/simulate/{config}.yaml", "--data.cts", sys.argv[1], "--data.simulation_voxels", "128",
+                    [sys.executable, "infer.py", "test", "-c", f"configs/reconstruct/{preset}.yaml", "-c",
+                     f"configs/simulate/{config}.yaml", "--data.cts", sys.argv[1], "--data.simulation_voxels", "128",
                      "--model.out", out, "--model.name", method, *changes, *sys.argv[2:]], cwd=ROOT, check=True)
                 rows += read_csv(Path(out) / method / "results.csv")
     write_csv(HERE / "simulate.csv", [{key: value for key, value in row.items() if key != "seconds"} for row in rows])

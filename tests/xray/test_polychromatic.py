@@ -209,8 +209,9 @@ def test_the_stated_attenuation_gives_water_its_hu_back(kvp):
 @pytest.mark.parametrize("settings, words", [
     ({"kvp": 90}, "no tube spectrum of 90 kVp"), ({"air_photons": 0}, "photons per pixel must be > 0"),
     ({"readout": -1}, "readout must be finite and >= 0"), ({"scatter": float("nan")}, "scatter must be finite"),
-    ({"scintillator": 0}, "scintillator must be > 0"), ({"saturation": -1.0}, "saturation must be > 0"),
-    ({"scatter_width": 0.0}, "scatter_width must be > 0"), ({"ct_energy": 300.0}, "300.0 keV were given"),
+    ({"scintillator": 0}, "scintillator must be finite and > 0"),
+    ({"saturation": -1.0}, "saturation must be finite"), ({"scatter_width": math.inf}, "scatter_width must be finite"),
+    ({"air_photons": math.inf}, "photons per pixel must be > 0"), ({"ct_energy": 300.0}, "300.0 keV were given"),
     ({"spectrum": Spectrum((5.0, 60.0), (1, 1))}, "from 5.0 to 60.0 keV")])
 def test_bad_settings_are_refused(settings, words):
     with pytest.raises(ValueError, match=words):

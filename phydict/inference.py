@@ -46,7 +46,7 @@ class ReconstructionTask(lightning.LightningModule):
     method: a Sampler (run with the prior) or a Reconstructor; name: what tables call it; prior: the prior's file;
     guidance: classifier-free guidance when a report is given; out: output folder; overwrite: redo finished cases;
     seed: with the case's id, the only source of randomness. In test the method takes its attenuation of water from the
-    simulator, so that HU come out right whatever the spectrum.
+    simulator, so that the HU scale fits the spectrum.
     """
 
     def __init__(self, method: Sampler | Reconstructor, name: str, prior: str = str(DEFAULT_PRIOR),

@@ -45,8 +45,8 @@ class Polychromatic(Simulator):
     scatter_width: standard deviation in mm on the detector of the scatter kernel.
     saturation: the largest signal that the detector can read, as a multiple of the signal without patient; None: no
         limit. Signals below half a detected photon read as half a photon, so that no pixel is infinite.
-    metal: HU from which voxels are titanium, None for never; 3000, say, for whole CTs. CTs clipped to a prior's HU window
-        hold no metal.
+    metal: HU from which voxels are titanium (such as 3000), None for never. CTs clipped to a prior's HU window hold no
+        metal.
     ct_energy: effective energy in keV of the CT that the volume is from; 70 suits 120 kVp.
 
     Not modelled: heel effect, bow-tie filters, focal spot, blur of the detector, motion.

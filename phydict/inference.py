@@ -47,7 +47,8 @@ class ReconstructionTask(lightning.LightningModule):
 
     method: a Sampler (run with the prior) or a Reconstructor; name: what tables call it; prior: the prior's file;
     guidance: classifier-free guidance when a report is given; out: output folder; overwrite: redo finished cases;
-    seed: with the case's id, the only source of randomness.
+    seed: with the case's id, the only source of randomness. In test the method takes its attenuation of water from the
+    simulator, so that the HU scale fits the spectrum.
     """
 
     def __init__(self, method: Sampler | Reconstructor, name: str, prior: str = str(DEFAULT_PRIOR),
@@ -89,7 +90,8 @@ class ReconstructionTask(lightning.LightningModule):
 
     def test_step(self, case: dict, _=None) -> None:
         case["beam"] = self.trainer.datamodule.beam
-        case["xrays"] = self.trainer.datamodule.simulate(case, self._seed(case), self.grid, self.window)
+        case["xrays"] = self.trainer.datamodule.simulate(case, self._seed(case), self.grid, self.window, self.device)
+        case["mu_water"] = self.trainer.datamodule.simulator.effective_mu_water
         result = self._reconstruct(case)
         if "affine" in case:  # back to its place in the CT it came from
             result = replace(result, grid=Grid(self.grid.shape, affine=case["affine"].numpy()))
@@ -124,8 +126,9 @@ class ReconstructionTask(lightning.LightningModule):
         case["report"] = case["report"] if self.trainer.datamodule.with_report else ""
         xrays, projector = fit_to_grid(self.reconstructor, self.grid, case["xrays"].to(self.device), case["beam"])
         self.progress.case(case["id"])
-        return self.reconstructor.reconstruct(xrays, projector, case["report"],
-                                              case.get("display", False), self._seed(case), self.progress.advance)
+        ready = self.reconstructor.assuming(case["mu_water"]) if "mu_water" in case else self.reconstructor
+        return ready.reconstruct(xrays, projector, case["report"], case.get("display", False), self._seed(case),
+                                 self.progress.advance)
 
     def _finish(self, case: dict, result: Reconstruction, scores: dict | None = None,
                 truth: Tensor | None = None) -> None:
@@ -155,7 +158,8 @@ class ReconstructionTask(lightning.LightningModule):
                 "misfit_per_view": result.misfit_per_view, "seconds": result.seconds,
                 "network_calls": result.network_calls, "projector_calls": result.projector_calls,
                 "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-                "views": len(result.xrays), "grid": result.grid.to_dict(), "seed": result.seed,
+                "mu_water": case.get("mu_water", self.reconstructor.mu_water), "views": len(result.xrays),
+                "grid": result.grid.to_dict(), "seed": result.seed,
                 "report": case["report"], "settings": self.settings, "versions": versions()}
 
     def summarise(self) -> list[dict]:

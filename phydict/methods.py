@@ -61,14 +61,17 @@ def fit_to_grid(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam)
 
 def reconstruct(xrays: Tensor, beam: ConeBeam, prior: Prior | str | Path | None = None,
                 method: str | Sampler | Reconstructor = "phydict_fast", report: str | None = None,
-                display: bool = False, seed: int = 0, guidance: float = 2.0, on_step=lambda: None) -> Reconstruction:
+                display: bool = False, seed: int = 0, guidance: float = 2.0, mu_water: float | None = None,
+                on_step=lambda: None) -> Reconstruction:
     """A CT volume from X-rays (K, V, U) and their geometry.
 
     xrays: line integrals; with display=True, display values with an unknown gain and offset per view.
     prior: a Prior, a file, or None for the shipped one; report: radiology text, if any.
+    mu_water: attenuation in 1/mm that water has in the X-rays (None: the method's own, near 65 keV).
     A detector finer than the grid can use is binned. Raises ValueError when X-rays, geometry and prior do not fit.
     """
     ready = reconstructor(method, prior, guidance)
+    ready = ready if mu_water is None else ready.assuming(mu_water)
     grid = ready.prior.grid if isinstance(ready, Posterior) else Grid.cube(64)
     xrays, projector = fit_to_grid(ready, grid, xrays, beam)
     return ready.reconstruct(xrays, projector, report or "", display, seed, on_step)

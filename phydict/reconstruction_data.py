@@ -16,7 +16,7 @@ from phydict.datasets import find_cts, find_xrays, load_xrays, phantom_case, pre
 from phydict.grid import Grid
 from phydict.reconstructor import describe
 from phydict.units import HUWindow
-from phydict.xray import ConeBeam, Ideal, Projector
+from phydict.xray import ConeBeam, Ideal, Projector, Simulator
 
 
 class Listed(Dataset):
@@ -40,15 +40,15 @@ class ReconstructionData(lightning.LightningDataModule):
     file used instead of theirs. cts: for test, a NIfTI file or a folder of CTs, or the word phantom; reports, metadata,
     fixed: as for training; phantoms: how many phantoms; with_report: whether the cases' reports are used.
     views, source_to_detector, source_to_isocentre (mm), detector (rows, columns), pixel (mm): the simulated orbit;
-    simulator: how X-rays are made of a CT; simulation_voxels: voxels per side of the volume they are made of (None:
-    the reconstruction's own grid, which is an inverse crime; more lessens it).
+    simulator: how X-rays are made of a CT (configs/simulate); simulation_voxels: voxels per side of the volume they
+    are made of (None: the reconstruction's own grid, which is an inverse crime; more lessens it).
     """
 
     def __init__(self, xrays: str | None = None, geometry: str | None = None, cts: str | None = None,
                  reports: str | None = None, metadata: str | None = None, fixed: bool = True, phantoms: int = 4,
                  with_report: bool = True, views: int = 8, source_to_detector: float = 1020.0,
                  source_to_isocentre: float = 740.0, detector: tuple[int, int] = (448, 448),
-                 pixel: tuple[float, float] = (1.25, 1.25), simulator: Ideal = Ideal(),
+                 pixel: tuple[float, float] = (1.25, 1.25), simulator: Simulator = Ideal(),
                  simulation_voxels: int | None = None):
         super().__init__()
         self.xrays, self.geometry, self.cts, self.phantoms = xrays, geometry, cts, phantoms
@@ -89,9 +89,9 @@ class ReconstructionData(lightning.LightningDataModule):
                 c.path, grid, task.window, id=c.id, calibration=c.calibration)) | {"report": c.report})
             for ct in find_cts(self.cts, **self.tables)])
 
-    def simulate(self, case: dict, seed: int, grid: Grid, window: HUWindow) -> Tensor:
-        """X-rays (K, V, U) of a CT case."""
-        source = case.get("source", case["volume"])
+    def simulate(self, case: dict, seed: int, grid: Grid, window: HUWindow, device: torch.device) -> Tensor:
+        """X-rays (K, V, U) of a CT case, made on `device`."""
+        source = case.get("source", case["volume"]).to(device)
         fine = Grid.cube(source.shape[-1], grid.extent[0])
         return self.simulator(Projector(fine, self.beam, full_detector=True), window.to_mu(source)[None], seed)[0]
 

@@ -6,7 +6,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 
 import nibabel
@@ -14,6 +14,7 @@ import numpy as np
 from torch import Tensor
 
 from phydict.grid import Grid
+from phydict.units import MU_WATER
 from phydict.xray import ConeBeam, Projector
 
 
@@ -73,12 +74,18 @@ def save_nifti(path: str | Path, volume: np.ndarray, grid: Grid) -> None:
 
 
 class Reconstructor(ABC):
-    """Turns X-rays into a CT volume. Implementations hold settings only; one object serves any number of cases.
+    """Turns X-rays into a CT volume. Implementations are dataclasses of settings; one object serves many cases.
 
     full_detector: whether the method wants every pixel, instead of a detector binned to what the grid can hold.
+    mu_water: attenuation in 1/mm that water has in the X-rays; between it and HU lies this factor.
     """
 
     full_detector = False
+    mu_water: float = MU_WATER
+
+    def assuming(self, mu_water: float) -> Reconstructor:
+        """The same method for X-rays in which water attenuates `mu_water` in 1/mm."""
+        return replace(self, mu_water=mu_water)
 
     @abstractmethod
     def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,

@@ -17,7 +17,7 @@ from phydict.inference import main as infer
 from phydict.methods import METHODS
 from phydict.posterior import Posterior
 from phydict.prior import save_prior
-from phydict.xray import ConeBeam
+from phydict.xray import ConeBeam, Ideal, Polychromatic
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "phydict"
@@ -29,7 +29,7 @@ FLOORS = {
     "methods": 4, "dry_run": 4, "datamodule": 4, "reconstruction_data": 4, "training": 4, "inference": 4}
 LIGHTNING = ("datamodule", "reconstruction_data", "training", "inference")
 CONFIGS = {folder: sorted((ROOT / "configs" / folder).glob("*.yaml"))
-           for folder in ("prior", "reconstruct", "geometry")}
+           for folder in ("prior", "reconstruct", "geometry", "simulate")}
 
 
 def files():
@@ -88,14 +88,14 @@ def test_everything_below_the_top_floor_runs_without_lightning():
 
 @pytest.fixture
 def inference(tmp_path, monkeypatch):
-    """Builds infer.py's command line from a configuration, with a tiny prior and nothing run."""
+    """Builds infer.py's command line from configurations, with a tiny prior and nothing run."""
     monkeypatch.chdir(tmp_path)
     save_prior(tiny_prior(), "tiny.safetensors")
-    return lambda config: InferenceCLI(
+    return lambda *configs: InferenceCLI(
         ReconstructionTask, ReconstructionData, run=False, save_config_callback=None,
         trainer_defaults={"logger": False, "accelerator": "cpu", "devices": 1, "enable_progress_bar": False,
                           "enable_checkpointing": False, "enable_model_summary": False},
-        args=["--config", str(config), "--model.prior", "tiny.safetensors", "--model.out", "out"])
+        args=[*(f"--config={config}" for config in configs), "--model.prior=tiny.safetensors", "--model.out=out"])
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -108,6 +108,16 @@ def test_a_named_method_is_what_its_configuration_builds(inference, name):
 
 def test_every_reconstruction_configuration_is_a_named_method():
     assert {file.stem for file in CONFIGS["reconstruct"]} == set(METHODS)
+
+
+@pytest.mark.parametrize("preset", CONFIGS["reconstruct"], ids=lambda f: f.stem)
+@pytest.mark.parametrize("config", CONFIGS["simulate"], ids=lambda f: f.stem)
+def test_every_simulator_goes_with_every_method(inference, preset, config):
+    cli = inference(preset, config)
+    assert cli.datamodule.simulator == {"ideal": Ideal(), "polychromatic": Polychromatic()}[config.stem]
+    assert cli.model.method_name == preset.stem
+    ready = cli.model.reconstructor.assuming(cli.datamodule.simulator.effective_mu_water)
+    assert ready.mu_water == cli.datamodule.simulator.effective_mu_water and ready.name == preset.stem
 
 
 @pytest.mark.parametrize("config", CONFIGS["prior"], ids=lambda f: f.stem)

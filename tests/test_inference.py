@@ -28,8 +28,8 @@ from phydict.inference import main
 from phydict.methods import reconstruct, reconstructor
 from phydict.posterior import PriorOnly
 from phydict.prior import Prior, VolumeUNet, save_prior
-from phydict.units import HUWindow
-from phydict.xray import ConeBeam, Projector
+from phydict.units import MU_WATER, HUWindow
+from phydict.xray import ConeBeam, Polychromatic, Projector
 from phydict.xray.geometry_files import write_beam
 
 ROOT = Path(__file__).parents[1]
@@ -319,6 +319,18 @@ def test_the_simulated_orbit_is_the_one_asked_for(scored, tmp_path):
 def test_other_xrays_into_a_finished_folder_are_refused(scored, capsys):
     for change in ("--data.views=4", "--data.simulation_voxels=32", "--data.simulator.noise=0.1"):
         assert "other settings" in refusal(capsys, phantoms(scored.parent, 2, change))
+
+
+def test_realistic_xrays_are_made_and_come_out_in_hu(scored, tmp_path):
+    realistic = f"--config={CONFIGS.parent / 'simulate' / 'polychromatic.yaml'}"
+    main(phantoms(tmp_path, 1, realistic, "--data.simulator.kvp=70"))
+    folder = "sirt/phantom-1000000"
+    said, density = record(tmp_path / folder), volume(tmp_path / folder) + 1000
+    assert said["settings"]["data"]["simulator"]["kvp"] == 70
+    assert said["mu_water"] == Polychromatic(kvp=70).effective_mu_water > 1.2 * MU_WATER
+    assert record(scored / "phantom-1000000")["mu_water"] == MU_WATER
+    ideal = volume(scored / "phantom-1000000") + 1000
+    assert density.mean() == pytest.approx(ideal.mean(), rel=0.05) and not np.allclose(density, ideal, rtol=1e-3)
 
 
 def test_two_processes_split_the_cases_and_agree_with_one(scored, tmp_path):

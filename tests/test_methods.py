@@ -38,6 +38,13 @@ def test_sirt_in_one_call_finds_the_ball_in_its_exact_line_integrals():
     assert result.volume[26:38, 26:38, 26:38].mean() == pytest.approx(0, abs=100)
 
 
+def test_hu_do_not_depend_on_the_beams_attenuation_of_water_once_it_is_stated():
+    beam = ConeBeam.orbit(4, 1020, 740, (28, 28), 20.0)
+    soft = reconstruct(ball(beam, 90.0), beam, method=SIRT(5)).volume
+    hard = reconstruct(0.85 * ball(beam, 90.0), beam, method=SIRT(5), mu_water=0.85 * MU_WATER).volume
+    torch.testing.assert_close(hard, soft, rtol=1e-4, atol=0.05)
+
+
 def test_a_detector_finer_than_the_grid_can_use_is_binned():
     beam = ConeBeam.orbit(3, 1020, 740, (112, 112), 4.0)
     result = reconstruct(ball(beam, 90.0), beam, method=SIRT(2))

@@ -22,7 +22,7 @@ METHODS = ("auto", "separable", "siddon", "eq4", "joseph", "matrix")
 MEMORY = 2**29
 """Bytes that a projector may hold beside volume and X-rays, unless told otherwise."""
 
-KEPT = 4
+KEPT = 2
 """Operators, with all that they computed from their geometry, that are kept for the next projector of the same one."""
 
 

@@ -10,14 +10,16 @@
     evaluation       metrics, tables, picture panels                                scores
     methods          the named methods, and `reconstruct` in one call
     dry_run         geometry drawn before anything is reconstructed
+    case_results     finished cases on disk
     training, inference, datamodule                                                 Lightning
 """
 
+from phydict.datasets import load_xrays
 from phydict.grid import Grid
 from phydict.methods import METHODS, reconstruct
 from phydict.prior import load_prior, save_prior
 from phydict.units import HUWindow, hu_to_mu, mu_to_hu
 from phydict.xray import ConeBeam, Projector
 
-__all__ = ["METHODS", "ConeBeam", "Grid", "HUWindow", "Projector", "hu_to_mu", "load_prior", "mu_to_hu", "reconstruct",
+__all__ = ["METHODS", "ConeBeam", "Grid", "HUWindow", "Projector", "hu_to_mu", "load_prior", "load_xrays", "mu_to_hu", "reconstruct",
            "save_prior"]

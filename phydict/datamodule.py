@@ -15,7 +15,7 @@ from phydict.datasets.cache import read_arrays, write_arrays
 from phydict.grid import Grid
 from phydict.units import HUWindow
 
-VERSION = 1
+PHANTOM_VERSION = 1
 """Raised whenever a phantom of the same seed comes out differently, so that cached ones are made anew."""
 
 HELD_OUT_PHANTOM = 1_000_000
@@ -31,7 +31,7 @@ class CachedPhantoms(Dataset):
     def __init__(self, first_seed: int, count: int, grid: Grid, window: HUWindow, cache: Path):
         self.first_seed, self.count, self.grid, self.window = first_seed, count, grid, window
         size = "x".join(map(str, grid.shape))
-        self.folder = cache / f"phantoms{VERSION}-{size}-{grid.spacing[0]:g}mm-{window.low:g}-{window.high:g}"
+        self.folder = cache / f"phantoms{PHANTOM_VERSION}-{size}-{grid.spacing[0]:g}mm-{window.low:g}-{window.high:g}"
 
     def __len__(self) -> int:
         return self.count

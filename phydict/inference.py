@@ -7,15 +7,12 @@ Each finished case is one folder of the output; a run that was stopped goes on w
 
 from __future__ import annotations
 
-import json
-import os
 import platform
 import resource
-import shutil
 import sys
-import tempfile
+import warnings
 import zlib
-from contextlib import suppress
+from collections.abc import Callable
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -23,12 +20,15 @@ from pathlib import Path
 import lightning
 import torch
 from lightning.pytorch.cli import LightningCLI
+from lightning.pytorch.utilities.exceptions import MisconfigurationException, SIGTERMException
 from rich.console import Console
 from torch import Tensor
 
-from phydict.command_line import one_sentence_errors, quiet
+from phydict.case_results import CaseResults
+from phydict.command_line import check_writable, one_sentence_errors, quiet, sentence
+from phydict.datasets import load_xrays
 from phydict.dry_run import dry_run
-from phydict.evaluation import CaseMetrics, markdown, panel, rich_table, volume_metrics, write_csv
+from phydict.evaluation import CaseMetrics, panel, rich_table, volume_metrics
 from phydict.grid import Grid
 from phydict.methods import DEFAULT_PRIOR, fit_to_grid, reconstructor
 from phydict.posterior import Sampler
@@ -38,27 +38,32 @@ from phydict.reconstruction_data import ReconstructionData
 from phydict.reconstructor import Reconstruction, Reconstructor, describe
 from phydict.units import HUWindow
 
-RECORD = "reconstruction.json"
-"""The file that marks a case as finished."""
-
-
 class ReconstructionTask(lightning.LightningModule):
     """Reconstructs every case with one method and writes it; in test, scores it against the CT it came from.
 
-    method: a Sampler (run with the prior) or a Reconstructor; name: what tables call it; prior: the prior's file;
-    guidance: classifier-free guidance when a report is given; out: output folder; overwrite: redo finished cases;
-    seed: with the case's id, the only source of randomness. In test the method takes its attenuation of water from the
-    simulator, so that the HU scale fits the spectrum.
+    In test the method takes its attenuation of water from the simulator, so that the HU scale fits the spectrum.
+
+    Args:
+        method: a Sampler, which is run with the prior, or a Reconstructor
+        name: what tables and folders call the method
+        prior: the prior's file, read where the method is a Sampler
+        guidance: scale of classifier-free guidance when a report is given; 1: none
+        out: output folder; cases go to <out>/<name>/<case>
+        overwrite: do finished cases again, and replace what is in their place
+        seed: with the case's id, the only source of randomness
+        voxels: voxels along each side of the cube, for methods without a prior
+        side: side of the cube in mm, for methods without a prior
     """
 
     def __init__(self, method: Sampler | Reconstructor, name: str, prior: str = str(DEFAULT_PRIOR),
-                 guidance: float = 2.0, out: str = "runs/reconstructions", overwrite: bool = False, seed: int = 0):
+                 guidance: float = 2.0, out: str = "runs/reconstructions", overwrite: bool = False, seed: int = 0,
+                 voxels: int = 64, side: float = 384.0):
         super().__init__()
-        self.method_name, self.folder, self.overwrite, self.seed = name, Path(out) / name, overwrite, seed
-        self.pages = Path(out) / "dry_run"
-        check_writable(self.folder)
+        self.method_name, self.seed, self.pages = name, seed, Path(out) / "dry_run"
+        self.results = CaseResults(Path(out) / name, overwrite)
+        check_writable(self.results.folder, "model.out")
         self.settings = {"name": name, "seed": seed, "method": describe(method)}
-        self.grid, self.window = Grid.cube(64), HUWindow()
+        self.grid, self.window = Grid.cube(voxels, side), HUWindow()
         if isinstance(method, Sampler):
             self.prior = load_prior(prior)
             self.grid, self.window = self.prior.grid, self.prior.window
@@ -67,28 +72,37 @@ class ReconstructionTask(lightning.LightningModule):
         self.reconstructor = reconstructor(method, getattr(self, "prior", None), guidance, name)
         self.metrics = CaseMetrics([name])
         self.progress = CaseProgress()
+        self.cases: list[str] = []
+
+    @property
+    def reads_no_text(self) -> bool:
+        prior = getattr(self, "prior", None)
+        return prior is not None and prior.text is None and prior.load_text is None
 
     def setup(self, stage: str) -> None:
         self.settings["data"] = self.trainer.datamodule.settings(stage)
 
-    def pending(self, cases: list[tuple]) -> list[tuple]:
-        """The (id, loader) pairs that are not finished yet; a case finished with other settings is an error."""
-        if self.overwrite:
-            return cases
-        for name, _ in cases:
-            record = self.folder / name / RECORD
-            if record.exists() and json.loads(record.read_text())["settings"] != self._json(self.settings):
-                raise ValueError(f"{self.folder / name} was finished with other settings: "
-                                 "set model.overwrite to true, or give another model.out")
-        left = [case for case in cases if not (self.folder / case[0] / RECORD).exists()]
-        if len(left) < len(cases) and self.trainer.is_global_zero:
-            print(f"{len(cases) - len(left)} of {len(cases)} cases are finished already and are kept", file=sys.stderr)
+    def unfinished(self, sources: dict[str, str]) -> list[str]:
+        """Of this run's cases, id -> what identifies their data, those that remain to be done."""
+        self.cases = list(sources)
+        if self.trainer.is_global_zero:
+            self.results.remove_leftovers()
+        left = self.results.unfinished(sources, self.settings)
+        if len(left) < len(sources) and self.trainer.is_global_zero:
+            print(f"{len(sources) - len(left)} of {len(sources)} cases are finished already and are kept",
+                  file=sys.stderr)
         return left
 
     def predict_step(self, case: dict, _=None) -> None:
-        self._finish(case, self._reconstruct(case))
+        self._attempt(case, self._predict)
 
     def test_step(self, case: dict, _=None) -> None:
+        self._attempt(case, self._test)
+
+    def _predict(self, case: dict) -> None:
+        self._finish(case, self._reconstruct(case))
+
+    def _test(self, case: dict) -> None:
         case["beam"] = self.trainer.datamodule.beam
         case["xrays"] = self.trainer.datamodule.simulate(case, self._seed(case), self.grid, self.window, self.device)
         case["mu_water"] = self.trainer.datamodule.simulator.effective_mu_water
@@ -100,6 +114,22 @@ class ReconstructionTask(lightning.LightningModule):
         scores = volume_metrics(result.volume[None, None], truth, lung) | {"misfit": result.misfit}
         self.metrics.update(case["index"], self.method_name, scores, seconds=sum(result.seconds.values()))
         self._finish(case, result, scores, truth[0, 0])
+
+    def _attempt(self, case: dict, work: Callable[[dict], None]) -> None:
+        """Bad input ends the run, or, where there are more cases, this one alone; a signal ends it between cases."""
+        if self.trainer.received_sigterm:
+            raise SIGTERMException
+        self.progress.case(case["id"])
+        try:
+            if "error" in case:
+                raise ValueError(case["error"]) from case["error"]
+            work(case)
+        except ValueError as error:
+            self.results.discard(case["id"])
+            if len(self.cases) == 1:
+                raise
+            self.progress.finished("not reconstructed")
+            print(f"error: {case['id']}: {sentence(error)}", file=sys.stderr)
 
     def on_test_epoch_end(self) -> None:
         self.log_dict(self.metrics.compute())
@@ -123,33 +153,23 @@ class ReconstructionTask(lightning.LightningModule):
         return zlib.crc32(f"{self.seed}/{case['id']}".encode())
 
     def _reconstruct(self, case: dict) -> Reconstruction:
-        case["report"] = case["report"] if self.trainer.datamodule.with_report else ""
+        with_report = self.trainer.datamodule.with_report
+        if case["report"] and with_report and self.reads_no_text:
+            warnings.warn("the prior was trained without text: reports are not used", stacklevel=2)
+        case["report"] = case["report"] if with_report and not self.reads_no_text else ""
         xrays, projector = fit_to_grid(self.reconstructor, self.grid, case["xrays"].to(self.device), case["beam"])
-        self.progress.case(case["id"])
         ready = self.reconstructor.assuming(case["mu_water"]) if "mu_water" in case else self.reconstructor
         return ready.reconstruct(xrays, projector, case["report"], case.get("display", False), self._seed(case),
                                  self.progress.advance)
 
     def _finish(self, case: dict, result: Reconstruction, scores: dict | None = None,
                 truth: Tensor | None = None) -> None:
-        """Writes a case's folder beside its place and moves it there when it is complete."""
-        final = self.folder / case["id"]
-        partial = self.folder / f".{case['id']}.{os.getpid()}.partial"
-        try:
-            partial.mkdir(parents=True, exist_ok=True)
-            result.save_nifti(partial / "volume.nii.gz")
-            panel(partial / "panel.png", result.volume, result.grid, result.xrays, result.reprojection, truth,
+        def write_files(folder: Path) -> None:
+            result.save_nifti(folder / "volume.nii.gz")
+            panel(folder / "panel.png", result.volume, result.grid, result.xrays, result.reprojection, truth,
                   title=f"{case['id']}: {self.method_name}")
-            (partial / RECORD).write_text(json.dumps(self._record(case, result, scores), indent=1))
-            while partial.exists():  # another process may have finished the same case, with the same result
-                shutil.rmtree(final, ignore_errors=True)
-                with suppress(FileExistsError):
-                    partial.rename(final)
-        except OSError as error:
-            raise OSError(f"the case {final} could not be written ({error.strerror or error}): "
-                          "free some space, or give another model.out") from error
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
+
+        self.results.write(case["id"], self._record(case, result, scores), write_files)
         self.progress.finished(f"{sum(result.seconds.values()):.1f} s, misfit {result.misfit:.4f}")
 
     def _record(self, case: dict, result: Reconstruction, scores: dict | None) -> dict:
@@ -157,46 +177,23 @@ class ReconstructionTask(lightning.LightningModule):
         return {"case": case["id"], "method": self.method_name, "scores": scores, "misfit": result.misfit,
                 "misfit_per_view": result.misfit_per_view, "seconds": result.seconds,
                 "network_calls": result.network_calls, "projector_calls": result.projector_calls,
-                "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+                "process_peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
                 "mu_water": case.get("mu_water", self.reconstructor.mu_water), "views": len(result.xrays),
                 "grid": result.grid.to_dict(), "seed": result.seed,
-                "report": case["report"], "settings": self.settings, "versions": versions()}
+                "report": case["report"], "source": case["source"], "settings": self.settings, "versions": versions()}
 
-    def summarise(self) -> list[dict]:
-        """Scores of all finished cases; written as results.csv and results.md and printed."""
-        rows = []
-        for record in sorted(self.folder.glob(f"*/{RECORD}")):
-            case = json.loads(record.read_text())
-            if case["scores"]:
-                rows.append({"case": case["case"], "method": case["method"], "views": case["views"],
-                             "grid": "x".join(map(str, case["grid"]["shape"]))} | case["scores"] | {
-                                 "seconds": sum(case["seconds"].values()), "network_calls": case["network_calls"],
-                                 "projector_calls": case["projector_calls"]})
+    def summarise(self) -> None:
+        """Prints and writes the scores of this run's cases. Raises ValueError, naming them, where some have failed."""
+        missing = [case for case in self.cases if not (self.results.folder / case).exists()]
+        rows = self.results.summarise(case for case in self.cases if case not in missing)
         if rows:
-            write_csv(self.folder / "results.csv", rows)
-            (self.folder / "results.md").write_text(markdown(rows))
             console = Console()
             console.width = max(console.width, 80 if console.is_terminal else 120)
             console.print(rich_table(rows))
-        return rows
-
-    @staticmethod
-    def _json(value: dict) -> dict:
-        return json.loads(json.dumps(value))
-
-
-def check_writable(folder: Path) -> None:
-    """Raises ValueError, in one sentence, unless files can be written at `folder` (which need not exist yet)."""
-    there = folder.absolute()
-    while not there.exists():
-        there = there.parent
-    try:
-        with tempfile.TemporaryFile(dir=there):
-            pass
-    except OSError as error:
-        reason = "is a file" if there.is_file() else f"cannot be written to ({error.strerror})"
-        raise ValueError(f"the output folder {folder} cannot be used because {there} {reason}: "
-                         "give another model.out") from error
+        print(f"results in {self.results.folder}")
+        if missing:
+            raise ValueError(f"{len(missing)} of {len(self.cases)} cases were not reconstructed ({', '.join(missing)}): "
+                             "see the messages above, and run the same command again")
 
 
 def versions() -> dict[str, str]:
@@ -228,8 +225,9 @@ class InferenceCLI(LightningCLI):
     def predict(self, model: ReconstructionTask, datamodule: ReconstructionData) -> None:
         """Reconstruct X-rays, or draw their geometry."""
         if self.dry_run:
-            for name, load in datamodule.xray_cases():
-                print(*dry_run(model.pages / f"{name}.png", load() | {"id": name}, model.grid), sep="\n")
+            for name, folder in datamodule.xray_cases().items():
+                case = load_xrays(folder, datamodule.geometry) | {"id": name}
+                print(*dry_run(model.pages / f"{name}.png", case, model.grid), sep="\n")
             return
         with model.progress:
             self.trainer.predict(model, datamodule=datamodule, return_predictions=False)
@@ -242,10 +240,10 @@ class InferenceCLI(LightningCLI):
 
 def main(args: list[str] | None = None) -> None:
     """Command line of inference: predict, test. A bad input ends in one sentence and exit code 2."""
-    with one_sentence_errors(), quiet():
+    with one_sentence_errors(MisconfigurationException), quiet():
         cli = InferenceCLI(
             ReconstructionTask, ReconstructionData, args=args, seed_everything_default=0, save_config_callback=None,
-            parser_kwargs={"exit_on_error": False},
+            parser_kwargs={"exit_on_error": False, "description": "Reconstruct chest CTs from X-rays."},
             trainer_defaults={"inference_mode": False, "logger": False, "enable_progress_bar": False,
                               "enable_checkpointing": False, "enable_model_summary": False, "accelerator": "auto",
                               "devices": 1})
@@ -254,4 +252,3 @@ def main(args: list[str] | None = None) -> None:
                 print(f"pages in {cli.model.pages}")
                 return
             cli.model.summarise()
-            print(f"results in {cli.model.folder}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -35,15 +36,17 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: Prior | str | Pa
     prior: a Prior or the file it is in; None for the shipped one. It is only loaded by methods that need it. name: what
     the result calls the method (None: its own name).
     """
-    name = name or (method if isinstance(method, str) else type(method).__name__)
     if isinstance(method, str):
         if method not in METHODS:
             raise ValueError(f"there is no method '{method}': use one of {', '.join(METHODS)}")
-        method = METHODS[method]
+        name, method = name or method, METHODS[method]
     if isinstance(method, Reconstructor):
-        return method
-    prior = prior if isinstance(prior, Prior) else load_prior(prior or DEFAULT_PRIOR)
-    return Posterior(prior, method, guidance, name=name)
+        return replace(method, name=name) if name else method
+    if not isinstance(method, Sampler):
+        raise ValueError(f"a method is a name ({', '.join(METHODS)}), a Sampler or a Reconstructor, but {method!r} was "
+                         "given")
+    prior = load_prior(prior or DEFAULT_PRIOR) if prior is None or isinstance(prior, str | Path) else prior
+    return Posterior(prior, method, guidance, name=name or type(method).__name__)
 
 
 def fit_to_grid(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam) -> tuple[Tensor, Projector]:
@@ -62,16 +65,17 @@ def fit_to_grid(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam)
 def reconstruct(xrays: Tensor, beam: ConeBeam, prior: Prior | str | Path | None = None,
                 method: str | Sampler | Reconstructor = "phydict_fast", report: str | None = None,
                 display: bool = False, seed: int = 0, guidance: float = 2.0, mu_water: float | None = None,
-                on_step=lambda: None) -> Reconstruction:
+                grid: Grid = Grid.cube(64), on_step=lambda: None) -> Reconstruction:
     """A CT volume from X-rays (K, V, U) and their geometry.
 
-    xrays: line integrals; with display=True, display values with an unknown gain and offset per view.
+    xrays: tensor or array of line integrals; with display=True, of display values with an unknown gain and offset per
+    view. grid: for methods without a prior; others work on their prior's.
     prior: a Prior, a file, or None for the shipped one; report: radiology text, if any.
     mu_water: attenuation in 1/mm that water has in the X-rays (None: the method's own, near 65 keV).
     A detector finer than the grid can use is binned. Raises ValueError when X-rays, geometry and prior do not fit.
     """
     ready = reconstructor(method, prior, guidance)
     ready = ready if mu_water is None else ready.assuming(mu_water)
-    grid = ready.prior.grid if isinstance(ready, Posterior) else Grid.cube(64)
-    xrays, projector = fit_to_grid(ready, grid, xrays, beam)
+    grid = ready.prior.grid if isinstance(ready, Posterior) else grid
+    xrays, projector = fit_to_grid(ready, grid, torch.as_tensor(xrays), beam)
     return ready.reconstruct(xrays, projector, report or "", display, seed, on_step)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,8 +12,8 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from phydict.datamodule import HELD_OUT_PHANTOM
-from phydict.datasets import find_cts, find_xrays, load_xrays, phantom_case, prepare_ct
+from phydict.datamodule import HELD_OUT_PHANTOM, PHANTOM_VERSION
+from phydict.datasets import CTFile, find_cts, find_xrays, load_xrays, phantom_case, prepare_ct
 from phydict.grid import Grid
 from phydict.reconstructor import describe
 from phydict.units import HUWindow
@@ -20,7 +21,7 @@ from phydict.xray import ConeBeam, Ideal, Projector, Simulator
 
 
 class Listed(Dataset):
-    """Cases made on demand: (id, function) pairs."""
+    """Cases made on demand: (id, what identifies its data, function) triples."""
 
     def __init__(self, makers: list):
         self.makers = makers
@@ -29,30 +30,49 @@ class Listed(Dataset):
         return len(self.makers)
 
     def __getitem__(self, i: int) -> dict:
-        name, make = self.makers[i]
-        return make() | {"id": name, "index": i}
+        name, source, make = self.makers[i]
+        case = {"id": name, "index": i, "source": source}
+        try:
+            return make() | case
+        except (ValueError, OSError) as error:  # the task decides what becomes of it
+            return case | {"error": error}
 
 
 class ReconstructionData(lightning.LightningDataModule):
     """What to reconstruct.
 
-    xrays: for predict, a folder of X-ray images with geometry.yaml, or a folder of such folders; geometry: a geometry
-    file used instead of theirs. cts: for test, a NIfTI file or a folder of CTs, or the word phantom; reports, metadata,
-    fixed: as for training; phantoms: how many phantoms; with_report: whether the cases' reports are used.
-    views, source_to_detector, source_to_isocentre (mm), detector (rows, columns), pixel (mm): the simulated orbit;
-    simulator: how X-rays are made of a CT (configs/simulate); simulation_voxels: voxels per side of the volume they
-    are made of (None: the reconstruction's own grid, which is an inverse crime; more lessens it).
+    Args:
+        xrays: for predict, a folder of X-ray images with geometry.yaml, or a folder of such folders
+        geometry: a geometry file used instead of theirs
+        cts: for test, a NIfTI file or a folder of CTs, or the word phantom
+        reports: CT-RATE's table of reports, or the folder it is in; none given: looked for beside the CTs
+        metadata: CT-RATE's metadata table, needed where headers are not fixed
+        fixed: whether the NIfTI headers are right (CT-RATE's *_fixed folders and ordinary archives)
+        only: a text file of the case ids to test, such as the held_out.txt of a training; none given: all
+        exclude: a text file of case ids to leave out
+        phantoms: how many phantoms where cts is the word phantom
+        with_report: whether the cases' reports are used
+        views: simulated views, on a full circle from anterior
+        source_to_detector: mm
+        source_to_isocentre: mm
+        detector: rows and columns of simulated pixels
+        pixel: mm from row to row and from column to column
+        simulator: how X-rays are made of a CT (configs/simulate)
+        simulation_voxels: voxels per side of the volume that X-rays are made of; none given: the reconstruction's own
+            grid, which is an inverse crime; more lessens it
     """
 
     def __init__(self, xrays: str | None = None, geometry: str | None = None, cts: str | None = None,
-                 reports: str | None = None, metadata: str | None = None, fixed: bool = True, phantoms: int = 4,
-                 with_report: bool = True, views: int = 8, source_to_detector: float = 1020.0,
+                 reports: str | None = None, metadata: str | None = None, fixed: bool = True, only: str | None = None,
+                 exclude: str | None = None, phantoms: int = 4, with_report: bool = True, views: int = 8, source_to_detector: float = 1020.0,
                  source_to_isocentre: float = 740.0, detector: tuple[int, int] = (448, 448),
                  pixel: tuple[float, float] = (1.25, 1.25), simulator: Simulator = Ideal(),
                  simulation_voxels: int | None = None):
         super().__init__()
-        self.xrays, self.geometry, self.cts, self.phantoms = xrays, geometry, cts, phantoms
-        self.tables = {"reports": reports, "metadata": metadata, "fixed": fixed}
+        if phantoms < 1:
+            raise ValueError(f"data.phantoms must be at least 1, but {phantoms} was given")
+        self.xrays, self.geometry, self.cts, self.phantoms, self.only = xrays, geometry, cts, phantoms, only
+        self.tables = {"reports": reports, "metadata": metadata, "fixed": fixed, "exclude": exclude}
         self.with_report, self.simulator, self.simulation_voxels = with_report, simulator, simulation_voxels
         self.beam = ConeBeam.orbit(views, source_to_detector, source_to_isocentre, detector, pixel)
         self.orbit = {"views": views, "source_to_detector": source_to_detector,
@@ -65,15 +85,15 @@ class ReconstructionData(lightning.LightningDataModule):
         return {"with_report": self.with_report, **self.orbit, "simulator": describe(self.simulator),
                 "simulation_voxels": self.simulation_voxels}
 
-    def xray_cases(self) -> list[tuple]:
-        """(id, function that loads the Case) of every folder of X-rays. Raises ValueError without data.xrays."""
+    def xray_cases(self) -> dict[str, Path]:
+        """Id -> folder of X-rays. Raises ValueError without data.xrays."""
         if not self.xrays:
             raise ValueError("predict needs data.xrays: a folder of X-ray images with geometry.yaml")
-        return [(Path(os.path.abspath(folder)).name, lambda f=folder: load_xrays(f, self.geometry))
-                for folder in find_xrays(self.xrays)]
+        return {Path(os.path.abspath(folder)).name: folder for folder in find_xrays(self.xrays)}
 
     def predict_dataloader(self) -> DataLoader:
-        return self._loader(self.xray_cases())
+        return self._loader([(name, self._xrays_source(folder), lambda f=folder: load_xrays(f, self.geometry))
+                             for name, folder in self.xray_cases().items()])
 
     def test_dataloader(self) -> DataLoader:
         if not self.cts:
@@ -81,30 +101,54 @@ class ReconstructionData(lightning.LightningDataModule):
         task = self.trainer.lightning_module
         if self.cts == "phantom":
             return self._loader([
-                (f"phantom-{seed:06d}", lambda s=seed: self._with_source(
+                (f"phantom-{seed:06d}", f"phantom version {PHANTOM_VERSION}", lambda s=seed: self._with_fine(
                     task, lambda grid: phantom_case(s, grid, task.window)))
                 for seed in range(HELD_OUT_PHANTOM, HELD_OUT_PHANTOM + self.phantoms)])
         return self._loader([
-            (ct.id, lambda c=ct: self._with_source(task, lambda grid: prepare_ct(
+            (ct.id, _ct_source(ct), lambda c=ct: self._with_fine(task, lambda grid: prepare_ct(
                 c.path, grid, task.window, id=c.id, calibration=c.calibration)) | {"report": c.report})
-            for ct in find_cts(self.cts, **self.tables)])
+            for ct in self._chosen(find_cts(self.cts, **self.tables))])
+
+    def _chosen(self, cts: list[CTFile]) -> list[CTFile]:
+        if not self.only:
+            return cts
+        wanted = set(Path(self.only).read_text().split())
+        missing = wanted - {ct.id for ct in cts}
+        if missing or not wanted:
+            raise ValueError(f"data.only ({self.only}) names {', '.join(sorted(missing)[:3]) or 'no case'}, which "
+                             f"data.cts ({self.cts}) does not hold: correct the list, or give the folder it was made of")
+        return [ct for ct in cts if ct.id in wanted]
+
+    def _xrays_source(self, folder: Path) -> str:
+        """What identifies a folder's X-rays: a checksum of its files and of the geometry used instead of its own."""
+        crc = 0
+        files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+        for file in [*files, Path(self.geometry)] if self.geometry else files:
+            crc = zlib.crc32(file.read_bytes() if file.is_file() else b"", zlib.crc32(file.name.encode(), crc))
+        return f"files crc32 {crc:08x}"
 
     def simulate(self, case: dict, seed: int, grid: Grid, window: HUWindow, device: torch.device) -> Tensor:
         """X-rays (K, V, U) of a CT case, made on `device`."""
-        source = case.get("source", case["volume"]).to(device)
+        source = case.get("fine", case["volume"]).to(device)
         fine = Grid.cube(source.shape[-1], grid.extent[0])
         return self.simulator(Projector(fine, self.beam, full_detector=True), window.to_mu(source)[None], seed)[0]
 
-    def _with_source(self, task: lightning.LightningModule, make: Callable[[Grid], dict]) -> dict:
-        """A case, and under "source" the volume its X-rays are simulated from where that is another one."""
+    def _with_fine(self, task: lightning.LightningModule, make: Callable[[Grid], dict]) -> dict:
+        """A case, and under "fine" the volume its X-rays are simulated from where that is another one."""
         if not self.simulation_voxels:
             return make(task.grid)
-        return make(task.grid) | {"source": make(Grid.cube(self.simulation_voxels, task.grid.extent[0]))["volume"]}
+        return make(task.grid) | {"fine": make(Grid.cube(self.simulation_voxels, task.grid.extent[0]))["volume"]}
 
     def transfer_batch_to_device(self, batch: dict, device: torch.device, dataloader_idx: int) -> dict:
         return batch  # a case holds its beam, which has no device; its X-rays are moved when they are reconstructed
 
     def _loader(self, makers: list[tuple]) -> DataLoader:
-        cases = Listed(self.trainer.lightning_module.pending(makers))
+        left = set(self.trainer.lightning_module.unfinished({name: source for name, source, _ in makers}))
+        cases = Listed([maker for maker in makers if maker[0] in left])
         self.trainer.strategy.barrier()  # every process has looked before any process finishes a case
         return DataLoader(cases, None)
+
+
+def _ct_source(ct: CTFile) -> str:
+    stat = ct.path.stat()
+    return f"{ct.path.name}, {stat.st_size} bytes of {stat.st_mtime_ns}, report crc32 {zlib.crc32(ct.report.encode()):08x}"

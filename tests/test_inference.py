@@ -6,6 +6,8 @@ import csv
 import json
 import os
 import resource
+import shutil
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -142,7 +144,7 @@ def test_predict_writes_what_the_library_reconstructs(measured, tmp_path, capsys
     np.testing.assert_array_equal(volume(folder), expected.volume.numpy())
     said = record(folder)
     assert said["misfit"] == pytest.approx(expected.misfit) and len(said["misfit_per_view"]) == said["views"] == 3
-    assert set(said["seconds"]) == {"prepare", "sample", "score"} and said["peak_memory_mb"] > 100
+    assert set(said["seconds"]) == {"prepare", "sample", "score"} and said["process_peak_memory_mb"] > 100
     assert said["settings"]["seed"] == 7 and said["settings"]["method"]["iterations"] == 3
     assert said["settings"]["method"]["mu_water"] == 0.02  # also what the configuration left out
     assert {"phydict", "torch", "python"} <= set(said["versions"]) and said["report"] == "No effusion."
@@ -245,11 +247,92 @@ def test_a_stopped_run_goes_on_where_it_was(measured, tmp_path, monkeypatch, sto
 
 
 def test_a_partial_folder_is_never_a_finished_case(measured, scored, tmp_path):
-    for name in ("anna", ".anna.1234.partial"):  # a process killed while it wrote, and a folder without its record
-        (tmp_path / "sirt" / name).mkdir(parents=True)
-        (tmp_path / "sirt" / name / "volume.nii.gz").write_bytes(b"half")
+    gone = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True).stdout
+    for process in (gone.strip(), os.getpid()):  # killed while it wrote, and writing now
+        partial = tmp_path / "sirt" / f".anna.{socket.gethostname()}.{process}.partial"
+        partial.mkdir(parents=True)
+        (partial / "volume.nii.gz").write_bytes(b"half")
     main(sirt("predict", tmp_path, f"--data.xrays={measured / 'anna'}"))
     assert names(tmp_path / "sirt" / "anna") == FILES and volume(tmp_path / "sirt" / "anna").shape == (64, 64, 64)
+    assert names(tmp_path / "sirt") == ["anna"]
+
+
+def test_a_folder_that_is_no_case_is_never_replaced_unasked(measured, tmp_path, capsys):
+    notes = tmp_path / "sirt" / "anna" / "notes.txt"
+    notes.parent.mkdir(parents=True)
+    notes.write_text("mine")
+    args = sirt("predict", tmp_path, f"--data.xrays={measured / 'anna'}")
+    said = refusal(capsys, args)
+    assert str(notes.parent) in said and "model.overwrite" in said and notes.read_text() == "mine"
+    main([*args, "--model.overwrite=true"])
+    assert names(notes.parent) == FILES
+
+
+def test_a_damaged_record_is_named(measured, tmp_path, capsys):
+    args = sirt("predict", tmp_path, f"--data.xrays={measured / 'anna'}")
+    main(args)
+    file = tmp_path / "sirt" / "anna" / "reconstruction.json"
+    for content in (file.read_text()[:50], "{}"):
+        file.write_text(content)
+        said = refusal(capsys, args)
+        assert str(file.parent) in said and "damaged" in said
+
+
+def test_a_finished_case_is_never_taken_for_that_of_other_data(measured, cts, tmp_path, capsys):
+    shutil.copytree(measured / "anna", tmp_path / "case")
+    xrays, ct = (sirt("predict", tmp_path / "out", f"--data.xrays={tmp_path / 'case'}"),
+                 sirt("test", tmp_path / "out", f"--data.cts={tmp_path / 'ct.nii.gz'}", *ORBIT))
+    main(xrays)
+    for file in sorted((tmp_path / "case").iterdir()):
+        whole = file.read_bytes()
+        file.write_bytes(whole + b"\n")
+        assert "other data" in refusal(capsys, xrays), file
+        file.write_bytes(whole)
+    main(xrays)
+    for name in ("a", "b"):
+        shutil.copyfile(cts / f"{name}.nii.gz", tmp_path / "ct.nii.gz")
+        if name == "a":
+            main(ct)
+    assert "other data" in refusal(capsys, ct)
+
+
+def test_one_bad_case_spoils_no_other(measured, tmp_path, capsys):
+    shutil.copytree(measured, tmp_path / "cases")
+    next(path for path in (tmp_path / "cases" / "anna").iterdir() if path.suffix not in (".yaml", ".txt")).unlink()
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as stopped:
+        main(sirt("predict", tmp_path / "out", f"--data.xrays={tmp_path / 'cases'}"))
+    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+    assert stopped.value.code == 2 and len(said) == 2
+    assert said[0].startswith("error: anna: ") and "1 of 2 cases were not reconstructed (anna)" in said[1]
+    assert names(tmp_path / "out" / "sirt") == ["bert"] and names(tmp_path / "out" / "sirt" / "bert") == FILES
+
+
+def test_a_table_holds_the_cases_of_its_run_alone(cts, tmp_path):
+    main(sirt("test", tmp_path, f"--data.cts={cts}", *ORBIT))
+    (tmp_path / "only.txt").write_text("b\n")
+    main(sirt("test", tmp_path, f"--data.cts={cts}", *ORBIT, f"--data.only={tmp_path / 'only.txt'}"))
+    with (tmp_path / "sirt" / "results.csv").open() as file:
+        assert [row["case"] for row in csv.DictReader(file)] == ["b"]
+
+
+def test_a_list_of_cases_must_fit_the_folder(cts, tmp_path, capsys):
+    (tmp_path / "only.txt").write_text("b\nnobody\n")
+    said = refusal(capsys, sirt("test", tmp_path, f"--data.cts={cts}", *ORBIT, f"--data.only={tmp_path / 'only.txt'}"))
+    assert "nobody" in said and "data.only" in said
+
+
+def test_a_signal_ends_the_run_between_cases_and_is_no_success(tmp_path):
+    args = phantoms(tmp_path, 200)
+    run = subprocess.Popen([sys.executable, str(ROOT / "infer.py"), *args], stderr=subprocess.PIPE, text=True)
+    for line in run.stderr:
+        if "misfit" in line:
+            break
+    run.terminate()
+    said = run.stderr.read()
+    assert run.wait(60) == 143 and "run the same command again" in said
+    done = names(tmp_path / "sirt")
+    assert 1 <= len(done) < 200 and all(names(tmp_path / "sirt" / case) == FILES for case in done)
 
 
 def test_scores_are_those_of_the_written_volumes(scored):
@@ -480,9 +563,11 @@ def test_a_bad_prior_is_one_sentence(case, prior, measured, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_report_for_a_prior_without_text_is_one_sentence(prior, measured, tmp_path, capsys):
-    said = refusal(capsys, with_prior("predict", tmp_path / "out", prior, f"--data.xrays={measured}"))
-    assert "without text" in said and not (tmp_path / "out").exists()
+def test_a_prior_without_text_says_that_it_reads_no_report(prior, measured, tmp_path, capsys):
+    main(with_prior("predict", tmp_path / "out", prior, f"--data.xrays={measured}"))
+    said = capsys.readouterr().err
+    assert said.count("trained without text") == 1
+    assert record(tmp_path / "out" / "prior_only" / "anna")["report"] == ""
 
 
 def test_a_prior_refuses_xrays_of_another_grid(prior):
@@ -528,7 +613,7 @@ def test_a_read_only_disk_is_one_sentence(measured, tmp_path, capsys, monkeypatc
     def refuse(**_):
         raise OSError(30, "Read-only file system")
 
-    monkeypatch.setattr("phydict.inference.tempfile.TemporaryFile", refuse)
+    monkeypatch.setattr("phydict.command_line.tempfile.TemporaryFile", refuse)
     said = refusal(capsys, sirt("predict", tmp_path / "out", f"--data.xrays={measured}"))
     assert "Read-only file system" in said and not (tmp_path / "out").exists()
 

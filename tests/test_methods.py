@@ -72,7 +72,8 @@ def test_an_unknown_method_names_the_known_ones():
 
 
 def test_sirt_needs_no_prior_and_a_sampler_says_which_one_is_missing(tmp_path):
-    assert reconstructor("sirt", tmp_path / "nowhere.safetensors") is METHODS["sirt"]
+    assert reconstructor("sirt", tmp_path / "nowhere.safetensors") == METHODS["sirt"]
+    assert reconstructor("sirt", name="mine").name == "mine"
     with pytest.raises(FileNotFoundError, match="nowhere.safetensors"):
         reconstructor("phydict_fast", tmp_path / "nowhere.safetensors")
 

@@ -27,6 +27,10 @@ class SIRT(Reconstructor):
     mu_water: float = MU_WATER
     name: str = "sirt"
 
+    def __post_init__(self):
+        if self.iterations < 1:
+            raise ValueError(f"SIRT needs at least 1 iteration, but {self.iterations} was given")
+
     def steps(self) -> int:
         return self.iterations
 

@@ -13,6 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 KINDS = ("line_integrals", "counts", "display")
+MOST = 100.0
+"""No line integral of a patient is larger: it is 2 m of bone."""
+
 ABOVE_AIR = 1.5
 """Counts above so many times the air value are no noise."""
 
@@ -45,6 +48,8 @@ class Intensity:
             self._make_number("dark")
         if self.flat is not None and not _names(self.flat):
             raise ValueError(f"`flat` is the name of an image, or a list of names, but {self.flat!r} was given")
+        if self.scale == 0:
+            raise ValueError("the scale of line integrals must not be 0; give what one pixel value stands for")
         counts = [name for name in ("air", "flat", "dark", "floor") if getattr(self, name) is not None]
         if self.kind != "counts" and counts:
             raise ValueError(f"`{counts[0]}` belongs to the intensity kind counts, but the kind is {self.kind}")
@@ -79,7 +84,12 @@ class Intensity:
         Raises ValueError for negative counts, counts far above air, and air that is not above dark.
         """
         if self.kind == "line_integrals":
-            return self.scale * pixels + self.offset
+            y = self.scale * pixels + self.offset
+            if np.nanmax(y) > MOST or np.nanmedian(y) < 0:
+                raise ValueError(f"the line integrals have a median of {np.nanmedian(y):.3g} and reach {np.nanmax(y):.3g}, "
+                                 f"but behind a patient they lie between 0 and about 10; correct `scale` and `offset`, "
+                                 "or state another intensity kind")
+            return y
         if self.kind == "display":
             return pixels / full_scale if self.bright_is_dense else 1 - pixels / full_scale
         references = references or {}

@@ -139,8 +139,8 @@ class _Views:
 
     @property
     def full_scale(self) -> float:
-        """The largest value that the images' type can hold; for floating-point images the largest that they do."""
-        if np.issubdtype(self.images[0].dtype, np.integer):
+        """The largest value that the images' type can hold; of types beyond 16 bits the largest that they do hold."""
+        if np.issubdtype(self.images[0].dtype, np.integer) and self.images[0].dtype.itemsize <= 2:
             return float(np.iinfo(self.images[0].dtype).max)
         return max(*(float(np.abs(image).max()) for image in self.images), 1e-12)
 

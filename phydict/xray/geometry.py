@@ -186,7 +186,8 @@ class ConeBeam:
 
     @classmethod
     def load(cls, path: str | Path) -> ConeBeam:
-        """Read a beam from YAML: the vector form that `save` writes, or one mapping `orbit:`.
+        """Read a beam from YAML: the vector form that `save` writes, or one mapping `orbit:`, at the top level
+        or under `beam:` as in geometry.yaml.
 
         orbit: {views, source_to_detector, source_to_isocentre, shape: [rows, columns], pixel: [row mm, column mm]}
         and optionally start_degrees (0) and arc_degrees (360).
@@ -200,7 +201,8 @@ class ConeBeam:
         except yaml.YAMLError as error:
             raise ValueError(f"{path} is not valid YAML: {error}") from error
         try:
-            return cls.from_dict(content)
+            beam = content.get("beam", content) if isinstance(content, dict) else content
+            return cls.from_dict(beam)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
 

@@ -1,0 +1,125 @@
+"""The finished cases of one method on disk: each one a folder that appears whole or not at all."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+import socket
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from phydict.evaluation import markdown, write_csv
+
+RECORD = "reconstruction.json"
+"""The file that marks a case as finished."""
+
+
+class CaseResults:
+    """Finished cases below `folder`, one folder each.
+
+    A case is finished with certain settings and a certain source (what identifies its input); both are kept in its
+    record, so that a result is never taken for that of other settings or of other data.
+    """
+
+    def __init__(self, folder: Path, overwrite: bool = False):
+        self.folder, self.overwrite = folder, overwrite
+
+    def unfinished(self, sources: dict[str, str], settings: dict) -> list[str]:
+        """Of the cases, id -> source, those that remain to be done; all of them with `overwrite`.
+
+        Raises ValueError for a folder in a case's place that holds no finished case, or one of another origin.
+        """
+        if self.overwrite:
+            return list(sources)
+        settings = json.loads(json.dumps(settings))
+        left = []
+        for case, source in sources.items():
+            folder = self.folder / case
+            if not folder.exists():
+                left.append(case)
+                continue
+            record = self.read(case)
+            for what, same in (("settings", record["settings"] == settings), ("data", record["source"] == source)):
+                if not same:
+                    raise ValueError(f"{folder} was finished with other {what}: set model.overwrite to true, or give "
+                                     "another model.out")
+        return left
+
+    def read(self, case: str) -> dict:
+        """The record of a finished case. Raises ValueError where there is none or it is damaged."""
+        file = self.folder / case / RECORD
+        try:
+            record = json.loads(file.read_text())
+            record["settings"], record["source"], record["scores"]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{file.parent} is in the place of a case, but its {RECORD} is missing or damaged: "
+                             "move that folder away, set model.overwrite to true, or give another model.out") from error
+        return record
+
+    def remove_leftovers(self) -> None:
+        """Removes what processes of this machine that are no more had begun to write."""
+        for partial in self.folder.glob(".*.partial"):
+            host, _, process = partial.name.removesuffix(".partial").rpartition(".")
+            if host.endswith("." + socket.gethostname()) and process.isdigit() and not _runs(int(process)):
+                shutil.rmtree(partial, ignore_errors=True)
+
+    def write(self, case: str, record: dict, write_files: Callable[[Path], None]) -> None:
+        """Makes a case's folder: `write_files` fills it, the record completes it, then it takes its place.
+
+        Raises OSError, in one sentence, where it cannot be written.
+        """
+        final = self.folder / case
+        partial = self.folder / f".{case}.{socket.gethostname()}.{os.getpid()}.partial"
+        try:
+            partial.mkdir(parents=True, exist_ok=True)
+            write_files(partial)
+            (partial / RECORD).write_text(json.dumps(record, indent=1))
+            _take_place(partial, final)
+        except OSError as error:
+            raise OSError(f"the case {final} could not be written ({error.strerror or error}): "
+                          "free some space, or give another model.out") from error
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+
+    def discard(self, case: str) -> None:
+        """Removes the older result, if any, of a case that was to be overwritten and has failed."""
+        if self.overwrite:
+            shutil.rmtree(self.folder / case, ignore_errors=True)
+
+    def summarise(self, cases: Iterable[str]) -> list[dict]:
+        """One row of scores per case that was scored; written as results.csv and results.md."""
+        rows = []
+        for case in cases:
+            record = self.read(case)
+            if record["scores"]:
+                rows.append({"case": case, "method": record["method"], "views": record["views"],
+                             "grid": "x".join(map(str, record["grid"]["shape"]))} | record["scores"] | {
+                                 "seconds": sum(record["seconds"].values()), "network_calls": record["network_calls"],
+                                 "projector_calls": record["projector_calls"]})
+        if rows:
+            write_csv(self.folder / "results.csv", rows)
+            (self.folder / "results.md").write_text(markdown(rows))
+        return rows
+
+
+def _take_place(partial: Path, final: Path) -> None:
+    while True:  # another process may have finished the same case in the meantime, with the same result
+        try:
+            partial.rename(final)
+            return
+        except OSError as error:
+            if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):
+                raise
+            shutil.rmtree(final)
+
+
+def _runs(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        pass
+    return True

@@ -77,6 +77,7 @@ class PriorData(lightning.LightningDataModule):
         reports: CT-RATE's table of reports, or the folder it is in; none given: looked for beside the CTs
         metadata: CT-RATE's metadata table, needed where headers are not fixed
         fixed: whether the NIfTI headers are right (CT-RATE's *_fixed folders and ordinary archives)
+        first_reconstruction: keep one volume per scan
         exclude: a text file of case ids to leave out
         holdout: CTs whose id contains one of these words validate instead of training
         holdout_fraction: share of the patients that validate instead of training, in [0, 1]
@@ -94,23 +95,23 @@ class PriorData(lightning.LightningDataModule):
     """
 
     def __init__(self, cts: str | None = None, reports: str | None = None, metadata: str | None = None,
-                 fixed: bool = True, exclude: str | None = None, holdout: list[str] | None = None,
-                 holdout_fraction: float = 0.0, phantoms: int = 2000, ct_fraction: float = 0.5,
-                 validation_phantoms: int = 6, epoch_size: int = 400, batch_size: int = 4, workers: int = 0,
+                 fixed: bool = True, first_reconstruction: bool = False, exclude: str | None = None,
+                 holdout: list[str] | None = None, holdout_fraction: float = 0.0, phantoms: int = 2000,
+                 ct_fraction: float = 0.5, validation_phantoms: int = 6, epoch_size: int = 400, batch_size: int = 4, workers: int = 0,
                  cache: str = "runs/cache", seed: int = 0, voxels: int = 64, side: float = 384.0,
                  window: tuple[float, float] = (-1000.0, 1000.0)):
         super().__init__()
         if not cts and not phantoms:
             raise ValueError("there is nothing to train on: give data.cts, or data.phantoms above 0")
         if phantoms < 0 or not 0 <= ct_fraction <= 1:
-            raise ValueError(f"data.phantoms must not be negative and data.ct_fraction lies in [0, 1], but {phantoms} and "
-                             f"{ct_fraction} were given")
+            raise ValueError("data.phantoms must not be negative and data.ct_fraction lies in [0, 1], but "
+                             f"{phantoms} and {ct_fraction} were given")
         if cts and Path(cache).resolve().is_relative_to(Path(cts).resolve()):
             raise ValueError(f"data.cache {cache} lies inside data.cts {cts}: give a folder elsewhere")
         window = HUWindow(*window)
         self.grid, self.window = Grid.cube(voxels, side), window
         self.phantoms = CachedPhantoms(0, phantoms, self.grid, window, Path(cache))
-        files = find_cts(cts, reports, metadata, fixed, exclude=exclude) if cts else []
+        files = find_cts(cts, reports, metadata, fixed, first_reconstruction, exclude) if cts else []
         for word in holdout or []:
             if not any(word in f.id for f in files):
                 raise ValueError(f"data.holdout names '{word}', but no CT has that in its id"

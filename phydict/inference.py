@@ -192,8 +192,8 @@ class ReconstructionTask(lightning.LightningModule):
             console.print(rich_table(rows))
         print(f"results in {self.results.folder}")
         if missing:
-            raise ValueError(f"{len(missing)} of {len(self.cases)} cases were not reconstructed ({', '.join(missing)}): "
-                             "see the messages above, and run the same command again")
+            raise ValueError(f"{len(missing)} of {len(self.cases)} cases were not reconstructed "
+                             f"({', '.join(missing)}): see the messages above, and run the same command again")
 
 
 def versions() -> dict[str, str]:

@@ -74,6 +74,10 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: Prior | str | Path | None 
     mu_water: attenuation in 1/mm that water has in the X-rays (None: the method's own, near 65 keV).
     A detector finer than the grid can use is binned. Raises ValueError when X-rays, geometry and prior do not fit.
     """
+    if not isinstance(beam, ConeBeam):
+        raise ValueError(f"the geometry must be a ConeBeam, but {beam!r} was given; ConeBeam.load reads one")
+    if not isinstance(report, str | None):
+        raise ValueError(f"the report must be text, but {report!r} was given")
     ready = reconstructor(method, prior, guidance)
     ready = ready if mu_water is None else ready.assuming(mu_water)
     grid = ready.prior.grid if isinstance(ready, Posterior) else grid

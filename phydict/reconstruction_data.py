@@ -49,6 +49,7 @@ class ReconstructionData(lightning.LightningDataModule):
         metadata: CT-RATE's metadata table, needed where headers are not fixed
         fixed: whether the NIfTI headers are right (CT-RATE's *_fixed folders and ordinary archives)
         only: a text file of the case ids to test, such as the held_out.txt of a training; none given: all
+        first_reconstruction: keep one volume per scan
         exclude: a text file of case ids to leave out
         phantoms: how many phantoms where cts is the word phantom
         with_report: whether the cases' reports are used
@@ -64,7 +65,8 @@ class ReconstructionData(lightning.LightningDataModule):
 
     def __init__(self, xrays: str | None = None, geometry: str | None = None, cts: str | None = None,
                  reports: str | None = None, metadata: str | None = None, fixed: bool = True, only: str | None = None,
-                 exclude: str | None = None, phantoms: int = 4, with_report: bool = True, views: int = 8, source_to_detector: float = 1020.0,
+                 first_reconstruction: bool = False, exclude: str | None = None, phantoms: int = 4,
+                 with_report: bool = True, views: int = 8, source_to_detector: float = 1020.0,
                  source_to_isocentre: float = 740.0, detector: tuple[int, int] = (448, 448),
                  pixel: tuple[float, float] = (1.25, 1.25), simulator: Simulator = Ideal(),
                  simulation_voxels: int | None = None):
@@ -72,7 +74,8 @@ class ReconstructionData(lightning.LightningDataModule):
         if phantoms < 1:
             raise ValueError(f"data.phantoms must be at least 1, but {phantoms} was given")
         self.xrays, self.geometry, self.cts, self.phantoms, self.only = xrays, geometry, cts, phantoms, only
-        self.tables = {"reports": reports, "metadata": metadata, "fixed": fixed, "exclude": exclude}
+        self.tables = {"reports": reports, "metadata": metadata, "fixed": fixed,
+                       "first_reconstruction": first_reconstruction, "exclude": exclude}
         self.with_report, self.simulator, self.simulation_voxels = with_report, simulator, simulation_voxels
         self.beam = ConeBeam.orbit(views, source_to_detector, source_to_isocentre, detector, pixel)
         self.orbit = {"views": views, "source_to_detector": source_to_detector,
@@ -116,7 +119,7 @@ class ReconstructionData(lightning.LightningDataModule):
         missing = wanted - {ct.id for ct in cts}
         if missing or not wanted:
             raise ValueError(f"data.only ({self.only}) names {', '.join(sorted(missing)[:3]) or 'no case'}, which "
-                             f"data.cts ({self.cts}) does not hold: correct the list, or give the folder it was made of")
+                             f"data.cts ({self.cts}) does not hold: correct the list, or give its folder")
         return [ct for ct in cts if ct.id in wanted]
 
     def _xrays_source(self, folder: Path) -> str:
@@ -134,10 +137,15 @@ class ReconstructionData(lightning.LightningDataModule):
         return self.simulator(Projector(fine, self.beam, full_detector=True), window.to_mu(source)[None], seed)[0]
 
     def _with_fine(self, task: lightning.LightningModule, make: Callable[[Grid], dict]) -> dict:
-        """A case, and under "fine" the volume its X-rays are simulated from where that is another one."""
+        """A case; where X-rays are made of a finer volume, that one as "fine", and its block means as the truth."""
         if not self.simulation_voxels:
             return make(task.grid)
-        return make(task.grid) | {"fine": make(Grid.cube(self.simulation_voxels, task.grid.extent[0]))["volume"]}
+        voxels, factor = self.simulation_voxels, self.simulation_voxels // task.grid.shape[0]
+        if voxels != factor * task.grid.shape[0]:
+            raise ValueError(f"data.simulation_voxels must be a multiple of the reconstruction's {task.grid.shape[0]} "
+                             f"voxels, but {voxels} was given")
+        fine = make(Grid.cube(voxels, task.grid.extent[0]))["volume"]
+        return make(task.grid) | {"fine": fine, "volume": torch.nn.functional.avg_pool3d(fine, factor)}
 
     def transfer_batch_to_device(self, batch: dict, device: torch.device, dataloader_idx: int) -> dict:
         return batch  # a case holds its beam, which has no device; its X-rays are moved when they are reconstructed
@@ -151,4 +159,5 @@ class ReconstructionData(lightning.LightningDataModule):
 
 def _ct_source(ct: CTFile) -> str:
     stat = ct.path.stat()
-    return f"{ct.path.name}, {stat.st_size} bytes of {stat.st_mtime_ns}, report crc32 {zlib.crc32(ct.report.encode()):08x}"
+    report = zlib.crc32(ct.report.encode())
+    return f"{ct.path.name}, {stat.st_size} bytes of {stat.st_mtime_ns}, report crc32 {report:08x}"

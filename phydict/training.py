@@ -128,6 +128,7 @@ class PriorTraining(lightning.LightningModule):
         if reports:
             losses = learn_findings(text, reports, labels, self.text_steps, self.seed)
             _tell(f"report encoder learns findings: loss {losses[0]:.3f} -> {losses[-1]:.3f}")
+        _tell("preparing cases that have reports, at most 1000")
         reports, coarse = data.coarse_cases(self.prior.network.text_map.cells)
         losses = learn_sketch(self.prior, reports, coarse, self.text_steps, self.seed)
         _tell(f"text map learns coarse CTs: squared error {losses[0]:.3f} -> {losses[-1]:.3f}")

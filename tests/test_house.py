@@ -26,7 +26,8 @@ FLOORS = {
     "xray": 1, "diffusion": 1,
     "prior": 2, "datasets": 2, "reconstructor": 2,
     "posterior": 3, "baselines": 3, "evaluation": 3,
-    "methods": 4, "dry_run": 4, "datamodule": 4, "case_results": 4, "reconstruction_data": 4, "training": 4, "inference": 4}
+    "methods": 4, "dry_run": 4, "datamodule": 4, "case_results": 4, "reconstruction_data": 4, "training": 4,
+    "inference": 4}
 LIGHTNING = ("datamodule", "reconstruction_data", "training", "inference")
 CONFIGS = {folder: sorted((ROOT / "configs" / folder).glob("*.yaml"))
            for folder in ("prior", "reconstruct", "geometry", "simulate")}

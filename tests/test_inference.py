@@ -247,8 +247,9 @@ def test_a_stopped_run_goes_on_where_it_was(measured, tmp_path, monkeypatch, sto
 
 
 def test_a_partial_folder_is_never_a_finished_case(measured, scored, tmp_path):
-    gone = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True).stdout
-    for process in (gone.strip(), os.getpid()):  # killed while it wrote, and writing now
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    for process in (gone.pid, os.getpid()):  # killed while it wrote, and writing now
         partial = tmp_path / "sirt" / f".anna.{socket.gethostname()}.{process}.partial"
         partial.mkdir(parents=True)
         (partial / "volume.nii.gz").write_bytes(b"half")
@@ -389,18 +390,19 @@ def test_the_default_method_reconstructs_with_a_prior(prior, measured, tmp_path)
     assert said["misfit"] < 0.5
 
 
-def test_the_simulated_orbit_is_the_one_asked_for(scored, tmp_path):
+def test_the_simulated_orbit_is_the_one_asked_for(scored, tmp_path, capsys):
     case = "phantom-1000000"
     main(phantoms(tmp_path / "five", 1, "--data.views=5"))
     assert len(record(tmp_path / "five" / "sirt" / case)["misfit_per_view"]) == 5
     main(phantoms(tmp_path / "same", 1, "--data.simulation_voxels=64"))
     np.testing.assert_array_equal(volume(tmp_path / "same" / "sirt" / case), volume(scored / case))
-    main(phantoms(tmp_path / "coarser", 1, "--data.simulation_voxels=32"))
-    assert not np.array_equal(volume(tmp_path / "coarser" / "sirt" / case), volume(scored / case))
+    main(phantoms(tmp_path / "finer", 1, "--data.simulation_voxels=128"))
+    assert not np.array_equal(volume(tmp_path / "finer" / "sirt" / case), volume(scored / case))
+    assert "multiple" in refusal(capsys, phantoms(tmp_path / "coarser", 1, "--data.simulation_voxels=96"))
 
 
 def test_other_xrays_into_a_finished_folder_are_refused(scored, capsys):
-    for change in ("--data.views=4", "--data.simulation_voxels=32", "--data.simulator.noise=0.1"):
+    for change in ("--data.views=4", "--data.simulation_voxels=128", "--data.simulator.noise=0.1"):
         assert "other settings" in refusal(capsys, phantoms(scored.parent, 2, change))
 
 

@@ -1,6 +1,7 @@
 """The named methods, and a reconstruction in one call."""
 
 import warnings
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -8,12 +9,13 @@ import torch
 from prior.tiny import tiny_prior
 
 from phydict.baselines import SIRT
+from phydict.diffusion import GaussianDenoiser
 from phydict.grid import Grid
 from phydict.methods import METHODS, reconstruct, reconstructor
-from phydict.posterior import Posterior, PriorOnly, ProximalCG, SplitGibbs
+from phydict.posterior import Posterior, PriorOnly, ProximalCG, Sampler, SplitGibbs
 from phydict.prior import save_prior
-from phydict.units import MU_WATER, hu_to_mu
-from phydict.xray import ConeBeam, binned, binning
+from phydict.units import MU_WATER, HUWindow, hu_to_mu
+from phydict.xray import ConeBeam, Projector, binned, binning
 
 GRID = Grid.cube(64)
 DEFAULT = ConeBeam.orbit(8, 1020, 740, (448, 448), 1.25)
@@ -76,6 +78,53 @@ def test_sirt_needs_no_prior_and_a_sampler_says_which_one_is_missing(tmp_path):
     assert reconstructor("sirt", name="mine").name == "mine"
     with pytest.raises(FileNotFoundError, match="nowhere.safetensors"):
         reconstructor("phydict_fast", tmp_path / "nowhere.safetensors")
+
+
+def test_priors_samplers_and_projectors_of_ones_own_fit_in():
+    """The README's contract, by the smallest objects that keep it."""
+    grid, beam = Grid.cube(16), ConeBeam.orbit(3, 1020, 740, (24, 24), 23.0)
+
+    class OwnPrior:
+        window, state_channels = HUWindow(), 1
+
+        def bind(self, report, guidance, bf16):
+            return GaussianDenoiser(torch.full((1, 1, 16, 16, 16), -0.5), torch.tensor(0.01))
+
+    OwnPrior.grid = grid
+
+    @dataclass(frozen=True)
+    class Mean(Sampler):
+        def steps(self):
+            return 1
+
+        def sample(self, denoiser, measurement, x, draw, on_step):
+            on_step()
+            return denoiser.denoise(x, 1.0)
+
+    class Doubled:
+        def __init__(self):
+            self.grid, self.beam, self._A = grid, beam, Projector(grid, beam)
+
+        def __call__(self, mu):
+            return 2 * self._A(mu)
+
+        def T(self, y):
+            return 2 * self._A.T(y)
+
+    y = Projector(grid, beam)(hu_to_mu(torch.full((1, 1, 16, 16, 16), -500.0)))[0]
+    mean = reconstruct(y, beam, OwnPrior(), Mean())
+    assert mean.volume.mean() == pytest.approx(-500, abs=20) and mean.misfit < 0.1 and mean.method == "Mean"
+    doubled = Posterior(OwnPrior(), METHODS["phydict_fast"]).reconstruct(2 * y, Doubled())
+    assert doubled.misfit < 0.02 and doubled.volume.mean() == pytest.approx(-500, abs=20)
+
+
+@pytest.mark.parametrize("change, sentence", [
+    ({"beam": "geometry.yaml"}, "ConeBeam.load"), ({"report": 5}, "report must be text"),
+    ({"method": 123}, "a Sampler or"), ({"method": SIRT}, "a Sampler or"), ({"method": "fbp"}, "phydict_fast, phydict_paper"),
+    ({"xrays": np.full((8, 448, 448), np.nan)}, "NaN"), ({"xrays": np.zeros((7, 448, 448))}, "8 views")])
+def test_bad_arguments_are_one_sentence(change, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        reconstruct(**{"xrays": np.zeros((8, 448, 448)), "beam": DEFAULT, "method": "sirt"} | change)
 
 
 def test_a_method_may_be_a_name_a_sampler_or_a_reconstructor(tmp_path):

@@ -86,8 +86,8 @@ class Intensity:
         if self.kind == "line_integrals":
             y = self.scale * pixels + self.offset
             if np.nanmax(y) > MOST or np.nanmedian(y) < 0:
-                raise ValueError(f"the line integrals have a median of {np.nanmedian(y):.3g} and reach {np.nanmax(y):.3g}, "
-                                 f"but behind a patient they lie between 0 and about 10; correct `scale` and `offset`, "
+                raise ValueError(f"the line integrals have a median of {np.nanmedian(y):.3g} and reach "
+                                 f"{np.nanmax(y):.3g}, but behind a patient they lie between 0 and about 10; correct `scale` and `offset`, "
                                  "or state another intensity kind")
             return y
         if self.kind == "display":

@@ -51,14 +51,7 @@ MEASURES = {
     "psnr_lung": Measure("PSNR lung (dB)", True, 2),
     "mae_hu_lung": Measure("MAE lung (HU)", False, 1),
     "misfit": Measure("misfit", False, 4),
-    "lpips": Measure("LPIPS", False, 3),
-    "fid_xy": Measure("FID-XY", False, 2),
-    "fid_yz": Measure("FID-YZ", False, 2),
-    "fid_zx": Measure("FID-ZX", False, 2),
-    "fid": Measure("FID", False, 2),
-    "t2i": Measure("T2I (%)", True, 1),
-    "i2i": Measure("I2I (%)", True, 1),
-    "seconds": Measure("time (s)", False, 1),
+    "seconds": Measure("time (s)", False, 2),
 }
 """Every metric a table knows, in the order of its columns."""
 
@@ -171,14 +164,6 @@ class CaseMetrics(Metric):
                     result[f"{method}/{name}"] = column.mean()
                     result[f"{method}/{name}_std"] = column.std() if len(column) > 1 else column.new_tensor(math.nan)
         return result
-
-    def rows(self, ids: Sequence[str]) -> list[dict]:
-        """The cases of all processes as tidy rows {case, method, metric: value}; every process must call it.
-
-        ids: case index -> case id.
-        """
-        with self.sync_context():
-            return [{"case": ids[case], "method": method, **values} for (case, method), values in self._cases().items()]
 
     def _cases(self) -> dict[tuple[int, str], dict[str, float]]:
         n = len(self.names)

@@ -63,7 +63,7 @@ class Posterior(Reconstructor):
             denoiser = _Counted(prior.bind(report, self.guidance, self.bf16))
             measurement = Measurement(projector, xrays, prior.window, display, self.mu_water)
             draw = torch.Generator().manual_seed(seed)
-            state = torch.empty(1, prior.network.state_channels, *prior.grid.shape, device=xrays.device)
+            state = torch.empty(1, prior.state_channels, *prior.grid.shape, device=xrays.device)
             x = noise_like(state, draw)
         with watch.stage("sample"):
             state = self.sampler.sample(denoiser, measurement, x, draw, on_step)

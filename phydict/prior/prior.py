@@ -57,6 +57,11 @@ class Prior(nn.Module):
         mask = mask & torch.tensor([bool(r) for r in reports], device=mask.device)[:, None]
         return torch.where(mask[..., None], states, self.null)
 
+    @property
+    def state_channels(self) -> int:
+        """Channels of the state: the CT, then masks."""
+        return self.network.state_channels
+
     def forward(self, x: Tensor, t: Tensor, context: Tensor) -> Tensor:
         """Clean estimate of the state x (B, C, X, Y, Z) at times t (B,), in x's dtype."""
         a, s = (w.to(x.dtype).view(-1, 1, 1, 1, 1) for w in self.schedule.scales(t.double()))

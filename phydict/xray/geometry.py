@@ -70,8 +70,8 @@ class ConeBeam:
         the source is at the patient's left. Distances and pixel = (row height, column width) in mm.
         Raises ValueError unless views >= 1 and 0 < source_to_isocentre < source_to_detector and pixel > 0.
         """
-        if views != int(views) or views < 1:
-            raise ValueError(f"an orbit needs at least one view, but views={views} was given")
+        if isinstance(views, str) or views != int(views) or views < 1:
+            raise ValueError(f"an orbit needs at least one view, a whole number, but views={views!r} was given")
         if not 0 < source_to_isocentre < source_to_detector:
             raise ValueError(f"the isocentre must lie between source and detector, but source_to_isocentre="
                              f"{source_to_isocentre} mm and source_to_detector={source_to_detector} mm were given")
@@ -212,15 +212,26 @@ class ConeBeam:
         try:
             if not isinstance(content, dict) or "orbit" not in content:
                 _check_keys(content, VECTOR_KEYS, ())
+                for key, value in content.items():
+                    _check_numbers(key, value)
                 return cls(**content)
             _check_keys(content, ("orbit",), ())
             orbit = content["orbit"]
             _check_keys(orbit, ORBIT_KEYS, ORBIT_OPTIONS)
+            for key, value in orbit.items():
+                _check_numbers(key, value)
             return cls.orbit(**{key: orbit[key] for key in ORBIT_KEYS},
                              start=math.radians(orbit.get("start_degrees", 0.0)),
                              arc=math.radians(orbit.get("arc_degrees", 360.0)))
         except TypeError as error:
             raise ValueError(f"a beam's values are numbers and lists of numbers ({error})") from error
+
+
+def _check_numbers(key: str, value) -> None:
+    try:
+        np.asarray(value, float)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{key} is a number or a list of numbers without units, but {value!r} was given") from error
 
 
 def _check_keys(content, required: tuple[str, ...], optional: tuple[str, ...]) -> None:

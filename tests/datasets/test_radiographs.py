@@ -160,6 +160,27 @@ def test_scale_and_offset_are_applied(tmp_path):
     np.testing.assert_allclose(xrays, 0.1 * pixels - 1, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize(("intensity", "sentence"), [
+    ({"scale": 1.0}, "reach 6e.04, .* correct `scale`"),
+    ({"scale": 1e-4, "offset": -9.0}, "median of -"),
+    ({"scale": 0.0}, "scale of line integrals must not be 0"),
+])
+def test_line_integrals_of_no_patient_are_refused(tmp_path, intensity, sentence):
+    pixels = np.arange(0, 60_000, 1000, dtype=np.uint16).reshape(2, *SHAPE) + 1000
+    fails(sentence, write(tmp_path, pixels, orbit=ORBIT, intensity={"kind": "line_integrals"} | intensity))
+
+
+@pytest.mark.parametrize("dense", [True, False])
+def test_wide_integers_keep_every_grey_level(tmp_path, dense):
+    pixels = np.arange(60).reshape(2, *SHAPE)
+    intensity = {"kind": "display", "bright_is_dense": dense}
+    narrow, wide = (load_xrays(write(tmp_path / str(kind), pixels.astype(kind), orbit=ORBIT, intensity=intensity))
+                    for kind in (np.uint16, np.int64))
+    assert len(wide["xrays"].unique()) == 60
+    scaled = [(x - x.mean()) / x.std() for x in (narrow["xrays"].double(), wide["xrays"].double())]
+    torch.testing.assert_close(*scaled, atol=1e-3, rtol=0)
+
+
 def test_zero_counts_are_finite(tmp_path):
     block = {"orbit": ORBIT, "intensity": {"kind": "counts", "air": 1000, "floor": 0.5}}
     xrays = load_xrays(write(tmp_path, np.zeros((2, *SHAPE), np.uint16), **block))["xrays"]

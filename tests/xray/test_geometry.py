@@ -107,6 +107,9 @@ def test_yaml_orbit_is_read_in_degrees(tmp_path):
     path = tmp_path / "beam.yaml"
     path.write_text(ORBIT)
     assert ConeBeam.load(path).same_as(orbit())
+    inner = "".join(f"  {line}\n" for line in ORBIT.splitlines())
+    path.write_text(f"intensity: {{kind: line_integrals}}\nbeam:\n{inner}")
+    assert ConeBeam.load(path).same_as(orbit())  # a case's geometry.yaml
     path.write_text(ORBIT + "  start_degrees: 90\n  arc_degrees: 180\n")
     assert ConeBeam.load(path).same_as(orbit(start=np.pi / 2, arc=np.pi))
 

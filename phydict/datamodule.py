@@ -12,6 +12,7 @@ from torch.utils.data import ConcatDataset, DataLoader, Dataset
 
 from phydict.datasets import CTCases, Thorax, augment, find_cts, phantom_case, report, split_by_patient
 from phydict.datasets.cache import read_arrays, write_arrays
+from phydict.datasets.phantom import build, without
 from phydict.grid import Grid
 from phydict.units import HUWindow
 
@@ -138,13 +139,30 @@ class PriorData(lightning.LightningDataModule):
         labels = torch.tensor([[float(column in own) for column in columns] for own in findings])
         return [report(thorax) for thorax in thoraxes], labels
 
-    def coarse_cases(self, cells: int, most: int = 1000) -> tuple[list[str], torch.Tensor]:
-        """Training cases that have reports, at most so many: reports, and CTs averaged over cells (N, 1, cells^3)."""
-        sources = [(self.cts, i) for i, ct in enumerate(self.cts.cts) if ct.report]
-        sources = (sources + [(self.phantoms, i) for i in range(len(self.phantoms))])[:most]
-        cases = [source[i] for source, i in sources]
+    def sketches(self, cells: int, most: int = 1500) -> tuple[list[str], torch.Tensor]:
+        """What reports imply, for at most so many cases that have one: reports, and maps (N, 1, cells^3).
+
+        Of a phantom, the map is what its findings change, averaged over cells; where there are none, it is how a CT
+        departs from the mean of the CTs. Both are in the prior's range.
+        """
+        if len(self.phantoms):
+            count = min(most, len(self.phantoms))
+            reports = [report(Thorax.draw(seed)) for seed in range(count)]
+            file = self.phantoms.folder / f"effects-{cells}-{count}.npz"
+            stored = read_arrays(file)
+            if stored is None:
+                stored = {"effects": np.stack([self._effect(seed, cells) for seed in range(count)])}
+                write_arrays(file, stored)
+            return reports, torch.from_numpy(stored["effects"])
+        cases = [self.cts[i] for i, ct in enumerate(self.cts.cts) if ct.report][:most]
         coarse = [torch.nn.functional.adaptive_avg_pool3d(case["volume"], cells) for case in cases]
-        return [case["report"] for case in cases], torch.stack(coarse)
+        coarse = torch.stack(coarse) if cases else torch.zeros(0, 1, cells, cells, cells)
+        return [case["report"] for case in cases], coarse - coarse.mean(0)
+
+    def _effect(self, seed: int, cells: int) -> np.ndarray:
+        thorax, grid = Thorax.draw(seed), Grid.cube(2 * cells, self.grid.extent[0])
+        change = (build(thorax, grid)[0] - build(without(thorax), grid)[0]) / self.window.half_width
+        return change.reshape(1, cells, 2, cells, 2, cells, 2).mean((2, 4, 6)).astype(np.float32)
 
     def train_dataloader(self) -> DataLoader:
         least = self.batch_size * self.trainer.world_size

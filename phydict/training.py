@@ -128,10 +128,11 @@ class PriorTraining(lightning.LightningModule):
         if reports:
             losses = learn_findings(text, reports, labels, self.text_steps, self.seed)
             _tell(f"report encoder learns findings: loss {losses[0]:.3f} -> {losses[-1]:.3f}")
-        _tell("preparing cases that have reports, at most 1000")
-        reports, coarse = data.coarse_cases(self.prior.network.text_map.cells)
-        losses = learn_sketch(self.prior, reports, coarse, self.text_steps, self.seed)
-        _tell(f"text map learns coarse CTs: squared error {losses[0]:.3f} -> {losses[-1]:.3f}")
+        _tell("preparing what reports imply")
+        reports, maps = data.sketches(self.prior.network.text_map.cells)
+        if reports:
+            losses = learn_sketch(self.prior, reports, maps, self.text_steps, self.seed)
+            _tell(f"text map learns what reports imply: squared error {losses[0]:.3f} -> {losses[-1]:.3f} of its variance")
 
     def on_fit_start(self) -> None:
         if self.prior.text is not None and self.text_steps:

@@ -16,6 +16,7 @@ import torch
 from torch.utils.data import default_collate
 
 from phydict.datamodule import CachedPhantoms, PriorData
+from phydict.datasets import Thorax
 from phydict.grid import Grid
 from phydict.prior import load_prior, save_prior
 from phydict.training import PriorTraining, main
@@ -278,3 +279,17 @@ def test_training_goes_on_from_a_prior_and_refuses_one_of_another_grid(tmp_path)
     assert all(w.requires_grad for w in task.prior.parameters())
     with pytest.raises(ValueError, match="another grid"):
         PriorTraining(initial=str(path), voxels=32, window=(-1000, 600), text="none")
+
+
+def test_a_phantoms_sketch_is_the_change_its_findings_make_where_they_are(cache):
+    data = PriorData(phantoms=30, cache=str(cache))
+    reports, maps = data.sketches(8)
+    again = data.sketches(8)[1]  # from the cache
+    assert torch.equal(maps, again) and len(reports) == len(maps) == 30
+    for seed, change in enumerate(maps):
+        findings = Thorax.draw(seed).findings
+        assert bool(change.any()) == bool(findings) or not change.abs().max() > 0.01
+        sides = {finding.side for finding in findings}
+        if sides in ({"left"}, {"right"}):
+            low, high = change[0, :4].abs().sum(), change[0, 4:].abs().sum()
+            assert (high > low) == (sides == {"right"}), (seed, findings)

@@ -1,7 +1,8 @@
 """Teaching a report encoder before denoising begins.
 
 Denoising alone teaches text slowly, since at most noise levels the state shows what the report says. Two short tasks
-come first: telling a report's findings, and the coarse CT that a report implies.
+come first: telling a report's findings, and sketching what they change in the CT. The sketch is of the change alone,
+since in a whole CT one finding is too small a part for its side to be learnt.
 """
 
 from __future__ import annotations
@@ -30,14 +31,17 @@ def learn_findings(text: TextEncoder, reports: list[str], labels: Tensor, steps:
     return _learn([*text.parameters(), *head.parameters()], loss, len(reports), steps, seed)
 
 
-def learn_sketch(prior: Prior, reports: list[str], coarse: Tensor, steps: int, seed: int = 0) -> list[float]:
-    """The text map learns the CTs (N, 1, cells^3), averaged over cells, of N reports. Returns the loss of each step."""
-    text_map = prior.network.text_map
+def learn_sketch(prior: Prior, reports: list[str], maps: Tensor, steps: int, seed: int = 0) -> list[float]:
+    """The text map learns maps (N, 1, cells^3) that N reports imply, in units of their root mean square.
+
+    Returns the loss of each step.
+    """
+    text_map, maps = prior.network.text_map, maps / maps.square().mean().sqrt().clamp(min=1e-6)
 
     def loss(picked: list[int]) -> Tensor:
         with torch.no_grad():
             context = prior.context([reports[i] for i in picked])
-        return (text_map.sketch(context) - coarse[picked].to(context)).square().mean()
+        return (text_map.sketch(context) - maps[picked].to(context)).square().mean()
 
     return _learn(text_map.parameters(), loss, len(reports), steps, seed)
 

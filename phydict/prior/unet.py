@@ -31,7 +31,7 @@ class TextMap(nn.Module):
         return self.answer(heard).transpose(1, 2).unflatten(2, (self.cells,) * 3)
 
     def sketch(self, context: Tensor) -> Tensor:
-        """The expected CT given the report, averaged over cells: (B, 1, cells, cells, cells) in the prior's range."""
+        """What the report implies, averaged over cells: (B, 1, cells, cells, cells); see `learn_sketch`."""
         return self.to_sketch(self(context))
 
 

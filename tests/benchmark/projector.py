@@ -103,23 +103,25 @@ def main() -> None:
     grid, beam = Grid.cube(64, 250), ConeBeam.orbit(8, 1020, 800, (128, 128), 3.5)
     exact = body(grid)
     mu, y = exact.float(), torch.rand(1, 8, 128, 128, generator=torch.Generator().manual_seed(1))
-    siddon = Projector(grid, beam, "siddon")
-    methods = {"separable": Projector(grid, beam, "separable"), "siddon": siddon}
+    methods = {name: Projector(grid, beam, name) for name in ("separable", "matrix", "siddon", "joseph", "eq4")}
     peer = diffdrr_siddon(grid, beam)
     if peer is not None:
         methods["DiffDRR Siddon"] = peer
 
     every = slice(None, None, STRIDE)
-    boxes, smooth = siddon(exact), trilinear(exact, grid, beam)
+    boxes, smooth, midpoints = methods["siddon"](exact), trilinear(exact, grid, beam), methods["eq4"](exact)
     rows = []
     for threads in arguments.threads:
         torch.set_num_threads(threads)
         times = medians(methods, mu, y, arguments.repeats)
         for name, project in methods.items():
             image, back = project(mu).double(), gradient(project, mu, y)[0].double()
-            if name == "separable":
+            if name in ("separable", "joseph"):
                 error = (image[..., every, every] - smooth).norm() / smooth.norm()
                 reference = "trilinear volume, 4000 samples per ray"
+            elif name == "eq4":
+                error = (image - midpoints).norm() / midpoints.norm()
+                reference = "the paper's Eq. 4, phydict eq4 float64"
             else:
                 error = (image - boxes).norm() / boxes.norm()
                 reference = "piecewise-constant voxels, phydict siddon float64"

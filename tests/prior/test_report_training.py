@@ -1,4 +1,4 @@
-"""Reports are learnt before denoising: findings told, and the coarse CT sketched on the right side."""
+"""Reports are learnt before denoising: findings told, and what they change sketched on the right side."""
 
 from statistics import mean
 

@@ -56,7 +56,7 @@ class ReconstructionTask(lightning.LightningModule):
     """
 
     def __init__(self, method: Sampler | Reconstructor, name: str, prior: str = str(DEFAULT_PRIOR),
-                 guidance: float = 2.0, out: str = "runs/reconstructions", overwrite: bool = False, seed: int = 0,
+                 guidance: float = 1.0, out: str = "runs/reconstructions", overwrite: bool = False, seed: int = 0,
                  voxels: int = 64, side: float = 384.0):
         super().__init__()
         self.method_name, self.seed, self.pages = name, seed, Path(out) / "dry_run"

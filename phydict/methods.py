@@ -20,7 +20,7 @@ DEFAULT_PRIOR = Path(__file__).parents[1] / "data" / "prior" / "phydict_64.safet
 
 METHODS: dict[str, Sampler | Reconstructor] = {
     "phydict_fast": SplitGibbs(iterations=4, warm_start=0.3, last=0.15, fresh_noise=0.0,
-                               final_likelihood=ProximalCG(iterations=10, restarts=8)),
+                               final_likelihood=ProximalCG(iterations=10, restarts=5)),
     "phydict_paper": SplitGibbs(iterations=50, likelihood=GradientSteps(reward=Reward(lpips=1.0)), refine_from=0.8,
                                 refine_iterations=40, full_detector=True),
     "prior_only": PriorOnly(iterations=50),
@@ -30,7 +30,7 @@ METHODS: dict[str, Sampler | Reconstructor] = {
 
 
 def reconstructor(method: str | Sampler | Reconstructor, prior: Prior | str | Path | None = None,
-                  guidance: float = 2.0, name: str | None = None) -> Reconstructor:
+                  guidance: float = 1.0, name: str | None = None) -> Reconstructor:
     """A method ready to reconstruct: a name of METHODS, a sampler (which needs a prior), or a Reconstructor.
 
     prior: a Prior or the file it is in; None for the shipped one. It is only loaded by methods that need it. name: what
@@ -64,7 +64,7 @@ def fit_to_grid(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam)
 
 def reconstruct(xrays: Tensor, beam: ConeBeam, prior: Prior | str | Path | None = None,
                 method: str | Sampler | Reconstructor = "phydict_fast", report: str | None = None,
-                display: bool = False, seed: int = 0, guidance: float = 2.0, mu_water: float | None = None,
+                display: bool = False, seed: int = 0, guidance: float = 1.0, mu_water: float | None = None,
                 grid: Grid = Grid.cube(64), on_step=lambda: None) -> Reconstruction:
     """A CT volume from X-rays (K, V, U) and their geometry.
 

@@ -265,7 +265,7 @@ def test_v1_takes_hu_and_spacing_from_the_metadata(tmp_path, thorax):
     root = tmp_path / "dataset"
     stored = (thorax[::-1, ::-1] + 8192).astype(np.int16)
     save(root / "valid/valid_1/valid_1_a/valid_1_a_1.nii.gz", stored, np.eye(4))
-    with pytest.raises(ValueError, match="needs CT-RATE's metadata table"):
+    with pytest.raises(ValueError, match="need CT-RATE's metadata table"):
         find_cts(root, fixed=False)
     table = write_csv(root / "metadata/validation_metadata.csv", METADATA_COLUMNS,
                       ("valid_1_a_1.nii.gz", "-8192", "1", "[6.0, 6.0]", "6.0"))

@@ -12,7 +12,7 @@ from torch.utils.data import ConcatDataset, DataLoader, Dataset
 
 from phydict.datasets import CTCases, Thorax, augment, find_cts, phantom_case, report, split_by_patient
 from phydict.datasets.cache import read_arrays, write_arrays
-from phydict.datasets.phantom import build, without
+from phydict.datasets.phantom import change_by_findings
 from phydict.grid import Grid
 from phydict.units import HUWindow
 
@@ -98,8 +98,8 @@ class PriorData(lightning.LightningDataModule):
     def __init__(self, cts: str | None = None, reports: str | None = None, metadata: str | None = None,
                  fixed: bool = True, first_reconstruction: bool = False, exclude: str | None = None,
                  holdout: list[str] | None = None, holdout_fraction: float = 0.0, phantoms: int = 2000,
-                 ct_fraction: float = 0.5, validation_phantoms: int = 6, epoch_size: int = 400, batch_size: int = 4, workers: int = 0,
-                 cache: str = "runs/cache", seed: int = 0, voxels: int = 64, side: float = 384.0,
+                 ct_fraction: float = 0.5, validation_phantoms: int = 6, epoch_size: int = 400, batch_size: int = 4,
+                 workers: int = 0, cache: str = "runs/cache", seed: int = 0, voxels: int = 64, side: float = 384.0,
                  window: tuple[float, float] = (-1000.0, 1000.0)):
         super().__init__()
         if not cts and not phantoms:
@@ -122,7 +122,8 @@ class PriorData(lightning.LightningDataModule):
         if len(held_out) == len(files) and not phantoms:
             raise ValueError("there is nothing to train on: data.holdout holds out every CT, and data.phantoms is 0")
         self.held_out = [f.id for f in held_out]
-        self.cts = CTCases([f for f in files if f.id not in set(self.held_out)], cache, self.grid, window)
+        validating = set(self.held_out)
+        self.cts = CTCases([f for f in files if f.id not in validating], cache, self.grid, window)
         self.validation = ConcatDataset([
             CachedPhantoms(HELD_OUT_PHANTOM, validation_phantoms, self.grid, window, Path(cache)),
             CTCases(held_out, cache, self.grid, window)])
@@ -161,7 +162,7 @@ class PriorData(lightning.LightningDataModule):
 
     def _effect(self, seed: int, cells: int) -> np.ndarray:
         thorax, grid = Thorax.draw(seed), Grid.cube(2 * cells, self.grid.extent[0])
-        change = (build(thorax, grid)[0] - build(without(thorax), grid)[0]) / self.window.half_width
+        change = change_by_findings(thorax, grid) / self.window.half_width
         return change.reshape(1, cells, 2, cells, 2, cells, 2).mean((2, 4, 6)).astype(np.float32)
 
     def train_dataloader(self) -> DataLoader:

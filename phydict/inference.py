@@ -64,20 +64,19 @@ class ReconstructionTask(lightning.LightningModule):
         check_writable(self.results.folder, "model.out")
         self.settings = {"name": name, "seed": seed, "method": describe(method)}
         self.grid, self.window = Grid.cube(voxels, side), HUWindow()
-        if isinstance(method, Sampler):
-            self.prior = load_prior(prior)
+        self.prior = load_prior(prior) if isinstance(method, Sampler) else None
+        if self.prior is not None:
             self.grid, self.window = self.prior.grid, self.prior.window
             self.settings |= {"prior": Path(prior).name, "prior_crc32": zlib.crc32(Path(prior).read_bytes()),
                               "guidance": guidance}
-        self.reconstructor = reconstructor(method, getattr(self, "prior", None), guidance, name)
+        self.reconstructor = reconstructor(method, self.prior, guidance, name)
         self.metrics = CaseMetrics([name])
         self.progress = CaseProgress()
         self.cases: list[str] = []
 
     @property
     def reads_no_text(self) -> bool:
-        prior = getattr(self, "prior", None)
-        return prior is not None and prior.text is None and prior.load_text is None
+        return self.prior is not None and self.prior.text is None and self.prior.load_text is None
 
     def setup(self, stage: str) -> None:
         self.settings["data"] = self.trainer.datamodule.settings(stage)

@@ -209,7 +209,12 @@ def _scanner(canvas: Canvas, masks: np.ndarray) -> None:
 
 def pathology_region(thorax: Thorax, grid: Grid, threshold: float = 30.0) -> np.ndarray:
     """Voxels (X, Y, Z) bool that the findings change by more than `threshold` HU, noise being equal."""
-    return np.abs(build(thorax, grid)[0] - build(without(thorax), grid)[0]) > threshold
+    return np.abs(change_by_findings(thorax, grid)) > threshold
+
+
+def change_by_findings(thorax: Thorax, grid: Grid) -> np.ndarray:
+    """HU (X, Y, Z) that the findings add to the same thorax without them, noise being equal."""
+    return build(thorax, grid)[0] - build(without(thorax), grid)[0]
 
 
 def phantom_case(seed: int, grid: Grid | None = None, window: HUWindow = HUWindow()) -> dict:

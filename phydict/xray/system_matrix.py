@@ -17,7 +17,7 @@ from scipy.sparse import csr_array
 from phydict.grid import Grid
 from phydict.xray.csr import csr_tensor, index_type
 from phydict.xray.geometry import ConeBeam
-from phydict.xray.tracer import aim, enter, nearest, rays_in_voxels, run
+from phydict.xray.tracer import aim, enter, nearest, ray_lengths, rays_in_voxels, run
 
 
 class SystemMatrix:
@@ -29,7 +29,7 @@ class SystemMatrix:
 
     def __init__(self, grid: Grid, beam: ConeBeam, memory: int):
         self.grid, self.beam, self.memory = grid, beam, memory
-        self._lengths = np.linalg.norm(beam.pixels() - beam.sources[:, None, None], axis=-1)
+        self._lengths = ray_lengths(beam)
         self._crossed = _crossed_voxels(grid, beam)
         self._tables: dict[tuple, tuple[torch.Tensor, torch.Tensor]] = {}
         self._check(torch.float32)

@@ -44,7 +44,7 @@ class Tracer:
 
     def __init__(self, grid: Grid, beam: ConeBeam):
         self.grid, self.beam, self.rays = grid, beam, rays_in_voxels(grid, beam)
-        self._lengths = np.linalg.norm(beam.pixels() - beam.sources[:, None, None], axis=-1)
+        self._lengths = ray_lengths(beam)
 
     def forward(self, mu: torch.Tensor) -> torch.Tensor:
         volumes = self._array(mu)
@@ -74,6 +74,11 @@ def rays_in_voxels(grid: Grid, beam: ConeBeam) -> np.ndarray:
     to_index = np.linalg.inv(grid.affine[:3, :3])
     first = beam.detectors - (beam.shape[1] - 1) / 2 * beam.u - (beam.shape[0] - 1) / 2 * beam.v
     return np.stack([grid.index(beam.sources), grid.index(first), beam.u @ to_index.T, beam.v @ to_index.T], 1)
+
+
+def ray_lengths(beam: ConeBeam) -> np.ndarray:
+    """(K, V, U) mm from each view's source to its pixels."""
+    return np.linalg.norm(beam.pixels() - beam.sources[:, None, None], axis=-1)
 
 
 def support(volume: np.ndarray, reach: int) -> tuple[tuple[int, ...], tuple[int, ...]] | None:

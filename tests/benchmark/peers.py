@@ -213,7 +213,7 @@ PEERS: dict[str, Callable[[Grid, ConeBeam], Peer]] = {
     "DiffDRR trilinear": diffdrr_trilinear, "nanodrr": nanodrr,
     "nanodrr, half-voxel steps": partial(nanodrr, step=0.5), "diffct": diffct, "mbirjax": mbirjax, "RTK Joseph": rtk}
 MODELS = {
-    "DiffDRR Siddon": "voxels", "DiffDRR Siddon, bilinear": "trilinear", "DiffDRR trilinear": "trilinear", "nanodrr": "trilinear",
-    "nanodrr, half-voxel steps": "trilinear", "diffct": "voxels",
+    "DiffDRR Siddon": "voxels", "DiffDRR Siddon, bilinear": "trilinear", "DiffDRR trilinear": "trilinear",
+    "nanodrr": "trilinear", "nanodrr, half-voxel steps": "trilinear", "diffct": "voxels",
     "mbirjax": "trilinear",  # neither: it averages voxels' footprints over pixels, which comes nearer to trilinear
     "RTK Joseph": "trilinear"}

@@ -3,10 +3,10 @@
     pip install phydict[benchmark]
     python tests/benchmark/projector.py
 
-Work: a cube of 250 mm, 8 views at source-isocentre 800 mm and source-detector 1020 mm, float32, in three sizes; forward,
+Work: a cube of 250 mm, 8 views, source-isocentre 800 mm, source-detector 1020 mm, float32, in three sizes; forward,
 and forward with the gradient of <A mu, y>. Every method lives in a process of its own, so that its memory can be told
-from the others'; the processes take turns, never two at once. Medians of up to --repeats turns, fewer for a method
-that has spent --seconds. A package that is not installed, or that fails, gets a row that says so. Rows of sizes that a run
+from the others'; the processes take turns, never two at once. Medians of up to --repeats turns, fewer for a method that
+has spent --seconds. A package that is not installed, or that fails, gets a row that says so. Rows of sizes that a run
 leaves out stay in the file.
 
 Memory is the process's peak beside package, volume and X-rays: tables, temporaries and results. Errors are relative L2

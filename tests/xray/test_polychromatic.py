@@ -166,6 +166,26 @@ def test_metal_shadows_more_than_bone_of_the_same_hu():
     assert replace(CLEAN, metal=1500.0)(A, box(2500.0)).max() > 2 * CLEAN(A, box(2500.0)).max()
 
 
+class Counted:
+    """A projector that counts what is projected."""
+
+    def __init__(self):
+        self.beam, self.projections = A.beam, 0
+
+    def __call__(self, mu: torch.Tensor) -> torch.Tensor:
+        self.projections += len(mu)
+        return A(mu)
+
+
+@pytest.mark.parametrize("hu, metal, materials", [(-1000.0, None, 0), (0.0, None, 1), (700.0, None, 2),
+                                                  (2500.0, 1500.0, 1)])
+@pytest.mark.parametrize("kvp", [70, 120])
+def test_the_projector_runs_once_per_material_that_is_there(hu, metal, materials, kvp):
+    projector = Counted()
+    replace(CLEAN, kvp=kvp, metal=metal)(projector, box(hu))
+    assert projector.projections == materials
+
+
 def test_a_case_depends_on_its_seed_alone():
     simulate, mu = Polychromatic(air_photons=1e4), torch.cat([chest(), 0.8 * chest()]).float()
     both = simulate(A, mu, [5, 6])

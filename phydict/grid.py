@@ -45,8 +45,8 @@ class Grid:
         if abs(cosines).max() > 1e-3:
             i, j = sorted(np.unravel_index(abs(cosines).argmax(), (3, 3)))
             raise ValueError(f"the affine has shear: axes {i} and {j} meet at "
-                             f"{np.degrees(np.arccos(cosines[i, j])):.1f} degrees instead of 90; resample the volume to "
-                             "an orthogonal grid first")
+                             f"{np.degrees(np.arccos(cosines[i, j])):.1f} degrees instead of 90; resample the volume "
+                             "to an orthogonal grid first")
         affine.setflags(write=False)
         object.__setattr__(self, "shape", shape)
         object.__setattr__(self, "spacing", tuple(float(s) for s in spacing))

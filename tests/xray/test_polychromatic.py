@@ -100,7 +100,7 @@ def test_air_reads_zero_with_and_without_scatter():
 def test_noise_is_that_of_the_counts(simulate):
     """Var[-log s] = Var[s] / s^2 with Var[s] = quantum s / n + readout^2, far from starvation."""
     beam = ConeBeam.orbit(1, 1020, 740, (96, 96), 1.0)
-    projector, mu = Projector(Grid.cube(16), beam), box(0.0, 4)
+    projector, mu = Projector(Grid.cube(16), beam, full_detector=True), box(0.0, 4)
     clean = replace(simulate, air_photons=None)(projector, mu)
     residual = simulate(projector, mu, 3) - clean
     paths = torch.cat([projector(density[None]) for density in partial_densities(mu[0] / MU_WATER * 1000 - 1000)])

@@ -41,8 +41,12 @@ class Grid:
         if not (np.isfinite(affine).all() and (spacing > 0).all()):
             raise ValueError(f"a grid's spacing must be positive and finite, but {tuple(spacing)} mm was given")
         axes = affine[:3, :3] / spacing
-        if not np.allclose(axes.T @ axes, np.eye(3), atol=1e-3):
-            raise ValueError("the affine has shear; resample the volume to an orthogonal grid first")
+        cosines = axes.T @ axes - np.eye(3)
+        if abs(cosines).max() > 1e-3:
+            i, j = sorted(np.unravel_index(abs(cosines).argmax(), (3, 3)))
+            raise ValueError(f"the affine has shear: axes {i} and {j} meet at "
+                             f"{np.degrees(np.arccos(cosines[i, j])):.1f} degrees instead of 90; resample the volume "
+                             "to an orthogonal grid first")
         affine.setflags(write=False)
         object.__setattr__(self, "shape", shape)
         object.__setattr__(self, "spacing", tuple(float(s) for s in spacing))

@@ -156,13 +156,20 @@ def test_predict_writes_what_the_library_reconstructs(measured, tmp_path, capsys
     assert [line.split(":")[0] for line in err.splitlines() if not line.startswith("Seed")] == ["sirt", "anna", "bert"]
 
 
-def test_a_dicom_run_gives_the_volume_of_its_npy_twin(measured, tmp_path):
+@pytest.mark.parametrize("files", ["one run", "a series"])
+def test_dicom_gives_the_volume_of_its_npy_twin(measured, tmp_path, files):
     xrays = load_xrays(measured / "anna")["xrays"].numpy().astype(np.float64)
     slope = 2.0**-12  # exact in DICOM's decimal strings and in float32
     stored = np.rint(xrays / slope).astype(np.uint16)
     save_xrays(tmp_path / "in" / "npy", stored * slope, BEAM)
-    write_dicom(tmp_path / "in" / "dicom" / "run", stored, RescaleSlope=slope, RescaleIntercept=0.0,
-                **orbit_tags(3, 1020.0, 740.0, (24.0, 24.0)))
+    tags = orbit_tags(3, 1020.0, 740.0, (24.0, 24.0)) | {"RescaleSlope": slope, "RescaleIntercept": 0.0}
+    if files == "one run":
+        write_dicom(tmp_path / "in" / "dicom" / "run", stored, **tags)
+    else:  # a file per view, each with its own angle
+        angles = tags.pop("PositionerPrimaryAngleIncrement")
+        del tags["PositionerSecondaryAngleIncrement"]
+        for k, angle in enumerate(angles):
+            write_dicom(tmp_path / "in" / "dicom" / f"IM{k}", stored[k], **tags | {"PositionerPrimaryAngle": angle})
     (tmp_path / "in" / "dicom" / "geometry.yaml").write_text("intensity: {kind: line_integrals}\n")
     main(sirt("predict", tmp_path / "out", f"--data.xrays={tmp_path / 'in'}"))
     dicom, npy = (volume(tmp_path / "out" / "sirt" / name) for name in ("dicom", "npy"))

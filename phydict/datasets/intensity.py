@@ -87,8 +87,8 @@ class Intensity:
             y = self.scale * pixels + self.offset
             if np.nanmax(y) > MOST or np.nanmedian(y) < 0:
                 raise ValueError(f"the line integrals have a median of {np.nanmedian(y):.3g} and reach "
-                                 f"{np.nanmax(y):.3g}, but behind a patient they lie between 0 and about 10; correct `scale` and `offset`, "
-                                 "or state another intensity kind")
+                                 f"{np.nanmax(y):.3g}, but behind a patient they lie between 0 and about 10; correct "
+                                 "`scale` and `offset`, or state another intensity kind")
             return y
         if self.kind == "display":
             return pixels / full_scale if self.bright_is_dense else 1 - pixels / full_scale
@@ -100,7 +100,8 @@ class Intensity:
                              "image is which, and repair dead pixels")
         negative = int((pixels < 0).sum())
         if negative:
-            raise ValueError(f"{negative} pixels hold negative counts; give counts, or another intensity kind")
+            raise ValueError(f"{negative} pixels hold negative counts, down to {pixels.min():g}; give counts >= 0, or "
+                             "another intensity kind")
         signal = pixels - dark
         above = signal / air
         if (above > ABOVE_AIR).any():

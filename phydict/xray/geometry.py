@@ -74,7 +74,8 @@ class ConeBeam:
             raise ValueError(f"an orbit needs at least one view, a whole number, but views={views!r} was given")
         if not 0 < source_to_isocentre < source_to_detector:
             raise ValueError(f"the isocentre must lie between source and detector, but source_to_isocentre="
-                             f"{source_to_isocentre} mm and source_to_detector={source_to_detector} mm were given")
+                             f"{source_to_isocentre} mm and source_to_detector={source_to_detector} mm were given; "
+                             "correct them, both from the source and in mm")
         height, width = np.broadcast_to(np.asarray(pixel, float), 2)
         if not (height > 0 and width > 0):
             raise ValueError(f"pixel must be (row height, column width) > 0 in mm, but {pixel} was given")

@@ -6,7 +6,8 @@ ray's length from plane to plane. The rays of a view are split by their dominant
 left out. Outside the grid mu is 0: the interpolant falls linearly from the outermost voxel centres to 0 one voxel
 further out, so a row of n equal voxels integrates to n voxels.
 
-Nothing of a sample is kept: the adjoint samples again. On CUDA it adds with atomic operations, so that its last bits
+Nothing of a sample is kept: the adjoint samples again. What is kept of the rays themselves obeys the memory budget;
+views beyond it are laid out anew each time. On CUDA it adds with atomic operations, so that its last bits
 may differ from run to run; on the CPU every result has one writer.
 """
 
@@ -46,6 +47,10 @@ class Sweep(NamedTuple):
         return Sweep(self.axis, self.pixels.to(like.device), *[
             None if part is None else part.to(like) for part in self[2:]])
 
+    @property
+    def nbytes(self) -> int:
+        return sum(part.nbytes for part in self[1:] if part is not None)
+
     def part(self, rays: slice) -> Sweep:
         return Sweep(self.axis, *[None if part is None else part[rays] for part in self[1:]])
 
@@ -61,19 +66,20 @@ class Sweep(NamedTuple):
 class Joseph:
     """The operator for one grid and beam: `forward` (B, X, Y, Z) -> (B, K, V, U) and its adjoint, float32 or float64.
 
-    mu in 1/mm, on any device. memory: bytes that temporaries may take; at least one plane for one ray is held.
+    mu in 1/mm, on any device. memory: bytes that temporaries and the rays of all views together may take; at least one
+    plane for one ray, and one view's rays, are held.
     """
 
     def __init__(self, grid: Grid, beam: ConeBeam, memory: int):
-        self.grid, self.beam, self.memory = grid, beam, min(memory, WORKING_BYTES)
-        self._views = [_sweeps(grid, beam, k, rays) for k, rays in enumerate(rays_in_voxels(grid, beam))]
-        self._tables: dict[tuple, list[list[Sweep]]] = {}
+        self.grid, self.beam, self.memory = grid, beam, min(memory // 2, WORKING_BYTES)
+        self.rays, self._left = rays_in_voxels(grid, beam), memory - self.memory
+        self._tables: dict[tuple, list[Sweep]] = {}
 
     def forward(self, mu: torch.Tensor) -> torch.Tensor:
         xrays = mu.new_zeros(len(mu), self.beam.views, self.beam.shape[0] * self.beam.shape[1])
         filled = [_filled(mu, axis) for axis in range(3)]
-        for k, sweeps in enumerate(self._on(mu)):
-            for sweep in sweeps:
+        for k in range(self.beam.views):
+            for sweep in self._on(mu, k):
                 stack, planes = _stack(mu, sweep.axis), filled[sweep.axis]
                 together = max(1, self._samples(mu) // max(1, planes.stop - planes.start))
                 for rays in _slices(len(sweep.pixels), together):
@@ -86,8 +92,8 @@ class Joseph:
     def adjoint(self, xrays: torch.Tensor) -> torch.Tensor:
         mu = xrays.new_zeros(len(xrays), *self.grid.shape)
         images = xrays.flatten(2)
-        for k, sweeps in enumerate(self._on(xrays)):
-            for sweep in sweeps:
+        for k in range(self.beam.views):
+            for sweep in self._on(xrays, k):
                 stack = _stack(mu, sweep.axis)
                 together = min(len(sweep.pixels), self._samples(xrays))
                 plane = together * self._sample(xrays) + 2 * stack[0].nbytes
@@ -107,12 +113,16 @@ class Joseph:
         """Bytes of a sample of every case: its position, the making of it, and the values."""
         return (6 + 2 * len(like)) * like.itemsize
 
-    def _on(self, like: torch.Tensor) -> list[list[Sweep]]:
-        """The rays in the precision and on the device of `like`, made once."""
-        key = like.dtype, like.device
-        if key not in self._tables:
-            self._tables[key] = [[sweep.to(like) for sweep in sweeps] for sweeps in self._views]
-        return self._tables[key]
+    def _on(self, like: torch.Tensor, view: int) -> list[Sweep]:
+        """A view's rays in the precision and on the device of `like`, made once as long as the memory lasts."""
+        key = view, like.dtype, like.device
+        if key in self._tables:
+            return self._tables[key]
+        sweeps = [sweep.to(like) for sweep in _sweeps(self.grid, self.beam, view, self.rays[view])]
+        needed = sum(sweep.nbytes for sweep in sweeps)
+        if needed <= self._left:
+            self._tables[key], self._left = sweeps, self._left - needed
+        return sweeps
 
 
 def _stack(volumes: torch.Tensor, axis: int) -> torch.Tensor:

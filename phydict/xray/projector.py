@@ -39,7 +39,9 @@ class Projector:
         "matrix": what siddon computes, as a stored matrix, any pose and device (phydict.xray.system_matrix);
         "auto": separable for upright detectors; else the matrix if it fits, else siddon on the CPU and joseph on other
             devices. `A.method` tells which one runs and `A.reason` why.
-    memory: bytes that the stored matrix or the plane sweep's temporaries may take.
+    memory: bytes that the stored matrix, or the plane sweep's temporaries and rays, may take. The other methods hold
+        little: the separable one, on other devices than the CPU, the sparse factors of every view (some 15 MB each at
+        256^3 voxels, 448^2 pixels and float32), which the budget does not count.
     device: where A will be used, for "auto" to choose by; None for the CPU.
     full_detector: that every pixel is wanted, so that no warning is due where the detector is finer than the grid.
     Raises ValueError when a source or detector lies inside the volume, the method does not suit the beam, or the

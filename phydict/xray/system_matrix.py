@@ -47,7 +47,7 @@ class SystemMatrix:
         """A and its transpose in the precision and on the device of `like`, made once."""
         key = like.dtype, like.device
         if key not in self._tables:
-            self._check(like.dtype)
+            self._make_room(like.dtype)
             matrix = self._build(np.float32 if like.dtype == torch.float32 else np.float64)
             self._tables[key] = csr_tensor(matrix, like), csr_tensor(matrix.T, like)
         return self._tables[key]
@@ -63,8 +63,17 @@ class SystemMatrix:
         starts = np.concatenate([[0], ends.reshape(-1)]).astype(voxels.dtype)
         return csr_array((values, voxels, starts), shape=shape)
 
+    def _make_room(self, dtype: torch.dtype) -> None:
+        """Forget the tables of other precisions and devices where the memory does not hold these beside them."""
+        self._check(dtype)
+        if sum(self._bytes(held) for held, _ in self._tables) + self._bytes(dtype) > self.memory:
+            self._tables.clear()
+
+    def _bytes(self, dtype: torch.dtype) -> int:
+        return _table_bytes(self._crossed, math.prod(self.grid.shape), dtype)
+
     def _check(self, dtype: torch.dtype) -> None:
-        needed = _table_bytes(self._crossed, math.prod(self.grid.shape), dtype)
+        needed = self._bytes(dtype)
         if needed > self.memory:
             raise ValueError(f"the system matrix needs {needed:,} bytes in {str(dtype).removeprefix('torch.')}, but "
                              f"the memory budget is {self.memory:,} bytes; use another method or raise memory")

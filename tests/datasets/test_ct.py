@@ -106,15 +106,16 @@ def test_detail_finer_than_a_voxel_is_averaged_not_sampled():
     assert np.abs(to_grid(board, np.eye(4), grid, 0)).max() < 10
 
 
-@pytest.mark.parametrize("degrees", [0, 20])
-def test_a_ball_keeps_its_world_position_and_mass(degrees):
+@pytest.mark.parametrize("degrees, tilt", [(0, 0), (20, 0), (0, 0.8)], ids=["straight", "turned", "tilted gantry"])
+def test_a_ball_keeps_its_world_position_and_mass(degrees, tilt):
     turn, angle = np.eye(4), np.radians(degrees)
     turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
     affine = turn @ np.diag([1.5, 1.5, 2.0, 1.0])
+    affine[1, 2] = tilt  # mm from slice to slice: shear
     affine[:3, 3] = -45, -60, -50
     index = np.stack(np.indices((60, 60, 50)), -1)
     centre = np.array([12.0, -8.0, 5.0])
-    if degrees:
+    if degrees or tilt:
         centre = affine[:3, :3] @ [32, 30, 28] + affine[:3, 3]
     ball = (((index @ affine[:3, :3].T + affine[:3, 3] - centre) ** 2).sum(-1) < 14**2).astype(np.float32)
     grid = Grid.cube(32, 192)

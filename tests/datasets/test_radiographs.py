@@ -301,7 +301,7 @@ def test_bad_pixels_are_counted(tmp_path):
     fails("view_1.npy holds 1 NaN", write(tmp_path / "nan", bad))
     bad[1, 2, :3] = -1, -2, -0.5
     bad[1, 2, 3] = 1
-    fails("3 pixels hold negative counts", write(tmp_path / "negative", bad),
+    fails("3 pixels hold negative counts, down to -2; give", write(tmp_path / "negative", bad),
           intensity=Intensity("counts", air=100.0))
 
 

@@ -8,6 +8,7 @@ import torch
 from laws import assert_adjoint, assert_gradient_is_adjoint, assert_linear, random_like
 
 from phydict.xray import ConeBeam, Grid, Projector
+from phydict.xray.joseph import Joseph
 from phydict.xray.separable import Separable
 from phydict.xray.system_matrix import SystemMatrix
 
@@ -151,13 +152,73 @@ def test_impossible_choices_are_refused_with_a_reason():
         Projector(GRIDS["turned"], TILTED, memory=0)
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_nothing_is_kept_for_the_gradient(method):
+    """So that memory does not grow with the samples along a ray."""
+    A, kept = Projector(GRIDS["turned"], BEAM, method), []
+    mu, y = random_like((2, 1, *A.grid.shape)).requires_grad_(), random_like((2, 3, *BEAM.shape)).requires_grad_()
+    with torch.autograd.graph.saved_tensors_hooks(lambda tensor: kept.append(tensor.shape), lambda tensor: tensor):
+        nodes = [A(mu).grad_fn, A.T(y).grad_fn]
+    assert not kept
+    while nodes:
+        node = nodes.pop()
+        held = [value for value in getattr(node, "__dict__", {}).values() if isinstance(value, torch.Tensor)]
+        assert not held, f"{node} holds {[tuple(value.shape) for value in held]}"
+        nodes += [parent for parent, _ in node.next_functions if parent]
+
+
+def test_the_plane_sweep_keeps_as_many_rays_as_its_budget_holds():
+    A = Joseph(GRIDS["turned"], TILTED, 10**7)
+    for dtype in (torch.float32, torch.float64):
+        A.adjoint(torch.zeros(1, 1, *TILTED.shape, dtype=dtype))
+    tables = [sweep for sweeps in A._tables.values() for sweep in sweeps]
+    held = sum(part.nbytes for sweep in tables for part in sweep[1:] if part is not None)
+    assert len(A._tables) == 2 and held > 1000
+    A.adjoint(torch.zeros(1, 1, *TILTED.shape))
+    again = [sweep for sweeps in A._tables.values() for sweep in sweeps]
+    assert all(new is old for new, old in zip(again, tables, strict=True))  # made once
+    for memory in (1, held, 2 * held):
+        A = Joseph(GRIDS["turned"], TILTED, memory)
+        for dtype in (torch.float32, torch.float64):
+            A.adjoint(torch.zeros(1, 1, *TILTED.shape, dtype=dtype))
+        held_now = sum(sweep.nbytes for sweeps in A._tables.values() for sweep in sweeps)
+        assert held_now + A.memory <= memory and (held_now == held) == (memory == 2 * held)
+
+
+def test_rays_that_miss_are_not_even_stored():
+    grid, beam = GRIDS["turned"], BEAM
+    wide = ConeBeam(beam.sources, beam.detectors, beam.u, beam.v, tuple(3 * n for n in beam.shape))
+    narrow, wider = (Projector(grid, b, "siddon")(torch.ones(1, 1, *grid.shape)) for b in (beam, wide))
+    assert (wider > 0).sum() > (narrow > 0).sum() and (wider == 0).double().mean() > 0.5
+    crossed = SystemMatrix(grid, wide, 10**8)._crossed
+    assert (crossed[(wider == 0)[0].numpy()] <= 1).all()  # a ray may be counted for an edge that it touches
+    A = Joseph(grid, wide, 10**8)
+    A.adjoint(torch.zeros(1, 3, *wide.shape))
+    around = Grid(tuple(n + 2 for n in grid.shape), affine=_padded(grid))
+    seen = Projector(around, wide, "siddon")(torch.ones(1, 1, *around.shape))[0].flatten(1) > 0
+    for (view, *_), sweeps in A._tables.items():
+        assert all(seen[view, sweep.pixels].all() for sweep in sweeps)
+
+
+def _padded(grid: Grid) -> np.ndarray:
+    """The affine of a grid that is one voxel larger on every side."""
+    affine = grid.affine.copy()
+    affine[:3, 3] -= affine[:3, :3].sum(1)
+    return affine
+
+
 def test_the_matrix_takes_the_bytes_that_it_announces():
     A = SystemMatrix(GRIDS["turned"], TILTED, 10**7)
     for dtype in (torch.float32, torch.float64):
         A.forward(torch.zeros(1, *A.grid.shape, dtype=dtype))
         tables = A._tables[dtype, torch.device("cpu")]
+        assert len(A._tables) == (1 if dtype == torch.float32 else 2)
         held = sum(part.nbytes for t in tables for part in (t.values(), t.col_indices(), t.crow_indices()))
         assert held == SystemMatrix.bytes_for(A.grid, TILTED, dtype)
+    small = SystemMatrix(A.grid, TILTED, held)  # one precision at a time
+    for dtype in (torch.float32, torch.float64, torch.float32):
+        small.forward(torch.zeros(1, *A.grid.shape, dtype=dtype))
+        assert list(small._tables) == [(dtype, torch.device("cpu"))]
     between = (SystemMatrix.bytes_for(A.grid, TILTED, torch.float32) + held) // 2
     with pytest.raises(ValueError, match=f"{held:,} bytes in float64"):
         Projector(A.grid, TILTED, "matrix", memory=between)(torch.zeros(1, 1, *A.grid.shape, dtype=torch.float64))

@@ -100,7 +100,7 @@ def test_air_reads_zero_with_and_without_scatter():
 def test_noise_is_that_of_the_counts(simulate):
     """Var[-log s] = Var[s] / s^2 with Var[s] = quantum s / n + readout^2, far from starvation."""
     beam = ConeBeam.orbit(1, 1020, 740, (96, 96), 1.0)
-    projector, mu = Projector(Grid.cube(16), beam), box(0.0, 4)
+    projector, mu = Projector(Grid.cube(16), beam, full_detector=True), box(0.0, 4)
     clean = replace(simulate, air_photons=None)(projector, mu)
     residual = simulate(projector, mu, 3) - clean
     paths = torch.cat([projector(density[None]) for density in partial_densities(mu[0] / MU_WATER * 1000 - 1000)])
@@ -164,6 +164,26 @@ def test_starved_and_saturated_pixels_are_finite(simulate, dtype):
 
 def test_metal_shadows_more_than_bone_of_the_same_hu():
     assert replace(CLEAN, metal=1500.0)(A, box(2500.0)).max() > 2 * CLEAN(A, box(2500.0)).max()
+
+
+class Counted:
+    """A projector that counts what is projected."""
+
+    def __init__(self):
+        self.beam, self.projections = A.beam, 0
+
+    def __call__(self, mu: torch.Tensor) -> torch.Tensor:
+        self.projections += len(mu)
+        return A(mu)
+
+
+@pytest.mark.parametrize("hu, metal, materials", [(-1000.0, None, 0), (0.0, None, 1), (700.0, None, 2),
+                                                  (2500.0, 1500.0, 1)])
+@pytest.mark.parametrize("kvp", [70, 120])
+def test_the_projector_runs_once_per_material_that_is_there(hu, metal, materials, kvp):
+    projector = Counted()
+    replace(CLEAN, kvp=kvp, metal=metal)(projector, box(hu))
+    assert projector.projections == materials
 
 
 def test_a_case_depends_on_its_seed_alone():

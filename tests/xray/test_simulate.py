@@ -5,7 +5,7 @@ import torch
 
 from phydict.xray import ConeBeam, Grid, Ideal, Projector
 
-A = Projector(Grid.cube(12), ConeBeam.orbit(2, 1020, 740, (40, 40), 12.0))
+A = Projector(Grid.cube(12), ConeBeam.orbit(2, 1020, 740, (40, 40), 12.0), full_detector=True)
 MU = 0.02 * torch.rand(2, 1, 12, 12, 12, generator=torch.Generator().manual_seed(0))
 
 

@@ -24,12 +24,12 @@ def join_report(findings: str | None, impression: str | None) -> str:
     A section that is None, NaN, empty, white space or "Not given." is left out; without both, the report is "".
     Headings inside a section are obeyed, as in `format_report`.
     """
-    sections = {"Findings": [], "Impression": []}
+    sections = {"Findings": "", "Impression": ""}
     for title, text in (("Findings", findings), ("Impression", impression)):
         for heading, part in _parts(text, title):
             if heading in sections and part.lower() not in ABSENT:
-                sections[heading].append(part)
-    return " ".join(f"{title}: {' '.join(parts)}" for title, parts in sections.items() if parts)
+                sections[heading] = f"{sections[heading]} {part}".strip()
+    return " ".join(f"{title}: {text}" for title, text in sections.items() if text.lower() not in ABSENT)
 
 
 def format_report(text: str | None) -> str:

@@ -99,7 +99,7 @@ def _read_weights(file: Path) -> dict[str, Tensor]:
     """The encoder's weights under BertModel's own names."""
     try:
         weights = load_file(file) if file.suffix == ".safetensors" else torch.load(file, "cpu", weights_only=True)
-    except (SafetensorError, UnpicklingError, RuntimeError, EOFError) as error:
+    except (SafetensorError, UnpicklingError, RuntimeError, EOFError, OSError) as error:
         raise ValueError(f"'{file}' is truncated or holds more than weights, and code in it is never run: copy it "
                          "again, or give it as model.safetensors") from error
     named = {}

@@ -59,7 +59,7 @@ def test_the_small_encoder_learns_and_a_pretrained_one_is_frozen(tmp_path):
     small = TextEncoder.small(learn_vocabulary(REPORTS), 16, 1, 24)
     assert small(REPORTS)[0].requires_grad
     write_bert(tmp_path, small)
-    assert not TextEncoder.pretrained(tmp_path)(REPORTS)[0].requires_grad
+    assert not TextEncoder.pretrained(tmp_path, 24)(REPORTS)[0].requires_grad
 
 
 def write_bert(folder, encoder):
@@ -70,8 +70,8 @@ def write_bert(folder, encoder):
 def test_a_bert_from_a_folder_speaks_like_the_one_that_was_written_there(tmp_path):
     small = TextEncoder.small(learn_vocabulary(REPORTS), 16, 1, 24).eval()
     write_bert(tmp_path, small)
-    loaded = TextEncoder.pretrained(tmp_path).eval()
-    assert loaded.source == str(tmp_path) and loaded.length == 24  # what the BERT has positions for
+    loaded = TextEncoder.pretrained(tmp_path, 24).eval()
+    assert loaded.source == str(tmp_path)
     torch.testing.assert_close(loaded(REPORTS)[0], small(REPORTS)[0])
     assert TextEncoder.pretrained(tmp_path, 8)(REPORTS)[0].shape[1] == 8
 
@@ -120,6 +120,8 @@ def test_medsyns_contexts_keep_padding_where_others_have_the_null_token(tmp_path
 
 
 def test_positions_that_a_checkpoint_lacks_are_stated(tmp_path):
+    with pytest.warns(UserWarning, match="knows 64 of the 100 positions"):
+        assert frozen(tmp_path, length=100).length == 64
     with pytest.warns(UserWarning, match="knows 64 of the 2048 positions .* cut to 64 tokens"):
         encoder = frozen(tmp_path, length=48, padded_to=2048)
     torch.testing.assert_close(encoder([LONG])[0], TextEncoder.pretrained(tmp_path, 48, 64)([LONG])[0])
@@ -165,7 +167,7 @@ def test_contexts_follow_changed_weights(tmp_path):
     encoder, other = frozen(tmp_path / "a", length=24), tmp_path / "b"
     write_cxr_bert(other, seed=1)
     before = encoder(REPORTS)[0]
-    encoder.bert.load_state_dict(TextEncoder.pretrained(other).bert.state_dict())
+    encoder.bert.load_state_dict(TextEncoder.pretrained(other, 24).bert.state_dict())
     assert torch.equal(encoder(REPORTS)[0], TextEncoder.pretrained(other, 24)(REPORTS)[0])
     assert not torch.allclose(encoder(REPORTS)[0], before)
 

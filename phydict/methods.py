@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from phydict.baselines import SIRT
+from phydict.datasets import format_report
 from phydict.grid import Grid
 from phydict.posterior import GradientSteps, Posterior, PriorOnly, ProximalCG, Reward, Sampler, SplitGibbs
 from phydict.prior import Prior, load_prior
@@ -70,7 +71,7 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: Prior | str | Path | None 
 
     xrays: tensor or array of line integrals; with display=True, of display values with an unknown gain and offset per
     view. grid: for methods without a prior; others work on their prior's.
-    prior: a Prior, a file, or None for the shipped one; report: radiology text, if any.
+    prior: a Prior, a file, or None for the shipped one; report: radiology text, if any, which `format_report` lays out.
     mu_water: attenuation in 1/mm that water has in the X-rays (None: the method's own, near 65 keV).
     A detector finer than the grid can use is binned. Raises ValueError when X-rays, geometry and prior do not fit.
     """
@@ -82,4 +83,4 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: Prior | str | Path | None 
     ready = ready if mu_water is None else ready.assuming(mu_water)
     grid = ready.prior.grid if isinstance(ready, Posterior) else grid
     xrays, projector = fit_to_grid(ready, grid, torch.as_tensor(xrays), beam)
-    return ready.reconstruct(xrays, projector, report or "", display, seed, on_step)
+    return ready.reconstruct(xrays, projector, format_report(report), display, seed, on_step)

@@ -43,6 +43,8 @@ class PriorTraining(lightning.LightningModule):
         network: the UNet; none given: the default VolumeUNet
         text: "small" for a BERT that learns reports first (none where the data have no reports), a folder or hub id
             for a frozen one, "none" for a prior without text
+        text_length: tokens of a report that a frozen text reads
+        text_padded_to: 2048, with text_length 192, for contexts as MedSyn's; none given: padding is hidden
         reports: texts that the small BERT's vocabulary is learnt from (taken from the data)
         voxels: voxels along each side of the cube
         side: side of the cube in mm
@@ -62,7 +64,8 @@ class PriorTraining(lightning.LightningModule):
         seed: of times, noise and text dropout
     """
 
-    def __init__(self, network: VolumeUNet | None = None, text: str = "small", reports: list[str] | None = None,
+    def __init__(self, network: VolumeUNet | None = None, text: str = "small", text_length: int = 128,
+                 text_padded_to: int | None = None, reports: list[str] | None = None,
                  voxels: int = 64, side: float = 384.0, window: tuple[float, float] = (-1000.0, 1000.0),
                  sigma_data: float = 0.5, text_dropout: float = 0.1, mask_weight: float = 0.1,
                  learning_rate: float = 5e-4, weight_decay: float = 0.01, warmup: int = 100, decay_from: int = 0,
@@ -76,10 +79,12 @@ class PriorTraining(lightning.LightningModule):
         elif text == "small":
             encoder = TextEncoder.small(learn_vocabulary(reports), network.context_dim)
         elif text != "none":
-            encoder = TextEncoder.pretrained(text)
+            encoder = TextEncoder.pretrained(text, text_length, text_padded_to)
         self.prior = Prior(network, Grid.cube(voxels, side), HUWindow(*window), encoder, sigma_data=sigma_data)
         if initial:
             self._start_from(load_prior(initial), initial)
+        if self.prior.text is not None and reports:
+            self.prior.text.check(reports)
         self.text_dropout, self.mask_weight, self.montage_steps = text_dropout, mask_weight, montage_steps
         self.learning_rate, self.weight_decay = learning_rate, weight_decay
         self.warmup, self.decay_from, self.decay_steps = warmup, decay_from, decay_steps

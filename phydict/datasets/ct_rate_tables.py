@@ -1,34 +1,27 @@
-"""Radiology reports: one layout for all sources, and CT-RATE's tables of reports and DICOM values."""
+"""CT-RATE's tables: reports, and DICOM values."""
 
 from __future__ import annotations
 
 import csv
 import json
-import re
 from pathlib import Path
 
+from phydict.datasets.reports import join_report
 from phydict.datasets.transforms import Calibration, case_id
-
-EMPTY = {"", "nan", "none", "not given", "not given."}
-
-
-def join_report(findings: str | None, impression: str | None) -> str:
-    """"Findings: ... Impression: ..." with absent parts left out; "Not given." and NaN count as absent."""
-    parts = []
-    for title, text in (("Findings", findings), ("Impression", impression)):
-        text = re.sub(r"\s+", " ", text or "").strip()
-        if text.lower() not in EMPTY:
-            parts.append(f"{title}: {text}")
-    return " ".join(parts)
-
 
 def read_reports(path: str | Path) -> dict[str, str]:
     """Reports by volume name (without .nii.gz) from one CT-RATE CSV, or from all CSVs of a folder.
 
-    Columns VolumeName, Findings_EN, Impressions_EN. Raises FileNotFoundError, and ValueError for missing columns.
+    Columns VolumeName, Findings_EN, Impressions_EN; a report is laid out by `join_report`. Raises FileNotFoundError,
+    and ValueError for missing columns and for a volume with two different reports.
     """
-    rows = _rows(path, ("VolumeName", "Findings_EN", "Impressions_EN"))
-    return {case_id(row["VolumeName"]): join_report(row["Findings_EN"], row["Impressions_EN"]) for row in rows}
+    reports = {}
+    for row in _rows(path, ("VolumeName", "Findings_EN", "Impressions_EN")):
+        name, report = case_id(row["VolumeName"]), join_report(row["Findings_EN"], row["Impressions_EN"])
+        if reports.setdefault(name, report) != report:
+            raise ValueError(f"the reports in {path} name {name} twice, with different texts: keep one row of each "
+                             "volume")
+    return reports
 
 
 def read_calibrations(path: str | Path) -> dict[str, Calibration]:

@@ -14,6 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from phydict.datasets.reports import join_report
+
 KINDS = ("nodule", "mass", "effusion", "consolidation", "emphysema", "cardiomegaly", "pneumothorax")
 PLEURAL = ("effusion", "pneumothorax")
 FOCAL = ("nodule", "mass", "consolidation")
@@ -177,4 +179,4 @@ def write_report(findings: tuple[Finding, ...], contrast: bool, seed: int) -> st
         if stated and not present.intersection(kinds):
             lines.append(pick(options))
     text = " ".join(line for line in lines if line) or "The lungs are clear."
-    return f"Findings: {text} Impression: {' '.join(impression) or pick(NORMAL)}"
+    return join_report(text, " ".join(impression) or pick(NORMAL))

@@ -18,6 +18,7 @@ from PIL import Image
 from phydict.datasets.dicom import DicomTags, read_dicom, shown, tags_intensity
 from phydict.datasets.intensity import KINDS, Intensity
 from phydict.datasets.natural_order import natural_order
+from phydict.datasets.reports import format_report
 from phydict.datasets.xray_description import GEOMETRY, Description, read_description
 from phydict.datasets.xray_images import ENDINGS, image_files, is_dicom, read_image
 from phydict.xray.geometry import ConeBeam
@@ -191,6 +192,6 @@ def _mean(paths: list[Path], shape: tuple[int, int]) -> np.ndarray:
 
 def _read_report(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8").strip() if path.is_file() else ""
+        return format_report(path.read_text(encoding="utf-8-sig")) if path.is_file() else ""
     except UnicodeDecodeError as error:
         raise ValueError(f"{path} is not UTF-8 text ({error}); save it as UTF-8") from error

@@ -45,7 +45,8 @@ def describe(prior: Prior) -> dict:
     if text is not None:
         text = {"source": text.source, "length": text.length, "width": text.width,
                 "layers": text.bert.config.num_hidden_layers,
-                "vocabulary": None if text.source else text.vocabulary}
+                "vocabulary": None if text.source else text.vocabulary,
+                **({"padded_to": text.padded_to} if text.padded_to else {})}
     return {"format": FORMAT, "grid": prior.grid.to_dict(), "hu_window": [prior.window.low, prior.window.high],
             "state": STATE[:prior.network.state_channels], "sigma_data": prior.sigma_data, "skip_std": prior.skip_std,
             "schedule": vars(prior.schedule), "network": prior.network.settings, "text": text}
@@ -96,7 +97,7 @@ def build_prior(header: dict, weights: dict[str, Tensor]) -> Prior:
 def build_text(text: dict, weights: dict[str, Tensor]) -> TextEncoder:
     """The text encoder of a header's "text", frozen; `weights` ("text.") are used unless it is a pretrained one."""
     if text["source"]:
-        return TextEncoder.pretrained(text["source"], text["length"])
+        return TextEncoder.pretrained(text["source"], text["length"], text.get("padded_to"))
     encoder = TextEncoder.small(text["vocabulary"], text["width"], text["layers"], text["length"])
     encoder.load_state_dict({k.removeprefix("text."): w.float() for k, w in weights.items() if k.startswith("text.")})
     encoder.trainable = False

@@ -37,6 +37,9 @@ class Prior(nn.Module):
         super().__init__()
         if any(n % network.divisor for n in grid.shape):
             raise ValueError(f"this network needs sizes divisible by {network.divisor}, but the grid is {grid.shape}")
+        if text is not None and text.width != network.context_dim:
+            raise ValueError(f"this text encoder's tokens have width {text.width}, but the network's context_dim is "
+                             f"{network.context_dim}: build the network with context_dim {text.width}")
         self.network, self.text, self.load_text = network, text, load_text
         self.grid, self.window, self.schedule, self.sigma_data = grid, window, schedule, sigma_data
         self.skip_std = skip_std
@@ -77,10 +80,15 @@ class Prior(nn.Module):
 
     @torch.no_grad()
     def bind(self, report: str = "", guidance: float = 1.0, bf16: bool | None = None) -> BoundPrior:
-        """The denoiser of one report, with classifier-free guidance of the given scale inside (1 = none)."""
+        """The denoiser of one report, with classifier-free guidance of the given scale inside (1 = none).
+
+        Warns, once for each report, where it is cut or in words that the text encoder does not know.
+        """
         if guidance < 0:
             raise ValueError(f"the guidance scale is at least 0, but {guidance} was given")
         context = self.context([report])
+        if report:
+            self.text.check([report])
         return BoundPrior(self, context, guidance if report else 1.0, bf16)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
@@ -11,6 +12,11 @@ from tokenizers import normalizers, pre_tokenizers
 from torch import Tensor, nn
 from transformers import BertConfig, BertModel, BertTokenizer
 
+from phydict.prior.bert_files import load_bert
+
+FOREIGN = 0.2
+"""Share of a report's tokens that may be [UNK] before `TextEncoder.check` warns."""
+
 
 class TextEncoder(nn.Module):
     """A BERT and its tokenizer: reports -> token embeddings (B, length, D).
@@ -18,14 +24,28 @@ class TextEncoder(nn.Module):
     length: a report is cut or padded to this many tokens, so a context never depends on its batch.
     trainable: whether the weights learn with the prior (the small default) or stay frozen (a pretrained BERT).
     source: folder or hub id it was loaded from; None for a BERT that belongs to its prior.
+    padded_to: MedSyn's convention (see `pretrained`): the BERT reads up to this many tokens, of which the first
+    `length` are kept; None: it reads no more than `length`.
+
+    A frozen encoder reads each report alone, without dropout and in the precision of its weights, and keeps the result
+    in main memory until its weights change or `cache_bytes` are full: a report's context costs one reading.
+    A word that the vocabulary lacks becomes [UNK], a token without meaning, as do most words in another script.
     """
 
+    cache_bytes = 2**30
+
     def __init__(self, tokenizer: BertTokenizer, bert: BertModel, length: int = 128, trainable: bool = False,
-                 source: str | None = None):
+                 source: str | None = None, padded_to: int | None = None):
         super().__init__()
+        if padded_to is not None and padded_to < length:
+            raise ValueError(f"a report padded to {padded_to} tokens has no {length} of them to keep: give a padded_to "
+                             "of at least the length")
         self.tokenizer, self.bert, self.length, self.source = tokenizer, bert, length, source
-        self.trainable = trainable
+        self.trainable, self.padded_to = trainable, padded_to
         self.bert.requires_grad_(trainable)
+        self._kept: dict[str, tuple[Tensor, Tensor]] = {}
+        self._kept_of, self._kept_bytes = None, 0
+        self._checked: set[str] = set()
 
     @property
     def width(self) -> int:
@@ -33,22 +53,23 @@ class TextEncoder(nn.Module):
         return self.bert.config.hidden_size
 
     @classmethod
-    def pretrained(cls, source: str | Path, length: int = 128) -> TextEncoder:
-        """From a folder or hub id holding a BERT and its vocabulary (for example CXR-BERT); its weights stay frozen.
+    def pretrained(cls, source: str | Path, length: int = 128, padded_to: int | None = None) -> TextEncoder:
+        """From a folder or hub id holding a BERT and its vocabulary (see `load_bert`); its weights stay frozen.
 
+        For contexts as MedSyn (10.1109/TMI.2024.3415032) was trained with, give its language model or CXR-BERT with
+        length=192, padded_to=2048: the last hidden states of the first 192 positions of a report that was cut or padded
+        to 2048 tokens, states of padding included, which cross-attention sees. The BERT itself masks padding, so that
+        padding beyond the first `length` changes nothing and is left out.
+        Where the BERT has fewer positions than asked for, both are lowered to these, and a warning says so.
         Raises FileNotFoundError, with what to do, when it is neither on disk nor reachable.
         """
-        try:
-            tokenizer = BertTokenizer.from_pretrained(source)
-            bert = BertModel.from_pretrained(source, add_pooling_layer=False)
-        except OSError as error:
-            raise FileNotFoundError(
-                f"no BERT text encoder at '{source}': give a folder with config.json, model weights and vocabulary, "
-                f"or a hub id that can be downloaded ({str(error).splitlines()[0]})") from error
-        if len(tokenizer) <= len(tokenizer.all_special_tokens):
-            raise FileNotFoundError(f"no BERT text encoder at '{source}': its vocabulary is missing, give a folder "
-                                    "with config.json, model weights and vocabulary")
-        return cls(tokenizer, bert, min(length, bert.config.max_position_embeddings), source=str(source))
+        tokenizer, bert = load_bert(source)
+        positions, asked = bert.config.max_position_embeddings, padded_to or length
+        if asked > positions:
+            warnings.warn(f"the text encoder at '{source}' knows {positions} of the {asked} positions asked for: "
+                          f"reports are cut to {positions} tokens", stacklevel=2)
+        return cls(tokenizer, bert, min(length, positions), source=str(source),
+                   padded_to=padded_to and min(padded_to, positions))
 
     @classmethod
     def small(cls, vocabulary: list[str], width: int = 64, layers: int = 2, length: int = 128) -> TextEncoder:
@@ -67,14 +88,62 @@ class TextEncoder(nn.Module):
         return sorted(words, key=words.get)
 
     def forward(self, reports: list[str]) -> tuple[Tensor, Tensor]:
-        """Reports -> token embeddings (B, length, D) and their mask (B, length), True where a token stands."""
+        """Reports -> token embeddings (B, length, D) and their mask (B, length), True where cross-attention looks:
+        at tokens, and with padded_to at padding too."""
+        if self.trainable:
+            return self._read(reports)
+        states, masks = zip(*map(self._read_once, reports))
+        return torch.stack(states).to(self.bert.device), torch.stack(masks).to(self.bert.device)
+
+    def check(self, reports: Iterable[str]) -> None:
+        """Warns of reports that are longer than `length` tokens and of reports in words that the vocabulary lacks.
+
+        Each report is looked at once: later calls speak of new reports alone.
+        """
+        new = [report for report in dict.fromkeys(reports) if report and report not in self._checked]
+        if not new:
+            return
+        self._checked.update(new)
+        tokens = self.tokenizer(new, add_special_tokens=False, verbose=False)["input_ids"]
+        excess = [len(own) + 2 - self.length for own in tokens if len(own) + 2 > self.length]
+        if excess:
+            warnings.warn(f"{len(excess)} of {len(new)} reports are longer than the {self.length} tokens that the "
+                          f"prior reads: up to {max(excess)} tokens at their end are left out", stacklevel=2)
+        unknown = [sum(token == self.tokenizer.unk_token_id for token in own) / max(len(own), 1) for own in tokens]
+        foreign = [share for share in unknown if share > FOREIGN]
+        if foreign:
+            warnings.warn(f"{len(foreign)} of {len(new)} reports are in words that the text encoder does not know, up "
+                          f"to {max(foreign):.0%} of a report, and say little to it: give them in the language that "
+                          "it learnt, or leave them out", stacklevel=2)
+
+    def _read(self, reports: list[str]) -> tuple[Tensor, Tensor]:
+        window = self.length
+        if self.padded_to:
+            tokens = self.tokenizer(reports, truncation=True, max_length=self.padded_to)["input_ids"]
+            window = max(window, *map(len, tokens))
         tokens = self.tokenizer(
-            reports, padding="max_length", truncation=True, max_length=self.length, return_tensors="pt")
+            reports, padding="max_length", truncation=True, max_length=window, return_tensors="pt")
         mask = tokens["attention_mask"].to(self.bert.device)
-        with torch.set_grad_enabled(self.trainable and torch.is_grad_enabled()):
-            states = self.bert(
-                input_ids=tokens["input_ids"].to(self.bert.device), attention_mask=mask).last_hidden_state
-        return states, mask.bool()
+        states = self.bert(
+            input_ids=tokens["input_ids"].to(self.bert.device), attention_mask=mask).last_hidden_state
+        seen = torch.ones_like(mask) if self.padded_to else mask
+        return states[:, :self.length], seen[:, :self.length].bool()
+
+    def _read_once(self, report: str) -> tuple[Tensor, Tensor]:
+        """What `_read` says of one report, without its batch axis: from the cache, or put there."""
+        weights = (self.bert.device, self.bert.dtype,
+                   sum(0 if w.is_inference() else w._version for w in self.bert.parameters()))
+        if weights != self._kept_of:
+            self._kept, self._kept_of, self._kept_bytes = {}, weights, 0
+        if report in self._kept:
+            return self._kept[report]
+        self.bert.eval()
+        with torch.inference_mode(False), torch.no_grad(), torch.autocast(self.bert.device.type, enabled=False):
+            states, mask = (part[0].cpu() for part in self._read([report]))
+        if self._kept_bytes + states.nbytes <= self.cache_bytes:
+            self._kept[report] = states.clone(), mask.clone()
+            self._kept_bytes += states.nbytes
+        return states, mask
 
 
 def learn_vocabulary(reports: Iterable[str], size: int = 2000) -> list[str]:

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from phydict.datasets.ct_rate import CTCases, find_cts, patient_of, split_by_patient
-from phydict.datasets.ct_rate_tables import join_report, read_reports
+from phydict.datasets.ct_rate_tables import read_reports
 from phydict.datasets.augment import Deformation, augment
 from phydict.datasets.transforms import (AIR, Calibration, covering_grid, load_ct, prepare_ct,
                                          to_grid)
@@ -231,14 +231,6 @@ REPORT_COLUMNS = ("VolumeName", "ClinicalInformation_EN", "Technique_EN", "Findi
 METADATA_COLUMNS = ("VolumeName", "RescaleIntercept", "RescaleSlope", "XYSpacing", "ZSpacing")
 
 
-@pytest.mark.parametrize(("findings", "impression", "report"), [
-    ("Clear\nlungs.", "Normal.", "Findings: Clear lungs. Impression: Normal."),
-    ("Not given.", "Normal.", "Impression: Normal."),
-    ("nan", "", ""), (None, "Not given.", ""), ("A, \"b\" (c).", None, 'Findings: A, "b" (c).')])
-def test_reports_have_one_layout_and_absent_parts_are_left_out(findings, impression, report):
-    assert join_report(findings, impression) == report
-
-
 def ct_rate(root, thorax, version="_fixed"):
     for name in ("1_a_1", "1_a_2", "1_b_1", "2_a_1", "10_a_1"):
         patient, scan, _ = name.split("_")
@@ -323,6 +315,11 @@ def test_report_tables_are_checked(tmp_path):
         read_reports(tmp_path / "absent.csv")
     with pytest.raises(ValueError, match="lacks the columns Findings_EN, Impressions_EN"):
         read_reports(write_csv(tmp_path / "a.csv", ("VolumeName",)))
+    row = ("train_1_a_1.nii.gz", "", "", "Nodule.", "")
+    twice = write_csv(tmp_path / "b.csv", REPORT_COLUMNS, row, row)
+    assert read_reports(twice) == {"train_1_a_1": "Findings: Nodule."}
+    with pytest.raises(ValueError, match="name train_1_a_1 twice, with different texts: keep one row"):
+        read_reports(write_csv(twice, REPORT_COLUMNS, row, (*row[:3], "Mass.", "")))
 
 
 def test_a_patient_never_straddles_the_split():

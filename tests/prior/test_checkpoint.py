@@ -8,8 +8,9 @@ from laws import random_like
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from phydict.prior import TextEncoder, load_prior, save_prior
-from prior.tiny import REPORTS, tiny_prior
+from phydict.prior import TextEncoder, describe, load_prior, save_prior
+from phydict.prior.checkpoint import build_text
+from prior.tiny import REPORTS, tiny_prior, write_cxr_bert
 
 X = random_like((1, 4, 16, 16, 16), torch.float32, seed=1)
 
@@ -89,6 +90,24 @@ def test_a_pretrained_encoder_is_named_and_not_copied(tmp_path):
         assert not any(key.startswith("text.") for key in opened.keys())
     found = estimates(load_prior(tmp_path / "named.safetensors"))[1]
     assert (found - estimates(prior)[1]).square().mean().sqrt() < 3e-3 * found.std()
+
+
+@pytest.mark.parametrize("padded_to", [None, 48])
+def test_a_prior_reads_reports_as_it_was_trained_to(tmp_path, padded_to):
+    write_cxr_bert(tmp_path / "bert")
+    prior = tiny_prior()
+    prior.text = TextEncoder.pretrained(tmp_path / "bert", 24, padded_to)
+    save_prior(prior, tmp_path / "named.safetensors", dtype=torch.float32)
+    report = "left nodule " * 15
+    assert torch.equal(load_prior(tmp_path / "named.safetensors").context([report]), prior.context([report]))
+
+
+def test_a_header_from_before_padding_was_a_choice_still_loads(tmp_path):
+    write_cxr_bert(tmp_path)
+    text = describe(tiny_prior())["text"] | {"source": str(tmp_path), "vocabulary": None}
+    assert set(text) == {"source", "length", "width", "layers", "vocabulary"}
+    states, mask = build_text(text, {})(REPORTS)
+    assert not mask.all() and torch.equal(states, TextEncoder.pretrained(tmp_path, 24)(REPORTS)[0])
 
 
 def test_a_missing_file_is_named(tmp_path):

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import torch
+from transformers import BertConfig, BertForMaskedLM
 
 from phydict.grid import Grid
 from phydict.prior import Prior, TextEncoder, VolumeUNet, learn_vocabulary
@@ -23,3 +27,35 @@ def tiny_prior(text: bool = True, voxels: int = 16, seed: int = 0) -> Prior:
         prior = Prior(network, Grid.cube(voxels), HUWindow(-1000, 600), encoder)
         torch.nn.init.normal_(prior.null)
     return prior.eval().requires_grad_(False)
+
+
+def write_cxr_bert(folder: Path, positions: int = 64, told_positions: int = 64, seed: int = 0) -> BertForMaskedLM:
+    """Writes files laid out as CXR-BERT's, with random weights, and returns the model that they hold.
+
+    positions: rows of the table in pytorch_model.bin; told_positions: what config.json says. (MedSyn's language model
+    has 2048 rows, and CXR-BERT's config.json, which its users put beside it, says 512.)
+    """
+    words = learn_vocabulary(REPORTS)
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        model = BertForMaskedLM(BertConfig(
+            vocab_size=len(words), hidden_size=16, num_hidden_layers=2, num_attention_heads=4, intermediate_size=32,
+            max_position_embeddings=positions, hidden_dropout_prob=0.25, attention_probs_dropout_prob=0.25)).eval()
+        for name, weight in model.named_parameters():  # of a trained model's size, so that every word shows
+            if weight.ndim > 1 or name.endswith("bias"):
+                torch.nn.init.normal_(weight, std=0.4)
+        heads = {f"cls_projection_head.{name}.weight": torch.randn(8, 8)
+                 for name in ("dense_to_hidden", "dense_to_output")}
+    weights = model.state_dict() | {"bert.embeddings.position_ids": torch.arange(positions)[None]} | heads
+    folder.mkdir(parents=True, exist_ok=True)
+    torch.save(weights, folder / "pytorch_model.bin")
+    config = model.config.to_dict() | {
+        "model_type": "cxr-bert", "architectures": ["CXRBertModel"], "projection_size": 8,
+        "max_position_embeddings": told_positions, "auto_map": {"AutoModel": "modeling_cxrbert.CXRBertModel"}}
+    (folder / "config.json").write_text(json.dumps(config))
+    (folder / "modeling_cxrbert.py").write_text("raise SystemExit('code that came with weights was run')\n")
+    (folder / "vocab.txt").write_text("\n".join(words) + "\n")
+    (folder / "tokenizer_config.json").write_text(json.dumps({
+        "do_lower_case": True, "model_max_length": told_positions, "tokenizer_class": "CXRBertTokenizer",
+        "auto_map": {"AutoTokenizer": ["modeling_cxrbert.CXRBertTokenizer", None]}}))
+    return model

@@ -1,0 +1,56 @@
+"""Radiology reports in the one layout that priors are trained on: "Findings: ... Impression: ...".
+
+CT-RATE's tables give the two sections apart; a report.txt or a call of `phydict.reconstruct` gives one text. Both end
+in the same layout, so that a prior meets at inference what it met in training.
+"""
+
+from __future__ import annotations
+
+import re
+
+ABSENT = {"", "nan", "none", "null", "n/a", "<na>", "not given", "not given.", "-", "."}
+"""What stands for a section that nobody wrote, in lower case."""
+
+SECTIONS = {"finding": "Findings", "impression": "Impression", "conclusion": "Impression"}
+LEFT_OUT = ("clinical information", "clinical history", "clinical indication", "history", "indication", "technique",
+            "comparison", "examination")
+HEADING = re.compile(rf"(?:^[ \t]*|(?<=\s)(?=(?-i:[A-Z])))({'|'.join((*SECTIONS, *LEFT_OUT))})s?[ \t]*:",
+                     re.IGNORECASE | re.MULTILINE)
+
+
+def join_report(findings: str | None, impression: str | None) -> str:
+    """"Findings: ... Impression: ..." of two sections, on one line.
+
+    A section that is None, NaN, empty, white space or "Not given." is left out; without both, the report is "".
+    Headings inside a section are obeyed, as in `format_report`.
+    """
+    sections = {"Findings": "", "Impression": ""}
+    for title, text in (("Findings", findings), ("Impression", impression)):
+        for heading, part in _parts(text, title):
+            if heading in sections and part.lower() not in ABSENT:
+                sections[heading] = f"{sections[heading]} {part}".strip()
+    return " ".join(f"{title}: {text}" for title, text in sections.items() if text.lower() not in ABSENT)
+
+
+def format_report(text: str | None) -> str:
+    """A whole report as `join_report` writes it; the layout's own texts stay as they are.
+
+    Headings (findings, impression or conclusion) count at the start of a line, or anywhere with a capital, and need a
+    colon. Text before any heading belongs to the findings. Clinical information, technique and comparison are left out,
+    as they are in training. A text without findings or impression is kept as it is, on one line.
+    """
+    if any(heading in SECTIONS.values() for heading, _ in _parts(text, "")):
+        return join_report(text, None)
+    whole = " ".join(_written(text).split())
+    return "" if whole.lower() in ABSENT else whole
+
+
+def _parts(text: str | None, title: str) -> list[tuple[str, str]]:
+    """(section, text on one line) in order; what comes before any heading belongs to `title`."""
+    pieces = HEADING.split(_written(text))
+    titles = [title, *(SECTIONS.get(name.lower(), "") for name in pieces[1::2])]
+    return [(name, " ".join(piece.split())) for name, piece in zip(titles, pieces[0::2])]
+
+
+def _written(text: str | None) -> str:
+    return "" if text is None or text != text else text  # NaN differs from itself

@@ -1,0 +1,112 @@
+"""A BERT and its tokenizer from a folder or a hub id: weights and words alone, never code that came with them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from pickle import UnpicklingError
+
+import torch
+from huggingface_hub import HfApi, snapshot_download
+from huggingface_hub.errors import HTTPError
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor
+from transformers import BertConfig, BertModel, BertTokenizer
+
+CONFIG = "config.json"
+WEIGHTS = ("model.safetensors", "pytorch_model.bin")
+VOCABULARY = ("vocab.txt", "tokenizer.json")
+BESIDE = ("tokenizer_config.json", "special_tokens_map.json")
+NEEDED = "config.json, model weights and vocabulary"
+"""What `load_bert` reads; of WEIGHTS and VOCABULARY the first that is there."""
+
+ATTEMPT_SECONDS = 5.0
+"""How long the one attempt to reach the hub may take."""
+
+OLD_NAMES = {"LayerNorm.gamma": "LayerNorm.weight", "LayerNorm.beta": "LayerNorm.bias"}
+UNUSED = ("embeddings.position_ids", "embeddings.token_type_ids")
+
+
+def load_bert(source: str | Path) -> tuple[BertTokenizer, BertModel]:
+    """The tokenizer and the BERT without pooler (float32) in a folder, or under a hub id.
+
+    Any checkpoint whose encoder is a BERT is understood, bare or below "bert." and with further heads, which are left
+    out: CXR-BERT (microsoft/BiomedVLP-CXR-BERT-specialized) as it is, and MedSyn's language model as a folder with its
+    pytorch_model.bin and CXR-BERT's config.json and vocab.txt. The weights decide how many positions there are.
+    A hub id is looked for in the local cache, then downloaded after one attempt to reach the hub, or none where
+    HF_HUB_OFFLINE is set. Raises FileNotFoundError where there is none, ValueError where its files do not fit together
+    or hold more than weights.
+    """
+    folder = _folder(source)
+    weights = _read_weights(_first(folder, WEIGHTS))
+    try:
+        config = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
+        config.pop("model_type", None)
+        config["max_position_embeddings"] = len(weights["embeddings.position_embeddings.weight"])
+        bert = BertModel(BertConfig.from_dict(config), add_pooling_layer=False)
+        bert.load_state_dict(weights)
+    except (KeyError, AttributeError, TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"the weights in '{folder}' are not those of the BERT that its {CONFIG} describes "
+                         f"({' '.join(str(error).split())[:300]}): give the files of one model") from error
+    tokenizer = BertTokenizer.from_pretrained(folder, local_files_only=True)
+    if len(tokenizer) > bert.config.vocab_size:
+        raise ValueError(f"the vocabulary in '{folder}' has {len(tokenizer)} words, but the BERT knows "
+                         f"{bert.config.vocab_size}: give the vocabulary that belongs to it")
+    return tokenizer, bert.eval()
+
+
+def _folder(source: str | Path) -> Path:
+    """The folder on disk that holds a source's files, downloaded to the local cache if need be."""
+    folder = Path(source)
+    if not folder.is_dir():
+        try:
+            folder = _cached(str(source)) or _downloaded(str(source))
+        except (OSError, ValueError, HTTPError) as error:
+            raise FileNotFoundError(f"no BERT text encoder at '{source}': give a folder with {NEEDED}, or a hub id "
+                                    f"that can be downloaded ({str(error).splitlines()[0]})") from error
+    if missing := _missing(folder):
+        raise FileNotFoundError(f"no BERT text encoder at '{source}', since it lacks {missing}: give a folder or hub "
+                                f"id with {NEEDED}")
+    return folder
+
+
+def _cached(hub_id: str) -> Path | None:
+    try:
+        folder = Path(snapshot_download(hub_id, local_files_only=True))
+    except FileNotFoundError:
+        return None
+    return None if _missing(folder) else folder
+
+
+def _downloaded(hub_id: str) -> Path:
+    hub = HfApi().model_info(hub_id, timeout=ATTEMPT_SECONDS)  # a download's own attempts repeat for minutes
+    held = {file.rfilename for file in hub.siblings or ()}
+    weights = [name for name in WEIGHTS if name in held][:1]
+    return Path(snapshot_download(hub_id, revision=hub.sha, allow_patterns=[CONFIG, *weights, *VOCABULARY, *BESIDE]))
+
+
+def _missing(folder: Path) -> str:
+    choices = {CONFIG: (CONFIG,), " or ".join(WEIGHTS): WEIGHTS, " or ".join(VOCABULARY): VOCABULARY}
+    return ", ".join(name for name, files in choices.items() if not any((folder / file).is_file() for file in files))
+
+
+def _first(folder: Path, names: tuple[str, ...]) -> Path:
+    return next(folder / name for name in names if (folder / name).is_file())
+
+
+def _read_weights(file: Path) -> dict[str, Tensor]:
+    """The encoder's weights under BertModel's own names."""
+    try:
+        weights = load_file(file) if file.suffix == ".safetensors" else torch.load(file, "cpu", weights_only=True)
+    except (SafetensorError, UnpicklingError, RuntimeError, EOFError, OSError) as error:
+        raise ValueError(f"'{file}' is truncated or holds more than weights, and code in it is never run: copy it "
+                         "again, or give it as model.safetensors") from error
+    named = {}
+    for name, weight in weights.items() if isinstance(weights, dict) else ():
+        name = name.removeprefix("module.").removeprefix("bert.")
+        for old, new in OLD_NAMES.items():
+            name = name.replace(old, new)
+        if name.startswith(("embeddings.", "encoder.")) and name not in UNUSED:
+            named[name] = weight
+    return named

@@ -8,7 +8,7 @@ from pathlib import Path
 import lightning
 import numpy as np
 import torch
-from torch.utils.data import ConcatDataset, DataLoader, Dataset
+from torch.utils.data import ConcatDataset, DataLoader, Dataset, DistributedSampler
 
 from phydict.datasets import Augmentation, CTCases, Thorax, augment, find_cts, phantom_case, report, split_by_patient
 from phydict.datasets.cache import read_arrays, write_arrays
@@ -173,7 +173,9 @@ class PriorData(lightning.LightningDataModule):
                              "raise it, or lower data.batch_size")
         epoch = MixedCases(self.cts, self.phantoms, self.ct_fraction, self.grid, self.window, self.epoch_size,
                            self.trainer.current_epoch, self.seed, self.augmentation)
-        return DataLoader(epoch, self.batch_size, num_workers=self.workers, drop_last=True)
+        # Lightning's own sampler would shuffle: several processes take turns, so that each step sees what one would.
+        turns = DistributedSampler(epoch, self.trainer.world_size, self.trainer.global_rank, shuffle=False)
+        return DataLoader(epoch, self.batch_size, sampler=turns, num_workers=self.workers, drop_last=True)
 
     def val_dataloader(self) -> DataLoader:
         return DataLoader(self.validation, 1, collate_fn=_collate)

@@ -122,9 +122,8 @@ class PriorTraining(lightning.LightningModule):
     def denoising_loss(self, batch: dict, key: tuple[int, ...] = (0,), rank: int = 0, processes: int = 1) -> Tensor:
         """Weighted squared error of one batch's clean estimates.
 
-        Times, noise and text dropout follow from `key` and each sample's place in the batch of all `processes` (this
-        one, `rank`, has every so-manieth), so that a resumed run repeats an uninterrupted one, and several processes
-        do what one would.
+        Times, noise and text dropout follow from `key` and each sample's place in the batch that all `processes` share
+        in turns, so that a resumed run repeats an uninterrupted one, and several processes do what one would.
         """
         x0, weight = self._state(batch)
         places = range(rank, len(x0) * processes, processes)

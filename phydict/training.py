@@ -110,6 +110,10 @@ class PriorTraining(lightning.LightningModule):
         if any(isinstance(callback, WeightAveraging) for callback in self.trainer.callbacks):
             raise ValueError("spread weights cannot be averaged: train without EMAWeightAveraging "
                              "(trainer.callbacks: null), as configs/prior/fsdp.yaml does")
+        # A spread optimizer goes on only if it has moved each of its weights: those that denoising leaves alone rest.
+        self.prior.network.text_map.to_sketch.requires_grad_(False)
+        if self.prior.text is not None and self.text_steps:
+            self.prior.text.requires_grad_(False)
         shard(self.prior, mesh["data_parallel"])
 
     def training_step(self, batch: dict, index: int) -> Tensor:

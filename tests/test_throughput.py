@@ -16,7 +16,7 @@ from phydict.units import HUWindow
 
 def test_flop_are_those_of_the_layers_three_times():
     """Forward, gradient of the input and gradient of the weights cost the same, but the input itself needs none."""
-    network, counted = VolumeUNet(4, 2, (16, 16), (False, False), 2), []
+    network, counted = VolumeUNet(4, 2, (16, 16), (False, False), 2, 8), []
 
     def count(layer, inputs, output):
         weights = layer.weight.numel() / (layer.out_channels if hasattr(layer, "out_channels") else layer.out_features)
@@ -27,7 +27,7 @@ def test_flop_are_those_of_the_layers_three_times():
             layer.register_forward_hook(count)
     network(torch.zeros(1, 4, 32, 32, 32), torch.zeros(1), torch.zeros(1, 1, 64))
     prior = Prior(network, Grid.cube(32), HUWindow())
-    assert sample_flop(prior) == pytest.approx(sum(counted), rel=0.02)  # the text map's attention is no such layer
+    assert 1 <= sample_flop(prior) / sum(counted) < 1.05  # attention's own products are in no layer
 
 
 def test_flop_are_counted_without_touching_the_prior():

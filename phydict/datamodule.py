@@ -8,9 +8,9 @@ from pathlib import Path
 import lightning
 import numpy as np
 import torch
-from torch.utils.data import ConcatDataset, DataLoader, Dataset
+from torch.utils.data import ConcatDataset, DataLoader, Dataset, DistributedSampler
 
-from phydict.datasets import CTCases, Thorax, augment, find_cts, phantom_case, report, split_by_patient
+from phydict.datasets import Augmentation, CTCases, Thorax, augment, find_cts, phantom_case, report, split_by_patient
 from phydict.datasets.cache import read_arrays, write_arrays
 from phydict.datasets.phantom import change_by_findings
 from phydict.grid import Grid
@@ -55,9 +55,9 @@ class MixedCases(Dataset):
     """One epoch of deformed draws from CTs and phantoms; draw n of epoch e is the same on every machine."""
 
     def __init__(self, cts: Sequence, phantoms: Sequence, ct_fraction: float, grid: Grid, window: HUWindow,
-                 length: int, epoch: int, seed: int):
+                 length: int, epoch: int, seed: int, augmentation: Augmentation = Augmentation()):
         self.cts, self.phantoms, self.ct_fraction, self.grid, self.window = cts, phantoms, ct_fraction, grid, window
-        self.length, self.epoch, self.seed = length, epoch, seed
+        self.length, self.epoch, self.seed, self.augmentation = length, epoch, seed, augmentation
 
     def __len__(self) -> int:
         return self.length
@@ -67,7 +67,7 @@ class MixedCases(Dataset):
         from_ct = len(self.phantoms) == 0 or (len(self.cts) > 0 and draw.random() < self.ct_fraction)
         source = self.cts if from_ct else self.phantoms
         case = source[int(draw.integers(len(source)))]
-        return _training_parts(augment(case, int(draw.integers(2**31)), self.grid, self.window))
+        return _training_parts(augment(case, int(draw.integers(2**31)), self.grid, self.window, self.augmentation))
 
 
 class PriorData(lightning.LightningDataModule):
@@ -89,6 +89,7 @@ class PriorData(lightning.LightningDataModule):
         batch_size: draws per step on each device
         workers: loader processes per device
         cache: folder for prepared cases, never inside the CTs' folder
+        augmentation: strengths of the random changes of each draw
         seed: of the draws and of the split into patients
         voxels: tied to model.voxels
         side: tied to model.side
@@ -99,7 +100,8 @@ class PriorData(lightning.LightningDataModule):
                  fixed: bool = True, first_reconstruction: bool = False, exclude: str | None = None,
                  holdout: list[str] | None = None, holdout_fraction: float = 0.0, phantoms: int = 2000,
                  ct_fraction: float = 0.5, validation_phantoms: int = 6, epoch_size: int = 400, batch_size: int = 4,
-                 workers: int = 0, cache: str = "runs/cache", seed: int = 0, voxels: int = 64, side: float = 384.0,
+                 workers: int = 0, cache: str = "runs/cache", augmentation: Augmentation = Augmentation(),
+                 seed: int = 0, voxels: int = 64, side: float = 384.0,
                  window: tuple[float, float] = (-1000.0, 1000.0)):
         super().__init__()
         if not cts and not phantoms:
@@ -130,7 +132,7 @@ class PriorData(lightning.LightningDataModule):
         self.reports = [f.report for f in files if f.report]
         self.reports += [report(Thorax.draw(s)) for s in range(min(phantoms, 1000))]
         self.ct_fraction, self.epoch_size, self.seed = ct_fraction, epoch_size, seed
-        self.batch_size, self.workers = batch_size, workers
+        self.batch_size, self.workers, self.augmentation = batch_size, workers, augmentation
 
     def labelled_reports(self, count: int = 6000) -> tuple[list[str], torch.Tensor]:
         """Reports of phantoms and which findings (kind, side, lobe) each has: labels (N, F). None without phantoms."""
@@ -171,8 +173,10 @@ class PriorData(lightning.LightningDataModule):
             raise ValueError(f"data.epoch_size is {self.epoch_size}, less than one batch on every device ({least}): "
                              "raise it, or lower data.batch_size")
         epoch = MixedCases(self.cts, self.phantoms, self.ct_fraction, self.grid, self.window, self.epoch_size,
-                           self.trainer.current_epoch, self.seed)
-        return DataLoader(epoch, self.batch_size, num_workers=self.workers, drop_last=True)
+                           self.trainer.current_epoch, self.seed, self.augmentation)
+        # Lightning's own sampler would shuffle: several processes take turns, so that each step sees what one would.
+        turns = DistributedSampler(epoch, self.trainer.world_size, self.trainer.global_rank, shuffle=False)
+        return DataLoader(epoch, self.batch_size, sampler=turns, num_workers=self.workers, drop_last=True)
 
     def val_dataloader(self) -> DataLoader:
         return DataLoader(self.validation, 1, collate_fn=_collate)

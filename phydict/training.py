@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import time
 import warnings
 from pathlib import Path
 from pickle import UnpicklingError
@@ -11,7 +10,7 @@ from pickle import UnpicklingError
 import lightning
 import torch
 from jsonargparse import auto_cli
-from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.callbacks import ModelCheckpoint, WeightAveraging
 from lightning.pytorch.cli import LightningCLI
 from lightning.pytorch.loggers import CSVLogger
 from lightning.pytorch.utilities import rank_zero_only
@@ -27,6 +26,8 @@ from phydict.posterior import descend
 from phydict.prior import Prior, TextEncoder, VolumeUNet, describe, learn_vocabulary, load_prior, save_prior
 from phydict.prior.checkpoint import build_prior, build_text
 from phydict.prior.report_training import learn_findings, learn_sketch
+from phydict.prior.sharding import shard
+from phydict.throughput import Throughput
 from phydict.units import HUWindow
 
 CHECKPOINT, HELD_OUT = "last.ckpt", "held_out.txt"
@@ -60,6 +61,9 @@ class PriorTraining(lightning.LightningModule):
         text_steps: steps of each task by which a small BERT learns reports before denoising begins; 0: it learns by
             denoising
         montage_steps: noise levels of the samples that validation paints; 0: none
+        gradient_checkpointing: less memory for a second computation of each block's activations
+        channels_last: lay the network's channels side by side in memory
+        compile: run the network through torch.compile
         initial: a prior's file to go on from, which then decides network and text
         seed: of times, noise and text dropout
     """
@@ -69,8 +73,9 @@ class PriorTraining(lightning.LightningModule):
                  voxels: int = 64, side: float = 384.0, window: tuple[float, float] = (-1000.0, 1000.0),
                  sigma_data: float = 0.5, text_dropout: float = 0.1, mask_weight: float = 0.1,
                  learning_rate: float = 5e-4, weight_decay: float = 0.01, warmup: int = 100, decay_from: int = 0,
-                 decay_steps: int = 0, text_steps: int = 600, montage_steps: int = 16, initial: str | None = None,
-                 seed: int = 0):
+                 decay_steps: int = 0, text_steps: int = 600, montage_steps: int = 16,
+                 gradient_checkpointing: bool = False, channels_last: bool = True, compile: bool = False,
+                 initial: str | None = None, seed: int = 0):
         super().__init__()
         network = network or VolumeUNet()
         encoder = None
@@ -85,11 +90,12 @@ class PriorTraining(lightning.LightningModule):
             self._start_from(load_prior(initial), initial)
         if self.prior.text is not None and reports:
             self.prior.text.check(reports)
+        self.prior.network.run_with(gradient_checkpointing, channels_last, compile)
         self.text_dropout, self.mask_weight, self.montage_steps = text_dropout, mask_weight, montage_steps
         self.learning_rate, self.weight_decay = learning_rate, weight_decay
         self.warmup, self.decay_from, self.decay_steps = warmup, decay_from, decay_steps
         self.text_steps = text_steps
-        self.seed, self.last_step_at, self.samples = seed, None, 0
+        self.seed, self.samples = seed, 0
 
     def _start_from(self, prior: Prior, path: str) -> None:
         if not prior.grid.same_as(self.prior.grid) or prior.window != self.prior.window:
@@ -102,24 +108,44 @@ class PriorTraining(lightning.LightningModule):
         if prior.text is not None:
             prior.text.requires_grad_(prior.text.trainable)
 
-    def training_step(self, batch: dict, _) -> Tensor:
-        # Times and noise follow from seed and step alone, so that a resumed run repeats an uninterrupted one.
-        draw = torch.Generator().manual_seed(hash((self.seed, self.global_step, self.global_rank)) % 2**31)
+    def configure_model(self) -> None:
+        mesh = self.device_mesh  # only of a strategy that spreads the weights
+        if mesh is None:
+            return
+        if any(isinstance(callback, WeightAveraging) for callback in self.trainer.callbacks):
+            raise ValueError("spread weights cannot be averaged: train without EMAWeightAveraging "
+                             "(trainer.callbacks: null), as configs/prior/fsdp.yaml does")
+        # A spread optimizer goes on only if it has moved each of its weights: those that denoising leaves alone rest.
+        self.prior.network.text_map.to_sketch.requires_grad_(False)
+        if self.prior.text is not None and self.text_steps:
+            self.prior.text.requires_grad_(False)
+        shard(self.prior, mesh["data_parallel"])
+
+    def training_step(self, batch: dict, index: int) -> Tensor:
+        loss = self.denoising_loss(batch, (self.seed, self.global_step, index), self.global_rank,
+                                   self.trainer.world_size)
+        self.samples += len(batch["volume"]) * self.trainer.world_size
+        self.log("loss", loss, prog_bar=True, batch_size=len(batch["volume"]), sync_dist=True)
+        return loss
+
+    def denoising_loss(self, batch: dict, key: tuple[int, ...] = (0,), rank: int = 0, processes: int = 1) -> Tensor:
+        """Weighted squared error of one batch's clean estimates.
+
+        Times, noise and text dropout follow from `key` and each sample's place in the batch that all `processes` share
+        in turns, so that a resumed run repeats an uninterrupted one, and several processes do what one would.
+        """
         x0, weight = self._state(batch)
-        n = len(x0)
-        t = ((torch.arange(n) + torch.rand(n, generator=draw)) / n).to(self.device)
-        noise = torch.randn(x0.shape, generator=draw).to(self.device)
-        reports = batch["report"] if self.prior.text is not None else [""] * n
-        keep = torch.rand(n, generator=draw) >= self.text_dropout
-        context = self.prior.context([r if k else "" for r, k in zip(reports, keep)])
+        places = range(rank, len(x0) * processes, processes)
+        draws = [torch.Generator().manual_seed(hash((*key, place)) % 2**31) for place in places]
+        u, keep = torch.stack([torch.rand(2, generator=draw) for draw in draws], 1)
+        t = ((torch.tensor(places) + u) / (len(x0) * processes)).to(self.device)
+        noise = torch.stack([torch.randn(x0.shape[1:], generator=draw) for draw in draws]).to(self.device)
+        reports = batch["report"] if self.prior.text is not None else [""] * len(x0)
+        context = self.prior.context([r if k >= self.text_dropout else "" for r, k in zip(reports, keep)])
         a, s = (w.float().view(-1, 1, 1, 1, 1) for w in self.prior.schedule.scales(t.double()))
         error = (self.prior(a * x0 + s * noise, t, context) - x0).square()
         unit = self.prior.preconditioning(t)[1].clamp(min=0.25) ** -2
-        loss = (unit * weight * error).sum() / (weight.expand_as(error).sum())
-        self._log_speed(n)
-        self.samples += n * self.trainer.world_size
-        self.log("loss", loss, prog_bar=True, batch_size=n)
-        return loss
+        return (unit * weight * error).mean() * x0.shape[1] / (1 + self.mask_weight * (x0.shape[1] - 1))
 
     def learn_reports(self, data: PriorData) -> None:
         """Teaches a small report encoder and the text map, once, before the first denoising step.
@@ -151,13 +177,6 @@ class PriorTraining(lightning.LightningModule):
         weight = torch.cat([torch.ones_like(known[:, :1]), known], 1)[:, :channels]
         return x0, weight[..., None, None, None]
 
-    def _log_speed(self, samples: int) -> None:
-        now = time.perf_counter()
-        if self.last_step_at is not None:
-            self.log("samples_per_s", samples * self.trainer.world_size / (now - self.last_step_at), prog_bar=True,
-                     batch_size=samples)
-        self.last_step_at = now
-
     def validation_step(self, batch: dict, index: int) -> None:
         x0, _ = self._state(batch)
         draw = torch.Generator().manual_seed(index)
@@ -170,8 +189,10 @@ class PriorTraining(lightning.LightningModule):
             self.log(f"val/rmse_hu_t{t}", errors[-1], sync_dist=True, batch_size=len(x0))
         self.log("val/rmse_hu", torch.stack(errors).mean(), prog_bar=True, sync_dist=True, batch_size=len(x0))
         folder = Path(self.trainer.log_dir or self.trainer.default_root_dir) / "samples"  # asks every process
-        if index < 2 and self.montage_steps and self.trainer.is_global_zero:
+        painted = index < 2 and self.montage_steps
+        if painted and (self.trainer.is_global_zero or self.device_mesh):  # spread weights need every process's help
             sample = descend(denoiser, noise, self.montage_steps)
+        if painted and self.trainer.is_global_zero:
             window = self.prior.window
             method_panel(folder / f"step{self.global_step:06d}_{index}.png",
                          {"prior sample": window.to_hu(sample[0, 0].cpu())}, window.to_hu(x0[0, 0].cpu()),
@@ -251,6 +272,7 @@ class PriorCLI(LightningCLI):
         parser.add_lightning_class_args(ModelCheckpoint, "checkpoint")
         parser.set_defaults({"checkpoint.filename": "last", "checkpoint.enable_version_counter": False,
                              "checkpoint.every_n_epochs": 1, "checkpoint.save_on_train_epoch_end": True})
+        parser.add_lightning_class_args(Throughput, "throughput")
         parser.link_arguments("out", "checkpoint.dirpath")
         parser.link_arguments("out", "trainer.default_root_dir")
         for name in ("voxels", "side", "window"):

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 import yaml
+from lightning.pytorch.callbacks import WeightAveraging
+from lightning.pytorch.strategies import DDPStrategy, ModelParallelStrategy
 from prior.tiny import tiny_prior
 
 from phydict import training
@@ -27,10 +29,12 @@ FLOORS = {
     "prior": 2, "datasets": 2, "reconstructor": 2,
     "posterior": 3, "baselines": 3, "evaluation": 3,
     "methods": 4, "dry_run": 4, "datamodule": 4, "case_results": 4, "reconstruction_data": 4, "training": 4,
-    "inference": 4}
-LIGHTNING = ("datamodule", "reconstruction_data", "training", "inference")
+    "throughput": 4, "inference": 4}
+LIGHTNING = ("datamodule", "reconstruction_data", "throughput", "training", "inference")
 CONFIGS = {folder: sorted((ROOT / "configs" / folder).glob("*.yaml"))
            for folder in ("prior", "reconstruct", "geometry", "simulate")}
+
+SEVERAL_DEVICES = (ROOT / "configs" / "prior" / "ddp.yaml", ROOT / "configs" / "prior" / "fsdp.yaml")
 
 
 def files():
@@ -121,15 +125,31 @@ def test_every_simulator_goes_with_every_method(inference, preset, config):
     assert ready.mu_water == cli.datamodule.simulator.effective_mu_water and ready.name == preset.stem
 
 
-@pytest.mark.parametrize("config", CONFIGS["prior"], ids=lambda f: f.stem)
-def test_every_prior_configuration_builds(tmp_path, monkeypatch, config):
+@pytest.fixture
+def prior_training(tmp_path, monkeypatch):
+    """Builds train.py's command line from configurations, on two phantoms and one CPU process, with nothing run."""
     monkeypatch.chdir(tmp_path)
-    cli = training.PriorCLI(
+    return lambda *configs: training.PriorCLI(
         training.PriorTraining, training.PriorData, run=False, save_config_callback=None,
-        args=["--config", str(config), "--data.phantoms", "2", "--data.validation_phantoms", "1",
-              "--trainer.accelerator", "cpu"])
+        args=[*(f"--config={config}" for config in configs), "--data.phantoms=2", "--data.validation_phantoms=1",
+              "--trainer.accelerator=cpu", "--trainer.devices=1"])
+
+
+@pytest.mark.parametrize("config", [f for f in CONFIGS["prior"] if f not in SEVERAL_DEVICES], ids=lambda f: f.stem)
+def test_every_prior_configuration_builds(prior_training, config):
+    cli = prior_training(config)
     assert cli.model.prior.grid.same_as(cli.datamodule.grid) and cli.model.prior.window == cli.datamodule.window
     assert cli.trainer.max_steps == yaml.safe_load(config.read_text())["trainer"]["max_steps"]
+
+
+@pytest.mark.parametrize("devices, strategy, averaged", zip(SEVERAL_DEVICES, (DDPStrategy, ModelParallelStrategy),
+                                                            (True, False)), ids=["ddp", "fsdp"])
+def test_several_devices_are_a_second_configuration_that_changes_nothing_else(prior_training, devices, strategy,
+                                                                              averaged):
+    alone, cli = (prior_training(CONFIGS["prior"][0], *more) for more in ([], [devices]))
+    assert isinstance(cli.trainer.strategy, strategy)
+    assert any(isinstance(c, WeightAveraging) for c in cli.trainer.callbacks) == averaged
+    assert cli.trainer.max_steps == alone.trainer.max_steps and cli.trainer.precision == alone.trainer.precision
 
 
 @pytest.mark.parametrize("config", CONFIGS["geometry"], ids=lambda f: f.stem)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+import re
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -12,12 +13,50 @@ from phydict.grid import Grid
 from phydict.units import HUWindow
 
 
+NAMES_A_SIDE = re.compile(r"\b(left|right|middle lobe|lingula\w*|[LR](UL|ML|LL)?)\b", re.IGNORECASE)
+"""What makes an English report one of a side."""
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """How strong random changes of a patient are; 0 leaves that kind out. `Augmentation.none()` changes nothing.
+
+    rotation: degrees about any axis. scale: share of the size, along each axis. shift: mm. waves: mm, amplitude of
+    the slowest bending. gain: share of HU + 1000. offset: HU, in tissue only.
+    mirror: share of the cases mirrored left to right among those whose report is empty or names no side (in English),
+    in [0, 1]. It is 0 unless asked for, since a thorax is not symmetric: a mirrored one has its heart on the right.
+    Nothing is ever turned upside down or back to front.
+    """
+
+    rotation: float = 8.0
+    scale: float = 0.1
+    shift: float = 20.0
+    waves: float = 2.5
+    gain: float = 0.03
+    offset: float = 20.0
+    mirror: float = 0.0
+
+    def __post_init__(self):
+        negative = [name for name, value in vars(self).items() if not value >= 0]
+        if negative:
+            raise ValueError(f"augmentation strengths are not negative, but {negative[0]} is "
+                             f"{vars(self)[negative[0]]}: give 0 for none")
+        if self.scale > 0.5 or self.gain > 0.5 or self.rotation > 45 or self.mirror > 1:
+            raise ValueError("augmentation is for small changes: rotation up to 45 degrees, scale and gain up to 0.5, "
+                             f"mirror up to 1, but {self.rotation}, {self.scale}, {self.gain} and {self.mirror} were "
+                             "given")
+
+    @classmethod
+    def none(cls) -> Augmentation:
+        return cls(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
 @dataclass(frozen=True)
 class Deformation:
-    """A small random change of a patient: pose, size, shape and HU, without mirroring.
+    """A small random change of a patient: pose, size, shape and HU.
 
     rotation: (3,) radians about x, y, z. scale: (3,). shift: (3,) mm. waves: (3, 4, 4, 4) mm, amplitudes of cosines
-    of up to 1.5 periods over the grid. gain: factor of HU + 1000. offset: HU, in tissue only.
+    of up to 1.5 periods over the grid. gain: factor of HU + 1000. offset: HU, in tissue only. mirrored: left to right.
     """
 
     rotation: torch.Tensor
@@ -26,10 +65,11 @@ class Deformation:
     waves: torch.Tensor
     gain: float
     offset: float
+    mirrored: bool = False
 
     @classmethod
-    def draw(cls, seed: int | torch.Generator) -> Deformation:
-        """Rotation <= 8 degrees, scale .9-1.1, shift <= 20 mm, waves of about 4 mm, gain .97-1.03, offset <= 20 HU."""
+    def draw(cls, seed: int | torch.Generator, strength: Augmentation = Augmentation()) -> Deformation:
+        """Within `strength`; without its mirroring, which depends on the report."""
         generator = seed if isinstance(seed, torch.Generator) else torch.Generator().manual_seed(int(seed))
 
         def uniform(size, bound):
@@ -37,9 +77,10 @@ class Deformation:
 
         waves = torch.randn((3, 4, 4, 4), generator=generator)
         frequency = torch.stack(torch.meshgrid(*[torch.arange(4.0)] * 3, indexing="ij")).pow(2).sum(0)
-        waves = torch.where((frequency > 0) & (frequency <= 9), waves * 2.5 / (1 + frequency.sqrt()), 0.0)
-        return cls(uniform(3, math.radians(8) / math.sqrt(3)), 1 + uniform(3, 0.1), uniform(3, 20 / math.sqrt(3)),
-                   waves, 1 + float(uniform(1, 0.03)), float(uniform(1, 20.0)))
+        waves = torch.where((frequency > 0) & (frequency <= 9), waves * strength.waves / (1 + frequency.sqrt()), 0.0)
+        return cls(uniform(3, math.radians(strength.rotation) / math.sqrt(3)), 1 + uniform(3, strength.scale),
+                   uniform(3, strength.shift / math.sqrt(3)), waves, 1 + float(uniform(1, strength.gain)),
+                   float(uniform(1, strength.offset)))
 
     def sample_points(self, grid: Grid) -> torch.Tensor:
         """(X, Y, Z, 3) mm from the grid's centre, along its axes: where the deformed voxels take their values."""
@@ -59,6 +100,7 @@ class Deformation:
         points = (self.sample_points(grid) / half).flip(-1)[None]  # grid_sample wants z, y, x of the last axis first
         air = float(window.to_range(torch.tensor(AIR)))
         state = torch.cat([case["volume"] - air, case["masks"]])
+        state = state.flip(1) if self.mirrored else state
         state = torch.nn.functional.grid_sample(state[None], points, padding_mode="zeros", align_corners=False)[0]
         hu = window.to_hu(state[:1] + air)
         hu = AIR + self.gain * (hu - AIR) + self.offset * ((hu - AIR) / 200).clamp(0, 1)
@@ -66,8 +108,9 @@ class Deformation:
         return moved | {"volume": window.to_range(hu), "masks": state[1:].clamp(0, 1)}
 
 
-def augment(case: dict, seed: int | torch.Generator, grid: Grid = Grid.cube(64), window: HUWindow = HUWindow()) -> dict:
-    """A Case deformed by `Deformation.draw(seed)`; the same integer seed gives the same Case.
+def augment(case: dict, seed: int | torch.Generator, grid: Grid = Grid.cube(64), window: HUWindow = HUWindow(),
+            strength: Augmentation = Augmentation()) -> dict:
+    """A Case deformed by `Deformation.draw(seed, strength)`; the same integer seed gives the same Case.
 
     The place in the source CT ("affine") is dropped. Raises ValueError for a Case on another grid or with X-rays.
     """
@@ -76,4 +119,9 @@ def augment(case: dict, seed: int | torch.Generator, grid: Grid = Grid.cube(64),
                          "give the grid the case was prepared on")
     if "xrays" in case:
         raise ValueError(f"case {case['id']} holds X-rays of the undeformed patient; deform it before projecting")
-    return Deformation.draw(seed).apply(case, grid, window)
+    generator = seed if isinstance(seed, torch.Generator) else torch.Generator().manual_seed(int(seed))
+    deformation = Deformation.draw(generator, strength)
+    if strength.mirror and not NAMES_A_SIDE.search(case["report"]):
+        mirrored = bool(torch.rand(1, generator=generator) < strength.mirror)
+        deformation = replace(deformation, mirrored=mirrored)
+    return deformation.apply(case, grid, window)

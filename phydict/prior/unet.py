@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from functools import partial
+from types import MethodType
+
 import torch
 from einops import rearrange
 from monai.networks.nets import DiffusionModelUNet
+from monai.networks.nets.diffusion_model_unet import DiffusionUNetResnetBlock, SpatialTransformer
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
+from torch.utils.checkpoint import checkpoint
 
 
 class TextMap(nn.Module):
@@ -82,13 +87,36 @@ class VolumeUNet(nn.Module):
         nn.init.zeros_(self.unfold.bias)
         nn.init.zeros_(self.hint.weight)
         nn.init.zeros_(self.hint.bias)
-        self.to(memory_format=torch.channels_last_3d)
+        self.run_with()
+
+    def blocks(self) -> list[nn.Module]:
+        """The residual and attention blocks of the UNet, which hold nearly all of its weights and activations."""
+        return [m for m in self.unet.modules() if isinstance(m, (DiffusionUNetResnetBlock, SpatialTransformer))]
+
+    def run_with(self, gradient_checkpointing: bool = False, channels_last: bool = True,
+                 compiled: bool = False) -> VolumeUNet:
+        """Chooses how this network computes; what it computes and the names of its weights stay as they are.
+
+        gradient_checkpointing: keep what enters each block alone, and compute the block again in the backward pass.
+        channels_last: lay channels side by side in memory. compiled: torch.compile, anew for each shape of input.
+        """
+        self.memory_format = torch.channels_last_3d if channels_last else torch.contiguous_format
+        self.to(memory_format=self.memory_format)
+        for block in self.blocks():
+            vars(block).pop("forward", None)
+            if gradient_checkpointing:
+                block.forward = partial(checkpoint, MethodType(type(block).forward, block), use_reentrant=False)
+        if compiled:
+            self.compile(dynamic=False)
+        else:
+            self._compiled_call_impl = None
+        return self
 
     def forward(self, x: Tensor, t: Tensor, context: Tensor) -> Tensor:
         """x (B, C, X, Y, Z), t (B,) in [0, 1], context (B, L, D) -> (B, C, X, Y, Z)."""
         n = self.block
         h = rearrange(x, "b c (x i) (y j) (z k) -> b (c i j k) x y z", i=n, j=n, k=n)
-        h = self.fold(h.contiguous(memory_format=torch.channels_last_3d))
+        h = self.fold(h.contiguous(memory_format=self.memory_format))
         h = h + interpolate(self.hint(self.text_map(context)), h.shape[2:], mode="trilinear")
         h = self.unfold(self.unet(h, 1000 * t, context=context))
         return rearrange(h, "b (c i j k) x y z -> b c (x i) (y j) (z k)", i=n, j=n, k=n)

@@ -16,7 +16,7 @@ import torch
 
 from phydict.datasets.ct_rate import CTCases, find_cts, patient_of, split_by_patient
 from phydict.datasets.ct_rate_tables import read_reports
-from phydict.datasets.augment import Deformation, augment
+from phydict.datasets.augment import Augmentation, Deformation, augment
 from phydict.datasets.transforms import (AIR, Calibration, covering_grid, load_ct, prepare_ct,
                                          to_grid)
 from phydict.grid import Grid
@@ -404,6 +404,53 @@ def test_a_deformation_of_nothing_changes_nothing(case):
     new = still.apply(case, GRID, HUWindow())
     torch.testing.assert_close(new["volume"], case["volume"], atol=1e-4, rtol=0)
     torch.testing.assert_close(new["masks"], case["masks"], atol=1e-4, rtol=0)
+
+
+def test_augmentation_of_no_strength_changes_nothing_and_each_strength_is_its_own_bound(case):
+    new = augment(case, 3, GRID, strength=Augmentation.none())
+    torch.testing.assert_close(new["volume"], case["volume"], atol=1e-4, rtol=0)
+    for name in ("rotation", "scale", "shift", "waves", "gain", "offset"):
+        weak = dataclasses.replace(Augmentation(), **{name: getattr(Augmentation(), name) / 100})
+        for seed in range(10):
+            usual, less = (vars(Deformation.draw(seed, strength)) for strength in (Augmentation(), weak))
+            rest = 1 if name in ("scale", "gain") else 0
+            for part in ("rotation", "scale", "shift", "waves", "gain", "offset"):
+                factor = 0.01 if part == name else 1
+                torch.testing.assert_close(torch.as_tensor(less[part] - rest * (part == name)),
+                                           factor * torch.as_tensor(usual[part] - rest * (part == name)),
+                                           atol=1e-6, rtol=1e-3)
+
+
+def test_hu_changes_spare_air_and_scale_tissue(case):
+    strength = dataclasses.replace(Augmentation.none(), gain=0.03, offset=20.0)
+    old = HUWindow().to_hu(case["volume"])
+    for seed in range(5):
+        move = Deformation.draw(seed, strength)
+        new = HUWindow().to_hu(augment(case, seed, GRID, strength=strength)["volume"])
+        air, tissue = old < -999.9, (old > -790) & (old < 900)
+        assert air.any() and tissue.any()
+        torch.testing.assert_close(new[air], old[air], atol=0.3, rtol=0)
+        expected = move.gain * (old[tissue] + 1000) - 1000 + move.offset
+        torch.testing.assert_close(new[tissue], expected, atol=0.5, rtol=0)
+
+
+@pytest.mark.parametrize(("report", "may"), [
+    ("", True), ("No focal consolidation.", True), ("Bilateral pleural effusion.", True), ("Nodule, right lung.", False),
+    ("LEFT-sided effusion", False), ("Consolidation of the middle lobe.", False), ("Opacity in the LLL.", False),
+    ("Lingular atelectasis", False)])
+def test_only_a_report_without_side_may_be_mirrored_and_only_on_demand(case, report, may):
+    case = case | {"report": report}
+    for strength, mirrored in ((0.0, False), (1.0, may)):
+        new = augment(case, 0, GRID, strength=dataclasses.replace(Augmentation.none(), mirror=strength))
+        for key in ("volume", "masks"):
+            torch.testing.assert_close(new[key], case[key].flip(1) if mirrored else case[key], atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize(("strength", "words"), [({"shift": -1.0}, "shift is -1"), ({"scale": 0.9}, "small changes"),
+                                                 ({"mirror": 1.5}, "small changes")])
+def test_augmentation_refuses_impossible_strengths(strength, words):
+    with pytest.raises(ValueError, match=words):
+        Augmentation(**strength)
 
 
 def test_a_shift_moves_by_its_millimetres(case):

@@ -1,5 +1,8 @@
-"""The network: space-to-depth and back loses nothing, and an untrained one can learn."""
+"""The network: space-to-depth and back loses nothing, an untrained one can learn, and how it runs changes nothing."""
 
+from copy import deepcopy
+
+import pytest
 import torch
 from einops import rearrange
 from laws import random_like
@@ -48,3 +51,54 @@ def test_settings_build_the_same_network_again():
     arguments = (x, torch.tensor([0.3]), torch.zeros(1, 1, 16))
     assert net(*arguments).any() and torch.equal(net(*arguments), again(*arguments))
     assert net.divisor == again.divisor == 8
+
+
+def gradients(net: VolumeUNet) -> list[torch.Tensor]:
+    x, context = random_like((2, 2, 8, 8, 8)), random_like((2, 3, 16), seed=1)
+    net(x, torch.tensor([0.2, 0.7]), context).square().mean().backward()
+    return [weight.grad for weight in net.parameters() if weight.grad is not None]
+
+
+def awake(**flags) -> VolumeUNet:
+    """A network in float64 whose layers that start at zero do not."""
+    net = network().double()
+    for weight in net.parameters():
+        if weight.ndim > 1 and not weight.any():
+            torch.nn.init.normal_(weight, std=0.1, generator=torch.Generator().manual_seed(1))
+    return net.run_with(**flags)
+
+
+@pytest.mark.parametrize("flags, tolerance", [
+    ({"gradient_checkpointing": True}, 1e-12), ({"channels_last": False}, 1e-12), ({"compiled": True}, 1e-6),
+], ids=["checkpointing", "layout", "compiled"])
+def test_how_it_runs_changes_neither_gradients_nor_names(flags, tolerance, monkeypatch):
+    compile_module = torch.nn.Module.compile
+    monkeypatch.setattr("torch.nn.Module.compile",  # the whole path but the C++ compiler, which takes minutes
+                        lambda net, **settings: compile_module(net, backend="aot_eager", **settings))
+    plain, other = awake(), awake(**flags)
+    for expected, gradient in zip(gradients(plain), gradients(other), strict=True):
+        torch.testing.assert_close(gradient, expected, rtol=0, atol=tolerance * float(expected.abs().max()) + 1e-300)
+    assert list(plain.state_dict()) == list(other.state_dict()) and plain.settings == other.settings
+    assert list(dict(plain.named_parameters())) == list(dict(other.named_parameters()))
+
+
+def test_checkpointed_blocks_are_computed_again_for_the_gradient_and_only_then():
+    calls = {}
+    for checkpointing in (False, True):
+        net, seen = awake(gradient_checkpointing=checkpointing), []
+        net.blocks()[0].norm1.register_forward_hook(lambda *_: seen.append(1))
+        with torch.no_grad():
+            net(random_like((1, 2, 8, 8, 8)), torch.tensor([0.5]), random_like((1, 3, 16)))
+        evaluated = len(seen)
+        gradients(net)
+        calls[checkpointing] = (evaluated, len(seen) - evaluated)
+    assert calls == {False: (1, 1), True: (1, 2)}
+
+
+def test_a_checkpointed_copy_computes_with_its_own_weights():
+    net = awake(gradient_checkpointing=True)
+    copy = deepcopy(net)  # as weight averaging makes one
+    with torch.no_grad():
+        net.blocks()[0].conv1.conv.weight.zero_()
+    arguments = random_like((1, 2, 8, 8, 8)), torch.tensor([0.5]), random_like((1, 3, 16))
+    assert torch.equal(copy(*arguments), awake()(*arguments)) and not torch.equal(net(*arguments), copy(*arguments))

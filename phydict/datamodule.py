@@ -169,16 +169,20 @@ class PriorData(lightning.LightningDataModule):
         if self.epoch_size < least:
             raise ValueError(f"data.epoch_size is {self.epoch_size}, less than one batch on every device ({least}): "
                              "raise it, or lower data.batch_size")
-        epoch = MixedCases(self.cts, self.phantoms, self.ct_fraction, self.grid, self.window, self.epoch_size,
-                           self.trainer.current_epoch, self.seed)
-        return DataLoader(epoch, self.batch_size, num_workers=self.workers, drop_last=True)
+        return DataLoader(self.draws(self.trainer.current_epoch), self.batch_size, num_workers=self.workers,
+                          drop_last=True)
+
+    def draws(self, epoch: int) -> Dataset:
+        """What is trained on in an epoch."""
+        return MixedCases(self.cts, self.phantoms, self.ct_fraction, self.grid, self.window, self.epoch_size, epoch,
+                          self.seed)
 
     def val_dataloader(self) -> DataLoader:
         return DataLoader(self.validation, 1, collate_fn=_collate)
 
 
 def _training_parts(case: dict) -> dict:
-    return {key: case[key] for key in KEYS}
+    return {key: case[key] for key in KEYS if key in case}
 
 
 def _collate(cases: list[dict]) -> dict:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
 import time
 import warnings
+from abc import ABC, abstractmethod
 from pathlib import Path
 from pickle import UnpicklingError
 
 import lightning
 import torch
+import yaml
 from jsonargparse import auto_cli
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.cli import LightningCLI
@@ -17,16 +20,20 @@ from lightning.pytorch.loggers import CSVLogger
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from torch import Tensor
+from torch.nn.functional import avg_pool3d
 
 from phydict.command_line import check_writable, one_sentence_errors, quiet
 from phydict.datamodule import PriorData
-from phydict.diffusion import renoise
+from phydict.diffusion import Denoiser, renoise
 from phydict.evaluation import method_panel
 from phydict.grid import Grid
 from phydict.posterior import descend
-from phydict.prior import Prior, TextEncoder, VolumeUNet, describe, learn_vocabulary, load_prior, save_prior
-from phydict.prior.checkpoint import build_prior, build_text
+from phydict.prior import (
+    LocalUNet, Prior, SuperResolution, TextEncoder, VolumeUNet, describe, describe_super_resolution, learn_vocabulary,
+    load_prior, load_super_resolution, save_prior, save_super_resolution)
+from phydict.prior.checkpoint import build_prior, build_super_resolution, build_text, check_stage
 from phydict.prior.report_training import learn_findings, learn_sketch
+from phydict.super_resolution_data import SuperResolutionData
 from phydict.units import HUWindow
 
 CHECKPOINT, HELD_OUT = "last.ckpt", "held_out.txt"
@@ -36,8 +43,110 @@ NOISE_LEVELS = (0.1, 0.3, 0.5, 0.7, 0.9)
 """Times t at which validation measures the denoising error."""
 
 
-class PriorTraining(lightning.LightningModule):
-    """Learns a Prior by denoising: squared error of x0 at all noise levels, up to four times heavier at the low ones.
+class StageTraining(lightning.LightningModule, ABC):
+    """Learns one stage by denoising: squared error of x0 at all noise levels, up to four times heavier at the low ones.
+
+    A stage says what a batch's clean state is (`_state`), what its network is told beside it (`_condition`), and what
+    denoises a held-out case (`_bound`). Its network is `self.prior`.
+    """
+
+    def __init__(self, prior: Prior | SuperResolution, typical_std: float, learning_rate: float, weight_decay: float,
+                 warmup: int, decay_from: int, decay_steps: int, montage_steps: int, seed: int):
+        super().__init__()
+        self.prior, self.typical_std, self.montage_steps = prior, typical_std, montage_steps
+        self.learning_rate, self.weight_decay = learning_rate, weight_decay
+        self.warmup, self.decay_from, self.decay_steps = warmup, decay_from, decay_steps
+        self.seed, self.last_step_at, self.samples = seed, None, 0
+
+    @abstractmethod
+    def _state(self, batch: dict) -> tuple[Tensor, Tensor]:
+        """The clean state (B, C, X, Y, Z) of a batch and the weight of each channel's error (B, C, 1, 1, 1)."""
+
+    @abstractmethod
+    def _condition(self, batch: dict, x0: Tensor, draw: torch.Generator) -> tuple[Tensor, ...]:
+        """What the network is told beside the noisy state and its time."""
+
+    @abstractmethod
+    def _bound(self, batch: dict, x0: Tensor) -> Denoiser:
+        """The denoiser of a held-out case."""
+
+    @abstractmethod
+    def _describe(self) -> dict:
+        """What the stage is, as plain JSON values."""
+
+    def learn_reports(self, data: PriorData) -> None:
+        """Teaches the text part, where there is one, before the first denoising step."""
+
+    def training_step(self, batch: dict, _) -> Tensor:
+        # Times and noise follow from seed and step alone, so that a resumed run repeats an uninterrupted one.
+        draw = torch.Generator().manual_seed(hash((self.seed, self.global_step, self.global_rank)) % 2**31)
+        x0, weight = self._state(batch)
+        n = len(x0)
+        t = ((torch.arange(n) + torch.rand(n, generator=draw)) / n).to(self.device)
+        noise = torch.randn(x0.shape, generator=draw).to(self.device)
+        told = self._condition(batch, x0, draw)
+        a, s = (w.float().view(-1, 1, 1, 1, 1) for w in self.prior.schedule.scales(t.double()))
+        error = (self.prior(a * x0 + s * noise, t, *told) - x0).square()
+        unit = self.prior.preconditioning(t)[1].clamp(min=self.typical_std / 2) ** -2
+        loss = (unit * weight * error).sum() / (weight.expand_as(error).sum())
+        self._log_speed(n)
+        self.samples += n * self.trainer.world_size
+        self.log("loss", loss, prog_bar=True, batch_size=n)
+        return loss
+
+    def _log_speed(self, samples: int) -> None:
+        now = time.perf_counter()
+        if self.last_step_at is not None:
+            self.log("samples_per_s", samples * self.trainer.world_size / (now - self.last_step_at), prog_bar=True,
+                     batch_size=samples)
+        self.last_step_at = now
+
+    def validation_step(self, batch: dict, index: int) -> None:
+        x0, _ = self._state(batch)
+        draw = torch.Generator().manual_seed(index)
+        noise = torch.randn(x0.shape, generator=draw).to(self.device)
+        denoiser, errors = self._bound(batch, x0), []
+        for t in NOISE_LEVELS:
+            estimate = denoiser.denoise(renoise(self.prior.schedule, x0, t, noise), t)
+            errors.append((estimate - x0)[:, 0].square().mean().sqrt() * self.prior.window.half_width)
+            self.log(f"val/rmse_hu_t{t}", errors[-1], sync_dist=True, batch_size=len(x0))
+        self.log("val/rmse_hu", torch.stack(errors).mean(), prog_bar=True, sync_dist=True, batch_size=len(x0))
+        folder = Path(self.trainer.log_dir or self.trainer.default_root_dir) / "samples"  # asks every process
+        if index < 2 and self.montage_steps and self.trainer.is_global_zero:
+            sample = descend(denoiser, noise, self.montage_steps)
+            self._paint(folder / f"step{self.global_step:06d}_{index}.png", batch, x0, sample)
+
+    @abstractmethod
+    def _paint(self, file: Path, batch: dict, x0: Tensor, sample: Tensor) -> None:
+        """Writes a picture of a held-out case and a sample."""
+
+    def configure_optimizers(self) -> dict:
+        def factor(step: int) -> float:
+            rise = min(1.0, (step + 1) / self.warmup) if self.warmup else 1.0
+            past = step - self.decay_from
+            return rise * (max(0.0, 1 - past / self.decay_steps) if self.decay_steps and past > 0 else 1.0)
+
+        weights = [w for w in self.parameters() if w.requires_grad]
+        optimizer = torch.optim.AdamW(weights, self.learning_rate, weight_decay=self.weight_decay)
+        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def on_save_checkpoint(self, checkpoint: dict) -> None:
+        seen = {"steps": self.trainer.global_step, "samples": self.samples}
+        checkpoint["phydict"] = self._describe() | {"training": seen}
+
+    def on_load_checkpoint(self, checkpoint: dict) -> None:
+        theirs, ours = {"stage": "base"} | checkpoint["phydict"], self._describe()
+        check_stage(theirs, ours["stage"], "the checkpoint")
+        for key, own in ours.items():
+            if theirs[key] != own:
+                raise ValueError(f"the checkpoint's prior and this training's differ in '{key}': give the settings and "
+                                 "data that the checkpoint was trained with, or start anew with model.initial")
+        self.samples = checkpoint["phydict"].get("training", {}).get("samples", 0)
+
+
+class PriorTraining(StageTraining):
+    """Learns a Prior, first its text, then denoising.
 
     Args:
         network: the UNet; none given: the default VolumeUNet
@@ -68,7 +177,6 @@ class PriorTraining(lightning.LightningModule):
                  learning_rate: float = 5e-4, weight_decay: float = 0.01, warmup: int = 100, decay_from: int = 0,
                  decay_steps: int = 0, text_steps: int = 600, montage_steps: int = 16, initial: str | None = None,
                  seed: int = 0):
-        super().__init__()
         network = network or VolumeUNet()
         encoder = None
         if text == "small" and not reports:
@@ -77,14 +185,12 @@ class PriorTraining(lightning.LightningModule):
             encoder = TextEncoder.small(learn_vocabulary(reports), network.context_dim)
         elif text != "none":
             encoder = TextEncoder.pretrained(text)
-        self.prior = Prior(network, Grid.cube(voxels, side), HUWindow(*window), encoder, sigma_data=sigma_data)
+        prior = Prior(network, Grid.cube(voxels, side), HUWindow(*window), encoder, sigma_data=sigma_data)
+        super().__init__(prior, sigma_data, learning_rate, weight_decay, warmup, decay_from, decay_steps, montage_steps,
+                         seed)
         if initial:
             self._start_from(load_prior(initial), initial)
-        self.text_dropout, self.mask_weight, self.montage_steps = text_dropout, mask_weight, montage_steps
-        self.learning_rate, self.weight_decay = learning_rate, weight_decay
-        self.warmup, self.decay_from, self.decay_steps = warmup, decay_from, decay_steps
-        self.text_steps = text_steps
-        self.seed, self.last_step_at, self.samples = seed, None, 0
+        self.text_dropout, self.mask_weight, self.text_steps = text_dropout, mask_weight, text_steps
 
     def _start_from(self, prior: Prior, path: str) -> None:
         if not prior.grid.same_as(self.prior.grid) or prior.window != self.prior.window:
@@ -97,24 +203,22 @@ class PriorTraining(lightning.LightningModule):
         if prior.text is not None:
             prior.text.requires_grad_(prior.text.trainable)
 
-    def training_step(self, batch: dict, _) -> Tensor:
-        # Times and noise follow from seed and step alone, so that a resumed run repeats an uninterrupted one.
-        draw = torch.Generator().manual_seed(hash((self.seed, self.global_step, self.global_rank)) % 2**31)
-        x0, weight = self._state(batch)
+    def _condition(self, batch: dict, x0: Tensor, draw: torch.Generator) -> tuple[Tensor, ...]:
         n = len(x0)
-        t = ((torch.arange(n) + torch.rand(n, generator=draw)) / n).to(self.device)
-        noise = torch.randn(x0.shape, generator=draw).to(self.device)
         reports = batch["report"] if self.prior.text is not None else [""] * n
         keep = torch.rand(n, generator=draw) >= self.text_dropout
-        context = self.prior.context([r if k else "" for r, k in zip(reports, keep)])
-        a, s = (w.float().view(-1, 1, 1, 1, 1) for w in self.prior.schedule.scales(t.double()))
-        error = (self.prior(a * x0 + s * noise, t, context) - x0).square()
-        unit = self.prior.preconditioning(t)[1].clamp(min=0.25) ** -2
-        loss = (unit * weight * error).sum() / (weight.expand_as(error).sum())
-        self._log_speed(n)
-        self.samples += n * self.trainer.world_size
-        self.log("loss", loss, prog_bar=True, batch_size=n)
-        return loss
+        return (self.prior.context([r if k else "" for r, k in zip(reports, keep)]),)
+
+    def _bound(self, batch: dict, x0: Tensor) -> Denoiser:
+        return self.prior.bind(batch["report"][0] if self.prior.text is not None else "")
+
+    def _describe(self) -> dict:
+        return describe(self.prior)
+
+    def _paint(self, file: Path, batch: dict, x0: Tensor, sample: Tensor) -> None:
+        window = self.prior.window
+        method_panel(file, {"prior sample": window.to_hu(sample[0, 0].cpu())}, window.to_hu(x0[0, 0].cpu()),
+                     self.prior.grid, title=batch["report"][0][:80] or "no report")
 
     def learn_reports(self, data: PriorData) -> None:
         """Teaches a small report encoder and the text map, once, before the first denoising step.
@@ -139,61 +243,78 @@ class PriorTraining(lightning.LightningModule):
             self.prior.text.trainable = False  # what it learnt stays, while the UNet learns to use it
 
     def _state(self, batch: dict) -> tuple[Tensor, Tensor]:
-        """The clean state (B, C, X, Y, Z) of a batch and the weight of each channel's error (B, C, 1, 1, 1)."""
         channels = self.prior.network.state_channels
         x0 = torch.cat([batch["volume"], 2 * batch["masks"] - 1], 1)[:, :channels]
         known = self.mask_weight * batch["has_masks"].float()
         weight = torch.cat([torch.ones_like(known[:, :1]), known], 1)[:, :channels]
         return x0, weight[..., None, None, None]
 
-    def _log_speed(self, samples: int) -> None:
-        now = time.perf_counter()
-        if self.last_step_at is not None:
-            self.log("samples_per_s", samples * self.trainer.world_size / (now - self.last_step_at), prog_bar=True,
-                     batch_size=samples)
-        self.last_step_at = now
+class SuperResolutionTraining(StageTraining):
+    """Learns a SuperResolution from crops; a crop's block means are its coarse volume.
+
+    Args:
+        network: the UNet; none given: the default LocalUNet
+        voxels: voxels along each side of the fine cube
+        factor: fine voxels along each side of a coarse one
+        side: side of the cube in mm
+        window: HU that the prior's range [-1, 1] stands for
+        detail_std: standard deviation, in the prior's range, of what the fine CT adds to the coarse one
+        most_noise: highest level of the noise that the coarse volume is given, in [0, 1]
+        learning_rate: of AdamW
+        weight_decay: of AdamW
+        warmup: steps over which the learning rate rises
+        decay_from: step at which a linear decay of the learning rate to zero begins
+        decay_steps: length of that decay in steps; 0: no decay
+        montage_steps: noise levels of the samples that validation paints; 0: none
+        initial: a stage's file to go on from, which then decides the network
+        seed: of times and noise
+    """
+
+    def __init__(self, network: LocalUNet | None = None, voxels: int = 256, factor: int = 4, side: float = 384.0,
+                 window: tuple[float, float] = (-1000.0, 1000.0), detail_std: float = 0.1, most_noise: float = 0.3,
+                 learning_rate: float = 5e-4, weight_decay: float = 0.01, warmup: int = 100, decay_from: int = 0,
+                 decay_steps: int = 0, montage_steps: int = 16, initial: str | None = None, seed: int = 0):
+        if not 0 <= most_noise <= 1:
+            raise ValueError(f"model.most_noise lies in [0, 1], but {most_noise} was given")
+        fine = SuperResolution(network or LocalUNet(), Grid.cube(voxels, side), HUWindow(*window), factor,
+                               detail_std=detail_std)
+        if initial:
+            first = load_super_resolution(initial)
+            if not first.grid.same_as(fine.grid) or first.window != fine.window or first.factor != factor:
+                raise ValueError(f"the stage {initial} has another grid, HU window or factor than this training: set "
+                                 "model.voxels, model.side, model.window and model.factor to its own")
+            fine = first.train().requires_grad_(True)
+        super().__init__(fine, fine.detail_std, learning_rate, weight_decay, warmup, decay_from, decay_steps,
+                         montage_steps, seed)
+        self.most_noise = most_noise
+
+    def _state(self, batch: dict) -> tuple[Tensor, Tensor]:
+        return batch["volume"], torch.ones(len(batch["volume"]), 1, 1, 1, 1, device=self.device)
+
+    def _condition(self, batch: dict, x0: Tensor, draw: torch.Generator) -> tuple[Tensor, ...]:
+        coarse = avg_pool3d(x0, self.prior.factor)
+        level = self.most_noise * torch.rand(len(x0), generator=draw).to(self.device)
+        noise = torch.randn(coarse.shape, generator=draw).to(self.device)
+        return self.prior.upsample(coarse + level.view(-1, 1, 1, 1, 1) * noise), level
+
+    def _bound(self, batch: dict, x0: Tensor) -> Denoiser:
+        return self.prior.bind(avg_pool3d(x0, self.prior.factor))
+
+    def _describe(self) -> dict:
+        return describe_super_resolution(self.prior)
 
     def validation_step(self, batch: dict, index: int) -> None:
-        x0, _ = self._state(batch)
-        draw = torch.Generator().manual_seed(index)
-        noise = torch.randn(x0.shape, generator=draw).to(self.device)
-        errors = []
-        for t in NOISE_LEVELS:
-            denoiser = self.prior.bind(batch["report"][0] if self.prior.text is not None else "")
-            estimate = denoiser.denoise(renoise(self.prior.schedule, x0, t, noise), t)
-            errors.append((estimate - x0)[:, 0].square().mean().sqrt() * self.prior.window.half_width)
-            self.log(f"val/rmse_hu_t{t}", errors[-1], sync_dist=True, batch_size=len(x0))
-        self.log("val/rmse_hu", torch.stack(errors).mean(), prog_bar=True, sync_dist=True, batch_size=len(x0))
-        folder = Path(self.trainer.log_dir or self.trainer.default_root_dir) / "samples"  # asks every process
-        if index < 2 and self.montage_steps and self.trainer.is_global_zero:
-            sample = descend(denoiser, noise, self.montage_steps)
-            window = self.prior.window
-            method_panel(folder / f"step{self.global_step:06d}_{index}.png",
-                         {"prior sample": window.to_hu(sample[0, 0].cpu())}, window.to_hu(x0[0, 0].cpu()),
-                         self.prior.grid, title=batch["report"][0][:80] or "no report")
+        super().validation_step(batch, index)
+        x0 = batch["volume"]
+        lacking = (self.prior.upsample(avg_pool3d(x0, self.prior.factor)) - x0).square().mean().sqrt()
+        self.log("val/rmse_hu_upsampled", lacking * self.prior.window.half_width, sync_dist=True, batch_size=len(x0))
 
-    def configure_optimizers(self) -> dict:
-        def factor(step: int) -> float:
-            rise = min(1.0, (step + 1) / self.warmup) if self.warmup else 1.0
-            past = step - self.decay_from
-            return rise * (max(0.0, 1 - past / self.decay_steps) if self.decay_steps and past > 0 else 1.0)
-
-        weights = [w for w in self.parameters() if w.requires_grad]
-        optimizer = torch.optim.AdamW(weights, self.learning_rate, weight_decay=self.weight_decay)
-        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
-
-    def on_save_checkpoint(self, checkpoint: dict) -> None:
-        seen = {"steps": self.trainer.global_step, "samples": self.samples}
-        checkpoint["phydict"] = describe(self.prior) | {"training": seen}
-
-    def on_load_checkpoint(self, checkpoint: dict) -> None:
-        theirs, ours = checkpoint["phydict"], describe(self.prior)
-        for key, own in ours.items():
-            if theirs[key] != own:
-                raise ValueError(f"the checkpoint's prior and this training's differ in '{key}': give the settings and "
-                                 "data that the checkpoint was trained with, or start anew with model.initial")
-        self.samples = checkpoint["phydict"].get("training", {}).get("samples", 0)
+    def _paint(self, file: Path, batch: dict, x0: Tensor, sample: Tensor) -> None:
+        upsampled = self.prior.upsample(avg_pool3d(x0, self.prior.factor))
+        volumes = {"coarse, upsampled": upsampled, "sample": sample}
+        to_hu = self.prior.window.to_hu
+        method_panel(file, {name: to_hu(volume[0, 0].cpu()) for name, volume in volumes.items()},
+                     to_hu(x0[0, 0].cpu()), Grid(x0.shape[2:], self.prior.grid.spacing), title="crop")
 
 
 @rank_zero_only
@@ -215,7 +336,7 @@ def read_checkpoint(path: str | Path) -> dict:
 
 
 def export_prior(checkpoint: str, out: str) -> None:
-    """Write the averaged weights of a training checkpoint as a prior for reconstruction.
+    """Write the averaged weights of a training checkpoint as a prior, or a super-resolution stage, for reconstruction.
 
     Args:
         checkpoint: the .ckpt file that training wrote
@@ -227,11 +348,36 @@ def export_prior(checkpoint: str, out: str) -> None:
     content = read_checkpoint(checkpoint)
     header = content["phydict"]
     weights = {k.removeprefix("prior."): w for k, w in content["state_dict"].items() if k.startswith("prior.")}
-    prior = build_prior(header, weights)
-    if header["text"]:
-        prior.text = build_text(header["text"], {k: w for k, w in weights.items() if k.startswith("text.")})
-    save_prior(prior, out, header.get("training", {"steps": content["global_step"]}))
+    training = header.get("training", {"steps": content["global_step"]})
+    if header.get("stage") == "super_resolution":
+        save_super_resolution(build_super_resolution(header, weights), out, training)
+    else:
+        prior = build_prior(header, weights)
+        if header["text"]:
+            prior.text = build_text(header["text"], {k: w for k, w in weights.items() if k.startswith("text.")})
+        save_prior(prior, out, training)
     print(f"prior in {out}")
+
+
+STAGES = {"base": (PriorTraining, PriorData), "super_resolution": (SuperResolutionTraining, SuperResolutionData)}
+"""What trains a stage, and on which data."""
+
+
+def stage_of(args: list[str]) -> str:
+    """The stage that a command line trains: its --stage, or the `stage` of the last configuration file with one."""
+    look = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    look.add_argument("--config", "-c", action="append", default=[])
+    look.add_argument("--stage")
+    given, _ = look.parse_known_args(args)
+    stages = [given.stage] if given.stage else []
+    for file in reversed(given.config):
+        settings = yaml.safe_load(Path(file).read_text()) if Path(file).is_file() else None
+        if isinstance(settings, dict) and "stage" in settings:
+            stages.append(settings["stage"])
+    stage = stages[0] if stages else "base"
+    if stage not in STAGES:
+        raise ValueError(f"the stages that can be trained are {' and '.join(STAGES)}, but '{stage}' was given")
+    return stage
 
 
 class PriorCLI(LightningCLI):
@@ -243,6 +389,7 @@ class PriorCLI(LightningCLI):
 
     def add_arguments_to_parser(self, parser) -> None:
         parser.add_argument("--out", default="runs/prior", help="folder for checkpoint, logs and samples")
+        parser.add_argument("--stage", default="base", choices=list(STAGES), help="which stage of a cascade to train")
         parser.add_lightning_class_args(ModelCheckpoint, "checkpoint")
         parser.set_defaults({"checkpoint.filename": "last", "checkpoint.enable_version_counter": False,
                              "checkpoint.every_n_epochs": 1, "checkpoint.save_on_train_epoch_end": True})
@@ -250,7 +397,10 @@ class PriorCLI(LightningCLI):
         parser.link_arguments("out", "trainer.default_root_dir")
         for name in ("voxels", "side", "window"):
             parser.link_arguments(f"model.{name}", f"data.{name}")
-        parser.link_arguments("data.reports", "model.reports", apply_on="instantiate")
+        if self.model_class is PriorTraining:
+            parser.link_arguments("data.reports", "model.reports", apply_on="instantiate")
+        else:
+            parser.link_arguments("model.factor", "data.factor")
 
     def instantiate_trainer(self, **kwargs) -> lightning.Trainer:
         return super().instantiate_trainer(logger=CSVLogger(self._get(self.config, "out"), name="logs"), **kwargs)
@@ -289,7 +439,7 @@ def main(args: list[str] | None = None) -> None:
         if given[:1] == ["export"]:
             auto_cli(export_prior, args=given[1:], as_positional=False, exit_on_error=False)
         else:
-            PriorCLI(PriorTraining, PriorData, args=args, seed_everything_default=0,
+            PriorCLI(*STAGES[stage_of(given)], args=args, seed_everything_default=0,
                      save_config_kwargs={"overwrite": True}, parser_kwargs={"exit_on_error": False, "description": (
                          "Train a prior of chest CT. A third command, `train.py export --checkpoint <last.ckpt> --out "
                          "<prior.safetensors>`, writes what a training learnt as a prior for reconstruction.")})

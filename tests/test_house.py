@@ -27,8 +27,8 @@ FLOORS = {
     "prior": 2, "datasets": 2, "reconstructor": 2,
     "posterior": 3, "baselines": 3, "evaluation": 3,
     "methods": 4, "dry_run": 4, "datamodule": 4, "case_results": 4, "reconstruction_data": 4, "training": 4,
-    "inference": 4}
-LIGHTNING = ("datamodule", "reconstruction_data", "training", "inference")
+    "super_resolution_data": 4, "inference": 4}
+LIGHTNING = ("datamodule", "super_resolution_data", "reconstruction_data", "training", "inference")
 CONFIGS = {folder: sorted((ROOT / "configs" / folder).glob("*.yaml"))
            for folder in ("prior", "reconstruct", "geometry", "simulate")}
 
@@ -125,7 +125,7 @@ def test_every_simulator_goes_with_every_method(inference, preset, config):
 def test_every_prior_configuration_builds(tmp_path, monkeypatch, config):
     monkeypatch.chdir(tmp_path)
     cli = training.PriorCLI(
-        training.PriorTraining, training.PriorData, run=False, save_config_callback=None,
+        *training.STAGES[training.stage_of(["-c", str(config)])], run=False, save_config_callback=None,
         args=["--config", str(config), "--data.phantoms", "2", "--data.validation_phantoms", "1",
               "--trainer.accelerator", "cpu"])
     assert cli.model.prior.grid.same_as(cli.datamodule.grid) and cli.model.prior.window == cli.datamodule.window

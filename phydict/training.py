@@ -271,7 +271,7 @@ class SuperResolutionTraining(StageTraining):
     """
 
     def __init__(self, network: LocalUNet | None = None, voxels: int = 256, factor: int = 4, side: float = 384.0,
-                 window: tuple[float, float] = (-1000.0, 1000.0), detail_std: float = 0.1, most_noise: float = 0.3,
+                 window: tuple[float, float] = (-1000.0, 1000.0), detail_std: float = 0.08, most_noise: float = 0.3,
                  learning_rate: float = 5e-4, weight_decay: float = 0.01, warmup: int = 100, decay_from: int = 0,
                  decay_steps: int = 0, montage_steps: int = 16, initial: str | None = None, seed: int = 0):
         if not 0 <= most_noise <= 1:

@@ -32,7 +32,7 @@ class SuperResolution(nn.Module):
     """
 
     def __init__(self, network: LocalUNet, grid: Grid, window: HUWindow, factor: int = 4, coarse_channels: int = 1,
-                 schedule: CosineSchedule = CosineSchedule(), detail_std: float = 0.1, skip_std: float = 0.1,
+                 schedule: CosineSchedule = CosineSchedule(), detail_std: float = 0.08, skip_std: float = 0.1,
                  memory: int = 2**32, overlap: int = 48):
         super().__init__()
         if any(n % network.divisor or n % factor for n in grid.shape):

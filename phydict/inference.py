@@ -31,7 +31,7 @@ from phydict.dry_run import dry_run
 from phydict.evaluation import CaseMetrics, panel, rich_table, volume_metrics
 from phydict.grid import Grid
 from phydict.methods import DEFAULT_PRIOR, fit_to_grid, reconstructor
-from phydict.posterior import Sampler
+from phydict.posterior import CascadePosterior, Sampler
 from phydict.prior import load_prior, load_super_resolution
 from phydict.progress import CaseProgress
 from phydict.reconstruction_data import ReconstructionData
@@ -51,6 +51,7 @@ class ReconstructionTask(lightning.LightningModule):
         super_resolution: file of a cascade's second stage, which refines what the prior gives; none given: no such stage
         guide_fine: whether the X-rays guide the second stage too
         fine_sampler: how they do; none given: the cascade's own
+        fine_noise: level in [0, 1] of the noise that the prior's estimate is given before the second stage sees it
         fine_memory: GiB that the second stage's network may take; it works in tiles where the whole takes more
         out: output folder; cases go to <out>/<name>/<case>
         overwrite: do finished cases again, and replace what is in their place
@@ -61,8 +62,9 @@ class ReconstructionTask(lightning.LightningModule):
 
     def __init__(self, method: Sampler | Reconstructor, name: str, prior: str = str(DEFAULT_PRIOR),
                  guidance: float = 1.0, super_resolution: str | None = None, guide_fine: bool = True,
-                 fine_sampler: Sampler | None = None, fine_memory: float = 4.0, out: str = "runs/reconstructions",
-                 overwrite: bool = False, seed: int = 0, voxels: int = 64, side: float = 384.0):
+                 fine_sampler: Sampler | None = None, fine_noise: float = 0.05, fine_memory: float = 4.0,
+                 out: str = "runs/reconstructions", overwrite: bool = False, seed: int = 0, voxels: int = 64,
+                 side: float = 384.0):
         super().__init__()
         self.method_name, self.seed, self.pages = name, seed, Path(out) / "dry_run"
         self.results = CaseResults(Path(out) / name, overwrite)
@@ -79,12 +81,12 @@ class ReconstructionTask(lightning.LightningModule):
             self.fine = load_super_resolution(super_resolution)
             self.fine.memory = int(fine_memory * 2**30)
             self.grid = self.fine.grid
-            self.settings |= {"super_resolution": Path(super_resolution).name, "guide_fine": guide_fine,
-                              "super_resolution_crc32": zlib.crc32(Path(super_resolution).read_bytes())}
         self.reconstructor = reconstructor(method, getattr(self, "prior", None), guidance, name, self.fine, guide_fine,
-                                           fine_sampler)
-        if super_resolution and guide_fine:
-            self.settings["fine_sampler"] = describe(self.reconstructor.fine_sampler)
+                                           fine_sampler, fine_noise)
+        if isinstance(self.reconstructor, CascadePosterior):
+            self.settings |= {"super_resolution": Path(super_resolution).name, "fine_noise": fine_noise,
+                              "super_resolution_crc32": zlib.crc32(Path(super_resolution).read_bytes()),
+                              "second": describe(self.reconstructor.second)}
         self.metrics = CaseMetrics([name])
         self.progress = CaseProgress()
         self.cases: list[str] = []

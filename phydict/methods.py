@@ -33,13 +33,13 @@ METHODS: dict[str, Sampler | Reconstructor] = {
 def reconstructor(method: str | Sampler | Reconstructor, prior: Prior | str | Path | None = None,
                   guidance: float = 1.0, name: str | None = None,
                   super_resolution: SuperResolution | str | Path | None = None, guide_fine: bool = True,
-                  fine_sampler: Sampler | None = None) -> Reconstructor:
+                  fine_sampler: Sampler | None = None, fine_noise: float = 0.05) -> Reconstructor:
     """A method ready to reconstruct: a name of METHODS, a sampler (which needs a prior), or a Reconstructor.
 
     prior: a Prior or the file it is in; None for the shipped one. It is only loaded by methods that need it. name: what
     the result calls the method (None: its own name).
     super_resolution: the second stage of a cascade, or its file; None reconstructs on the prior's own grid. guide_fine:
-    whether the X-rays guide that stage too; fine_sampler: how (None: the method's own default).
+    whether the X-rays guide that stage too; fine_sampler: how (None: CascadePosterior's own); fine_noise: its noise.
     """
     if isinstance(method, str):
         if method not in METHODS:
@@ -59,8 +59,9 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: Prior | str | Pa
         return Posterior(prior, method, guidance, name=name)
     if isinstance(super_resolution, str | Path):
         super_resolution = load_super_resolution(super_resolution)
-    second = {"fine_sampler": fine_sampler} if fine_sampler else {}
-    return CascadePosterior(Cascade(prior, super_resolution), method, guide_fine, **second, guidance=guidance, name=name)
+    ready = CascadePosterior(Cascade(prior, super_resolution), method, guide_fine, noise=fine_noise, guidance=guidance,
+                             name=name)
+    return replace(ready, fine_sampler=fine_sampler) if fine_sampler else ready
 
 
 def fit_to_grid(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam) -> tuple[Tensor, Projector]:

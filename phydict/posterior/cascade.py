@@ -46,6 +46,10 @@ class CascadePosterior(Reconstructor):
     name: str = "phydict"
     bf16: bool = True
 
+    def __post_init__(self):
+        if not 0 <= self.noise <= 1:
+            raise ValueError(f"the noise of the base estimate is a level in [0, 1], but {self.noise} was given")
+
     @property
     def grid(self) -> Grid:
         """Where the reconstructed volumes live."""
@@ -53,14 +57,15 @@ class CascadePosterior(Reconstructor):
 
     @property
     def full_detector(self) -> bool:
-        return self.sampler.full_detector or self._second.full_detector
+        return self.sampler.full_detector or self.second.full_detector
 
     @property
-    def _second(self) -> Sampler:
+    def second(self) -> Sampler:
+        """What samples the fine stage."""
         return self.fine_sampler if self.guide_fine else self.unguided
 
     def steps(self) -> int:
-        return self.sampler.steps() + self._second.steps()
+        return self.sampler.steps() + self.second.steps()
 
     @torch.no_grad()
     def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,
@@ -80,7 +85,7 @@ class CascadePosterior(Reconstructor):
             measurement = Measurement(projector, xrays, fine.window, display, self.mu_water)
             x = noise_like(torch.empty(1, fine.state_channels, *fine.grid.shape, device=xrays.device), draw)
         with watch.stage("sample"):
-            state = self._second.sample(denoiser, measurement, x, draw, on_step)
+            state = self.second.sample(denoiser, measurement, x, draw, on_step)
         with watch.stage("score"):
             ct = state[:, :1]
             measurement.calibrate(ct)

@@ -64,7 +64,7 @@ class LocalUNet(nn.Module):
             bottom = level == levels - 1
             convolutions = 2 * blocks + 2 * (blocks + 1) + (4 if bottom else 3)  # with middle, or down and up
             positions += 2**level * convolutions
-        return self.block * positions
+        return self.block * (positions + 1) - 1
 
     @property
     def bytes_per_voxel(self) -> float:

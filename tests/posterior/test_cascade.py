@@ -14,7 +14,7 @@ from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector, binned
 from prior.tiny import tiny_prior, tiny_super_resolution
 
-BEAM = ConeBeam.orbit(4, 1020, 740, (28, 28), 20.0)
+BEAM = ConeBeam.orbit(4, 1020, 740, (56, 56), 10.0)
 FINE = Grid.cube(32)
 PROJECTOR = Projector(FINE, BEAM, full_detector=True)
 SAMPLER = SplitGibbs(3, ProximalCG(4), ProximalCG(4), warm_start=0.5, last=0.3, fresh_noise=0.0)

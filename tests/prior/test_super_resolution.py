@@ -93,16 +93,38 @@ def in_tiles(overlap=16, voxels=64):
     return fine
 
 
-def test_a_sample_in_tiles_is_that_of_the_whole_within_a_tolerance_and_the_same_each_time():
-    """The overlap reaches less far than the network: 1 % of the detail's size is what remains of it."""
-    coarse, noise = COARSE.repeat(1, 1, 2, 2, 2), X.repeat(1, 1, 2, 2, 2)
-    whole, tiled = tiny_super_resolution(64), in_tiles()
-    expected = descend(whole.bind(coarse, 0.05, bf16=False), noise, 4)
-    found = descend(tiled.bind(coarse, 0.05, bf16=False), noise, 4)
-    detail = (expected - whole.upsample(coarse)).std()
-    assert 0 < (found - expected).square().mean().sqrt() < 0.01 * detail
-    assert (found - expected).abs().max() < 0.15 * detail
-    assert torch.equal(descend(tiled.bind(coarse, 0.05, bf16=False), noise, 4), found)
+def long_stage(overlap, memory_of=None):
+    """A stage on 160 x 16 x 16 voxels whose network sees 12 voxels far; in tiles of twice the overlap, or whole."""
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        network = LocalUNet(2, 1, 1, (8,)).requires_grad_(False)
+        for weight in network.parameters():
+            if not weight.any():
+                torch.nn.init.normal_(weight, std=0.3)
+    fine = SuperResolution(network, Grid((160, 16, 16), (2.4,) * 3), HUWindow(), 2, overlap=overlap)
+    if memory_of:
+        fine.memory = int((memory_of + 1) ** 3 * network.bytes_per_voxel)
+    return fine
+
+
+def test_a_sample_in_tiles_is_that_of_the_whole_and_the_same_bits_each_time():
+    coarse, noise = COARSE[:, :, :, :8, :8].repeat(1, 1, 5, 1, 1), X[..., :16, :16].repeat(1, 1, 5, 1, 1)
+
+    def sample(fine):
+        return descend(fine.bind(coarse, 0.05, bf16=False), noise, 3)
+
+    expected = sample(long_stage(8))
+    detail = (expected - long_stage(8).upsample(coarse)).std()
+    wide = long_stage(48, memory_of=96)
+    assert wide.network.reach <= 12 and len(wide.tiles().starts(160)) == 3
+    torch.testing.assert_close(sample(wide), expected, atol=1e-5, rtol=0)
+    errors = []
+    for overlap in (4, 8, 16, 32):
+        fine = long_stage(overlap, memory_of=2 * overlap)
+        found = sample(fine)
+        assert torch.equal(sample(fine), found)
+        errors.append(float((found - expected).square().mean().sqrt() / detail))
+    assert errors == sorted(errors, reverse=True) and errors[0] > errors[-1] and errors[-1] < 0.01
 
 
 def test_tiles_leave_no_seams():
@@ -113,7 +135,7 @@ def test_tiles_leave_no_seams():
     for face in (15, 31, 47):
         for axis in (2, 3, 4):
             steps = [volume.diff(dim=axis).narrow(axis, face, 1).square().mean().sqrt() for volume in (tiled, whole)]
-            assert steps[0] == pytest.approx(float(steps[1]), rel=1e-3)
+            assert steps[0] == pytest.approx(float(steps[1]), rel=0.01)
 
 
 @pytest.mark.parametrize("channels, block", [((16, 16), 2), ((64, 96), 4), ((32, 64, 64), 4)])
@@ -136,7 +158,7 @@ def test_less_memory_is_enough_in_tiles():
         return found.most
 
     tiled, volume = in_tiles(voxels=64), 4 * 96**3
-    assert peak(tiled) <= tiled.memory + 2 * volume
+    assert peak(tiled) <= tiled.memory + 3 * volume  # state, coarse volume and estimate
     assert peak(tiny_super_resolution(64)) > 4 * peak(tiled)
 
 

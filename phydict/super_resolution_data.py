@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -22,8 +23,8 @@ def mapped_volume(file: Path, make: Callable[[], Tensor]) -> np.ndarray:
     if file.is_file():
         try:
             return np.load(file, mmap_mode="r")
-        except (ValueError, EOFError):
-            file.unlink()
+        except (ValueError, EOFError) as error:
+            warnings.warn(f"the cached volume {file} cannot be read ({error}); it is prepared again", stacklevel=3)
     file.parent.mkdir(parents=True, exist_ok=True)
     part = file.with_name(f"{file.stem}.{os.getpid()}.part")
     try:

@@ -371,7 +371,10 @@ def stage_of(args: list[str]) -> str:
     given, _ = look.parse_known_args(args)
     stages = [given.stage] if given.stage else []
     for file in reversed(given.config):
-        settings = yaml.safe_load(Path(file).read_text()) if Path(file).is_file() else None
+        try:
+            settings = yaml.safe_load(Path(file).read_text()) if Path(file).is_file() else None
+        except yaml.YAMLError:  # the parser of the command line says what is wrong
+            continue
         if isinstance(settings, dict) and "stage" in settings:
             stages.append(settings["stage"])
     stage = stages[0] if stages else "base"

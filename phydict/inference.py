@@ -48,7 +48,7 @@ class ReconstructionTask(lightning.LightningModule):
         name: what tables and folders call the method
         prior: the prior's file, read where the method is a Sampler
         guidance: scale of classifier-free guidance when a report is given; 1: none
-        super_resolution: file of a cascade's second stage, which refines what the prior gives; none given: no such stage
+        super_resolution: file of a cascade's second stage, which refines what the prior gives; none given: none
         guide_fine: whether the X-rays guide the second stage too
         fine_sampler: how they do; none given: the cascade's own
         fine_noise: level in [0, 1] of the noise that the prior's estimate is given before the second stage sees it

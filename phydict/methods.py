@@ -47,8 +47,8 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: Prior | str | Pa
         name, method = name or method, METHODS[method]
     if isinstance(method, Reconstructor):
         if super_resolution is not None:
-            raise ValueError(f"super_resolution refines what a prior gives, but {type(method).__name__} has none: leave "
-                             "it out, or use a method with a prior")
+            raise ValueError(f"super_resolution refines what a prior gives, but {type(method).__name__} has none: "
+                             "leave it out, or use a method with a prior")
         return replace(method, name=name) if name else method
     if not isinstance(method, Sampler):
         raise ValueError(f"a method is a name ({', '.join(METHODS)}), a Sampler or a Reconstructor, but {method!r} was "
@@ -81,7 +81,8 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: Prior | str | Path | None 
                 method: str | Sampler | Reconstructor = "phydict_fast", report: str | None = None,
                 display: bool = False, seed: int = 0, guidance: float = 1.0, mu_water: float | None = None,
                 grid: Grid = Grid.cube(64), on_step=lambda: None,
-                super_resolution: SuperResolution | str | Path | None = None, guide_fine: bool = True) -> Reconstruction:
+                super_resolution: SuperResolution | str | Path | None = None,
+                guide_fine: bool = True) -> Reconstruction:
     """A CT volume from X-rays (K, V, U) and their geometry.
 
     xrays: tensor or array of line integrals; with display=True, of display values with an unknown gain and offset per

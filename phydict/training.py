@@ -236,7 +236,8 @@ class PriorTraining(StageTraining):
         reports, maps = data.sketches(self.prior.network.text_map.cells)
         if reports:
             losses = learn_sketch(self.prior, reports, maps, self.text_steps, self.seed)
-            _tell(f"text map learns what reports imply: squared error {losses[0]:.3f} -> {losses[-1]:.3f} of its variance")
+            _tell(f"text map learns what reports imply: squared error {losses[0]:.3f} -> {losses[-1]:.3f} of its "
+                  "variance")
 
     def on_fit_start(self) -> None:
         if self.prior.text is not None and self.text_steps:

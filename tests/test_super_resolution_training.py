@@ -80,7 +80,8 @@ def test_a_resumed_run_is_the_uninterrupted_one(tmp_path, cache, straight):
 
 def test_validation_logs_every_noise_level_beside_what_upsampling_lacks(straight):
     log = next(straight.glob("logs/**/metrics.csv")).read_text().splitlines()[0].split(",")
-    assert {f"val/rmse_hu_t{t}" for t in (0.1, 0.3, 0.5, 0.7, 0.9)} | {"val/rmse_hu", "val/rmse_hu_upsampled"} <= set(log)
+    levels = {f"val/rmse_hu_t{t}" for t in (0.1, 0.3, 0.5, 0.7, 0.9)}
+    assert levels | {"val/rmse_hu", "val/rmse_hu_upsampled"} <= set(log)
     assert len(list(straight.glob("logs/**/samples/*.png"))) == 2
 
 
@@ -124,7 +125,8 @@ def test_a_checkpoint_of_the_other_stage_is_one_sentence(straight, cache, tmp_pa
 @pytest.mark.parametrize("change, words", [
     (["--data.crop=15"], ["data.crop", "15"]), (["--data.crop=18"], ["18", "divisible by 4"]),
     (["--model.voxels=34"], ["34", "divisible"]), (["--model.most_noise=2"], ["most_noise"]),
-    (["--stage=fine"], ["fine"]), (["--model.text=none"], ["model.text"]), (["--model.initial={base}"], ["base prior"])],
+    (["--stage=fine"], ["fine"]), (["--model.text=none"], ["model.text"]),
+    (["--model.initial={base}"], ["base prior"])],
     ids=lambda value: value[0].split("=")[0].strip("-") if value[0].startswith("-") else "")
 def test_bad_input_is_one_sentence(change, words, cache, tmp_path, capsys):
     save_prior(tiny_prior(False), tmp_path / "base.safetensors")

@@ -1,4 +1,4 @@
-"""The diffusion prior of CT: networks, report encoder, cascade, and the files that keep them with grid and HU window."""
+"""The diffusion prior of CT: networks, report encoder, cascade, and their files with grid and HU window."""
 
 from phydict.prior.cascade import Cascade
 from phydict.prior.checkpoint import (

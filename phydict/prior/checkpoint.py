@@ -60,9 +60,9 @@ def describe(prior: Prior) -> dict:
         text = {"source": text.source, "length": text.length, "width": text.width,
                 "layers": text.bert.config.num_hidden_layers,
                 "vocabulary": None if text.source else text.vocabulary}
-    return {"format": FORMAT, "stage": "base", "grid": prior.grid.to_dict(), "hu_window": [prior.window.low, prior.window.high],
-            "state": STATE[:prior.network.state_channels], "sigma_data": prior.sigma_data, "skip_std": prior.skip_std,
-            "schedule": vars(prior.schedule), "network": prior.network.settings, "text": text}
+    return {"format": FORMAT, "stage": "base", "grid": prior.grid.to_dict(),
+            "hu_window": [prior.window.low, prior.window.high], "state": STATE[:prior.network.state_channels],
+            "sigma_data": prior.sigma_data, "skip_std": prior.skip_std, "schedule": vars(prior.schedule), "network": prior.network.settings, "text": text}
 
 
 def describe_super_resolution(fine: SuperResolution) -> dict:

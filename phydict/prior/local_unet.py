@@ -31,8 +31,8 @@ class LocalUNet(nn.Module):
     Spatial sizes must be divisible by block * 2^(levels - 1).
     """
 
-    def __init__(self, in_channels: int = 2, out_channels: int = 1, block: int = 4, channels: tuple[int, ...] = (64, 96),
-                 res_blocks: int = 1):
+    def __init__(self, in_channels: int = 2, out_channels: int = 1, block: int = 4,
+                 channels: tuple[int, ...] = (64, 96), res_blocks: int = 1):
         super().__init__()
         self.settings = {"in_channels": in_channels, "out_channels": out_channels, "block": block,
                          "channels": list(channels), "res_blocks": res_blocks}

@@ -18,8 +18,8 @@ from phydict.units import HUWindow
 class SuperResolution(nn.Module):
     """x0-predicting denoiser of the fine state, conditioned on the coarse state and on how noisy that is.
 
-    x0 = k x_t / a + (1 - k) u + c_out F(c_in (x_t - a u), u, t, level): u is the coarse state upsampled trilinearly, and
-    the network F predicts what it lacks, in units of that detail's expected size. Only below the noise level
+    x0 = k x_t / a + (1 - k) u + c_out F(c_in (x_t - a u), u, t, level): u is the coarse state upsampled trilinearly,
+    and the network F predicts what it lacks, in units of that detail's expected size. Only below the noise level
     `skip_std` does the input itself take over, k = skip_std^2 / (sigma^2 + skip_std^2), as in Prior.
 
     In training the coarse state carries Gaussian noise of a random level (noise augmentation; Ho et al. 2022,

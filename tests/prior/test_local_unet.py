@@ -22,7 +22,8 @@ def network(channels, block=1, res_blocks=1):
     return local
 
 
-@pytest.mark.parametrize("channels, block, res_blocks", [((8,), 2, 1), ((8, 8), 1, 1), ((8, 8), 2, 2), ((8, 8, 8), 1, 1)])
+@pytest.mark.parametrize("channels, block, res_blocks", [
+    ((8,), 2, 1), ((8, 8), 1, 1), ((8, 8), 2, 2), ((8, 8, 8), 1, 1)])
 def test_nothing_beyond_the_reach_changes_the_answer_and_what_is_near_does(channels, block, res_blocks):
     local = network(channels, block, res_blocks)
     n = -(-(local.reach + 3) // local.divisor) * local.divisor

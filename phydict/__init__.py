@@ -3,7 +3,7 @@
     units, grid      HU, mu and the prior's range; where voxels are
     xray             geometry, projector and its exact adjoint, simulation          physics
     diffusion        noise schedule, sampling moves, denoisers                      mathematics
-    prior            3D UNet, report encoder, checkpoints                           networks
+    prior            3D UNets, report encoder, cascade, checkpoints                 networks
     datasets         phantoms, CTs and X-ray files -> Cases                         files
     posterior        likelihood steps, reward, samplers                             prior x X-rays
     baselines        reconstruction without a prior                                 yardsticks
@@ -11,7 +11,7 @@
     methods          the named methods, and `reconstruct` in one call
     dry_run         geometry drawn before anything is reconstructed
     case_results     finished cases on disk
-    training, inference, datamodule                                                 Lightning
+    training, inference, datamodule, super_resolution_data, reconstruction_data     Lightning
 """
 
 from phydict.datasets import load_xrays

@@ -172,18 +172,22 @@ class PriorData(lightning.LightningDataModule):
         if self.epoch_size < least:
             raise ValueError(f"data.epoch_size is {self.epoch_size}, less than one batch on every device ({least}): "
                              "raise it, or lower data.batch_size")
-        epoch = MixedCases(self.cts, self.phantoms, self.ct_fraction, self.grid, self.window, self.epoch_size,
-                           self.trainer.current_epoch, self.seed, self.augmentation)
         # Lightning's own sampler would shuffle: several processes take turns, so that each step sees what one would.
-        turns = DistributedSampler(epoch, self.trainer.world_size, self.trainer.global_rank, shuffle=False)
-        return DataLoader(epoch, self.batch_size, sampler=turns, num_workers=self.workers, drop_last=True)
+        draws = self.draws(self.trainer.current_epoch)
+        turns = DistributedSampler(draws, self.trainer.world_size, self.trainer.global_rank, shuffle=False)
+        return DataLoader(draws, self.batch_size, sampler=turns, num_workers=self.workers, drop_last=True)
+
+    def draws(self, epoch: int) -> Dataset:
+        """What is trained on in an epoch."""
+        return MixedCases(self.cts, self.phantoms, self.ct_fraction, self.grid, self.window, self.epoch_size, epoch,
+                          self.seed, self.augmentation)
 
     def val_dataloader(self) -> DataLoader:
         return DataLoader(self.validation, 1, collate_fn=_collate)
 
 
 def _training_parts(case: dict) -> dict:
-    return {key: case[key] for key in KEYS}
+    return {key: case[key] for key in KEYS if key in case}
 
 
 def _collate(cases: list[dict]) -> dict:

@@ -31,8 +31,8 @@ from phydict.dry_run import dry_run
 from phydict.evaluation import CaseMetrics, panel, rich_table, volume_metrics
 from phydict.grid import Grid
 from phydict.methods import DEFAULT_PRIOR, fit_to_grid, reconstructor
-from phydict.posterior import Sampler
-from phydict.prior import load_prior
+from phydict.posterior import CascadePosterior, Sampler
+from phydict.prior import load_prior, load_super_resolution
 from phydict.progress import CaseProgress
 from phydict.reconstruction_data import ReconstructionData
 from phydict.reconstructor import Reconstruction, Reconstructor, describe
@@ -48,6 +48,11 @@ class ReconstructionTask(lightning.LightningModule):
         name: what tables and folders call the method
         prior: the prior's file, read where the method is a Sampler
         guidance: scale of classifier-free guidance when a report is given; 1: none
+        super_resolution: file of a cascade's second stage, which refines what the prior gives; none given: none
+        guide_fine: whether the X-rays guide the second stage too
+        fine_sampler: how they do; none given: the cascade's own
+        fine_noise: level in [0, 1] of the noise that the prior's estimate is given before the second stage sees it
+        fine_memory: GiB that the second stage's network may take; it works in tiles where the whole takes more
         out: output folder; cases go to <out>/<name>/<case>
         overwrite: do finished cases again, and replace what is in their place
         seed: with the case's id, the only source of randomness
@@ -56,8 +61,10 @@ class ReconstructionTask(lightning.LightningModule):
     """
 
     def __init__(self, method: Sampler | Reconstructor, name: str, prior: str = str(DEFAULT_PRIOR),
-                 guidance: float = 1.0, out: str = "runs/reconstructions", overwrite: bool = False, seed: int = 0,
-                 voxels: int = 64, side: float = 384.0):
+                 guidance: float = 1.0, super_resolution: str | None = None, guide_fine: bool = True,
+                 fine_sampler: Sampler | None = None, fine_noise: float = 0.05, fine_memory: float = 4.0,
+                 out: str = "runs/reconstructions", overwrite: bool = False, seed: int = 0, voxels: int = 64,
+                 side: float = 384.0):
         super().__init__()
         self.method_name, self.seed, self.pages = name, seed, Path(out) / "dry_run"
         self.results = CaseResults(Path(out) / name, overwrite)
@@ -69,7 +76,17 @@ class ReconstructionTask(lightning.LightningModule):
             self.grid, self.window = self.prior.grid, self.prior.window
             self.settings |= {"prior": Path(prior).name, "prior_crc32": zlib.crc32(Path(prior).read_bytes()),
                               "guidance": guidance}
-        self.reconstructor = reconstructor(method, self.prior, guidance, name)
+        self.fine = None
+        if super_resolution:
+            self.fine = load_super_resolution(super_resolution)
+            self.fine.memory = int(fine_memory * 2**30)
+            self.grid = self.fine.grid
+        self.reconstructor = reconstructor(method, self.prior, guidance, name, self.fine, guide_fine, fine_sampler,
+                                           fine_noise)
+        if isinstance(self.reconstructor, CascadePosterior):
+            self.settings |= {"super_resolution": Path(super_resolution).name, "fine_noise": fine_noise,
+                              "super_resolution_crc32": zlib.crc32(Path(super_resolution).read_bytes()),
+                              "second": describe(self.reconstructor.second)}
         self.metrics = CaseMetrics([name])
         self.progress = CaseProgress()
         self.cases: list[str] = []

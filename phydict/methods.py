@@ -11,8 +11,9 @@ from torch import Tensor
 from phydict.baselines import SIRT
 from phydict.datasets import format_report
 from phydict.grid import Grid
-from phydict.posterior import GradientSteps, Posterior, PriorOnly, ProximalCG, Reward, Sampler, SplitGibbs
-from phydict.prior import Prior, load_prior
+from phydict.posterior import (
+    CascadePosterior, GradientSteps, Posterior, PriorOnly, ProximalCG, Reward, Sampler, SplitGibbs)
+from phydict.prior import Cascade, Prior, SuperResolution, load_prior, load_super_resolution
 from phydict.reconstructor import Reconstruction, Reconstructor, check_xrays
 from phydict.xray import ConeBeam, Projector, binned, binning
 
@@ -31,23 +32,37 @@ METHODS: dict[str, Sampler | Reconstructor] = {
 
 
 def reconstructor(method: str | Sampler | Reconstructor, prior: Prior | str | Path | None = None,
-                  guidance: float = 1.0, name: str | None = None) -> Reconstructor:
+                  guidance: float = 1.0, name: str | None = None,
+                  super_resolution: SuperResolution | str | Path | None = None, guide_fine: bool = True,
+                  fine_sampler: Sampler | None = None, fine_noise: float = 0.05) -> Reconstructor:
     """A method ready to reconstruct: a name of METHODS, a sampler (which needs a prior), or a Reconstructor.
 
     prior: a Prior or the file it is in; None for the shipped one. It is only loaded by methods that need it. name: what
     the result calls the method (None: its own name).
+    super_resolution: the second stage of a cascade, or its file; None reconstructs on the prior's own grid. guide_fine:
+    whether the X-rays guide that stage too; fine_sampler: how (None: CascadePosterior's own); fine_noise: its noise.
     """
     if isinstance(method, str):
         if method not in METHODS:
             raise ValueError(f"there is no method '{method}': use one of {', '.join(METHODS)}")
         name, method = name or method, METHODS[method]
     if isinstance(method, Reconstructor):
+        if super_resolution is not None:
+            raise ValueError(f"super_resolution refines what a prior gives, but {type(method).__name__} has none: "
+                             "leave it out, or use a method with a prior")
         return replace(method, name=name) if name else method
     if not isinstance(method, Sampler):
         raise ValueError(f"a method is a name ({', '.join(METHODS)}), a Sampler or a Reconstructor, but {method!r} was "
                          "given")
     prior = load_prior(prior or DEFAULT_PRIOR) if prior is None or isinstance(prior, str | Path) else prior
-    return Posterior(prior, method, guidance, name=name or type(method).__name__)
+    name = name or type(method).__name__
+    if super_resolution is None:
+        return Posterior(prior, method, guidance, name=name)
+    if isinstance(super_resolution, str | Path):
+        super_resolution = load_super_resolution(super_resolution)
+    ready = CascadePosterior(Cascade(prior, super_resolution), method, guide_fine, noise=fine_noise, guidance=guidance,
+                             name=name)
+    return replace(ready, fine_sampler=fine_sampler) if fine_sampler else ready
 
 
 def fit_to_grid(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam) -> tuple[Tensor, Projector]:
@@ -66,21 +81,24 @@ def fit_to_grid(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam)
 def reconstruct(xrays: Tensor, beam: ConeBeam, prior: Prior | str | Path | None = None,
                 method: str | Sampler | Reconstructor = "phydict_fast", report: str | None = None,
                 display: bool = False, seed: int = 0, guidance: float = 1.0, mu_water: float | None = None,
-                grid: Grid = Grid.cube(64), on_step=lambda: None) -> Reconstruction:
+                grid: Grid = Grid.cube(64), on_step=lambda: None,
+                super_resolution: SuperResolution | str | Path | None = None,
+                guide_fine: bool = True) -> Reconstruction:
     """A CT volume from X-rays (K, V, U) and their geometry.
 
     xrays: tensor or array of line integrals; with display=True, of display values with an unknown gain and offset per
     view. grid: for methods without a prior; others work on their prior's.
     prior: a Prior, a file, or None for the shipped one; report: radiology text, if any, which `format_report` lays out.
     mu_water: attenuation in 1/mm that water has in the X-rays (None: the method's own, near 65 keV).
+    super_resolution, guide_fine: the second stage of a cascade, as for `reconstructor`; the volume is then on its grid.
     A detector finer than the grid can use is binned. Raises ValueError when X-rays, geometry and prior do not fit.
     """
     if not isinstance(beam, ConeBeam):
         raise ValueError(f"the geometry must be a ConeBeam, but {beam!r} was given; ConeBeam.load reads one")
     if not isinstance(report, str | None):
         raise ValueError(f"the report must be text, but {report!r} was given")
-    ready = reconstructor(method, prior, guidance)
+    ready = reconstructor(method, prior, guidance, super_resolution=super_resolution, guide_fine=guide_fine)
     ready = ready if mu_water is None else ready.assuming(mu_water)
-    grid = ready.prior.grid if isinstance(ready, Posterior) else grid
+    grid = ready.grid if isinstance(ready, Posterior | CascadePosterior) else grid
     xrays, projector = fit_to_grid(ready, grid, torch.as_tensor(xrays), beam)
     return ready.reconstruct(xrays, projector, format_report(report), display, seed, on_step)

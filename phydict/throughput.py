@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Sequence
 
 import lightning
 import torch
 from lightning.pytorch.utilities import rank_zero_only
 from torch.utils.flop_counter import FlopCounterMode
 
-from phydict.prior import Prior
+from phydict.prior import Prior, SuperResolution
 
 REPEATS = 5
 """Matrix products of which the fastest counts."""
@@ -34,7 +35,10 @@ class Throughput(lightning.Callback):
         self.peak, self.began, self.flop = peak, None, 0
 
     def on_fit_start(self, trainer, module) -> None:
-        self.began, self.flop = None, sample_flop(module.prior)
+        self.began, self.flop = None, 0
+
+    def _tell_costs(self, trainer, module, shape: tuple[int, ...]) -> None:
+        self.flop = sample_flop(module.prior, shape)
         low = torch.bfloat16 if "bf16" in str(trainer.precision) else torch.float32
         if self.peak is None:
             self.peak = matmul_peak(module.device, low) / 1e12
@@ -42,6 +46,8 @@ class Throughput(lightning.Callback):
               f"matrix product reaches {self.peak:.3g} TFLOP/s on this device")
 
     def on_train_batch_start(self, trainer, module, batch, _) -> None:
+        if not self.flop:
+            self._tell_costs(trainer, module, batch["volume"].shape[2:])
         now, samples = time.perf_counter(), len(batch["volume"])
         if self.began is not None:
             rate = samples * trainer.world_size / (now - self.began)
@@ -57,15 +63,13 @@ def _tell(message: str) -> None:
     print(message, file=sys.stderr)
 
 
-def sample_flop(prior: Prior) -> int:
-    """FLOP of the network's forward and backward pass over one state of the prior's grid; nothing is computed."""
+def sample_flop(prior: Prior | SuperResolution, shape: Sequence[int]) -> int:
+    """FLOP of the network's forward and backward pass over one state of `shape` voxels; nothing is computed."""
     with torch.device("meta"):
         network = type(prior.network)(**prior.network.settings)
-    state = torch.empty(1, prior.state_channels, *prior.grid.shape, device="meta")
-    length = prior.text.length if prior.text is not None else 1
-    context = torch.empty(1, length, network.context_dim, device="meta")
+        inputs = prior.network_inputs(shape)
     with FlopCounterMode(display=False) as counter:
-        network(state, torch.empty(1, device="meta"), context).sum().backward()
+        network(*inputs).sum().backward()
     return counter.get_total_flops()
 
 

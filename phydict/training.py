@@ -1,230 +1,32 @@
-"""Training a prior with Lightning: pairs with train.py."""
+"""Training a prior from the command line: pairs with train.py."""
 
 from __future__ import annotations
 
+import argparse
 import sys
-import warnings
 from pathlib import Path
 from pickle import UnpicklingError
 
 import lightning
 import torch
+import yaml
 from jsonargparse import auto_cli
-from lightning.pytorch.callbacks import ModelCheckpoint, WeightAveraging
+from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.cli import LightningCLI
 from lightning.pytorch.loggers import CSVLogger
-from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
-from torch import Tensor
 
 from phydict.command_line import check_writable, one_sentence_errors, quiet
 from phydict.datamodule import PriorData
-from phydict.diffusion import renoise
-from phydict.evaluation import method_panel
-from phydict.grid import Grid
-from phydict.posterior import descend
-from phydict.prior import Prior, TextEncoder, VolumeUNet, describe, learn_vocabulary, load_prior, save_prior
-from phydict.prior.checkpoint import build_prior, build_text
-from phydict.prior.report_training import learn_findings, learn_sketch
-from phydict.prior.sharding import shard
+from phydict.prior import save_prior, save_super_resolution
+from phydict.prior.checkpoint import build_prior, build_super_resolution, build_text
+from phydict.prior_training import PriorTraining
+from phydict.super_resolution_data import SuperResolutionData
+from phydict.super_resolution_training import SuperResolutionTraining
 from phydict.throughput import Throughput
-from phydict.units import HUWindow
 
 CHECKPOINT, HELD_OUT = "last.ckpt", "held_out.txt"
 """Files of a training's folder: what it can be resumed from, and the ids of the CTs that it never saw."""
-
-NOISE_LEVELS = (0.1, 0.3, 0.5, 0.7, 0.9)
-"""Times t at which validation measures the denoising error."""
-
-
-class PriorTraining(lightning.LightningModule):
-    """Learns a Prior by denoising: squared error of x0 at all noise levels, up to four times heavier at the low ones.
-
-    Args:
-        network: the UNet; none given: the default VolumeUNet
-        text: "small" for a BERT that learns reports first (none where the data have no reports), a folder or hub id
-            for a frozen one, "none" for a prior without text
-        text_length: tokens of a report that a frozen text reads
-        text_padded_to: 2048, with text_length 192, for contexts as MedSyn's; none given: padding is hidden
-        reports: texts that the small BERT's vocabulary is learnt from (taken from the data)
-        voxels: voxels along each side of the cube
-        side: side of the cube in mm
-        window: HU that the prior's range [-1, 1] stands for
-        sigma_data: standard deviation of the data in the prior's range
-        text_dropout: share of reports replaced by the null context, in [0, 1]
-        mask_weight: weight of the anatomy masks' error beside the CT's
-        learning_rate: of AdamW
-        weight_decay: of AdamW
-        warmup: steps over which the learning rate rises
-        decay_from: step at which a linear decay of the learning rate to zero begins
-        decay_steps: length of that decay in steps; 0: no decay
-        text_steps: steps of each task by which a small BERT learns reports before denoising begins; 0: it learns by
-            denoising
-        montage_steps: noise levels of the samples that validation paints; 0: none
-        gradient_checkpointing: less memory for a second computation of each block's activations
-        channels_last: lay the network's channels side by side in memory
-        compile: run the network through torch.compile
-        initial: a prior's file to go on from, which then decides network and text
-        seed: of times, noise and text dropout
-    """
-
-    def __init__(self, network: VolumeUNet | None = None, text: str = "small", text_length: int = 128,
-                 text_padded_to: int | None = None, reports: list[str] | None = None,
-                 voxels: int = 64, side: float = 384.0, window: tuple[float, float] = (-1000.0, 1000.0),
-                 sigma_data: float = 0.5, text_dropout: float = 0.1, mask_weight: float = 0.1,
-                 learning_rate: float = 5e-4, weight_decay: float = 0.01, warmup: int = 100, decay_from: int = 0,
-                 decay_steps: int = 0, text_steps: int = 600, montage_steps: int = 16,
-                 gradient_checkpointing: bool = False, channels_last: bool = True, compile: bool = False,
-                 initial: str | None = None, seed: int = 0):
-        super().__init__()
-        network = network or VolumeUNet()
-        encoder = None
-        if text == "small" and not reports:
-            warnings.warn("the data have no reports: this prior will know no text")
-        elif text == "small":
-            encoder = TextEncoder.small(learn_vocabulary(reports), network.context_dim)
-        elif text != "none":
-            encoder = TextEncoder.pretrained(text, text_length, text_padded_to)
-        self.prior = Prior(network, Grid.cube(voxels, side), HUWindow(*window), encoder, sigma_data=sigma_data)
-        if initial:
-            self._start_from(load_prior(initial), initial)
-        if self.prior.text is not None and reports:
-            self.prior.text.check(reports)
-        self.prior.network.run_with(gradient_checkpointing, channels_last, compile)
-        self.text_dropout, self.mask_weight, self.montage_steps = text_dropout, mask_weight, montage_steps
-        self.learning_rate, self.weight_decay = learning_rate, weight_decay
-        self.warmup, self.decay_from, self.decay_steps = warmup, decay_from, decay_steps
-        self.text_steps = text_steps
-        self.seed, self.samples = seed, 0
-
-    def _start_from(self, prior: Prior, path: str) -> None:
-        if not prior.grid.same_as(self.prior.grid) or prior.window != self.prior.window:
-            raise ValueError(f"the prior {path} has another grid or HU window than this training: "
-                             "set model.voxels, model.side and model.window to its own")
-        if prior.load_text is not None:
-            prior.text = prior.load_text()
-            prior.text.trainable = prior.text.source is None
-        self.prior = prior.train().requires_grad_(True)
-        if prior.text is not None:
-            prior.text.requires_grad_(prior.text.trainable)
-
-    def configure_model(self) -> None:
-        mesh = self.device_mesh  # only of a strategy that spreads the weights
-        if mesh is None:
-            return
-        if any(isinstance(callback, WeightAveraging) for callback in self.trainer.callbacks):
-            raise ValueError("spread weights cannot be averaged: train without EMAWeightAveraging "
-                             "(trainer.callbacks: null), as configs/prior/fsdp.yaml does")
-        # A spread optimizer goes on only if it has moved each of its weights: those that denoising leaves alone rest.
-        self.prior.network.text_map.to_sketch.requires_grad_(False)
-        if self.prior.text is not None and self.text_steps:
-            self.prior.text.requires_grad_(False)
-        shard(self.prior, mesh["data_parallel"])
-
-    def training_step(self, batch: dict, index: int) -> Tensor:
-        loss = self.denoising_loss(batch, (self.seed, self.global_step, index), self.global_rank,
-                                   self.trainer.world_size)
-        self.samples += len(batch["volume"]) * self.trainer.world_size
-        self.log("loss", loss, prog_bar=True, batch_size=len(batch["volume"]), sync_dist=True)
-        return loss
-
-    def denoising_loss(self, batch: dict, key: tuple[int, ...] = (0,), rank: int = 0, processes: int = 1) -> Tensor:
-        """Weighted squared error of one batch's clean estimates.
-
-        Times, noise and text dropout follow from `key` and each sample's place in the batch that all `processes` share
-        in turns, so that a resumed run repeats an uninterrupted one, and several processes do what one would.
-        """
-        x0, weight = self._state(batch)
-        places = range(rank, len(x0) * processes, processes)
-        draws = [torch.Generator().manual_seed(hash((*key, place)) % 2**31) for place in places]
-        u, keep = torch.stack([torch.rand(2, generator=draw) for draw in draws], 1)
-        t = ((torch.tensor(places) + u) / (len(x0) * processes)).to(self.device)
-        noise = torch.stack([torch.randn(x0.shape[1:], generator=draw) for draw in draws]).to(self.device)
-        reports = batch["report"] if self.prior.text is not None else [""] * len(x0)
-        context = self.prior.context([r if k >= self.text_dropout else "" for r, k in zip(reports, keep)])
-        a, s = (w.float().view(-1, 1, 1, 1, 1) for w in self.prior.schedule.scales(t.double()))
-        error = (self.prior(a * x0 + s * noise, t, context) - x0).square()
-        unit = self.prior.preconditioning(t)[1].clamp(min=0.25) ** -2
-        return (unit * weight * error).mean() * x0.shape[1] / (1 + self.mask_weight * (x0.shape[1] - 1))
-
-    def learn_reports(self, data: PriorData) -> None:
-        """Teaches a small report encoder and the text map, once, before the first denoising step.
-
-        It belongs before `fit`, since distributed training watches every backward pass from there on.
-        """
-        text = self.prior.text
-        if text is None or not text.trainable or not self.text_steps:
-            return
-        reports, labels = data.labelled_reports()
-        if reports:
-            losses = learn_findings(text, reports, labels, self.text_steps, self.seed)
-            _tell(f"report encoder learns findings: loss {losses[0]:.3f} -> {losses[-1]:.3f}")
-        _tell("preparing what reports imply")
-        reports, maps = data.sketches(self.prior.network.text_map.cells)
-        if reports:
-            losses = learn_sketch(self.prior, reports, maps, self.text_steps, self.seed)
-            _tell(f"text map learns what reports imply: squared error {losses[0]:.3f} -> {losses[-1]:.3f} of its variance")
-
-    def on_fit_start(self) -> None:
-        if self.prior.text is not None and self.text_steps:
-            self.prior.text.trainable = False  # what it learnt stays, while the UNet learns to use it
-
-    def _state(self, batch: dict) -> tuple[Tensor, Tensor]:
-        """The clean state (B, C, X, Y, Z) of a batch and the weight of each channel's error (B, C, 1, 1, 1)."""
-        channels = self.prior.network.state_channels
-        x0 = torch.cat([batch["volume"], 2 * batch["masks"] - 1], 1)[:, :channels]
-        known = self.mask_weight * batch["has_masks"].float()
-        weight = torch.cat([torch.ones_like(known[:, :1]), known], 1)[:, :channels]
-        return x0, weight[..., None, None, None]
-
-    def validation_step(self, batch: dict, index: int) -> None:
-        x0, _ = self._state(batch)
-        draw = torch.Generator().manual_seed(index)
-        noise = torch.randn(x0.shape, generator=draw).to(self.device)
-        errors = []
-        for t in NOISE_LEVELS:
-            denoiser = self.prior.bind(batch["report"][0] if self.prior.text is not None else "")
-            estimate = denoiser.denoise(renoise(self.prior.schedule, x0, t, noise), t)
-            errors.append((estimate - x0)[:, 0].square().mean().sqrt() * self.prior.window.half_width)
-            self.log(f"val/rmse_hu_t{t}", errors[-1], sync_dist=True, batch_size=len(x0))
-        self.log("val/rmse_hu", torch.stack(errors).mean(), prog_bar=True, sync_dist=True, batch_size=len(x0))
-        folder = Path(self.trainer.log_dir or self.trainer.default_root_dir) / "samples"  # asks every process
-        painted = index < 2 and self.montage_steps
-        if painted and (self.trainer.is_global_zero or self.device_mesh):  # spread weights need every process's help
-            sample = descend(denoiser, noise, self.montage_steps)
-        if painted and self.trainer.is_global_zero:
-            window = self.prior.window
-            method_panel(folder / f"step{self.global_step:06d}_{index}.png",
-                         {"prior sample": window.to_hu(sample[0, 0].cpu())}, window.to_hu(x0[0, 0].cpu()),
-                         self.prior.grid, title=batch["report"][0][:80] or "no report")
-
-    def configure_optimizers(self) -> dict:
-        def factor(step: int) -> float:
-            rise = min(1.0, (step + 1) / self.warmup) if self.warmup else 1.0
-            past = step - self.decay_from
-            return rise * (max(0.0, 1 - past / self.decay_steps) if self.decay_steps and past > 0 else 1.0)
-
-        weights = [w for w in self.parameters() if w.requires_grad]
-        optimizer = torch.optim.AdamW(weights, self.learning_rate, weight_decay=self.weight_decay)
-        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
-
-    def on_save_checkpoint(self, checkpoint: dict) -> None:
-        seen = {"steps": self.trainer.global_step, "samples": self.samples}
-        checkpoint["phydict"] = describe(self.prior) | {"training": seen}
-
-    def on_load_checkpoint(self, checkpoint: dict) -> None:
-        theirs, ours = checkpoint["phydict"], describe(self.prior)
-        for key, own in ours.items():
-            if theirs[key] != own:
-                raise ValueError(f"the checkpoint's prior and this training's differ in '{key}': give the settings and "
-                                 "data that the checkpoint was trained with, or start anew with model.initial")
-        self.samples = checkpoint["phydict"].get("training", {}).get("samples", 0)
-
-
-@rank_zero_only
-def _tell(message: str) -> None:
-    print(message, file=sys.stderr)
 
 
 def read_checkpoint(path: str | Path) -> dict:
@@ -241,7 +43,7 @@ def read_checkpoint(path: str | Path) -> dict:
 
 
 def export_prior(checkpoint: str, out: str) -> None:
-    """Write the averaged weights of a training checkpoint as a prior for reconstruction.
+    """Write the averaged weights of a training checkpoint as a prior, or a super-resolution stage, for reconstruction.
 
     Args:
         checkpoint: the .ckpt file that training wrote
@@ -253,11 +55,39 @@ def export_prior(checkpoint: str, out: str) -> None:
     content = read_checkpoint(checkpoint)
     header = content["phydict"]
     weights = {k.removeprefix("prior."): w for k, w in content["state_dict"].items() if k.startswith("prior.")}
-    prior = build_prior(header, weights)
-    if header["text"]:
-        prior.text = build_text(header["text"], {k: w for k, w in weights.items() if k.startswith("text.")})
-    save_prior(prior, out, header.get("training", {"steps": content["global_step"]}))
+    training = header.get("training", {"steps": content["global_step"]})
+    if header.get("stage") == "super_resolution":
+        save_super_resolution(build_super_resolution(header, weights), out, training)
+    else:
+        prior = build_prior(header, weights)
+        if header["text"]:
+            prior.text = build_text(header["text"], {k: w for k, w in weights.items() if k.startswith("text.")})
+        save_prior(prior, out, training)
     print(f"prior in {out}")
+
+
+STAGES = {"base": (PriorTraining, PriorData), "super_resolution": (SuperResolutionTraining, SuperResolutionData)}
+"""What trains a stage, and on which data."""
+
+
+def stage_of(args: list[str]) -> str:
+    """The stage that a command line trains: its --stage, or the `stage` of the last configuration file with one."""
+    look = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    look.add_argument("--config", "-c", action="append", default=[])
+    look.add_argument("--stage")
+    given, _ = look.parse_known_args(args)
+    stages = [given.stage] if given.stage else []
+    for file in reversed(given.config):
+        try:
+            settings = yaml.safe_load(Path(file).read_text()) if Path(file).is_file() else None
+        except yaml.YAMLError:  # the parser of the command line says what is wrong
+            continue
+        if isinstance(settings, dict) and "stage" in settings:
+            stages.append(settings["stage"])
+    stage = stages[0] if stages else "base"
+    if stage not in STAGES:
+        raise ValueError(f"the stages that can be trained are {' and '.join(STAGES)}, but '{stage}' was given")
+    return stage
 
 
 class PriorCLI(LightningCLI):
@@ -269,6 +99,7 @@ class PriorCLI(LightningCLI):
 
     def add_arguments_to_parser(self, parser) -> None:
         parser.add_argument("--out", default="runs/prior", help="folder for checkpoint, logs and samples")
+        parser.add_argument("--stage", default="base", choices=list(STAGES), help="which stage of a cascade to train")
         parser.add_lightning_class_args(ModelCheckpoint, "checkpoint")
         parser.set_defaults({"checkpoint.filename": "last", "checkpoint.enable_version_counter": False,
                              "checkpoint.every_n_epochs": 1, "checkpoint.save_on_train_epoch_end": True})
@@ -277,7 +108,10 @@ class PriorCLI(LightningCLI):
         parser.link_arguments("out", "trainer.default_root_dir")
         for name in ("voxels", "side", "window"):
             parser.link_arguments(f"model.{name}", f"data.{name}")
-        parser.link_arguments("data.reports", "model.reports", apply_on="instantiate")
+        if self.model_class is PriorTraining:
+            parser.link_arguments("data.reports", "model.reports", apply_on="instantiate")
+        else:
+            parser.link_arguments("model.factor", "data.factor")
 
     def instantiate_trainer(self, **kwargs) -> lightning.Trainer:
         return super().instantiate_trainer(logger=CSVLogger(self._get(self.config, "out"), name="logs"), **kwargs)
@@ -316,7 +150,7 @@ def main(args: list[str] | None = None) -> None:
         if given[:1] == ["export"]:
             auto_cli(export_prior, args=given[1:], as_positional=False, exit_on_error=False)
         else:
-            PriorCLI(PriorTraining, PriorData, args=args, seed_everything_default=0,
+            PriorCLI(*STAGES[stage_of(given)], args=args, seed_everything_default=0,
                      save_config_kwargs={"overwrite": True}, parser_kwargs={"exit_on_error": False, "description": (
                          "Train a prior of chest CT. A third command, `train.py export --checkpoint <last.ckpt> --out "
                          "<prior.safetensors>`, writes what a training learnt as a prior for reconstruction.")})

@@ -29,8 +29,10 @@ FLOORS = {
     "prior": 2, "datasets": 2, "reconstructor": 2,
     "posterior": 3, "baselines": 3, "evaluation": 3,
     "methods": 4, "dry_run": 4, "datamodule": 4, "case_results": 4, "reconstruction_data": 4, "training": 4,
+    "prior_training": 4, "stage_training": 4, "super_resolution_data": 4, "super_resolution_training": 4,
     "throughput": 4, "inference": 4}
-LIGHTNING = ("datamodule", "reconstruction_data", "throughput", "training", "inference")
+LIGHTNING = ("datamodule", "super_resolution_data", "reconstruction_data", "throughput", "stage_training",
+             "prior_training", "super_resolution_training", "training", "inference")
 CONFIGS = {folder: sorted((ROOT / "configs" / folder).glob("*.yaml"))
            for folder in ("prior", "reconstruct", "geometry", "simulate")}
 
@@ -130,7 +132,8 @@ def prior_training(tmp_path, monkeypatch):
     """Builds train.py's command line from configurations, on two phantoms and one CPU process, with nothing run."""
     monkeypatch.chdir(tmp_path)
     return lambda *configs: training.PriorCLI(
-        training.PriorTraining, training.PriorData, run=False, save_config_callback=None,
+        *training.STAGES[training.stage_of([f"--config={config}" for config in configs])], run=False,
+        save_config_callback=None,
         args=[*(f"--config={config}" for config in configs), "--data.phantoms=2", "--data.validation_phantoms=1",
               "--trainer.accelerator=cpu", "--trainer.devices=1"])
 

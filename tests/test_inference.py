@@ -23,13 +23,13 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from phydict.baselines import SIRT
-from phydict.datasets import load_xrays, phantom_case, save_xrays
+from phydict.datasets import load_xrays, phantom_case, prepare_ct, save_xrays
 from phydict.evaluation import volume_metrics
 from phydict.grid import Grid
 from phydict.inference import main
 from phydict.methods import reconstruct, reconstructor
 from phydict.posterior import PriorOnly
-from phydict.prior import Prior, VolumeUNet, save_prior
+from phydict.prior import LocalUNet, Prior, SuperResolution, VolumeUNet, save_prior, save_super_resolution
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import ConeBeam, Polychromatic, Projector
 from phydict.xray.geometry_files import write_beam
@@ -113,6 +113,15 @@ def prior(tmp_path_factory) -> Path:
     file = tmp_path_factory.mktemp("prior") / "tiny.safetensors"
     save_prior(Prior(VolumeUNet(channels=(8, 8), attention=(False, True), head_channels=8), Grid.cube(16),
                      HUWindow()), file)
+    return file
+
+
+@pytest.fixture(scope="module")
+def fine(tmp_path_factory) -> Path:
+    """An untrained super-resolution stage from 16^3 to 32^3 voxels."""
+    torch.manual_seed(0)
+    file = tmp_path_factory.mktemp("fine") / "fine.safetensors"
+    save_super_resolution(SuperResolution(LocalUNet(2, 1, 2, (8, 8)), Grid.cube(32), HUWindow(), 2), file)
     return file
 
 
@@ -570,6 +579,31 @@ def test_a_bad_prior_is_one_sentence(case, prior, measured, tmp_path, capsys):
     said = refusal(capsys, with_prior("predict", tmp_path / "out", file, f"--data.xrays={measured}"))
     assert all(word in said for word in words), said
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("guided", [True, False])
+def test_a_second_stage_is_scored_on_the_fine_grid(guided, prior, fine, cts, tmp_path):
+    main(with_prior("test", tmp_path, prior, f"--data.cts={cts / 'a.nii.gz'}", *ORBIT,
+                    f"--model.super_resolution={fine}", f"--model.guide_fine={guided}", "--model.fine_memory=1"))
+    folder = tmp_path / "prior_only" / "a"
+    found, said = nibabel.load(folder / "volume.nii.gz"), record(folder)
+    assert found.shape == (32, 32, 32) and found.header.get_zooms() == (12.0, 12.0, 12.0)
+    truth = prepare_ct(cts / "a.nii.gz", Grid.cube(32))
+    scores = volume_metrics(torch.from_numpy(volume(folder).copy())[None, None],
+                            HUWindow().to_hu(truth["volume"])[None])
+    assert said["scores"]["psnr"] == pytest.approx(float(scores["psnr"]), rel=1e-3)
+    assert said["settings"]["super_resolution"] == "fine.safetensors"
+    assert said["settings"]["second"]["class"] == ("SplitGibbs" if guided else "PriorOnly")
+
+
+def test_stages_in_each_others_place_are_one_sentence(prior, fine, measured, tmp_path, capsys):
+    data = f"--data.xrays={measured}"
+    said = refusal(capsys, with_prior("predict", tmp_path / "out", fine, data))
+    assert "fine.safetensors' is a super-resolution stage, but a base prior" in said
+    said = refusal(capsys, with_prior("predict", tmp_path / "out", prior, data, f"--model.super_resolution={prior}"))
+    assert "is a base prior, but a super-resolution stage" in said
+    said = refusal(capsys, sirt("predict", tmp_path / "out", data, f"--model.super_resolution={fine}"))
+    assert "SIRT has none" in said
 
 
 def test_a_prior_without_text_says_that_it_reads_no_report(prior, measured, tmp_path, capsys):

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from phydict.diffusion import Denoiser
+from phydict.grid import Grid
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.sampler import Sampler
 from phydict.posterior.split_gibbs import SplitGibbs, noise_like
@@ -18,7 +19,7 @@ from phydict.units import MU_WATER
 from phydict.xray import Projector
 
 
-class _Counted:
+class Counted:
     """A denoiser that counts its calls."""
 
     def __init__(self, denoiser: Denoiser):
@@ -45,6 +46,11 @@ class Posterior(Reconstructor):
     bf16: bool = True
 
     @property
+    def grid(self) -> Grid:
+        """Where the reconstructed volumes live."""
+        return self.prior.grid
+
+    @property
     def full_detector(self) -> bool:
         return self.sampler.full_detector
 
@@ -60,7 +66,7 @@ class Posterior(Reconstructor):
                 f"the prior was trained on {prior.grid.shape} voxels of {prior.grid.spacing} mm, but the X-rays are "
                 f"projected from {projector.grid.shape} voxels of {projector.grid.spacing} mm: use the prior's grid")
         with watch.stage("prepare"):
-            denoiser = _Counted(prior.bind(report, self.guidance, self.bf16))
+            denoiser = Counted(prior.bind(report, self.guidance, self.bf16))
             measurement = Measurement(projector, xrays, prior.window, display, self.mu_water)
             draw = torch.Generator().manual_seed(seed)
             state = torch.empty(1, prior.state_channels, *prior.grid.shape, device=xrays.device)

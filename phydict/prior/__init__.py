@@ -1,9 +1,14 @@
-"""The diffusion prior of CT: network, report encoder, and the file that keeps them with their grid and HU window."""
+"""The diffusion prior of CT: networks, report encoder, cascade, and their files with grid and HU window."""
 
-from phydict.prior.checkpoint import describe, load_prior, save_prior
+from phydict.prior.cascade import Cascade
+from phydict.prior.checkpoint import (
+    describe, describe_super_resolution, load_prior, load_super_resolution, save_prior, save_super_resolution)
+from phydict.prior.local_unet import LocalUNet
 from phydict.prior.prior import STATE, BoundPrior, Prior
+from phydict.prior.super_resolution import SuperResolution
 from phydict.prior.text import TextEncoder, learn_vocabulary
 from phydict.prior.unet import VolumeUNet
 
-__all__ = ["STATE", "BoundPrior", "Prior", "TextEncoder", "VolumeUNet", "describe", "learn_vocabulary",
-           "load_prior", "save_prior"]
+__all__ = ["STATE", "BoundPrior", "Cascade", "LocalUNet", "Prior", "SuperResolution", "TextEncoder", "VolumeUNet",
+           "describe", "describe_super_resolution", "learn_vocabulary", "load_prior", "load_super_resolution",
+           "save_prior", "save_super_resolution"]

@@ -12,12 +12,17 @@ from torch import Tensor
 
 from phydict.diffusion import CosineSchedule
 from phydict.grid import Grid
+from phydict.prior.local_unet import LocalUNet
 from phydict.prior.prior import STATE, Prior
+from phydict.prior.super_resolution import SuperResolution
 from phydict.prior.text import TextEncoder
 from phydict.prior.unet import VolumeUNet
 from phydict.units import HUWindow
 
 FORMAT = 1
+
+STAGES = {"base": "a base prior", "super_resolution": "a super-resolution stage"}
+"""What a file's header may call it, and what that is; a header that says nothing is of a base prior."""
 
 
 def save_prior(prior: Prior, path: str | Path, training: dict | None = None, dtype: torch.dtype = torch.float16):
@@ -28,14 +33,23 @@ def save_prior(prior: Prior, path: str | Path, training: dict | None = None, dty
     """
     if prior.text is None and prior.load_text is not None:
         prior.text = prior.load_text()
-    header = {"phydict": json.dumps(describe(prior) | {"training": training or {}})}
     weights = prior.state_dict()
     if prior.text is not None and prior.text.source:  # a pretrained BERT is named, not copied
         weights = {k: w for k, w in weights.items() if not k.startswith("text.")}
-    path = Path(path)
+    _write(Path(path), describe(prior) | {"training": training or {}}, weights, dtype)
+
+
+def save_super_resolution(fine: SuperResolution, path: str | Path, training: dict | None = None,
+                          dtype: torch.dtype = torch.float16):
+    """Writes `fine` to one .safetensors file, as `save_prior` does."""
+    _write(Path(path), describe_super_resolution(fine) | {"training": training or {}}, fine.state_dict(), dtype)
+
+
+def _write(path: Path, header: dict, weights: dict[str, Tensor], dtype: torch.dtype) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(".partial")
-    save_file({k: w.detach().to("cpu", dtype).contiguous() for k, w in weights.items()}, partial, header)
+    save_file({k: w.detach().to("cpu", dtype).contiguous() for k, w in weights.items()}, partial,
+              {"phydict": json.dumps(header)})
     partial.replace(path)
 
 
@@ -47,9 +61,19 @@ def describe(prior: Prior) -> dict:
                 "layers": text.bert.config.num_hidden_layers,
                 "vocabulary": None if text.source else text.vocabulary,
                 **({"padded_to": text.padded_to} if text.padded_to else {})}
-    return {"format": FORMAT, "grid": prior.grid.to_dict(), "hu_window": [prior.window.low, prior.window.high],
-            "state": STATE[:prior.network.state_channels], "sigma_data": prior.sigma_data, "skip_std": prior.skip_std,
-            "schedule": vars(prior.schedule), "network": prior.network.settings, "text": text}
+    return {"format": FORMAT, "stage": "base", "grid": prior.grid.to_dict(),
+            "hu_window": [prior.window.low, prior.window.high], "state": STATE[:prior.network.state_channels],
+            "sigma_data": prior.sigma_data, "skip_std": prior.skip_std, "schedule": vars(prior.schedule),
+            "network": prior.network.settings, "text": text}
+
+
+def describe_super_resolution(fine: SuperResolution) -> dict:
+    """What a super-resolution stage is, as plain JSON values, for `build_super_resolution`."""
+    return {"format": FORMAT, "stage": "super_resolution", "grid": fine.grid.to_dict(),
+            "hu_window": [fine.window.low, fine.window.high], "factor": fine.factor,
+            "state": STATE[:fine.state_channels], "coarse_state": STATE[:fine.coarse_channels],
+            "detail_std": fine.detail_std, "skip_std": fine.skip_std, "schedule": vars(fine.schedule),
+            "network": fine.network.settings}
 
 
 def load_prior(path: str | Path, device: str = "cpu") -> Prior:
@@ -59,6 +83,28 @@ def load_prior(path: str | Path, device: str = "cpu") -> Prior:
     when it is truncated or is no phydict prior.
     """
     path = Path(path)
+    header, weights = _read(path, "base", device)
+    try:
+        prior = build_prior(header, weights)
+    except ValueError as error:
+        raise ValueError(f"'{path}' contradicts itself: {error}") from error
+    if header["text"]:
+        prior.load_text = lambda: _load_text(path, header["text"])
+    return prior.to(device).eval().requires_grad_(False)
+
+
+def load_super_resolution(path: str | Path, device: str = "cpu") -> SuperResolution:
+    """The super-resolution stage in a file written by `save_super_resolution`; otherwise as `load_prior`."""
+    header, weights = _read(Path(path), "super_resolution", device)
+    try:
+        fine = build_super_resolution(header, weights)
+    except ValueError as error:
+        raise ValueError(f"'{path}' contradicts itself: {error}") from error
+    return fine.to(device).eval().requires_grad_(False)
+
+
+def _read(path: Path, stage: str, device: str) -> tuple[dict, dict[str, Tensor]]:
+    """Header and weights, but those of a text encoder, of a file that must be of one of STAGES."""
     if not path.is_file():
         raise FileNotFoundError(f"no prior at '{path}': give the .safetensors file that training wrote")
     try:
@@ -70,13 +116,16 @@ def load_prior(path: str | Path, device: str = "cpu") -> Prior:
                          "or export it from its training checkpoint") from error
     if header.get("format") != FORMAT:
         raise ValueError(f"'{path}' carries no phydict prior of format {FORMAT}: give a file that save_prior wrote")
-    try:
-        prior = build_prior(header, weights)
-    except ValueError as error:
-        raise ValueError(f"'{path}' contradicts itself: {error}") from error
-    if header["text"]:
-        prior.load_text = lambda: _load_text(path, header["text"])
-    return prior.to(device).eval().requires_grad_(False)
+    check_stage(header, stage, f"'{path}'")
+    return header, weights
+
+
+def check_stage(header: dict, stage: str, name: str) -> None:
+    """Raises ValueError where the header of the file `name` is of another stage."""
+    found = header.get("stage", "base")
+    if found != stage:
+        raise ValueError(f"{name} is {STAGES.get(found, found)}, but {STAGES[stage]} is needed here: give the file of "
+                         "that stage")
 
 
 def build_prior(header: dict, weights: dict[str, Tensor]) -> Prior:
@@ -92,6 +141,22 @@ def build_prior(header: dict, weights: dict[str, Tensor]) -> Prior:
     except (KeyError, TypeError, RuntimeError) as error:
         raise ValueError(f"the weights are not those of the network that the header describes ({error})") from error
     return prior
+
+
+def build_super_resolution(header: dict, weights: dict[str, Tensor]) -> SuperResolution:
+    """The stage that `describe_super_resolution` described, with these weights.
+
+    Raises ValueError where header and weights do not fit together.
+    """
+    try:
+        fine = SuperResolution(
+            LocalUNet(**header["network"]), Grid(**header["grid"]), HUWindow(*header["hu_window"]), header["factor"],
+            len(header["coarse_state"]), CosineSchedule(**header["schedule"]), header["detail_std"],
+            header["skip_std"])
+        fine.load_state_dict({k: w.float() for k, w in weights.items()})
+    except (KeyError, TypeError, RuntimeError) as error:
+        raise ValueError(f"the weights are not those of the network that the header describes ({error})") from error
+    return fine
 
 
 def build_text(text: dict, weights: dict[str, Tensor]) -> TextEncoder:

@@ -72,6 +72,12 @@ class Prior(nn.Module):
         inward = (s**2 + (a * self.sigma_data) ** 2).rsqrt()
         return share * x / a + out * self.network(inward * x, t, context).to(x.dtype)
 
+    def network_inputs(self, shape: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
+        """Zeros on the default device, laid out as what the network is given for one state of `shape` voxels."""
+        length = self.text.length if self.text is not None else 1
+        return (torch.zeros(1, self.state_channels, *shape), torch.zeros(1),
+                torch.zeros(1, length, self.network.context_dim))
+
     def preconditioning(self, t: Tensor) -> tuple[Tensor, Tensor]:
         """At times t (B,): the share of x_t / a in the estimate, and the scale of the network's output."""
         sigma = self.schedule.sigma(t.double()).float().view(-1, 1, 1, 1, 1)

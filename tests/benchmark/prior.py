@@ -17,7 +17,7 @@ from phydict.datasets import find_cts, phantom_case, prepare_ct
 from phydict.diffusion import renoise
 from phydict.evaluation import write_csv
 from phydict.methods import DEFAULT_PRIOR
-from phydict.training import NOISE_LEVELS
+from phydict.stage_training import NOISE_LEVELS
 
 if __name__ == "__main__":
     prior = load_prior(sys.argv[1] if len(sys.argv) > 1 else DEFAULT_PRIOR)

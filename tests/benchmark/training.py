@@ -101,7 +101,8 @@ def peak_mib() -> float:
 def measure(name: str, cases: list[dict]) -> dict:
     """One row of the table, and the losses."""
     loader = DataLoader(cases * (BATCH * (STEPS + WARM_UP) // len(cases)), BATCH)
-    flop = sample_flop(new_task().prior)
+    prior = new_task().prior
+    flop = sample_flop(prior, prior.grid.shape)
     low = torch.bfloat16 if "bf16" in name else torch.float32
     peak = matmul_peak(torch.device("cpu"), low)
     before = peak_mib()

@@ -9,7 +9,7 @@ import torch
 from transformers import BertConfig, BertForMaskedLM
 
 from phydict.grid import Grid
-from phydict.prior import Prior, TextEncoder, VolumeUNet, learn_vocabulary
+from phydict.prior import LocalUNet, Prior, SuperResolution, TextEncoder, VolumeUNet, learn_vocabulary
 from phydict.units import HUWindow
 
 REPORTS = ["Small nodule in the left upper lobe.", "No focal consolidation; cardiomegaly.",
@@ -27,6 +27,18 @@ def tiny_prior(text: bool = True, voxels: int = 16, seed: int = 0) -> Prior:
         prior = Prior(network, Grid.cube(voxels), HUWindow(-1000, 600), encoder)
         torch.nn.init.normal_(prior.null)
     return prior.eval().requires_grad_(False)
+
+
+def tiny_super_resolution(voxels: int = 32, factor: int = 2, seed: int = 0, **settings) -> SuperResolution:
+    """A super-resolution stage for `tiny_prior`, untrained, whose network answers to all that it is told."""
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        network = LocalUNet(2, 1, 2, (8, 8))
+        for weight in network.parameters():
+            if weight.ndim > 1 and not weight.any():
+                torch.nn.init.normal_(weight, std=0.1)
+        fine = SuperResolution(network, Grid.cube(voxels), HUWindow(-1000, 600), factor, **settings)
+    return fine.eval().requires_grad_(False)
 
 
 def write_cxr_bert(folder: Path, positions: int = 64, told_positions: int = 64, seed: int = 0) -> BertForMaskedLM:

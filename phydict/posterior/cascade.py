@@ -1,0 +1,109 @@
+"""Reconstruction with a cascade: on the base prior's grid first, then on the fine one, where X-rays may guide again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from phydict.grid import Grid
+from phydict.posterior.likelihood import ProximalCG
+from phydict.posterior.measurement import Measurement
+from phydict.posterior.posterior import Counted, Posterior
+from phydict.posterior.sampler import PriorOnly, Sampler
+from phydict.posterior.split_gibbs import SplitGibbs, noise_like
+from phydict.prior import Cascade
+from phydict.reconstructor import Reconstruction, Reconstructor, Stopwatch, misfits
+from phydict.units import MU_WATER
+from phydict.xray import Projector, binned, binning
+
+
+@dataclass(frozen=True)
+class CascadePosterior(Reconstructor):
+    """Samples p(x | Y, report) under a cascade: the base stage by `sampler`, then the fine stage given its estimate.
+
+    guide_fine: whether the X-rays guide the fine stage too, by `fine_sampler`, as in the paper; else `unguided` samples
+    it from the base estimate alone, as in the authors' release. noise: level of the Gaussian noise that the base
+    estimate is given before the fine stage sees it, in [0, 1] (noise augmentation): more trusts it less. The rest as
+    for Posterior; a base sampler that wants the full detector gives it to both stages.
+
+    Of each result, volume and misfit are the fine stage's; masks that it does not make are the base stage's, upsampled.
+    """
+
+    cascade: Cascade
+    sampler: Sampler = field(default_factory=SplitGibbs)
+    guide_fine: bool = True
+    fine_sampler: Sampler = SplitGibbs(
+        iterations=4, warm_start=0.3, last=0.15, fresh_noise=0.0, prior_std=0.1,
+        final_likelihood=ProximalCG(iterations=10, restarts=2))
+    unguided: Sampler = PriorOnly(20)
+    noise: float = 0.05
+    guidance: float = 1.0
+    mu_water: float = MU_WATER
+    name: str = "phydict"
+    bf16: bool = True
+
+    def __post_init__(self):
+        if not 0 <= self.noise <= 1:
+            raise ValueError(f"the noise of the base estimate is a level in [0, 1], but {self.noise} was given")
+
+    @property
+    def grid(self) -> Grid:
+        """Where the reconstructed volumes live."""
+        return self.cascade.fine.grid
+
+    @property
+    def full_detector(self) -> bool:
+        return self.sampler.full_detector or self.second.full_detector
+
+    @property
+    def second(self) -> Sampler:
+        """What samples the fine stage."""
+        return self.fine_sampler if self.guide_fine else self.unguided
+
+    def steps(self) -> int:
+        return self.sampler.steps() + self.second.steps()
+
+    @torch.no_grad()
+    def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,
+                    seed: int = 0, on_step: Callable[[], None] = lambda: None) -> Reconstruction:
+        fine, watch = self.cascade.fine, Stopwatch()
+        if not fine.grid.same_as(projector.grid):
+            raise ValueError(
+                f"the super-resolution stage makes {fine.grid.shape} voxels of {fine.grid.spacing} mm, but the X-rays "
+                f"are projected from {projector.grid.shape} voxels of {projector.grid.spacing} mm: use its grid")
+        with watch.stage("base"):
+            base = self._base(xrays, projector, report, display, seed, on_step)
+        with watch.stage("prepare"):
+            draw = torch.Generator().manual_seed(seed + 1)
+            state = torch.cat([fine.window.to_range(base.volume)[None], 2 * base.masks - 1])[None].to(xrays)
+            state = state[:, :fine.coarse_channels]
+            denoiser = Counted(fine.bind(state + self.noise * noise_like(state, draw), self.noise, self.bf16))
+            measurement = Measurement(projector, xrays, fine.window, display, self.mu_water)
+            x = noise_like(torch.empty(1, fine.state_channels, *fine.grid.shape, device=xrays.device), draw)
+        with watch.stage("sample"):
+            state = self.second.sample(denoiser, measurement, x, draw, on_step)
+        with watch.stage("score"):
+            ct = state[:, :1]
+            measurement.calibrate(ct)
+            reprojection = measurement.project(ct)[0].cpu()
+            measured = measurement.y[0].cpu()
+            masks = interpolate(base.masks[None], fine.grid.shape, mode="trilinear")[0]
+            masks[:fine.state_channels - 1] = ((state[0, 1:] + 1) / 2).cpu()
+        return Reconstruction(
+            volume=fine.window.to_hu(ct[0, 0]).cpu(), grid=fine.grid, method=self.name, seed=seed,
+            **misfits(reprojection, measured), seconds=watch.seconds, xrays=measured, reprojection=reprojection,
+            network_calls=base.network_calls + denoiser.calls,
+            projector_calls=base.projector_calls + measurement.calls, masks=masks)
+
+    def _base(self, xrays: Tensor, projector: Projector, report: str, display: bool, seed: int,
+              on_step: Callable[[], None]) -> Reconstruction:
+        """The base stage's reconstruction, from X-rays binned to what its grid can hold."""
+        prior, beam = self.cascade.base, projector.beam
+        factor = 1 if self.sampler.full_detector else binning(prior.grid, beam)
+        coarse = Projector(prior.grid, beam.binned(factor), device=xrays.device, full_detector=True)
+        posterior = Posterior(prior, self.sampler, self.guidance, self.mu_water, self.name, self.bf16)
+        return posterior.reconstruct(binned(xrays, factor), coarse, report, display, seed, on_step)

@@ -1,0 +1,82 @@
+"""The network of the super-resolution stage: a UNet that sees only a voxel's neighbourhood."""
+
+from __future__ import annotations
+
+import torch
+from einops import rearrange
+from monai.networks.nets import DiffusionModelUNet
+from torch import Tensor, nn
+from torch.nn.functional import layer_norm
+
+
+class PositionNorm(nn.Module):
+    """Normalisation over the channels of each position. Unlike group normalisation it looks at no other position."""
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.weight, self.bias = nn.Parameter(torch.ones(channels)), nn.Parameter(torch.zeros(channels))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """x (B, C, X, Y, Z) -> the same shape."""
+        return layer_norm(x.movedim(1, -1), self.weight.shape, self.weight, self.bias, 1e-6).movedim(-1, 1)
+
+
+class LocalUNet(nn.Module):
+    """MONAI's DiffusionModelUNet on blocks of `block`^3 voxels, without attention and normalised position by position.
+
+    Its result at a voxel depends on voxels up to `reach` away alone, so that it runs on crops and tiles as on a whole
+    volume; it learns from crops whose border is no part of the anatomy.
+
+    in_channels, out_channels: per voxel. channels: width of each level. res_blocks: residual blocks per level.
+    Spatial sizes must be divisible by block * 2^(levels - 1).
+    """
+
+    def __init__(self, in_channels: int = 2, out_channels: int = 1, block: int = 4,
+                 channels: tuple[int, ...] = (64, 96), res_blocks: int = 1):
+        super().__init__()
+        self.settings = {"in_channels": in_channels, "out_channels": out_channels, "block": block,
+                         "channels": list(channels), "res_blocks": res_blocks}
+        self.in_channels, self.out_channels, self.block = in_channels, out_channels, block
+        self.divisor = block * 2 ** (len(channels) - 1)
+        self.fold = nn.Conv3d(in_channels * block**3 + 1, channels[0], 1)
+        self.unet = DiffusionModelUNet(
+            spatial_dims=3, in_channels=channels[0], out_channels=channels[0], channels=tuple(channels),
+            attention_levels=(False,) * len(channels), num_res_blocks=res_blocks, norm_num_groups=1,
+            num_head_channels=channels[-1])
+        self.unet.middle_block.attention = nn.Identity()
+        for module in list(self.unet.modules()):
+            for name, child in module.named_children():
+                if isinstance(child, nn.GroupNorm):
+                    setattr(module, name, PositionNorm(child.num_channels))
+        self.unfold = nn.Conv3d(channels[0], out_channels * block**3, 1)
+        # MONAI's output convolution starts at zero; two zero layers in a row would never learn.
+        nn.init.xavier_uniform_(self.unet.out[-1].conv.weight)
+        nn.init.zeros_(self.unfold.weight)
+        nn.init.zeros_(self.unfold.bias)
+        self.to(memory_format=torch.channels_last_3d)
+
+    @property
+    def reach(self) -> int:
+        """Voxels beyond which nothing changes the result (a bound)."""
+        levels, blocks = len(self.settings["channels"]), self.settings["res_blocks"]
+        positions = 2  # first and last convolution
+        for level in range(levels):
+            bottom = level == levels - 1
+            convolutions = 2 * blocks + 2 * (blocks + 1) + (4 if bottom else 3)  # with middle, or down and up
+            positions += 2**level * convolutions
+        return self.block * (positions + 1) - 1
+
+    @property
+    def bytes_per_voxel(self) -> float:
+        """Memory that a call without gradients takes per voxel, in bytes: about a dozen float32 maps of the top level
+        and the folded input and output."""
+        return 4 * (12 * self.settings["channels"][0] / self.block**3 + 3 * self.in_channels + 2 * self.out_channels)
+
+    def forward(self, x: Tensor, t: Tensor, level: Tensor) -> Tensor:
+        """x (B, in_channels, X, Y, Z), times t (B,) and noise levels (B,) in [0, 1] -> (B, out_channels, X, Y, Z)."""
+        n = self.block
+        h = rearrange(x, "b c (x i) (y j) (z k) -> b (c i j k) x y z", i=n, j=n, k=n)
+        h = torch.cat([h, level.to(h).view(-1, 1, 1, 1, 1).expand(-1, 1, *h.shape[2:])], 1)
+        h = self.fold(h.contiguous(memory_format=torch.channels_last_3d))
+        h = self.unfold(self.unet(h, 1000 * t))
+        return rearrange(h, "b (c i j k) x y z -> b c (x i) (y j) (z k)", i=n, j=n, k=n)

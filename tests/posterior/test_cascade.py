@@ -1,0 +1,150 @@
+"""Reconstruction in two stages: what each is given, what guidance adds, and what a result depends on."""
+
+from dataclasses import dataclass, replace
+
+import pytest
+import torch
+from torch.nn.functional import interpolate
+
+from phydict.diffusion import CosineSchedule, GaussianDenoiser
+from phydict.grid import Grid
+from phydict.posterior import CascadePosterior, Posterior, PriorOnly, ProximalCG, SplitGibbs
+from phydict.prior import Cascade
+from phydict.units import HUWindow
+from phydict.xray import ConeBeam, Projector, binned
+from prior.tiny import tiny_prior, tiny_super_resolution
+
+BEAM = ConeBeam.orbit(4, 1020, 740, (56, 56), 10.0)
+FINE = Grid.cube(32)
+PROJECTOR = Projector(FINE, BEAM, full_detector=True)
+SAMPLER = SplitGibbs(3, ProximalCG(4), ProximalCG(4), warm_start=0.5, last=0.3, fresh_noise=0.0)
+
+
+@dataclass
+class GaussianStage:
+    """A stage in closed form: given the coarse CT, fine ones are N(its upsampling, variance), independent by voxel."""
+
+    variance: float
+    grid = FINE
+    window = HUWindow(-1000, 600)
+    schedule = CosineSchedule(offset=1e-3, floor=1e-6)
+    state_channels, coarse_channels, factor = 1, 1, 2
+
+    def bind(self, coarse, noise=0.0, bf16=None):
+        mean = interpolate(coarse, scale_factor=2, mode="trilinear")
+        return GaussianDenoiser(mean, torch.tensor(self.variance), self.schedule)
+
+
+@pytest.fixture(scope="module")
+def xrays():
+    """Line integrals of a block of soft tissue with a hollow, finer than the base grid."""
+    mu = torch.zeros(1, 1, *FINE.shape)
+    mu[:, :, 6:26, 8:24] = 0.02
+    mu[:, :, 9:14, 12:19, 10:23] = 0.005
+    return PROJECTOR(mu)[0]
+
+
+@pytest.fixture(scope="module")
+def cascade():
+    return Cascade(tiny_prior(False), tiny_super_resolution())
+
+
+def gaussian(variance=1e-2, **settings):
+    return CascadePosterior(Cascade(tiny_prior(False), GaussianStage(variance)), SAMPLER, bf16=False, **settings)
+
+
+def base_alone(xrays, seed=3):
+    """The base stage's reconstruction by itself, in the prior's range, upsampled."""
+    half = BEAM.binned(2)
+    result = Posterior(tiny_prior(False), SAMPLER, bf16=False).reconstruct(
+        binned(xrays, 2), Projector(Grid.cube(16), half, full_detector=True), seed=seed)
+    coarse = HUWindow(-1000, 600).to_range(result.volume)[None, None]
+    return interpolate(coarse, scale_factor=2, mode="trilinear")
+
+
+def test_unguided_and_without_detail_it_is_the_base_stages_result_upsampled(xrays):
+    method = gaussian(1e-12, guide_fine=False, noise=0.0)
+    found = method.reconstruct(xrays, PROJECTOR, seed=3)
+    expected = HUWindow(-1000, 600).to_hu(base_alone(xrays))[0, 0]
+    torch.testing.assert_close(found.volume, expected, atol=0.1, rtol=0)
+    assert found.grid.same_as(FINE)
+
+
+def test_guided_it_is_the_posterior_mean_of_a_gaussian_stage(xrays):
+    """At time 1 the state tells nothing: one likelihood step there ends at the mean of p(x | coarse, Y)."""
+    solve = ProximalCG(iterations=300, restarts=1, noise=1.0, tolerance=1e-7)
+    one = SplitGibbs(1, ProximalCG(), final_likelihood=solve, prior_std=0.1)
+    found = gaussian(0.01, fine_sampler=one, noise=0.0).reconstruct(xrays, PROJECTOR, seed=3)
+    x, mean = HUWindow(-1000, 600).to_range(found.volume)[None, None], base_alone(xrays).clamp(-1, 1)
+    slope, offset = HUWindow(-1000, 600).mu_affine()
+    residual = xrays[None] - PROJECTOR(slope * x + offset)
+    downhill = slope * PROJECTOR.T(residual) + (mean - x) / 0.1**2
+    inside = x.abs() < 1 - 1e-6
+    assert inside.float().mean() > 0.1
+    start = slope * PROJECTOR.T(xrays[None] - PROJECTOR(slope * mean + offset))
+    assert downhill[inside].norm() < 1e-3 * start[inside].norm()
+
+
+def test_the_xrays_guide_the_fine_stage_only_if_asked(xrays):
+    guided, unguided = (gaussian(guide_fine=flag).reconstruct(xrays, PROJECTOR, seed=3) for flag in (True, False))
+    assert guided.misfit < 0.3 * unguided.misfit
+    assert guided.projector_calls > unguided.projector_calls
+
+
+def test_display_values_are_calibrated_at_both_stages(xrays):
+    method = gaussian(noise=0.0)
+    displayed = 7.0 + 3.0 * xrays
+    found = method.reconstruct(displayed, PROJECTOR, display=True, seed=3)
+    assert (found.xrays - found.reprojection).norm() < 0.2 * found.xrays.norm()
+    assert found.xrays.std() == pytest.approx(float(xrays.std()), rel=0.5)
+
+
+@pytest.mark.parametrize("guide", [True, False])
+def test_the_same_seed_gives_the_same_bits_and_another_seed_others(cascade, xrays, guide):
+    method = CascadePosterior(cascade, SAMPLER, guide, unguided=PriorOnly(3))
+    one, again, other = (method.reconstruct(xrays, PROJECTOR, seed=seed) for seed in (3, 3, 4))
+    assert torch.equal(one.volume, again.volume) and torch.equal(one.masks, again.masks)
+    assert not torch.allclose(one.volume, other.volume)
+
+
+def test_in_tiles_the_result_is_that_of_the_whole_within_a_tolerance(cascade, xrays):
+    method = CascadePosterior(cascade, SAMPLER, unguided=PriorOnly(3), bf16=False)
+    tiled = tiny_super_resolution(overlap=8)
+    tiled.memory = int(17**3 * tiled.network.bytes_per_voxel)
+    assert len(tiled.tiles().starts(32)) == 3
+    for guide in (True, False):
+        whole, parts = (replace(method, cascade=Cascade(cascade.base, fine), guide_fine=guide).reconstruct(
+            xrays, PROJECTOR, seed=3).volume for fine in (cascade.fine, tiled))
+        assert 0 < (whole - parts).square().mean().sqrt() < 0.02 * whole.std()
+
+
+def test_the_noise_given_to_the_coarse_volume_is_used_and_told(cascade, xrays):
+    volumes = [CascadePosterior(cascade, SAMPLER, noise=noise).reconstruct(xrays, PROJECTOR, seed=3).volume
+               for noise in (0.0, 0.2)]
+    assert (volumes[0] - volumes[1]).std() > 1
+
+
+def test_all_figures_are_finite_and_belong_to_the_volume(cascade, xrays):
+    calls = []
+    method = CascadePosterior(cascade, SAMPLER, name="both")
+    found = method.reconstruct(xrays, PROJECTOR, on_step=lambda: calls.append(1))
+    assert len(calls) == method.steps() == 3 + 4 and found.method == "both" and found.network_calls == 7
+    assert set(found.seconds) == {"base", "prepare", "sample", "score"}
+    assert found.volume.min() >= -1000 and found.volume.max() <= 600
+    assert found.masks.shape == (3, *FINE.shape) and 0 <= found.masks.min() and found.masks.max() <= 1
+    window = cascade.fine.window
+    again = PROJECTOR(window.to_mu(window.to_range(found.volume))[None, None])[0]
+    torch.testing.assert_close(found.reprojection, again, atol=1e-4, rtol=1e-4)
+
+
+def test_xrays_of_another_grid_are_refused(cascade, xrays):
+    with pytest.raises(ValueError, match=r"\(32, 32, 32\).*\(16, 16, 16\).*use its grid"):
+        CascadePosterior(cascade, SAMPLER).reconstruct(
+            xrays, Projector(Grid.cube(16), BEAM, full_detector=True))
+
+
+def test_a_stage_that_wants_the_full_detector_gets_it(cascade):
+    full = replace(SAMPLER, full_detector=True)
+    assert CascadePosterior(cascade, full).full_detector
+    assert CascadePosterior(cascade, SAMPLER, fine_sampler=full).full_detector
+    assert not CascadePosterior(cascade, SAMPLER, False, fine_sampler=full).full_detector

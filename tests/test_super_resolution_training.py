@@ -1,0 +1,154 @@
+"""Training the super-resolution stage by the same command: it learns, resumes exactly, exports, and is not mistaken."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from phydict.prior import load_super_resolution, save_prior, save_super_resolution
+from phydict.training import SuperResolutionTraining, main, stage_of
+from prior.tiny import tiny_prior, tiny_super_resolution
+
+CONFIG = Path(__file__).parents[1] / "configs" / "prior" / "super_resolution.yaml"
+BASE_CONFIG = CONFIG.with_name("phantom.yaml")
+TINY = ["--model.network.class_path=phydict.prior.LocalUNet", "--model.network.init_args.block=2",
+        "--model.network.init_args.channels=[8,8]", "--model.voxels=32", "--model.factor=2", "--model.warmup=2",
+        "--model.montage_steps=2", "--data.phantoms=2", "--data.validation_phantoms=1", "--data.validation_crops=1",
+        "--data.crop=16", "--data.epoch_size=8", "--data.batch_size=2", "--trainer.accelerator=cpu",
+        "--trainer.devices=1", "--trainer.precision=32", "--trainer.max_steps=-1", "--trainer.log_every_n_steps=1",
+        "--trainer.check_val_every_n_epoch=1", "--trainer.enable_progress_bar=false",
+        "--trainer.enable_model_summary=false"]
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("cache")
+
+
+def arguments(folder: Path, cache: Path, *more: str) -> list[str]:
+    return ["fit", f"--config={CONFIG}", *TINY, f"--data.cache={cache}", f"--out={folder}", *more]
+
+
+@pytest.fixture(scope="module")
+def straight(tmp_path_factory, cache) -> Path:
+    """The folder of an uninterrupted run of two epochs."""
+    folder = tmp_path_factory.mktemp("straight")
+    main(arguments(folder, cache, "--trainer.max_epochs=2"))
+    return folder
+
+
+def rows(folder: Path, key: str) -> list[float]:
+    log = max(folder.glob("logs/**/metrics.csv"), key=lambda path: path.stat().st_mtime_ns)
+    with log.open() as file:
+        return [float(row[key]) for row in csv.DictReader(file) if row[key]]
+
+
+def refusal(capsys, args: list[str]) -> str:
+    """The one sentence on stderr with which the command line refuses `args`."""
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as stopped:
+        main(args)
+    assert stopped.value.code == 2
+    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+    assert len(said) == 1
+    return said[0]
+
+
+def checkpoint(folder: Path) -> dict:
+    return torch.load(folder / "last.ckpt", map_location="cpu", weights_only=True)
+
+
+def test_the_loss_falls(tmp_path, cache):
+    main(arguments(tmp_path, cache, "--trainer.max_epochs=10", "--model.learning_rate=5e-3",
+                   "--trainer.limit_val_batches=0"))
+    loss = rows(tmp_path, "loss")
+    assert len(loss) == 40 and np.mean(loss[-10:]) < 0.8 * np.mean(loss[:5])
+
+
+def test_a_resumed_run_is_the_uninterrupted_one(tmp_path, cache, straight):
+    main(arguments(tmp_path, cache, "--trainer.max_epochs=1"))
+    torch.manual_seed(99)
+    main(arguments(tmp_path, cache, "--trainer.max_epochs=2", f"--ckpt_path={tmp_path / 'last.ckpt'}"))
+    ours, theirs = checkpoint(tmp_path)["state_dict"], checkpoint(straight)["state_dict"]
+    assert all(torch.equal(ours[name], weight) for name, weight in theirs.items())
+    assert rows(tmp_path, "loss") == rows(straight, "loss")[4:]
+
+
+def test_validation_logs_every_noise_level_beside_what_upsampling_lacks(straight):
+    log = next(straight.glob("logs/**/metrics.csv")).read_text().splitlines()[0].split(",")
+    levels = {f"val/rmse_hu_t{t}" for t in (0.1, 0.3, 0.5, 0.7, 0.9)}
+    assert levels | {"val/rmse_hu", "val/rmse_hu_upsampled"} <= set(log)
+    assert len(list(straight.glob("logs/**/samples/*.png"))) == 2
+
+
+def test_an_exported_checkpoint_is_a_stage_with_the_averaged_weights(tmp_path, straight):
+    main(["export", f"--checkpoint={straight / 'last.ckpt'}", f"--out={tmp_path / 'fine.safetensors'}"])
+    fine, averaged = load_super_resolution(tmp_path / "fine.safetensors"), checkpoint(straight)["state_dict"]
+    for name, weight in fine.state_dict().items():
+        assert torch.equal(weight, averaged[f"prior.{name}"].half().float()), name
+    assert fine.grid.shape == (32, 32, 32) and fine.factor == 2 and fine.window.low == -1000
+
+
+def test_what_is_learnt_is_the_detail_of_a_crop_given_its_block_means():
+    task = SuperResolutionTraining(tiny_super_resolution().network, 32, 2, most_noise=0.0)
+    x0 = torch.rand(2, 1, 16, 16, 16)
+    upsampled, level = task._condition({"volume": x0}, x0, _draws())
+    assert torch.equal(upsampled, task.prior.upsample(torch.nn.functional.avg_pool3d(x0, 2))) and not level.any()
+    noisy = SuperResolutionTraining(tiny_super_resolution().network, 32, 2, most_noise=0.4)
+    upsampled, level = noisy._condition({"volume": x0}, x0, _draws())
+    coarse, draws = torch.nn.functional.avg_pool3d(x0, 2), _draws()
+    torch.testing.assert_close(level, torch.cat([0.4 * torch.rand(1, generator=draw) for draw in draws]))
+    added = torch.stack([torch.randn(coarse.shape[1:], generator=draw) for draw in draws]) * level.view(-1, 1, 1, 1, 1)
+    torch.testing.assert_close(upsampled, noisy.prior.upsample(coarse + added))
+    assert 0 < level.min() and level.max() <= 0.4 and level[0] != level[1]
+
+
+def _draws() -> list[torch.Generator]:
+    return [torch.Generator().manual_seed(seed) for seed in (0, 1)]
+
+
+def test_a_checkpoint_of_the_other_stage_is_one_sentence(straight, cache, tmp_path, capsys):
+    args = ["fit", f"--config={BASE_CONFIG}", "--model.network.class_path=phydict.prior.VolumeUNet",
+            "--model.network.init_args.channels=[8,8]", "--model.network.init_args.attention=[false,true]",
+            "--model.network.init_args.head_channels=8", "--model.voxels=16", "--model.text=none", "--data.phantoms=2",
+            "--data.validation_phantoms=0", "--trainer.accelerator=cpu", "--trainer.devices=1",
+            "--trainer.precision=32", f"--data.cache={cache}", f"--out={tmp_path / 'base'}"]
+    said = refusal(capsys, [*args, f"--ckpt_path={straight / 'last.ckpt'}"])
+    assert "super-resolution stage" in said and "base prior is needed" in said
+
+
+@pytest.mark.parametrize("change, words", [
+    (["--data.crop=15"], ["data.crop", "15"]), (["--data.crop=18"], ["18", "divisible by 4"]),
+    (["--model.voxels=34"], ["34", "divisible"]), (["--model.most_noise=2"], ["most_noise"]),
+    (["--stage=fine"], ["fine"]), (["--model.text=none"], ["model.text"]),
+    (["--model.initial={base}"], ["base prior"])],
+    ids=lambda value: value[0].split("=")[0].strip("-") if value[0].startswith("-") else "")
+def test_bad_input_is_one_sentence(change, words, cache, tmp_path, capsys):
+    save_prior(tiny_prior(False), tmp_path / "base.safetensors")
+    change = [text.format(base=tmp_path / "base.safetensors") for text in change]
+    said = refusal(capsys, arguments(tmp_path / "run", cache, "--trainer.max_epochs=1", *change))
+    assert all(word in said for word in words), said
+    assert not list((tmp_path / "run").glob("*.ckpt"))
+
+
+def test_training_goes_on_from_a_stage_and_refuses_one_of_another_grid(tmp_path):
+    path, first = tmp_path / "fine.safetensors", tiny_super_resolution()
+    save_super_resolution(first, path, dtype=torch.float32)
+    task = SuperResolutionTraining(initial=str(path), voxels=32, factor=2, window=(-1000, 600))
+    assert all(torch.equal(weight, first.state_dict()[name]) for name, weight in task.prior.state_dict().items())
+    assert all(weight.requires_grad for weight in task.prior.parameters())
+    with pytest.raises(ValueError, match="another grid"):
+        SuperResolutionTraining(initial=str(path), voxels=64, factor=2, window=(-1000, 600))
+
+
+def test_the_stage_is_the_command_lines_or_the_last_configurations(tmp_path):
+    assert stage_of(["fit", "-c", str(CONFIG)]) == "super_resolution"
+    assert stage_of(["fit", f"--config={BASE_CONFIG}"]) == stage_of([]) == "base"
+    assert stage_of(["fit", "-c", str(CONFIG), "--stage=base"]) == "base"
+    assert stage_of(["fit", "-c", str(CONFIG), "-c", str(BASE_CONFIG)]) == "super_resolution"
+    with pytest.raises(ValueError, match="base and super_resolution, but 'third'"):
+        stage_of(["--stage", "third"])

@@ -25,7 +25,8 @@ def join_report(findings: str | None, impression: str | None) -> str:
 def read_reports(path: str | Path) -> dict[str, str]:
     """Reports by volume name (without .nii.gz) from one CT-RATE CSV, or from all CSVs of a folder.
 
-    Columns VolumeName, Findings_EN, Impressions_EN. Raises FileNotFoundError, and ValueError for missing columns.
+    Columns VolumeName, Findings_EN, Impressions_EN. Raises FileNotFoundError, and ValueError for missing columns and
+    for volumes without a name or with two rows.
     """
     rows = _rows(path, ("VolumeName", "Findings_EN", "Impressions_EN"))
     return {case_id(row["VolumeName"]): join_report(row["Findings_EN"], row["Impressions_EN"]) for row in rows}
@@ -34,7 +35,8 @@ def read_reports(path: str | Path) -> dict[str, str]:
 def read_calibrations(path: str | Path) -> dict[str, Calibration]:
     """HU scale, spacing and orientation by volume name from CT-RATE's metadata CSV, or from all CSVs of a folder.
 
-    Raises FileNotFoundError, and ValueError for missing columns and for numbers that cannot be read.
+    Raises FileNotFoundError, and ValueError for missing columns, numbers that cannot be read and volumes
+    with two rows.
     """
     columns = ("VolumeName", "RescaleSlope", "RescaleIntercept", "XYSpacing", "ZSpacing")
     calibrations = {}
@@ -55,13 +57,26 @@ def _rows(path: str | Path, columns: tuple[str, ...]) -> list[dict[str, str]]:
     files = sorted(path.glob("*.csv")) if path.is_dir() else [path]
     if not files or not files[0].is_file():
         raise FileNotFoundError(f"there is no CSV table at {path}; give a .csv file or a folder that holds some")
-    rows = []
+    rows = {}
     for file in files:
+        for number, row in enumerate(_table(file, columns), 2):
+            id = case_id(row["VolumeName"] or "")
+            if not id:
+                raise ValueError(f"row {number} of {file} has no VolumeName; fill it in or remove that row")
+            if id in rows:
+                raise ValueError(f"{id} has two rows, the second in row {number} of {file}; keep one row per volume")
+            rows[id] = row
+    return list(rows.values())
+
+
+def _table(file: Path, columns: tuple[str, ...]) -> list[dict[str, str]]:
+    try:
         with file.open(newline="", encoding="utf-8-sig") as lines:
             table = csv.DictReader(lines)
-            missing = [name for name in columns if name not in (table.fieldnames or ())]
-            if missing:
-                raise ValueError(f"{file} lacks the columns {', '.join(missing)}; CT-RATE's tables have "
-                                 f"{', '.join(columns)}")
-            rows += table
+            rows, found = list(table), table.fieldnames or ()
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{file} cannot be read as a table ({error}); save it as CSV in UTF-8") from error
+    missing = [name for name in columns if name not in found]
+    if missing:
+        raise ValueError(f"{file} lacks the columns {', '.join(missing)}; CT-RATE's tables have {', '.join(columns)}")
     return rows

@@ -10,6 +10,7 @@
     evaluation       metrics, tables, picture panels                                scores
     methods          the named methods, and `reconstruct` in one call
     dry_run         geometry drawn before anything is reconstructed
+    atomic           files and folders that appear whole or not at all
     case_results     finished cases on disk
     training, inference, datamodule, super_resolution_data, reconstruction_data     Lightning
 """

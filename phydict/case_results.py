@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import errno
 import json
-import os
 import shutil
-import socket
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+from phydict.atomic import remove_leftovers, whole_folder
 from phydict.evaluation import markdown, write_csv
 
 RECORD = "reconstruction.json"
@@ -60,10 +58,7 @@ class CaseResults:
 
     def remove_leftovers(self) -> None:
         """Removes what processes of this machine that are no more had begun to write."""
-        for partial in self.folder.glob(".*.partial"):
-            host, _, process = partial.name.removesuffix(".partial").rpartition(".")
-            if host.endswith("." + socket.gethostname()) and process.isdigit() and not _runs(int(process)):
-                shutil.rmtree(partial, ignore_errors=True)
+        remove_leftovers(self.folder)
 
     def write(self, case: str, record: dict, write_files: Callable[[Path], None]) -> None:
         """Makes a case's folder: `write_files` fills it, the record completes it, then it takes its place.
@@ -71,17 +66,13 @@ class CaseResults:
         Raises OSError, in one sentence, where it cannot be written.
         """
         final = self.folder / case
-        partial = self.folder / f".{case}.{socket.gethostname()}.{os.getpid()}.partial"
         try:
-            partial.mkdir(parents=True, exist_ok=True)
-            write_files(partial)
-            (partial / RECORD).write_text(json.dumps(record, indent=1))
-            _take_place(partial, final)
+            with whole_folder(final) as partial:
+                write_files(partial)
+                (partial / RECORD).write_text(json.dumps(record, indent=1))
         except OSError as error:
             raise OSError(f"the case {final} could not be written ({error.strerror or error}): "
                           "free some space, or give another model.out") from error
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
 
     def discard(self, case: str) -> None:
         """Removes the older result, if any, of a case that was to be overwritten and has failed."""
@@ -103,23 +94,3 @@ class CaseResults:
             (self.folder / "results.md").write_text(markdown(rows))
         return rows
 
-
-def _take_place(partial: Path, final: Path) -> None:
-    while True:  # another process may have finished the same case in the meantime, with the same result
-        try:
-            partial.rename(final)
-            return
-        except OSError as error:
-            if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):
-                raise
-            shutil.rmtree(final)
-
-
-def _runs(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        pass
-    return True

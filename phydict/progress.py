@@ -28,11 +28,11 @@ class CaseProgress:
     def __exit__(self, *_) -> None:
         self.bars.stop()
 
-    def begin(self, name: str, cases: int, steps: int) -> None:
-        """A run over `cases` cases of `steps` steps each."""
+    def begin(self, name: str, cases: int, steps: int = 0, verb: str = "reconstruct") -> None:
+        """A run over `cases` cases of `steps` steps each; 0 where steps are not followed."""
         self.cases = self.bars.add_task(name, total=cases)
-        self.steps = self.bars.add_task("", total=steps)
-        self._line(f"{name}: {cases} {'case' if cases == 1 else 'cases'} to reconstruct")
+        self.steps = self.bars.add_task("", total=steps, visible=steps > 0)
+        self._line(f"{name}: {cases} {'case' if cases == 1 else 'cases'} to {verb}")
 
     def case(self, name: str) -> None:
         """The next case begins."""

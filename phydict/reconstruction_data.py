@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from phydict.datamodule import HELD_OUT_PHANTOM, PHANTOM_VERSION
-from phydict.datasets import CTFile, find_cts, find_xrays, load_xrays, phantom_case, prepare_ct
+from phydict.datasets import CTFile, find_cts, find_xrays, load_case, load_xrays, phantom_case
 from phydict.grid import Grid
 from phydict.reconstructor import describe
 from phydict.units import HUWindow
@@ -108,8 +108,8 @@ class ReconstructionData(lightning.LightningDataModule):
                     task, lambda grid: phantom_case(s, grid, task.window)))
                 for seed in range(HELD_OUT_PHANTOM, HELD_OUT_PHANTOM + self.phantoms)])
         return self._loader([
-            (ct.id, _ct_source(ct), lambda c=ct: self._with_fine(task, lambda grid: prepare_ct(
-                c.path, grid, task.window, id=c.id, calibration=c.calibration)) | {"report": c.report})
+            (ct.id, _ct_source(ct), lambda c=ct: self._with_fine(
+                task, lambda grid: load_case(c, grid, task.window)))
             for ct in self._chosen(find_cts(self.cts, **self.tables))])
 
     def _chosen(self, cts: list[CTFile]) -> list[CTFile]:

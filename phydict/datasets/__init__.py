@@ -2,7 +2,7 @@
 
 from phydict.datasets.anatomy import MASKS, segment
 from phydict.datasets.augment import Augmentation, Deformation, augment
-from phydict.datasets.ct_rate import CTCases, CTFile, find_cts, patient_of, split_by_patient
+from phydict.datasets.ct_rate import CTCases, CTFile, find_cts, load_case, patient_of, split_by_patient
 from phydict.datasets.ct_rate_tables import read_calibrations, read_reports
 from phydict.datasets.findings import Finding
 from phydict.datasets.intensity import Intensity
@@ -13,6 +13,6 @@ from phydict.datasets.thorax import Thorax, report, without, wrong_side
 from phydict.datasets.transforms import Calibration, load_ct, prepare_ct
 
 __all__ = ["Augmentation", "CTCases", "CTFile", "Calibration", "Deformation", "Finding", "Intensity", "MASKS", "Thorax",
-           "augment", "build", "find_cts", "find_xrays", "format_report", "join_report", "load_ct", "load_xrays",
-           "pathology_region", "patient_of", "phantom_case", "prepare_ct", "read_calibrations", "read_reports",
-           "report", "save_xrays", "segment", "split_by_patient", "without", "wrong_side"]
+           "augment", "build", "find_cts", "find_xrays", "format_report", "join_report", "load_case", "load_ct",
+           "load_xrays", "pathology_region", "patient_of", "phantom_case", "prepare_ct", "read_calibrations",
+           "read_reports", "report", "save_xrays", "segment", "split_by_patient", "without", "wrong_side"]

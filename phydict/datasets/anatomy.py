@@ -23,6 +23,8 @@ AIRWAY_BELOW, TRACHEA_BELOW, GAS_MEDIAN = (-700.0, -740.0, -780.0, -820.0, -860.
 LUNG_LITRES, AIRWAY_LITRES = 0.15, 0.1
 CLOSING_MM, SURFACE_MM, AXIS_MM = 8.0, 3.0, 45.0
 TRACHEA_MM2 = (50.0, 800.0)
+BODY_RIM = 2
+"""Voxels by which `_body` is widened before its holes are filled."""
 IN_PLANE = ndimage.generate_binary_structure(3, 1) & np.array([False, True, False])
 
 
@@ -50,10 +52,21 @@ def segment(hu: np.ndarray, spacing) -> tuple[np.ndarray, np.ndarray]:
     return masks, known
 
 
+def body_mask(hu: np.ndarray, spacing) -> np.ndarray:
+    """The body without table and clothes, its lungs filled: (X, Y, Z) bool of `hu` (X, Y, Z) at `spacing` mm."""
+    body = _body(hu, np.broadcast_to(np.asarray(spacing, float), 3))
+    return ndimage.binary_erosion(body, IN_PLANE, iterations=BODY_RIM, border_value=1)
+
+
 def lung_box_centre(lung: np.ndarray, affine: np.ndarray) -> np.ndarray:
     """World position (3,) in mm of the centre of the box around the mask `lung` (X, Y, Z), which must not be empty."""
     middle = [(s.start + s.stop - 1) / 2 for s in _box(lung > 0.5, 0)]
     return affine[:3, :3] @ middle + affine[:3, 3]
+
+
+def lung_box_size(lung: np.ndarray, spacing) -> np.ndarray:
+    """Edge lengths (3,) in mm of the box around the mask `lung` (X, Y, Z), which must not be empty."""
+    return np.array([s.stop - s.start for s in _box(lung > 0.5, 0)]) * spacing
 
 
 def _without_border(air: np.ndarray) -> np.ndarray:
@@ -67,14 +80,14 @@ def _without_border(air: np.ndarray) -> np.ndarray:
 
 
 def _body(hu: np.ndarray, spacing: np.ndarray) -> np.ndarray:
-    """The largest piece of tissue, cut from the table by an opening of 4 mm, with its holes filled slice by slice."""
+    """The largest piece of tissue, cut from the table by an opening of 4 mm, widened, its holes filled by slice."""
     tissue = ndimage.binary_opening(hu > LUNG_BELOW, IN_PLANE, iterations=max(1, round(4 / spacing[:2].min())))
     labels, _ = ndimage.label(tissue)
     size = np.bincount(labels.ravel())
     size[0] = 0
     body = np.zeros(hu.shape, bool) if len(size) < 2 else labels == size.argmax()
     for k in range(hu.shape[2]):
-        body[:, :, k] = ndimage.binary_fill_holes(ndimage.binary_dilation(body[:, :, k], iterations=2))
+        body[:, :, k] = ndimage.binary_fill_holes(ndimage.binary_dilation(body[:, :, k], iterations=BODY_RIM))
     return body
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import warnings
 import zipfile
 import zlib
@@ -10,14 +9,20 @@ from pathlib import Path
 
 import numpy as np
 
+from phydict.atomic import whole_file
+
 
 def write_arrays(file: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Writes under a name of its own first, so that no process ever reads half a file."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    part = file.with_name(f"{file.stem}.{os.getpid()}.part")
-    with part.open("wb") as stream:
-        np.savez_compressed(stream, **arrays)
-    part.replace(file)
+    """Writes `arrays` as one file that appears only when complete, so that no process ever reads half a file.
+
+    Raises OSError, in one sentence, where it cannot be written; nothing of it is left then.
+    """
+    try:
+        with whole_file(file) as part, part.open("wb") as stream:
+            np.savez_compressed(stream, **arrays)
+    except OSError as error:
+        raise OSError(f"the prepared case {file} could not be cached ({error.strerror or error}): "
+                      "free some space, or give another data.cache") from error
 
 
 def read_arrays(file: Path) -> dict[str, np.ndarray] | None:

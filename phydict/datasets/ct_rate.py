@@ -20,6 +20,8 @@ from torch.utils.data import Dataset
 from phydict.datasets.cache import read_arrays, write_arrays
 from phydict.datasets.ct_rate_tables import read_calibrations, read_reports
 from phydict.datasets.natural_order import natural_order
+from phydict.datasets.prepared import VOLUME, is_prepared, read_prepared, read_record
+from phydict.datasets.segmentations import is_segmentation
 from phydict.datasets.transforms import Calibration, case_id, prepare_ct
 from phydict.grid import Grid
 from phydict.units import HUWindow
@@ -61,6 +63,8 @@ def find_cts(root: str | Path, reports: str | Path | None = None, metadata: str 
     fixed: trust the headers; False reads CT-RATE v1 by its metadata. Where the folder holds both versions of a volume,
     the one `fixed` asks for is kept. first_reconstruction: keep one volume per scan. exclude: a text file of volume
     names to leave out (CT-RATE's no_chest_*.txt).
+    Segmentations beside CTs are passed over. Of cases prepared by data/prepare_cts.py the volume alone is taken, with
+    their own ids, and with their own reports where no table has one.
     Ids are file names without ending; outside CT-RATE's names, a file in a subfolder gets `<first subfolder>__<name>`.
     Raises FileNotFoundError where there is no NIfTI, ValueError for ids found twice and v1 volumes without metadata.
     """
@@ -83,7 +87,8 @@ def find_cts(root: str | Path, reports: str | Path | None = None, metadata: str 
     reports = reports or _beside(root, "radiology_text_reports")
     texts = read_reports(reports) if reports else {}
     by_scan = {scan_of(id): text for id, text in texts.items()}
-    cts = [CTFile(files[id], id, texts.get(id, by_scan.get(scan_of(id), ""))) for id in ids]
+    found = {id: texts.get(id, by_scan.get(scan_of(id))) for id in ids}
+    cts = [CTFile(files[id], id, _own_report(files[id]) if text is None else text) for id, text in found.items()]
     return cts if fixed else _calibrated(cts, metadata or _beside(root, "metadata"))
 
 
@@ -106,8 +111,10 @@ def _nifti_files(root: Path) -> list[Path]:
         return [root]
     if not root.is_dir():
         raise FileNotFoundError(f"there is no folder or file {root}; give the folder that holds the CTs")
-    every = [p for p in root.rglob("*") if p.is_file() and not p.name.startswith(".")]
-    found = sorted(p for p in every if p.name.lower().endswith((".nii", ".nii.gz")))
+    every = [p for p in root.rglob("*") if p.is_file()
+             and not any(part.startswith(".") for part in p.relative_to(root).parts)]
+    found = sorted(p for p in every if p.name.lower().endswith((".nii", ".nii.gz")) and not is_segmentation(p)
+                   and (p.name == VOLUME or not is_prepared(p)))
     if not found:
         held = f"its {len(every)} files are of other kinds" if every else "it is empty"
         raise FileNotFoundError(f"there is no .nii or .nii.gz file in {root} ({held}); give a folder of NIfTI CTs")
@@ -115,9 +122,15 @@ def _nifti_files(root: Path) -> list[Path]:
 
 
 def _id(path: Path, root: Path) -> str:
+    if is_prepared(path):
+        return path.absolute().parent.name
     name = case_id(path)
     inner = path.relative_to(root).parts if root.is_dir() else ()
     return name if NAME.fullmatch(name) or len(inner) < 2 else f"{inner[0]}__{name}"
+
+
+def _own_report(path: Path) -> str:
+    return read_record(path)["report"] if is_prepared(path) else ""
 
 
 def _is_fixed(path: Path) -> bool:
@@ -145,6 +158,13 @@ def split_by_patient(ids: list[str], fraction: float, seed: int = 0) -> tuple[li
     return [id for id in ids if patient_of(id) not in held], [id for id in ids if patient_of(id) in held]
 
 
+def load_case(ct: CTFile, grid: Grid, window: HUWindow) -> dict:
+    """The Case of a CT, prepared now or read as it was prepared. Raises what `prepare_ct` and `read_prepared` raise."""
+    case = read_prepared(ct.path, grid, window) if is_prepared(ct.path) else prepare_ct(
+        ct.path, grid, window, id=ct.id, calibration=ct.calibration)
+    return case | {"id": ct.id, "report": ct.report}
+
+
 class CTCases(Dataset):
     """Cases prepared from CT files, one by one when first asked for, then read from a cache folder.
 
@@ -168,8 +188,7 @@ class CTCases(Dataset):
         file = self.cache and self.cache / f"{ct.id}-{self._key(ct)}.npz"
         packed = file and read_arrays(file)
         if packed is None:
-            case = prepare_ct(ct.path, self.grid, self.window, id=ct.id, calibration=ct.calibration)
-            packed = _pack(case)
+            packed = _pack(load_case(ct, self.grid, self.window))
             if file:
                 write_arrays(file, packed)
         return _unpack(packed) | {"id": ct.id, "report": ct.report}

@@ -9,25 +9,22 @@ from pathlib import Path
 from phydict.datasets.reports import join_report
 from phydict.datasets.transforms import Calibration, case_id
 
+
 def read_reports(path: str | Path) -> dict[str, str]:
     """Reports by volume name (without .nii.gz) from one CT-RATE CSV, or from all CSVs of a folder.
 
     Columns VolumeName, Findings_EN, Impressions_EN; a report is laid out by `join_report`. Raises FileNotFoundError,
-    and ValueError for missing columns and for a volume with two different reports.
+    and ValueError for missing columns and for volumes without a name or with two rows.
     """
-    reports = {}
-    for row in _rows(path, ("VolumeName", "Findings_EN", "Impressions_EN")):
-        name, report = case_id(row["VolumeName"]), join_report(row["Findings_EN"], row["Impressions_EN"])
-        if reports.setdefault(name, report) != report:
-            raise ValueError(f"the reports in {path} name {name} twice, with different texts: keep one row of each "
-                             "volume")
-    return reports
+    rows = _rows(path, ("VolumeName", "Findings_EN", "Impressions_EN"))
+    return {case_id(row["VolumeName"]): join_report(row["Findings_EN"], row["Impressions_EN"]) for row in rows}
 
 
 def read_calibrations(path: str | Path) -> dict[str, Calibration]:
     """HU scale, spacing and orientation by volume name from CT-RATE's metadata CSV, or from all CSVs of a folder.
 
-    Raises FileNotFoundError, and ValueError for missing columns and for numbers that cannot be read.
+    Raises FileNotFoundError, and ValueError for missing columns, numbers that cannot be read and volumes
+    with two rows.
     """
     columns = ("VolumeName", "RescaleSlope", "RescaleIntercept", "XYSpacing", "ZSpacing")
     calibrations = {}
@@ -48,13 +45,26 @@ def _rows(path: str | Path, columns: tuple[str, ...]) -> list[dict[str, str]]:
     files = sorted(path.glob("*.csv")) if path.is_dir() else [path]
     if not files or not files[0].is_file():
         raise FileNotFoundError(f"there is no CSV table at {path}; give a .csv file or a folder that holds some")
-    rows = []
+    rows = {}
     for file in files:
+        for number, row in enumerate(_table(file, columns), 2):
+            id = case_id(row["VolumeName"] or "")
+            if not id:
+                raise ValueError(f"row {number} of {file} has no VolumeName; fill it in or remove that row")
+            if id in rows:
+                raise ValueError(f"{id} has two rows, the second in row {number} of {file}; keep one row per volume")
+            rows[id] = row
+    return list(rows.values())
+
+
+def _table(file: Path, columns: tuple[str, ...]) -> list[dict[str, str]]:
+    try:
         with file.open(newline="", encoding="utf-8-sig") as lines:
             table = csv.DictReader(lines)
-            missing = [name for name in columns if name not in (table.fieldnames or ())]
-            if missing:
-                raise ValueError(f"{file} lacks the columns {', '.join(missing)}; CT-RATE's tables have "
-                                 f"{', '.join(columns)}")
-            rows += table
+            rows, found = list(table), table.fieldnames or ()
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{file} cannot be read as a table ({error}); save it as CSV in UTF-8") from error
+    missing = [name for name in columns if name not in found]
+    if missing:
+        raise ValueError(f"{file} lacks the columns {', '.join(missing)}; CT-RATE's tables have {', '.join(columns)}")
     return rows

@@ -24,6 +24,8 @@ from phydict.units import HUWindow
 
 AIR = -1000.0
 SEGMENTATION_MM = 2.0
+LEAST_SLICES = 8
+"""Fewer are a scout or a test image, from which no lungs can be found."""
 UNREADABLE = (OSError, EOFError, ValueError, RuntimeError, zlib.error, nibabel.filebasedimages.ImageFileError)
 
 
@@ -54,8 +56,8 @@ def load_ct(path: str | Path, calibration: Calibration | None = None) -> tuple[n
 
     calibration: for files without a usable header (CT-RATE v1) HU scale and spacing come from it instead.
     Returns HU (X, Y, Z) float32 and the 4x4 index -> world mm affine.
-    Raises FileNotFoundError, and ValueError naming the file where it cannot be read, is not one 3D volume, has no
-    orientation or holds NaN or infinite values.
+    Raises FileNotFoundError, and ValueError naming the file where it cannot be read, is not one 3D volume, has
+    fewer than LEAST_SLICES slices, no orientation, or holds NaN or infinite values.
     """
     path = Path(path)
     if not path.is_file():
@@ -71,15 +73,21 @@ def load_ct(path: str | Path, calibration: Calibration | None = None) -> tuple[n
     except UNREADABLE as error:
         raise ValueError(f"the voxels of {path} cannot be read, the file seems truncated or damaged; "
                          "download or convert it again") from error
-    image = MetaTensor(torch.from_numpy(np.array(stored, np.float32))[None], affine=meta["affine"])
+    hu, affine = np.array(stored, np.float32), meta["affine"]
     if calibration is not None:
-        image = MetaTensor(image.as_tensor() * calibration.slope + calibration.intercept, affine=calibration.affine())
-    image = Orientationd("ct", axcodes="RAS", labels=None)({"ct": image})["ct"]
-    hu, affine = image.as_tensor()[0].numpy(), image.affine.numpy().astype(float)
+        hu, affine = hu * np.float32(calibration.slope) + np.float32(calibration.intercept), calibration.affine()
+    hu, affine = to_ras(hu, affine)
     bad = hu.size - int(np.isfinite(hu).sum())
     if bad:
         raise ValueError(f"{path} holds {bad} NaN or infinite voxels; replace them, by -1000 HU where there is no data")
     return hu, affine
+
+
+def to_ras(volume: np.ndarray, affine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A volume (X, Y, Z) with its axes permuted and flipped to RAS+, without interpolation; and its new affine."""
+    image = MetaTensor(torch.from_numpy(np.ascontiguousarray(volume, np.float32))[None], affine=affine)
+    image = Orientationd("ct", axcodes="RAS", labels=None)({"ct": image})["ct"]
+    return image.as_tensor()[0].numpy(), image.affine.numpy().astype(float)
 
 
 def _check_header(path: Path, header, calibration: Calibration | None) -> None:
@@ -90,6 +98,9 @@ def _check_header(path: Path, header, calibration: Calibration | None) -> None:
         raise ValueError(f"{path} is {len(shape)}D with shape {tuple(shape)}; give one 3D volume per file")
     if min(shape) < 2:
         raise ValueError(f"{path} is a single 2D slice with shape {tuple(shape)}; give a 3D volume")
+    if min(shape) < LEAST_SLICES:
+        raise ValueError(f"{path} has {min(shape)} slices (its shape is {tuple(shape)}), but a chest CT has at least "
+                         f"{LEAST_SLICES}; give the whole series")
     if calibration is not None:
         return
     codes = [int(header[name]) for name in ("sform_code", "qform_code") if name in header]
@@ -183,6 +194,13 @@ def covering_grid(shape, affine: np.ndarray, spacing: float) -> Grid:
     return Grid(tuple(voxels), affine=cover)
 
 
+def centred(grid: Grid, centre: np.ndarray) -> Grid:
+    """`grid` moved so that its centre lies at the world position `centre` (3,) in mm."""
+    affine = grid.affine.copy()
+    affine[:3, 3] += centre - grid.centre
+    return Grid(grid.shape, affine=affine)
+
+
 def case_id(path: str | Path) -> str:
     """A file's name without .nii or .nii.gz."""
     name = Path(path).name
@@ -213,11 +231,10 @@ def prepare_ct(ct: str | Path | tuple[np.ndarray, np.ndarray], grid: Grid = Grid
         centre = affine[:3, :3] @ ((np.asarray(hu.shape) - 1) / 2) + affine[:3, 3]
         warnings.warn(f"no lungs were found in {name}; its volume is centred on the scan and its masks are unknown",
                       stacklevel=2)
-    placed = grid.affine.copy()
-    placed[:3, 3] += centre - grid.centre
-    target = Grid(grid.shape, affine=placed)
+    target = centred(grid, centre)
     volume = window.to_range(to_grid(hu, affine, target, AIR))
     masks = np.stack([to_grid(m, work.affine, target, 0.0) for m in masks]).clip(0, 1)
     return {"id": name, "volume": torch.from_numpy(volume.astype(np.float32))[None],
             "masks": torch.from_numpy(masks.astype(np.float32)), "has_masks": torch.from_numpy(known),
-            "report": report, "affine": torch.from_numpy(placed), "centred_on": "lungs" if known[0] else "volume"}
+            "report": report, "affine": torch.from_numpy(target.affine.copy()),
+            "centred_on": "lungs" if known[0] else "volume"}

@@ -32,7 +32,7 @@ from phydict.evaluation import CaseMetrics, panel, rich_table, volume_metrics
 from phydict.grid import Grid
 from phydict.methods import DEFAULT_PRIOR, fit_to_grid, reconstructor
 from phydict.posterior import Sampler
-from phydict.prior import load_prior
+from phydict.prior import MedSynCheckpoint, fingerprint, load_prior
 from phydict.progress import CaseProgress
 from phydict.reconstruction_data import ReconstructionData
 from phydict.reconstructor import Reconstruction, Reconstructor, describe
@@ -46,7 +46,7 @@ class ReconstructionTask(lightning.LightningModule):
     Args:
         method: a Sampler, which is run with the prior, or a Reconstructor
         name: what tables and folders call the method
-        prior: the prior's file, read where the method is a Sampler
+        prior: the prior's file, or a file or folder of MedSyn's, read where the method is a Sampler
         guidance: scale of classifier-free guidance when a report is given; 1: none
         out: output folder; cases go to <out>/<name>/<case>
         overwrite: do finished cases again, and replace what is in their place
@@ -55,9 +55,10 @@ class ReconstructionTask(lightning.LightningModule):
         side: side of the cube in mm, for methods without a prior
     """
 
-    def __init__(self, method: Sampler | Reconstructor, name: str, prior: str = str(DEFAULT_PRIOR),
-                 guidance: float = 1.0, out: str = "runs/reconstructions", overwrite: bool = False, seed: int = 0,
-                 voxels: int = 64, side: float = 384.0):
+    def __init__(self, method: Sampler | Reconstructor, name: str,
+                 prior: str | MedSynCheckpoint = str(DEFAULT_PRIOR), guidance: float = 1.0,
+                 out: str = "runs/reconstructions", overwrite: bool = False, seed: int = 0, voxels: int = 64,
+                 side: float = 384.0):
         super().__init__()
         self.method_name, self.seed, self.pages = name, seed, Path(out) / "dry_run"
         self.results = CaseResults(Path(out) / name, overwrite)
@@ -67,8 +68,8 @@ class ReconstructionTask(lightning.LightningModule):
         if isinstance(method, Sampler):
             self.prior = load_prior(prior)
             self.grid, self.window = self.prior.grid, self.prior.window
-            self.settings |= {"prior": Path(prior).name, "prior_crc32": zlib.crc32(Path(prior).read_bytes()),
-                              "guidance": guidance}
+            self.settings |= {"prior": Path(prior).name if isinstance(prior, str) else describe(prior),
+                              "prior_crc32": fingerprint(prior), "guidance": guidance}
         self.reconstructor = reconstructor(method, getattr(self, "prior", None), guidance, name)
         self.metrics = CaseMetrics([name])
         self.progress = CaseProgress()

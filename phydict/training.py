@@ -6,7 +6,6 @@ import sys
 import time
 import warnings
 from pathlib import Path
-from pickle import UnpicklingError
 
 import lightning
 import torch
@@ -26,6 +25,7 @@ from phydict.grid import Grid
 from phydict.posterior import descend
 from phydict.prior import Prior, TextEncoder, VolumeUNet, describe, learn_vocabulary, load_prior, save_prior
 from phydict.prior.checkpoint import build_prior, build_text
+from phydict.prior.pretrained import inspect_prior, read_torch
 from phydict.prior.report_training import learn_findings, learn_sketch
 from phydict.units import HUWindow
 
@@ -202,13 +202,11 @@ def _tell(message: str) -> None:
 
 
 def read_checkpoint(path: str | Path) -> dict:
-    """A checkpoint that training wrote. Raises FileNotFoundError, or ValueError when it is truncated or another's."""
+    """A checkpoint that training wrote. Raises FileNotFoundError, or ValueError when it is truncated, holds code or is
+    another's."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"there is no checkpoint {path}: give a .ckpt file that training wrote")
-    try:
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-    except (RuntimeError, EOFError, UnpicklingError) as error:
-        raise ValueError(f"the checkpoint {path} is truncated or damaged: copy it again, or train anew") from error
+    checkpoint = read_torch(path)
     if not isinstance(checkpoint, dict) or "phydict" not in checkpoint:
         raise ValueError(f"{path} is no checkpoint of a prior: give a .ckpt file that training wrote")
     return checkpoint
@@ -232,6 +230,17 @@ def export_prior(checkpoint: str, out: str) -> None:
         prior.text = build_text(header["text"], {k: w for k, w in weights.items() if k.startswith("text.")})
     save_prior(prior, out, header.get("training", {"steps": content["global_step"]}))
     print(f"prior in {out}")
+
+
+def print_prior(path: str) -> None:
+    """Tell what a file or folder is: a prior, a checkpoint of its training, or one of MedSyn's networks, and whether
+    it is whole.
+
+    Args:
+        path: the file or folder
+    """
+    for file, properties in inspect_prior(path).items():
+        print(file, *(f"  {name}: {value}" for name, value in properties.items()), sep="\n")
 
 
 class PriorCLI(LightningCLI):
@@ -283,13 +292,16 @@ class PriorCLI(LightningCLI):
 
 
 def main(args: list[str] | None = None) -> None:
-    """Command line of training: fit, validate, export. A bad input ends in one sentence and exit code 2."""
+    """Command line of training: fit, validate, export, inspect-prior. A bad input ends in one sentence and exit code 2."""
     given = sys.argv[1:] if args is None else args
     with one_sentence_errors(MisconfigurationException, to_go_on="add --ckpt_path and the run's last.ckpt"), quiet():
         if given[:1] == ["export"]:
             auto_cli(export_prior, args=given[1:], as_positional=False, exit_on_error=False)
+        elif given[:1] == ["inspect-prior"]:
+            auto_cli(print_prior, args=given[1:], exit_on_error=False)
         else:
             PriorCLI(PriorTraining, PriorData, args=args, seed_everything_default=0,
                      save_config_kwargs={"overwrite": True}, parser_kwargs={"exit_on_error": False, "description": (
-                         "Train a prior of chest CT. A third command, `train.py export --checkpoint <last.ckpt> --out "
-                         "<prior.safetensors>`, writes what a training learnt as a prior for reconstruction.")})
+                         "Train a prior of chest CT. Two more commands: `train.py export --checkpoint <last.ckpt> --out "
+                         "<prior.safetensors>` writes what a training learnt as a prior for reconstruction, and "
+                         "`train.py inspect-prior <path>` tells what a file or folder is.")})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zlib
 from pathlib import Path
 
 import torch
@@ -12,6 +13,8 @@ from torch import Tensor
 
 from phydict.diffusion import CosineSchedule
 from phydict.grid import Grid
+from phydict.prior.medsyn import MedSynPrior
+from phydict.prior.pretrained import MedSynCheckpoint, is_medsyn, load_medsyn
 from phydict.prior.prior import STATE, Prior
 from phydict.prior.text import TextEncoder
 from phydict.prior.unet import VolumeUNet
@@ -51,12 +54,15 @@ def describe(prior: Prior) -> dict:
             "schedule": vars(prior.schedule), "network": prior.network.settings, "text": text}
 
 
-def load_prior(path: str | Path, device: str = "cpu") -> Prior:
-    """The prior in a .safetensors file written by `save_prior`, ready to denoise (float32, evaluation mode).
+def load_prior(path: str | Path | MedSynCheckpoint, device: str = "cpu") -> Prior | MedSynPrior:
+    """The prior in a .safetensors file written by `save_prior`, or in a file or folder of MedSyn's (`load_medsyn`),
+    ready to denoise (float32, evaluation mode).
 
     The text encoder stays on disk until the first report. Raises FileNotFoundError when there is no file, ValueError
-    when it is truncated or is no phydict prior.
+    when it is truncated or is no prior.
     """
+    if isinstance(path, MedSynCheckpoint) or is_medsyn(path):
+        return load_medsyn(path, device)
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no prior at '{path}': give the .safetensors file that training wrote")
@@ -76,6 +82,17 @@ def load_prior(path: str | Path, device: str = "cpu") -> Prior:
     if header["text"]:
         prior.load_text = lambda: _load_text(path, header["text"])
     return prior.to(device).eval().requires_grad_(False)
+
+
+def fingerprint(path: str | Path | MedSynCheckpoint) -> int:
+    """CRC-32 of the file that `load_prior` reads: two priors with different ones are not the same."""
+    if not isinstance(path, MedSynCheckpoint):
+        path = MedSynCheckpoint(str(path))
+    crc = 0
+    with path.file.open("rb") as file:
+        while chunk := file.read(2**24):
+            crc = zlib.crc32(chunk, crc)
+    return crc
 
 
 def build_prior(header: dict, weights: dict[str, Tensor]) -> Prior:

@@ -87,6 +87,9 @@ class PriorTraining(lightning.LightningModule):
         self.seed, self.last_step_at, self.samples = seed, None, 0
 
     def _start_from(self, prior: Prior, path: str) -> None:
+        if not isinstance(prior, Prior):
+            raise ValueError(f"training goes on from priors of phydict's own, but {path} is MedSyn's: leave out "
+                             "model.initial")
         if not prior.grid.same_as(self.prior.grid) or prior.window != self.prior.window:
             raise ValueError(f"the prior {path} has another grid or HU window than this training: "
                              "set model.voxels, model.side and model.window to its own")
@@ -292,7 +295,7 @@ class PriorCLI(LightningCLI):
 
 
 def main(args: list[str] | None = None) -> None:
-    """Command line of training: fit, validate, export, inspect-prior. A bad input ends in one sentence and exit code 2."""
+    """Command line of training: fit, validate, export, inspect-prior. A bad input ends in one sentence and code 2."""
     given = sys.argv[1:] if args is None else args
     with one_sentence_errors(MisconfigurationException, to_go_on="add --ckpt_path and the run's last.ckpt"), quiet():
         if given[:1] == ["export"]:
@@ -302,6 +305,6 @@ def main(args: list[str] | None = None) -> None:
         else:
             PriorCLI(PriorTraining, PriorData, args=args, seed_everything_default=0,
                      save_config_kwargs={"overwrite": True}, parser_kwargs={"exit_on_error": False, "description": (
-                         "Train a prior of chest CT. Two more commands: `train.py export --checkpoint <last.ckpt> --out "
-                         "<prior.safetensors>` writes what a training learnt as a prior for reconstruction, and "
+                         "Train a prior of chest CT. Two more commands: `train.py export --checkpoint <last.ckpt> "
+                         "--out <prior.safetensors>` writes what a training learnt as a prior for reconstruction, and "
                          "`train.py inspect-prior <path>` tells what a file or folder is.")})

@@ -126,10 +126,10 @@ class MedSynWeights:
         if not stage:
             raise ValueError(f"holds none of MedSyn's networks: of {len(entries)} entries ({listed(entries)}), none is "
                              "denoise_fn.init_conv.weight (stage 1) or denoise_fn.init_conv0.weight (stage 2)")
+        tied = _tie(weights)
         with torch.device("meta"):
             network = (TextUNet if stage == 1 else SuperResolutionUNet)(
                 **_settings(weights, stage), upsample_first=upsample_first)
-        tied = _tie(weights)
         return cls(stage, network, weights, ignored, tied)
 
     @property
@@ -154,13 +154,11 @@ class MedSynWeights:
         return ", ".join(f"{len(names)} {kind} ({listed(names)})" for kind, names in kinds.items() if names)
 
     def loaded(self) -> SliceUNet:
-        """The network with these weights, in float32. Raises ValueError where they do not fit it."""
+        """The network with copies of these weights, in float32. Raises ValueError where they do not fit it."""
         if self.misfits:
             raise ValueError(f"does not fit MedSyn's {STAGES[self.stage]} of width {self.network.widths[0]}: "
                              f"{self.misfits}")
-        single = {}  # keeps one tensor one where its precision changes
-        full = {name: single.setdefault(id(tensor), tensor.float()) for name, tensor in self.weights.items()}
-        self.network.load_state_dict(full, assign=True)
+        self.network.to_empty(device="cpu").load_state_dict(self.weights)
         return self.network
 
 
@@ -221,11 +219,11 @@ def _network(checkpoint: MedSynCheckpoint, stage: int) -> SliceUNet:
     file = checkpoint.file
     entries = read_tensors(file)
     try:
-        sorted_weights = MedSynWeights.sort(entries, checkpoint.upsample_first)
-        if sorted_weights.stage != stage:
-            raise ValueError(f"is MedSyn's {STAGES[sorted_weights.stage]}, but the {STAGES[stage]} is needed here: give "
-                             f"that one ({FOLDERS[stage]} in MedSyn's archive)")
-        return sorted_weights.loaded()
+        found = MedSynWeights.sort(entries, checkpoint.upsample_first)
+        if found.stage != stage:
+            raise ValueError(f"is MedSyn's {STAGES[found.stage]}, but the {STAGES[stage]} is needed here: give that "
+                             f"one ({FOLDERS[stage]} in MedSyn's archive)")
+        return found.loaded()
     except ValueError as error:
         raise ValueError(f"'{file}' {error}") from error
 
@@ -268,6 +266,8 @@ def read_tensors(file: Path, shapes_only: bool = False) -> dict[str, Tensor]:
         except (SafetensorError, OSError) as error:
             raise ValueError(f"'{file}' is truncated or not a safetensors file ({error}): copy it again") from error
     content = read_torch(file)
+    if isinstance(content, dict) and "phydict" in content:
+        raise ValueError(f"'{file}' is a checkpoint of phydict's training: make it a prior with train.py export")
     if not isinstance(content, dict) or not all(isinstance(value, Tensor) for value in content.values()):
         raise ValueError(f"'{file}' holds no dictionary of tensors alone: give a model file of MedSyn's, such as "
                          f"{' or '.join(FILES['ema'])}")

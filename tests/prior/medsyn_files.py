@@ -14,19 +14,19 @@ SMALL = {"width": 8, "multipliers": (1, 2), "heads": 1}
 
 
 def text_unet(seed: int = 0, **settings) -> TextUNet:
-    return _random(TextUNet(**SMALL | {"tokens": 6, "context_dim": 16} | settings), seed)
+    return _random(TextUNet, seed, {"tokens": 6, "context_dim": 16} | settings)
 
 
 def super_resolution_unet(seed: int = 0, **settings) -> SuperResolutionUNet:
-    return _random(SuperResolutionUNet(**SMALL | settings), seed)
+    return _random(SuperResolutionUNet, seed, settings)
 
 
-def _random(network: SliceUNet, seed: int) -> SliceUNet:
-    draw = torch.Generator().manual_seed(seed)
-    with torch.no_grad():
-        for weight in network.parameters():  # gains and biases too, so that none can be mistaken for another
-            noise = torch.randn(weight.shape, generator=draw)
-            weight.copy_(noise / weight[0].numel()**0.5 if weight.ndim > 1 else weight + 0.1 * noise)
+def _random(kind: type[SliceUNet], seed: int, settings: dict) -> SliceUNet:
+    with torch.random.fork_rng(), torch.no_grad():
+        torch.manual_seed(seed)
+        network = kind(**SMALL | settings)
+        for weight in network.parameters():  # gains too, so that none can be mistaken for another
+            weight.add_(0.1 * torch.randn(weight.shape))
     return network.eval().requires_grad_(False)
 
 

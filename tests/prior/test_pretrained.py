@@ -167,6 +167,8 @@ BAD = {
     "one tensor": ("a.bin", lambda file, source: torch.save(torch.zeros(3), file), ["no dictionary of tensors"]),
     "an optimiser": ("optimizer.bin", lambda file, source: torch.save({"state": {}, "groups": [1]}, file),
                      ["no dictionary of tensors"]),
+    "a training": ("a.ckpt", lambda file, source: torch.save({"phydict": {"format": 1}, "state_dict": {}}, file),
+                   ["train.py export"]),
     "another network": ("a.bin", lambda file, source: torch.save({"conv.weight": torch.zeros(3)}, file),
                         ["none of MedSyn's networks", "conv.weight"]),
     "the other stage": ("a.bin", lambda file, source: write(file, entries(super_resolution_unet())),
@@ -198,12 +200,14 @@ def test_a_bad_checkpoint_is_one_sentence_and_never_run(case, source, tmp_path, 
     report = inspect_prior(tmp_path / name)[str(tmp_path / name)]  # says the same, and raises nothing
     if case == "the other stage":
         assert "super-resolution" in report["kind"] and report["fits"] == "yes"
+    elif case == "a training":
+        assert "phydict training checkpoint" in report["kind"]
     else:
         assert report["kind"].startswith("unknown") or report["fits"].startswith("no"), report
 
 
 def test_each_stage_refuses_the_other(source, tmp_path):
-    with pytest.raises(ValueError, match="is MedSyn's 64.3 stage .*, but the 256.3 super-resolution .* results_SR_"):
+    with pytest.raises(ValueError, match="is MedSyn's 64.3 stage .*, but the 256.3 super-resolution .*results_SR_"):
         load_medsyn_super_resolution(write(tmp_path / "one.bin", entries(source)))
 
 
@@ -267,7 +271,7 @@ def test_the_command_line_takes_medsyns_folder_and_its_switches(switch, results,
 
 def test_the_xrays_of_a_ct_are_simulated_on_the_box_of_the_prior():
     """A prior's grid need not be a cube."""
-    data, grid = ReconstructionData(cts="phantom", views=2, detector=(12, 12), pixel=(48.0, 48.0)), Grid((8, 8, 4), 40.0)
+    data, grid = ReconstructionData(cts="phantom", views=2), Grid((8, 8, 4), 40.0)
     seen = []
     data.simulator = lambda projector, mu, seed: seen.append(projector.grid) or mu[0]
     case = {"volume": torch.zeros(1, 8, 8, 4), "fine": torch.zeros(1, 16, 16, 8)}

@@ -11,6 +11,7 @@ import warnings
 import zipfile
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from pickle import UnpicklingError
 
@@ -19,7 +20,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from phydict.prior.medsyn import (
-    HEAD_WIDTH, MedSynPrior, MedSynSuperResolution, SliceUNet, SuperResolutionUNet, TextUNet)
+    GROUPS, HEAD_WIDTH, MedSynPrior, MedSynSuperResolution, SliceUNet, SuperResolutionUNet, TextUNet)
 from phydict.prior.text import TextEncoder
 
 FILES = {"ema": ("model_1.safetensors", "pytorch_model_1.bin"), "online": ("model.safetensors", "pytorch_model.bin")}
@@ -164,18 +165,19 @@ class MedSynWeights:
 
 def _settings(weights: dict[str, Tensor], stage: int) -> dict:
     """The sizes of a network of MedSyn's, from shapes; where a tensor is missing, those of the full-size network."""
-    def shape(name: str, *default: int) -> tuple[int, ...]:
-        return tuple(weights[name].shape) if name in weights else default
+    def size(name: str, axis: int, default: int) -> int:
+        return weights[name].shape[axis] if name in weights and weights[name].ndim > axis else default
 
-    width = shape("init_conv.weight" if stage == 1 else "init_conv0.weight")[0]
-    levels = 1 + max((int(name.split(".")[1]) for name in weights if re.match(r"downs\.\d+\.", name)), default=3)
-    deep = [shape(f"downs.{i}.0.block1.proj.weight", width * 2**i)[0] for i in range(levels)]
-    attention = shape("mid_spatial_attn1.fn.fn.fn.to_qkv.weight" if stage == 1 else
-                      "mid_spatial_attn.fn.fn.fn.to_qkv.weight", 768 if stage == 1 else 384)[0]
-    settings = {"width": width, "multipliers": [max(1, n // width) for n in deep],
-                "heads": max(1, attention // (3 * HEAD_WIDTH))}
+    width = size("init_conv.weight", 0, 160) if stage == 1 else size("init_conv0.weight", 0, 56)
+    if width < GROUPS:
+        raise ValueError(f"is not MedSyn's: its first convolution has {width} channels, but at least {GROUPS} are needed")
+    levels = next(i for i in count(1) if not any(name.startswith(f"downs.{i}.") for name in weights))
+    deep = [size(f"downs.{i}.0.block1.proj.weight", 0, width * 2**i) for i in range(levels)]
+    attention = "mid_spatial_attn1" if stage == 1 else "mid_spatial_attn"
+    inner = size(f"{attention}.fn.fn.fn.to_out.weight", 1, 256 if stage == 1 else 128)
+    settings = {"width": width, "multipliers": [max(1, n // width) for n in deep], "heads": max(1, inner // HEAD_WIDTH)}
     if stage == 1:
-        _, settings["tokens"], settings["context_dim"] = shape("null_cond_emb", 1, 192, 768)
+        settings |= {"tokens": size("null_cond_emb", 1, 192), "context_dim": size("null_cond_emb", 2, 768)}
     return settings
 
 

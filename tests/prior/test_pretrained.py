@@ -181,6 +181,9 @@ BAD = {
     "an unexpected tensor": ("a.safetensors", changed(denoise_fn__extra=torch.zeros(2)), ["1 unexpected (extra)"]),
     "another shape": ("a.bin", changed(denoise_fn__init_conv__bias=torch.zeros(9)),
                       ["1 of another shape (init_conv.bias (9,) instead of (8,))"]),
+    "a scalar": ("a.bin", changed(denoise_fn__downs__0__0__block1__proj__weight=torch.tensor(1.0)),
+                 ["1 of another shape (downs.0.0.block1.proj.weight () instead of (8, 8, 1, 3, 3))"]),
+    "too narrow": ("a.bin", changed(denoise_fn__init_conv__weight=torch.zeros(2, 4, 7, 7, 7)), ["2 channels"]),
     "untied attention": ("a.bin", changed(
         denoise_fn__mid_spatial_attn2__fn__fn__fn__to_qkv__weight=torch.zeros(96, 16)), ["share one to_qkv"]),
 }

@@ -32,7 +32,7 @@ from phydict.evaluation import CaseMetrics, panel, rich_table, volume_metrics
 from phydict.grid import Grid
 from phydict.methods import DEFAULT_PRIOR, fit_to_grid, reconstructor
 from phydict.posterior import CascadePosterior, Sampler
-from phydict.prior import load_prior, load_super_resolution
+from phydict.prior import MedSynCheckpoint, fingerprint, load_prior, load_super_resolution
 from phydict.progress import CaseProgress
 from phydict.reconstruction_data import ReconstructionData
 from phydict.reconstructor import Reconstruction, Reconstructor, describe
@@ -46,7 +46,7 @@ class ReconstructionTask(lightning.LightningModule):
     Args:
         method: a Sampler, which is run with the prior, or a Reconstructor
         name: what tables and folders call the method
-        prior: the prior's file, read where the method is a Sampler
+        prior: the prior's file, or a file or folder of MedSyn's, read where the method is a Sampler
         guidance: scale of classifier-free guidance when a report is given; 1: none
         super_resolution: file of a cascade's second stage, which refines what the prior gives; none given: none
         guide_fine: whether the X-rays guide the second stage too
@@ -60,8 +60,9 @@ class ReconstructionTask(lightning.LightningModule):
         side: side of the cube in mm, for methods without a prior
     """
 
-    def __init__(self, method: Sampler | Reconstructor, name: str, prior: str = str(DEFAULT_PRIOR),
-                 guidance: float = 1.0, super_resolution: str | None = None, guide_fine: bool = True,
+    def __init__(self, method: Sampler | Reconstructor, name: str,
+                 prior: str | MedSynCheckpoint = str(DEFAULT_PRIOR), guidance: float = 1.0,
+                 super_resolution: str | MedSynCheckpoint | None = None, guide_fine: bool = True,
                  fine_sampler: Sampler | None = None, fine_noise: float = 0.05, fine_memory: float = 4.0,
                  out: str = "runs/reconstructions", overwrite: bool = False, seed: int = 0, voxels: int = 64,
                  side: float = 384.0):
@@ -74,8 +75,7 @@ class ReconstructionTask(lightning.LightningModule):
         self.prior = load_prior(prior) if isinstance(method, Sampler) else None
         if self.prior is not None:
             self.grid, self.window = self.prior.grid, self.prior.window
-            self.settings |= {"prior": Path(prior).name, "prior_crc32": zlib.crc32(Path(prior).read_bytes()),
-                              "guidance": guidance}
+            self.settings |= {"prior": _name(prior), "prior_crc32": fingerprint(prior), "guidance": guidance}
         self.fine = None
         if super_resolution:
             self.fine = load_super_resolution(super_resolution)
@@ -84,8 +84,8 @@ class ReconstructionTask(lightning.LightningModule):
         self.reconstructor = reconstructor(method, self.prior, guidance, name, self.fine, guide_fine, fine_sampler,
                                            fine_noise)
         if isinstance(self.reconstructor, CascadePosterior):
-            self.settings |= {"super_resolution": Path(super_resolution).name, "fine_noise": fine_noise,
-                              "super_resolution_crc32": zlib.crc32(Path(super_resolution).read_bytes()),
+            self.settings |= {"super_resolution": _name(super_resolution), "fine_noise": fine_noise,
+                              "super_resolution_crc32": fingerprint(super_resolution),
                               "second": describe(self.reconstructor.second)}
         self.metrics = CaseMetrics([name])
         self.progress = CaseProgress()
@@ -210,6 +210,10 @@ class ReconstructionTask(lightning.LightningModule):
         if missing:
             raise ValueError(f"{len(missing)} of {len(self.cases)} cases were not reconstructed "
                              f"({', '.join(missing)}): see the messages above, and run the same command again")
+
+
+def _name(prior: str | MedSynCheckpoint) -> str | dict:
+    return Path(prior).name if isinstance(prior, str) else describe(prior)
 
 
 def versions() -> dict[str, str]:

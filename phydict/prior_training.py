@@ -80,6 +80,9 @@ class PriorTraining(StageTraining):
         self.text_dropout, self.text_steps = text_dropout, text_steps
 
     def _start_from(self, prior: Prior, path: str) -> None:
+        if not isinstance(prior, Prior):
+            raise ValueError(f"training goes on from priors of phydict's own, but {path} is MedSyn's: leave out "
+                             "model.initial")
         if not prior.grid.same_as(self.prior.grid) or prior.window != self.prior.window:
             raise ValueError(f"the prior {path} has another grid or HU window than this training: "
                              "set model.voxels, model.side and model.window to its own")

@@ -133,7 +133,7 @@ class ReconstructionData(lightning.LightningDataModule):
     def simulate(self, case: dict, seed: int, grid: Grid, window: HUWindow, device: torch.device) -> Tensor:
         """X-rays (K, V, U) of a CT case, made on `device`."""
         source = case.get("fine", case["volume"]).to(device)
-        fine = Grid.cube(source.shape[-1], grid.extent[0])
+        fine = _divided(grid, tuple(source.shape[-3:]))
         return self.simulator(Projector(fine, self.beam, full_detector=True), window.to_mu(source)[None], seed)[0]
 
     def _with_fine(self, task: lightning.LightningModule, make: Callable[[Grid], dict]) -> dict:
@@ -144,7 +144,7 @@ class ReconstructionData(lightning.LightningDataModule):
         if voxels != factor * task.grid.shape[0]:
             raise ValueError(f"data.simulation_voxels must be a multiple of the reconstruction's {task.grid.shape[0]} "
                              f"voxels, but {voxels} was given")
-        fine = make(Grid.cube(voxels, task.grid.extent[0]))["volume"]
+        fine = make(_divided(task.grid, tuple(factor * n for n in task.grid.shape)))["volume"]
         return make(task.grid) | {"fine": fine, "volume": torch.nn.functional.avg_pool3d(fine, factor)}
 
     def transfer_batch_to_device(self, batch: dict, device: torch.device, dataloader_idx: int) -> dict:
@@ -155,6 +155,11 @@ class ReconstructionData(lightning.LightningDataModule):
         cases = Listed([maker for maker in makers if maker[0] in left])
         self.trainer.strategy.barrier()  # every process has looked before any process finishes a case
         return DataLoader(cases, None)
+
+
+def _divided(grid: Grid, shape: tuple[int, int, int]) -> Grid:
+    """The same box in other voxels, centred on the isocentre."""
+    return Grid(shape, tuple(grid.extent / shape))
 
 
 def _ct_source(ct: CTFile) -> str:

@@ -5,10 +5,8 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from pickle import UnpicklingError
 
 import lightning
-import torch
 import yaml
 from jsonargparse import auto_cli
 from lightning.pytorch.callbacks import ModelCheckpoint
@@ -20,6 +18,7 @@ from phydict.command_line import check_writable, one_sentence_errors, quiet
 from phydict.datamodule import PriorData
 from phydict.prior import save_prior, save_super_resolution
 from phydict.prior.checkpoint import build_prior, build_super_resolution, build_text
+from phydict.prior.pretrained import inspect_prior, read_torch
 from phydict.prior_training import PriorTraining
 from phydict.super_resolution_data import SuperResolutionData
 from phydict.super_resolution_training import SuperResolutionTraining
@@ -30,13 +29,11 @@ CHECKPOINT, HELD_OUT = "last.ckpt", "held_out.txt"
 
 
 def read_checkpoint(path: str | Path) -> dict:
-    """A checkpoint that training wrote. Raises FileNotFoundError, or ValueError when it is truncated or another's."""
+    """A checkpoint that training wrote. Raises FileNotFoundError, or ValueError when it is truncated, holds code or is
+    another's."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"there is no checkpoint {path}: give a .ckpt file that training wrote")
-    try:
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-    except (RuntimeError, EOFError, UnpicklingError) as error:
-        raise ValueError(f"the checkpoint {path} is truncated or damaged: copy it again, or train anew") from error
+    checkpoint = read_torch(path)
     if not isinstance(checkpoint, dict) or "phydict" not in checkpoint:
         raise ValueError(f"{path} is no checkpoint of a prior: give a .ckpt file that training wrote")
     return checkpoint
@@ -64,6 +61,17 @@ def export_prior(checkpoint: str, out: str) -> None:
             prior.text = build_text(header["text"], {k: w for k, w in weights.items() if k.startswith("text.")})
         save_prior(prior, out, training)
     print(f"prior in {out}")
+
+
+def print_prior(path: str) -> None:
+    """Tell what a file or folder is: a prior, a checkpoint of its training, or one of MedSyn's networks, and whether
+    it is whole.
+
+    Args:
+        path: the file or folder
+    """
+    for file, properties in inspect_prior(path).items():
+        print(file, *(f"  {name}: {value}" for name, value in properties.items()), sep="\n")
 
 
 STAGES = {"base": (PriorTraining, PriorData), "super_resolution": (SuperResolutionTraining, SuperResolutionData)}
@@ -144,13 +152,16 @@ class PriorCLI(LightningCLI):
 
 
 def main(args: list[str] | None = None) -> None:
-    """Command line of training: fit, validate, export. A bad input ends in one sentence and exit code 2."""
+    """Command line of training: fit, validate, export, inspect-prior. A bad input ends in one sentence and code 2."""
     given = sys.argv[1:] if args is None else args
     with one_sentence_errors(MisconfigurationException, to_go_on="add --ckpt_path and the run's last.ckpt"), quiet():
         if given[:1] == ["export"]:
             auto_cli(export_prior, args=given[1:], as_positional=False, exit_on_error=False)
+        elif given[:1] == ["inspect-prior"]:
+            auto_cli(print_prior, args=given[1:], exit_on_error=False)
         else:
             PriorCLI(*STAGES[stage_of(given)], args=args, seed_everything_default=0,
                      save_config_kwargs={"overwrite": True}, parser_kwargs={"exit_on_error": False, "description": (
-                         "Train a prior of chest CT. A third command, `train.py export --checkpoint <last.ckpt> --out "
-                         "<prior.safetensors>`, writes what a training learnt as a prior for reconstruction.")})
+                         "Train a prior of chest CT. Two more commands: `train.py export --checkpoint <last.ckpt> "
+                         "--out <prior.safetensors>` writes what a training learnt as a prior for reconstruction, and "
+                         "`train.py inspect-prior <path>` tells what a file or folder is.")})

@@ -22,6 +22,7 @@ from phydict.grid import Grid
 from phydict.prior import VolumeUNet, load_prior, save_prior
 from phydict.training import PriorTraining, main
 from phydict.units import HUWindow
+from prior.medsyn_files import entries, text_unet, write
 from prior.tiny import tiny_prior
 
 CONFIG = Path(__file__).parents[1] / "configs" / "prior" / "phantom.yaml"
@@ -50,6 +51,13 @@ def straight(tmp_path_factory, cache) -> Path:
     folder = tmp_path_factory.mktemp("straight")
     main(arguments(folder, cache, "--trainer.max_epochs=2"))
     return folder
+
+
+class Code:
+    """What runs a command when it is unpickled."""
+
+    def __reduce__(self):
+        return os.system, ("exit 1",)
 
 
 def losses(folder: Path, column: str = "loss") -> dict[int, str]:
@@ -242,6 +250,7 @@ def test_a_loader_process_sends_the_message_too(cts, tmp_path, cache, capsys):
 @pytest.mark.parametrize("spoil, words", [
     (lambda file, whole: file.write_bytes(whole[:-1000]), ["truncated"]),
     (lambda file, whole: torch.save({"state_dict": {}}, file), ["no checkpoint of a prior"]),
+    (lambda file, whole: torch.save({"phydict": {}, "code": Code()}, file), ["asks for code (posix.system)"]),
     (lambda file, whole: None, ["there is no checkpoint"]),
 ])
 def test_what_cannot_be_exported_is_one_sentence(spoil, words, straight, tmp_path, capsys):
@@ -250,6 +259,16 @@ def test_what_cannot_be_exported_is_one_sentence(spoil, words, straight, tmp_pat
     said = refusal(capsys, ["export", f"--checkpoint={file}", f"--out={out}"])
     assert all(word in said for word in [*words, "spoilt.ckpt"]), said
     assert not out.exists()
+
+
+def test_inspecting_tells_what_training_and_medsyn_left(straight, tmp_path, capsys):
+    main(["inspect-prior", str(straight / "last.ckpt")])
+    told = capsys.readouterr().out
+    assert told.startswith(f"{straight / 'last.ckpt'}\n  kind: phydict training checkpoint") and "16 x 16 x 16" in told
+    write(tmp_path / "5_ckpt" / "model.safetensors", entries(text_unet()))
+    main(["inspect-prior", str(tmp_path)])
+    assert "kind: MedSyn's 64^3 stage" in capsys.readouterr().out
+    assert "nowhere" in refusal(capsys, ["inspect-prior", str(tmp_path / "nowhere")])
 
 
 @pytest.mark.parametrize("out", ["folder.safetensors", "file/prior.safetensors"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zlib
 from pathlib import Path
 
 import torch
@@ -13,6 +14,8 @@ from torch import Tensor
 from phydict.diffusion import CosineSchedule
 from phydict.grid import Grid
 from phydict.prior.local_unet import LocalUNet
+from phydict.prior.medsyn import MedSynPrior, MedSynSuperResolution
+from phydict.prior.pretrained import MedSynCheckpoint, is_medsyn, load_medsyn, load_medsyn_super_resolution
 from phydict.prior.prior import STATE, Prior
 from phydict.prior.super_resolution import SuperResolution
 from phydict.prior.text import TextEncoder
@@ -76,12 +79,15 @@ def describe_super_resolution(fine: SuperResolution) -> dict:
             "network": fine.network.settings}
 
 
-def load_prior(path: str | Path, device: str = "cpu") -> Prior:
-    """The prior in a .safetensors file written by `save_prior`, ready to denoise (float32, evaluation mode).
+def load_prior(path: str | Path | MedSynCheckpoint, device: str = "cpu") -> Prior | MedSynPrior:
+    """The prior in a .safetensors file written by `save_prior`, or in a file or folder of MedSyn's (`load_medsyn`),
+    ready to denoise (float32, evaluation mode).
 
     The text encoder stays on disk until the first report. Raises FileNotFoundError when there is no file, ValueError
-    when it is truncated or is no phydict prior.
+    when it is truncated or is no prior.
     """
+    if isinstance(path, MedSynCheckpoint) or is_medsyn(path):
+        return load_medsyn(path, device)
     path = Path(path)
     header, weights = _read(path, "base", device)
     try:
@@ -93,8 +99,11 @@ def load_prior(path: str | Path, device: str = "cpu") -> Prior:
     return prior.to(device).eval().requires_grad_(False)
 
 
-def load_super_resolution(path: str | Path, device: str = "cpu") -> SuperResolution:
-    """The super-resolution stage in a file written by `save_super_resolution`; otherwise as `load_prior`."""
+def load_super_resolution(path: str | Path | MedSynCheckpoint,
+                          device: str = "cpu") -> SuperResolution | MedSynSuperResolution:
+    """The super-resolution stage in a file written by `save_super_resolution`, or MedSyn's; as `load_prior`."""
+    if isinstance(path, MedSynCheckpoint) or is_medsyn(path):
+        return load_medsyn_super_resolution(path, device)
     header, weights = _read(Path(path), "super_resolution", device)
     try:
         fine = build_super_resolution(header, weights)
@@ -126,6 +135,17 @@ def check_stage(header: dict, stage: str, name: str) -> None:
     if found != stage:
         raise ValueError(f"{name} is {STAGES.get(found, found)}, but {STAGES[stage]} is needed here: give the file of "
                          "that stage")
+
+
+def fingerprint(path: str | Path | MedSynCheckpoint) -> int:
+    """CRC-32 of the file that `load_prior` reads: two priors with different ones are not the same."""
+    if not isinstance(path, MedSynCheckpoint):
+        path = MedSynCheckpoint(str(path))
+    crc = 0
+    with path.file.open("rb") as file:
+        while chunk := file.read(2**24):
+            crc = zlib.crc32(chunk, crc)
+    return crc
 
 
 def build_prior(header: dict, weights: dict[str, Tensor]) -> Prior:

@@ -1,0 +1,229 @@
+"""MedSyn's networks: exactly its parameters, what each part may and may not see, and where voxels go."""
+
+import hashlib
+
+import pytest
+import torch
+from laws import random_like
+from torch import nn
+from torch.nn.functional import interpolate
+
+from phydict import reconstruct
+from phydict.diffusion import guided
+from phydict.grid import Grid
+from phydict.posterior import PriorOnly, ProximalCG, SplitGibbs
+from phydict.prior import MedSynPrior, MedSynSuperResolution
+from phydict.prior.medsyn import (
+    ChannelNorm, SelfAttention, Sinusoid, SuperResolutionUNet, TextUNet, atlas_grid, from_slices, to_slices)
+from phydict.xray import ConeBeam
+from prior.medsyn_files import super_resolution_unet, text_unet
+
+GRID = Grid((8, 4, 6), (40.0, 80.0, 48.0))
+X = random_like((1, 4, 8, 4, 6), torch.float32, seed=1)
+SLICES = random_like((1, 4, 6, 4, 8), torch.float32, seed=2)
+CONTEXT = random_like((1, 6, 16), torch.float32, seed=3)
+TIME = torch.tensor([0.4])
+
+
+class Words(nn.Module):
+    """Reports -> contexts by their length alone."""
+
+    def forward(self, reports):
+        states = torch.stack([random_like((6, 16), torch.float32, seed=len(report)) for report in reports])
+        return states, torch.ones(states.shape[:2], dtype=torch.bool)
+
+
+def prior(**settings) -> MedSynPrior:
+    return MedSynPrior(text_unet(**settings), Words(), grid=GRID)
+
+
+@pytest.mark.parametrize("kind, parameters, count, digest", [
+    (TextUNet, 716_215_684, 377, "5b8d204876778dbd3ba83e3a842b89b542079cf1cd4319928eff602add8eaf33"),
+    (SuperResolutionUNet, 54_307_908, 317, "cd2d69f28d4c1bf2319f015a969cd13fe0860930f501e5d8bbe351dd1da1a244")])
+def test_the_full_size_networks_have_exactly_medsyns_names_and_shapes(kind, parameters, count, digest):
+    """The digest is of "name<tab>shape" lines of MedSyn's checkpoints, sorted, without the prefix denoise_fn."""
+    with torch.device("meta"):
+        network = kind()
+    assert sum(weight.numel() for weight in network.parameters()) == parameters
+    lines = sorted(f"{name}\t{tuple(weight.shape)}" for name, weight in network.state_dict().items())
+    assert len(lines) == count and hashlib.sha256("\n".join(lines).encode()).hexdigest() == digest
+
+
+@pytest.mark.parametrize("network, condition", [(text_unet, CONTEXT), (super_resolution_unet, SLICES)])
+def test_the_order_of_the_way_up_changes_the_result_but_no_name(network, condition):
+    early, late = network(upsample_first=True), network(upsample_first=False)
+    early.load_state_dict(late.state_dict())
+    difference = early(SLICES, TIME, condition) - late(SLICES, TIME, condition)
+    assert difference.std() > 0.01 * late(SLICES, TIME, condition).std()
+
+
+def test_everything_given_reaches_the_estimate():
+    network, fine = text_unet(), super_resolution_unet()
+    for one, other in (((SLICES, TIME, CONTEXT), (SLICES, TIME, -CONTEXT)),
+                       ((SLICES, TIME, CONTEXT), (SLICES, TIME + 0.1, CONTEXT)),
+                       ((SLICES, TIME, CONTEXT), (-SLICES, TIME, CONTEXT))):
+        assert not torch.allclose(network(*one), network(*other), rtol=1e-3)
+    assert not torch.allclose(fine(SLICES, TIME, SLICES), fine(SLICES, TIME, -SLICES), rtol=1e-3)
+    assert not torch.allclose(fine(SLICES, TIME, 0 * SLICES), fine(0 * SLICES, TIME, SLICES), rtol=1e-3)
+
+
+def test_slices_are_never_downsampled_and_rows_and_columns_are():
+    shapes = []
+    network = text_unet(multipliers=(1, 2, 4))
+    network.mid_block1.register_forward_hook(lambda _, inputs, __: shapes.append(tuple(inputs[0].shape[2:])))
+    network(random_like((1, 4, 5, 8, 12), torch.float32), TIME, CONTEXT)
+    assert shapes == [(5, 2, 3)]
+
+
+def test_the_self_attentions_of_stage_1_are_one_and_its_norms_are_four():
+    network = text_unet()
+    assert len({id(network.get_submodule(f"mid_spatial_attn{n}").fn.fn.fn) for n in (1, 2, 3, 4)}) == 1
+    assert len({id(network.get_submodule(f"mid_spatial_attn{n}").fn.norm) for n in (1, 2, 3, 4)}) == 4
+
+
+def test_self_attention_is_softmax_of_scaled_products_by_head():
+    attention = SelfAttention(16, 2)
+    x = random_like((3, 5, 16), torch.float32)
+    q, k, v = attention.to_qkv(x).chunk(3, dim=2)
+    heads = [(q[..., h] @ k[..., h].mT / 32**0.5).softmax(-1) @ v[..., h] for h in (slice(0, 32), slice(32, 64))]
+    torch.testing.assert_close(attention(x), attention.to_out(torch.cat(heads, 2)))
+
+
+def test_self_attention_stays_in_its_slice_and_knows_no_order_within_it():
+    attend = text_unet().mid_spatial_attn1
+    x = random_like((1, 16, 3, 2, 2), torch.float32)
+    changed = x.clone()
+    changed[:, :, 0] += 1 + random_like((1, 16, 2, 2), torch.float32, seed=9)
+    assert torch.allclose(attend(x)[:, :, 1:], attend(changed)[:, :, 1:], atol=1e-6)
+    assert not torch.allclose(attend(x)[:, :, 0], attend(changed)[:, :, 0], atol=1e-2)
+    torch.testing.assert_close(attend(x.flip(4)), attend(x).flip(4))
+
+
+def test_cross_attention_knows_no_order_of_tokens_and_attends_to_every_one():
+    attend = text_unet().mid_cross_attn1
+    x = random_like((1, 16, 3, 2, 2), torch.float32)
+    torch.testing.assert_close(attend(x, CONTEXT), attend(x, CONTEXT.flip(1)))
+    for token in range(6):
+        without = torch.cat([CONTEXT[:, :token], CONTEXT[:, token + 1:]], 1)
+        assert not torch.allclose(attend(x, CONTEXT), attend(x, without), atol=1e-5)
+
+
+def test_channels_are_normed_voxel_by_voxel():
+    norm = ChannelNorm(16)
+    x = 3 + 5 * random_like((2, 16, 2, 3, 4), torch.float32)
+    torch.testing.assert_close(norm(x).mean(1), torch.zeros(2, 2, 3, 4), atol=1e-5, rtol=0)
+    torch.testing.assert_close(norm(x).square().mean(1), torch.ones(2, 2, 3, 4), atol=1e-4, rtol=0)
+
+
+def test_times_are_sines_then_cosines_of_frequencies_from_one_to_a_ten_thousandth():
+    angle = 250.0 * torch.tensor([1.0, 10000 ** -(1 / 3), 10000 ** -(2 / 3), 1e-4])
+    torch.testing.assert_close(Sinusoid(8)(torch.tensor([250.0])), torch.cat([angle.sin(), angle.cos()])[None],
+                               atol=1e-4, rtol=0)
+
+
+def test_a_voxel_goes_where_medsyn_has_it_and_comes_back():
+    volume = torch.zeros(1, 1, 5, 6, 7)
+    volume[0, 0, 4, 1, 2] = 1  # far right, second from posterior, third from inferior
+    assert to_slices(volume).shape == (1, 1, 7, 6, 5)
+    assert to_slices(volume)[0, 0, 2, 1, 0] == 1  # third from inferior, second from posterior, first from the right
+    assert torch.equal(from_slices(to_slices(volume)), volume)
+
+
+def test_a_prior_shows_its_network_medsyns_axes_and_returns_ours():
+    one, seen = prior(), {}
+    one.network.forward = lambda x, t, context: seen.update(x=x) or x
+    assert torch.equal(one.bind(bf16=False).denoise(X, 0.5), X)
+    assert seen["x"][0, 2, 5, 1, 0] == X[0, 2, 7, 1, 5]
+    fine, coarse = MedSynSuperResolution(super_resolution_unet(), GRID), random_like((1, 4, 2, 1, 3), torch.float32)
+    fine.network.forward = lambda x, t, coarse: coarse
+    x = torch.zeros(1, 4, 8, 4, 12)
+    assert torch.equal(fine.bind(coarse, bf16=False).denoise(x, 0.5), interpolate(coarse, x.shape[2:]))
+
+
+def test_the_atlas_is_316_by_316_by_292_mm_at_both_stages():
+    for voxels in (64, 256):
+        assert atlas_grid(voxels).extent == pytest.approx([316, 316, 292])
+        assert atlas_grid(voxels).centre == pytest.approx([0, 0, 0])
+    with torch.device("meta"):
+        base, fine = MedSynPrior(TextUNet()), MedSynSuperResolution(SuperResolutionUNet())
+    assert base.grid.same_as(atlas_grid(64)) and fine.grid.same_as(atlas_grid(256))
+    assert (base.window.to_hu(-1.0), base.window.to_hu(1.0)) == (-1024, 600) and base.window == fine.window
+    assert tuple(fine.factor * n for n in base.grid.shape) == fine.grid.shape
+
+
+def test_no_report_is_the_learned_context_and_a_report_is_the_encoders():
+    one = prior()
+    both = one.context(["a report", ""])
+    assert torch.equal(both[0], Words()(["a report"])[0][0]) and torch.equal(both[1], one.null[0])
+    assert torch.equal(one.context(["", ""]), one.null.expand(2, -1, -1))
+    bare = MedSynPrior(one.network, lambda reports: Words()(reports)[0], grid=GRID)
+    assert torch.equal(bare.context(["a report"]), one.context(["a report"]))
+
+
+def test_guidance_leads_away_from_the_estimate_without_a_report():
+    one = prior()
+    with_report, without = (one.bind(report, bf16=False).denoise(X, 0.5) for report in ("a report", ""))
+    assert not torch.equal(with_report, without)
+    torch.testing.assert_close(one.bind("a report", 3.0, bf16=False).denoise(X, 0.5),
+                               guided(with_report, without, 3.0))
+    assert torch.equal(one.bind("", 3.0, bf16=False).denoise(X, 0.5), without)
+
+
+@pytest.mark.parametrize("stage", [lambda bf16: prior().bind("a report", bf16=bf16),
+                                   lambda bf16: MedSynSuperResolution(super_resolution_unet(), GRID).bind(
+                                       X[:, :, :2, :1, :2], bf16=bf16)])
+def test_half_precision_changes_the_estimate_slightly(stage):
+    x = random_like((1, 4, 8, 4, 8), torch.float32, seed=4)
+    full, low = stage(False).denoise(x, 0.5), stage(None).denoise(x, 0.5)
+    assert low.dtype == torch.float32
+    assert 0 < (low - full).square().mean().sqrt() < 0.05 * full.std()
+
+
+def test_a_batch_is_denoised_as_its_members_are():
+    x = random_like((2, 4, 8, 4, 6), torch.float32, seed=5)
+    together = prior().bind("a report", bf16=False).denoise(x, 0.7)
+    alone = torch.cat([prior().bind("a report", bf16=False).denoise(part, 0.7) for part in x.split(1)])
+    torch.testing.assert_close(together, alone, atol=1e-5, rtol=1e-4)
+
+
+def test_a_network_can_be_differentiated():
+    x = X.clone().requires_grad_()
+    estimate = prior()(x, TIME, CONTEXT)
+    direction, step = random_like(X.shape, torch.float32, seed=7), 1e-2
+    slope = torch.autograd.grad((estimate * direction).sum(), x)[0]
+    with torch.no_grad():
+        moved = [(prior()(X + s * step * slope, TIME, CONTEXT) * direction).sum() for s in (-1, 1)]
+    assert (moved[1] - moved[0]) / (2 * step) == pytest.approx(float(slope.square().sum()), rel=0.02)
+
+
+BEAM = ConeBeam.orbit(2, 1020.0, 740.0, (12, 12), 48.0)
+
+
+@pytest.mark.parametrize("sampler", [PriorOnly(2), SplitGibbs(2), SplitGibbs(
+    2, warm_start=0.3, last=0.2, fresh_noise=0.0, final_likelihood=ProximalCG(2))], ids=["prior", "ddim", "fast"])
+def test_every_sampler_works_with_it(sampler):
+    result = reconstruct(torch.full((2, 12, 12), 2.0), BEAM, prior(), sampler, report="a report", seed=3)
+    assert result.volume.shape == (8, 4, 6) and -1024 <= result.volume.min() < result.volume.max() <= 600
+    assert result.masks.shape == (3, 8, 4, 6) and result.network_calls == 2
+    again = reconstruct(torch.full((2, 12, 12), 2.0), BEAM, prior(), sampler, report="a report", seed=3)
+    assert torch.equal(result.volume, again.volume)
+
+
+def test_the_second_stage_samples_on_the_fine_voxels_of_a_part():
+    fine = MedSynSuperResolution(super_resolution_unet())
+    denoiser = fine.bind(random_like((1, 4, 2, 1, 2), torch.float32), 0.1, bf16=False)
+    state = PriorOnly(2).sample(denoiser, None, random_like((1, 4, 8, 4, 8), torch.float32, seed=8), None)
+    assert state.shape == (1, 4, 8, 4, 8) and state.isfinite().all() and denoiser.schedule == fine.schedule
+
+
+@pytest.mark.parametrize("wrong, words", [
+    (lambda: MedSynPrior(text_unet(), grid=Grid((8, 5, 6), 1.0)), "divisible by 2, but the grid is"),
+    (lambda: prior().bind(guidance=-1.0), "guidance scale is at least 0"),
+    (lambda: MedSynPrior(text_unet(), grid=GRID).bind("a report"), "no text encoder, but a report was given"),
+    (lambda: MedSynPrior(text_unet(tokens=9), Words(), grid=GRID).bind("a report"), "9 tokens of 16 .* gave .6, 16."),
+    (lambda: MedSynSuperResolution(super_resolution_unet()).bind(X[:, :1]), "whole state"),
+    (lambda: MedSynSuperResolution(super_resolution_unet()).bind(X, noise=1.5), "share of noise"),
+    (lambda: MedSynSuperResolution(super_resolution_unet()).bind(X).denoise(X, 0.5), "the same region")])
+def test_what_does_not_fit_is_refused(wrong, words):
+    with pytest.raises(ValueError, match=words):
+        wrong()

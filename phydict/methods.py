@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from phydict.baselines import SIRT
+from phydict.baselines import CGLS, FDK, FISTATV, SIRT, DiffVox
 from phydict.datasets import format_report
 from phydict.grid import Grid
 from phydict.posterior import (
@@ -27,6 +27,10 @@ METHODS: dict[str, Sampler | Reconstructor] = {
                                 refine_iterations=40, full_detector=True),
     "prior_only": PriorOnly(iterations=50),
     "sirt": SIRT(iterations=300),
+    "fdk": FDK(),
+    "cgls": CGLS(),
+    "tv": FISTATV(),
+    "diffvox": DiffVox(),
 }
 """Settings by name; configs/reconstruct/<name>.yaml holds the same settings for the command line."""
 

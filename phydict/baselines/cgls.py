@@ -13,7 +13,8 @@ from phydict.units import MU_WATER, HUWindow
 
 @dataclass(frozen=True)
 class CGLS(Baseline):
-    """Towards argmin |A mu - y|^2, by conjugate gradients from zero (Hestenes & Stiefel 1952, doi:10.6028/jres.049.044).
+    """Towards argmin |A mu - y|^2, by conjugate gradients from zero (Hestenes & Stiefel 1952,
+    doi:10.6028/jres.049.044).
 
     What the views see best is corrected first, so few iterations regularise and many fit the noise.
     iterations: per restart; window: HU bounds, whose low end of -1000 HU is non-negativity, or None for none. restarts:

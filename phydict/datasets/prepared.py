@@ -5,8 +5,8 @@
     case.json                                    space, box, window, report, source and the row of the summary
 
 In the space `patient` the voxels form a cube along the patient's RAS+ axes. In the space `medsyn` the arrays have
-MedSyn's axes (inferior to superior, posterior to anterior, right to left) and its size in atlas millimetres; the
-headers' sform leads back to the patient's world, their qform (code 5, template) to the atlas, centred on 0.
+MedSyn's axes (inferior to superior, posterior to anterior, right to left) and cover its atlas box; the headers lead
+back to the patient's world, case.json's atlas_affine to atlas millimetres, centred on 0.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ def write_prepared(folder: Path, grid: Grid, images: dict[str, np.ndarray], reco
     if medsyn:
         affine = affine @ _medsyn_index(grid.shape)
         atlas = Grid(grid.shape, np.asarray(record["extent"]) / grid.shape).affine @ _medsyn_index(grid.shape)
+        record = record | {"atlas_affine": atlas.tolist()}
     for name, image in images.items():
         image = np.ascontiguousarray(image[::-1].transpose(2, 1, 0)) if medsyn else image
         if name == "ct":
@@ -47,7 +48,7 @@ def write_prepared(folder: Path, grid: Grid, images: dict[str, np.ndarray], reco
             nifti.set_data_dtype(np.uint8)
         nifti.header.set_xyzt_units("mm", "sec")
         nifti.set_sform(affine, code="scanner")
-        nifti.set_qform(atlas if medsyn else affine, code=5 if medsyn else "scanner")
+        nifti.set_qform(affine, code="scanner")
         nibabel.save(nifti, folder / (VOLUME if name == "ct" else f"{name}.nii.gz"))
     (folder / RECORD).write_text(json.dumps(record, indent=1))
 

@@ -60,11 +60,6 @@ class SuperResolutionTraining(StageTraining):
             raise ValueError("a super-resolution stage is too small to spread its weights over devices: train it with "
                              "configs/prior/ddp.yaml instead of fsdp.yaml")
 
-    def on_fit_start(self) -> None:
-        crop, divisor = self.trainer.datamodule.crop, self.prior.network.divisor
-        if crop % divisor:
-            raise ValueError(f"this network needs crops divisible by {divisor}, but data.crop is {crop}")
-
     def _state(self, batch: dict) -> tuple[Tensor, Tensor]:
         return batch["volume"], torch.ones(len(batch["volume"]), 1, 1, 1, 1, device=self.device)
 

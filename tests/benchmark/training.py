@@ -3,7 +3,8 @@
     python tests/benchmark/training.py [names of the steps to measure, "float32" first]
 
 Every step runs in a process of its own, on the shipped prior, the same phantoms and the CPU. Seconds are the median
-step, after one that compiles and allocates; memory is what the process grew by at its peak, from before its first step. Writes training.csv beside this file.
+step, after one that compiles and allocates; memory is what the process grew by at its peak, from before its first
+step. Writes training.csv beside this file.
 """
 
 import resource

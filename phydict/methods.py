@@ -12,8 +12,8 @@ from phydict.baselines import SIRT
 from phydict.datasets import format_report
 from phydict.grid import Grid
 from phydict.posterior import (
-    DAPS, DDS, DPS, CascadePosterior, DiffPIR, ExactDraw, GradientSteps, PnPDM, Posterior, PriorOnly, ProximalCG, Reward,
-    Sampler, SplitGibbs)
+    DAPS, DDS, DPS, CascadePosterior, DiffPIR, ExactDraw, GradientSteps, PnPDM, Posterior, PriorOnly, ProximalCG,
+    Reward, Sampler, SplitGibbs)
 from phydict.prior import Cascade, Prior, SuperResolution, load_prior, load_super_resolution
 from phydict.reconstructor import Reconstruction, Reconstructor, check_xrays
 from phydict.xray import ConeBeam, Projector, binned, binning

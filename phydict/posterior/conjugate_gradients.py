@@ -22,11 +22,12 @@ def conjugate_gradients(operator: Callable[[Tensor], Tensor], right: Tensor, ite
     energy = right.square().sum(over, keepdim=True)
     stop = energy * tolerance**2
     for _ in range(iterations):
-        active = energy > stop
-        if not active.any():
+        if not (energy > stop).any():
             break
         curved = operator(direction)
-        step = torch.where(active, energy / (direction * curved).sum(over, keepdim=True), 0)
+        curvature = (direction * curved).sum(over, keepdim=True)
+        active = (energy > stop) & (curvature > 0)
+        step = torch.where(active, energy / curvature, 0)
         d, residual = d + step * direction, residual - step * curved
         previous, energy = energy, torch.where(active, residual.square().sum(over, keepdim=True), energy)
         direction = residual + torch.where(active, energy / previous, 0) * direction

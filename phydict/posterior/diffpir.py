@@ -29,9 +29,9 @@ class DiffPIR(Sampler):
     trust noise^2; its covariance is (1 + sqrt(1 - renewed)) / 2 times the posterior's.
 
     iterations: noise levels; spacing: their times are (1 - i / iterations)^spacing, dense near pure noise as
-    published (there called quadratic), even at 1; trust: the published lambda, weight of the prior's estimate; renewed: the published zeta, share of the noise's
-    variance that is new at each level; noise: standard deviation of the line integrals' error; cg_iterations:
-    of conjugate gradients, which take the place of the published closed forms.
+    published (there called quadratic), even at 1; trust: the published lambda, weight of the prior's estimate;
+    renewed: the published zeta, share of the noise's variance that is new at each level; noise: standard deviation of
+    the line integrals' error; cg_iterations: of conjugate gradients, in place of the published closed forms.
     """
 
     citation = ("Zhu et al., Denoising Diffusion Models for Plug-and-Play Image Restoration, CVPR Workshops (NTIRE) "

@@ -82,9 +82,9 @@ class GradientSteps(LikelihoodStep):
     steps: int = 2
     learning_rate: float = 0.1
     rho: float = 1.0
+    reward: Reward = field(default_factory=Reward)
     adam: bool = True
     prior_mean: bool = False
-    reward: Reward = field(default_factory=Reward)
 
     def __call__(self, measurement: Measurement, x0: Tensor, spread: float) -> Tensor:
         with torch.enable_grad():

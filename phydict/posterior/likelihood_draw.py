@@ -30,8 +30,8 @@ class ExactDraw(LikelihoodDraw):
 
     iterations, tolerance: of the conjugate gradients, which start at the perturbed estimate: what the X-rays do not
     see has its full spread at once, and few iterations suffice for the rest. Exact with as many iterations as the
-    operator has singular values. Perturb and optimise: Papandreou & Yuille 2010; Orieux et al. 2012,
-    doi:10.1109/LSP.2012.2189104.
+    operator has singular values. Perturb and optimise: Papandreou & Yuille 2010; cut short, Gilavert et
+    al. 2015, arXiv:1409.0606.
     """
 
     iterations: int = 30

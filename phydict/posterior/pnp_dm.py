@@ -31,7 +31,8 @@ class PnPDM(Sampler):
     those below it; stochastic: whether the prior step draws, as the Gibbs sampler asks, or follows the probability
     flow, which is published too; likelihood: ExactDraw, published for linear operators, or Langevin, for others;
     noise: standard deviation of the line integrals' error; burn_in, thinning: the result is the mean of every
-    `thinning`-th state after the first burn_in ones: the posterior mean. One draw: burn_in = iterations - 1, thinning 1.
+    `thinning`-th state after the first burn_in ones: the posterior mean. For one draw: burn_in iterations - 1 and
+    thinning 1.
 
     With many levels its states tend to p(x | y) for data whose noise has the covariance noise^2 I + rho_min^2 A A'.
     """

@@ -72,7 +72,8 @@ def test_the_result_depends_on_the_seed_alone():
     assert torch.equal(one, sample(settings, seed=3)) and not torch.allclose(one, sample(settings, seed=4))
 
 
-@pytest.mark.parametrize("settings", [{"iterations": 0}, {"trust": 0.0}, {"spacing": -1.0}, {"renewed": 1.5}, {"noise": 0.0}])
+@pytest.mark.parametrize("settings", [
+    {"iterations": 0}, {"trust": 0.0}, {"spacing": -1.0}, {"renewed": 1.5}, {"noise": 0.0}])
 def test_impossible_settings_are_refused(settings):
     with pytest.raises(ValueError, match=str(next(iter(settings.values())))):
         DiffPIR(**settings)

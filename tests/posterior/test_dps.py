@@ -26,12 +26,12 @@ def test_one_level_is_the_denoisers_estimate_pushed_along_the_gradient_of_the_un
     slope = a * V / (a**2 * V + s**2)
     gradient = slope * m.adjoint(residual / residual.norm()) / m.norm()
     found = sample(DPS(1, scale / slope))  # the denoiser's slope is small at pure noise
-    torch.testing.assert_close(found, x0 - scale / slope * gradient, atol=1e-9, rtol=0)
+    torch.testing.assert_close(found, x0 - scale / slope * gradient, atol=1e-7, rtol=0)
     assert (found - x0).norm() > 0.05
 
 
 def test_without_a_push_it_samples_the_prior():
-    found, spread = moments(sample(DPS(200, 0.0), random_like((4000, *SHAPE), seed=11)))
+    found, spread = moments(sample(DPS(800, 0.0), random_like((4000, *SHAPE), seed=11)))
     torch.testing.assert_close(found, denoiser(V).mean.flatten(), atol=0.015, rtol=0)
     assert (spread / V - torch.eye(N).double()).norm() < 0.08 * N**0.5
 

@@ -63,7 +63,7 @@ def test_published_langevin_dynamics_stay_finite_and_pull_towards_the_data():
 
 
 @pytest.mark.parametrize("spread", [TRUE, {}])
-def test_exact_data_are_met_within_the_stated_noise_and_closer_with_more_conjugate_gradients(spread):
+def test_exact_data_are_met_to_the_stated_noise_by_more_levels_and_closer_by_more_conjugate_gradients(spread):
     m, noise = measurement(), 0.05
     m.y = m.project(denoiser(V).mean + V**0.5 * X)
 
@@ -72,7 +72,8 @@ def test_exact_data_are_met_within_the_stated_noise_and_closer_with_more_conjuga
         return float((m.project(sample(settings, 2000, m)) - m.y).square().mean().sqrt())
 
     levels = [misfit(n, 6) for n in (3, 10, 30)]
-    assert all(after < max(before, noise) for before, after in zip([2 * noise, *levels], levels)), levels
+    assert all(after <= max(before, 1.05 * noise) for before, after in zip(levels, levels[1:])), levels
+    assert levels[-1] < 1.05 * noise
     inner = [misfit(10, n) for n in (0, 1, 2, 3)]
     assert all(after < before for before, after in zip(inner, inner[1:])), inner
 

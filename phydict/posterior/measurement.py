@@ -25,8 +25,8 @@ class Measurement:
                  mu_water: float = MU_WATER):
         check_xrays(xrays, projector.beam)
         self.projector, self.display = projector, xrays[None] if display else None
-        self.slope, offset = window.mu_affine(mu_water)
-        self.background = offset * projector(torch.ones(1, 1, *projector.grid.shape).to(xrays))
+        self.slope, self.offset = window.mu_affine(mu_water)
+        self.background = self.offset * projector(torch.ones(1, 1, *projector.grid.shape).to(xrays))
         self.y = xrays[None]
         self.calls = 1
 
@@ -44,6 +44,10 @@ class Measurement:
         """The exact adjoint of `linear`: (B, K, V, U) -> (B, 1, X, Y, Z)."""
         self.calls += 1
         return self.slope * self.projector.T(r)
+
+    def norm(self) -> float:
+        """The largest singular value of `linear`."""
+        return self.slope * self.projector.norm()
 
     def calibrate(self, x: Tensor) -> None:
         """Where the views are display values: refit their gain and offset to the projections of the CT x."""

@@ -54,6 +54,10 @@ class Posterior(Reconstructor):
     def full_detector(self) -> bool:
         return self.sampler.full_detector
 
+    @property
+    def citation(self) -> str:
+        return self.sampler.citation
+
     def steps(self) -> int:
         return self.sampler.steps()
 

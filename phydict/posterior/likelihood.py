@@ -55,18 +55,23 @@ class ProximalCG(LikelihoodStep):
     def _solve(self, measurement: Measurement, residual: Tensor, free: Tensor, weight: float) -> Tensor:
         """Conjugate gradients for (A'A + weight) d = residual over the free voxels, from zero."""
         direction, d = residual.clone(), torch.zeros_like(residual)
-        energy = residual.square().sum()
+        energy = _dot(residual, residual)
         stop = energy * self.tolerance**2
         for _ in range(self.iterations):
-            if energy <= stop:
+            if (energy <= stop).all():
                 break
             curved = (measurement.adjoint(measurement.linear(direction)) + weight * direction) * free
-            step = energy / (direction * curved).sum()
+            step = torch.where(energy > stop, energy / _dot(direction, curved), 0)
             d += step * direction
             residual = residual - step * curved
-            previous, energy = energy, residual.square().sum()
-            direction = residual + (energy / previous) * direction
+            previous, energy = energy, _dot(residual, residual)
+            direction = residual + torch.where(energy > stop, energy / previous, 0) * direction
         return d
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    """Inner products of the states of a batch, (B, 1, 1, 1, 1)."""
+    return (a * b).flatten(1).sum(1).view(-1, 1, 1, 1, 1)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from phydict.xray.calibration import match_views
 class Measurement:
     """Line integrals y (1, K, V, U) and the affine operator P on CT volumes x (B, 1, X, Y, Z) in the prior's range.
 
-    calls: how many times A or its adjoint ran over all views.
+    calls: how many times A or its adjoint ran over all views, per volume of a batch.
     """
 
     def __init__(self, projector: Projector, xrays: Tensor, window: HUWindow, display: bool = False,
@@ -32,17 +32,17 @@ class Measurement:
 
     def project(self, x: Tensor) -> Tensor:
         """P(x): line integrals (B, K, V, U) of the CT x."""
-        self.calls += 1
+        self.calls += len(x)
         return self.slope * self.projector(x) + self.background
 
     def linear(self, d: Tensor) -> Tensor:
         """The linear part of P, for differences d of CTs."""
-        self.calls += 1
+        self.calls += len(d)
         return self.slope * self.projector(d)
 
     def adjoint(self, r: Tensor) -> Tensor:
         """The exact adjoint of `linear`: (B, K, V, U) -> (B, 1, X, Y, Z)."""
-        self.calls += 1
+        self.calls += len(r)
         return self.slope * self.projector.T(r)
 
     def calibrate(self, x: Tensor) -> None:

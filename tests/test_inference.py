@@ -679,3 +679,20 @@ def test_a_disk_that_fills_up_leaves_no_case_that_looks_finished(measured, tmp_p
     assert names(tmp_path / "sirt") == []
     main(args)
     assert names(tmp_path / "sirt") == ["anna", "bert"]
+
+
+def test_several_samples_leave_a_deviation_map_in_the_volumes_place(measured, prior, tmp_path):
+    args = with_prior("predict", tmp_path, prior, f"--data.xrays={measured / 'anna'}", "--model.name=several")
+    main([*args, "--model.samples=2"])
+    folder = tmp_path / "several" / "anna"
+    assert names(folder) == sorted([*FILES, "deviation.nii.gz"])
+    image, ct = (nibabel.load(folder / name) for name in ("deviation.nii.gz", "volume.nii.gz"))
+    assert image.shape == ct.shape and np.array_equal(image.affine, ct.affine)
+    deviation = np.asarray(image.dataobj)
+    assert deviation.min() >= 0 and deviation.max() > 1
+    assert record(folder)["settings"]["samples"] == 2 and record(folder)["network_calls"] == 4
+
+
+def test_samples_of_a_method_without_a_prior_are_refused(capsys, measured, tmp_path):
+    assert "leave samples at 1" in refusal(capsys, sirt("predict", tmp_path, f"--data.xrays={measured}",
+                                                        "--model.samples=3"))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -15,24 +15,33 @@ from phydict.diffusion import Denoiser, ddim
 if TYPE_CHECKING:
     from phydict.posterior.measurement import Measurement
 
+Draw = torch.Generator | Sequence[torch.Generator]
+"""Where noise comes from: one generator, or one for each state of a batch."""
+
 
 class Sampler(ABC):
     """Settings of a sampling method; `sample` turns noise into a clean state.
 
-    full_detector, citation: as for a Reconstructor.
+    full_detector, citation: as for a Reconstructor. batches: whether the states of a batch do not influence each other,
+    so that several samples may be drawn at once, with one generator for each.
     """
 
     full_detector = False
     citation = ""
+    batches = False
 
     @abstractmethod
-    def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, draw: torch.Generator,
+    def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, draw: Draw,
                on_step: Callable[[], None] = lambda: None) -> Tensor:
         """Noise x (B, C, X, Y, Z) at time 1 -> clean states; `draw` is the source of any further noise."""
 
     @abstractmethod
     def steps(self) -> int:
         """How often `sample` calls on_step."""
+
+    def randomised(self) -> Sampler:
+        """The settings of which independent runs differ as far as the posterior is wide; these, unless overridden."""
+        return self
 
 
 @dataclass(frozen=True)
@@ -42,11 +51,12 @@ class PriorOnly(Sampler):
     citation = "Song, Meng & Ermon, Denoising Diffusion Implicit Models, ICLR 2021, arXiv:2010.02502"
 
     iterations: int = 50
+    batches = True
 
     def steps(self) -> int:
         return self.iterations
 
-    def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, draw: torch.Generator,
+    def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, draw: Draw,
                on_step: Callable[[], None] = lambda: None) -> Tensor:
         return descend(denoiser, x, self.iterations, on_step=on_step)
 

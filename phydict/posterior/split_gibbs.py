@@ -11,7 +11,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -19,7 +19,7 @@ from torch import Tensor
 from phydict.diffusion import Denoiser, ddim, renoise
 from phydict.posterior.likelihood import LikelihoodStep, ProximalCG
 from phydict.posterior.measurement import Measurement
-from phydict.posterior.sampler import Sampler, descend
+from phydict.posterior.sampler import Draw, Sampler, descend
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,8 @@ class SplitGibbs(Sampler):
     last: the last level's time (None: levels evenly spaced down to 0);
     fresh_noise: None for the paper's DDIM moves; else each level starts from the estimate with new noise of this
     share of the level's own: 1 decouples the levels, 0 adds none and descends to a point estimate;
+    randomised_noise: the fresh_noise that takes its place where several samples are to show how far they differ;
+    None: the same;
     prior_std: standard deviation of the state, which sets the spread of x0 at each time;
     refine_from: EC's delta in [0, 1), 0 for none; refine_iterations: its noise levels;
     full_detector: meet the X-rays pixel by pixel instead of binned to what the grid can hold;
@@ -48,12 +50,14 @@ class SplitGibbs(Sampler):
     warm_start: float = 1.0
     last: float | None = None
     fresh_noise: float | None = None
+    randomised_noise: float | None = None
     prior_std: float = 0.5
     refine_from: float = 0.0
     refine_iterations: int = 0
     full_detector: bool = False
     clip: bool = True
     at_zero: bool = False
+    batches = True
 
     def __post_init__(self):
         if self.iterations < 1:
@@ -64,8 +68,10 @@ class SplitGibbs(Sampler):
             raise ValueError("a warm_start below 1 needs at least 2 iterations, but 1 was given")
         if self.last is not None and not 0 < self.last <= self.warm_start:
             raise ValueError(f"last is a time above 0 and not above warm_start, but {self.last} was given")
-        if self.fresh_noise is not None and not 0 <= self.fresh_noise <= 1:
-            raise ValueError(f"fresh_noise is a share in [0, 1] or left out, but {self.fresh_noise} was given")
+        for name in ("fresh_noise", "randomised_noise"):
+            share = getattr(self, name)
+            if share is not None and not 0 <= share <= 1:
+                raise ValueError(f"{name} is a share in [0, 1] or left out, but {share} was given")
         if not 0 <= self.refine_from < 1:
             raise ValueError(f"refine_from (the paper's delta) lies in [0, 1), but {self.refine_from} was given")
         if self.refine_from and self.refine_iterations < 1:
@@ -76,13 +82,16 @@ class SplitGibbs(Sampler):
         passes = [self.iterations] + ([self.refine_iterations] if self.refine_from else [])
         return sum(passes) + len(passes) * self.at_zero
 
+    def randomised(self) -> SplitGibbs:
+        return self if self.randomised_noise is None else replace(self, fresh_noise=self.randomised_noise)
+
     def times(self, denoiser: Denoiser) -> list[tuple[float, float]]:
         """The pairs (t, s) of noise levels passed through."""
         if self.warm_start == 1.0:
             return list(denoiser.schedule.steps(self.iterations, last=self.last))
         return [(1.0, self.warm_start), *denoiser.schedule.steps(self.iterations - 1, self.warm_start, self.last)]
 
-    def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, draw: torch.Generator,
+    def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, draw: Draw,
                on_step: Callable[[], None] = lambda: None) -> Tensor:
         schedule = denoiser.schedule
         for t, s in self.times(denoiser):
@@ -113,6 +122,8 @@ class SplitGibbs(Sampler):
         return self.prior_std * s / (s**2 + (a * self.prior_std) ** 2) ** 0.5
 
 
-def noise_like(x: Tensor, draw: torch.Generator) -> Tensor:
+def noise_like(x: Tensor, draw: Draw) -> Tensor:
     """Standard normal noise drawn on the generator's device, so that a result does not depend on x's."""
+    if not isinstance(draw, torch.Generator):
+        return torch.cat([noise_like(one[None], own) for one, own in zip(x, draw, strict=True)])
     return torch.randn(x.shape, generator=draw, dtype=x.dtype).to(x.device)

@@ -41,16 +41,21 @@ def write_prepared(folder: Path, grid: Grid, images: dict[str, np.ndarray], reco
     for name, image in images.items():
         image = np.ascontiguousarray(image[::-1].transpose(2, 1, 0)) if medsyn else image
         if name == "ct":
-            nifti = nibabel.Nifti1Image(np.rint(image).clip(-32768, 32767).astype(np.int16), affine)
+            nifti = nibabel.Nifti1Image(_integers(image).clip(-32768, 32767).astype(np.int16), affine)
             nifti.header["cal_min"], nifti.header["cal_max"] = record["window"]
         else:
-            nifti = nibabel.Nifti1Image(image.clip(0, 1).astype(np.float32), affine)
+            nifti = nibabel.Nifti1Image(_integers(255 * image.clip(0, 1)).astype(np.float32) / 255, affine)
             nifti.set_data_dtype(np.uint8)
         nifti.header.set_xyzt_units("mm", "sec")
         nifti.set_sform(affine, code="scanner")
         nifti.set_qform(affine, code="scanner")
         nibabel.save(nifti, folder / (VOLUME if name == "ct" else f"{name}.nii.gz"))
     (folder / RECORD).write_text(json.dumps(record, indent=1))
+
+
+def _integers(image: np.ndarray) -> np.ndarray:
+    """The nearest integers; a half that averaging left a rounding error beside is a half."""
+    return np.rint(image.round(2))
 
 
 def _medsyn_index(shape) -> np.ndarray:

@@ -35,7 +35,7 @@ from phydict.posterior import CascadePosterior, Sampler
 from phydict.prior import MedSynCheckpoint, fingerprint, load_prior, load_super_resolution
 from phydict.progress import CaseProgress
 from phydict.reconstruction_data import ReconstructionData
-from phydict.reconstructor import Reconstruction, Reconstructor, describe
+from phydict.reconstructor import Reconstruction, Reconstructor, describe, save_nifti
 from phydict.units import HUWindow
 
 class ReconstructionTask(lightning.LightningModule):
@@ -52,6 +52,7 @@ class ReconstructionTask(lightning.LightningModule):
         guide_fine: whether the X-rays guide the second stage too
         fine_sampler: how they do; none given: the cascade's own
         fine_noise: level in [0, 1] of the noise that the prior's estimate is given before the second stage sees it
+        samples: how many are drawn; of several the volume is the mean, and deviation.nii.gz their standard deviation
         fine_memory: GiB that the second stage's network may take; it works in tiles where the whole takes more
         out: output folder; cases go to <out>/<name>/<case>
         overwrite: do finished cases again, and replace what is in their place
@@ -65,7 +66,7 @@ class ReconstructionTask(lightning.LightningModule):
                  super_resolution: str | MedSynCheckpoint | None = None, guide_fine: bool = True,
                  fine_sampler: Sampler | None = None, fine_noise: float = 0.05, fine_memory: float = 4.0,
                  out: str = "runs/reconstructions", overwrite: bool = False, seed: int = 0, voxels: int = 64,
-                 side: float = 384.0):
+                 side: float = 384.0, samples: int = 1):
         super().__init__()
         self.method_name, self.seed, self.pages = name, seed, Path(out) / "dry_run"
         self.results = CaseResults(Path(out) / name, overwrite)
@@ -76,13 +77,15 @@ class ReconstructionTask(lightning.LightningModule):
         if self.prior is not None:
             self.grid, self.window = self.prior.grid, self.prior.window
             self.settings |= {"prior": _name(prior), "prior_crc32": fingerprint(prior), "guidance": guidance}
+            if samples != 1:
+                self.settings["samples"] = samples
         self.fine = None
         if super_resolution:
             self.fine = load_super_resolution(super_resolution)
             self.fine.memory = int(fine_memory * 2**30)
             self.grid = self.fine.grid
         self.reconstructor = reconstructor(method, self.prior, guidance, name, self.fine, guide_fine, fine_sampler,
-                                           fine_noise)
+                                           fine_noise, samples)
         if isinstance(self.reconstructor, CascadePosterior):
             self.settings |= {"super_resolution": _name(super_resolution), "fine_noise": fine_noise,
                               "super_resolution_crc32": fingerprint(super_resolution),
@@ -182,15 +185,18 @@ class ReconstructionTask(lightning.LightningModule):
                 truth: Tensor | None = None) -> None:
         def write_files(folder: Path) -> None:
             result.save_nifti(folder / "volume.nii.gz")
+            if result.deviation is not None:
+                save_nifti(folder / "deviation.nii.gz", result.deviation.numpy(), result.grid)
             panel(folder / "panel.png", result.volume, result.grid, result.xrays, result.reprojection, truth,
-                  title=f"{case['id']}: {self.method_name}")
+                  title=f"{case['id']}: {self.method_name}", deviation_hu=result.deviation)
 
         self.results.write(case["id"], self._record(case, result, scores), write_files)
         self.progress.finished(f"{sum(result.seconds.values()):.1f} s, misfit {result.misfit:.4f}")
 
     def _record(self, case: dict, result: Reconstruction, scores: dict | None) -> dict:
         """All that is known of a finished case, as plain JSON values."""
-        return {"case": case["id"], "method": self.method_name, "scores": scores, "misfit": result.misfit,
+        return {"case": case["id"], "method": self.method_name,
+                "citation": self.reconstructor.citation, "scores": scores, "misfit": result.misfit,
                 "misfit_per_view": result.misfit_per_view, "seconds": result.seconds,
                 "network_calls": result.network_calls, "projector_calls": result.projector_calls,
                 "process_peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,

@@ -12,7 +12,8 @@ from phydict.baselines import CGLS, FDK, FISTATV, SIRT, DiffVox
 from phydict.datasets import format_report
 from phydict.grid import Grid
 from phydict.posterior import (
-    CascadePosterior, GradientSteps, Posterior, PriorOnly, ProximalCG, Reward, Sampler, SplitGibbs)
+    DAPS, DDS, DPS, CascadePosterior, DiffPIR, ExactDraw, GradientSteps, PnPDM, Posterior, PriorOnly, ProximalCG,
+    Reward, Sampler, SplitGibbs)
 from phydict.prior import Cascade, Prior, SuperResolution, load_prior, load_super_resolution
 from phydict.reconstructor import Reconstruction, Reconstructor, check_xrays
 from phydict.xray import ConeBeam, Projector, binned, binning
@@ -20,11 +21,24 @@ from phydict.xray import ConeBeam, Projector, binned, binning
 DEFAULT_PRIOR = Path(__file__).parents[1] / "data" / "prior" / "phydict_64.safetensors"
 """The prior that comes with the project."""
 
+RELEASED_STEPS = GradientSteps(learning_rate=0.01, prior_mean=True, reward=Reward(
+    lpips=0.5, random_backbone=True, dropout=True, squared=0.1, pixel_mean=True, view_sum=True, standardise=True,
+    raw_range=True, renderer="siddon"))
+"""The likelihood step of the authors' release."""
+
 METHODS: dict[str, Sampler | Reconstructor] = {
     "phydict_fast": SplitGibbs(iterations=4, warm_start=0.3, last=0.15, fresh_noise=0.0,
                                final_likelihood=ProximalCG(iterations=10, restarts=5)),
     "phydict_paper": SplitGibbs(iterations=50, likelihood=GradientSteps(reward=Reward(lpips=1.0)), refine_from=0.8,
                                 refine_iterations=40, full_detector=True),
+    "phydict_released": SplitGibbs(
+        iterations=50, likelihood=RELEASED_STEPS, final_likelihood=RELEASED_STEPS, refine_from=0.8,
+        refine_iterations=40, full_detector=True, clip=False, at_zero=True),
+    "daps": DAPS(levels=25, sigma_min=0.02, flow_steps=2, likelihood=ExactDraw(iterations=10), prior_std=0.5),
+    "pnp_dm": PnPDM(iterations=30, decay=0.85, levels=12, likelihood=ExactDraw(iterations=10), burn_in=24, thinning=1),
+    "diffpir": DiffPIR(iterations=100),
+    "dds": DDS(iterations=50),
+    "dps": DPS(iterations=100, scale=3.0),
     "prior_only": PriorOnly(iterations=50),
     "sirt": SIRT(iterations=300),
     "fdk": FDK(),
@@ -38,13 +52,14 @@ METHODS: dict[str, Sampler | Reconstructor] = {
 def reconstructor(method: str | Sampler | Reconstructor, prior: Prior | str | Path | None = None,
                   guidance: float = 1.0, name: str | None = None,
                   super_resolution: SuperResolution | str | Path | None = None, guide_fine: bool = True,
-                  fine_sampler: Sampler | None = None, fine_noise: float = 0.05) -> Reconstructor:
+                  fine_sampler: Sampler | None = None, fine_noise: float = 0.05, samples: int = 1) -> Reconstructor:
     """A method ready to reconstruct: a name of METHODS, a sampler (which needs a prior), or a Reconstructor.
 
     prior: a Prior or the file it is in; None for the shipped one. It is only loaded by methods that need it. name: what
     the result calls the method (None: its own name).
     super_resolution: the second stage of a cascade, or its file; None reconstructs on the prior's own grid. guide_fine:
     whether the X-rays guide that stage too; fine_sampler: how (None: CascadePosterior's own); fine_noise: its noise.
+    samples: how many to draw; of several, the result is the mean, with their standard deviation as a map of trust.
     """
     if isinstance(method, str):
         if method not in METHODS:
@@ -54,6 +69,9 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: Prior | str | Pa
         if super_resolution is not None:
             raise ValueError(f"super_resolution refines what a prior gives, but {type(method).__name__} has none: "
                              "leave it out, or use a method with a prior")
+        if samples != 1:
+            raise ValueError(f"several samples are drawn of a prior, but {type(method).__name__} has none: leave "
+                             f"samples at 1 instead of {samples}, or use a method with a prior")
         return replace(method, name=name) if name else method
     if not isinstance(method, Sampler):
         raise ValueError(f"a method is a name ({', '.join(METHODS)}), a Sampler or a Reconstructor, but {method!r} was "
@@ -61,7 +79,10 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: Prior | str | Pa
     prior = load_prior(prior or DEFAULT_PRIOR) if prior is None or isinstance(prior, str | Path) else prior
     name = name or type(method).__name__
     if super_resolution is None:
-        return Posterior(prior, method, guidance, name=name)
+        return Posterior(prior, method, guidance, name=name, samples=samples)
+    if samples != 1:
+        raise ValueError(f"samples are drawn of a prior without a second stage, but {samples} were asked for with "
+                         "super_resolution: leave one of the two out")
     if isinstance(super_resolution, str | Path):
         super_resolution = load_super_resolution(super_resolution)
     ready = CascadePosterior(Cascade(prior, super_resolution), method, guide_fine, noise=fine_noise, guidance=guidance,
@@ -87,7 +108,7 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: Prior | str | Path | None 
                 display: bool = False, seed: int = 0, guidance: float = 1.0, mu_water: float | None = None,
                 grid: Grid = Grid.cube(64), on_step=lambda: None,
                 super_resolution: SuperResolution | str | Path | None = None,
-                guide_fine: bool = True) -> Reconstruction:
+                guide_fine: bool = True, samples: int = 1) -> Reconstruction:
     """A CT volume from X-rays (K, V, U) and their geometry.
 
     xrays: tensor or array of line integrals; with display=True, of display values with an unknown gain and offset per
@@ -95,13 +116,15 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: Prior | str | Path | None 
     prior: a Prior, a file, or None for the shipped one; report: radiology text, if any, which `format_report` lays out.
     mu_water: attenuation in 1/mm that water has in the X-rays (None: the method's own, near 65 keV).
     super_resolution, guide_fine: the second stage of a cascade, as for `reconstructor`; the volume is then on its grid.
+    samples: more than one gives their mean, and `deviation`, a map of how far they differ, as for `reconstructor`.
     A detector finer than the grid can use is binned. Raises ValueError when X-rays, geometry and prior do not fit.
     """
     if not isinstance(beam, ConeBeam):
         raise ValueError(f"the geometry must be a ConeBeam, but {beam!r} was given; ConeBeam.load reads one")
     if not isinstance(report, str | None):
         raise ValueError(f"the report must be text, but {report!r} was given")
-    ready = reconstructor(method, prior, guidance, super_resolution=super_resolution, guide_fine=guide_fine)
+    ready = reconstructor(method, prior, guidance, super_resolution=super_resolution, guide_fine=guide_fine,
+                          samples=samples)
     ready = ready if mu_water is None else ready.assuming(mu_water)
     grid = ready.grid if isinstance(ready, Posterior | CascadePosterior) else grid
     xrays, projector = fit_to_grid(ready, grid, torch.as_tensor(xrays), beam)

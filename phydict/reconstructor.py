@@ -40,7 +40,8 @@ class Reconstruction:
     volume: HU (X, Y, Z) on `grid`; misfit: relative residual |A mu - y| / |y| over all views, and misfit_per_view;
     seconds: per stage; network_calls, projector_calls: denoiser evaluations and applications of A or A.T to all
     views; xrays, reprojection: line integrals (K, V, U), measured (calibrated where they were display values) and
-    of the volume; masks: soft anatomy masks (M, X, Y, Z) in [0, 1] where the method gives them.
+    of the volume; masks: soft anatomy masks (M, X, Y, Z) in [0, 1] where the method gives them; deviation: HU
+    (X, Y, Z), the standard deviation of the samples of which the volume is the mean, where there are several.
     """
 
     volume: Tensor
@@ -55,6 +56,7 @@ class Reconstruction:
     network_calls: int = 0
     projector_calls: int = 0
     masks: Tensor | None = None
+    deviation: Tensor | None = None
 
     def save_nifti(self, path: str | Path) -> None:
         """Writes the volume as float32 HU with the grid's affine (RAS+ mm), replacing the file only when complete."""
@@ -78,9 +80,11 @@ class Reconstructor(ABC):
 
     full_detector: whether the method wants every pixel, instead of a detector binned to what the grid can hold.
     mu_water: attenuation in 1/mm that water has in the X-rays; between it and HU lies this factor.
+    citation: authors, title, venue and DOI or arXiv number of the method's publication.
     """
 
     full_detector = False
+    citation = ""
     mu_water: float = MU_WATER
 
     def assuming(self, mu_water: float) -> Reconstructor:

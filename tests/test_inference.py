@@ -295,6 +295,12 @@ def test_a_damaged_record_is_named(measured, tmp_path, capsys):
         assert str(file.parent) in said and "damaged" in said
 
 
+def test_the_record_names_the_methods_publication(measured, tmp_path):
+    main(sirt("predict", tmp_path, f"--data.xrays={measured / 'anna'}"))
+    file = tmp_path / "sirt" / "anna" / "reconstruction.json"
+    assert "10.1109/TMI.2008.923696" in json.loads(file.read_text())["citation"]
+
+
 def test_a_finished_case_is_never_taken_for_that_of_other_data(measured, cts, tmp_path, capsys):
     shutil.copytree(measured / "anna", tmp_path / "case")
     xrays, ct = (sirt("predict", tmp_path / "out", f"--data.xrays={tmp_path / 'case'}"),
@@ -673,3 +679,20 @@ def test_a_disk_that_fills_up_leaves_no_case_that_looks_finished(measured, tmp_p
     assert names(tmp_path / "sirt") == []
     main(args)
     assert names(tmp_path / "sirt") == ["anna", "bert"]
+
+
+def test_several_samples_leave_a_deviation_map_in_the_volumes_place(measured, prior, tmp_path):
+    args = with_prior("predict", tmp_path, prior, f"--data.xrays={measured / 'anna'}", "--model.name=several")
+    main([*args, "--model.samples=2"])
+    folder = tmp_path / "several" / "anna"
+    assert names(folder) == sorted([*FILES, "deviation.nii.gz"])
+    image, ct = (nibabel.load(folder / name) for name in ("deviation.nii.gz", "volume.nii.gz"))
+    assert image.shape == ct.shape and np.array_equal(image.affine, ct.affine)
+    deviation = np.asarray(image.dataobj)
+    assert deviation.min() >= 0 and deviation.max() > 1
+    assert record(folder)["settings"]["samples"] == 2 and record(folder)["network_calls"] == 4
+
+
+def test_samples_of_a_method_without_a_prior_are_refused(capsys, measured, tmp_path):
+    assert "leave samples at 1" in refusal(capsys, sirt("predict", tmp_path, f"--data.xrays={measured}",
+                                                        "--model.samples=3"))

@@ -20,6 +20,9 @@ class SIRT(Baseline):
     iterations: more fit the views better and, on noisy data, the noise too.
     """
 
+    citation = ("Gregor & Benson, Computational Analysis and Improvement of SIRT, IEEE Transactions on Medical Imaging "
+                "27(7), 2008, doi:10.1109/TMI.2008.923696")
+
     iterations: int = 300
     mu_water: float = MU_WATER
     name: str = "sirt"

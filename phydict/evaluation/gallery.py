@@ -26,7 +26,7 @@ DISPLAY = (-1000.0, 400.0)
 """HU shown as black and as white."""
 
 DIFFERENCE = 500.0
-"""HU of error shown in full blue (too low) and full red (too high)."""
+"""HU of error shown in full blue (too low) and full red (too high), and of deviation in the brightest colour."""
 
 PLANES = {"axial": (2, "RLAP"), "coronal": (1, "RLSI"), "sagittal": (0, "APSI")}
 """Plane -> the axis across it, and the letters on the left, right, top and bottom edge."""
@@ -34,6 +34,7 @@ PLANES = {"axial": (2, "RLAP"), "coronal": (1, "RLSI"), "sagittal": (0, "APSI")}
 MOST_VIEWS = 8
 
 GREY = colormaps["gray"].with_extremes(bad="magenta")
+SPREAD = colormaps["inferno"].with_extremes(bad="magenta")
 SIGNED = colormaps["RdBu_r"].with_extremes(bad="magenta")
 
 
@@ -59,8 +60,10 @@ def plane(volume, grid: Grid, name: str) -> tuple[np.ndarray, float]:
 
 
 def panel(path: str | Path, reconstruction_hu, grid: Grid, xrays=None, reprojection=None, truth_hu=None,
-          title: str = "") -> None:
+          title: str = "", deviation_hu=None) -> None:
     """Write one PNG page of a case: three planes, beside the truth and the difference, and its X-rays below.
+
+    deviation_hu: (X, Y, Z), the standard deviation of several samples, shown beside them from black to yellow.
 
     reconstruction_hu, truth_hu: (X, Y, Z) in HU. xrays, reprojection: (K, V, U) line integrals, measured and of the
     reconstruction; up to 8 views, evenly picked, all in one scale. The misfit ||A x - y|| / ||y|| of each view stands
@@ -70,16 +73,19 @@ def panel(path: str | Path, reconstruction_hu, grid: Grid, xrays=None, reproject
     if reprojection is not None and xrays is None:
         raise ValueError("a re-projection is shown against measured X-rays; pass xrays as well")
     volumes = {"reconstruction": reconstruction_hu} | ({} if truth_hu is None else {"truth": truth_hu})
-    beside = truth_hu is not None
+    beside = truth_hu is not None or deviation_hu is not None
     rows = 3 if beside else 1
+    columns = 1 + 2 * (truth_hu is not None) + (deviation_hu is not None) if beside else 3
     planes_height, xrays_height = 3.6 * rows, 0.0 if xrays is None else (1.9 if reprojection is None else 5.6)
-    figure, upper, lower = _page(12.0, planes_height, xrays_height, title)
-    cells = upper.add_gridspec(rows, 3, wspace=0.08, hspace=0.14, **_margins(planes_height, 0.3))
+    figure, upper, lower = _page(4.0 * max(columns, 3), planes_height, xrays_height, title)
+    cells = upper.add_gridspec(rows, columns, wspace=0.08, hspace=0.14, **_margins(planes_height, 0.3))
     for n, name in enumerate(PLANES):
         for column, (label, volume) in enumerate(volumes.items()):
             ax = upper.add_subplot(cells[n, column] if beside else cells[0, n])
             _show_plane(ax, volume, grid, name, f"{label}, {name}")
-        if beside:
+        if deviation_hu is not None:
+            _show_deviation(upper.add_subplot(cells[n, columns - 1]), deviation_hu, grid, name)
+        if truth_hu is not None:
             difference = _array(reconstruction_hu, 3, "a volume") - _array(truth_hu, 3, "a volume")
             _show_difference(upper.add_subplot(cells[n, 2]), difference, grid, name)
     if xrays is not None:
@@ -141,6 +147,12 @@ def _show_plane(ax: Axes, volume, grid: Grid, name: str, heading: str) -> None:
 def _write(ax: Axes, x: float, y: float, text: str, align: str) -> None:
     outline = [withStroke(linewidth=2, foreground="black")]
     ax.text(x, y, text, transform=ax.transAxes, color="gold", fontsize=8, ha=align, va="center", path_effects=outline)
+
+
+def _show_deviation(ax: Axes, deviation, grid: Grid, name: str) -> None:
+    image, aspect = plane(deviation, grid, name)
+    ax.imshow(np.ma.masked_invalid(image), SPREAD, aspect=aspect, vmin=0, vmax=DIFFERENCE, interpolation="nearest")
+    _finish(ax, f"standard deviation, up to {DIFFERENCE:g} HU")
 
 
 def _show_difference(ax: Axes, difference: np.ndarray, grid: Grid, name: str) -> None:

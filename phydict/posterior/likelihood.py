@@ -33,7 +33,10 @@ class ProximalCG(LikelihoodStep):
     regularise, since what the views see best is corrected first.
 
     iterations: per restart, at most; restarts; noise: standard deviation of the line integrals' error (noise and
-    model); tolerance: a restart ends once its residual has shrunk by this factor. Hestenes & Stiefel 1952,
+    model); tolerance: a restart ends once its residual has shrunk by this factor;
+    discrepancy: the step ends once |P(z) - y| is at most this many times what the measurement's own noise gives, since
+    a closer fit would be one of the noise (Morozov's principle, Engl, Hanke & Neubauer 1996, section 4.3); 0: never.
+    Hestenes & Stiefel 1952,
     doi:10.6028/jres.049.044; with bounds, More & Toraldo 1991, doi:10.1137/0801008; as data consistency in diffusion
     sampling, Chung et al. 2024, arXiv:2303.05754.
     """
@@ -42,31 +45,51 @@ class ProximalCG(LikelihoodStep):
     restarts: int = 2
     noise: float = 0.02
     tolerance: float = 1e-6
+    discrepancy: float = 0.0
+
+    def __post_init__(self):
+        if not self.discrepancy >= 0:
+            raise ValueError(f"discrepancy is a multiple >= 0 of the noise, 0 for none, but {self.discrepancy} was "
+                             "given")
 
     def __call__(self, measurement: Measurement, x0: Tensor, spread: float) -> Tensor:
         weight = (self.noise / spread) ** 2
         z = x0.clamp(-1, 1)
+        enough = self.discrepancy**2 * measurement.noise_energy if self.discrepancy else -1.0
         for _ in range(self.restarts):
-            downhill = measurement.adjoint(measurement.y - measurement.project(z)) + weight * (x0 - z)
+            missed = measurement.y - measurement.project(z)
+            if (_dot(missed, missed) <= enough).all():
+                break
+            downhill = measurement.adjoint(missed) + weight * (x0 - z)
             free = ~((z <= -1) & (downhill < 0) | (z >= 1) & (downhill > 0))
-            z = (z + self._solve(measurement, downhill * free, free, weight)).clamp(-1, 1)
+            z = (z + self._solve(measurement, downhill * free, free, weight, missed, enough)).clamp(-1, 1)
         return z
 
-    def _solve(self, measurement: Measurement, residual: Tensor, free: Tensor, weight: float) -> Tensor:
-        """Conjugate gradients for (A'A + weight) d = residual over the free voxels, from zero."""
+    def _solve(self, measurement: Measurement, residual: Tensor, free: Tensor, weight: float, missed: Tensor,
+               enough: float) -> Tensor:
+        """Conjugate gradients for (A'A + weight) d = residual over the free voxels, from zero, until |missed - A d|^2
+        is `enough`."""
         direction, d = residual.clone(), torch.zeros_like(residual)
-        energy = residual.square().sum()
+        energy = _dot(residual, residual)
         stop = energy * self.tolerance**2
         for _ in range(self.iterations):
-            if energy <= stop:
+            going = (energy > stop) & (_dot(missed, missed) > enough)
+            if not going.any():
                 break
-            curved = (measurement.adjoint(measurement.linear(direction)) + weight * direction) * free
-            step = energy / (direction * curved).sum()
+            seen = measurement.linear(direction)
+            curved = (measurement.adjoint(seen) + weight * direction) * free
+            step = torch.where(going, energy / _dot(direction, curved), 0)
             d += step * direction
+            missed = missed - step.view(-1, *[1] * (missed.dim() - 1)) * seen
             residual = residual - step * curved
-            previous, energy = energy, residual.square().sum()
-            direction = residual + (energy / previous) * direction
+            previous, energy = energy, _dot(residual, residual)
+            direction = residual + torch.where(going, energy / previous, 0) * direction
         return d
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    """Inner products of the states of a batch, (B, 1, 1, 1, 1)."""
+    return (a * b).flatten(1).sum(1).view(-1, 1, 1, 1, 1)
 
 
 @dataclass(frozen=True)
@@ -74,22 +97,28 @@ class GradientSteps(LikelihoodStep):
     """The paper's step: a few Adam steps on J(Y, z) + |z - x0|^2 / rho, started at x0.
 
     The text gives two gradient steps of 0.1 and rho = 1; Adam is what the authors' release uses, with a fresh state
-    at every time. The spread is not used.
+    at every time. The spread is not used. adam: else plain gradient descent, which diverges unless
+    learning_rate (1 / rho + |A|^2 / K) < 1, with |A| the operator's norm and K the number of views.
+    prior_mean: the mean over voxels of |z - x0|^2 instead of the sum, as in the release.
     """
 
     steps: int = 2
     learning_rate: float = 0.1
     rho: float = 1.0
     reward: Reward = field(default_factory=Reward)
+    adam: bool = True
+    prior_mean: bool = False
 
     def __call__(self, measurement: Measurement, x0: Tensor, spread: float) -> Tensor:
         with torch.enable_grad():
             z = x0.detach().clone().requires_grad_(True)
-            adam = torch.optim.Adam([z], self.learning_rate)
+            optimiser = (torch.optim.Adam if self.adam else torch.optim.SGD)([z], self.learning_rate)
             for _ in range(self.steps):
-                adam.zero_grad()
-                loss = (z - x0).square().sum() / self.rho - self.reward(measurement, z).sum()
+                optimiser.zero_grad()
+                apart = (z - x0).square().flatten(1)
+                apart = apart.mean(1) if self.prior_mean else apart.sum(1)
+                loss = (apart / self.rho - self.reward(measurement, z)).sum()
                 loss.backward()
                 measurement.calls += 1  # autograd's use of the adjoint
-                adam.step()
+                optimiser.step()
         return z.detach()

@@ -13,37 +13,53 @@ from phydict.reconstructor import check_xrays
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import Projector
 from phydict.xray.calibration import match_views
+from phydict.xray.noise_level import noise_level
 
 
 class Measurement:
     """Line integrals y (1, K, V, U) and the affine operator P on CT volumes x (B, 1, X, Y, Z) in the prior's range.
 
-    calls: how many times A or its adjoint ran over all views.
+    noise: standard deviation of the noise of y, as a share of its largest value or, as a tensor that expands to
+    (K, V, U), of each pixel; None: estimated from y where it is needed.
+    calls: how many times A or its adjoint ran over all views, per volume of a batch.
     """
 
     def __init__(self, projector: Projector, xrays: Tensor, window: HUWindow, display: bool = False,
-                 mu_water: float = MU_WATER):
+                 mu_water: float = MU_WATER, noise: float | Tensor | None = None):
         check_xrays(xrays, projector.beam)
+        self.noise = noise
         self.projector, self.display = projector, xrays[None] if display else None
-        self.slope, offset = window.mu_affine(mu_water)
-        self.background = offset * projector(torch.ones(1, 1, *projector.grid.shape).to(xrays))
+        self.slope, self.offset = window.mu_affine(mu_water)
+        self.background = self.offset * projector(torch.ones(1, 1, *projector.grid.shape).to(xrays))
         self.y = xrays[None]
         self.calls = 1
 
     def project(self, x: Tensor) -> Tensor:
         """P(x): line integrals (B, K, V, U) of the CT x."""
-        self.calls += 1
+        self.calls += len(x)
         return self.slope * self.projector(x) + self.background
 
     def linear(self, d: Tensor) -> Tensor:
         """The linear part of P, for differences d of CTs."""
-        self.calls += 1
+        self.calls += len(d)
         return self.slope * self.projector(d)
 
     def adjoint(self, r: Tensor) -> Tensor:
         """The exact adjoint of `linear`: (B, K, V, U) -> (B, 1, X, Y, Z)."""
-        self.calls += 1
+        self.calls += len(r)
         return self.slope * self.projector.T(r)
+
+    def norm(self) -> float:
+        """The largest singular value of `linear`."""
+        return self.slope * self.projector.norm()
+
+    @property
+    def noise_energy(self) -> float:
+        """The sum over all pixels of the variance of their noise: what |P(x) - y|^2 is expected to be for the true x."""
+        if self.noise is None:
+            return float(noise_level(self.y[0]).square().sum()) * self.y[0, 0].numel()
+        level = self.noise if isinstance(self.noise, Tensor) else self.noise * self.y.max()
+        return float(level.square().expand(self.y.shape[1:]).sum())
 
     def calibrate(self, x: Tensor) -> None:
         """Where the views are display values: refit their gain and offset to the projections of the CT x."""

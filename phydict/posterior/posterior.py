@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -20,13 +21,13 @@ from phydict.xray import Projector
 
 
 class Counted:
-    """A denoiser that counts its calls."""
+    """A denoiser that counts its calls, one for each state of a batch."""
 
     def __init__(self, denoiser: Denoiser):
         self.schedule, self._denoiser, self.calls = denoiser.schedule, denoiser, 0
 
     def denoise(self, x: Tensor, t: float) -> Tensor:
-        self.calls += 1
+        self.calls += len(x)
         return self._denoiser.denoise(x, t)
 
 
@@ -35,7 +36,11 @@ class Posterior(Reconstructor):
     """Reconstructs by sampling p(x | Y, report) under a prior.
 
     sampler: how; guidance: classifier-free guidance scale used when a report is given; mu_water: 1/mm;
-    bf16: run the denoiser in bfloat16, which on most processors is twice as fast.
+    bf16: run the denoiser in bfloat16, which on most processors is twice as fast;
+    samples: how many are drawn. One is the sampler's own result; of several, drawn by its `randomised` settings, the
+    volume is the mean, and their standard deviation says where not to trust it. batch: how many of them go through
+    the denoiser at once, where the sampler allows it; fewer need less memory. Sample i depends neither on samples nor,
+    but for rounding, on batch.
     """
 
     prior: Prior
@@ -44,6 +49,14 @@ class Posterior(Reconstructor):
     mu_water: float = MU_WATER
     name: str = "phydict"
     bf16: bool = True
+    samples: int = 1
+    batch: int = 4
+
+    def __post_init__(self):
+        for name in ("samples", "batch"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is a number of reconstructions, 1 or more, but {getattr(self, name)} was "
+                                 "given")
 
     @property
     def grid(self) -> Grid:
@@ -54,8 +67,13 @@ class Posterior(Reconstructor):
     def full_detector(self) -> bool:
         return self.sampler.full_detector
 
+    @property
+    def citation(self) -> str:
+        return self.sampler.citation
+
     def steps(self) -> int:
-        return self.sampler.steps()
+        together = min(self.batch, self.samples) if self.sampler.batches else 1
+        return self.sampler.steps() * -(-self.samples // together)
 
     @torch.no_grad()
     def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,
@@ -65,21 +83,36 @@ class Posterior(Reconstructor):
             raise ValueError(
                 f"the prior was trained on {prior.grid.shape} voxels of {prior.grid.spacing} mm, but the X-rays are "
                 f"projected from {projector.grid.shape} voxels of {projector.grid.spacing} mm: use the prior's grid")
+        seeds = [sample_seed(seed, i) for i in range(self.samples)]
+        together = self.batch if self.sampler.batches else 1
+        sampler = self.sampler.randomised() if self.samples > 1 else self.sampler
         with watch.stage("prepare"):
             denoiser = Counted(prior.bind(report, self.guidance, self.bf16))
             measurement = Measurement(projector, xrays, prior.window, display, self.mu_water)
-            draw = torch.Generator().manual_seed(seed)
             state = torch.empty(1, prior.state_channels, *prior.grid.shape, device=xrays.device)
-            x = noise_like(state, draw)
         with watch.stage("sample"):
-            state = self.sampler.sample(denoiser, measurement, x, draw, on_step)
+            states = []
+            for first in range(0, self.samples, together):
+                draws = [torch.Generator().manual_seed(s) for s in seeds[first:first + together]]
+                x = noise_like(state.expand(len(draws), -1, -1, -1, -1), draws)
+                draw = draws if len(draws) > 1 else draws[0]
+                states.append(sampler.sample(denoiser, measurement, x, draw, on_step))
+            states = torch.cat(states)
         with watch.stage("score"):
-            ct = state[:, :1]
+            state, ct = states.mean(0), states[:, :1].mean(0, keepdim=True)
             measurement.calibrate(ct)
             reprojection = measurement.project(ct)[0].cpu()
             measured = measurement.y[0].cpu()
+            deviation = None
+            if self.samples > 1:
+                deviation = (prior.window.half_width * states[:, 0].std(0)).cpu()
         return Reconstruction(
             volume=prior.window.to_hu(ct[0, 0]).cpu(), grid=prior.grid, method=self.name, seed=seed,
             **misfits(reprojection, measured), seconds=watch.seconds, xrays=measured, reprojection=reprojection,
             network_calls=denoiser.calls * (2 if report and self.guidance != 1 else 1),
-            projector_calls=measurement.calls, masks=((state[0, 1:] + 1) / 2).cpu())
+            projector_calls=measurement.calls, masks=((state[1:] + 1) / 2).cpu(), deviation=deviation)
+
+
+def sample_seed(seed: int, i: int) -> int:
+    """The seed of sample i of a reconstruction: its own for the first, one that hardly returns for the others."""
+    return seed if i == 0 else zlib.crc32(f"{seed}/sample {i}".encode())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -15,17 +15,23 @@ from phydict.diffusion import Denoiser, ddim
 if TYPE_CHECKING:
     from phydict.posterior.measurement import Measurement
 
+Draw = torch.Generator | Sequence[torch.Generator]
+"""Where noise comes from: one generator, or one for each state of a batch."""
+
 
 class Sampler(ABC):
     """Settings of a sampling method; `sample` turns noise into a clean state.
 
-    full_detector: as for a Reconstructor.
+    full_detector, citation: as for a Reconstructor. batches: whether the states of a batch do not influence each other,
+    so that several samples may be drawn at once, with one generator for each.
     """
 
     full_detector = False
+    citation = ""
+    batches = False
 
     @abstractmethod
-    def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, draw: torch.Generator,
+    def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, draw: Draw,
                on_step: Callable[[], None] = lambda: None) -> Tensor:
         """Noise x (B, C, X, Y, Z) at time 1 -> clean states; `draw` is the source of any further noise."""
 
@@ -33,25 +39,35 @@ class Sampler(ABC):
     def steps(self) -> int:
         """How often `sample` calls on_step."""
 
+    def randomised(self) -> Sampler:
+        """The settings of which independent runs differ as far as the posterior is wide; these, unless overridden."""
+        return self
+
 
 @dataclass(frozen=True)
 class PriorOnly(Sampler):
     """A sample of the prior that ignores the X-rays: deterministic DDIM with `iterations` noise levels."""
 
+    citation = "Song, Meng & Ermon, Denoising Diffusion Implicit Models, ICLR 2021, arXiv:2010.02502"
+
     iterations: int = 50
+    batches = True
 
     def steps(self) -> int:
         return self.iterations
 
-    def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, draw: torch.Generator,
+    def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, draw: Draw,
                on_step: Callable[[], None] = lambda: None) -> Tensor:
         return descend(denoiser, x, self.iterations, on_step=on_step)
 
 
 def descend(denoiser: Denoiser, x: Tensor, iterations: int, start: float = 1.0,
-            on_step: Callable[[], None] = lambda: None) -> Tensor:
-    """Deterministic descent of the state x from time `start` to its clean end, clipped to the prior's range."""
-    for t, s in denoiser.schedule.steps(iterations, start):
+            on_step: Callable[[], None] = lambda: None, at_zero: bool = False) -> Tensor:
+    """Deterministic descent of the state x from time `start` to its clean end, clipped to the prior's range.
+
+    at_zero: denoise once more at time 0.
+    """
+    for t, s in [*denoiser.schedule.steps(iterations, start), *[(0.0, 0.0)] * at_zero]:
         x0 = denoiser.denoise(x, t).clamp(-1, 1)
         x = ddim(denoiser.schedule, x0, x, t, s)
         on_step()

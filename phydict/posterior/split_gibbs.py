@@ -11,7 +11,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -19,7 +19,7 @@ from torch import Tensor
 from phydict.diffusion import Denoiser, ddim, renoise
 from phydict.posterior.likelihood import LikelihoodStep, ProximalCG
 from phydict.posterior.measurement import Measurement
-from phydict.posterior.sampler import Sampler, descend
+from phydict.posterior.sampler import Draw, Sampler, descend
 
 
 @dataclass(frozen=True)
@@ -32,10 +32,17 @@ class SplitGibbs(Sampler):
     last: the last level's time (None: levels evenly spaced down to 0);
     fresh_noise: None for the paper's DDIM moves; else each level starts from the estimate with new noise of this
     share of the level's own: 1 decouples the levels, 0 adds none and descends to a point estimate;
+    randomised_noise: the fresh_noise that takes its place where several samples are to show how far they differ;
+    None: the same;
     prior_std: standard deviation of the state, which sets the spread of x0 at each time;
     refine_from: EC's delta in [0, 1), 0 for none; refine_iterations: its noise levels;
-    full_detector: meet the X-rays pixel by pixel instead of binned to what the grid can hold.
+    full_detector: meet the X-rays pixel by pixel instead of binned to what the grid can hold;
+    clip: pull the denoiser's estimate into the prior's range before the likelihood step, not only after it;
+    at_zero: both passes end with one more call of the denoiser, at time 0 and without X-rays, as in the release.
     """
+
+    citation = ("Dai, Ghosh & Batmanghelich, PhyDiCT: Plug-and-Play CT Reconstruction from Sparse X-Rays via "
+                "Differentiable Rendering and Strong Priors, MICCAI 2026")
 
     iterations: int = 50
     likelihood: LikelihoodStep = field(default_factory=ProximalCG)
@@ -43,10 +50,14 @@ class SplitGibbs(Sampler):
     warm_start: float = 1.0
     last: float | None = None
     fresh_noise: float | None = None
+    randomised_noise: float | None = None
     prior_std: float = 0.5
     refine_from: float = 0.0
     refine_iterations: int = 0
     full_detector: bool = False
+    clip: bool = True
+    at_zero: bool = False
+    batches = True
 
     def __post_init__(self):
         if self.iterations < 1:
@@ -57,8 +68,10 @@ class SplitGibbs(Sampler):
             raise ValueError("a warm_start below 1 needs at least 2 iterations, but 1 was given")
         if self.last is not None and not 0 < self.last <= self.warm_start:
             raise ValueError(f"last is a time above 0 and not above warm_start, but {self.last} was given")
-        if self.fresh_noise is not None and not 0 <= self.fresh_noise <= 1:
-            raise ValueError(f"fresh_noise is a share in [0, 1] or left out, but {self.fresh_noise} was given")
+        for name in ("fresh_noise", "randomised_noise"):
+            share = getattr(self, name)
+            if share is not None and not 0 <= share <= 1:
+                raise ValueError(f"{name} is a share in [0, 1] or left out, but {share} was given")
         if not 0 <= self.refine_from < 1:
             raise ValueError(f"refine_from (the paper's delta) lies in [0, 1), but {self.refine_from} was given")
         if self.refine_from and self.refine_iterations < 1:
@@ -66,7 +79,11 @@ class SplitGibbs(Sampler):
                              f"{self.refine_iterations} was given")
 
     def steps(self) -> int:
-        return self.iterations + (self.refine_iterations if self.refine_from else 0)
+        passes = [self.iterations] + ([self.refine_iterations] if self.refine_from else [])
+        return sum(passes) + len(passes) * self.at_zero
+
+    def randomised(self) -> SplitGibbs:
+        return self if self.randomised_noise is None else replace(self, fresh_noise=self.randomised_noise)
 
     def times(self, denoiser: Denoiser) -> list[tuple[float, float]]:
         """The pairs (t, s) of noise levels passed through."""
@@ -74,24 +91,29 @@ class SplitGibbs(Sampler):
             return list(denoiser.schedule.steps(self.iterations, last=self.last))
         return [(1.0, self.warm_start), *denoiser.schedule.steps(self.iterations - 1, self.warm_start, self.last)]
 
-    def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, draw: torch.Generator,
+    def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, draw: Draw,
                on_step: Callable[[], None] = lambda: None) -> Tensor:
         schedule = denoiser.schedule
         for t, s in self.times(denoiser):
-            x0 = denoiser.denoise(x, t).clamp(-1, 1)
+            x0 = denoiser.denoise(x, t)
+            if self.clip:
+                x0 = x0.clamp(-1, 1)
             measurement.calibrate(x0[:, :1])
-            z, step = x0, self.likelihood if s > 0 else self.final_likelihood
+            z, step = x0.clamp(-1, 1), self.likelihood if s > 0 else self.final_likelihood
             if step:
                 ct = step(measurement, x0[:, :1], self.spread(denoiser, t)).clamp(-1, 1)
-                z = torch.cat([ct, x0[:, 1:]], 1)
+                z = torch.cat([ct, z[:, 1:]], 1)
             if self.fresh_noise is None:
                 x = ddim(schedule, z, x, t, s)
-            elif s > 0:
+            elif s > 0 or self.at_zero:
                 x = renoise(schedule, z, s, self.fresh_noise * noise_like(z, draw))
+            on_step()
+        if self.at_zero:
+            z = denoiser.denoise(x, 0.0).clamp(-1, 1)
             on_step()
         if self.refine_from:
             x = renoise(schedule, z, self.refine_from, noise_like(z, draw))
-            z = descend(denoiser, x, self.refine_iterations, self.refine_from, on_step)
+            z = descend(denoiser, x, self.refine_iterations, self.refine_from, on_step, self.at_zero)
         return z
 
     def spread(self, denoiser: Denoiser, t: float) -> float:
@@ -100,6 +122,8 @@ class SplitGibbs(Sampler):
         return self.prior_std * s / (s**2 + (a * self.prior_std) ** 2) ** 0.5
 
 
-def noise_like(x: Tensor, draw: torch.Generator) -> Tensor:
+def noise_like(x: Tensor, draw: Draw) -> Tensor:
     """Standard normal noise drawn on the generator's device, so that a result does not depend on x's."""
+    if not isinstance(draw, torch.Generator):
+        return torch.cat([noise_like(one[None], own) for one, own in zip(x, draw, strict=True)])
     return torch.randn(x.shape, generator=draw, dtype=x.dtype).to(x.device)

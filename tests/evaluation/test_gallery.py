@@ -82,6 +82,18 @@ def test_pages_are_written_with_every_combination_and_accept_tensors(tmp_path):
     assert sizes == sorted(set(sizes))
 
 
+@pytest.mark.parametrize("given", [{}, {"truth_hu": np.full(GRID.shape, -1000.0)}], ids=["alone", "with the truth"])
+def test_the_deviation_is_bright_where_it_is_large(tmp_path, given):
+    deviation = np.zeros(GRID.shape)
+    deviation[HIGH, HIGH, MIDDLE] = 600
+    panel(tmp_path / "p.png", np.full(GRID.shape, -1000.0), GRID, deviation_hu=deviation, **given)
+    page = matplotlib.image.imread(tmp_path / "p.png")[..., :3]
+    brightest = np.argwhere(np.abs(page - [0.988, 1.0, 0.645]).max(2) < 0.02)  # inferno's end
+    assert len(brightest) > 500
+    (top, left), (bottom, right) = brightest.min(0), brightest.max(0)
+    assert bottom - top == pytest.approx(right - left, abs=2) and left > page.shape[1] * 0.4  # in the last column
+
+
 def test_values_that_are_not_finite_are_shown_in_magenta(tmp_path):
     volume = np.zeros(GRID.shape)
     volume[10:20, 10:20, 10:20] = np.nan

@@ -1,0 +1,53 @@
+"""The noise of X-rays is read off them, whatever they show."""
+
+import pytest
+import torch
+from laws import random_like
+
+from phydict.datasets import phantom_case
+from phydict.grid import Grid
+from phydict.units import HUWindow
+from phydict.xray import ConeBeam, Projector
+from phydict.xray.noise_level import noise_level
+
+
+@pytest.fixture(scope="module")
+def chest():
+    """Noiseless X-rays of a phantom."""
+    grid, window = Grid.cube(48), HUWindow()
+    beam = ConeBeam.orbit(4, 1020, 740, (96, 96), 5.8)
+    return Projector(grid, beam, full_detector=True)(window.to_mu(phantom_case(3, grid, window)["volume"])[None])[0]
+
+
+def noise(like, seed=1):
+    return random_like(like.shape, torch.float32, seed=seed)
+
+
+@pytest.mark.parametrize("share", [0.005, 0.01, 0.05])
+def test_the_noise_of_a_chests_views_is_found_to_a_fifth(chest, share):
+    level = share * float(chest.max())
+    found = noise_level(chest + level * noise(chest))
+    torch.testing.assert_close(found, torch.full((4,), level), rtol=0.2, atol=0)
+
+
+def test_a_chest_without_noise_has_next_to_none(chest):
+    assert noise_level(chest).max() < 0.001 * chest.max()
+
+
+def test_each_view_has_its_own_and_it_grows_with_the_values():
+    y = noise(torch.empty(3, 64, 64)) * torch.tensor([0.1, 1.0, 5.0]).view(3, 1, 1)
+    torch.testing.assert_close(noise_level(y), torch.tensor([0.1, 1.0, 5.0]), rtol=0.1, atol=0)
+    torch.testing.assert_close(noise_level(7 * y), 7 * noise_level(y))
+
+
+def test_bilinear_ramps_and_few_edges_are_no_noise():
+    v, u = torch.meshgrid(torch.linspace(0, 1, 40), torch.linspace(-1, 1, 50), indexing="ij")
+    ramp = (3 + 2 * u - v + 4 * u * v)[None].double()
+    assert noise_level(ramp).max() < 1e-6
+    ramp[:, 10:30, 12:40] += 5
+    assert noise_level(ramp).max() < 1e-6
+
+
+@pytest.mark.parametrize("shape", [(2, 2, 9), (2, 9, 1)])
+def test_views_too_small_to_tell_have_none(shape):
+    assert noise_level(noise(torch.empty(shape))).equal(torch.zeros(2))

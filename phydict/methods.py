@@ -16,6 +16,7 @@ from phydict.posterior import (
     Reward, Sampler, SplitGibbs)
 from phydict.prior import Cascade, Prior, SuperResolution, load_prior, load_super_resolution
 from phydict.reconstructor import Reconstruction, Reconstructor, check_xrays
+from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector, binned, binning
 
 DEFAULT_PRIOR = Path(__file__).parents[1] / "data" / "prior" / "phydict_64.safetensors"
@@ -40,9 +41,9 @@ METHODS: dict[str, Sampler | Reconstructor] = {
     "dds": DDS(iterations=50),
     "dps": DPS(iterations=100, scale=3.0),
     "prior_only": PriorOnly(iterations=50),
-    "sirt": SIRT(iterations=300),
+    "sirt": SIRT(),
     "fdk": FDK(),
-    "cgls": CGLS(),
+    "cgls": CGLS(iterations=10, restarts=20, window=HUWindow()),
     "tv": FISTATV(),
     "diffvox": DiffVox(),
 }

@@ -130,7 +130,7 @@ def test_bad_arguments_are_one_sentence(change, sentence):
 @pytest.mark.parametrize("name", METHODS)
 def test_every_method_names_its_publication(name):
     ready = reconstructor(name, tiny_prior(False))
-    year = [word for word in ready.citation.replace(",", " ").split() if word.isdigit() and 1990 < int(word) < 2030]
+    year = [word for word in ready.citation.replace(",", " ").split() if word.isdigit() and 1900 < int(word) < 2030]
     assert year and ready.citation.split(",")[0]
 
 

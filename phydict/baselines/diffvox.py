@@ -28,8 +28,11 @@ class DiffVox(Baseline):
     window: HU bounds of the result, or None for none.
     """
 
-    iterations: int = 300
-    smoothness: float = 15.0
+    citation = ("Momeni et al., Voxel-Based Differentiable X-Ray Rendering Improves Self-Supervised 3D CBCT "
+                "Reconstruction, 2024, arXiv:2411.19224")
+
+    iterations: int = 1000
+    smoothness: float = 50.0
     learning_rate: float = 0.01
     window: HUWindow | None = HUWindow()
     mu_water: float = MU_WATER

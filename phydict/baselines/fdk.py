@@ -33,7 +33,10 @@ class FDK(Baseline):
     that are no such orbit.
     """
 
-    hann: bool = False
+    citation = ("Feldkamp, Davis & Kress, Practical Cone-Beam Algorithm, Journal of the Optical Society of America A 1(6), "
+                "1984, doi:10.1364/JOSAA.1.000612")
+
+    hann: bool = True
     window: HUWindow | None = HUWindow()
     mu_water: float = MU_WATER
     name: str = "fdk"

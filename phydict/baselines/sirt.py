@@ -23,7 +23,7 @@ class SIRT(Baseline):
     citation = ("Gregor & Benson, Computational Analysis and Improvement of SIRT, IEEE Transactions on Medical Imaging "
                 "27(7), 2008, doi:10.1109/TMI.2008.923696")
 
-    iterations: int = 300
+    iterations: int = 1000
     mu_water: float = MU_WATER
     name: str = "sirt"
 

@@ -25,8 +25,11 @@ class FISTATV(Baseline):
     HU bounds, whose low end of -1000 HU is non-negativity, or None for none.
     """
 
-    iterations: int = 200
-    weight: float = 1e-3
+    citation = ("Beck & Teboulle, Fast Gradient-Based Algorithms for Constrained Total Variation Image Denoising and "
+                "Deblurring Problems, IEEE Transactions on Image Processing 18(11), 2009, doi:10.1109/TIP.2009.2028250")
+
+    iterations: int = 400
+    weight: float = 3e-4
     inner: int = 5
     window: HUWindow | None = HUWindow()
     mu_water: float = MU_WATER

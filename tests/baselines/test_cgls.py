@@ -24,7 +24,7 @@ def solved(method: CGLS, y: torch.Tensor = NOISY) -> torch.Tensor:
 def test_many_iterations_reach_the_least_squares_solution():
     exact = torch.linalg.lstsq(MATRIX, NOISY[:, None]).solution[:, 0]
     assert torch.linalg.matrix_rank(MATRIX) == 64
-    torch.testing.assert_close(solved(CGLS(200)), exact, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(solved(CGLS(200)), exact, rtol=0, atol=1e-4)
 
 
 def test_every_iterate_is_the_best_of_its_krylov_space():
@@ -45,7 +45,8 @@ def test_the_misfit_falls_and_the_volume_grows_with_the_iterations():
 
 def test_stopping_early_is_nearer_to_the_truth_than_fitting_the_noise():
     truth = 0.5 + random_like((64,), seed=1)
-    errors = [float((solved(CGLS(k)) - truth).norm()) for k in (1, 8, 200)]
+    noisy = MATRIX @ truth + 60 * random_like((len(MATRIX),), seed=2)
+    errors = [float((solved(CGLS(k), noisy) - truth).norm()) for k in (1, 8, 200)]
     assert errors[1] < errors[0] and errors[1] < errors[2]
 
 

@@ -130,8 +130,8 @@ def test_lines_seen_from_both_sides_count_once_in_all_and_lines_seen_once_too(ar
         partner = np.arange(views) + (math.pi + 2 * scan.turns[0] * fan) / step
         partner = partner % (2 * math.pi / step)
         inside = partner < views - 1
-        nearest = np.rint(partner[inside]).astype(int).clip(0, views - 1)
-        assert abs(weights[inside, j] + weights[nearest, len(tangents) - 1 - j] - 1).max() < 0.01
+        there = np.interp(partner[inside], np.arange(views), weights[:, len(tangents) - 1 - j])
+        assert abs(weights[inside, j] + there - 1).max() < 0.002
         alone = (partner > views) & (partner < 2 * math.pi / step - 1)
         assert (weights[alone, j] == 1).all()
         seen_twice += int(inside.sum())
@@ -157,7 +157,7 @@ def test_the_ramp_removes_the_mean_and_keeps_half_at_nyquist():
 
 
 def tilted() -> ConeBeam:
-    beam, turn = orbit(4), math.radians(12)
+    beam, turn = orbit(4), math.radians(5)
     v = beam.v.copy()
     v[2] = math.cos(turn) * beam.v[2] + math.sin(turn) * 12.0 * beam.normals[2]
     return ConeBeam(beam.sources, beam.detectors, beam.u, v, beam.shape)

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from phydict import HUWindow
-from phydict.baselines import CGLS, FDK, FISTATV, DiffVox
+from phydict.baselines import CGLS, FDK, FISTATV, SIRT, DiffVox
 from phydict.datasets import CTFile, find_cts, prepare_ct
 from phydict.evaluation import read_csv, volume_metrics, write_csv
 from phydict.grid import Grid
@@ -32,7 +32,9 @@ SETTINGS = {
     "cgls": [*(CGLS(n) for n in (5, 10, 20, 40)),
              *(CGLS(n, restarts, WINDOW) for n, restarts in ((5, 10), (10, 5), (10, 10), (10, 20)))],
     "tv": [FISTATV(n, w) for n, w in ((200, 1e-4), (200, 3e-4), (200, 1e-3), (200, 3e-3), (100, 3e-4), (400, 3e-4))],
-    "diffvox": [DiffVox(n, s) for n, s in ((300, 1.5), (300, 5.0), (300, 15.0), (300, 50.0), (500, 15.0))],
+    "diffvox": [DiffVox(n, s) for n, s in ((300, 1.5), (300, 5.0), (300, 15.0), (300, 50.0), (500, 15.0), (500, 50.0), (1000, 15.0),
+                                            (1000, 50.0))],
+    "sirt": [SIRT(n) for n in (100, 300, 1000)],
 }
 
 

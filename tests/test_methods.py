@@ -120,7 +120,8 @@ def test_priors_samplers_and_projectors_of_ones_own_fit_in():
 
 @pytest.mark.parametrize("change, sentence", [
     ({"beam": "geometry.yaml"}, "ConeBeam.load"), ({"report": 5}, "report must be text"),
-    ({"method": 123}, "a Sampler or"), ({"method": SIRT}, "a Sampler or"), ({"method": "fbp"}, "phydict_fast, phydict_paper"),
+    ({"method": 123}, "a Sampler or"), ({"method": SIRT}, "a Sampler or"),
+    ({"method": "fbp"}, "phydict_fast, phydict_paper"),
     ({"xrays": np.full((8, 448, 448), np.nan)}, "NaN"), ({"xrays": np.zeros((7, 448, 448))}, "8 views")])
 def test_bad_arguments_are_one_sentence(change, sentence):
     with pytest.raises(ValueError, match=sentence):

@@ -22,8 +22,8 @@ class CGLS(Baseline):
     (More & Toraldo 1991, doi:10.1137/0801008); without bounds one is the classical method.
     """
 
-    citation = ("Hestenes & Stiefel, Methods of Conjugate Gradients for Solving Linear Systems, Journal of Research of the "
-                "National Bureau of Standards 49(6), 1952, doi:10.6028/jres.049.044")
+    citation = ("Hestenes & Stiefel, Methods of Conjugate Gradients for Solving Linear Systems, Journal of Research "
+                "of the National Bureau of Standards 49(6), 1952, doi:10.6028/jres.049.044")
 
     iterations: int = 10
     restarts: int = 1

@@ -33,8 +33,8 @@ class FDK(Baseline):
     that are no such orbit.
     """
 
-    citation = ("Feldkamp, Davis & Kress, Practical Cone-Beam Algorithm, Journal of the Optical Society of America A 1(6), "
-                "1984, doi:10.1364/JOSAA.1.000612")
+    citation = ("Feldkamp, Davis & Kress, Practical Cone-Beam Algorithm, Journal of the Optical Society of America "
+                "A 1(6), 1984, doi:10.1364/JOSAA.1.000612")
 
     hann: bool = True
     window: HUWindow | None = HUWindow()

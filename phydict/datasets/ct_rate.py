@@ -100,7 +100,7 @@ def _calibrated(cts: list[CTFile], metadata: str | Path | None) -> list[CTFile]:
     missing = [ct.id for ct in cts if ct.id not in table]
     if missing:
         raise ValueError(f"{len(missing)} of {len(cts)} volumes are not in the metadata {metadata}, the first is "
-                         f"{missing[0]}; give the table of these volumes, or data.fixed true if their headers are right")
+                         f"{missing[0]}; give the table of these volumes, or data.fixed true if they are right")
     return [replace(ct, calibration=table[ct.id]) for ct in cts]
 
 

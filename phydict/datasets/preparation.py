@@ -42,8 +42,8 @@ SPACES, SEGMENTERS = ("patient", "medsyn"), ("threshold", "lungmask")
 ATLAS_MM = (316.0, 316.0, 292.0)
 """MedSyn's atlas volume, right-left, posterior-anterior and inferior-superior."""
 ATLAS_LUNGS_MM = (275.0, 193.0, 256.0)
-"""The box around the atlas' lungs, an assumption, because the atlas may not be shipped: the mean over seven uncut CTs of
-LIDC-IDRI, placed in the middle of the atlas volume. `atlas_lungs` measures a copy of the atlas instead."""
+"""The box around the atlas' lungs, an assumption, because the atlas may not be shipped: the mean over seven uncut CTs
+of LIDC-IDRI, placed in the middle of the atlas volume. `atlas_lungs` measures a copy of the atlas instead."""
 
 
 @dataclass(frozen=True)

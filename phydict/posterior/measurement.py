@@ -55,7 +55,7 @@ class Measurement:
 
     @property
     def noise_energy(self) -> float:
-        """The sum over all pixels of the variance of their noise: what |P(x) - y|^2 is expected to be for the true x."""
+        """The sum over all pixels of their noise's variance: what |P(x) - y|^2 is expected to be for the true x."""
         if self.noise is None:
             return float(noise_level(self.y[0]).square().sum()) * self.y[0, 0].numel()
         level = self.noise if isinstance(self.noise, Tensor) else self.noise * self.y.max()

@@ -31,8 +31,9 @@ if __name__ == "__main__":
         denoiser = prior.bind(case["report"])
         for t in NOISE_LEVELS:
             error = denoiser.denoise(renoise(prior.schedule, x0, t, noise), t) - x0
-            rows.append({"case": case["id"], "t": t, "sigma_hu": float(prior.schedule.sigma(t)) * prior.window.half_width,
-                         "rmse_hu": float(error[:, 0].square().mean().sqrt()) * prior.window.half_width})
+            rmse, sigma = float(error[:, 0].square().mean().sqrt()), float(prior.schedule.sigma(t))
+            rows.append({"case": case["id"], "t": t, "sigma_hu": sigma * prior.window.half_width,
+                         "rmse_hu": rmse * prior.window.half_width})
     write_csv(Path(__file__).with_suffix(".csv"), rows)
     kinds = {"phantoms": [r for r in rows if r["case"].startswith("phantom")],
              "CTs": [r for r in rows if not r["case"].startswith("phantom")]}

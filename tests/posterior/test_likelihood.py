@@ -153,7 +153,8 @@ def chest_measurement(share, noise=None, seed=0):
     projector = Projector(grid, ConeBeam.orbit(6, 1020, 740, (48, 48), 11.5), full_detector=True)
     truth = phantom_case(7, grid, window)["volume"][None]
     y = projector(window.to_mu(truth))[0]
-    m = Measurement(projector, y + share * y.max() * random_like(y.shape, torch.float32, seed=seed), window, noise=noise)
+    error = share * y.max() * random_like(y.shape, torch.float32, seed=seed)
+    m = Measurement(projector, y + error, window, noise=noise)
     return m, float(share * y.max()), truth
 
 

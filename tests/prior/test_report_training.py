@@ -11,8 +11,8 @@ from phydict.prior.report_training import learn_findings, learn_sketch
 from phydict.units import HUWindow
 
 SIDES = ("right", "left")
-WORDS = ("A large pleural effusion on the {}.", "There is a {} pleural effusion.", "Consolidation in the {} lower lobe.",
-         "No pneumothorax. Focal consolidation in the {} upper lobe.")
+WORDS = ("A large pleural effusion on the {}.", "There is a {} pleural effusion.",
+         "Consolidation in the {} lower lobe.", "No pneumothorax. Focal consolidation in the {} upper lobe.")
 REPORTS = [words.format(side) for words in WORDS for side in SIDES]
 LABELS = torch.tensor([[float(side == "left"), float("effusion" in words)] for words in WORDS for side in SIDES])
 

@@ -5,8 +5,11 @@ from __future__ import annotations
 import torch
 from jsonargparse import ArgumentParser
 
+from phydict.ablation.plots import write_plots
 from phydict.ablation.run import RESULTS, alone_in, run
 from phydict.ablation.spec import read_specification
+from phydict.ablation.summary import entries
+from phydict.ablation.tables import all_tables, write_tables
 from phydict.command_line import check_writable, one_sentence_errors, quiet
 from phydict.progress import CaseProgress
 
@@ -14,13 +17,16 @@ from phydict.progress import CaseProgress
 def main(args: list[str] | None = None) -> None:
     """infer.py ablate -c <file>. A bad input ends in one sentence and exit code 2; a run that was stopped goes on."""
     with one_sentence_errors(), quiet():
-        given = vars(_parser().parse_args(args))
+        given = _parser().parse_args(args).as_dict()
         device = given.pop("device") or ("cuda" if torch.cuda.is_available() else "cpu")
         specification = read_specification(given.pop("config"), **given)
         check_writable(specification.out, "out")
         with alone_in(specification.out), CaseProgress() as progress:
             rows = run(specification, torch.device(device), progress)
         print(f"{len(rows)} rows in {specification.out / RESULTS}")
+        found = entries(rows)
+        written = write_tables(specification.out, all_tables(found, rows)) + write_plots(specification.out, found)
+        print(f"tables and plots in {specification.out}: {', '.join(path.name for path in written)}")
 
 
 def _parser() -> ArgumentParser:

@@ -92,7 +92,7 @@ def run(specification: Specification, device: torch.device, progress: CaseProgre
         if (acquisition := trial.acquisition()) not in found:
             found[acquisition] = trial.data.test_cases(*trial.scene())
         for case, source, make in found[acquisition]:
-            name = key(trial, source)
+            name = key(trial, case, source)
             planned[name] = {"case": case} | trial.columns | {"grid": "x".join(map(str, trial.scene()[0].shape))}
             cases.setdefault(case, []).append((trial, name, make))
     results = Results(specification.out, planned)
@@ -112,12 +112,11 @@ def run(specification: Specification, device: torch.device, progress: CaseProgre
             first, _, make = group[0]
             scene = _attempt(lambda: Scene(case, first, made.case(first, make), device))
             for trial, name, _ in group:
-                progress.case(f"{case}: {trial.name}")
+                progress.case(f"{case}: {trial.label}")
                 measured = scene if isinstance(scene, dict) else bench.measure(trial, scene, progress.advance)
                 results.add(name, measured)
-                progress.finished(f"{trial.name}: " + (
-                    f"{measured['seconds']:.2f} s, {measured['psnr']:.2f} dB" if measured["status"] == "ok" else
-                    f"{measured['status']}: {measured['error']}"))
+                progress.finished(f"{measured['seconds']:.2f} s, {measured['psnr']:.2f} dB"
+                                  if measured["status"] == "ok" else f"{measured['status']}: {measured['error']}")
     results.write()
     return results.rows
 

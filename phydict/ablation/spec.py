@@ -88,6 +88,12 @@ class Trial:
     def name(self) -> str:
         return self.columns["method"]
 
+    @property
+    def label(self) -> str:
+        """The method and what was changed of it or of its X-rays."""
+        return ", ".join([self.name, *(f"{name} {value}" for name, value in self.columns.items()
+                                       if "." in name or name in ("views", "delta"))])
+
     def scene(self) -> tuple[Grid, HUWindow]:
         """The grid of the volume and the HU window that the truth is clipped to."""
         if self.prior is None:
@@ -176,6 +182,10 @@ def _specification(content, given: Mapping) -> Specification:
 def _trials(base: Mapping, axes: Mapping, methods: Mapping, cases: Cases) -> tuple[list[Trial], set[str]]:
     """The trials of one product, those that come out the same still among them, and the settings that mean anything
     to one of them."""
+    for name in base | axes:
+        if name not in SETTINGS and not name.startswith(("method.", "simulator.")):
+            raise ValueError(f"there is no setting {name!r}: use one of {', '.join(SETTINGS)}, method.<field> or "
+                             "simulator.<field>")
     if "method" not in base | axes:
         if not methods:
             raise ValueError("there is no method: give it as an axis or in the base")
@@ -183,20 +193,16 @@ def _trials(base: Mapping, axes: Mapping, methods: Mapping, cases: Cases) -> tup
     for name, values in axes.items():
         if not isinstance(values, list) or not values:
             raise ValueError(f"the axis {name} is a list of at least one value, but {values!r} was given")
-    known = set(SETTINGS)
-    for name in base | axes:
-        if name not in known and not name.startswith(("method.", "simulator.")):
-            raise ValueError(f"there is no setting {name!r}: use one of {', '.join(SETTINGS)}, method.<field> or "
-                             "simulator.<field>")
     found, used = [], set()
     for values in product(*axes.values()):
         mine = dict(zip(axes, values))
         name = mine.get("method", base.get("method"))
-        if name not in methods and name not in METHODS:
+        if not isinstance(name, str) or name not in methods and name not in METHODS:
             raise ValueError(f"there is no method {name!r}: use one of {', '.join([*methods, *METHODS])}")
         changes = _dotted(methods.get(name) or {})
         of = changes.pop("of", name)
         trial, meant = _trial(of, base | changes | mine | {"method": name}, cases)
+        _check_used(changes, meant, [trial])
         found.append(trial)
         used |= meant
     scenes = {(str(grid.to_dict()), window) for grid, window in (trial.scene() for trial in found)}
@@ -311,9 +317,9 @@ def _crc(file: str) -> int:
     return fingerprint(file)
 
 
-def key(trial: Trial, source: str) -> str:
-    """What a row of results is known by: equal for equal settings and equal data alone."""
-    text = json.dumps([trial.identity(), source], sort_keys=True)
+def key(trial: Trial, case: str, source: str) -> str:
+    """What a row of results is known by: equal for equal settings and equal data (id, what identifies it) alone."""
+    text = json.dumps([trial.identity(), case, source], sort_keys=True)
     return f"k{zlib.crc32(text.encode()):08x}{zlib.adler32(text.encode()):08x}"
 
 

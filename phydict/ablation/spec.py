@@ -246,8 +246,6 @@ def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
                  for part, paths in changes.items() for path in paths}
     columns = {name: value[name] for name in SHOWN if name in given or name not in OF_A_PRIOR or with_prior}
     columns |= {name: given[name] for name in SETTINGS if name in given and name not in columns} | overrides
-    if "prior" in columns:
-        columns["prior"] = Path(columns["prior"]).name
     trial = Trial(columns, method, data, value["prior"] if with_prior else None, value["guidance"], value["samples"],
                   value["seed"], value["voxels"], value["side"])
     meant = set(given) | set(overrides)
@@ -302,8 +300,8 @@ def parsed(hint, value, name: str):
 
 
 def plain(value):
-    """A setting as one field of a table."""
-    return json.dumps(describe(value)) if is_dataclass(value) else value
+    """A setting as one field of a table, where an empty field means that it is the method's own."""
+    return json.dumps(describe(value)) if is_dataclass(value) else "none" if value is None else value
 
 
 @cache

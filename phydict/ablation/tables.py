@@ -54,7 +54,7 @@ class Table:
         marks = ("{}", "\\textbf{{{}}}", "\\underline{{{}}}")
         lines = [" & ".join(map(escaped, self.header)) + " \\\\"]
         for (label, _, values), places in zip(self.lines, self.places()):
-            cells = [marks[place].format(text) for text, place in zip(self._texts(values), places)]
+            cells = [marks[place].format(escaped(text)) for text, place in zip(self._texts(values), places)]
             lines.append(" & ".join([escaped(label), *cells]) + " \\\\")
         body = "\n".join([lines[0], "\\midrule", *lines[1:]])
         notes = " ".join(map(escaped, [self.title + ".", *self.notes]))

@@ -11,7 +11,6 @@ import platform
 import resource
 import sys
 import warnings
-import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from importlib.metadata import version
@@ -24,17 +23,18 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException, SI
 from rich.console import Console
 from torch import Tensor
 
+from phydict.ablation import main as ablate
 from phydict.case_results import CaseResults
 from phydict.command_line import check_writable, one_sentence_errors, quiet, sentence
 from phydict.datasets import load_xrays
 from phydict.dry_run import dry_run
-from phydict.evaluation import CaseMetrics, panel, rich_table, volume_metrics
+from phydict.evaluation import CaseMetrics, panel, rich_table
 from phydict.grid import Grid
 from phydict.methods import DEFAULT_PRIOR, fit_to_grid, reconstructor
 from phydict.posterior import CascadePosterior, Sampler
 from phydict.prior import MedSynCheckpoint, fingerprint, load_prior, load_super_resolution
 from phydict.progress import CaseProgress
-from phydict.reconstruction_data import ReconstructionData
+from phydict.reconstruction_data import ReconstructionData, case_scores, case_seed
 from phydict.reconstructor import Reconstruction, Reconstructor, describe, save_nifti
 from phydict.units import HUWindow
 
@@ -128,11 +128,9 @@ class ReconstructionTask(lightning.LightningModule):
         result = self._reconstruct(case)
         if "affine" in case:  # back to its place in the CT it came from
             result = replace(result, grid=Grid(self.grid.shape, affine=case["affine"].numpy()))
-        truth = self.window.to_hu(case["volume"])[None].cpu()
-        lung = case["masks"][None, :1].cpu() if bool(case["has_masks"][0]) else None
-        scores = volume_metrics(result.volume[None, None], truth, lung) | {"misfit": result.misfit}
+        scores = case_scores(result.volume, result.misfit, case, self.window)
         self.metrics.update(case["index"], self.method_name, scores, seconds=sum(result.seconds.values()))
-        self._finish(case, result, scores, truth[0, 0])
+        self._finish(case, result, scores, self.window.to_hu(case["volume"])[0].cpu())
 
     def _attempt(self, case: dict, work: Callable[[dict], None]) -> None:
         """Bad input ends the run, or, where there are more cases, this one alone; a signal ends it between cases."""
@@ -169,7 +167,7 @@ class ReconstructionTask(lightning.LightningModule):
         self.progress.begin(self.method_name, cases, self.reconstructor.steps())
 
     def _seed(self, case: dict) -> int:
-        return zlib.crc32(f"{self.seed}/{case['id']}".encode())
+        return case_seed(self.seed, case["id"])
 
     def _reconstruct(self, case: dict) -> Reconstruction:
         with_report = self.trainer.datamodule.with_report
@@ -265,11 +263,15 @@ class InferenceCLI(LightningCLI):
 
 
 def main(args: list[str] | None = None) -> None:
-    """Command line of inference: predict, test. A bad input ends in one sentence and exit code 2."""
+    """Command line of inference: predict, test, ablate. A bad input ends in one sentence and exit code 2."""
+    args = sys.argv[1:] if args is None else args
+    if args[:1] == ["ablate"]:
+        return ablate(args[1:])
     with one_sentence_errors(MisconfigurationException), quiet():
         cli = InferenceCLI(
             ReconstructionTask, ReconstructionData, args=args, seed_everything_default=0, save_config_callback=None,
-            parser_kwargs={"exit_on_error": False, "description": "Reconstruct chest CTs from X-rays."},
+            parser_kwargs={"exit_on_error": False, "description": (
+                "Reconstruct chest CTs from X-rays. A third subcommand, ablate, compares methods: ablate --help.")},
             trainer_defaults={"inference_mode": False, "logger": False, "enable_progress_bar": False,
                               "enable_checkpointing": False, "enable_model_summary": False, "accelerator": "auto",
                               "devices": 1})

@@ -14,6 +14,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from phydict.datamodule import HELD_OUT_PHANTOM, PHANTOM_VERSION
 from phydict.datasets import CTFile, find_cts, find_xrays, load_case, load_xrays, phantom_case
+from phydict.evaluation import volume_metrics
 from phydict.grid import Grid
 from phydict.reconstructor import describe
 from phydict.units import HUWindow
@@ -99,18 +100,19 @@ class ReconstructionData(lightning.LightningDataModule):
                              for name, folder in self.xray_cases().items()])
 
     def test_dataloader(self) -> DataLoader:
+        task = self.trainer.lightning_module
+        return self._loader(self.test_cases(task.grid, task.window))
+
+    def test_cases(self, grid: Grid, window: HUWindow) -> list[tuple[str, str, Callable[[], dict]]]:
+        """The CTs or phantoms of test: id, what identifies its data, and the function that makes it on `grid`."""
         if not self.cts:
             raise ValueError("test needs data.cts: a NIfTI file, a folder of CTs, or the word phantom")
-        task = self.trainer.lightning_module
         if self.cts == "phantom":
-            return self._loader([
-                (f"phantom-{seed:06d}", f"phantom version {PHANTOM_VERSION}", lambda s=seed: self._with_fine(
-                    task, lambda grid: phantom_case(s, grid, task.window)))
-                for seed in range(HELD_OUT_PHANTOM, HELD_OUT_PHANTOM + self.phantoms)])
-        return self._loader([
-            (ct.id, _ct_source(ct), lambda c=ct: self._with_fine(
-                task, lambda grid: load_case(c, grid, task.window)))
-            for ct in self._chosen(find_cts(self.cts, **self.tables))])
+            return [(f"phantom-{seed:06d}", f"phantom version {PHANTOM_VERSION}", lambda s=seed: self._with_fine(
+                        grid, lambda g: phantom_case(s, g, window)))
+                    for seed in range(HELD_OUT_PHANTOM, HELD_OUT_PHANTOM + self.phantoms)]
+        return [(ct.id, _ct_source(ct), lambda c=ct: self._with_fine(grid, lambda g: load_case(c, g, window)))
+                for ct in self._chosen(find_cts(self.cts, **self.tables))]
 
     def _chosen(self, cts: list[CTFile]) -> list[CTFile]:
         if not self.only:
@@ -136,16 +138,16 @@ class ReconstructionData(lightning.LightningDataModule):
         fine = _divided(grid, tuple(source.shape[-3:]))
         return self.simulator(Projector(fine, self.beam, full_detector=True), window.to_mu(source)[None], seed)[0]
 
-    def _with_fine(self, task: lightning.LightningModule, make: Callable[[Grid], dict]) -> dict:
+    def _with_fine(self, grid: Grid, make: Callable[[Grid], dict]) -> dict:
         """A case; where X-rays are made of a finer volume, that one as "fine", and its block means as the truth."""
         if not self.simulation_voxels:
-            return make(task.grid)
-        voxels, factor = self.simulation_voxels, self.simulation_voxels // task.grid.shape[0]
-        if voxels != factor * task.grid.shape[0]:
-            raise ValueError(f"data.simulation_voxels must be a multiple of the reconstruction's {task.grid.shape[0]} "
+            return make(grid)
+        voxels, factor = self.simulation_voxels, self.simulation_voxels // grid.shape[0]
+        if voxels != factor * grid.shape[0]:
+            raise ValueError(f"data.simulation_voxels must be a multiple of the reconstruction's {grid.shape[0]} "
                              f"voxels, but {voxels} was given")
-        fine = make(_divided(task.grid, tuple(factor * n for n in task.grid.shape)))["volume"]
-        return make(task.grid) | {"fine": fine, "volume": torch.nn.functional.avg_pool3d(fine, factor)}
+        fine = make(_divided(grid, tuple(factor * n for n in grid.shape)))["volume"]
+        return make(grid) | {"fine": fine, "volume": torch.nn.functional.avg_pool3d(fine, factor)}
 
     def transfer_batch_to_device(self, batch: dict, device: torch.device, dataloader_idx: int) -> dict:
         return batch  # a case holds its beam, which has no device; its X-rays are moved when they are reconstructed
@@ -155,6 +157,17 @@ class ReconstructionData(lightning.LightningDataModule):
         cases = Listed([maker for maker in makers if maker[0] in left])
         self.trainer.strategy.barrier()  # every process has looked before any process finishes a case
         return DataLoader(cases, None)
+
+
+def case_seed(seed: int, case: str) -> int:
+    """The seed of one case, which depends neither on the other cases nor on the method."""
+    return zlib.crc32(f"{seed}/{case}".encode())
+
+
+def case_scores(volume: Tensor, misfit: float, case: dict, window: HUWindow) -> dict[str, float]:
+    """Scores of a reconstructed volume (X, Y, Z) in HU against the CT case that its X-rays were made of."""
+    lung = case["masks"][None, :1].cpu() if bool(case["has_masks"][0]) else None
+    return volume_metrics(volume[None, None], window.to_hu(case["volume"])[None].cpu(), lung) | {"misfit": misfit}
 
 
 def _divided(grid: Grid, shape: tuple[int, int, int]) -> Grid:

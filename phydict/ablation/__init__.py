@@ -1,0 +1,7 @@
+"""Methods and settings compared on the same X-rays: from a YAML file to one table, further tables and plots."""
+
+from phydict.ablation.command import main
+from phydict.ablation.run import run
+from phydict.ablation.spec import Specification, Trial, read_specification
+
+__all__ = ["Specification", "Trial", "main", "read_specification", "run"]

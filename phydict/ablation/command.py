@@ -1,0 +1,43 @@
+"""The command line of ablations: runs what is missing of a specification, then makes its tables and plots."""
+
+from __future__ import annotations
+
+import torch
+from jsonargparse import ArgumentParser
+
+from phydict.ablation.plots import write_plots
+from phydict.ablation.run import RESULTS, alone_in, run
+from phydict.ablation.spec import read_specification
+from phydict.ablation.summary import entries
+from phydict.ablation.tables import all_tables, write_tables
+from phydict.command_line import check_writable, one_sentence_errors, quiet
+from phydict.progress import CaseProgress
+
+
+def main(args: list[str] | None = None) -> None:
+    """infer.py ablate -c <file>. A bad input ends in one sentence and exit code 2; a run that was stopped goes on."""
+    with one_sentence_errors(), quiet():
+        given = _parser().parse_args(args).as_dict()
+        device = given.pop("device") or ("cuda" if torch.cuda.is_available() else "cpu")
+        specification = read_specification(given.pop("config"), **given)
+        check_writable(specification.out, "out")
+        with alone_in(specification.out), CaseProgress() as progress:
+            rows = run(specification, torch.device(device), progress)
+        print(f"{len(rows)} rows in {specification.out / RESULTS}")
+        found = entries(rows)
+        written = write_tables(specification.out, all_tables(found, rows)) + write_plots(specification.out, found)
+        print(f"tables and plots in {specification.out}: {', '.join(path.name for path in written)}")
+
+
+def _parser() -> ArgumentParser:
+    parser = ArgumentParser(prog="infer.py ablate", exit_on_error=False, description=(
+        "Compare methods on the same X-rays: every combination of settings that a file names, one row of results each, "
+        "then tables and plots."))
+    parser.add_argument("-c", "--config", required=True, help="what to compare, such as configs/ablate/pareto.yaml")
+    parser.add_argument("--cts", type=str, help="a NIfTI file or a folder of CTs, instead of the file's cases")
+    parser.add_argument("--phantoms", type=int, help="a number of phantoms, instead of the file's cases")
+    parser.add_argument("--only", type=str, help="a text file of the case ids to take")
+    parser.add_argument("--reports", type=str, help="CT-RATE's table of reports, or the folder it is in")
+    parser.add_argument("--out", type=str, help="folder of the results, instead of the file's")
+    parser.add_argument("--device", type=str, help="cpu or cuda; left out: cuda where there is one")
+    return parser

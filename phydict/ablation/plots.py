@@ -1,0 +1,136 @@
+"""Plots of an ablation: seconds against error, error against views, Extra Compute's delta, where the time goes."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from phydict.ablation.summary import SHOWN_MEASURES, Entry, best_settings, conditions, told
+from phydict.ablation.tables import apart, deltas, headed
+from phydict.atomic import whole_file
+
+COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f", "#bcbd22", "#17becf",
+           "#005f40", "#b15928", "#6a3d9a", "#ff1493")
+MARKERS = "osD^v<>pP*Xhd8"
+STAGES = {"seconds_network": "network", "seconds_projector": "projector", "rest": "the rest"}
+
+
+def write_plots(folder: Path, found: Sequence[Entry]) -> list[Path]:
+    """Every plot that the entries allow, as PNG in a folder; returns the files."""
+    written, style = [], styles(found)
+    for condition, group in conditions(found):
+        own = [entry for entry in group if entry.complete]
+        where = ", ".join(told(condition))
+        if len(own) > 1:
+            written.append(_draw(folder, f"pareto {where}", 2, lambda axes: _pareto(axes, own, where, style)))
+            written.append(_draw(folder, f"stages {where}", 1, lambda axes: _stages(axes[0], own, where)))
+    for rest, group in apart(found, "views"):
+        if len({entry.condition.get("views") for entry in group}) > 1:
+            written.append(_draw(folder, f"views {' '.join(told(rest))}", 2, lambda axes: _views(axes, group, style)))
+    curves = [(label, group) for label, group in deltas(found) if len(group) > 1]
+    if curves:
+        written.append(_draw(folder, "delta", 2, lambda axes: _deltas(axes, curves)))
+    return written
+
+
+def styles(found: Sequence[Entry]) -> dict[str, dict]:
+    """A colour and a marker for each method, the same in every plot."""
+    return {method: {"color": COLOURS[i % len(COLOURS)], "marker": MARKERS[i % len(MARKERS)]}
+            for i, method in enumerate(dict.fromkeys(entry.method for entry in found))}
+
+
+def front(points: Sequence[tuple[float, float]]) -> list[int]:
+    """Of points (cost, gain) those that none beats, in order of cost: no other costs at most as much and gains at
+    least as much, one of both strictly."""
+    kept, best = [], -math.inf
+    for i in sorted(range(len(points)), key=lambda i: (points[i][0], -points[i][1])):
+        if points[i][1] > best:
+            kept.append(i)
+            best = points[i][1]
+    return kept
+
+
+def _draw(folder: Path, name: str, panels: int, draw: Callable[[Sequence[Axes]], None]) -> Path:
+    figure = Figure(figsize=(5.5 * panels + 2.5, 4.8), dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    draw(figure.subplots(1, panels, squeeze=False)[0])
+    path = folder / (re.sub(r"[^\w.]+", "_", name.strip()) + ".png")
+    with whole_file(path) as part:
+        figure.savefig(part, format="png")
+    return path
+
+
+def _pareto(axes: Sequence[Axes], group: Sequence[Entry], where: str, style: dict) -> None:
+    """Seconds against PSNR and SSIM; the settings of a method are joined, and the front is dashed."""
+    for ax, name in zip(axes, ("psnr", "ssim")):
+        for method in dict.fromkeys(entry.method for entry in group):
+            own = sorted((e.means["seconds"], e.means[name]) for e in group if e.method == method)
+            ax.plot(*zip(*own), **style[method], linewidth=0.8, markersize=6, label=method)
+        points = [(e.means["seconds"], e.means[name]) for e in group]
+        best = [points[i] for i in front(points)]
+        ax.plot(*zip(*best), color="black", linestyle="--", linewidth=1, zorder=0, label="front")
+        for i in front(points):
+            ax.annotate(group[i].label, points[i], xytext=(4, 4), textcoords="offset points", fontsize=7)
+        ax.set_xscale("log")
+        _dress(ax, "seconds per case", headed(SHOWN_MEASURES[name]))
+        ax.set_title(where, fontsize=9)
+    axes[-1].legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
+
+
+def _views(axes: Sequence[Axes], group: Sequence[Entry], style: dict) -> None:
+    for ax, name in zip(axes, ("psnr", "ssim")):
+        labels = {", ".join([e.method, *told(e.settings)]): e.method for e in group}
+        for label, method in labels.items():
+            own = sorted((e.condition["views"], e.means[name]) for e in group
+                         if e.complete and ", ".join([e.method, *told(e.settings)]) == label)
+            if own:
+                ax.plot(*zip(*own), **style[method], markersize=5, label=label)
+        views = sorted({e.condition["views"] for e in group})
+        ax.set_xscale("log", base=2)
+        ax.set_xticks(views, map(str, views))
+        _dress(ax, "views", headed(SHOWN_MEASURES[name]))
+    axes[-1].legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
+
+
+def _deltas(axes: Sequence[Axes], curves: Sequence[tuple[str, list[Entry]]]) -> None:
+    """SSIM and, beside it, the misfit of the X-rays."""
+    for ax, name in zip(axes, ("ssim", "misfit")):
+        for i, (label, group) in enumerate(curves):
+            own = [(e.settings["delta"], e.means[name]) for e in group if e.complete]
+            if own:
+                ax.plot(*zip(*own), color=COLOURS[i % len(COLOURS)], marker="o", markersize=5, label=label)
+        _dress(ax, "delta of Extra Compute (0: none)", headed(SHOWN_MEASURES[name]))
+    axes[-1].set_yscale("log")
+    axes[-1].legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
+
+
+def _stages(ax: Axes, group: Sequence[Entry], where: str) -> None:
+    """Stacked shares of the seconds, a bar for each method at its best setting, with the seconds in all."""
+    own = sorted(best_settings(group), key=lambda entry: entry.means["seconds"])
+    labels, left = [entry.label for entry in own], [0.0] * len(own)
+    for stage, label in STAGES.items():
+        shares = []
+        for entry in own:
+            known = {name: entry.means.get(name, 0.0) for name in STAGES if name != "rest"}
+            known["rest"] = max(0.0, entry.means["seconds"] - sum(known.values()))
+            shares.append(100 * known[stage] / entry.means["seconds"])
+        ax.barh(labels, shares, left=left, label=label)
+        left = [a + b for a, b in zip(left, shares)]
+    for i, entry in enumerate(own):
+        ax.annotate(f"{entry.means['seconds']:.3g} s", (100, i), xytext=(4, -3), textcoords="offset points", fontsize=7)
+    _dress(ax, "share of the time (%)", "")
+    ax.set_title(where, fontsize=9)
+    ax.legend(fontsize=7, loc="lower center", bbox_to_anchor=(0.5, 1.06), ncols=3)
+
+
+def _dress(ax: Axes, x: str, y: str) -> None:
+    ax.set_xlabel(x)
+    ax.set_ylabel(y)
+    ax.grid(True, linewidth=0.3)
+    ax.tick_params(labelsize=8)

@@ -1,0 +1,206 @@
+"""Runs the trials of a specification on every case, and keeps one row of results for each."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from phydict.ablation.spec import Specification, Trial, key, prior_of
+from phydict.ablation.timing import PeakMemory, TimedPrior, TimedProjector, WarmUp
+from phydict.command_line import sentence
+from phydict.evaluation import read_csv, write_csv
+from phydict.methods import fit_to_grid, reconstructor
+from phydict.posterior import Sampler
+from phydict.progress import CaseProgress
+from phydict.reconstruction_data import case_scores, case_seed
+from phydict.reconstructor import Reconstruction, Stopwatch
+
+RESULTS = "results.csv"
+
+FINISHED = ("ok", "refused", "diverged")
+"""What a row's status may be that is not tried again; "failed" is, since its reason may lie outside."""
+
+MEASURED = ("status", "error", "ssim", "psnr", "mae_hu", "ssim_lung", "psnr_lung", "mae_hu_lung", "misfit", "seconds",
+            "seconds_prepare", "seconds_sample", "seconds_score", "seconds_network", "seconds_projector",
+            "network_calls", "projector_calls", "peak_memory_mb", "device", "threads")
+"""Columns that a run fills; the others are the trial's."""
+
+
+class Results:
+    """The table of results in a folder, of which this process alone writes while it is open.
+
+    A row is known by its key (spec.key): rows of other settings or other data that the file holds are kept at its end.
+    Raises ValueError where another process has it open or the file is damaged.
+    """
+
+    def __init__(self, folder: Path, planned: Mapping[str, dict]):
+        self.file, self.planned = folder / RESULTS, planned
+        found = {row.get("key"): row for row in read_csv(self.file)}
+        if None in found:
+            raise ValueError(f"{self.file} has rows without a key, so that it is no table of this command: give "
+                             "another out")
+        self.others = [row for name, row in found.items() if name not in planned]
+        self.done = {name: self._row(name, row) for name, row in found.items()
+                     if name in planned and row.get("status") in FINISHED}
+
+    def _row(self, name: str, measured: Mapping) -> dict:
+        return self.planned[name] | {k: measured[k] for k in MEASURED if measured.get(k) is not None} | {"key": name}
+
+    @property
+    def rows(self) -> list[dict]:
+        """The rows of what is planned, in its order."""
+        return [self.done[name] for name in self.planned if name in self.done]
+
+    def add(self, name: str, measured: Mapping) -> None:
+        """Adds a row and writes the table, in one step."""
+        self.done[name] = self._row(name, measured)
+        self.write()
+
+    def write(self) -> None:
+        """The table with the columns in one order, whatever order its rows came in."""
+        order = dict.fromkeys(k for row in self.planned.values() for k in row) | dict.fromkeys((*MEASURED, "key"))
+        write_csv(self.file, [{k: row.get(k) for k in order} | row for row in self.rows + self.others])
+
+
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Raises ValueError where another process is inside with the same folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(folder / ".lock", "w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise ValueError(f"another run writes to {folder}: wait for its end, or give another out") from error
+        yield
+
+
+def run(specification: Specification, device: torch.device, progress: CaseProgress) -> list[dict]:
+    """The rows of a specification: those that its table holds already, and those that are run now.
+
+    Case by case; the X-rays of a case are simulated once for all trials that share an acquisition.
+    """
+    found, planned = {}, {}  # cases of an acquisition; key -> columns
+    cases: dict[str, list] = {}  # id -> trials, their rows' keys, and the functions that make the case
+    for trial in specification.trials:
+        if (acquisition := trial.acquisition()) not in found:
+            found[acquisition] = trial.data.test_cases(*trial.scene())
+        for case, source, make in found[acquisition]:
+            name = key(trial, case, source)
+            planned[name] = {"case": case} | trial.columns | {"grid": "x".join(map(str, trial.scene()[0].shape))}
+            cases.setdefault(case, []).append((trial, name, make))
+    results = Results(specification.out, planned)
+    left = sum(name not in results.done for name in planned)
+    print(f"{len(planned) - left} of {len(planned)} rows are there already, {left} are to be run")
+    if results.others:
+        print(f"{len(results.others)} rows of other settings or data are kept in {results.file} and left out of tables")
+    bench = Bench(device)
+    progress.begin("ablate", left, verb="run")
+    for case, work in cases.items():
+        groups: dict[str, list] = {}
+        made = Made()
+        for trial, name, make in work:
+            if name not in results.done:
+                groups.setdefault(trial.acquisition(), []).append((trial, name, make))
+        for group in groups.values():
+            first, _, make = group[0]
+            scene = _attempt(lambda: Scene(case, first, made.case(first, make), device))
+            for trial, name, _ in group:
+                progress.case(f"{case}: {trial.label}")
+                measured = scene if isinstance(scene, dict) else bench.measure(trial, scene, progress.advance)
+                results.add(name, measured)
+                progress.finished(f"{measured['seconds']:.2f} s, {measured['psnr']:.2f} dB"
+                                  if measured["status"] == "ok" else f"{measured['status']}: {measured['error']}")
+    results.write()
+    return results.rows
+
+
+class Made:
+    """One case as trials need it, made once for each grid, HU window and voxels of its simulation."""
+
+    def __init__(self):
+        self._kept = {}
+
+    def case(self, trial: Trial, make: Callable[[], dict]) -> dict:
+        """The case of a trial."""
+        grid, window = trial.scene()
+        like = str((grid.to_dict(), window, trial.data.simulation_voxels))
+        if like not in self._kept:
+            self._kept[like] = make()
+        return self._kept[like]
+
+
+class Scene:
+    """One case under one acquisition: X-rays for all methods, and the truth, which no method is shown."""
+
+    def __init__(self, case: str, trial: Trial, made: dict, device: torch.device):
+        self.case, self.truth = case, made
+        (self.grid, self.window), data = trial.scene(), trial.data
+        self.beam, self.mu_water = data.beam, data.simulator.effective_mu_water
+        self.xrays = data.simulate(made, case_seed(trial.seed, case), self.grid, self.window, device)
+
+    def report(self, trial: Trial) -> str:
+        """The report, where the trial uses it and its prior reads text."""
+        prior = prior_of(trial.prior) if trial.prior else None
+        reads = prior is not None and (prior.text is not None or prior.load_text is not None)
+        return self.truth["report"] if reads and trial.data.with_report else ""
+
+
+class Bench:
+    """Runs trials and measures them; what only a first call costs is spent before the clock runs."""
+
+    def __init__(self, device: torch.device):
+        self.device, self.warm = device, set()
+
+    def measure(self, trial: Trial, scene: Scene, on_step: Callable[[], None]) -> dict:
+        """The measured columns of one trial on one case."""
+        if (state := str(trial.identity() | {"seed": None})) not in self.warm:
+            self.warm.add(state)
+            _attempt(lambda: self._reconstruct(trial, scene, Stopwatch(), WarmUp(on_step)))
+        return _attempt(lambda: self._measured(trial, scene, on_step))
+
+    def _measured(self, trial: Trial, scene: Scene, on_step: Callable[[], None]) -> dict:
+        watch, memory = Stopwatch(), PeakMemory(self.device)
+        result = self._reconstruct(trial, scene, watch, on_step)
+        peak, finite = memory.mb(), bool(result.volume.isfinite().all())
+        scores = case_scores(result.volume, result.misfit, scene.truth, scene.window) if finite else {}
+        return scores | {
+            "status": "ok" if finite else "diverged",
+            "error": None if finite else "the volume holds NaN or infinite voxels", "misfit": result.misfit,
+            "seconds": sum(result.seconds.values()),
+            **{f"seconds_{stage}": value for stage, value in (result.seconds | watch.seconds).items()},
+            "network_calls": result.network_calls, "projector_calls": result.projector_calls, "peak_memory_mb": peak,
+            "device": self.device.type, "threads": torch.get_num_threads()}
+
+    def _reconstruct(self, trial: Trial, scene: Scene, watch: Stopwatch, on_step: Callable[[], None]) -> Reconstruction:
+        seed = case_seed(trial.seed, scene.case)
+        torch.manual_seed(seed)
+        prior = TimedPrior(_on(trial.prior, self.device), watch) if isinstance(trial.method, Sampler) else None
+        ready = reconstructor(trial.method, prior, trial.guidance, trial.name, samples=trial.samples)
+        xrays, projector = fit_to_grid(ready, scene.grid, scene.xrays.clone(), scene.beam)
+        return ready.assuming(scene.mu_water).reconstruct(
+            xrays, TimedProjector(projector, watch), scene.report(trial), False, seed, on_step)
+
+
+@cache
+def _on(prior: str, device: torch.device):
+    return prior_of(prior).to(device)
+
+
+def _attempt(work: Callable[[], object]) -> object | dict:
+    """What `work` gives, or the columns of a row that says why there is nothing; with PHYDICT_TRACEBACK=1 the trace of
+    a failure instead."""
+    try:
+        return work()
+    except ValueError as error:
+        return {"status": "refused", "error": sentence(error)}
+    except Exception as error:  # of whatever kind: one method's failure must not end the others' runs
+        if os.environ.get("PHYDICT_TRACEBACK"):
+            raise
+        return {"status": "failed", "error": f"{type(error).__name__}: {sentence(error)}"}

@@ -1,0 +1,119 @@
+"""From rows of results to what tables and plots show: conditions, settings of methods, and means over cases."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from phydict.ablation.run import MEASURED
+from phydict.evaluation.metrics import MEASURES, Measure
+
+SHOWN_MEASURES = MEASURES | {"network_calls": Measure("network calls", None, 0),
+                             "projector_calls": Measure("projector calls", None, 0),
+                             "peak_memory_mb": Measure("peak memory (MB)", False, 0)}
+"""How the columns of results are printed."""
+
+OF_A_METHOD = ("method", "prior", "guidance", "samples", "delta", "report")
+"""Columns that, with method.<field>, tell one method's settings; all others but seeds tell the X-rays."""
+
+NEITHER = (*MEASURED, "case", "key", "seed", "grid")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """The mean over cases of one method's settings under one condition.
+
+    settings: those that differ among the method's entries, beside its name; means: measure -> mean over cases, the
+    seeds of a case averaged first; cases, of: how many cases it has and how many it was to have; error: why one is
+    missing.
+    """
+
+    method: str
+    settings: dict
+    condition: dict
+    means: dict[str, float]
+    cases: int
+    of: int
+    error: str | None = None
+
+    @property
+    def complete(self) -> bool:
+        return 0 < self.cases == self.of
+
+    @property
+    def label(self) -> str:
+        """The method with its settings, and how many cases it has where some are missing."""
+        return ", ".join([self.method, *told(self.settings)]) + (
+            f" ({self.cases} of {self.of} cases)" if 0 < self.cases < self.of else "")
+
+
+def told(settings: Mapping) -> list[str]:
+    """Settings in words: "K = 8", "iterations 50"."""
+    return [_told(name, f"{value:g}" if isinstance(value, float) else str(value)) for name, value in settings.items()]
+
+
+def _told(name: str, value: str) -> str:
+    if name == "simulator":
+        return value
+    return f"K = {value}" if name == "views" else f"{name.split('.', 1)[-1].replace('_', ' ')} {value}"
+
+
+def entries(rows: Iterable[Mapping]) -> list[Entry]:
+    """One entry per method, settings and condition, in the order of the rows.
+
+    The condition of an entry is what differs among the rows' X-rays.
+    """
+    rows = list(rows)
+    names = [name for name in dict.fromkeys(k for row in rows for k in row) if name not in NEITHER]
+    mine = [name for name in names if name in OF_A_METHOD or name.startswith("method.")]
+    varying = _varying(rows, [name for name in names if name not in mine])
+    own = {method: _varying([row for row in rows if row["method"] == method], [n for n in mine if n != "method"])
+           for method in dict.fromkeys(row["method"] for row in rows)}
+    groups: dict[tuple, list] = {}
+    for row in rows:
+        place = (row["method"], *(row.get(name) for name in (*own[row["method"]], *varying)))
+        groups.setdefault(place, []).append(row)
+    return [_entry(group, own[group[0]["method"]], varying) for group in groups.values()]
+
+
+def conditions(found: Sequence[Entry]) -> list[tuple[dict, list[Entry]]]:
+    """The entries under each condition."""
+    groups: dict[tuple, list] = {}
+    for entry in found:
+        groups.setdefault(tuple(entry.condition.items()), []).append(entry)
+    return [(dict(condition), group) for condition, group in groups.items()]
+
+
+def best_settings(found: Sequence[Entry], measure: str = "psnr") -> list[Entry]:
+    """Of each method the entry with the highest mean of `measure`, complete ones first."""
+    best: dict[str, Entry] = {}
+    for entry in found:
+        rank = (entry.complete, entry.means.get(measure, -math.inf))
+        other = best.get(entry.method)
+        if other is None or rank > (other.complete, other.means.get(measure, -math.inf)):
+            best[entry.method] = entry
+    return list(best.values())
+
+
+def _entry(rows: Sequence[Mapping], own: Sequence[str], varying: Sequence[str]) -> Entry:
+    first, good = rows[0], {}
+    for row in rows:
+        if row["status"] == "ok":
+            good.setdefault(row["case"], []).append(row)
+    means = {}
+    for name in SHOWN_MEASURES.keys() | {k for row in rows for k in row if k.startswith("seconds_")}:
+        values = [np.mean([row[name] for row in group]) for group in good.values() if all(name in r for r in group)]
+        if values and len(values) == len(good):
+            means[name] = float(np.mean(values))
+    error = next((f"{row['status']}: {row['error']}" for row in rows if row["status"] != "ok"), None)
+    return Entry(first["method"], {n: first[n] for n in own if n in first},
+                 {n: first[n] for n in varying if n in first}, means, len(good), len({row["case"] for row in rows}),
+                 error)
+
+
+def _varying(rows: Sequence[Mapping], names: Sequence[str]) -> list[str]:
+    return [name for name in names if len({row.get(name) for row in rows}) > 1]
+

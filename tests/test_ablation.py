@@ -1,0 +1,384 @@
+"""Ablations: what is run, on which X-rays, what a stop leaves, and what tables and plots make of it."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import random
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from prior.tiny import tiny_prior
+
+from phydict.ablation import plots, read_specification
+from phydict.ablation.run import alone_in
+from phydict.ablation.spec import changed, refined_from
+from phydict.ablation.summary import entries
+from phydict.ablation.tables import Table, all_tables, ranks
+from phydict.ablation.timing import TimedProjector
+from phydict.baselines.baseline import Baseline
+from phydict.evaluation import read_csv
+from phydict.evaluation.metrics import MEASURES
+from phydict.grid import Grid
+from phydict.inference import main
+from phydict.methods import METHODS
+from phydict.posterior import DAPS, SplitGibbs
+from phydict.prior import save_prior
+from phydict.reconstructor import Stopwatch
+from phydict.units import MU_WATER
+from phydict.xray import ConeBeam, Projector
+
+ROOT = Path(__file__).parents[1]
+TINY = {"voxels": 16, "detector": 24, "views": 3}
+TIMES = ("seconds", "memory")
+
+
+@dataclass(frozen=True)
+class Trace(Baseline):
+    """A method of four steps that keeps what it is given, does as it is told, and spoils its own X-rays."""
+
+    citation = "none"
+    given = []
+    behave = staticmethod(lambda calls: None)
+
+    mu_water: float = MU_WATER
+    name: str = "trace"
+
+    def steps(self):
+        return 4
+
+    def reconstruct(self, xrays, projector, report="", display=False, seed=0, on_step=lambda: None):
+        Trace.given.append((xrays.clone(), seed, report))
+        try:
+            return super().reconstruct(xrays, projector, report, display, seed, on_step)
+        finally:
+            xrays.zero_()
+
+    def solve(self, A, y, on_step):
+        for _ in range(4):
+            on_step()
+        Trace.behave(len(Trace.given))
+        return A.T(y) / 1e4
+
+
+@pytest.fixture(autouse=True)
+def trace(monkeypatch):
+    monkeypatch.setitem(METHODS, "trace", Trace())
+    monkeypatch.setattr(Trace, "given", [])
+    return Trace
+
+
+def write(folder: Path, **content) -> Path:
+    file = folder / "spec.yaml"
+    file.write_text(yaml.safe_dump({"out": str(folder / "out"), "phantoms": 2, "base": TINY} | content))
+    return file
+
+
+def ablate(folder: Path, **content) -> list[dict]:
+    """The rows after a run."""
+    main(["ablate", "-c", str(write(folder, **content)), "--device", "cpu"])
+    return read_csv(folder / "out" / "results.csv")
+
+
+def lasting(rows: list[dict]) -> list[dict]:
+    """Rows without what the clock decides."""
+    return [{k: v for k, v in row.items() if not any(word in k for word in TIMES)} for row in rows]
+
+
+def refusal(capsys, args: list[str]) -> str:
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as stopped:
+        main(args)
+    assert stopped.value.code == 2
+    (line,) = (line for line in capsys.readouterr().err.splitlines() if line.startswith("error: "))
+    return line
+
+
+def test_a_stopped_run_loses_no_row_and_ends_as_if_it_had_not_been_stopped(tmp_path, monkeypatch, trace):
+    axes = {"method": ["trace", "sirt"], "seed": [0, 1], "method.iterations": [2]}
+    (tmp_path / "whole").mkdir()
+    whole = ablate(tmp_path / "whole", axes=axes)
+    assert len(whole) == 8 and {row["status"] for row in whole} == {"ok"}
+
+    def stop(calls):
+        if calls == before + 4:  # the second case's warm call is that of the first case: 2 + 2 calls for two seeds
+            raise KeyboardInterrupt
+
+    before = len(trace.given)
+    monkeypatch.setattr(trace, "behave", staticmethod(stop))
+    with pytest.raises(SystemExit) as stopped:
+        ablate(tmp_path, axes=axes)
+    assert stopped.value.code == 130
+    kept = {row["key"]: row for row in read_csv(tmp_path / "out" / "results.csv")}
+    assert 0 < len(kept) < 8
+    monkeypatch.setattr(trace, "behave", staticmethod(lambda calls: None))
+    resumed = ablate(tmp_path, axes=axes)
+    assert lasting(resumed) == lasting(whole)
+    assert all(row == kept[row["key"]] for row in resumed if row["key"] in kept)
+
+
+def test_nothing_is_run_again_and_tables_and_plots_come_back(tmp_path, trace):
+    content = {"axes": {"method": ["trace", "sirt"], "method.iterations": [2], "views": [2, 3]}}
+    rows = ablate(tmp_path, **content)
+    calls, out = len(trace.given), tmp_path / "out"
+    made = {path.name: path.read_bytes() for path in out.iterdir() if path.suffix in (".md", ".tex", ".csv")}
+    pictures = [path for path in out.iterdir() if path.suffix == ".png"]
+    assert {p.name.split("_")[0] for p in pictures} >= {"pareto", "stages"} and "tables.tex" in made
+    for path in pictures:
+        path.unlink()
+    assert ablate(tmp_path, **content) == rows and len(trace.given) == calls
+    assert {path.name: path.read_bytes() for path in out.iterdir() if path.name in made} == made
+    assert all(path.exists() for path in pictures)
+
+
+def test_an_axis_that_grows_runs_what_is_new_alone(tmp_path, trace):
+    first = ablate(tmp_path, axes={"method": ["trace"], "views": [2]})
+    calls = len(trace.given)
+    both = ablate(tmp_path, axes={"method": ["trace"], "views": [3, 2]})
+    assert len(trace.given) == calls + 3  # a warm call and two cases
+    assert [row["views"] for row in both] == [3, 3, 2, 2] and both[2:] == first
+    again = ablate(tmp_path, axes={"method": ["trace"], "views": [3]})
+    assert {row["key"] for row in again} == {row["key"] for row in both} and len(trace.given) == calls + 3
+
+
+def test_all_methods_see_the_same_xrays_and_score_as_in_a_test_of_their_own(tmp_path, monkeypatch, trace):
+    monkeypatch.setitem(METHODS, "trace again", Trace())
+    rows = ablate(tmp_path, axes={"method": ["trace", "trace again", "sirt"], "method.iterations": [3]})
+    calls = {seed: [] for _, seed, _ in trace.given}
+    for xrays, seed, report in trace.given:
+        calls[seed].append(xrays)
+        assert report == ""
+    assert len(calls) == 2 and all(len(seen) >= 2 for seen in calls.values())
+    assert all(torch.equal(seen[0], other) for seen in calls.values() for other in seen)
+    assert not torch.equal(*(seen[0] for seen in calls.values()))
+    main(["test", f"--config={ROOT / 'configs' / 'reconstruct' / 'sirt.yaml'}", "--data.cts=phantom",
+          "--data.phantoms=2", "--data.views=3", "--data.detector=[24,24]", f"--data.pixel=[{560 / 24},{560 / 24}]",
+          "--model.method.init_args.iterations=3", "--model.voxels=16", f"--model.out={tmp_path}",
+          "--trainer.accelerator=cpu"])
+    for own in read_csv(tmp_path / "sirt" / "results.csv"):
+        (row,) = (row for row in rows if row["method"] == "sirt" and row["case"] == own["case"])
+        for name in ("psnr", "ssim", "mae_hu", "psnr_lung", "misfit", "projector_calls"):
+            assert row[name] == own[name], name
+
+
+def test_one_untimed_call_per_setting_stops_after_two_steps(tmp_path, monkeypatch, trace):
+    steps = []
+    solve = trace.solve
+    monkeypatch.setattr(trace, "solve", lambda self, A, y, on_step: solve(
+        self, A, y, lambda: (steps.append(len(trace.given)), on_step())))
+    ablate(tmp_path, axes={"method": ["trace"]})
+    assert [len(list(group)) for _, group in itertools.groupby(steps)] == [2, 4, 4]
+
+
+@pytest.mark.parametrize("error, status, again", [(ValueError("Two\nlines."), "refused", 0),
+                                                  (RuntimeError("no memory"), "failed", 1)])
+def test_a_method_that_gives_up_is_a_row_with_its_sentence(tmp_path, monkeypatch, trace, error, status, again):
+    def give_up(calls):
+        raise error
+
+    monkeypatch.setattr(trace, "behave", staticmethod(give_up))
+    content = {"phantoms": 1, "axes": {"method": ["trace", "sirt", "cgls"], "method.iterations": [2]}}
+    rows = ablate(tmp_path, **content)
+    assert [row["status"] for row in rows] == [status, "ok", "ok"]
+    assert rows[0]["error"].endswith(" ".join(str(error).split())) and "psnr" not in rows[0]
+    table = (tmp_path / "out" / "tables.md").read_text()
+    assert "| trace | – |" in table and rows[0]["error"] in table
+    calls = len(trace.given)
+    ablate(tmp_path, **content)
+    assert (len(trace.given) > calls) == bool(again)
+
+
+def test_a_setting_that_means_nothing_to_a_method_does_not_multiply_it(tmp_path):
+    trials = read_specification(write(
+        tmp_path, base=TINY | {"voxels": 64}, axes={"method": ["sirt", "phydict_fast"], "guidance": [1, 2],
+                                                    "method.warm_start": [0.2, 0.4]})).trials
+    assert [trial.name for trial in trials] == ["sirt"] + ["phydict_fast"] * 4
+    assert "guidance" not in trials[0].columns and trials[-1].columns["method.warm_start"] == 0.4
+    assert trials[-1].guidance == 2.0 and trials[-1].method.warm_start == 0.4
+
+
+def test_named_variants_change_a_method_under_the_axes(tmp_path):
+    methods = {"mine": {"of": "phydict_paper", "method.likelihood.reward.lpips": 0, "method.iterations": 7}}
+    one, two = read_specification(write(tmp_path, base={}, methods=methods,
+                                        axes={"method.init_args.iterations": [7, 9]})).trials
+    assert (one.name, two.name) == ("mine", "mine") and (one.method.iterations, two.method.iterations) == (7, 9)
+    assert one.method.likelihood.reward.lpips == 0
+    assert changed(one.method, {"likelihood.reward.lpips": 1.0, "iterations": 50}, "method") == METHODS["phydict_paper"]
+
+
+def test_settings_that_hold_each_other_are_changed_together():
+    method = changed(METHODS["pnp_dm"], {"iterations": 8, "burn_in": 6}, "method")
+    assert (method.iterations, method.burn_in) == (8, 6)
+    assert changed(DAPS(), {"likelihood": {"class_path": "phydict.posterior.ExactDraw"}, "likelihood.iterations": 3},
+                   "method").likelihood.iterations == 3
+
+
+def test_delta_keeps_the_length_of_a_step():
+    paper = METHODS["phydict_paper"]
+    assert refined_from(paper, 0.8) == paper
+    for delta in (0.1, 0.5, 0.99):
+        method = refined_from(SplitGibbs(100), delta)
+        assert method.refine_from / method.refine_iterations == pytest.approx(1 / 100)
+    assert refined_from(paper, 0.0).steps() == paper.iterations
+
+
+@pytest.mark.parametrize("content, words", [
+    ({"axes": {"veiws": [2]}}, ["'veiws'", "views"]),
+    ({"axes": {"method": ["sirt"], "veiws": [2]}}, ["'veiws'", "views"]),
+    ({"axes": {"method": ["sart"]}}, ["'sart'", "sirt"]), ({"axes": {"method": [["sirt"]]}}, ["['sirt']"]),
+    ({"axes": {"method": []}}, ["method", "at least one"]), ({"axes": {"method": "sirt"}}, ["list", "'sirt'"]),
+    ({"axes": {"method": ["sirt"], "views": ["two"]}}, ["views", "int", "'two'"]),
+    ({"axes": {"method": ["sirt"], "views": [0]}}, ["one view"]),
+    ({"axes": {"method": ["sirt"], "views": [None]}}, ["views", "None"]),
+    ({"axes": {"method": ["sirt"], "method.iterations": [2.5]}}, ["method.iterations", "2.5"]),
+    ({"axes": {"method": ["sirt"], "method.steps": [2]}}, ["method.steps", "iterations"]),
+    ({"axes": {"method": ["tv"], "method.iterations": [0]}}, ["iterations of at least 1"]),
+    ({"axes": {"method": ["sirt"], "delta": [0.5]}}, ["delta"]),
+    ({"axes": {"method": ["sirt"], "simulator": ["real"]}}, ["'real'", "polychromatic"]),
+    ({"axes": {"method": ["sirt"], "simulator.kvp": [80]}}, ["simulator.kvp", "photons"]),
+    ({"axes": {"method": ["sirt", "prior_only"]}}, ["one grid"]),
+    ({"axes": {"method": ["sirt"]}, "cts": "folder"}, ["one of the two"]),
+    ({"axes": {}}, ["no method"]), ({"products": []}, ["products"]), ({"products": [{"axis": {}}]}, ["'axis'"]),
+    ({"axes": {"method": ["sirt"]}, "products": []}, ["not both"]), ({"axs": {}}, ["'axs'"]),
+    ({"methods": {"mine": {"of": "sart"}}}, ["'sart'"]), ({"methods": {"mine": {}}}, ["'mine'"]),
+    ({"methods": {"mine": {"of": "sirt", "method.iteration": 2}}}, ["method.iteration ", "iterations"]),
+    ({"base": TINY | {"method.iteration": 3}, "axes": {"method": ["sirt"]}}, ["method.iteration "]),
+    ({"axes": [1]}, ["axes", "mapping"])], ids=lambda value: str(value)[:60] if isinstance(value, dict) else "")
+def test_a_specification_that_cannot_be_meant_is_one_sentence(tmp_path, capsys, content, words):
+    said = refusal(capsys, ["ablate", "-c", str(write(tmp_path, **content))])
+    assert "spec.yaml" in said and all(word in said for word in words), said
+    assert not (tmp_path / "out").exists()
+
+
+def test_arguments_and_files_that_cannot_be_meant_are_one_sentence(tmp_path, capsys):
+    assert "nowhere.yaml" in refusal(capsys, ["ablate", "-c", str(tmp_path / "nowhere.yaml")])
+    file = write(tmp_path, axes={"method": ["trace"]})
+    assert "nowhere" in refusal(capsys, ["ablate", "-c", str(file), "--cts", str(tmp_path / "nowhere")])
+    (tmp_path / "bad.yaml").write_text("axes: [")
+    assert "bad.yaml is no YAML" in refusal(capsys, ["ablate", "-c", str(tmp_path / "bad.yaml")])
+    with alone_in(tmp_path / "out"):
+        assert "another run" in refusal(capsys, ["ablate", "-c", str(file)])
+    (tmp_path / "out" / "results.csv").write_text("case,method\na,b\n")
+    assert "another out" in refusal(capsys, ["ablate", "-c", str(file)])
+
+
+@pytest.mark.parametrize("config", sorted((ROOT / "configs" / "ablate").glob("*.yaml")), ids=lambda file: file.stem)
+def test_every_committed_specification_can_be_run(config):
+    specification = read_specification(config, phantoms=1)
+    assert len(specification.trials) > 5
+    if config.stem == "pareto":
+        told = yaml.safe_load(config.read_text())["methods"]
+        for views in (2, 8):
+            names = {trial.name for trial in specification.trials if trial.data.beam.views == views}
+            assert {told.get(name, {}).get("of", name) for name in names} >= set(METHODS) - {"trace"}
+
+
+def test_parts_of_the_time_are_parts_of_it_and_calls_are_counted(tmp_path):
+    save_prior(tiny_prior(False), tmp_path / "tiny.safetensors")
+    rows = ablate(tmp_path, phantoms=1, base=TINY | {"prior": str(tmp_path / "tiny.safetensors")},
+                  axes={"method": ["phydict_fast", "dps", "dds"], "method.iterations": [3], "samples": [1, 2]})
+    assert [row["samples"] for row in rows] == [1, 2] * 3 and {row["status"] for row in rows} == {"ok"}
+    for row in rows:
+        assert row["network_calls"] == 3 * row["samples"] and row["projector_calls"] > 3
+        assert 0 < row["seconds_network"] + row["seconds_projector"] <= row["seconds"]
+        assert row["seconds"] == pytest.approx(sum(row[f"seconds_{stage}"] for stage in ("prepare", "sample", "score")))
+        assert row["prior"].endswith("tiny.safetensors") and row["grid"] == "16x16x16"
+
+
+def test_a_timed_projector_is_the_projector():
+    projector, watch = Projector(Grid.cube(8), ConeBeam.orbit(2, 1020, 740, (12, 12), 40.0)), Stopwatch()
+    timed = TimedProjector(projector, watch)
+    mu = torch.rand(1, 1, 8, 8, 8, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    gradients = []
+    for A in (projector, timed):
+        x = mu.clone().requires_grad_(True)
+        y = A(x)
+        (A.T(y).square().sum() + y.sum()).backward()
+        gradients.append(x.grad)
+    torch.testing.assert_close(*gradients, rtol=0, atol=0)
+    assert torch.equal(timed(mu), projector(mu)) and timed.norm() == projector.norm() and watch.seconds["projector"] > 0
+
+
+def test_ranks_follow_the_direction_and_the_printed_values():
+    draw = random.Random(0)
+    for _ in range(200):
+        values = [draw.choice([draw.random(), 0.5, math.nan]) for _ in range(draw.randint(0, 6))]
+        known = sorted(v for v in values if not math.isnan(v))
+        places = ranks(values, False)
+        assert places == ranks([-v for v in values], True)
+        assert [v for v, place in zip(values, places) if place == 1] == (
+            known[:known.count(known[0])] if len(known) > 1 else [])
+        seconds = {v for v, place in zip(values, places) if place == 2}
+        assert seconds == ({known[1]} if len(known) > 1 and known[1] > known[0] else set())
+        assert ranks(values, None) == [0] * len(values)
+
+
+def test_the_best_is_bold_and_the_second_underlined_by_what_is_printed():
+    table = Table("T_1", ["method", "PSNR", "MAE"], [MEASURES["psnr"], MEASURES["mae_hu"]],
+                  [("a_b", True, [20.001, 9.0]), ("b", True, [30.0, 5.0]), ("c", False, [40.0, 1.0]),
+                   ("d", True, [20.0, math.nan])], ["100 %"])
+    lines = table.markdown().splitlines()
+    assert lines[4:8] == ["| a_b | <u>20.00</u> | <u>9.0</u> |", "| b | **30.00** | **5.0** |", "| c | 40.00 | 1.0 |",
+                          "| d | <u>20.00</u> | – |"]
+    tex = table.latex()
+    assert "a\\_b & \\underline{20.00} & \\underline{9.0} \\\\" in tex and "b & \\textbf{30.00} & \\textbf{5.0}" in tex
+    assert "T\\_1. 100 \\%" in tex and "d & \\underline{20.00} & --" in tex
+
+
+def row(case: str, method: str, psnr: float | None, **more) -> dict:
+    scores = {"status": "refused", "error": "no."} if psnr is None else {
+        "status": "ok", "psnr": psnr, "ssim": psnr / 40, "mae_hu": 100.0, "misfit": 1 / psnr, "seconds": 1.0,
+        "network_calls": 4}
+    return {"case": case, "method": method, "views": 8, "simulator": "ideal", "seed": 0, "grid": "64x64x64"} | more | \
+        scores
+
+
+def test_a_case_counts_once_whatever_its_seeds_and_a_missing_case_takes_a_method_out():
+    rows = [row("a", "x", 10.0), row("a", "x", 20.0, seed=1), row("b", "x", 35.0), row("a", "y", 39.0),
+            row("b", "y", None), row("a", "z", 5.0), row("b", "z", 5.0)]
+    x, y, z = entries(rows)
+    assert x.means["psnr"] == 25.0 and x.complete and not y.complete and y.label == "y (1 of 2 cases)"
+    (table,) = all_tables([x, y, z], rows)
+    text = table.markdown()
+    assert "| x | **0.625** | **25.00** |" in text and "| y (1 of 2 cases) | 0.975 | 39.00 |" in text
+    assert "y: refused: no." in text and "| z | <u>0.125</u> |" in text
+
+
+def test_each_condition_has_its_table_and_the_best_setting_stands_for_a_method():
+    rows = [row("a", "x", 20.0 + n + views / 10, views=views, **{"method.iterations": n}) for views in (2, 8)
+            for n in (1, 3, 2)] + [row("a", "y", 21.0, views=views) for views in (2, 8)]
+    tables = {table.title: table for table in all_tables(entries(rows), rows)}
+    best = tables["Methods, K = 8: each at its setting of highest mean PSNR"]
+    assert [label for label, _, _ in best.lines] == ["x, iterations 3", "y"]
+    assert len(tables["Methods, K = 2: all settings"].lines) == 4
+    assert tables["PSNR (dB) ↑ against the number of views"].header == ["method", "K = 2", "K = 8"]
+    assert tables["PSNR (dB) ↑ against the number of views"].lines[1] == ("x, iterations 3", True, [23.2, 23.8])
+
+
+def test_the_table_of_delta_has_the_misfit_beside_ssim():
+    rows = [row("a", "x", 20.0 + d, delta=d) for d in (0.0, 0.8, 0.1)]
+    table = next(t for t in all_tables(entries(rows), rows) if "delta" in t.header)
+    assert table.header[1:3] == ["SSIM ↑", "misfit ↓"] and [label for label, _, _ in table.lines] == ["0", "0.1", "0.8"]
+    assert [values[:2] for _, _, values in table.lines] == [[(20 + d) / 40, 1 / (20 + d)] for d in (0.0, 0.1, 0.8)]
+
+
+def test_the_front_holds_what_nothing_beats():
+    draw = random.Random(1)
+    for _ in range(100):
+        points = [(draw.randint(1, 6), draw.randint(1, 6)) for _ in range(draw.randint(1, 12))]
+        kept = [points[i] for i in plots.front(points)]
+        assert kept == sorted(set(kept)) and sorted(kept, key=lambda p: p[1]) == kept
+        for cost, gain in points:
+            beaten = any(c <= cost and g >= gain and (c, g) != (cost, gain) for c, g in points)
+            assert ((cost, gain) in kept) != beaten
+
+
+def test_every_plot_that_the_rows_allow_is_drawn(tmp_path):
+    rows = [row("a", method, 20.0 + n, views=views, seconds_network=0.5, **more) for views in (1, 8)
+            for n, (method, more) in enumerate([("x", {"delta": 0.0}), ("x", {"delta": 0.8}), ("y", {})])]
+    files = plots.write_plots(tmp_path, entries(rows))
+    assert sorted(file.name for file in files) == sorted(p.name for p in tmp_path.iterdir())
+    assert {file.stem for file in files} == {"pareto_K_1", "pareto_K_8", "stages_K_1", "stages_K_8", "views", "delta"}

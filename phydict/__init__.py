@@ -12,6 +12,7 @@
     dry_run         geometry drawn before anything is reconstructed
     atomic           files and folders that appear whole or not at all
     case_results     finished cases on disk
+    profiling        seconds and memory of a computation's stages
     training, inference, datamodule, super_resolution_data, reconstruction_data     Lightning
 """
 

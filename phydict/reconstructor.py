@@ -6,14 +6,16 @@ import math
 import time
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
+from statistics import median
 from typing import Protocol
 
 import nibabel
 import numpy as np
+import torch
 from torch import Tensor
 
 from phydict import profiling
@@ -21,8 +23,14 @@ from phydict.grid import Grid
 from phydict.units import MU_WATER
 from phydict.xray import ConeBeam, Projector
 
-RISE, RISEN = 2.0, 0.1
-"""A misfit has risen where it is more than RISE times its smallest so far, and more than RISEN."""
+EMPTY, RISE, RISEN = 1.0, 2.0, 0.1
+"""A misfit has risen where it is more than RISE times its smallest so far, that of an empty volume included, and more
+than RISEN."""
+ALONE, LARGE = 2.0, 0.2
+"""Where a view's misfit is more than ALONE times the median of all, that view is doubted; where the misfit is more than
+LARGE, all of them are."""
+CHEST = 1.0, 20.0
+"""Between these lies the largest line integral of a chest: 50 mm and 1 m of water."""
 NOTHING = 1e-3
 """A line integral, 0.05 mm of water, below which misfits are not relative to what is measured, but to this."""
 
@@ -133,6 +141,15 @@ def check_xrays(xrays: Tensor, beam: ConeBeam) -> None:
                          "does: leave it out of the X-rays and of the geometry")
 
 
+def check_line_integrals(xrays: Tensor) -> None:
+    """Warns of line integrals that no chest has."""
+    largest = float(xrays.max())
+    if not CHEST[0] < largest < CHEST[1]:
+        warnings.warn(f"the largest line integral is {largest:.3g}, but those of a chest lie between {CHEST[0]:g} and "
+                      f"{CHEST[1]:g}: check that the X-rays are line integrals of attenuation in 1/mm along mm, or "
+                      "give display: true where they are display values", stacklevel=3)
+
+
 def misfits(reprojection: Tensor, xrays: Tensor) -> dict:
     """Relative residual |P - y| / |y| of line integrals (K, V, U): over all views and per view."""
     residual, size = _norms(reprojection - xrays), _sizes(xrays)
@@ -180,30 +197,44 @@ class Guard:
         self.step += 1
         seen, self.operator.seen = self.operator.seen, None
         estimate, self.estimate = self.estimate, None
-        for found in (estimate, seen):
-            if found is not None:
-                self._check(found)
+        if estimate is not None:
+            self._check(estimate)
         if seen is not None:
             y = self.operator.y
-            relative = _norms(seen - y).norm(dim=-1) / _sizes(y).norm(dim=-1)
-            self.misfits[self.step] = float(relative.max())
+            misfit = (_norms(seen - y).norm(dim=-1) / _sizes(y).norm(dim=-1)).max()
+            self._check(misfit)
+            self.misfits[self.step] = float(misfit)
         self.on_step()
 
-    def end(self, volumes: Tensor, misfit: float | None = None) -> None:
-        """The last step is done and gave `volumes`, of this misfit if it is known.
+    def end(self, volumes: Tensor, misfit: float | None = None, misfit_per_view: Sequence[float] = ()) -> None:
+        """The last step is done and gave `volumes`, of these misfits if they are known.
 
-        Raises FloatingPointError where they are not finite, and warns where the misfit has risen.
+        Raises FloatingPointError where they are not finite. Warns where the misfit has risen and, of methods that look
+        at the X-rays, where it is large and where one view alone does not fit.
         """
         self._check(volumes)
+        if misfit is not None:
+            self._check(torch.tensor(misfit))
         if misfit is not None and self.misfits:
             self.misfits[min(max(self.misfits) + 1, self.step)] = misfit
         risen = risen_from(self.misfits)
         if risen is not None and self.diverged_at is None:
             self.diverged_at = risen
-            before = min(value for step, value in self.misfits.items() if step < risen)
+            before = min([EMPTY, *(value for step, value in self.misfits.items() if step < risen)])
             now = list(self.misfits.values())[-1]
             warnings.warn(f"the misfit rose from {before:.3g} to {now:.3g}, from step {risen} of {self.steps} on: the "
                           "volume went away from the X-rays", stacklevel=3)
+        elif misfit is not None and self.misfits:
+            self._doubt(misfit, misfit_per_view)
+
+    def _doubt(self, misfit: float, misfit_per_view: Sequence[float]) -> None:
+        view, ratio = worst_view(misfit_per_view)
+        if ratio > ALONE and misfit_per_view[view] > 0.01:
+            warnings.warn(f"view {view} (counted from 0) fits {ratio:.1f} times worse than the median view: check "
+                          "whether it is flipped, shifted or another's, and its geometry", stacklevel=4)
+        elif misfit > LARGE:
+            warnings.warn(f"no volume was found that explains the X-rays (misfit {misfit:.2g}): check that they are "
+                          "line integrals, or give display: true, and check their geometry", stacklevel=4)
 
     def _check(self, values: Tensor) -> None:
         if not values.isfinite().all():
@@ -211,9 +242,15 @@ class Guard:
                                      "smaller steps or less guidance, and check that the X-rays are line integrals")
 
 
+def worst_view(misfit_per_view: Sequence[float]) -> tuple[int, float]:
+    """The view that fits worst, and how many times the median misfit of all views its own is."""
+    view = max(range(len(misfit_per_view)), key=misfit_per_view.__getitem__)
+    return view, misfit_per_view[view] / max(median(misfit_per_view), 1e-12)
+
+
 def risen_from(misfits: dict[int, float]) -> int | None:
     """Of misfits by step, the first step of those at the end that had all risen above what was reached before."""
-    smallest, first = math.inf, None
+    smallest, first = EMPTY, None
     for step, misfit in misfits.items():
         risen = misfit > max(RISE * smallest, RISEN)
         first, smallest = (first or step) if risen else None, min(smallest, misfit)

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from phydict.profiling import stage
-from phydict.reconstructor import Guard, Reconstruction, Reconstructor, Stopwatch, check_xrays, misfits
+from phydict.reconstructor import (
+    Guard, Reconstruction, Reconstructor, Stopwatch, check_line_integrals, check_xrays, misfits)
 from phydict.units import HUWindow, mu_to_hu
 from phydict.xray import Projector
 from phydict.xray.calibration import match_views
@@ -59,6 +60,8 @@ class Baseline(Reconstructor):
                     seed: int = 0, on_step: Callable[[], None] = lambda: None) -> Reconstruction:
         watch, A = Stopwatch(), CountedProjector(projector)
         check_xrays(xrays, A.beam)
+        if not display:
+            check_line_integrals(xrays)
         with watch.stage("prepare"):
             y = xrays[None] / self.mu_water
             if display:
@@ -69,7 +72,7 @@ class Baseline(Reconstructor):
         with watch.stage("score"):
             reprojection, measured = (self.mu_water * views[0].cpu() for views in (A(density), y))
             found = misfits(reprojection, measured)
-            guard.end(density, found["misfit"])
+            guard.end(density, **found)
         return Reconstruction(
             volume=mu_to_hu(density[0, 0], 1.0).cpu(), grid=A.grid, method=self.name, seed=seed,
             **found, seconds=watch.seconds, xrays=measured, reprojection=reprojection,

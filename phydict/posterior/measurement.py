@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from phydict.profiling import stage
-from phydict.reconstructor import check_xrays
+from phydict.reconstructor import check_line_integrals, check_xrays
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import Projector
 from phydict.xray.calibration import match_views
@@ -28,6 +28,8 @@ class Measurement:
     def __init__(self, projector: Projector, xrays: Tensor, window: HUWindow, display: bool = False,
                  mu_water: float = MU_WATER, noise: float | Tensor | None = None):
         check_xrays(xrays, projector.beam)
+        if not display:
+            check_line_integrals(xrays)
         self.noise = noise
         self.projector, self.display = projector, xrays[None] if display else None
         self.slope, self.offset = window.mu_affine(mu_water)

@@ -100,7 +100,7 @@ class Posterior(Reconstructor):
             for first in range(0, self.samples, together):
                 guard.begin()
                 draws = [torch.Generator().manual_seed(s) for s in seeds[first:first + together]]
-                x = noise_like(state.expand(len(draws), -1, -1, -1, -1), draws)
+                x = noise_like(state.expand(len(draws), -1, -1, -1, -1), draws).to(xrays.dtype)
                 draw = draws if len(draws) > 1 else draws[0]
                 states.append(sampler.sample(denoiser, measurement, x, draw, guard))
                 if self.samples > 1:
@@ -113,7 +113,7 @@ class Posterior(Reconstructor):
             measured = measurement.y[0].cpu()
             found, deviation = misfits(reprojection, measured), None
             if self.samples == 1:
-                guard.end(states, found["misfit"])
+                guard.end(states, **found)
             else:
                 deviation = (prior.window.half_width * states[:, 0].std(0)).cpu()
         return Reconstruction(

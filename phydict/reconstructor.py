@@ -233,8 +233,8 @@ class Guard:
             warnings.warn(f"view {view} (counted from 0) fits {ratio:.1f} times worse than the median view: check "
                           "whether it is flipped, shifted or another's, and its geometry", stacklevel=4)
         elif misfit > LARGE:
-            warnings.warn(f"no volume was found that explains the X-rays (misfit {misfit:.2g}): check that they are "
-                          "line integrals, or give display: true, and check their geometry", stacklevel=4)
+            warnings.warn(f"no volume was found that explains the X-rays (misfit {misfit:.2g}): check their scale, "
+                          "their geometry, and whether they are line integrals or display values", stacklevel=4)
 
     def _check(self, values: Tensor) -> None:
         if not values.isfinite().all():

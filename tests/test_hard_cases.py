@@ -19,6 +19,8 @@ from phydict.posterior import (
 from phydict.reconstructor import misfits, risen_from
 from phydict.xray import Ideal
 
+pytestmark = [pytest.mark.filterwarnings(f"ignore:{said}") for said in
+              ("no volume was found", "the largest line integral", "the misfit rose")]
 GRID = Grid.cube(16)
 BEAM = ConeBeam.orbit(8, 1020, 740, (24, 24), 24.0)
 FAST = METHODS["phydict_fast"]
@@ -280,14 +282,22 @@ def test_a_baseline_that_overflows_stops_and_the_step_is_told():
 
 def test_descent_that_is_too_fast_is_told_with_the_step_from_which_the_misfit_rose():
     prior = FixedPrior(GaussianDenoiser(torch.full((1, 4, *GRID.shape), -0.5), torch.tensor(0.1)))
-    far, near = (SplitGibbs(6, GradientSteps(20, rate, adam=False), GradientSteps(20, rate, adam=False))
-                 for rate in (1.0, 1e-5))
+    far, near = (SplitGibbs(6, GradientSteps(2, rate, adam=False), GradientSteps(2, rate, adam=False))
+                 for rate in (10.0, 1e-5))
     with pytest.warns(UserWarning, match=r"the misfit rose from .* to .*, from step \d of 6 on"):
         result = reconstruct(CLEAN, BEAM, prior, far)
     assert 1 <= result.diverged_at <= 6 and result.volume.isfinite().all()
     with warnings.catch_warnings():
-        warnings.simplefilter("error")
+        warnings.filterwarnings("error", "the misfit rose")
         assert reconstruct(CLEAN, BEAM, prior, near).diverged_at is None
+
+
+def test_the_step_at_which_a_rise_began_is_told_where_the_last_steps_forget_the_x_rays(prior):
+    sampler = SplitGibbs(4, ProximalCG(10), ProximalCG(10), warm_start=0.3, last=0.15, refine_from=0.99,
+                         refine_iterations=3)
+    with pytest.warns(UserWarning, match="from step 5 of 7 on"):
+        result = reconstruct(CLEAN, BEAM, prior, sampler)
+    assert result.diverged_at == 5 and result.misfit > 0.1
 
 
 @pytest.mark.parametrize("name", ["fast", "daps", "pnp_dm", "diffpir", "dds", "dps", "sirt", "cgls", "tv", "diffvox"])

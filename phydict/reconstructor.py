@@ -26,7 +26,7 @@ from phydict.xray import ConeBeam, Projector
 EMPTY, RISE, RISEN = 1.0, 2.0, 0.1
 """A misfit has risen where it is more than RISE times its smallest so far, that of an empty volume included, and more
 than RISEN."""
-ALONE, LARGE = 2.0, 0.2
+ALONE, LARGE = 2.0, 0.1
 """Where a view's misfit is more than ALONE times the median of all, that view is doubted; where the misfit is more than
 LARGE, all of them are."""
 CHEST = 1.0, 20.0
@@ -206,11 +206,10 @@ class Guard:
             self.misfits[self.step] = float(misfit)
         self.on_step()
 
-    def end(self, volumes: Tensor, misfit: float | None = None, misfit_per_view: Sequence[float] = ()) -> None:
-        """The last step is done and gave `volumes`, of these misfits if they are known.
+    def end(self, volumes: Tensor, misfit: float | None = None) -> None:
+        """The last step is done and gave `volumes`, of this misfit if it is known.
 
-        Raises FloatingPointError where they are not finite. Warns where the misfit has risen and, of methods that look
-        at the X-rays, where it is large and where one view alone does not fit.
+        Raises FloatingPointError where they are not finite, and warns where the misfit has risen.
         """
         self._check(volumes)
         if misfit is not None:
@@ -224,17 +223,18 @@ class Guard:
             now = list(self.misfits.values())[-1]
             warnings.warn(f"the misfit rose from {before:.3g} to {now:.3g}, from step {risen} of {self.steps} on: the "
                           "volume went away from the X-rays", stacklevel=3)
-        elif misfit is not None and self.misfits:
-            self._doubt(misfit, misfit_per_view)
 
-    def _doubt(self, misfit: float, misfit_per_view: Sequence[float]) -> None:
+    def doubt(self, misfit: float, misfit_per_view: Sequence[float]) -> None:
+        """Warns where a method that looked at the X-rays and did not diverge has left one view, or all, badly fitted."""
+        if not self.misfits or self.diverged_at is not None:
+            return
         view, ratio = worst_view(misfit_per_view)
         if ratio > ALONE and misfit_per_view[view] > 0.01:
             warnings.warn(f"view {view} (counted from 0) fits {ratio:.1f} times worse than the median view: check "
-                          "whether it is flipped, shifted or another's, and its geometry", stacklevel=4)
+                          "whether it is flipped, shifted or another's, and its geometry", stacklevel=3)
         elif misfit > LARGE:
-            warnings.warn(f"no volume was found that explains the X-rays (misfit {misfit:.2g}): check their scale, "
-                          "their geometry, and whether they are line integrals or display values", stacklevel=4)
+            warnings.warn(f"no volume was found that explains the X-rays (misfit {misfit:.2g}): check their scale "
+                          "and geometry, that they are not display values, and that the body fits into the volume", stacklevel=3)
 
     def _check(self, values: Tensor) -> None:
         if not values.isfinite().all():

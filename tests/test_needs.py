@@ -22,63 +22,63 @@ from posterior.test_posterior import BEAM, views
 
 ROOT = Path(__file__).parents[1]
 
-SCENE = """
+SCENES = """
 import json, sys, warnings
 from dataclasses import replace
 import torch, phydict
+from phydict.posterior import GradientSteps, Reward
+warnings.simplefilter("ignore")
 made, begin = set(), torch.nn.Module.__init__
 torch.nn.Module.__init__ = lambda self, *a, **k: made.add(type(self).__name__) or begin(self, *a, **k)
-from phydict.posterior import GradientSteps, Reward
-prior_file, name, report = sys.argv[1:]
-method = phydict.METHODS[name]
-if name == "phydict_paper":
-    method = replace(method, likelihood=GradientSteps(reward=Reward(lpips=0.0)))
-few = {"iterations": 2, "refine_iterations": 2, "levels": 2, "burn_in": 1, "thinning": 1}
-few = {key: value for key, value in few.items() if hasattr(method, key)}
 beam = phydict.ConeBeam.orbit(3, 1020, 740, (32, 32), 17.5)
 xrays = torch.rand(3, 32, 32, generator=torch.Generator().manual_seed(0))
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore")
-    phydict.reconstruct(xrays, beam, prior_file, replace(method, **few), report=report, grid=phydict.Grid.cube(16))
-print(json.dumps({"modules": sorted(sys.modules), "networks": sorted(made)}))
+networks = {}
+for name, report in json.loads(sys.argv[2]):
+    method = phydict.METHODS[name]
+    if name == "phydict_paper":
+        method = replace(method, likelihood=GradientSteps(reward=Reward(lpips=0.0)))
+    few = {key: 2 for key in ("iterations", "refine_iterations") if hasattr(method, key)}
+    made.clear()
+    phydict.reconstruct(xrays, beam, sys.argv[1], replace(method, **few), report=report, grid=phydict.Grid.cube(16))
+    networks[f"{name} {report}".strip()] = sorted(made)
+print(json.dumps({"modules": sorted(sys.modules), "networks": networks}))
 """
 
 NEVER = ("lightning", "pytorch_lightning", "tensorboard", "lungmask", "itk", "ignite", "phydict.training",
          "phydict.datamodule", "phydict.prior_training", "phydict.inference")
 """Of use to training, to tables and to other files, and to no reconstruction in memory. MONAI is not among them,
 nor are transformers and lpips: the networks are MONAI's, which imports all of itself and those two with it."""
-RELEASED = "phydict_released"
+PRESETS = ("sirt", "fdk", "phydict_fast", "phydict_paper", "phydict_released")
 
 
 @pytest.fixture(scope="module")
-def prior_file(tmp_path_factory) -> Path:
+def scenes(tmp_path_factory) -> dict:
+    """Modules imported, and networks made by each preset, in a process of its own that reconstructs with them in turn,
+    with a report last of all."""
     file = tmp_path_factory.mktemp("prior") / "tiny.safetensors"
     save_prior(tiny_prior(), file)
-    return file
-
-
-def scene(prior_file: Path, name: str, report: str = "") -> tuple[set[str], set[str]]:
-    """Modules imported and networks made by one reconstruction in a process of its own."""
-    done = subprocess.run([sys.executable, "-c", SCENE, str(prior_file), name, report], capture_output=True, text=True,
+    runs = [*((name, "") for name in PRESETS), ("phydict_fast", REPORTS[0])]
+    done = subprocess.run([sys.executable, "-c", SCENES, str(file), json.dumps(runs)], capture_output=True, text=True,
                           cwd=ROOT, env={"PYTHONPATH": str(ROOT), "PATH": "", "OMP_NUM_THREADS": "1"})
     assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout.splitlines()[-1])
-    return set(found["modules"]), set(found["networks"])
+    return json.loads(done.stdout.splitlines()[-1])
 
 
-@pytest.mark.parametrize("name", ["phydict_fast", "phydict_paper", RELEASED, "sirt", "fdk"])
-def test_a_preset_imports_and_makes_what_it_uses_alone(prior_file, name):
-    modules, networks = scene(prior_file, name)
-    assert {m for m in NEVER if m in modules} == set()
-    assert ("LPIPS" in networks) == (name == RELEASED)
+def test_no_reconstruction_imports_training_or_lightning(scenes):
+    assert set(NEVER) & set(scenes["modules"]) == set()
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_makes_the_networks_that_it_uses_alone(scenes, name):
+    networks = set(scenes["networks"][name])
+    assert ("LPIPS" in networks) == (name == "phydict_released")  # LPIPS at weight 0 is not made for phydict_paper
     assert ("Prior" in networks) == isinstance(METHODS[name], Sampler)
     assert not {"TextEncoder", "BertModel", "SuperResolution", "LocalUNet"} & networks
 
 
-def test_a_report_loads_the_text_encoder_and_nothing_else(prior_file):
-    modules, networks = scene(prior_file, "phydict_fast", REPORTS[0])
-    assert {"TextEncoder", "BertModel"} <= networks and not {"SuperResolution", "LPIPS"} & networks
-    assert {m for m in NEVER if m in modules} == set()
+def test_a_report_loads_the_text_encoder_and_nothing_else(scenes):
+    without, told = (set(scenes["networks"][name]) for name in ("phydict_fast", f"phydict_fast {REPORTS[0]}"))
+    assert {"TextEncoder", "BertModel"} <= told - without and not {"SuperResolution", "LPIPS"} & told
 
 
 class Watched:

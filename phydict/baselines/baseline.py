@@ -72,7 +72,8 @@ class Baseline(Reconstructor):
         with watch.stage("score"):
             reprojection, measured = (self.mu_water * views[0].cpu() for views in (A(density), y))
             found = misfits(reprojection, measured)
-            guard.end(density, **found)
+            guard.end(density, found["misfit"])
+            guard.doubt(**found)
         return Reconstruction(
             volume=mu_to_hu(density[0, 0], 1.0).cpu(), grid=A.grid, method=self.name, seed=seed,
             **found, seconds=watch.seconds, xrays=measured, reprojection=reprojection,

@@ -97,7 +97,8 @@ class CascadePosterior(Reconstructor):
             reprojection = measurement.project(ct)[0].cpu()
             measured = measurement.y[0].cpu()
             found = misfits(reprojection, measured)
-            guard.end(state, **found)
+            guard.end(state, found["misfit"])
+            guard.doubt(**found)
             masks = interpolate(base.masks[None], fine.grid.shape, mode="trilinear")[0]
             masks[:fine.state_channels - 1] = ((state[0, 1:] + 1) / 2).cpu()
         return Reconstruction(

@@ -113,9 +113,10 @@ class Posterior(Reconstructor):
             measured = measurement.y[0].cpu()
             found, deviation = misfits(reprojection, measured), None
             if self.samples == 1:
-                guard.end(states, **found)
+                guard.end(states, found["misfit"])
             else:
                 deviation = (prior.window.half_width * states[:, 0].std(0)).cpu()
+            guard.doubt(**found)
         return Reconstruction(
             volume=prior.window.to_hu(ct[0, 0]).cpu(), grid=prior.grid, method=self.name, seed=seed,
             **found, seconds=watch.seconds, xrays=measured, reprojection=reprojection,

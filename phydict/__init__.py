@@ -13,6 +13,7 @@
     atomic           files and folders that appear whole or not at all
     case_results     finished cases on disk
     ablation         methods and settings compared on the same X-rays
+    profiling        seconds and memory of a computation's stages
     training, inference, datamodule, super_resolution_data, reconstruction_data     Lightning
 """
 

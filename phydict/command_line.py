@@ -23,9 +23,9 @@ NOISE = (".*does not have many workers", ".*LeafSpec.*is deprecated", ".*is smal
 
 @contextmanager
 def one_sentence_errors(*also: type[Exception], to_go_on: str = "run the same command again") -> Iterator[None]:
-    """Prints bad arguments, ValueError, OSError and `also` as one sentence and exits with code 2; the environment
-    variable PHYDICT_TRACEBACK=1 shows the trace instead. A run that a signal stopped says how to go on and exits with
-    code 130 (SIGINT) or 143 (SIGTERM)."""
+    """Prints bad arguments, ValueError, OSError, FloatingPointError and `also` as one sentence and exits with code 2;
+    the environment variable PHYDICT_TRACEBACK=1 shows the trace instead. A run that a signal stopped says how to go on
+    and exits with code 130 (SIGINT) or 143 (SIGTERM)."""
     try:
         yield
     except (KeyboardInterrupt, SystemExit) as stop:  # Lightning exits with 1 on SIGINT and without a code on SIGTERM
@@ -34,7 +34,7 @@ def one_sentence_errors(*also: type[Exception], to_go_on: str = "run the same co
             raise
         print(f"stopped by a signal; to go on, {to_go_on}", file=sys.stderr)
         raise SystemExit(130 if interrupted else 143) from None
-    except (ValueError, OSError, ArgumentError, *also) as error:
+    except (ValueError, OSError, FloatingPointError, ArgumentError, *also) as error:
         if os.environ.get("PHYDICT_TRACEBACK"):
             raise
         print(f"error: {sentence(error)}", file=sys.stderr)

@@ -33,6 +33,7 @@ from phydict.grid import Grid
 from phydict.methods import DEFAULT_PRIOR, fit_to_grid, reconstructor
 from phydict.posterior import CascadePosterior, Sampler
 from phydict.prior import MedSynCheckpoint, fingerprint, load_prior, load_super_resolution
+from phydict.profiling import profiled, stage
 from phydict.progress import CaseProgress
 from phydict.reconstruction_data import ReconstructionData, case_scores, case_seed
 from phydict.reconstructor import Reconstruction, Reconstructor, describe, save_nifti
@@ -93,6 +94,7 @@ class ReconstructionTask(lightning.LightningModule):
         self.metrics = CaseMetrics([name])
         self.progress = CaseProgress()
         self.cases: list[str] = []
+        self.profile = False
 
     @property
     def reads_no_text(self) -> bool:
@@ -123,12 +125,15 @@ class ReconstructionTask(lightning.LightningModule):
 
     def _test(self, case: dict) -> None:
         case["beam"] = self.trainer.datamodule.beam
-        case["xrays"] = self.trainer.datamodule.simulate(case, self._seed(case), self.grid, self.window, self.device)
+        with stage("simulate"):
+            case["xrays"] = self.trainer.datamodule.simulate(case, self._seed(case), self.grid, self.window,
+                                                             self.device)
         case["mu_water"] = self.trainer.datamodule.simulator.effective_mu_water
         result = self._reconstruct(case)
         if "affine" in case:  # back to its place in the CT it came from
             result = replace(result, grid=Grid(self.grid.shape, affine=case["affine"].numpy()))
-        scores = case_scores(result.volume, result.misfit, case, self.window)
+        with stage("metrics"):
+            scores = case_scores(result.volume, result.misfit, case, self.window)
         self.metrics.update(case["index"], self.method_name, scores, seconds=sum(result.seconds.values()))
         self._finish(case, result, scores, self.window.to_hu(case["volume"])[0].cpu())
 
@@ -140,8 +145,13 @@ class ReconstructionTask(lightning.LightningModule):
         try:
             if "error" in case:
                 raise ValueError(case["error"]) from case["error"]
-            work(case)
-        except ValueError as error:
+            if self.profile:
+                with profiled() as profile:
+                    work(case)
+                print(f"{case['id']}: {self.method_name}", profile.table(), sep="\n")
+            else:
+                work(case)
+        except (ValueError, FloatingPointError) as error:
             self.results.discard(case["id"])
             if len(self.cases) == 1:
                 raise
@@ -174,7 +184,8 @@ class ReconstructionTask(lightning.LightningModule):
         if case["report"] and with_report and self.reads_no_text:
             warnings.warn("the prior was trained without text: reports are not used", stacklevel=2)
         case["report"] = case["report"] if with_report and not self.reads_no_text else ""
-        xrays, projector = fit_to_grid(self.reconstructor, self.grid, case["xrays"].to(self.device), case["beam"])
+        with stage("fit to grid"):
+            xrays, projector = fit_to_grid(self.reconstructor, self.grid, case["xrays"].to(self.device), case["beam"])
         ready = self.reconstructor.assuming(case["mu_water"]) if "mu_water" in case else self.reconstructor
         return ready.reconstruct(xrays, projector, case["report"], case.get("display", False), self._seed(case),
                                  self.progress.advance)
@@ -188,14 +199,15 @@ class ReconstructionTask(lightning.LightningModule):
             panel(folder / "panel.png", result.volume, result.grid, result.xrays, result.reprojection, truth,
                   title=f"{case['id']}: {self.method_name}", deviation_hu=result.deviation)
 
-        self.results.write(case["id"], self._record(case, result, scores), write_files)
+        with stage("write"):
+            self.results.write(case["id"], self._record(case, result, scores), write_files)
         self.progress.finished(f"{sum(result.seconds.values()):.1f} s, misfit {result.misfit:.4f}")
 
     def _record(self, case: dict, result: Reconstruction, scores: dict | None) -> dict:
         """All that is known of a finished case, as plain JSON values."""
         return {"case": case["id"], "method": self.method_name,
                 "citation": self.reconstructor.citation, "scores": scores, "misfit": result.misfit,
-                "misfit_per_view": result.misfit_per_view, "seconds": result.seconds,
+                "misfit_per_view": result.misfit_per_view, "diverged_at": result.diverged_at, "seconds": result.seconds,
                 "network_calls": result.network_calls, "projector_calls": result.projector_calls,
                 "process_peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
                 "mu_water": case.get("mu_water", self.reconstructor.mu_water), "views": len(result.xrays),
@@ -236,6 +248,8 @@ class InferenceCLI(LightningCLI):
 
     def _prepare_subcommand_parser(self, klass: type, subcommand: str, **kwargs):
         parser = super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
+        parser.add_argument("--profile", action="store_true",
+                            help="print the seconds and the peak memory of every stage of each case")
         if subcommand == "predict":
             parser.add_argument("--dry_run", action="store_true",
                                 help="draw the geometry of every case and reconstruct nothing")
@@ -246,6 +260,11 @@ class InferenceCLI(LightningCLI):
         """Whether the geometry is drawn and nothing reconstructed."""
         return bool(self._get(self.config, "dry_run", False))
 
+    @property
+    def profile(self) -> bool:
+        """Whether each case's stages are timed and their memory measured."""
+        return bool(self._get(self.config, "profile", False))
+
     def predict(self, model: ReconstructionTask, datamodule: ReconstructionData) -> None:
         """Reconstruct X-rays, or draw their geometry."""
         if self.dry_run:
@@ -253,11 +272,13 @@ class InferenceCLI(LightningCLI):
                 case = load_xrays(folder, datamodule.geometry) | {"id": name}
                 print(*dry_run(model.pages / f"{name}.png", case, model.grid), sep="\n")
             return
+        model.profile = self.profile
         with model.progress:
             self.trainer.predict(model, datamodule=datamodule, return_predictions=False)
 
     def test(self, model: ReconstructionTask, datamodule: ReconstructionData) -> None:
         """Simulate the X-rays of CTs, reconstruct and score them."""
+        model.profile = self.profile
         with model.progress:
             self.trainer.test(model, datamodule=datamodule, verbose=False)
 

@@ -696,3 +696,39 @@ def test_several_samples_leave_a_deviation_map_in_the_volumes_place(measured, pr
 def test_samples_of_a_method_without_a_prior_are_refused(capsys, measured, tmp_path):
     assert "leave samples at 1" in refusal(capsys, sirt("predict", tmp_path, f"--data.xrays={measured}",
                                                         "--model.samples=3"))
+
+
+def test_a_profile_shows_the_stages_of_every_case_and_changes_no_volume(measured, tmp_path, capsys):
+    shown = []
+    for out, more in (("plain", []), ("profiled", ["--profile"])):
+        capsys.readouterr()
+        main(sirt("predict", tmp_path / out, f"--data.xrays={measured}", *more))
+        shown.append(capsys.readouterr().out)
+    plain, profiled = shown
+    assert "peak MB" not in plain and profiled.count("peak MB") == 2
+    for words in ("anna: sirt", "bert: sirt", "fit to grid", "sample / projector", "write"):
+        assert words in profiled
+    for case in ("anna", "bert"):
+        np.testing.assert_array_equal(*(volume(tmp_path / out / "sirt" / case) for out in ("plain", "profiled")))
+
+
+def test_a_run_that_is_not_finite_ends_in_one_sentence_and_leaves_no_case(measured, tmp_path, capsys, monkeypatch):
+    solve = SIRT.solve
+    monkeypatch.setattr(SIRT, "solve", lambda self, *given: solve(self, *given) * float("nan"))
+    said = refusal(capsys, sirt("predict", tmp_path, f"--data.xrays={measured / 'anna'}"))
+    assert "not finite from step 3 of 3 on" in said and not (tmp_path / "sirt" / "anna").exists()
+
+
+def test_the_record_says_whether_the_misfit_rose(measured, tmp_path, monkeypatch):
+    solve = SIRT.solve
+
+    def worse(self, A, y, on_step):
+        density = solve(self, A, y, on_step)
+        A.seen = 9 * y
+        on_step()
+        return 9 * density
+
+    for name, change, expected in (("good", solve, None), ("bad", worse, 4)):
+        monkeypatch.setattr(SIRT, "solve", change)
+        main(sirt("predict", tmp_path / name, f"--data.xrays={measured / 'anna'}"))
+        assert record(tmp_path / name / "sirt" / "anna")["diverged_at"] == expected

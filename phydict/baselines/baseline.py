@@ -9,25 +9,36 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from phydict.reconstructor import Reconstruction, Reconstructor, Stopwatch, check_xrays, misfits
+from phydict.profiling import stage
+from phydict.reconstructor import (
+    Guard, Reconstruction, Reconstructor, Stopwatch, check_line_integrals, check_xrays, misfits)
 from phydict.units import HUWindow, mu_to_hu
 from phydict.xray import Projector
 from phydict.xray.calibration import match_views
 
 
 class CountedProjector:
-    """A projector, with `calls`: how often it or its adjoint ran over all views."""
+    """A projector, with `calls`: how often it or its adjoint ran over all views; `y`, the X-rays in mm of water, and
+    `seen`, what it last made of a density."""
 
     def __init__(self, projector: Projector):
         self.grid, self.beam, self._projector, self.calls = projector.grid, projector.beam, projector, 0
+        self.y = self.seen = None
 
     def __call__(self, density: Tensor) -> Tensor:
+        self.seen = self.linear(density)
+        return self.seen
+
+    def linear(self, d: Tensor) -> Tensor:
+        """The same of directions and test volumes, which are no estimates."""
         self.calls += 1
-        return self._projector(density)
+        with stage("projector"):
+            return self._projector(d)
 
     def T(self, xrays: Tensor) -> Tensor:
         self.calls += 1
-        return self._projector.T(xrays)
+        with stage("projector"):
+            return self._projector.T(xrays)
 
 
 class Baseline(Reconstructor):
@@ -49,18 +60,24 @@ class Baseline(Reconstructor):
                     seed: int = 0, on_step: Callable[[], None] = lambda: None) -> Reconstruction:
         watch, A = Stopwatch(), CountedProjector(projector)
         check_xrays(xrays, A.beam)
+        if not display:
+            check_line_integrals(xrays)
         with watch.stage("prepare"):
             y = xrays[None] / self.mu_water
             if display:
                 y = match_views(xrays[None], A(typical_chest(A).to(xrays)))
         with watch.stage("sample"):
-            density = self.solve(A, y, on_step)
+            A.y, guard = y, Guard(A, on_step, self.steps())
+            density = self.solve(A, y, guard)
         with watch.stage("score"):
             reprojection, measured = (self.mu_water * views[0].cpu() for views in (A(density), y))
+            found = misfits(reprojection, measured)
+            guard.end(density, found["misfit"])
+            guard.doubt(**found)
         return Reconstruction(
             volume=mu_to_hu(density[0, 0], 1.0).cpu(), grid=A.grid, method=self.name, seed=seed,
-            **misfits(reprojection, measured), seconds=watch.seconds, xrays=measured, reprojection=reprojection,
-            projector_calls=A.calls)
+            **found, seconds=watch.seconds, xrays=measured, reprojection=reprojection,
+            projector_calls=A.calls, diverged_at=guard.diverged_at)
 
 
 def empty(A: CountedProjector, y: Tensor) -> Tensor:
@@ -87,7 +104,7 @@ def norm(A: CountedProjector, y: Tensor) -> float:
     for _ in range(50):
         if abs(norm - last) <= 1e-4 * norm:
             break
-        density, last = A.T(A(density / density.norm())), norm
+        density, last = A.T(A.linear(density / density.norm())), norm
         norm = float(density.norm()) ** 0.5
     return norm
 

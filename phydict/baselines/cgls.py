@@ -56,7 +56,7 @@ class CGLS(Baseline):
         energy = start = downhill.square().sum()
         for _ in range(self.iterations):
             if energy > 1e-12 * start:
-                seen = A(direction)
+                seen = A.linear(direction)
                 step = energy / seen.square().sum()
                 density, residual = density + step * direction, residual - step * seen
                 downhill = A.T(residual) * free

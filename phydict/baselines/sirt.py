@@ -36,7 +36,8 @@ class SIRT(Baseline):
 
     def solve(self, A: CountedProjector, y: Tensor, on_step: Callable[[], None]) -> Tensor:
         density = empty(A, y)
-        rows, columns = (1 / w.clamp(min=1e-6 * float(w.max())) for w in (A(density + 1), A.T(torch.ones_like(y))))
+        sums = A.linear(density + 1), A.T(torch.ones_like(y))
+        rows, columns = (1 / w.clamp(min=1e-6 * float(w.max())) for w in sums)
         for _ in range(self.iterations):
             density = (density + columns * A.T(rows * (y - A(density)))).clamp(min=0)
             on_step()

@@ -16,7 +16,7 @@ from phydict.posterior.posterior import Counted, Posterior
 from phydict.posterior.sampler import PriorOnly, Sampler
 from phydict.posterior.split_gibbs import SplitGibbs, noise_like
 from phydict.prior import Cascade
-from phydict.reconstructor import Reconstruction, Reconstructor, Stopwatch, misfits
+from phydict.reconstructor import Guard, Reconstruction, Reconstructor, Stopwatch, misfits
 from phydict.units import MU_WATER
 from phydict.xray import Projector, binned, binning
 
@@ -85,23 +85,28 @@ class CascadePosterior(Reconstructor):
             draw = torch.Generator().manual_seed(seed + 1)
             state = torch.cat([fine.window.to_range(base.volume)[None], 2 * base.masks - 1])[None].to(xrays)
             state = state[:, :fine.coarse_channels]
-            denoiser = Counted(fine.bind(state + self.noise * noise_like(state, draw), self.noise, self.bf16))
             measurement = Measurement(projector, xrays, fine.window, display, self.mu_water)
+            guard = Guard(measurement, on_step, self.second.steps())
+            denoiser = Counted(fine.bind(state + self.noise * noise_like(state, draw), self.noise, self.bf16), guard)
             x = noise_like(torch.empty(1, fine.state_channels, *fine.grid.shape, device=xrays.device), draw)
         with watch.stage("sample"):
-            state = self.second.sample(denoiser, measurement, x, draw, on_step)
+            state = self.second.sample(denoiser, measurement, x, draw, guard)
         with watch.stage("score"):
             ct = state[:, :1]
             measurement.calibrate(ct)
             reprojection = measurement.project(ct)[0].cpu()
             measured = measurement.y[0].cpu()
+            found = misfits(reprojection, measured)
+            guard.end(state, found["misfit"])
+            guard.doubt(**found)
             masks = interpolate(base.masks[None], fine.grid.shape, mode="trilinear")[0]
             masks[:fine.state_channels - 1] = ((state[0, 1:] + 1) / 2).cpu()
         return Reconstruction(
             volume=fine.window.to_hu(ct[0, 0]).cpu(), grid=fine.grid, method=self.name, seed=seed,
-            **misfits(reprojection, measured), seconds=watch.seconds, xrays=measured, reprojection=reprojection,
+            **found, seconds=watch.seconds, xrays=measured, reprojection=reprojection,
             network_calls=base.network_calls + denoiser.calls,
-            projector_calls=base.projector_calls + measurement.calls, masks=masks)
+            projector_calls=base.projector_calls + measurement.calls, masks=masks,
+            diverged_at=base.diverged_at or guard.diverged_at)
 
     def _base(self, xrays: Tensor, projector: Projector, report: str, display: bool, seed: int,
               on_step: Callable[[], None]) -> Reconstruction:

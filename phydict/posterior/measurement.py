@@ -9,7 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from phydict.reconstructor import check_xrays
+from phydict.profiling import stage
+from phydict.reconstructor import check_line_integrals, check_xrays
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import Projector
 from phydict.xray.calibration import match_views
@@ -21,33 +22,40 @@ class Measurement:
 
     noise: standard deviation of the noise of y, as a share of its largest value or, as a tensor that expands to
     (K, V, U), of each pixel; None: estimated from y where it is needed.
-    calls: how many times A or its adjoint ran over all views, per volume of a batch.
+    calls: how many times A or its adjoint ran over all views, per volume of a batch; seen: what `project` last gave.
     """
 
     def __init__(self, projector: Projector, xrays: Tensor, window: HUWindow, display: bool = False,
                  mu_water: float = MU_WATER, noise: float | Tensor | None = None):
         check_xrays(xrays, projector.beam)
+        if not display:
+            check_line_integrals(xrays)
         self.noise = noise
         self.projector, self.display = projector, xrays[None] if display else None
         self.slope, self.offset = window.mu_affine(mu_water)
         self.background = self.offset * projector(torch.ones(1, 1, *projector.grid.shape).to(xrays))
         self.y = xrays[None]
-        self.calls = 1
+        self.calls, self.seen = 1, None
 
     def project(self, x: Tensor) -> Tensor:
         """P(x): line integrals (B, K, V, U) of the CT x."""
         self.calls += len(x)
-        return self.slope * self.projector(x) + self.background
+        with stage("projector"):
+            projected = self.slope * self.projector(x) + self.background
+        self.seen = projected.detach()
+        return projected
 
     def linear(self, d: Tensor) -> Tensor:
         """The linear part of P, for differences d of CTs."""
         self.calls += len(d)
-        return self.slope * self.projector(d)
+        with stage("projector"):
+            return self.slope * self.projector(d)
 
     def adjoint(self, r: Tensor) -> Tensor:
         """The exact adjoint of `linear`: (B, K, V, U) -> (B, 1, X, Y, Z)."""
         self.calls += len(r)
-        return self.slope * self.projector.T(r)
+        with stage("projector"):
+            return self.slope * self.projector.T(r)
 
     def norm(self) -> float:
         """The largest singular value of `linear`."""

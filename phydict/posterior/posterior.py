@@ -15,20 +15,24 @@ from phydict.posterior.measurement import Measurement
 from phydict.posterior.sampler import Sampler
 from phydict.posterior.split_gibbs import SplitGibbs, noise_like
 from phydict.prior import Prior
-from phydict.reconstructor import Reconstruction, Reconstructor, Stopwatch, misfits
+from phydict.profiling import stage
+from phydict.reconstructor import Guard, Reconstruction, Reconstructor, Stopwatch, misfits
 from phydict.units import MU_WATER
 from phydict.xray import Projector
 
 
 class Counted:
-    """A denoiser that counts its calls, one for each state of a batch."""
+    """A denoiser that counts its calls, one for each state of a batch, and shows a guard what it estimates."""
 
-    def __init__(self, denoiser: Denoiser):
-        self.schedule, self._denoiser, self.calls = denoiser.schedule, denoiser, 0
+    def __init__(self, denoiser: Denoiser, guard: Guard):
+        self.schedule, self._denoiser, self.guard, self.calls = denoiser.schedule, denoiser, guard, 0
 
     def denoise(self, x: Tensor, t: float) -> Tensor:
         self.calls += len(x)
-        return self._denoiser.denoise(x, t)
+        with stage("network"):
+            x0 = self._denoiser.denoise(x, t)
+        self.guard.estimate = x0.detach()
+        return x0
 
 
 @dataclass(frozen=True)
@@ -87,30 +91,38 @@ class Posterior(Reconstructor):
         together = self.batch if self.sampler.batches else 1
         sampler = self.sampler.randomised() if self.samples > 1 else self.sampler
         with watch.stage("prepare"):
-            denoiser = Counted(prior.bind(report, self.guidance, self.bf16))
             measurement = Measurement(projector, xrays, prior.window, display, self.mu_water)
+            guard = Guard(measurement, on_step, sampler.steps())
+            denoiser = Counted(prior.bind(report, self.guidance, self.bf16), guard)
             state = torch.empty(1, prior.state_channels, *prior.grid.shape, device=xrays.device)
         with watch.stage("sample"):
             states = []
             for first in range(0, self.samples, together):
+                guard.begin()
                 draws = [torch.Generator().manual_seed(s) for s in seeds[first:first + together]]
-                x = noise_like(state.expand(len(draws), -1, -1, -1, -1), draws)
+                x = noise_like(state.expand(len(draws), -1, -1, -1, -1), draws).to(xrays.dtype)
                 draw = draws if len(draws) > 1 else draws[0]
-                states.append(sampler.sample(denoiser, measurement, x, draw, on_step))
+                states.append(sampler.sample(denoiser, measurement, x, draw, guard))
+                if self.samples > 1:
+                    guard.end(states[-1])
             states = torch.cat(states)
         with watch.stage("score"):
             state, ct = states.mean(0), states[:, :1].mean(0, keepdim=True)
             measurement.calibrate(ct)
             reprojection = measurement.project(ct)[0].cpu()
             measured = measurement.y[0].cpu()
-            deviation = None
-            if self.samples > 1:
+            found, deviation = misfits(reprojection, measured), None
+            if self.samples == 1:
+                guard.end(states, found["misfit"])
+            else:
                 deviation = (prior.window.half_width * states[:, 0].std(0)).cpu()
+            guard.doubt(**found)
         return Reconstruction(
             volume=prior.window.to_hu(ct[0, 0]).cpu(), grid=prior.grid, method=self.name, seed=seed,
-            **misfits(reprojection, measured), seconds=watch.seconds, xrays=measured, reprojection=reprojection,
+            **found, seconds=watch.seconds, xrays=measured, reprojection=reprojection,
             network_calls=denoiser.calls * (2 if report and self.guidance != 1 else 1),
-            projector_calls=measurement.calls, masks=((state[1:] + 1) / 2).cpu(), deviation=deviation)
+            projector_calls=measurement.calls, masks=((state[1:] + 1) / 2).cpu(), deviation=deviation,
+            diverged_at=guard.diverged_at)
 
 
 def sample_seed(seed: int, i: int) -> int:

@@ -9,6 +9,7 @@ The authors' release differs in almost every term: each difference is a switch.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -88,7 +89,14 @@ class Reward:
         with torch.random.fork_rng(enabled=self.dropout):
             if self.dropout:
                 torch.manual_seed(seed)
-            found = network(*(v.flatten(0, 1)[:, None].expand(-1, 3, -1, -1) for v in images))
+            try:
+                found = network(*(v.flatten(0, 1)[:, None].expand(-1, 3, -1, -1) for v in images))
+            except RuntimeError as error:
+                if not re.search("Output size is too small|Kernel size can't be greater", str(error)):
+                    raise
+                raise ValueError(f"views of {projected.shape[2]} x {projected.shape[3]} pixels are too small for "
+                                 f"LPIPS' {self.backbone}: give a finer detector, or set the reward's lpips weight to 0"
+                                 ) from error
         return found.view(projected.shape[:2])
 
 

@@ -1,0 +1,112 @@
+"""What the stages of a computation take: seconds, calls and peak memory, measured while someone asks and free otherwise.
+
+The peak is that of the process' resident memory on Linux, where the kernel's mark can be set back before each stage;
+elsewhere it is the largest so far. On a CUDA device it is also that of the tensors there.
+"""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+_running: Profile | None = None
+
+
+@dataclass
+class Use:
+    """What a stage took in all its calls: seconds, and the peaks in MB of the process and of the device."""
+
+    calls: int = 0
+    seconds: float = 0.0
+    peak_mb: float = 0.0
+    device_mb: float = 0.0
+
+
+class Profile:
+    """Uses by stage; a stage inside another is named `outer / inner`, and its peak counts for both."""
+
+    def __init__(self):
+        self.uses: dict[str, Use] = {}
+        self._open: list[str] = []
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        self._mark()
+        self._open.append(f"{self._open[-1]} / {name}" if self._open else name)
+        use = self.uses.setdefault(self._open[-1], Use())
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            _wait()
+            use.seconds += time.perf_counter() - began
+            use.calls += 1
+            self._mark()
+            self._open.pop()
+
+    def _mark(self) -> None:
+        """Gives the peaks since the last mark to every open stage."""
+        _wait()
+        process, device = _peaks()
+        for name in self._open:
+            use = self.uses[name]
+            use.peak_mb, use.device_mb = max(use.peak_mb, process), max(use.device_mb, device)
+
+    def table(self) -> str:
+        """One line per stage."""
+        on_device = any(use.device_mb for use in self.uses.values())
+        width = max((len(name) for name in self.uses), default=5)
+        lines = [f"{'stage':{width}s}  {'calls':>6s}  {'seconds':>8s}  {'peak MB':>8s}" + "  device MB" * on_device]
+        for name, use in self.uses.items():
+            lines.append(f"{name:{width}s}  {use.calls:6d}  {use.seconds:8.3f}  {use.peak_mb:8.0f}"
+                         + f"  {use.device_mb:9.0f}" * on_device)
+        return "\n".join(lines)
+
+
+@contextmanager
+def profiled() -> Iterator[Profile]:
+    """A profile of the stages that run inside."""
+    global _running
+    before, _running = _running, Profile()
+    try:
+        yield _running
+    finally:
+        _running = before
+
+
+@contextmanager
+def stage(name: str) -> Iterator[None]:
+    """A stage of a computation; without a profile nothing is measured."""
+    if _running is None:
+        yield
+    else:
+        with _running.stage(name):
+            yield
+
+
+def _wait() -> None:
+    if torch.cuda.is_initialized():
+        torch.cuda.synchronize()
+
+
+def _peaks() -> tuple[float, float]:
+    """Peaks in MB, of the process and of the CUDA device, since the last call."""
+    device = 0.0
+    if torch.cuda.is_initialized():
+        device = torch.cuda.max_memory_allocated() / 1e6
+        torch.cuda.reset_peak_memory_stats()
+    try:
+        lines = Path("/proc/self/status").read_text().splitlines()
+        process = next(int(line.split()[1]) * 1024 / 1e6 for line in lines if line.startswith("VmHWM"))
+        Path("/proc/self/clear_refs").write_text("5")
+    except (OSError, StopIteration):
+        unit = 1 if sys.platform == "darwin" else 1024
+        process = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
+    return process, device

@@ -1,0 +1,325 @@
+"""Data and settings at the limits: every run ends finite or with one sentence, and tells where it went astray."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from prior.tiny import REPORTS, tiny_prior
+
+from phydict import METHODS, ConeBeam, Grid, HUWindow, Projector, reconstruct
+from phydict.baselines import CGLS, FISTATV, SIRT, DiffVox
+from phydict.diffusion import CosineSchedule, GaussianDenoiser
+from phydict.methods import reconstructor
+from phydict.posterior import (
+    DAPS, DDS, DPS, DiffPIR, ExactDraw, GradientSteps, Langevin, PnPDM, Posterior, PriorOnly, ProximalCG, SplitGibbs)
+from phydict.reconstructor import misfits, risen_from
+from phydict.xray import Ideal
+
+pytestmark = [pytest.mark.filterwarnings(f"ignore:{said}") for said in
+              ("no volume was found", "the largest line integral", "the misfit rose")]
+GRID = Grid.cube(16)
+BEAM = ConeBeam.orbit(8, 1020, 740, (24, 24), 24.0)
+FAST = METHODS["phydict_fast"]
+SAMPLERS = {
+    "fast": FAST, "paper": SplitGibbs(4, GradientSteps(), refine_from=0.3, refine_iterations=2),
+    "released": replace(METHODS["phydict_released"], iterations=2, refine_iterations=2),
+    "daps": DAPS(levels=3, flow_steps=1, likelihood=ExactDraw(3), prior_std=0.5),
+    "daps langevin": DAPS(levels=3, flow_steps=1, likelihood=Langevin(5)),
+    "pnp_dm": PnPDM(iterations=4, decay=0.5, levels=3, likelihood=ExactDraw(3), burn_in=2, thinning=1),
+    "diffpir": DiffPIR(4), "dds": DDS(4), "dps": DPS(4, 3.0), "prior": PriorOnly(2)}
+BASELINES = {"sirt": SIRT(50), "cgls": CGLS(5, 4, HUWindow()), "tv": FISTATV(30), "diffvox": DiffVox(20),
+             "fdk": METHODS["fdk"]}
+METHOD = pytest.mark.parametrize("name", [*SAMPLERS, *BASELINES])
+
+
+def body(grid: Grid = GRID) -> torch.Tensor:
+    """Attenuation (1, 1, X, Y, Z) in 1/mm of an ellipse with two lungs and a heart, fainter towards the top."""
+    index = np.stack(np.meshgrid(*map(np.arange, grid.shape), indexing="ij"), -1)
+    x, y, z = np.moveaxis((index @ grid.affine[:3, :3].T + grid.affine[:3, 3] - grid.centre) / grid.extent * 2, -1, 0)
+    trunk = (x / 0.8) ** 2 + (y / 0.55) ** 2 < 1
+    lungs = ((abs(x) - 0.4) / 0.27) ** 2 + (y / 0.4) ** 2 + (z / 0.8) ** 2 < 1
+    heart = ((x + 0.15) / 0.3) ** 2 + ((y - 0.2) / 0.25) ** 2 + ((z + 0.3) / 0.4) ** 2 < 1
+    mu = 0.02 * trunk - 0.015 * (lungs & ~heart) - 0.002 * z * trunk
+    return torch.as_tensor(mu, dtype=torch.float32)[None, None]
+
+
+def views(mu: torch.Tensor | None = None, beam: ConeBeam = BEAM, simulator: Ideal = Ideal()) -> torch.Tensor:
+    return simulator(Projector(GRID, beam, full_detector=True), body() if mu is None else mu, 0)[0]
+
+
+CLEAN = views()
+
+
+def changed(change, view: int = 3) -> torch.Tensor:
+    """The views, of which one is changed."""
+    xrays = CLEAN.clone()
+    xrays[view] = change(xrays[view])
+    return xrays
+
+
+def metal() -> torch.Tensor:
+    mu = body()
+    mu[..., 8, 5, 6:9] = 0.5
+    return mu
+
+
+def water(level: float) -> torch.Tensor:
+    return torch.full((1, 1, *GRID.shape), level)
+
+
+def orbit(views: int, degrees: float = 360.0, shape: tuple[int, int] = (24, 24)) -> ConeBeam:
+    return ConeBeam.orbit(views, 1020, 740, shape, 24.0, arc=np.radians(degrees))
+
+
+OTHERS = [0, 1, 2, 4, 5, 6, 7]
+CASES = {
+    "one view": (lambda: views(beam=orbit(1)), orbit(1)),
+    "arc of 60 degrees": (lambda: views(beam=orbit(8, 60)), orbit(8, 60)),
+    "a view flipped": (lambda: changed(lambda v: v.flip(-1)), BEAM),
+    "a view shifted": (lambda: changed(lambda v: v.roll(5, -1)), BEAM),
+    "a view missing": (lambda: CLEAN[OTHERS], BEAM.select(OTHERS)),
+    "a view twice": (lambda: CLEAN[[*range(8), 3]], BEAM.select([*range(8), 3])),
+    "no noise": (lambda: views(simulator=Ideal(0)), BEAM),
+    "ten photons": (lambda: views(simulator=Ideal(0, 10)), BEAM),
+    "only noise": (lambda: torch.randn(CLEAN.shape, generator=torch.Generator().manual_seed(0)), BEAM),
+    "metal": (lambda: views(metal()), BEAM),
+    "narrow detector": (lambda: views(beam=orbit(8, shape=(24, 10))), orbit(8, shape=(24, 10))),
+    "a thousand times too large": (lambda: 1000 * CLEAN, BEAM),
+    "negative": (lambda: -CLEAN, BEAM),
+    "tiny": (lambda: 1e-20 * CLEAN, BEAM),
+    "all air": (lambda: views(water(0.0)), BEAM),
+    "all water": (lambda: views(water(0.02)), BEAM),
+}
+
+
+@pytest.fixture(scope="module")
+def prior():
+    return tiny_prior()
+
+
+def run(name: str, prior, xrays=CLEAN, beam=BEAM, **settings):
+    method = SAMPLERS.get(name) or BASELINES[name]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return reconstruct(xrays, beam, prior if name in SAMPLERS else None, method, grid=GRID, **settings)
+
+
+def assert_finite(result) -> None:
+    for values in (result.volume, result.reprojection, torch.tensor([result.misfit, *result.misfit_per_view])):
+        assert values.isfinite().all()
+
+
+# Data
+
+@METHOD
+@pytest.mark.parametrize("case", CASES)
+def test_every_method_ends_finite_whatever_the_x_rays(prior, name, case):
+    make, beam = CASES[case]
+    try:
+        assert_finite(run(name, prior, make(), beam))
+    except ValueError as refused:  # a method may refuse what it cannot do, in one sentence
+        allowed = {"fdk": ("one view", "a view twice"), "released": ("narrow detector",)}
+        assert case in allowed[name] and "\n" not in str(refused)
+
+
+@METHOD
+@pytest.mark.parametrize("case", ["all air", "ten photons", "a thousand times too large"])
+def test_display_values_end_finite_too(prior, name, case):
+    assert_finite(run(name, prior, CASES[case][0](), display=True))
+
+
+@METHOD
+def test_a_missing_view_is_refused_and_an_honest_geometry_without_it_is_not(prior, name):
+    with pytest.raises(ValueError, match="8 views.*7, 24, 24"):
+        run(name, prior, CLEAN[OTHERS])
+    with pytest.raises(ValueError, match="NaN"):
+        run(name, prior, changed(lambda v: v * float("nan")))
+    assert_finite(run(name, prior, CLEAN[OTHERS], BEAM.select(OTHERS)))
+
+
+@pytest.mark.parametrize("blank", [0.0, 5.0])
+def test_a_blank_view_among_others_is_refused_by_its_number_and_views_that_are_all_alike_are_not(prior, blank):
+    with pytest.raises(ValueError, match="view 3 .*same value"):
+        run("sirt", prior, changed(lambda v: torch.full_like(v, blank)))
+    assert_finite(run("sirt", prior, torch.full_like(CLEAN, blank)))
+
+
+@pytest.mark.parametrize("name", ["fast", "sirt", "cgls", "tv"])
+@pytest.mark.parametrize("change", [lambda v: v.flip(-1), lambda v: v.roll(5, -1), lambda v: v.max() - v],
+                         ids=["flipped", "shifted", "negated"])
+def test_one_bad_view_fits_worst_and_raises_the_misfit(prior, name, change):
+    good, bad = run(name, prior), run(name, prior, changed(change))
+    assert int(np.argmax(bad.misfit_per_view)) == 3
+    assert bad.misfit > 1.2 * good.misfit and bad.misfit_per_view[3] > 1.5 * good.misfit_per_view[3]
+
+
+def test_one_bad_view_is_named_in_a_warning_and_good_ones_are_not(prior):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        reconstruct(CLEAN, BEAM, prior, FAST)
+    with pytest.warns(UserWarning, match=r"view 3 .* times worse than the median"):
+        reconstruct(changed(lambda v: v.roll(8, -1)), BEAM, prior, FAST)
+
+
+@pytest.mark.parametrize("scale", [0.1, 10.0])
+def test_line_integrals_of_no_chest_are_warned_of_and_display_values_of_any_size_are_not(prior, scale):
+    with pytest.warns(UserWarning, match="largest line integral .* of a chest"):
+        reconstruct(scale * CLEAN, BEAM, method=SIRT(2), grid=GRID)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        reconstruct(scale * CLEAN, BEAM, prior, FAST, display=True)
+
+
+def test_x_rays_that_no_volume_can_explain_have_a_misfit_near_one(prior):
+    assert run("fast", prior).misfit < 0.1
+    assert run("fast", prior, 10 * CLEAN).misfit > 0.5
+
+
+def test_the_misfit_of_x_rays_that_read_nothing_is_finite_and_grows_with_what_is_seen_instead():
+    nothing = torch.zeros(2, 5, 5)
+    assert misfits(nothing, nothing)["misfit"] == 0
+    assert misfits(nothing + 1e-3, nothing) == {"misfit": pytest.approx(1), "misfit_per_view": pytest.approx([1, 1])}
+
+
+# Settings
+
+@pytest.mark.parametrize("guidance", [1, 3, 10])
+def test_a_contradictory_report_at_any_guidance_ends_finite_and_x_rays_are_met_as_well(prior, guidance):
+    alone, told = run("fast", prior), run("fast", prior, report=REPORTS[2], guidance=guidance)
+    assert_finite(told)
+    assert told.misfit < 2 * alone.misfit
+
+
+@pytest.mark.parametrize("delta", [0.0, 0.01, 0.99])
+def test_extra_compute_from_any_delta_ends_finite_in_the_priors_range(prior, delta):
+    volume = reconstruct(CLEAN, BEAM, prior, replace(FAST, refine_from=delta, refine_iterations=2)).volume
+    assert volume.isfinite().all() and volume.min() >= -1000 and volume.max() <= 600
+
+
+@pytest.mark.parametrize("make", [
+    lambda n: replace(FAST, iterations=n, warm_start=1.0, last=None), lambda n: PriorOnly(n), lambda n: DPS(n, 1.0),
+    lambda n: DDS(n), lambda n: DiffPIR(n), lambda n: DAPS(n, flow_steps=1, likelihood=ExactDraw(3), prior_std=0.5),
+    lambda n: PnPDM(n, levels=2, likelihood=ExactDraw(3), burn_in=n - 1, thinning=1)],
+    ids=["fast", "prior", "dps", "dds", "diffpir", "daps", "pnp_dm"])
+@pytest.mark.parametrize("steps", [1, 2, 40])
+def test_few_and_many_steps_end_finite(prior, make, steps):
+    result = reconstruct(CLEAN, BEAM, prior, make(steps))
+    assert_finite(result)
+
+
+def test_a_thousand_noise_levels_change_little_beside_a_hundred():
+    prior = FixedPrior(GaussianDenoiser(torch.full((1, 4, *GRID.shape), -0.5), torch.tensor(0.1)))
+    few, many = (reconstruct(CLEAN, BEAM, prior, replace(FAST, iterations=n, likelihood=ProximalCG(2, 1))).volume
+                 for n in (100, 1000))
+    assert float((few - many).square().mean().sqrt()) < 20
+
+
+def test_denoisers_in_bf16_fp32_and_fp64_agree(prior):
+    projector = Projector(GRID, BEAM, full_detector=True)
+
+    def volume(kind: torch.dtype, bf16: bool) -> torch.Tensor:
+        return Posterior(tiny_prior().to(kind), FAST, bf16=bf16).reconstruct(CLEAN.to(kind), projector).volume
+
+    exact = volume(torch.float64, False)
+    difference = [float((volume(torch.float32, bf16) - exact).square().mean().sqrt()) for bf16 in (False, True)]
+    assert exact.dtype == torch.float64 and difference[0] < 0.5 and difference[1] < 20
+
+
+def test_seeds_differ_less_where_the_x_rays_say_more(prior):
+    method = replace(FAST, randomised_noise=1.0)
+
+    def spread(beam: ConeBeam) -> float:
+        return float(reconstruct(views(beam=beam), beam, prior, method, samples=4).deviation.mean())
+
+    assert 0 < spread(orbit(8)) < spread(orbit(1))
+
+
+# Divergence
+
+class Broken:
+    """A denoiser whose estimates are `value` from its call number `at` on."""
+
+    schedule = CosineSchedule()
+
+    def __init__(self, at: int, value: float):
+        self.at, self.value, self.calls = at, value, 0
+
+    def denoise(self, x: torch.Tensor, t: float) -> torch.Tensor:
+        self.calls += 1
+        return torch.full_like(x, self.value if self.calls >= self.at else -0.5) + 0 * x
+
+
+class FixedPrior:
+    """A prior whose denoiser is given."""
+
+    grid, window, state_channels = GRID, HUWindow(), 4
+
+    def __init__(self, denoiser):
+        self.denoiser = denoiser
+
+    def bind(self, *_):
+        return self.denoiser
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+@pytest.mark.parametrize("sampler", [PriorOnly(5), SplitGibbs(5), SplitGibbs(5, GradientSteps()), DDS(5), DiffPIR(5),
+                                     DPS(5), DAPS(5, flow_steps=1)], ids=lambda s: type(s).__name__)
+def test_an_estimate_that_is_not_finite_stops_the_run_and_the_step_is_told(sampler, value):
+    steps = []
+    with pytest.raises(FloatingPointError, match="from step 3 of 5 on"):
+        reconstruct(CLEAN, BEAM, FixedPrior(Broken(3, value)), sampler, on_step=lambda: steps.append(1))
+    assert len(steps) == 2
+
+
+def test_a_baseline_that_overflows_stops_and_the_step_is_told():
+    with pytest.raises(FloatingPointError, match="from step 1 of 5 on"):
+        reconstruct(torch.full_like(CLEAN, 1e38), BEAM, method=CGLS(5), grid=GRID)
+
+
+def test_descent_that_is_too_fast_is_told_with_the_step_from_which_the_misfit_rose():
+    prior = FixedPrior(GaussianDenoiser(torch.full((1, 4, *GRID.shape), -0.5), torch.tensor(0.1)))
+    far, near = (SplitGibbs(6, GradientSteps(2, rate, adam=False), GradientSteps(2, rate, adam=False))
+                 for rate in (10.0, 1e-5))
+    with pytest.warns(UserWarning, match=r"the misfit rose from .* to .*, from step \d of 6 on"):
+        result = reconstruct(CLEAN, BEAM, prior, far)
+    assert 1 <= result.diverged_at <= 6 and result.volume.isfinite().all()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", "the misfit rose")
+        assert reconstruct(CLEAN, BEAM, prior, near).diverged_at is None
+
+
+def test_the_step_at_which_a_rise_began_is_told_where_the_last_steps_forget_the_x_rays(prior):
+    sampler = SplitGibbs(4, ProximalCG(10), ProximalCG(10), warm_start=0.3, last=0.15, refine_from=0.99,
+                         refine_iterations=3)
+    with pytest.warns(UserWarning, match="from step 5 of 7 on"):
+        result = reconstruct(CLEAN, BEAM, prior, sampler)
+    assert result.diverged_at == 5 and result.misfit > 0.1
+
+
+@pytest.mark.parametrize("name", ["fast", "daps", "pnp_dm", "diffpir", "dds", "dps", "sirt", "cgls", "tv", "diffvox"])
+def test_runs_that_converge_are_not_called_divergent(prior, name):
+    assert run(name, prior).diverged_at is None
+
+
+@pytest.mark.parametrize("misfits, step", [
+    ({}, None), ({1: 0.5}, None), ({1: 0.5, 2: 0.2, 3: 0.1}, None), ({1: 0.1, 2: 0.3, 3: 0.15}, None),
+    ({1: 0.1, 2: 0.3, 3: 0.4}, 2), ({1: 1.9}, None), ({1: 9.0, 2: 0.4}, None), ({1: 9.0, 2: 2.1}, 1),
+    ({1: 0.5, 4: 0.2, 5: 0.45, 8: 3.0}, 5), ({1: 1e-4, 2: 1e-2}, None)])
+def test_a_rise_counts_from_where_the_misfit_stays_above_what_was_reached(misfits, step):
+    assert risen_from(misfits) == step
+
+
+def test_watching_takes_no_projection_of_its_own(prior):
+    for sampler, calls in ((PriorOnly(5), 2), (SplitGibbs(3, ProximalCG(1, 1)), 2 + 2 * 4)):
+        assert reconstruct(CLEAN, BEAM, prior, sampler).projector_calls == calls
+
+
+def test_a_step_is_called_once_by_every_method(prior):
+    for name, method in (SAMPLERS | BASELINES).items():
+        steps = []
+        run(name, prior, on_step=lambda: steps.append(1))
+        assert len(steps) == reconstructor(method, prior).steps(), name

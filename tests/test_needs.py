@@ -1,0 +1,167 @@
+"""Only what a scene needs: what each preset imports, makes and differentiates, and nothing beyond."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from prior.tiny import REPORTS, tiny_prior
+
+from phydict import METHODS, ConeBeam, Grid, reconstruct
+from phydict.methods import fit_to_grid, reconstructor
+from phydict.posterior import DPS, GradientSteps, Posterior, Reward, Sampler
+from phydict.prior import save_prior
+from phydict.profiling import profiled, stage
+from phydict.xray import Projector
+from posterior.test_posterior import BEAM, views
+
+ROOT = Path(__file__).parents[1]
+
+SCENES = """
+import json, sys, warnings
+from dataclasses import replace
+import torch, phydict
+from phydict.posterior import GradientSteps, Reward
+warnings.simplefilter("ignore")
+made, begin = set(), torch.nn.Module.__init__
+torch.nn.Module.__init__ = lambda self, *a, **k: made.add(type(self).__name__) or begin(self, *a, **k)
+beam = phydict.ConeBeam.orbit(3, 1020, 740, (32, 32), 17.5)
+xrays = torch.rand(3, 32, 32, generator=torch.Generator().manual_seed(0))
+networks = {}
+for name, report in json.loads(sys.argv[2]):
+    method = phydict.METHODS[name]
+    if name == "phydict_paper":
+        method = replace(method, likelihood=GradientSteps(reward=Reward(lpips=0.0)))
+    few = {key: 2 for key in ("iterations", "refine_iterations") if hasattr(method, key)}
+    made.clear()
+    phydict.reconstruct(xrays, beam, sys.argv[1], replace(method, **few), report=report, grid=phydict.Grid.cube(16))
+    networks[f"{name} {report}".strip()] = sorted(made)
+print(json.dumps({"modules": sorted(sys.modules), "networks": networks}))
+"""
+
+NEVER = ("lightning", "pytorch_lightning", "tensorboard", "lungmask", "itk", "ignite", "phydict.training",
+         "phydict.datamodule", "phydict.prior_training", "phydict.inference")
+"""Of use to training, to tables and to other files, and to no reconstruction in memory. MONAI is not among them,
+nor are transformers and lpips: the networks are MONAI's, which imports all of itself and those two with it."""
+PRESETS = ("sirt", "fdk", "phydict_fast", "phydict_paper", "phydict_released")
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory) -> dict:
+    """Modules imported, and networks made by each preset, in a process of its own that reconstructs with them in turn,
+    with a report last of all."""
+    file = tmp_path_factory.mktemp("prior") / "tiny.safetensors"
+    save_prior(tiny_prior(), file)
+    runs = [*((name, "") for name in PRESETS), ("phydict_fast", REPORTS[0])]
+    done = subprocess.run([sys.executable, "-c", SCENES, str(file), json.dumps(runs)], capture_output=True, text=True,
+                          cwd=ROOT, env={"PYTHONPATH": str(ROOT), "PATH": "", "OMP_NUM_THREADS": "1"})
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def test_no_reconstruction_imports_training_or_lightning(scenes):
+    assert set(NEVER) & set(scenes["modules"]) == set()
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_makes_the_networks_that_it_uses_alone(scenes, name):
+    networks = set(scenes["networks"][name])
+    assert ("LPIPS" in networks) == (name == "phydict_released")  # LPIPS at weight 0 is not made for phydict_paper
+    assert ("Prior" in networks) == isinstance(METHODS[name], Sampler)
+    assert not {"TextEncoder", "BertModel", "SuperResolution", "LocalUNet"} & networks
+
+
+def test_a_report_loads_the_text_encoder_and_nothing_else(scenes):
+    without, told = (set(scenes["networks"][name]) for name in ("phydict_fast", f"phydict_fast {REPORTS[0]}"))
+    assert {"TextEncoder", "BertModel"} <= told - without and not {"SuperResolution", "LPIPS"} & told
+
+
+class Watched:
+    """A prior whose denoiser notes whether gradients are recorded."""
+
+    def __init__(self, prior):
+        self.prior, self.grid, self.window, self.state_channels = prior, prior.grid, prior.window, prior.state_channels
+        self.recorded: set[bool] = set()
+
+    def bind(self, *settings):
+        bound = self.prior.bind(*settings)
+        self.schedule = bound.schedule
+
+        class Denoiser:
+            schedule = bound.schedule
+
+            @staticmethod
+            def denoise(x, t):
+                x0 = bound.denoise(x, t)
+                self.recorded.add(torch.is_grad_enabled() or x0.requires_grad)
+                return x0
+
+        return Denoiser()
+
+
+def reduced(method: Sampler) -> Sampler:
+    few = {"iterations": 2, "refine_iterations": 2, "levels": 2, "burn_in": 1, "thinning": 1}
+    method = replace(method, **{key: value for key, value in few.items() if hasattr(method, key)})
+    if hasattr(method, "likelihood") and isinstance(method.likelihood, GradientSteps):
+        method = replace(method, likelihood=GradientSteps(reward=Reward()), final_likelihood=None)
+    return method
+
+
+@pytest.mark.parametrize("name", [name for name, method in METHODS.items() if isinstance(method, Sampler)])
+def test_gradients_are_recorded_inside_the_likelihood_step_alone(name, monkeypatch):
+    sampler, prior, projected = reduced(METHODS[name]), Watched(tiny_prior()), []
+    through = Projector.__call__
+    monkeypatch.setattr(Projector, "__call__", lambda self, mu: projected.append(mu.requires_grad) or through(self, mu))
+    result = reconstruct(views(), BEAM, prior, sampler)
+    assert prior.recorded == {isinstance(sampler, DPS)}  # the one method that differentiates the denoiser itself
+    by_gradients = isinstance(sampler, DPS) or isinstance(getattr(sampler, "likelihood", None), GradientSteps)
+    assert any(projected) == by_gradients
+    assert not result.volume.requires_grad and not result.reprojection.requires_grad
+
+
+def test_the_detector_is_binned_to_the_grid_unless_a_method_wants_every_pixel():
+    beam = ConeBeam.orbit(2, 1020, 740, (448, 448), 1.25)
+    for name, method in METHODS.items():
+        ready = reconstructor(method, tiny_prior())
+        xrays, projector = fit_to_grid(ready, Grid.cube(16), torch.zeros(2, 448, 448), beam)
+        full = isinstance(ready, Posterior) and ready.sampler.full_detector
+        assert (xrays.shape[-1] == 448) == full == (projector.beam.shape == (448, 448)), name
+
+
+def test_without_a_profile_nothing_is_measured_and_with_one_stages_nest():
+    with stage("outside"):
+        pass
+    with profiled() as profile:
+        for _ in range(3):
+            with stage("outer"), stage("inner"):
+                kept = torch.zeros(10_000_000)
+        del kept
+    with stage("after"):
+        pass
+    assert list(profile.uses) == ["outer", "outer / inner"]
+    outer, inner = profile.uses.values()
+    assert outer.calls == inner.calls == 3 and outer.seconds >= inner.seconds > 0
+    assert outer.peak_mb >= inner.peak_mb > 0
+
+
+def test_a_profile_holds_the_calls_that_a_reconstruction_reports_and_its_table_every_stage():
+    with profiled() as profile:
+        result = reconstruct(views(), BEAM, tiny_prior(), replace(METHODS["phydict_fast"], iterations=3))
+    assert profile.uses["sample / network"].calls == result.network_calls == 3
+    projector = sum(use.calls for name, use in profile.uses.items() if name.endswith("projector"))
+    assert projector == result.projector_calls - 1  # the projection of ones, which makes the operator affine
+    for name, seconds in result.seconds.items():
+        assert profile.uses[name].seconds <= seconds
+    lines = profile.table().splitlines()
+    assert len(lines) == 1 + len(profile.uses) and "peak MB" in lines[0]
+
+
+def test_profiling_changes_nothing_in_the_result():
+    plain = reconstruct(views(), BEAM, tiny_prior(), METHODS["phydict_fast"])
+    with profiled():
+        assert torch.equal(reconstruct(views(), BEAM, tiny_prior(), METHODS["phydict_fast"]).volume, plain.volume)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
 import re
@@ -15,7 +16,7 @@ from pathlib import Path
 
 NOISE = (".*does not have many workers", ".*LeafSpec.*is deprecated", ".*is smaller than the logging interval",
          "Total length of `DataLoader` across ranks is zero", "Checkpoint directory .* exists and is not empty",
-         "It is recommended to use `self.log", "Using `DistributedSampler` with the dataloaders",
+         r"Found \d+ module\(s\) in eval mode", "It is recommended to use `self.log", "Using `DistributedSampler` with the dataloaders",
          ".*args parameter is intended to run from within Python", "predict returned None",
          "You're using the WeightAveraging callback with a model that overrides the configure_model")
 """Warnings that tell a user of the command lines nothing to act on."""
@@ -37,7 +38,9 @@ def one_sentence_errors(*also: type[Exception], to_go_on: str = "run the same co
     except (ValueError, OSError, FloatingPointError, ArgumentError, *also) as error:
         if os.environ.get("PHYDICT_TRACEBACK"):
             raise
-        print(f"error: {sentence(error)}", file=sys.stderr)
+        full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
+        said = f"{sentence(error)}: free some space; to go on, {to_go_on}" if full else sentence(error)
+        print(f"error: {said}", file=sys.stderr)
         raise SystemExit(2) from None
     except RuntimeError as error:
         if os.environ.get("PHYDICT_TRACEBACK") or not re.search("Connection (closed|reset) by peer", str(error)):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +13,7 @@ from torch.utils.data import ConcatDataset, Dataset
 
 from phydict.datamodule import HELD_OUT_PHANTOM, CachedPhantoms, PriorData
 from phydict.datasets import CTCases, Deformation, phantom_case, prepare_ct
+from phydict.datasets.cache import write_array
 from phydict.datasets.transforms import AIR
 from phydict.units import HUWindow
 
@@ -25,14 +25,7 @@ def mapped_volume(file: Path, make: Callable[[], Tensor]) -> np.ndarray:
             return np.load(file, mmap_mode="r")
         except (ValueError, EOFError) as error:
             warnings.warn(f"the cached volume {file} cannot be read ({error}); it is prepared again", stacklevel=3)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    part = file.with_name(f"{file.stem}.{os.getpid()}.part")
-    try:
-        with part.open("wb") as stream:
-            np.save(stream, make().numpy().astype(np.float16))
-        part.replace(file)
-    finally:
-        part.unlink(missing_ok=True)
+    write_array(file, make().numpy().astype(np.float16))
     return np.load(file, mmap_mode="r")
 
 

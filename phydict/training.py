@@ -7,13 +7,16 @@ import sys
 from pathlib import Path
 
 import lightning
+import torch
 import yaml
 from jsonargparse import auto_cli
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.cli import LightningCLI
 from lightning.pytorch.loggers import CSVLogger
+from lightning.pytorch.plugins.io import TorchCheckpointIO
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
+from phydict.atomic import whole_file
 from phydict.command_line import check_writable, one_sentence_errors, quiet
 from phydict.datamodule import PriorData
 from phydict.prior import save_prior, save_super_resolution
@@ -98,6 +101,19 @@ def stage_of(args: list[str]) -> str:
     return stage
 
 
+class WholeCheckpoints(TorchCheckpointIO):
+    """Checkpoints that take the last one's place only when they are complete, whatever stops the writing."""
+
+    def save_checkpoint(self, checkpoint: dict, path: str | Path, storage_options: object = None) -> None:
+        try:
+            with whole_file(Path(path)) as part:
+                torch.save(checkpoint, part)
+        except (OSError, RuntimeError) as error:  # torch reports a full disk as the latter
+            reason = getattr(error, "strerror", None) or "perhaps the disk is full"
+            raise OSError(f"the checkpoint {path} could not be written ({reason}): free some space and go on from the "
+                          "last one, if there is one, with --ckpt_path") from error
+
+
 class PriorCLI(LightningCLI):
     """fit and validate; ties the data's grid and HU window to the model's, and writes everything below `out`."""
 
@@ -122,7 +138,10 @@ class PriorCLI(LightningCLI):
             parser.link_arguments("model.factor", "data.factor")
 
     def instantiate_trainer(self, **kwargs) -> lightning.Trainer:
-        return super().instantiate_trainer(logger=CSVLogger(self._get(self.config, "out"), name="logs"), **kwargs)
+        asked = self._get(self.config_init, "trainer").plugins or []
+        plugins = [*(asked if isinstance(asked, list) else [asked]), WholeCheckpoints()]
+        logger = CSVLogger(self._get(self.config, "out"), name="logs")
+        return super().instantiate_trainer(logger=logger, plugins=plugins, **kwargs)
 
     def before_fit(self) -> None:
         out = Path(self.config.fit.out)

@@ -3,13 +3,17 @@
 import ast
 import subprocess
 import sys
+import tomllib
 import warnings
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
 import yaml
 from lightning.pytorch.callbacks import WeightAveraging
 from lightning.pytorch.strategies import DDPStrategy, ModelParallelStrategy
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 from prior.tiny import tiny_prior
 
 from phydict import training
@@ -70,6 +74,19 @@ def test_a_file_imports_from_lower_floors_and_its_own_part_alone(file):
         assert other in FLOORS, f"{file} imports {name}, which is on no floor"
         beside = FLOORS[own] == 4 == FLOORS[other] and not (own == "methods" and other in LIGHTNING)
         assert other == own or FLOORS[other] < FLOORS[own] or beside, f"{own} must not import {other} ({name})"
+
+
+def test_what_is_imported_is_declared_and_what_is_declared_is_pinned():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    wanted = project["dependencies"] + sum(project["optional-dependencies"].values(), [])
+    declared = {canonicalize_name(Requirement(text).name) for text in wanted}
+    homes = packages_distributions()
+    tops = {name.split(".")[0] for file in files() for name in imported(file)} - set(sys.stdlib_module_names)
+    for top in tops - {"phydict"}:
+        assert {canonicalize_name(home) for home in homes.get(top, [top])} & declared, f"{top} is not declared"
+    pinned = {canonicalize_name(line.partition("=")[0]) for line in (ROOT / "constraints.txt").read_text().splitlines()}
+    needed = {canonicalize_name(Requirement(text).name) for text in project["dependencies"]}
+    assert needed <= pinned, f"not pinned: {needed - pinned}"
 
 
 @pytest.mark.parametrize("file", files(), ids=lambda f: str(f.relative_to(PACKAGE)))

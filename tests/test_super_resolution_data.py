@@ -1,5 +1,6 @@
 """Crops for the super-resolution stage: where they are cut, what augmentation keeps, and what the cache survives."""
 
+import resource
 from itertools import product
 
 import nibabel
@@ -56,6 +57,17 @@ def test_mere_air_is_rarely_drawn():
     volume[:16] += np.random.default_rng(0).random((16, 32, 32)).astype(np.float16)
     drawn = Crops([], [volume], 0.0, HUWindow(), 8, 4, 100, 0, 0, False)
     assert sum(float(drawn[i]["volume"].std()) < 0.05 for i in range(100)) < 20
+
+
+def test_a_volume_that_the_disk_cannot_hold_is_one_sentence_and_leaves_nothing(tmp_path):
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))  # no file may grow beyond 1000 bytes
+    try:
+        with pytest.raises(OSError, match="a.npy could not be cached .*: free some space, or give another data.cache"):
+            mapped_volume(tmp_path / "a.npy", lambda: torch.zeros(8, 8, 8))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not [*tmp_path.iterdir()]
 
 
 def test_a_volume_is_made_once_and_again_when_its_file_is_damaged(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -118,6 +119,20 @@ def test_a_killed_run_goes_on_as_if_it_had_not_been(tmp_path, straight, cache):
     resumed, expected = losses(tmp_path), losses(straight)
     assert {step: resumed[step] for step in range(4, 8)} == {step: expected[step] for step in range(4, 8)}
     assert ours["phydict"]["training"] == {"steps": 8, "samples": 16}
+
+
+def test_a_checkpoint_that_the_disk_cannot_hold_leaves_the_last_one(tmp_path, cache, capsys):
+    short = ["--trainer.limit_train_batches=1", "--trainer.limit_val_batches=0"]
+    main(arguments(tmp_path, cache, "--trainer.max_epochs=1", *short))
+    last, limits = (tmp_path / "last.ckpt").read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(last) // 2, limits[1]))  # no file may grow beyond half of it
+    try:
+        said = refusal(capsys, arguments(tmp_path, cache, "--trainer.max_epochs=2", *short,
+                                         f"--ckpt_path={tmp_path / 'last.ckpt'}"))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert "last.ckpt could not be written" in said and "--ckpt_path" in said
+    assert (tmp_path / "last.ckpt").read_bytes() == last and not list(tmp_path.rglob("*.part"))
 
 
 def test_an_exported_checkpoint_is_a_prior_with_the_averaged_weights(tmp_path, straight, capsys):

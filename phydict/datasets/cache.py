@@ -5,7 +5,10 @@ from __future__ import annotations
 import warnings
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -17,9 +20,21 @@ def write_arrays(file: Path, arrays: dict[str, np.ndarray]) -> None:
 
     Raises OSError, in one sentence, where it cannot be written; nothing of it is left then.
     """
+    with _cached(file) as stream:
+        np.savez_compressed(stream, **arrays)
+
+
+def write_array(file: Path, array: np.ndarray) -> None:
+    """Writes one array, uncompressed, so that a part of it can be read without the rest; else as `write_arrays`."""
+    with _cached(file) as stream:
+        np.save(stream, array)
+
+
+@contextmanager
+def _cached(file: Path) -> Iterator[BinaryIO]:
     try:
         with whole_file(file) as part, part.open("wb") as stream:
-            np.savez_compressed(stream, **arrays)
+            yield stream
     except OSError as error:
         raise OSError(f"the prepared case {file} could not be cached ({error.strerror or error}): "
                       "free some space, or give another data.cache") from error

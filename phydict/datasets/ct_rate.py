@@ -117,7 +117,8 @@ def _nifti_files(root: Path) -> list[Path]:
                    and (p.name == VOLUME or not is_prepared(p)))
     if not found:
         held = f"its {len(every)} files are of other kinds" if every else "it is empty"
-        raise FileNotFoundError(f"there is no .nii or .nii.gz file in {root} ({held}); give a folder of NIfTI CTs")
+        raise FileNotFoundError(f"there is no .nii or .nii.gz file in {root} ({held}); give a folder of NIfTI CTs, or "
+                                "prepare DICOM series with data/prepare_cts.py first")
     return found
 
 

@@ -11,6 +11,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from phydict.atomic import whole_file
 from phydict.diffusion import CosineSchedule
 from phydict.grid import Grid
 from phydict.prior.local_unet import LocalUNet
@@ -29,7 +30,7 @@ STAGES = {"base": "a base prior", "super_resolution": "a super-resolution stage"
 
 
 def save_prior(prior: Prior, path: str | Path, training: dict | None = None, dtype: torch.dtype = torch.float16):
-    """Writes `prior` to one .safetensors file, replacing it only when complete.
+    """Writes `prior` to one .safetensors file, replacing it only when complete. Raises OSError where it cannot.
 
     training: what the header should say of how it was trained (data, steps, command); plain JSON values.
     dtype: precision of the weights on disk.
@@ -49,11 +50,12 @@ def save_super_resolution(fine: SuperResolution, path: str | Path, training: dic
 
 
 def _write(path: Path, header: dict, weights: dict[str, Tensor], dtype: torch.dtype) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(".partial")
-    save_file({k: w.detach().to("cpu", dtype).contiguous() for k, w in weights.items()}, partial,
-              {"phydict": json.dumps(header)})
-    partial.replace(path)
+    tensors = {k: w.detach().to("cpu", dtype).contiguous() for k, w in weights.items()}
+    try:
+        with whole_file(path) as part:
+            save_file(tensors, part, {"phydict": json.dumps(header)})
+    except (SafetensorError, OSError) as error:
+        raise OSError(f"'{path}' could not be written ({error}): free some space, or give another place") from error
 
 
 def describe(prior: Prior) -> dict:

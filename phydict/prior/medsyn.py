@@ -27,6 +27,7 @@ from torch.nn.functional import interpolate, scaled_dot_product_attention, silu
 from phydict.diffusion import CosineSchedule
 from phydict.grid import Grid
 from phydict.prior.prior import BoundPrior
+from phydict.prior.text import TextEncoder
 from phydict.units import HUWindow
 
 WINDOW = HUWindow(-1024.0, 600.0)
@@ -357,10 +358,16 @@ class MedSynPrior(nn.Module):
 
     @torch.no_grad()
     def bind(self, report: str = "", guidance: float = 1.0, bf16: bool | None = None) -> BoundPrior:
-        """The denoiser of one report, with classifier-free guidance of the given scale inside (1 = none)."""
+        """The denoiser of one report, with classifier-free guidance of the given scale inside (1 = none).
+
+        Warns, once for each report, where a TextEncoder cuts it or does not know its words.
+        """
         if guidance < 0:
             raise ValueError(f"the guidance scale is at least 0, but {guidance} was given")
-        return BoundPrior(self, self.context([report]), guidance if report else 1.0, bf16)
+        context = self.context([report])
+        if report and isinstance(self.text, TextEncoder):
+            self.text.check([report])
+        return BoundPrior(self, context, guidance if report else 1.0, bf16)
 
 
 class MedSynSuperResolution(nn.Module):

@@ -29,7 +29,9 @@ class SuperResolution(nn.Module):
     network: F, with state_channels + coarse_channels inputs; grid, window: where and in which HU range the fine volumes
     live; factor: fine voxels along each side of a coarse one; coarse_channels: how many of the coarse state's
     channels are used; detail_std: standard deviation of x0 - u; memory: bytes that denoising may take beside the
-    volumes, which decides whether it runs on the whole or in tiles; overlap: voxels that neighbouring tiles share.
+    volumes, which decides whether it runs on the whole or in tiles; overlap: voxels that neighbouring tiles share at
+    least. Tiles that share 48 changed the shipped stage's estimates and a sample, on 144^3 voxels of a held-out CT, by
+    0.06 HU in the root mean square and 0.9 HU at most; bfloat16 changes estimates by 0.3 and 2.5 HU.
     """
 
     def __init__(self, network: LocalUNet, grid: Grid, window: HUWindow, factor: int = 4, coarse_channels: int = 1,

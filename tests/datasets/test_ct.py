@@ -302,7 +302,7 @@ def test_folders_without_cts_are_explained(tmp_path):
     with pytest.raises(FileNotFoundError, match="it is empty"):
         find_cts(tmp_path)
     (tmp_path / "slice.dcm").write_text("x")
-    with pytest.raises(FileNotFoundError, match="its 1 files are of other kinds"):
+    with pytest.raises(FileNotFoundError, match="its 1 files are of other kinds.*DICOM series with data/prepare_cts"):
         find_cts(tmp_path)
     with pytest.raises(FileNotFoundError, match="is not a NIfTI file"):
         find_cts(tmp_path / "slice.dcm")

@@ -1,6 +1,7 @@
 """One file holds a prior: what is loaded denoises like what was saved, and a bad file ends in one sentence."""
 
 import json
+import resource
 
 import pytest
 import torch
@@ -45,6 +46,18 @@ def test_grid_window_schedule_and_training_come_along(file):
         header = json.loads(opened.metadata()["phydict"])
     assert header["training"] == {"steps": 12, "data": "phantoms"}
     assert header["state"] == ["ct", "lung", "airway", "vessel"]
+
+
+def test_a_prior_that_the_disk_cannot_hold_is_one_sentence_and_the_old_file_stays(file):
+    before = file.read_bytes()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))  # no file may grow beyond 1000 bytes
+    try:
+        with pytest.raises(OSError, match="tiny.safetensors' could not be written .*: free some space"):
+            save_prior(tiny_prior(), file)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert [*file.parent.iterdir()] == [file] and file.read_bytes() == before
 
 
 def test_the_text_encoder_stays_on_disk_until_the_first_report(file):

@@ -1,6 +1,7 @@
 """MedSyn's networks: exactly its parameters, what each part may and may not see, and where voxels go."""
 
 import hashlib
+import warnings
 
 import pytest
 import torch
@@ -12,7 +13,7 @@ from phydict import reconstruct
 from phydict.diffusion import guided
 from phydict.grid import Grid
 from phydict.posterior import PriorOnly, ProximalCG, SplitGibbs
-from phydict.prior import MedSynPrior, MedSynSuperResolution
+from phydict.prior import MedSynPrior, MedSynSuperResolution, TextEncoder, learn_vocabulary
 from phydict.prior.medsyn import (
     ChannelNorm, SelfAttention, Sinusoid, SuperResolutionUNet, TextUNet, atlas_grid, from_slices, to_slices)
 from phydict.xray import ConeBeam
@@ -158,6 +159,20 @@ def test_no_report_is_the_learned_context_and_a_report_is_the_encoders():
     assert torch.equal(one.context(["", ""]), one.null.expand(2, -1, -1))
     bare = MedSynPrior(one.network, lambda reports: Words()(reports)[0], grid=GRID)
     assert torch.equal(bare.context(["a report"]), one.context(["a report"]))
+
+
+def test_a_report_that_is_cut_or_foreign_is_stated_once():
+    words = learn_vocabulary(["No effusion. Clear lungs."])
+    one = MedSynPrior(text_unet(), TextEncoder.small(words, 16, length=6), grid=GRID)
+    for report, said in (("Clear lungs. No effusion. Clear lungs.", "longer than the 6 tokens"),
+                         ("肺 結節", "words that the text encoder does not know")):
+        with pytest.warns(match=said):
+            one.bind(report)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        one.bind("肺 結節")
+        one.bind("Clear lungs.")
+        one.bind()
 
 
 def test_guidance_leads_away_from_the_estimate_without_a_report():

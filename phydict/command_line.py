@@ -16,9 +16,10 @@ from pathlib import Path
 
 NOISE = (".*does not have many workers", ".*LeafSpec.*is deprecated", ".*is smaller than the logging interval",
          "Total length of `DataLoader` across ranks is zero", "Checkpoint directory .* exists and is not empty",
-         r"Found \d+ module\(s\) in eval mode", "It is recommended to use `self.log", "Using `DistributedSampler` with the dataloaders",
+         "It is recommended to use `self.log", "Using `DistributedSampler` with the dataloaders",
          ".*args parameter is intended to run from within Python", "predict returned None",
-         "You're using the WeightAveraging callback with a model that overrides the configure_model")
+         "You're using the WeightAveraging callback with a model that overrides the configure_model",
+         r"Found \d+ module\(s\) in eval mode at the start of training")
 """Warnings that tell a user of the command lines nothing to act on."""
 
 

@@ -25,9 +25,12 @@ def write_arrays(file: Path, arrays: dict[str, np.ndarray]) -> None:
 
 
 def write_array(file: Path, array: np.ndarray) -> None:
-    """Writes one array, uncompressed, so that a part of it can be read without the rest; else as `write_arrays`."""
+    """Writes one array as .npy, so that a part of it can be read without the rest; else as `write_arrays`."""
+    array = np.ascontiguousarray(array)
     with _cached(file) as stream:
-        np.save(stream, array)
+        header = np.lib.format.header_data_from_array_1_0(array)
+        np.lib.format.write_array_header_1_0(stream, header)
+        stream.write(array)  # np.save would not notice that a full disk takes no more of an array's end
 
 
 @contextmanager

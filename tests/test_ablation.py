@@ -28,7 +28,7 @@ from phydict.methods import METHODS
 from phydict.posterior import DAPS, SplitGibbs
 from phydict.prior import save_prior
 from phydict.reconstructor import Stopwatch
-from phydict.units import MU_WATER
+from phydict.units import MU_WATER, HUWindow
 from phydict.xray import ConeBeam, Projector
 
 ROOT = Path(__file__).parents[1]
@@ -198,6 +198,14 @@ def test_a_setting_that_means_nothing_to_a_method_does_not_multiply_it(tmp_path)
     assert [trial.name for trial in trials] == ["sirt"] + ["phydict_fast"] * 4
     assert "guidance" not in trials[0].columns and trials[-1].columns["method.warm_start"] == 0.4
     assert trials[-1].guidance == 2.0 and trials[-1].method.warm_start == 0.4
+
+
+def test_methods_without_a_prior_take_the_grid_and_window_of_those_with_one(tmp_path):
+    save_prior(tiny_prior(False), tmp_path / "tiny.safetensors")
+    sirt, fast = read_specification(write(tmp_path, base={"prior": str(tmp_path / "tiny.safetensors")},
+                                          axes={"method": ["sirt", "phydict_fast"]})).trials
+    assert sirt.scene()[0].shape == (16, 16, 16) and sirt.scene()[1] == fast.scene()[1] != HUWindow()
+    assert sirt.acquisition() == fast.acquisition()
 
 
 def test_named_variants_change_a_method_under_the_axes(tmp_path):

@@ -71,7 +71,8 @@ class Trial:
     """One method with one set of settings, to be run on every case.
 
     columns: what the table of results says of it; method, prior (a file, None where the method needs none), guidance,
-    samples, seed: as in infer.py; data: the X-rays; voxels, side: the grid of a method without a prior.
+    samples, seed: as in infer.py; data: the X-rays; like: for a method without a prior, the file of the prior whose
+    grid and HU window it takes; voxels, side: its grid where there is none.
     """
 
     columns: dict
@@ -83,6 +84,7 @@ class Trial:
     seed: int
     voxels: int
     side: float
+    like: str | None = None
 
     @property
     def name(self) -> str:
@@ -96,10 +98,10 @@ class Trial:
 
     def scene(self) -> tuple[Grid, HUWindow]:
         """The grid of the volume and the HU window that the truth is clipped to."""
-        if self.prior is None:
+        file = self.prior or self.like
+        if file is None:
             return Grid.cube(self.voxels, self.side), HUWindow()
-        prior = prior_of(self.prior)
-        return prior.grid, prior.window
+        return prior_of(file).grid, prior_of(file).window
 
     def identity(self) -> dict:
         """All that decides the numbers of a trial beside the case, as plain JSON values."""
@@ -205,11 +207,14 @@ def _trials(base: Mapping, axes: Mapping, methods: Mapping, cases: Cases) -> tup
         _check_used(changes, meant, [trial])
         found.append(trial)
         used |= meant
-    scenes = {(str(grid.to_dict()), window) for grid, window in (trial.scene() for trial in found)}
-    if len(scenes) > 1:
+    like = next((trial.prior for trial in found if trial.prior), None)
+    found = [trial if trial.prior else replace(trial, like=like) for trial in found]
+    scenes = [trial.scene() for trial in found]
+    asked = [Grid.cube(trial.voxels, trial.side) for trial in found if {"voxels", "side"} & trial.columns.keys()]
+    if any(window != scenes[0][1] for _, window in scenes) or not all(
+            grid.same_as(scenes[0][0]) for grid in [*asked, *(grid for grid, _ in scenes)]):
         raise ValueError("the methods of a product are compared on one grid and HU window, but their priors, or voxels "
-                         "and side for methods without one, give several: set voxels and side to the prior's, or make "
-                         "products of their own")
+                         "and side, give several: leave voxels and side out, or make products of their own")
     return found, used
 
 

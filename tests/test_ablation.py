@@ -369,7 +369,8 @@ def test_each_condition_has_its_table_and_the_best_setting_stands_for_a_method()
 def test_the_table_of_delta_has_the_misfit_beside_ssim():
     rows = [row("a", "x", 20.0 + d, delta=d) for d in (0.0, 0.8, 0.1)]
     table = next(t for t in all_tables(entries(rows), rows) if "delta" in t.header)
-    assert table.header[1:3] == ["SSIM ↑", "misfit ↓"] and [label for label, _, _ in table.lines] == ["0", "0.1", "0.8"]
+    assert table.header[1:3] == ["SSIM ↑", "misfit ↓"]
+    assert [label for label, _, _ in table.lines] == ["0", "0.1", "0.8"]
     assert [values[:2] for _, _, values in table.lines] == [[(20 + d) / 40, 1 / (20 + d)] for d in (0.0, 0.1, 0.8)]
 
 

@@ -32,7 +32,8 @@ SIMULATORS: dict[str, Simulator] = {"ideal": Ideal(), "polychromatic": Polychrom
 SETTINGS: dict[str, tuple[type, object]] = {
     "method": (str, None), "seed": (int, 0),
     "views": (int, 8), "detector": (int, 448), "pixel": (float | None, None), "simulator": (str, "ideal"),
-    "simulation_voxels": (int | None, None), "source_to_detector": (float, 1020.0), "source_to_isocentre": (float, 740.0),
+    "simulation_voxels": (int | None, None), "source_to_detector": (float, 1020.0),
+    "source_to_isocentre": (float, 740.0),
     "report": (bool, True), "voxels": (int, 64), "side": (float, 384.0),
     "prior": (str, str(DEFAULT_PRIOR)), "guidance": (float, 1.0), "samples": (int, 1),
     "delta": (float | None, None)}
@@ -240,7 +241,8 @@ def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
         given = {name: value for name, value in given.items() if name not in OF_A_PRIOR}
     value = {name: default for name, (_, default) in SETTINGS.items()} | given
     if value["detector"] < 1:
-        raise ValueError(f"detector is a number of pixels along each side, 1 or more, but {value['detector']} was given")
+        raise ValueError("detector is a number of pixels along each side, 1 or more, but "
+                         f"{value['detector']} was given")
     pixel = SIDE / value["detector"] if value["pixel"] is None else value["pixel"]
     data = cases.data(
         with_report=value["report"], views=value["views"], source_to_detector=value["source_to_detector"],

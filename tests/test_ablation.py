@@ -28,7 +28,7 @@ from phydict.methods import METHODS
 from phydict.posterior import DAPS, SplitGibbs
 from phydict.prior import save_prior
 from phydict.reconstructor import Stopwatch
-from phydict.units import MU_WATER
+from phydict.units import MU_WATER, HUWindow
 from phydict.xray import ConeBeam, Projector
 
 ROOT = Path(__file__).parents[1]
@@ -200,6 +200,14 @@ def test_a_setting_that_means_nothing_to_a_method_does_not_multiply_it(tmp_path)
     assert trials[-1].guidance == 2.0 and trials[-1].method.warm_start == 0.4
 
 
+def test_methods_without_a_prior_take_the_grid_and_window_of_those_with_one(tmp_path):
+    save_prior(tiny_prior(False), tmp_path / "tiny.safetensors")
+    sirt, fast = read_specification(write(tmp_path, base={"prior": str(tmp_path / "tiny.safetensors")},
+                                          axes={"method": ["sirt", "phydict_fast"]})).trials
+    assert sirt.scene()[0].shape == (16, 16, 16) and sirt.scene()[1] == fast.scene()[1] != HUWindow()
+    assert sirt.acquisition() == fast.acquisition()
+
+
 def test_named_variants_change_a_method_under_the_axes(tmp_path):
     methods = {"mine": {"of": "phydict_paper", "method.likelihood.reward.lpips": 0, "method.iterations": 7}}
     one, two = read_specification(write(tmp_path, base={}, methods=methods,
@@ -361,7 +369,8 @@ def test_each_condition_has_its_table_and_the_best_setting_stands_for_a_method()
 def test_the_table_of_delta_has_the_misfit_beside_ssim():
     rows = [row("a", "x", 20.0 + d, delta=d) for d in (0.0, 0.8, 0.1)]
     table = next(t for t in all_tables(entries(rows), rows) if "delta" in t.header)
-    assert table.header[1:3] == ["SSIM ↑", "misfit ↓"] and [label for label, _, _ in table.lines] == ["0", "0.1", "0.8"]
+    assert table.header[1:3] == ["SSIM ↑", "misfit ↓"]
+    assert [label for label, _, _ in table.lines] == ["0", "0.1", "0.8"]
     assert [values[:2] for _, _, values in table.lines] == [[(20 + d) / 40, 1 / (20 + d)] for d in (0.0, 0.1, 0.8)]
 
 

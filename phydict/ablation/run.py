@@ -10,7 +10,6 @@ from functools import cache
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from phydict.ablation.spec import Specification, Trial, key, prior_of
 from phydict.ablation.timing import PeakMemory, TimedPrior, TimedProjector, WarmUp

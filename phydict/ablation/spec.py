@@ -32,7 +32,8 @@ SIMULATORS: dict[str, Simulator] = {"ideal": Ideal(), "polychromatic": Polychrom
 SETTINGS: dict[str, tuple[type, object]] = {
     "method": (str, None), "seed": (int, 0),
     "views": (int, 8), "detector": (int, 448), "pixel": (float | None, None), "simulator": (str, "ideal"),
-    "simulation_voxels": (int | None, None), "source_to_detector": (float, 1020.0), "source_to_isocentre": (float, 740.0),
+    "simulation_voxels": (int | None, None), "source_to_detector": (float, 1020.0),
+    "source_to_isocentre": (float, 740.0),
     "report": (bool, True), "voxels": (int, 64), "side": (float, 384.0),
     "prior": (str, str(DEFAULT_PRIOR)), "guidance": (float, 1.0), "samples": (int, 1),
     "delta": (float | None, None)}
@@ -71,7 +72,8 @@ class Trial:
     """One method with one set of settings, to be run on every case.
 
     columns: what the table of results says of it; method, prior (a file, None where the method needs none), guidance,
-    samples, seed: as in infer.py; data: the X-rays; voxels, side: the grid of a method without a prior.
+    samples, seed: as in infer.py; data: the X-rays; like: for a method without a prior, the file of the prior whose
+    grid and HU window it takes; voxels, side: its grid where there is none.
     """
 
     columns: dict
@@ -83,6 +85,7 @@ class Trial:
     seed: int
     voxels: int
     side: float
+    like: str | None = None
 
     @property
     def name(self) -> str:
@@ -96,10 +99,10 @@ class Trial:
 
     def scene(self) -> tuple[Grid, HUWindow]:
         """The grid of the volume and the HU window that the truth is clipped to."""
-        if self.prior is None:
+        file = self.prior or self.like
+        if file is None:
             return Grid.cube(self.voxels, self.side), HUWindow()
-        prior = prior_of(self.prior)
-        return prior.grid, prior.window
+        return prior_of(file).grid, prior_of(file).window
 
     def identity(self) -> dict:
         """All that decides the numbers of a trial beside the case, as plain JSON values."""
@@ -205,11 +208,14 @@ def _trials(base: Mapping, axes: Mapping, methods: Mapping, cases: Cases) -> tup
         _check_used(changes, meant, [trial])
         found.append(trial)
         used |= meant
-    scenes = {(str(grid.to_dict()), window) for grid, window in (trial.scene() for trial in found)}
-    if len(scenes) > 1:
+    like = next((trial.prior for trial in found if trial.prior), None)
+    found = [trial if trial.prior else replace(trial, like=like) for trial in found]
+    scenes = [trial.scene() for trial in found]
+    asked = [Grid.cube(trial.voxels, trial.side) for trial in found if {"voxels", "side"} & trial.columns.keys()]
+    if any(window != scenes[0][1] for _, window in scenes) or not all(
+            grid.same_as(scenes[0][0]) for grid in [*asked, *(grid for grid, _ in scenes)]):
         raise ValueError("the methods of a product are compared on one grid and HU window, but their priors, or voxels "
-                         "and side for methods without one, give several: set voxels and side to the prior's, or make "
-                         "products of their own")
+                         "and side, give several: leave voxels and side out, or make products of their own")
     return found, used
 
 
@@ -235,7 +241,8 @@ def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
         given = {name: value for name, value in given.items() if name not in OF_A_PRIOR}
     value = {name: default for name, (_, default) in SETTINGS.items()} | given
     if value["detector"] < 1:
-        raise ValueError(f"detector is a number of pixels along each side, 1 or more, but {value['detector']} was given")
+        raise ValueError("detector is a number of pixels along each side, 1 or more, but "
+                         f"{value['detector']} was given")
     pixel = SIDE / value["detector"] if value["pixel"] is None else value["pixel"]
     data = cases.data(
         with_report=value["report"], views=value["views"], source_to_detector=value["source_to_detector"],

@@ -225,7 +225,7 @@ class Guard:
                           "volume went away from the X-rays", stacklevel=3)
 
     def doubt(self, misfit: float, misfit_per_view: Sequence[float]) -> None:
-        """Warns where a method that looked at the X-rays and did not diverge has left one view, or all, badly fitted."""
+        """Warns where a method that looked at the X-rays and did not diverge fits one view, or all, badly."""
         if not self.misfits or self.diverged_at is not None:
             return
         view, ratio = worst_view(misfit_per_view)
@@ -233,8 +233,9 @@ class Guard:
             warnings.warn(f"view {view} (counted from 0) fits {ratio:.1f} times worse than the median view: check "
                           "whether it is flipped, shifted or another's, and its geometry", stacklevel=3)
         elif misfit > LARGE:
-            warnings.warn(f"no volume was found that explains the X-rays (misfit {misfit:.2g}): check their scale "
-                          "and geometry, that they are not display values, and that the body fits into the volume", stacklevel=3)
+            warnings.warn(f"no volume was found that explains the X-rays (misfit {misfit:.2g}): check their scale and "
+                          "geometry, that they are not display values, and that the body fits into the volume",
+                          stacklevel=3)
 
     def _check(self, values: Tensor) -> None:
         if not values.isfinite().all():

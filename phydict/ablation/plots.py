@@ -124,6 +124,8 @@ def _stages(ax: Axes, group: Sequence[Entry], where: str) -> None:
         left = [a + b for a, b in zip(left, shares)]
     for i, entry in enumerate(own):
         ax.annotate(f"{entry.means['seconds']:.3g} s", (100, i), xytext=(4, -3), textcoords="offset points", fontsize=7)
+    ax.set_xlim(0, 115)
+    ax.set_axisbelow(True)
     _dress(ax, "share of the time (%)", "")
     ax.set_title(where, fontsize=9)
     ax.legend(fontsize=7, loc="lower center", bbox_to_anchor=(0.5, 1.06), ncols=3)

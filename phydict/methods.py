@@ -21,8 +21,8 @@ DEFAULT_PRIOR = Path(__file__).parents[1] / "data" / "prior" / "phydict_64.safet
 """The prior that comes with the project."""
 
 METHODS: dict[str, Sampler | Reconstructor] = {
-    "phydict_fast": SplitGibbs(iterations=4, warm_start=0.3, last=0.15, fresh_noise=0.0,
-                               final_likelihood=ProximalCG(iterations=10, restarts=5)),
+    "phydict_fast": SplitGibbs(iterations=4, warm_start=0.3, last=0.15, fresh_noise=0.0, randomised_noise=1.0,
+                               final_likelihood=ProximalCG(iterations=10, restarts=5, discrepancy=1.0)),
     "phydict_paper": SplitGibbs(iterations=50, likelihood=GradientSteps(reward=Reward(lpips=1.0)), refine_from=0.8,
                                 refine_iterations=40, full_detector=True),
     "prior_only": PriorOnly(iterations=50),

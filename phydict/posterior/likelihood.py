@@ -35,7 +35,8 @@ class ProximalCG(LikelihoodStep):
     iterations: per restart, at most; restarts; noise: standard deviation of the line integrals' error (noise and
     model); tolerance: a restart ends once its residual has shrunk by this factor;
     discrepancy: the step ends once |P(z) - y| is at most this many times what the measurement's own noise gives, since
-    a closer fit would be one of the noise (Morozov's principle, Engl, Hanke & Neubauer 1996, section 4.3); 0: never.
+    a closer fit would be one of the noise (Morozov's principle, Engl, Hanke & Neubauer 1996, section 4.3); 0: never;
+    refit: whether each restart refits the scatter of a measurement that has some.
     Hestenes & Stiefel 1952,
     doi:10.6028/jres.049.044; with bounds, More & Toraldo 1991, doi:10.1137/0801008; as data consistency in diffusion
     sampling, Chung et al. 2024, arXiv:2303.05754.
@@ -46,6 +47,7 @@ class ProximalCG(LikelihoodStep):
     noise: float = 0.02
     tolerance: float = 1e-6
     discrepancy: float = 0.0
+    refit: bool = False
 
     def __post_init__(self):
         if not self.discrepancy >= 0:
@@ -57,7 +59,10 @@ class ProximalCG(LikelihoodStep):
         z = x0.clamp(-1, 1)
         enough = self.discrepancy**2 * measurement.noise_energy if self.discrepancy else -1.0
         for _ in range(self.restarts):
-            missed = measurement.y - measurement.project(z)
+            reprojection = measurement.project(z)
+            if self.refit:
+                measurement.correct(reprojection)
+            missed = measurement.y - reprojection
             if (_dot(missed, missed) <= enough).all():
                 break
             downhill = measurement.adjoint(missed) + weight * (x0 - z)

@@ -12,8 +12,11 @@ from torch import Tensor
 from phydict.reconstructor import check_xrays
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import Projector
-from phydict.xray.calibration import match_views
+from phydict.xray.calibration import match_views, subtract_scatter
 from phydict.xray.noise_level import noise_level
+
+SCATTER = 0.045
+"""The mean share of scatter in the signal from which it is believed; model errors look like up to 0.04."""
 
 
 class Measurement:
@@ -27,7 +30,7 @@ class Measurement:
     def __init__(self, projector: Projector, xrays: Tensor, window: HUWindow, display: bool = False,
                  mu_water: float = MU_WATER, noise: float | Tensor | None = None):
         check_xrays(xrays, projector.beam)
-        self.noise = noise
+        self.noise, self.measured = noise, xrays[None]
         self.projector, self.display = projector, xrays[None] if display else None
         self.slope, offset = window.mu_affine(mu_water)
         self.background = offset * projector(torch.ones(1, 1, *projector.grid.shape).to(xrays))
@@ -61,3 +64,17 @@ class Measurement:
         """Where the views are display values: refit their gain and offset to the projections of the CT x."""
         if self.display is not None:
             self.y = match_views(self.display, self.project(x))
+
+    def correct(self, reprojection: Tensor) -> None:
+        """Subtract the scatter that the projections P(x) tell of, where it is SCATTER of the signal or more on average.
+
+        Display values are left alone: their offset has taken it.
+        """
+        if self.display is None:
+            corrected = subtract_scatter(self.measured, reprojection)
+            share = 1 - torch.exp(self.measured - corrected).mean((1, 2, 3), keepdim=True)
+            self.y = torch.where(share < SCATTER, self.measured, corrected)
+
+    def restore(self) -> None:
+        """Forget corrections: y as it was measured."""
+        self.y = self.measured

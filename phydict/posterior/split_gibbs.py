@@ -36,7 +36,8 @@ class SplitGibbs(Sampler):
     None: the same;
     prior_std: standard deviation of the state, which sets the spread of x0 at each time;
     refine_from: EC's delta in [0, 1), 0 for none; refine_iterations: its noise levels;
-    full_detector: meet the X-rays pixel by pixel instead of binned to what the grid can hold.
+    full_detector: meet the X-rays pixel by pixel instead of binned to what the grid can hold;
+    scatter: compare each estimate after the first with the X-rays, and subtract the scatter where there is some.
     """
 
     iterations: int = 50
@@ -50,6 +51,7 @@ class SplitGibbs(Sampler):
     refine_from: float = 0.0
     refine_iterations: int = 0
     full_detector: bool = False
+    scatter: bool = False
     batches = True
 
     def __post_init__(self):
@@ -86,9 +88,13 @@ class SplitGibbs(Sampler):
     def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, draw: Draw,
                on_step: Callable[[], None] = lambda: None) -> Tensor:
         schedule = denoiser.schedule
+        if self.scatter:
+            measurement.restore()
         for t, s in self.times(denoiser):
             x0 = denoiser.denoise(x, t).clamp(-1, 1)
             measurement.calibrate(x0[:, :1])
+            if self.scatter and t < 1:
+                measurement.correct(measurement.project(x0[:, :1]))
             z, step = x0, self.likelihood if s > 0 else self.final_likelihood
             if step:
                 ct = step(measurement, x0[:, :1], self.spread(denoiser, t)).clamp(-1, 1)

@@ -195,7 +195,8 @@ class ReconstructionTask(lightning.LightningModule):
 
     def _record(self, case: dict, result: Reconstruction, scores: dict | None) -> dict:
         """All that is known of a finished case, as plain JSON values."""
-        return {"case": case["id"], "method": self.method_name, "scores": scores, "misfit": result.misfit,
+        return {"case": case["id"], "method": self.method_name,
+                "citation": self.reconstructor.citation, "scores": scores, "misfit": result.misfit,
                 "misfit_per_view": result.misfit_per_view, "seconds": result.seconds,
                 "network_calls": result.network_calls, "projector_calls": result.projector_calls,
                 "process_peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,

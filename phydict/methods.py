@@ -8,25 +8,44 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from phydict.baselines import SIRT
+from phydict.baselines import CGLS, FDK, FISTATV, SIRT, DiffVox
 from phydict.datasets import format_report
 from phydict.grid import Grid
 from phydict.posterior import (
-    CascadePosterior, GradientSteps, Posterior, PriorOnly, ProximalCG, Reward, Sampler, SplitGibbs)
+    DAPS, DDS, DPS, CascadePosterior, DiffPIR, ExactDraw, GradientSteps, PnPDM, Posterior, PriorOnly, ProximalCG,
+    Reward, Sampler, SplitGibbs)
 from phydict.prior import Cascade, Prior, SuperResolution, load_prior, load_super_resolution
 from phydict.reconstructor import Reconstruction, Reconstructor, check_xrays
+from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector, binned, binning
 
 DEFAULT_PRIOR = Path(__file__).parents[1] / "data" / "prior" / "phydict_64.safetensors"
 """The prior that comes with the project."""
+
+RELEASED_STEPS = GradientSteps(learning_rate=0.01, prior_mean=True, reward=Reward(
+    lpips=0.5, random_backbone=True, dropout=True, squared=0.1, pixel_mean=True, view_sum=True, standardise=True,
+    raw_range=True, renderer="siddon"))
+"""The likelihood step of the authors' release."""
 
 METHODS: dict[str, Sampler | Reconstructor] = {
     "phydict_fast": SplitGibbs(iterations=4, warm_start=0.3, last=0.15, fresh_noise=0.0, randomised_noise=1.0,
                                final_likelihood=ProximalCG(iterations=10, restarts=5, discrepancy=1.0)),
     "phydict_paper": SplitGibbs(iterations=50, likelihood=GradientSteps(reward=Reward(lpips=1.0)), refine_from=0.8,
                                 refine_iterations=40, full_detector=True),
+    "phydict_released": SplitGibbs(
+        iterations=50, likelihood=RELEASED_STEPS, final_likelihood=RELEASED_STEPS, refine_from=0.8,
+        refine_iterations=40, full_detector=True, clip=False, at_zero=True),
+    "daps": DAPS(levels=25, sigma_min=0.02, flow_steps=2, likelihood=ExactDraw(iterations=10), prior_std=0.5),
+    "pnp_dm": PnPDM(iterations=30, decay=0.85, levels=12, likelihood=ExactDraw(iterations=10), burn_in=24, thinning=1),
+    "diffpir": DiffPIR(iterations=100),
+    "dds": DDS(iterations=50),
+    "dps": DPS(iterations=100, scale=3.0),
     "prior_only": PriorOnly(iterations=50),
-    "sirt": SIRT(iterations=300),
+    "sirt": SIRT(),
+    "fdk": FDK(),
+    "cgls": CGLS(iterations=10, restarts=20, window=HUWindow()),
+    "tv": FISTATV(),
+    "diffvox": DiffVox(),
 }
 """Settings by name; configs/reconstruct/<name>.yaml holds the same settings for the command line."""
 

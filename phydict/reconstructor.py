@@ -80,9 +80,11 @@ class Reconstructor(ABC):
 
     full_detector: whether the method wants every pixel, instead of a detector binned to what the grid can hold.
     mu_water: attenuation in 1/mm that water has in the X-rays; between it and HU lies this factor.
+    citation: authors, title, venue and DOI or arXiv number of the method's publication.
     """
 
     full_detector = False
+    citation = ""
     mu_water: float = MU_WATER
 
     def assuming(self, mu_water: float) -> Reconstructor:

@@ -295,6 +295,12 @@ def test_a_damaged_record_is_named(measured, tmp_path, capsys):
         assert str(file.parent) in said and "damaged" in said
 
 
+def test_the_record_names_the_methods_publication(measured, tmp_path):
+    main(sirt("predict", tmp_path, f"--data.xrays={measured / 'anna'}"))
+    file = tmp_path / "sirt" / "anna" / "reconstruction.json"
+    assert "10.1109/TMI.2008.923696" in json.loads(file.read_text())["citation"]
+
+
 def test_a_finished_case_is_never_taken_for_that_of_other_data(measured, cts, tmp_path, capsys):
     shutil.copytree(measured / "anna", tmp_path / "case")
     xrays, ct = (sirt("predict", tmp_path / "out", f"--data.xrays={tmp_path / 'case'}"),

@@ -127,6 +127,13 @@ def test_bad_arguments_are_one_sentence(change, sentence):
         reconstruct(**{"xrays": np.zeros((8, 448, 448)), "beam": DEFAULT, "method": "sirt"} | change)
 
 
+@pytest.mark.parametrize("name", METHODS)
+def test_every_method_names_its_publication(name):
+    ready = reconstructor(name, tiny_prior(False))
+    year = [word for word in ready.citation.replace(",", " ").split() if word.isdigit() and 1900 < int(word) < 2030]
+    assert year and ready.citation.split(",")[0]
+
+
 def test_a_method_may_be_a_name_a_sampler_or_a_reconstructor(tmp_path):
     prior = tiny_prior()
     save_prior(prior, tmp_path / "tiny.safetensors")

@@ -102,7 +102,8 @@ def test_a_killed_run_goes_on_as_if_it_had_not_been(tmp_path, straight, cache):
         PriorTraining.training_step = fatal_step
         main(sys.argv[1:])"""
     done = subprocess.run([sys.executable, "-c", killed, *arguments(tmp_path, cache, "--trainer.max_epochs=2")],
-                          capture_output=True, text=True, cwd=CONFIG.parents[2])
+                          capture_output=True, text=True, cwd=CONFIG.parents[2],
+                          env=os.environ | {"OMP_NUM_THREADS": str(torch.get_num_threads())})  # sums in the same order
     assert done.returncode == -signal.SIGKILL, done.stderr[-2000:]
     assert checkpoint(tmp_path)["global_step"] == 4
     torch.manual_seed(99)  # the new process knows nothing of the old one's random numbers

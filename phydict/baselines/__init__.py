@@ -1,5 +1,9 @@
 """Reconstruction without a learnt prior."""
 
+from phydict.baselines.cgls import CGLS
+from phydict.baselines.diffvox import DiffVox
+from phydict.baselines.fdk import FDK
 from phydict.baselines.sirt import SIRT
+from phydict.baselines.tv import FISTATV
 
-__all__ = ["SIRT"]
+__all__ = ["CGLS", "DiffVox", "FDK", "FISTATV", "SIRT"]

@@ -5,8 +5,8 @@
     case.json                                    space, box, window, report, source and the row of the summary
 
 In the space `patient` the voxels form a cube along the patient's RAS+ axes. In the space `medsyn` the arrays have
-MedSyn's axes (inferior to superior, posterior to anterior, right to left) and its size in atlas millimetres; the
-headers' sform leads back to the patient's world, their qform (code 5, template) to the atlas, centred on 0.
+MedSyn's axes (inferior to superior, posterior to anterior, right to left) and cover its atlas box; the headers lead
+back to the patient's world, case.json's atlas_affine to atlas millimetres, centred on 0.
 """
 
 from __future__ import annotations
@@ -37,19 +37,25 @@ def write_prepared(folder: Path, grid: Grid, images: dict[str, np.ndarray], reco
     if medsyn:
         affine = affine @ _medsyn_index(grid.shape)
         atlas = Grid(grid.shape, np.asarray(record["extent"]) / grid.shape).affine @ _medsyn_index(grid.shape)
+        record = record | {"atlas_affine": atlas.tolist()}
     for name, image in images.items():
         image = np.ascontiguousarray(image[::-1].transpose(2, 1, 0)) if medsyn else image
         if name == "ct":
-            nifti = nibabel.Nifti1Image(np.rint(image).clip(-32768, 32767).astype(np.int16), affine)
+            nifti = nibabel.Nifti1Image(_integers(image).clip(-32768, 32767).astype(np.int16), affine)
             nifti.header["cal_min"], nifti.header["cal_max"] = record["window"]
         else:
-            nifti = nibabel.Nifti1Image(image.clip(0, 1).astype(np.float32), affine)
+            nifti = nibabel.Nifti1Image(_integers(255 * image.clip(0, 1)).astype(np.float32) / 255, affine)
             nifti.set_data_dtype(np.uint8)
         nifti.header.set_xyzt_units("mm", "sec")
         nifti.set_sform(affine, code="scanner")
-        nifti.set_qform(atlas if medsyn else affine, code=5 if medsyn else "scanner")
+        nifti.set_qform(affine, code="scanner")
         nibabel.save(nifti, folder / (VOLUME if name == "ct" else f"{name}.nii.gz"))
     (folder / RECORD).write_text(json.dumps(record, indent=1))
+
+
+def _integers(image: np.ndarray) -> np.ndarray:
+    """The nearest integers; a half that averaging left a rounding error beside is a half."""
+    return np.rint(image.round(2))
 
 
 def _medsyn_index(shape) -> np.ndarray:

@@ -2,6 +2,6 @@
 
 from phydict.diffusion.denoiser import Denoiser, GaussianDenoiser, guided
 from phydict.diffusion.schedule import CosineSchedule
-from phydict.diffusion.steps import ddim, renoise
+from phydict.diffusion.steps import ddim, noise_in, renoise
 
-__all__ = ["CosineSchedule", "Denoiser", "GaussianDenoiser", "ddim", "guided", "renoise"]
+__all__ = ["CosineSchedule", "Denoiser", "GaussianDenoiser", "ddim", "guided", "noise_in", "renoise"]

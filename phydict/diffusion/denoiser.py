@@ -12,7 +12,10 @@ from phydict.diffusion.schedule import CosineSchedule
 
 
 class Denoiser(Protocol):
-    """denoise(x, t) = E[x_0 | x_t = x]; x (B, C, X, Y, Z), t a time in [0, 1] shared by the batch."""
+    """denoise(x, t) = E[x_0 | x_t = x]; x (B, C, X, Y, Z), t a time in [0, 1] shared by the batch.
+
+    A denoiser that is differentiable where x requires a gradient serves every sampler; DPS alone needs that.
+    """
 
     schedule: CosineSchedule
 

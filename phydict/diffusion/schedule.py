@@ -41,6 +41,11 @@ class CosineSchedule:
         signal, noise = self.scales(t)
         return noise / signal
 
+    def time(self, sigma: float) -> float:
+        """The time in [0, 1] whose noise level is `sigma`; levels beyond those of the schedule have its ends' times."""
+        angle = math.atan(min(max(sigma, float(self.sigma(0.0))), float(self.sigma(1.0))))
+        return min(max(angle / (math.pi / 2) * (1 + self.offset) - self.offset, 0.0), 1.0)
+
     def steps(self, n: int, start: float = 1.0, last: float | None = None) -> Iterator[tuple[float, float]]:
         """n time pairs (t, s) with start = t_1 > s_1 = t_2 > ... > s_n = 0, evenly spaced in t.
 

@@ -18,10 +18,13 @@ def ddim(schedule: CosineSchedule, x0: Tensor, x: Tensor, t: float, s: float) ->
 
     ddim(x0, x, t, t) = x; the noise is recomputed from the x0 that is given, so a changed x0 stays consistent.
     """
-    signal_t, noise_t = schedule.scales(t)
-    signal_s, noise_s = schedule.scales(s)
-    eps = (x - signal_t.to(x) * x0) / noise_t.to(x)
-    return signal_s.to(x) * x0 + noise_s.to(x) * eps
+    return renoise(schedule, x0, s, noise_in(schedule, x0, x, t))
+
+
+def noise_in(schedule: CosineSchedule, x0: Tensor, x: Tensor, t: float) -> Tensor:
+    """The noise that the state x at time t holds if its clean state is x0: renoise(x0, t, noise_in(x0, x, t)) = x."""
+    signal, sigma = schedule.scales(t)
+    return (x - signal.to(x) * x0) / sigma.to(x)
 
 
 def renoise(schedule: CosineSchedule, x0: Tensor, t: float, noise: Tensor) -> Tensor:

@@ -64,6 +64,10 @@ class CascadePosterior(Reconstructor):
         """What samples the fine stage."""
         return self.fine_sampler if self.guide_fine else self.unguided
 
+    @property
+    def citation(self) -> str:
+        return self.sampler.citation
+
     def steps(self) -> int:
         return self.sampler.steps() + self.second.steps()
 

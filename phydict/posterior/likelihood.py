@@ -102,22 +102,28 @@ class GradientSteps(LikelihoodStep):
     """The paper's step: a few Adam steps on J(Y, z) + |z - x0|^2 / rho, started at x0.
 
     The text gives two gradient steps of 0.1 and rho = 1; Adam is what the authors' release uses, with a fresh state
-    at every time. The spread is not used.
+    at every time. The spread is not used. adam: else plain gradient descent, which diverges unless
+    learning_rate (1 / rho + |A|^2 / K) < 1, with |A| the operator's norm and K the number of views.
+    prior_mean: the mean over voxels of |z - x0|^2 instead of the sum, as in the release.
     """
 
     steps: int = 2
     learning_rate: float = 0.1
     rho: float = 1.0
     reward: Reward = field(default_factory=Reward)
+    adam: bool = True
+    prior_mean: bool = False
 
     def __call__(self, measurement: Measurement, x0: Tensor, spread: float) -> Tensor:
         with torch.enable_grad():
             z = x0.detach().clone().requires_grad_(True)
-            adam = torch.optim.Adam([z], self.learning_rate)
+            optimiser = (torch.optim.Adam if self.adam else torch.optim.SGD)([z], self.learning_rate)
             for _ in range(self.steps):
-                adam.zero_grad()
-                loss = (z - x0).square().sum() / self.rho - self.reward(measurement, z).sum()
+                optimiser.zero_grad()
+                apart = (z - x0).square().flatten(1)
+                apart = apart.mean(1) if self.prior_mean else apart.sum(1)
+                loss = (apart / self.rho - self.reward(measurement, z)).sum()
                 loss.backward()
                 measurement.calls += 1  # autograd's use of the adjoint
-                adam.step()
+                optimiser.step()
         return z.detach()

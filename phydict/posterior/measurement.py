@@ -32,8 +32,8 @@ class Measurement:
         check_xrays(xrays, projector.beam)
         self.noise, self.measured = noise, xrays[None]
         self.projector, self.display = projector, xrays[None] if display else None
-        self.slope, offset = window.mu_affine(mu_water)
-        self.background = offset * projector(torch.ones(1, 1, *projector.grid.shape).to(xrays))
+        self.slope, self.offset = window.mu_affine(mu_water)
+        self.background = self.offset * projector(torch.ones(1, 1, *projector.grid.shape).to(xrays))
         self.y = xrays[None]
         self.calls = 1
 
@@ -51,6 +51,10 @@ class Measurement:
         """The exact adjoint of `linear`: (B, K, V, U) -> (B, 1, X, Y, Z)."""
         self.calls += len(r)
         return self.slope * self.projector.T(r)
+
+    def norm(self) -> float:
+        """The largest singular value of `linear`."""
+        return self.slope * self.projector.norm()
 
     @property
     def noise_energy(self) -> float:

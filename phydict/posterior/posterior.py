@@ -67,6 +67,10 @@ class Posterior(Reconstructor):
     def full_detector(self) -> bool:
         return self.sampler.full_detector
 
+    @property
+    def citation(self) -> str:
+        return self.sampler.citation
+
     def steps(self) -> int:
         together = min(self.batch, self.samples) if self.sampler.batches else 1
         return self.sampler.steps() * -(-self.samples // together)

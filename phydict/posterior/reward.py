@@ -3,6 +3,8 @@
 | here            | paper                                             |
 |-----------------|---------------------------------------------------|
 | Reward()(m, x)  | -J(Y, x), J = (1/K) sum_k (|y_k - P_k(x)|^2 + LPIPS) |
+
+The authors' release differs in almost every term: each difference is a switch.
 """
 
 from __future__ import annotations
@@ -12,8 +14,11 @@ from functools import lru_cache
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import interpolate
 
+from phydict.grid import Grid
 from phydict.posterior.measurement import Measurement
+from phydict.xray import Projector
 
 
 @dataclass(frozen=True)
@@ -22,29 +27,82 @@ class Reward:
 
     lpips: weight of LPIPS; at 0 it is not loaded. backbone: alex, vgg or squeeze. random_backbone: use LPIPS with an
     untrained backbone, which needs no download; its figures mean nothing beside those of the trained one.
+    dropout: leave LPIPS' dropout active, as it is in training; it then draws anew at each call.
+    squared: weight of the squared error; pixel_mean: its mean over a view's pixels instead of the sum; view_sum: the
+    sum over views instead of the mean. standardise: both views of a pair less their mean and divided by their standard
+    deviation, each by itself; LPIPS is then given those. raw_range: project the prior's range itself, zero outside the
+    volume, instead of attenuation. renderer: a method of Projector instead of the measurement's; upsampling: project
+    the volume on a grid so many times finer, interpolated linearly, or by `nearest`, where each voxel is repeated.
     """
 
     lpips: float = 0.0
     backbone: str = "vgg"
     random_backbone: bool = False
+    dropout: bool = False
+    squared: float = 1.0
+    pixel_mean: bool = False
+    view_sum: bool = False
+    standardise: bool = False
+    raw_range: bool = False
+    renderer: str | None = None
+    upsampling: int = 1
+    nearest: bool = False
+
+    def __post_init__(self):
+        if self.upsampling < 1:
+            raise ValueError(f"a volume is projected on a grid at least 1 times as fine, but upsampling "
+                             f"{self.upsampling} was given")
 
     def __call__(self, measurement: Measurement, x: Tensor) -> Tensor:
         """CTs x (B, 1, X, Y, Z) in the prior's range -> rewards (B,)."""
-        projected = measurement.project(x)
-        error = (projected - measurement.y).square().sum((-2, -1))
+        views = self.project(measurement, x), measurement.y
+        projected, measured = (_standardised(v) for v in views) if self.standardise else views
+        error = (projected - measured).square()
+        error = self.squared * (error.mean((-2, -1)) if self.pixel_mean else error.sum((-2, -1)))
         if self.lpips:
-            network = load_lpips(self.backbone, self.random_backbone).to(x.device)
-            error = error + self.lpips * _lpips(network, projected, measurement.y)
-        return -error.mean(1)
+            error = error + self.lpips * self._lpips(projected, measured, seed=measurement.calls)
+        return -(error.sum(1) if self.view_sum else error.mean(1))
+
+    def project(self, measurement: Measurement, x: Tensor) -> Tensor:
+        """What is compared with the X-rays: projections (B, K, V, U) of the CT x."""
+        if not (self.raw_range or self.renderer or self.upsampling > 1):
+            return measurement.project(x)
+        projector, n = measurement.projector, self.upsampling
+        field = x if self.raw_range else measurement.slope * x + measurement.offset
+        if n > 1:
+            field = interpolate(field, scale_factor=n, **({} if self.nearest else {"mode": "trilinear"}))
+        if self.renderer or n > 1:
+            projector = Projector(finer(projector.grid, n), projector.beam, self.renderer or "auto", device=x.device,
+                                  full_detector=True)
+        measurement.calls += 1
+        return projector(field)
+
+    def _lpips(self, projected: Tensor, measured: Tensor, seed: int) -> Tensor:
+        """LPIPS per view (B, K). The measured views' range is mapped to the [-1, 1] that LPIPS expects, unless both
+        are standardised. seed: of dropout, if any."""
+        images = projected, measured.expand_as(projected)
+        if not self.standardise:
+            low, high = measured.amin((-2, -1), keepdim=True), measured.amax((-2, -1), keepdim=True)
+            images = [(v - low) * (2 / (high - low).clamp(min=1e-6)) - 1 for v in images]
+        network = load_lpips(self.backbone, self.random_backbone).to(projected.device).train(self.dropout)
+        with torch.random.fork_rng(enabled=self.dropout):
+            if self.dropout:
+                torch.manual_seed(seed)
+            found = network(*(v.flatten(0, 1)[:, None].expand(-1, 3, -1, -1) for v in images))
+        return found.view(projected.shape[:2])
 
 
-def _lpips(network: nn.Module, projected: Tensor, measured: Tensor) -> Tensor:
-    """LPIPS per view (B, K); the measured views' range is mapped to the [-1, 1] that LPIPS expects."""
-    low, high = measured.amin((-2, -1), keepdim=True), measured.amax((-2, -1), keepdim=True)
-    scale = 2 / (high - low).clamp(min=1e-6)
-    images = [((v - low) * scale - 1).flatten(0, 1)[:, None].expand(-1, 3, -1, -1)
-              for v in (projected, measured.expand_as(projected))]
-    return network(*images).view(projected.shape[:2])
+def finer(grid: Grid, n: int) -> Grid:
+    """The grid of n^3 voxels in the place of each one."""
+    affine = grid.affine.copy()
+    affine[:3, :3] /= n
+    affine[:3, 3] -= affine[:3, :3].sum(1) * (n - 1) / 2
+    return Grid(tuple(n * size for size in grid.shape), affine=affine)
+
+
+def _standardised(views: Tensor) -> Tensor:
+    deviation, mean = torch.std_mean(views, (-2, -1), keepdim=True)
+    return (views - mean) / deviation.clamp(min=1e-6)
 
 
 @lru_cache(maxsize=2)

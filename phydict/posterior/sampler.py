@@ -22,12 +22,13 @@ Draw = torch.Generator | Sequence[torch.Generator]
 class Sampler(ABC):
     """Settings of a sampling method; `sample` turns noise into a clean state.
 
-    full_detector: as for a Reconstructor. batches: whether the states of a batch do not influence each other, so that
-    several samples may be drawn at once, with one generator for each. scatter: whether scatter is sought in the X-rays
-    and subtracted where it is found.
+    full_detector, citation: as for a Reconstructor. batches: whether the states of a batch do not influence each other,
+    so that several samples may be drawn at once, with one generator for each. scatter: whether scatter is sought in the
+    X-rays and subtracted where it is found.
     """
 
     full_detector = False
+    citation = ""
     batches = False
     scatter = False
 
@@ -49,6 +50,8 @@ class Sampler(ABC):
 class PriorOnly(Sampler):
     """A sample of the prior that ignores the X-rays: deterministic DDIM with `iterations` noise levels."""
 
+    citation = "Song, Meng & Ermon, Denoising Diffusion Implicit Models, ICLR 2021, arXiv:2010.02502"
+
     iterations: int = 50
     batches = True
 
@@ -61,9 +64,12 @@ class PriorOnly(Sampler):
 
 
 def descend(denoiser: Denoiser, x: Tensor, iterations: int, start: float = 1.0,
-            on_step: Callable[[], None] = lambda: None) -> Tensor:
-    """Deterministic descent of the state x from time `start` to its clean end, clipped to the prior's range."""
-    for t, s in denoiser.schedule.steps(iterations, start):
+            on_step: Callable[[], None] = lambda: None, at_zero: bool = False) -> Tensor:
+    """Deterministic descent of the state x from time `start` to its clean end, clipped to the prior's range.
+
+    at_zero: denoise once more at time 0.
+    """
+    for t, s in [*denoiser.schedule.steps(iterations, start), *[(0.0, 0.0)] * at_zero]:
         x0 = denoiser.denoise(x, t).clamp(-1, 1)
         x = ddim(denoiser.schedule, x0, x, t, s)
         on_step()

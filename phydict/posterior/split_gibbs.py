@@ -37,8 +37,13 @@ class SplitGibbs(Sampler):
     prior_std: standard deviation of the state, which sets the spread of x0 at each time;
     refine_from: EC's delta in [0, 1), 0 for none; refine_iterations: its noise levels;
     full_detector: meet the X-rays pixel by pixel instead of binned to what the grid can hold;
+    clip: pull the denoiser's estimate into the prior's range before the likelihood step, not only after it;
+    at_zero: both passes end with one more call of the denoiser, at time 0 and without X-rays, as in the release;
     scatter: compare each estimate after the first with the X-rays, and subtract the scatter where there is some.
     """
+
+    citation = ("Dai, Ghosh & Batmanghelich, PhyDiCT: Plug-and-Play CT Reconstruction from Sparse X-Rays via "
+                "Differentiable Rendering and Strong Priors, MICCAI 2026")
 
     iterations: int = 50
     likelihood: LikelihoodStep = field(default_factory=ProximalCG)
@@ -51,6 +56,8 @@ class SplitGibbs(Sampler):
     refine_from: float = 0.0
     refine_iterations: int = 0
     full_detector: bool = False
+    clip: bool = True
+    at_zero: bool = False
     scatter: bool = False
     batches = True
 
@@ -74,7 +81,8 @@ class SplitGibbs(Sampler):
                              f"{self.refine_iterations} was given")
 
     def steps(self) -> int:
-        return self.iterations + (self.refine_iterations if self.refine_from else 0)
+        passes = [self.iterations] + ([self.refine_iterations] if self.refine_from else [])
+        return sum(passes) + len(passes) * self.at_zero
 
     def randomised(self) -> SplitGibbs:
         return self if self.randomised_noise is None else replace(self, fresh_noise=self.randomised_noise)
@@ -91,22 +99,27 @@ class SplitGibbs(Sampler):
         if self.scatter:
             measurement.restore()
         for t, s in self.times(denoiser):
-            x0 = denoiser.denoise(x, t).clamp(-1, 1)
+            x0 = denoiser.denoise(x, t)
+            if self.clip:
+                x0 = x0.clamp(-1, 1)
             measurement.calibrate(x0[:, :1])
             if self.scatter and t < 1:
                 measurement.correct(measurement.project(x0[:, :1]))
-            z, step = x0, self.likelihood if s > 0 else self.final_likelihood
+            z, step = x0.clamp(-1, 1), self.likelihood if s > 0 else self.final_likelihood
             if step:
                 ct = step(measurement, x0[:, :1], self.spread(denoiser, t)).clamp(-1, 1)
-                z = torch.cat([ct, x0[:, 1:]], 1)
+                z = torch.cat([ct, z[:, 1:]], 1)
             if self.fresh_noise is None:
                 x = ddim(schedule, z, x, t, s)
-            elif s > 0:
+            elif s > 0 or self.at_zero:
                 x = renoise(schedule, z, s, self.fresh_noise * noise_like(z, draw))
+            on_step()
+        if self.at_zero:
+            z = denoiser.denoise(x, 0.0).clamp(-1, 1)
             on_step()
         if self.refine_from:
             x = renoise(schedule, z, self.refine_from, noise_like(z, draw))
-            z = descend(denoiser, x, self.refine_iterations, self.refine_from, on_step)
+            z = descend(denoiser, x, self.refine_iterations, self.refine_from, on_step, self.at_zero)
         return z
 
     def spread(self, denoiser: Denoiser, t: float) -> float:

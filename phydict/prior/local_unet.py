@@ -74,6 +74,8 @@ class LocalUNet(nn.Module):
 
     def forward(self, x: Tensor, t: Tensor, level: Tensor) -> Tensor:
         """x (B, in_channels, X, Y, Z), times t (B,) and noise levels (B,) in [0, 1] -> (B, out_channels, X, Y, Z)."""
+        if any(size % self.divisor for size in x.shape[2:]):
+            raise ValueError(f"this network needs sizes divisible by {self.divisor}, but {tuple(x.shape[2:])} was given")
         n = self.block
         h = rearrange(x, "b c (x i) (y j) (z k) -> b (c i j k) x y z", i=n, j=n, k=n)
         h = torch.cat([h, level.to(h).view(-1, 1, 1, 1, 1).expand(-1, 1, *h.shape[2:])], 1)

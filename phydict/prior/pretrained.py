@@ -170,7 +170,7 @@ def _settings(weights: dict[str, Tensor], stage: int) -> dict:
 
     width = size("init_conv.weight", 0, 160) if stage == 1 else size("init_conv0.weight", 0, 56)
     if width < GROUPS:
-        raise ValueError(f"is not MedSyn's: its first convolution has {width} channels, but at least {GROUPS} are needed")
+        raise ValueError(f"is not MedSyn's: its first convolution has {width} channels, but it needs {GROUPS} at least")
     levels = next(i for i in count(1) if not any(name.startswith(f"downs.{i}.") for name in weights))
     deep = [size(f"downs.{i}.0.block1.proj.weight", 0, width * 2**i) for i in range(levels)]
     attention = "mid_spatial_attn1" if stage == 1 else "mid_spatial_attn"

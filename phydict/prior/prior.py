@@ -111,13 +111,15 @@ class BoundPrior:
     def schedule(self) -> CosineSchedule:
         return self.prior.schedule
 
-    @torch.no_grad()
     def denoise(self, x: Tensor, t: float) -> Tensor:
-        """E[x_0 | x_t = x, report]; runs in bfloat16 where `bf16` says so (None: unless x is float64)."""
+        """E[x_0 | x_t = x, report]; runs in bfloat16 where `bf16` says so (None: unless x is float64).
+
+        Differentiable where x requires a gradient; otherwise nothing is kept for one.
+        """
         n, prior = len(x), self.prior
         times = torch.full((n,), float(t), device=x.device)
         low = x.dtype != torch.float64 if self.bf16 is None else self.bf16
-        with torch.autocast(x.device.type, torch.bfloat16, enabled=low):
+        with torch.set_grad_enabled(x.requires_grad), torch.autocast(x.device.type, torch.bfloat16, enabled=low):
             conditional = prior(x, times, self.context.expand(n, -1, -1))
             if self.guidance == 1.0:
                 return conditional

@@ -107,5 +107,5 @@ def _backproject(volume, images, rays, lengths, bottom, top):
 class Eq4(Tracer):
     """Eq. 4 of the paper; shapes, types and threads as phydict.xray.tracer.Tracer says."""
 
-    name, reach = "eq4", 1
+    reach = 1
     project, backproject = staticmethod(_project), staticmethod(_backproject)

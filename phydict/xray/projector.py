@@ -33,8 +33,8 @@ class Projector:
     computed once, in float64, and shared by projectors of the same grid and beam. mu is 0 outside the grid.
     method:
         "separable": trilinear volumes, upright detectors, any device; the fast one (phydict.xray.separable);
-        "siddon": piecewise-constant voxels exactly, any pose, on the CPU (phydict.xray.siddon);
-        "eq4": the paper's Eq. 4 to the letter, any pose, on the CPU (phydict.xray.eq4);
+        "siddon": piecewise-constant voxels exactly, any pose, computed on the CPU (phydict.xray.siddon);
+        "eq4": the paper's Eq. 4 to the letter, any pose, computed on the CPU (phydict.xray.eq4);
         "joseph": plane sweep with bilinear samples, any pose and device (phydict.xray.joseph);
         "matrix": what siddon computes, as a stored matrix, any pose and device (phydict.xray.system_matrix);
         "auto": separable for upright detectors; else the matrix if it fits, else siddon on the CPU and joseph on other

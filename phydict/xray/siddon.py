@@ -62,5 +62,5 @@ def _backproject(volume, images, rays, lengths, bottom, top):
 class Siddon(Tracer):
     """Line integrals of boxes of constant mu; shapes, types and threads as phydict.xray.tracer.Tracer says."""
 
-    name, reach = "siddon", 0
+    reach = 0
     project, backproject = staticmethod(_project), staticmethod(_backproject)

@@ -29,15 +29,14 @@ SLAB = 8
 class Tracer:
     """The operator for one grid and beam: `forward` (B, X, Y, Z) -> (B, K, V, U) and its adjoint, float32 or float64.
 
-    mu in 1/mm, on the CPU. Runs on as many threads as torch does.
+    mu in 1/mm. Runs on the CPU, on as many threads as torch does; tensors of other devices are carried over and back.
 
-    name: what errors call the method. reach: voxels beside the one that a ray is in whose values count.
+    reach: voxels beside the one that a ray is in whose values count.
     project(volume, image, ray, lengths, low, high) fills the image (V, U) with a view's integrals through the voxels
     low <= index < high. backproject(volume, images, rays, lengths, low, high) adds the adjoint of images (K, V, U) to
     the slices low <= k < high of the volume. Both are compiled and release the GIL.
     """
 
-    name: str
     reach: int
     project: Callable
     backproject: Callable
@@ -47,26 +46,24 @@ class Tracer:
         self._lengths = ray_lengths(beam)
 
     def forward(self, mu: torch.Tensor) -> torch.Tensor:
-        volumes = self._array(mu)
+        volumes = _array(mu)
         xrays = np.zeros((len(volumes), self.beam.views, *self.beam.shape), volumes.dtype)
         boxes = [support(volume, self.reach) for volume in volumes]
         run([(self.project, volumes[b], xrays[b, k], self.rays[k], self._lengths[k], *box)
              for b, box in enumerate(boxes) if box for k in range(self.beam.views)])
-        return torch.from_numpy(xrays)
+        return torch.from_numpy(xrays).to(mu.device)
 
     def adjoint(self, xrays: torch.Tensor) -> torch.Tensor:
-        images = self._array(xrays)
+        images = _array(xrays)
         volumes = np.zeros((len(images), *self.grid.shape), images.dtype)
         slices = self.grid.shape[2]
         run([(self.backproject, volumes[b], images[b], self.rays, self._lengths, low, min(low + SLAB, slices))
              for b in range(len(images)) for low in range(0, slices, SLAB)])
-        return torch.from_numpy(volumes)
+        return torch.from_numpy(volumes).to(xrays.device)
 
-    def _array(self, x: torch.Tensor) -> np.ndarray:
-        if x.device.type != "cpu":
-            raise ValueError(f"method '{self.name}' runs on the CPU, but a tensor on {x.device} was given; choose "
-                             "method='joseph' or 'matrix', or move the tensor with .cpu()")
-        return np.ascontiguousarray(x.detach().numpy())
+
+def _array(x: torch.Tensor) -> np.ndarray:
+    return np.ascontiguousarray(x.detach().cpu().numpy())
 
 
 def rays_in_voxels(grid: Grid, beam: ConeBeam) -> np.ndarray:

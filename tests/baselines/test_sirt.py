@@ -6,7 +6,7 @@ import torch
 from laws import random_like
 
 from phydict.baselines import SIRT
-from phydict.baselines.sirt import typical_chest
+from phydict.baselines.baseline import typical_chest
 from phydict.grid import Grid
 from phydict.units import MU_WATER, hu_to_mu
 from phydict.xray import ConeBeam, Projector

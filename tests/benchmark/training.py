@@ -1,9 +1,10 @@
 """What a training step costs: ours against one written with MONAI's own inferer, and what each flag changes.
 
-    python tests/benchmark/training.py [names of the steps to measure]
+    python tests/benchmark/training.py [names of the steps to measure, "float32" first]
 
-Every step runs in a process of its own, on the same network, the same phantoms and the CPU. Seconds are the median
-step; memory is what the process grew by at its peak, from before its first step. Writes training.csv beside this file.
+Every step runs in a process of its own, on the shipped prior, the same phantoms and the CPU. Seconds are the median
+step, after one that compiles and allocates; memory is what the process grew by at its peak, from before its first
+step. Writes training.csv beside this file.
 """
 
 import resource
@@ -21,20 +22,21 @@ from monai.inferers import DiffusionInferer
 from monai.networks.schedulers import DDPMScheduler
 from torch.utils.data import DataLoader
 
+from phydict.command_line import quiet
 from phydict.datasets import phantom_case
 from phydict.evaluation import write_csv
-from phydict.prior import STATE, VolumeUNet
+from phydict.methods import DEFAULT_PRIOR
+from phydict.prior import VolumeUNet, load_prior
 from phydict.throughput import matmul_peak, sample_flop
 from phydict.training import PriorTraining
 
-VOXELS, BATCH, STEPS, WARM_UP = 64, 2, 5, 2
+BATCH, STEPS, WARM_UP = 2, 4, 1
 
-OURS = {"float32": {}, "gradient checkpointing": {"gradient_checkpointing": True},
-        "channels first": {"channels_last": False},
-        "torch.compile": {"compile": True}, "weight averaging": {"callbacks": [EMAWeightAveraging(decay=0.999)]},
-        "bf16": {"precision": "bf16-mixed"},
-        "bf16, gradient checkpointing": {"precision": "bf16-mixed", "gradient_checkpointing": True}}
 MONAI = "MONAI's DiffusionInferer"
+OURS = {"float32": {}, "bf16": {"precision": "bf16-mixed"}, "gradient checkpointing": {"gradient_checkpointing": True},
+        "bf16, gradient checkpointing": {"precision": "bf16-mixed", "gradient_checkpointing": True},
+        "channels first": {"channels_last": False},
+        "weight averaging": {"callbacks": [EMAWeightAveraging(decay=0.999)]}, "torch.compile": {"compile": True}}
 
 
 class Clock(lightning.Callback):
@@ -73,12 +75,14 @@ def our_steps(loader: DataLoader, precision: str = "32-true", callbacks: list = 
 
 def monai_steps(loader: DataLoader) -> Clock:
     clock, prior = Clock(), new_task().prior
-    model, context = MonaiNames(prior.network), prior.null.detach().expand(BATCH, 1, -1)
+    model = MonaiNames(prior.network)
+    prior.text.trainable = False  # as in our training
     inferer = DiffusionInferer(DDPMScheduler(num_train_timesteps=1000, schedule="cosine", prediction_type="sample"))
     optimizer = torch.optim.AdamW(model.parameters(), 5e-4, weight_decay=0.01)
     for index, batch in enumerate(loader):
         clock.on_train_batch_start()
         x0 = torch.cat([batch["volume"], 2 * batch["masks"] - 1], 1)
+        context = prior.context(batch["report"])
         estimate = inferer(inputs=x0, diffusion_model=model, noise=torch.randn_like(x0),
                            timesteps=torch.randint(0, 1000, (BATCH,)), condition=context)
         loss = torch.nn.functional.mse_loss(estimate, x0)
@@ -91,7 +95,9 @@ def monai_steps(loader: DataLoader) -> Clock:
 
 def new_task(**flags) -> PriorTraining:
     torch.manual_seed(0)
-    return PriorTraining(text="none", voxels=VOXELS, montage_steps=0, **flags)
+    prior = load_prior(DEFAULT_PRIOR)
+    return PriorTraining(text="none", initial=str(DEFAULT_PRIOR), voxels=prior.grid.shape[0], side=prior.grid.extent[0],
+                         window=(prior.window.low, prior.window.high), montage_steps=0, **flags)
 
 
 def peak_mib() -> float:
@@ -100,16 +106,17 @@ def peak_mib() -> float:
 
 def measure(name: str, cases: list[dict]) -> dict:
     """One row of the table, and the losses."""
-    loader = DataLoader(cases * (BATCH * (STEPS + WARM_UP) // len(cases)), BATCH)
+    loader = DataLoader(cases * (STEPS + WARM_UP), BATCH)
     prior = new_task().prior
     flop = sample_flop(prior, prior.grid.shape)
     low = torch.bfloat16 if "bf16" in name else torch.float32
     peak = matmul_peak(torch.device("cpu"), low)
     before = peak_mib()
-    clock = monai_steps(loader) if name == MONAI else our_steps(loader, **OURS[name])
+    with quiet():
+        clock = monai_steps(loader) if name == MONAI else our_steps(loader, **OURS[name])
     seconds = median(clock.seconds[WARM_UP:])
-    return {"step": name, "threads": torch.get_num_threads(), "channels": len(STATE), "voxels": VOXELS, "batch": BATCH,
-            "seconds": seconds, "samples_per_s": BATCH / seconds, "tflop_per_s": BATCH * flop / seconds / 1e12,
+    return {"step": name, "threads": torch.get_num_threads(), "batch": BATCH, "seconds": seconds,
+            "samples_per_s": BATCH / seconds, "tflop_per_s": BATCH * flop / seconds / 1e12,
             "matmul_peak_tflop_per_s": peak / 1e12, "share_of_peak": BATCH * flop / seconds / peak,
             "memory_mib": peak_mib() - before, "losses": clock.losses}
 
@@ -120,23 +127,23 @@ if __name__ == "__main__":
     cases = [phantom_case(seed, prior.grid, prior.window) for seed in range(BATCH)]
     cases = [{key: case[key] for key in keys} for case in cases]
     rows = []
-    for name in sys.argv[1:] or [*OURS, MONAI]:
+    for name in sys.argv[1:] or ["float32", MONAI, *list(OURS)[1:]]:
         with ProcessPoolExecutor(1, get_context("spawn")) as fresh:
-            rows.append(fresh.submit(measure, name, cases).result())
-        print(f"{name}: {rows[-1]['seconds']:.2f} s", file=sys.stderr)
-    plain = rows[0]
-    for row in rows:
+            row = fresh.submit(measure, name, cases).result()
+        losses = row.pop("losses")
+        if not rows:
+            plain, plain_losses = row, losses
         row["times_float32"] = row["seconds"] / plain["seconds"]
         row["memory_times_float32"] = row["memory_mib"] / plain["memory_mib"]
-        row["loss_difference"] = "" if row["step"] == MONAI else max(
-            abs(own / other - 1) for own, other in zip(row["losses"], plain["losses"]))
-    for row in rows:
-        del row["losses"]
-    write_csv(Path(__file__).with_suffix(".csv"), rows)
+        row["loss_difference"] = None if name == MONAI else max(
+            abs(own / other - 1) for own, other in zip(losses, plain_losses))
+        rows.append(row)
+        write_csv(Path(__file__).with_suffix(".csv"), rows)
+        print(f"{name}: {row['seconds']:.2f} s", file=sys.stderr)
     print("| step | seconds | x float32 | TFLOP/s | of matmul peak | memory (MiB) | x float32 | loss differs by |")
-    print("|---|---|---|---|---|---|---|---|")
+    print("|---|---:|---:|---:|---:|---:|---:|---:|")
     for row in rows:
-        differs = "another loss" if row["step"] == MONAI else f"{row['loss_difference']:.1e}"
+        differs = "another loss" if row["loss_difference"] is None else f"{row['loss_difference']:.0e}"
         print(f"| {row['step']} | {row['seconds']:.2f} | {row['times_float32']:.2f} | {row['tflop_per_s']:.3f} | "
               f"{100 * row['share_of_peak']:.0f} % | {row['memory_mib']:.0f} | {row['memory_times_float32']:.2f} | "
               f"{differs} |")

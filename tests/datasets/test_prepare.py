@@ -293,7 +293,10 @@ def test_medsyns_space_scales_the_lungs_box_to_the_atlas_and_leads_back(tmp_path
     lung, ct = (nibabel.load(tmp_path / f"out/a/{name}.nii.gz") for name in ("lung", "ct"))
     assert nibabel.aff2axcodes(ct.affine) == ("S", "A", "L")
     voxel = np.array(ATLAS_MM)[::-1] / 64
-    np.testing.assert_allclose(ct.header.get_zooms(), voxel, rtol=1e-5)
+    atlas = np.array(json.loads((tmp_path / "out/a" / RECORD).read_text())["atlas_affine"])
+    np.testing.assert_allclose(nibabel.affines.voxel_sizes(atlas), voxel)
+    assert nibabel.aff2axcodes(atlas) == ("S", "A", "L")
+    np.testing.assert_allclose(atlas[:3, :3] @ np.full(3, 31.5) + atlas[:3, 3], 0, atol=1e-9)
     box = np.argwhere(lung.get_fdata() > 0.5)
     size = (box.max(0) - box.min(0) + 1) * voxel
     np.testing.assert_allclose(size, ATLAS_LUNGS_MM[::-1], atol=1.6 * voxel.max())
@@ -303,15 +306,14 @@ def test_medsyns_space_scales_the_lungs_box_to_the_atlas_and_leads_back(tmp_path
     np.testing.assert_allclose(ct.affine[:3, :3] @ ball + ct.affine[:3, 3], true, atol=3)
     assert ct.get_fdata().min() == -1024
     assert (ct.header["cal_min"], ct.header["cal_max"]) == (-1024, 600)
-    atlas, code = ct.get_qform(coded=True)
-    assert code == 5 and nibabel.aff2axcodes(atlas) == ("S", "A", "L")
-    np.testing.assert_allclose(atlas[:3, :3] @ np.full(3, 31.5) + atlas[:3, 3], 0, atol=1e-3)
+    np.testing.assert_allclose(ct.get_qform(), ct.affine, atol=1e-3)
     grid = Grid((32,) * 3, np.array(ATLAS_MM) / 32)
     case = load_case(*find_cts(tmp_path / "out"), grid, HUWindow(-1024, 600))
     hu, affine = load_ct(tmp_path / "in/a.nii.gz")
     again = to_grid(hu.clip(-1024), affine, Grid((32,) * 3, affine=case["affine"].numpy()), AIR)
     inside = again > -900
-    assert abs(HUWindow(-1024, 600).to_hu(case["volume"][0].numpy())[inside] - again.clip(max=600)[inside]).max() < 60
+    found = HUWindow(-1024, 600).to_hu(case["volume"][0].numpy())
+    assert inside.mean() > 0.2 and abs(found - again.clip(max=600))[inside].max() < 2
     with pytest.raises(ValueError, match="prepared in MedSyn's space, a box of 316 x 316 x 292 mm.* --space patient"):
         load_case(*find_cts(tmp_path / "out"), Grid.cube(32), WINDOW)
 

@@ -31,6 +31,9 @@ class DenseMeasurement:
         self.calls += 1
         return (r @ self.matrix.to(r)).view(len(r), *SHAPE)
 
+    def norm(self) -> float:
+        return float(torch.linalg.matrix_norm(self.matrix, 2))
+
     def calibrate(self, x: Tensor) -> None:
         pass
 
@@ -49,6 +52,11 @@ def condition(m: DenseMeasurement, mean: Tensor, variance: float, noise: float) 
     precision = m.matrix.T @ m.matrix / noise**2 + torch.eye(N).double() / variance
     shift = m.matrix.T @ (m.y[0] - m.background) / noise**2 + mean.flatten() / variance
     return torch.linalg.solve(precision, shift), torch.linalg.inv(precision)
+
+
+def moments(samples: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean (N,) and covariance (N, N) of samples (B, 1, 1, 2, 3)."""
+    return samples.flatten(1).mean(0), samples.flatten(1).T.cov()
 
 
 def propagate(sample) -> tuple[Tensor, Tensor]:

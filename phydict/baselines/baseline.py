@@ -1,0 +1,103 @@
+"""What the methods without a prior share: X-rays in, density relative to water in between, HU out."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from phydict.reconstructor import Reconstruction, Reconstructor, Stopwatch, check_xrays, misfits
+from phydict.units import HUWindow, mu_to_hu
+from phydict.xray import Projector
+from phydict.xray.calibration import match_views
+
+
+class CountedProjector:
+    """A projector, with `calls`: how often it or its adjoint ran over all views."""
+
+    def __init__(self, projector: Projector):
+        self.grid, self.beam, self._projector, self.calls = projector.grid, projector.beam, projector, 0
+
+    def __call__(self, density: Tensor) -> Tensor:
+        self.calls += 1
+        return self._projector(density)
+
+    def T(self, xrays: Tensor) -> Tensor:
+        self.calls += 1
+        return self._projector.T(xrays)
+
+
+class Baseline(Reconstructor):
+    """A method without a prior: a subclass says how to solve A density = y.
+
+    Works on densities relative to water, so that HU do not depend on what water attenuates in the X-rays. Display
+    values need a scale to start from: they are first matched to a water ellipse of a typical chest.
+    Subclasses are frozen dataclasses with the fields mu_water (1/mm) and name beside their own.
+    """
+
+    name: str
+
+    @abstractmethod
+    def solve(self, A: CountedProjector, y: Tensor, on_step: Callable[[], None]) -> Tensor:
+        """Density relative to water (1, 1, X, Y, Z) of line integrals y (1, K, V, U) in mm of water."""
+
+    @torch.no_grad()
+    def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,
+                    seed: int = 0, on_step: Callable[[], None] = lambda: None) -> Reconstruction:
+        watch, A = Stopwatch(), CountedProjector(projector)
+        check_xrays(xrays, A.beam)
+        with watch.stage("prepare"):
+            y = xrays[None] / self.mu_water
+            if display:
+                y = match_views(xrays[None], A(typical_chest(A).to(xrays)))
+        with watch.stage("sample"):
+            density = self.solve(A, y, on_step)
+        with watch.stage("score"):
+            reprojection, measured = (self.mu_water * views[0].cpu() for views in (A(density), y))
+        return Reconstruction(
+            volume=mu_to_hu(density[0, 0], 1.0).cpu(), grid=A.grid, method=self.name, seed=seed,
+            **misfits(reprojection, measured), seconds=watch.seconds, xrays=measured, reprojection=reprojection,
+            projector_calls=A.calls)
+
+
+def empty(A: CountedProjector, y: Tensor) -> Tensor:
+    """A volume of zeros (1, 1, X, Y, Z), of the type and on the device of y."""
+    return torch.zeros(1, 1, *A.grid.shape).to(y)
+
+
+def bounds(window: HUWindow | None) -> tuple[float, float]:
+    """The densities relative to water at both ends of an HU window; without one, minus and plus infinity."""
+    return (-math.inf, math.inf) if window is None else (window.to_mu(-1, 1.0), window.to_mu(1, 1.0))
+
+
+def clip(density: Tensor, window: HUWindow | None) -> Tensor:
+    """Density relative to water, held inside an HU window; None lets every value pass."""
+    return density.clamp(*bounds(window))
+
+
+def norm(A: CountedProjector, y: Tensor) -> float:
+    """The largest singular value of A, by power iteration to a relative change of 1e-4.
+
+    A has no negative weights, so its leading singular vector has none either and a constant start reaches it.
+    """
+    density, norm, last = empty(A, y) + 1, 0.0, -1.0
+    for _ in range(50):
+        if abs(norm - last) <= 1e-4 * norm:
+            break
+        density, last = A.T(A(density / density.norm())), norm
+        norm = float(density.norm()) ** 0.5
+    return norm
+
+
+def typical_chest(projector: Projector | CountedProjector) -> Tensor:
+    """Density relative to water (1, 1, X, Y, Z) of an upright elliptic cylinder, 320 x 220 mm, with two lungs."""
+    grid = projector.grid
+    index = torch.stack(torch.meshgrid(*[torch.arange(n) for n in grid.shape], indexing="ij"), -1).double()
+    affine = torch.tensor(grid.affine)
+    x, y, _ = (index @ affine[:3, :3].T + affine[:3, 3] - torch.tensor(grid.centre)).unbind(-1)
+    body = (x / 160) ** 2 + (y / 110) ** 2 < 1
+    lungs = ((x.abs() - 75) / 55) ** 2 + (y / 80) ** 2 < 1
+    return (body.float() - 0.75 * (body & lungs).float())[None, None]

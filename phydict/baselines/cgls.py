@@ -1,0 +1,66 @@
+"""CGLS: conjugate gradients on the least-squares problem, regularised by stopping early."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from phydict.baselines.baseline import Baseline, CountedProjector, bounds, clip, empty
+from phydict.units import MU_WATER, HUWindow
+
+
+@dataclass(frozen=True)
+class CGLS(Baseline):
+    """Towards argmin |A mu - y|^2, by conjugate gradients from zero (Hestenes & Stiefel 1952,
+    doi:10.6028/jres.049.044).
+
+    What the views see best is corrected first, so few iterations regularise and many fit the noise.
+    iterations: per restart; window: HU bounds, whose low end of -1000 HU is non-negativity, or None for none. restarts:
+    each frees the voxels inside the bounds or pulled back into them, runs conjugate gradients on those alone and clips
+    (More & Toraldo 1991, doi:10.1137/0801008); without bounds one is the classical method.
+    """
+
+    citation = ("Hestenes & Stiefel, Methods of Conjugate Gradients for Solving Linear Systems, Journal of Research of the "
+                "National Bureau of Standards 49(6), 1952, doi:10.6028/jres.049.044")
+
+    iterations: int = 10
+    restarts: int = 1
+    window: HUWindow | None = None
+    mu_water: float = MU_WATER
+    name: str = "cgls"
+
+    def __post_init__(self):
+        for what in ("iterations", "restarts"):
+            if getattr(self, what) < 1:
+                raise ValueError(f"CGLS needs {what} of at least 1, but {getattr(self, what)} was given")
+
+    def steps(self) -> int:
+        return self.iterations * self.restarts
+
+    def solve(self, A: CountedProjector, y: Tensor, on_step: Callable[[], None]) -> Tensor:
+        low, high = bounds(self.window)
+        density = clip(empty(A, y), self.window)
+        for _ in range(self.restarts):
+            residual = y - A(density)
+            downhill = A.T(residual)
+            free = ~((density <= low) & (downhill < 0) | (density >= high) & (downhill > 0))
+            density = clip(self._descend(A, density, residual, downhill, free, on_step), self.window)
+        return density
+
+    def _descend(self, A: CountedProjector, density: Tensor, residual: Tensor, downhill: Tensor, free: Tensor,
+                 on_step: Callable[[], None]) -> Tensor:
+        """Conjugate gradients over the free voxels, from `density`, whose residual and downhill direction are given."""
+        downhill = direction = downhill * free
+        energy = start = downhill.square().sum()
+        for _ in range(self.iterations):
+            if energy > 1e-12 * start:
+                seen = A(direction)
+                step = energy / seen.square().sum()
+                density, residual = density + step * direction, residual - step * seen
+                downhill = A.T(residual) * free
+                previous, energy = energy, downhill.square().sum()
+                direction = downhill + energy / previous * direction
+            on_step()
+        return density

@@ -1,0 +1,45 @@
+"""Conjugate gradients for symmetric positive systems, one system per case of a batch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from phydict.posterior.normalised import NormalisedMeasurement
+
+
+def conjugate_gradients(operator: Callable[[Tensor], Tensor], right: Tensor, iterations: int,
+                        tolerance: float = 1e-6) -> Tensor:
+    """d with operator(d) = right (B, ...), from zero (Hestenes & Stiefel 1952, doi:10.6028/jres.049.044).
+
+    iterations: at most; a case is left alone once its residual has shrunk by `tolerance`. Where the operator is
+    singular and `right` in its range, this is the solution of least norm.
+    """
+    over = tuple(range(1, right.ndim))
+    residual, direction, d = right, right, torch.zeros_like(right)
+    energy = right.square().sum(over, keepdim=True)
+    stop = energy * tolerance**2
+    for _ in range(iterations):
+        if not (energy > stop).any():
+            break
+        curved = operator(direction)
+        curvature = (direction * curved).sum(over, keepdim=True)
+        active = (energy > stop) & (curvature > 0)
+        step = torch.where(active, energy / curvature, 0)
+        d, residual = d + step * direction, residual - step * curved
+        previous, energy = energy, torch.where(active, residual.square().sum(over, keepdim=True), energy)
+        direction = residual + torch.where(active, energy / previous, 0) * direction
+    return d
+
+
+def nearest_fit(measurement: NormalisedMeasurement, x: Tensor, weight: float, iterations: int,
+                tolerance: float = 1e-6, y: Tensor | None = None) -> Tensor:
+    """argmin over z of |P(z) - y|^2 + weight |z - x|^2 by conjugate gradients from x (B, 1, X, Y, Z).
+
+    y: the measured line integrals unless others are given. weight 0: of all least-squares solutions the one nearest x.
+    """
+    residual = (measurement.y if y is None else y) - measurement.project(x)
+    return x + conjugate_gradients(lambda d: measurement.adjoint(measurement.linear(d)) + weight * d,
+                                   measurement.adjoint(residual), iterations, tolerance)

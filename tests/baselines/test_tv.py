@@ -1,0 +1,112 @@
+"""FISTA-TV: its parts in closed form, its objective falling onto what another algorithm finds."""
+
+import numpy as np
+import pytest
+import torch
+from laws import assert_adjoint, random_like
+
+from phydict.baselines import CGLS, FISTATV
+from phydict.baselines.tv import differences, differences_adjoint, finest_to_own, total_variation, tv_proximal
+from phydict.grid import Grid
+from phydict.units import MU_WATER, HUWindow
+from phydict.xray import ConeBeam, Projector
+
+UNIT = (1.0, 1.0, 1.0)
+SMALL = Projector(Grid((4, 3, 4), (75.0, 75.0, 90.0)), ConeBeam.orbit(3, 1020, 740, (6, 6), 80.0, start=0.2),
+                  full_detector=True)
+SCALES = finest_to_own(SMALL.grid.spacing)
+MATRIX = torch.cat([SMALL(e.view(1, 1, 4, 3, 4)).flatten(1) for e in torch.eye(48).double()]).T
+NORM = float(torch.linalg.matrix_norm(MATRIX, 2))
+Y = MATRIX @ (0.7 + 0.6 * random_like((48,), seed=1)) + 10 * random_like((len(MATRIX),), seed=2)  # mm of water
+
+
+def solved(method: FISTATV) -> torch.Tensor:
+    """Density relative to water (1, 1, 4, 3, 4)."""
+    return 1 + method.reconstruct(MU_WATER * Y.view(3, 6, 6), SMALL).volume[None, None] / 1000
+
+
+def objective(x: torch.Tensor, weight: float) -> float:
+    residual = (MATRIX @ x.flatten() - Y).square().sum() / (2 * NORM**2 * 1.02)
+    return float(residual + weight * total_variation(x, SCALES))
+
+
+def primal_dual(weight: float, low: float, high: float, iterations: int = 20000) -> np.ndarray:
+    """The minimiser by Chambolle & Pock's algorithm with dense matrices: another way to the same end."""
+    gradient = torch.stack([differences(e.view(1, 1, 4, 3, 4), SCALES).flatten() for e in torch.eye(48).double()], 1)
+    D, A = gradient.numpy(), (MATRIX / (NORM * 1.02**0.5)).numpy()
+    b = Y.numpy() / (NORM * 1.02**0.5)
+    step = 0.99 / np.linalg.norm(np.concatenate([A, D]), 2)
+    x, ahead, p, q = np.zeros(48), np.zeros(48), np.zeros(len(A)), np.zeros(len(D))
+    for _ in range(iterations):
+        p = (p + step * (A @ ahead - b)) / (1 + step)
+        q = (q + step * D @ ahead).reshape(3, -1)
+        q = (q / np.maximum(1, np.sqrt((q**2).sum(0)) / weight)).ravel()
+        new = (x - step * (A.T @ p + D.T @ q)).clip(low, high)
+        x, ahead = new, 2 * new - x
+    return x
+
+
+def test_the_differences_adjoint_is_exact():
+    scales = (1.0, 0.5, 0.3)
+    assert_adjoint(lambda x: differences(x, scales), lambda p: differences_adjoint(p, scales), (1, 1, 4, 5, 3))
+
+
+def test_total_variation_is_the_area_of_faces_times_their_step_and_isotropic_at_edges():
+    cube = torch.zeros(1, 1, 8, 8, 8).double()
+    cube[..., 4:, :, :] = 2.0
+    assert total_variation(cube, UNIT) == pytest.approx(2 * 64)
+    ramp = torch.arange(8.0).double()
+    diagonal = (ramp[:, None, None] + ramp[:, None] + ramp)[None, None]
+    assert differences(diagonal, UNIT)[..., :7, :7, :7].square().sum(0).sqrt() == pytest.approx(3**0.5)
+
+
+def test_the_proximal_step_moves_both_sides_of_a_plane_together_by_weight_over_depth():
+    v = torch.zeros(1, 1, 6, 4, 4).double()
+    v[..., 2:, :, :] = 1.0
+    x, _ = tv_proximal(v, 0.2, UNIT, None, 3000, torch.zeros(3, *v.shape).double())
+    assert x[..., :2, :, :].numpy() == pytest.approx(0.2 / 2, abs=1e-3)
+    assert x[..., 2:, :, :].numpy() == pytest.approx(1 - 0.2 / 4, abs=1e-3)
+
+
+def test_the_proximal_step_of_a_constant_or_of_no_weight_is_clipping():
+    window, start = HUWindow(-1000, 0), torch.zeros(3, 1, 1, 4, 4, 4).double()
+    v = torch.full((1, 1, 4, 4, 4), 1.7).double()
+    assert torch.equal(tv_proximal(v, 0.5, UNIT, window, 9, start)[0], torch.ones_like(v))
+    v = random_like((1, 1, 4, 4, 4))
+    assert torch.equal(tv_proximal(v, 0.0, UNIT, window, 9, start)[0], v.clamp(0, 1))
+
+
+def test_a_large_weight_leaves_the_mean_alone():
+    v = random_like((1, 1, 5, 4, 3))
+    x, _ = tv_proximal(v, 100.0, UNIT, None, 3000, torch.zeros(3, *v.shape).double())
+    assert x.numpy() == pytest.approx(float(v.mean()), abs=1e-3)
+
+
+@pytest.mark.parametrize("window", [HUWindow(-1000, 200), None])
+def test_the_objective_falls_onto_that_of_another_algorithm(window):
+    weight = 3e-3
+    low, high = (0, 1.2) if window else (-np.inf, np.inf)
+    reference = primal_dual(weight, low, high)
+    values = [objective(solved(FISTATV(n, weight, 30, window)), weight) for n in (3, 10, 30, 100, 1000)]
+    best = objective(torch.as_tensor(reference).view(1, 1, 4, 3, 4), weight)
+    assert values == sorted(values, reverse=True)
+    assert values[-1] == pytest.approx(best, rel=1e-3)
+    assert solved(FISTATV(3000, weight, 30, window)).flatten().numpy() == pytest.approx(reference, abs=0.02)
+
+
+def test_without_weight_it_is_bounded_least_squares():
+    window = HUWindow(-1000, 1000)
+    smooth = solved(FISTATV(3000, 0.0, 1, window))
+    direct = 1 + CGLS(48, 20, window).reconstruct(MU_WATER * Y.view(3, 6, 6), SMALL).volume / 1000
+    assert objective(smooth, 0.0) == pytest.approx(objective(direct[None, None], 0.0), rel=1e-3)
+
+
+def test_more_weight_is_smoother_and_fits_less():
+    results = [FISTATV(400, w, 20).reconstruct(MU_WATER * Y.view(3, 6, 6), SMALL) for w in (0, 1e-3, 1e-2, 1e-1)]
+    variations = [float(total_variation(r.volume[None, None], SCALES)) for r in results]
+    misfits = [r.misfit for r in results]
+    assert variations == sorted(variations, reverse=True) and misfits == sorted(misfits)
+
+
+def test_coarser_axes_count_by_their_slope():
+    assert finest_to_own((2.0, 4.0, 3.0)) == [1.0, 0.5, 2 / 3]

@@ -1,0 +1,79 @@
+"""DiffPIR on a Gaussian prior: what its mean and its spread are, and what it does with exact data."""
+
+import pytest
+import torch
+from laws import random_like
+
+from phydict.posterior import DiffPIR
+from posterior.dense import FINE, N, SHAPE, condition, denoiser, measurement, moments, propagate
+
+V, NOISE = 0.04, 0.3
+X = random_like((1, *SHAPE), seed=10)
+
+
+def sample(settings, x=X, data=None, seed=0):
+    return settings.sample(denoiser(V), data or measurement(), x, torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize("trust", [1.0, 3.0])
+def test_one_level_is_the_minimiser_of_its_own_objective(trust):
+    m, prior = measurement(), denoiser(V)
+    found = sample(DiffPIR(1, 1.0, trust, 0.0, NOISE, 50))
+    spread = float(FINE.sigma(1.0)) / trust**0.5
+    expected, _ = condition(m, prior.denoise(X, 1.0), spread**2, NOISE)
+    torch.testing.assert_close(found.flatten(), expected, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("trust, renewed", [(1.0, 0.5), (1.0, 1.0), (4.0, 0.5)])
+def test_the_mean_tends_to_the_posteriors_and_the_spread_to_a_known_share_of_it(trust, renewed):
+    mean, covariance = condition(measurement(), denoiser(V).mean, V, NOISE * trust**0.5)
+    samples = sample(DiffPIR(600, 1.0, trust, renewed, NOISE, 6), random_like((4000, *SHAPE), seed=11))
+    found, spread = moments(samples)
+    torch.testing.assert_close(found, mean, atol=0.012, rtol=0)
+    expected = (1 + (1 - renewed) ** 0.5) / 2 * covariance
+    assert (spread - expected).norm() < 0.08 * covariance.norm()
+
+
+def test_with_exact_data_and_no_renewal_it_samples_the_posterior():
+    m, tiny = measurement(), 1e-5
+    mean, covariance = condition(m, denoiser(V).mean, V, tiny)
+    found, spread = propagate(lambda x: sample(DiffPIR(200, 1.0, renewed=0.0, noise=tiny, cg_iterations=20), x))
+    torch.testing.assert_close(found, mean, atol=1e-4, rtol=0)
+    assert (spread - covariance).norm() < 0.05 * covariance.norm()
+
+
+def test_data_without_weight_leave_the_prior():
+    errors = []
+    for n in (100, 400):
+        _, spread = propagate(lambda x: sample(DiffPIR(n, renewed=0.0, noise=1e7), x))
+        errors.append(float((spread / V - torch.eye(N).double()).norm() / N**0.5))
+    assert errors[1] < 0.3 and errors[0] / errors[1] > 2  # the published spacing leaves a long last step
+
+
+def test_exact_data_are_met_within_the_stated_noise_and_closer_with_more_conjugate_gradients():
+    m, noise = measurement(), 0.05
+    m.y = m.project(denoiser(V).mean + V**0.5 * X)
+    starts = random_like((500, *SHAPE), seed=12)
+
+    def misfit(settings):
+        return float((m.project(sample(settings, starts, m)) - m.y).square().mean().sqrt())
+
+    assert misfit(DiffPIR(30, noise=1e7)) > 4 * noise
+    assert all(misfit(DiffPIR(n, noise=noise)) < noise for n in (3, 10, 30, 100))
+    inner = [misfit(DiffPIR(30, noise=noise, cg_iterations=n)) for n in (0, 1, 2, 3, 4)]
+    assert all(after < before for before, after in zip(inner, inner[1:]))
+
+
+def test_the_result_depends_on_the_seed_alone():
+    settings = DiffPIR(5, noise=NOISE)
+    torch.manual_seed(1)
+    one = sample(settings, seed=3)
+    torch.manual_seed(2)
+    assert torch.equal(one, sample(settings, seed=3)) and not torch.allclose(one, sample(settings, seed=4))
+
+
+@pytest.mark.parametrize("settings", [
+    {"iterations": 0}, {"trust": 0.0}, {"spacing": -1.0}, {"renewed": 1.5}, {"noise": 0.0}])
+def test_impossible_settings_are_refused(settings):
+    with pytest.raises(ValueError, match=str(next(iter(settings.values())))):
+        DiffPIR(**settings)

@@ -33,17 +33,17 @@ class ProximalCG(LikelihoodStep):
     Starts at x0. Each restart frees the voxels that are inside the range or pulled back into it, runs conjugate
     gradients on them and clips: air stays air, which is worth more than many iterations without the bounds. With a
     Gaussian prior, bounds that do not act and enough iterations this is exactly E[x_0 | x_t, y]; few iterations
-    regularise, since what the views see best is corrected first.
+    regularise, since what the views see best is corrected first. TV(z) sums sqrt(slope^2 + edge^2) over the voxels.
 
     iterations: per restart, at most; restarts; noise: standard deviation of the line integrals' error (noise and
     model); tolerance: a restart ends once its residual has shrunk by this factor;
     discrepancy: the step ends once |P(z) - y| is at most this many times what the measurement's own noise gives, since
     a closer fit would be one of the noise (Morozov's principle, Engl, Hanke & Neubauer 1996, section 4.3); 0: never;
     refit: whether each restart refits the scatter of a measurement that has some;
-    variation: weight of the total variation, smoothed where neighbours differ by less than `edge`; each restart
-    replaces it by the quadratic that touches it there; 0: none.
-    Hestenes & Stiefel 1952,
-    doi:10.6028/jres.049.044; with bounds, More & Toraldo 1991, doi:10.1137/0801008; as data consistency in diffusion
+    variation: weight of the total variation TV, 0 for none; each restart replaces it by the quadratic that touches it
+    there (Vogel & Oman 1996, doi:10.1137/0917016), so it wants several; edge: differences between neighbours, in the
+    prior's range, below which TV is smooth.
+    Hestenes & Stiefel 1952, doi:10.6028/jres.049.044; with bounds, More & Toraldo 1991, doi:10.1137/0801008; as data consistency in diffusion
     sampling, Chung et al. 2024, arXiv:2303.05754.
     """
 
@@ -60,6 +60,9 @@ class ProximalCG(LikelihoodStep):
         if not self.discrepancy >= 0:
             raise ValueError(f"discrepancy is a multiple >= 0 of the noise, 0 for none, but {self.discrepancy} was "
                              "given")
+        if not self.variation >= 0 or not self.edge > 0:
+            raise ValueError("total variation needs a weight variation >= 0, 0 for none, and an edge > 0, but "
+                             f"{self.variation} and {self.edge} were given")
 
     def __call__(self, measurement: Measurement, x0: Tensor, spread: float) -> Tensor:
         weight = (self.noise / spread) ** 2
@@ -74,11 +77,13 @@ class ProximalCG(LikelihoodStep):
             if (_dot(missed, missed) <= enough).all():
                 break
             downhill = measurement.adjoint(missed) + weight * (x0 - z)
-            penalty = lambda d: weight * d
-            if steepness:
-                tv = Majoriser(z, self.edge)
+            tv = Majoriser(z, self.edge) if steepness else None
+            if tv:
                 downhill = downhill - steepness * tv.gradient(z)
-                penalty = lambda d, tv=tv: weight * d + steepness * tv.gradient(d)
+
+            def penalty(d, tv=tv):
+                return weight * d + steepness * tv.gradient(d) if tv else weight * d
+
             free = ~((z <= -1) & (downhill < 0) | (z >= 1) & (downhill > 0))
             z = (z + self._solve(measurement, downhill * free, free, penalty, missed, enough)).clamp(-1, 1)
         return z

@@ -37,14 +37,6 @@ class Majoriser:
         """The quadratic's gradient at x, which is linear."""
         return differences_adjoint([w * d for w, d in zip(self.weights, differences(x))])
 
-    def diagonal(self) -> Tensor:
-        """What the linear map `gradient` has on its diagonal."""
-        total = 0.0
-        for i, w in enumerate(self.weights):
-            rest = [0, 0] * (2 - i)
-            total = total + pad(w, rest + [0, 1]) + pad(w, rest + [1, 0])
-        return total
-
 
 def _squared_slope(x: Tensor) -> Tensor:
     total = torch.zeros_like(x)

@@ -7,6 +7,7 @@ They act on the CT channel; the other channels of the state pass through.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import torch
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.reward import Reward
+from phydict.posterior.smoothed_tv import Majoriser
 
 
 class LikelihoodStep(ABC):
@@ -25,19 +27,23 @@ class LikelihoodStep(ABC):
 
 @dataclass(frozen=True)
 class ProximalCG(LikelihoodStep):
-    """Towards argmin over z in [-1, 1] of |P(z) - y|^2 / noise^2 + |z - x0|^2 / spread^2, by conjugate gradients.
+    """Towards argmin over z in [-1, 1] of |P(z) - y|^2 / noise^2 + |z - x0|^2 / spread^2 + 2 variation TV(z), by
+    conjugate gradients.
 
     Starts at x0. Each restart frees the voxels that are inside the range or pulled back into it, runs conjugate
     gradients on them and clips: air stays air, which is worth more than many iterations without the bounds. With a
     Gaussian prior, bounds that do not act and enough iterations this is exactly E[x_0 | x_t, y]; few iterations
-    regularise, since what the views see best is corrected first.
+    regularise, since what the views see best is corrected first. TV(z) sums sqrt(slope^2 + edge^2) over the voxels.
 
     iterations: per restart, at most; restarts; noise: standard deviation of the line integrals' error (noise and
     model); tolerance: a restart ends once its residual has shrunk by this factor;
     discrepancy: the step ends once |P(z) - y| is at most this many times what the measurement's own noise gives, since
-    a closer fit would be one of the noise (Morozov's principle, Engl, Hanke & Neubauer 1996, section 4.3); 0: never.
-    Hestenes & Stiefel 1952,
-    doi:10.6028/jres.049.044; with bounds, More & Toraldo 1991, doi:10.1137/0801008; as data consistency in diffusion
+    a closer fit would be one of the noise (Morozov's principle, Engl, Hanke & Neubauer 1996, section 4.3); 0: never;
+    refit: whether each restart refits the scatter of a measurement that has some;
+    variation: weight of the total variation TV, 0 for none; each restart replaces it by the quadratic that touches it
+    there (Vogel & Oman 1996, doi:10.1137/0917016), so it wants several; edge: differences between neighbours, in the
+    prior's range, below which TV is smooth.
+    Hestenes & Stiefel 1952, doi:10.6028/jres.049.044; with bounds, More & Toraldo 1991, doi:10.1137/0801008; as data consistency in diffusion
     sampling, Chung et al. 2024, arXiv:2303.05754.
     """
 
@@ -46,28 +52,45 @@ class ProximalCG(LikelihoodStep):
     noise: float = 0.02
     tolerance: float = 1e-6
     discrepancy: float = 0.0
+    refit: bool = False
+    variation: float = 0.0
+    edge: float = 0.01
 
     def __post_init__(self):
         if not self.discrepancy >= 0:
             raise ValueError(f"discrepancy is a multiple >= 0 of the noise, 0 for none, but {self.discrepancy} was "
                              "given")
+        if not self.variation >= 0 or not self.edge > 0:
+            raise ValueError("total variation needs a weight variation >= 0, 0 for none, and an edge > 0, but "
+                             f"{self.variation} and {self.edge} were given")
 
     def __call__(self, measurement: Measurement, x0: Tensor, spread: float) -> Tensor:
         weight = (self.noise / spread) ** 2
         z = x0.clamp(-1, 1)
         enough = self.discrepancy**2 * measurement.noise_energy if self.discrepancy else -1.0
+        steepness = self.noise**2 * self.variation
         for _ in range(self.restarts):
-            missed = measurement.y - measurement.project(z)
+            reprojection = measurement.project(z)
+            if self.refit:
+                measurement.correct(reprojection)
+            missed = measurement.y - reprojection
             if (_dot(missed, missed) <= enough).all():
                 break
             downhill = measurement.adjoint(missed) + weight * (x0 - z)
+            tv = Majoriser(z, self.edge) if steepness else None
+            if tv:
+                downhill = downhill - steepness * tv.gradient(z)
+
+            def penalty(d, tv=tv):
+                return weight * d + steepness * tv.gradient(d) if tv else weight * d
+
             free = ~((z <= -1) & (downhill < 0) | (z >= 1) & (downhill > 0))
-            z = (z + self._solve(measurement, downhill * free, free, weight, missed, enough)).clamp(-1, 1)
+            z = (z + self._solve(measurement, downhill * free, free, penalty, missed, enough)).clamp(-1, 1)
         return z
 
-    def _solve(self, measurement: Measurement, residual: Tensor, free: Tensor, weight: float, missed: Tensor,
-               enough: float) -> Tensor:
-        """Conjugate gradients for (A'A + weight) d = residual over the free voxels, from zero, until |missed - A d|^2
+    def _solve(self, measurement: Measurement, residual: Tensor, free: Tensor, penalty: Callable[[Tensor], Tensor],
+               missed: Tensor, enough: float) -> Tensor:
+        """Conjugate gradients for A'A d + penalty(d) = residual over the free voxels, from zero, until |missed - A d|^2
         is `enough`."""
         direction, d = residual.clone(), torch.zeros_like(residual)
         energy = _dot(residual, residual)
@@ -77,7 +100,7 @@ class ProximalCG(LikelihoodStep):
             if not going.any():
                 break
             seen = measurement.linear(direction)
-            curved = (measurement.adjoint(seen) + weight * direction) * free
+            curved = (measurement.adjoint(seen) + penalty(direction)) * free
             step = torch.where(going, energy / _dot(direction, curved), 0)
             d += step * direction
             missed = missed - step.view(-1, *[1] * (missed.dim() - 1)) * seen

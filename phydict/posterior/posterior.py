@@ -109,7 +109,10 @@ class Posterior(Reconstructor):
         with watch.stage("score"):
             state, ct = states.mean(0), states[:, :1].mean(0, keepdim=True)
             measurement.calibrate(ct)
-            reprojection = measurement.project(ct)[0].cpu()
+            reprojection = measurement.project(ct)
+            if self.sampler.scatter:
+                measurement.correct(reprojection)
+            reprojection = reprojection[0].cpu()
             measured = measurement.y[0].cpu()
             found, deviation = misfits(reprojection, measured), None
             if self.samples == 1:

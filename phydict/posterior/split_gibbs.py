@@ -38,7 +38,8 @@ class SplitGibbs(Sampler):
     refine_from: EC's delta in [0, 1), 0 for none; refine_iterations: its noise levels;
     full_detector: meet the X-rays pixel by pixel instead of binned to what the grid can hold;
     clip: pull the denoiser's estimate into the prior's range before the likelihood step, not only after it;
-    at_zero: both passes end with one more call of the denoiser, at time 0 and without X-rays, as in the release.
+    at_zero: both passes end with one more call of the denoiser, at time 0 and without X-rays, as in the release;
+    scatter: compare each estimate after the first with the X-rays, and subtract the scatter where there is some.
     """
 
     citation = ("Dai, Ghosh & Batmanghelich, PhyDiCT: Plug-and-Play CT Reconstruction from Sparse X-Rays via "
@@ -57,6 +58,7 @@ class SplitGibbs(Sampler):
     full_detector: bool = False
     clip: bool = True
     at_zero: bool = False
+    scatter: bool = False
     batches = True
 
     def __post_init__(self):
@@ -94,11 +96,15 @@ class SplitGibbs(Sampler):
     def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, draw: Draw,
                on_step: Callable[[], None] = lambda: None) -> Tensor:
         schedule = denoiser.schedule
+        if self.scatter:
+            measurement.restore()
         for t, s in self.times(denoiser):
             x0 = denoiser.denoise(x, t)
             if self.clip:
                 x0 = x0.clamp(-1, 1)
             measurement.calibrate(x0[:, :1])
+            if self.scatter and t < 1:
+                measurement.correct(measurement.project(x0[:, :1]))
             z, step = x0.clamp(-1, 1), self.likelihood if s > 0 else self.final_likelihood
             if step:
                 ct = step(measurement, x0[:, :1], self.spread(denoiser, t)).clamp(-1, 1)

@@ -1,8 +1,17 @@
-"""Display values to line integrals: an unknown gain and offset per view, matched to a reference projection."""
+"""What X-rays hold beside line integrals, found by comparing them with a reference projection.
+
+Display values have an unknown gain and offset per view; scatter adds a smooth signal to what each view reads.
+"""
 
 from __future__ import annotations
 
+import math
+
+import torch
 from torch import Tensor
+
+LARGEST_SHARE = 0.9
+"""The share of a pixel's signal that may at most be scatter."""
 
 
 def match_views(display: Tensor, reference: Tensor) -> Tensor:
@@ -16,3 +25,21 @@ def match_views(display: Tensor, reference: Tensor) -> Tensor:
     spread = centred.square().mean(axes, keepdim=True).sqrt()
     gain = reference.std(axes, keepdim=True, correction=0) / spread.clamp(min=1e-12)
     return gain * centred + reference.mean(axes, keepdim=True)
+
+
+def subtract_scatter(xrays: Tensor, reference: Tensor, order: int = 3) -> Tensor:
+    """Line integrals (B, K, V, U) without the scatter that makes their signal exceed that of `reference`.
+
+    exp(-xrays) = exp(-reference) + S, with S per view a sum of the cosines of a total order below `order` along rows
+    and columns, fitted by least squares relative to the signal, so that what is thick counts as much as what is thin.
+    S is kept above zero and below LARGEST_SHARE of the signal.
+    """
+    signal = torch.exp(-xrays.double())
+    down, along = (torch.linspace(0, math.pi, n, dtype=torch.float64, device=xrays.device) for n in xrays.shape[-2:])
+    smooth = torch.stack([torch.cos(i * down)[:, None] * torch.cos(j * along)
+                          for i in range(order) for j in range(order - i)])
+    design = (smooth / signal[..., None, :, :]).flatten(-2)
+    excess = (1 - torch.exp(-reference.double()) / signal).flatten(-2)
+    normal, right = design @ design.transpose(-1, -2), design @ excess[..., None]
+    scatter = torch.einsum("...q,qvu->...vu", torch.linalg.solve(normal, right)[..., 0], smooth)
+    return -torch.log(signal - torch.minimum(scatter.clamp(min=0), LARGEST_SHARE * signal)).to(xrays)

@@ -9,6 +9,7 @@ from scipy.optimize import lsq_linear
 from phydict.datasets import phantom_case
 from phydict.grid import Grid
 from phydict.posterior import GradientSteps, Measurement, ProximalCG, Reward
+from phydict.posterior.smoothed_tv import Majoriser, smoothed_tv
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 from posterior.dense import N, SHAPE, DenseMeasurement, measurement
@@ -190,3 +191,32 @@ def test_an_estimate_that_meets_the_data_to_their_noise_is_left_alone():
 def test_a_negative_discrepancy_is_refused():
     with pytest.raises(ValueError, match="multiple >= 0"):
         ProximalCG(discrepancy=-1.0)
+
+
+def test_with_total_variation_every_restart_lowers_the_objective_and_they_end_where_its_gradient_is_none():
+    m, noise, spread, variation, edge = measurement(4), 0.3, 0.5, 2.0, 0.05
+
+    def objective(z):
+        return float((m.project(z) - m.y).square().sum() / noise**2 + (z - X0).square().sum() / spread**2
+                     + 2 * variation * smoothed_tv(z, edge))
+
+    def after(restarts):
+        return ProximalCG(20, restarts, noise, 1e-13, variation=variation, edge=edge)(m, X0, spread)
+
+    values = [objective(X0), *(objective(after(n)) for n in range(1, 8))]
+    assert all(later < earlier for earlier, later in zip(values, values[1:]))
+    z = after(300)
+    gradient = (m.adjoint(m.project(z) - m.y) / noise**2 + (z - X0) / spread**2
+                + variation * Majoriser(z, edge).gradient(z))
+    assert gradient.abs().max() < 1e-6
+
+
+def test_much_total_variation_leaves_a_constant():
+    z = ProximalCG(20, 50, 0.3, 1e-13, variation=1e4, edge=0.01)(measurement(4), X0, 0.5)
+    assert z.max() - z.min() < 1e-3
+
+
+@pytest.mark.parametrize("wrong, message", [({"variation": -1.0}, "variation"), ({"edge": 0.0}, "edge")])
+def test_impossible_total_variation_is_refused(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        ProximalCG(**wrong)

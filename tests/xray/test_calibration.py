@@ -1,0 +1,51 @@
+"""Scatter is found by comparison with a reference, and nothing else is taken for it."""
+
+import pytest
+import torch
+from laws import random_like
+
+from phydict.xray.calibration import LARGEST_SHARE, subtract_scatter
+
+V, U = 24, 32
+DOWN, ALONG = torch.meshgrid(torch.linspace(-1, 1, V), torch.linspace(-1, 1, U), indexing="ij")
+CHEST = 3.5 * torch.exp(-2 * ALONG**2 - DOWN**2) * (1 + 0.2 * torch.sin(9 * DOWN))
+CLEAN = CHEST[None, None].double().expand(1, 2, -1, -1)
+SMOOTH = torch.stack([0.02 + 0 * DOWN, 0.03 + 0.01 * torch.cos(torch.pi * (ALONG + 1) / 2)]).double()
+
+
+def scattered(clean, scatter):
+    return -torch.log(torch.exp(-clean) + scatter)
+
+
+def test_smooth_scatter_is_subtracted_exactly_where_the_reference_is_right():
+    torch.testing.assert_close(subtract_scatter(scattered(CLEAN, SMOOTH), CLEAN), CLEAN, atol=1e-6, rtol=0)
+
+
+def test_a_reference_that_is_wrong_in_detail_spoils_little():
+    measured = scattered(CLEAN, SMOOTH)
+    reference = CLEAN + 0.1 * random_like(CLEAN.shape, seed=1)
+    left = (subtract_scatter(measured, reference) - CLEAN).norm()
+    assert left < 0.1 * (measured - CLEAN).norm()
+
+
+def test_x_rays_without_scatter_are_left_alone_and_x_rays_that_read_too_little_nearly_so():
+    torch.testing.assert_close(subtract_scatter(CLEAN, CLEAN), CLEAN)
+    too_little = CLEAN + 0.1
+    assert (subtract_scatter(too_little, CLEAN) - too_little).abs().mean() < 0.01
+
+
+def test_each_view_and_each_reference_of_a_batch_has_its_own_scatter():
+    measured, two = scattered(CLEAN, SMOOTH), torch.cat([CLEAN, 1.1 * CLEAN])
+    both = subtract_scatter(measured, two)
+    for row, reference in zip(both, two):
+        torch.testing.assert_close(row[None], subtract_scatter(measured, reference[None]))
+        for k in range(2):
+            alone = subtract_scatter(measured[:, k:k + 1], reference[None, k:k + 1])
+            torch.testing.assert_close(row[None, k:k + 1], alone)
+
+
+@pytest.mark.parametrize("reference", [0.0, 50.0])
+def test_the_signal_is_never_used_up(reference):
+    found = subtract_scatter(CLEAN.float(), torch.full_like(CLEAN, reference).float())
+    assert found.isfinite().all() and (found - CLEAN <= -torch.log(torch.tensor(1 - LARGEST_SHARE)) + 1e-4).all()
+    assert (found - CLEAN >= -1e-5).all()

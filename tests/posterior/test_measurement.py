@@ -77,3 +77,33 @@ def test_every_use_of_the_operator_is_counted():
     before, d = m.calls, torch.zeros(SHAPE).double()
     m.project(d), m.linear(d), m.adjoint(Y[None])
     assert m.calls == before + 3
+
+
+def chest_views():
+    """X-rays like a chest's, of a detector fine enough to tell scatter from anatomy, and their Measurement."""
+    beam = ConeBeam.orbit(3, 1020, 740, (24, 32), 17.0)
+    down, along = torch.meshgrid(torch.linspace(-1, 1, 24), torch.linspace(-1, 1, 32), indexing="ij")
+    clean = (3.5 * torch.exp(-2 * along**2 - down**2) * (1 + 0.2 * torch.sin(9 * down))).expand(3, -1, -1)
+    return clean, lambda y, **more: Measurement(Projector(GRID, beam), y, HUWindow(), **more)
+
+
+def test_scatter_is_subtracted_where_there_is_enough_of_it_and_what_was_measured_can_be_had_back():
+    clean, measurement = chest_views()
+    for scatter, seen in ((0.0, False), (0.002, False), (0.03, True)):
+        measured = -torch.log(torch.exp(-clean) + scatter)
+        m = measurement(measured)
+        m.correct(clean[None])
+        torch.testing.assert_close(m.y[0], clean if seen else measured, atol=1e-3, rtol=0)
+        assert seen or torch.equal(m.y[0], measured)
+        m.correct(clean[None])  # always from what was measured
+        torch.testing.assert_close(m.y[0], clean if seen else measured, atol=1e-3, rtol=0)
+        m.restore()
+        assert torch.equal(m.y[0], measured)
+
+
+def test_display_values_have_no_scatter_to_subtract():
+    clean, measurement = chest_views()
+    m = measurement(-torch.log(torch.exp(-clean) + 0.05), display=True)
+    before = m.y
+    m.correct(clean[None])
+    assert torch.equal(m.y, before)

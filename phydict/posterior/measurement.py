@@ -19,6 +19,8 @@ from phydict.xray.noise_level import noise_level
 SCATTER = 0.03
 """The mean share of scatter in the signal from which it is believed: on the CTs that it was chosen on, X-rays without
 scatter look like 0.027 at most."""
+DARKEST = 30.0
+"""Line integrals above which no photon comes through, so that they hold no scatter either."""
 
 
 class Measurement:
@@ -81,9 +83,9 @@ class Measurement:
     def correct(self, reprojection: Tensor) -> None:
         """Subtract the scatter that the projections P(x) tell of, where it is SCATTER of the signal or more on average.
 
-        Display values are left alone: their offset has taken it.
+        Display values are left alone: their offset has taken it. So are X-rays of which no signal is left (DARKEST).
         """
-        if self.display is None:
+        if self.display is None and self.measured.max() < DARKEST:
             corrected = subtract_scatter(self.measured, reprojection)
             share = 1 - torch.exp(self.measured - corrected).mean((1, 2, 3), keepdim=True)
             self.y = torch.where(share < SCATTER, self.measured, corrected)

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from phydict.posterior.conjugate_gradients import conjugate_gradients
 from phydict.posterior.normalised import NormalisedMeasurement
+from phydict.posterior.smoothed_tv import differences, differences_adjoint
 
 AXES = {"x": 2, "y": 3, "z": 4}
 
@@ -61,11 +61,7 @@ class ADMMPasses:
         return x
 
     def _differences(self, x: Tensor) -> list[Tensor]:
-        return [x.diff(dim=AXES[axis]) for axis in self.settings.axes]
+        return differences(x, [AXES[axis] for axis in self.settings.axes])
 
-    def _adjoint(self, differences: list[Tensor]) -> Tensor:
-        total = 0.0
-        for axis, d in zip(self.settings.axes, differences):
-            room = [0, 0] * (4 - AXES[axis]) + [1, 1]
-            total = total - pad(d, room).diff(dim=AXES[axis])
-        return total
+    def _adjoint(self, d: list[Tensor]) -> Tensor:
+        return differences_adjoint(d, [AXES[axis] for axis in self.settings.axes])

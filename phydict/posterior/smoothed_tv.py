@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
 
-def differences(x: Tensor) -> list[Tensor]:
-    """Forward differences of x (B, 1, X, Y, Z) along X, Y and Z, each one voxel shorter along its axis."""
-    return [x.diff(dim=axis) for axis in (2, 3, 4)]
+def differences(x: Tensor, axes: Sequence[int] = (2, 3, 4)) -> list[Tensor]:
+    """Forward differences of x (B, 1, X, Y, Z) along `axes`, each one voxel shorter along its axis."""
+    return [x.diff(dim=axis) for axis in axes]
 
 
-def differences_adjoint(d: list[Tensor]) -> Tensor:
+def differences_adjoint(d: list[Tensor], axes: Sequence[int] = (2, 3, 4)) -> Tensor:
     """The adjoint of `differences`."""
-    return -sum(pad(one, [0, 0] * (2 - i) + [1, 1]).diff(dim=2 + i) for i, one in enumerate(d))
+    return -sum(pad(one, [0, 0] * (4 - axis) + [1, 1]).diff(dim=axis) for axis, one in zip(axes, d))
 
 
 def smoothed_tv(x: Tensor, edge: float) -> Tensor:

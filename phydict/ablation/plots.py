@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from phydict.ablation.summary import SHOWN_MEASURES, Entry, best_settings, conditions, told
-from phydict.ablation.tables import apart, deltas, headed
+from phydict.ablation.tables import deltas, headed
 from phydict.atomic import whole_file
 
 COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f", "#bcbd22", "#17becf",
@@ -30,7 +30,7 @@ def write_plots(folder: Path, found: Sequence[Entry]) -> list[Path]:
         if len(own) > 1:
             written.append(_draw(folder, f"pareto {where}", 2, lambda axes: _pareto(axes, own, where, style)))
             written.append(_draw(folder, f"stages {where}", 1, lambda axes: _stages(axes[0], own, where)))
-    for rest, group in apart(found, "views"):
+    for rest, group in conditions(found, without="views"):
         if len({entry.condition.get("views") for entry in group}) > 1:
             written.append(_draw(folder, f"views {' '.join(told(rest))}", 2, lambda axes: _views(axes, group, style)))
     curves = [(label, group) for label, group in deltas(found) if len(group) > 1]

@@ -79,11 +79,11 @@ def entries(rows: Iterable[Mapping]) -> list[Entry]:
     return [_entry(group, own[group[0]["method"]], varying) for group in groups.values()]
 
 
-def conditions(found: Sequence[Entry]) -> list[tuple[dict, list[Entry]]]:
-    """The entries under each condition."""
+def conditions(found: Sequence[Entry], without: str | None = None) -> list[tuple[dict, list[Entry]]]:
+    """The entries under each condition, or under what is left of it `without` one of its parts."""
     groups: dict[tuple, list] = {}
     for entry in found:
-        groups.setdefault(tuple(entry.condition.items()), []).append(entry)
+        groups.setdefault(tuple((k, v) for k, v in entry.condition.items() if k != without), []).append(entry)
     return [(dict(condition), group) for condition, group in groups.items()]
 
 

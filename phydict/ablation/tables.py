@@ -87,7 +87,7 @@ def method_table(found: Sequence[Entry], title: str, notes: Sequence[str] = ()) 
 def views_tables(found: Sequence[Entry], notes: Sequence[str] = ()) -> list[Table]:
     """Method x number of views, a table for each measure and each other condition: the form of the paper's Table 3."""
     tables = []
-    for rest, group in apart(found, "views"):
+    for rest, group in conditions(found, without="views"):
         views = sorted({entry.condition["views"] for entry in group})
         for name in OF_VIEWS:
             measure, lines = SHOWN_MEASURES[name], {}
@@ -124,15 +124,6 @@ def deltas(found: Sequence[Entry]) -> list[tuple[str, list[Entry]]]:
             label = ", ".join([entry.method, *told(others), *told(entry.condition)])
             groups.setdefault(label, []).append(entry)
     return [(label, sorted(group, key=lambda entry: entry.settings["delta"])) for label, group in groups.items()]
-
-
-def apart(found: Sequence[Entry], name: str) -> list[tuple[dict, list[Entry]]]:
-    """The entries by their condition without one part of it, which they all have."""
-    groups: dict[tuple, tuple[dict, list]] = {}
-    for entry in found:
-        rest = {k: v for k, v in entry.condition.items() if k != name}
-        groups.setdefault(tuple(rest.items()), (rest, []))[1].append(entry)
-    return list(groups.values())
 
 
 def all_tables(found: Sequence[Entry], rows: Sequence[dict]) -> list[Table]:

@@ -39,7 +39,7 @@ class ProximalCG(LikelihoodStep):
     model); tolerance: a restart ends once its residual has shrunk by this factor;
     discrepancy: the step ends once |P(z) - y| is at most this many times what the measurement's own noise gives, since
     a closer fit would be one of the noise (Morozov's principle, Engl, Hanke & Neubauer 1996, section 4.3); 0: never;
-    refit: whether each restart refits the scatter of a measurement that has some;
+    refit: whether each restart refits the scatter of a measurement in which it is sought;
     variation: weight of the total variation TV, 0 for none; each restart replaces it by the quadratic that touches it
     there (Vogel & Oman 1996, doi:10.1137/0917016), so it wants several; edge: differences between neighbours, in the
     prior's range, below which TV is smooth.

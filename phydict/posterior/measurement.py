@@ -28,7 +28,8 @@ class Measurement:
 
     noise: standard deviation of the noise of y, as a share of its largest value or, as a tensor that expands to
     (K, V, U), of each pixel; None: estimated from y where it is needed.
-    calls: how many times A or its adjoint ran over all views, per volume of a batch; seen: what `project` last gave.
+    scattered: whether `correct` subtracts scatter; calls: how many times A or its adjoint ran over all views, per volume
+    of a batch; seen: what `project` last gave.
     """
 
     def __init__(self, projector: Projector, xrays: Tensor, window: HUWindow, display: bool = False,
@@ -41,6 +42,7 @@ class Measurement:
         self.slope, self.offset = window.mu_affine(mu_water)
         self.background = self.offset * projector(torch.ones(1, 1, *projector.grid.shape).to(xrays))
         self.y = xrays[None]
+        self.scattered = False
         self.calls, self.seen = 1, None
 
     def project(self, x: Tensor) -> Tensor:
@@ -75,21 +77,30 @@ class Measurement:
         level = self.noise if isinstance(self.noise, Tensor) else self.noise * self.y.max()
         return float(level.square().expand(self.y.shape[1:]).sum())
 
+    def missed(self, x: Tensor) -> Tensor:
+        """By how many times their noise the CTs x miss the X-rays, about 1 for the truth: (B, 1, 1, 1, 1)."""
+        missed = (self.project(x) - self.y).flatten(1).norm(dim=1)
+        return (missed / max(self.noise_energy, 1e-12) ** 0.5).view(-1, 1, 1, 1, 1)
+
     def calibrate(self, x: Tensor) -> None:
         """Where the views are display values: refit their gain and offset to the projections of the CT x."""
         if self.display is not None:
             self.y = match_views(self.display, self.project(x))
 
-    def correct(self, reprojection: Tensor) -> None:
-        """Subtract the scatter that the projections P(x) tell of, where it is SCATTER of the signal or more on average.
+    @property
+    def may_scatter(self) -> bool:
+        """Whether the X-rays can hold scatter that `correct` could find: not display values, whose offset has taken it,
+        nor X-rays of which no signal is left (DARKEST)."""
+        return self.display is None and bool(self.measured.max() < DARKEST)
 
-        Display values are left alone: their offset has taken it. So are X-rays of which no signal is left (DARKEST).
-        """
-        if self.display is None and self.measured.max() < DARKEST:
+    def seek_scatter(self, seek: bool) -> None:
+        """Forget what was subtracted, and from now on let `correct` subtract scatter or not."""
+        self.y, self.scattered = self.measured, seek and self.may_scatter
+
+    def correct(self, reprojection: Tensor) -> None:
+        """Where scatter is sought, subtract what the projections P(x) tell of, if it is SCATTER of the signal on
+        average or more."""
+        if self.scattered:
             corrected = subtract_scatter(self.measured, reprojection)
             share = 1 - torch.exp(self.measured - corrected).mean((1, 2, 3), keepdim=True)
             self.y = torch.where(share < SCATTER, self.measured, corrected)
-
-    def restore(self) -> None:
-        """Forget corrections: y as it was measured."""
-        self.y = self.measured

@@ -110,8 +110,7 @@ class Posterior(Reconstructor):
             state, ct = states.mean(0), states[:, :1].mean(0, keepdim=True)
             measurement.calibrate(ct)
             reprojection = measurement.project(ct)
-            if self.sampler.scatter:
-                measurement.correct(reprojection)
+            measurement.correct(reprojection)
             reprojection = reprojection[0].cpu()
             measured = measurement.y[0].cpu()
             found, deviation = misfits(reprojection, measured), None

@@ -23,14 +23,12 @@ class Sampler(ABC):
     """Settings of a sampling method; `sample` turns noise into a clean state.
 
     full_detector, citation: as for a Reconstructor. batches: whether the states of a batch do not influence each other,
-    so that several samples may be drawn at once, with one generator for each. scatter: whether scatter is sought in the
-    X-rays and subtracted where it is found.
+    so that several samples may be drawn at once, with one generator for each.
     """
 
     full_detector = False
     citation = ""
     batches = False
-    scatter = False
 
     @abstractmethod
     def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, draw: Draw,

@@ -229,6 +229,7 @@ def test_refitting_the_scatter_comes_nearer_to_the_truth_and_without_scatter_cha
             m, _, truth = chest_measurement(0.0, 0.0)
             y = -torch.log(torch.exp(-m.y[0]) + scatter) if scatter else m.y[0]
             m = Measurement(m.projector, y, HUWindow(), noise=0.0)
+            m.seek_scatter(True)
             z = ProximalCG(10, 5, refit=refit, variation=15.0)(m, truth * 0.9 - 0.1, 0.3)
             errors.append(float((z - truth).norm()))
         assert errors[1] < 0.8 * errors[0] if scatter else errors[1] == errors[0]

@@ -87,17 +87,20 @@ def chest_views():
     return clean, lambda y, **more: Measurement(Projector(GRID, beam), y, HUWindow(), **more)
 
 
-def test_scatter_is_subtracted_where_there_is_enough_of_it_and_what_was_measured_can_be_had_back():
+def test_scatter_is_subtracted_where_it_is_sought_and_there_is_enough_of_it_and_what_was_measured_can_be_had_back():
     clean, measurement = chest_views()
     for scatter, seen in ((0.0, False), (0.002, False), (0.03, True)):
         measured = -torch.log(torch.exp(-clean) + scatter)
         m = measurement(measured)
+        m.correct(clean[None])  # not sought
+        assert torch.equal(m.y[0], measured)
+        m.seek_scatter(True)
         m.correct(clean[None])
         torch.testing.assert_close(m.y[0], clean if seen else measured, atol=1e-3, rtol=0)
         assert seen or torch.equal(m.y[0], measured)
         m.correct(clean[None])  # always from what was measured
         torch.testing.assert_close(m.y[0], clean if seen else measured, atol=1e-3, rtol=0)
-        m.restore()
+        m.seek_scatter(False)
         assert torch.equal(m.y[0], measured)
 
 
@@ -105,5 +108,16 @@ def test_display_values_have_no_scatter_to_subtract():
     clean, measurement = chest_views()
     m = measurement(-torch.log(torch.exp(-clean) + 0.05), display=True)
     before = m.y
+    m.seek_scatter(True)
     m.correct(clean[None])
-    assert torch.equal(m.y, before)
+    assert not m.may_scatter and torch.equal(m.y, before)
+
+
+def test_the_truth_is_missed_by_the_noise_and_each_state_of_a_batch_by_its_own():
+    truth, level = random_like((1, 1, *GRID.shape), seed=3).clamp(-1, 1), 0.01
+    clean = Measurement(PROJECTOR, Y, HUWindow()).project(truth)[0]
+    noisy = clean + level * random_like(clean.shape, seed=4)
+    m = Measurement(PROJECTOR, noisy, HUWindow(), noise=level / float(noisy.max()))
+    missed = m.missed(torch.cat([truth, truth + 0.1]))
+    assert float(missed[0]) == pytest.approx(1, abs=0.15) and float(missed[1]) > 3
+    torch.testing.assert_close(missed, torch.cat([m.missed(truth), m.missed(truth + 0.1)]))

@@ -1,13 +1,17 @@
 """Split Gibbs on a Gaussian prior and a linear measurement meets the closed-form posterior."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
 from laws import random_like
 
+from phydict.datasets import phantom_case
 from phydict.diffusion import CosineSchedule, GaussianDenoiser, renoise
-from phydict.posterior import LikelihoodStep, PriorOnly, ProximalCG, SplitGibbs, descend
+from phydict.grid import Grid
+from phydict.posterior import LikelihoodStep, Measurement, PriorOnly, ProximalCG, SplitGibbs, descend
+from phydict.units import HUWindow
+from phydict.xray import ConeBeam, Projector
 from posterior.dense import FINE, SHAPE, DenseMeasurement, condition, denoiser, measurement, propagate
 
 V, NOISE = 0.04, 0.3
@@ -190,3 +194,26 @@ def test_the_result_does_not_depend_on_the_default_schedules_ends():
     coarse = GaussianDenoiser(denoiser().mean, torch.tensor(V).double(), CosineSchedule())
     fine, wide = (sample(sampler(100, final_likelihood=EXACT), prior=p) for p in (denoiser(V), coarse))
     assert (fine - wide).abs().max() < 0.01
+
+
+@pytest.mark.parametrize("scatter", [0.0, 0.05])
+def test_scatter_is_looked_for_where_the_xrays_are_missed_and_otherwise_costs_and_changes_nothing(scatter):
+    grid, window = Grid.cube(24), HUWindow()
+    projector = Projector(grid, ConeBeam.orbit(6, 1020, 740, (48, 48), 11.5), full_detector=True)
+    truth = phantom_case(7, grid, window)["volume"][None]
+    y = -torch.log(torch.exp(-projector(window.to_mu(truth))[0]) + scatter)
+    y = y + 0.005 * random_like(y.shape, torch.float32)
+    prior = GaussianDenoiser(0.8 * truth, torch.tensor(0.04))
+    settings = SplitGibbs(4, ProximalCG(noise=0.02), ProximalCG(10, 5, noise=0.02, discrepancy=1.0, refit=True),
+                          warm_start=0.9, last=0.2, fresh_noise=0.0)
+    found = {}
+    for seek in (False, True):
+        m = Measurement(projector, y, window, noise=0.005 / float(y.max()))
+        x = random_like((2, 1, 24, 24, 24), torch.float32)
+        z = replace(settings, scatter=seek).sample(prior, m, x, torch.Generator())
+        found[seek] = z, float((z - truth).norm()), m.calls
+    if scatter:
+        assert found[True][1] < 0.8 * found[False][1]
+    else:
+        torch.testing.assert_close(found[True][0], found[False][0], atol=0, rtol=0)
+        assert found[True][2] == found[False][2] + 2  # to see what is missed

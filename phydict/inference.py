@@ -207,8 +207,9 @@ class ReconstructionTask(lightning.LightningModule):
         """All that is known of a finished case, as plain JSON values."""
         return {"case": case["id"], "method": self.method_name,
                 "citation": self.reconstructor.citation, "scores": scores, "misfit": result.misfit,
-                "misfit_per_view": result.misfit_per_view, "diverged_at": result.diverged_at, "seconds": result.seconds,
-                "network_calls": result.network_calls, "projector_calls": result.projector_calls,
+                "misfit_per_view": result.misfit_per_view, "diverged_at": result.diverged_at, "scatter": result.scatter,
+                "seconds": result.seconds, "network_calls": result.network_calls,
+                "projector_calls": result.projector_calls,
                 "process_peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
                 "mu_water": case.get("mu_water", self.reconstructor.mu_water), "views": len(result.xrays),
                 "grid": result.grid.to_dict(), "seed": result.seed,

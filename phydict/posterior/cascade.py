@@ -86,6 +86,10 @@ class CascadePosterior(Reconstructor):
             state = torch.cat([fine.window.to_range(base.volume)[None], 2 * base.masks - 1])[None].to(xrays)
             state = state[:, :fine.coarse_channels]
             measurement = Measurement(projector, xrays, fine.window, display, self.mu_water)
+            if base.scatter:
+                measurement.seek_scatter(True)
+                measurement.correct(measurement.project(fine.upsample(state)[:, :1]))
+                measurement.scattered = False  # what the base stage tells of is kept
             guard = Guard(measurement, on_step, self.second.steps())
             denoiser = Counted(fine.bind(state + self.noise * noise_like(state, draw), self.noise, self.bf16), guard)
             x = noise_like(torch.empty(1, fine.state_channels, *fine.grid.shape, device=xrays.device), draw)
@@ -106,7 +110,7 @@ class CascadePosterior(Reconstructor):
             **found, seconds=watch.seconds, xrays=measured, reprojection=reprojection,
             network_calls=base.network_calls + denoiser.calls,
             projector_calls=base.projector_calls + measurement.calls, masks=masks,
-            diverged_at=base.diverged_at or guard.diverged_at)
+            diverged_at=base.diverged_at or guard.diverged_at, scatter=base.scatter)
 
     def _base(self, xrays: Tensor, projector: Projector, report: str, display: bool, seed: int,
               on_step: Callable[[], None]) -> Reconstruction:

@@ -102,5 +102,12 @@ class Measurement:
         average or more."""
         if self.scattered:
             corrected = subtract_scatter(self.measured, reprojection)
-            share = 1 - torch.exp(self.measured - corrected).mean((1, 2, 3), keepdim=True)
-            self.y = torch.where(share < SCATTER, self.measured, corrected)
+            self.y = torch.where(self._share(corrected) < SCATTER, self.measured, corrected)
+
+    @property
+    def scatter(self) -> float:
+        """The mean share of the signal that is now subtracted as scatter."""
+        return float(self._share(self.y).mean()) if self.scattered else 0.0
+
+    def _share(self, corrected: Tensor) -> Tensor:
+        return 1 - torch.exp(self.measured - corrected).mean((1, 2, 3), keepdim=True)

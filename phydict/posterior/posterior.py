@@ -124,7 +124,7 @@ class Posterior(Reconstructor):
             **found, seconds=watch.seconds, xrays=measured, reprojection=reprojection,
             network_calls=denoiser.calls * (2 if report and self.guidance != 1 else 1),
             projector_calls=measurement.calls, masks=((state[1:] + 1) / 2).cpu(), deviation=deviation,
-            diverged_at=guard.diverged_at)
+            diverged_at=guard.diverged_at, scatter=measurement.scatter)
 
 
 def sample_seed(seed: int, i: int) -> int:

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import pytest
 import torch
+from laws import random_like
 from torch.nn.functional import interpolate
 
 from phydict.diffusion import CosineSchedule, GaussianDenoiser
@@ -30,9 +31,11 @@ class GaussianStage:
     schedule = CosineSchedule(offset=1e-3, floor=1e-6)
     state_channels, coarse_channels, factor = 1, 1, 2
 
+    def upsample(self, coarse):
+        return interpolate(coarse, scale_factor=2, mode="trilinear")
+
     def bind(self, coarse, noise=0.0, bf16=None):
-        mean = interpolate(coarse, scale_factor=2, mode="trilinear")
-        return GaussianDenoiser(mean, torch.tensor(self.variance), self.schedule)
+        return GaussianDenoiser(self.upsample(coarse), torch.tensor(self.variance), self.schedule)
 
 
 @pytest.fixture(scope="module")
@@ -97,6 +100,19 @@ def test_display_values_are_calibrated_at_both_stages(xrays):
     found = method.reconstruct(displayed, PROJECTOR, display=True, seed=3)
     assert (found.xrays - found.reprojection).norm() < 0.2 * found.xrays.norm()
     assert found.xrays.std() == pytest.approx(float(xrays.std()), rel=0.5)
+
+
+@pytest.mark.parametrize("scatter", [0.0, 0.05])
+def test_scatter_that_the_base_stage_finds_is_subtracted_at_both_stages(xrays, scatter):
+    step = ProximalCG(10, 5, discrepancy=1.0, refit=True)
+    base = SplitGibbs(3, ProximalCG(4), step, warm_start=0.5, last=0.3, fresh_noise=0.0, scatter=True)
+    measured = -torch.log(torch.exp(-xrays) + scatter) + 0.005 * random_like(xrays.shape, torch.float32)
+    found = replace(gaussian(), sampler=base).reconstruct(measured, PROJECTOR, seed=3)
+    if scatter:
+        assert found.scatter == pytest.approx(float((scatter * torch.exp(measured)).mean()), rel=0.3)
+        assert (found.xrays - xrays).norm() < 0.5 * (measured - xrays).norm()
+    else:
+        assert found.scatter == 0 and found.xrays.equal(measured)
 
 
 @pytest.mark.parametrize("guide", [True, False])

@@ -14,7 +14,7 @@ from phydict.reconstructor import check_line_integrals, check_xrays
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import Projector
 from phydict.xray.calibration import match_views, subtract_scatter
-from phydict.xray.noise_level import noise_level
+from phydict.xray.noise_level import noise_by_value, noise_level
 
 SCATTER = 0.03
 """The mean share of scatter in the signal from which it is believed: on the CTs that it was chosen on, X-rays without
@@ -68,12 +68,19 @@ class Measurement:
         return self.slope * self.projector.norm()
 
     @property
+    def noise_variance(self) -> Tensor:
+        """Variance (K, V, U) of the noise of each pixel of y."""
+        if self.noise is None:
+            return noise_by_value(self.y[0]).square()
+        level = self.noise if isinstance(self.noise, Tensor) else self.noise * self.y.max()
+        return level.square().expand(self.y.shape[1:])
+
+    @property
     def noise_energy(self) -> float:
         """The sum over all pixels of their noise's variance: what |P(x) - y|^2 is expected to be for the true x."""
         if self.noise is None:
             return float(noise_level(self.y[0]).square().sum()) * self.y[0, 0].numel()
-        level = self.noise if isinstance(self.noise, Tensor) else self.noise * self.y.max()
-        return float(level.square().expand(self.y.shape[1:]).sum())
+        return float(self.noise_variance.sum())
 
     def calibrate(self, x: Tensor) -> None:
         """Where the views are display values: refit their gain and offset to the projections of the CT x."""

@@ -8,7 +8,7 @@ from phydict.datasets import phantom_case
 from phydict.grid import Grid
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
-from phydict.xray.noise_level import noise_level
+from phydict.xray.noise_level import BINS, noise_by_value, noise_level
 
 
 @pytest.fixture(scope="module")
@@ -51,3 +51,21 @@ def test_bilinear_ramps_and_few_edges_are_no_noise():
 @pytest.mark.parametrize("shape", [(2, 2, 9), (2, 9, 1)])
 def test_views_too_small_to_tell_have_none(shape):
     assert noise_level(noise(torch.empty(shape))).equal(torch.zeros(2))
+    assert noise_by_value(noise(torch.empty(shape))).equal(torch.zeros(shape))
+
+
+@pytest.mark.parametrize("photons", [1e3, 1e4, 1e5])
+def test_the_noise_of_counted_photons_is_found_in_every_part_of_a_chests_views(chest, photons):
+    level = (chest.exp() / photons).sqrt()
+    found = noise_by_value(chest + level * noise(chest))
+    order = chest.flatten().argsort()
+    for part in order.tensor_split(4):
+        assert found.flatten()[part].norm() == pytest.approx(float(level.flatten()[part].norm()), rel=0.3)
+
+
+def test_noise_that_is_the_same_everywhere_reads_the_same_in_every_group_of_pixels():
+    y = 0.3 * noise(torch.empty(2, 200, 200)) + torch.linspace(0, 5, 200)
+    found = noise_by_value(y)
+    torch.testing.assert_close(found, torch.full_like(found, 0.3), rtol=0.15, atol=0)
+    torch.testing.assert_close(noise_by_value(7 * y), 7 * found)
+    assert all(len(view.unique()) <= BINS for view in found)

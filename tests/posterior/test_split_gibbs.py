@@ -180,7 +180,8 @@ def test_impossible_settings_are_refused(settings, message):
 
 @pytest.mark.parametrize("settings", [
     {"refine_from": 0.8, "refine_iterations": 0}, {"iterations": 1, "warm_start": 0.7},
-    {"fresh_noise": 1.5}, {"fresh_noise": -0.1}, {"overshoot": 0.5}, {"fresh_noise": 0.0, "overshoot": 1.5}, {"last": 0.8, "warm_start": 0.5}])
+    {"fresh_noise": 1.5}, {"fresh_noise": -0.1}, {"overshoot": 0.5},
+    {"fresh_noise": 0.0, "overshoot": 1.5}, {"last": 0.8, "warm_start": 0.5}])
 def test_settings_that_contradict_each_other_are_refused_before_the_long_computation(settings):
     with pytest.raises(ValueError):
         SplitGibbs(**settings)

@@ -40,6 +40,8 @@ class ProximalCG(LikelihoodStep):
     discrepancy: the step ends once |P(z) - y| is at most this many times what the measurement's own noise gives, since
     a closer fit would be one of the noise (Morozov's principle, Engl, Hanke & Neubauer 1996, section 4.3); 0: never;
     refit: whether each restart refits the scatter of a measurement in which it is sought;
+    weighted: whether the variance of each pixel's own noise is added to noise^2, so that pixels which few photons reach
+    count less (Thibault et al. 2007, doi:10.1118/1.2789499);
     variation: weight of the total variation TV, 0 for none; each restart replaces it by the quadratic that touches it
     there (Vogel & Oman 1996, doi:10.1137/0917016), so it wants several; edge: differences between neighbours, in the
     prior's range, below which TV is smooth.
@@ -53,6 +55,7 @@ class ProximalCG(LikelihoodStep):
     tolerance: float = 1e-6
     discrepancy: float = 0.0
     refit: bool = False
+    weighted: bool = False
     variation: float = 0.0
     edge: float = 0.01
 
@@ -68,15 +71,20 @@ class ProximalCG(LikelihoodStep):
         weight = (self.noise / spread) ** 2
         z = x0.clamp(-1, 1)
         enough = self.discrepancy**2 * measurement.noise_energy if self.discrepancy else -1.0
+        trust = 1.0
+        if self.weighted:
+            variance = measurement.noise_variance
+            trust = (1 + variance / self.noise**2) ** -0.5
+            enough = self.discrepancy**2 * float((trust**2 * variance).sum()) if self.discrepancy else -1.0
         steepness = self.noise**2 * self.variation
         for _ in range(self.restarts):
             reprojection = measurement.project(z)
             if self.refit:
                 measurement.correct(reprojection)
-            missed = measurement.y - reprojection
+            missed = trust * (measurement.y - reprojection)
             if (_dot(missed, missed) <= enough).all():
                 break
-            downhill = measurement.adjoint(missed) + weight * (x0 - z)
+            downhill = measurement.adjoint(trust * missed) + weight * (x0 - z)
             tv = Majoriser(z, self.edge) if steepness else None
             if tv:
                 downhill = downhill - steepness * tv.gradient(z)
@@ -85,13 +93,13 @@ class ProximalCG(LikelihoodStep):
                 return weight * d + steepness * tv.gradient(d) if tv else weight * d
 
             free = ~((z <= -1) & (downhill < 0) | (z >= 1) & (downhill > 0))
-            z = (z + self._solve(measurement, downhill * free, free, penalty, missed, enough)).clamp(-1, 1)
+            z = (z + self._solve(measurement, downhill * free, free, penalty, trust, missed, enough)).clamp(-1, 1)
         return z
 
     def _solve(self, measurement: Measurement, residual: Tensor, free: Tensor, penalty: Callable[[Tensor], Tensor],
-               missed: Tensor, enough: float) -> Tensor:
-        """Conjugate gradients for A'A d + penalty(d) = residual over the free voxels, from zero, until |missed - A d|^2
-        is `enough`."""
+               trust: Tensor | float, missed: Tensor, enough: float) -> Tensor:
+        """Conjugate gradients for A' trust^2 A d + penalty(d) = residual over the free voxels, from zero, until
+        |missed - trust A d|^2 is `enough`."""
         direction, d = residual.clone(), torch.zeros_like(residual)
         energy = _dot(residual, residual)
         stop = energy * self.tolerance**2
@@ -99,8 +107,8 @@ class ProximalCG(LikelihoodStep):
             going = (energy > stop) & (_dot(missed, missed) > enough)
             if not going.any():
                 break
-            seen = measurement.linear(direction)
-            curved = (measurement.adjoint(seen) + penalty(direction)) * free
+            seen = trust * measurement.linear(direction)
+            curved = (measurement.adjoint(trust * seen) + penalty(direction)) * free
             step = torch.where(going, energy / _dot(direction, curved), 0)
             d += step * direction
             missed = missed - step.view(-1, *[1] * (missed.dim() - 1)) * seen

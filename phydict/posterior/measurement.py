@@ -70,12 +70,17 @@ class Measurement:
         return self.slope * self.projector.norm()
 
     @property
+    def noise_variance(self) -> Tensor:
+        """Variance (K, V, U) of the noise of each pixel of y."""
+        if self.noise is None:
+            return noise_level(self.y[0]).square()
+        level = self.noise if isinstance(self.noise, Tensor) else self.noise * self.y.max()
+        return level.square().expand(self.y.shape[1:])
+
+    @property
     def noise_energy(self) -> float:
         """The sum over all pixels of their noise's variance: what |P(x) - y|^2 is expected to be for the true x."""
-        if self.noise is None:
-            return float(noise_level(self.y[0]).square().sum()) * self.y[0, 0].numel()
-        level = self.noise if isinstance(self.noise, Tensor) else self.noise * self.y.max()
-        return float(level.square().expand(self.y.shape[1:]).sum())
+        return float(self.noise_variance.sum())
 
     def missed(self, x: Tensor) -> Tensor:
         """By how many times their noise the CTs x miss the X-rays, about 1 for the truth: (B, 1, 1, 1, 1)."""

@@ -233,3 +233,27 @@ def test_refitting_the_scatter_comes_nearer_to_the_truth_and_without_scatter_cha
             z = ProximalCG(10, 5, refit=refit, variation=15.0)(m, truth * 0.9 - 0.1, 0.3)
             errors.append(float((z - truth).norm()))
         assert errors[1] < 0.8 * errors[0] if scatter else errors[1] == errors[0]
+
+
+def test_weighted_each_pixel_counts_by_its_own_noise():
+    m, noise, spread = measurement(4), 0.3, 0.5
+    m.noise_variance = torch.tensor([0.0, 0.01, 0.3, 100.0]).double()
+    precision = 1 / (noise**2 + m.noise_variance)
+    normal = m.matrix.T * precision @ m.matrix + torch.eye(N).double() / spread**2
+    right = m.matrix.T * precision @ (m.y[0] - m.background) + X0.flatten() / spread**2
+    z = ProximalCG(40, noise=noise, tolerance=1e-13, weighted=True)(m, X0, spread)
+    torch.testing.assert_close(z.flatten(), torch.linalg.solve(normal, right), atol=1e-8, rtol=0)
+
+
+def test_weighting_comes_nearer_to_the_truth_where_few_photons_arrive_and_without_noise_changes_nothing():
+    for photons, given in ((1e3, None), (None, 0.0)):
+        errors = []
+        for weighted in (False, True):
+            m, _, truth = chest_measurement(0.0)
+            y = m.y[0]
+            if photons:
+                y = y + (y.exp() / photons).sqrt() * random_like(y.shape, torch.float32, seed=3)
+            m = Measurement(m.projector, y, HUWindow(), noise=given)
+            z = ProximalCG(10, 5, weighted=weighted, variation=10.0)(m, truth * 0.9 - 0.1, 0.3)
+            errors.append(float((z - truth).norm()))
+        assert errors[1] < 0.5 * errors[0] if photons else errors[1] == errors[0]

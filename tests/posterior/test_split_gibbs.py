@@ -153,7 +153,7 @@ def test_without_fresh_noise_nothing_is_drawn_and_with_it_the_draw_decides():
     assert not torch.allclose(sample(noisy, seed=1), sample(noisy, seed=2))
 
 
-@pytest.mark.parametrize("path", [{}, {"warm_start": 0.4, "last": 0.2}])
+@pytest.mark.parametrize("path", [{}, {"warm_start": 0.4, "last": 0.2}, {"overshoot": 0.75}])
 def test_a_descent_without_noise_ends_at_the_posterior_mean(path):
     mean, _ = condition(measurement(), denoiser(V).mean, V, NOISE)
     found = sample(sampler(20, fresh_noise=0.0, final_likelihood=EXACT, **path))
@@ -184,7 +184,8 @@ def test_impossible_settings_are_refused(settings, message):
 
 @pytest.mark.parametrize("settings", [
     {"refine_from": 0.8, "refine_iterations": 0}, {"iterations": 1, "warm_start": 0.7},
-    {"fresh_noise": 1.5}, {"fresh_noise": -0.1}, {"last": 0.8, "warm_start": 0.5}])
+    {"fresh_noise": 1.5}, {"fresh_noise": -0.1}, {"overshoot": 0.5},
+    {"fresh_noise": 0.0, "overshoot": 1.5}, {"last": 0.8, "warm_start": 0.5}])
 def test_settings_that_contradict_each_other_are_refused_before_the_long_computation(settings):
     with pytest.raises(ValueError):
         SplitGibbs(**settings)

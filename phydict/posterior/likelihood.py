@@ -37,8 +37,6 @@ class ProximalCG(LikelihoodStep):
 
     iterations: per restart, at most; restarts; noise: standard deviation of the line integrals' error (noise and
     model); tolerance: a restart ends once its residual has shrunk by this factor;
-    discrepancy: the step ends once |P(z) - y| is at most this many times what the measurement's own noise gives, since
-    a closer fit would be one of the noise (Morozov's principle, Engl, Hanke & Neubauer 1996, section 4.3); 0: never;
     refit: whether each restart refits the scatter of a measurement in which it is sought;
     weighted: whether the variance of each pixel's own noise is added to noise^2, so that pixels which few photons reach
     count less (Thibault et al. 2007, doi:10.1118/1.2789499);
@@ -53,16 +51,12 @@ class ProximalCG(LikelihoodStep):
     restarts: int = 2
     noise: float = 0.02
     tolerance: float = 1e-6
-    discrepancy: float = 0.0
     refit: bool = False
     weighted: bool = False
     variation: float = 0.0
     edge: float = 0.01
 
     def __post_init__(self):
-        if not self.discrepancy >= 0:
-            raise ValueError(f"discrepancy is a multiple >= 0 of the noise, 0 for none, but {self.discrepancy} was "
-                             "given")
         if not self.variation >= 0 or not self.edge > 0:
             raise ValueError("total variation needs a weight variation >= 0, 0 for none, and an edge > 0, but "
                              f"{self.variation} and {self.edge} were given")
@@ -70,21 +64,13 @@ class ProximalCG(LikelihoodStep):
     def __call__(self, measurement: Measurement, x0: Tensor, spread: float) -> Tensor:
         weight = (self.noise / spread) ** 2
         z = x0.clamp(-1, 1)
-        enough = self.discrepancy**2 * measurement.noise_energy if self.discrepancy else -1.0
-        trust = 1.0
-        if self.weighted:
-            variance = measurement.noise_variance
-            trust = (1 + variance / self.noise**2) ** -0.5
-            enough = self.discrepancy**2 * float((trust**2 * variance).sum()) if self.discrepancy else -1.0
+        trust = (1 + measurement.noise_variance / self.noise**2) ** -0.5 if self.weighted else 1.0
         steepness = self.noise**2 * self.variation
         for _ in range(self.restarts):
             reprojection = measurement.project(z)
             if self.refit:
                 measurement.correct(reprojection)
-            missed = trust * (measurement.y - reprojection)
-            if (_dot(missed, missed) <= enough).all():
-                break
-            downhill = measurement.adjoint(trust * missed) + weight * (x0 - z)
+            downhill = measurement.adjoint(trust**2 * (measurement.y - reprojection)) + weight * (x0 - z)
             tv = Majoriser(z, self.edge) if steepness else None
             if tv:
                 downhill = downhill - steepness * tv.gradient(z)
@@ -93,25 +79,23 @@ class ProximalCG(LikelihoodStep):
                 return weight * d + steepness * tv.gradient(d) if tv else weight * d
 
             free = ~((z <= -1) & (downhill < 0) | (z >= 1) & (downhill > 0))
-            z = (z + self._solve(measurement, downhill * free, free, penalty, trust, missed, enough)).clamp(-1, 1)
+            z = (z + self._solve(measurement, downhill * free, free, penalty, trust)).clamp(-1, 1)
         return z
 
     def _solve(self, measurement: Measurement, residual: Tensor, free: Tensor, penalty: Callable[[Tensor], Tensor],
-               trust: Tensor | float, missed: Tensor, enough: float) -> Tensor:
-        """Conjugate gradients for A' trust^2 A d + penalty(d) = residual over the free voxels, from zero, until
-        |missed - trust A d|^2 is `enough`."""
+               trust: Tensor | float) -> Tensor:
+        """Conjugate gradients for A' trust^2 A d + penalty(d) = residual over the free voxels, from zero."""
         direction, d = residual.clone(), torch.zeros_like(residual)
         energy = _dot(residual, residual)
         stop = energy * self.tolerance**2
         for _ in range(self.iterations):
-            going = (energy > stop) & (_dot(missed, missed) > enough)
+            going = energy > stop
             if not going.any():
                 break
-            seen = trust * measurement.linear(direction)
-            curved = (measurement.adjoint(trust * seen) + penalty(direction)) * free
+            seen = measurement.linear(direction)
+            curved = (measurement.adjoint(trust**2 * seen) + penalty(direction)) * free
             step = torch.where(going, energy / _dot(direction, curved), 0)
             d += step * direction
-            missed = missed - step.view(-1, *[1] * (missed.dim() - 1)) * seen
             residual = residual - step * curved
             previous, energy = energy, _dot(residual, residual)
             direction = residual + torch.where(going, energy / previous, 0) * direction

@@ -104,7 +104,7 @@ def test_display_values_are_calibrated_at_both_stages(xrays):
 
 @pytest.mark.parametrize("scatter", [0.0, 0.05])
 def test_scatter_that_the_base_stage_finds_is_subtracted_at_both_stages(xrays, scatter):
-    step = ProximalCG(10, 5, discrepancy=1.0, refit=True)
+    step = ProximalCG(10, 5, refit=True)
     base = SplitGibbs(3, ProximalCG(4), step, warm_start=0.5, last=0.3, fresh_noise=0.0, scatter=True)
     measured = -torch.log(torch.exp(-xrays) + scatter) + 0.005 * random_like(xrays.shape, torch.float32)
     found = replace(gaussian(), sampler=base).reconstruct(measured, PROJECTOR, seed=3)

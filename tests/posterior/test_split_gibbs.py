@@ -205,7 +205,7 @@ def test_scatter_is_looked_for_where_the_xrays_are_missed_and_otherwise_costs_an
     y = -torch.log(torch.exp(-projector(window.to_mu(truth))[0]) + scatter)
     y = y + 0.005 * random_like(y.shape, torch.float32)
     prior = GaussianDenoiser(0.8 * truth, torch.tensor(0.04))
-    settings = SplitGibbs(4, ProximalCG(noise=0.02), ProximalCG(10, 5, noise=0.02, discrepancy=1.0, refit=True),
+    settings = SplitGibbs(4, ProximalCG(noise=0.02), ProximalCG(10, 5, noise=0.02, refit=True),
                           warm_start=0.9, last=0.2, fresh_noise=0.0)
     found = {}
     for seek in (False, True):

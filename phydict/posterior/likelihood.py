@@ -64,13 +64,13 @@ class ProximalCG(LikelihoodStep):
     def __call__(self, measurement: Measurement, x0: Tensor, spread: float) -> Tensor:
         weight = (self.noise / spread) ** 2
         z = x0.clamp(-1, 1)
-        trust = (1 + measurement.noise_variance / self.noise**2) ** -0.5 if self.weighted else 1.0
+        trust = 1 / (1 + measurement.noise_variance / self.noise**2) if self.weighted else 1.0
         steepness = self.noise**2 * self.variation
         for _ in range(self.restarts):
             reprojection = measurement.project(z)
             if self.refit:
                 measurement.correct(reprojection)
-            downhill = measurement.adjoint(trust**2 * (measurement.y - reprojection)) + weight * (x0 - z)
+            downhill = measurement.adjoint(trust * (measurement.y - reprojection)) + weight * (x0 - z)
             tv = Majoriser(z, self.edge) if steepness else None
             if tv:
                 downhill = downhill - steepness * tv.gradient(z)
@@ -84,7 +84,7 @@ class ProximalCG(LikelihoodStep):
 
     def _solve(self, measurement: Measurement, residual: Tensor, free: Tensor, penalty: Callable[[Tensor], Tensor],
                trust: Tensor | float) -> Tensor:
-        """Conjugate gradients for A' trust^2 A d + penalty(d) = residual over the free voxels, from zero."""
+        """Conjugate gradients for A' trust A d + penalty(d) = residual over the free voxels, from zero."""
         direction, d = residual.clone(), torch.zeros_like(residual)
         energy = _dot(residual, residual)
         stop = energy * self.tolerance**2
@@ -92,8 +92,7 @@ class ProximalCG(LikelihoodStep):
             going = energy > stop
             if not going.any():
                 break
-            seen = measurement.linear(direction)
-            curved = (measurement.adjoint(trust**2 * seen) + penalty(direction)) * free
+            curved = (measurement.adjoint(trust * measurement.linear(direction)) + penalty(direction)) * free
             step = torch.where(going, energy / _dot(direction, curved), 0)
             d += step * direction
             residual = residual - step * curved

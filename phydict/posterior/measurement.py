@@ -28,8 +28,8 @@ class Measurement:
 
     noise: standard deviation of the noise of y, as a share of its largest value or, as a tensor that expands to
     (K, V, U), of each pixel; None: estimated from y where it is needed.
-    scattered: whether `correct` subtracts scatter; calls: how many times A or its adjoint ran over all views, per volume
-    of a batch; seen: what `project` last gave.
+    scattered: whether `correct` subtracts scatter; calls: how many times A or its adjoint ran over all views, per
+    volume of a batch; seen: what `project` last gave.
     """
 
     def __init__(self, projector: Projector, xrays: Tensor, window: HUWindow, display: bool = False,
@@ -77,15 +77,10 @@ class Measurement:
         level = self.noise if isinstance(self.noise, Tensor) else self.noise * self.y.max()
         return level.square().expand(self.y.shape[1:])
 
-    @property
-    def noise_energy(self) -> float:
-        """The sum over all pixels of their noise's variance: what |P(x) - y|^2 is expected to be for the true x."""
-        return float(self.noise_variance.sum())
-
     def missed(self, x: Tensor) -> Tensor:
         """By how many times their noise the CTs x miss the X-rays, about 1 for the truth: (B, 1, 1, 1, 1)."""
         missed = (self.project(x) - self.y).flatten(1).norm(dim=1)
-        return (missed / max(self.noise_energy, 1e-12) ** 0.5).view(-1, 1, 1, 1, 1)
+        return (missed / self.noise_variance.sum().clamp(min=1e-12).sqrt()).view(-1, 1, 1, 1, 1)
 
     def calibrate(self, x: Tensor) -> None:
         """Where the views are display values: refit their gain and offset to the projections of the CT x."""

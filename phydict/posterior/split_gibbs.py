@@ -23,7 +23,8 @@ from phydict.posterior.sampler import Draw, Sampler, descend
 
 MISSED = 2.5
 """Times their noise that X-rays are missed by before scatter is looked for: on the CTs that it was chosen on, ideal ones
-are missed by 1.4 at most, polychromatic ones by 1.4 to 3.5, those with scatter of 6 % by 2.7 to 17, fewer views by less."""
+are missed by 1.4 at most, polychromatic ones by 1.4 to 3.5, those with scatter of 6 % by 2.7 to 17, fewer views by
+less."""
 
 
 @dataclass(frozen=True)
@@ -112,8 +113,7 @@ class SplitGibbs(Sampler):
             return self._descend(denoiser, measurement, x, draw, on_step)
         measurement.seek_scatter(False)
         z = self._descend(denoiser, measurement, x, draw, on_step)
-        missed = measurement.missed(z[:, :1])
-        if measurement.may_scatter and (missed > MISSED).any():
+        if measurement.may_scatter and ((missed := measurement.missed(z[:, :1])) > MISSED).any():
             measurement.seek_scatter(True)
             again = self._descend(denoiser, measurement, x, draw)
             better = (missed > MISSED) & (measurement.missed(again[:, :1]) < missed)

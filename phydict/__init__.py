@@ -11,6 +11,7 @@
     methods          the named methods, and `reconstruct` in one call
     dry_run         geometry drawn before anything is reconstructed
     atomic           files and folders that appear whole or not at all
+    checksum         what tells one file from another
     case_results     finished cases on disk
     ablation         methods and settings compared on the same X-rays
     profiling        seconds and memory of a computation's stages

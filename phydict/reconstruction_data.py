@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
+from phydict.checksum import file_crc32
 from phydict.datamodule import HELD_OUT_PHANTOM, PHANTOM_VERSION
 from phydict.datasets import CTFile, find_cts, find_xrays, load_case, load_xrays, phantom_case
 from phydict.evaluation import volume_metrics
@@ -129,7 +130,8 @@ class ReconstructionData(lightning.LightningDataModule):
         crc = 0
         files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
         for file in [*files, Path(self.geometry)] if self.geometry else files:
-            crc = zlib.crc32(file.read_bytes() if file.is_file() else b"", zlib.crc32(file.name.encode(), crc))
+            named = zlib.crc32(file.name.encode(), crc)
+            crc = file_crc32(file, named) if file.is_file() else named
         return f"files crc32 {crc:08x}"
 
     def simulate(self, case: dict, seed: int, grid: Grid, window: HUWindow, device: torch.device) -> Tensor:
@@ -176,6 +178,6 @@ def _divided(grid: Grid, shape: tuple[int, int, int]) -> Grid:
 
 
 def _ct_source(ct: CTFile) -> str:
-    stat = ct.path.stat()
+    """What identifies a CT and its report, wherever the file lies."""
     report = zlib.crc32(ct.report.encode())
-    return f"{ct.path.name}, {stat.st_size} bytes of {stat.st_mtime_ns}, report crc32 {report:08x}"
+    return f"{ct.path.name}, crc32 {file_crc32(ct.path):08x}, {ct.calibration}, report crc32 {report:08x}"

@@ -316,6 +316,8 @@ def test_a_finished_case_is_never_taken_for_that_of_other_data(measured, cts, tm
         shutil.copyfile(cts / f"{name}.nii.gz", tmp_path / "ct.nii.gz")
         if name == "a":
             main(ct)
+            shutil.copyfile(cts / "a.nii.gz", tmp_path / "ct.nii.gz")  # later, but the same
+            main(ct)
     assert "other data" in refusal(capsys, ct)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import zlib
 from pathlib import Path
 
 import torch
@@ -12,6 +11,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from phydict.atomic import whole_file
+from phydict.checksum import file_crc32
 from phydict.diffusion import CosineSchedule
 from phydict.grid import Grid
 from phydict.prior.local_unet import LocalUNet
@@ -143,11 +143,7 @@ def fingerprint(path: str | Path | MedSynCheckpoint) -> int:
     """CRC-32 of the file that `load_prior` reads: two priors with different ones are not the same."""
     if not isinstance(path, MedSynCheckpoint):
         path = MedSynCheckpoint(str(path))
-    crc = 0
-    with path.file.open("rb") as file:
-        while chunk := file.read(2**24):
-            crc = zlib.crc32(chunk, crc)
-    return crc
+    return file_crc32(path.file)
 
 
 def build_prior(header: dict, weights: dict[str, Tensor]) -> Prior:

@@ -27,27 +27,19 @@ from scipy.stats import rankdata, wasserstein_distance
 
 from phydict.datamodule import HELD_OUT_PHANTOM
 from phydict.datasets import Thorax, build, find_cts, prepare_ct, without
+from phydict.datasets.anatomy import body_mask
 from phydict.evaluation import write_csv
 from phydict.grid import Grid
 from phydict.units import HUWindow
 
 GRID, WINDOW = Grid.cube(64), HUWindow()
 MM, ML = 6.0, 0.216
-CLASSES = {"gas and lung": (-1001, -500), "fat": (-150, -30), "soft tissue": (-30, 180), "bone or contrast": (180, 2000)}
+CLASSES = {"gas and lung": (-1001, -500), "fat": (-150, -30), "soft tissue": (-30, 180),
+           "bone or contrast": (180, 2000)}
 BANDS = (2, 8, 16, 32, 50, 83)
 """Edges in cycles per metre."""
 SLABS = np.arange(-1, 9)
 BLOCK = 8
-
-
-def outline(hu: np.ndarray) -> np.ndarray:
-    """The body with all it contains (X, Y, Z) bool, without the table."""
-    core = ndimage.binary_opening(hu > -300, ndimage.generate_binary_structure(3, 1))
-    labels, count = ndimage.label(core)
-    if not count:
-        return core
-    body = labels == 1 + np.argmax(np.bincount(labels.ravel())[1:])
-    return np.stack([ndimage.binary_fill_holes(body[..., k]) for k in range(body.shape[2])], -1)
 
 
 def span(mask: np.ndarray, axis: int) -> float:
@@ -69,7 +61,7 @@ class Case:
 
     def __init__(self, name: str, hu: np.ndarray, masks: np.ndarray):
         self.name, self.hu, self.masks = name, hu.clip(WINDOW.low, WINDOW.high), masks
-        self.body = outline(hu)
+        self.body = body_mask(self.hu, GRID.spacing)
         self.lung = masks[0] > 0.5
         levels = np.nonzero(self.lung.sum((0, 1)) > 3)[0]
         self.low, self.high = levels[0], levels[-1] + 1
@@ -96,18 +88,20 @@ class Case:
             hu, body, lung = self.hu[..., part], self.body[..., part], self.lung[..., part]
             count = body.shape[2]
             if not body.any():
-                rows.append([np.nan] * 9)
+                rows.append([np.nan] * 10)
                 continue
             inside = hu[body]
-            column = np.abs(GRID.centre[0] + (np.arange(64) - 31.5) * MM) < 20
-            bone = (hu > 180) & column[:, None, None] & body
+            column = np.abs(np.arange(64) - 31.5) * MM < 20
+            filled = np.nonzero(body.any((0, 2)))[0]
+            behind = np.arange(64) < filled.mean()
+            bone = (hu > 180) & column[:, None, None] & behind[:, None] & body
             centre = (np.nonzero(bone)[1].mean() - 31.5) * MM if bone.any() else np.nan
-            front = np.nonzero(body.any((0, 2)))[0][-1] * MM - 31.5 * MM
+            back, front = (filled[[0, -1]] - 31.5) * MM
             rows.append([body.sum() / count * MM**2 / 100, lung.sum() / count * MM**2 / 100, span(body, 0),
                          span(body, 1), inside.mean(), (inside > 180).sum() / count * MM**2 / 100,
-                         ((inside > -150) & (inside < -30)).mean(), centre, front])
+                         ((inside > -150) & (inside < -30)).mean(), centre, back, front])
         names = ("body area", "lung area", "body width", "body depth", "mean HU of the body", "bone area", "fat share",
-                 "spine's position", "front's position")
+                 "spine's position", "back's position", "front's position")
         return dict(zip(names, np.array(rows).T))
 
     def numbers(self) -> dict[str, float]:
@@ -271,9 +265,7 @@ def histogram_rows(cts: list[Case], phantoms: list[Case]) -> list[dict]:
                 for side in (real, made))
         own = [wasserstein_distance(middle, middle, a[i], np.delete(a, i, 0).mean(0)) for i in range(len(a))]
         other = [wasserstein_distance(middle, middle, h, np.delete(a, i % len(a), 0).mean(0)) for i, h in enumerate(b)]
-        rows.append({"kind": "histogram", "figure": f"{figure} HU", "real": np.mean(own), "real_sd": np.std(own, ddof=1),
-                     "phantom": np.mean(other), "phantom_sd": np.std(other, ddof=1),
-                     "distance": np.mean(other) / np.mean(own)})
+        rows.append(_distance_row("histogram", f"{figure} HU", own, other))
     return rows
 
 
@@ -285,14 +277,18 @@ def profile_rows(cts: list[Case], phantoms: list[Case]) -> list[dict]:
         a, b = (np.array([profiles[figure] for profiles in side]) for side in (real, made))
 
         def away(profile, others):
-            return np.sqrt(np.nanmean(((profile - np.nanmean(others, 0)) / np.nanstd(others, 0, ddof=1)) ** 2))
+            spread = np.fmax(np.nanstd(others, 0, ddof=1), 0.1 * np.nanmax(np.nanstd(others, 0, ddof=1)))
+            return np.sqrt(np.nanmean(((profile - np.nanmean(others, 0)) / spread) ** 2))
 
         own = [away(a[i], np.delete(a, i, 0)) for i in range(len(a))]
         other = [away(profile, np.delete(a, i % len(a), 0)) for i, profile in enumerate(b)]
-        rows.append({"kind": "profile", "figure": figure, "real": np.mean(own), "real_sd": np.std(own, ddof=1),
-                     "phantom": np.mean(other), "phantom_sd": np.std(other, ddof=1),
-                     "distance": np.mean(other) / np.mean(own)})
+        rows.append(_distance_row("profile", figure, own, other))
     return rows
+
+
+def _distance_row(kind: str, figure: str, own: list[float], other: list[float]) -> dict:
+    return {"kind": kind, "figure": figure, "real": np.mean(own), "real_sd": np.std(own, ddof=1),
+            "phantom": np.mean(other), "phantom_sd": np.std(other, ddof=1), "distance": np.mean(other) / np.mean(own)}
 
 
 def compare(cts: list[Case], phantoms: list[Case]) -> list[dict]:

@@ -12,7 +12,7 @@ AIR = -1000.0
 LEAST_BLOOD = 45.0
 """HU of blood without contrast agent, below which none is lowered."""
 
-SPINE_SHARE = 0.3
+SPINE_SHARE = 0.33
 """Hindmost share of the lungs' depth, where the spine lies between the lungs."""
 
 BODY_MARGIN = 1

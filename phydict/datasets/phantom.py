@@ -83,7 +83,7 @@ def _trunk(canvas: Canvas, texture: np.ndarray) -> None:
     if t.breast:
         gland = canvas.soft(breast + 14) * np.clip(0.4 + 0.5 * texture, 0, 1)
         canvas.paint(gland, 20.0)
-    streaks = t.marbling * (1 + np.clip(2 * t.level(z) - 1, 0, 1)) * np.clip((texture + 0.2) * 0.45, 0, 0.9)
+    streaks = t.marbling * (1 + 0.4 * np.clip(2 * t.level(z) - 1, 0, 1)) * np.clip((texture + 0.2) * 0.45, 0, 0.9)
     canvas.paint(canvas.soft(muscle), np.maximum(t.muscle_hu - 155 * streaks, -100))
     cage = t.cage(x, y, z)
     roof = z - 0.5 * t.height

@@ -72,7 +72,7 @@ def _shoulder(thorax: Thorax, side: float) -> list[Tubes]:
         y = centre - (depth + 15) * reach
         ends = np.array([[medial, y[0], z], [(medial + lateral) / 2, y.mean() - 5, z],
                          [lateral, y[1] + 4 * (1 - share), z]])
-        parts.append(Tubes.chain(ends * mirror, [6.5, 6.5, 7.5], [0.3, 0.6], hu=0.8 * thorax.cortex,
+        parts.append(Tubes.chain(ends * mirror, [7, 7, 8], [0.3, 0.6], hu=0.8 * thorax.cortex,
                                  core_hu=thorax.bone, core=0.4))
     ridge = np.array([[74, -0.95 * thorax.depth - 22, top - 48], [105, -0.75 * thorax.depth - 18, top - 16],
                       [outer + 4, -40, top + 30]])

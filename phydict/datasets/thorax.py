@@ -134,7 +134,7 @@ class Thorax:
     @property
     def cortex(self) -> float:
         """HU of compact bone."""
-        return 420 + 3 * self.bone
+        return 470 + 3.4 * self.bone
 
     @property
     def back_plane(self) -> float:

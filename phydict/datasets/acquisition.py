@@ -6,9 +6,9 @@ import numpy as np
 import torch
 
 from phydict.datasets.anatomy import body_mask
+from phydict.datasets.transforms import AIR
 from phydict.grid import Grid
 
-AIR = -1000.0
 LEAST_BLOOD = 45.0
 """HU of blood without contrast agent, below which none is lowered."""
 

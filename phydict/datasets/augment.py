@@ -1,4 +1,4 @@
-"""Random anatomical change of a patient, for learning from few CTs."""
+"""Random change of a patient's anatomy and of how it was scanned, for learning from few CTs."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from phydict.datasets.phantom import change_by_findings
 from phydict.grid import Grid
 from phydict.units import HUWindow
 
-PHANTOM_VERSION = 1
+PHANTOM_VERSION = 2
 """Raised whenever a phantom of the same seed comes out differently, so that cached ones are made anew."""
 
 HELD_OUT_PHANTOM = 1_000_000

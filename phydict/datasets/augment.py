@@ -1,13 +1,14 @@
-"""Random anatomical change of a patient, for learning from few CTs."""
+"""Random change of a patient's anatomy and of how it was scanned, for learning from few CTs."""
 
 from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import torch
 
+from phydict.datasets.acquisition import change_contrast, cut_field, without_table
 from phydict.datasets.transforms import AIR
 from phydict.grid import Grid
 from phydict.units import HUWindow
@@ -16,13 +17,18 @@ from phydict.units import HUWindow
 NAMES_A_SIDE = re.compile(r"\b(left|right|middle lobe|lingula\w*|[LR](UL|ML|LL)?)\b", re.IGNORECASE)
 """What makes an English report one of a side."""
 
+FIELD_MM, FIELD_SHIFT_MM = (310.0, 400.0), 15.0
+"""Diameters of the scanner's field that `Augmentation.field` draws, and how far it lies off the grid's centre."""
+
 
 @dataclass(frozen=True)
 class Augmentation:
     """How strong random changes of a patient are; 0 leaves that kind out. `Augmentation.none()` changes nothing.
 
     rotation: degrees about any axis. scale: share of the size, along each axis. shift: mm. waves: mm, amplitude of
-    the slowest bending. gain: share of HU + 1000. offset: HU, in tissue only.
+    the slowest bending. gain: share of HU + 1000. offset: HU, in tissue only. contrast: HU, in blood only.
+    table: share of the cases whose table and clothes are taken away. field: share of the cases cut by a scanner's
+    circular field of view of 310 to 400 mm.
     mirror: share of the cases mirrored left to right among those whose report is empty or names no side (in English),
     in [0, 1]. It is 0 unless asked for, since a thorax is not symmetric: a mirrored one has its heart on the right.
     Nothing is ever turned upside down or back to front.
@@ -34,6 +40,9 @@ class Augmentation:
     waves: float = 2.5
     gain: float = 0.03
     offset: float = 20.0
+    contrast: float = 60.0
+    table: float = 0.2
+    field: float = 0.15
     mirror: float = 0.0
 
     def __post_init__(self):
@@ -41,14 +50,17 @@ class Augmentation:
         if negative:
             raise ValueError(f"augmentation strengths are not negative, but {negative[0]} is "
                              f"{vars(self)[negative[0]]}: give 0 for none")
-        if self.scale > 0.5 or self.gain > 0.5 or self.rotation > 45 or self.mirror > 1:
+        if self.scale > 0.5 or self.gain > 0.5 or self.rotation > 45:
             raise ValueError("augmentation is for small changes: rotation up to 45 degrees, scale and gain up to 0.5, "
-                             f"mirror up to 1, but {self.rotation}, {self.scale}, {self.gain} and {self.mirror} were "
-                             "given")
+                             f"but {self.rotation}, {self.scale} and {self.gain} were given")
+        over = [name for name in ("table", "field", "mirror") if getattr(self, name) > 1]
+        if over:
+            raise ValueError(f"augmentation's {over[0]} is a share of the cases, in [0, 1], but "
+                             f"{getattr(self, over[0])} was given")
 
     @classmethod
     def none(cls) -> Augmentation:
-        return cls(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        return cls(**{field.name: 0.0 for field in fields(cls)})
 
 
 @dataclass(frozen=True)
@@ -69,7 +81,7 @@ class Deformation:
 
     @classmethod
     def draw(cls, seed: int | torch.Generator, strength: Augmentation = Augmentation()) -> Deformation:
-        """Within `strength`; without its mirroring, which depends on the report."""
+        """Within `strength`; without its mirroring, which depends on the report, and its changes of the scan."""
         generator = seed if isinstance(seed, torch.Generator) else torch.Generator().manual_seed(int(seed))
 
         def uniform(size, bound):
@@ -124,4 +136,18 @@ def augment(case: dict, seed: int | torch.Generator, grid: Grid = Grid.cube(64),
     if strength.mirror and not NAMES_A_SIDE.search(case["report"]):
         mirrored = bool(torch.rand(1, generator=generator) < strength.mirror)
         deformation = replace(deformation, mirrored=mirrored)
-    return deformation.apply(case, grid, window)
+    return _rescanned(deformation.apply(case, grid, window), generator, grid, window, strength)
+
+
+def _rescanned(case: dict, generator: torch.Generator, grid: Grid, window: HUWindow, strength: Augmentation) -> dict:
+    """The Case with another contrast of the blood, without its table, or in a smaller field of view, by chance."""
+    chance, amount, diameter, *centre = torch.rand(6, generator=generator).split((2, 1, 1, 1, 1))
+    hu, masks = window.to_hu(case["volume"]), case["masks"]
+    if chance[0] < strength.table:
+        hu = without_table(hu, grid)
+    if strength.contrast:
+        hu = change_contrast(hu, masks, strength.contrast * (2 * float(amount) - 1))
+    if chance[1] < strength.field:
+        middle = tuple(FIELD_SHIFT_MM * (2 * float(place) - 1) for place in centre)
+        hu, masks = cut_field(hu, masks, grid, FIELD_MM[0] + float(diameter) * (FIELD_MM[1] - FIELD_MM[0]), middle)
+    return case | {"volume": window.to_range(hu), "masks": masks}

@@ -29,7 +29,8 @@ class Texture:
 class Canvas:
     """The HU volume being painted, and where its voxels are in the thorax's frame.
 
-    `axes` are x, y, z in mm, thin arrays that broadcast to the volume where the grid follows the world's axes.
+    `axes` are x, y, z in mm, thin arrays that broadcast to the volume where the grid follows the world's axes; y is
+    that of a thorax that its spine does not bend, `straight_y` that of the scanner.
     """
 
     def __init__(self, thorax: Thorax, grid: Grid):
@@ -44,6 +45,8 @@ class Canvas:
         for row, origin in zip(matrix, start):
             used = [c * i for c, i in zip(row, index) if abs(c) > 1e-6] or [0 * index[0]]
             self.axes.append(np.float32(sum(used) + origin))
+        self.straight_y = self.axes[1]
+        self.axes[1] = self.straight_y - np.float32(thorax.bend(self.axes[2]))
 
     def soft(self, distance) -> np.ndarray:
         """Share of each voxel inside a body with signed `distance` mm."""
@@ -61,6 +64,8 @@ class Canvas:
     def box(self, low, high) -> tuple[tuple[slice, ...], list[np.ndarray]]:
         """The voxels around the box low..high (mm) and their x, y, z."""
         low, high = np.asarray(low) - self.edge, np.asarray(high) + self.edge
+        bend = self.thorax.bend(np.linspace(low[2], high[2], 9))
+        low, high = low + [0, bend.min(), 0], high + [0, bend.max(), 0]
         corners = np.stack(np.meshgrid(*zip(low, high), indexing="ij"), -1).reshape(-1, 3) + self.thorax.offset
         index = self.grid.index(corners)
         first = np.clip(np.floor(index.min(0)).astype(int), 0, self.grid.shape)
@@ -92,6 +97,7 @@ class Canvas:
     def fill(self, tubes: Tubes) -> tuple[np.ndarray, np.ndarray]:
         """Share of each voxel inside thin tubes, and their mean HU there."""
         points, volume, hu = tubes.points(self.pitch)
+        points[:, 1] += self.thorax.bend(points[:, 2])
         index = np.rint(self.grid.index(points + self.thorax.offset)).astype(np.int64)
         inside = ((index >= 0) & (index < self.grid.shape)).all(1)
         flat = np.ravel_multi_index(tuple(index[inside].T), self.grid.shape)

@@ -18,7 +18,7 @@ def lung_tissue(canvas: Canvas, texture: np.ndarray) -> np.ndarray:
     """HU of aerated lung everywhere: gravity gradient, grain, fissures, emphysema with its bullae."""
     t, (x, y, z) = canvas.thorax, canvas.axes
     fine = Texture(t.seed, 1, 7.0)(x, y, z)
-    tissue = t.parenchyma - t.gravity * (y / t.depth) + 14 * fine + 8 * texture
+    tissue = t.parenchyma - t.gravity * (y / t.depth) + 18 * fine + 16 * texture
     for finding in t.findings:
         if finding.kind == "pneumothorax":
             tissue = tissue + (SIDES[finding.side] * x > 0) * finding.size * 160
@@ -141,7 +141,7 @@ def airways(canvas: Canvas, pleural: np.ndarray) -> np.ndarray:
     bundles = []
     for side in SIDES:
         points, _ = t.lung_points(side)
-        bundles.append(tree(main[side][-1], points[-64:], 0.75, AIR, 0.45))
+        bundles.append(tree(main[side][-1], points[-64:], 0.55, AIR, 0.45))
     branches = Tubes.join(bundles)
     walls = Tubes.of(branches.start, branches.end, branches.start_radius * 1.15 + 0.4, branches.end_radius * 1.15 + 0.4)
     share, _ = canvas.fill(walls)

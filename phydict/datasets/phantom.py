@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 from scipy.ndimage import gaussian_filter
+from scipy.special import ndtr
 
 from phydict.datasets.canvas import AIR, Canvas, Texture
 from phydict.datasets.findings import Finding
@@ -22,6 +23,9 @@ from phydict.grid import Grid
 from phydict.units import HUWindow
 
 __all__ = ["Finding", "Thorax", "build", "pathology_region", "phantom_case", "report", "without", "wrong_side"]
+
+NOISE_MM = 1.5
+"""Voxels to which `Thorax.noise` refers; larger ones average it, as noise that neighbours share in part."""
 
 
 def build(thorax: Thorax, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
@@ -59,7 +63,7 @@ def _trunk(canvas: Canvas, texture: np.ndarray) -> None:
     neck_y = y + 0.28 * t.depth
     muscle = -smooth_max(-muscle, -np.maximum(superellipse(x, neck_y, 56, 56, 2.2), (0.3 * t.height - z)), 30.0)
     end = arm_end(t)
-    start = np.array([t.width + t.wall + 6, -14, 0.5 * t.height - 50])
+    start = np.array([t.width + t.wall + 6, -18, 0.5 * t.height - 25])
     line = end - start
     along = np.clip(((np.abs(x) - start[0]) * line[0] + (y - start[1]) * line[1] + (z - start[2]) * line[2])
                     / (line @ line), 0, 1)
@@ -68,18 +72,19 @@ def _trunk(canvas: Canvas, texture: np.ndarray) -> None:
     muscle = -smooth_max(-muscle, -arm, 25.0)
     front = np.clip(y / t.depth, -1, 1)
     skin = muscle - t.fat * (0.85 + 0.25 * np.clip(-t.level(z) + 0.6, -0.6, 0.6) - 0.15 * front) - 2
+    skin = smooth_max(skin, -canvas.straight_y - t.back_plane, 16.0)
     if t.breast:
         bulge = np.array([62, 34, 55]) * t.breast
         centre = [0.55 * t.width, 0.85 * t.depth, -0.02 * t.height]
         breast = ellipsoid(np.abs(x), y, z, centre, np.eye(3), bulge)
         skin = -smooth_max(-skin, -breast, 15.0)
-    canvas.paint(canvas.soft(skin), -105 + 10 * texture)
+    canvas.paint(canvas.soft(skin), -103 + 3 * texture)
     canvas.paint(canvas.soft(skin) - canvas.soft(skin + 1.6), 20.0)
     if t.breast:
         gland = canvas.soft(breast + 14) * np.clip(0.4 + 0.5 * texture, 0, 1)
         canvas.paint(gland, 20.0)
-    streaks = np.clip((texture - 0.5) * 0.5, 0, 0.7)
-    canvas.paint(canvas.soft(muscle), 52 - 130 * streaks)
+    streaks = t.marbling * (1 + 0.4 * np.clip(2 * t.level(z) - 1, 0, 1)) * np.clip((texture + 0.2) * 0.45, 0, 0.9)
+    canvas.paint(canvas.soft(muscle), np.maximum(t.muscle_hu - 155 * streaks, -100))
     cage = t.cage(x, y, z)
     roof = z - 0.5 * t.height
     inside = canvas.soft(smooth_max(cage - 2, roof, 10.0))
@@ -105,7 +110,7 @@ def _abdomen(canvas: Canvas, texture: np.ndarray) -> None:
     stomach = np.maximum(ellipsoid(x, y, z, fundus, np.eye(3), np.array([38, 44, 48.0])), room)
     spleen = np.maximum(ellipsoid(x, y, z, [-0.68 * t.width, -0.5 * t.depth, base - 62], np.eye(3),
                                   np.array([30, 40, 52.0])), room)
-    canvas.paint(canvas.soft(room + 3) * 0.7, 30 + enhanced / 3 - 80 * np.clip(content, -0.3, 1.2), box)
+    canvas.paint(canvas.soft(room + 3) * 0.9, 5 + enhanced / 3 - 90 * np.clip(content, -0.8, 1.1), box)
     canvas.paint(canvas.soft(stomach), 35 + 8 * content, box)
     level = fundus[1] + 44 * (0.95 - 1.3 * t.gas)
     canvas.paint(canvas.soft(np.maximum(stomach + 3, level - y)), AIR + 40, box)
@@ -134,8 +139,8 @@ def _mediastinum(canvas: Canvas) -> np.ndarray:
         if covers:
             organs[box] = np.maximum(organs[box], share)
 
-    put(*canvas.blob(centre, half, axes), -70.0)
-    put(*canvas.blob(centre, half - 3.5, axes), 48 + (45 if t.contrast else 0))
+    put(*canvas.blob(centre, half, axes), -60.0)
+    put(*canvas.blob(centre, half - 2.0, axes), 48 + (45 if t.contrast else 0))
     chambers = [((-0.36, -0.10, -0.08), 0.42, left_blood), ((0.08, 0.40, -0.12), 0.38, right_blood),
                 ((0.58, 0.05, 0.05), 0.36, right_blood), ((0.15, -0.52, 0.30), 0.38, left_blood)]
     for place, size, blood in chambers:
@@ -151,8 +156,9 @@ def _mediastinum(canvas: Canvas) -> np.ndarray:
     for path in lungs:
         put(*canvas.pipe(path, [t.aorta * 0.85] * (len(path) - 1) + [7]), right_blood)
     cava = [[25, 10, c + 40], [27, 8, c - 10], [25, 6, c - 55]]
-    put(*canvas.pipe(cava, 9), right_blood)
-    put(*canvas.pipe([[40, 8, c + 80], [25, 10, c + 42], [-8, 22, c + 54], [-45, 6, c + 84]], 7), right_blood)
+    put(*canvas.pipe(cava, 9), t.cava)
+    brachiocephalic = [[40, 8, c + 80], [25, 10, c + 42], [-8, 22, c + 54], [-45, 6, c + 84]]
+    put(*canvas.pipe(brachiocephalic, 7), 0.5 * (t.cava + right_blood))
     put(*canvas.pipe([[-4, back + 12, c + 140], [-4, back + 12, c], [-2, low + 20, -0.4 * t.height]], 7), 32.0)
     taper = np.array([1.05, 1.1, 1.08, 1.0, 0.95, 0.92, 0.9, 0.86, 0.82, 0.78, 0.7])
     put(*canvas.pipe(arch, t.aorta * taper), left_blood)
@@ -174,12 +180,12 @@ def _skeleton(canvas: Canvas, texture: np.ndarray) -> None:
         phase = np.abs((z - 0.5 * t.height + 4) / t.vertebra - np.rint((z - 0.5 * t.height + 4) / t.vertebra))
         disc = (0.5 - phase) * t.vertebra - 2.6
         muscles = superellipse(np.abs(x) - 26, y + 0.8 * t.spine + 26, 24, 20, 2.2) + 0 * z
-        canvas.paint(canvas.soft(muscles), 50.0, box)
-        canvas.paint(canvas.soft(body), 90.0, box)
+        canvas.paint(canvas.soft(muscles) * 0.9, t.muscle_hu - 5, box)
+        canvas.paint(canvas.soft(body), 95.0, box)
         inside = canvas.soft(np.maximum(body, -disc))
-        canvas.paint(inside, t.bone + 15 * texture[box], box)
+        canvas.paint(inside, t.bone + 30 * texture[box], box)
         rim = (canvas.sheet(body + 1, 2.2) * canvas.soft(-disc) + canvas.sheet(disc - 1, 2.0) * canvas.soft(body))
-        canvas.paint(np.minimum(rim, 1) * 0.8, 500.0, box)
+        canvas.paint(np.minimum(rim, 1) * 0.8, 0.5 * t.cortex, box)
     share, value = canvas.fill(bones(t))
     canvas.paint(share, value)
     if 0 not in canvas.hu[box].shape:
@@ -188,19 +194,27 @@ def _skeleton(canvas: Canvas, texture: np.ndarray) -> None:
 
 def _scanner(canvas: Canvas, masks: np.ndarray) -> None:
     """Table, noise, and air outside the field of view and the scanned range."""
-    t, (x, y, z) = canvas.thorax, canvas.axes
+    t = canvas.thorax
     if t.table is not None:
-        back = t.depth + (t.wall + t.back) / 2 + 4 + (t.back - t.wall) / 2 + 6 + t.fat * 0.95 + 2
-        surface = y + back + t.table - 7e-4 * x * x
-        width = canvas.soft(np.abs(x) - 205)
-        canvas.paint(width * canvas.sheet(surface, 2.2) + 0 * z, -100.0)
-        canvas.paint(width * canvas.sheet(surface + 32, 3.0) + 0 * z, 100.0)
-        foam = width * (canvas.soft(surface) - canvas.soft(surface + 32))
-        canvas.paint(foam * 0.6, -940.0)
+        mattress, thickness = t.table
+        x, y, z = canvas.axes[0], canvas.straight_y, canvas.axes[2]
+        surface = y + t.back_plane - 7e-4 * x * x
+        width, free = canvas.soft(np.abs(x) - 215), np.clip((-900 - canvas.hu) / 100, 0, 1)
+        top, bottom = surface + mattress, surface + mattress + thickness
+        canvas.paint(free * width * (canvas.soft(surface) - canvas.soft(top)), -920.0)
+        canvas.paint(free * width * (canvas.soft(top) - canvas.soft(bottom)), -940.0)
+        for shell in (top, bottom):
+            canvas.paint(width * canvas.sheet(shell, 3.0) + 0 * z, 0.0)
     if t.noise:
         grain = np.random.default_rng([t.seed, 9]).standard_normal(canvas.grid.shape, np.float32)
-        canvas.hu += np.float32(1.9 * t.noise) * gaussian_filter(grain, 0.6)
-    world = [axis + offset for axis, offset in zip(canvas.axes, t.offset)]
+        averaged = min(1.0, NOISE_MM / canvas.edge)
+        canvas.hu += np.float32(1.9 * t.noise * averaged) * gaussian_filter(grain, 0.6)
+        slow = Texture(t.seed, 10, 13.0)(*canvas.axes)
+        canvas.hu += np.float32(0.3 * t.noise) * slow * np.clip((canvas.hu - AIR) / 1000, 0, 1)
+        unresolved = t.noise * np.sqrt(max(1 - averaged**2, 1e-6))
+        above = (canvas.hu - AIR) / unresolved
+        canvas.hu = AIR + unresolved * (above * ndtr(above) + np.exp(-above * above / 2) / np.sqrt(2 * np.pi))
+    world = [axis + offset for axis, offset in zip((canvas.axes[0], canvas.straight_y, canvas.axes[2]), t.offset)]
     across = np.hypot(world[0], world[1]) if t.round_field else np.maximum(np.abs(world[0]), np.abs(world[1]))
     seen = canvas.soft(across - t.field / 2) * canvas.soft(np.maximum(t.scan[0] - world[2], world[2] - t.scan[1]))
     canvas.hu = np.maximum(AIR + seen * (canvas.hu - AIR), AIR).astype(np.float32)

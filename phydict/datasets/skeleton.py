@@ -30,7 +30,8 @@ def _sternum_point(thorax: Thorax, below_apex: float) -> np.ndarray:
 def _sternum(thorax: Thorax) -> Tubes:
     levels = np.linspace(36, 36 + 0.68 * thorax.height, 8)
     points = np.stack([_sternum_point(thorax, level) for level in levels])
-    return Tubes.chain(points, [22, 24, 17, 17, 18, 18, 14, 6], 0.32, hu=430, core_hu=thorax.bone * 0.6, core=0.55)
+    return Tubes.chain(points, [22, 24, 17, 17, 18, 18, 14, 6], 0.32, hu=0.6 * thorax.cortex,
+                       core_hu=thorax.bone * 0.6, core=0.65)
 
 
 def _rib(thorax: Thorax, number: int, side: float) -> list[Tubes]:
@@ -45,7 +46,7 @@ def _rib(thorax: Thorax, number: int, side: float) -> list[Tubes]:
     back = thorax.spine_y(head)
     start = np.array([[thorax.spine * 0.8, back - 12, head], [thorax.spine + 20, back - 25, head - 2]])
     points = np.concatenate([start, np.stack([x, y, z], 1)]) * [side, 1, 1]
-    parts = [Tubes.chain(points, 5.6, 0.58, hu=800, core_hu=thorax.bone, core=0.52)]
+    parts = [Tubes.chain(points, 5.2, 0.55, hu=thorax.cortex, core_hu=thorax.bone, core=0.55)]
     if number < 7:
         front = _sternum_point(thorax, 44 + 0.083 * thorax.height * number) + [side * 16, -2, 0]
         middle = (points[-1] + front) / 2 + [side * 6, 4, -6 - number]
@@ -57,13 +58,13 @@ def _shoulder(thorax: Thorax, side: float) -> list[Tubes]:
     top = 0.5 * thorax.height
     mirror = np.array([side, 1, 1])
     outer = thorax.width + thorax.wall + 10
-    joint = np.array([outer + 8, -14, top - 22])
+    joint = np.array([outer + 6, -20, top + 14])
     front = _sternum_point(thorax, 34)
-    clavicle = np.array([[20, front[1], front[2]], [55, front[1] - 4, top - 14], [95, -12, top - 4],
-                         [outer, -22, top + 2]])
-    parts = [Tubes.chain(clavicle * mirror, [8, 6, 5.5, 6], hu=650, core_hu=thorax.bone, core=0.35)]
+    clavicle = np.array([[20, front[1], front[2]], [55, front[1] - 6, top - 6], [95, -16, top + 10],
+                         [outer - 8, -26, top + 26]])
+    parts = [Tubes.chain(clavicle * mirror, [8, 6, 5.5, 6], hu=thorax.cortex, core_hu=thorax.bone, core=0.35)]
     for share in np.linspace(0, 1, 12):
-        z = top - 18 - 125 * share
+        z = top + 8 - 138 * share
         width, depth, centre = thorax.cage_axes(z)
         medial = 68 + 14 * share
         lateral = (outer - 6) * (1 - share) + (medial + 16) * share
@@ -71,13 +72,15 @@ def _shoulder(thorax: Thorax, side: float) -> list[Tubes]:
         y = centre - (depth + 15) * reach
         ends = np.array([[medial, y[0], z], [(medial + lateral) / 2, y.mean() - 5, z],
                          [lateral, y[1] + 4 * (1 - share), z]])
-        parts.append(Tubes.chain(ends * mirror, [6.5, 6.5, 7.5], [0.4, 0.7], hu=480, core_hu=thorax.bone, core=0.3))
-    ridge = np.array([[74, -0.95 * thorax.depth - 22, top - 48], [105, -0.75 * thorax.depth - 18, top - 30],
-                      [outer + 6, -34, top + 2]])
-    parts.append(Tubes.chain(ridge * mirror, 6, 0.7, hu=480, core_hu=thorax.bone, core=0.3))
-    parts.append(Tubes.of((joint - [0, 0, 20]) * mirror, (joint + [0, 0, 20]) * mirror, 21, hu=420,
+        parts.append(Tubes.chain(ends * mirror, [7, 7, 8], [0.3, 0.6], hu=0.8 * thorax.cortex,
+                                 core_hu=thorax.bone, core=0.4))
+    ridge = np.array([[74, -0.95 * thorax.depth - 22, top - 48], [105, -0.75 * thorax.depth - 18, top - 16],
+                      [outer + 4, -40, top + 30]])
+    parts.append(Tubes.chain(ridge * mirror, 6, 0.7, hu=0.8 * thorax.cortex, core_hu=thorax.bone, core=0.3))
+    parts.append(Tubes.of((joint - [0, 0, 20]) * mirror, (joint + [0, 0, 20]) * mirror, 21, hu=0.7 * thorax.cortex,
                           core_hu=thorax.bone, core=0.75))
-    parts.append(Tubes.of((joint + [0, 0, 12]) * mirror, arm_end(thorax) * mirror, 12, hu=1000, core_hu=40, core=0.35))
+    parts.append(Tubes.of((joint + [0, 0, 12]) * mirror, arm_end(thorax) * mirror, 12, hu=1.1 * thorax.cortex,
+                          core_hu=40, core=0.4))
     return parts
 
 
@@ -95,11 +98,12 @@ def _arches(thorax: Thorax) -> list[Tubes]:
         return np.stack([np.full(z.shape, float(x)), y - behind, z - lower], 1)
 
     rear = 0.8 * wide
-    parts = [Tubes.of(at(0, rear + 19), at(0, rear + 38, 16), 7, 4, 0.5, 480, thorax.bone, 0.3)]
+    parts = [Tubes.of(at(0, rear + 19), at(0, rear + 36, 18), 7, 4, 0.5, 0.75 * thorax.cortex, thorax.bone, 0.35)]
     for side in (1, -1):
-        parts.append(Tubes.of(at(11 * side, rear - 3), at(12 * side, rear + 9), 5, hu=450,
+        parts.append(Tubes.of(at(11 * side, rear - 3), at(12 * side, rear + 9), 5, hu=0.7 * thorax.cortex,
                               core_hu=thorax.bone, core=0.4))
-        parts.append(Tubes.of(at(12 * side, rear + 9), at(1 * side, rear + 20), 7, flat=0.5, hu=480,
+        parts.append(Tubes.of(at(12 * side, rear + 9), at(1 * side, rear + 20), 7, flat=0.5, hu=0.8 * thorax.cortex,
                               core_hu=thorax.bone, core=0.3))
-        parts.append(Tubes.of(at(12 * side, rear + 9), at(34 * side, rear + 17), 6, 4.5, 0.75, 450, thorax.bone, 0.4))
+        parts.append(Tubes.of(at(12 * side, rear + 9), at(34 * side, rear + 17), 6, 4.5, 0.75, 0.7 * thorax.cortex,
+                              thorax.bone, 0.4))
     return parts

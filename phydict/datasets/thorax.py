@@ -17,10 +17,10 @@ from phydict.datasets.findings import Finding, draw_findings, write_report
 
 LEVELS = np.array([-0.8, 0.0, 0.2, 0.4, 0.6, 0.75, 0.86, 0.95, 1.0, 1.3])
 CAGE_WIDTH = PchipInterpolator(LEVELS, [0.95, 1.0, 1.0, 0.98, 0.93, 0.86, 0.76, 0.62, 0.53, 0.44])
-CAGE_DEPTH = PchipInterpolator(LEVELS, [0.97, 1.0, 1.0, 0.98, 0.94, 0.88, 0.79, 0.68, 0.60, 0.52])
+CAGE_DEPTH = PchipInterpolator(LEVELS, [0.97, 1.0, 1.0, 0.975, 0.91, 0.81, 0.74, 0.67, 0.61, 0.52])
 MEDIASTINUM_LEVEL = PchipInterpolator([-1, 0.0, 0.4, 0.6, 0.8, 1.0, 1.5], [0.8, 0.8, 0.85, 1.0, 0.95, 1.05, 1.1])
 MEDIASTINUM_DEPTH = PchipInterpolator([-2, -0.9, -0.45, -0.1, 0.35, 0.7, 1.0, 2], [21, 21, 27, 31, 27, 14, 7, 7])
-SHOULDER = PchipInterpolator([-0.8, 0.0, 0.5, 0.75, 0.9, 1.2], [0.0, 0.0, 5.0, 15.0, 20.0, 20.0])
+SHOULDER = PchipInterpolator([-0.8, 0.0, 0.5, 0.75, 0.9, 1.2], [-2.0, 0.0, 6.0, 10.0, 13.0, 13.0])
 SIDES = {"right": 1.0, "left": -1.0}
 
 
@@ -30,11 +30,14 @@ class Thorax:
 
     width, depth, height: half-width, half-depth and full height of the lung cavity in mm.
     wall, back, fat: mm of chest wall at the sides, extra muscle at the back, subcutaneous fat.
+    kyphosis: mm by which the spine bends forwards from its hindmost level to the apices.
     dome: height in mm of the left diaphragm dome over the deepest recess; dome_step: how much higher the right one is.
     heart: cardiothoracic ratio without cardiomegaly. parenchyma, gravity: HU of aerated lung, its gradient to the back.
-    blood: HU of (right heart and pulmonary arteries, left heart and aorta). noise: standard deviation in HU.
+    blood: HU of (right heart and pulmonary arteries, left heart and aorta), cava: HU of the superior vena cava.
+    noise: standard deviation in HU of voxels of 1.5 mm.
+    marbling: how much fat lies between the muscles, muscle_hu: HU of muscle without it.
     scan: (low, high) world z in mm of the scanned range, field: diameter in mm of the reconstructed field of view,
-    both -1000 HU outside. table: gap in mm between back and table, None without one.
+    both -1000 HU outside. table: mm of (mattress under the back, table under it), None without a table.
     """
 
     seed: int
@@ -45,6 +48,8 @@ class Thorax:
     wall: float
     back: float
     fat: float
+    marbling: float
+    muscle_hu: float
     dome: float
     dome_step: float
     heart: float
@@ -54,6 +59,7 @@ class Thorax:
     spine: float
     vertebra: float
     rib_slope: float
+    kyphosis: float
     aorta: float
     trachea: float
     parenchyma: float
@@ -61,9 +67,10 @@ class Thorax:
     bone: float
     contrast: bool
     blood: tuple[float, float]
+    cava: float
     liver_hu: float
     gas: float
-    table: float | None
+    table: tuple[float, float] | None
     round_field: bool
     field: float
     scan: tuple[float, float]
@@ -78,35 +85,37 @@ class Thorax:
         rng = np.random.default_rng([seed, 1])
         uniform = rng.uniform
         size = uniform(0.93, 1.06)
-        height = size * uniform(245, 292)
+        height = size * uniform(236, 282)
         offset = tuple(float(v) for v in uniform(-15, 15, 3))
-        contrast = bool(rng.random() < 0.4)
+        contrast = bool(rng.random() < 0.6)
         blood = (uniform(110, 300), uniform(120, 260)) if contrast else (uniform(35, 50),) * 2
         apex, base = offset[2] + height / 2, offset[2] - height / 2
-        whole = rng.random() < 0.2
-        scan = (-400.0, 400.0) if whole else (base - uniform(12, 75), apex + uniform(8, 45))
+        whole = rng.random() < 0.08
+        scan = (-400.0, 400.0) if whole else (base - uniform(8, 95), apex + uniform(5, 38))
         return cls(
-            seed=seed, offset=offset, width=size * uniform(122, 142), depth=size * uniform(80, 98), height=height,
-            wall=uniform(12, 22), back=uniform(12, 20), fat=float(np.clip(rng.gamma(4.0, 4.0), 4, 38)),
-            dome=uniform(48, 72), dome_step=uniform(4, 20), heart=uniform(0.42, 0.49), heart_turn=uniform(0.45, 0.8),
+            seed=seed, offset=offset, width=size * uniform(126, 146), depth=size * uniform(88, 105), height=height,
+            wall=uniform(9, 17), back=uniform(6, 13), fat=float(np.clip(rng.gamma(5.0, 4.2), 6, 44)),
+            marbling=uniform(0.4, 1.2), muscle_hu=uniform(42, 68) + (8 if contrast else 0),
+            dome=uniform(42, 66), dome_step=uniform(4, 20), heart=uniform(0.42, 0.49), heart_turn=uniform(0.45, 0.8),
             breast=uniform(0.6, 1.3) if rng.random() < 0.4 else 0.0, arm_width=uniform(36, 46),
-            spine=uniform(15.5, 19.0), vertebra=size * uniform(21, 25), rib_slope=uniform(0.75, 1.2),
-            aorta=uniform(11.5, 16.0), trachea=uniform(7.5, 10.0), parenchyma=uniform(-890, -818),
-            gravity=uniform(15, 45), bone=uniform(120, 230), contrast=contrast,
-            blood=tuple(float(v) for v in blood), liver_hu=uniform(45, 65) + (45 if contrast else 0),
-            gas=uniform(0.0, 1.0), table=uniform(3, 14) if rng.random() < 0.6 else None,
-            round_field=bool(rng.random() < 0.35), field=uniform(345, 470), scan=scan, noise=uniform(5, 25),
+            spine=uniform(15.5, 19.0), vertebra=size * uniform(21, 25), rib_slope=uniform(0.95, 1.45),
+            kyphosis=uniform(8, 28), aorta=uniform(11.5, 16.0), trachea=uniform(6.5, 8.8),
+            parenchyma=uniform(-905, -812), gravity=uniform(15, 45), bone=uniform(120, 230), contrast=contrast,
+            blood=tuple(float(v) for v in blood), cava=float(blood[0] * (uniform(1.0, 3.0) if contrast else 1.0)),
+            liver_hu=uniform(45, 65) + (45 if contrast else 0), gas=uniform(0.0, 1.0),
+            table=(uniform(3, 22), uniform(15, 90)) if rng.random() < 0.9 else None,
+            round_field=bool(rng.random() < 0.85), field=uniform(320, 470), scan=scan, noise=uniform(8, 32),
             findings=draw_findings(np.random.default_rng([seed, 2])))
 
     @classmethod
     def standard(cls) -> Thorax:
         """The thorax of average size, healthy, without contrast agent, noise or table, scanned as a whole."""
         return cls(
-            seed=0, offset=(0.0, 0.0, 0.0), width=132.0, depth=89.0, height=268.0, wall=17.0, back=16.0, fat=16.0,
-            dome=60.0, dome_step=12.0, heart=0.455, heart_turn=0.62, breast=0.0, arm_width=41.0, spine=17.2,
-            vertebra=23.0, rib_slope=1.0, aorta=13.8, trachea=8.8, parenchyma=-854.0, gravity=30.0, bone=175.0,
-            contrast=False, blood=(42.0, 42.0), liver_hu=55.0, gas=0.5, table=None, round_field=False, field=800.0,
-            scan=(-400.0, 400.0), noise=0.0)
+            seed=0, offset=(0.0, 0.0, 0.0), width=136.0, depth=96.0, height=259.0, wall=13.0, back=9.0, fat=20.0,
+            marbling=0.7, muscle_hu=55.0, dome=54.0, dome_step=12.0, heart=0.455, heart_turn=0.62, breast=0.0,
+            arm_width=41.0, spine=17.2, vertebra=23.0, rib_slope=1.2, kyphosis=18.0, aorta=13.8, trachea=8.0,
+            parenchyma=-848.0, gravity=30.0, bone=175.0, contrast=False, blood=(42.0, 42.0), cava=42.0, liver_hu=55.0,
+            gas=0.5, table=None, round_field=False, field=800.0, scan=(-400.0, 400.0), noise=0.0)
 
     def level(self, z):
         """0 at the deepest recess of the lungs, 1 at the apices."""
@@ -121,6 +130,20 @@ class Thorax:
     def horizontal_fissure(self) -> float:
         """z of the fissure under the right upper lobe."""
         return 0.03 * self.height
+
+    @property
+    def cortex(self) -> float:
+        """HU of compact bone."""
+        return 470 + 3.4 * self.bone
+
+    @property
+    def back_plane(self) -> float:
+        """mm behind the centre, in the scanner's y, of the plane on which the patient lies."""
+        return max(self.depth + self.back + 4 + 0.8 * self.fat, self.depth + 28)
+
+    def bend(self, z):
+        """mm by which the body at height z lies further forwards in the scanner than in a straight thorax."""
+        return self.kyphosis * ((np.clip(self.level(z), -0.5, 1.4) - 0.4) / 0.6) ** 2
 
     def cage_axes(self, z):
         """Half-width, half-depth and centre y of the rib cage's inner surface at height z."""
@@ -138,18 +161,20 @@ class Thorax:
         level = np.clip(self.level(z), -0.8, 1.2)
         a = self.width + self.wall + SHOULDER(level)
         b = self.depth + (self.wall + self.back) / 2 + 4
-        lean = 0.30 * b * np.clip(level - 0.45, 0, 1)
-        trunk = superellipse(x, y + (self.back - self.wall) / 2 + 6 + lean * 0.8, a, b - lean, 2.4)
-        top = 0.5 * self.height + 6 - 0.42 * np.maximum(np.abs(x) - 45, 0)
+        lean = 0.26 * b * np.clip(level - 0.38, 0, 1) + 0.22 * b * np.clip(level - 0.55, 0, 1)
+        belly = 8 * np.clip(1 - 3 * level, 0, 1.5)
+        shift = (self.back - self.wall) / 2 + 6 + lean * 0.9 - belly / 2
+        trunk = superellipse(x, y + shift, a, b - lean + belly / 2, 2.4)
+        top = 0.5 * self.height + 16 + 0.2 * np.maximum(np.abs(x) - 45, 0)
         return smooth_max(trunk, (z - top) * 0.92, 12.0)
 
     def diaphragm(self, x, y):
         """Height z of the diaphragm: two domes, the right one higher, falling to the recess at wall and back."""
         x, y = np.broadcast_arrays(x, y)
         side = np.abs(x) / self.width - 0.5
-        drop = 40 * np.clip(2 * side, 0, 1.3) ** 2 + 9 * np.clip(-2 * side, 0, 1) ** 2
+        drop = 38 * np.clip(2 * side, 0, 1.3) ** 1.4 + 9 * np.clip(-2 * side, 0, 1) ** 2
         depth = (y - 6) / self.depth
-        drop = drop + 62 * np.clip(-depth, 0, 1.4) ** 2 + 26 * np.clip(depth, 0, 1.4) ** 2
+        drop = drop + 62 * np.clip(-depth, 0, 1.4) ** 1.3 + 30 * np.clip(depth, 0, 1.4) ** 2
         right = 1 / (1 + np.exp(-np.clip(x / 14, -30, 30)))
         return -0.5 * self.height + self.dome + 12 + self.dome_step * right - drop
 
@@ -165,19 +190,20 @@ class Thorax:
         reach = np.sqrt(((axes * half[:, None]) ** 2).sum(0))
         front = self.cage_axes(-0.15 * self.height)[1]
         bottom = self.diaphragm(-0.25 * self.width, 0.3 * self.depth) - 8 - 70 * max(ratio - 0.45, 0)
-        centre = np.array([-0.30 * reach[0], max(front - reach[1] - 8, -0.9 * self.depth + 52 + reach[1] * 0.62),
-                           bottom + 0.86 * reach[2]])
+        centre = np.array([-0.34 * reach[0], max(front - reach[1] - 8, -0.9 * self.depth + 52 + reach[1] * 0.62),
+                           bottom + 0.78 * reach[2]])
         return centre, axes, half
 
     def spine_y(self, z):
         """y of the vertebral bodies' centres: a gentle kyphosis along the back of the cage."""
-        return -self.depth + 27 + 10 * (self.level(z) - 0.45) ** 2 * 2
+        return -self.depth + 37 + 10 * (self.level(z) - 0.45) ** 2 * 2
 
     def lung(self, side: str, x, y, z):
         """One lung's cavity with the heart of `heart` and the spine cut out; findings do not change it."""
         s = SIDES[side]
         _, b, centre = self.cage_axes(z)
         inner = MEDIASTINUM_LEVEL(np.clip(self.level(z), -1, 1.5)) * MEDIASTINUM_DEPTH(np.clip((y - centre) / b, -2, 2))
+        inner = inner - 3 * s
         floor = self.diaphragm(x, y)
         apex_x, apex_y = s * x - 0.33 * self.width, y + 0.32 * self.depth
         apex = np.sqrt(apex_x**2 + apex_y**2) / 34

@@ -43,7 +43,7 @@ def test_the_standard_thorax_has_its_heart_left_its_liver_right_and_its_spine_be
     soft, bone = (hu > -50).astype(float), (hu > 90).astype(float)
     middle, low = slice(12, 18), slice(4, 8)
     assert soft[4:16, 14:26, middle].sum() > 1.2 * soft[16:28, 14:26, middle].sum()  # index 0 is left
-    assert np.argwhere(bone[12:20, :, middle])[:, 1].mean() < 12
+    assert np.median(np.argwhere(bone[12:20, :, middle])[:, 1]) < 12
     assert hu[18:24, 12:20, low].mean() > hu[8:14, 12:20, low].mean()
 
 

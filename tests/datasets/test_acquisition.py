@@ -1,0 +1,105 @@
+"""Laws of changed scans: contrast agent reaches blood alone, the table goes and the body stays, a field is a circle."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from phydict.datasets.acquisition import LEAST_BLOOD, change_contrast, cut_field, without_table
+from phydict.datasets.augment import Augmentation, augment
+from phydict.datasets.phantom import Thorax, build, phantom_case, without
+from phydict.grid import Grid
+from phydict.units import HUWindow
+
+GRID = Grid.cube(48)
+
+
+def chest(seed: int = 5, **changes) -> tuple[torch.Tensor, torch.Tensor]:
+    """HU (1, 48, 48, 48) and masks of a healthy thorax scanned as a whole, without noise."""
+    thorax = replace(without(Thorax.draw(seed)), noise=0.0, scan=(-400.0, 400.0), field=470.0, **changes)
+    hu, masks = build(thorax, GRID)
+    return torch.from_numpy(hu)[None], torch.from_numpy(masks)
+
+
+def place(x: float, y: float, z: float, reach: float) -> tuple[torch.Tensor, ...]:
+    """Where the voxels within `reach` mm of a point of the world are."""
+    axes = [(torch.arange(48) - 23.5) * 8 - centre for centre in (x, y, z)]
+    return (axes[0][:, None, None] ** 2 + axes[1][:, None] ** 2 + axes[2] ** 2 < reach**2)[None]
+
+
+@pytest.mark.parametrize("amount", [40.0, -40.0])
+def test_contrast_agent_changes_blood_and_spares_lung_fat_and_spine(amount):
+    thorax = replace(without(Thorax.draw(5)), contrast=True, blood=(200.0, 200.0), offset=(0.0, 0.0, 0.0))
+    hu, masks = chest(contrast=True, blood=(200.0, 200.0), offset=(0.0, 0.0, 0.0))
+    change = change_contrast(hu, masks, amount) - hu
+    heart = place(*thorax.heart_ellipsoid(thorax.heart)[0], 18)
+    assert change[heart].mean() == pytest.approx(amount, abs=0.1 * abs(amount))
+    spine = place(0, float(thorax.spine_y(0.0)), 0, 8)
+    lung = (masks[0] > 0.99) & (masks[2] < 0.01) & (hu[0] < -800)
+    assert change[spine].abs().max() < 1 and change[0][lung].abs().max() < 1
+    fat = (hu > -120) & (hu < -80) & (masks[:1] == 0)
+    assert fat.any() and change[fat].abs().max() < 1 and not change[hu < -999].any()
+
+
+def test_blood_without_contrast_agent_is_not_lowered():
+    hu, masks = chest(contrast=False, blood=(42.0, 42.0))
+    change = change_contrast(hu, masks, -60.0) - hu
+    soft = (hu < LEAST_BLOOD) & (masks[2:3] == 0)
+    assert soft.any() and not change[soft].any()
+
+
+def test_without_lungs_there_is_no_blood():
+    hu, masks = chest()
+    assert change_contrast(hu, 0 * masks, 80.0).equal(hu)
+
+
+@pytest.mark.parametrize("seed", [5, 6])
+def test_the_table_goes_and_the_body_stays(seed):
+    with_table, _ = chest(seed, table=(22.0, 40.0))
+    bare, _ = chest(seed, table=None)
+    assert (with_table - bare).abs().max() > 200
+    new = without_table(with_table, GRID)
+    body = bare > -300
+    assert new[body].equal(with_table[body])
+    assert ((new - bare).abs() > 100).sum() < 0.1 * ((with_table - bare).abs() > 100).sum()
+    air = torch.full((1, *GRID.shape), -1000.0)
+    assert without_table(air, GRID).equal(air)
+
+
+def test_a_field_of_view_is_a_circle_of_its_diameter():
+    hu, masks = chest()
+    new, seen = cut_field(hu, masks, GRID, 300.0, (10.0, -20.0))
+    axis = (torch.arange(48) - 23.5) * 8
+    away = torch.hypot(axis[:, None] - 10, axis + 20)[..., None].expand(hu.shape)
+    assert (new[away > 155] == -1000).all() and not seen[:, away[0] > 155].any()
+    assert new[away < 145].equal(hu[away < 145]) and seen[:, away[0] < 145].equal(masks[:, away[0] < 145])
+    area = float((cut_field(0 * hu, masks, GRID, 300.0)[0] + 1000).sum()) / 1000 / 48 * 64
+    assert area == pytest.approx(np.pi * 150**2, rel=0.01)
+
+
+@pytest.mark.parametrize("name", ["table", "field"])
+def test_augmentation_changes_the_scan_of_its_share_of_the_cases(name):
+    case = phantom_case(1, GRID)
+    plain = augment(case, 3, GRID, strength=Augmentation.none())["volume"]
+    never, always = (replace(Augmentation.none(), **{name: share}) for share in (0.0, 1.0))
+    assert augment(case, 3, GRID, strength=never)["volume"].equal(plain)
+    changed = augment(case, 3, GRID, strength=always)["volume"]
+    taken = changed < plain - 1e-6
+    assert taken.any() and not (changed > plain + 1e-6).any(), "both only take away"
+    half = replace(Augmentation.none(), **{name: 0.5})
+    taken = [not augment(case, seed, GRID, strength=half)["volume"].equal(plain) for seed in range(40)]
+    assert 0.2 < np.mean(taken) < 0.8
+
+
+def test_augmentation_of_contrast_stays_within_its_strength():
+    case, strength = phantom_case(1, GRID), replace(Augmentation.none(), contrast=60.0)
+    plain = augment(case, 0, GRID, strength=Augmentation.none())["volume"]
+    largest = []
+    for seed in range(6):
+        change = HUWindow().half_width * (augment(case, seed, GRID, strength=strength)["volume"] - plain)
+        largest.append(float(change.abs().max()))
+        assert largest[-1] <= 60.01
+    assert max(largest) > 15

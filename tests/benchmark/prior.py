@@ -1,11 +1,12 @@
-"""Held-out denoising error of a prior, per noise level: phantoms never trained on, and CTs if a folder is given.
+"""Held-out denoising error of priors, per noise level: phantoms never trained on, and CTs if folders are given.
 
-    python tests/benchmark/prior.py [prior.safetensors] [folder of held-out CTs]
+    python tests/benchmark/prior.py [prior.safetensors ...] [--cts folder of held-out CTs ...]
 
-Writes prior.csv beside this file: RMSE of the CT in HU, one noise draw per case and level.
+Without a prior, the shipped one. Writes prior.csv beside this file: RMSE of the CT in HU, one noise draw per case and
+level, the same for all priors.
 """
 
-import sys
+import argparse
 from pathlib import Path
 from statistics import mean
 
@@ -17,13 +18,17 @@ from phydict.datasets import find_cts, phantom_case, prepare_ct
 from phydict.diffusion import renoise
 from phydict.evaluation import write_csv
 from phydict.methods import DEFAULT_PRIOR
+from phydict.prior import Prior
 from phydict.stage_training import NOISE_LEVELS
 
-if __name__ == "__main__":
-    prior = load_prior(sys.argv[1] if len(sys.argv) > 1 else DEFAULT_PRIOR)
+KINDS = {"phantoms": lambda row: row["case"].startswith("phantom"),
+         "CTs": lambda row: not row["case"].startswith("phantom")}
+
+
+def errors(name: str, prior: Prior, cts: list) -> list[dict]:
+    """One row for each held-out case and noise level."""
     cases = [phantom_case(HELD_OUT_PHANTOM + i, prior.grid, prior.window) for i in range(6)]
-    if len(sys.argv) > 2:
-        cases += [prepare_ct(ct.path, prior.grid, prior.window, id=ct.id) for ct in find_cts(sys.argv[2])]
+    cases += [prepare_ct(ct.path, prior.grid, prior.window, id=ct.id) for ct in cts]
     rows = []
     for i, case in enumerate(cases):
         x0 = torch.cat([case["volume"], 2 * case["masks"] - 1])[None]
@@ -32,13 +37,30 @@ if __name__ == "__main__":
         for t in NOISE_LEVELS:
             error = denoiser.denoise(renoise(prior.schedule, x0, t, noise), t) - x0
             rmse, sigma = float(error[:, 0].square().mean().sqrt()), float(prior.schedule.sigma(t))
-            rows.append({"case": case["id"], "t": t, "sigma_hu": sigma * prior.window.half_width,
+            rows.append({"prior": name, "case": case["id"], "t": t, "sigma_hu": sigma * prior.window.half_width,
                          "rmse_hu": rmse * prior.window.half_width})
+    return rows
+
+
+def table(rows: list[dict]) -> str:
+    """Mean errors in Markdown, a row for each prior and kind of case."""
+    lines = ["| prior | cases | " + " | ".join(f"t = {t}" for t in NOISE_LEVELS) + " |",
+             "|---|---|" + "---:|" * len(NOISE_LEVELS)]
+    for name in dict.fromkeys(row["prior"] for row in rows):
+        for kind, belongs in KINDS.items():
+            own = [row for row in rows if row["prior"] == name and belongs(row)]
+            if own:
+                lines.append(f"| {name} | {kind} | " + " | ".join(
+                    f"{mean(row['rmse_hu'] for row in own if row['t'] == t):.0f}" for t in NOISE_LEVELS) + " |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("priors", nargs="*", type=Path, default=[DEFAULT_PRIOR])
+    parser.add_argument("--cts", nargs="*", default=[])
+    given = parser.parse_args()
+    held_out = [ct for folder in given.cts for ct in find_cts(folder)]
+    rows = [row for file in given.priors for row in errors(file.stem, load_prior(file), held_out)]
     write_csv(Path(__file__).with_suffix(".csv"), rows)
-    kinds = {"phantoms": [r for r in rows if r["case"].startswith("phantom")],
-             "CTs": [r for r in rows if not r["case"].startswith("phantom")]}
-    print("| t | noise (HU) | " + " | ".join(f"{k} (HU)" for k, own in kinds.items() if own) + " |")
-    for t in NOISE_LEVELS:
-        level = [[r for r in own if r["t"] == t] for own in kinds.values() if own]
-        print(f"| {t} | {level[0][0]['sigma_hu']:.0f} | "
-              + " | ".join(f"{mean(r['rmse_hu'] for r in own):.0f}" for own in level) + " |")
+    print(table(rows))

@@ -15,7 +15,7 @@ from phydict.datamodule import PriorData
 from phydict.diffusion import Denoiser
 from phydict.evaluation import method_panel
 from phydict.grid import Grid
-from phydict.prior import Prior, TextEncoder, VolumeUNet, describe, learn_vocabulary, load_prior
+from phydict.prior import DetailNetwork, Prior, TextEncoder, VolumeUNet, describe, learn_vocabulary, load_prior
 from phydict.prior.report_training import learn_findings, learn_sketch
 from phydict.prior.sharding import shard
 from phydict.stage_training import StageTraining
@@ -32,6 +32,7 @@ class PriorTraining(StageTraining):
         text_length: tokens of a report that a frozen text reads
         text_padded_to: 2048, with text_length 192, for contexts as MedSyn's; none given: padding is hidden
         reports: texts that the small BERT's vocabulary is learnt from (taken from the data)
+        detail: the network for what the UNet's blocks of voxels cannot hold; none given: the default DetailNetwork
         voxels: voxels along each side of the cube
         side: side of the cube in mm
         window: HU that the prior's range [-1, 1] stands for
@@ -49,14 +50,15 @@ class PriorTraining(StageTraining):
         gradient_checkpointing: less memory for a second computation of each block's activations
         channels_last: lay the network's channels side by side in memory
         compile: run the network through torch.compile
-        initial: a prior's file to go on from, which then decides network and text
+        initial: a prior's file to go on from, which then decides the networks and the text; one without a detail
+            network is given this training's
         seed: of times, noise and text dropout
     """
 
     def __init__(self, network: VolumeUNet | None = None, text: str = "small", text_length: int = 128,
                  text_padded_to: int | None = None, reports: list[str] | None = None,
-                 voxels: int = 64, side: float = 384.0, window: tuple[float, float] = (-1000.0, 1000.0),
-                 sigma_data: float = 0.5, text_dropout: float = 0.1, mask_weight: float = 0.1,
+                 detail: DetailNetwork | None = None, voxels: int = 64, side: float = 384.0,
+                 window: tuple[float, float] = (-1000.0, 1000.0), sigma_data: float = 0.5, text_dropout: float = 0.1, mask_weight: float = 0.1,
                  learning_rate: float = 5e-4, weight_decay: float = 0.01, warmup: int = 100, decay_from: int = 0,
                  decay_steps: int = 0, text_steps: int = 600, montage_steps: int = 16,
                  gradient_checkpointing: bool = False, channels_last: bool = True, compile: bool = False,
@@ -69,7 +71,8 @@ class PriorTraining(StageTraining):
             encoder = TextEncoder.small(learn_vocabulary(reports), network.context_dim)
         elif text != "none":
             encoder = TextEncoder.pretrained(text, text_length, text_padded_to)
-        prior = Prior(network, Grid.cube(voxels, side), HUWindow(*window), encoder, sigma_data=sigma_data)
+        prior = Prior(network, Grid.cube(voxels, side), HUWindow(*window), encoder, sigma_data=sigma_data,
+                      detail=detail or DetailNetwork(network.state_channels))
         super().__init__(prior, sigma_data, learning_rate, weight_decay, warmup, decay_from, decay_steps, montage_steps,
                          seed, mask_weight)
         if initial:
@@ -89,6 +92,7 @@ class PriorTraining(StageTraining):
         if prior.load_text is not None:
             prior.text = prior.load_text()
             prior.text.trainable = prior.text.source is None
+        prior.detail = prior.detail or self.prior.detail
         self.prior = prior.train().requires_grad_(True)
         if prior.text is not None:
             prior.text.requires_grad_(prior.text.trainable)

@@ -14,6 +14,7 @@ from phydict.atomic import whole_file
 from phydict.checksum import file_crc32
 from phydict.diffusion import CosineSchedule
 from phydict.grid import Grid
+from phydict.prior.detail import DetailNetwork
 from phydict.prior.local_unet import LocalUNet
 from phydict.prior.medsyn import MedSynPrior, MedSynSuperResolution
 from phydict.prior.pretrained import MedSynCheckpoint, is_medsyn, load_medsyn, load_medsyn_super_resolution
@@ -69,7 +70,8 @@ def describe(prior: Prior) -> dict:
     return {"format": FORMAT, "stage": "base", "grid": prior.grid.to_dict(),
             "hu_window": [prior.window.low, prior.window.high], "state": STATE[:prior.network.state_channels],
             "sigma_data": prior.sigma_data, "skip_std": prior.skip_std, "schedule": vars(prior.schedule),
-            "network": prior.network.settings, "text": text}
+            "network": prior.network.settings, "text": text,
+            **({"detail": prior.detail.settings} if prior.detail else {})}  # which older files do not name
 
 
 def describe_super_resolution(fine: SuperResolution) -> dict:
@@ -154,7 +156,8 @@ def build_prior(header: dict, weights: dict[str, Tensor]) -> Prior:
     try:
         prior = Prior(VolumeUNet(**header["network"]), Grid(**header["grid"]), HUWindow(*header["hu_window"]),
                       schedule=CosineSchedule(**header["schedule"]), sigma_data=header["sigma_data"],
-                      skip_std=header["skip_std"])
+                      skip_std=header["skip_std"],
+                      detail=DetailNetwork(**header["detail"]) if "detail" in header else None)
         prior.load_state_dict({k: w.float() for k, w in weights.items() if not k.startswith("text.")})
     except (KeyError, TypeError, RuntimeError) as error:
         raise ValueError(f"the weights are not those of the network that the header describes ({error})") from error

@@ -10,12 +10,17 @@ from torch import Tensor, nn
 
 from phydict.diffusion import CosineSchedule, guided
 from phydict.grid import Grid
+from phydict.prior.detail import DetailNetwork
 from phydict.prior.text import TextEncoder
 from phydict.prior.unet import VolumeUNet
 from phydict.units import HUWindow
 
 STATE = ("ct", "lung", "airway", "vessel")
 """The channels of the state: the CT volume, then soft anatomy masks mapped to [-1, 1]."""
+
+
+DETAIL_REACH = 8.0
+"""Noise, over the size of the detail, beyond which a detail network is not asked."""
 
 
 class Prior(nn.Module):
@@ -26,21 +31,26 @@ class Prior(nn.Module):
     skip_std^2). (With Karras et al.'s larger skip, arXiv:2206.00364, F would have to carry the noise voxel by voxel
     through its narrow top level, and removes none of it.)
 
-    network: F; text: the report encoder, None for a prior without text, or a function that loads it when the first
-    report arrives; grid, window: where and in which HU range the volumes live; sigma_data: standard deviation of
-    the state; skip_std: see above.
+    A detail network D works on single voxels where F works on blocks: to x0 it adds
+    c D((x_t / a - b) / sqrt(sigma^2 + skip_std^2), b, t) with b = sigma_data F and c = sigma skip_std / sqrt(sigma^2 +
+    skip_std^2), Karras et al.'s preconditioning of what b lacks, whose expected size is skip_std. It is left out where
+    sigma > DETAIL_REACH skip_std and the noise hides all detail.
+
+    network: F; detail: D, None for a prior without; text: the report encoder, None for a prior without text, or a
+    function that loads it when the first report arrives; grid, window: where and in which HU range the volumes live;
+    sigma_data: standard deviation of the state; skip_std: see above.
     """
 
     def __init__(self, network: VolumeUNet, grid: Grid, window: HUWindow, text: TextEncoder | None = None,
                  schedule: CosineSchedule = CosineSchedule(), sigma_data: float = 0.5, skip_std: float = 0.1,
-                 load_text: Callable[[], TextEncoder] | None = None):
+                 load_text: Callable[[], TextEncoder] | None = None, detail: DetailNetwork | None = None):
         super().__init__()
         if any(n % network.divisor for n in grid.shape):
             raise ValueError(f"this network needs sizes divisible by {network.divisor}, but the grid is {grid.shape}")
         if text is not None and text.width != network.context_dim:
             raise ValueError(f"this text encoder's tokens have width {text.width}, but the network's context_dim is "
                              f"{network.context_dim}: build the network with context_dim {text.width}")
-        self.network, self.text, self.load_text = network, text, load_text
+        self.network, self.detail, self.text, self.load_text = network, detail, text, load_text
         self.grid, self.window, self.schedule, self.sigma_data = grid, window, schedule, sigma_data
         self.skip_std = skip_std
         self.null = nn.Parameter(0.02 * torch.randn(1, 1, network.context_dim))
@@ -70,7 +80,24 @@ class Prior(nn.Module):
         a, s = (w.to(x.dtype).view(-1, 1, 1, 1, 1) for w in self.schedule.scales(t.double()))
         share, out = self.preconditioning(t)
         inward = (s**2 + (a * self.sigma_data) ** 2).rsqrt()
-        return share * x / a + out * self.network(inward * x, t, context).to(x.dtype)
+        answer = self.network(inward * x, t, context).to(x.dtype)
+        found = share * x / a + out * answer
+        if self.detail is None:
+            return found
+        estimate = self.sigma_data * answer
+        return found + self._detail(x / a - estimate, estimate, t)
+
+    def _detail(self, difference: Tensor, estimate: Tensor, t: Tensor) -> Tensor | float:
+        """What the detail network adds. In training it is always run, so that every process does the same."""
+        sigma = self.schedule.sigma(t.double()).to(difference.dtype)
+        reached = sigma <= DETAIL_REACH * self.skip_std
+        if not reached.any() and not self.training:
+            return 0.0
+        asked = reached if reached.any() else torch.arange(len(t), device=t.device) == 0
+        size = (sigma**2 + self.skip_std**2).sqrt()
+        inward, out = (w[asked].view(-1, 1, 1, 1, 1) for w in (1 / size, reached * sigma * self.skip_std / size))
+        added = out * self.detail(inward * difference[asked], estimate[asked], t[asked].to(difference.dtype)).to(out)
+        return torch.zeros_like(estimate).index_put((asked,), added)
 
     def network_inputs(self, shape: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
         """Zeros on the default device, laid out as what the network is given for one state of `shape` voxels."""

@@ -17,7 +17,7 @@ X = random_like((1, 4, 16, 16, 16), torch.float32, seed=1)
 
 
 def estimates(prior):
-    return [prior.bind(report, 2.0, bf16=False).denoise(X, 0.5) for report in ("", REPORTS[0])]
+    return [prior.bind(report, 2.0, bf16=False).denoise(X, 0.3) for report in ("", REPORTS[0])]
 
 
 @pytest.fixture
@@ -31,9 +31,11 @@ def test_a_loaded_prior_denoises_like_the_saved_one_to_half_precision(file):
         assert (found - expected).square().mean().sqrt() < 3e-3 * expected.std()
 
 
-def test_saved_in_full_precision_nothing_changes(tmp_path):
-    save_prior(tiny_prior(), tmp_path / "full.safetensors", dtype=torch.float32)
-    for found, expected in zip(estimates(load_prior(tmp_path / "full.safetensors")), estimates(tiny_prior())):
+@pytest.mark.parametrize("detail", [False, True], ids=["blocks alone", "with detail"])
+def test_saved_in_full_precision_nothing_changes(tmp_path, detail):
+    saved = tiny_prior(detail=detail)
+    save_prior(saved, tmp_path / "full.safetensors", dtype=torch.float32)
+    for found, expected in zip(estimates(load_prior(tmp_path / "full.safetensors")), estimates(saved)):
         assert torch.equal(found, expected)
 
 

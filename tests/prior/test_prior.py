@@ -6,7 +6,7 @@ from laws import random_like
 
 from phydict.diffusion import GaussianDenoiser
 from phydict.grid import Grid
-from phydict.prior import Prior, VolumeUNet
+from phydict.prior import DetailNetwork, Prior, VolumeUNet
 from phydict.units import HUWindow
 from prior.tiny import REPORTS, tiny_prior
 
@@ -14,19 +14,51 @@ SHAPE = (1, 4, 16, 16, 16)
 X = random_like(SHAPE, seed=1)
 
 
-@pytest.fixture(scope="module")
-def prior():
-    return tiny_prior().double()
+@pytest.fixture(scope="module", params=[False, True], ids=["blocks alone", "with detail"])
+def prior(request):
+    return tiny_prior(detail=request.param).double()
 
 
-def untrained():
-    return Prior(VolumeUNet(4, 2, (8, 8), (False, True), 1, 8, 16), Grid.cube(16), HUWindow(), sigma_data=0.4).double()
+def untrained(detail=None):
+    return Prior(VolumeUNet(4, 2, (8, 8), (False, True), 1, 8, 16), Grid.cube(16), HUWindow(), sigma_data=0.4,
+                 detail=detail).double()
 
 
+@pytest.mark.parametrize("detail", [None, DetailNetwork()], ids=["blocks alone", "with detail"])
 @pytest.mark.parametrize("t", [0.0, 0.2, 0.6, 1.0])
-def test_an_untrained_prior_is_the_exact_denoiser_of_gaussian_detail_of_its_skip_std(t):
+def test_an_untrained_prior_is_the_exact_denoiser_of_gaussian_detail_of_its_skip_std(t, detail):
     expected = GaussianDenoiser(torch.zeros(()).double(), torch.tensor(0.1**2).double()).denoise(X, t)
-    torch.testing.assert_close(untrained().bind().denoise(X, t), expected, atol=1e-6, rtol=1e-6)
+    torch.testing.assert_close(untrained(detail).bind().denoise(X, t), expected, atol=1e-6, rtol=1e-6)
+
+
+@pytest.mark.parametrize("t", [0.05, 0.2])
+def test_detail_is_added_where_it_can_be_seen_and_stays_of_its_size(t):
+    told, silent = tiny_prior(detail=True).double(), tiny_prior(detail=True).double()
+    torch.nn.init.zeros_(silent.detail.leave.weight)
+    torch.nn.init.zeros_(silent.detail.leave.bias)
+    sigma = float(told.schedule.sigma(torch.tensor(t).double()))
+    size = sigma * told.skip_std / (sigma**2 + told.skip_std**2) ** 0.5
+    answers = []
+    told.detail.register_forward_hook(lambda *call: answers.append(call[2]))
+    added = told.bind().denoise(X, t) - silent.bind().denoise(X, t)
+    torch.testing.assert_close(added, size * answers[0])
+    assert answers[0].abs().mean() > 0.01
+
+
+def test_a_detail_network_is_not_asked_where_noise_hides_all_detail():
+    prior, asked = tiny_prior(detail=True), []
+    prior.detail.register_forward_hook(lambda *call: asked.append(call[1][2]))
+    for t in (0.1, 0.3, 0.6, 1.0):
+        prior.bind().denoise(X.float(), t)
+    assert torch.cat(asked).tolist() == pytest.approx([0.1, 0.3])
+
+
+def test_in_training_a_detail_network_is_asked_at_any_noise_and_adds_nothing_beyond_its_reach():
+    prior, asked = tiny_prior(detail=True), []
+    still = prior.bind().denoise(X.float(), 0.8)
+    prior.detail.register_forward_hook(lambda *call: asked.append(call[2]))
+    torch.testing.assert_close(prior.train().bind().denoise(X.float(), 0.8), still)
+    assert asked[0].abs().mean() > 0.01
 
 
 def test_without_noise_the_state_is_returned_whatever_the_network_says(prior):

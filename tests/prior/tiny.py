@@ -9,22 +9,25 @@ import torch
 from transformers import BertConfig, BertForMaskedLM
 
 from phydict.grid import Grid
-from phydict.prior import LocalUNet, Prior, SuperResolution, TextEncoder, VolumeUNet, learn_vocabulary
+from phydict.prior import DetailNetwork, LocalUNet, Prior, SuperResolution, TextEncoder, VolumeUNet, learn_vocabulary
 from phydict.units import HUWindow
 
 REPORTS = ["Small nodule in the left upper lobe.", "No focal consolidation; cardiomegaly.",
            "Pleural effusion (right), 12 mm."]
 
 
-def tiny_prior(text: bool = True, voxels: int = 16, seed: int = 0) -> Prior:
+def tiny_prior(text: bool = True, voxels: int = 16, seed: int = 0, detail: bool = False) -> Prior:
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         network = VolumeUNet(4, 2, (16, 16), (False, True), 1, 8, 16)
         for weight in network.parameters():  # layers that start at zero would let nothing show
             if weight.ndim > 1 and not weight.any():
                 torch.nn.init.normal_(weight, std=0.3)
+        details = DetailNetwork(4, 8, 1) if detail else None
+        if detail:
+            torch.nn.init.normal_(details.leave.weight, std=0.05)
         encoder = TextEncoder.small(learn_vocabulary(REPORTS), 16, 1, 24) if text else None
-        prior = Prior(network, Grid.cube(voxels), HUWindow(-1000, 600), encoder)
+        prior = Prior(network, Grid.cube(voxels), HUWindow(-1000, 600), encoder, detail=details)
         torch.nn.init.normal_(prior.null)
     return prior.eval().requires_grad_(False)
 

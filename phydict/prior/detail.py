@@ -1,0 +1,41 @@
+"""The network that adds to a prior's estimate what its blocks of voxels cannot hold."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import silu
+
+FREQUENCIES = 8
+
+
+class DetailNetwork(nn.Module):
+    """A few convolutions over single voxels, scaled and shifted by what they are told of the time.
+
+    state_channels: channels of the state. width: channels between the convolutions. layers: convolutions between the
+    first and the last. Untrained it answers with zeros.
+    """
+
+    def __init__(self, state_channels: int = 4, width: int = 16, layers: int = 2):
+        super().__init__()
+        self.settings = {"state_channels": state_channels, "width": width, "layers": layers}
+        self.enter = nn.Conv3d(2 * state_channels, width, 3, padding=1)
+        self.middle = nn.ModuleList(nn.Conv3d(width, width, 3, padding=1) for _ in range(layers))
+        self.leave = nn.Conv3d(width, state_channels, 3, padding=1)
+        self.time = nn.Sequential(nn.Linear(2 * FREQUENCIES, 64), nn.SiLU(), nn.Linear(64, 2 * width * (layers + 1)))
+        nn.init.zeros_(self.leave.weight)
+        nn.init.zeros_(self.leave.bias)
+        self.to(memory_format=torch.channels_last_3d)
+
+    def forward(self, difference: Tensor, estimate: Tensor, t: Tensor) -> Tensor:
+        """Difference of state and estimate, and the estimate (B, C, X, Y, Z), at times t (B,) -> (B, C, X, Y, Z)."""
+        phase = math.pi * t[:, None] * torch.arange(1, FREQUENCIES + 1, device=t.device).to(t)
+        told = self.time(torch.cat([phase.sin(), phase.cos()], 1).to(difference.dtype))
+        scales, shifts = told[..., None, None, None].unflatten(1, (len(self.middle) + 1, 2, -1)).unbind(2)
+        h = torch.cat([difference, 2 * estimate], 1).contiguous(memory_format=torch.channels_last_3d)
+        h = silu(self.enter(h) * (1 + scales[:, 0]) + shifts[:, 0])
+        for i, layer in enumerate(self.middle, 1):
+            h = h + silu(layer(h) * (1 + scales[:, i]) + shifts[:, i])
+        return self.leave(h)

@@ -58,11 +58,11 @@ class PriorTraining(StageTraining):
     def __init__(self, network: VolumeUNet | None = None, text: str = "small", text_length: int = 128,
                  text_padded_to: int | None = None, reports: list[str] | None = None,
                  detail: DetailNetwork | None = None, voxels: int = 64, side: float = 384.0,
-                 window: tuple[float, float] = (-1000.0, 1000.0), sigma_data: float = 0.5, text_dropout: float = 0.1, mask_weight: float = 0.1,
-                 learning_rate: float = 5e-4, weight_decay: float = 0.01, warmup: int = 100, decay_from: int = 0,
-                 decay_steps: int = 0, text_steps: int = 600, montage_steps: int = 16,
-                 gradient_checkpointing: bool = False, channels_last: bool = True, compile: bool = False,
-                 initial: str | None = None, seed: int = 0):
+                 window: tuple[float, float] = (-1000.0, 1000.0), sigma_data: float = 0.5,
+                 text_dropout: float = 0.1, mask_weight: float = 0.1, learning_rate: float = 5e-4,
+                 weight_decay: float = 0.01, warmup: int = 100, decay_from: int = 0, decay_steps: int = 0,
+                 text_steps: int = 600, montage_steps: int = 16, gradient_checkpointing: bool = False,
+                 channels_last: bool = True, compile: bool = False, initial: str | None = None, seed: int = 0):
         network = network or VolumeUNet()
         encoder = None
         if text == "small" and not reports:

@@ -64,7 +64,8 @@ def _tell(message: str) -> None:
 
 
 def sample_flop(prior: Prior | SuperResolution, shape: Sequence[int]) -> int:
-    """FLOP of the network's forward and backward pass over one state of `shape` voxels; nothing is computed."""
+    """FLOP of the network's forward and backward pass over one state of `shape` voxels; nothing is computed. What a
+    prior's detail network does, a tenth of it by default, is not counted."""
     with torch.device("meta"):
         network = type(prior.network)(**prior.network.settings)
         inputs = prior.network_inputs(shape)

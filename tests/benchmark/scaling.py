@@ -1,0 +1,54 @@
+"""Held-out denoising error of a training against the samples it has seen, at each noise level.
+
+    python tests/benchmark/scaling.py <name>=<the training's metrics.csv> ... [--batch 2]
+
+Several trainings may be given; --batch is the samples of one step. Writes scaling.csv and scaling.png beside this file:
+RMSE of the CT in HU as validation logged it, on logarithmic axes, where a power law is a straight line.
+"""
+
+import argparse
+from pathlib import Path
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from phydict.evaluation import read_csv, write_csv
+from phydict.stage_training import NOISE_LEVELS
+
+FILE = Path(__file__)
+
+
+def curve(name: str, log: Path, batch: int) -> list[dict]:
+    """One row for each validation of a training and each noise level."""
+    rows = [row for row in read_csv(log) if row.get("val/rmse_hu") is not None]
+    return [{"training": name, "samples": (row["step"] + 1) * batch, "t": t, "rmse_hu": row[f"val/rmse_hu_t{t}"]}
+            for row in rows for t in NOISE_LEVELS]
+
+
+def plot(rows: list[dict], file: Path) -> None:
+    """A panel for each noise level, a line for each training."""
+    figure = Figure(figsize=(3 * len(NOISE_LEVELS), 3.4), dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, t in zip(figure.subplots(1, len(NOISE_LEVELS)), NOISE_LEVELS):
+        for name in dict.fromkeys(row["training"] for row in rows):
+            own = [row for row in rows if row["training"] == name and row["t"] == t]
+            axes.loglog([row["samples"] for row in own], [row["rmse_hu"] for row in own], ".-", label=name)
+        axes.set_title(f"t = {t}")
+        axes.set_xlabel("samples seen")
+        axes.grid(alpha=0.3, which="both")
+    figure.axes[0].set_ylabel("held-out RMSE (HU)")
+    figure.axes[0].legend()
+    figure.savefig(file)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("trainings", nargs="+", metavar="name=metrics.csv")
+    parser.add_argument("--batch", type=int, default=2)
+    given = parser.parse_args()
+    rows = []
+    for told in given.trainings:
+        name, _, log = told.rpartition("=")
+        rows += curve(name or Path(log).parent.name, Path(log), given.batch)
+    write_csv(FILE.with_suffix(".csv"), rows)
+    plot(rows, FILE.with_suffix(".png"))

@@ -254,11 +254,20 @@ def test_delta_keeps_the_length_of_a_step():
     ({"methods": {"mine": {"of": "sart"}}}, ["'sart'"]), ({"methods": {"mine": {}}}, ["'mine'"]),
     ({"methods": {"mine": {"of": "sirt", "method.iteration": 2}}}, ["method.iteration ", "iterations"]),
     ({"base": TINY | {"method.iteration": 3}, "axes": {"method": ["sirt"]}}, ["method.iteration "]),
+    ({"axes": {"method": ["phydict_fast"], "method.iterations": [1]}}, ["phydict_fast: ", "2 iterations"]),
     ({"axes": [1]}, ["axes", "mapping"])], ids=lambda value: str(value)[:60] if isinstance(value, dict) else "")
 def test_a_specification_that_cannot_be_meant_is_one_sentence(tmp_path, capsys, content, words):
     said = refusal(capsys, ["ablate", "-c", str(write(tmp_path, **content))])
     assert "spec.yaml" in said and all(word in said for word in words), said
     assert not (tmp_path / "out").exists()
+
+
+def test_the_table_of_another_comparison_is_left_alone(tmp_path, capsys, trace):
+    ablate(tmp_path, phantoms=1, base=TINY, axes={"method": ["trace"]})
+    before = {file: file.read_bytes() for file in (tmp_path / "out").iterdir()}
+    other = write(tmp_path, phantoms=1, base=TINY | {"seed": 7}, axes={"method": ["trace"]})
+    assert "another out" in refusal(capsys, ["ablate", "-c", str(other)])
+    assert {file: file.read_bytes() for file in (tmp_path / "out").iterdir()} == before
 
 
 def test_arguments_and_files_that_cannot_be_meant_are_one_sentence(tmp_path, capsys):

@@ -36,7 +36,7 @@ class Results:
     """The table of results in a folder, of which this process alone writes while it is open.
 
     A row is known by its key (spec.key): rows of other settings or other data that the file holds are kept at its end.
-    Raises ValueError where another process has it open or the file is damaged.
+    Raises ValueError where the file is damaged, or is the table of another comparison, with no row in common.
     """
 
     def __init__(self, folder: Path, planned: Mapping[str, dict]):
@@ -45,6 +45,9 @@ class Results:
         if None in found:
             raise ValueError(f"{self.file} has rows without a key, so that it is no table of this command: give "
                              "another out")
+        if found and not found.keys() & planned.keys():
+            raise ValueError(f"{self.file} is the table of another comparison, whose {len(found)} rows are all of other "
+                             "settings or data: give another out, or remove it")
         self.others = [row for name, row in found.items() if name not in planned]
         self.done = {name: self._row(name, row) for name, row in found.items()
                      if name in planned and row.get("status") in FINISHED}

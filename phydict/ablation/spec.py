@@ -57,8 +57,8 @@ class Cases:
 
     def __post_init__(self):
         if (self.cts is None) == (self.phantoms is None):
-            raise ValueError("the cases are those of a folder, cts, or a number of phantoms: give one of the two, in "
-                             "the file or on the command line")
+            raise ValueError("the cases are those of a folder, cts, or a number of phantoms: give exactly one of the "
+                             "two, in the file or on the command line")
 
     def data(self, **settings) -> ReconstructionData:
         """The simulated X-rays of these cases."""
@@ -93,9 +93,9 @@ class Trial:
 
     @property
     def label(self) -> str:
-        """The method and what was changed of it or of its X-rays."""
-        return ", ".join([self.name, *(f"{name} {value}" for name, value in self.columns.items()
-                                       if "." in name or name in ("views", "delta"))])
+        """The method and what was changed of it or of its X-rays; the number of views always."""
+        return ", ".join([self.name, *(f"{name} {value}" for name, value in self.columns.items() if name == "views" or
+                                       name != "method" and ("." in name or value != SETTINGS[name][1]))])
 
     def scene(self) -> tuple[Grid, HUWindow]:
         """The grid of the volume and the HU window that the truth is clipped to."""
@@ -140,6 +140,9 @@ def read_specification(file: str | Path, **given) -> Specification:
     """
     try:
         content = yaml.safe_load(Path(file).read_text())
+    except FileNotFoundError as error:
+        raise ValueError(f"there is no file {file}: give one that says what to compare, such as "
+                         "configs/ablate/pareto.yaml") from error
     except yaml.YAMLError as error:
         raise ValueError(f"{file} is no YAML: {' '.join(str(error).split())}") from error
     try:
@@ -232,7 +235,10 @@ def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
         part, _, path = name.partition(".")
         if path and has_field(own[part], path.split(".")):
             changes[part][path] = value
-    method, simulator = (changed(own[part], changes[part], part) for part in own)
+    try:
+        method, simulator = (changed(own[part], changes[part], part) for part in own)
+    except ValueError as error:
+        raise ValueError(f"{settings['method']}: {error}") from error
     if not isinstance(method, Sampler) or not has_field(method, ["refine_from"]):
         given.pop("delta", None)
     if given.get("delta") is not None:

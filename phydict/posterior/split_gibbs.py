@@ -5,12 +5,12 @@
 | denoise(x, t)              | Eq. 1, (x0)_t = F_t(x_t, c)                        |
 | likelihood(m, x0, spread)  | z_t, from pi(z | x, Y)                             |
 | ddim(z, x, t, s)           | Eq. 2, x_s = DDIM(z_t, x_t)                        |
-| refine                     | Extra Compute: renoise to delta, descend unguided  |
+| refine_from                | Extra Compute: renoise to delta, descend unguided  |
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -42,7 +42,8 @@ class SplitGibbs(Sampler):
     randomised_noise: the fresh_noise that takes its place, without overshoot, where several samples are to show how far
     they differ; None: the same;
     prior_std: standard deviation of the state, which sets the spread of x0 at each time;
-    refine_from: EC's delta in [0, 1), 0 for none; refine_iterations: its noise levels;
+    refine_from: EC's delta in [0, 1), 0 for none; refine_iterations: its noise levels; refine_guided: meet the X-rays at
+    each of them too, as in the first pass, instead of following the prior alone, as the paper does;
     full_detector: meet the X-rays pixel by pixel instead of binned to what the grid can hold;
     clip: pull the denoiser's estimate into the prior's range before the likelihood step, not only after it;
     at_zero: both passes end with one more call of the denoiser, at time 0 and without X-rays, as in the release;
@@ -64,6 +65,7 @@ class SplitGibbs(Sampler):
     prior_std: float = 0.5
     refine_from: float = 0.0
     refine_iterations: int = 0
+    refine_guided: bool = False
     full_detector: bool = False
     clip: bool = True
     at_zero: bool = False
@@ -123,9 +125,22 @@ class SplitGibbs(Sampler):
 
     def _descend(self, denoiser: Denoiser, measurement: Measurement, x: Tensor, draw: Draw,
                  on_step: Callable[[], None] = lambda: None) -> Tensor:
+        z = self._meet(denoiser, measurement, x, self.times(denoiser), draw, on_step)
+        if not self.refine_from:
+            return z
+        x = renoise(denoiser.schedule, z, self.refine_from, noise_like(z, draw))
+        if not self.refine_guided:
+            return descend(denoiser, x, self.refine_iterations, self.refine_from, on_step, self.at_zero)
+        last = self.last if self.last is not None and self.last < self.refine_from else None
+        times = denoiser.schedule.steps(self.refine_iterations, self.refine_from, last)
+        return self._meet(denoiser, measurement, x, times, draw, on_step)
+
+    def _meet(self, denoiser: Denoiser, measurement: Measurement, x: Tensor, times: Iterable[tuple[float, float]],
+              draw: Draw, on_step: Callable[[], None]) -> Tensor:
+        """The estimate after the noise levels of `times`, at each of which it meets the X-rays."""
         schedule = denoiser.schedule
         previous = None
-        for t, s in self.times(denoiser):
+        for t, s in times:
             x0 = denoiser.denoise(x, t)
             if self.clip:
                 x0 = x0.clamp(-1, 1)
@@ -146,9 +161,6 @@ class SplitGibbs(Sampler):
         if self.at_zero:
             z = denoiser.denoise(x, 0.0).clamp(-1, 1)
             on_step()
-        if self.refine_from:
-            x = renoise(schedule, z, self.refine_from, noise_like(z, draw))
-            z = descend(denoiser, x, self.refine_iterations, self.refine_from, on_step, self.at_zero)
         return z
 
     def spread(self, denoiser: Denoiser, t: float) -> float:

@@ -153,7 +153,9 @@ def test_without_fresh_noise_nothing_is_drawn_and_with_it_the_draw_decides():
     assert not torch.allclose(sample(noisy, seed=1), sample(noisy, seed=2))
 
 
-@pytest.mark.parametrize("path", [{}, {"warm_start": 0.4, "last": 0.2}, {"overshoot": 0.75}])
+@pytest.mark.parametrize("path", [{}, {"warm_start": 0.4, "last": 0.2}, {"overshoot": 0.75},
+                                  {"refine_from": 0.9, "refine_iterations": 20, "refine_guided": True},
+                                  {"last": 0.2, "refine_from": 0.5, "refine_iterations": 20, "refine_guided": True}])
 def test_a_descent_without_noise_ends_at_the_posterior_mean(path):
     mean, _ = condition(measurement(), denoiser(V).mean, V, NOISE)
     found = sample(sampler(20, fresh_noise=0.0, final_likelihood=EXACT, **path))
@@ -166,7 +168,9 @@ def test_the_last_level_is_where_the_settings_say():
 
 
 @pytest.mark.parametrize("settings", [
-    sampler(9), sampler(9, warm_start=0.5), sampler(9, refine_from=0.4, refine_iterations=5)])
+    sampler(9), sampler(9, warm_start=0.5), sampler(9, refine_from=0.4, refine_iterations=5),
+    sampler(9, refine_from=0.4, refine_iterations=5, refine_guided=True, at_zero=True),
+    sampler(9, last=0.2, refine_from=0.1, refine_iterations=5, refine_guided=True)])
 def test_on_step_is_called_as_often_as_promised(settings):
     calls = []
     settings.sample(denoiser(V), measurement(), X, torch.Generator(), lambda: calls.append(1))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import zlib
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import lightning
@@ -179,5 +180,12 @@ def _divided(grid: Grid, shape: tuple[int, int, int]) -> Grid:
 
 def _ct_source(ct: CTFile) -> str:
     """What identifies a CT and its report, wherever the file lies."""
-    report = zlib.crc32(ct.report.encode())
-    return f"{ct.path.name}, crc32 {file_crc32(ct.path):08x}, {ct.calibration}, report crc32 {report:08x}"
+    stat, report = ct.path.stat(), zlib.crc32(ct.report.encode())
+    contents = _crc32_of(ct.path, stat.st_size, stat.st_mtime_ns)
+    return f"{ct.path.name}, crc32 {contents:08x}, {ct.calibration}, report crc32 {report:08x}"
+
+
+@cache
+def _crc32_of(path: Path, size: int, modified: int) -> int:
+    """A file's checksum, read once for all the acquisitions of a comparison while the file stays as it is."""
+    return file_crc32(path)

@@ -46,8 +46,8 @@ class Results:
             raise ValueError(f"{self.file} has rows without a key, so that it is no table of this command: give "
                              "another out")
         if found and not found.keys() & planned.keys():
-            raise ValueError(f"{self.file} is the table of another comparison, whose {len(found)} rows are all of other "
-                             "settings or data: give another out, or remove it")
+            raise ValueError(f"{self.file} is the table of another comparison, whose {len(found)} rows are all of "
+                             "other settings or data: give another out, or remove it")
         self.others = [row for name, row in found.items() if name not in planned]
         self.done = {name: self._row(name, row) for name, row in found.items()
                      if name in planned and row.get("status") in FINISHED}

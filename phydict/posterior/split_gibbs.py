@@ -22,9 +22,9 @@ from phydict.posterior.measurement import Measurement
 from phydict.posterior.sampler import Draw, Sampler, descend
 
 MISSED = 2.5
-"""Times their noise that X-rays are missed by before scatter is looked for: on the CTs that it was chosen on, ideal ones
-are missed by 1.4 at most, polychromatic ones by 1.4 to 3.5, those with scatter of 6 % by 2.7 to 17, fewer views by
-less."""
+"""Times their noise that X-rays are missed by before scatter is looked for: on the CTs that it was chosen on, ideal
+ones are missed by 1.4 at most, polychromatic ones by 1.4 to 3.5, those with scatter of 6 % by 2.7 to 17, fewer views
+by less."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ class SplitGibbs(Sampler):
     randomised_noise: the fresh_noise that takes its place, without overshoot, where several samples are to show how far
     they differ; None: the same;
     prior_std: standard deviation of the state, which sets the spread of x0 at each time;
-    refine_from: EC's delta in [0, 1), 0 for none; refine_iterations: its noise levels; refine_guided: meet the X-rays at
-    each of them too, as in the first pass, instead of following the prior alone, as the paper does;
+    refine_from: EC's delta in [0, 1), 0 for none; refine_iterations: its noise levels; refine_guided: meet the X-rays
+    at each of them too, as in the first pass, instead of following the prior alone, as the paper does;
     full_detector: meet the X-rays pixel by pixel instead of binned to what the grid can hold;
     clip: pull the denoiser's estimate into the prior's range before the likelihood step, not only after it;
     at_zero: both passes end with one more call of the denoiser, at time 0 and without X-rays, as in the release;

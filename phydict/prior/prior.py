@@ -84,20 +84,23 @@ class Prior(nn.Module):
         found = share * x / a + out * answer
         if self.detail is None:
             return found
-        estimate = self.sigma_data * answer
-        return found + self._detail(x / a - estimate, estimate, t)
+        return self._with_detail(found, x, a, self.sigma_data * answer, t)
 
-    def _detail(self, difference: Tensor, estimate: Tensor, t: Tensor) -> Tensor | float:
-        """What the detail network adds. In training it is always run, so that every process does the same."""
-        sigma = self.schedule.sigma(t.double()).to(difference.dtype)
+    def _with_detail(self, found: Tensor, x: Tensor, a: Tensor, estimate: Tensor, t: Tensor) -> Tensor:
+        """`found` and what the detail network adds. In training it is always run, so that every process does the
+        same."""
+        sigma = self.schedule.sigma(t.double()).to(x.dtype)
         reached = sigma <= DETAIL_REACH * self.skip_std
-        if not reached.any() and not self.training:
-            return 0.0
-        asked = reached if reached.any() else torch.arange(len(t), device=t.device) == 0
+        asked = reached.nonzero().flatten()
+        if not len(asked):
+            if not self.training:
+                return found
+            asked = asked.new_zeros(1)
         size = (sigma**2 + self.skip_std**2).sqrt()
         inward, out = (w[asked].view(-1, 1, 1, 1, 1) for w in (1 / size, reached * sigma * self.skip_std / size))
-        added = out * self.detail(inward * difference[asked], estimate[asked], t[asked].to(difference.dtype)).to(out)
-        return torch.zeros_like(estimate).index_put((asked,), added)
+        estimate = estimate[asked]
+        answer = self.detail(inward * (x[asked] / a[asked] - estimate), estimate, t[asked].to(x.dtype))
+        return found.index_add(0, asked, out * answer.to(out))
 
     def network_inputs(self, shape: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
         """Zeros on the default device, laid out as what the network is given for one state of `shape` voxels."""

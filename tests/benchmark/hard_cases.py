@@ -4,9 +4,9 @@
 
 64^3 voxels of 6 mm; unless the case says otherwise, eight ideal views of 448 x 448 pixels with 0.5 % noise. Writes
 hard_cases.csv beside this file, a row per case and method, and keeps the rows that are there already: delete a row to
-have it computed anew; and from it the table hard_cases.md. Columns: worst_view_misfit and worst_view, the view that fits worst; error_rank_correlation,
-Spearman's, over voxels, of the deviation of eight samples with the true error of their mean, where samples were drawn;
-body_rank_correlation, the same over voxels of more than -900 HU in truth;
+have it computed anew; and from it the table hard_cases.md. Columns: worst_view_misfit and worst_view, the view that
+fits worst; error_rank_correlation, Spearman's, over voxels, of the deviation of eight samples with the true error of
+their mean, where samples were drawn; body_rank_correlation, the same over voxels of more than -900 HU in truth;
 difference_hu, root mean square difference from the volume that the case names; said: warnings, or the sentence with
 which the case was refused.
 """

@@ -21,9 +21,6 @@ from phydict.methods import DEFAULT_PRIOR
 from phydict.prior import Prior
 from phydict.stage_training import NOISE_LEVELS
 
-KINDS = {"phantoms": lambda row: row["case"].startswith("phantom"),
-         "CTs": lambda row: not row["case"].startswith("phantom")}
-
 
 def errors(name: str, prior: Prior, cts: list) -> list[dict]:
     """One row for each held-out case and noise level."""
@@ -47,8 +44,8 @@ def table(rows: list[dict]) -> str:
     lines = ["| prior | cases | " + " | ".join(f"t = {t}" for t in NOISE_LEVELS) + " |",
              "|---|---|" + "---:|" * len(NOISE_LEVELS)]
     for name in dict.fromkeys(row["prior"] for row in rows):
-        for kind, belongs in KINDS.items():
-            own = [row for row in rows if row["prior"] == name and belongs(row)]
+        for kind, made in (("phantoms", True), ("CTs", False)):
+            own = [row for row in rows if row["prior"] == name and row["case"].startswith("phantom") == made]
             if own:
                 lines.append(f"| {name} | {kind} | " + " | ".join(
                     f"{mean(row['rmse_hu'] for row in own if row['t'] == t):.0f}" for t in NOISE_LEVELS) + " |")

@@ -18,6 +18,7 @@ without their findings, since no report belongs to the CTs.
 """
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -263,9 +264,11 @@ def histogram_rows(cts: list[Case], phantoms: list[Case]) -> list[dict]:
     for figure in real[0]:
         a, b = (np.array([np.histogram(values[figure], bins)[0] / len(values[figure]) for values in side])
                 for side in (real, made))
-        own = [wasserstein_distance(middle, middle, a[i], np.delete(a, i, 0).mean(0)) for i in range(len(a))]
-        other = [wasserstein_distance(middle, middle, h, np.delete(a, i % len(a), 0).mean(0)) for i, h in enumerate(b)]
-        rows.append(_distance_row("histogram", f"{figure} HU", own, other))
+
+        def away(histogram, others):
+            return wasserstein_distance(middle, middle, histogram, others.mean(0))
+
+        rows.append(_distance_row("histogram", f"{figure} HU", a, b, away))
     return rows
 
 
@@ -280,13 +283,13 @@ def profile_rows(cts: list[Case], phantoms: list[Case]) -> list[dict]:
             spread = np.fmax(np.nanstd(others, 0, ddof=1), 0.1 * np.nanmax(np.nanstd(others, 0, ddof=1)))
             return np.sqrt(np.nanmean(((profile - np.nanmean(others, 0)) / spread) ** 2))
 
-        own = [away(a[i], np.delete(a, i, 0)) for i in range(len(a))]
-        other = [away(profile, np.delete(a, i % len(a), 0)) for i, profile in enumerate(b)]
-        rows.append(_distance_row("profile", figure, own, other))
+        rows.append(_distance_row("profile", figure, a, b, away))
     return rows
 
 
-def _distance_row(kind: str, figure: str, own: list[float], other: list[float]) -> dict:
+def _distance_row(kind: str, figure: str, real: np.ndarray, made: np.ndarray, away: Callable) -> dict:
+    """How far each curve is from those of all CTs but one: a CT from those of the others."""
+    own, other = ([away(one, np.delete(real, i % len(real), 0)) for i, one in enumerate(side)] for side in (real, made))
     return {"kind": kind, "figure": figure, "real": np.mean(own), "real_sd": np.std(own, ddof=1),
             "phantom": np.mean(other), "phantom_sd": np.std(other, ddof=1), "distance": np.mean(other) / np.mean(own)}
 

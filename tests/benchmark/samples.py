@@ -29,11 +29,14 @@ from phydict.prior import Prior
 ITERATIONS = 50
 
 
-def sample(prior: Prior, seed: int) -> Case:
-    """An unconditional sample of a prior, with the lung masks that it drew."""
-    noise = torch.randn(1, prior.state_channels, *prior.grid.shape, generator=torch.Generator().manual_seed(seed))
-    x0 = descend(prior.bind(), noise, ITERATIONS)[0]
-    return Case(f"sample {seed}", prior.window.to_hu(x0[0]).numpy(), ((x0[1:] + 1) / 2).numpy())
+def samples(prior: Prior, count: int) -> list[Case]:
+    """Unconditional samples of a prior, with the lung masks that it drew."""
+    found, shape = [], (1, prior.state_channels, *prior.grid.shape)
+    for seed in range(count):
+        noise = torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+        x0 = descend(prior.bind(), noise, ITERATIONS)[0]
+        found.append(Case(f"sample {seed}", prior.window.to_hu(x0[0]).numpy(), ((x0[1:] + 1) / 2).numpy()))
+    return found
 
 
 def frechet(a: np.ndarray, b: np.ndarray) -> float:
@@ -55,15 +58,16 @@ if __name__ == "__main__":
     parser.add_argument("--samples", type=int, default=16)
     parser.add_argument("--picture", type=Path)
     given = parser.parse_args()
-    with torch.no_grad():
-        drawn = {file.stem: [sample(load_prior(file), seed) for seed in range(given.samples)] for file in given.priors}
+    drawn = {file.stem: samples(load_prior(file), given.samples) for file in given.priors}
     evaluation, training = ([ct(file) for file in find_cts(folder)] for folder in (given.evaluation, given.training))
     phantoms = [phantom(HELD_OUT_PHANTOM + i) for i in range(given.samples)]
     real = features(evaluation)
     scale = real.std(0) + 1e-6
-    rows = [{"cases": name, "number": len(cases), "slices": len(features(cases)),
-             "frechet_distance": frechet(features(cases) / scale, real / scale)}
-            for name, cases in ({"training CTs": training, "phantoms": phantoms} | drawn).items()]
+    rows = []
+    for name, cases in ({"training CTs": training, "phantoms": phantoms} | drawn).items():
+        own = features(cases)
+        rows.append({"cases": name, "number": len(cases), "slices": len(own),
+                     "frechet_distance": frechet(own / scale, real / scale)})
     write_csv(Path(__file__).with_suffix(".csv"), rows)
     for row in rows:
         print("{cases:24s} {number:3d} of {slices} slices: {frechet_distance:.2f}".format(**row))

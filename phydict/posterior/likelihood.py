@@ -41,7 +41,8 @@ class ProximalCG(LikelihoodStep):
     weighted: whether the variance of each pixel's own noise is added to noise^2, so that pixels which few photons reach
     count less (Thibault et al. 2007, doi:10.1118/1.2789499);
     variation: weight of the total variation TV, 0 for none; each restart replaces it by the quadratic that touches it
-    there (Vogel & Oman 1996, doi:10.1137/0917016), so it wants several; edge: differences between neighbours, in the
+    there (Vogel & Oman 1996, doi:10.1137/0917016), so it wants several, and conjugate gradients are preconditioned by
+    the diagonal of that quadratic, which differs by orders between flat parts and edges; edge: differences between neighbours, in the
     prior's range, below which TV is smooth.
     Hestenes & Stiefel 1952, doi:10.6028/jres.049.044; with bounds, More & Toraldo 1991, doi:10.1137/0801008; as data
     consistency in diffusion sampling, Chung et al. 2024, arXiv:2303.05754.
@@ -79,25 +80,28 @@ class ProximalCG(LikelihoodStep):
                 return weight * d + steepness * tv.gradient(d) if tv else weight * d
 
             free = ~((z <= -1) & (downhill < 0) | (z >= 1) & (downhill > 0))
-            z = (z + self._solve(measurement, downhill * free, free, penalty, trust)).clamp(-1, 1)
+            scale = 1 / (weight + steepness * tv.diagonal()) if tv else torch.ones_like(z)
+            z = (z + self._solve(measurement, downhill * free, scale * free, penalty, trust)).clamp(-1, 1)
         return z
 
-    def _solve(self, measurement: Measurement, residual: Tensor, free: Tensor, penalty: Callable[[Tensor], Tensor],
+    def _solve(self, measurement: Measurement, residual: Tensor, scale: Tensor, penalty: Callable[[Tensor], Tensor],
                trust: Tensor | float) -> Tensor:
-        """Conjugate gradients for A' trust A d + penalty(d) = residual over the free voxels, from zero."""
-        direction, d = residual.clone(), torch.zeros_like(residual)
-        energy = _dot(residual, residual)
+        """Preconditioned conjugate gradients for A' trust A d + penalty(d) = residual over the voxels with a scale
+        above 0, from zero; scale: the inverse of the penalty's diagonal, up to a factor."""
+        scaled, d = scale * residual, torch.zeros_like(residual)
+        direction, energy = scaled, _dot(residual, scaled)
         stop = energy * self.tolerance**2
         for _ in range(self.iterations):
             going = energy > stop
             if not going.any():
                 break
-            curved = (measurement.adjoint(trust * measurement.linear(direction)) + penalty(direction)) * free
+            curved = measurement.adjoint(trust * measurement.linear(direction)) + penalty(direction)
             step = torch.where(going, energy / _dot(direction, curved), 0)
             d += step * direction
             residual = residual - step * curved
-            previous, energy = energy, _dot(residual, residual)
-            direction = residual + torch.where(going, energy / previous, 0) * direction
+            scaled = scale * residual
+            previous, energy = energy, _dot(residual, scaled)
+            direction = scaled + torch.where(going, energy / previous, 0) * direction
         return d
 
 

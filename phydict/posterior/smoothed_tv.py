@@ -39,6 +39,11 @@ class Majoriser:
         """The quadratic's gradient at x, which is linear."""
         return differences_adjoint([w * d for w, d in zip(self.weights, differences(x))])
 
+    def diagonal(self) -> Tensor:
+        """The diagonal of the quadratic's matrix: what `gradient` makes of a voxel there itself."""
+        ends = [([0, 0] * (4 - axis) + [0, 1], [0, 0] * (4 - axis) + [1, 0]) for axis in (2, 3, 4)]
+        return sum(pad(w, below) + pad(w, above) for w, (below, above) in zip(self.weights, ends))
+
 
 def _squared_slope(x: Tensor) -> Tensor:
     total = torch.zeros_like(x)

@@ -36,6 +36,15 @@ def test_the_majoriser_lies_above_the_variation(far):
     assert smoothed_tv(moved, EDGE) - smoothed_tv(X, EDGE) <= rise
 
 
+def test_the_diagonal_is_what_a_voxel_alone_makes_of_itself():
+    m, found = Majoriser(X[:1], EDGE), torch.zeros_like(X[:1])
+    for place in range(found.numel()):
+        alone = torch.zeros_like(found)
+        alone.view(-1)[place] = 1
+        found.view(-1)[place] = m.gradient(alone).view(-1)[place]
+    torch.testing.assert_close(m.diagonal(), found)
+
+
 def test_constants_cost_nothing_and_each_state_of_a_batch_is_its_own():
     m = Majoriser(X, EDGE)
     assert m.gradient(torch.full_like(X, 3.0)).abs().max() < 1e-12

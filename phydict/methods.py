@@ -29,8 +29,8 @@ RELEASED_STEPS = GradientSteps(learning_rate=0.01, prior_mean=True, reward=Rewar
 
 METHODS: dict[str, Sampler | Reconstructor] = {
     "phydict_fast": SplitGibbs(
-        iterations=10, warm_start=0.97, last=0.15, fresh_noise=0.0, overshoot=0.75, randomised_noise=1.0, scatter=True,
-        likelihood=ProximalCG(iterations=10, restarts=1, variation=10.0, edge=0.003),
+        iterations=10, warm_start=0.97, last=0.15, fresh_noise=0.4, overshoot=0.5, randomised_noise=1.0, scatter=True,
+        likelihood=ProximalCG(iterations=7, restarts=1, variation=10.0, edge=0.003),
         final_likelihood=ProximalCG(iterations=10, restarts=5, refit=True, weighted=True, variation=10.0,
                                     edge=0.003)),
     "phydict_paper": SplitGibbs(iterations=50, likelihood=GradientSteps(reward=Reward(lpips=1.0)), refine_from=0.8,

@@ -42,8 +42,8 @@ class ProximalCG(LikelihoodStep):
     count less (Thibault et al. 2007, doi:10.1118/1.2789499);
     variation: weight of the total variation TV, 0 for none; each restart replaces it by the quadratic that touches it
     there (Vogel & Oman 1996, doi:10.1137/0917016), so it wants several, and conjugate gradients are preconditioned by
-    the diagonal of that quadratic, which differs by orders between flat parts and edges; edge: differences between neighbours, in the
-    prior's range, below which TV is smooth.
+    the diagonal of that quadratic, which differs by orders between flat parts and edges; edge: differences between
+    neighbours, in the prior's range, below which TV is smooth.
     Hestenes & Stiefel 1952, doi:10.6028/jres.049.044; with bounds, More & Toraldo 1991, doi:10.1137/0801008; as data
     consistency in diffusion sampling, Chung et al. 2024, arXiv:2303.05754.
     """

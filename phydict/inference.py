@@ -110,7 +110,8 @@ class ReconstructionTask(lightning.LightningModule):
             self.results.remove_leftovers()
         left = self.results.unfinished(sources, self.settings)
         if len(left) < len(sources) and self.trainer.is_global_zero:
-            print(f"{len(sources) - len(left)} of {len(sources)} cases are finished already and are kept",
+            print(f"{len(sources) - len(left)} of {len(sources)} cases are finished already and are kept"
+                  + (", so they are not profiled: --model.overwrite true does them again" if self.profile else ""),
                   file=sys.stderr)
         return left
 

@@ -233,6 +233,8 @@ def test_a_finished_case_is_kept_until_asked_otherwise(measured, tmp_path, capsy
     before = stamp(folder)
     main(args)
     assert stamp(folder) == before and "1 of 1 cases are finished already" in capsys.readouterr().err
+    main([*args, "--profile"])
+    assert "not profiled: --model.overwrite true" in capsys.readouterr().err
     for change in ("--model.seed=1", "--model.method.init_args.iterations=4", "--data.geometry=other.yaml"):
         said = refusal(capsys, [*args, change])
         assert "other settings" in said and "overwrite" in said

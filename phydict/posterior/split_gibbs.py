@@ -170,7 +170,7 @@ class SplitGibbs(Sampler):
 
 
 def noise_like(x: Tensor, draw: Draw) -> Tensor:
-    """Standard normal noise drawn on the generator's device, so that a result does not depend on x's."""
+    """Standard normal noise drawn in float32 on the generator's device, so that a result depends on neither of x's."""
     if not isinstance(draw, torch.Generator):
         return torch.cat([noise_like(one[None], own) for one, own in zip(x, draw, strict=True)])
-    return torch.randn(x.shape, generator=draw, dtype=x.dtype).to(x.device)
+    return torch.randn(x.shape, generator=draw).to(x)

@@ -1,6 +1,7 @@
 """The likelihood step: from the prior's clean estimate towards the X-rays.
 
-Both steps minimise (or descend) a data term plus a term that keeps z near the denoiser's estimate x0.
+Both steps minimise (or descend) a data term plus a term that keeps z near the denoiser's estimate x0; ProximalCG may
+add total variation.
 They act on the CT channel; the other channels of the state pass through.
 """
 
@@ -32,8 +33,9 @@ class ProximalCG(LikelihoodStep):
 
     Starts at x0. Each restart frees the voxels that are inside the range or pulled back into it, runs conjugate
     gradients on them and clips: air stays air, which is worth more than many iterations without the bounds. With a
-    Gaussian prior, bounds that do not act and enough iterations this is exactly E[x_0 | x_t, y]; few iterations
-    regularise, since what the views see best is corrected first. TV(z) sums sqrt(slope^2 + edge^2) over the voxels.
+    Gaussian prior, no variation, bounds that do not act and enough iterations this is exactly E[x_0 | x_t, y]; few
+    iterations regularise, since what the views see best is corrected first. TV(z) sums sqrt(slope^2 + edge^2) over the
+    voxels.
 
     iterations: per restart, at most; restarts; noise: standard deviation of the line integrals' error (noise and
     model); tolerance: a restart ends once its residual has shrunk by this factor;
@@ -41,9 +43,9 @@ class ProximalCG(LikelihoodStep):
     weighted: whether the variance of each pixel's own noise is added to noise^2, so that pixels which few photons reach
     count less (Thibault et al. 2007, doi:10.1118/1.2789499);
     variation: weight of the total variation TV, 0 for none; each restart replaces it by the quadratic that touches it
-    there (Vogel & Oman 1996, doi:10.1137/0917016), so it wants several, and conjugate gradients are preconditioned by
-    the diagonal of that quadratic, which differs by orders between flat parts and edges; edge: differences between
-    neighbours, in the prior's range, below which TV is smooth.
+    there (Vogel & Oman 1996, doi:10.1137/0917016), so the last step wants several, and conjugate gradients are
+    preconditioned by the diagonal of that quadratic, which differs by orders between flat parts and edges; edge:
+    differences between neighbours, in the prior's range, below which TV is smooth.
     Hestenes & Stiefel 1952, doi:10.6028/jres.049.044; with bounds, More & Toraldo 1991, doi:10.1137/0801008; as data
     consistency in diffusion sampling, Chung et al. 2024, arXiv:2303.05754.
     """

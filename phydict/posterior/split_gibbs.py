@@ -5,7 +5,7 @@
 | denoise(x, t)              | Eq. 1, (x0)_t = F_t(x_t, c)                        |
 | likelihood(m, x0, spread)  | z_t, from pi(z | x, Y)                             |
 | ddim(z, x, t, s)           | Eq. 2, x_s = DDIM(z_t, x_t)                        |
-| refine_from                | Extra Compute: renoise to delta, descend unguided  |
+| refine_from                | Extra Compute: renoise to delta, descend again     |
 """
 
 from __future__ import annotations
@@ -23,13 +23,14 @@ from phydict.posterior.sampler import Draw, Sampler, descend
 
 MISSED = 2.5
 """Times their noise that X-rays are missed by before scatter is looked for: on the CTs that it was chosen on, ideal
-ones are missed by 1.4 at most, polychromatic ones by 1.4 to 3.5, those with scatter of 6 % by 2.7 to 17, fewer views
-by less."""
+ones are missed by 1.4 at most (those without noise by whatever the grid cannot hold), polychromatic ones by 1.4 to 3.5,
+those with scatter of 6 % by 2.7 to 17, fewer views by less."""
 
 
 @dataclass(frozen=True)
 class SplitGibbs(Sampler):
-    """Samples p(x | Y, report) with one denoiser call and one likelihood step per noise level.
+    """Samples p(x | Y, report) with one denoiser call and one likelihood step per noise level, twice where
+    scatter is sought.
 
     iterations: noise levels; likelihood: the step towards the X-rays; final_likelihood: the one at the last level,
     None to return the denoiser's estimate there, as the paper does;

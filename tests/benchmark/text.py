@@ -3,7 +3,8 @@
     python tests/benchmark/text.py [prior.safetensors ...] [--phantoms number]
 
 Without a prior, the shipped one. The error is the mean absolute HU error over the voxels that the phantom's findings
-changed. Writes text.csv beside this file. Only phantoms with a one-sided finding of at least 50 ml count: others have no wrong side.
+changed. Writes text.csv beside this file. Only phantoms with a one-sided finding of at least 50 ml count: others have
+no wrong side.
 """
 
 import argparse

@@ -37,8 +37,9 @@ class CascadePosterior(Reconstructor):
     sampler: Sampler = field(default_factory=SplitGibbs)
     guide_fine: bool = True
     fine_sampler: Sampler = SplitGibbs(
-        iterations=4, warm_start=0.3, last=0.15, fresh_noise=0.0, prior_std=0.1,
-        final_likelihood=ProximalCG(iterations=10, restarts=2))
+        iterations=2, warm_start=0.3, last=0.15, fresh_noise=0.0, prior_std=0.2,
+        likelihood=ProximalCG(iterations=5, restarts=2, variation=10.0, edge=0.003),
+        final_likelihood=ProximalCG(iterations=10, restarts=2, variation=10.0, edge=0.003))
     unguided: Sampler = PriorOnly(20)
     noise: float = 0.05
     guidance: float = 1.0

@@ -1,9 +1,10 @@
-"""What a super-resolution stage adds: reconstructions of CTs on its fine grid, from eight X-rays made there.
+"""What a super-resolution stage adds: reconstructions of CTs on its fine grid, from X-rays made there.
 
-    python tests/benchmark/cascade.py <super-resolution stage> <folder of CTs> [more infer.py arguments]
+    python tests/benchmark/cascade.py <folder of CTs> <super-resolution stage>[=<views>,<views>...] ...
 
-Runs `infer.py test` with the base prior alone, with the second stage unguided, and guided; the base prior's volumes are
-upsampled trilinearly and scored on the fine grid too. Writes cascade.csv beside this file.
+From eight views where none are told. Runs `infer.py test` with the base prior alone, with the second stage unguided,
+and guided; the base prior's volumes are upsampled trilinearly and scored on the fine grid too. Writes cascade.csv
+beside this file, and leaves the rows of stages and views that were not asked for.
 """
 
 import json
@@ -21,22 +22,21 @@ from phydict.datasets import find_cts, prepare_ct
 from phydict.evaluation import read_csv, rich_table, volume_metrics, write_csv
 from phydict.prior import load_super_resolution
 
-HERE = Path(__file__).parent
-ROOT = HERE.parents[1]
+FILE = Path(__file__).with_suffix(".csv")
+ROOT = FILE.parents[2]
 
-if __name__ == "__main__":
-    if len(sys.argv) < 3:
-        raise SystemExit("give both: python tests/benchmark/cascade.py <super-resolution stage> <folder of CTs>")
-    stage, cts, *more = sys.argv[1:]
+
+def compared(stage: str, views: int, cts: str) -> list[dict]:
+    """One row for each way to the fine grid and each CT."""
     fine, rows = load_super_resolution(stage), []
     runs = {"upsampled": [f"--data.simulation_voxels={fine.grid.shape[0]}"],
-            "cascade, unguided": [f"--model.super_resolution={stage}", "--model.guide_fine=false"],
-            "cascade, guided": [f"--model.super_resolution={stage}"]}
+            "unguided": [f"--model.super_resolution={stage}", "--model.guide_fine=false"],
+            "guided": [f"--model.super_resolution={stage}"]}
     with tempfile.TemporaryDirectory() as out:
         for name, arguments in runs.items():
             subprocess.run([sys.executable, "infer.py", "test", "-c", "configs/reconstruct/phydict_fast.yaml",
-                            f"--data.cts={cts}", f"--model.out={out}", f"--model.name={name}", *arguments, *more],
-                           cwd=ROOT, check=True)
+                            f"--data.cts={cts}", f"--data.views={views}", f"--model.out={out}", f"--model.name={name}",
+                            *arguments], cwd=ROOT, check=True)
             scores = {row["case"]: row for row in read_csv(Path(out) / name / "results.csv")}
             for ct in find_cts(cts):
                 case = Path(out) / name / ct.id
@@ -47,6 +47,17 @@ if __name__ == "__main__":
                     volume = torch.from_numpy(nibabel.load(case / "volume.nii.gz").get_fdata().astype("float32"))
                     volume = interpolate(volume[None, None], fine.grid.shape, mode="trilinear")
                     row |= volume_metrics(volume, fine.window.to_hu(truth["volume"])[None], truth["masks"][None, :1])
-                rows.append(row)
-    write_csv(HERE / "cascade.csv", rows)
-    Console(width=160).print(rich_table(rows))
+                rows.append({"stage": Path(stage).stem} | row)
+    return rows
+
+
+if __name__ == "__main__":
+    if len(sys.argv) < 3:
+        raise SystemExit("give both: python tests/benchmark/cascade.py <folder of CTs> <super-resolution stage> ...")
+    cts, *stages = sys.argv[1:]
+    for stage, _, views in (given.partition("=") for given in stages):
+        for count in (int(n) for n in (views or "8").split(",")):
+            new = compared(stage, count, cts)
+            others = [row for row in read_csv(FILE) if (row["stage"], row["views"]) != (Path(stage).stem, count)]
+            write_csv(FILE, others + new)
+            Console(width=160).print(rich_table(new))

@@ -144,7 +144,7 @@ def test_all_figures_are_finite_and_belong_to_the_volume(cascade, xrays):
     calls = []
     method = CascadePosterior(cascade, SAMPLER, name="both")
     found = method.reconstruct(xrays, PROJECTOR, on_step=lambda: calls.append(1))
-    assert len(calls) == method.steps() == 3 + 4 and found.method == "both" and found.network_calls == 7
+    assert len(calls) == method.steps() == 3 + 2 and found.method == "both" and found.network_calls == 5
     assert set(found.seconds) == {"base", "prepare", "sample", "score"}
     assert found.volume.min() >= -1000 and found.volume.max() <= 600
     assert found.masks.shape == (3, *FINE.shape) and 0 <= found.masks.min() and found.masks.max() <= 1

@@ -1,0 +1,212 @@
+"""Designs of the prior's network, compared after equal training effort.
+
+    python tests/benchmark/designs.py <folder of training CTs> [--out runs/designs] [--seconds 720] [--designs ...]
+
+Each design learns from the same draws, noise and times, for the same CPU time of one thread, which other work on the
+machine does not change. The learning rate rises over 30 steps and falls to zero over the second half of the time;
+the weights are averaged. LIDC-IDRI-0004 and the phantoms from seed 1,000,000 on are held out. A training that was
+stopped goes on from its last checkpoint in --out; a design that designs.csv holds already is not run again.
+
+Writes designs.csv beside this file, one row per design and held-out case: denoising error (RMSE of the CT in HU) at
+each noise level, and SSIM, PSNR and MAE of phydict_fast's reconstruction from four ideal views; CPU seconds of one
+call of the denoiser relative to the default VolumeUNet's, measured in turns on one thread.
+"""
+
+import argparse
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import mean
+
+import lightning
+import numpy as np
+import torch
+from lightning.pytorch.callbacks import EMAWeightAveraging, ModelCheckpoint
+from torch import nn
+from torch.utils.data import Dataset
+
+from phydict import ConeBeam, Projector
+from phydict.command_line import quiet
+from phydict.datamodule import PriorData
+from phydict.datasets.cache import read_arrays, write_arrays
+from phydict.diffusion import renoise
+from phydict.evaluation import read_csv, volume_metrics, write_csv
+from phydict.methods import METHODS, fit_to_grid, reconstructor
+from phydict.prior import Prior, VolumeUNet
+from phydict.prior_training import PriorTraining
+from phydict.stage_training import NOISE_LEVELS
+from phydict.training import CHECKPOINT
+from phydict.xray import Ideal
+
+FILE = Path(__file__).with_suffix(".csv")
+HELD_OUT_CT = "LIDC-IDRI-0004"
+VIEWS, METHOD = 4, "phydict_fast"
+WARMUP, DECAY = 30, 0.99
+
+
+@dataclass(frozen=True)
+class Design:
+    """What differs from VolumeUNet's defaults, and how Prior and StageTraining use the network.
+
+    middle_attention: attention between encoder and decoder. typical_std: errors are weighted by
+    1 / max(c_out, typical_std / 2)^2; from 1 on, all noise levels weigh the same. seed: of initial weights, times and
+    noise.
+    """
+
+    network: dict = field(default_factory=dict)
+    middle_attention: bool = True
+    typical_std: float = 0.5
+    seed: int = 0
+
+
+DESIGNS = {
+    "block 2, 32-64-128": Design(),
+    "the same, another seed": Design(seed=1),
+    "block 4, 128-192": Design({"block": 4, "channels": (128, 192), "attention": (False, True)}),
+    "without attention": Design({"attention": (False,) * 3}, middle_attention=False),
+    "narrow, 24-48-96": Design({"channels": (24, 48, 96), "head_channels": 24}),
+    "even weights": Design(typical_std=1.0),
+}
+
+
+class NoAttention(nn.Module):
+    """Stands where MONAI's network has attention, and changes nothing."""
+
+    def forward(self, x: torch.Tensor, context: torch.Tensor) -> torch.Tensor:
+        return x
+
+
+class CachedDraws(Dataset):
+    """Draws of one epoch, each kept as a file when it was first made."""
+
+    def __init__(self, draws: Dataset, folder: Path):
+        self.draws, self.folder = draws, folder
+
+    def __len__(self) -> int:
+        return len(self.draws)
+
+    def __getitem__(self, i: int) -> dict:
+        file = self.folder / f"{i:04d}.npz"
+        stored = read_arrays(file)
+        if stored is None:
+            case = self.draws[i]
+            stored = {"volume": case["volume"].numpy().astype(np.float16), "has_masks": case["has_masks"].numpy(),
+                      "masks": (255 * case["masks"].numpy()).round().astype(np.uint8)}
+            write_arrays(file, stored)
+        return {"volume": torch.from_numpy(stored["volume"].astype(np.float32)),
+                "masks": torch.from_numpy(stored["masks"].astype(np.float32) / 255),
+                "has_masks": torch.from_numpy(stored["has_masks"]), "report": ""}
+
+
+class Draws(PriorData):
+    """PriorData whose deformed draws are kept, so that every design learns from them and only one waits for them."""
+
+    def draws(self, epoch: int) -> Dataset:
+        return CachedDraws(super().draws(epoch), self.folder / f"epoch{epoch:04d}")
+
+
+class Effort(lightning.Callback):
+    """Ends a training after `seconds` of CPU time in its steps, and sets the learning rate by the share that is
+    spent."""
+
+    def __init__(self, seconds: float):
+        self.seconds, self.spent = seconds, 0.0
+
+    def on_train_batch_start(self, trainer, module, batch, index) -> None:
+        rate = min(1.0, (trainer.global_step + 1) / WARMUP) * min(1.0, max(0.0, 2 - 2 * self.spent / self.seconds))
+        for group in trainer.optimizers[0].param_groups:
+            group["lr"] = rate * module.learning_rate
+        self.begun = time.process_time()
+
+    def on_train_batch_end(self, trainer, module, outputs, batch, index) -> None:
+        self.spent += time.process_time() - self.begun
+        trainer.should_stop = self.spent >= self.seconds
+
+    def state_dict(self) -> dict:
+        return {"spent": self.spent}
+
+    def load_state_dict(self, state: dict) -> None:
+        self.spent = state["spent"]
+
+
+def learnt(design: Design, data: PriorData, seconds: float, folder: Path) -> tuple[Prior, int]:
+    """The prior that a design becomes, and the samples that it saw."""
+    torch.manual_seed(design.seed)
+    training = PriorTraining(VolumeUNet(**design.network), "none", learning_rate=1e-3, warmup=0, seed=design.seed)
+    training.typical_std = design.typical_std
+    if not design.middle_attention:
+        training.prior.network.unet.middle_block.attention = NoAttention()
+    last = folder / CHECKPOINT
+    callbacks = [Effort(seconds), EMAWeightAveraging(decay=DECAY), ModelCheckpoint(
+        folder, "last", every_n_epochs=1, save_on_train_epoch_end=True, enable_version_counter=False)]
+    trainer = lightning.Trainer(
+        accelerator="cpu", devices=1, precision="bf16-mixed", gradient_clip_val=1.0, max_epochs=-1, logger=False,
+        limit_val_batches=0, reload_dataloaders_every_n_epochs=1, callbacks=callbacks, enable_model_summary=False,
+        enable_progress_bar=False)
+    trainer.fit(training, data, ckpt_path=last if last.exists() else None)
+    return training.prior.eval(), training.samples
+
+
+def scores(prior: Prior, cases: list[dict]) -> list[dict]:
+    """For each held-out case, denoising errors and the scores of a reconstruction."""
+    beam = ConeBeam.orbit(VIEWS, 1020, 740, (448, 448), 1.25)
+    exact, window = Projector(prior.grid, beam, full_detector=True), prior.window
+    denoiser, rows = prior.bind(), []
+    for i, case in enumerate(cases):
+        x0 = torch.cat([case["volume"], 2 * case["masks"] - 1])[None]
+        noise = torch.randn(x0.shape, generator=torch.Generator().manual_seed(i))
+        row = {"case": case["id"]}
+        for t in NOISE_LEVELS:
+            error = denoiser.denoise(renoise(prior.schedule, x0, t, noise), t) - x0
+            row[f"rmse_hu_t{t}"] = float(error[:, 0].square().mean().sqrt()) * window.half_width
+        ready = reconstructor(METHODS[METHOD], prior)
+        xrays = Ideal()(exact, window.to_mu(x0[:, :1]), i)[0]
+        found = ready.reconstruct(*fit_to_grid(ready, prior.grid, xrays, beam), seed=i)
+        rows.append(row | volume_metrics(found.volume[None, None], window.to_hu(x0[:, :1])))
+    return rows
+
+
+def call_seconds(priors: list[Prior], rounds: int = 7) -> list[float]:
+    """The least CPU seconds of one call of each prior's denoiser, measured in turns."""
+    best = [float("inf")] * len(priors)
+    for _ in range(rounds):
+        for i, prior in enumerate(priors):
+            denoiser, x = prior.bind(), torch.zeros(1, prior.state_channels, *prior.grid.shape)
+            begun = time.process_time()
+            denoiser.denoise(x, 0.5)
+            best[i] = min(best[i], time.process_time() - begun)
+    return best
+
+
+def parser() -> argparse.ArgumentParser:
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    arguments.add_argument("cts", help="folder of training CTs")
+    arguments.add_argument("--out", type=Path, default=Path("runs/designs"), help="checkpoints and cached draws")
+    arguments.add_argument("--seconds", type=float, default=360.0, help="CPU time of each training")
+    arguments.add_argument("--phantoms", type=int, default=200)
+    arguments.add_argument("--designs", nargs="*", choices=DESIGNS, default=list(DESIGNS), metavar="NAME",
+                           help=", ".join(DESIGNS))
+    return arguments
+
+
+if __name__ == "__main__":
+    given = parser().parse_args()
+    torch.set_num_threads(1)
+    with quiet():
+        data = Draws(given.cts, holdout=[HELD_OUT_CT], phantoms=given.phantoms, ct_fraction=0.4, epoch_size=50,
+                     batch_size=2, validation_phantoms=2, cache=str(given.out / "cache"))
+        data.folder = given.out / "draws"
+        cases = [data.validation[i] | {"id": name} for i, name in
+                 enumerate(("held-out phantom 0", "held-out phantom 1", *data.held_out))]
+        today = PriorTraining(VolumeUNet(), "none").prior.eval()
+        for name in given.designs:
+            if any(row["design"] == name and row["budget_s"] == given.seconds for row in read_csv(FILE)):
+                continue
+            prior, samples = learnt(DESIGNS[name], data, given.seconds, given.out / f"{name}, {given.seconds:g} s")
+            own, least = call_seconds([prior, today])
+            told = {"design": name, "budget_s": given.seconds, "samples": samples,
+                    "parameters": sum(w.numel() for w in prior.parameters()), "relative_call": own / least}
+            new = [told | row for row in scores(prior, cases)]
+            write_csv(FILE, read_csv(FILE) + new)
+            print(name, {k: round(mean(row[k] for row in new), 3) for k in new[0] if k not in ("case", "design")},
+                  flush=True)

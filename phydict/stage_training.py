@@ -14,6 +14,7 @@ from phydict.diffusion import Denoiser, renoise
 from phydict.posterior import descend
 from phydict.prior import Prior, SuperResolution
 from phydict.prior.checkpoint import check_stage
+from phydict.units import HUWindow
 
 NOISE_LEVELS = (0.1, 0.3, 0.5, 0.7, 0.9)
 """Times t at which validation measures the denoising error."""
@@ -83,12 +84,12 @@ class StageTraining(lightning.LightningModule, ABC):
         x0, _ = self._state(batch)
         draw = torch.Generator().manual_seed(index)
         noise = torch.randn(x0.shape, generator=draw).to(self.device)
-        denoiser, errors = self._bound(batch, x0), []
-        for t in NOISE_LEVELS:
-            estimate = denoiser.denoise(renoise(self.prior.schedule, x0, t, noise), t)
-            errors.append((estimate - x0)[:, 0].square().mean().sqrt() * self.prior.window.half_width)
-            self.log(f"val/rmse_hu_t{t}", errors[-1], sync_dist=True, batch_size=len(x0))
-        self.log("val/rmse_hu", torch.stack(errors).mean(), prog_bar=True, sync_dist=True, batch_size=len(x0))
+        denoiser = self._bound(batch, x0)
+        errors = denoising_errors(denoiser, x0, noise, self.prior.window)
+        for t, error in errors.items():
+            self.log(f"val/rmse_hu_t{t}", error, sync_dist=True, batch_size=len(x0))
+        mean = torch.stack([*errors.values()]).mean()
+        self.log("val/rmse_hu", mean, prog_bar=True, sync_dist=True, batch_size=len(x0))
         folder = Path(self.trainer.log_dir or self.trainer.default_root_dir) / "samples"  # asks every process
         painted = index < 2 and self.montage_steps
         if painted and (self.trainer.is_global_zero or self.device_mesh):  # spread weights need every process's help
@@ -123,3 +124,13 @@ class StageTraining(lightning.LightningModule, ABC):
                 raise ValueError(f"the checkpoint's prior and this training's differ in '{key}': give the settings and "
                                  "data that the checkpoint was trained with, or start anew with model.initial")
         self.samples = checkpoint["phydict"].get("training", {}).get("samples", 0)
+
+
+def denoising_errors(denoiser: Denoiser, x0: Tensor, noise: Tensor, window: HUWindow) -> dict[float, Tensor]:
+    """RMSE of the CT in HU, by time t of NOISE_LEVELS, of a denoiser's estimates of the state x0 (B, C, X, Y, Z) from
+    x0 renoised with `noise`, of x0's shape."""
+    errors = {}
+    for t in NOISE_LEVELS:
+        estimate = denoiser.denoise(renoise(denoiser.schedule, x0, t, noise), t)
+        errors[t] = (estimate - x0)[:, 0].square().mean().sqrt() * window.half_width
+    return errors

@@ -29,12 +29,11 @@ from phydict import ConeBeam, Projector
 from phydict.command_line import quiet
 from phydict.datamodule import PriorData
 from phydict.datasets.cache import read_arrays, write_arrays
-from phydict.diffusion import renoise
 from phydict.evaluation import read_csv, volume_metrics, write_csv
 from phydict.methods import METHODS, fit_to_grid, reconstructor
 from phydict.prior import Prior, VolumeUNet
 from phydict.prior_training import PriorTraining
-from phydict.stage_training import NOISE_LEVELS
+from phydict.stage_training import denoising_errors
 from phydict.training import CHECKPOINT
 from phydict.xray import Ideal
 
@@ -155,10 +154,8 @@ def scores(prior: Prior, cases: list[dict]) -> list[dict]:
     for i, case in enumerate(cases):
         x0 = torch.cat([case["volume"], 2 * case["masks"] - 1])[None]
         noise = torch.randn(x0.shape, generator=torch.Generator().manual_seed(i))
-        row = {"case": case["id"]}
-        for t in NOISE_LEVELS:
-            error = denoiser.denoise(renoise(prior.schedule, x0, t, noise), t) - x0
-            row[f"rmse_hu_t{t}"] = float(error[:, 0].square().mean().sqrt()) * window.half_width
+        errors = denoising_errors(denoiser, x0, noise, window)
+        row = {"case": case["id"]} | {f"rmse_hu_t{t}": float(error) for t, error in errors.items()}
         ready = reconstructor(METHODS[METHOD], prior)
         xrays = Ideal()(exact, window.to_mu(x0[:, :1]), i)[0]
         found = ready.reconstruct(*fit_to_grid(ready, prior.grid, xrays, beam), seed=i)

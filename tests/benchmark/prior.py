@@ -15,11 +15,10 @@ import torch
 from phydict import load_prior
 from phydict.datamodule import HELD_OUT_PHANTOM
 from phydict.datasets import find_cts, phantom_case, prepare_ct
-from phydict.diffusion import renoise
 from phydict.evaluation import write_csv
 from phydict.methods import DEFAULT_PRIOR
 from phydict.prior import Prior
-from phydict.stage_training import NOISE_LEVELS
+from phydict.stage_training import NOISE_LEVELS, denoising_errors
 
 
 def errors(name: str, prior: Prior, cts: list) -> list[dict]:
@@ -31,11 +30,9 @@ def errors(name: str, prior: Prior, cts: list) -> list[dict]:
         x0 = torch.cat([case["volume"], 2 * case["masks"] - 1])[None]
         noise = torch.randn(x0.shape, generator=torch.Generator().manual_seed(i))
         denoiser = prior.bind(case["report"])
-        for t in NOISE_LEVELS:
-            error = denoiser.denoise(renoise(prior.schedule, x0, t, noise), t) - x0
-            rmse, sigma = float(error[:, 0].square().mean().sqrt()), float(prior.schedule.sigma(t))
-            rows.append({"prior": name, "case": case["id"], "t": t, "sigma_hu": sigma * prior.window.half_width,
-                         "rmse_hu": rmse * prior.window.half_width})
+        for t, error in denoising_errors(denoiser, x0, noise, prior.window).items():
+            sigma_hu = float(prior.schedule.sigma(t)) * prior.window.half_width
+            rows.append({"prior": name, "case": case["id"], "t": t, "sigma_hu": sigma_hu, "rmse_hu": float(error)})
     return rows
 
 

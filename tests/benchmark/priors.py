@@ -21,6 +21,8 @@ if __name__ == "__main__":
     parser.add_argument("priors", nargs="+", metavar="name=file")
     parser.add_argument("--out", default=str(Path(__file__).with_suffix("")))
     given = parser.parse_args()
+    if not all("=" in prior for prior in given.priors):
+        parser.error("a prior is given as <name>=<file>")
     priors = {f"phydict_fast, {name}": file for name, _, file in (prior.partition("=") for prior in given.priors)}
     axes = {"views": [1, 2, 4, 8, 16], "method": [*priors, "tv", "sirt"]}
     comparison = {"methods": {name: {"of": "phydict_fast", "prior": file} for name, file in priors.items()},

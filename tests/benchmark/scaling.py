@@ -47,6 +47,8 @@ if __name__ == "__main__":
     parser.add_argument("trainings", nargs="+", metavar="name=metrics.csv+before")
     parser.add_argument("--batch", type=int, default=2)
     given = parser.parse_args()
+    if not all("=" in training for training in given.trainings):
+        parser.error("a training is given as <name>=<its metrics.csv>")
     rows = []
     for told in given.trainings:
         name, _, log = told.partition("=")

@@ -1,6 +1,6 @@
 """Designs of the prior's network, compared after equal training effort.
 
-    python tests/benchmark/designs.py <folder of training CTs> [--out runs/designs] [--seconds 720] [--designs ...]
+    python tests/benchmark/designs.py <folder of training CTs> [--out runs/designs] [--seconds 360] [--designs ...]
 
 Each design learns from the same draws, noise and times, for the same CPU time of one thread, which other work on the
 machine does not change. The learning rate rises over 30 steps and falls to zero over the second half of the time;

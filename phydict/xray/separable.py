@@ -121,6 +121,10 @@ def _array(x: torch.Tensor) -> np.ndarray:
 
 
 def _set_threads() -> int:
-    threads = min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS)
+    """The number of threads that torch uses, told to numba, whose first start sets OpenMP's, and so torch's, to all."""
+    asked = torch.get_num_threads()
+    threads = min(asked, numba.config.NUMBA_NUM_THREADS)
     numba.set_num_threads(threads)
+    if torch.get_num_threads() != asked:
+        torch.set_num_threads(asked)
     return threads

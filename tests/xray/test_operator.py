@@ -1,6 +1,9 @@
 """The projector as a linear operator: exact adjoint, autograd, norm, batches, bad input."""
 
+import subprocess
+import sys
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -121,6 +124,18 @@ def test_threads_change_nothing(method):
         assert torch.equal(A.T(y), one[1])
     finally:
         torch.set_num_threads(threads)
+
+
+def test_the_first_projection_of_a_process_leaves_torch_its_threads():
+    code = """if True:
+        import torch
+        from phydict.xray import ConeBeam, Grid, Projector
+        torch.set_num_threads(1)
+        Projector(Grid.cube(8), ConeBeam.orbit(1, 1020, 740, (4, 4), 100.0), full_detector=True)(torch.rand(1, 1, 8, 8, 8))
+        print(torch.get_num_threads())"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=Path(__file__).parents[2])
+    assert done.stdout.strip() == "1", done.stderr
+
 
 
 @pytest.mark.parametrize("method", METHODS)

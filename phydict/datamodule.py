@@ -183,7 +183,7 @@ class PriorData(lightning.LightningDataModule):
                           self.seed, self.augmentation)
 
     def val_dataloader(self) -> DataLoader:
-        return DataLoader(self.validation, 1, collate_fn=_collate)
+        return DataLoader(self.validation, 1, collate_fn=_collate, num_workers=self.workers)
 
 
 def _training_parts(case: dict) -> dict:

@@ -90,6 +90,7 @@ class StageTraining(lightning.LightningModule, ABC):
             self.log(f"val/rmse_hu_t{t}", error, sync_dist=True, batch_size=len(x0))
         mean = torch.stack([*errors.values()]).mean()
         self.log("val/rmse_hu", mean, prog_bar=True, sync_dist=True, batch_size=len(x0))
+        self.log("samples", float(self.samples), rank_zero_only=True, batch_size=len(x0))
         folder = Path(self.trainer.log_dir or self.trainer.default_root_dir) / "samples"  # asks every process
         painted = index < 2 and self.montage_steps
         if painted and (self.trainer.is_global_zero or self.device_mesh):  # spread weights need every process's help

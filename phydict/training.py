@@ -27,8 +27,9 @@ from phydict.super_resolution_data import SuperResolutionData
 from phydict.super_resolution_training import SuperResolutionTraining
 from phydict.throughput import Throughput
 
-CHECKPOINT, HELD_OUT = "last.ckpt", "held_out.txt"
-"""Files of a training's folder: what it can be resumed from, and the ids of the CTs that it never saw."""
+CHECKPOINT, BEST, HELD_OUT = "last.ckpt", "best.ckpt", "held_out.txt"
+"""Files of a training's folder: what it can be resumed from, what reconstructed the held-out cases best, and the ids of
+the CTs that it never saw."""
 
 
 def read_checkpoint(path: str | Path) -> dict:
@@ -114,6 +115,14 @@ class WholeCheckpoints(TorchCheckpointIO):
                           "last one, if there is one, with --ckpt_path") from error
 
 
+class BestCheckpoint(ModelCheckpoint):
+    """Keeps the weights with the best score so far, where validation gives one."""
+
+    def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        if self.monitor in trainer.callback_metrics:
+            super().on_validation_end(trainer, pl_module)
+
+
 class PriorCLI(LightningCLI):
     """fit and validate; ties the data's grid and HU window to the model's, and writes everything below `out`."""
 
@@ -134,6 +143,10 @@ class PriorCLI(LightningCLI):
             parser.link_arguments(f"model.{name}", f"data.{name}")
         if self.model_class is PriorTraining:
             parser.link_arguments("data.reports", "model.reports", apply_on="instantiate")
+            parser.add_lightning_class_args(BestCheckpoint, "best")
+            parser.set_defaults({"best.filename": Path(BEST).stem, "best.enable_version_counter": False,
+                                 "best.monitor": "val/psnr", "best.mode": "max", "best.save_on_train_epoch_end": False})
+            parser.link_arguments("out", "best.dirpath")
         else:
             parser.link_arguments("model.factor", "data.factor")
 

@@ -18,9 +18,10 @@ import torch
 from torch.utils.data import default_collate
 
 from phydict.datamodule import CachedPhantoms, PriorData
-from phydict.datasets import Thorax
+from phydict.datasets import Thorax, phantom_case
 from phydict.grid import Grid
 from phydict.prior import VolumeUNet, load_prior, save_prior
+from phydict.prior_training import reconstruction_scores
 from phydict.training import PriorTraining, main
 from phydict.units import HUWindow
 from prior.medsyn_files import entries, text_unet, write
@@ -154,6 +155,32 @@ def test_validation_logs_every_noise_level_and_paints_a_montage(straight):
     assert {f"val/rmse_hu_t{t}" for t in (0.1, 0.3, 0.5, 0.7, 0.9)} | {"val/rmse_hu"} <= set(log)
     assert [file.name for file in sorted(straight.glob("logs/**/samples/*.png"))] == [
         "step000004_0.png", "step000008_0.png"]
+
+
+def test_the_checkpoint_that_reconstructs_best_is_kept(tmp_path, cache, monkeypatch):
+    scores = iter((10.0, 30.0, 20.0))
+    monkeypatch.setattr("phydict.prior_training.reconstruction_scores",
+                        lambda *_: {"psnr": next(scores), "ssim": 0.5})
+    main(arguments(tmp_path, cache, "--trainer.max_epochs=3"))
+    best = torch.load(tmp_path / "best.ckpt", map_location="cpu", weights_only=True)
+    assert best["global_step"] == 8 and checkpoint(tmp_path)["global_step"] == 12
+    assert {step: float(value) for step, value in losses(tmp_path, "val/psnr").items()} == {3: 10, 7: 30, 11: 20}
+    assert [float(value) for value in losses(tmp_path, "samples").values()] == [8, 16, 24]
+    main(["export", f"--checkpoint={tmp_path / 'best.ckpt'}", f"--out={tmp_path / 'prior.safetensors'}"])
+    assert load_prior(tmp_path / "prior.safetensors").grid.shape == (16, 16, 16)
+
+
+def test_without_validation_views_nothing_is_reconstructed_or_kept(tmp_path, cache):
+    main(arguments(tmp_path, cache, "--trainer.max_epochs=1", "--model.validation_views=0"))
+    assert "val/psnr" not in next(tmp_path.glob("logs/**/metrics.csv")).read_text()
+    assert not (tmp_path / "best.ckpt").exists() and (tmp_path / "last.ckpt").exists()
+
+
+def test_more_views_reconstruct_a_held_out_case_better():
+    prior = tiny_prior()
+    ct = phantom_case(0, prior.grid, prior.window)["volume"][None]
+    few, many = (reconstruction_scores(prior, ct, views, seed=0) for views in (2, 32))
+    assert many["psnr"] > few["psnr"] + 3 and many["ssim"] > few["ssim"]
 
 
 @pytest.fixture(scope="module")
@@ -314,7 +341,7 @@ def assert_same_curve(folder: Path, straight: Path, column: str = "loss") -> Non
 def test_two_processes_train_the_prior_that_one_would(tmp_path, cache, straight):
     done = two_processes(tmp_path, cache, "ddp.yaml")
     assert done.returncode == 0, done.stderr[-2000:]
-    for column in ("loss", "val/rmse_hu", "val/rmse_hu_t0.5"):
+    for column in ("loss", "val/rmse_hu", "val/rmse_hu_t0.5", "val/psnr", "samples"):
         assert_same_curve(tmp_path, straight, column)
     assert checkpoint(tmp_path)["phydict"]["training"] == {"steps": 4, "samples": 8}
     assert list(tmp_path.glob("logs/**/samples/*.png"))

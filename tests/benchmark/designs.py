@@ -25,21 +25,18 @@ from lightning.pytorch.callbacks import EMAWeightAveraging, ModelCheckpoint
 from torch import nn
 from torch.utils.data import Dataset
 
-from phydict import ConeBeam, Projector
 from phydict.command_line import quiet
 from phydict.datamodule import PriorData
 from phydict.datasets.cache import read_arrays, write_arrays
-from phydict.evaluation import read_csv, volume_metrics, write_csv
-from phydict.methods import METHODS, fit_to_grid, reconstructor
+from phydict.evaluation import read_csv, write_csv
 from phydict.prior import Prior, VolumeUNet
-from phydict.prior_training import PriorTraining
+from phydict.prior_training import PriorTraining, reconstruction_scores
 from phydict.stage_training import denoising_errors
 from phydict.training import CHECKPOINT
-from phydict.xray import Ideal
 
 FILE = Path(__file__).with_suffix(".csv")
 HELD_OUT_CT = "LIDC-IDRI-0004"
-VIEWS, METHOD = 4, "phydict_fast"
+VIEWS = 4
 WARMUP, DECAY = 30, 0.99
 
 
@@ -146,20 +143,15 @@ def learnt(design: Design, data: PriorData, seconds: float, folder: Path) -> tup
     return training.prior.eval(), training.samples
 
 
-def scores(prior: Prior, cases: list[dict]) -> list[dict]:
+def scores(prior: Prior, cases: list[dict], views: int = VIEWS) -> list[dict]:
     """For each held-out case, denoising errors and the scores of a reconstruction."""
-    beam = ConeBeam.orbit(VIEWS, 1020, 740, (448, 448), 1.25)
-    exact, window = Projector(prior.grid, beam, full_detector=True), prior.window
     denoiser, rows = prior.bind(), []
     for i, case in enumerate(cases):
         x0 = torch.cat([case["volume"], 2 * case["masks"] - 1])[None]
         noise = torch.randn(x0.shape, generator=torch.Generator().manual_seed(i))
-        errors = denoising_errors(denoiser, x0, noise, window)
+        errors = denoising_errors(denoiser, x0, noise, prior.window)
         row = {"case": case["id"]} | {f"rmse_hu_t{t}": float(error) for t, error in errors.items()}
-        ready = reconstructor(METHODS[METHOD], prior)
-        xrays = Ideal()(exact, window.to_mu(x0[:, :1]), i)[0]
-        found = ready.reconstruct(*fit_to_grid(ready, prior.grid, xrays, beam), seed=i)
-        rows.append(row | volume_metrics(found.volume[None, None], window.to_hu(x0[:, :1])))
+        rows.append(row | reconstruction_scores(prior, x0[:, :1], views, i))
     return rows
 
 

@@ -1,8 +1,8 @@
 """Held-out denoising error of trainings against the samples they have seen, at each noise level.
 
-    python tests/benchmark/scaling.py <name>=<the training's metrics.csv>[+<samples seen before it>] ... [--batch 2]
+    python tests/benchmark/scaling.py <name>=<the training's metrics.csv>[+<samples seen before it>] ...
 
---batch is the samples of one step. Writes scaling.csv and scaling.png beside this file: RMSE of the CT in HU as
+Writes scaling.csv and scaling.png beside this file: RMSE of the CT in HU as
 validation logged it, on logarithmic axes, where a power law is a straight line.
 """
 
@@ -18,10 +18,10 @@ from phydict.stage_training import NOISE_LEVELS
 FILE = Path(__file__)
 
 
-def curve(name: str, log: Path, batch: int, before: int) -> list[dict]:
+def curve(name: str, log: Path, before: int) -> list[dict]:
     """One row for each validation of a training and each noise level."""
     rows = [row for row in read_csv(log) if row.get("val/rmse_hu") is not None]
-    return [{"training": name, "samples": before + (row["step"] + 1) * batch, "t": t,
+    return [{"training": name, "samples": before + row["samples"], "t": t,
              "rmse_hu": row[f"val/rmse_hu_t{t}"]}
             for row in rows for t in NOISE_LEVELS]
 
@@ -45,7 +45,6 @@ def plot(rows: list[dict], file: Path) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("trainings", nargs="+", metavar="name=metrics.csv+before")
-    parser.add_argument("--batch", type=int, default=2)
     given = parser.parse_args()
     if not all("=" in training for training in given.trainings):
         parser.error("a training is given as <name>=<its metrics.csv>")
@@ -53,6 +52,6 @@ if __name__ == "__main__":
     for told in given.trainings:
         name, _, log = told.partition("=")
         log, _, before = log.partition("+")
-        rows += curve(name, Path(log), given.batch, int(before or 0))
+        rows += curve(name, Path(log), int(before or 0))
     write_csv(FILE.with_suffix(".csv"), rows)
     plot(rows, FILE.with_suffix(".png"))

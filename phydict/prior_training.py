@@ -15,7 +15,7 @@ from phydict.datamodule import PriorData
 from phydict.diffusion import Denoiser
 from phydict.evaluation import method_panel, volume_metrics
 from phydict.grid import Grid
-from phydict.methods import fit_to_grid, reconstructor
+from phydict.methods import reconstruct
 from phydict.prior import DetailNetwork, Prior, TextEncoder, VolumeUNet, describe, learn_vocabulary, load_prior
 from phydict.prior.report_training import learn_findings, learn_sketch
 from phydict.prior.sharding import shard
@@ -132,12 +132,10 @@ class PriorTraining(StageTraining):
         super().validation_step(batch, index)
         if not self.validation_views or self.device_mesh is not None:
             return
-        ct = self._state(batch)[0][:, :1]
-        with torch.autocast(ct.device.type, enabled=False):
-            scores = [reconstruction_scores(self.prior, case[None], self.validation_views, index) for case in ct]
+        with torch.autocast(self.device.type, enabled=False):
+            scores = reconstruction_scores(self.prior, batch["volume"], self.validation_views, index)
         for name in ("psnr", "ssim"):
-            mean = sum(score[name] for score in scores) / len(scores)
-            self.log(f"val/{name}", mean, prog_bar=name == "psnr", sync_dist=True, batch_size=len(ct))
+            self.log(f"val/{name}", scores[name], prog_bar=name == "psnr", sync_dist=True, batch_size=1)
 
     def _paint(self, file: Path, batch: dict, x0: Tensor, sample: Tensor) -> None:
         window = self.prior.window
@@ -180,10 +178,8 @@ def reconstruction_scores(prior: Prior, ct: Tensor, views: int, seed: int) -> di
     (1, 1, X, Y, Z) in the prior's range, on an orbit that is the benchmarks' where the cube has 384 mm."""
     scale = prior.grid.shape[0] * prior.grid.spacing[0] / 384
     beam = ConeBeam.orbit(views, 1020 * scale, 740 * scale, (448, 448), 1.25 * scale)
-    ready = reconstructor("phydict_fast", prior)
     exact = Projector(prior.grid, beam, device=ct.device, full_detector=True)
-    xrays = Ideal()(exact, prior.window.to_mu(ct), seed)[0]
-    found = ready.reconstruct(*fit_to_grid(ready, prior.grid, xrays, beam), seed=seed)
+    found = reconstruct(Ideal()(exact, prior.window.to_mu(ct), seed)[0], beam, prior, seed=seed)
     return volume_metrics(found.volume[None, None], prior.window.to_hu(ct))
 
 

@@ -335,7 +335,8 @@ def assert_same_curve(folder: Path, straight: Path, column: str = "loss", tolera
     """The logged numbers of one epoch are those of the uninterrupted one-process run, to rounding: sums are taken in
     another order, which Adam carries on."""
     expected = {step: float(value) for step, value in losses(straight, column).items() if step < 4}
-    assert {step: float(value) for step, value in losses(folder, column).items()} == pytest.approx(expected, rel=tolerance)
+    found = {step: float(value) for step, value in losses(folder, column).items()}
+    assert found == pytest.approx(expected, rel=tolerance)
 
 
 def test_two_processes_train_the_prior_that_one_would(tmp_path, cache, straight):

@@ -2,8 +2,8 @@
 
     python tests/benchmark/scaling.py <name>=<the training's metrics.csv>[+<samples seen before it>] ...
 
-Writes scaling.csv and scaling.png beside this file: RMSE of the CT in HU as
-validation logged it, on logarithmic axes, where a power law is a straight line.
+Writes scaling.csv and scaling.png beside this file: RMSE of the CT in HU as validation logged it, on logarithmic axes,
+where a power law is a straight line.
 """
 
 import argparse

@@ -131,11 +131,11 @@ def test_the_first_projection_of_a_process_leaves_torch_its_threads():
         import torch
         from phydict.xray import ConeBeam, Grid, Projector
         torch.set_num_threads(1)
-        Projector(Grid.cube(8), ConeBeam.orbit(1, 1020, 740, (4, 4), 100.0), full_detector=True)(torch.rand(1, 1, 8, 8, 8))
+        project = Projector(Grid.cube(8), ConeBeam.orbit(1, 1020, 740, (4, 4), 100.0), full_detector=True)
+        project(torch.rand(1, 1, 8, 8, 8))
         print(torch.get_num_threads())"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=Path(__file__).parents[2])
     assert done.stdout.strip() == "1", done.stderr
-
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -88,7 +88,9 @@ class CaseResults:
                 rows.append({"case": case, "method": record["method"], "views": record["views"],
                              "grid": "x".join(map(str, record["grid"]["shape"]))} | record["scores"] | {
                                  "seconds": sum(record["seconds"].values()), "network_calls": record["network_calls"],
-                                 "projector_calls": record["projector_calls"]})
+                                 "projector_calls": record["projector_calls"],
+                                 "precision": record.get("precision"),
+                                 "instruction_set": record.get("instruction_set")})
         if rows:
             write_csv(self.folder / "results.csv", rows)
             (self.folder / "results.md").write_text(markdown(rows))

@@ -32,6 +32,7 @@ from phydict.evaluation import CaseMetrics, panel, rich_table
 from phydict.grid import Grid
 from phydict.methods import DEFAULT_PRIOR, fit_to_grid, reconstructor
 from phydict.posterior import CascadePosterior, Sampler
+from phydict.precision import instruction_set
 from phydict.prior import MedSynCheckpoint, fingerprint, load_prior, load_super_resolution
 from phydict.profiling import profiled, stage
 from phydict.progress import CaseProgress
@@ -55,6 +56,7 @@ class ReconstructionTask(lightning.LightningModule):
         fine_noise: level in [0, 1] of the noise that the prior's estimate is given before the second stage sees it
         samples: how many are drawn; of several the volume is the mean, and deviation.nii.gz their standard deviation
         fine_memory: GiB that the second stage's network may take; it works in tiles where the whole takes more
+        precision: of the networks: auto (bfloat16 where the device computes it), float32 or bfloat16
         out: output folder; cases go to <out>/<name>/<case>
         overwrite: do finished cases again, and replace what is in their place
         seed: with the case's id, the only source of randomness
@@ -67,7 +69,7 @@ class ReconstructionTask(lightning.LightningModule):
                  super_resolution: str | MedSynCheckpoint | None = None, guide_fine: bool = True,
                  fine_sampler: Sampler | None = None, fine_noise: float = 0.05, fine_memory: float = 4.0,
                  out: str = "runs/reconstructions", overwrite: bool = False, seed: int = 0, voxels: int = 64,
-                 side: float = 384.0, samples: int = 1):
+                 side: float = 384.0, samples: int = 1, precision: str = "auto"):
         super().__init__()
         self.method_name, self.seed, self.pages = name, seed, Path(out) / "dry_run"
         self.results = CaseResults(Path(out) / name, overwrite)
@@ -80,13 +82,15 @@ class ReconstructionTask(lightning.LightningModule):
             self.settings |= {"prior": _name(prior), "prior_crc32": fingerprint(prior), "guidance": guidance}
             if samples != 1:
                 self.settings["samples"] = samples
+            if precision != "auto":
+                self.settings["precision"] = precision
         self.fine = None
         if super_resolution:
             self.fine = load_super_resolution(super_resolution)
             self.fine.memory = int(fine_memory * 2**30)
             self.grid = self.fine.grid
         self.reconstructor = reconstructor(method, self.prior, guidance, name, self.fine, guide_fine, fine_sampler,
-                                           fine_noise, samples)
+                                           fine_noise, samples, precision)
         if isinstance(self.reconstructor, CascadePosterior):
             self.settings |= {"super_resolution": _name(super_resolution), "fine_noise": fine_noise,
                               "super_resolution_crc32": fingerprint(super_resolution),
@@ -213,6 +217,7 @@ class ReconstructionTask(lightning.LightningModule):
                 "projector_calls": result.projector_calls,
                 "process_peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
                 "mu_water": case.get("mu_water", self.reconstructor.mu_water), "views": len(result.xrays),
+                "precision": result.precision, "instruction_set": instruction_set(self.device),
                 "grid": result.grid.to_dict(), "seed": result.seed,
                 "report": case["report"], "source": case["source"], "settings": self.settings, "versions": versions()}
 

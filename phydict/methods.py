@@ -14,6 +14,7 @@ from phydict.grid import Grid
 from phydict.posterior import (
     DAPS, DDS, DPS, CascadePosterior, DiffPIR, ExactDraw, GradientSteps, PnPDM, Posterior, PriorOnly, ProximalCG,
     Reward, Sampler, SplitGibbs)
+from phydict.precision import check_precision
 from phydict.prior import Cascade, Prior, SuperResolution, load_prior, load_super_resolution
 from phydict.reconstructor import Reconstruction, Reconstructor, check_xrays
 from phydict.units import HUWindow
@@ -56,7 +57,8 @@ METHODS: dict[str, Sampler | Reconstructor] = {
 def reconstructor(method: str | Sampler | Reconstructor, prior: Prior | str | Path | None = None,
                   guidance: float = 1.0, name: str | None = None,
                   super_resolution: SuperResolution | str | Path | None = None, guide_fine: bool = True,
-                  fine_sampler: Sampler | None = None, fine_noise: float = 0.05, samples: int = 1) -> Reconstructor:
+                  fine_sampler: Sampler | None = None, fine_noise: float = 0.05, samples: int = 1,
+                  precision: str = "auto") -> Reconstructor:
     """A method ready to reconstruct: a name of METHODS, a sampler (which needs a prior), or a Reconstructor.
 
     prior: a Prior or the file it is in; None for the shipped one. It is only loaded by methods that need it. name: what
@@ -64,7 +66,9 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: Prior | str | Pa
     super_resolution: the second stage of a cascade, or its file; None reconstructs on the prior's own grid. guide_fine:
     whether the X-rays guide that stage too; fine_sampler: how (None: CascadePosterior's own); fine_noise: its noise.
     samples: how many to draw; of several, the result is the mean, with their standard deviation as a map of trust.
+    precision: of the networks, one of phydict.precision.PRECISIONS. Raises ValueError for what cannot be meant.
     """
+    check_precision(precision)
     if isinstance(method, str):
         if method not in METHODS:
             raise ValueError(f"there is no method '{method}': use one of {', '.join(METHODS)}")
@@ -83,14 +87,14 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: Prior | str | Pa
     prior = load_prior(prior or DEFAULT_PRIOR) if prior is None or isinstance(prior, str | Path) else prior
     name = name or type(method).__name__
     if super_resolution is None:
-        return Posterior(prior, method, guidance, name=name, samples=samples)
+        return Posterior(prior, method, guidance, name=name, precision=precision, samples=samples)
     if samples != 1:
         raise ValueError(f"samples are drawn of a prior without a second stage, but {samples} were asked for with "
                          "super_resolution: leave one of the two out")
     if isinstance(super_resolution, str | Path):
         super_resolution = load_super_resolution(super_resolution)
     ready = CascadePosterior(Cascade(prior, super_resolution), method, guide_fine, noise=fine_noise, guidance=guidance,
-                             name=name)
+                             name=name, precision=precision)
     return replace(ready, fine_sampler=fine_sampler) if fine_sampler else ready
 
 
@@ -112,7 +116,7 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: Prior | str | Path | None 
                 display: bool = False, seed: int = 0, guidance: float = 1.0, mu_water: float | None = None,
                 grid: Grid = Grid.cube(64), on_step=lambda: None,
                 super_resolution: SuperResolution | str | Path | None = None,
-                guide_fine: bool = True, samples: int = 1) -> Reconstruction:
+                guide_fine: bool = True, samples: int = 1, precision: str = "auto") -> Reconstruction:
     """A CT volume from X-rays (K, V, U) and their geometry.
 
     xrays: tensor or array of line integrals; with display=True, of display values with an unknown gain and offset per
@@ -121,6 +125,7 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: Prior | str | Path | None 
     mu_water: attenuation in 1/mm that water has in the X-rays (None: the method's own, near 65 keV).
     super_resolution, guide_fine: the second stage of a cascade, as for `reconstructor`; the volume is then on its grid.
     samples: more than one gives their mean, and `deviation`, a map of how far they differ, as for `reconstructor`.
+    precision: of the networks; "auto" is bfloat16 where the device computes it, float32 elsewhere.
     A detector finer than the grid can use is binned. Raises ValueError when X-rays, geometry and prior do not fit.
     """
     if not isinstance(beam, ConeBeam):
@@ -128,7 +133,7 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: Prior | str | Path | None 
     if not isinstance(report, str | None):
         raise ValueError(f"the report must be text, but {report!r} was given")
     ready = reconstructor(method, prior, guidance, super_resolution=super_resolution, guide_fine=guide_fine,
-                          samples=samples)
+                          samples=samples, precision=precision)
     ready = ready if mu_water is None else ready.assuming(mu_water)
     grid = ready.grid if isinstance(ready, Posterior | CascadePosterior) else grid
     xrays, projector = fit_to_grid(ready, grid, torch.as_tensor(xrays), beam)

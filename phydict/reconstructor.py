@@ -61,6 +61,7 @@ class Reconstruction:
     of the volume; masks: soft anatomy masks (M, X, Y, Z) in [0, 1] where the method gives them; deviation: HU
     (X, Y, Z), the standard deviation of the samples of which the volume is the mean, where there are several;
     diverged_at: the step, counted from 1, from which on the misfit had risen until the end, None where it had not;
+    precision: what the networks computed in, or, without any, the X-rays' type;
     scatter: the mean share of the pixels' signal that was subtracted as scatter, and is no longer in xrays.
     """
 
@@ -79,6 +80,7 @@ class Reconstruction:
     deviation: Tensor | None = None
     diverged_at: int | None = None
     scatter: float = 0.0
+    precision: str = "float32"
 
     def save_nifti(self, path: str | Path) -> None:
         """Writes the volume as float32 HU with the grid's affine (RAS+ mm), replacing the file only when complete."""

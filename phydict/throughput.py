@@ -11,6 +11,7 @@ import torch
 from lightning.pytorch.utilities import rank_zero_only
 from torch.utils.flop_counter import FlopCounterMode
 
+from phydict.precision import instruction_set
 from phydict.prior import Prior, SuperResolution
 
 REPEATS = 5
@@ -40,10 +41,11 @@ class Throughput(lightning.Callback):
     def _tell_costs(self, trainer, module, shape: tuple[int, ...]) -> None:
         self.flop = sample_flop(module.prior, shape)
         low = torch.bfloat16 if "bf16" in str(trainer.precision) else torch.float32
+        precision, instructions = str(low).removeprefix("torch."), instruction_set(module.device)
         if self.peak is None:
             self.peak = matmul_peak(module.device, low) / 1e12
-        _tell(f"a sample costs {self.flop / 1e9:.3g} GFLOP forward and backward; a {str(low).removeprefix('torch.')} "
-              f"matrix product reaches {self.peak:.3g} TFLOP/s on this device")
+        _tell(f"training in {precision} on {instructions}: a sample costs {self.flop / 1e9:.3g} GFLOP forward and backward; a "
+              f"{precision} matrix product reaches {self.peak:.3g} TFLOP/s on this device")
 
     def on_train_batch_start(self, trainer, module, batch, _) -> None:
         if not self.flop:

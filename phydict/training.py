@@ -19,6 +19,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from phydict.atomic import whole_file
 from phydict.command_line import check_writable, one_sentence_errors, quiet
 from phydict.datamodule import PriorData
+from phydict.precision import PRECISIONS, resolve_precision
 from phydict.prior import save_prior, save_super_resolution
 from phydict.prior.checkpoint import build_prior, build_super_resolution, build_text
 from phydict.prior.pretrained import inspect_prior, read_torch
@@ -133,6 +134,9 @@ class PriorCLI(LightningCLI):
     def add_arguments_to_parser(self, parser) -> None:
         parser.add_argument("--out", default="runs/prior", help="folder for checkpoint, logs and samples")
         parser.add_argument("--stage", default="base", choices=list(STAGES), help="which stage of a cascade to train")
+        parser.add_argument("--precision", default="auto", choices=list(PRECISIONS),
+                            help="of the network: bfloat16 where the device computes it and float32 elsewhere (auto), or "
+                                 "one of the two; trainer.precision takes Lightning's own names instead")
         parser.add_lightning_class_args(ModelCheckpoint, "checkpoint")
         parser.set_defaults({"checkpoint.filename": "last", "checkpoint.enable_version_counter": False,
                              "checkpoint.every_n_epochs": 1, "checkpoint.save_on_train_epoch_end": True})
@@ -154,6 +158,13 @@ class PriorCLI(LightningCLI):
         asked = self._get(self.config_init, "trainer").plugins or []
         plugins = [*(asked if isinstance(asked, list) else [asked]), WholeCheckpoints()]
         logger = CSVLogger(self._get(self.config, "out"), name="logs")
+        trainer = self._get(self.config_init, "trainer")
+        device = torch.device("cpu" if trainer.accelerator == "cpu" else torch.accelerator.current_accelerator() or "cpu")
+        if trainer.precision is None:
+            chosen = resolve_precision(self._get(self.config, "precision"), device)
+            kwargs["precision"] = "bf16-mixed" if chosen == torch.bfloat16 else "32-true"
+        elif "bf16" in str(trainer.precision):
+            resolve_precision("bfloat16", device)  # warns where that is slow
         return super().instantiate_trainer(logger=logger, plugins=plugins, **kwargs)
 
     def before_fit(self) -> None:

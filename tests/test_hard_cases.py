@@ -221,11 +221,13 @@ def test_a_thousand_noise_levels_change_little_beside_a_hundred():
 def test_denoisers_in_bf16_fp32_and_fp64_agree(prior):
     projector, sampler = Projector(GRID, BEAM, full_detector=True), replace(FAST, iterations=4)
 
-    def volume(kind: torch.dtype, bf16: bool) -> torch.Tensor:
-        return Posterior(tiny_prior().to(kind), sampler, bf16=bf16).reconstruct(CLEAN.to(kind), projector).volume
+    def volume(kind: torch.dtype, precision: str) -> torch.Tensor:
+        method = Posterior(tiny_prior().to(kind), sampler, precision=precision)
+        return method.reconstruct(CLEAN.to(kind), projector).volume
 
-    exact = volume(torch.float64, False)
-    difference = [float((volume(torch.float32, bf16) - exact).square().mean().sqrt()) for bf16 in (False, True)]
+    exact = volume(torch.float64, "float32")
+    difference = [float((volume(torch.float32, precision) - exact).square().mean().sqrt()) 
+                  for precision in ("float32", "bfloat16")]
     assert exact.dtype == torch.float64 and difference[0] < 0.5 and difference[1] < 30
 
 

@@ -87,7 +87,7 @@ def test_priors_samplers_and_projectors_of_ones_own_fit_in():
     class OwnPrior:
         window, state_channels = HUWindow(), 1
 
-        def bind(self, report, guidance, bf16):
+        def bind(self, report, guidance, precision):
             return GaussianDenoiser(torch.full((1, 1, 16, 16, 16), -0.5), torch.tensor(0.01))
 
     OwnPrior.grid = grid

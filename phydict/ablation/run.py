@@ -17,6 +17,7 @@ from phydict.command_line import sentence
 from phydict.evaluation import read_csv, write_csv
 from phydict.methods import fit_to_grid, reconstructor
 from phydict.posterior import Sampler
+from phydict.precision import instruction_set
 from phydict.progress import CaseProgress
 from phydict.reconstruction_data import case_scores, case_seed
 from phydict.reconstructor import Reconstruction, Stopwatch
@@ -28,7 +29,8 @@ FINISHED = ("ok", "refused", "diverged")
 
 MEASURED = ("status", "error", "ssim", "psnr", "mae_hu", "ssim_lung", "psnr_lung", "mae_hu_lung", "misfit", "seconds",
             "seconds_prepare", "seconds_sample", "seconds_score", "seconds_network", "seconds_projector",
-            "network_calls", "projector_calls", "peak_memory_mb", "device", "threads")
+            "network_calls", "projector_calls", "peak_memory_mb", "device", "threads",
+            "precision", "instruction_set")
 """Columns that a run fills; the others are the trial's."""
 
 
@@ -178,7 +180,8 @@ class Bench:
             "seconds": sum(result.seconds.values()),
             **{f"seconds_{stage}": value for stage, value in (result.seconds | watch.seconds).items()},
             "network_calls": result.network_calls, "projector_calls": result.projector_calls, "peak_memory_mb": peak,
-            "device": self.device.type, "threads": torch.get_num_threads()}
+            "device": self.device.type, "threads": torch.get_num_threads(), "precision": result.precision,
+            "instruction_set": instruction_set(self.device)}
 
     def _reconstruct(self, trial: Trial, scene: Scene, watch: Stopwatch, on_step: Callable[[], None]) -> Reconstruction:
         seed = case_seed(trial.seed, scene.case)

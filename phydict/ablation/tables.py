@@ -158,12 +158,13 @@ def caption(rows: Sequence[dict]) -> str:
     """What the numbers of tables were taken from."""
     cases = len({row["case"] for row in rows})
     listed = {name: ", ".join(dict.fromkeys(str(row[name]) for row in rows if name in row))
-              for name in ("grid", "device", "threads", "seed")}
+              for name in ("grid", "device", "threads", "seed", "precision", "instruction_set")}
+    how = " on ".join(listed[name] for name in ("precision", "instruction_set") if listed[name])
     return (f"Mean over {cases} {'case' if cases == 1 else 'cases'}; best in bold, second underlined. HU clipped to "
             f"[{RANGE.low:g}, {RANGE.high:g}], data range {2 * RANGE.half_width:g} HU; SSIM 3-D on HU from the range's "
             f"low end, Gaussian of {TAPS} taps, sigma {SIGMA:g} voxels. Grid: {listed['grid']}. Seeds: "
             f"{listed['seed']}. Seconds: one reconstruction after a warm-up, {listed['device'] or 'none'}, threads "
-            f"{listed['threads'] or 'none'}; loading and scoring excluded.")
+            f"{listed['threads'] or 'none'}{how and f', {how}'}; loading and scoring excluded.")
 
 
 def reasons(found: Sequence[Entry]) -> list[str]:

@@ -22,8 +22,8 @@ class TimedPrior:
         self.grid, self.window, self.state_channels = prior.grid, prior.window, prior.state_channels
         self._prior, self._watch = prior, watch
 
-    def bind(self, report: str, guidance: float, bf16: bool) -> Denoiser:
-        return TimedDenoiser(self._prior.bind(report, guidance, bf16), self._watch)
+    def bind(self, report: str, guidance: float, precision: str) -> Denoiser:
+        return TimedDenoiser(self._prior.bind(report, guidance, precision), self._watch)
 
 
 class TimedDenoiser:

@@ -15,6 +15,7 @@ from phydict.posterior.measurement import Measurement
 from phydict.posterior.posterior import Counted, Posterior
 from phydict.posterior.sampler import PriorOnly, Sampler
 from phydict.posterior.split_gibbs import SplitGibbs, noise_like
+from phydict.precision import check_precision
 from phydict.prior import Cascade
 from phydict.reconstructor import Guard, Reconstruction, Reconstructor, Stopwatch, misfits
 from phydict.units import MU_WATER
@@ -45,9 +46,10 @@ class CascadePosterior(Reconstructor):
     guidance: float = 1.0
     mu_water: float = MU_WATER
     name: str = "phydict"
-    bf16: bool = True
+    precision: str = "auto"
 
     def __post_init__(self):
+        check_precision(self.precision)
         if not 0 <= self.noise <= 1:
             raise ValueError(f"the noise of the base estimate is a level in [0, 1], but {self.noise} was given")
 
@@ -92,7 +94,7 @@ class CascadePosterior(Reconstructor):
                 measurement.correct(measurement.project(fine.upsample(state)[:, :1]))
                 measurement.scattered = False  # what the base stage tells of is kept
             guard = Guard(measurement, on_step, self.second.steps())
-            denoiser = Counted(fine.bind(state + self.noise * noise_like(state, draw), self.noise, self.bf16), guard)
+            denoiser = Counted(fine.bind(state + self.noise * noise_like(state, draw), self.noise, self.precision), guard)
             x = noise_like(torch.empty(1, fine.state_channels, *fine.grid.shape, device=xrays.device), draw)
         with watch.stage("sample"):
             state = self.second.sample(denoiser, measurement, x, draw, guard)
@@ -111,7 +113,7 @@ class CascadePosterior(Reconstructor):
             **found, seconds=watch.seconds, xrays=measured, reprojection=reprojection,
             network_calls=base.network_calls + denoiser.calls,
             projector_calls=base.projector_calls + measurement.calls, masks=masks,
-            diverged_at=base.diverged_at or guard.diverged_at, scatter=base.scatter)
+            diverged_at=base.diverged_at or guard.diverged_at, scatter=base.scatter, precision=base.precision)
 
     def _base(self, xrays: Tensor, projector: Projector, report: str, display: bool, seed: int,
               on_step: Callable[[], None]) -> Reconstruction:
@@ -119,5 +121,5 @@ class CascadePosterior(Reconstructor):
         prior, beam = self.cascade.base, projector.beam
         factor = 1 if self.sampler.full_detector else binning(prior.grid, beam)
         coarse = Projector(prior.grid, beam.binned(factor), device=xrays.device, full_detector=True)
-        posterior = Posterior(prior, self.sampler, self.guidance, self.mu_water, self.name, self.bf16)
+        posterior = Posterior(prior, self.sampler, self.guidance, self.mu_water, self.name, self.precision)
         return posterior.reconstruct(binned(xrays, factor), coarse, report, display, seed, on_step)

@@ -14,6 +14,7 @@ from phydict.grid import Grid
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.sampler import Sampler
 from phydict.posterior.split_gibbs import SplitGibbs, noise_like
+from phydict.precision import check_precision, precision_name
 from phydict.prior import Prior
 from phydict.profiling import stage
 from phydict.reconstructor import Guard, Reconstruction, Reconstructor, Stopwatch, misfits
@@ -40,7 +41,7 @@ class Posterior(Reconstructor):
     """Reconstructs by sampling p(x | Y, report) under a prior.
 
     sampler: how; guidance: classifier-free guidance scale used when a report is given; mu_water: 1/mm;
-    bf16: run the denoiser in bfloat16, which on most processors is twice as fast;
+    precision: of the denoiser, see phydict.precision;
     samples: how many are drawn. One is the sampler's own result; of several, drawn by its `randomised` settings, the
     volume is the mean, and their standard deviation says where not to trust it. batch: how many of them go through
     the denoiser at once, where the sampler allows it; fewer need less memory. Sample i depends neither on samples nor,
@@ -52,11 +53,12 @@ class Posterior(Reconstructor):
     guidance: float = 1.0
     mu_water: float = MU_WATER
     name: str = "phydict"
-    bf16: bool = True
+    precision: str = "auto"
     samples: int = 1
     batch: int = 4
 
     def __post_init__(self):
+        check_precision(self.precision)
         for name in ("samples", "batch"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is a number of reconstructions, 1 or more, but {getattr(self, name)} was "
@@ -93,7 +95,7 @@ class Posterior(Reconstructor):
         with watch.stage("prepare"):
             measurement = Measurement(projector, xrays, prior.window, display, self.mu_water)
             guard = Guard(measurement, on_step, sampler.steps())
-            denoiser = Counted(prior.bind(report, self.guidance, self.bf16), guard)
+            denoiser = Counted(prior.bind(report, self.guidance, self.precision), guard)
             state = torch.empty(1, prior.state_channels, *prior.grid.shape, device=xrays.device)
         with watch.stage("sample"):
             states = []
@@ -124,7 +126,8 @@ class Posterior(Reconstructor):
             **found, seconds=watch.seconds, xrays=measured, reprojection=reprojection,
             network_calls=denoiser.calls * (2 if report and self.guidance != 1 else 1),
             projector_calls=measurement.calls, masks=((state[1:] + 1) / 2).cpu(), deviation=deviation,
-            diverged_at=guard.diverged_at, scatter=measurement.scatter)
+            diverged_at=guard.diverged_at, scatter=measurement.scatter,
+            precision=precision_name(self.precision, xrays))
 
 
 def sample_seed(seed: int, i: int) -> int:

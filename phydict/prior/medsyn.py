@@ -26,6 +26,7 @@ from torch.nn.functional import interpolate, scaled_dot_product_attention, silu
 
 from phydict.diffusion import CosineSchedule
 from phydict.grid import Grid
+from phydict.precision import network_precision
 from phydict.prior.prior import BoundPrior
 from phydict.prior.text import TextEncoder
 from phydict.units import HUWindow
@@ -357,7 +358,7 @@ class MedSynPrior(nn.Module):
         return from_slices(self.network(to_slices(x).contiguous(), t, context)).to(x.dtype)
 
     @torch.no_grad()
-    def bind(self, report: str = "", guidance: float = 1.0, bf16: bool | None = None) -> BoundPrior:
+    def bind(self, report: str = "", guidance: float = 1.0, precision: str = "auto") -> BoundPrior:
         """The denoiser of one report, with classifier-free guidance of the given scale inside (1 = none).
 
         Warns, once for each report, where a TextEncoder cuts it or does not know its words.
@@ -367,7 +368,7 @@ class MedSynPrior(nn.Module):
         context = self.context([report])
         if report and isinstance(self.text, TextEncoder):
             self.text.check([report])
-        return BoundPrior(self, context, guidance if report else 1.0, bf16)
+        return BoundPrior(self, context, guidance if report else 1.0, precision)
 
 
 class MedSynSuperResolution(nn.Module):
@@ -389,7 +390,7 @@ class MedSynSuperResolution(nn.Module):
         """Clean estimate of x (B, 4, X, Y, Z) at times t (B,), given a coarse state repeated to x's size."""
         return from_slices(self.network(to_slices(x).contiguous(), t, to_slices(coarse))).to(x.dtype)
 
-    def bind(self, coarse: Tensor, noise: float = 0.0, bf16: bool | None = None) -> BoundSuperResolution:
+    def bind(self, coarse: Tensor, noise: float = 0.0, precision: str = "auto") -> BoundSuperResolution:
         """The denoiser of the fine states of a coarse one (B, 4, X/4, Y/4, Z/4), which may be a part of the grid's.
 
         noise: share in [0, 1) of normal noise that `coarse` carries (MedSyn trained with up to 0.4); this network is
@@ -400,7 +401,7 @@ class MedSynSuperResolution(nn.Module):
                              "given: give the whole state of MedSyn's first stage, masks included")
         if not 0 <= noise < 1:
             raise ValueError(f"the coarse state's share of noise lies in [0, 1), but {noise} was given")
-        return BoundSuperResolution(self, interpolate(coarse, scale_factor=self.factor, mode="nearest"), bf16)
+        return BoundSuperResolution(self, interpolate(coarse, scale_factor=self.factor, mode="nearest"), precision)
 
 
 @dataclass(frozen=True)
@@ -409,7 +410,7 @@ class BoundSuperResolution:
 
     stage: MedSynSuperResolution
     coarse: Tensor
-    bf16: bool | None = None
+    precision: str = "auto"
 
     @property
     def schedule(self) -> CosineSchedule:
@@ -417,13 +418,12 @@ class BoundSuperResolution:
 
     @torch.no_grad()
     def denoise(self, x: Tensor, t: float) -> Tensor:
-        """E[x_0 | x_t = x, coarse]; runs in bfloat16 where `bf16` says so (None: unless x is float64)."""
+        """E[x_0 | x_t = x, coarse]."""
         if x.shape[2:] != self.coarse.shape[2:]:
             raise ValueError(f"the coarse state belongs to {tuple(self.coarse.shape[2:])} fine voxels, but "
                              f"{tuple(x.shape[2:])} were given: bind the coarse state of the same region")
         times = torch.full((len(x),), float(t), device=x.device)
-        low = x.dtype != torch.float64 if self.bf16 is None else self.bf16
-        with torch.autocast(x.device.type, torch.bfloat16, enabled=low):
+        with network_precision(self.precision, x):
             return self.stage(x, times, self.coarse.to(x).expand(len(x), -1, -1, -1, -1))
 
 

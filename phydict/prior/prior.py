@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from phydict.diffusion import CosineSchedule, guided
 from phydict.grid import Grid
+from phydict.precision import network_precision
 from phydict.prior.detail import DetailNetwork
 from phydict.prior.text import TextEncoder
 from phydict.prior.unet import VolumeUNet
@@ -115,17 +116,17 @@ class Prior(nn.Module):
         return share, (((1 - share) * self.sigma_data) ** 2 + (share * sigma) ** 2).sqrt()
 
     @torch.no_grad()
-    def bind(self, report: str = "", guidance: float = 1.0, bf16: bool | None = None) -> BoundPrior:
+    def bind(self, report: str = "", guidance: float = 1.0, precision: str = "auto") -> BoundPrior:
         """The denoiser of one report, with classifier-free guidance of the given scale inside (1 = none).
 
-        Warns, once for each report, where it is cut or in words that the text encoder does not know.
+        precision: see phydict.precision. Warns, once for each report, where it is cut or in words that the text encoder does not know.
         """
         if guidance < 0:
             raise ValueError(f"the guidance scale is at least 0, but {guidance} was given")
         context = self.context([report])
         if report:
             self.text.check([report])
-        return BoundPrior(self, context, guidance if report else 1.0, bf16)
+        return BoundPrior(self, context, guidance if report else 1.0, precision)
 
 
 @dataclass(frozen=True)
@@ -135,21 +136,17 @@ class BoundPrior:
     prior: Prior
     context: Tensor
     guidance: float
-    bf16: bool | None = None
+    precision: str = "auto"
 
     @property
     def schedule(self) -> CosineSchedule:
         return self.prior.schedule
 
     def denoise(self, x: Tensor, t: float) -> Tensor:
-        """E[x_0 | x_t = x, report]; runs in bfloat16 where `bf16` says so (None: unless x is float64).
-
-        Differentiable where x requires a gradient; otherwise nothing is kept for one.
-        """
+        """E[x_0 | x_t = x, report]. Differentiable where x requires a gradient; otherwise nothing is kept for one."""
         n, prior = len(x), self.prior
         times = torch.full((n,), float(t), device=x.device)
-        low = x.dtype != torch.float64 if self.bf16 is None else self.bf16
-        with torch.set_grad_enabled(x.requires_grad), torch.autocast(x.device.type, torch.bfloat16, enabled=low):
+        with torch.set_grad_enabled(x.requires_grad), network_precision(self.precision, x):
             conditional = prior(x, times, self.context.expand(n, -1, -1))
             if self.guidance == 1.0:
                 return conditional

@@ -11,6 +11,7 @@ from torch.nn.functional import interpolate
 
 from phydict.diffusion import CosineSchedule
 from phydict.grid import Grid
+from phydict.precision import network_precision
 from phydict.prior.local_unet import LocalUNet
 from phydict.prior.tiles import Tiles
 from phydict.units import HUWindow
@@ -83,10 +84,10 @@ class SuperResolution(nn.Module):
         return Tiles.within(self.memory, self.network.bytes_per_voxel, self.overlap, self.network.divisor)
 
     @torch.no_grad()
-    def bind(self, coarse: Tensor, noise: float = 0.0, bf16: bool | None = None) -> BoundSuperResolution:
+    def bind(self, coarse: Tensor, noise: float = 0.0, precision: str = "auto") -> BoundSuperResolution:
         """The denoiser given a coarse state (B, C, x, y, z) that carries Gaussian noise of the level `noise`.
 
-        bf16: run the network in bfloat16 (None: unless the state is float64). Raises ValueError for a level outside
+        precision: see phydict.precision. Raises ValueError for a level outside
         [0, 1] or too few channels.
         """
         if not 0 <= noise <= 1:
@@ -94,7 +95,7 @@ class SuperResolution(nn.Module):
         if coarse.shape[1] < self.coarse_channels:
             raise ValueError(f"this super-resolution stage needs {self.coarse_channels} coarse channels, but "
                              f"{coarse.shape[1]} were given")
-        return BoundSuperResolution(self, self.upsample(coarse), noise, bf16)
+        return BoundSuperResolution(self, self.upsample(coarse), noise, precision)
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,7 @@ class BoundSuperResolution:
     stage: SuperResolution
     upsampled: Tensor
     noise: float = 0.0
-    bf16: bool | None = None
+    precision: str = "auto"
 
     @property
     def schedule(self) -> CosineSchedule:
@@ -115,7 +116,6 @@ class BoundSuperResolution:
         """E[x_0 | x_t = x, coarse state]."""
         times = torch.full((len(x),), float(t), device=x.device)
         level = torch.full((len(x),), float(self.noise), device=x.device)
-        low = x.dtype != torch.float64 if self.bf16 is None else self.bf16
-        with torch.autocast(x.device.type, torch.bfloat16, enabled=low):
+        with network_precision(self.precision, x):
             return self.stage.tiles()(lambda part, coarse: self.stage(part, times, coarse, level), x,
                                       self.upsampled.to(x.dtype))

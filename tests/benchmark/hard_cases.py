@@ -193,15 +193,15 @@ class HardCases:
         yield "1000 noise levels", lambda: self._with(replace(FAST, iterations=1000))
 
     def _precisions(self):
-        def run(kind: torch.dtype, bf16: bool = False) -> Reconstruction:
-            ready = Posterior(load_prior(DEFAULT_PRIOR).to(kind), FAST, bf16=bf16)
+        def run(kind: torch.dtype, precision: str = "float32") -> Reconstruction:
+            ready = Posterior(load_prior(DEFAULT_PRIOR).to(kind), FAST, precision=precision)
             xrays, projector = fit_to_grid(ready, GRID, self.xrays, BEAM)
             return ready.reconstruct(xrays.to(kind), projector)
 
-        for name, kind, bf16 in (("bf16", torch.float32, True), ("fp32", torch.float32, False),
-                                 ("fp64", torch.float64, False)):
-            yield f"denoiser in {name}, against fp64", lambda kind=kind, bf16=bf16: replace(
-                self._with(), run=lambda: run(kind, bf16), compared_with=lambda: run(torch.float64).volume)
+        for name, kind, precision in (("bf16", torch.float32, "bfloat16"), ("fp32", torch.float32, "float32"),
+                                      ("fp64", torch.float64, "float32")):
+            yield f"denoiser in {name}, against fp64", lambda kind=kind, precision=precision: replace(
+                self._with(), run=lambda: run(kind, precision), compared_with=lambda: run(torch.float64).volume)
 
     def _seeds(self):
         for seed in range(20):

@@ -34,9 +34,9 @@ def measure(stage: int, width: int) -> dict:
         weight.normal_(0, 0.02)
     n = VOXELS[stage]
     if stage == 1:
-        denoiser = MedSynPrior(network).bind(bf16=True)
+        denoiser = MedSynPrior(network).bind(precision="bfloat16")
     else:
-        denoiser = MedSynSuperResolution(network).bind(torch.zeros(1, 4, n // 4, n // 4, n // 4), bf16=True)
+        denoiser = MedSynSuperResolution(network).bind(torch.zeros(1, 4, n // 4, n // 4, n // 4), precision="bfloat16")
     weights = peak_mib()
     x = torch.randn(1, 4, n, n, n)
     start = time.perf_counter()

@@ -34,7 +34,7 @@ class GaussianStage:
     def upsample(self, coarse):
         return interpolate(coarse, scale_factor=2, mode="trilinear")
 
-    def bind(self, coarse, noise=0.0, bf16=None):
+    def bind(self, coarse, noise=0.0, precision="auto"):
         return GaussianDenoiser(self.upsample(coarse), torch.tensor(self.variance), self.schedule)
 
 
@@ -53,13 +53,13 @@ def cascade():
 
 
 def gaussian(variance=1e-2, **settings):
-    return CascadePosterior(Cascade(tiny_prior(False), GaussianStage(variance)), SAMPLER, bf16=False, **settings)
+    return CascadePosterior(Cascade(tiny_prior(False), GaussianStage(variance)), SAMPLER, precision="float32", **settings)
 
 
 def base_alone(xrays, seed=3):
     """The base stage's reconstruction by itself, in the prior's range, upsampled."""
     half = BEAM.binned(2)
-    result = Posterior(tiny_prior(False), SAMPLER, bf16=False).reconstruct(
+    result = Posterior(tiny_prior(False), SAMPLER, precision="float32").reconstruct(
         binned(xrays, 2), Projector(Grid.cube(16), half, full_detector=True), seed=seed)
     coarse = HUWindow(-1000, 600).to_range(result.volume)[None, None]
     return interpolate(coarse, scale_factor=2, mode="trilinear")
@@ -124,7 +124,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_seed_others(cascade, xray
 
 
 def test_in_tiles_the_result_is_that_of_the_whole_within_a_tolerance(cascade, xrays):
-    method = CascadePosterior(cascade, SAMPLER, unguided=PriorOnly(3), bf16=False)
+    method = CascadePosterior(cascade, SAMPLER, unguided=PriorOnly(3), precision="float32")
     tiled = tiny_super_resolution(overlap=8)
     tiled.memory = int(17**3 * tiled.network.bytes_per_voxel)
     assert len(tiled.tiles().starts(32)) == 3

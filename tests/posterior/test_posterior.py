@@ -111,7 +111,7 @@ def test_a_report_changes_the_result(prior):
 
 
 def test_display_values_count_only_up_to_a_positive_gain_and_an_offset_per_view(prior):
-    method, y = Posterior(prior, FAST, bf16=False), views()
+    method, y = Posterior(prior, FAST, precision="float32"), views()
     shown = method.reconstruct(y, PROJECTOR, display=True)
     scaled = method.reconstruct(torch.tensor([4.0, 0.5, 2.0, 64.0]).view(4, 1, 1) * y, PROJECTOR, display=True)
     assert torch.equal(scaled.volume, shown.volume)  # powers of two are exact

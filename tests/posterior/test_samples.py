@@ -19,7 +19,7 @@ SAMPLER = SplitGibbs(4, ProximalCG(3), ProximalCG(3), warm_start=0.7, fresh_nois
 
 @pytest.fixture(scope="module")
 def method():
-    return Posterior(tiny_prior(), SAMPLER, bf16=False)
+    return Posterior(tiny_prior(), SAMPLER, precision="float32")
 
 
 def drawn(method, n, batch=4, display=False):
@@ -45,7 +45,7 @@ def test_one_sample_is_the_samplers_own_result_without_a_deviation(method):
     draw = torch.Generator().manual_seed(5)
     x = torch.randn((1, method.prior.state_channels, 16, 16, 16), generator=draw)
     m = Measurement(PROJECTOR, views(), method.prior.window)
-    expected = SAMPLER.sample(method.prior.bind(bf16=False), m, x, draw)
+    expected = SAMPLER.sample(method.prior.bind(precision="float32"), m, x, draw)
     assert torch.equal(one.volume, method.prior.window.to_hu(expected[0, 0]))
 
 

@@ -17,7 +17,7 @@ X = random_like((1, 4, 16, 16, 16), torch.float32, seed=1)
 
 
 def estimates(prior):
-    return [prior.bind(report, 2.0, bf16=False).denoise(X, 0.3) for report in ("", REPORTS[0])]
+    return [prior.bind(report, 2.0, precision="float32").denoise(X, 0.3) for report in ("", REPORTS[0])]
 
 
 @pytest.fixture

@@ -133,12 +133,12 @@ def test_a_voxel_goes_where_medsyn_has_it_and_comes_back():
 def test_a_prior_shows_its_network_medsyns_axes_and_returns_ours():
     one, seen = prior(), {}
     one.network.forward = lambda x, t, context: seen.update(x=x) or x
-    assert torch.equal(one.bind(bf16=False).denoise(X, 0.5), X)
+    assert torch.equal(one.bind(precision="float32").denoise(X, 0.5), X)
     assert seen["x"][0, 2, 5, 1, 0] == X[0, 2, 7, 1, 5]
     fine, coarse = MedSynSuperResolution(super_resolution_unet(), GRID), random_like((1, 4, 2, 1, 3), torch.float32)
     fine.network.forward = lambda x, t, coarse: coarse
     x = torch.zeros(1, 4, 8, 4, 12)
-    assert torch.equal(fine.bind(coarse, bf16=False).denoise(x, 0.5), interpolate(coarse, x.shape[2:]))
+    assert torch.equal(fine.bind(coarse, precision="float32").denoise(x, 0.5), interpolate(coarse, x.shape[2:]))
 
 
 def test_the_atlas_is_316_by_316_by_292_mm_at_both_stages():
@@ -177,27 +177,27 @@ def test_a_report_that_is_cut_or_foreign_is_stated_once():
 
 def test_guidance_leads_away_from_the_estimate_without_a_report():
     one = prior()
-    with_report, without = (one.bind(report, bf16=False).denoise(X, 0.5) for report in ("a report", ""))
+    with_report, without = (one.bind(report, precision="float32").denoise(X, 0.5) for report in ("a report", ""))
     assert not torch.equal(with_report, without)
-    torch.testing.assert_close(one.bind("a report", 3.0, bf16=False).denoise(X, 0.5),
+    torch.testing.assert_close(one.bind("a report", 3.0, precision="float32").denoise(X, 0.5),
                                guided(with_report, without, 3.0))
-    assert torch.equal(one.bind("", 3.0, bf16=False).denoise(X, 0.5), without)
+    assert torch.equal(one.bind("", 3.0, precision="float32").denoise(X, 0.5), without)
 
 
-@pytest.mark.parametrize("stage", [lambda bf16: prior().bind("a report", bf16=bf16),
-                                   lambda bf16: MedSynSuperResolution(super_resolution_unet(), GRID).bind(
-                                       X[:, :, :2, :1, :2], bf16=bf16)])
+@pytest.mark.parametrize("stage", [lambda precision: prior().bind("a report", precision=precision),
+                                   lambda precision: MedSynSuperResolution(super_resolution_unet(), GRID).bind(
+                                       X[:, :, :2, :1, :2], precision=precision)])
 def test_half_precision_changes_the_estimate_slightly(stage):
     x = random_like((1, 4, 8, 4, 8), torch.float32, seed=4)
-    full, low = stage(False).denoise(x, 0.5), stage(None).denoise(x, 0.5)
+    full, low = stage("float32").denoise(x, 0.5), stage("bfloat16").denoise(x, 0.5)
     assert low.dtype == torch.float32
     assert 0 < (low - full).square().mean().sqrt() < 0.05 * full.std()
 
 
 def test_a_batch_is_denoised_as_its_members_are():
     x = random_like((2, 4, 8, 4, 6), torch.float32, seed=5)
-    together = prior().bind("a report", bf16=False).denoise(x, 0.7)
-    alone = torch.cat([prior().bind("a report", bf16=False).denoise(part, 0.7) for part in x.split(1)])
+    together = prior().bind("a report", precision="float32").denoise(x, 0.7)
+    alone = torch.cat([prior().bind("a report", precision="float32").denoise(part, 0.7) for part in x.split(1)])
     torch.testing.assert_close(together, alone, atol=1e-5, rtol=1e-4)
 
 
@@ -226,7 +226,7 @@ def test_every_sampler_works_with_it(sampler):
 
 def test_the_second_stage_samples_on_the_fine_voxels_of_a_part():
     fine = MedSynSuperResolution(super_resolution_unet())
-    denoiser = fine.bind(random_like((1, 4, 2, 1, 2), torch.float32), 0.1, bf16=False)
+    denoiser = fine.bind(random_like((1, 4, 2, 1, 2), torch.float32), 0.1, precision="float32")
     state = PriorOnly(2).sample(denoiser, None, random_like((1, 4, 8, 4, 8), torch.float32, seed=8), None)
     assert state.shape == (1, 4, 8, 4, 8) and state.isfinite().all() and denoiser.schedule == fine.schedule
 

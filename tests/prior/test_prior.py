@@ -123,7 +123,7 @@ def test_without_a_report_there_is_nothing_to_guide(prior):
 def test_half_precision_changes_little_and_double_is_kept():
     prior = tiny_prior()
     x = X.float()
-    full, low = (prior.bind(bf16=b).denoise(x, 0.5) for b in (False, True))
+    full, low = (prior.bind(precision=p).denoise(x, 0.5) for p in ("float32", "bfloat16"))
     assert low.dtype == torch.float32 and 0 < (low - full).square().mean().sqrt() < 0.03 * full.std()
     assert prior.double().bind().denoise(X, 0.5).dtype == torch.float64
 

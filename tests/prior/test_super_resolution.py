@@ -43,7 +43,7 @@ class Peak(TorchDispatchMode):
 
 def test_untrained_it_believes_the_coarse_volume_in_pure_noise_and_the_state_without_noise():
     fine = SuperResolution(LocalUNet(2, 1, 2, (8, 8)), Grid.cube(32), HUWindow(), 2)
-    denoiser = fine.bind(COARSE, bf16=False)
+    denoiser = fine.bind(COARSE, precision="float32")
     upsampled = fine.upsample(COARSE)
     torch.testing.assert_close(denoiser.denoise(X, 1.0), upsampled, atol=1e-3, rtol=0)
     share = 0.1**2 / (0.1**2 + float(fine.schedule.sigma(0.0)) ** 2)
@@ -70,14 +70,14 @@ def test_only_the_coarse_channels_it_uses_change_the_estimate():
 
 def test_the_noise_level_of_the_coarse_volume_is_told():
     fine = tiny_super_resolution()
-    estimates = [fine.bind(COARSE, noise, bf16=False).denoise(X, 0.5) for noise in (0.0, 0.1, 0.5)]
+    estimates = [fine.bind(COARSE, noise, precision="float32").denoise(X, 0.5) for noise in (0.0, 0.1, 0.5)]
     assert (estimates[0] - estimates[1]).std() > 1e-4 and (estimates[1] - estimates[2]).std() > 1e-4
 
 
 def test_half_precision_changes_little_and_double_precision_stays():
     fine = tiny_super_resolution()
-    exact = fine.bind(COARSE, bf16=False).denoise(X, 0.5)
-    low = fine.bind(COARSE, bf16=True).denoise(X, 0.5)
+    exact = fine.bind(COARSE, precision="float32").denoise(X, 0.5)
+    low = fine.bind(COARSE, precision="bfloat16").denoise(X, 0.5)
     assert 0 < (low - exact).std() < 0.03 * exact.std() and low.dtype == torch.float32
     double = tiny_super_resolution().double()
     found = double.bind(COARSE.double()).denoise(X.double(), 0.5)
@@ -112,7 +112,7 @@ def test_a_sample_in_tiles_is_that_of_the_whole_and_the_same_bits_each_time():
     noise = X[..., :16, :16].repeat(1, 1, 5, 1, 1)[:, :, :144]
 
     def sample(fine):
-        return descend(fine.bind(coarse, 0.05, bf16=False), noise, 2)
+        return descend(fine.bind(coarse, 0.05, precision="float32"), noise, 2)
 
     expected = sample(long_stage(8))
     detail = (expected - long_stage(8).upsample(coarse)).std()
@@ -131,8 +131,8 @@ def test_a_sample_in_tiles_is_that_of_the_whole_and_the_same_bits_each_time():
 def test_tiles_leave_no_seams():
     """Across the faces of the tiles, the estimate changes as much from voxel to voxel as the whole's."""
     coarse, noise = COARSE.repeat(1, 1, 2, 2, 2), X.repeat(1, 1, 2, 2, 2)
-    whole = tiny_super_resolution(64).bind(coarse, bf16=False).denoise(noise, 0.5)
-    tiled = in_tiles().bind(coarse, bf16=False).denoise(noise, 0.5)
+    whole = tiny_super_resolution(64).bind(coarse, precision="float32").denoise(noise, 0.5)
+    tiled = in_tiles().bind(coarse, precision="float32").denoise(noise, 0.5)
     for face in (15, 31, 47):
         for axis in (2, 3, 4):
             steps = [volume.diff(dim=axis).narrow(axis, face, 1).square().mean().sqrt() for volume in (tiled, whole)]
@@ -144,7 +144,7 @@ def test_a_call_stays_within_the_memory_that_it_states(channels, block):
     torch.manual_seed(0)
     network = LocalUNet(2, 1, block, channels).requires_grad_(False)
     fine = SuperResolution(network, Grid.cube(64), HUWindow(), 2)
-    denoiser = fine.bind(torch.zeros(1, 1, 32, 32, 32), bf16=False)
+    denoiser = fine.bind(torch.zeros(1, 1, 32, 32, 32), precision="float32")
     x = torch.zeros(1, 1, 64, 64, 64)
     with Peak() as peak:
         denoiser.denoise(x, 0.5)
@@ -153,7 +153,7 @@ def test_a_call_stays_within_the_memory_that_it_states(channels, block):
 
 def test_less_memory_is_enough_in_tiles():
     def peak(fine):
-        denoiser, x = fine.bind(torch.zeros(1, 1, 32, 32, 32), bf16=False), torch.zeros(1, 1, 64, 64, 64)
+        denoiser, x = fine.bind(torch.zeros(1, 1, 32, 32, 32), precision="float32"), torch.zeros(1, 1, 64, 64, 64)
         with Peak() as found:
             denoiser.denoise(x, 0.5)
         return found.most

@@ -29,6 +29,7 @@ from phydict.grid import Grid
 from phydict.inference import main
 from phydict.methods import reconstruct, reconstructor
 from phydict.posterior import PriorOnly
+from phydict.precision import instruction_set
 from phydict.prior import LocalUNet, Prior, SuperResolution, VolumeUNet, save_prior, save_super_resolution
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import ConeBeam, Polychromatic, Projector
@@ -156,6 +157,7 @@ def test_predict_writes_what_the_library_reconstructs(measured, tmp_path, capsys
     assert set(said["seconds"]) == {"prepare", "sample", "score"} and said["process_peak_memory_mb"] > 100
     assert said["settings"]["seed"] == 7 and said["settings"]["method"]["iterations"] == 3
     assert said["settings"]["method"]["mu_water"] == 0.02  # also what the configuration left out
+    assert said["precision"] == "float32" and said["instruction_set"] == instruction_set(torch.device("cpu"))
     assert {"phydict", "torch", "python"} <= set(said["versions"]) and said["report"] == "No effusion."
     assert isinstance(said["seed"], int) and said["scores"] is None
     with Image.open(folder / "panel.png") as page:
@@ -373,6 +375,7 @@ def test_scores_are_those_of_the_written_volumes(scored):
         for name, value in expected.items():
             assert float(row[name]) == pytest.approx(value, rel=1e-6), name
         assert float(row["misfit"]) == record(scored / row["case"])["misfit"]
+        assert row["precision"] == "float32" and row["instruction_set"] == instruction_set(torch.device("cpu"))
     table = (scored / "results.md").read_text()
     psnr = [float(row["psnr"]) for row in rows]
     assert f"{np.mean(psnr):.2f} ± {np.std(psnr, ddof=1):.2f}" in table and "n = 2 cases" in table
@@ -636,6 +639,7 @@ def test_a_prior_refuses_xrays_of_another_grid(prior):
     (["--model.method.init_args.iteration=3"], ["iteration"]),
     (["--data.source_to_isocentre=2000"], ["isocentre"]),
     (["--config=nowhere.yaml"], ["nowhere.yaml"]),
+    (["--model.precision=half"], ["precision is auto, float32 or bfloat16, but 'half' was given"]),
 ], ids=lambda value: value[0] if value[0].startswith("--") else "")
 def test_a_bad_argument_is_one_sentence(change, words, tmp_path, capsys):
     said = refusal(capsys, phantoms(tmp_path / "out", 1, *change))

@@ -32,7 +32,7 @@ TINY = ["--model.network.class_path=phydict.prior.VolumeUNet", "--model.network.
         "--model.network.init_args.attention=[false,true]", "--model.network.init_args.head_channels=8",
         "--model.voxels=16", "--model.text_steps=2", "--model.warmup=2", "--model.montage_steps=2", "--data.phantoms=4",
         "--data.validation_phantoms=1", "--data.epoch_size=8", "--data.batch_size=2", "--trainer.accelerator=cpu",
-        "--trainer.devices=1", "--trainer.precision=32", "--trainer.max_steps=-1", "--trainer.log_every_n_steps=1",
+        "--trainer.devices=1", "--precision=float32", "--trainer.max_steps=-1", "--trainer.log_every_n_steps=1",
         "--trainer.check_val_every_n_epoch=1", "--trainer.enable_progress_bar=false",
         "--trainer.enable_model_summary=false"]
 
@@ -373,7 +373,7 @@ def test_spread_weights_are_not_averaged(tmp_path, cache):
 
 @pytest.mark.parametrize("flags, tolerance", [
     (["--model.gradient_checkpointing=true"], 1e-6), (["--model.channels_last=false"], 1e-4),
-    (["--trainer.precision=bf16-mixed"], 0.03)], ids=["checkpointing", "layout", "bf16"])
+    (["--precision=bfloat16"], 0.03)], ids=["checkpointing", "layout", "bf16"])
 def test_flags_leave_the_loss_and_their_checkpoint_goes_on_without_them(flags, tolerance, straight, cache, tmp_path):
     main(arguments(tmp_path, cache, "--trainer.max_epochs=1", "--trainer.limit_val_batches=0", *flags))
     loss, expected = losses(tmp_path), losses(straight)

@@ -35,7 +35,7 @@ class DetailNetwork(nn.Module):
         told = self.time(torch.cat([phase.sin(), phase.cos()], 1).to(difference.dtype))
         scales, shifts = told[..., None, None, None].unflatten(1, (len(self.middle) + 1, 2, -1)).unbind(2)
         h = torch.cat([difference, 2 * estimate], 1).contiguous(memory_format=torch.channels_last_3d)
-        h = silu(self.enter(h) * (1 + scales[:, 0]) + shifts[:, 0])
+        h = silu(torch.addcmul(shifts[:, 0], self.enter(h), 1 + scales[:, 0]), inplace=True)
         for i, layer in enumerate(self.middle, 1):
-            h = h + silu(layer(h) * (1 + scales[:, i]) + shifts[:, i])
+            h = silu(torch.addcmul(shifts[:, i], layer(h), 1 + scales[:, i]), inplace=True).add_(h)
         return self.leave(h)

@@ -8,6 +8,8 @@ from monai.networks.nets import DiffusionModelUNet
 from torch import Tensor, nn
 from torch.nn.functional import layer_norm
 
+from phydict.prior.convolution import speed_up
+
 
 class PositionNorm(nn.Module):
     """Normalisation over the channels of each position. Unlike group normalisation it looks at no other position."""
@@ -53,6 +55,7 @@ class LocalUNet(nn.Module):
         nn.init.xavier_uniform_(self.unet.out[-1].conv.weight)
         nn.init.zeros_(self.unfold.weight)
         nn.init.zeros_(self.unfold.bias)
+        speed_up(self)
         self.to(memory_format=torch.channels_last_3d)
 
     @property

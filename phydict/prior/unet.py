@@ -13,6 +13,8 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 from torch.utils.checkpoint import checkpoint
 
+from phydict.prior.convolution import speed_up
+
 
 class TextMap(nn.Module):
     """Where in the chest a report speaks of: learned positions attend to its tokens and answer with a coarse map.
@@ -87,6 +89,7 @@ class VolumeUNet(nn.Module):
         nn.init.zeros_(self.unfold.bias)
         nn.init.zeros_(self.hint.weight)
         nn.init.zeros_(self.hint.bias)
+        speed_up(self)
         self.run_with()
 
     def blocks(self) -> list[nn.Module]:

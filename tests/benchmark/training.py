@@ -100,6 +100,13 @@ def new_task(**flags) -> PriorTraining:
                          window=(prior.window.low, prior.window.high), montage_steps=0, **flags)
 
 
+def example_cases() -> list[dict]:
+    """A batch of phantoms, as training is given them."""
+    prior = new_task().prior
+    cases = [phantom_case(seed, prior.grid, prior.window) for seed in range(BATCH)]
+    return [{key: case[key] for key in ("volume", "masks", "has_masks", "report")} for case in cases]
+
+
 def peak_mib() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024  # Linux counts KiB
 
@@ -122,11 +129,7 @@ def measure(name: str, cases: list[dict]) -> dict:
 
 
 if __name__ == "__main__":
-    prior = new_task().prior
-    keys = ("volume", "masks", "has_masks", "report")
-    cases = [phantom_case(seed, prior.grid, prior.window) for seed in range(BATCH)]
-    cases = [{key: case[key] for key in keys} for case in cases]
-    rows = []
+    cases, rows = example_cases(), []
     for name in sys.argv[1:] or ["float32", MONAI, *list(OURS)[1:]]:
         with ProcessPoolExecutor(1, get_context("spawn")) as fresh:
             row = fresh.submit(measure, name, cases).result()

@@ -1,0 +1,56 @@
+"""3D convolutions that a CPU computes by oneDNN wherever torch would take its slow road.
+
+For float32 batches of one, torch sends a convolution whose input has few channels times slices times rows to
+`slow_conv3d`, forward and backward, which takes two to four times as long as oneDNN's.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+SLOW_UP_TO = 20480
+"""Channels times slices times rows of a single float32 input up to which torch does not ask oneDNN."""
+
+
+class FastConv3d(nn.Conv3d):
+    """nn.Conv3d, with the same weights, names and results, by oneDNN where that is faster."""
+
+    def _conv_forward(self, x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
+        if not self._taken_slowly(x, weight):
+            return super()._conv_forward(x, weight, bias)
+        return _OneDNN.apply(x, weight, bias, self.stride, self.padding, self.dilation)
+
+    def _taken_slowly(self, x: Tensor, weight: Tensor) -> bool:
+        return (x.device.type == "cpu" and x.dtype == weight.dtype == torch.float32 and len(x) == 1 and self.groups == 1
+                and x.shape[1] * x.shape[2] * x.shape[3] <= SLOW_UP_TO and self.padding_mode == "zeros"
+                and not isinstance(self.padding, str) and not torch.is_autocast_enabled("cpu")
+                and torch.backends.mkldnn.is_available() and not torch.compiler.is_compiling())
+
+
+class _OneDNN(torch.autograd.Function):
+    """A convolution and its gradients, both by oneDNN."""
+
+    @staticmethod
+    def forward(ctx, x, weight, bias, stride, padding, dilation):
+        ctx.save_for_backward(x, weight)
+        ctx.settings = stride, padding, dilation
+        ctx.bias_shape = None if bias is None else list(bias.shape)
+        return torch.ops.aten.mkldnn_convolution(x, weight, bias, padding, stride, dilation, 1)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, gradient):
+        x, weight = ctx.saved_tensors
+        wanted = [*ctx.needs_input_grad[:2], ctx.needs_input_grad[2] and ctx.bias_shape is not None]
+        # Only inputs in oneDNN's own layout keep torch from its slow road here.
+        found = torch.ops.aten.convolution_backward(
+            gradient.to_mkldnn(), x.to_mkldnn(), weight, ctx.bias_shape, *ctx.settings, False, [0] * 3, 1, wanted)
+        return *(part.to_dense() if part is not None and part.is_mkldnn else part for part in found), None, None, None
+
+
+def speed_up(network: nn.Module) -> None:
+    """Makes every nn.Conv3d of a network a FastConv3d, in place; weights and their names stay."""
+    for module in network.modules():
+        if type(module) is nn.Conv3d:
+            module.__class__ = FastConv3d

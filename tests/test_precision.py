@@ -1,0 +1,111 @@
+"""What networks compute in is decided by the hardware, in one place, and told."""
+
+import json
+import os
+import subprocess
+import sys
+import warnings
+
+import pytest
+import torch
+from posterior.test_posterior import PROJECTOR, views
+from prior.tiny import tiny_prior
+
+from phydict import precision
+from phydict.baselines import SIRT
+from phydict.posterior import Posterior, PriorOnly
+from phydict.precision import (
+    computes_bfloat16, instruction_set, network_precision, precision_name, resolve_precision)
+
+CPU = torch.device("cpu")
+AVX2 = {"ONEDNN_MAX_CPU_ISA": "AVX2", "ATEN_CPU_CAPABILITY": "avx2"}
+X86 = pytest.mark.skipif(not torch.cpu._is_avx2_supported(), reason="these variables limit x86 processors")
+
+
+@pytest.fixture(autouse=True)
+def said_anew():
+    precision._warn_slow.cache_clear()
+    precision._tell_gpu.cache_clear()
+
+
+@pytest.fixture
+def hardware(monkeypatch):
+    """Makes the CPU one that computes bfloat16, or not."""
+    return lambda able: monkeypatch.setattr(precision, "computes_bfloat16", lambda device: able)
+
+
+@pytest.mark.parametrize("asked, able, state, chosen", [
+    ("auto", True, torch.float32, torch.bfloat16), ("auto", False, torch.float32, torch.float32),
+    ("auto", True, torch.float64, torch.float64), ("float32", True, torch.float32, torch.float32),
+    ("float32", True, torch.float64, torch.float64), ("bfloat16", True, torch.float64, torch.bfloat16)])
+def test_the_hardware_decides_unless_someone_asks(hardware, asked, able, state, chosen):
+    hardware(able)
+    assert resolve_precision(asked, CPU, state) == chosen
+    with network_precision(asked, torch.zeros(1, dtype=state)) as used:
+        assert used == chosen
+        product = torch.zeros(2, 2, dtype=state) @ torch.zeros(2, 2, dtype=state)
+        assert product.dtype == (torch.bfloat16 if chosen == torch.bfloat16 and state != torch.float64 else state)
+
+
+def test_slow_bfloat16_runs_and_warns_once_with_the_factor(hardware, monkeypatch):
+    hardware(False)
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX2")
+    with pytest.warns(UserWarning, match="AVX2 does not compute it.*about 200 times slower"):
+        assert resolve_precision("bfloat16", CPU) == torch.bfloat16
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert resolve_precision("bfloat16", CPU) == torch.bfloat16
+
+
+def test_a_gpu_without_bfloat16_computes_in_float32_and_is_named_once(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: including_emulation)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "an old GPU")
+    gpu = torch.device("cuda")
+    with pytest.warns(UserWarning, match="an old GPU does not compute bfloat16: networks run in float32"):
+        assert resolve_precision("auto", gpu) == torch.float32
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert resolve_precision("auto", gpu) == torch.float32
+    assert instruction_set(gpu) == "an old GPU"
+
+
+def test_other_devices_compute_in_float32():
+    assert resolve_precision("auto", torch.device("mps")) == torch.float32
+
+
+@pytest.mark.parametrize("given", ["half", "", None, True])
+def test_another_precision_is_refused_in_a_sentence(given):
+    for refused in (lambda: resolve_precision(given, CPU), lambda: Posterior(tiny_prior(), precision=given)):
+        with pytest.raises(ValueError, match="precision is auto, float32 or bfloat16, but .* was given"):
+            refused()
+
+
+@X86
+def test_a_cpu_limited_to_avx2_decides_for_float32():
+    code = ("import json, torch; from phydict.precision import *; cpu = torch.device('cpu');"
+            "x = torch.zeros(1);"
+            "print(json.dumps([torch.backends.cpu.get_cpu_capability(), torch.ops.mkldnn._is_mkldnn_bf16_supported(),"
+            "precision_name('auto', x), instruction_set(cpu)]))")
+    done = subprocess.run([sys.executable, "-c", code], env=os.environ | AVX2, capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout.splitlines()[-1]) == ["AVX2", False, "float32", "AVX2"]
+
+
+def test_a_processor_with_bfloat16_is_named_so():
+    said = instruction_set(CPU)
+    assert said.startswith(torch.backends.cpu.get_cpu_capability())
+    assert said.endswith(("with bfloat16", "with AMX")) == computes_bfloat16(CPU)
+    assert precision_name("auto", torch.zeros(1)) == ("bfloat16" if computes_bfloat16(CPU) else "float32")
+
+
+@pytest.mark.parametrize("asked", ["float32", "bfloat16"])
+def test_a_reconstruction_names_what_it_was_computed_in_and_differs_with_it(asked):
+    method = Posterior(tiny_prior(), PriorOnly(2), precision=asked)
+    found = method.reconstruct(views(), PROJECTOR, seed=1)
+    assert found.precision == asked
+    difference = found.volume - Posterior(tiny_prior().double(), PriorOnly(2)).reconstruct(
+        views().double(), PROJECTOR, seed=1).volume
+    assert (difference.abs().max() > 0.1) == (asked == "bfloat16")
+
+
+def test_methods_without_a_network_name_the_precision_of_the_xrays():
+    assert SIRT(iterations=1).reconstruct(views(), PROJECTOR).precision == "float32"

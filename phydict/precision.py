@@ -55,6 +55,11 @@ def resolve_precision(precision: str, device: torch.device, state: torch.dtype =
     return state
 
 
+def trainer_precision(precision: str, device: torch.device) -> str:
+    """The name that Lightning's Trainer has for what `precision` means on `device`."""
+    return "bf16-mixed" if resolve_precision(precision, device) == torch.bfloat16 else "32-true"
+
+
 @contextmanager
 def network_precision(precision: str, x: Tensor) -> Iterator[torch.dtype]:
     """Networks run inside compute in what `precision` means for the state x; gives that type."""

@@ -19,7 +19,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from phydict.atomic import whole_file
 from phydict.command_line import check_writable, one_sentence_errors, quiet
 from phydict.datamodule import PriorData
-from phydict.precision import PRECISIONS, resolve_precision
+from phydict.precision import PRECISIONS, resolve_precision, trainer_precision
 from phydict.prior import save_prior, save_super_resolution
 from phydict.prior.checkpoint import build_prior, build_super_resolution, build_text
 from phydict.prior.pretrained import inspect_prior, read_torch
@@ -161,8 +161,7 @@ class PriorCLI(LightningCLI):
         trainer = self._get(self.config_init, "trainer")
         device = torch.device("cpu" if trainer.accelerator == "cpu" else torch.accelerator.current_accelerator() or "cpu")
         if trainer.precision is None:
-            chosen = resolve_precision(self._get(self.config, "precision"), device)
-            kwargs["precision"] = "bf16-mixed" if chosen == torch.bfloat16 else "32-true"
+            kwargs["precision"] = trainer_precision(self._get(self.config, "precision"), device)
         elif "bf16" in str(trainer.precision):
             resolve_precision("bfloat16", device)  # warns where that is slow
         return super().instantiate_trainer(logger=logger, plugins=plugins, **kwargs)

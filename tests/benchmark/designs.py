@@ -29,6 +29,7 @@ from phydict.command_line import quiet
 from phydict.datamodule import PriorData
 from phydict.datasets.cache import read_arrays, write_arrays
 from phydict.evaluation import read_csv, write_csv
+from phydict.precision import trainer_precision
 from phydict.prior import Prior, VolumeUNet
 from phydict.prior_training import PriorTraining, reconstruction_scores
 from phydict.stage_training import denoising_errors
@@ -136,7 +137,7 @@ def learnt(design: Design, data: PriorData, seconds: float, folder: Path) -> tup
     callbacks = [Effort(seconds), EMAWeightAveraging(decay=DECAY), ModelCheckpoint(
         folder, "last", every_n_epochs=1, save_on_train_epoch_end=True, enable_version_counter=False)]
     trainer = lightning.Trainer(
-        accelerator="cpu", devices=1, precision="bf16-mixed", gradient_clip_val=1.0, max_epochs=-1, logger=False,
+        accelerator="cpu", devices=1, precision=trainer_precision("auto", torch.device("cpu")), gradient_clip_val=1.0, max_epochs=-1, logger=False,
         limit_val_batches=0, reload_dataloaders_every_n_epochs=1, callbacks=callbacks, enable_model_summary=False,
         enable_progress_bar=False)
     trainer.fit(training, data, ckpt_path=last if last.exists() else None)

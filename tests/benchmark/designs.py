@@ -137,9 +137,9 @@ def learnt(design: Design, data: PriorData, seconds: float, folder: Path) -> tup
     callbacks = [Effort(seconds), EMAWeightAveraging(decay=DECAY), ModelCheckpoint(
         folder, "last", every_n_epochs=1, save_on_train_epoch_end=True, enable_version_counter=False)]
     trainer = lightning.Trainer(
-        accelerator="cpu", devices=1, precision=trainer_precision("auto", torch.device("cpu")), gradient_clip_val=1.0, max_epochs=-1, logger=False,
-        limit_val_batches=0, reload_dataloaders_every_n_epochs=1, callbacks=callbacks, enable_model_summary=False,
-        enable_progress_bar=False)
+        accelerator="cpu", devices=1, precision=trainer_precision("auto", torch.device("cpu")), gradient_clip_val=1.0,
+        max_epochs=-1, logger=False, limit_val_batches=0, reload_dataloaders_every_n_epochs=1, callbacks=callbacks,
+        enable_model_summary=False, enable_progress_bar=False)
     trainer.fit(training, data, ckpt_path=last if last.exists() else None)
     return training.prior.eval(), training.samples
 

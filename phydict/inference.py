@@ -33,7 +33,7 @@ from phydict.grid import Grid
 from phydict.methods import DEFAULT_PRIOR, fit_to_grid, reconstructor
 from phydict.posterior import CascadePosterior, Sampler
 from phydict.precision import instruction_set
-from phydict.prior import MedSynCheckpoint, fingerprint, load_prior, load_super_resolution
+from phydict.prior import MedSynCheckpoint, file_read, fingerprint, load_prior, load_super_resolution
 from phydict.profiling import profiled, stage
 from phydict.progress import CaseProgress
 from phydict.reconstruction_data import ReconstructionData, case_scores, case_seed
@@ -53,9 +53,11 @@ class ReconstructionTask(lightning.LightningModule):
         super_resolution: file of a cascade's second stage, which refines what the prior gives; none given: none
         guide_fine: whether the X-rays guide the second stage too
         fine_sampler: how they do; none given: the cascade's own
-        fine_noise: level in [0, 1] of the noise that the prior's estimate is given before the second stage sees it
+        fine_noise: level in [0, 1] of the noise that the prior's estimate is given before the second stage sees it;
+            none given: the stage's own, 0.05, or 0 for MedSyn's
         samples: how many are drawn; of several the volume is the mean, and deviation.nii.gz their standard deviation
-        fine_memory: GiB that the second stage's network may take; it works in tiles where the whole takes more
+        fine_memory: GiB that the second stage's network may take; it works in tiles where the whole takes more, and
+            MedSyn's, which cannot, is refused
         precision: of the networks: auto (bfloat16 where the device computes it), float32 or bfloat16
         out: output folder; cases go to <out>/<name>/<case>
         overwrite: do finished cases again, and replace what is in their place
@@ -67,7 +69,7 @@ class ReconstructionTask(lightning.LightningModule):
     def __init__(self, method: Sampler | Reconstructor, name: str,
                  prior: str | MedSynCheckpoint = str(DEFAULT_PRIOR), guidance: float = 1.0,
                  super_resolution: str | MedSynCheckpoint | None = None, guide_fine: bool = True,
-                 fine_sampler: Sampler | None = None, fine_noise: float = 0.05, fine_memory: float = 4.0,
+                 fine_sampler: Sampler | None = None, fine_noise: float | None = None, fine_memory: float = 4.0,
                  out: str = "runs/reconstructions", overwrite: bool = False, seed: int = 0, voxels: int = 64,
                  side: float = 384.0, samples: int = 1, precision: str = "auto"):
         super().__init__()
@@ -79,7 +81,7 @@ class ReconstructionTask(lightning.LightningModule):
         self.prior = load_prior(prior) if isinstance(method, Sampler) else None
         if self.prior is not None:
             self.grid, self.window = self.prior.grid, self.prior.window
-            self.settings |= {"prior": _name(prior), "prior_crc32": fingerprint(prior), "guidance": guidance}
+            self.settings |= _identity("prior", prior) | {"guidance": guidance}
             if samples != 1:
                 self.settings["samples"] = samples
             if precision != "auto":
@@ -92,9 +94,8 @@ class ReconstructionTask(lightning.LightningModule):
         self.reconstructor = reconstructor(method, self.prior, guidance, name, self.fine, guide_fine, fine_sampler,
                                            fine_noise, samples, precision)
         if isinstance(self.reconstructor, CascadePosterior):
-            self.settings |= {"super_resolution": _name(super_resolution), "fine_noise": fine_noise,
-                              "super_resolution_crc32": fingerprint(super_resolution),
-                              "second": describe(self.reconstructor.second)}
+            self.settings |= _identity("super_resolution", super_resolution) | {
+                "fine_noise": self.reconstructor.level, "second": describe(self.reconstructor.second)}
         self.metrics = CaseMetrics([name])
         self.progress = CaseProgress()
         self.cases: list[str] = []
@@ -179,6 +180,8 @@ class ReconstructionTask(lightning.LightningModule):
         self.trainer.strategy.barrier()
 
     def _start(self, cases: int) -> None:
+        if isinstance(self.reconstructor, CascadePosterior):
+            self.reconstructor.check_memory(self.device)
         self.progress.begin(self.method_name, cases, self.reconstructor.steps())
 
     def _seed(self, case: dict) -> int:
@@ -235,8 +238,11 @@ class ReconstructionTask(lightning.LightningModule):
                              f"({', '.join(missing)}): see the messages above, and run the same command again")
 
 
-def _name(prior: str | MedSynCheckpoint) -> str | dict:
-    return Path(prior).name if isinstance(prior, str) else describe(prior)
+def _identity(role: str, prior: str | MedSynCheckpoint) -> dict:
+    """What a record tells of a prior: its name, CRC-32 and, where it was chosen from a folder of MedSyn's, its file."""
+    file = file_read(prior)
+    return {role: Path(prior).name if isinstance(prior, str) else describe(prior),
+            f"{role}_crc32": fingerprint(prior)} | ({f"{role}_file": file} if file else {})
 
 
 def versions() -> dict[str, str]:

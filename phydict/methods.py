@@ -57,14 +57,15 @@ METHODS: dict[str, Sampler | Reconstructor] = {
 def reconstructor(method: str | Sampler | Reconstructor, prior: Prior | str | Path | None = None,
                   guidance: float = 1.0, name: str | None = None,
                   super_resolution: SuperResolution | str | Path | None = None, guide_fine: bool = True,
-                  fine_sampler: Sampler | None = None, fine_noise: float = 0.05, samples: int = 1,
+                  fine_sampler: Sampler | None = None, fine_noise: float | None = None, samples: int = 1,
                   precision: str = "auto") -> Reconstructor:
     """A method ready to reconstruct: a name of METHODS, a sampler (which needs a prior), or a Reconstructor.
 
     prior: a Prior or the file it is in; None for the shipped one. It is only loaded by methods that need it. name: what
     the result calls the method (None: its own name).
     super_resolution: the second stage of a cascade, or its file; None reconstructs on the prior's own grid. guide_fine:
-    whether the X-rays guide that stage too; fine_sampler: how (None: CascadePosterior's own); fine_noise: its noise.
+    whether the X-rays guide that stage too; fine_sampler: how (None: CascadePosterior's own); fine_noise: its noise
+    (None: the stage's own).
     samples: how many to draw; of several, the result is the mean, with their standard deviation as a map of trust.
     precision: of the networks, one of phydict.precision.PRECISIONS. Raises ValueError for what cannot be meant.
     """

@@ -34,6 +34,7 @@ from phydict.prior import LocalUNet, Prior, SuperResolution, VolumeUNet, save_pr
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import ConeBeam, Polychromatic, Projector
 from phydict.xray.geometry_files import write_beam
+from prior.medsyn_files import entries, super_resolution_unet, text_unet, write
 
 ROOT = Path(__file__).parents[1]
 CONFIGS = ROOT / "configs" / "reconstruct"
@@ -607,6 +608,16 @@ def test_a_second_stage_is_scored_on_the_fine_grid(guided, prior, fine, cts, tmp
     assert said["scores"]["psnr"] == pytest.approx(float(scores["psnr"]), rel=1e-3)
     assert said["settings"]["super_resolution"] == "fine.safetensors"
     assert said["settings"]["second"]["class"] == ("SplitGibbs" if guided else "PriorOnly")
+
+
+def test_medsyns_second_stage_is_refused_before_anything_is_done_where_it_takes_too_much_memory(
+        measured, tmp_path, capsys):
+    base = write(tmp_path / "base" / "model_1.safetensors", entries(text_unet()))
+    second = write(tmp_path / "second" / "model.safetensors", entries(super_resolution_unet())).parent
+    said = refusal(capsys, with_prior("predict", tmp_path / "out", base, f"--data.xrays={measured}",
+                                      f"--model.super_resolution={second}", "--model.fine_memory=1"))
+    assert "(256, 256, 256)" in said and "1 GiB are allowed" in said and "--model.fine_memory " in said
+    assert not (tmp_path / "out").exists()
 
 
 def test_stages_in_each_others_place_are_one_sentence(prior, fine, measured, tmp_path, capsys):

@@ -15,7 +15,7 @@ from phydict.posterior.measurement import Measurement
 from phydict.posterior.posterior import Counted, Posterior
 from phydict.posterior.sampler import PriorOnly, Sampler
 from phydict.posterior.split_gibbs import SplitGibbs, noise_like
-from phydict.precision import check_precision
+from phydict.precision import check_precision, resolve_precision
 from phydict.prior import Cascade
 from phydict.reconstructor import Guard, Reconstruction, Reconstructor, Stopwatch, misfits
 from phydict.units import MU_WATER
@@ -28,8 +28,9 @@ class CascadePosterior(Reconstructor):
 
     guide_fine: whether the X-rays guide the fine stage too, by `fine_sampler`, as in the paper; else `unguided` samples
     it from the base estimate alone, as in the authors' release. noise: level of the Gaussian noise that the base
-    estimate is given before the fine stage sees it, in [0, 1] (noise augmentation): more trusts it less. The rest as
-    for Posterior; a base sampler that wants the full detector gives it to both stages.
+    estimate is given before the fine stage sees it, in [0, 1] (noise augmentation): more trusts it less; None: the fine
+    stage's `default_noise`. The rest as for Posterior; a base sampler that wants the full detector gives it to both
+    stages.
 
     Of each result, volume and misfit are the fine stage's; masks that it does not make are the base stage's, upsampled.
     """
@@ -42,7 +43,7 @@ class CascadePosterior(Reconstructor):
         likelihood=ProximalCG(iterations=5, restarts=2, variation=10.0, edge=0.003),
         final_likelihood=ProximalCG(iterations=10, restarts=2, variation=10.0, edge=0.003))
     unguided: Sampler = PriorOnly(20)
-    noise: float = 0.05
+    noise: float | None = None
     guidance: float = 1.0
     mu_water: float = MU_WATER
     name: str = "phydict"
@@ -50,7 +51,7 @@ class CascadePosterior(Reconstructor):
 
     def __post_init__(self):
         check_precision(self.precision)
-        if not 0 <= self.noise <= 1:
+        if not 0 <= self.level <= 1:
             raise ValueError(f"the noise of the base estimate is a level in [0, 1], but {self.noise} was given")
 
     @property
@@ -59,20 +60,30 @@ class CascadePosterior(Reconstructor):
         return self.cascade.fine.grid
 
     @property
+    def level(self) -> float:
+        """The level of the noise that the base estimate is given."""
+        return self.cascade.fine.default_noise if self.noise is None else self.noise
+
+    @property
     def full_detector(self) -> bool:
         return self.sampler.full_detector or self.second.full_detector
 
     @property
     def second(self) -> Sampler:
         """What samples the fine stage."""
-        return self.fine_sampler if self.guide_fine else self.unguided
+        return (self.fine_sampler if self.guide_fine else self.unguided).suited(self.cascade.fine)
 
     @property
     def citation(self) -> str:
         return self.sampler.citation
 
     def steps(self) -> int:
-        return self.sampler.steps() + self.second.steps()
+        return self.sampler.suited(self.cascade.base).steps() + self.second.steps()
+
+    def check_memory(self, device: torch.device, state: torch.dtype = torch.float32) -> None:
+        """Raises ValueError where the fine stage, for states of type `state` on `device`, does not fit into the memory
+        that it may take."""
+        self.cascade.fine.check_memory(resolve_precision(self.precision, device, state))
 
     @torch.no_grad()
     def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,
@@ -82,6 +93,7 @@ class CascadePosterior(Reconstructor):
             raise ValueError(
                 f"the super-resolution stage makes {fine.grid.shape} voxels of {fine.grid.spacing} mm, but the X-rays "
                 f"are projected from {projector.grid.shape} voxels of {projector.grid.spacing} mm: use its grid")
+        self.check_memory(xrays.device, xrays.dtype)
         with watch.stage("base"):
             base = self._base(xrays, projector, report, display, seed, on_step)
         with watch.stage("prepare"):
@@ -94,7 +106,7 @@ class CascadePosterior(Reconstructor):
                 measurement.correct(measurement.project(fine.upsample(state)[:, :1]))
                 measurement.scattered = False  # what the base stage tells of is kept
             guard = Guard(measurement, on_step, self.second.steps())
-            denoiser = Counted(fine.bind(state + self.noise * noise_like(state, draw), self.noise, self.precision), guard)
+            denoiser = Counted(fine.bind(state, self.level, self.precision, draw), guard)
             x = noise_like(torch.empty(1, fine.state_channels, *fine.grid.shape, device=xrays.device), draw)
         with watch.stage("sample"):
             state = self.second.sample(denoiser, measurement, x, draw, guard)

@@ -79,7 +79,7 @@ class Posterior(Reconstructor):
 
     def steps(self) -> int:
         together = min(self.batch, self.samples) if self.sampler.batches else 1
-        return self.sampler.steps() * -(-self.samples // together)
+        return self.sampler.suited(self.prior).steps() * -(-self.samples // together)
 
     @torch.no_grad()
     def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,
@@ -91,7 +91,8 @@ class Posterior(Reconstructor):
                 f"projected from {projector.grid.shape} voxels of {projector.grid.spacing} mm: use the prior's grid")
         seeds = [sample_seed(seed, i) for i in range(self.samples)]
         together = self.batch if self.sampler.batches else 1
-        sampler = self.sampler.randomised() if self.samples > 1 else self.sampler
+        sampler = self.sampler.suited(prior)
+        sampler = sampler.randomised() if self.samples > 1 else sampler
         with watch.stage("prepare"):
             measurement = Measurement(projector, xrays, prior.window, display, self.mu_water)
             guard = Guard(measurement, on_step, sampler.steps())

@@ -17,7 +17,8 @@ from phydict.grid import Grid
 from phydict.prior.detail import DetailNetwork
 from phydict.prior.local_unet import LocalUNet
 from phydict.prior.medsyn import MedSynPrior, MedSynSuperResolution
-from phydict.prior.pretrained import MedSynCheckpoint, is_medsyn, load_medsyn, load_medsyn_super_resolution
+from phydict.prior.pretrained import (
+    FILES, MedSynCheckpoint, as_checkpoint, is_medsyn, load_medsyn, load_medsyn_super_resolution)
 from phydict.prior.prior import STATE, Prior
 from phydict.prior.super_resolution import SuperResolution
 from phydict.prior.text import TextEncoder
@@ -142,10 +143,20 @@ def check_stage(header: dict, stage: str, name: str) -> None:
 
 
 def fingerprint(path: str | Path | MedSynCheckpoint) -> int:
-    """CRC-32 of the file that `load_prior` reads: two priors with different ones are not the same."""
-    if not isinstance(path, MedSynCheckpoint):
-        path = MedSynCheckpoint(str(path))
-    return file_crc32(path.file)
+    """CRC-32 of the file that `load_prior` or `load_super_resolution` reads: two priors with different ones are not the
+    same."""
+    return file_crc32(as_checkpoint(path).file)
+
+
+def file_read(path: str | Path | MedSynCheckpoint) -> str | None:
+    """Of a folder of MedSyn's, the file that is read and, in brackets, which weights it holds by its name; None for a
+    file."""
+    given = as_checkpoint(path)
+    if Path(given.path).is_file():
+        return None
+    file = given.file
+    kind = next(kind for kind, names in FILES.items() if file.name in names)
+    return f"{file.parent.name}/{file.name} ({kind})"
 
 
 def build_prior(header: dict, weights: dict[str, Tensor]) -> Prior:

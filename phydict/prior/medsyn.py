@@ -284,6 +284,12 @@ class SuperResolutionUNet(SliceUNet):
         self.final_conv0 = nn.Sequential(ResidualBlock(2 * width, width, IN_SLICE),
                                          nn.Conv3d(width, STATE_CHANNELS, 1))
 
+    def bytes_per_voxel(self, dtype: torch.dtype) -> float:
+        """Memory that a call without gradients, computed in `dtype`, takes per voxel, in bytes: of the first level's
+        width seven maps and three more that a convolution may lay out anew, and sixteen float32 maps of the states.
+        (Calls on a CPU took 0.7 to 1.1 times as much.)"""
+        return 10 * self.widths[0] * dtype.itemsize + 64
+
     def forward(self, x: Tensor, t: Tensor, coarse: Tensor) -> Tensor:
         """x and coarse (B, 4, slices, rows, columns), t (B,) in [0, 1] -> clean state of x's shape."""
         first, time = self.init_conv0(torch.cat([coarse.to(x), x], 1)), self.time(t)
@@ -313,10 +319,12 @@ class MedSynPrior(nn.Module):
 
     network: predicts the clean state; text: reports -> contexts (B, L, D), with or without a mask, such as a
     TextEncoder; load_text: a function that returns it when the first report arrives; grid: where the voxels are.
-    The attenuation of the window's low end, -1024 HU, is slightly negative.
+    The attenuation of the window's low end, -1024 HU, is slightly negative. ends_at_zero: MedSyn's inference descends
+    in 50 steps from time 1 to 0 and denoises there once more.
     """
 
     window, schedule, state_channels = WINDOW, CosineSchedule(), STATE_CHANNELS
+    ends_at_zero = True
 
     def __init__(self, network: TextUNet, text: Callable | None = None,
                  load_text: Callable[[], Callable] | None = None, grid: Grid = atlas_grid(64)):
@@ -374,34 +382,61 @@ class MedSynPrior(nn.Module):
 class MedSynSuperResolution(nn.Module):
     """MedSyn's stage 2: denoises fine states (B, 4, X, Y, Z), in RAS+, that belong to given coarse ones.
 
-    network: predicts the clean state; grid: where the fine voxels are.
+    network: predicts the clean state; grid: where the fine voxels are; memory: bytes that denoising the whole grid may
+    take, see `check_memory`.
+
+    It is never run in tiles. Its group norms take mean and variance from the whole region, its attention looks at whole
+    slices, and below 8-fold downsampling its convolutions reach far, so that tiles would give another result than
+    MedSyn's inference, which runs on the whole; how far another, only the trained weights could tell. (MedSyn trained
+    on 72 rows and columns of all slices: if any tiles, then these.)
+    ends_at_zero: as for MedSynPrior, after 20 steps. default_noise: MedSyn's inference gives the coarse state none.
     """
 
     window, schedule = WINDOW, CosineSchedule()
     state_channels = coarse_channels = STATE_CHANNELS
-    factor = FACTOR
+    factor, default_noise, ends_at_zero = FACTOR, 0.0, True
 
-    def __init__(self, network: SuperResolutionUNet, grid: Grid = atlas_grid(256)):
+    def __init__(self, network: SuperResolutionUNet, grid: Grid = atlas_grid(256), memory: int = 2**32):
         super().__init__()
         _check_divisible(network, grid)
-        self.network, self.grid = network, grid
+        self.network, self.grid, self.memory = network, grid, memory
 
     def forward(self, x: Tensor, t: Tensor, coarse: Tensor) -> Tensor:
         """Clean estimate of x (B, 4, X, Y, Z) at times t (B,), given a coarse state repeated to x's size."""
         return from_slices(self.network(to_slices(x).contiguous(), t, to_slices(coarse))).to(x.dtype)
 
-    def bind(self, coarse: Tensor, noise: float = 0.0, precision: str = "auto") -> BoundSuperResolution:
+    def upsample(self, coarse: Tensor) -> Tensor:
+        """The coarse state (B, C, x, y, z), repeated to the fine voxels."""
+        return interpolate(coarse, scale_factor=self.factor, mode="nearest")
+
+    def check_memory(self, dtype: torch.dtype) -> None:
+        """Raises ValueError where denoising the whole grid, computed in `dtype`, takes more than `memory`."""
+        needed = math.prod(self.grid.shape) * self.network.bytes_per_voxel(dtype)
+        if needed > self.memory:
+            gib = math.ceil(10 * needed / 2**30) / 10
+            raise ValueError(f"MedSyn's super-resolution stage denoises its {self.grid.shape} voxels at once, not in "
+                             f"tiles, which takes about {gib:g} GiB in {str(dtype).removeprefix('torch.')}, but "
+                             f"{self.memory / 2**30:g} GiB are allowed: where there is so much memory, allow it with "
+                             f"--model.fine_memory {gib:g} (in Python, the stage's `memory` in bytes), else leave the "
+                             "super-resolution stage out")
+
+    def bind(self, coarse: Tensor, noise: float = 0.0, precision: str = "auto",
+             draw: torch.Generator | None = None) -> BoundSuperResolution:
         """The denoiser of the fine states of a coarse one (B, 4, X/4, Y/4, Z/4), which may be a part of the grid's.
 
-        noise: share in [0, 1) of normal noise that `coarse` carries (MedSyn trained with up to 0.4); this network is
-        not told, so it changes nothing here.
+        noise: share in [0, 1] of normal noise in the coarse state (MedSyn trained with up to 0.4); the network is not
+        told. draw: what the noise is drawn from, to be (1 - noise) coarse + noise n on the fine voxels, as in MedSyn's
+        training; None: `coarse` carries it already.
         """
         if coarse.ndim != 5 or coarse.shape[1] != self.coarse_channels:
             raise ValueError(f"a coarse state is (B, {self.coarse_channels}, X, Y, Z), but {tuple(coarse.shape)} was "
                              "given: give the whole state of MedSyn's first stage, masks included")
-        if not 0 <= noise < 1:
-            raise ValueError(f"the coarse state's share of noise lies in [0, 1), but {noise} was given")
-        return BoundSuperResolution(self, interpolate(coarse, scale_factor=self.factor, mode="nearest"), precision)
+        if not 0 <= noise <= 1:
+            raise ValueError(f"the coarse state's share of noise lies in [0, 1], but {noise} was given")
+        upsampled = self.upsample(coarse)
+        if noise and draw is not None:
+            upsampled = torch.lerp(upsampled, torch.randn(upsampled.shape, generator=draw).to(upsampled), noise)
+        return BoundSuperResolution(self, upsampled, precision)
 
 
 @dataclass(frozen=True)
@@ -415,6 +450,10 @@ class BoundSuperResolution:
     @property
     def schedule(self) -> CosineSchedule:
         return self.stage.schedule
+
+    @property
+    def ends_at_zero(self) -> bool:
+        return self.stage.ends_at_zero
 
     @torch.no_grad()
     def denoise(self, x: Tensor, t: float) -> Tensor:

@@ -46,8 +46,8 @@ class MedSynCheckpoint:
 
     Args:
         path: a file, the <N>_ckpt folder it is in, or a folder of such folders, of which the latest is read
-        which: in a folder, the averaged weights (ema), those being trained (online), or the averaged ones where there
-            are any (auto)
+        which: in a folder, the averaged weights (ema), those being trained (online), or those that MedSyn's inference
+            reads (auto): averaged for stage 1, online for stage 2, and the others where these are missing
         upsample_first: the order of the network's upward path: false as in MedSyn's inference code, true as in its
             training code
         text: the folder of the language model; none given: pretrained_lm, beside the checkpoint or up to two folders
@@ -74,9 +74,9 @@ class MedSynCheckpoint:
                                  "the folder")
             return path
         held = files_in(path)
-        for kind in FILES if self.which == "auto" else [self.which]:
-            if kind in held:
-                return held[kind]
+        kind = default_kind(held) if self.which == "auto" else self.which
+        if kind in held:
+            return held[kind]
         there = f"there is {', '.join(file.name for file in held.values())}" if held else "there is none"
         wanted = [name for kind, names in FILES.items() if self.which in ("auto", kind) for name in names]
         raise FileNotFoundError(f"no prior at '{path}': MedSyn's folders hold {' or '.join(wanted)}, but {there}")
@@ -97,6 +97,22 @@ def files_in(folder: Path) -> dict[str, Path]:
         folder = max(saved, key=lambda sub: int(sub.name.removesuffix("_ckpt")))
     return {kind: next(folder / name for name in names if (folder / name).is_file())
             for kind, names in FILES.items() if any((folder / name).is_file() for name in names)}
+
+
+def default_kind(held: dict[str, Path]) -> str | None:
+    """Of a folder's model files by what they hold, the kind that MedSyn's inference reads, where it is there; None of
+    none."""
+    if len(held) > 1 and any(_of_second_stage(file) for file in held.values()):
+        return "online"
+    return next((kind for kind in FILES if kind in held), None)
+
+
+def _of_second_stage(file: Path) -> bool:
+    """Whether a file holds stage 2's first convolution; not where it is damaged, which reading it will tell."""
+    try:
+        return any("init_conv0." in name for name in read_tensors(file, shapes_only=True))
+    except ValueError:
+        return False
 
 
 @dataclass(frozen=True)
@@ -201,7 +217,7 @@ def load_medsyn(checkpoint: MedSynCheckpoint | str | Path, device: str = "cpu") 
     Raises FileNotFoundError where there is no such file; ValueError where it is truncated, holds code, is of another
     stage, or where its weights are not exactly the network's.
     """
-    checkpoint = _checkpoint(checkpoint)
+    checkpoint = as_checkpoint(checkpoint)
     prior = MedSynPrior(_network(checkpoint, 1))
     prior.load_text = lambda: _load_text(checkpoint, prior.null.shape[1])
     return prior.to(device).eval().requires_grad_(False)
@@ -210,10 +226,11 @@ def load_medsyn(checkpoint: MedSynCheckpoint | str | Path, device: str = "cpu") 
 def load_medsyn_super_resolution(checkpoint: MedSynCheckpoint | str | Path,
                                  device: str = "cpu") -> MedSynSuperResolution:
     """MedSyn's 256^3 super-resolution stage, ready to denoise; raises as `load_medsyn` does."""
-    return MedSynSuperResolution(_network(_checkpoint(checkpoint), 2)).to(device).eval().requires_grad_(False)
+    return MedSynSuperResolution(_network(as_checkpoint(checkpoint), 2)).to(device).eval().requires_grad_(False)
 
 
-def _checkpoint(given: MedSynCheckpoint | str | Path) -> MedSynCheckpoint:
+def as_checkpoint(given: MedSynCheckpoint | str | Path) -> MedSynCheckpoint:
+    """A path as a checkpoint that is read by default."""
     return given if isinstance(given, MedSynCheckpoint) else MedSynCheckpoint(str(given))
 
 
@@ -312,8 +329,8 @@ def inspect_prior(path: str | Path) -> dict[str, dict[str, str]]:
     if path.is_file():
         return {str(path): _inspect_file(path)}
     held = files_in(path)
-    chosen = next((held[kind] for kind in FILES if kind in held), None)
-    found = {str(file): {"by its name": kind + (", read by default" if file == chosen else "")} | _inspect_file(file)
+    chosen = default_kind(held)
+    found = {str(file): {"by its name": kind + (", read by default" if kind == chosen else "")} | _inspect_file(file)
              for kind, file in held.items()}
     names = [name for both in FILES.values() for name in both]
     return found or {str(path): {"kind": f"unknown: the folder holds no {' or '.join(names)}, nor <N>_ckpt folders"}}

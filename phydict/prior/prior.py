@@ -37,10 +37,13 @@ class Prior(nn.Module):
     skip_std^2), Karras et al.'s preconditioning of what b lacks, whose expected size is skip_std. It is left out where
     sigma > DETAIL_REACH skip_std and the noise hides all detail.
 
+    ends_at_zero: whether its own inference ends with a call at time 0 (see PriorOnly).
     network: F; detail: D, None for a prior without; text: the report encoder, None for a prior without text, or a
     function that loads it when the first report arrives; grid, window: where and in which HU range the volumes live;
     sigma_data: standard deviation of the state; skip_std: see above.
     """
+
+    ends_at_zero = False
 
     def __init__(self, network: VolumeUNet, grid: Grid, window: HUWindow, text: TextEncoder | None = None,
                  schedule: CosineSchedule = CosineSchedule(), sigma_data: float = 0.5, skip_std: float = 0.1,
@@ -141,6 +144,10 @@ class BoundPrior:
     @property
     def schedule(self) -> CosineSchedule:
         return self.prior.schedule
+
+    @property
+    def ends_at_zero(self) -> bool:
+        return self.prior.ends_at_zero
 
     def denoise(self, x: Tensor, t: float) -> Tensor:
         """E[x_0 | x_t = x, report]. Differentiable where x requires a gradient; otherwise nothing is kept for one."""

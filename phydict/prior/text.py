@@ -96,7 +96,8 @@ class TextEncoder(nn.Module):
         return torch.stack(states).to(self.bert.device), torch.stack(masks).to(self.bert.device)
 
     def check(self, reports: Iterable[str]) -> None:
-        """Warns of reports that are longer than `length` tokens and of reports in words that the vocabulary lacks.
+        """Warns of reports that are longer than the BERT reads (`padded_to`, else `length`) and of reports in words
+        that the vocabulary lacks.
 
         Each report is looked at once: later calls speak of new reports alone.
         """
@@ -105,10 +106,11 @@ class TextEncoder(nn.Module):
             return
         self._checked.update(new)
         tokens = self.tokenizer(new, add_special_tokens=False, verbose=False)["input_ids"]
-        excess = [len(own) + 2 - self.length for own in tokens if len(own) + 2 > self.length]
+        read = self.padded_to or self.length
+        excess = [len(own) + 2 - read for own in tokens if len(own) + 2 > read]
         if excess:
-            warnings.warn(f"{len(excess)} of {len(new)} reports are longer than the {self.length} tokens that the "
-                          f"prior reads: up to {max(excess)} tokens at their end are left out", stacklevel=2)
+            warnings.warn(f"{len(excess)} of {len(new)} reports are longer than the {read} tokens that the text "
+                          f"encoder reads: up to {max(excess)} tokens at their end are left out", stacklevel=2)
         unknown = [sum(token == self.tokenizer.unk_token_id for token in own) / max(len(own), 1) for own in tokens]
         foreign = [share for share in unknown if share > FOREIGN]
         if foreign:

@@ -10,9 +10,10 @@ from torch.nn.functional import interpolate
 from phydict.diffusion import CosineSchedule, GaussianDenoiser
 from phydict.grid import Grid
 from phydict.posterior import CascadePosterior, Posterior, PriorOnly, ProximalCG, SplitGibbs
-from phydict.prior import Cascade
+from phydict.prior import Cascade, MedSynSuperResolution
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector, binned
+from prior.medsyn_files import super_resolution_unet
 from prior.tiny import tiny_prior, tiny_super_resolution
 
 BEAM = ConeBeam.orbit(4, 1020, 740, (56, 56), 10.0)
@@ -30,11 +31,15 @@ class GaussianStage:
     window = HUWindow(-1000, 600)
     schedule = CosineSchedule(offset=1e-3, floor=1e-6)
     state_channels, coarse_channels, factor = 1, 1, 2
+    default_noise = 0.05
 
     def upsample(self, coarse):
         return interpolate(coarse, scale_factor=2, mode="trilinear")
 
-    def bind(self, coarse, noise=0.0, precision="auto"):
+    def check_memory(self, dtype):
+        pass
+
+    def bind(self, coarse, noise=0.0, precision="auto", draw=None):
         return GaussianDenoiser(self.upsample(coarse), torch.tensor(self.variance), self.schedule)
 
 
@@ -113,6 +118,46 @@ def test_scatter_that_the_base_stage_finds_is_subtracted_at_both_stages(xrays, s
         assert (found.xrays - xrays).norm() < 0.5 * (measured - xrays).norm()
     else:
         assert found.scatter == 0 and found.xrays.equal(measured)
+
+
+def medsyn_stage():
+    """MedSyn's second stage, narrow, on the cube and window of the other stages here."""
+    stage = MedSynSuperResolution(super_resolution_unet(), FINE)
+    stage.window, stage.factor = HUWindow(-1000, 600), 2
+    return stage
+
+
+@pytest.mark.parametrize("guide", [True, False])
+def test_medsyns_second_stage_goes_on_where_the_base_stage_found_scatter(xrays, guide):
+    step = ProximalCG(10, 5, refit=True)
+    base = SplitGibbs(3, ProximalCG(4), step, warm_start=0.5, last=0.3, fresh_noise=0.0, scatter=True)
+    measured = -torch.log(torch.exp(-xrays) + 0.05) + 0.005 * random_like(xrays.shape, torch.float32)
+    method = CascadePosterior(Cascade(tiny_prior(False), medsyn_stage()), base, guide, unguided=PriorOnly(2))
+    found = method.reconstruct(measured, PROJECTOR, seed=3)
+    assert found.scatter > 0 and (found.xrays - xrays).norm() < 0.5 * (measured - xrays).norm()
+
+
+def test_medsyns_second_stage_unguided_ends_with_a_call_at_time_zero(xrays):
+    steps, times, stage = [], [], medsyn_stage()
+    stage.network.register_forward_pre_hook(lambda _, inputs: times.append(float(inputs[1])))
+    method = CascadePosterior(Cascade(tiny_prior(False), stage), SAMPLER, False, unguided=PriorOnly(4))
+    found = method.reconstruct(xrays, PROJECTOR, on_step=lambda: steps.append(1))
+    assert times == [1, 0.75, 0.5, 0.25, 0] and found.network_calls == len(steps) == method.steps() == 3 + 5
+
+
+def test_a_second_stage_without_enough_memory_is_refused_before_the_first_is_run(xrays):
+    steps, stage = [], medsyn_stage()
+    stage.memory = 2**20
+    method = CascadePosterior(Cascade(tiny_prior(False), stage), SAMPLER)
+    with pytest.raises(ValueError, match="fine_memory"):
+        method.reconstruct(xrays, PROJECTOR, on_step=lambda: steps.append(1))
+    assert not steps
+
+
+def test_the_noise_of_the_coarse_volume_is_the_stages_own_unless_given(cascade):
+    medsyn = Cascade(tiny_prior(False), medsyn_stage())
+    assert CascadePosterior(cascade).level == 0.05 and CascadePosterior(medsyn).level == 0
+    assert CascadePosterior(cascade, noise=0.0).level == 0 and CascadePosterior(medsyn, noise=0.2).level == 0.2
 
 
 @pytest.mark.parametrize("guide", [True, False])

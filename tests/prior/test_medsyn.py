@@ -1,23 +1,29 @@
 """MedSyn's networks: exactly its parameters, what each part may and may not see, and where voxels go."""
 
+import csv
 import hashlib
 import warnings
+from pathlib import Path
 
 import pytest
 import torch
 from laws import random_like
 from torch import nn
+from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.nn.functional import interpolate
 
 from phydict import reconstruct
 from phydict.diffusion import guided
 from phydict.grid import Grid
+from phydict.methods import reconstructor
 from phydict.posterior import PriorOnly, ProximalCG, SplitGibbs
 from phydict.prior import MedSynPrior, MedSynSuperResolution, TextEncoder, learn_vocabulary
 from phydict.prior.medsyn import (
     ChannelNorm, SelfAttention, Sinusoid, SuperResolutionUNet, TextUNet, atlas_grid, from_slices, to_slices)
 from phydict.xray import ConeBeam
 from prior.medsyn_files import super_resolution_unet, text_unet
+from prior.peak import Peak
+from prior.tiny import tiny_prior
 
 GRID = Grid((8, 4, 6), (40.0, 80.0, 48.0))
 X = random_like((1, 4, 8, 4, 6), torch.float32, seed=1)
@@ -219,9 +225,77 @@ BEAM = ConeBeam.orbit(2, 1020.0, 740.0, (12, 12), 48.0)
 def test_every_sampler_works_with_it(sampler):
     result = reconstruct(torch.full((2, 12, 12), 2.0), BEAM, prior(), sampler, report="a report", seed=3)
     assert result.volume.shape == (8, 4, 6) and -1024 <= result.volume.min() < result.volume.max() <= 600
-    assert result.masks.shape == (3, 8, 4, 6) and result.network_calls == 2
+    assert result.masks.shape == (3, 8, 4, 6)
+    assert result.network_calls == (3 if isinstance(sampler, PriorOnly) else 2)
     again = reconstruct(torch.full((2, 12, 12), 2.0), BEAM, prior(), sampler, report="a report", seed=3)
     assert torch.equal(result.volume, again.volume)
+
+
+def times_of(network) -> list[float]:
+    """A list that grows by the time of every call of a network of MedSyn's."""
+    times = []
+    network.register_forward_pre_hook(lambda _, inputs: times.append(float(inputs[1])))
+    return times
+
+
+def test_sampled_alone_it_ends_as_medsyns_inference_does():
+    """Stage 1 in 51 calls, 1000, 980, ..., 0; stage 2 in 21, 1000, 950, ..., 0."""
+    one, fine, steps = prior(), MedSynSuperResolution(super_resolution_unet(), GRID), []
+    times, fine_times = times_of(one.network), times_of(fine.network)
+    found = reconstruct(torch.full((2, 12, 12), 2.0), BEAM, one, PriorOnly(50), on_step=lambda: steps.append(1))
+    assert times == pytest.approx([(50 - i) / 50 for i in range(51)])
+    assert found.network_calls == len(steps) == reconstructor(PriorOnly(50), one).steps() == 51
+    PriorOnly(20).sample(fine.bind(X[:, :, :2, :1, :2]), None, torch.zeros(1, 4, 8, 4, 8), None)
+    assert fine_times == pytest.approx([(20 - i) / 20 for i in range(21)])
+
+
+def test_the_last_call_can_be_left_out_and_other_priors_make_none():
+    assert reconstructor(PriorOnly(5, at_zero=False), prior()).steps() == 5
+    assert reconstructor(PriorOnly(5), tiny_prior(False)).steps() == 5
+    assert reconstructor(PriorOnly(5, at_zero=True), tiny_prior(False)).steps() == 6
+
+
+def test_the_second_stages_noise_takes_its_share_of_the_coarse_state_on_fine_voxels():
+    fine, coarse = MedSynSuperResolution(super_resolution_unet(), GRID), random_like((1, 4, 2, 1, 3), torch.float32)
+    noise = torch.randn(1, 4, 8, 4, 12, generator=torch.Generator().manual_seed(5))
+    for share in (0.0, 0.1, 1.0):
+        given = fine.bind(coarse, share, draw=torch.Generator().manual_seed(5)).coarse
+        torch.testing.assert_close(given, (1 - share) * fine.upsample(coarse) + share * noise)
+    assert torch.equal(fine.bind(coarse, 0.1).coarse, fine.upsample(coarse))  # it carries its noise already
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_the_second_stage_states_the_memory_of_a_call(dtype):
+    with FakeTensorMode():  # full size, nothing computed
+        fine = MedSynSuperResolution(SuperResolutionUNet()).requires_grad_(False)
+        denoiser = fine.bind(torch.zeros(1, 4, 64, 64, 64), precision=str(dtype).removeprefix("torch."))
+        x = torch.zeros(1, 4, 256, 256, 256)
+        with Peak() as peak:
+            denoiser.denoise(x, 0.5)
+    assert 0.7 < peak.most / (256**3 * fine.network.bytes_per_voxel(dtype)) < 1
+
+
+def test_the_stated_memory_is_that_of_a_measured_call():
+    """tests/benchmark/medsyn.csv, on 128^3 voxels in bfloat16."""
+    rows = csv.DictReader((Path(__file__).parents[1] / "benchmark" / "medsyn.csv").open())
+    row = next(row for row in rows if row["stage"] == "2")
+    taken = 2**20 * (int(row["peak_mib"]) - int(row["peak_mib_before_the_call"]))
+    with torch.device("meta"):
+        network = SuperResolutionUNet()
+    assert row["precision"] == "bfloat16"
+    assert taken == pytest.approx(int(row["voxels"]) * network.bytes_per_voxel(torch.bfloat16), rel=0.1)
+
+
+def test_a_second_stage_that_needs_more_memory_than_it_may_take_says_how_much_it_needs():
+    with torch.device("meta"):
+        fine = MedSynSuperResolution(SuperResolutionUNet())
+    with pytest.raises(ValueError, match=r"256.* about 36 GiB in float32, but 4 GiB .*--model.fine_memory 36") as error:
+        fine.check_memory(torch.float32)
+    assert "\n" not in str(error.value)
+    with pytest.raises(ValueError, match="about 18.5 GiB in bfloat16"):
+        fine.check_memory(torch.bfloat16)
+    fine.memory = int(36 * 2**30)
+    fine.check_memory(torch.float32)
 
 
 def test_the_second_stage_samples_on_the_fine_voxels_of_a_part():

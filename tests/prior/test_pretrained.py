@@ -13,7 +13,8 @@ from safetensors import safe_open
 from phydict.grid import Grid
 from phydict.inference import InferenceCLI, ReconstructionData, ReconstructionTask
 from phydict.prior import (
-    MedSynCheckpoint, TextEncoder, fingerprint, inspect_prior, load_prior, load_super_resolution, save_prior)
+    MedSynCheckpoint, TextEncoder, file_read, fingerprint, inspect_prior, load_prior, load_super_resolution,
+    save_prior)
 from phydict.prior.medsyn import MedSynPrior, MedSynSuperResolution
 from phydict.units import HUWindow
 from prior.medsyn_files import entries, super_resolution_unet, text_unet, write
@@ -100,6 +101,23 @@ def test_of_a_folder_the_latest_state_and_the_averaged_weights_are_read(results)
             found = load_prior(MedSynCheckpoint(str(path), which)).network
             assert torch.equal(estimate(found), estimate(network))
         assert torch.equal(estimate(load_prior(path).network), estimate(averaged))
+
+
+def test_of_the_second_stages_folder_the_online_weights_are_read_as_medsyns_inference_does(tmp_path):
+    folder, online, averaged = tmp_path / "results" / "3_ckpt", super_resolution_unet(1), super_resolution_unet(2)
+    for names in (("model.safetensors", FORMATS[0]), ("pytorch_model.bin", FORMATS[1])):
+        for name, network in zip(names, (online, averaged)):
+            write(folder / name, entries(network))
+        for which, network in (("auto", online), ("online", online), ("ema", averaged)):
+            found = load_super_resolution(MedSynCheckpoint(str(tmp_path / "results"), which)).network
+            assert torch.equal(estimate(found, X), estimate(network, X))
+        assert fingerprint(folder) == fingerprint(folder / names[0])
+        assert file_read(folder) == file_read(tmp_path / "results") == f"3_ckpt/{names[0]} (online)"
+        by_default = {file: told["by its name"] for file, told in inspect_prior(folder).items()}
+        assert by_default == {str(folder / names[0]): "online, read by default", str(folder / names[1]): "ema"}
+        (folder / names[0]).unlink()
+        assert file_read(folder) == f"3_ckpt/{names[1]} (ema)"
+        (folder / names[1]).unlink()
 
 
 def test_a_folder_without_averaged_weights_gives_the_online_ones_unless_asked(source, tmp_path):
@@ -270,6 +288,8 @@ def test_the_command_line_takes_medsyns_folder_and_its_switches(switch, results,
     assert all(torch.equal(weight, expected[name]) for name, weight in model.prior.network.state_dict().items())
     assert model.settings["prior_crc32"] == fingerprint(
         results[0] / "10_ckpt" / ("model.safetensors" if switch else FORMATS[0]))
+    assert model.settings["prior_file"] == (
+        "10_ckpt/model.safetensors (online)" if switch else f"10_ckpt/{FORMATS[0]} (ema)")
 
 
 def test_the_xrays_of_a_ct_are_simulated_on_the_box_of_the_prior():

@@ -1,44 +1,19 @@
 """The super-resolution stage: what it does before training, in tiles, with noise, and on bad input."""
 
-import weakref
-
 import pytest
 import torch
 from laws import random_like
 from torch.nn.functional import avg_pool3d
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
 
 from phydict.grid import Grid
 from phydict.posterior import descend
 from phydict.prior import LocalUNet, SuperResolution
 from phydict.units import HUWindow
+from prior.peak import Peak
 from prior.tiny import tiny_super_resolution
 
 COARSE = 0.3 * random_like((1, 4, 16, 16, 16), torch.float32, seed=1)
 X = random_like((1, 1, 32, 32, 32), torch.float32, seed=2)
-
-
-class Peak(TorchDispatchMode):
-    """The most bytes that tensors made within it held at once."""
-
-    def __init__(self):
-        super().__init__()
-        self.live, self.held, self.most = weakref.WeakKeyDictionary(), 0, 0
-
-    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
-        result = function(*args, **(kwargs or {}))
-        for tensor in tree_leaves(result):
-            if isinstance(tensor, torch.Tensor) and tensor.untyped_storage() not in self.live:
-                storage, size = tensor.untyped_storage(), tensor.untyped_storage().nbytes()
-                self.live[storage] = size
-                self.held += size
-                weakref.finalize(storage, self._freed, size)
-        self.most = max(self.most, self.held)
-        return result
-
-    def _freed(self, size):
-        self.held -= size
 
 
 def test_untrained_it_believes_the_coarse_volume_in_pure_noise_and_the_state_without_noise():
@@ -161,6 +136,21 @@ def test_less_memory_is_enough_in_tiles():
     tiled, volume = in_tiles(), 4 * 64**3
     assert peak(tiled) <= tiled.memory + 3 * volume  # state, coarse volume and estimate
     assert peak(tiny_super_resolution(64)) > 2 * peak(tiled)
+
+
+def test_memory_that_holds_no_tile_is_refused_before_anything_is_denoised():
+    fine = in_tiles()
+    fine.check_memory(torch.float32)
+    fine.memory = 1000
+    with pytest.raises(ValueError, match="allow at least"):
+        fine.check_memory(torch.float32)
+
+
+def test_noise_drawn_for_the_coarse_volume_is_added_to_it():
+    fine, draw = tiny_super_resolution(), torch.Generator().manual_seed(5)
+    noisy = COARSE + 0.2 * torch.randn(COARSE.shape, generator=torch.Generator().manual_seed(5))
+    given, drawn = fine.bind(noisy, 0.2), fine.bind(COARSE, 0.2, draw=draw)
+    assert torch.equal(given.upsampled, drawn.upsampled) and given.noise == drawn.noise == 0.2
 
 
 @pytest.mark.parametrize("noise", [-0.1, 1.1])

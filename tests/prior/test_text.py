@@ -212,6 +212,17 @@ def test_reports_that_are_cut_are_counted_and_measured(tmp_path):
     assert torch.equal(encoder([words])[0], encoder(["left nodule " * 11])[0])  # 22 words, [CLS] and [SEP]
 
 
+def test_a_report_that_medsyns_bert_reads_whole_is_not_called_cut(tmp_path):
+    encoder = frozen(tmp_path, length=24, padded_to=40)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        encoder.check(["left nodule " * 15])  # 30 words, [CLS] and [SEP]
+    assert not torch.equal(encoder(["left nodule " * 15])[0], encoder(["left nodule " * 11])[0])
+    with pytest.warns(UserWarning, match="1 of 1 reports are longer than the 40 tokens .* up to 22 tokens at"):
+        encoder.check(["left nodule " * 30])
+    assert torch.equal(encoder(["left nodule " * 30])[0], encoder(["left nodule " * 19])[0])
+
+
 def test_reports_in_another_script_are_told_with_their_share(tmp_path):
     encoder = frozen(tmp_path, length=24)
     with pytest.warns(UserWarning, match="2 of 5 reports are in words .* up to 100% of a report"):

@@ -58,7 +58,8 @@ def cascade():
 
 
 def gaussian(variance=1e-2, **settings):
-    return CascadePosterior(Cascade(tiny_prior(False), GaussianStage(variance)), SAMPLER, precision="float32", **settings)
+    stages = Cascade(tiny_prior(False), GaussianStage(variance))
+    return CascadePosterior(stages, SAMPLER, precision="float32", **settings)
 
 
 def base_alone(xrays, seed=3):

@@ -21,10 +21,10 @@ TABLE = "results.csv"
 
 
 class Finished(NamedTuple):
-    """A finished case: its record as it stands in the file, which tells one result from another, and as values."""
+    """A finished case: its record, and which file that is, by which two results of the same are told apart."""
 
-    text: str
     record: dict
+    file: tuple[int, int]
 
 
 class CaseResults:
@@ -66,7 +66,7 @@ class CaseResults:
         with undisturbed(self.folder):
             now = {case: self._there(case) for case in self._sources}
         return [case for case, there in now.items()
-                if not there or self._other(case, there) or self.overwrite and there == self._before[case]]
+                if not there or self._other(case, there) or self.overwrite and self._is_unchanged(case, there)]
 
     def write(self, case: str, record: dict, write_files: Callable[[Path], None]) -> None:
         """Makes a case's folder: `write_files` fills it, the record, which lists them, completes it, then it takes its
@@ -109,19 +109,24 @@ class CaseResults:
         if not os.path.lexists(folder):
             return None
         try:
-            text = (folder / RECORD).read_text()
-            record = json.loads(text)
+            stat = (folder / RECORD).stat()
+            record = json.loads((folder / RECORD).read_text())
             record["settings"], record["source"], record["scores"], set(record.get("files", UNLISTED))
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"{folder} is in the place of a case, but its {RECORD} is missing or damaged, and it is "
                              "not replaced: move it away, or give another model.out") from error
-        return Finished(text, record)
+        return Finished(record, (stat.st_ino, stat.st_mtime_ns))
 
     def _other(self, case: str, there: Finished) -> str:
         """In what a finished case differs from what is asked for; empty where it does not."""
         same = {"settings": there.record["settings"] == self._settings,
                 "data": there.record["source"] == self._sources[case]}
         return " and ".join(what for what in same if not same[what])
+
+    def _is_unchanged(self, case: str, there: Finished) -> bool:
+        """Whether a finished case is the one that was there when `unfinished` looked."""
+        before = self._before[case]
+        return before is not None and before.file == there.file
 
     def _check_own(self, case: str, there: Finished) -> None:
         """Raises ValueError where a finished case's folder is not this project's alone, so that it must stay."""
@@ -137,7 +142,7 @@ class CaseResults:
         there = self._there(case)
         if there is None:
             return True
-        if there == self._before[case]:
+        if self._is_unchanged(case, there):
             self._check_own(case, there)
             return True
         if other := self._other(case, there):

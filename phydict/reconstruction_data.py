@@ -100,7 +100,8 @@ class ReconstructionData(lightning.LightningDataModule):
     def inputs(self, stage: str) -> list[Path]:
         """The files and folders that a stage (predict, test) reads its cases from."""
         if stage == "predict":
-            return [*self.xray_cases().values(), Path(self.xrays)]
+            cases = self.xray_cases()
+            return [Path(self.xrays), *cases.values()]
         return [Path(self.cts)] if self.cts and self.cts != "phantom" else []
 
     def predict_dataloader(self) -> DataLoader:

@@ -332,16 +332,19 @@ def _inspect_file(file: Path) -> dict[str, str]:
             content = read_torch(file)
             header = content.get("phydict") if isinstance(content, dict) else None
             entries = content.get("state_dict", {}) if header else read_tensors(file)
-        report = (_inspect_phydict(header, entries, file.suffix == ".safetensors") if header
-                  else _inspect_medsyn(MedSynWeights.sort(entries), entries))
+        if header:
+            report, used = _inspect_phydict(header, entries, file.suffix == ".safetensors"), [*entries]
+        else:
+            found = MedSynWeights.sort(entries)
+            report, used = _inspect_medsyn(found, entries), [name for name in entries if name not in found.ignored]
     except ValueError as error:
         return {"kind": "unknown: " + " ".join(str(error).removeprefix(f"'{file}' ").split())}
     if file.suffix == ".safetensors":
         with safe_open(file, "pt") as opened:
-            for name in opened.keys():
+            for name in used:
                 check_finite({name: opened.get_tensor(name)}, file)
     else:
-        check_finite(entries, file)
+        check_finite({name: entries[name] for name in used}, file)
     return report
 
 

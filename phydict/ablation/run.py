@@ -83,7 +83,7 @@ class Results:
 def alone_in(folder: Path) -> Iterator[None]:
     """Raises ValueError where another process is inside with the same folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    with open(folder / ".lock", "w") as lock:
+    with open(folder / ".lock", "a") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:

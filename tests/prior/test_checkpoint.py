@@ -71,10 +71,10 @@ def test_weights_that_are_not_finite_are_not_written_and_named(file, value):
     assert file.read_bytes() == before and [*file.parent.iterdir()] == [file]
 
 
-@pytest.mark.parametrize("name", ["null", "text.project.weight"])
-def test_weights_that_are_not_finite_are_refused_by_name(file, name):
+@pytest.mark.parametrize("part", ["null", "text."])
+def test_weights_that_are_not_finite_are_refused_by_name(file, part):
     weights = load_file(file)
-    name = next(key for key in weights if key == name or key.startswith(name.split(".")[0] + "."))
+    name = next(key for key in weights if key.startswith(part))
     weights[name].view(-1)[0] = float("nan")
     with safe_open(file, "pt") as opened:
         save_file(weights, file, opened.metadata())

@@ -2,56 +2,112 @@
 
 from __future__ import annotations
 
-import errno
+import fcntl
 import os
 import shutil
 import socket
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 
 @contextmanager
 def whole_file(final: Path) -> Iterator[Path]:
-    """A path to write to; when the block ends well that file takes `final`'s place, else it is removed."""
+    """A path of the same ending to write to; when the block ends well that file takes `final`'s place, else it is
+    removed."""
     final.parent.mkdir(parents=True, exist_ok=True)
-    part = final.with_name(f".{final.name}.{os.getpid()}.part")
+    part = final.with_name(f".{os.getpid()}.part.{final.name}")
     try:
         yield part
+        _sync(part)
         part.replace(final)
     finally:
         part.unlink(missing_ok=True)
 
 
 @contextmanager
-def whole_folder(final: Path) -> Iterator[Path]:
-    """A folder to fill; when the block ends well that folder takes `final`'s place, else it is removed."""
-    partial = final.with_name(f".{final.name}.{socket.gethostname()}.{os.getpid()}.partial")
+def whole_folder(final: Path, wanted: Callable[[], bool] = lambda: True) -> Iterator[Path]:
+    """A folder to fill; when the block ends well that folder takes `final`'s place, else it is removed.
+
+    wanted: asked when all is written and no other process is at it, so that what is in `final`'s place then can be
+    looked at; where it is not true, or raises, that stays.
+    """
+    partial = _partial(final)
     try:
         partial.mkdir(parents=True, exist_ok=True)
         yield partial
-        _take_place(partial, final)
+        for path in (*partial.rglob("*"), partial):
+            _sync(path)
+        with undisturbed(final.parent):
+            if wanted():
+                _take_place(partial, final)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 
 
+@contextmanager
+def undisturbed(folder: Path) -> Iterator[None]:
+    """In the block no process of this machine puts a whole folder into `folder`, if there is such a folder, and none
+    that a process set aside before it was killed is missing."""
+    if not folder.is_dir():
+        yield
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        with suppress(OSError):  # a file system without locks: then the renaming alone must do
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        for aside in folder.glob(".*.replaced"):
+            _settle(aside.with_name(aside.name[1:].removesuffix(".replaced")))
+        yield
+    finally:
+        os.close(handle)
+
+
 def remove_leftovers(folder: Path) -> None:
-    """Removes what processes of this machine that are no more had begun to write as folders below `folder`."""
-    for partial in folder.glob(".*.partial"):
-        host, _, process = partial.name.removesuffix(".partial").rpartition(".")
-        if host.endswith("." + socket.gethostname()) and process.isdigit() and not _runs(int(process)):
-            shutil.rmtree(partial, ignore_errors=True)
+    """Removes what processes of this machine that are no more had begun to write as folders below `folder`, and puts
+    back what they had set aside."""
+    with undisturbed(folder):
+        for partial in folder.glob(".*.partial"):
+            host, _, process = partial.name.removesuffix(".partial").rpartition(".")
+            if host.endswith("." + socket.gethostname()) and process.isdigit() and not _runs(int(process)):
+                shutil.rmtree(partial, ignore_errors=True)
 
 
 def _take_place(partial: Path, final: Path) -> None:
-    while True:  # another process may have finished the same folder in the meantime, with the same result
-        try:
-            partial.rename(final)
-            return
-        except OSError as error:
-            if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):
-                raise
-            shutil.rmtree(final)
+    try:
+        if os.path.lexists(final):
+            final.rename(_aside(final))
+        partial.rename(final)
+    finally:
+        _settle(final)
+
+
+def _settle(final: Path) -> None:
+    """Of what was set aside for `final`: puts it back where nothing took its place, and removes it where that did."""
+    aside = _aside(final)
+    if not aside.is_dir():
+        return
+    if os.path.lexists(final):
+        shutil.rmtree(aside.rename(_partial(aside)), ignore_errors=True)  # no part of it is ever taken for the whole
+    else:
+        aside.rename(final)
+
+
+def _aside(final: Path) -> Path:
+    return final.with_name(f".{final.name}.replaced")
+
+
+def _partial(final: Path) -> Path:
+    return final.with_name(f".{final.name}.{socket.gethostname()}.{os.getpid()}.partial")
+
+
+def _sync(path: Path) -> None:
+    """Waits until the disk holds a file or a folder."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def _runs(process: int) -> bool:

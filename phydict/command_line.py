@@ -10,7 +10,7 @@ import sys
 import tempfile
 import warnings
 from argparse import ArgumentError
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -65,6 +65,17 @@ def check_writable(path: Path, option: str, file: bool = False) -> None:
     except OSError as error:
         reason = "is a file" if there.is_file() else f"cannot be written to ({error.strerror})"
         raise ValueError(f"{path} cannot be written because {there} {reason}: give another {option}") from error
+
+
+def check_apart(output: Path, option: str, inputs: Iterable[Path]) -> None:
+    """Raises ValueError, in one sentence, where `output` is one of the inputs, lies inside one or holds one, wherever
+    links lead; `option` is what the user should change."""
+    there = Path(os.path.realpath(output))
+    for given in inputs:
+        here = Path(os.path.realpath(given))
+        if there.is_relative_to(here) or here.is_relative_to(there):
+            how = "is" if there == here else "lies inside" if there.is_relative_to(here) else "holds"
+            raise ValueError(f"the output {output} {how} the input {given}: give another {option}")
 
 
 def sentence(error: Exception) -> str:

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from phydict.ablation import main as ablate
 from phydict.case_results import CaseResults
-from phydict.command_line import check_writable, one_sentence_errors, quiet, sentence
+from phydict.command_line import check_apart, check_writable, one_sentence_errors, quiet, sentence
 from phydict.datasets import load_xrays
 from phydict.dry_run import dry_run
 from phydict.evaluation import CaseMetrics, panel, rich_table
@@ -60,7 +60,7 @@ class ReconstructionTask(lightning.LightningModule):
             MedSyn's, which cannot, is refused
         precision: of the networks: auto (bfloat16 where the device computes it), float32 or bfloat16
         out: output folder; cases go to <out>/<name>/<case>
-        overwrite: do finished cases again, and replace what is in their place
+        overwrite: do finished cases again; a new result takes the old one's place when it is complete
         seed: with the case's id, the only source of randomness
         voxels: voxels along each side of the cube, for methods without a prior
         side: side of the cube in mm, for methods without a prior
@@ -73,6 +73,8 @@ class ReconstructionTask(lightning.LightningModule):
                  out: str = "runs/reconstructions", overwrite: bool = False, seed: int = 0, voxels: int = 64,
                  side: float = 384.0, samples: int = 1, precision: str = "auto"):
         super().__init__()
+        if name in ("", "..") or name != Path(name).name:
+            raise ValueError(f"model.name is the name of one folder inside model.out, but '{name}' was given")
         self.method_name, self.seed, self.pages = name, seed, Path(out) / "dry_run"
         self.results = CaseResults(Path(out) / name, overwrite)
         check_writable(self.results.folder, "model.out")
@@ -107,12 +109,11 @@ class ReconstructionTask(lightning.LightningModule):
 
     def setup(self, stage: str) -> None:
         self.settings["data"] = self.trainer.datamodule.settings(stage)
+        check_apart(self.results.folder, "model.out", self.trainer.datamodule.inputs(stage))
 
     def unfinished(self, sources: dict[str, str]) -> list[str]:
         """Of this run's cases, id -> what identifies their data, those that remain to be done."""
         self.cases = list(sources)
-        if self.trainer.is_global_zero:
-            self.results.remove_leftovers()
         left = self.results.unfinished(sources, self.settings)
         if len(left) < len(sources) and self.trainer.is_global_zero:
             print(f"{len(sources) - len(left)} of {len(sources)} cases are finished already and are kept"
@@ -158,7 +159,6 @@ class ReconstructionTask(lightning.LightningModule):
             else:
                 work(case)
         except (ValueError, FloatingPointError) as error:
-            self.results.discard(case["id"])
             if len(self.cases) == 1:
                 raise
             self.progress.finished("not reconstructed")
@@ -226,7 +226,7 @@ class ReconstructionTask(lightning.LightningModule):
 
     def summarise(self) -> None:
         """Prints and writes the scores of this run's cases. Raises ValueError, naming them, where some have failed."""
-        missing = [case for case in self.cases if not (self.results.folder / case).exists()]
+        missing = self.results.missing()
         rows = self.results.summarise(case for case in self.cases if case not in missing)
         if rows:
             console = Console()
@@ -281,6 +281,7 @@ class InferenceCLI(LightningCLI):
     def predict(self, model: ReconstructionTask, datamodule: ReconstructionData) -> None:
         """Reconstruct X-rays, or draw their geometry."""
         if self.dry_run:
+            check_apart(model.pages, "model.out", datamodule.inputs("predict"))
             for name, folder in datamodule.xray_cases().items():
                 case = load_xrays(folder, datamodule.geometry) | {"id": name}
                 print(*dry_run(model.pages / f"{name}.png", case, model.grid), sep="\n")

@@ -97,6 +97,13 @@ class ReconstructionData(lightning.LightningDataModule):
             raise ValueError("predict needs data.xrays: a folder of X-ray images with geometry.yaml")
         return {Path(os.path.abspath(folder)).name: folder for folder in find_xrays(self.xrays)}
 
+    def inputs(self, stage: str) -> list[Path]:
+        """The files and folders that a stage (predict, test) reads its cases from."""
+        if stage == "predict":
+            cases = self.xray_cases()
+            return [Path(self.xrays), *cases.values()]
+        return [Path(self.cts)] if self.cts and self.cts != "phantom" else []
+
     def predict_dataloader(self) -> DataLoader:
         return self._loader([(name, self._xrays_source(folder), lambda f=folder: load_xrays(f, self.geometry))
                              for name, folder in self.xray_cases().items()])

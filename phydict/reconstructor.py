@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from phydict import profiling
+from phydict.atomic import whole_file
 from phydict.grid import Grid
 from phydict.units import MU_WATER
 from phydict.xray import ConeBeam, Projector
@@ -89,14 +90,12 @@ class Reconstruction:
 
 def save_nifti(path: str | Path, volume: np.ndarray, grid: Grid) -> None:
     """Writes `volume` (X, Y, Z) on `grid` as NIfTI (.nii or .nii.gz), replacing the file only when complete."""
-    path = Path(path)
     image = nibabel.Nifti1Image(np.asarray(volume, np.float32), grid.affine)
     image.header.set_xyzt_units("mm", "sec")
     image.set_sform(grid.affine, code="scanner")
     image.set_qform(grid.affine, code="scanner")
-    partial = path.with_name("partial." + path.name)
-    nibabel.save(image, partial)
-    partial.replace(path)
+    with whole_file(Path(path)) as part:
+        nibabel.save(image, part)
 
 
 class Reconstructor(ABC):

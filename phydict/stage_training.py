@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from pathlib import Path
 
 import lightning
@@ -14,7 +15,11 @@ from phydict.diffusion import Denoiser, renoise
 from phydict.posterior import descend
 from phydict.prior import Prior, SuperResolution
 from phydict.prior.checkpoint import check_stage
+from phydict.prior.finite import not_finite
 from phydict.units import HUWindow
+
+CHECKPOINT = "last.ckpt"
+"""The file of a training's folder that it can be resumed from."""
 
 NOISE_LEVELS = (0.1, 0.3, 0.5, 0.7, 0.9)
 """Times t at which validation measures the denoising error."""
@@ -58,8 +63,11 @@ class StageTraining(lightning.LightningModule, ABC):
     def training_step(self, batch: dict, index: int) -> Tensor:
         loss = self.denoising_loss(batch, (self.seed, self.global_step, index), self.global_rank,
                                    self.trainer.world_size)
+        mean = self.trainer.strategy.reduce(loss.detach().clone(), reduce_op="mean")  # so that every process stops
+        if not mean.isfinite():
+            raise FloatingPointError(f"the loss is {float(mean)} after {self.global_step} steps: {self._way_back()}")
         self.samples += len(batch["volume"]) * self.trainer.world_size
-        self.log("loss", loss, prog_bar=True, batch_size=len(batch["volume"]), sync_dist=True)
+        self.log("loss", mean, prog_bar=True, batch_size=len(batch["volume"]))
         return loss
 
     def denoising_loss(self, batch: dict, key: tuple[int, ...] = (0,), rank: int = 0, processes: int = 1) -> Tensor:
@@ -79,6 +87,25 @@ class StageTraining(lightning.LightningModule, ABC):
         error = (self.prior(a * x0 + s * noise, t, *told) - x0).square()
         unit = self.prior.preconditioning(t)[1].clamp(min=self.typical_std / 2) ** -2
         return (unit * weight * error).mean() * x0.shape[1] / (1 + self.mask_weight * (x0.shape[1] - 1))
+
+    def on_validation_start(self) -> None:
+        if self.device_mesh is None:  # the parts of spread weights are looked at when they are put together
+            self._check_weights(self.state_dict())
+
+    def _check_weights(self, *states: Mapping[str, Tensor]) -> None:
+        """Raises FloatingPointError in every process where the weights of one are not finite."""
+        broken = next(filter(None, map(not_finite, states)), "")
+        anywhere = torch.tensor(float(bool(broken)), device=self.device)
+        if self.trainer.strategy.reduce(anywhere, reduce_op="sum"):
+            raise FloatingPointError(f"the weights are not finite after {self.global_step} steps "
+                                     f"({broken or 'those of another process'}): {self._way_back()}")
+
+    def _way_back(self) -> str:
+        """What to do where a training has come to nothing."""
+        file = Path(self.trainer.default_root_dir) / CHECKPOINT
+        last = file if file.is_file() else self.trainer.ckpt_path
+        return (f"the last good checkpoint is {last}, from which --ckpt_path goes on; " if last else
+                "no checkpoint had been written; ") + "a lower model.learning_rate is for a new run"
 
     def validation_step(self, batch: dict, index: int) -> None:
         x0, _ = self._state(batch)
@@ -114,6 +141,7 @@ class StageTraining(lightning.LightningModule, ABC):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def on_save_checkpoint(self, checkpoint: dict) -> None:
+        self._check_weights(checkpoint["state_dict"], checkpoint.get("current_model_state", {}))
         seen = {"steps": self.trainer.global_step, "samples": self.samples}
         checkpoint["phydict"] = self._describe() | {"training": seen}
 

@@ -21,39 +21,48 @@ from phydict.command_line import check_writable, one_sentence_errors, quiet
 from phydict.datamodule import PriorData
 from phydict.precision import PRECISIONS, resolve_precision, trainer_precision
 from phydict.prior import save_prior, save_super_resolution
-from phydict.prior.checkpoint import build_prior, build_super_resolution, build_text
+from phydict.prior.checkpoint import build_prior, build_super_resolution, build_text, is_saved_prior
+from phydict.prior.finite import check_finite
 from phydict.prior.pretrained import inspect_prior, read_torch
 from phydict.prior_training import PriorTraining
+from phydict.stage_training import CHECKPOINT
 from phydict.super_resolution_data import SuperResolutionData
 from phydict.super_resolution_training import SuperResolutionTraining
 from phydict.throughput import Throughput
 
-CHECKPOINT, BEST, HELD_OUT = "last.ckpt", "best.ckpt", "held_out.txt"
-"""Files of a training's folder: what it can be resumed from, what reconstructed the held-out cases best, and the ids of
-the CTs that it never saw."""
+BEST, HELD_OUT = "best.ckpt", "held_out.txt"
+"""Files of a training's folder: what reconstructed the held-out cases best, and the ids of the CTs that it never
+saw."""
 
 
 def read_checkpoint(path: str | Path) -> dict:
-    """A checkpoint that training wrote. Raises FileNotFoundError, or ValueError when it is truncated, holds code or is
-    another's."""
+    """A checkpoint that training wrote. Raises FileNotFoundError, or ValueError when it is truncated, holds code, is
+    another's or holds weights that are not finite."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"there is no checkpoint {path}: give a .ckpt file that training wrote")
     checkpoint = read_torch(path)
     if not isinstance(checkpoint, dict) or "phydict" not in checkpoint:
         raise ValueError(f"{path} is no checkpoint of a prior: give a .ckpt file that training wrote")
+    for state in ("state_dict", "current_model_state"):
+        check_finite(checkpoint.get(state, {}), path)
     return checkpoint
 
 
-def export_prior(checkpoint: str, out: str) -> None:
+def export_prior(checkpoint: str, out: str, overwrite: bool = False) -> None:
     """Write the averaged weights of a training checkpoint as a prior, or a super-resolution stage, for reconstruction.
 
     Args:
         checkpoint: the .ckpt file that training wrote
         out: the .safetensors file to write
+        overwrite: whether a prior or stage that is there already is replaced
     """
     if Path(out).suffix != ".safetensors":
         raise ValueError(f"a prior is a .safetensors file, but {out} was given: give a name with that ending")
     check_writable(Path(out), "--out", file=True)
+    if Path(out).exists() and not is_saved_prior(out):
+        raise ValueError(f"{out} is there already, is no prior of phydict's, and is not replaced: give another --out")
+    if Path(out).exists() and not overwrite:
+        raise ValueError(f"{out} is a prior already: add --overwrite true to replace it, or give another --out")
     content = read_checkpoint(checkpoint)
     header = content["phydict"]
     weights = {k.removeprefix("prior."): w for k, w in content["state_dict"].items() if k.startswith("prior.")}
@@ -167,15 +176,23 @@ class PriorCLI(LightningCLI):
         return super().instantiate_trainer(logger=logger, plugins=plugins, **kwargs)
 
     def before_fit(self) -> None:
-        out = Path(self.config.fit.out)
-        if self.config.fit.ckpt_path:
+        out, resumed = Path(self.config.fit.out), self.config.fit.ckpt_path
+        if resumed and (resumed in ("last", "best") or Path(resumed).resolve().parent == out.resolve()):
             return
-        if (out / CHECKPOINT).exists():
-            raise ValueError(f"{out} holds a training already: go on with --ckpt_path {out / CHECKPOINT}, or give "
-                             "another folder with --out")
+        for name in (CHECKPOINT, BEST):
+            if (out / name).exists():
+                raise ValueError(f"{out} holds a training already: go on with --ckpt_path {out / name}, or give "
+                                 "another folder with --out")
+        if resumed:
+            return
         if self.trainer.is_global_zero and self.datamodule.held_out:
-            out.mkdir(parents=True, exist_ok=True)
-            (out / HELD_OUT).write_text("".join(f"{case}\n" for case in self.datamodule.held_out))
+            held_out = "".join(f"{case}\n" for case in self.datamodule.held_out)
+            file = out / HELD_OUT
+            if file.exists() and file.read_bytes() != held_out.encode():
+                raise ValueError(f"{file} is there already and names other cases than this training holds out: move "
+                                 "it away, or give another folder with --out")
+            with whole_file(file) as part:
+                part.write_text(held_out)
         self.model.learn_reports(self.datamodule)
 
     def before_validate(self) -> None:

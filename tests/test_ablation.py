@@ -270,6 +270,15 @@ def test_the_table_of_another_comparison_is_left_alone(tmp_path, capsys, trace):
     assert {file: file.read_bytes() for file in (tmp_path / "out").iterdir()} == before
 
 
+@pytest.mark.parametrize("name", ["tables.md", "picture.png"])
+def test_what_other_programs_wrote_is_left_alone(tmp_path, capsys, trace, name):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / name).write_text("mine")
+    said = refusal(capsys, ["ablate", "-c", str(write(tmp_path, axes={"method": ["trace"]})), "--device", "cpu"])
+    assert f"holds {name}, but no results.csv of this command" in said and not trace.given
+    assert (tmp_path / "out" / name).read_text() == "mine"
+
+
 def test_arguments_and_files_that_cannot_be_meant_are_one_sentence(tmp_path, capsys):
     assert "nowhere.yaml" in refusal(capsys, ["ablate", "-c", str(tmp_path / "nowhere.yaml")])
     file = write(tmp_path, axes={"method": ["trace"]})

@@ -20,7 +20,7 @@ import yaml
 from dicom_files import orbit_tags, write_dicom
 from PIL import Image
 from safetensors import safe_open
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 
 from phydict.baselines import SIRT
 from phydict.datasets import load_xrays, phantom_case, prepare_ct, save_xrays
@@ -279,15 +279,108 @@ def test_a_partial_folder_is_never_a_finished_case(measured, scored, tmp_path):
     assert names(tmp_path / "sirt") == ["anna"]
 
 
-def test_a_folder_that_is_no_case_is_never_replaced_unasked(measured, tmp_path, capsys):
+@pytest.mark.parametrize("overwrite", ["false", "true"])
+def test_a_folder_that_is_no_case_is_never_replaced(measured, tmp_path, capsys, overwrite):
     notes = tmp_path / "sirt" / "anna" / "notes.txt"
     notes.parent.mkdir(parents=True)
     notes.write_text("mine")
-    args = sirt("predict", tmp_path, f"--data.xrays={measured / 'anna'}")
+    said = refusal(capsys, sirt("predict", tmp_path, f"--data.xrays={measured / 'anna'}",
+                                f"--model.overwrite={overwrite}"))
+    assert str(notes.parent) in said and "model.out" in said and "overwrite" not in said
+    assert names(tmp_path / "sirt") == ["anna"] and notes.read_text() == "mine"
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("place, name, how", [
+    (".", "cases", "is the input"), (".", "linked", "is the input"), ("cases", "anna", "lies inside"),
+    ("cases", "sirt", "lies inside"), ("cases/anna", "sirt", "lies inside"), ("..", "{parent}", "holds"),
+    ("linked", "anna", "lies inside")])
+def test_an_output_that_is_holds_or_lies_inside_the_input_is_refused(measured, tmp_path, capsys, place, name, how):
+    shutil.copytree(measured, tmp_path / "cases")
+    (tmp_path / "linked").symlink_to(tmp_path / "cases")
+    before = contents(tmp_path)
+    args = sirt("predict", tmp_path / place, f"--data.xrays={tmp_path / 'cases'}", "--model.overwrite=true",
+                f"--model.name={name.format(parent=tmp_path.name)}")
     said = refusal(capsys, args)
-    assert str(notes.parent) in said and "model.overwrite" in said and notes.read_text() == "mine"
-    main([*args, "--model.overwrite=true"])
-    assert names(notes.parent) == FILES
+    assert how in said and "give another model.out" in said and contents(tmp_path) == before
+
+
+def test_results_are_never_written_among_the_cts(cts, tmp_path, capsys):
+    before = contents(cts)
+    said = refusal(capsys, sirt("test", cts, f"--data.cts={cts}", *ORBIT))
+    assert "lies inside the input" in said and contents(cts) == before
+
+
+def test_a_dry_run_writes_no_page_among_the_xrays(measured, tmp_path, capsys):
+    shutil.copytree(measured, tmp_path / "dry_run")
+    before = contents(tmp_path)
+    said = refusal(capsys, sirt("predict", tmp_path, f"--data.xrays={tmp_path / 'dry_run'}", "--dry_run"))
+    assert "is the input" in said and contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("name", ["../other", "/{out}/other", "a/b", "..", ".", ""])
+def test_a_name_is_that_of_one_folder_inside_the_output(measured, tmp_path, capsys, name):
+    name = name.format(out=str(tmp_path).strip("/"))
+    said = refusal(capsys, sirt("predict", tmp_path / "out", f"--data.xrays={measured}", f"--model.name={name}"))
+    assert f"one folder inside model.out, but '{name}' was given" in said and names(tmp_path) == []
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_a_result_stays_when_its_redo_fails(measured, tmp_path, capsys, several):
+    shutil.copytree(measured if several else measured / "anna", tmp_path / "anna" if not several else tmp_path / "in")
+    given = tmp_path / ("in" if several else "anna")
+    args = sirt("predict", tmp_path / "out", f"--data.xrays={given}")
+    main(args)
+    folder = tmp_path / "out" / "sirt" / "anna"
+    before = stamp(folder)
+    image = (given / "anna" if several else given) / "view_1.npy"
+    image.write_bytes(image.read_bytes()[:200])
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as stopped:
+        main([*args, "--model.overwrite=true"])
+    said = capsys.readouterr().err
+    assert stopped.value.code == 2 and "view_1.npy" in said and stamp(folder) == before
+    assert ("1 of 2 cases were not reconstructed (anna)" in said) == several
+
+
+@pytest.mark.parametrize("seed, code", [(0, None), (1, 2)], ids=["same settings", "other settings"])
+def test_a_run_that_another_one_overtakes_keeps_its_result(measured, tmp_path, capsys, monkeypatch, seed, code):
+    args = sirt("predict", tmp_path, f"--data.xrays={measured / 'anna'}")
+    folder, whole = tmp_path / "sirt" / "anna", SIRT.reconstruct
+    overtaken = []
+
+    def slow(self, *given):
+        found = whole(self, *given)
+        if not overtaken:
+            overtaken.append(True)
+            main([*args, f"--model.seed={seed}"])
+            overtaken.append(stamp(folder))
+        return found
+
+    monkeypatch.setattr(SIRT, "reconstruct", slow)
+    if code is None:
+        main(args)
+    else:
+        assert "another process has finished" in refusal(capsys, args)
+    assert stamp(folder) == overtaken[1] and record(folder)["settings"]["seed"] == seed
+
+
+def test_a_result_that_cannot_be_written_leaves_nothing_beside(measured, tmp_path):
+    case = load_xrays(measured / "anna")
+    found = reconstruct(case["xrays"], case["beam"], method=SIRT(iterations=1))
+    found.save_nifti(tmp_path / "volume.nii.gz")
+    before = contents(tmp_path)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))  # no file may grow beyond 1000 bytes
+    try:
+        with pytest.raises(OSError):
+            found.save_nifti(tmp_path / "volume.nii.gz")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert contents(tmp_path) == before
 
 
 def test_a_damaged_record_is_named(measured, tmp_path, capsys):
@@ -484,6 +577,15 @@ def rewritten(source: Path, target: Path, **changes) -> Path:
     return target
 
 
+def with_nan(source: Path, target: Path) -> Path:
+    """A prior's file of which one weight is NaN."""
+    weights = load_file(source)
+    weights["null"].view(-1)[3] = np.nan
+    with safe_open(source, "pt") as file:
+        save_file(weights, target, file.metadata())
+    return target
+
+
 def wrong_size(folder: Path) -> Path:
     np.save(xrays(folder) / "view_1.npy", np.ones((24, 20), np.float32))
     return folder
@@ -563,6 +665,8 @@ BAD_PRIORS = {
                         ["p.safetensors", "(15, 15, 15)", "divisible"]),
     "other network": (lambda at, good: rewritten(good, at / "p.safetensors", network=VolumeUNet(
         channels=(8, 16), attention=(False, True), head_channels=8).settings), ["p.safetensors", "network"]),
+    "weights that are not finite": (lambda at, good: with_nan(good, at / "p.safetensors"),
+                                    ["p.safetensors", "weights that are not finite (null has 1 NaN"]),
     "others' file": (lambda at, good: rewritten(good, at / "p.safetensors", format=99), ["p.safetensors", "format"]),
 }
 

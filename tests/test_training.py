@@ -122,6 +122,49 @@ def test_a_killed_run_goes_on_as_if_it_had_not_been(tmp_path, straight, cache):
     assert ours["phydict"]["training"] == {"steps": 8, "samples": 16}
 
 
+@pytest.mark.parametrize("before", [False, True], ids=["at once", "after a checkpoint"])
+def test_a_loss_that_is_not_finite_stops_the_training(tmp_path, cache, capsys, monkeypatch, before):
+    loss, at = PriorTraining.denoising_loss, 5 if before else 1
+    monkeypatch.setattr(PriorTraining, "denoising_loss", lambda task, *given: loss(task, *given) * (
+        float("nan") if task.global_step == at else 1))
+    said = refusal(capsys, arguments(tmp_path, cache, "--trainer.max_epochs=2", "--trainer.limit_val_batches=0"))
+    assert f"the loss is nan after {at} steps" in said
+    assert (f"the last good checkpoint is {tmp_path / 'last.ckpt'}" if before else "no checkpoint") in said
+    assert not before or checkpoint(tmp_path)["global_step"] == 4
+
+
+@pytest.mark.parametrize("validated", [True, False])
+def test_weights_that_are_not_finite_never_replace_a_checkpoint(tmp_path, cache, capsys, monkeypatch, validated):
+    def spoil(task: PriorTraining, *_) -> None:
+        if task.global_step == 8:
+            task.prior.null.data.view(-1)[3] = float("nan")
+
+    monkeypatch.setattr(PriorTraining, "on_train_batch_end", spoil)
+    more = [] if validated else ["--trainer.limit_val_batches=0"]
+    said = refusal(capsys, arguments(tmp_path, cache, "--trainer.max_epochs=3", *more))
+    assert "the weights are not finite after 8 steps (prior.null has 1 NaN" in said and "last.ckpt" in said
+    assert checkpoint(tmp_path)["global_step"] == 4
+    assert not validated or torch.load(tmp_path / "best.ckpt", weights_only=True)["global_step"] == 4
+
+
+@pytest.fixture
+def spoilt(straight, tmp_path) -> Path:
+    """A checkpoint of which one weight is NaN."""
+    content = checkpoint(straight)
+    content["state_dict"]["prior.null"].view(-1)[3] = float("nan")
+    torch.save(content, tmp_path / "spoilt.ckpt")
+    return tmp_path / "spoilt.ckpt"
+
+
+def test_weights_that_are_not_finite_are_refused_by_name(spoilt, cache, tmp_path, capsys):
+    for args in (["export", f"--checkpoint={spoilt}", f"--out={tmp_path / 'prior.safetensors'}"],
+                 ["inspect-prior", str(spoilt)],
+                 arguments(tmp_path / "run", cache, f"--ckpt_path={spoilt}")):
+        said = refusal(capsys, args)
+        assert "spoilt.ckpt" in said and "not finite (prior.null has 1 NaN or infinite values of 64)" in said
+    assert [path.name for path in tmp_path.iterdir()] == ["spoilt.ckpt"]
+
+
 def test_a_checkpoint_that_the_disk_cannot_hold_leaves_the_last_one(tmp_path, cache, capsys):
     short = ["--trainer.limit_train_batches=1", "--trainer.limit_val_batches=0"]
     main(arguments(tmp_path, cache, "--trainer.max_epochs=1", *short))
@@ -133,7 +176,7 @@ def test_a_checkpoint_that_the_disk_cannot_hold_leaves_the_last_one(tmp_path, ca
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert "last.ckpt could not be written" in said and "--ckpt_path" in said
-    assert (tmp_path / "last.ckpt").read_bytes() == last and not list(tmp_path.rglob("*.part"))
+    assert (tmp_path / "last.ckpt").read_bytes() == last and not list(tmp_path.rglob("*.part.*"))
 
 
 def test_an_exported_checkpoint_is_a_prior_with_the_averaged_weights(tmp_path, straight, capsys):
@@ -233,6 +276,36 @@ def test_a_second_training_never_overwrites_a_first(straight, cache, capsys):
     said = refusal(capsys, arguments(straight, cache, "--trainer.max_epochs=1"))
     assert str(straight) in said and "--ckpt_path" in said and "--out" in said
     assert (straight / "last.ckpt").read_bytes() == before
+
+
+@pytest.mark.parametrize("name", ["last.ckpt", "best.ckpt"])
+def test_a_training_that_goes_on_elsewhere_overwrites_no_other(straight, cache, tmp_path, capsys, name):
+    (tmp_path / name).write_bytes(b"another's")
+    for more in ([], [f"--ckpt_path={straight / 'last.ckpt'}"]):
+        said = refusal(capsys, arguments(tmp_path, cache, "--trainer.max_epochs=3", *more))
+        assert f"--ckpt_path {tmp_path / name}" in said and "--out" in said
+    assert (tmp_path / name).read_bytes() == b"another's"
+
+
+def test_a_list_of_someone_elses_is_not_replaced(cts, cache, tmp_path, capsys):
+    (tmp_path / "held_out.txt").write_text("mine\n")
+    said = refusal(capsys, arguments(tmp_path, cache, "--trainer.max_epochs=1", f"--data.cts={cts}",
+                                     "--data.holdout=[patient1]"))
+    assert "held_out.txt is there already" in said and (tmp_path / "held_out.txt").read_text() == "mine\n"
+
+
+def test_an_export_replaces_a_prior_when_asked_and_nothing_else_ever(straight, tmp_path, capsys):
+    file = tmp_path / "prior.safetensors"
+    args = ["export", f"--checkpoint={straight / 'last.ckpt'}", f"--out={file}"]
+    file.write_bytes(b"mine")
+    for more in ([], ["--overwrite=true"]):
+        assert "is no prior of phydict's, and is not replaced" in refusal(capsys, [*args, *more])
+    assert file.read_bytes() == b"mine"
+    save_prior(tiny_prior(), file)
+    before = file.read_bytes()
+    assert "add --overwrite true" in refusal(capsys, args) and file.read_bytes() == before
+    main([*args, "--overwrite=true"])
+    assert load_prior(file).window.high == 1000
 
 
 @pytest.mark.parametrize("change, key", [(["--model.voxels=24"], "grid"), (["--model.text=none"], "text"),
@@ -347,6 +420,23 @@ def test_two_processes_train_the_prior_that_one_would(tmp_path, cache, straight)
     assert_same_curve(tmp_path, straight, "val/psnr", tolerance=1e-3)  # ten calls of the network carry rounding on
     assert checkpoint(tmp_path)["phydict"]["training"] == {"steps": 4, "samples": 8}
     assert list(tmp_path.glob("logs/**/samples/*.png"))
+
+
+def test_every_process_stops_where_one_of_them_has_a_loss_that_is_not_finite(tmp_path, cache):
+    (tmp_path / "train.py").write_text("""if True:
+        from phydict.training import PriorTraining, main
+        loss = PriorTraining.denoising_loss
+        def broken(task, batch, key, rank, processes):
+            return loss(task, batch, key, rank, processes) * (float("nan") if rank == task.global_step == 1 else 1)
+        PriorTraining.denoising_loss = broken
+        main()""")
+    args = arguments(tmp_path / "run", cache, f"--config={CONFIG.with_name('ddp.yaml')}", "--trainer.devices=2",
+                     "--data.batch_size=1", "--trainer.max_epochs=1", "--model.text=none")
+    done = subprocess.run([sys.executable, str(tmp_path / "train.py"), *args], capture_output=True, text=True,
+                          env=os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(CONFIG.parents[2])}, timeout=300)
+    assert done.returncode == 2 and "Traceback" not in done.stderr, done.stderr[-2000:]
+    assert "error: the loss is nan after 1 steps: no checkpoint" in done.stderr
+    assert not (tmp_path / "run" / "last.ckpt").exists()
 
 
 @pytest.mark.slow

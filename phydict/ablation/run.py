@@ -22,7 +22,8 @@ from phydict.progress import CaseProgress
 from phydict.reconstruction_data import case_scores, case_seed
 from phydict.reconstructor import Reconstruction, Stopwatch
 
-RESULTS = "results.csv"
+RESULTS, TABLES = "results.csv", ("tables.md", "tables.tex")
+"""The results of a folder, and the tables that are made of them."""
 
 FINISHED = ("ok", "refused", "diverged")
 """What a row's status may be that is not tried again; "failed" is, since its reason may lie outside."""
@@ -38,11 +39,16 @@ class Results:
     """The table of results in a folder, of which this process alone writes while it is open.
 
     A row is known by its key (spec.key): rows of other settings or other data that the file holds are kept at its end.
-    Raises ValueError where the file is damaged, or is the table of another comparison, with no row in common.
+    Raises ValueError where the file is damaged, is the table of another comparison, with no row in common, or is not
+    there while what is made of it is, which then is someone else's.
     """
 
     def __init__(self, folder: Path, planned: Mapping[str, dict]):
         self.file, self.planned = folder / RESULTS, planned
+        others = [file.name for file in folder.glob("*") if file.suffix == ".png" or file.name in TABLES]
+        if others and not self.file.exists():
+            raise ValueError(f"{folder} holds {others[0]}, but no {RESULTS} of this command, and is not written to: give "
+                             "another out, or move that away")
         found = {row.get("key"): row for row in read_csv(self.file)}
         if None in found:
             raise ValueError(f"{self.file} has rows without a key, so that it is no table of this command: give "
@@ -77,7 +83,7 @@ class Results:
 def alone_in(folder: Path) -> Iterator[None]:
     """Raises ValueError where another process is inside with the same folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    with open(folder / ".lock", "w") as lock:
+    with open(folder / ".lock", "a") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from phydict.ablation.run import TABLES
 from phydict.ablation.summary import SHOWN_MEASURES, Entry, best_settings, conditions, told
 from phydict.atomic import whole_file
 from phydict.evaluation.metrics import RANGE, SIGMA, TAPS, Measure
@@ -146,8 +147,9 @@ def all_tables(found: Sequence[Entry], rows: Sequence[dict]) -> list[Table]:
 
 def write_tables(folder: Path, tables: Sequence[Table]) -> list[Path]:
     """tables.md and tables.tex in a folder."""
-    files = {folder / "tables.md": "\n".join(table.markdown() for table in tables),
-             folder / "tables.tex": "% needs \\usepackage{booktabs}\n" + "\n".join(table.latex() for table in tables)}
+    markdown, latex = (folder / name for name in TABLES)
+    files = {markdown: "\n".join(table.markdown() for table in tables),
+             latex: "% needs \\usepackage{booktabs}\n" + "\n".join(table.latex() for table in tables)}
     for path, text in files.items():
         with whole_file(path) as part:
             part.write_text(text)

@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from phydict.atomic import whole_file
 from phydict.evaluation.gallery import DISPLAY, GREY, MOST_VIEWS, PLANES, plane
 from phydict.grid import Grid
 from phydict.xray import ConeBeam
@@ -24,6 +25,9 @@ DRAWN = {"axial": 1, "coronal": 2}
 FLIPS = {"as it is": (1, 1), "flip_rows": (-1, 1), "flip_columns": (1, -1), "flip_rows and flip_columns": (-1, -1)}
 CLEAR = 0.03
 """By how much a flip must agree better with the standard thorax before it is worth a word."""
+
+SIGNED = "phydict's page of a geometry"
+"""What the file of a page says wrote it, so that none but a page is ever replaced."""
 
 
 def body_side(direction) -> str:
@@ -55,12 +59,15 @@ def geometry_page(path: str | Path, beam: ConeBeam, grid: Grid, xrays: np.ndarra
 
     xrays: (K, V, U) the measured images; thorax: (K, V, U) the standard thorax's in the same beam; thorax_hu: its HU
     (X, Y, Z) on `grid`, shown where it lies.
-    Raises ValueError where the images do not have the beam's shape.
+    Raises ValueError where the images do not have the beam's shape, or where what is at `path` is no such page.
     """
     for images in (xrays, thorax):
         if images.shape != (beam.views, *beam.shape):
             raise ValueError(f"images of shape {images.shape} were given for a beam of {(beam.views, *beam.shape)}; "
                              "give the images of this beam")
+    if Path(path).exists() and SIGNED.encode() not in Path(path).read_bytes()[:1000]:
+        raise ValueError(f"{path} is there already, is no page of this kind, and is not replaced: move it away, or "
+                         "give another place")
     shown = np.linspace(0, beam.views - 1, min(beam.views, MOST_VIEWS)).round().astype(int)
     figure = Figure(figsize=(max(2.1 * len(shown), 12.0), 12.6), dpi=110, facecolor="white")
     FigureCanvasAgg(figure)
@@ -80,8 +87,8 @@ def geometry_page(path: str | Path, beam: ConeBeam, grid: Grid, xrays: np.ndarra
         bottom.set_xlabel(agreement(xrays[k], thorax[k]).replace(", ", ",\n").replace(" with ", "\nwith "), fontsize=8)
     cells[0, 0].set_ylabel("your X-rays", fontsize=9)
     cells[1, 0].set_ylabel("a standard thorax", fontsize=9)
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, format="png")
+    with whole_file(Path(path)) as part:
+        figure.savefig(part, format="png", metadata={"Software": SIGNED})
 
 
 def _draw(ax: Axes, beam: ConeBeam, grid: Grid, thorax_hu: np.ndarray, name: str, axis: int) -> None:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import csv
 import math
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -15,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from rich.table import Table
 
+from phydict.atomic import whole_file
 from phydict.evaluation.metrics import MEASURES, RANGE, SIGMA, TAPS, Measure
 from phydict.grid import Grid
 from phydict.units import HUWindow
@@ -33,19 +33,10 @@ def write_csv(path: str | Path, rows: Iterable[Mapping]) -> None:
     rows = list(rows)
     seen = dict.fromkeys(key for row in rows for key in row)
     columns = [name for name in TEXT_COLUMNS if name in seen] + [name for name in seen if name not in TEXT_COLUMNS]
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        with open(partial, "w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(columns)
-            writer.writerows([_to_text(row.get(name)) for name in columns] for row in rows)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with whole_file(Path(path)) as part, part.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows([_to_text(row.get(name)) for name in columns] for row in rows)
 
 
 def read_csv(path: str | Path) -> list[dict]:

@@ -14,6 +14,8 @@ from safetensors.torch import load_file
 from torch import Tensor
 from transformers import BertConfig, BertModel, BertTokenizer
 
+from phydict.prior.finite import check_finite
+
 CONFIG = "config.json"
 WEIGHTS = ("model.safetensors", "pytorch_model.bin")
 VOCABULARY = ("vocab.txt", "tokenizer.json")
@@ -109,4 +111,5 @@ def _read_weights(file: Path) -> dict[str, Tensor]:
             name = name.replace(old, new)
         if name.startswith(("embeddings.", "encoder.")) and name not in UNUSED:
             named[name] = weight
+    check_finite(named, file)
     return named

@@ -15,6 +15,7 @@ from phydict.checksum import file_crc32
 from phydict.diffusion import CosineSchedule
 from phydict.grid import Grid
 from phydict.prior.detail import DetailNetwork
+from phydict.prior.finite import check_finite, not_finite
 from phydict.prior.local_unet import LocalUNet
 from phydict.prior.medsyn import MedSynPrior, MedSynSuperResolution
 from phydict.prior.pretrained import (
@@ -32,7 +33,8 @@ STAGES = {"base": "a base prior", "super_resolution": "a super-resolution stage"
 
 
 def save_prior(prior: Prior, path: str | Path, training: dict | None = None, dtype: torch.dtype = torch.float16):
-    """Writes `prior` to one .safetensors file, replacing it only when complete. Raises OSError where it cannot.
+    """Writes `prior` to one .safetensors file, replacing it only when complete. Raises OSError where it cannot,
+    and ValueError where weights are not finite.
 
     training: what the header should say of how it was trained (data, steps, command); plain JSON values.
     dtype: precision of the weights on disk.
@@ -53,6 +55,8 @@ def save_super_resolution(fine: SuperResolution, path: str | Path, training: dic
 
 def _write(path: Path, header: dict, weights: dict[str, Tensor], dtype: torch.dtype) -> None:
     tensors = {k: w.detach().to("cpu", dtype).contiguous() for k, w in weights.items()}
+    if broken := not_finite(tensors):
+        raise ValueError(f"'{path}' was not written, since its weights are not finite in {dtype}: {broken}")
     try:
         with whole_file(path) as part:
             save_file(tensors, part, {"phydict": json.dumps(header)})
@@ -89,7 +93,7 @@ def load_prior(path: str | Path | MedSynCheckpoint, device: str = "cpu") -> Prio
     ready to denoise (float32, evaluation mode).
 
     The text encoder stays on disk until the first report. Raises FileNotFoundError when there is no file, ValueError
-    when it is truncated or is no prior.
+    when it is truncated, is no prior, or holds weights that are not finite.
     """
     if isinstance(path, MedSynCheckpoint) or is_medsyn(path):
         return load_medsyn(path, device)
@@ -131,7 +135,17 @@ def _read(path: Path, stage: str, device: str) -> tuple[dict, dict[str, Tensor]]
     if header.get("format") != FORMAT:
         raise ValueError(f"'{path}' carries no phydict prior of format {FORMAT}: give a file that save_prior wrote")
     check_stage(header, stage, f"'{path}'")
+    check_finite(weights, path)
     return header, weights
+
+
+def is_saved_prior(path: str | Path) -> bool:
+    """Whether `save_prior` or `save_super_resolution` wrote a file."""
+    try:
+        with safe_open(path, "pt") as file:
+            return "phydict" in (file.metadata() or {})
+    except (SafetensorError, OSError):
+        return False
 
 
 def check_stage(header: dict, stage: str, name: str) -> None:
@@ -203,4 +217,6 @@ def build_text(text: dict, weights: dict[str, Tensor]) -> TextEncoder:
 
 def _load_text(path: Path, text: dict) -> TextEncoder:
     with safe_open(path, "pt") as file:
-        return build_text(text, {k: file.get_tensor(k) for k in file.keys() if k.startswith("text.")})
+        weights = {k: file.get_tensor(k) for k in file.keys() if k.startswith("text.")}
+    check_finite(weights, path)
+    return build_text(text, weights)

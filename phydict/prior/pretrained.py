@@ -19,6 +19,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
+from phydict.prior.finite import check_finite
 from phydict.prior.medsyn import (
     GROUPS, HEAD_WIDTH, MedSynPrior, MedSynSuperResolution, SliceUNet, SuperResolutionUNet, TextUNet)
 from phydict.prior.text import TextEncoder
@@ -242,9 +243,11 @@ def _network(checkpoint: MedSynCheckpoint, stage: int) -> SliceUNet:
         if found.stage != stage:
             raise ValueError(f"is MedSyn's {STAGES[found.stage]}, but the {STAGES[stage]} is needed here: give that "
                              f"one ({FOLDERS[stage]} in MedSyn's archive)")
-        return found.loaded()
+        network = found.loaded()
     except ValueError as error:
         raise ValueError(f"'{file}' {error}") from error
+    check_finite(found.weights, file)
+    return network
 
 
 def _load_text(checkpoint: MedSynCheckpoint, tokens: int) -> TextEncoder:
@@ -321,7 +324,7 @@ def inspect_prior(path: str | Path) -> dict[str, dict[str, str]]:
     """What a file or folder is, as file -> {property: value}; nothing is run, and tensors are not kept.
 
     Told apart: priors and training checkpoints of phydict, MedSyn's two stages, and others, with the reason why they
-    are none of these. Raises FileNotFoundError where nothing is there.
+    are none of these. Raises FileNotFoundError where nothing is there, and ValueError where weights are not finite.
     """
     path = Path(path)
     if not path.exists():
@@ -347,11 +350,19 @@ def _inspect_file(file: Path) -> dict[str, str]:
             header = content.get("phydict") if isinstance(content, dict) else None
             entries = content.get("state_dict", {}) if header else read_tensors(file)
         if header:
-            return _inspect_phydict(header, entries, file.suffix == ".safetensors")
-        found = MedSynWeights.sort(entries)
+            report, used = _inspect_phydict(header, entries, file.suffix == ".safetensors"), [*entries]
+        else:
+            found = MedSynWeights.sort(entries)
+            report, used = _inspect_medsyn(found, entries), [name for name in entries if name not in found.ignored]
     except ValueError as error:
         return {"kind": "unknown: " + " ".join(str(error).removeprefix(f"'{file}' ").split())}
-    return _inspect_medsyn(found, entries)
+    if file.suffix == ".safetensors":
+        with safe_open(file, "pt") as opened:
+            for name in used:
+                check_finite({name: opened.get_tensor(name)}, file)
+    else:
+        check_finite({name: entries[name] for name in used}, file)
+    return report
 
 
 def _inspect_phydict(header: dict, entries: dict[str, Tensor], finished: bool) -> dict[str, str]:

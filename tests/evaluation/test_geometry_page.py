@@ -67,3 +67,17 @@ def test_the_page_shows_every_view_and_refuses_images_of_another_beam(thorax, tm
     geometry_page(tmp_path / "fewer.png", BEAM.select([0]), GRID, images[:1], images[:1], hu)
     with pytest.raises(ValueError, match=r"\(3, 40, 40\) were given for a beam of \(4, 40, 40\)"):
         geometry_page(tmp_path / "page.png", BEAM, GRID, images[:3], images, hu)
+
+
+def test_a_picture_that_is_no_page_is_not_replaced(thorax, tmp_path):
+    hu, images = thorax
+    file = tmp_path / "anna.png"
+    matplotlib.image.imsave(file, images[0])
+    before = file.read_bytes()
+    with pytest.raises(ValueError, match="anna.png is there already, is no page of this kind, and is not replaced"):
+        geometry_page(file, BEAM, GRID, images, images, hu)
+    assert file.read_bytes() == before
+    file.unlink()
+    for title in ("first", "second"):  # which takes the first one's place
+        geometry_page(file, BEAM, GRID, images, images, hu, title)
+    assert [*tmp_path.iterdir()] == [file]

@@ -49,6 +49,14 @@ def test_every_usual_naming_is_the_same_bert(tmp_path, change):
     assert torch.equal(states(tokenizer, bert, REPORTS[0]), states(tokenizer, written, REPORTS[0]))
 
 
+def test_weights_that_are_not_finite_are_refused_by_name(tmp_path):
+    write_cxr_bert(tmp_path)
+    name = "bert.embeddings.word_embeddings.weight"
+    rewritten(tmp_path, lambda weights: weights | {name: weights[name] / 0})
+    with pytest.raises(ValueError, match="not finite .embeddings.word_embeddings.weight has"):
+        load_bert(tmp_path)
+
+
 def test_weights_decide_how_many_positions_there_are(tmp_path):
     written = write_cxr_bert(tmp_path, positions=96, told_positions=24)
     tokenizer, bert = load_bert(tmp_path)

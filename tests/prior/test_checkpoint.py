@@ -7,9 +7,9 @@ import pytest
 import torch
 from laws import random_like
 from safetensors import safe_open
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 
-from phydict.prior import TextEncoder, describe, load_prior, save_prior
+from phydict.prior import TextEncoder, describe, inspect_prior, load_prior, save_prior
 from phydict.prior.checkpoint import build_text
 from prior.tiny import REPORTS, tiny_prior, write_cxr_bert
 
@@ -60,6 +60,29 @@ def test_a_prior_that_the_disk_cannot_hold_is_one_sentence_and_the_old_file_stay
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert [*file.parent.iterdir()] == [file] and file.read_bytes() == before
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e5], ids=["NaN", "infinite", "beyond half precision"])
+def test_weights_that_are_not_finite_are_not_written_and_named(file, value):
+    broken, before = tiny_prior(), file.read_bytes()
+    broken.null.view(-1)[3] = value
+    with pytest.raises(ValueError, match="tiny.safetensors' was not written, .*: null has 1 NaN or infinite values of"):
+        save_prior(broken, file)
+    assert file.read_bytes() == before and [*file.parent.iterdir()] == [file]
+
+
+@pytest.mark.parametrize("part", ["null", "text."])
+def test_weights_that_are_not_finite_are_refused_by_name(file, part):
+    weights = load_file(file)
+    name = next(key for key in weights if key.startswith(part))
+    weights[name].view(-1)[0] = float("nan")
+    with safe_open(file, "pt") as opened:
+        save_file(weights, file, opened.metadata())
+    said = rf"tiny.safetensors' holds weights that are not finite \({name} has 1 NaN"
+    with pytest.raises(ValueError, match=said):
+        load_prior(file).bind(REPORTS[0])  # the text is read with the first report
+    with pytest.raises(ValueError, match=said):
+        inspect_prior(file)
 
 
 def test_the_text_encoder_stays_on_disk_until_the_first_report(file):

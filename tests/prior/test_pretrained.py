@@ -227,6 +227,16 @@ def test_a_bad_checkpoint_is_one_sentence_and_never_run(case, source, tmp_path, 
         assert report["kind"].startswith("unknown") or report["fits"].startswith("no"), report
 
 
+@pytest.mark.parametrize("name", ["a.bin", "a.safetensors"])
+def test_weights_that_are_not_finite_are_refused_by_name(name, source, tmp_path):
+    bad = entries(source)["denoise_fn.init_conv.bias"].clone()
+    bad[2] = float("nan")
+    changed(denoise_fn__init_conv__bias=bad, denoise_fn__betas=torch.tensor([float("nan")]))(tmp_path / name, source)
+    for read in (load_prior, inspect_prior):
+        with pytest.raises(ValueError, match=rf"{name}' holds weights that are not finite .*init_conv.bias has 1 NaN"):
+            read(tmp_path / name)
+
+
 def test_each_stage_refuses_the_other(source, tmp_path):
     with pytest.raises(ValueError, match="is MedSyn's 64.3 stage .*, but the 256.3 super-resolution .*results_SR_"):
         load_super_resolution(write(tmp_path / "one.bin", entries(source)))

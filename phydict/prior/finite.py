@@ -1,0 +1,22 @@
+"""Weights that hold NaN or infinite values, found before anything is made of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from torch import Tensor
+
+
+def not_finite(weights: Mapping[str, Tensor]) -> str:
+    """The first of the weights that is not finite, and how many values that concerns; empty where all are."""
+    for name, weight in weights.items():
+        if not weight.isfinite().all():
+            return f"{name} has {int((~weight.isfinite()).sum())} NaN or infinite values of {weight.numel()}"
+    return ""
+
+
+def check_finite(weights: Mapping[str, Tensor], file: object) -> None:
+    """Raises ValueError, naming the tensor, where the weights that `file` holds are not finite."""
+    if broken := not_finite(weights):
+        raise ValueError(f"'{file}' holds weights that are not finite ({broken}), so that nothing can come of it: give "
+                         "an earlier checkpoint, or another prior")

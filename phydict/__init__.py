@@ -10,6 +10,7 @@
     evaluation       metrics, tables, picture panels                                scores
     methods          the named methods, and `reconstruct` in one call
     dry_run         geometry drawn before anything is reconstructed
+    shipped          where the priors, tables and configurations lie that come with the project
     atomic           files and folders that appear whole or not at all
     checksum         what tells one file from another
     case_results     finished cases on disk
@@ -24,6 +25,8 @@ from phydict.methods import METHODS, reconstruct
 from phydict.prior import load_prior, save_prior
 from phydict.units import HUWindow, hu_to_mu, mu_to_hu
 from phydict.xray import ConeBeam, Projector
+
+__version__ = "0.1.0"
 
 __all__ = ["METHODS", "ConeBeam", "Grid", "HUWindow", "Projector", "hu_to_mu", "load_prior", "load_xrays", "mu_to_hu",
            "reconstruct", "save_prior"]

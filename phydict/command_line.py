@@ -14,6 +14,8 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from phydict.shipped import configuration
+
 NOISE = (".*does not have many workers", ".*LeafSpec.*is deprecated", ".*is smaller than the logging interval",
          "Total length of `DataLoader` across ranks is zero", "Checkpoint directory .* exists and is not empty",
          "It is recommended to use `self.log", "Using `DistributedSampler` with the dataloaders",
@@ -21,6 +23,9 @@ NOISE = (".*does not have many workers", ".*LeafSpec.*is deprecated", ".*is smal
          "You're using the WeightAveraging callback with a model that overrides the configure_model",
          r"Found \d+ module\(s\) in eval mode at the start of training")
 """Warnings that tell a user of the command lines nothing to act on."""
+
+CONFIGURATION = ("-c", "--config")
+"""The option that names a configuration file."""
 
 
 @contextmanager
@@ -48,6 +53,23 @@ def one_sentence_errors(*also: type[Exception], to_go_on: str = "run the same co
             raise
         print("stopped, because another process of this run ended; its message says why", file=sys.stderr)
         raise SystemExit(2) from None
+
+
+def with_configurations(args: list[str], kinds: tuple[str, ...]) -> list[str]:
+    """Arguments with the place of every configuration (-c, --config) that is a shipped one by its path or its name; see
+    `phydict.shipped.configuration`, which raises ValueError for those that are nowhere."""
+    def place(given: str) -> str:
+        return given if ":" in given else str(configuration(given, kinds))  # "key: value" is YAML itself
+
+    out = []
+    for before, arg in zip(["", *args], args):
+        option, equals, value = arg.partition("=")
+        if before in CONFIGURATION:
+            arg = place(arg)
+        elif equals and option in CONFIGURATION:
+            arg = f"{option}={place(value)}"
+        out.append(arg)
+    return out
 
 
 def check_writable(path: Path, option: str, file: bool = False) -> None:

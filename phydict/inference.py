@@ -25,15 +25,17 @@ from torch import Tensor
 
 from phydict.ablation import main as ablate
 from phydict.case_results import CaseResults
-from phydict.command_line import check_apart, check_writable, one_sentence_errors, quiet, sentence
+from phydict.command_line import (
+    check_apart, check_writable, one_sentence_errors, quiet, sentence, with_configurations)
 from phydict.datasets import load_xrays
 from phydict.dry_run import dry_run
 from phydict.evaluation import CaseMetrics, panel, rich_table
 from phydict.grid import Grid
-from phydict.methods import DEFAULT_PRIOR, fit_to_grid, reconstructor
+from phydict.methods import fit_to_grid, reconstructor
 from phydict.posterior import CascadePosterior, Sampler
 from phydict.precision import instruction_set
-from phydict.prior import MedSynCheckpoint, file_read, fingerprint, load_prior, load_super_resolution
+from phydict.prior import (
+    DEFAULT_PRIOR, MedSynCheckpoint, file_read, fingerprint, load_prior, load_super_resolution)
 from phydict.profiling import profiled, stage
 from phydict.progress import CaseProgress
 from phydict.reconstruction_data import ReconstructionData, case_scores, case_seed
@@ -303,6 +305,7 @@ def main(args: list[str] | None = None) -> None:
     if args[:1] == ["ablate"]:
         return ablate(args[1:])
     with one_sentence_errors(MisconfigurationException), quiet():
+        args = with_configurations(args, ("reconstruct", "simulate"))
         cli = InferenceCLI(
             ReconstructionTask, ReconstructionData, args=args, seed_everything_default=0, save_config_callback=None,
             parser_kwargs={"exit_on_error": False, "description": (

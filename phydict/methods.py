@@ -15,13 +15,10 @@ from phydict.posterior import (
     DAPS, DDS, DPS, CascadePosterior, DiffPIR, ExactDraw, GradientSteps, PnPDM, Posterior, PriorOnly, ProximalCG,
     Reward, Sampler, SplitGibbs)
 from phydict.precision import check_precision
-from phydict.prior import Cascade, Prior, SuperResolution, load_prior, load_super_resolution
+from phydict.prior import DEFAULT_PRIOR, Cascade, Prior, SuperResolution, load_prior, load_super_resolution
 from phydict.reconstructor import Reconstruction, Reconstructor, check_xrays
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector, binned, binning
-
-DEFAULT_PRIOR = Path(__file__).parents[1] / "data" / "prior" / "phydict_64.safetensors"
-"""The prior that comes with the project."""
 
 RELEASED_STEPS = GradientSteps(learning_rate=0.01, prior_mean=True, reward=Reward(
     lpips=0.5, random_backbone=True, dropout=True, squared=0.1, pixel_mean=True, view_sum=True, standardise=True,

@@ -19,6 +19,7 @@ from phydict.datasets import CTFile, find_cts, find_xrays, load_case, load_xrays
 from phydict.evaluation import volume_metrics
 from phydict.grid import Grid
 from phydict.reconstructor import describe
+from phydict.shipped import own_or_shipped
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Ideal, Projector, Simulator
 
@@ -137,7 +138,7 @@ class ReconstructionData(lightning.LightningDataModule):
         """What identifies a folder's X-rays: a checksum of its files and of the geometry used instead of its own."""
         crc = 0
         files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
-        for file in [*files, Path(self.geometry)] if self.geometry else files:
+        for file in [*files, own_or_shipped(self.geometry)] if self.geometry else files:
             named = zlib.crc32(file.name.encode(), crc)
             crc = file_crc32(file, named) if file.is_file() else named
         return f"files crc32 {crc:08x}"

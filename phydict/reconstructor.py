@@ -13,7 +13,6 @@ from pathlib import Path
 from statistics import median
 from typing import Protocol
 
-import nibabel
 import numpy as np
 import torch
 from torch import Tensor
@@ -90,6 +89,8 @@ class Reconstruction:
 
 def save_nifti(path: str | Path, volume: np.ndarray, grid: Grid) -> None:
     """Writes `volume` (X, Y, Z) on `grid` as NIfTI (.nii or .nii.gz), replacing the file only when complete."""
+    import nibabel
+
     image = nibabel.Nifti1Image(np.asarray(volume, np.float32), grid.affine)
     image.header.set_xyzt_units("mm", "sec")
     image.set_sform(grid.affine, code="scanner")

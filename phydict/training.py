@@ -17,7 +17,7 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from phydict.atomic import whole_file
-from phydict.command_line import check_writable, one_sentence_errors, quiet
+from phydict.command_line import check_writable, one_sentence_errors, quiet, with_configurations
 from phydict.datamodule import PriorData
 from phydict.precision import PRECISIONS, resolve_precision, trainer_precision
 from phydict.prior import save_prior, save_super_resolution
@@ -219,8 +219,9 @@ def main(args: list[str] | None = None) -> None:
         elif given[:1] == ["inspect-prior"]:
             auto_cli(print_prior, args=given[1:], exit_on_error=False)
         else:
-            PriorCLI(*STAGES[stage_of(given)], args=args, seed_everything_default=0,
+            given = with_configurations(given, ("prior",))
+            PriorCLI(*STAGES[stage_of(given)], args=given, seed_everything_default=0,
                      save_config_kwargs={"overwrite": True}, parser_kwargs={"exit_on_error": False, "description": (
-                         "Train a prior of chest CT. Two more commands: `train.py export --checkpoint <last.ckpt> "
-                         "--out <prior.safetensors>` writes what a training learnt as a prior for reconstruction, and "
-                         "`train.py inspect-prior <path>` tells what a file or folder is.")})
+                         "Train a prior of chest CT. Two more commands: `export --checkpoint <last.ckpt> --out "
+                         "<prior.safetensors>` writes what a training learnt as a prior for reconstruction, and "
+                         "`inspect-prior <path>` tells what a file or folder is.")})

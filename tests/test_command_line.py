@@ -5,7 +5,10 @@ import os
 
 import pytest
 
-from phydict.command_line import one_sentence_errors
+from phydict.command_line import one_sentence_errors, with_configurations
+from phydict.inference import main as infer
+from phydict.shipped import shipped
+from phydict.training import main as train
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
@@ -15,3 +18,45 @@ def test_a_full_disk_is_one_sentence_that_says_how_to_go_on(number, capsys):
     said = capsys.readouterr().err
     assert stopped.value.code == 2 and said.count("\n") == 1
     assert os.strerror(number) in said and "'metrics.csv'" in said and "free some space; to go on, add --ckpt" in said
+
+
+@pytest.fixture
+def empty(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("before", [["-c"], ["--config"]])
+@pytest.mark.parametrize("given", ["phydict_fast", "phydict_fast.yaml", "configs/reconstruct/phydict_fast.yaml"])
+def test_a_shipped_configuration_is_found_by_name_and_by_path_from_anywhere(empty, before, given):
+    file = str(shipped("configs/reconstruct/phydict_fast.yaml"))
+    for args, wanted in (([*before, given], [*before, file]), ([f"{before[0]}={given}"], [f"{before[0]}={file}"])):
+        assert with_configurations(["predict", *args, "--model.seed", "1"], ("reconstruct",)) == [
+            "predict", *wanted, "--model.seed", "1"]
+
+
+def test_what_is_there_comes_before_what_is_shipped(empty):
+    own = empty / "configs" / "reconstruct" / "phydict_fast.yaml"
+    own.parent.mkdir(parents=True)
+    own.touch()
+    (empty / "phydict_fast").touch()
+    for given in ("configs/reconstruct/phydict_fast.yaml", "phydict_fast", str(own), "{model: {seed: 1}}"):
+        assert with_configurations(["-c", given], ("reconstruct",)) == ["-c", given]
+
+
+@pytest.mark.parametrize("main, command, names", [
+    (infer, "predict", ("phydict_fast", "polychromatic")), (infer, "ablate", ("pareto", "views")),
+    (train, "fit", ("ct_rate", "super_resolution"))], ids=["infer", "ablate", "train"])
+@pytest.mark.parametrize("given", ["phydict_quick", "configs/reconstruct/quick.yaml", "../data/prior"])
+def test_an_unknown_configuration_is_one_sentence_that_lists_what_there_is(empty, capsys, main, command, names, given):
+    with pytest.raises(SystemExit) as stopped:
+        main([command, "-c", given])
+    said = capsys.readouterr().err
+    assert stopped.value.code == 2 and said.count("\n") == 1 and f"no configuration {given}:" in said
+    assert all(name in said for name in names)
+
+
+def test_a_configuration_of_another_command_is_none_of_its_names(empty, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        train(["fit", "-c", "phydict_fast"])
+    assert stopped.value.code == 2 and "no configuration phydict_fast" in capsys.readouterr().err

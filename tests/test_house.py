@@ -28,8 +28,8 @@ from phydict.xray import ConeBeam, Ideal, Polychromatic
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "phydict"
 FLOORS = {
-    "units": 0, "grid": 0, "atomic": 0, "checksum": 0, "command_line": 0, "progress": 0, "profiling": 0, "precision": 0,
-    "xray": 1, "diffusion": 1,
+    "units": 0, "grid": 0, "atomic": 0, "checksum": 0, "progress": 0, "profiling": 0, "precision": 0, "shipped": 0,
+    "xray": 1, "diffusion": 1, "command_line": 1,
     "prior": 2, "datasets": 2, "reconstructor": 2,
     "posterior": 3, "baselines": 3, "evaluation": 3,
     "methods": 4, "dry_run": 4, "datamodule": 4, "case_results": 4, "reconstruction_data": 4, "training": 4,
@@ -108,6 +108,20 @@ def test_everything_below_the_top_floor_runs_without_lightning():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip().splitlines()[-1] == "[]"
+
+
+def test_a_bare_import_brings_nothing_heavy_and_everything_works_afterwards():
+    code = """if True:
+        import sys
+        import phydict
+        print(*{name.partition(".")[0] for name in sys.modules})
+        print(phydict.load_prior().grid.shape)"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    loaded, shape = done.stdout.splitlines()
+    assert not set(loaded.split()) & {"monai", "lightning", "pytorch_lightning", "transformers", "lpips", "torchvision",
+                                      "matplotlib", "torchmetrics", "numba", "nibabel", "huggingface_hub"}
+    assert "torch" in loaded.split() and shape == "(64, 64, 64)"
 
 
 @pytest.fixture

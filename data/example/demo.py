@@ -18,7 +18,7 @@ METHODS = ("phydict_fast", "prior_only", "sirt")
 
 if __name__ == "__main__":
     here, out = Path(__file__).parent, Path("runs/demo")
-    case, prior = load_xrays(here / "xrays"), phydict.load_prior("data/prior/phydict_64.safetensors")
+    case, prior = load_xrays(here / "xrays"), phydict.load_prior()
     truth = torch.from_numpy(nibabel.load(here / "truth.nii.gz").get_fdata(dtype="float32"))
     out.mkdir(parents=True, exist_ok=True)
     rows, volumes = [], {}

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import torch
 from jsonargparse import ArgumentParser
 
@@ -30,10 +33,11 @@ def main(args: list[str] | None = None) -> None:
 
 
 def _parser() -> ArgumentParser:
-    parser = ArgumentParser(prog="infer.py ablate", exit_on_error=False, description=(
+    parser = ArgumentParser(prog=f"{Path(sys.argv[0]).name} ablate", exit_on_error=False, description=(
         "Compare methods on the same X-rays: every combination of settings that a file names, one row of results each, "
         "then tables and plots."))
-    parser.add_argument("-c", "--config", required=True, help="what to compare, such as configs/ablate/pareto.yaml")
+    parser.add_argument("-c", "--config", required=True,
+                        help="what to compare: a YAML file, or the name of a shipped one, such as pareto")
     parser.add_argument("--cts", type=str, help="a NIfTI file or a folder of CTs, instead of the file's cases")
     parser.add_argument("--phantoms", type=int, help="a number of phantoms, instead of the file's cases")
     parser.add_argument("--only", type=str, help="a text file of the case ids to take")

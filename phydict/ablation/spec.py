@@ -16,11 +16,12 @@ import yaml
 from jsonargparse import ArgumentError, ArgumentParser
 
 from phydict.grid import Grid
-from phydict.methods import DEFAULT_PRIOR, METHODS
+from phydict.methods import METHODS
 from phydict.posterior import Sampler
-from phydict.prior import fingerprint, load_prior
+from phydict.prior import DEFAULT_PRIOR, fingerprint, load_prior
 from phydict.reconstruction_data import ReconstructionData
 from phydict.reconstructor import Reconstructor, describe
+from phydict.shipped import configuration
 from phydict.units import HUWindow
 from phydict.xray import Ideal, Polychromatic, Simulator
 
@@ -130,8 +131,8 @@ class Specification:
 
 
 def read_specification(file: str | Path, **given) -> Specification:
-    """The specification in a YAML file; `given` (out, cts, phantoms, only, reports), where not None, takes the place
-    of what the file says.
+    """The specification in a YAML file, or in a shipped one by its name; `given` (out, cts, phantoms, only, reports),
+    where not None, takes the place of what the file says.
 
     Its keys: out; cts or phantoms, only, reports; methods: names for changed methods, each a mapping of settings and
     `of`, the method that is changed; base: settings of all trials; axes: setting -> list of values, of which every
@@ -139,10 +140,7 @@ def read_specification(file: str | Path, **given) -> Specification:
     out for it, and what then is the same is run once. Raises ValueError, in one sentence, on what cannot be meant.
     """
     try:
-        content = yaml.safe_load(Path(file).read_text())
-    except FileNotFoundError as error:
-        raise ValueError(f"there is no file {file}: give one that says what to compare, such as "
-                         "configs/ablate/pareto.yaml") from error
+        content = yaml.safe_load(configuration(file, ("ablate",)).read_text())
     except yaml.YAMLError as error:
         raise ValueError(f"{file} is no YAML: {' '.join(str(error).split())}") from error
     try:

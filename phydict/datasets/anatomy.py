@@ -15,7 +15,7 @@ that the field of view cuts open sideways is lost in those slices.
 from __future__ import annotations
 
 import numpy as np
-from scipy import ndimage
+import scipy
 
 MASKS = ("lung", "airway", "vessel")
 LUNG_BELOW, VESSEL_ABOVE = -320.0, -500.0
@@ -25,7 +25,7 @@ CLOSING_MM, SURFACE_MM, AXIS_MM = 8.0, 3.0, 45.0
 TRACHEA_MM2 = (50.0, 800.0)
 BODY_RIM = 2
 """Voxels by which `_body` is widened before its holes are filled."""
-IN_PLANE = ndimage.generate_binary_structure(3, 1) & np.array([False, True, False])
+IN_PLANE = np.array([[[0], [1], [0]], [[1], [1], [1]], [[0], [1], [0]]], bool) & [False, True, False]
 
 
 def segment(hu: np.ndarray, spacing) -> tuple[np.ndarray, np.ndarray]:
@@ -55,7 +55,7 @@ def segment(hu: np.ndarray, spacing) -> tuple[np.ndarray, np.ndarray]:
 def body_mask(hu: np.ndarray, spacing) -> np.ndarray:
     """The body without table and clothes, its lungs filled: (X, Y, Z) bool of `hu` (X, Y, Z) at `spacing` mm."""
     body = _body(hu, np.broadcast_to(np.asarray(spacing, float), 3))
-    return ndimage.binary_erosion(body, IN_PLANE, iterations=BODY_RIM, border_value=1)
+    return scipy.ndimage.binary_erosion(body, IN_PLANE, iterations=BODY_RIM, border_value=1)
 
 
 def lung_box_centre(lung: np.ndarray, affine: np.ndarray) -> np.ndarray:
@@ -71,7 +71,7 @@ def lung_box_size(lung: np.ndarray, spacing) -> np.ndarray:
 
 def _without_border(air: np.ndarray) -> np.ndarray:
     """Air that is not joined to the sides (x and y faces) within its own axial slice."""
-    labels, count = ndimage.label(air, IN_PLANE)
+    labels, count = scipy.ndimage.label(air, IN_PLANE)
     outside = np.zeros(count + 1, bool)
     outside[0] = True
     for face in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
@@ -81,19 +81,20 @@ def _without_border(air: np.ndarray) -> np.ndarray:
 
 def _body(hu: np.ndarray, spacing: np.ndarray) -> np.ndarray:
     """The largest piece of tissue, cut from the table by an opening of 4 mm, widened, its holes filled by slice."""
-    tissue = ndimage.binary_opening(hu > LUNG_BELOW, IN_PLANE, iterations=max(1, round(4 / spacing[:2].min())))
-    labels, _ = ndimage.label(tissue)
+    tissue = scipy.ndimage.binary_opening(hu > LUNG_BELOW, IN_PLANE, iterations=max(1, round(4 / spacing[:2].min())))
+    labels, _ = scipy.ndimage.label(tissue)
     size = np.bincount(labels.ravel())
     size[0] = 0
     body = np.zeros(hu.shape, bool) if len(size) < 2 else labels == size.argmax()
     for k in range(hu.shape[2]):
-        body[:, :, k] = ndimage.binary_fill_holes(ndimage.binary_dilation(body[:, :, k], iterations=BODY_RIM))
+        grown = scipy.ndimage.binary_dilation(body[:, :, k], iterations=BODY_RIM)
+        body[:, :, k] = scipy.ndimage.binary_fill_holes(grown)
     return body
 
 
 def _lung_components(interior: np.ndarray, hu: np.ndarray, spacing: np.ndarray) -> np.ndarray:
     """Interior air components of lung size whose median is not that of pure gas (bowel, folds of the table)."""
-    labels, count = ndimage.label(interior)
+    labels, count = scipy.ndimage.label(interior)
     litres = np.bincount(labels.ravel(), minlength=count + 1) * spacing.prod() / 1e6
     litres[0] = 0
     keep = litres > max(LUNG_LITRES, 0.05 * litres.max())
@@ -106,9 +107,9 @@ def _airway(interior: np.ndarray, lungs: np.ndarray, hu: np.ndarray, spacing: np
     """The trachea and bronchi grown from a tube of gas near the lungs' axis, or nothing where there is none."""
     seed = _trachea(interior, lungs, hu, spacing)
     for threshold in AIRWAY_BELOW if seed.any() else ():
-        grown = ndimage.binary_propagation(seed, mask=(interior & (hu < threshold)) | seed)
+        grown = scipy.ndimage.binary_propagation(seed, mask=(interior & (hu < threshold)) | seed)
         if grown.sum() * spacing.prod() / 1e6 < AIRWAY_LITRES:
-            return ndimage.binary_closing(grown)
+            return scipy.ndimage.binary_closing(grown)
     return seed
 
 
@@ -118,31 +119,31 @@ def _trachea(interior: np.ndarray, lungs: np.ndarray, hu: np.ndarray, spacing: n
     start = int(z.stop - 0.4 * (z.stop - z.start))
     gas = interior & (hu < TRACHEA_BELOW)
     gas[:, :, :start] = False
-    labels, count = ndimage.label(gas, IN_PLANE)
+    labels, count = scipy.ndimage.label(gas, IN_PLANE)
     if not count:
         return gas
     index = np.arange(1, count + 1)
     area = np.bincount(labels.ravel(), minlength=count + 1)[1:] * spacing[0] * spacing[1]
-    across = np.array(ndimage.center_of_mass(gas, labels, index))[:, 0]
+    across = np.array(scipy.ndimage.center_of_mass(gas, labels, index))[:, 0]
     near = abs(across - (x.start + x.stop - 1) / 2) * spacing[0] < AXIS_MM
     disc = np.concatenate([[False], near & (area > TRACHEA_MM2[0]) & (area < TRACHEA_MM2[1])])
-    stacks, count = ndimage.label(disc[labels])
-    heights = [0.0] + [(s[2].stop - s[2].start) * spacing[2] for s in ndimage.find_objects(stacks)]
+    stacks, count = scipy.ndimage.label(disc[labels])
+    heights = [0.0] + [(s[2].stop - s[2].start) * spacing[2] for s in scipy.ndimage.find_objects(stacks)]
     return (stacks == int(np.argmax(heights))) & (max(heights) > 15)
 
 
 def _fill(lungs: np.ndarray, airway: np.ndarray, hu: np.ndarray, spacing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The lungs without the airway and its wall, closed over their vessels; and the vessels."""
-    wall = ndimage.binary_dilation(airway, iterations=max(1, round(2 / spacing.min())))
-    lungs = ndimage.binary_opening(lungs & ~wall)
-    labels, _ = ndimage.label(lungs)
+    wall = scipy.ndimage.binary_dilation(airway, iterations=max(1, round(2 / spacing.min())))
+    lungs = scipy.ndimage.binary_opening(lungs & ~wall)
+    labels, _ = scipy.ndimage.label(lungs)
     size = np.bincount(labels.ravel())
     size[0] = 0
     lungs = (size > 0.02 * size.sum())[labels]
-    grown = ndimage.distance_transform_edt(~lungs, spacing) <= CLOSING_MM
-    filled = ndimage.distance_transform_edt(grown, spacing) > CLOSING_MM
-    filled = ndimage.binary_fill_holes(filled | lungs) & ~airway
-    depth = ndimage.distance_transform_edt(filled | airway, spacing)
+    grown = scipy.ndimage.distance_transform_edt(~lungs, spacing) <= CLOSING_MM
+    filled = scipy.ndimage.distance_transform_edt(grown, spacing) > CLOSING_MM
+    filled = scipy.ndimage.binary_fill_holes(filled | lungs) & ~airway
+    depth = scipy.ndimage.distance_transform_edt(filled | airway, spacing)
     return filled, filled & (hu > VESSEL_ABOVE) & (depth > SURFACE_MM)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import map_coordinates
+import scipy
 
 from phydict.datasets.thorax import Thorax, ellipsoid
 from phydict.datasets.tubes import Tubes
@@ -23,7 +23,7 @@ class Texture:
 
     def __call__(self, x, y, z) -> np.ndarray:
         places = np.stack(np.broadcast_arrays(x, y, z)).astype(np.float32) / self.pitch
-        return map_coordinates(self.lattice, places, order=1, mode="grid-wrap")
+        return scipy.ndimage.map_coordinates(self.lattice, places, order=1, mode="grid-wrap")
 
 
 class Canvas:

@@ -11,8 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from scipy.ndimage import gaussian_filter
-from scipy.special import ndtr
+import scipy
 
 from phydict.datasets.canvas import AIR, Canvas, Texture
 from phydict.datasets.findings import Finding
@@ -208,12 +207,13 @@ def _scanner(canvas: Canvas, masks: np.ndarray) -> None:
     if t.noise:
         grain = np.random.default_rng([t.seed, 9]).standard_normal(canvas.grid.shape, np.float32)
         averaged = min(1.0, NOISE_MM / canvas.edge)
-        canvas.hu += np.float32(1.9 * t.noise * averaged) * gaussian_filter(grain, 0.6)
+        canvas.hu += np.float32(1.9 * t.noise * averaged) * scipy.ndimage.gaussian_filter(grain, 0.6)
         slow = Texture(t.seed, 10, 13.0)(*canvas.axes)
         canvas.hu += np.float32(0.3 * t.noise) * slow * np.clip((canvas.hu - AIR) / 1000, 0, 1)
         unresolved = t.noise * np.sqrt(max(1 - averaged**2, 1e-6))
         above = (canvas.hu - AIR) / unresolved
-        canvas.hu = AIR + unresolved * (above * ndtr(above) + np.exp(-above * above / 2) / np.sqrt(2 * np.pi))
+        density = np.exp(-above * above / 2) / np.sqrt(2 * np.pi)
+        canvas.hu = AIR + unresolved * (above * scipy.special.ndtr(above) + density)
     world = [axis + offset for axis, offset in zip((canvas.axes[0], canvas.straight_y, canvas.axes[2]), t.offset)]
     across = np.hypot(world[0], world[1]) if t.round_field else np.maximum(np.abs(world[0]), np.abs(world[1]))
     seen = canvas.soft(across - t.field / 2) * canvas.soft(np.maximum(t.scan[0] - world[2], world[2] - t.scan[1]))

@@ -14,7 +14,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import nibabel
 import numpy as np
 import torch
 
@@ -33,6 +32,8 @@ def write_prepared(folder: Path, grid: Grid, images: dict[str, np.ndarray], reco
 
     record: holds at least "id", "space", "extent" (3,) mm of the box in the space, "window" (low, high) and "report".
     """
+    import nibabel
+
     affine, medsyn = grid.affine, record["space"] == "medsyn"
     if medsyn:
         affine = affine @ _medsyn_index(grid.shape)

@@ -21,6 +21,7 @@ from phydict.datasets.natural_order import natural_order
 from phydict.datasets.reports import format_report
 from phydict.datasets.xray_description import GEOMETRY, Description, read_description
 from phydict.datasets.xray_images import ENDINGS, image_files, is_dicom, read_image
+from phydict.shipped import own_or_shipped
 from phydict.xray.geometry import ConeBeam
 
 REPORT = "report.txt"
@@ -31,7 +32,7 @@ def find_xrays(path: str | Path) -> list[Path]:
 
     Raises FileNotFoundError where there is none.
     """
-    path = Path(path)
+    path = own_or_shipped(path)
     if not path.is_dir():
         raise FileNotFoundError(f"there is no folder {path}; give a folder of X-rays, or a folder of such folders")
     if _is_case(path):
@@ -53,10 +54,10 @@ def load_xrays(folder: str | Path, geometry: str | Path | None = None, intensity
     display True, the X-rays are display values whose gain and offset per view are unknown.
     Raises FileNotFoundError for a missing folder, geometry or images, ValueError for everything that does not fit.
     """
-    folder = Path(folder)
+    folder = own_or_shipped(folder)
     if not folder.is_dir():
         raise FileNotFoundError(f"there is no folder {folder}; give a folder of X-ray images with {GEOMETRY}")
-    source = folder / GEOMETRY if geometry is None else Path(geometry)
+    source = folder / GEOMETRY if geometry is None else own_or_shipped(geometry)
     files = image_files(folder)
     tagged = len(files) > 0 and all(is_dicom(file) for file in files)
     described = read_description(source, needed=geometry is not None or not tagged) if files else Description(source)

@@ -8,19 +8,34 @@ negative inside; it is exact to first order at the surface, which is what partia
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
-from scipy.interpolate import PchipInterpolator
+import scipy
 
 from phydict.datasets.findings import Finding, draw_findings, write_report
 
+
+class Curve:
+    """A smooth curve through (places, values) that rises and falls where they do."""
+
+    def __init__(self, places, values):
+        self.places, self.values = places, values
+
+    def __call__(self, at) -> np.ndarray:
+        return self._interpolator(at)
+
+    @cached_property
+    def _interpolator(self):
+        return scipy.interpolate.PchipInterpolator(self.places, self.values)
+
+
 LEVELS = np.array([-0.8, 0.0, 0.2, 0.4, 0.6, 0.75, 0.86, 0.95, 1.0, 1.3])
-CAGE_WIDTH = PchipInterpolator(LEVELS, [0.95, 1.0, 1.0, 0.98, 0.93, 0.86, 0.76, 0.62, 0.53, 0.44])
-CAGE_DEPTH = PchipInterpolator(LEVELS, [0.97, 1.0, 1.0, 0.975, 0.91, 0.81, 0.74, 0.67, 0.61, 0.52])
-MEDIASTINUM_LEVEL = PchipInterpolator([-1, 0.0, 0.4, 0.6, 0.8, 1.0, 1.5], [0.8, 0.8, 0.85, 1.0, 0.95, 1.05, 1.1])
-MEDIASTINUM_DEPTH = PchipInterpolator([-2, -0.9, -0.45, -0.1, 0.35, 0.7, 1.0, 2], [21, 21, 27, 31, 27, 14, 7, 7])
-SHOULDER = PchipInterpolator([-0.8, 0.0, 0.5, 0.75, 0.9, 1.2], [-2.0, 0.0, 6.0, 10.0, 13.0, 13.0])
+CAGE_WIDTH = Curve(LEVELS, [0.95, 1.0, 1.0, 0.98, 0.93, 0.86, 0.76, 0.62, 0.53, 0.44])
+CAGE_DEPTH = Curve(LEVELS, [0.97, 1.0, 1.0, 0.975, 0.91, 0.81, 0.74, 0.67, 0.61, 0.52])
+MEDIASTINUM_LEVEL = Curve([-1, 0.0, 0.4, 0.6, 0.8, 1.0, 1.5], [0.8, 0.8, 0.85, 1.0, 0.95, 1.05, 1.1])
+MEDIASTINUM_DEPTH = Curve([-2, -0.9, -0.45, -0.1, 0.35, 0.7, 1.0, 2], [21, 21, 27, 31, 27, 14, 7, 7])
+SHOULDER = Curve([-0.8, 0.0, 0.5, 0.75, 0.9, 1.2], [-2.0, 0.0, 6.0, 10.0, 13.0, 13.0])
 SIDES = {"right": 1.0, "left": -1.0}
 
 

@@ -11,12 +11,9 @@ import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
-import nibabel
 import numpy as np
 import torch
-from monai.data import MetaTensor, NibabelReader
-from monai.transforms import Orientationd
-from scipy import ndimage
+import scipy
 
 from phydict.datasets.anatomy import lung_box_centre, segment
 from phydict.grid import Grid
@@ -26,7 +23,6 @@ AIR = -1000.0
 SEGMENTATION_MM = 2.0
 LEAST_SLICES = 8
 """Fewer are a scout or a test image, from which no lungs can be found."""
-UNREADABLE = (OSError, EOFError, ValueError, RuntimeError, zlib.error, nibabel.filebasedimages.ImageFileError)
 
 
 @dataclass(frozen=True)
@@ -59,18 +55,22 @@ def load_ct(path: str | Path, calibration: Calibration | None = None) -> tuple[n
     Raises FileNotFoundError, and ValueError naming the file where it cannot be read, is not one 3D volume, has
     fewer than LEAST_SLICES slices, no orientation, or holds NaN or infinite values.
     """
+    import nibabel
+    from monai.data import NibabelReader
+
+    unreadable = (OSError, EOFError, ValueError, RuntimeError, zlib.error, nibabel.filebasedimages.ImageFileError)
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no CT file {path}; give a .nii or .nii.gz file that exists")
     try:
         header = nibabel.load(path).header
-    except UNREADABLE as error:
+    except unreadable as error:
         raise ValueError(f"{path} cannot be read as NIfTI ({error}); convert or download it again") from error
     _check_header(path, header, calibration)
     reader = NibabelReader(squeeze_non_spatial_dims=True)
     try:
         stored, meta = reader.get_data(reader.read(path))
-    except UNREADABLE as error:
+    except unreadable as error:
         raise ValueError(f"the voxels of {path} cannot be read, the file seems truncated or damaged; "
                          "download or convert it again") from error
     hu, affine = np.array(stored, np.float32), meta["affine"]
@@ -85,6 +85,9 @@ def load_ct(path: str | Path, calibration: Calibration | None = None) -> tuple[n
 
 def to_ras(volume: np.ndarray, affine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A volume (X, Y, Z) with its axes permuted and flipped to RAS+, without interpolation; and its new affine."""
+    from monai.data import MetaTensor
+    from monai.transforms import Orientationd
+
     image = MetaTensor(torch.from_numpy(np.ascontiguousarray(volume, np.float32))[None], affine=affine)
     image = Orientationd("ct", axcodes="RAS", labels=None)({"ct": image})["ct"]
     return image.as_tensor()[0].numpy(), image.affine.numpy().astype(float)
@@ -153,8 +156,8 @@ def to_grid(volume: np.ndarray, affine: np.ndarray, grid: Grid, pad: float) -> n
     fine = relative @ half
     fine[:3] /= step[:, None]
     fine[:3, 3] -= first / step
-    fine = ndimage.affine_transform(volume, fine[:3, :3], fine[:3, 3], tuple(2 * n for n in grid.shape), order=1,
-                                    mode="constant", cval=pad)
+    fine = scipy.ndimage.affine_transform(volume, fine[:3, :3], fine[:3, 3], tuple(2 * n for n in grid.shape), order=1,
+                                          mode="constant", cval=pad)
     x, y, z = grid.shape
     return fine.reshape(x, 2, y, 2, z, 2).mean((1, 3, 5))
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import zlib
 from pathlib import Path
 
-import nibabel
 import numpy as np
 from PIL import Image
 
@@ -13,7 +12,7 @@ from phydict.datasets.natural_order import natural_order
 
 DICOM = (".dcm", ".dicom", ".ima")
 ENDINGS = (".png", ".tif", ".tiff", ".npy", ".nii", ".nii.gz", *DICOM)
-UNREADABLE = (OSError, EOFError, ValueError, SyntaxError, zlib.error, nibabel.filebasedimages.ImageFileError)
+UNREADABLE = (OSError, EOFError, ValueError, SyntaxError, zlib.error)
 GREY = ("L", "I;16", "I;16B", "I;16L", "I", "F")
 
 
@@ -45,8 +44,7 @@ def read_image(path: Path) -> np.ndarray:
         if name.endswith(".npy"):
             image = np.load(path, allow_pickle=False)
         elif name.endswith((".nii", ".nii.gz")):
-            image = np.asarray(nibabel.load(path).dataobj)
-            image = image.reshape(image.shape[:2]).T if image.size == np.prod(image.shape[:2]) else image
+            image = _read_nifti(path)
         else:
             image = _read_picture(path)
     except UNREADABLE as error:
@@ -61,6 +59,17 @@ def read_image(path: Path) -> np.ndarray:
     if bad:
         raise ValueError(f"{path} holds {bad} NaN or infinite pixels; give finite values everywhere")
     return image
+
+
+def _read_nifti(path: Path) -> np.ndarray:
+    """An image (U, V) with any number of axes of length 1 behind, as (V, U); other shapes as they are."""
+    import nibabel
+
+    try:
+        image = np.asarray(nibabel.load(path).dataobj)
+    except nibabel.filebasedimages.ImageFileError as error:
+        raise ValueError(str(error)) from error
+    return image.reshape(image.shape[:2]).T if image.size == np.prod(image.shape[:2]) else image
 
 
 def _read_picture(path: Path) -> np.ndarray:

@@ -2,8 +2,8 @@
 
 from phydict.prior.cascade import Cascade
 from phydict.prior.checkpoint import (
-    describe, describe_super_resolution, file_read, fingerprint, load_prior, load_super_resolution, save_prior,
-    save_super_resolution)
+    DEFAULT_PRIOR, describe, describe_super_resolution, file_read, fingerprint, load_prior, load_super_resolution,
+    save_prior, save_super_resolution)
 from phydict.prior.detail import DetailNetwork
 from phydict.prior.local_unet import LocalUNet
 from phydict.prior.medsyn import MedSynPrior, MedSynSuperResolution
@@ -13,7 +13,7 @@ from phydict.prior.super_resolution import SuperResolution
 from phydict.prior.text import TextEncoder, learn_vocabulary
 from phydict.prior.unet import VolumeUNet
 
-__all__ = ["STATE", "BoundPrior", "Cascade", "DetailNetwork", "LocalUNet", "MedSynCheckpoint", "MedSynPrior",
-           "MedSynSuperResolution", "Prior", "SuperResolution", "TextEncoder", "VolumeUNet", "describe",
+__all__ = ["DEFAULT_PRIOR", "STATE", "BoundPrior", "Cascade", "DetailNetwork", "LocalUNet", "MedSynCheckpoint",
+           "MedSynPrior", "MedSynSuperResolution", "Prior", "SuperResolution", "TextEncoder", "VolumeUNet", "describe",
            "describe_super_resolution", "file_read", "fingerprint", "inspect_prior", "learn_vocabulary", "load_prior",
            "load_super_resolution", "save_prior", "save_super_resolution"]

@@ -5,14 +5,15 @@ from __future__ import annotations
 import json
 from pathlib import Path
 from pickle import UnpicklingError
+from typing import TYPE_CHECKING
 
 import torch
-from huggingface_hub import HfApi, snapshot_download
-from huggingface_hub.errors import HTTPError
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
-from transformers import BertConfig, BertModel, BertTokenizer
+
+if TYPE_CHECKING:
+    from transformers import BertModel, BertTokenizer
 
 from phydict.prior.finite import check_finite
 
@@ -40,6 +41,8 @@ def load_bert(source: str | Path) -> tuple[BertTokenizer, BertModel]:
     HF_HUB_OFFLINE is set. Raises FileNotFoundError where there is none, ValueError where its files do not fit together
     or hold more than weights.
     """
+    from transformers import BertConfig, BertModel, BertTokenizer
+
     folder = _folder(source)
     weights = _read_weights(_first(folder, WEIGHTS))
     try:
@@ -60,6 +63,8 @@ def load_bert(source: str | Path) -> tuple[BertTokenizer, BertModel]:
 
 def _folder(source: str | Path) -> Path:
     """The folder on disk that holds a source's files, downloaded to the local cache if need be."""
+    from huggingface_hub.errors import HTTPError
+
     folder = Path(source)
     if not folder.is_dir():
         try:
@@ -74,6 +79,8 @@ def _folder(source: str | Path) -> Path:
 
 
 def _cached(hub_id: str) -> Path | None:
+    from huggingface_hub import snapshot_download
+
     try:
         folder = Path(snapshot_download(hub_id, local_files_only=True))
     except FileNotFoundError:
@@ -82,6 +89,8 @@ def _cached(hub_id: str) -> Path | None:
 
 
 def _downloaded(hub_id: str) -> Path:
+    from huggingface_hub import HfApi, snapshot_download
+
     hub = HfApi().model_info(hub_id, timeout=ATTEMPT_SECONDS)  # a download's own attempts repeat for minutes
     held = {file.rfilename for file in hub.siblings or ()}
     weights = [name for name in WEIGHTS if name in held][:1]

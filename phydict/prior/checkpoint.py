@@ -24,9 +24,13 @@ from phydict.prior.prior import STATE, Prior
 from phydict.prior.super_resolution import SuperResolution
 from phydict.prior.text import TextEncoder
 from phydict.prior.unet import VolumeUNet
+from phydict.shipped import own_or_shipped, shipped
 from phydict.units import HUWindow
 
 FORMAT = 1
+
+DEFAULT_PRIOR = shipped("data/prior/phydict_64.safetensors")
+"""The prior that comes with the project."""
 
 STAGES = {"base": "a base prior", "super_resolution": "a super-resolution stage"}
 """What a file's header may call it, and what that is; a header that says nothing is of a base prior."""
@@ -88,16 +92,17 @@ def describe_super_resolution(fine: SuperResolution) -> dict:
             "network": fine.network.settings}
 
 
-def load_prior(path: str | Path | MedSynCheckpoint, device: str = "cpu") -> Prior | MedSynPrior:
+def load_prior(path: str | Path | MedSynCheckpoint = DEFAULT_PRIOR, device: str = "cpu") -> Prior | MedSynPrior:
     """The prior in a .safetensors file written by `save_prior`, or in a file or folder of MedSyn's (`load_medsyn`),
     ready to denoise (float32, evaluation mode).
 
-    The text encoder stays on disk until the first report. Raises FileNotFoundError when there is no file, ValueError
-    when it is truncated, is no prior, or holds weights that are not finite.
+    The default is the one that comes with the project. The text encoder stays on disk until the first report. Raises
+    FileNotFoundError when there is no file, ValueError when it is truncated, is no prior, or holds weights that are not
+    finite.
     """
+    path = _found(path)
     if isinstance(path, MedSynCheckpoint) or is_medsyn(path):
         return load_medsyn(path, device)
-    path = Path(path)
     header, weights = _read(path, "base", device)
     try:
         prior = build_prior(header, weights)
@@ -111,14 +116,19 @@ def load_prior(path: str | Path | MedSynCheckpoint, device: str = "cpu") -> Prio
 def load_super_resolution(path: str | Path | MedSynCheckpoint,
                           device: str = "cpu") -> SuperResolution | MedSynSuperResolution:
     """The super-resolution stage in a file written by `save_super_resolution`, or MedSyn's; as `load_prior`."""
+    path = _found(path)
     if isinstance(path, MedSynCheckpoint) or is_medsyn(path):
         return load_medsyn_super_resolution(path, device)
-    header, weights = _read(Path(path), "super_resolution", device)
+    header, weights = _read(path, "super_resolution", device)
     try:
         fine = build_super_resolution(header, weights)
     except ValueError as error:
         raise ValueError(f"'{path}' contradicts itself: {error}") from error
     return fine.to(device).eval().requires_grad_(False)
+
+
+def _found(path: str | Path | MedSynCheckpoint) -> Path | MedSynCheckpoint:
+    return path if isinstance(path, MedSynCheckpoint) else own_or_shipped(path)
 
 
 def _read(path: Path, stage: str, device: str) -> tuple[dict, dict[str, Tensor]]:
@@ -159,13 +169,13 @@ def check_stage(header: dict, stage: str, name: str) -> None:
 def fingerprint(path: str | Path | MedSynCheckpoint) -> int:
     """CRC-32 of the file that `load_prior` or `load_super_resolution` reads: two priors with different ones are not the
     same."""
-    return file_crc32(as_checkpoint(path).file)
+    return file_crc32(as_checkpoint(_found(path)).file)
 
 
 def file_read(path: str | Path | MedSynCheckpoint) -> str | None:
     """Of a folder of MedSyn's, the file that is read and, in brackets, which weights it holds by its name; None for a
     file."""
-    given = as_checkpoint(path)
+    given = as_checkpoint(_found(path))
     if Path(given.path).is_file():
         return None
     file = given.file

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import torch
 from einops import rearrange
-from monai.networks.nets import DiffusionModelUNet
 from torch import Tensor, nn
 from torch.nn.functional import layer_norm
 
@@ -35,6 +34,8 @@ class LocalUNet(nn.Module):
 
     def __init__(self, in_channels: int = 2, out_channels: int = 1, block: int = 4,
                  channels: tuple[int, ...] = (64, 96), res_blocks: int = 1):
+        from monai.networks.nets import DiffusionModelUNet
+
         super().__init__()
         self.settings = {"in_channels": in_channels, "out_channels": out_channels, "block": block,
                          "channels": list(channels), "res_blocks": res_blocks}

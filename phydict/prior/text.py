@@ -6,13 +6,15 @@ import warnings
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
-from tokenizers import normalizers, pre_tokenizers
 from torch import Tensor, nn
-from transformers import BertConfig, BertModel, BertTokenizer
 
 from phydict.prior.bert_files import load_bert
+
+if TYPE_CHECKING:
+    from transformers import BertModel, BertTokenizer
 
 FOREIGN = 0.2
 """Share of a report's tokens that may be [UNK] before `TextEncoder.check` warns."""
@@ -74,6 +76,8 @@ class TextEncoder(nn.Module):
     @classmethod
     def small(cls, vocabulary: list[str], width: int = 64, layers: int = 2, length: int = 128) -> TextEncoder:
         """A new small BERT over a WordPiece vocabulary (see `learn_vocabulary`); it trains with its prior."""
+        from transformers import BertConfig, BertModel, BertTokenizer
+
         tokenizer = BertTokenizer(vocab={word: i for i, word in enumerate(vocabulary)})
         bert = BertModel(BertConfig(
             vocab_size=len(vocabulary), hidden_size=width, num_hidden_layers=layers, num_attention_heads=4,
@@ -154,6 +158,8 @@ def learn_vocabulary(reports: Iterable[str], size: int = 2000) -> list[str]:
     Unlike the usual merging trainers it is the same in every process and on every machine, as resuming and
     distributed training need.
     """
+    from tokenizers import normalizers, pre_tokenizers
+
     normalize, split = normalizers.BertNormalizer(lowercase=True), pre_tokenizers.BertPreTokenizer()
     words = Counter(word for report in reports
                     for word, _ in split.pre_tokenize_str(normalize.normalize_str(report)))

@@ -7,8 +7,6 @@ from types import MethodType
 
 import torch
 from einops import rearrange
-from monai.networks.nets import DiffusionModelUNet
-from monai.networks.nets.diffusion_model_unet import DiffusionUNetResnetBlock, SpatialTransformer
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 from torch.utils.checkpoint import checkpoint
@@ -67,6 +65,8 @@ class VolumeUNet(nn.Module):
         head_channels: int = 32,
         context_dim: int = 64,
     ):
+        from monai.networks.nets import DiffusionModelUNet
+
         super().__init__()
         self.settings = {
             "state_channels": state_channels, "block": block, "channels": list(channels),
@@ -94,6 +94,8 @@ class VolumeUNet(nn.Module):
 
     def blocks(self) -> list[nn.Module]:
         """The residual and attention blocks of the UNet, which hold nearly all of its weights and activations."""
+        from monai.networks.nets.diffusion_model_unet import DiffusionUNetResnetBlock, SpatialTransformer
+
         return [m for m in self.unet.modules() if isinstance(m, (DiffusionUNetResnetBlock, SpatialTransformer))]
 
     def run_with(self, gradient_checkpointing: bool = False, channels_last: bool = True,

@@ -14,12 +14,12 @@ the sum ends. (A volume padded by one voxel of zeros has its sum end where x is 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from phydict.xray.compiled import compiled
 from phydict.xray.tracer import Tracer, aim, enter, nearest
 
 
-@njit(nogil=True, cache=True)
+@compiled()
 def _sample(volume, x, y, z):
     """The trilinear value at fractional voxel indices."""
     nx, ny, nz = volume.shape
@@ -39,7 +39,7 @@ def _sample(volume, x, y, z):
     return total
 
 
-@njit(nogil=True, cache=True)
+@compiled()
 def _spread(volume, x, y, z, value, bottom, top):
     """Add the adjoint of `_sample` to the slices bottom <= k < top."""
     nx, ny = volume.shape[:2]
@@ -57,7 +57,7 @@ def _spread(volume, x, y, z, value, bottom, top):
                         volume[i + di, j + dj, k + 1] += w * fz
 
 
-@njit(nogil=True, cache=True)
+@compiled()
 def _project(volume, image, ray, lengths, low, high):
     start, step = ray[0], np.empty(3)
     voxel, sign = np.empty(3, np.int64), np.empty(3, np.int64)
@@ -79,7 +79,7 @@ def _project(volume, image, ray, lengths, low, high):
             image[r, c] = total * lengths[r, c]
 
 
-@njit(nogil=True, cache=True)
+@compiled()
 def _backproject(volume, images, rays, lengths, bottom, top):
     nx, ny, nz = volume.shape
     low, high = (0, 0, max(bottom - 1, 0)), (nx, ny, min(top + 1, nz))  # samples there reach into the slab

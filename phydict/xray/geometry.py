@@ -138,6 +138,12 @@ class ConeBeam:
                 f"{distance - centre[k]:.1f} mm along the view, but the volume {reach} from its centre; "
                 "move the source or the detector, or give a smaller volume")
 
+    def is_upright(self, grid: Grid) -> bool:
+        """Whether every detector's columns of pixels run along the grid's third axis."""
+        axis = grid.affine[:3, 2] / grid.spacing[2]
+        tilt = np.linalg.norm(np.cross(self.v, axis), axis=1) / np.linalg.norm(self.v, axis=1)
+        return bool((tilt < 1e-6).all())
+
     def check_scale(self, grid: Grid) -> None:
         """Look for lengths that are not in mm: compare the shadow of the box of voxels with the detectors.
 

@@ -5,17 +5,20 @@ from __future__ import annotations
 import warnings
 from collections import OrderedDict
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 
 from phydict.grid import Grid
 from phydict.xray.binning import binning
-from phydict.xray.eq4 import Eq4
 from phydict.xray.geometry import VECTOR_KEYS, ConeBeam
-from phydict.xray.joseph import Joseph
-from phydict.xray.separable import Separable, is_separable
-from phydict.xray.siddon import Siddon
-from phydict.xray.system_matrix import SystemMatrix
+
+if TYPE_CHECKING:  # they bring a compiler, so that each is imported where it is first needed
+    from phydict.xray.eq4 import Eq4
+    from phydict.xray.joseph import Joseph
+    from phydict.xray.separable import Separable
+    from phydict.xray.siddon import Siddon
+    from phydict.xray.system_matrix import SystemMatrix
 
 METHODS = ("auto", "separable", "siddon", "eq4", "joseph", "matrix")
 
@@ -118,8 +121,10 @@ def _engine(grid: Grid, beam: ConeBeam, method: str, memory: int, device: str) -
 
 def _choose(grid: Grid, beam: ConeBeam, memory: int, device: str) -> tuple[str, str]:
     """The method for a geometry, a memory budget and a device, and a sentence that says why."""
-    if is_separable(grid, beam):
+    if beam.is_upright(grid):
         return "separable", "the detectors stand upright on the grid, where the separable projector is the fastest"
+    from phydict.xray.system_matrix import SystemMatrix
+
     needed = SystemMatrix.bytes_for(grid, beam, torch.float64)
     if needed <= memory:
         return "matrix", (f"the detectors are tilted, and the system matrix takes at most {needed:,} bytes of the "
@@ -131,6 +136,12 @@ def _choose(grid: Grid, beam: ConeBeam, memory: int, device: str) -> tuple[str, 
 
 
 def _operator(grid: Grid, beam: ConeBeam, method: str, memory: int):
+    from phydict.xray.eq4 import Eq4
+    from phydict.xray.joseph import Joseph
+    from phydict.xray.separable import Separable
+    from phydict.xray.siddon import Siddon
+    from phydict.xray.system_matrix import SystemMatrix
+
     if method in ("joseph", "matrix"):
         return {"joseph": Joseph, "matrix": SystemMatrix}[method](grid, beam, memory)
     return {"separable": Separable, "siddon": Siddon, "eq4": Eq4}[method](grid, beam)

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import torch
 
@@ -27,13 +26,6 @@ from phydict.grid import Grid
 from phydict.xray import separable_cpu
 from phydict.xray.geometry import ConeBeam
 from phydict.xray.separable_sparse import SparseFactors
-
-
-def is_separable(grid: Grid, beam: ConeBeam) -> bool:
-    """Whether every detector's columns of pixels run along the grid's third axis."""
-    axis = grid.affine[:3, 2] / grid.spacing[2]
-    upright = np.linalg.norm(np.cross(beam.v, axis), axis=1) / np.linalg.norm(beam.v, axis=1)
-    return bool((upright < 1e-6).all())
 
 
 class Rays(NamedTuple):
@@ -83,7 +75,7 @@ class Separable:
     """
 
     def __init__(self, grid: Grid, beam: ConeBeam):
-        if not is_separable(grid, beam):
+        if not beam.is_upright(grid):
             raise ValueError("method 'separable' needs detectors whose rows are stacked along the grid's third axis, "
                              "but this beam's are tilted; use method='siddon' or 'auto'")
         self.grid, self.beam, self.rays = grid, beam, Rays.of(grid, beam)
@@ -93,7 +85,6 @@ class Separable:
         if mu.device.type != "cpu":
             return self.sparse.forward(mu)
         xrays = mu.new_empty(len(mu), self.beam.views, *self.beam.shape)
-        _set_threads()
         separable_cpu.project(_array(mu), xrays.numpy(), *self.rays)
         return xrays
 
@@ -101,7 +92,7 @@ class Separable:
         if xrays.device.type != "cpu":
             return self.sparse.adjoint(xrays)
         mu = xrays.new_zeros(len(xrays), *self.grid.shape)
-        separable_cpu.backproject(mu.numpy(), _array(xrays), _set_threads(), *self.rays)
+        separable_cpu.backproject(mu.numpy(), _array(xrays), *self.rays)
         return mu
 
     @property
@@ -118,13 +109,3 @@ def _steps(count: int) -> np.ndarray:
 
 def _array(x: torch.Tensor) -> np.ndarray:
     return np.ascontiguousarray(x.detach().numpy())
-
-
-def _set_threads() -> int:
-    """The number of threads that torch uses, told to numba, whose first start sets OpenMP's, and so torch's, to all."""
-    asked = torch.get_num_threads()
-    threads = min(asked, numba.config.NUMBA_NUM_THREADS)
-    numba.set_num_threads(threads)
-    if torch.get_num_threads() != asked:
-        torch.set_num_threads(asked)
-    return threads

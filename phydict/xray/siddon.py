@@ -6,12 +6,12 @@ Siddon 1985, Med Phys 12:252 (doi:10.1118/1.595715). Outside the grid mu is 0. p
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from phydict.xray.compiled import compiled
 from phydict.xray.tracer import Tracer, aim, enter, nearest
 
 
-@njit(nogil=True, cache=True)
+@compiled()
 def _project(volume, image, ray, lengths, low, high):
     start, step = ray[0], np.empty(3)
     voxel, sign = np.empty(3, np.int64), np.empty(3, np.int64)
@@ -34,7 +34,7 @@ def _project(volume, image, ray, lengths, low, high):
             image[r, c] = total * lengths[r, c]
 
 
-@njit(nogil=True, cache=True)
+@compiled()
 def _backproject(volume, images, rays, lengths, bottom, top):
     low, high = (0, 0, bottom), (volume.shape[0], volume.shape[1], top)
     step = np.empty(3)

@@ -7,11 +7,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 
-TABLES = Path(__file__).parents[2] / "data" / "spectra"
+from phydict.shipped import shipped
 
 DENSITIES = {"water": 1.0, "soft_tissue": 1.06, "bone": 1.92, "titanium": 4.54, "aluminium": 2.699,
              "caesium_iodide": 4.51, "air": 1.205e-3}
@@ -23,10 +22,10 @@ GRAY_PER_KEV = 1.602176634e-13
 
 @cache
 def _table(name: str) -> dict[str, np.ndarray]:
-    path = TABLES / name
+    path = shipped(f"data/spectra/{name}")
     if not path.is_file():
-        raise FileNotFoundError(f"there is no table {path}; run phydict from a checkout that holds data/spectra, "
-                                "or write it with python data/spectra/make.py")
+        raise FileNotFoundError(f"there is no table {path}; install phydict again, or write it in a checkout with "
+                                "python data/spectra/make.py")
     columns = path.read_text().split("\n", 1)[0].split(",")
     return dict(zip(columns, np.loadtxt(path, delimiter=",", skiprows=1).T))
 

@@ -11,10 +11,10 @@ import math
 
 import numpy as np
 import torch
-from numba import njit
 from scipy.sparse import csr_array
 
 from phydict.grid import Grid
+from phydict.xray.compiled import compiled
 from phydict.xray.csr import csr_tensor, index_type
 from phydict.xray.geometry import ConeBeam
 from phydict.xray.tracer import aim, enter, nearest, ray_lengths, rays_in_voxels, run
@@ -97,7 +97,7 @@ def _table_bytes(crossed: np.ndarray, voxels: int, dtype: torch.dtype) -> int:
     return 2 * entries * (dtype.itemsize + index) + (crossed.size + voxels + 2) * index
 
 
-@njit(nogil=True, cache=True)
+@compiled()
 def _count(shape, ray, crossed):
     start, step = ray[0], np.empty(3)
     voxel, sign = np.empty(3, np.int64), np.empty(3, np.int64)
@@ -116,7 +116,7 @@ def _count(shape, ray, crossed):
                     break
 
 
-@njit(nogil=True, cache=True)
+@compiled()
 def _fill(shape, ray, lengths, offsets, voxels, values):
     """The voxels that a view's rays cross and the mm inside them, from each ray's offset on, as `_count` counts."""
     start, step = ray[0], np.empty(3)

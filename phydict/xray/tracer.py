@@ -17,9 +17,9 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import torch
-from numba import njit
 
 from phydict.grid import Grid
+from phydict.xray.compiled import compiled
 from phydict.xray.geometry import ConeBeam
 
 SLAB = 8
@@ -92,19 +92,24 @@ def support(volume: np.ndarray, reach: int) -> tuple[tuple[int, ...], tuple[int,
 
 def run(tasks: list[tuple]) -> None:
     """Run (function, *arguments) tasks on torch's number of threads."""
-    with ThreadPoolExecutor(max(1, min(torch.get_num_threads(), len(tasks)))) as pool:
+    threads = min(torch.get_num_threads(), len(tasks))
+    if threads < 2:
+        for function, *arguments in tasks:
+            function(*arguments)
+        return
+    with ThreadPoolExecutor(threads) as pool:
         for done in [pool.submit(*task) for task in tasks]:
             done.result()
 
 
-@njit(nogil=True, cache=True)
+@compiled()
 def aim(ray, row, column, step):
     """Fill the way from the source to a pixel, in voxel indices."""
     for a in range(3):
         step[a] = ray[1, a] + column * ray[2, a] + row * ray[3, a] - ray[0, a]
 
 
-@njit(nogil=True, cache=True)
+@compiled()
 def enter(start, step, low, high, voxel, sign, cross, delta):
     """Set up one ray, start + t step in voxel indices, and return its interval of t inside the box.
 
@@ -133,7 +138,7 @@ def enter(start, step, low, high, voxel, sign, cross, delta):
     return first, last
 
 
-@njit(nogil=True, cache=True)
+@compiled()
 def nearest(cross):
     """The axis whose crossing comes next."""
     if cross[0] <= cross[1]:

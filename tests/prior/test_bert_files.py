@@ -208,7 +208,7 @@ def test_a_download_takes_one_file_of_weights_and_no_code(tmp_path, hub, monkeyp
 
     files = [SimpleNamespace(rfilename=name) for name in (*held, "config.json", "vocab.txt", "modeling_cxrbert.py")]
     monkeypatch.setattr(HfApi, "model_info", lambda *_, **__: SimpleNamespace(sha="0" * 40, siblings=files))
-    monkeypatch.setattr(bert_files, "snapshot_download", download)
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", download)
     load_bert("some/cxr-bert")
     assert [name for name in taken if name in ("model.safetensors", "pytorch_model.bin")] == [wanted]
     assert {"config.json", "vocab.txt"} < set(taken) and not any(name.endswith(".py") for name in taken)

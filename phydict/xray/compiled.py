@@ -1,0 +1,22 @@
+"""How the projectors' loops are compiled."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from numba import njit
+
+
+def compiled(fastmath: bool | set[str] = False) -> Callable[[Callable], Callable]:
+    """Compiles a function at its first call; it runs without the GIL, with such liberties in arithmetic as `fastmath`.
+
+    The machine code is kept for other processes in NUMBA_CACHE_DIR, beside the source or in the user's cache folder,
+    the first of them that can be written to; where none can, every process compiles anew.
+    """
+    def decorate(function: Callable) -> Callable:
+        try:
+            return njit(nogil=True, cache=True, fastmath=fastmath)(function)
+        except RuntimeError:  # numba found no such folder
+            return njit(nogil=True, fastmath=fastmath)(function)
+
+    return decorate

@@ -1,0 +1,45 @@
+"""Compiled loops run wherever they are installed, and are compiled once."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import phydict
+from phydict.grid import Grid
+from phydict.xray import ConeBeam, Projector
+from phydict.xray.separable_cpu import _backproject_slab, _project_columns
+
+CODE = """if True:
+    import numpy as np
+    from phydict.xray import tracer
+    print(tracer.__file__, tracer.nearest(np.array([3.0, 1.0, 2.0])))"""
+
+
+@pytest.mark.parametrize("home", ["a folder", "nowhere"])
+def test_an_installation_that_cannot_be_written_caches_elsewhere_or_runs_without(tmp_path, home):
+    site, cache = tmp_path / "site", tmp_path / "home" / ".cache"
+    shutil.copytree(Path(phydict.__file__).parent, site / "phydict", ignore=shutil.ignore_patterns("__pycache__"))
+    (site / "phydict" / "xray" / "__pycache__").touch()  # a file in its place: not even root can write into it
+    (tmp_path / "home").mkdir() if home == "a folder" else (tmp_path / "home").touch()
+    clean = {name: value for name, value in os.environ.items() if not name.startswith(("NUMBA_CACHE", "XDG_"))}
+    done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, cwd=site, timeout=300,
+                          env=clean | {"HOME": str(tmp_path / "home"), "PYTHONDONTWRITEBYTECODE": "1"})
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == [str(site / "phydict" / "xray" / "tracer.py"), "1"]
+    assert bool(list(cache.rglob("tracer.nearest*.nbc"))) == (home == "a folder")
+
+
+def test_loops_are_compiled_once_for_each_precision():
+    for views in (1, 3):
+        project = Projector(Grid.cube(8), ConeBeam.orbit(views, 1020, 740, (1, 4), 100.0), "separable",
+                            full_detector=True)
+        for x in (torch.rand(2, 1, 8, 8, 8), torch.rand(1, 1, 8, 8, 8).transpose(2, 3), torch.zeros(1, 1, 8, 8, 8)):
+            for kind in (torch.float32, torch.float64):
+                project.T(project(x.to(kind)))
+    for loop in (_project_columns, _backproject_slab):
+        assert len(loop.signatures) == 2

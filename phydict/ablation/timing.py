@@ -20,6 +20,7 @@ class TimedPrior:
 
     def __init__(self, prior, watch: Stopwatch):
         self.grid, self.window, self.state_channels = prior.grid, prior.window, prior.state_channels
+        self.ends_at_zero = getattr(prior, "ends_at_zero", False)
         self._prior, self._watch = prior, watch
 
     def bind(self, report: str, guidance: float, precision: str) -> Denoiser:

@@ -10,6 +10,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+ASIDE = ".set-aside-by-phydict"
+"""What the name of a folder ends in while another takes its place."""
+
 
 @contextmanager
 def whole_file(final: Path) -> Iterator[Path]:
@@ -56,8 +59,8 @@ def undisturbed(folder: Path) -> Iterator[None]:
     try:
         with suppress(OSError):  # a file system without locks: then the renaming alone must do
             fcntl.flock(handle, fcntl.LOCK_EX)
-        for aside in folder.glob(".*.replaced"):
-            _settle(aside.with_name(aside.name[1:].removesuffix(".replaced")))
+        for aside in folder.glob(f".*{ASIDE}"):
+            _settle(aside.with_name(aside.name[1:].removesuffix(ASIDE)))
         yield
     finally:
         os.close(handle)
@@ -94,7 +97,7 @@ def _settle(final: Path) -> None:
 
 
 def _aside(final: Path) -> Path:
-    return final.with_name(f".{final.name}.replaced")
+    return final.with_name(f".{final.name}{ASIDE}")
 
 
 def _partial(final: Path) -> Path:

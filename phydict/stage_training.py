@@ -104,8 +104,10 @@ class StageTraining(lightning.LightningModule, ABC):
         """What to do where a training has come to nothing."""
         file = Path(self.trainer.default_root_dir) / CHECKPOINT
         last = file if file.is_file() else self.trainer.ckpt_path
-        return (f"the last good checkpoint is {last}, from which --ckpt_path goes on; " if last else
-                "no checkpoint had been written; ") + "a lower model.learning_rate is for a new run"
+        anew = "start anew with a lower model.learning_rate"
+        if not last:
+            return f"no checkpoint had been written, so {anew}"
+        return f"the last good checkpoint is {last}, so go on from it with --ckpt_path, or {anew}"
 
     def validation_step(self, batch: dict, index: int) -> None:
         x0, _ = self._state(batch)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from phydict.atomic import ASIDE
 from phydict.case_results import RECORD, CaseResults
 
 SETTINGS = {"seed": 0}
@@ -168,7 +169,7 @@ def finish_until(folder: Path, name: str) -> None:
     finish(results, "new")
 
 
-@pytest.mark.parametrize("name, content", [(".anna.replaced", "old"), ("anna", "new")],
+@pytest.mark.parametrize("name, content", [(f".anna{ASIDE}", "old"), ("anna", "new")],
                          ids=["nothing in its place", "the old one aside"])
 def test_a_kill_between_the_steps_of_taking_a_place_loses_no_case(old, name, content):
     killed = in_another_process(finish_until, old.parent, name)

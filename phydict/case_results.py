@@ -90,7 +90,8 @@ class CaseResults:
                                  "seconds": sum(record["seconds"].values()), "network_calls": record["network_calls"],
                                  "projector_calls": record["projector_calls"],
                                  "precision": record.get("precision"),
-                                 "instruction_set": record.get("instruction_set")})
+                                 "instruction_set": record.get("instruction_set"),
+                                 "warning": "; ".join(record.get("warnings", [])) or None})
         if rows:
             write_csv(self.folder / "results.csv", rows)
             (self.folder / "results.md").write_text(markdown(rows))

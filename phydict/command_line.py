@@ -97,5 +97,21 @@ def quiet() -> Iterator[None]:
                 logger.setLevel(level)
 
 
+@contextmanager
+def noted(found: list[str]) -> Iterator[None]:
+    """Adds to `found`, each once, the sentences of the UserWarnings given inside, which are shown as ever."""
+    with warnings.catch_warnings():
+        show = warnings.showwarning
+
+        def keep(message: Warning | str, category: type[Warning], *where) -> None:
+            text = " ".join(str(message).split())
+            if category is UserWarning and text not in found:
+                found.append(text)
+            show(message, category, *where)
+
+        warnings.showwarning = keep
+        yield
+
+
 def _show(message: Warning | str, *_) -> None:
     print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)

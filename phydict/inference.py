@@ -12,6 +12,7 @@ import resource
 import sys
 import warnings
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -25,7 +26,7 @@ from torch import Tensor
 
 from phydict.ablation import main as ablate
 from phydict.case_results import CaseResults
-from phydict.command_line import check_writable, one_sentence_errors, quiet, sentence
+from phydict.command_line import check_writable, noted, one_sentence_errors, quiet, sentence
 from phydict.datasets import load_xrays
 from phydict.dry_run import dry_run
 from phydict.evaluation import CaseMetrics, panel, rich_table
@@ -150,12 +151,10 @@ class ReconstructionTask(lightning.LightningModule):
         try:
             if "error" in case:
                 raise ValueError(case["error"]) from case["error"]
-            if self.profile:
-                with profiled() as profile:
-                    work(case)
-                print(f"{case['id']}: {self.method_name}", profile.table(), sep="\n")
-            else:
+            with noted(case["warnings"]), profiled() if self.profile else nullcontext() as profile:
                 work(case)
+            if profile:
+                print(f"{case['id']}: {self.method_name}", profile.table(), sep="\n")
         except (ValueError, FloatingPointError) as error:
             self.results.discard(case["id"])
             if len(self.cases) == 1:
@@ -219,7 +218,7 @@ class ReconstructionTask(lightning.LightningModule):
                 "mu_water": case.get("mu_water", self.reconstructor.mu_water), "views": len(result.xrays),
                 "precision": result.precision, "instruction_set": instruction_set(self.device),
                 "grid": result.grid.to_dict(), "seed": result.seed,
-                "report": case["report"], "source": case["source"], "settings": self.settings, "versions": versions()}
+                "warnings": case["warnings"], "report": case["report"], "source": case["source"], "settings": self.settings, "versions": versions()}
 
     def summarise(self) -> None:
         """Prints and writes the scores of this run's cases. Raises ValueError, naming them, where some have failed."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
@@ -13,7 +14,7 @@ import torch
 
 from phydict.ablation.spec import Specification, Trial, key, prior_of
 from phydict.ablation.timing import PeakMemory, TimedPrior, TimedProjector, WarmUp
-from phydict.command_line import sentence
+from phydict.command_line import noted, sentence
 from phydict.evaluation import read_csv, write_csv
 from phydict.methods import fit_to_grid, reconstructor
 from phydict.posterior import Sampler
@@ -27,8 +28,8 @@ RESULTS = "results.csv"
 FINISHED = ("ok", "refused", "diverged")
 """What a row's status may be that is not tried again; "failed" is, since its reason may lie outside."""
 
-MEASURED = ("status", "error", "ssim", "psnr", "mae_hu", "ssim_lung", "psnr_lung", "mae_hu_lung", "misfit", "seconds",
-            "seconds_prepare", "seconds_sample", "seconds_score", "seconds_network", "seconds_projector",
+MEASURED = ("status", "error", "warning", "ssim", "psnr", "mae_hu", "ssim_lung", "psnr_lung", "mae_hu_lung", "misfit",
+            "seconds", "seconds_prepare", "seconds_sample", "seconds_score", "seconds_network", "seconds_projector",
             "network_calls", "projector_calls", "peak_memory_mb", "device", "threads",
             "precision", "instruction_set")
 """Columns that a run fills; the others are the trial's."""
@@ -132,11 +133,13 @@ class Made:
         self._kept = {}
 
     def case(self, trial: Trial, make: Callable[[], dict]) -> dict:
-        """The case of a trial."""
+        """The case of a trial, with the warnings that making it took."""
         grid, window = trial.scene()
         like = str((grid.to_dict(), window, trial.data.simulation_voxels))
         if like not in self._kept:
-            self._kept[like] = make()
+            warned: list[str] = []
+            with noted(warned):
+                self._kept[like] = make() | {"warnings": warned}
         return self._kept[like]
 
 
@@ -147,7 +150,9 @@ class Scene:
         self.case, self.truth = case, made
         (self.grid, self.window), data = trial.scene(), trial.data
         self.beam, self.mu_water = data.beam, data.simulator.effective_mu_water
-        self.xrays = data.simulate(made, case_seed(trial.seed, case), self.grid, self.window, device)
+        self.warnings = list(made["warnings"])
+        with noted(self.warnings):
+            self.xrays = data.simulate(made, case_seed(trial.seed, case), self.grid, self.window, device)
 
     def report(self, trial: Trial) -> str:
         """The report, where the trial uses it and its prior reads text."""
@@ -166,8 +171,13 @@ class Bench:
         """The measured columns of one trial on one case."""
         if (state := str(trial.identity() | {"seed": None})) not in self.warm:
             self.warm.add(state)
-            _attempt(lambda: self._reconstruct(trial, scene, Stopwatch(), WarmUp(on_step)))
-        return _attempt(lambda: self._measured(trial, scene, on_step))
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # what there is to say is said again by the run that counts
+                _attempt(lambda: self._reconstruct(trial, scene, Stopwatch(), WarmUp(on_step)))
+        warned = list(scene.warnings)
+        with noted(warned):
+            measured = _attempt(lambda: self._measured(trial, scene, on_step))
+        return measured | {"warning": "; ".join(warned) or None}
 
     def _measured(self, trial: Trial, scene: Scene, on_step: Callable[[], None]) -> dict:
         watch, memory = Stopwatch(), PeakMemory(self.device)

@@ -98,8 +98,8 @@ def quiet() -> Iterator[None]:
 
 
 @contextmanager
-def noted(found: list[str]) -> Iterator[None]:
-    """Adds to `found`, each once, the sentences of the UserWarnings given inside, which are shown as ever."""
+def noted(found: list[str], name: str) -> Iterator[None]:
+    """Adds to `found`, each once, the sentences of the UserWarnings given inside, and shows them with the case's name."""
     with warnings.catch_warnings():
         show = warnings.showwarning
 
@@ -107,7 +107,7 @@ def noted(found: list[str]) -> Iterator[None]:
             text = " ".join(str(message).split())
             if category is UserWarning and text not in found:
                 found.append(text)
-            show(message, category, *where)
+            show(message if name in text else f"{name}: {text}", category, *where)
 
         warnings.showwarning = keep
         yield

@@ -37,8 +37,8 @@ from phydict.precision import instruction_set
 from phydict.prior import MedSynCheckpoint, fingerprint, load_prior, load_super_resolution
 from phydict.profiling import profiled, stage
 from phydict.progress import CaseProgress
-from phydict.reconstruction_data import ReconstructionData, case_scores, case_seed
-from phydict.reconstructor import Reconstruction, Reconstructor, describe, save_nifti
+from phydict.reconstruction_data import ReconstructionData, case_scores
+from phydict.reconstructor import Reconstruction, Reconstructor, case_seed, describe, save_nifti
 from phydict.units import HUWindow
 
 class ReconstructionTask(lightning.LightningModule):
@@ -60,7 +60,7 @@ class ReconstructionTask(lightning.LightningModule):
         precision: of the networks: auto (bfloat16 where the device computes it), float32 or bfloat16
         out: output folder; cases go to <out>/<name>/<case>
         overwrite: do finished cases again, and replace what is in their place
-        seed: with the case's id, the only source of randomness
+        seed: the only source of randomness; of each case in predict, as in Python, and by phydict.case_seed in test
         voxels: voxels along each side of the cube, for methods without a prior
         side: side of the cube in mm, for methods without a prior
     """
@@ -99,7 +99,7 @@ class ReconstructionTask(lightning.LightningModule):
         self.metrics = CaseMetrics([name])
         self.progress = CaseProgress()
         self.cases: list[str] = []
-        self.profile = False
+        self.profile = self.said_no_text = False
 
     @property
     def reads_no_text(self) -> bool:
@@ -127,15 +127,14 @@ class ReconstructionTask(lightning.LightningModule):
         self._attempt(case, self._test)
 
     def _predict(self, case: dict) -> None:
-        self._finish(case, self._reconstruct(case))
+        self._finish(case, self._reconstruct(case, self.seed))
 
     def _test(self, case: dict) -> None:
-        case["beam"] = self.trainer.datamodule.beam
+        case["beam"], seed = self.trainer.datamodule.beam, case_seed(self.seed, case["id"])
         with stage("simulate"):
-            case["xrays"] = self.trainer.datamodule.simulate(case, self._seed(case), self.grid, self.window,
-                                                             self.device)
+            case["xrays"] = self.trainer.datamodule.simulate(case, seed, self.grid, self.window, self.device)
         case["mu_water"] = self.trainer.datamodule.simulator.effective_mu_water
-        result = self._reconstruct(case)
+        result = self._reconstruct(case, seed)
         if "affine" in case:  # back to its place in the CT it came from
             result = replace(result, grid=Grid(self.grid.shape, affine=case["affine"].numpy()))
         with stage("metrics"):
@@ -151,7 +150,8 @@ class ReconstructionTask(lightning.LightningModule):
         try:
             if "error" in case:
                 raise ValueError(case["error"]) from case["error"]
-            with noted(case["warnings"]), profiled() if self.profile else nullcontext() as profile:
+            case["report"] = self._report(case)
+            with noted(case["warnings"], case["id"]), profiled() if self.profile else nullcontext() as profile:
                 work(case)
             if profile:
                 print(f"{case['id']}: {self.method_name}", profile.table(), sep="\n")
@@ -180,18 +180,20 @@ class ReconstructionTask(lightning.LightningModule):
     def _start(self, cases: int) -> None:
         self.progress.begin(self.method_name, cases, self.reconstructor.steps())
 
-    def _seed(self, case: dict) -> int:
-        return case_seed(self.seed, case["id"])
-
-    def _reconstruct(self, case: dict) -> Reconstruction:
-        with_report = self.trainer.datamodule.with_report
-        if case["report"] and with_report and self.reads_no_text:
+    def _report(self, case: dict) -> str:
+        """The report of a case where it is used; says once that a prior without text uses none."""
+        if not case["report"] or not self.trainer.datamodule.with_report:
+            return ""
+        if self.reads_no_text and not self.said_no_text:
             warnings.warn("the prior was trained without text: reports are not used", stacklevel=2)
-        case["report"] = case["report"] if with_report and not self.reads_no_text else ""
+            self.said_no_text = True
+        return "" if self.reads_no_text else case["report"]
+
+    def _reconstruct(self, case: dict, seed: int) -> Reconstruction:
         with stage("fit to grid"):
             xrays, projector = fit_to_grid(self.reconstructor, self.grid, case["xrays"].to(self.device), case["beam"])
         ready = self.reconstructor.assuming(case["mu_water"]) if "mu_water" in case else self.reconstructor
-        return ready.reconstruct(xrays, projector, case["report"], case.get("display", False), self._seed(case),
+        return ready.reconstruct(xrays, projector, case["report"], case.get("display", False), seed,
                                  self.progress.advance)
 
     def _finish(self, case: dict, result: Reconstruction, scores: dict | None = None,
@@ -274,13 +276,30 @@ class InferenceCLI(LightningCLI):
     def predict(self, model: ReconstructionTask, datamodule: ReconstructionData) -> None:
         """Reconstruct X-rays, or draw their geometry."""
         if self.dry_run:
-            for name, folder in datamodule.xray_cases().items():
-                case = load_xrays(folder, datamodule.geometry) | {"id": name}
-                print(*dry_run(model.pages / f"{name}.png", case, model.grid), sep="\n")
+            self._draw(datamodule.xray_cases(), model, datamodule.geometry)
             return
         model.profile = self.profile
         with model.progress:
             self.trainer.predict(model, datamodule=datamodule, return_predictions=False)
+
+    @staticmethod
+    def _draw(folders: dict[str, Path], model: ReconstructionTask, geometry: str | None) -> None:
+        """The page of every case, id -> folder. Raises ValueError, naming them, where some cannot be drawn."""
+        bad = []
+        for name, folder in folders.items():
+            try:
+                with noted([], name):
+                    case = load_xrays(folder, geometry) | {"id": name}
+                    print(*dry_run(model.pages / f"{name}.png", case, model.grid), sep="\n")
+            except (ValueError, OSError) as error:
+                if len(folders) == 1:
+                    raise
+                bad.append(name)
+                print(f"error: {name}: {sentence(error)}", file=sys.stderr)
+        print(f"pages in {model.pages}")
+        if bad:
+            raise ValueError(f"{len(bad)} of {len(folders)} cases cannot be reconstructed ({', '.join(bad)}): see the "
+                             "messages above")
 
     def test(self, model: ReconstructionTask, datamodule: ReconstructionData) -> None:
         """Simulate the X-rays of CTs, reconstruct and score them."""
@@ -302,8 +321,5 @@ def main(args: list[str] | None = None) -> None:
             trainer_defaults={"inference_mode": False, "logger": False, "enable_progress_bar": False,
                               "enable_checkpointing": False, "enable_model_summary": False, "accelerator": "auto",
                               "devices": 1})
-        if cli.trainer.is_global_zero:
-            if cli.dry_run:
-                print(f"pages in {cli.model.pages}")
-                return
+        if cli.trainer.is_global_zero and not cli.dry_run:
             cli.model.summarise()

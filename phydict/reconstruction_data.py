@@ -37,7 +37,7 @@ class Listed(Dataset):
         name, source, make = self.makers[i]
         case = {"id": name, "index": i, "source": source, "warnings": []}
         try:
-            with noted(case["warnings"]):
+            with noted(case["warnings"], name):
                 return make() | case
         except (ValueError, OSError) as error:  # the task decides what becomes of it
             return case | {"error": error}
@@ -162,11 +162,6 @@ class ReconstructionData(lightning.LightningDataModule):
         cases = Listed([maker for maker in makers if maker[0] in left])
         self.trainer.strategy.barrier()  # every process has looked before any process finishes a case
         return DataLoader(cases, None)
-
-
-def case_seed(seed: int, case: str) -> int:
-    """The seed of one case, which depends neither on the other cases nor on the method."""
-    return zlib.crc32(f"{seed}/{case}".encode())
 
 
 def case_scores(volume: Tensor, misfit: float, case: dict, window: HUWindow) -> dict[str, float]:

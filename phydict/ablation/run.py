@@ -20,8 +20,8 @@ from phydict.methods import fit_to_grid, reconstructor
 from phydict.posterior import Sampler
 from phydict.precision import instruction_set
 from phydict.progress import CaseProgress
-from phydict.reconstruction_data import case_scores, case_seed
-from phydict.reconstructor import Reconstruction, Stopwatch
+from phydict.reconstruction_data import case_scores
+from phydict.reconstructor import Reconstruction, Stopwatch, case_seed
 
 RESULTS = "results.csv"
 
@@ -115,7 +115,7 @@ def run(specification: Specification, device: torch.device, progress: CaseProgre
                 groups.setdefault(trial.acquisition(), []).append((trial, name, make))
         for group in groups.values():
             first, _, make = group[0]
-            scene = _attempt(lambda: Scene(case, first, made.case(first, make), device))
+            scene = _attempt(lambda: Scene(case, first, made.case(case, first, make), device))
             for trial, name, _ in group:
                 progress.case(f"{case}: {trial.label}")
                 measured = scene if isinstance(scene, dict) else bench.measure(trial, scene, progress.advance)
@@ -132,13 +132,13 @@ class Made:
     def __init__(self):
         self._kept = {}
 
-    def case(self, trial: Trial, make: Callable[[], dict]) -> dict:
-        """The case of a trial, with the warnings that making it took."""
+    def case(self, case: str, trial: Trial, make: Callable[[], dict]) -> dict:
+        """A case as a trial needs it, with the warnings that making it took."""
         grid, window = trial.scene()
         like = str((grid.to_dict(), window, trial.data.simulation_voxels))
         if like not in self._kept:
             warned: list[str] = []
-            with noted(warned):
+            with noted(warned, case):
                 self._kept[like] = make() | {"warnings": warned}
         return self._kept[like]
 
@@ -151,7 +151,7 @@ class Scene:
         (self.grid, self.window), data = trial.scene(), trial.data
         self.beam, self.mu_water = data.beam, data.simulator.effective_mu_water
         self.warnings = list(made["warnings"])
-        with noted(self.warnings):
+        with noted(self.warnings, case):
             self.xrays = data.simulate(made, case_seed(trial.seed, case), self.grid, self.window, device)
 
     def report(self, trial: Trial) -> str:
@@ -175,7 +175,7 @@ class Bench:
                 warnings.simplefilter("ignore")  # what there is to say is said again by the run that counts
                 _attempt(lambda: self._reconstruct(trial, scene, Stopwatch(), WarmUp(on_step)))
         warned = list(scene.warnings)
-        with noted(warned):
+        with noted(warned, f"{scene.case}, {trial.label}"):
             measured = _attempt(lambda: self._measured(trial, scene, on_step))
         return measured | {"warning": "; ".join(warned) or None}
 

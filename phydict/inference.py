@@ -26,7 +26,8 @@ from torch import Tensor
 
 from phydict.ablation import main as ablate
 from phydict.case_results import CaseResults
-from phydict.command_line import check_writable, noted, one_sentence_errors, quiet, sentence
+from phydict.command_line import (
+    check_command, check_configured, check_writable, noted, one_sentence_errors, quiet, sentence)
 from phydict.datasets import load_xrays
 from phydict.dry_run import dry_run
 from phydict.evaluation import CaseMetrics, panel, rich_table
@@ -246,6 +247,10 @@ def versions() -> dict[str, str]:
         name: version(name) for name in ("phydict", "torch", "lightning", "monai", "torchmetrics", "numpy")}
 
 
+COMMANDS = {"predict": "X-rays -> volumes", "test": "CTs -> X-rays -> volumes and scores",
+            "ablate": "methods compared on the same X-rays"}
+
+
 class InferenceCLI(LightningCLI):
     """predict and test only; no logs, no checkpoints, gradients allowed inside the steps."""
 
@@ -314,6 +319,10 @@ def main(args: list[str] | None = None) -> None:
     if args[:1] == ["ablate"]:
         return ablate(args[1:])
     with one_sentence_errors(MisconfigurationException), quiet():
+        check_command(args, COMMANDS, InferenceCLI.subcommands(), "python infer.py predict -c "
+                      "configs/reconstruct/phydict_fast.yaml --data.xrays data/example/xrays")
+        check_configured(args, ("--model", "--model.method", "--model.method.class_path"),
+                         "configs/reconstruct/phydict_fast.yaml")
         cli = InferenceCLI(
             ReconstructionTask, ReconstructionData, args=args, seed_everything_default=0, save_config_callback=None,
             parser_kwargs={"exit_on_error": False, "description": (

@@ -23,10 +23,11 @@ from phydict.datasets import load_xrays
 from phydict.grid import Grid
 from phydict.methods import METHODS, reconstruct
 from phydict.prior import load_prior, save_prior
+from phydict.reconstructor import case_seed
 from phydict.units import HUWindow, hu_to_mu, mu_to_hu
 from phydict.xray import ConeBeam, Projector
 
 __version__ = "0.1.0"
 
-__all__ = ["METHODS", "ConeBeam", "Grid", "HUWindow", "Projector", "hu_to_mu", "load_prior", "load_xrays", "mu_to_hu",
-           "reconstruct", "save_prior"]
+__all__ = ["METHODS", "ConeBeam", "Grid", "HUWindow", "Projector", "case_seed", "hu_to_mu", "load_prior", "load_xrays",
+           "mu_to_hu", "reconstruct", "save_prior"]

@@ -96,7 +96,8 @@ class CaseResults:
                                  "seconds": sum(record["seconds"].values()), "network_calls": record["network_calls"],
                                  "projector_calls": record["projector_calls"],
                                  "precision": record.get("precision"),
-                                 "instruction_set": record.get("instruction_set")})
+                                 "instruction_set": record.get("instruction_set"),
+                                 "warning": "; ".join(record.get("warnings", [])) or None})
         if rows:
             write_csv(self.folder / TABLE, rows)
             with whole_file(self.folder / "results.md") as part:

@@ -10,7 +10,7 @@ import sys
 import tempfile
 import warnings
 from argparse import ArgumentError
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -20,6 +20,7 @@ NOISE = (".*does not have many workers", ".*LeafSpec.*is deprecated", ".*is smal
          "Total length of `DataLoader` across ranks is zero", "Checkpoint directory .* exists and is not empty",
          "It is recommended to use `self.log", "Using `DistributedSampler` with the dataloaders",
          ".*args parameter is intended to run from within Python", "predict returned None",
+         "You're resuming from a checkpoint that ended before the epoch ended",
          "You're using the WeightAveraging callback with a model that overrides the configure_model",
          r"Found \d+ module\(s\) in eval mode at the start of training")
 """Warnings that tell a user of the command lines nothing to act on."""
@@ -70,6 +71,22 @@ def with_configurations(args: list[str], kinds: tuple[str, ...]) -> list[str]:
             arg = f"{option}={place(value)}"
         out.append(arg)
     return out
+
+
+def check_command(args: Sequence[str], commands: Mapping[str, str], anywhere: Collection[str], example: str) -> None:
+    """Raises ValueError, in one sentence that names `commands`, name -> what it does, and an example, where no argument
+    is one of those that may stand `anywhere`, and none asks for help."""
+    if not any(arg in anywhere or arg in ("-h", "--help") or arg.startswith("--print_config") for arg in args):
+        told = ", ".join(f"{name} ({what})" for name, what in commands.items())
+        raise ValueError(f"the first word says what to do, but {repr(args[0]) if args else 'none'} was given: use one "
+                         f"of {told}; such as: {example}")
+
+
+def check_configured(args: Sequence[str], options: Collection[str], example: str) -> None:
+    """Raises ValueError where `args` hold none of the options that say what to run, and do not ask for help."""
+    options = ("-c", "--config", "-h", "--help", *options)
+    if not any(arg.partition("=")[0] in options or arg.startswith("-c") for arg in args):
+        raise ValueError(f"no configuration file was given: add -c <file>, such as -c {example}")
 
 
 def check_writable(path: Path, option: str, file: bool = False) -> None:
@@ -128,6 +145,22 @@ def quiet() -> Iterator[None]:
         finally:
             for logger, level in zip(loggers, levels):
                 logger.setLevel(level)
+
+
+@contextmanager
+def noted(found: list[str], name: str) -> Iterator[None]:
+    """Adds to `found`, each once, the sentences of the UserWarnings given inside, and shows them with the case's name."""
+    with warnings.catch_warnings():
+        show = warnings.showwarning
+
+        def keep(message: Warning | str, category: type[Warning], *where) -> None:
+            text = " ".join(str(message).split())
+            if category is UserWarning and text not in found:
+                found.append(text)
+            show(message if name in text else f"{name}: {text}", category, *where)
+
+        warnings.showwarning = keep
+        yield
 
 
 def _show(message: Warning | str, *_) -> None:

@@ -12,6 +12,7 @@ import resource
 import sys
 import warnings
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -26,7 +27,8 @@ from torch import Tensor
 from phydict.ablation import main as ablate
 from phydict.case_results import CaseResults
 from phydict.command_line import (
-    check_apart, check_writable, one_sentence_errors, quiet, sentence, with_configurations)
+    check_apart, check_command, check_configured, check_writable, noted, one_sentence_errors, quiet, sentence,
+    with_configurations)
 from phydict.datasets import load_xrays
 from phydict.dry_run import dry_run
 from phydict.evaluation import CaseMetrics, panel, rich_table
@@ -38,8 +40,8 @@ from phydict.prior import (
     DEFAULT_PRIOR, MedSynCheckpoint, file_read, fingerprint, load_prior, load_super_resolution)
 from phydict.profiling import profiled, stage
 from phydict.progress import CaseProgress
-from phydict.reconstruction_data import ReconstructionData, case_scores, case_seed
-from phydict.reconstructor import Reconstruction, Reconstructor, describe, save_nifti
+from phydict.reconstruction_data import ReconstructionData, case_scores
+from phydict.reconstructor import Reconstruction, Reconstructor, case_seed, describe, save_nifti
 from phydict.units import HUWindow
 
 class ReconstructionTask(lightning.LightningModule):
@@ -63,7 +65,7 @@ class ReconstructionTask(lightning.LightningModule):
         precision: of the networks: auto (bfloat16 where the device computes it), float32 or bfloat16
         out: output folder; cases go to <out>/<name>/<case>
         overwrite: do finished cases again; a new result takes the old one's place when it is complete
-        seed: with the case's id, the only source of randomness
+        seed: the only source of randomness; of each case in predict, as in Python, and by phydict.case_seed in test
         voxels: voxels along each side of the cube, for methods without a prior
         side: side of the cube in mm, for methods without a prior
     """
@@ -103,7 +105,7 @@ class ReconstructionTask(lightning.LightningModule):
         self.metrics = CaseMetrics([name])
         self.progress = CaseProgress()
         self.cases: list[str] = []
-        self.profile = False
+        self.profile = self.said_no_text = False
 
     @property
     def reads_no_text(self) -> bool:
@@ -130,15 +132,14 @@ class ReconstructionTask(lightning.LightningModule):
         self._attempt(case, self._test)
 
     def _predict(self, case: dict) -> None:
-        self._finish(case, self._reconstruct(case))
+        self._finish(case, self._reconstruct(case, self.seed))
 
     def _test(self, case: dict) -> None:
-        case["beam"] = self.trainer.datamodule.beam
+        case["beam"], seed = self.trainer.datamodule.beam, case_seed(self.seed, case["id"])
         with stage("simulate"):
-            case["xrays"] = self.trainer.datamodule.simulate(case, self._seed(case), self.grid, self.window,
-                                                             self.device)
+            case["xrays"] = self.trainer.datamodule.simulate(case, seed, self.grid, self.window, self.device)
         case["mu_water"] = self.trainer.datamodule.simulator.effective_mu_water
-        result = self._reconstruct(case)
+        result = self._reconstruct(case, seed)
         if "affine" in case:  # back to its place in the CT it came from
             result = replace(result, grid=Grid(self.grid.shape, affine=case["affine"].numpy()))
         with stage("metrics"):
@@ -154,12 +155,11 @@ class ReconstructionTask(lightning.LightningModule):
         try:
             if "error" in case:
                 raise ValueError(case["error"]) from case["error"]
-            if self.profile:
-                with profiled() as profile:
-                    work(case)
-                print(f"{case['id']}: {self.method_name}", profile.table(), sep="\n")
-            else:
+            case["report"] = self._report(case)
+            with noted(case["warnings"], case["id"]), profiled() if self.profile else nullcontext() as profile:
                 work(case)
+            if profile:
+                print(f"{case['id']}: {self.method_name}", profile.table(), sep="\n")
         except (ValueError, FloatingPointError) as error:
             if len(self.cases) == 1:
                 raise
@@ -186,18 +186,20 @@ class ReconstructionTask(lightning.LightningModule):
             self.reconstructor.check_memory(self.device)
         self.progress.begin(self.method_name, cases, self.reconstructor.steps())
 
-    def _seed(self, case: dict) -> int:
-        return case_seed(self.seed, case["id"])
-
-    def _reconstruct(self, case: dict) -> Reconstruction:
-        with_report = self.trainer.datamodule.with_report
-        if case["report"] and with_report and self.reads_no_text:
+    def _report(self, case: dict) -> str:
+        """The report of a case where it is used; says once that a prior without text uses none."""
+        if not case["report"] or not self.trainer.datamodule.with_report:
+            return ""
+        if self.reads_no_text and not self.said_no_text:
             warnings.warn("the prior was trained without text: reports are not used", stacklevel=2)
-        case["report"] = case["report"] if with_report and not self.reads_no_text else ""
+            self.said_no_text = True
+        return "" if self.reads_no_text else case["report"]
+
+    def _reconstruct(self, case: dict, seed: int) -> Reconstruction:
         with stage("fit to grid"):
             xrays, projector = fit_to_grid(self.reconstructor, self.grid, case["xrays"].to(self.device), case["beam"])
         ready = self.reconstructor.assuming(case["mu_water"]) if "mu_water" in case else self.reconstructor
-        return ready.reconstruct(xrays, projector, case["report"], case.get("display", False), self._seed(case),
+        return ready.reconstruct(xrays, projector, case["report"], case.get("display", False), seed,
                                  self.progress.advance)
 
     def _finish(self, case: dict, result: Reconstruction, scores: dict | None = None,
@@ -224,7 +226,7 @@ class ReconstructionTask(lightning.LightningModule):
                 "mu_water": case.get("mu_water", self.reconstructor.mu_water), "views": len(result.xrays),
                 "precision": result.precision, "instruction_set": instruction_set(self.device),
                 "grid": result.grid.to_dict(), "seed": result.seed,
-                "report": case["report"], "source": case["source"], "settings": self.settings, "versions": versions()}
+                "warnings": case["warnings"], "report": case["report"], "source": case["source"], "settings": self.settings, "versions": versions()}
 
     def summarise(self) -> None:
         """Prints and writes the scores of this run's cases. Raises ValueError, naming them, where some have failed."""
@@ -251,6 +253,10 @@ def versions() -> dict[str, str]:
     """Versions of Python and of the packages that a result depends on."""
     return {"python": platform.python_version()} | {
         name: version(name) for name in ("phydict", "torch", "lightning", "monai", "torchmetrics", "numpy")}
+
+
+COMMANDS = {"predict": "X-rays -> volumes", "test": "CTs -> X-rays -> volumes and scores",
+            "ablate": "methods compared on the same X-rays"}
 
 
 class InferenceCLI(LightningCLI):
@@ -284,13 +290,30 @@ class InferenceCLI(LightningCLI):
         """Reconstruct X-rays, or draw their geometry."""
         if self.dry_run:
             check_apart(model.pages, "model.out", datamodule.inputs("predict"))
-            for name, folder in datamodule.xray_cases().items():
-                case = load_xrays(folder, datamodule.geometry) | {"id": name}
-                print(*dry_run(model.pages / f"{name}.png", case, model.grid), sep="\n")
+            self._draw(datamodule.xray_cases(), model, datamodule.geometry)
             return
         model.profile = self.profile
         with model.progress:
             self.trainer.predict(model, datamodule=datamodule, return_predictions=False)
+
+    @staticmethod
+    def _draw(folders: dict[str, Path], model: ReconstructionTask, geometry: str | None) -> None:
+        """The page of every case, id -> folder. Raises ValueError, naming them, where some cannot be drawn."""
+        bad = []
+        for name, folder in folders.items():
+            try:
+                with noted([], name):
+                    case = load_xrays(folder, geometry) | {"id": name}
+                    print(*dry_run(model.pages / f"{name}.png", case, model.grid), sep="\n")
+            except (ValueError, OSError) as error:
+                if len(folders) == 1:
+                    raise
+                bad.append(name)
+                print(f"error: {name}: {sentence(error)}", file=sys.stderr)
+        print(f"pages in {model.pages}")
+        if bad:
+            raise ValueError(f"{len(bad)} of {len(folders)} cases cannot be reconstructed ({', '.join(bad)}): see the "
+                             "messages above")
 
     def test(self, model: ReconstructionTask, datamodule: ReconstructionData) -> None:
         """Simulate the X-rays of CTs, reconstruct and score them."""
@@ -305,6 +328,10 @@ def main(args: list[str] | None = None) -> None:
     if args[:1] == ["ablate"]:
         return ablate(args[1:])
     with one_sentence_errors(MisconfigurationException), quiet():
+        check_command(args, COMMANDS, InferenceCLI.subcommands(), "python infer.py predict -c "
+                      "configs/reconstruct/phydict_fast.yaml --data.xrays data/example/xrays")
+        check_configured(args, ("--model", "--model.method", "--model.method.class_path"),
+                         "configs/reconstruct/phydict_fast.yaml")
         args = with_configurations(args, ("reconstruct", "simulate"))
         cli = InferenceCLI(
             ReconstructionTask, ReconstructionData, args=args, seed_everything_default=0, save_config_callback=None,
@@ -313,8 +340,5 @@ def main(args: list[str] | None = None) -> None:
             trainer_defaults={"inference_mode": False, "logger": False, "enable_progress_bar": False,
                               "enable_checkpointing": False, "enable_model_summary": False, "accelerator": "auto",
                               "devices": 1})
-        if cli.trainer.is_global_zero:
-            if cli.dry_run:
-                print(f"pages in {cli.model.pages}")
-                return
+        if cli.trainer.is_global_zero and not cli.dry_run:
             cli.model.summarise()

@@ -16,7 +16,7 @@ from phydict.posterior import (
     Reward, Sampler, SplitGibbs)
 from phydict.precision import check_precision
 from phydict.prior import DEFAULT_PRIOR, Cascade, Prior, SuperResolution, load_prior, load_super_resolution
-from phydict.reconstructor import Reconstruction, Reconstructor, check_xrays
+from phydict.reconstructor import Reconstruction, Reconstructor, check_air, check_xrays
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector, binned, binning
 
@@ -100,9 +100,10 @@ def fit_to_grid(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam)
     """X-rays (K, V, U), binned unless the method wants the full detector, and the projector that goes with them on the
     X-rays' device.
 
-    Raises ValueError where X-rays, geometry and grid do not fit.
+    Raises ValueError where X-rays, geometry and grid do not fit, and warns where the X-rays look inverted.
     """
     check_xrays(xrays, beam)
+    check_air(xrays)
     beam.check(grid)
     beam.check_scale(grid)
     factor = 1 if ready.full_detector else binning(grid, beam)

@@ -91,9 +91,9 @@ def _warn_slow(device: torch.device) -> None:
     factor = SLOWER.get(torch.backends.cpu.get_cpu_capability()) if device.type == "cpu" else None
     slower = f"about {factor} times slower there than float32" if factor else "slower there than float32"
     warnings.warn(f"bfloat16 was asked for, but {instruction_set(device)} does not compute it: networks are {slower}; "
-                  "precision auto or float32 is faster", stacklevel=4)
+                  "precision auto or float32 is faster", RuntimeWarning, stacklevel=4)
 
 
 @cache
 def _tell_gpu(name: str) -> None:
-    warnings.warn(f"{name} does not compute bfloat16: networks run in float32", stacklevel=4)
+    warnings.warn(f"{name} does not compute bfloat16: networks run in float32", RuntimeWarning, stacklevel=4)

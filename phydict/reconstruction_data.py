@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from phydict.checksum import file_crc32
+from phydict.command_line import noted
 from phydict.datamodule import HELD_OUT_PHANTOM, PHANTOM_VERSION
 from phydict.datasets import CTFile, find_cts, find_xrays, load_case, load_xrays, phantom_case
 from phydict.evaluation import volume_metrics
@@ -25,7 +26,7 @@ from phydict.xray import ConeBeam, Ideal, Projector, Simulator
 
 
 class Listed(Dataset):
-    """Cases made on demand: (id, what identifies its data, function) triples."""
+    """Cases made on demand, of (id, what identifies its data, function) triples, with the warnings that it took."""
 
     def __init__(self, makers: list):
         self.makers = makers
@@ -35,9 +36,10 @@ class Listed(Dataset):
 
     def __getitem__(self, i: int) -> dict:
         name, source, make = self.makers[i]
-        case = {"id": name, "index": i, "source": source}
+        case = {"id": name, "index": i, "source": source, "warnings": []}
         try:
-            return make() | case
+            with noted(case["warnings"], name):
+                return make() | case
         except (ValueError, OSError) as error:  # the task decides what becomes of it
             return case | {"error": error}
 
@@ -168,11 +170,6 @@ class ReconstructionData(lightning.LightningDataModule):
         cases = Listed([maker for maker in makers if maker[0] in left])
         self.trainer.strategy.barrier()  # every process has looked before any process finishes a case
         return DataLoader(cases, None)
-
-
-def case_seed(seed: int, case: str) -> int:
-    """The seed of one case, which depends neither on the other cases nor on the method."""
-    return zlib.crc32(f"{seed}/{case}".encode())
 
 
 def case_scores(volume: Tensor, misfit: float, case: dict, window: HUWindow) -> dict[str, float]:

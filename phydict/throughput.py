@@ -44,8 +44,9 @@ class Throughput(lightning.Callback):
         precision, instructions = str(low).removeprefix("torch."), instruction_set(module.device)
         if self.peak is None:
             self.peak = matmul_peak(module.device, low) / 1e12
-        _tell(f"training in {precision} on {instructions}: a sample costs {self.flop / 1e9:.3g} GFLOP forward and backward; a "
-              f"{precision} matrix product reaches {self.peak:.3g} TFLOP/s on this device")
+        weights = sum(weight.numel() for weight in module.prior.parameters() if weight.requires_grad)
+        _tell(f"training {weights / 1e6:.3g} M weights in {precision} on {instructions}: a sample costs "
+              f"{self.flop / 1e9:.3g} GFLOP forward and backward; a {precision} matrix product reaches {self.peak:.3g} TFLOP/s on this device")
 
     def on_train_batch_start(self, trainer, module, batch, _) -> None:
         if not self.flop:

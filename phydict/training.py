@@ -17,7 +17,7 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from phydict.atomic import whole_file
-from phydict.command_line import check_writable, one_sentence_errors, quiet, with_configurations
+from phydict.command_line import check_command, check_writable, one_sentence_errors, quiet, with_configurations
 from phydict.datamodule import PriorData
 from phydict.precision import PRECISIONS, resolve_precision, trainer_precision
 from phydict.prior import save_prior, save_super_resolution
@@ -29,6 +29,7 @@ from phydict.stage_training import CHECKPOINT
 from phydict.super_resolution_data import SuperResolutionData
 from phydict.super_resolution_training import SuperResolutionTraining
 from phydict.throughput import Throughput
+from phydict.training_progress import TrainingProgress
 
 BEST, HELD_OUT = "best.ckpt", "held_out.txt"
 """Files of a training's folder: what reconstructed the held-out cases best, and the ids of the CTs that it never
@@ -87,6 +88,9 @@ def print_prior(path: str) -> None:
     for file, properties in inspect_prior(path).items():
         print(file, *(f"  {name}: {value}" for name, value in properties.items()), sep="\n")
 
+
+COMMANDS = {"fit": "train a prior", "validate": "measure one on held-out cases", "export": "checkpoint -> prior",
+            "inspect-prior": "what a file is"}
 
 STAGES = {"base": (PriorTraining, PriorData), "super_resolution": (SuperResolutionTraining, SuperResolutionData)}
 """What trains a stage, and on which data."""
@@ -150,6 +154,7 @@ class PriorCLI(LightningCLI):
         parser.set_defaults({"checkpoint.filename": "last", "checkpoint.enable_version_counter": False,
                              "checkpoint.every_n_epochs": 1, "checkpoint.save_on_train_epoch_end": True})
         parser.add_lightning_class_args(Throughput, "throughput")
+        parser.add_lightning_class_args(TrainingProgress, "progress")
         parser.link_arguments("out", "checkpoint.dirpath")
         parser.link_arguments("out", "trainer.default_root_dir")
         for name in ("voxels", "side", "window"):
@@ -219,9 +224,12 @@ def main(args: list[str] | None = None) -> None:
         elif given[:1] == ["inspect-prior"]:
             auto_cli(print_prior, args=given[1:], exit_on_error=False)
         else:
+            check_command(given, COMMANDS, PriorCLI.subcommands(), "python train.py fit -c configs/prior/phantom.yaml")
             given = with_configurations(given, ("prior",))
             PriorCLI(*STAGES[stage_of(given)], args=given, seed_everything_default=0,
-                     save_config_kwargs={"overwrite": True}, parser_kwargs={"exit_on_error": False, "description": (
+                     save_config_kwargs={"overwrite": True},
+                     trainer_defaults={"enable_progress_bar": False, "enable_model_summary": False},
+                     parser_kwargs={"exit_on_error": False, "description": (
                          "Train a prior of chest CT. Two more commands: `export --checkpoint <last.ckpt> --out "
                          "<prior.safetensors>` writes what a training learnt as a prior for reconstruction, and "
                          "`inspect-prior <path>` tells what a file or folder is.")})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
@@ -13,14 +14,14 @@ import torch
 
 from phydict.ablation.spec import Specification, Trial, key, prior_of
 from phydict.ablation.timing import PeakMemory, TimedPrior, TimedProjector, WarmUp
-from phydict.command_line import sentence
+from phydict.command_line import noted, sentence
 from phydict.evaluation import read_csv, write_csv
 from phydict.methods import fit_to_grid, reconstructor
 from phydict.posterior import Sampler
 from phydict.precision import instruction_set
 from phydict.progress import CaseProgress
-from phydict.reconstruction_data import case_scores, case_seed
-from phydict.reconstructor import Reconstruction, Stopwatch
+from phydict.reconstruction_data import case_scores
+from phydict.reconstructor import Reconstruction, Stopwatch, case_seed
 
 RESULTS, TABLES = "results.csv", ("tables.md", "tables.tex")
 """The results of a folder, and the tables that are made of them."""
@@ -28,8 +29,8 @@ RESULTS, TABLES = "results.csv", ("tables.md", "tables.tex")
 FINISHED = ("ok", "refused", "diverged")
 """What a row's status may be that is not tried again; "failed" is, since its reason may lie outside."""
 
-MEASURED = ("status", "error", "ssim", "psnr", "mae_hu", "ssim_lung", "psnr_lung", "mae_hu_lung", "misfit", "seconds",
-            "seconds_prepare", "seconds_sample", "seconds_score", "seconds_network", "seconds_projector",
+MEASURED = ("status", "error", "warning", "ssim", "psnr", "mae_hu", "ssim_lung", "psnr_lung", "mae_hu_lung", "misfit",
+            "seconds", "seconds_prepare", "seconds_sample", "seconds_score", "seconds_network", "seconds_projector",
             "network_calls", "projector_calls", "peak_memory_mb", "device", "threads",
             "precision", "instruction_set")
 """Columns that a run fills; the others are the trial's."""
@@ -120,7 +121,7 @@ def run(specification: Specification, device: torch.device, progress: CaseProgre
                 groups.setdefault(trial.acquisition(), []).append((trial, name, make))
         for group in groups.values():
             first, _, make = group[0]
-            scene = _attempt(lambda: Scene(case, first, made.case(first, make), device))
+            scene = _attempt(lambda: Scene(case, first, made.case(case, first, make), device))
             for trial, name, _ in group:
                 progress.case(f"{case}: {trial.label}")
                 measured = scene if isinstance(scene, dict) else bench.measure(trial, scene, progress.advance)
@@ -137,12 +138,14 @@ class Made:
     def __init__(self):
         self._kept = {}
 
-    def case(self, trial: Trial, make: Callable[[], dict]) -> dict:
-        """The case of a trial."""
+    def case(self, case: str, trial: Trial, make: Callable[[], dict]) -> dict:
+        """A case as a trial needs it, with the warnings that making it took."""
         grid, window = trial.scene()
         like = str((grid.to_dict(), window, trial.data.simulation_voxels))
         if like not in self._kept:
-            self._kept[like] = make()
+            warned: list[str] = []
+            with noted(warned, case):
+                self._kept[like] = make() | {"warnings": warned}
         return self._kept[like]
 
 
@@ -153,7 +156,9 @@ class Scene:
         self.case, self.truth = case, made
         (self.grid, self.window), data = trial.scene(), trial.data
         self.beam, self.mu_water = data.beam, data.simulator.effective_mu_water
-        self.xrays = data.simulate(made, case_seed(trial.seed, case), self.grid, self.window, device)
+        self.warnings = list(made["warnings"])
+        with noted(self.warnings, case):
+            self.xrays = data.simulate(made, case_seed(trial.seed, case), self.grid, self.window, device)
 
     def report(self, trial: Trial) -> str:
         """The report, where the trial uses it and its prior reads text."""
@@ -172,8 +177,13 @@ class Bench:
         """The measured columns of one trial on one case."""
         if (state := str(trial.identity() | {"seed": None})) not in self.warm:
             self.warm.add(state)
-            _attempt(lambda: self._reconstruct(trial, scene, Stopwatch(), WarmUp(on_step)))
-        return _attempt(lambda: self._measured(trial, scene, on_step))
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # what there is to say is said again by the run that counts
+                _attempt(lambda: self._reconstruct(trial, scene, Stopwatch(), WarmUp(on_step)))
+        warned = list(scene.warnings)
+        with noted(warned, f"{scene.case}, {trial.label}"):
+            measured = _attempt(lambda: self._measured(trial, scene, on_step))
+        return measured | {"warning": "; ".join(warned) or None}
 
     def _measured(self, trial: Trial, scene: Scene, on_step: Callable[[], None]) -> dict:
         watch, memory = Stopwatch(), PeakMemory(self.device)

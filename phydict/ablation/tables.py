@@ -129,7 +129,7 @@ def deltas(found: Sequence[Entry]) -> list[tuple[str, list[Entry]]]:
 
 def all_tables(found: Sequence[Entry], rows: Sequence[dict]) -> list[Table]:
     """Every table that the entries of some rows allow."""
-    note, tables = [caption(rows)], []
+    note, tables = [caption(rows), *doubts(rows)], []
     for condition, group in conditions(found):
         where = ", ".join(told(condition)) or ", ".join(told({k: rows[0][k] for k in ("views", "simulator")}))
         best = best_settings(group)
@@ -172,6 +172,16 @@ def caption(rows: Sequence[dict]) -> str:
 def reasons(found: Sequence[Entry]) -> list[str]:
     """Why entries lack cases, each reason once."""
     return list(dict.fromkeys(f"{entry.method}: {entry.error}" for entry in found if entry.error))
+
+
+def doubts(rows: Sequence[dict]) -> list[str]:
+    """Which cases have warnings, and with which methods."""
+    warned: dict[str, dict] = {}
+    for row in rows:
+        if row.get("warning"):
+            warned.setdefault(row["case"], {})[row["method"]] = None
+    told = "; ".join(f"{case} ({', '.join(methods)})" for case, methods in warned.items())
+    return [f"Doubtful, by what the column warning of results.csv says: {told}."] if warned else []
 
 
 def headed(measure: Measure) -> str:

@@ -257,9 +257,11 @@ def prepare_source(source: Source, out: Path, settings: Settings) -> dict:
             grid, images, facts = _place(*source.load(), segmentations_beside(source.beside), settings)
             fingerprint = source.fingerprint()
         except (ValueError, OSError) as error:
-            return row | {"status": "rejected", "reason": " ".join(str(error).split())}
-    row |= facts | {"status": "prepared", "window_low": settings.window[0], "window_high": settings.window[1],
-                    "remark": "; ".join(str(w.message) for w in remarks if w.category is UserWarning)}
+            facts = {"status": "rejected", "reason": " ".join(str(error).split())}
+        row["remark"] = "; ".join(str(w.message) for w in remarks if w.category is UserWarning)
+    if "reason" in facts:
+        return row | facts
+    row |= facts | {"status": "prepared", "window_low": settings.window[0], "window_high": settings.window[1]}
     record = {"id": source.id, "space": settings.space, "extent": settings.extent, "window": settings.window,
               "report": "" if source.is_dicom else source.ct.report, "settings": asdict(settings),
               "fingerprint": fingerprint, "row": row}

@@ -12,6 +12,7 @@ back to the patient's world, case.json's atlas_affine to atlas millimetres, cent
 from __future__ import annotations
 
 import json
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -87,9 +88,12 @@ def read_prepared(path: Path, grid: Grid, window: HUWindow) -> dict:
 
     Where the grid's box is the case's own and divides its voxels, nothing is resampled: the voxels are taken as they
     are, or averaged in blocks. A smaller box or another coarser spacing is cut from a cube in the patient's space.
+    Warns of what was remarkable when it was prepared.
     Raises ValueError for a grid that is larger or finer than the prepared case, or of another space.
     """
     record = read_record(path)
+    if remark := record.get("row", {}).get("remark"):
+        warnings.warn(f"{record['id']} was prepared with the remark: {remark}", stacklevel=2)
     hu, affine = load_ct(path)
     found = [path.parent / f"{name}.nii.gz" for name in MASKS]
     known = np.array([file.is_file() for file in found])

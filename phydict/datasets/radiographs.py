@@ -25,6 +25,8 @@ from phydict.shipped import own_or_shipped
 from phydict.xray.geometry import ConeBeam
 
 REPORT = "report.txt"
+SATURATED = 0.99
+"""The share of an image's pixels that may not be all as dense as its densest."""
 
 
 def find_xrays(path: str | Path) -> list[Path]:
@@ -85,6 +87,11 @@ def load_xrays(folder: str | Path, geometry: str | Path | None = None, intensity
         xrays = intensity.line_integrals(np.stack(views.images).astype(np.float64), views.full_scale, flat_and_dark)
     except ValueError as error:
         raise ValueError(f"{folder}: {error}") from error
+    saturated = (xrays == xrays.max((1, 2), keepdims=True)).mean((1, 2)) >= SATURATED
+    if saturated.any():
+        raise ValueError(f"{views.names[saturated.argmax()]} shows nothing: {SATURATED:.0%} of its pixels or more hold "
+                         "its densest value, as in a missing or saturated image; export it again, or leave the view "
+                         "out of the images and of the geometry")
     return {"id": folder.absolute().name, "beam": beam, "report": _read_report(folder / REPORT),
             "xrays": torch.from_numpy(described.orientation.apply(xrays).astype(np.float32)),
             "display": intensity.kind == "display"}

@@ -232,8 +232,9 @@ def prepare_ct(ct: str | Path | tuple[np.ndarray, np.ndarray], grid: Grid = Grid
         centre = lung_box_centre(masks[0], work.affine)
     else:
         centre = affine[:3, :3] @ ((np.asarray(hu.shape) - 1) / 2) + affine[:3, 3]
-        warnings.warn(f"no lungs were found in {name}; its volume is centred on the scan and its masks are unknown",
-                      stacklevel=2)
+        size = " x ".join(f"{length:.0f}" for length in np.linalg.norm(affine[:3, :3], axis=0) * hu.shape)
+        warnings.warn(f"no lungs were found in {name}, a scan of {size} mm; its volume is centred on the scan and its "
+                      "masks are unknown", stacklevel=2)
     target = centred(grid, centre)
     volume = window.to_range(to_grid(hu, affine, target, AIR))
     masks = np.stack([to_grid(m, work.affine, target, 0.0) for m in masks]).clip(0, 1)

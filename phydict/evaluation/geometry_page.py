@@ -44,10 +44,13 @@ def view_sides(beam: ConeBeam, grid: Grid) -> list[str]:
 
 
 def agreement(xray: np.ndarray, thorax: np.ndarray) -> str:
-    """How well a view (V, U) correlates with the standard thorax's, and the flip that clearly agrees better, if any."""
+    """How well a view (V, U) correlates with the standard thorax's, and what clearly agrees better, if anything: a flip,
+    or the image inverted."""
     found = {name: _correlation(xray[::rows, ::columns], thorax) for name, (rows, columns) in FLIPS.items()}
     best = max(found, key=found.get)
     said = f"agreement {found['as it is']:.2f}"
+    if max(0, found[best]) < -found["as it is"]:
+        return f"{said}, better ({-found['as it is']:.2f}) inverted"
     if found[best] <= found["as it is"] + CLEAR:
         return said
     return f"{said}, better ({found[best]:.2f}) with {best} changed"

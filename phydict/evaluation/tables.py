@@ -1,6 +1,7 @@
 """Result tables: a tidy CSV with one row per case and method, and its summary as Markdown or for the console.
 
-A row is a dict {"case": id, "method": name, metric: value, ...}; `metrics.MEASURES` says how metrics are printed.
+A row is a dict {"case": id, "method": name, metric: value, ...}; `metrics.MEASURES` says how metrics are printed. Its
+"warning", if any, says why its numbers are to be doubted.
 """
 
 from __future__ import annotations
@@ -124,13 +125,14 @@ def summarise(rows: Iterable[Mapping], by: str = "method",
 
 def markdown(rows: Iterable[Mapping], by: str = "method", metrics: Sequence[str] | None = None,
              window: HUWindow = RANGE, grid: Grid | None = None, views: int | None = None) -> str:
-    """Markdown table of mean ± standard deviation over cases, a line per group, the best of each metric in bold.
+    """Markdown table of mean ± standard deviation over cases, a line per group, the best of each metric in bold; where
+    rows have warnings, a last column counts their cases.
 
     by, metrics: as in `summarise`. window: the HU range of `volume_metrics`. grid, views: what was scored, for the
     caption line; None takes a `grid` or `views` column of the rows, and says "not stated" where there is none.
     """
     rows = list(rows)
-    header, lines = _cells(summarise(rows, by, metrics), by)
+    header, lines = _cells(rows, by, metrics)
     text = [[f"**{cell}**" if best else cell.replace("|", "\\|") for cell, best in line] for line in lines]
     rule = ["---"] + ["---:"] * (len(header) - 1)
     table = "\n".join("| " + " | ".join(line) + " |" for line in [header, rule, *text])
@@ -141,7 +143,7 @@ def rich_table(rows: Iterable[Mapping], by: str = "method", metrics: Sequence[st
                window: HUWindow = RANGE, grid: Grid | None = None, views: int | None = None) -> Table:
     """The table of `markdown` as a rich Table for the console; same arguments."""
     rows = list(rows)
-    header, lines = _cells(summarise(rows, by, metrics), by)
+    header, lines = _cells(rows, by, metrics)
     table = Table(caption=caption(rows, by, window, grid, views))
     for name in header:
         table.add_column(name, justify="left" if name == by else "right")
@@ -152,18 +154,21 @@ def rich_table(rows: Iterable[Mapping], by: str = "method", metrics: Sequence[st
 
 def caption(rows: Sequence[Mapping], by: str = "method", window: HUWindow = RANGE,
             grid: Grid | None = None, views: int | None = None) -> str:
-    """One line that says what the numbers of a table were taken from: cases, HU range, SSIM window, grid, views."""
+    """One line that says what the numbers of a table were taken from: cases, HU range, SSIM window, grid, views, and
+    which cases have warnings."""
     counts = {}
     for n, row in enumerate(rows):
         counts.setdefault(row[by], set()).add(row.get("case", f"row {n}"))
     cases = sorted({len(ids) for ids in counts.values()})
     over = f"n = {cases[0]} cases" if len(cases) == 1 else f"n = {cases[0]} to {cases[-1]} cases"
     unequal = " (not the same cases in every line)" if len({frozenset(ids) for ids in counts.values()}) > 1 else ""
+    warned = dict.fromkeys(str(row.get("case", "a row")) for row in rows if row.get("warning"))
+    doubtful = f" Doubtful, by what the rows' warning says: {', '.join(warned)}." if warned else ""
     voxels = None if grid is None else f"{_product(grid.shape)} voxels of {_product(grid.spacing)} mm"
     return (f"Mean ± standard deviation over {over}{unequal}; best in bold. "
             f"HU clipped to [{window.low:g}, {window.high:g}], data range {2 * window.half_width:g} HU; "
             f"SSIM 3-D on HU from the range's low end, Gaussian of {TAPS} taps, sigma {SIGMA:g} voxels. "
-            f"Grid: {voxels or _listed(rows, 'grid')}. Views: {views or _listed(rows, 'views')}.")
+            f"Grid: {voxels or _listed(rows, 'grid')}. Views: {views or _listed(rows, 'views')}.{doubtful}")
 
 
 def _product(numbers: Sequence[float]) -> str:
@@ -175,8 +180,10 @@ def _listed(rows: Sequence[Mapping], column: str) -> str:
     return ", ".join(found) or "not stated"
 
 
-def _cells(summaries: Mapping[str, Mapping[str, Summary]], by: str) -> tuple[list[str], list[list[tuple[str, bool]]]]:
+def _cells(rows: Sequence[Mapping], by: str,
+           metrics: Sequence[str] | None) -> tuple[list[str], list[list[tuple[str, bool]]]]:
     """Header, and per group its cells as (text, whether it is the best); means equal as printed share the place."""
+    summaries = summarise(rows, by, metrics)
     names = list(dict.fromkeys(name for group in summaries.values() for name in group))
     header, lines = [by], [[(group, False)] for group in summaries]
     for name in names:
@@ -191,6 +198,11 @@ def _cells(summaries: Mapping[str, Mapping[str, Summary]], by: str) -> tuple[lis
             best = max(ranked) if measure.higher_is_better else min(ranked)
         for line, group, value in zip(lines, summaries.values(), printed):
             line.append((_value(group.get(name), measure.decimals), value == best))
+    if any(row.get("warning") for row in rows):
+        header.append("warned")
+        for line, group in zip(lines, summaries):
+            line.append((str(len({row.get("case") for row in rows if str(row[by]) == group and row.get("warning")})),
+                         False))
     return header, lines
 
 

@@ -14,7 +14,9 @@ from phydict.grid import Grid
 
 VECTOR_KEYS = ("sources", "detectors", "u", "v", "shape")
 ORBIT_KEYS = ("views", "source_to_detector", "source_to_isocentre", "shape", "pixel")
-ORBIT_OPTIONS = ("start_degrees", "arc_degrees")
+ORBIT_OPTIONS = ("start_degrees", "arc_degrees", "start", "arc")
+MOST_RADIANS = 4 * math.pi
+"""An angle in radians beyond two turns was meant in degrees."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,12 +65,15 @@ class ConeBeam:
 
     @classmethod
     def orbit(cls, views: int, source_to_detector: float, source_to_isocentre: float, shape: tuple[int, int],
-              pixel: float | tuple[float, float], start: float = 0.0, arc: float = 2 * math.pi) -> ConeBeam:
-        """Upright detectors on a circle about the superior axis: view k stands at start + arc k / views (radians).
+              pixel: float | tuple[float, float], start: float | None = None, arc: float | None = None,
+              start_degrees: float | None = None, arc_degrees: float | None = None) -> ConeBeam:
+        """Upright detectors on a circle about the superior axis: view k stands at start + arc k / views.
 
+        start (0) and arc (a full turn) are in radians, start_degrees and arc_degrees the same in degrees.
         Angle 0 is the PA view (source posterior, patient's right at the image's left, row 0 superior); at 90 degrees
         the source is at the patient's left. Distances and pixel = (row height, column width) in mm.
-        Raises ValueError unless views >= 1 and 0 < source_to_isocentre < source_to_detector and pixel > 0.
+        Raises ValueError unless views >= 1 and 0 < source_to_isocentre < source_to_detector and pixel > 0, and for an
+        angle given twice or in radians beyond two turns.
         """
         if isinstance(views, str) or views != int(views) or views < 1:
             raise ValueError(f"an orbit needs at least one view, a whole number, but views={views!r} was given")
@@ -79,7 +84,8 @@ class ConeBeam:
         height, width = np.broadcast_to(np.asarray(pixel, float), 2)
         if not (height > 0 and width > 0):
             raise ValueError(f"pixel must be (row height, column width) > 0 in mm, but {pixel} was given")
-        angle = start + arc * np.arange(int(views)) / int(views)
+        first, turn = _radians("start", start, start_degrees, 0.0), _radians("arc", arc, arc_degrees, 2 * math.pi)
+        angle = first + turn * np.arange(int(views)) / int(views)
         cos, sin = np.round(np.cos(angle), 15), np.round(np.sin(angle), 15)  # exact zeros at right angles
         zero = np.zeros_like(angle)
         towards = np.stack([sin, cos, zero], 1)
@@ -130,13 +136,17 @@ class ConeBeam:
             near, far = depth[:, k].min(), depth[:, k].max()
             if near > 0 and far < distance:
                 continue
-            reach = f"reaches {centre[k] - near:.1f} mm"
+            reach = (depth.max(0) - centre).max()  # of the view along which the box is longest
+            least, most = math.ceil(reach + 0.5), math.floor(distance - reach - 0.5)
+            room = f"a source_to_isocentre of {least} to {most} mm would do with" if least <= most else (
+                f"no source_to_isocentre would do, since {2 * least} mm are needed, with")
             culprit = "source" if near <= 0 else "detector"
             raise ValueError(
                 f"view {k}: the {culprit} lies inside the volume or the volume extends behind it: "
                 f"source to volume centre is {centre[k]:.1f} mm and volume centre to detector is "
-                f"{distance - centre[k]:.1f} mm along the view, but the volume {reach} from its centre; "
-                "move the source or the detector, or give a smaller volume")
+                f"{distance - centre[k]:.1f} mm along the view, but the volume reaches {centre[k] - near:.1f} mm from its "
+                f"centre; {room} this source_to_detector of {distance:g} mm; move the source or the detector, or give a "
+                "smaller volume")
 
     def is_upright(self, grid: Grid) -> bool:
         """Whether every detector's columns of pixels run along the grid's third axis."""
@@ -197,7 +207,7 @@ class ConeBeam:
         or under `beam:` as in geometry.yaml.
 
         orbit: {views, source_to_detector, source_to_isocentre, shape: [rows, columns], pixel: [row mm, column mm]}
-        and optionally start_degrees (0) and arc_degrees (360).
+        and optionally start_degrees (0) and arc_degrees (360), or start and arc in radians.
         Raises FileNotFoundError, and ValueError naming the file for unknown or missing keys and impossible geometry.
         """
         path = Path(path)
@@ -227,11 +237,19 @@ class ConeBeam:
             _check_keys(orbit, ORBIT_KEYS, ORBIT_OPTIONS)
             for key, value in orbit.items():
                 _check_numbers(key, value)
-            return cls.orbit(**{key: orbit[key] for key in ORBIT_KEYS},
-                             start=math.radians(orbit.get("start_degrees", 0.0)),
-                             arc=math.radians(orbit.get("arc_degrees", 360.0)))
+            return cls.orbit(**orbit)
         except TypeError as error:
             raise ValueError(f"a beam's values are numbers and lists of numbers ({error})") from error
+
+
+def _radians(name: str, radians: float | None, degrees: float | None, otherwise: float) -> float:
+    """An angle of an orbit that was given in radians, in degrees or not at all."""
+    if radians is not None and degrees is not None:
+        raise ValueError(f"{name}={radians} (radians) and {name}_degrees={degrees} were both given; leave one out")
+    if radians is not None and abs(radians) > MOST_RADIANS:
+        raise ValueError(f"{name} is in radians, but {radians} was given, more than two turns; give {name}_degrees for "
+                         "degrees")
+    return math.radians(degrees) if degrees is not None else otherwise if radians is None else radians
 
 
 def _check_numbers(key: str, value) -> None:

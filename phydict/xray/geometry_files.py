@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from phydict.xray.geometry import ConeBeam
-from phydict.xray.rtk import read_rtk, write_rtk
+from phydict.xray.rtk import check_beam, read_rtk, write_rtk
 
 VECTORS = ("source", "detector", "u", "v")
 COLUMNS = tuple(f"{vector}_{axis}" for vector in VECTORS for axis in "xyz")
@@ -57,8 +57,9 @@ def read_beam(path: str | Path, shape: tuple[int, int] | None = None,
 def write_beam(path: str | Path, beam: ConeBeam) -> None:
     """Write a beam as the kind of file that its ending names; `read_beam` reads it back.
 
-    Raises ValueError for other endings, and where RTK's XML cannot hold the beam.
+    Raises ValueError for other endings, where RTK's XML cannot hold the beam, and for what is no beam.
     """
+    check_beam("write_beam", path, beam)
     ending = _ending(Path(path))
     vectors = np.concatenate([beam.sources, beam.detectors, beam.u, beam.v], axis=1)
     if ending in (".yaml", ".yml"):

@@ -69,8 +69,10 @@ def read_rtk(path: str | Path, shape: tuple[int, int], pixel: float | tuple[floa
 def write_rtk(path: str | Path, beam: ConeBeam) -> None:
     """Write a beam as RTK's XML, version 3; `read_rtk` with its shape and pixel size gives the same beam.
 
-    Raises ValueError where u x v points away from the source: such images are mirrored, which RTK cannot say.
+    Raises ValueError where u x v points away from the source: such images are mirrored, which RTK cannot say; and for
+    what is no beam.
     """
+    check_beam("write_rtk", path, beam)
     root = ElementTree.Element(ROOT, version="3")
     for k in range(beam.views):
         values, matrix = _parameters(beam, k)
@@ -82,6 +84,13 @@ def write_rtk(path: str | Path, beam: ConeBeam) -> None:
     ElementTree.indent(root)
     text = ElementTree.tostring(root, encoding="unicode")
     Path(path).write_text(f'<?xml version="1.0"?>\n<!DOCTYPE RTKGEOMETRY>\n{text}\n')
+
+
+def check_beam(function: str, path, beam) -> None:
+    """Raises ValueError unless a function that writes a beam was given a path and a beam, in that order."""
+    if not isinstance(beam, ConeBeam):
+        order = f"the beam first; call {function}(path, beam)" if isinstance(path, ConeBeam) else f"{beam!r} as the beam"
+        raise ValueError(f"{function} takes a path and then a ConeBeam, but was given {order}")
 
 
 def _numbers(path, elements) -> dict[str, float]:

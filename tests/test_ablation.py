@@ -8,6 +8,8 @@ import random
 from dataclasses import dataclass
 from pathlib import Path
 
+import nibabel
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -312,6 +314,21 @@ def test_parts_of_the_time_are_parts_of_it_and_calls_are_counted(tmp_path):
         assert 0 < row["seconds_network"] + row["seconds_projector"] <= row["seconds"]
         assert row["seconds"] == pytest.approx(sum(row[f"seconds_{stage}"] for stage in ("prepare", "sample", "score")))
         assert row["prior"].endswith("tiny.safetensors") and row["grid"] == "16x16x16"
+
+
+def test_a_doubtful_ct_marks_its_rows_and_the_tables(tmp_path, trace):
+    image = nibabel.Nifti1Image(np.zeros((12, 12, 12), np.float32) + 24, np.diag([30.0, 30.0, 30.0, 1.0]))
+    image.set_sform(image.affine, code=1)
+    (tmp_path / "cts").mkdir()
+    nibabel.save(image, tmp_path / "cts" / "shifted.nii.gz")
+    file = write(tmp_path, cts=str(tmp_path / "cts"), base=TINY, axes={"method": ["trace"], "views": [2, 3]})
+    content = {k: v for k, v in yaml.safe_load(file.read_text()).items() if k != "phantoms"}
+    file.write_text(yaml.safe_dump(content))
+    main(["ablate", "-c", str(file), "--device", "cpu"])
+    rows = read_csv(tmp_path / "out" / "results.csv")
+    assert len(rows) == 2 and all("shifted does not look like HU" in row["warning"] for row in rows)
+    assert "Doubtful, by what the column warning of results.csv says: shifted (trace)" in (
+        tmp_path / "out" / "tables.md").read_text()
 
 
 def test_a_timed_projector_is_the_projector():

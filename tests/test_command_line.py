@@ -2,10 +2,11 @@
 
 import errno
 import os
+import warnings
 
 import pytest
 
-from phydict.command_line import one_sentence_errors, with_configurations
+from phydict.command_line import noted, one_sentence_errors, quiet, with_configurations
 from phydict.inference import main as infer
 from phydict.shipped import shipped
 from phydict.training import main as train
@@ -60,3 +61,16 @@ def test_a_configuration_of_another_command_is_none_of_its_names(empty, capsys):
     with pytest.raises(SystemExit) as stopped:
         train(["fit", "-c", "phydict_fast"])
     assert stopped.value.code == 2 and "no configuration phydict_fast" in capsys.readouterr().err
+
+
+def test_a_cases_warnings_are_noted_and_shown_with_its_name_however_often_others_gave_them(capsys):
+    found = {"anna": [], "bert": []}
+    with quiet():
+        for name, own in found.items():
+            with noted(own, name):
+                for _ in range(2):
+                    warnings.warn("too dark", stacklevel=1)
+                    warnings.warn("not about the case", RuntimeWarning, stacklevel=1)
+    assert found == {"anna": ["too dark"], "bert": ["too dark"]}
+    said = capsys.readouterr().err.splitlines()
+    assert [line for line in said if "dark" in line] == ["warning: anna: too dark", "warning: bert: too dark"]

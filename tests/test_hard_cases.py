@@ -142,10 +142,29 @@ def test_a_missing_view_is_refused_and_an_honest_geometry_without_it_is_not(prio
 
 
 @pytest.mark.parametrize("blank", [0.0, 5.0])
-def test_a_blank_view_among_others_is_refused_by_its_number_and_views_that_are_all_alike_are_not(prior, blank):
+def test_a_blank_view_among_others_is_refused_by_its_number(prior, blank):
     with pytest.raises(ValueError, match="view 3 .*same value"):
         run("sirt", prior, changed(lambda v: torch.full_like(v, blank)))
-    assert_finite(run("sirt", prior, torch.full_like(CLEAN, blank)))
+
+
+def test_blank_views_are_refused_unless_nothing_was_in_the_beam(prior):
+    for blank in (torch.full_like(CLEAN, 5.0), CLEAN.amax((1, 2), True).expand_as(CLEAN)):
+        with pytest.raises(ValueError, match="every view .*same value.* saturated"):
+            run("sirt", prior, blank)
+    assert_finite(run("sirt", prior, torch.zeros_like(CLEAN)))
+
+
+@pytest.mark.parametrize("name", ["fast", "sirt"])
+def test_inverted_images_are_warned_of_and_others_are_not_however_narrow(prior, name):
+    method, own = SAMPLERS.get(name) or BASELINES[name], prior if name in SAMPLERS else None
+    for display in (False, True):
+        with pytest.warns(UserWarning, match="as inverted images are"):
+            reconstruct(CLEAN.max() - CLEAN, BEAM, own, method, grid=GRID, display=display)
+    for columns in (24, 16, 10, 6):
+        first = (24 - columns) // 2
+        with warnings.catch_warnings():
+            warnings.filterwarnings("error", "the X-rays are densest")
+            reconstruct(CLEAN[..., first:first + columns], orbit(8, shape=(24, columns)), own, method, grid=GRID)
 
 
 @pytest.mark.parametrize("name", ["fast", "sirt", "cgls", "tv"])
@@ -279,7 +298,7 @@ def test_an_estimate_that_is_not_finite_stops_the_run_and_the_step_is_told(sampl
 
 def test_a_baseline_that_overflows_stops_and_the_step_is_told():
     with pytest.raises(FloatingPointError, match="from step 1 of 5 on"):
-        reconstruct(torch.full_like(CLEAN, 1e38), BEAM, method=CGLS(5), grid=GRID)
+        reconstruct(1e37 * CLEAN, BEAM, method=CGLS(5), grid=GRID)
 
 
 def test_descent_that_is_too_fast_is_told_with_the_step_from_which_the_misfit_rose():

@@ -34,9 +34,9 @@ FLOORS = {
     "posterior": 3, "baselines": 3, "evaluation": 3,
     "methods": 4, "dry_run": 4, "datamodule": 4, "case_results": 4, "reconstruction_data": 4, "training": 4,
     "prior_training": 4, "stage_training": 4, "super_resolution_data": 4, "super_resolution_training": 4,
-    "throughput": 4, "inference": 4, "ablation": 4}
-LIGHTNING = ("datamodule", "super_resolution_data", "reconstruction_data", "throughput", "stage_training",
-             "prior_training", "super_resolution_training", "training", "inference", "ablation")
+    "throughput": 4, "training_progress": 4, "inference": 4, "ablation": 4}
+LIGHTNING = ("datamodule", "super_resolution_data", "reconstruction_data", "throughput", "training_progress",
+             "stage_training", "prior_training", "super_resolution_training", "training", "inference", "ablation")
 CONFIGS = {folder: sorted((ROOT / "configs" / folder).glob("*.yaml"))
            for folder in ("prior", "reconstruct", "geometry", "simulate")}
 

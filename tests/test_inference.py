@@ -22,6 +22,7 @@ from PIL import Image
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
+import phydict
 from phydict.baselines import SIRT
 from phydict.datasets import load_xrays, phantom_case, prepare_ct, save_xrays
 from phydict.evaluation import volume_metrics
@@ -32,7 +33,7 @@ from phydict.posterior import PriorOnly
 from phydict.precision import instruction_set
 from phydict.prior import LocalUNet, Prior, SuperResolution, VolumeUNet, save_prior, save_super_resolution
 from phydict.units import MU_WATER, HUWindow
-from phydict.xray import ConeBeam, Polychromatic, Projector
+from phydict.xray import ConeBeam, Ideal, Polychromatic, Projector
 from phydict.xray.geometry_files import write_beam
 from prior.medsyn_files import entries, super_resolution_unet, text_unet, write
 
@@ -88,6 +89,7 @@ def refusal(capsys, args: list[str]) -> str:
 
 def write_ct(path: Path, seed: int, code: int = 1, change=lambda hu: hu) -> Path:
     """A box of soft tissue in air, 20^3 voxels of 10 mm."""
+    path.parent.mkdir(exist_ok=True)
     hu = np.full((20, 20, 20), -1000, np.float32)
     hu[4:16, 6:15] = 40 + 10 * np.random.default_rng(seed).standard_normal((12, 9, 20))
     image = nibabel.Nifti1Image(change(hu), None)
@@ -217,6 +219,29 @@ def test_a_dry_run_sees_images_that_lie_upside_down(measured, tmp_path, capsys):
     main(sirt("predict", tmp_path / "out", f"--data.xrays={tmp_path / 'case'}", "--dry_run"))
     lines = capsys.readouterr().out.splitlines()[:3]
     assert all("with flip_rows changed" in line for line in lines), lines
+
+
+def test_a_dry_run_goes_on_after_a_bad_case_and_names_it_at_the_end(measured, tmp_path, capsys):
+    shutil.copytree(measured, tmp_path / "cases")
+    (tmp_path / "cases" / "anna" / "view_1.npy").unlink()
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as stopped:
+        main(sirt("predict", tmp_path / "out", f"--data.xrays={tmp_path / 'cases'}", "--dry_run"))
+    out, err = capsys.readouterr()
+    said = [line for line in err.splitlines() if line.startswith("error: ")]
+    assert stopped.value.code == 2 and names(tmp_path / "out" / "dry_run") == ["bert.png"] and "bert view 1" in out
+    assert said[0].startswith("error: anna: ") and "1 of 2 cases cannot be reconstructed (anna)" in said[1]
+
+
+def test_a_dry_run_warns_of_a_left_lateral_view_told_to_stand_at_90_degrees(tmp_path, capsys):
+    lateral, told = (ConeBeam.orbit(1, 1020.0, 740.0, (48, 48), 12.0, start_degrees=angle) for angle in (270, 90))
+    truth = HUWindow().to_mu(phantom_case(1, Grid.cube(64))["volume"])
+    for name, beam in (("right", lateral), ("wrong", told)):
+        save_xrays(tmp_path / name, Projector(Grid.cube(64), lateral)(truth[None])[0], beam)
+        main(sirt("predict", tmp_path / "out", f"--data.xrays={tmp_path / name}", "--dry_run"))
+        said = [line for line in capsys.readouterr().err.splitlines() if "mirrored" in line]
+        assert len(said) == (name == "wrong"), name
+    assert "wrong: view 1 " in said[0] and "(LL)" in said[0] and "270" in said[0]
 
 
 def test_a_dry_run_belongs_to_predict(tmp_path, capsys):
@@ -475,6 +500,44 @@ def test_scores_are_those_of_the_written_volumes(scored):
     assert f"{np.mean(psnr):.2f} ± {np.std(psnr, ddof=1):.2f}" in table and "n = 2 cases" in table
 
 
+DOUBTFUL = {
+    "plus1024": lambda hu: hu + 1024, "wrapped": lambda hu: (hu.round().astype(np.int32) % 65536).astype(np.uint16),
+    "attenuation": lambda hu: (0.02 * (1 + hu / 1000)).astype(np.float32), "air": lambda hu: 0 * hu - 1000}
+
+
+def test_a_doubtful_ct_marks_its_row_its_record_and_the_table(tmp_path, capsys):
+    for name, change in DOUBTFUL.items():
+        write_ct(tmp_path / "cts" / f"{name}.nii.gz", 0, change=change)
+    image = nibabel.load(write_ct(tmp_path / "cts" / "cm.nii.gz", 0))
+    nibabel.save(nibabel.Nifti1Image(np.asarray(image.dataobj), np.diag([1.0, 1.0, 1.0, 1.0])), image.get_filename())
+    main(sirt("test", tmp_path / "out", f"--data.cts={tmp_path / 'cts'}", *ORBIT))
+    out, err = capsys.readouterr()
+    with (tmp_path / "out" / "sirt" / "results.csv").open() as file:
+        rows = {row["case"]: row["warning"] for row in csv.DictReader(file)}
+    assert rows.keys() == {*DOUBTFUL, "cm"}
+    for case, warning in rows.items():
+        assert ("20 x 20 x 20 mm" if case == "cm" else f"{case} does not look like HU") in warning
+        assert warning == "; ".join(record(tmp_path / "out" / "sirt" / case)["warnings"])
+        assert all(sentence in err for sentence in record(tmp_path / "out" / "sirt" / case)["warnings"])
+    for text in ((tmp_path / "out" / "sirt" / "results.md").read_text(), " ".join(out.split())):
+        assert "Doubtful" in text and "air, attenuation, cm, plus1024, wrapped" in text and "warned" in text
+
+
+def test_a_good_case_has_no_mark(tmp_path):
+    main([*phantoms(tmp_path, 1), "--model.method.init_args.iterations=60"])
+    assert record(tmp_path / "sirt" / "phantom-1000000")["warnings"] == []
+    assert "warned" not in (tmp_path / "sirt" / "results.md").read_text()
+
+
+def test_inverted_line_integrals_are_warned_of_and_marked(measured, tmp_path, capsys):
+    case = load_xrays(measured / "anna")
+    save_xrays(tmp_path / "case", case["xrays"].max() - case["xrays"], case["beam"])
+    for args in ((), ("--dry_run",)):
+        main(sirt("predict", tmp_path / "out", f"--data.xrays={tmp_path / 'case'}", *args))
+        assert capsys.readouterr().err.count("as inverted images are") == 1
+    assert "inverted" in record(tmp_path / "out" / "sirt" / "case")["warnings"][0]
+
+
 def test_a_second_test_scores_nothing_twice_and_shows_one_table(scored, capsys):
     before = stamp(scored / "phantom-1000000"), (scored / "results.csv").read_text()
     main(phantoms(scored.parent, 2))
@@ -493,14 +556,29 @@ def test_a_case_depends_on_its_id_and_the_seed_alone(cts, tmp_path):
     assert "ssim_lung" not in record(tmp_path / "one" / "sirt" / "b")["scores"]  # no lungs, no score of them
 
 
-def test_a_sample_of_the_prior_depends_on_its_id_and_the_seed_alone(prior, measured, tmp_path):
-    main(with_prior("predict", tmp_path / "both", prior, f"--data.xrays={measured}", "--data.with_report=false"))
-    main(with_prior("predict", tmp_path / "one", prior, f"--data.xrays={measured / 'bert'}",
-                    "--data.with_report=false"))
-    both, one = (volume(tmp_path / name / "prior_only" / "bert") for name in ("both", "one"))
-    np.testing.assert_array_equal(both, one)
-    assert not np.array_equal(volume(tmp_path / "both" / "prior_only" / "anna"), one)
-    assert both.shape == (16, 16, 16)
+def test_a_sample_of_the_prior_depends_on_the_seed_alone_and_is_that_of_python(prior, measured, tmp_path):
+    given = ["--data.with_report=false", "--model.precision=float32"]
+    main(with_prior("predict", tmp_path / "both", prior, f"--data.xrays={measured}", *given))
+    main(with_prior("predict", tmp_path / "other", prior, f"--data.xrays={measured / 'bert'}", "--model.seed=5", *given))
+    case = load_xrays(measured / "bert")
+    for name, seed in (("both", 0), ("other", 5)):
+        expected = reconstruct(case["xrays"], case["beam"], prior, PriorOnly(2), seed=seed, precision="float32")
+        found = volume(tmp_path / name / "prior_only" / "bert")
+        np.testing.assert_array_equal(found, expected.volume.numpy())
+    assert found.shape == (16, 16, 16)
+    assert not np.array_equal(found, volume(tmp_path / "both" / "prior_only" / "bert"))
+
+
+def test_python_gives_the_volume_of_a_test_by_the_cases_seed(prior, cts, tmp_path):
+    main(with_prior("test", tmp_path, prior, f"--data.cts={cts / 'a.nii.gz'}", *ORBIT, "--model.seed=3",
+                    "--model.precision=float32"))
+    seed = phydict.case_seed(3, "a")
+    truth = HUWindow().to_mu(prepare_ct(cts / "a.nii.gz", Grid.cube(16))["volume"])
+    views = Ideal()(Projector(Grid.cube(16), BEAM, full_detector=True), truth[None], seed)[0]
+    expected = reconstruct(views, BEAM, prior, PriorOnly(2), seed=seed, precision="float32")
+    np.testing.assert_array_equal(volume(tmp_path / "prior_only" / "a"), expected.volume.numpy())
+    assert record(tmp_path / "prior_only" / "a")["misfit"] == pytest.approx(expected.misfit)
+    assert record(tmp_path / "prior_only" / "a")["seed"] == seed
 
 
 def test_the_default_method_reconstructs_with_a_prior(prior, measured, tmp_path):
@@ -563,8 +641,8 @@ def test_two_processes_predict_every_case_once(measured, tmp_path):
 
 
 def xrays(folder: Path, beam: ConeBeam = BEAM) -> Path:
-    """A folder of X-rays of nothing."""
-    save_xrays(folder, np.ones((beam.views, *beam.shape), np.float32), beam)
+    """A folder of X-rays of noise."""
+    save_xrays(folder, np.random.default_rng(0).random((beam.views, *beam.shape), np.float32), beam)
     return folder
 
 
@@ -603,7 +681,7 @@ def geometry_key(folder: Path) -> Path:
 
 
 def change_geometry(folder: Path, **changes) -> Path:
-    """X-rays of nothing whose geometry.yaml holds an orbit, changed, and counts where `air` is given."""
+    """X-rays of noise whose geometry.yaml holds an orbit, changed, and counts where `air` is given."""
     orbit = {"views": 3, "source_to_detector": 1020.0, "source_to_isocentre": 740.0, "shape": [24, 24],
              "pixel": [24.0, 24.0]}
     air = changes.pop("air", None)
@@ -627,6 +705,27 @@ def dicom_without_distance(folder: Path) -> Path:
     return folder
 
 
+def saturated(folder: Path) -> Path:
+    """16-bit images at their maximum, but for a mark in a corner."""
+    pixels = np.full((24, 24), 65535, np.uint16)
+    pixels[0, :3] = 0
+    change_geometry(folder)
+    for k in range(3):
+        (folder / f"view_{k}.npy").unlink()
+        Image.fromarray(pixels).save(folder / f"view_{k}.png")
+    content = yaml.safe_load((folder / "geometry.yaml").read_text())
+    (folder / "geometry.yaml").write_text(yaml.safe_dump(content | {
+        "intensity": {"kind": "line_integrals", "scale": 1e-4}}))
+    return folder
+
+
+def constant(folder: Path) -> Path:
+    xrays(folder)
+    for k in range(3):
+        np.save(folder / f"view_{k}.npy", np.full((24, 24), 3, np.float32))
+    return folder
+
+
 def no_air(hu: np.ndarray) -> np.ndarray:
     hu[3, 4, 5] = np.nan
     return hu
@@ -646,6 +745,8 @@ BAD_XRAYS = {
     "infinite": (lambda at: one_pixel(at, np.inf), ["view_1.npy", "1 NaN or infinite"]),
     "negative counts": (lambda at: one_pixel(at, -1), ["1 pixels hold negative counts"]),
     "counts above air": (lambda at: one_pixel(at, 7), ["1 pixels hold counts above air, up to 7 times"]),
+    "constant": (constant, ["view_0.npy", "shows nothing"]),
+    "saturated": (saturated, ["view_0.png", "saturated"]),
     "DICOM without distance": (dicom_without_distance, ["run.dcm", "DistanceSourceToDetector (0018,1110)"]),
 }
 BAD_CTS = {
@@ -745,6 +846,16 @@ def test_a_prior_refuses_xrays_of_another_grid(prior):
     posterior = reconstructor(PriorOnly(iterations=1), prior)
     with pytest.raises(ValueError, match="16.*64.*use the prior's grid"):
         posterior.reconstruct(torch.ones(3, 24, 24), Projector(Grid.cube(64), BEAM))
+
+
+@pytest.mark.parametrize("args, words", [
+    ([], ["predict", "test", "ablate", "infer.py predict -c"]), (["reconstruct"], ["'reconstruct'", "ablate"]),
+    (["--data.xrays", "somewhere"], ["predict", "test", "ablate"]), (["predict"], ["-c configs/reconstruct/"]),
+    (["test", "--data.cts", "phantom"], ["-c configs/reconstruct/"]), (["ablate"], ["-c configs/ablate/"]),
+    (["ablate", "--phantoms", "3"], ["-c configs/ablate/"])], ids=lambda value: " ".join(value)[:20])
+def test_a_missing_command_or_configuration_says_what_to_give(args, words, capsys):
+    said = refusal(capsys, args)
+    assert all(word in said for word in words), said
 
 
 @pytest.mark.parametrize("change, words", [

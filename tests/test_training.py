@@ -92,6 +92,18 @@ def test_the_loss_falls(tmp_path, cache):
     assert np.mean(loss[-8:]) < 0.7 * np.mean(loss[:4])
 
 
+def test_a_log_file_tells_steps_in_whole_lines_and_nothing_of_lightnings(tmp_path, cache):
+    for more in (["--trainer.max_steps=3"], ["--trainer.max_steps=6", f"--ckpt_path={tmp_path / 'last.ckpt'}"]):
+        args = [arg for arg in arguments(tmp_path, cache, "--progress.interval=0") if "enable_" not in arg]
+        run = subprocess.run([sys.executable, "-c", "from phydict.training import main; main()", *args, *more],
+                             capture_output=True, text=True, cwd=CONFIG.parents[2], timeout=300)
+        assert run.returncode == 0, run.stderr[-2000:]
+        said = (run.stdout + run.stderr).splitlines()
+        last = f"step {more[0].split('=')[1]} of {more[0].split('=')[1]}: loss "
+        assert any(line.startswith(last) and "samples_per_s" in line for line in said), said
+        assert all(line.startswith(("step ", "training ", "report ", "preparing ", "text map ", "Seed")) for line in said)
+
+
 def test_a_killed_run_goes_on_as_if_it_had_not_been(tmp_path, straight, cache):
     killed = """if True:  # a process that dies without a word in the second epoch, after the first's checkpoint
         import os, signal, sys

@@ -137,7 +137,7 @@ class ConeBeam:
             if near > 0 and far < distance:
                 continue
             reach = (depth.max(0) - centre).max()  # of the view along which the box is longest
-            least, most = math.ceil(reach + 0.5), math.floor(distance - reach - 0.5)
+            least, most = math.floor(reach) + 1, math.ceil(distance - reach) - 1
             room = f"a source_to_isocentre of {least} to {most} mm would do with" if least <= most else (
                 f"no source_to_isocentre would do, since {2 * least} mm are needed, with")
             culprit = "source" if near <= 0 else "detector"

@@ -205,6 +205,18 @@ def test_training_and_inference_read_prepared_cases_without_resampling(tmp_path,
     assert len(data.cts) == 1 and data.cts[0]["volume"].shape == (1, 32, 32, 32) and data.reports == [ct.report]
 
 
+def test_what_was_remarkable_when_a_ct_was_prepared_is_said_wherever_it_is_read(tmp_path, thorax):
+    for name in ("a", "b"):
+        save(tmp_path / f"in/{name}.nii.gz", (thorax + 1024).astype(np.int16))
+    save(tmp_path / "in/a_lungmask.nii.gz", (thorax == -850).astype(np.uint8))
+    masked, lungless = prepare_folder(tmp_path / "in", tmp_path / "out", SMALL)
+    assert (masked["status"], lungless["status"]) == ("prepared", "rejected")
+    assert all("does not look like HU" in row["remark"] for row in (masked, lungless))
+    (ct,) = find_cts(tmp_path / "out")
+    with pytest.warns(UserWarning, match="a was prepared with the remark: .*does not look like HU"):
+        load_case(ct, Grid.cube(32), WINDOW)
+
+
 def test_a_coarser_case_is_the_same_whether_prepared_so_or_read_so(tmp_path, thorax):
     save(tmp_path / "in/a.nii.gz", thorax)
     prepare_folder(tmp_path / "in", tmp_path / "fine", Settings(voxels=64))

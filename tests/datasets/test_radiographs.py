@@ -82,7 +82,8 @@ def test_every_form_of_geometry_gives_the_same_beam(tmp_path, blocks):
 
 
 def test_view_10_comes_after_view_9(tmp_path):
-    stack = np.arange(11, dtype=np.float32)[:, None, None] * np.ones((1, *SHAPE), np.float32)
+    stack = np.arange(11, dtype=np.float32)[:, None, None] + images(11) / 100
+    stack[:, 0, 0] = np.arange(11)
     case = load_xrays(write(tmp_path, stack, name="img_800.0_{}", orbit=ORBIT | {"views": 11}))
     assert case["xrays"][:, 0, 0].tolist() == list(range(11))
 
@@ -183,8 +184,27 @@ def test_wide_integers_keep_every_grey_level(tmp_path, dense):
 
 def test_zero_counts_are_finite(tmp_path):
     block = {"orbit": ORBIT, "intensity": {"kind": "counts", "air": 1000, "floor": 0.5}}
-    xrays = load_xrays(write(tmp_path, np.zeros((2, *SHAPE), np.uint16), **block))["xrays"]
-    assert xrays.numpy() == pytest.approx(np.log(2000))
+    counts = np.zeros((2, *SHAPE), np.uint16)
+    counts[:, 0] = 1000
+    xrays = load_xrays(write(tmp_path, counts, **block))["xrays"]
+    assert xrays[:, 1:].numpy() == pytest.approx(np.log(2000))
+
+
+@pytest.mark.parametrize("intensity", [
+    {"kind": "line_integrals", "scale": 1e-4}, {"kind": "counts", "air": 65535},
+    {"kind": "display", "bright_is_dense": True}, {"kind": "display", "bright_is_dense": False}],
+    ids=lambda block: " ".join(map(str, block.values())))
+@pytest.mark.parametrize("level", [0, 30000, 65535])
+def test_an_image_of_one_value_is_refused_by_its_name_whatever_it_means(tmp_path, intensity, level):
+    stored = np.random.default_rng(0).integers(1, 60000, (2, *SHAPE)).astype(np.uint16)
+    stored[1] = level
+    fails("view_1.png shows nothing.*saturated", write(tmp_path, stored, "png", orbit=ORBIT, intensity=intensity))
+
+
+def test_little_in_much_air_is_no_saturated_image(tmp_path):
+    thin = np.zeros((2, *SHAPE), np.float32)
+    thin[:, 3, 2] = 5
+    assert load_xrays(write(tmp_path, thin, orbit=ORBIT))["xrays"].max() == 5
 
 
 def test_display_images_grow_with_density_whatever_their_polarity(tmp_path):
@@ -235,11 +255,12 @@ def test_rgba_with_equal_channels_is_grey(tmp_path):
 
 
 def test_a_shared_geometry_and_an_intensity_argument_replace_the_folders_own(tmp_path):
-    folder = write(tmp_path / "case", np.ones((2, *SHAPE), np.uint8), "png", nonsense=1)
+    stored = np.arange(60, dtype=np.uint8).reshape(2, *SHAPE)
+    folder = write(tmp_path / "case", stored, "png", nonsense=1)
     shared = tmp_path / "shared.yaml"
     shared.write_text(yaml.safe_dump({"orbit": ORBIT}))
     case = load_xrays(folder, geometry=shared, intensity=Intensity("line_integrals", scale=2.0))
-    assert (case["xrays"] == 2).all()
+    assert (case["xrays"].numpy() == 2.0 * stored).all()
 
 
 def test_find_xrays_takes_a_case_or_a_folder_of_cases(tmp_path):

@@ -59,6 +59,11 @@ def test_a_flip_is_named_in_every_view_that_shows_it(thorax, turn, name):
         assert said.endswith(f"better (1.00) with {name} changed"), (k, said)
 
 
+def test_an_inverted_view_is_called_inverted_and_not_flipped(thorax):
+    for image in thorax[1]:
+        assert agreement(-image, image) == "agreement -1.00, better (1.00) inverted"
+
+
 def test_the_page_shows_every_view_and_refuses_images_of_another_beam(thorax, tmp_path):
     hu, images = thorax
     geometry_page(tmp_path / "deep" / "page.png", BEAM, GRID, images, images, hu, "anna")

@@ -120,6 +120,14 @@ def test_the_caption_tells_when_methods_had_different_cases():
     assert "not the same" not in markdown(ROWS)
 
 
+def test_warnings_are_counted_in_the_line_and_name_their_cases_in_the_caption():
+    rows = [row | ({"warning": "no lungs"} if row["case"] == "008" and row["method"] == "fdk" else {}) for row in ROWS]
+    table = cells(markdown(rows))
+    assert (table["fdk"]["warned"], table["gibbs"]["warned"]) == ("1", "0")
+    assert "Doubtful, by what the rows' warning says: 008." in markdown(rows)
+    assert "Doubtful" not in markdown(ROWS) and "warned" not in markdown(ROWS)
+
+
 def test_seeds_of_a_case_are_averaged_before_cases():
     rows = [{"case": "a", "method": "m", "psnr": p} for p in (10.0, 10.0, 10.0)] + [
         {"case": "b", "method": "m", "psnr": 20.0}]

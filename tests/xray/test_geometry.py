@@ -38,6 +38,18 @@ def test_start_and_arc_place_the_same_views():
     assert full.select(np.arange(8) % 2 == 0).same_as(orbit(4))
 
 
+def test_angles_are_taken_in_degrees_or_radians_but_not_in_both():
+    assert orbit(4, start_degrees=180, arc_degrees=90).same_as(orbit(4, start=np.pi, arc=np.pi / 2))
+    with pytest.raises(ValueError, match="start=1 .radians. and start_degrees=60 were both given"):
+        orbit(4, start=1, start_degrees=60)
+
+
+@pytest.mark.parametrize("angle", ["start", "arc"])
+def test_degrees_given_as_radians_are_refused_with_the_name_of_degrees(angle):
+    with pytest.raises(ValueError, match=f"{angle} is in radians, but 90 .* give {angle}_degrees"):
+        orbit(4, **{angle: 90})
+
+
 def test_binned_pixels_are_the_means_of_their_blocks():
     beam = orbit()
     blocks = beam.pixels().reshape(4, 28, 4, 24, 4, 3).mean((2, 4))
@@ -92,6 +104,23 @@ def test_a_source_inside_or_beside_the_volume_is_refused():
         beam.check(Grid.cube(16, 256))
 
 
+def test_a_tilted_orbit_is_told_which_source_distances_would_do():
+    def tilted(to_isocentre: float) -> ConeBeam:
+        beam, angle = ConeBeam.orbit(8, 1020, to_isocentre, (448, 448), 1.25), np.radians(15)
+        turn = np.array([[1, 0, 0], [0, np.cos(angle), np.sin(angle)], [0, -np.sin(angle), np.cos(angle)]])
+        return ConeBeam(*(vectors @ turn for vectors in (beam.sources, beam.detectors, beam.u, beam.v)), beam.shape)
+
+    with pytest.raises(ValueError, match="source_to_isocentre of 303 to 717 mm would do .* 1020 mm"):
+        tilted(740).check(Grid.cube(64))
+    for distance in (303, 717):
+        tilted(distance).check(Grid.cube(64))
+    for distance in (300, 720):
+        with pytest.raises(ValueError, match="303 to 717"):
+            tilted(distance).check(Grid.cube(64))
+    with pytest.raises(ValueError, match="no source_to_isocentre would do, since 544 mm"):
+        ConeBeam.orbit(8, 500, 250, (448, 448), 1.25).check(Grid.cube(64))
+
+
 def test_the_default_geometry_clears_its_volume():
     ConeBeam.orbit(8, 1020, 740, (448, 448), 1.25).check(Grid.cube(64))
 
@@ -112,10 +141,13 @@ def test_yaml_orbit_is_read_in_degrees(tmp_path):
     assert ConeBeam.load(path).same_as(orbit())  # a case's geometry.yaml
     path.write_text(ORBIT + "  start_degrees: 90\n  arc_degrees: 180\n")
     assert ConeBeam.load(path).same_as(orbit(start=np.pi / 2, arc=np.pi))
+    path.write_text(ORBIT + f"  start: {np.pi / 2}\n  arc: {np.pi}\n")
+    assert ConeBeam.load(path).same_as(orbit(start=np.pi / 2, arc=np.pi))
 
 
 @pytest.mark.parametrize("text, sentence", [
-    (ORBIT + "  angle: 3\n", "unknown key 'angle'"),
+    (ORBIT + "  angle: 3\n", "unknown key 'angle'; .* start_degrees, arc_degrees"),
+    (ORBIT + "  start: 90\n", "give start_degrees"),
     (ORBIT.replace("  views: 4\n", ""), "missing key 'views'"),
     (ORBIT + "shape: [1, 1]\n", "unknown key 'shape'"),
     (ORBIT.replace("740", "2000"), "must lie between"),

@@ -9,6 +9,7 @@ import pytest
 
 from phydict.xray import ConeBeam
 from phydict.xray.geometry_files import COLUMNS, read_beam, write_beam
+from phydict.xray.rtk import write_rtk
 
 SHAPE, PIXEL = (6, 8), (2.0, 3.0)
 ENDINGS = ("yaml", "xml", "npy", "csv")
@@ -133,6 +134,15 @@ def test_a_mirrored_beam_cannot_become_rtk(tmp_path):
     mirrored = ConeBeam(beam.sources, beam.detectors, -beam.u, beam.v, SHAPE)
     with pytest.raises(ValueError, match="view 0: u x v points away from the source.*flip their columns"):
         write_beam(tmp_path / "beam.xml", mirrored)
+
+
+@pytest.mark.parametrize("write", [write_beam, write_rtk])
+def test_a_beam_and_a_path_in_each_others_place_are_told_their_order(tmp_path, write):
+    with pytest.raises(ValueError, match=rf"the beam first; call {write.__name__}\(path, beam\)"):
+        write(orbit(), tmp_path / "beam.xml")
+    with pytest.raises(ValueError, match="a path and then a ConeBeam, but was given 3"):
+        write(tmp_path / "beam.xml", 3)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(("name", "text", "sentence"), [

@@ -18,6 +18,7 @@ from phydict.datamodule import HELD_OUT_PHANTOM, PHANTOM_VERSION
 from phydict.datasets import CTFile, find_cts, find_xrays, load_case, load_xrays, phantom_case
 from phydict.evaluation import volume_metrics
 from phydict.grid import Grid
+from phydict.reading import check_memory, read_text
 from phydict.reconstructor import describe
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Ideal, Projector, Simulator
@@ -119,7 +120,7 @@ class ReconstructionData(lightning.LightningDataModule):
     def _chosen(self, cts: list[CTFile]) -> list[CTFile]:
         if not self.only:
             return cts
-        wanted = set(Path(self.only).read_text().split())
+        wanted = set(read_text(self.only).split())
         missing = wanted - {ct.id for ct in cts}
         if missing or not wanted:
             raise ValueError(f"data.only ({self.only}) names {', '.join(sorted(missing)[:3]) or 'no case'}, which "

@@ -213,10 +213,10 @@ def _finished(source: Source, out: Path, settings: Settings) -> dict | None:
     if not folder.exists():
         return None
     record = read_record(folder / VOLUME)
-    if record["settings"] != json.loads(json.dumps(asdict(settings))):
+    if record.get("settings") != json.loads(json.dumps(asdict(settings))):
         raise ValueError(f"{folder} was prepared with other settings; give another output folder, or remove that one")
     try:
-        return record["row"] if record["fingerprint"] == source.fingerprint() else None
+        return record.get("row") if record.get("fingerprint") == source.fingerprint() else None
     except ValueError:
         return None
 

@@ -371,7 +371,7 @@ def test_a_changed_input_is_prepared_again_and_other_settings_are_refused(tmp_pa
     with pytest.raises(ValueError, match="was prepared with other settings"):
         prepare_folder(tmp_path / "in", tmp_path / "out", Settings(voxels=16))
     (tmp_path / "out/a" / RECORD).write_text("{")
-    with pytest.raises(ValueError, match="case.json is damaged .* prepare that CT again"):
+    with pytest.raises(ValueError, match="case.json cannot be read .* prepare that CT again"):
         find_cts(tmp_path / "out")
 
 

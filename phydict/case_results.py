@@ -9,6 +9,7 @@ from pathlib import Path
 
 from phydict.atomic import remove_leftovers, whole_folder
 from phydict.evaluation import markdown, write_csv
+from phydict.reading import not_written
 
 RECORD = "reconstruction.json"
 """The file that marks a case as finished."""
@@ -71,8 +72,7 @@ class CaseResults:
                 write_files(partial)
                 (partial / RECORD).write_text(json.dumps(record, indent=1))
         except OSError as error:
-            raise OSError(f"the case {final} could not be written ({error.strerror or error}): "
-                          "free some space, or give another model.out") from error
+            raise not_written(f"the case {final}", error, "give another model.out") from error
 
     def discard(self, case: str) -> None:
         """Removes the older result, if any, of a case that was to be overwritten and has failed."""

@@ -7,6 +7,7 @@ Each finished case is one folder of the output; a run that was stopped goes on w
 
 from __future__ import annotations
 
+import os
 import platform
 import resource
 import sys
@@ -25,7 +26,8 @@ from torch import Tensor
 
 from phydict.ablation import main as ablate
 from phydict.case_results import CaseResults
-from phydict.command_line import check_writable, one_sentence_errors, quiet, sentence
+from phydict.command_line import (
+    TRACEBACK, check_options, check_writable, one_sentence_errors, quiet, read_configurations, sentence)
 from phydict.datasets import load_xrays
 from phydict.dry_run import dry_run
 from phydict.evaluation import CaseMetrics, panel, rich_table
@@ -37,7 +39,7 @@ from phydict.prior import MedSynCheckpoint, fingerprint, load_prior, load_super_
 from phydict.profiling import profiled, stage
 from phydict.progress import CaseProgress
 from phydict.reconstruction_data import ReconstructionData, case_scores, case_seed
-from phydict.reconstructor import Reconstruction, Reconstructor, describe, save_nifti
+from phydict.reconstructor import Reconstruction, Reconstructor, check_seed, describe, save_nifti
 from phydict.units import HUWindow
 
 class ReconstructionTask(lightning.LightningModule):
@@ -71,6 +73,7 @@ class ReconstructionTask(lightning.LightningModule):
                  out: str = "runs/reconstructions", overwrite: bool = False, seed: int = 0, voxels: int = 64,
                  side: float = 384.0, samples: int = 1, precision: str = "auto"):
         super().__init__()
+        check_seed(seed)
         self.method_name, self.seed, self.pages = name, seed, Path(out) / "dry_run"
         self.results = CaseResults(Path(out) / name, overwrite)
         check_writable(self.results.folder, "model.out")
@@ -157,6 +160,8 @@ class ReconstructionTask(lightning.LightningModule):
             else:
                 work(case)
         except (ValueError, FloatingPointError) as error:
+            if os.environ.get(TRACEBACK):
+                raise
             self.results.discard(case["id"])
             if len(self.cases) == 1:
                 raise
@@ -296,9 +301,11 @@ def main(args: list[str] | None = None) -> None:
     if args[:1] == ["ablate"]:
         return ablate(args[1:])
     with one_sentence_errors(MisconfigurationException), quiet():
+        check_options(args)
+        read_configurations(args)
         cli = InferenceCLI(
             ReconstructionTask, ReconstructionData, args=args, seed_everything_default=0, save_config_callback=None,
-            parser_kwargs={"exit_on_error": False, "description": (
+            parser_kwargs={"exit_on_error": False, "allow_abbrev": False, "description": (
                 "Reconstruct chest CTs from X-rays. A third subcommand, ablate, compares methods: ablate --help.")},
             trainer_defaults={"inference_mode": False, "logger": False, "enable_progress_bar": False,
                               "enable_checkpointing": False, "enable_model_summary": False, "accelerator": "auto",

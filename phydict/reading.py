@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
+import math
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -31,6 +34,13 @@ def reading(name: object, advice: str) -> Iterator[None]:
         raise Unreadable(f"{name} cannot be read ({reason(error)}); {advice}") from error
 
 
+def not_written(what: str, error: Exception, instead: str) -> OSError:
+    """The error of `what` that could not be written: its reason, to free space where a disk is full, and `instead`."""
+    full = getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT) or re.search(
+        rf"os error ({errno.ENOSPC}|{errno.EDQUOT})\b", str(error))
+    return OSError(f"{what} could not be written ({reason(error)}): {'free some space, or ' if full else ''}{instead}")
+
+
 def reason(error: Exception) -> str:
     """An error in a few words, its kind among them where that is not for users."""
     if isinstance(error, RecursionError):
@@ -56,9 +66,16 @@ def read_text(path: str | Path) -> str:
 
 
 def read_npy(path: str | Path) -> np.ndarray:
-    """The array in a .npy file, which is never larger than the file. Raises OSError, ValueError and what else a damaged
-    header leads NumPy to: for use inside `reading`."""
-    return np.array(np.lib.format.open_memmap(path, mode="r"))
+    """The array in a .npy file. For use inside `reading`: raises ValueError where the file is shorter than its header
+    promises, before anything is made for it, and whatever a damaged one leads NumPy to."""
+    with open(path, "rb") as stream:
+        version = np.lib.format.read_magic(stream)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, kind = read(stream)
+        promised, held = math.prod(shape) * kind.itemsize, os.fstat(stream.fileno()).st_size - stream.tell()
+    if promised > held:
+        raise ValueError(f"its header promises {promised:,} bytes, shape {shape}, but the file has {held:,}")
+    return np.load(path, allow_pickle=False)
 
 
 def check_memory(needed: int, what: str, advice: str) -> None:

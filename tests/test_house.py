@@ -29,6 +29,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "phydict"
 FLOORS = {
     "units": 0, "grid": 0, "atomic": 0, "checksum": 0, "command_line": 0, "progress": 0, "profiling": 0, "precision": 0,
+    "reading": 0, "yaml_file": 0,
     "xray": 1, "diffusion": 1,
     "prior": 2, "datasets": 2, "reconstructor": 2,
     "posterior": 3, "baselines": 3, "evaluation": 3,

@@ -12,7 +12,6 @@ from pathlib import Path
 from types import NoneType
 from typing import get_args, get_type_hints
 
-import yaml
 from jsonargparse import ArgumentError, ArgumentParser
 
 from phydict.grid import Grid
@@ -23,6 +22,7 @@ from phydict.reconstruction_data import ReconstructionData
 from phydict.reconstructor import Reconstructor, describe
 from phydict.units import HUWindow
 from phydict.xray import Ideal, Polychromatic, Simulator
+from phydict.yaml_file import read_yaml
 
 SIDE = 560.0
 """mm along each side of the simulated detector unless the size of its pixels is given."""
@@ -139,12 +139,10 @@ def read_specification(file: str | Path, **given) -> Specification:
     out for it, and what then is the same is run once. Raises ValueError, in one sentence, on what cannot be meant.
     """
     try:
-        content = yaml.safe_load(Path(file).read_text())
+        content = read_yaml(file)
     except FileNotFoundError as error:
         raise ValueError(f"there is no file {file}: give one that says what to compare, such as "
                          "configs/ablate/pareto.yaml") from error
-    except yaml.YAMLError as error:
-        raise ValueError(f"{file} is no YAML: {' '.join(str(error).split())}") from error
     try:
         return _specification(content, {k: v for k, v in given.items() if v is not None})
     except ValueError as error:

@@ -11,7 +11,7 @@ from typing import BinaryIO
 import numpy as np
 
 from phydict.atomic import whole_file
-from phydict.reading import reason
+from phydict.reading import not_written, reason
 
 
 def write_arrays(file: Path, arrays: dict[str, np.ndarray]) -> None:
@@ -38,8 +38,7 @@ def _cached(file: Path) -> Iterator[BinaryIO]:
         with whole_file(file) as part, part.open("wb") as stream:
             yield stream
     except OSError as error:
-        raise OSError(f"the prepared case {file} could not be cached ({error.strerror or error}): "
-                      "free some space, or give another data.cache") from error
+        raise not_written(f"the prepared case {file} of the cache", error, "give another data.cache") from error
 
 
 def read_arrays(file: Path) -> dict[str, np.ndarray] | None:

@@ -122,5 +122,9 @@ def _names(value) -> list[str]:
     """File names: of one name or a list of them; none of anything else."""
     if isinstance(value, str):
         value = [value]
-    named = isinstance(value, list | tuple) and all(isinstance(name, str) and "\0" not in name for name in value)
-    return list(value) if named else []
+    return list(value) if isinstance(value, list | tuple) and all(map(is_file_name, value)) else []
+
+
+def is_file_name(value) -> bool:
+    """Whether a value can be the name of a file, at most 255 characters without a null."""
+    return isinstance(value, str) and len(value) < 256 and "\0" not in value

@@ -33,6 +33,7 @@ from phydict.datasets.transforms import (AIR, SEGMENTATION_MM, case_id, centred,
                                          to_grid)
 from phydict.grid import Grid
 from phydict.progress import CaseProgress
+from phydict.reading import not_written
 
 SUMMARY = "summary.csv"
 COLUMNS = ("id", "status", "reason", "remark", "source", "kind", "slices", "spacing_x_mm", "spacing_y_mm",
@@ -267,8 +268,8 @@ def prepare_source(source: Source, out: Path, settings: Settings) -> dict:
         with whole_folder(out / source.id) as partial:
             write_prepared(partial, grid, images, record)
     except OSError as error:
-        raise OSError(f"the case {out / source.id} could not be written ({error.strerror or error}): free some space "
-                      "and run the same command again, finished cases are kept") from error
+        raise not_written(f"the case {out / source.id}", error, "give another output folder, and run the same command "
+                          "again, finished cases are kept") from error
     return row
 
 
@@ -313,5 +314,5 @@ def _write_summary(file: Path, rows: list[dict]) -> None:
             table.writeheader()
             table.writerows(rows)
     except OSError as error:
-        raise OSError(f"the summary {file} could not be written ({error.strerror or error}): free some space and run "
-                      "the same command again, finished cases are kept") from error
+        raise not_written(f"the summary {file}", error, "give another output folder, and run the same command again, "
+                          "finished cases are kept") from error

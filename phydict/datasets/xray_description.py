@@ -21,8 +21,8 @@ import numpy as np
 
 from phydict.datasets.dicom import DicomTags
 from phydict.datasets.dicom_beam import tags_beam
-from phydict.datasets.intensity import KINDS, Intensity
-from phydict.xray.geometry import ConeBeam
+from phydict.datasets.intensity import KINDS, Intensity, is_file_name
+from phydict.xray.geometry import ConeBeam, pixel_sizes
 from phydict.xray.geometry_files import read_beam
 from phydict.yaml_file import read_yaml
 
@@ -73,8 +73,9 @@ class Description:
     def views(self) -> int | None:
         """How many views the beam's mapping states, None where other files do or it states none that can be counted."""
         beam = self.beam or {}
-        stated = beam["orbit"].get("views") if isinstance(beam.get("orbit"), dict) else beam.get("sources")
-        return len(stated) if isinstance(stated, list) else stated if type(stated) is int else None
+        if isinstance(beam.get("orbit"), dict):
+            return beam["orbit"]["views"] if type(beam["orbit"].get("views")) is int else None
+        return len(beam["sources"]) if isinstance(beam.get("sources"), list) else None
 
     def beam_of(self, shape: tuple[int, int], tags: list[DicomTags]) -> ConeBeam:
         """The beam for images of `shape` (V, U), turned, and their DICOM tags, if any. Raises ValueError."""
@@ -140,7 +141,12 @@ def _check_beam(path: Path, beam) -> None:
         unknown = [reprlib.repr(name) for name in beam or {} if key in beam and name not in allowed]
         if unknown:
             raise ValueError(f"{path}: unknown key {', '.join(unknown)} in `beam:`; the keys are {', '.join(allowed)}")
-    if beam and (not isinstance(beam.get("file", ""), str) or "\0" in beam.get("file", "")):
+    if beam and not is_file_name(beam.get("file", "")):
         raise ValueError(f"{path}: `file:` is the name of a geometry file, but {reprlib.repr(beam['file'])} was found")
+    if beam and "file" in beam and beam.get("pixel") is not None:
+        try:
+            pixel_sizes(beam["pixel"])
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
     if beam and not isinstance(beam.get("dicom", {}), dict):
         raise ValueError(f"{path}: `dicom:` must be a mapping, but {reprlib.repr(beam['dicom'])} was found")

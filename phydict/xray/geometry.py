@@ -222,10 +222,10 @@ class ConeBeam:
             return cls(**{key: _numbers(key, value) for key, value in content.items()})
         _check_keys(content, ("orbit",), ())
         _check_keys(content["orbit"], ORBIT_KEYS, ORBIT_OPTIONS)
-        orbit = {key: _numbers(key, value) for key, value in content["orbit"].items()}
-        for key in ("views", "source_to_detector", "source_to_isocentre", *ORBIT_OPTIONS):
-            if isinstance(orbit.get(key), np.ndarray):
-                raise ValueError(f"{key} is one number, but {reprlib.repr(content['orbit'][key])} was given")
+        orbit = content["orbit"]
+        for key, value in orbit.items():
+            if np.ndim(_numbers(key, value)) and key not in ("shape", "pixel"):
+                raise ValueError(f"{key} is one number, but {reprlib.repr(value)} was given")
         return cls.orbit(**{key: orbit[key] for key in ORBIT_KEYS}, start=math.radians(orbit.get("start_degrees", 0.0)),
                          arc=math.radians(orbit.get("arc_degrees", 360.0)))
 

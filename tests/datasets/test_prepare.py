@@ -402,7 +402,7 @@ def test_a_full_disk_while_caching_is_one_sentence_and_leaves_nothing(tmp_path, 
 
     monkeypatch.setattr(cache.np, "savez_compressed", half)
     cases = CTCases(find_cts(tmp_path / "a.nii.gz"), tmp_path / "cache", Grid.cube(32))
-    with pytest.raises(OSError, match="could not be cached \\(No space left on device\\): free some space, or give"):
+    with pytest.raises(OSError, match="could not be written \\(No space left on device\\): free some space, or give"):
         cases[0]
     assert not [*(tmp_path / "cache").iterdir()]
 

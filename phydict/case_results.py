@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from phydict.atomic import remove_leftovers, undisturbed, whole_file, whole_folder
 from phydict.evaluation import markdown, write_csv
+from phydict.reading import not_written
 
 RECORD = "reconstruction.json"
 """The file that marks a case as finished."""
@@ -82,8 +83,7 @@ class CaseResults:
                 files = sorted(file.name for file in partial.iterdir())
                 (partial / RECORD).write_text(json.dumps(record | {"files": files}, indent=1))
         except OSError as error:
-            raise OSError(f"the case {final} could not be written ({error.strerror or error}): "
-                          "free some space, or give another model.out") from error
+            raise not_written(f"the case {final}", error, "give another model.out") from error
 
     def summarise(self, cases: Iterable[str]) -> list[dict]:
         """One row of scores per finished case that was scored; written as results.csv and results.md."""

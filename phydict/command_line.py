@@ -9,12 +9,13 @@ import re
 import sys
 import tempfile
 import warnings
-from argparse import ArgumentError
+from argparse import ArgumentError, ArgumentParser
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 from phydict.shipped import configuration
+from phydict.yaml_file import read_yaml
 
 NOISE = (".*does not have many workers", ".*LeafSpec.*is deprecated", ".*is smaller than the logging interval",
          "Total length of `DataLoader` across ranks is zero", "Checkpoint directory .* exists and is not empty",
@@ -27,6 +28,10 @@ NOISE = (".*does not have many workers", ".*LeafSpec.*is deprecated", ".*is smal
 
 CONFIGURATION = ("-c", "--config")
 """The option that names a configuration file."""
+
+
+TRACEBACK = "PHYDICT_TRACEBACK"
+"""The environment variable that, where it is set, lets every error show its trace."""
 
 
 @contextmanager
@@ -43,14 +48,14 @@ def one_sentence_errors(*also: type[Exception], to_go_on: str = "run the same co
         print(f"stopped by a signal; to go on, {to_go_on}", file=sys.stderr)
         raise SystemExit(130 if interrupted else 143) from None
     except (ValueError, OSError, FloatingPointError, ArgumentError, *also) as error:
-        if os.environ.get("PHYDICT_TRACEBACK"):
+        if os.environ.get(TRACEBACK):
             raise
         full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
         said = f"{sentence(error)}: free some space; to go on, {to_go_on}" if full else sentence(error)
         print(f"error: {said}", file=sys.stderr)
         raise SystemExit(2) from None
     except RuntimeError as error:
-        if os.environ.get("PHYDICT_TRACEBACK") or not re.search("Connection (closed|reset) by peer", str(error)):
+        if os.environ.get(TRACEBACK) or not re.search("Connection (closed|reset) by peer", str(error)):
             raise
         print("stopped, because another process of this run ended; its message says why", file=sys.stderr)
         raise SystemExit(2) from None
@@ -115,6 +120,31 @@ def check_apart(output: Path, option: str, inputs: Iterable[Path]) -> None:
         if there.is_relative_to(here) or here.is_relative_to(there):
             how = "is" if there == here else "lies inside" if there.is_relative_to(here) else "holds"
             raise ValueError(f"the output {output} {how} the input {given}: give another {option}")
+
+
+def read_configurations(args: Sequence[str]) -> list[object]:
+    """What the configuration files hold that a command line names with -c or --config, in their order.
+
+    They are read as `read_yaml` reads, so that what it refuses never reaches the command line's own parser. Files that
+    are not there are left to that. Raises ValueError.
+    """
+    look = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    look.add_argument("--config", "-c", action="append", default=[])
+    given, _ = look.parse_known_args(list(args))
+    return [read_yaml(file) for file in given.config if os.path.isfile(file)]
+
+
+def check_options(args: Sequence[str]) -> None:
+    """Raises ValueError where a command line gives one option two values; configuration files may follow each other."""
+    given = {}
+    several = any(arg.partition("=")[0].endswith("+") for arg in args)  # values appended to a list may have own settings
+    for arg, following in zip(args, [*args[1:], "--"]):
+        name, joined, value = arg.partition("=")
+        if not name.startswith("--") or name == "--config" or several:
+            continue
+        value = value if joined else "" if following.startswith("--") else following
+        if given.setdefault(name, value) != value:
+            raise ValueError(f"{name} is given twice, as {given[name]} and as {value}: keep one of them")
 
 
 def sentence(error: Exception) -> str:

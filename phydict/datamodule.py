@@ -14,6 +14,7 @@ from phydict.datasets import Augmentation, CTCases, Thorax, augment, find_cts, p
 from phydict.datasets.cache import read_arrays, write_arrays
 from phydict.datasets.phantom import change_by_findings
 from phydict.grid import Grid
+from phydict.reconstructor import check_seed
 from phydict.units import HUWindow
 
 PHANTOM_VERSION = 2
@@ -104,6 +105,7 @@ class PriorData(lightning.LightningDataModule):
                  seed: int = 0, voxels: int = 64, side: float = 384.0,
                  window: tuple[float, float] = (-1000.0, 1000.0)):
         super().__init__()
+        check_seed(seed)
         if not cts and not phantoms:
             raise ValueError("there is nothing to train on: give data.cts, or data.phantoms above 0")
         if phantoms < 0 or not 0 <= ct_fraction <= 1:

@@ -2,9 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
+
+from phydict.reading import check_memory
+
+
+def whole_sizes(values) -> tuple[int, ...] | None:
+    """`values` as whole numbers of 1 or more; None where they are anything else."""
+    sizes = np.atleast_1d(np.asarray(values))
+    if sizes.ndim != 1 or sizes.dtype.kind not in "iuf" or not np.isfinite(sizes).all():
+        return None
+    return tuple(map(int, sizes)) if (sizes >= 1).all() and (sizes == np.floor(sizes)).all() else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,9 +33,11 @@ class Grid:
     affine: np.ndarray | None = None
 
     def __post_init__(self):
-        shape = tuple(int(n) for n in self.shape)
-        if len(shape) != 3 or min(shape) < 1:
-            raise ValueError(f"a grid needs three positive sizes (X, Y, Z), but {self.shape} was given")
+        shape = whole_sizes(self.shape)
+        if shape is None or len(shape) != 3:
+            raise ValueError(f"a grid needs three positive sizes (X, Y, Z), whole numbers, but {self.shape} was given")
+        check_memory(3 * 4 * math.prod(shape), f"a reconstruction on {' x '.join(map(str, shape))} voxels, three volumes "
+                     "at least,", "give fewer voxels")
         if self.affine is None:
             if self.spacing is None:
                 raise ValueError("a grid needs either its spacing in mm or its index-to-world affine")
@@ -55,6 +68,8 @@ class Grid:
     @classmethod
     def cube(cls, voxels: int, side: float = 384.0) -> Grid:
         """`voxels`^3 voxels over a cube of `side` mm centred on the isocentre."""
+        if whole_sizes(voxels) is None:
+            raise ValueError(f"a cube has a whole number of voxels along each side, 1 or more, but {voxels} was given")
         return cls((voxels,) * 3, (side / voxels,) * 3)
 
     @property

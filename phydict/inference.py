@@ -7,6 +7,7 @@ Each finished case is one folder of the output; a run that was stopped goes on w
 
 from __future__ import annotations
 
+import os
 import platform
 import resource
 import sys
@@ -18,7 +19,6 @@ from importlib.metadata import version
 from pathlib import Path
 
 import lightning
-import torch
 from lightning.pytorch.cli import LightningCLI
 from lightning.pytorch.utilities.exceptions import MisconfigurationException, SIGTERMException
 from rich.console import Console
@@ -27,8 +27,8 @@ from torch import Tensor
 from phydict.ablation import main as ablate
 from phydict.case_results import CaseResults
 from phydict.command_line import (
-    check_apart, check_command, check_configured, check_writable, noted, one_sentence_errors, quiet, sentence,
-    with_configurations)
+    TRACEBACK, check_apart, check_command, check_configured, check_options, check_writable, noted, one_sentence_errors,
+    quiet, read_configurations, sentence, with_configurations)
 from phydict.datasets import load_xrays
 from phydict.dry_run import dry_run
 from phydict.evaluation import CaseMetrics, panel, rich_table
@@ -41,7 +41,7 @@ from phydict.prior import (
 from phydict.profiling import profiled, stage
 from phydict.progress import CaseProgress
 from phydict.reconstruction_data import ReconstructionData, case_scores
-from phydict.reconstructor import Reconstruction, Reconstructor, case_seed, describe, save_nifti
+from phydict.reconstructor import Reconstruction, Reconstructor, case_seed, check_seed, describe, save_nifti
 from phydict.units import HUWindow
 
 class ReconstructionTask(lightning.LightningModule):
@@ -77,6 +77,7 @@ class ReconstructionTask(lightning.LightningModule):
                  out: str = "runs/reconstructions", overwrite: bool = False, seed: int = 0, voxels: int = 64,
                  side: float = 384.0, samples: int = 1, precision: str = "auto"):
         super().__init__()
+        check_seed(seed)
         if name in ("", "..") or name != Path(name).name:
             raise ValueError(f"model.name is the name of one folder inside model.out, but '{name}' was given")
         self.method_name, self.seed, self.pages = name, seed, Path(out) / "dry_run"
@@ -161,6 +162,8 @@ class ReconstructionTask(lightning.LightningModule):
             if profile:
                 print(f"{case['id']}: {self.method_name}", profile.table(), sep="\n")
         except (ValueError, FloatingPointError) as error:
+            if os.environ.get(TRACEBACK):
+                raise
             if len(self.cases) == 1:
                 raise
             self.progress.finished("not reconstructed")
@@ -328,14 +331,16 @@ def main(args: list[str] | None = None) -> None:
     if args[:1] == ["ablate"]:
         return ablate(args[1:])
     with one_sentence_errors(MisconfigurationException), quiet():
+        check_options(args)
         check_command(args, COMMANDS, InferenceCLI.subcommands(), "python infer.py predict -c "
                       "configs/reconstruct/phydict_fast.yaml --data.xrays data/example/xrays")
         check_configured(args, ("--model", "--model.method", "--model.method.class_path"),
                          "configs/reconstruct/phydict_fast.yaml")
         args = with_configurations(args, ("reconstruct", "simulate"))
+        read_configurations(args)
         cli = InferenceCLI(
             ReconstructionTask, ReconstructionData, args=args, seed_everything_default=0, save_config_callback=None,
-            parser_kwargs={"exit_on_error": False, "description": (
+            parser_kwargs={"exit_on_error": False, "allow_abbrev": False, "description": (
                 "Reconstruct chest CTs from X-rays. A third subcommand, ablate, compares methods: ablate --help.")},
             trainer_defaults={"inference_mode": False, "logger": False, "enable_progress_bar": False,
                               "enable_checkpointing": False, "enable_model_summary": False, "accelerator": "auto",

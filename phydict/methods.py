@@ -16,7 +16,7 @@ from phydict.posterior import (
     Reward, Sampler, SplitGibbs)
 from phydict.precision import check_precision
 from phydict.prior import DEFAULT_PRIOR, Cascade, Prior, SuperResolution, load_prior, load_super_resolution
-from phydict.reconstructor import Reconstruction, Reconstructor, check_air, check_xrays
+from phydict.reconstructor import Reconstruction, Reconstructor, check_air, check_seed, check_xrays
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector, binned, binning
 
@@ -131,6 +131,7 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: Prior | str | Path | None 
         raise ValueError(f"the geometry must be a ConeBeam, but {beam!r} was given; ConeBeam.load reads one")
     if not isinstance(report, str | None):
         raise ValueError(f"the report must be text, but {report!r} was given")
+    check_seed(seed)
     ready = reconstructor(method, prior, guidance, super_resolution=super_resolution, guide_fine=guide_fine,
                           samples=samples, precision=precision)
     ready = ready if mu_water is None else ready.assuming(mu_water)

@@ -19,10 +19,14 @@ from phydict.datamodule import HELD_OUT_PHANTOM, PHANTOM_VERSION
 from phydict.datasets import CTFile, find_cts, find_xrays, load_case, load_xrays, phantom_case
 from phydict.evaluation import volume_metrics
 from phydict.grid import Grid
+from phydict.reading import read_text
 from phydict.reconstructor import describe
 from phydict.shipped import own_or_shipped
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Ideal, Projector, Simulator
+
+
+MOST_PHANTOMS = 100_000
 
 
 class Listed(Dataset):
@@ -77,8 +81,11 @@ class ReconstructionData(lightning.LightningDataModule):
                  pixel: tuple[float, float] = (1.25, 1.25), simulator: Simulator = Ideal(),
                  simulation_voxels: int | None = None):
         super().__init__()
-        if phantoms < 1:
-            raise ValueError(f"data.phantoms must be at least 1, but {phantoms} was given")
+        if not 1 <= phantoms <= MOST_PHANTOMS:
+            raise ValueError(f"data.phantoms lies between 1 and {MOST_PHANTOMS:,}, but {phantoms:,} was given")
+        if simulation_voxels is not None and simulation_voxels < 1:
+            raise ValueError(f"data.simulation_voxels must be at least 1, but {simulation_voxels} was given: leave it out "
+                             "for the reconstruction's own")
         self.xrays, self.geometry, self.cts, self.phantoms, self.only = xrays, geometry, cts, phantoms, only
         self.tables = {"reports": reports, "metadata": metadata, "fixed": fixed,
                        "first_reconstruction": first_reconstruction, "exclude": exclude}
@@ -129,7 +136,7 @@ class ReconstructionData(lightning.LightningDataModule):
     def _chosen(self, cts: list[CTFile]) -> list[CTFile]:
         if not self.only:
             return cts
-        wanted = set(Path(self.only).read_text().split())
+        wanted = set(read_text(self.only).split())
         missing = wanted - {ct.id for ct in cts}
         if missing or not wanted:
             raise ValueError(f"data.only ({self.only}) names {', '.join(sorted(missing)[:3]) or 'no case'}, which "

@@ -112,6 +112,11 @@ class Reconstructor(ABC):
     citation = ""
     mu_water: float = MU_WATER
 
+    def __post_init__(self):
+        if not 0 < self.mu_water < math.inf:
+            raise ValueError(f"mu_water, the attenuation of water in 1/mm, is above 0 and about {MU_WATER}, but "
+                             f"{self.mu_water} was given")
+
     def assuming(self, mu_water: float) -> Reconstructor:
         """The same method for X-rays in which water attenuates `mu_water` in 1/mm."""
         return replace(self, mu_water=mu_water)
@@ -136,6 +141,12 @@ def case_seed(seed: int, case: str) -> int:
     "<seed>/<id>". It decides the noise of the case's X-rays and their reconstruction, whatever the method and the other
     cases are."""
     return zlib.crc32(f"{seed}/{case}".encode())
+
+
+def check_seed(seed: int) -> None:
+    """Raises ValueError unless a seed is a whole number that random generators take."""
+    if not isinstance(seed, int) or not 0 <= seed < 2**63:
+        raise ValueError(f"a seed is a whole number from 0 to 2^63 - 1, but {seed} was given")
 
 
 def check_xrays(xrays: Tensor, beam: ConeBeam) -> None:
@@ -269,7 +280,7 @@ class Guard:
     def _check(self, values: Tensor) -> None:
         if not values.isfinite().all():
             raise FloatingPointError(f"the reconstruction is not finite from step {self.step} of {self.steps} on: use "
-                                     "smaller steps or less guidance, and check that the X-rays are line integrals")
+                                     "smaller steps, less guidance or another prior")
 
 
 def worst_view(misfit_per_view: Sequence[float]) -> tuple[int, float]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import errno
+import reprlib
 import sys
 from pathlib import Path
 
 import lightning
 import torch
-import yaml
 from jsonargparse import auto_cli
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.cli import LightningCLI
@@ -17,7 +18,8 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from phydict.atomic import whole_file
-from phydict.command_line import check_command, check_writable, one_sentence_errors, quiet, with_configurations
+from phydict.command_line import (
+    check_command, check_options, check_writable, one_sentence_errors, quiet, read_configurations, with_configurations)
 from phydict.datamodule import PriorData
 from phydict.precision import PRECISIONS, resolve_precision, trainer_precision
 from phydict.prior import save_prior, save_super_resolution
@@ -25,6 +27,7 @@ from phydict.prior.checkpoint import build_prior, build_super_resolution, build_
 from phydict.prior.finite import check_finite
 from phydict.prior.pretrained import inspect_prior, read_torch
 from phydict.prior_training import PriorTraining
+from phydict.reading import not_written
 from phydict.stage_training import CHECKPOINT
 from phydict.super_resolution_data import SuperResolutionData
 from phydict.super_resolution_training import SuperResolutionTraining
@@ -99,20 +102,14 @@ STAGES = {"base": (PriorTraining, PriorData), "super_resolution": (SuperResoluti
 def stage_of(args: list[str]) -> str:
     """The stage that a command line trains: its --stage, or the `stage` of the last configuration file with one."""
     look = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    look.add_argument("--config", "-c", action="append", default=[])
     look.add_argument("--stage")
     given, _ = look.parse_known_args(args)
     stages = [given.stage] if given.stage else []
-    for file in reversed(given.config):
-        try:
-            settings = yaml.safe_load(Path(file).read_text()) if Path(file).is_file() else None
-        except yaml.YAMLError:  # the parser of the command line says what is wrong
-            continue
-        if isinstance(settings, dict) and "stage" in settings:
-            stages.append(settings["stage"])
+    stages += [settings["stage"] for settings in reversed(read_configurations(args))
+               if isinstance(settings, dict) and "stage" in settings]
     stage = stages[0] if stages else "base"
-    if stage not in STAGES:
-        raise ValueError(f"the stages that can be trained are {' and '.join(STAGES)}, but '{stage}' was given")
+    if not isinstance(stage, str) or stage not in STAGES:
+        raise ValueError(f"the stages that can be trained are {' and '.join(STAGES)}, but {reprlib.repr(stage)} was given")
     return stage
 
 
@@ -123,10 +120,11 @@ class WholeCheckpoints(TorchCheckpointIO):
         try:
             with whole_file(Path(path)) as part:
                 torch.save(checkpoint, part)
-        except (OSError, RuntimeError) as error:  # torch reports a full disk as the latter
-            reason = getattr(error, "strerror", None) or "perhaps the disk is full"
-            raise OSError(f"the checkpoint {path} could not be written ({reason}): free some space and go on from the "
-                          "last one, if there is one, with --ckpt_path") from error
+        except (OSError, RuntimeError) as error:
+            if isinstance(error, RuntimeError):  # torch's words for a write that was cut short
+                error = OSError(errno.ENOSPC, "perhaps the disk is full")
+            raise not_written(f"the checkpoint {path}", error, "give another --out, and go on from the last one, if there "
+                              "is one, with --ckpt_path") from error
 
 
 class BestCheckpoint(ModelCheckpoint):
@@ -219,17 +217,18 @@ def main(args: list[str] | None = None) -> None:
     """Command line of training: fit, validate, export, inspect-prior. A bad input ends in one sentence and code 2."""
     given = sys.argv[1:] if args is None else args
     with one_sentence_errors(MisconfigurationException, to_go_on="add --ckpt_path and the run's last.ckpt"), quiet():
+        check_options(given)
         if given[:1] == ["export"]:
-            auto_cli(export_prior, args=given[1:], as_positional=False, exit_on_error=False)
+            auto_cli(export_prior, args=given[1:], as_positional=False, exit_on_error=False, allow_abbrev=False)
         elif given[:1] == ["inspect-prior"]:
-            auto_cli(print_prior, args=given[1:], exit_on_error=False)
+            auto_cli(print_prior, args=given[1:], exit_on_error=False, allow_abbrev=False)
         else:
             check_command(given, COMMANDS, PriorCLI.subcommands(), "python train.py fit -c configs/prior/phantom.yaml")
             given = with_configurations(given, ("prior",))
             PriorCLI(*STAGES[stage_of(given)], args=given, seed_everything_default=0,
                      save_config_kwargs={"overwrite": True},
                      trainer_defaults={"enable_progress_bar": False, "enable_model_summary": False},
-                     parser_kwargs={"exit_on_error": False, "description": (
+                     parser_kwargs={"exit_on_error": False, "allow_abbrev": False, "description": (
                          "Train a prior of chest CT. Two more commands: `export --checkpoint <last.ckpt> --out "
                          "<prior.safetensors>` writes what a training learnt as a prior for reconstruction, and "
                          "`inspect-prior <path>` tells what a file or folder is.")})

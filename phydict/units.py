@@ -8,6 +8,7 @@ All three scales are affine in each other, so a projector that is linear in mu i
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 MU_WATER = 0.02
@@ -35,8 +36,8 @@ class HUWindow:
     high: float = 1000.0
 
     def __post_init__(self):
-        if not self.low < self.high:
-            raise ValueError(f"an HU window needs low < high, but [{self.low}, {self.high}] was given")
+        if not (self.low < self.high and math.isfinite(self.low) and math.isfinite(self.high)):
+            raise ValueError(f"an HU window needs low < high, both finite, but [{self.low}, {self.high}] was given")
 
     @property
     def centre(self) -> float:

@@ -12,7 +12,6 @@ from pathlib import Path
 from types import NoneType
 from typing import get_args, get_type_hints
 
-import yaml
 from jsonargparse import ArgumentError, ArgumentParser
 
 from phydict.grid import Grid
@@ -24,6 +23,7 @@ from phydict.reconstructor import Reconstructor, describe
 from phydict.shipped import configuration
 from phydict.units import HUWindow
 from phydict.xray import Ideal, Polychromatic, Simulator
+from phydict.yaml_file import read_yaml
 
 SIDE = 560.0
 """mm along each side of the simulated detector unless the size of its pixels is given."""
@@ -139,10 +139,7 @@ def read_specification(file: str | Path, **given) -> Specification:
     combination is a trial; or products: a list of such bases and axes. A setting that means nothing to a method is left
     out for it, and what then is the same is run once. Raises ValueError, in one sentence, on what cannot be meant.
     """
-    try:
-        content = yaml.safe_load(configuration(file, ("ablate",)).read_text())
-    except yaml.YAMLError as error:
-        raise ValueError(f"{file} is no YAML: {' '.join(str(error).split())}") from error
+    content = read_yaml(configuration(file, ("ablate",)))
     try:
         return _specification(content, {k: v for k, v in given.items() if v is not None})
     except ValueError as error:

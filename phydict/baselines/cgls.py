@@ -32,6 +32,7 @@ class CGLS(Baseline):
     name: str = "cgls"
 
     def __post_init__(self):
+        super().__post_init__()
         for what in ("iterations", "restarts"):
             if getattr(self, what) < 1:
                 raise ValueError(f"CGLS needs {what} of at least 1, but {getattr(self, what)} was given")

@@ -39,6 +39,7 @@ class DiffVox(Baseline):
     name: str = "diffvox"
 
     def __post_init__(self):
+        super().__post_init__()
         if self.iterations < 1:
             raise ValueError(f"DiffVox needs at least 1 iteration, but {self.iterations} was given")
         if not (self.smoothness >= 0 and self.learning_rate > 0):

@@ -28,6 +28,7 @@ class SIRT(Baseline):
     name: str = "sirt"
 
     def __post_init__(self):
+        super().__post_init__()
         if self.iterations < 1:
             raise ValueError(f"SIRT needs at least 1 iteration, but {self.iterations} was given")
 

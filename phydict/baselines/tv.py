@@ -36,6 +36,7 @@ class FISTATV(Baseline):
     name: str = "tv"
 
     def __post_init__(self):
+        super().__post_init__()
         for what in ("iterations", "inner"):
             if getattr(self, what) < 1:
                 raise ValueError(f"FISTA-TV needs {what} of at least 1, but {getattr(self, what)} was given")

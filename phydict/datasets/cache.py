@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import warnings
-import zipfile
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +11,7 @@ from typing import BinaryIO
 import numpy as np
 
 from phydict.atomic import whole_file
+from phydict.reading import not_written, reason
 
 
 def write_arrays(file: Path, arrays: dict[str, np.ndarray]) -> None:
@@ -39,8 +38,7 @@ def _cached(file: Path) -> Iterator[BinaryIO]:
         with whole_file(file) as part, part.open("wb") as stream:
             yield stream
     except OSError as error:
-        raise OSError(f"the prepared case {file} could not be cached ({error.strerror or error}): "
-                      "free some space, or give another data.cache") from error
+        raise not_written(f"the prepared case {file} of the cache", error, "give another data.cache") from error
 
 
 def read_arrays(file: Path) -> dict[str, np.ndarray] | None:
@@ -50,6 +48,6 @@ def read_arrays(file: Path) -> dict[str, np.ndarray] | None:
     try:
         with np.load(file) as stored:
             return {name: stored[name] for name in stored.files}
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
-        warnings.warn(f"the cached case {file} cannot be read ({error}); it is prepared again", stacklevel=3)
+    except Exception as error:  # whatever a damaged archive leads NumPy to
+        warnings.warn(f"the cached case {file} cannot be read ({reason(error)}); it is prepared again", stacklevel=3)
         return None

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import csv
-import json
+import math
+import reprlib
 from pathlib import Path
 
 from phydict.datasets.reports import join_report
@@ -29,15 +30,28 @@ def read_calibrations(path: str | Path) -> dict[str, Calibration]:
     columns = ("VolumeName", "RescaleSlope", "RescaleIntercept", "XYSpacing", "ZSpacing")
     calibrations = {}
     for row in _rows(path, columns):
-        try:
-            columns_mm, rows_mm = json.loads(row["XYSpacing"])
-            orientation = tuple(json.loads(row.get("ImageOrientationPatient") or "[1, 0, 0, 0, 1, 0]"))
-            calibration = Calibration(float(row["RescaleSlope"]), float(row["RescaleIntercept"]),
-                                      (float(columns_mm), float(rows_mm), float(row["ZSpacing"])), orientation)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"the metadata of {row['VolumeName']} in {path} cannot be read: {error}") from error
-        calibrations[case_id(row["VolumeName"])] = calibration
+        slope, intercept, z_mm = (_numbers(path, row, name, 1)[0] for name in ("RescaleSlope", "RescaleIntercept",
+                                                                               "ZSpacing"))
+        spacing = (*_numbers(path, row, "XYSpacing", 2), z_mm)
+        if min(spacing) <= 0:
+            raise ValueError(f"the metadata of {row['VolumeName']} in {path} give it voxels of {spacing} mm; correct "
+                             "XYSpacing and ZSpacing")
+        orientation = _numbers(path, row, "ImageOrientationPatient", 6) if row.get("ImageOrientationPatient") else ()
+        calibrations[case_id(row["VolumeName"])] = Calibration(slope, intercept, spacing, *filter(None, [orientation]))
     return calibrations
+
+
+def _numbers(path: str | Path, row: dict[str, str], column: str, count: int) -> tuple[float, ...]:
+    """The finite numbers in one field: "1.5", or "[0.7, 0.7]" where there are several."""
+    written = str(row[column])
+    try:
+        found = tuple(map(float, written.strip(" []").split(",")))
+    except ValueError:
+        found = ()
+    if len(found) != count or not all(map(math.isfinite, found)):
+        raise ValueError(f"the metadata of {row['VolumeName']} in {path} cannot be read: {column} must be {count} finite "
+                         f"number{'s' * (count > 1)}, but {reprlib.repr(written)} was found")
+    return found
 
 
 def _rows(path: str | Path, columns: tuple[str, ...]) -> list[dict[str, str]]:

@@ -15,11 +15,14 @@ import numpy as np
 import pydicom
 from pydicom.errors import InvalidDicomError
 
-from phydict.datasets.dicom import UNREADABLE, read_dicom
+from phydict.datasets.dicom import read_dicom
 from phydict.datasets.natural_order import natural_order
 from phydict.datasets.transforms import LEAST_SLICES, to_ras
+from phydict.reading import reading
 
-NEEDED = ("ImagePositionPatient", "ImageOrientationPatient", "PixelSpacing", "RescaleSlope", "RescaleIntercept")
+NEEDED = {"ImagePositionPatient": 3, "ImageOrientationPatient": 6, "PixelSpacing": 2, "RescaleSlope": 1,
+          "RescaleIntercept": 1}
+"""Tags of every slice, and how many numbers each holds."""
 SAME = ("Rows", "Columns", "PixelSpacing", "ImageOrientationPatient")
 SAME_PLACE_MM, SPACING_TOLERANCE, TILT_DEGREES = 0.01, 0.05, 0.5
 
@@ -41,13 +44,13 @@ def find_series(root: Path) -> list[Series]:
             continue
         try:
             header = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=["SeriesInstanceUID", "SeriesNumber"])
+            number = header.get("SeriesNumber")
+            uid = str(header.get("SeriesInstanceUID") or path.parent)
         except InvalidDicomError:
             continue
-        except UNREADABLE:
+        except Exception:  # whatever a damaged file leads pydicom to: load_series says what
             groups[str(path)].append((path, ""))
             continue
-        number = header.get("SeriesNumber")
-        uid = header.get("SeriesInstanceUID") or str(path.parent)
         groups[uid].append((path, "" if number is None else str(number)))
     found = [Series(group[0][0].parent, group[0][1], tuple(path for path, _ in group)) for group in groups.values()]
     return sorted(found, key=lambda series: natural_order(f"{series.folder}/{series.number}"))
@@ -75,16 +78,25 @@ def load_series(series: Series) -> tuple[np.ndarray, np.ndarray]:
         missing = [keyword for keyword in NEEDED if header.get(keyword) in (None, "")]
         if missing:
             raise ValueError(f"{path.name} lacks {', '.join(missing)}; export the series again")
+        for keyword, count in NEEDED.items():
+            value = header.get(keyword)
+            if np.size(value) != count or not np.isfinite(np.asarray(value, float)).all():
+                raise ValueError(f"{keyword} of {path.name} must be {count} finite number{'s' * (count > 1)}, but {value} "
+                                 "was found; export the series again")
+        if min(header.PixelSpacing) <= 0:
+            raise ValueError(f"PixelSpacing of {path.name} must be positive, but {header.PixelSpacing} mm was found; "
+                             "export the series again")
     paths, affine = _stack(slices)
     volume = np.stack([read_dicom(path)[0][0].T.astype(np.float32) for path in paths], axis=2)
     return to_ras(volume, affine)
 
 
 def _header(path: Path) -> pydicom.Dataset:
-    try:
-        return pydicom.dcmread(path, stop_before_pixels=True)
-    except UNREADABLE as error:
-        raise ValueError(f"the DICOM file {path} cannot be read ({error}); export it again") from error
+    with reading(f"the DICOM file {path}", "export it again"):
+        header = pydicom.dcmread(path, stop_before_pixels=True)
+        for keyword in (*NEEDED, *SAME, "Modality", "ImageType", "NumberOfFrames"):
+            header.get(keyword)  # which is decoded only now
+        return header
 
 
 def _stack(slices: dict[Path, pydicom.Dataset]) -> tuple[list[Path], np.ndarray]:

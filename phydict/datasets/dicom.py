@@ -7,18 +7,20 @@ functional groups, in the shared ones, and in the file. The beam they state is p
 
 from __future__ import annotations
 
+import math
+import reprlib
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pydicom
-from pydicom.errors import InvalidDicomError
+from pydicom.multival import MultiValue
 from pydicom.pixels import apply_modality_lut
 
 from phydict.datasets.intensity import Intensity
+from phydict.reading import check_memory, reading
 
 VIEW_POSITIONS = {"PA": 0.0, "LL": 90.0, "AP": 180.0, "RL": -90.0}
-UNREADABLE = (InvalidDicomError, OSError, EOFError, ValueError, AttributeError, NotImplementedError, RuntimeError)
 
 
 @dataclass(frozen=True)
@@ -49,19 +51,20 @@ def read_dicom(path: Path) -> list[tuple[np.ndarray, DicomTags]]:
 
     Raises ValueError naming the file where it cannot be read or decoded, or is not grey.
     """
-    try:
+    with reading(f"the DICOM file {path}", "export it again, uncompressed"):
         dataset = pydicom.dcmread(path)
         if dataset.get("SamplesPerPixel", 1) != 1:
             raise ValueError(f"it has {dataset.SamplesPerPixel} colours per pixel; export it as grey")
         if "PixelData" not in dataset:
             raise ValueError("it holds no image")
+        check_memory(8 * int(dataset.Rows) * int(dataset.Columns) * int(dataset.get("NumberOfFrames") or 1),
+                     "what its tags promise", "give a smaller one")
         stored = dataset.pixel_array
-    except UNREADABLE as error:
-        raise ValueError(f"the DICOM file {path} cannot be read ({error}); export it again, uncompressed") from error
     frames = stored[None] if stored.ndim == 2 else stored
     several = len(frames) > 1
-    return [(_rescaled(frame, dataset, k), _tags(dataset, k, f"{path} frame {k + 1}" if several else str(path)))
-            for k, frame in enumerate(frames)]
+    names = [f"{path} frame {k + 1}" if several else str(path) for k in range(len(frames))]
+    return [(_rescaled(frame, dataset, k, name), _tags(dataset, k, name))
+            for k, (frame, name) in enumerate(zip(frames, names))]
 
 
 def tags_intensity(tags: list[DicomTags]) -> Intensity:
@@ -93,29 +96,34 @@ def shown(intensity: Intensity, tags: list[DicomTags]) -> Intensity:
     return Intensity("display", bright_is_dense=not intensity.bright_is_dense)
 
 
-def _find(dataset: pydicom.Dataset, frame: int, keyword: str):
-    """A tag's value for one frame: from its own functional groups, the shared ones, or the file; None if empty."""
-    groups = []
-    for name, index in (("PerFrameFunctionalGroupsSequence", frame), ("SharedFunctionalGroupsSequence", 0)):
-        sequence = dataset.get(name) or []
-        groups += [item[0] for element in (sequence[index] if index < len(sequence) else [])
-                   if (item := element.value) and element.VR == "SQ"]
-    for group in (*groups, dataset):
-        value = group.get(keyword)
-        if value is not None and value != "" and not (hasattr(value, "__len__") and len(value) == 0):
-            return value
+def _find(dataset: pydicom.Dataset, frame: int, keyword: str, name: str):
+    """A tag's value for one frame: from its own functional groups, the shared ones, or the file; None if empty.
+
+    Raises ValueError naming the tag and the frame's `name` where it cannot be read.
+    """
+    with reading(f"{keyword} of {name}", "export it again, or correct that tag"):
+        groups = []
+        for group, index in (("PerFrameFunctionalGroupsSequence", frame), ("SharedFunctionalGroupsSequence", 0)):
+            sequence = dataset.get(group) or []
+            groups += [item[0] for element in (sequence[index] if index < len(sequence) else [])
+                       if (item := element.value) and element.VR == "SQ"]
+        for group in (*groups, dataset):
+            value = group.get(keyword)
+            if value is not None and value != "" and not (hasattr(value, "__len__") and len(value) == 0):
+                return value
     return None
 
 
-def _rescaled(pixels: np.ndarray, dataset: pydicom.Dataset, frame: int) -> np.ndarray:
+def _rescaled(pixels: np.ndarray, dataset: pydicom.Dataset, frame: int, name: str) -> np.ndarray:
     if "ModalityLUTSequence" in dataset:
-        return np.asarray(apply_modality_lut(pixels, dataset), np.float64)
-    slope, intercept = _find(dataset, frame, "RescaleSlope"), _find(dataset, frame, "RescaleIntercept")
-    return pixels * float(1 if slope is None else slope) + float(intercept or 0)
+        with reading(f"the modality LUT of {name}", "export it with RescaleSlope and RescaleIntercept"):
+            return np.asarray(apply_modality_lut(pixels, dataset), np.float64)
+    slope, intercept = (_number(dataset, frame, f"Rescale{part}", name) for part in ("Slope", "Intercept"))
+    return pixels * (1.0 if slope is None else slope) + (intercept or 0.0)
 
 
 def _tags(dataset: pydicom.Dataset, frame: int, name: str) -> DicomTags:
-    angiographic = dataset.get("Modality", "") in ("XA", "RF")
+    angiographic = _find(dataset, frame, "Modality", name) in ("XA", "RF")
     to_isocentre = magnification = None
     if angiographic:
         to_isocentre = _number(dataset, frame, "DistanceSourceToIsocenter", name)
@@ -123,40 +131,54 @@ def _tags(dataset: pydicom.Dataset, frame: int, name: str) -> DicomTags:
             to_isocentre = _number(dataset, frame, "DistanceSourceToPatient", name)
     else:
         magnification = _number(dataset, frame, "EstimatedRadiographicMagnificationFactor", name)
-    pixel = _find(dataset, frame, "ImagerPixelSpacing")
     primary = _angle(dataset, frame, "PositionerPrimaryAngle", name)
     secondary = _angle(dataset, frame, "PositionerSecondaryAngle", name)
-    if primary is None and dataset.get("ViewPosition") in VIEW_POSITIONS:
-        primary = VIEW_POSITIONS[dataset.ViewPosition]
+    position = str(_find(dataset, frame, "ViewPosition", name))
+    if primary is None and position in VIEW_POSITIONS:
+        primary = VIEW_POSITIONS[position]
         secondary = secondary or 0.0
-    orientation = _find(dataset, frame, "PatientOrientation")
+    orientation = _find(dataset, frame, "PatientOrientation", name)
+    if isinstance(orientation, str):
+        orientation = orientation.split("\\")
     sign = _number(dataset, frame, "PixelIntensityRelationshipSign", name)
     if sign and (_number(dataset, frame, "RescaleSlope", name) or 1) < 0:
         sign = -sign  # the tag speaks of stored values
     return DicomTags(
         name, _number(dataset, frame, "DistanceSourceToDetector", name), to_isocentre, magnification,
-        None if pixel is None else tuple(float(p) for p in pixel), primary, secondary,
+        _numbers(dataset, frame, "ImagerPixelSpacing", name, 2), primary, secondary,
         None if orientation is None else tuple(str(o) for o in orientation), angiographic,
-        dataset.get("PhotometricInterpretation") == "MONOCHROME1",
-        str(_find(dataset, frame, "PixelIntensityRelationship") or ""), None if sign is None else int(sign))
+        _find(dataset, frame, "PhotometricInterpretation", name) == "MONOCHROME1",
+        str(_find(dataset, frame, "PixelIntensityRelationship", name) or ""), None if sign is None else int(sign))
+
+
+def _numbers(dataset: pydicom.Dataset, frame: int, keyword: str, name: str, count: int | None) -> tuple | None:
+    """The finite numbers of a tag, `count` of them if it is given; None where the tag is empty."""
+    value = _find(dataset, frame, keyword, name)
+    if value is None:
+        return None
+    wanted = "numbers" if count is None else "a number" if count == 1 else f"{count} numbers"
+    try:
+        found = tuple(float(part) for part in (value if isinstance(value, MultiValue) else [value]))
+    except (TypeError, ValueError, OverflowError):
+        found = (math.nan,)
+    if len(found) != (count or len(found)) or not all(map(math.isfinite, found)):
+        raise ValueError(f"{name}: {keyword} must be {wanted}, but {reprlib.repr(value)} was found")
+    return found
 
 
 def _number(dataset: pydicom.Dataset, frame: int, keyword: str, name: str) -> float | None:
-    value = _find(dataset, frame, keyword)
-    try:
-        return None if value is None else float(value)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name}: {keyword} must be a number, but {value!r} was found") from error
+    found = _numbers(dataset, frame, keyword, name, 1)
+    return None if found is None else found[0]
 
 
 def _angle(dataset: pydicom.Dataset, frame: int, keyword: str, name: str) -> float | None:
     """A positioner angle with its increment: one value per frame counts from the first, a single one is the step."""
-    angle, steps = _number(dataset, frame, keyword, name), dataset.get(f"{keyword}Increment")
-    if angle is None or steps is None or steps == "":
+    angle = _number(dataset, frame, keyword, name)
+    steps = None if angle is None else _numbers(dataset, frame, f"{keyword}Increment", name, None)
+    if steps is None:
         return angle
-    steps = np.atleast_1d(np.asarray(steps, float))
     if len(steps) == 1:
-        return angle + frame * float(steps[0])
+        return angle + frame * steps[0]
     if frame >= len(steps):
         raise ValueError(f"{name}: {keyword}Increment holds {len(steps)} values; give one, or one per frame")
-    return angle + float(steps[frame])
+    return angle + steps[frame]

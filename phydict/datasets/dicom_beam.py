@@ -21,13 +21,14 @@ CR or DX image must have it.
 from __future__ import annotations
 
 import math
+import reprlib
 
 import numpy as np
 from pydicom.datadict import tag_for_keyword
 from pydicom.tag import Tag
 
 from phydict.datasets.dicom import DicomTags
-from phydict.xray.geometry import ConeBeam
+from phydict.xray.geometry import MOST_MM, ConeBeam
 
 DIRECTIONS = {"R": (1, 0, 0), "L": (-1, 0, 0), "A": (0, 1, 0), "P": (0, -1, 0), "H": (0, 0, 1), "F": (0, 0, -1)}
 OVERRIDES = ("source_to_detector", "source_to_isocentre", "pixel", "primary_degrees", "secondary_degrees",
@@ -50,7 +51,7 @@ def tags_beam(tags: list[DicomTags], shape: tuple[int, int], overrides: dict | N
 
 def _per_frame(overrides: dict, frames: int) -> dict[str, list]:
     """Every override as a list with one value per frame."""
-    unknown = [repr(name) for name in overrides if name not in OVERRIDES]
+    unknown = [reprlib.repr(name) for name in overrides if name not in OVERRIDES]
     if unknown:
         raise ValueError(f"unknown key {', '.join(unknown)} in `dicom:`; the keys are {', '.join(OVERRIDES)}")
     stated = {}
@@ -67,13 +68,14 @@ def _stated(name: str, value):
     """One frame's value of an override. Raises ValueError where it is of the wrong kind."""
     if name == "patient_orientation":
         if not isinstance(value, str):
-            raise ValueError(f"`{name}` in `dicom:` is a text such as 'L\\F', but {value!r} was given")
+            raise ValueError(f"`{name}` in `dicom:` is a text such as 'L\\F', but {reprlib.repr(value)} was "
+                             "given")
         return value
-    try:
-        return tuple(np.broadcast_to(np.asarray(value, float), 2).tolist()) if name == "pixel" else float(value)
-    except (TypeError, ValueError) as error:
+    parts = value if name == "pixel" and isinstance(value, list) and len(value) == 2 else [value]
+    if not all(isinstance(part, int | float) and not isinstance(part, bool) and abs(part) < MOST_MM for part in parts):
         wanted = "[row height, column width]" if name == "pixel" else "a number"
-        raise ValueError(f"`{name}` in `dicom:` needs {wanted}, but {value!r} was given") from error
+        raise ValueError(f"`{name}` in `dicom:` needs {wanted}, but {reprlib.repr(value)} was given")
+    return float(value) if name != "pixel" else (float(parts[0]), float(parts[-1]))
 
 
 def _pose(tags: DicomTags, stated: dict, turned: bool) -> tuple[np.ndarray, ...]:

@@ -8,13 +8,18 @@
 
 from __future__ import annotations
 
+import reprlib
 from dataclasses import dataclass
+from numbers import Real
 
 import numpy as np
 
 KINDS = ("line_integrals", "counts", "display")
 MOST = 100.0
 """No line integral of a patient is larger: it is 2 m of bone."""
+
+LARGEST = 1e30
+"""No pixel value, scale or offset is as large: it would overflow."""
 
 ABOVE_AIR = 1.5
 """Counts above so many times the air value are no noise."""
@@ -41,13 +46,14 @@ class Intensity:
 
     def __post_init__(self):
         if self.kind not in KINDS:
-            raise ValueError(f"intensity kind {self.kind!r} is unknown; give one of {', '.join(KINDS)}")
+            raise ValueError(f"intensity kind {reprlib.repr(self.kind)} is unknown; give one of {', '.join(KINDS)}")
         for name in ("scale", "offset", "air", "floor"):
             self._make_number(name)
         if not _names(self.dark):
             self._make_number("dark")
         if self.flat is not None and not _names(self.flat):
-            raise ValueError(f"`flat` is the name of an image, or a list of names, but {self.flat!r} was given")
+            raise ValueError("`flat` is the name of an image, or a list of names, but "
+                             f"{reprlib.repr(self.flat)} was given")
         if self.scale == 0:
             raise ValueError("the scale of line integrals must not be 0; give what one pixel value stands for")
         counts = [name for name in ("air", "flat", "dark", "floor") if getattr(self, name) is not None]
@@ -65,10 +71,12 @@ class Intensity:
 
     def _make_number(self, name: str) -> None:
         value = getattr(self, name)
-        try:
-            object.__setattr__(self, name, value if value is None else float(value))
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"intensity needs a number for {name}, but {value!r} was given") from error
+        if value is None:
+            return
+        if isinstance(value, bool) or not isinstance(value, Real) or not abs(value) < LARGEST:
+            raise ValueError(f"intensity needs a number for {name}, but {reprlib.repr(value)} was given; give a "
+                             "finite one without quotes")
+        object.__setattr__(self, name, float(value))
 
     @property
     def references(self) -> dict[str, list[str]]:
@@ -113,5 +121,10 @@ class Intensity:
 def _names(value) -> list[str]:
     """File names: of one name or a list of them; none of anything else."""
     if isinstance(value, str):
-        return [value]
-    return list(value) if isinstance(value, (list, tuple)) and all(isinstance(name, str) for name in value) else []
+        value = [value]
+    return list(value) if isinstance(value, list | tuple) and all(map(is_file_name, value)) else []
+
+
+def is_file_name(value) -> bool:
+    """Whether a value can be the name of a file, at most 255 characters without a null."""
+    return isinstance(value, str) and len(value) < 256 and "\0" not in value

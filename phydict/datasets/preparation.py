@@ -27,12 +27,13 @@ from phydict.atomic import remove_leftovers, whole_file, whole_folder
 from phydict.datasets.anatomy import MASKS, body_mask, lung_box_centre, lung_box_size, segment
 from phydict.datasets.ct_rate import CTFile, find_cts
 from phydict.datasets.ct_series import Series, find_series, load_series
-from phydict.datasets.prepared import RECORD, VOLUME, read_record, write_prepared
+from phydict.datasets.prepared import VOLUME, read_record, write_prepared
 from phydict.datasets.segmentations import lungs_by_lungmask, read_segmentation, segmentations_beside
 from phydict.datasets.transforms import (AIR, SEGMENTATION_MM, case_id, centred, check_hu, covering_grid, load_ct,
                                          to_grid)
 from phydict.grid import Grid
 from phydict.progress import CaseProgress
+from phydict.reading import not_written
 
 SUMMARY = "summary.csv"
 COLUMNS = ("id", "status", "reason", "remark", "source", "kind", "slices", "spacing_x_mm", "spacing_y_mm",
@@ -213,10 +214,10 @@ def _finished(source: Source, out: Path, settings: Settings) -> dict | None:
     if not folder.exists():
         return None
     record = read_record(folder / VOLUME)
-    if record["settings"] != json.loads(json.dumps(asdict(settings))):
+    if record.get("settings") != json.loads(json.dumps(asdict(settings))):
         raise ValueError(f"{folder} was prepared with other settings; give another output folder, or remove that one")
     try:
-        return record["row"] if record["fingerprint"] == source.fingerprint() else None
+        return record.get("row") if record.get("fingerprint") == source.fingerprint() else None
     except ValueError:
         return None
 
@@ -269,8 +270,8 @@ def prepare_source(source: Source, out: Path, settings: Settings) -> dict:
         with whole_folder(out / source.id) as partial:
             write_prepared(partial, grid, images, record)
     except OSError as error:
-        raise OSError(f"the case {out / source.id} could not be written ({error.strerror or error}): free some space "
-                      "and run the same command again, finished cases are kept") from error
+        raise not_written(f"the case {out / source.id}", error, "give another output folder, and run the same command "
+                          "again, finished cases are kept") from error
     return row
 
 
@@ -315,5 +316,5 @@ def _write_summary(file: Path, rows: list[dict]) -> None:
             table.writeheader()
             table.writerows(rows)
     except OSError as error:
-        raise OSError(f"the summary {file} could not be written ({error.strerror or error}): free some space and run "
-                      "the same command again, finished cases are kept") from error
+        raise not_written(f"the summary {file}", error, "give another output folder, and run the same command again, "
+                          "finished cases are kept") from error

@@ -12,6 +12,7 @@ back to the patient's world, case.json's atlas_affine to atlas millimetres, cent
 from __future__ import annotations
 
 import json
+import reprlib
 import warnings
 from pathlib import Path
 
@@ -21,6 +22,7 @@ import torch
 from phydict.datasets.anatomy import MASKS
 from phydict.datasets.transforms import AIR, centred, load_ct, to_grid
 from phydict.grid import Grid
+from phydict.reading import read_text, reading
 from phydict.units import HUWindow
 
 RECORD, VOLUME = "case.json", "ct.nii.gz"
@@ -75,12 +77,14 @@ def is_prepared(path: Path) -> bool:
 def read_record(path: Path) -> dict:
     """What case.json says of the prepared case whose folder holds `path`. Raises ValueError where it is damaged."""
     file = path.parent / RECORD
-    try:
-        record = json.loads(file.read_text())
-        record["id"], record["space"], record["extent"], record["window"], record["report"]
+    with reading(file, "remove its folder and prepare that CT again"):
+        record = json.loads(read_text(file))
+        for name, kind in (("id", str), ("space", str), ("extent", list), ("window", list), ("report", str)):
+            if not isinstance(record[name], kind):
+                raise ValueError(f"it is damaged: {name} is {reprlib.repr(record[name])}")
+        if np.asarray(record["extent"], float).shape != (3,) or np.asarray(record["window"], float).shape != (2,):
+            raise ValueError("it is damaged: extent and window are three and two numbers")
         return record
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{file} is damaged ({error}); remove its folder and prepare that CT again") from error
 
 
 def read_prepared(path: Path, grid: Grid, window: HUWindow) -> dict:

@@ -21,6 +21,7 @@ from phydict.datasets.natural_order import natural_order
 from phydict.datasets.reports import format_report
 from phydict.datasets.xray_description import GEOMETRY, Description, read_description
 from phydict.datasets.xray_images import ENDINGS, image_files, is_dicom, read_image
+from phydict.reading import read_text
 from phydict.shipped import own_or_shipped
 from phydict.xray.geometry import ConeBeam
 
@@ -69,11 +70,10 @@ def load_xrays(folder: str | Path, geometry: str | Path | None = None, intensity
     views = _read_views([file for file in files if file.resolve() not in apart])
     if not views.images:
         raise FileNotFoundError(f"{folder} holds no X-ray image; put one of {', '.join(ENDINGS)} per view there")
+    _check_count(folder, source, len(views.images), described.views)
     upright = described.orientation.shape
     beam = described.beam_of(upright(views.images[0].shape), views.tags)
-    if len(views.images) != beam.views:
-        raise ValueError(f"{folder} holds {len(views.images)} images, but {source} describes {beam.views} views; "
-                         "give one image per view")
+    _check_count(folder, source, len(views.images), beam.views)
     for name, image in zip(views.names, views.images):
         rows, columns = upright(image.shape)
         if (rows, columns) != beam.shape:
@@ -132,6 +132,11 @@ def save_xrays(folder: str | Path, xrays: torch.Tensor | np.ndarray, beam: ConeB
         (folder / REPORT).write_text(report + "\n", encoding="utf-8")
     else:
         (folder / REPORT).unlink(missing_ok=True)
+
+
+def _check_count(folder: Path, source: Path, images: int, views: int | None) -> None:
+    if views not in (None, images):
+        raise ValueError(f"{folder} holds {images} images, but {source} describes {views} views; give one image per view")
 
 
 def _is_case(folder: Path) -> bool:
@@ -199,7 +204,4 @@ def _mean(paths: list[Path], shape: tuple[int, int]) -> np.ndarray:
 
 
 def _read_report(path: Path) -> str:
-    try:
-        return format_report(path.read_text(encoding="utf-8-sig")) if path.is_file() else ""
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path} is not UTF-8 text ({error}); save it as UTF-8") from error
+    return format_report(read_text(path)) if path.is_file() else ""

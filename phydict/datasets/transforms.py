@@ -7,7 +7,6 @@ anti-aliased when shrinking, smooth when enlarging, and every old voxel keeps it
 from __future__ import annotations
 
 import warnings
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +15,9 @@ import torch
 import scipy
 
 from phydict.datasets.anatomy import lung_box_centre, segment
+from phydict.datasets.nifti_file import open_nifti
 from phydict.grid import Grid
+from phydict.reading import reading
 from phydict.units import HUWindow
 
 AIR = -1000.0
@@ -55,25 +56,18 @@ def load_ct(path: str | Path, calibration: Calibration | None = None) -> tuple[n
     Raises FileNotFoundError, and ValueError naming the file where it cannot be read, is not one 3D volume, has
     fewer than LEAST_SLICES slices, no orientation, or holds NaN or infinite values.
     """
-    import nibabel
     from monai.data import NibabelReader
 
-    unreadable = (OSError, EOFError, ValueError, RuntimeError, zlib.error, nibabel.filebasedimages.ImageFileError)
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no CT file {path}; give a .nii or .nii.gz file that exists")
-    try:
-        header = nibabel.load(path).header
-    except unreadable as error:
-        raise ValueError(f"{path} cannot be read as NIfTI ({error}); convert or download it again") from error
+    with reading(path, "convert it to NIfTI, or download it, again"):
+        header = open_nifti(path).header
     _check_header(path, header, calibration)
     reader = NibabelReader(squeeze_non_spatial_dims=True)
-    try:
+    with reading(f"the voxels of {path}", "the file seems truncated or damaged: download or convert it again"):
         stored, meta = reader.get_data(reader.read(path))
-    except unreadable as error:
-        raise ValueError(f"the voxels of {path} cannot be read, the file seems truncated or damaged; "
-                         "download or convert it again") from error
-    hu, affine = np.array(stored, np.float32), meta["affine"]
+        hu, affine = np.array(stored, np.float32), meta["affine"]
     if calibration is not None:
         hu, affine = hu * np.float32(calibration.slope) + np.float32(calibration.intercept), calibration.affine()
     hu, affine = to_ras(hu, affine)

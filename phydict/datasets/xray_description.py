@@ -13,17 +13,18 @@ beam, wherever it comes from, is that of the images once they are turned.
 
 from __future__ import annotations
 
+import reprlib
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import yaml
 
 from phydict.datasets.dicom import DicomTags
 from phydict.datasets.dicom_beam import tags_beam
-from phydict.datasets.intensity import KINDS, Intensity
-from phydict.xray.geometry import ConeBeam
+from phydict.datasets.intensity import KINDS, Intensity, is_file_name
+from phydict.xray.geometry import ConeBeam, pixel_sizes
 from phydict.xray.geometry_files import read_beam
+from phydict.yaml_file import read_yaml
 
 GEOMETRY = "geometry.yaml"
 
@@ -40,8 +41,9 @@ class Orientation:
         flips = [self.flip_rows, self.flip_columns]
         if not all(isinstance(flip, bool) for flip in flips):
             raise ValueError(f"flip_rows and flip_columns are true or false, but {flips} was given")
-        if self.rotate_degrees not in (0, 90, 180, 270):
-            raise ValueError(f"rotate_degrees is 0, 90, 180 or 270, but {self.rotate_degrees} was given")
+        if isinstance(self.rotate_degrees, bool) or self.rotate_degrees not in (0, 90, 180, 270):
+            raise ValueError(f"rotate_degrees is 0, 90, 180 or 270, but {self.rotate_degrees!r} was given")
+        object.__setattr__(self, "rotate_degrees", int(self.rotate_degrees))
 
     @property
     def turned(self) -> bool:
@@ -66,6 +68,14 @@ class Description:
     beam: dict | None = None
     intensity: Intensity | None = None
     orientation: Orientation = Orientation()
+
+    @property
+    def views(self) -> int | None:
+        """How many views the beam's mapping states, None where other files do or it states none that can be counted."""
+        beam = self.beam or {}
+        if isinstance(beam.get("orbit"), dict):
+            return beam["orbit"]["views"] if type(beam["orbit"].get("views")) is int else None
+        return len(beam["sources"]) if isinstance(beam.get("sources"), list) else None
 
     def beam_of(self, shape: tuple[int, int], tags: list[DicomTags]) -> ConeBeam:
         """The beam for images of `shape` (V, U), turned, and their DICOM tags, if any. Raises ValueError."""
@@ -100,21 +110,19 @@ def read_description(path: Path, needed: bool = True) -> Description:
                                 "images, or give geometry=")
     if path.suffix.lower() not in (".yaml", ".yml"):
         return Description(path, {"file": path.name})
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is not valid YAML: {error}") from error
+    content = read_yaml(path)
     if not isinstance(content, dict):
         raise ValueError(f"{path} must hold `beam:`, and may hold `intensity:` and `orientation:`")
     intensity, orientation = content.pop("intensity", None) or {}, content.pop("orientation", None) or {}
     if "beam" in content and len(content) > 1:
-        unknown = ", ".join(repr(key) for key in content if key != "beam")
+        unknown = ", ".join(reprlib.repr(key) for key in content if key != "beam")
         raise ValueError(f"{path}: unknown key {unknown}; the keys are beam, intensity, orientation")
     beam = content.get("beam", content or None)
     _check_beam(path, beam)
     for block, value, kind in (("intensity", intensity, Intensity), ("orientation", orientation, Orientation)):
         keys = tuple(kind.__dataclass_fields__)
-        unknown = [repr(key) for key in value if key not in keys] if isinstance(value, dict) else [repr(value)]
+        unknown = [reprlib.repr(key) for key in value if key not in keys] if isinstance(value, dict) else [
+            reprlib.repr(value)]
         if unknown:
             raise ValueError(f"{path}: unknown {', '.join(unknown)} in `{block}:`; the keys are {', '.join(keys)}")
     if intensity and "kind" not in intensity:
@@ -128,12 +136,17 @@ def read_description(path: Path, needed: bool = True) -> Description:
 def _check_beam(path: Path, beam) -> None:
     """Raises ValueError unless `beam` is of a known form: the values are checked when the beam is built."""
     if beam is not None and not isinstance(beam, dict):
-        raise ValueError(f"{path}: `beam:` must be a mapping, but {beam!r} was found")
+        raise ValueError(f"{path}: `beam:` must be a mapping, but {reprlib.repr(beam)} was found")
     for key, allowed in (("file", ("file", "pixel")), ("dicom", ("dicom",))):
-        unknown = [repr(name) for name in beam or {} if key in beam and name not in allowed]
+        unknown = [reprlib.repr(name) for name in beam or {} if key in beam and name not in allowed]
         if unknown:
             raise ValueError(f"{path}: unknown key {', '.join(unknown)} in `beam:`; the keys are {', '.join(allowed)}")
-    if beam and not isinstance(beam.get("file", ""), str):
-        raise ValueError(f"{path}: `file:` is the name of a geometry file, but {beam['file']!r} was found")
+    if beam and not is_file_name(beam.get("file", "")):
+        raise ValueError(f"{path}: `file:` is the name of a geometry file, but {reprlib.repr(beam['file'])} was found")
+    if beam and "file" in beam and beam.get("pixel") is not None:
+        try:
+            pixel_sizes(beam["pixel"])
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
     if beam and not isinstance(beam.get("dicom", {}), dict):
-        raise ValueError(f"{path}: `dicom:` must be a mapping, but {beam['dicom']!r} was found")
+        raise ValueError(f"{path}: `dicom:` must be a mapping, but {reprlib.repr(beam['dicom'])} was found")

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import zlib
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
 from phydict.datasets.natural_order import natural_order
+from phydict.datasets.nifti_file import open_nifti
+from phydict.reading import read_npy, reading
 
 DICOM = (".dcm", ".dicom", ".ima")
 ENDINGS = (".png", ".tif", ".tiff", ".npy", ".nii", ".nii.gz", *DICOM)
-UNREADABLE = (OSError, EOFError, ValueError, SyntaxError, zlib.error)
 GREY = ("L", "I;16", "I;16B", "I;16L", "I", "F")
 
 
@@ -40,15 +40,13 @@ def read_image(path: Path) -> np.ndarray:
     finite numbers.
     """
     name = path.name.lower()
-    try:
+    with reading(f"the image {path}", "export it again"):
         if name.endswith(".npy"):
-            image = np.load(path, allow_pickle=False)
+            image = read_npy(path)
         elif name.endswith((".nii", ".nii.gz")):
             image = _read_nifti(path)
         else:
             image = _read_picture(path)
-    except UNREADABLE as error:
-        raise ValueError(f"the image {path} cannot be read ({error}); export it again") from error
     if image.ndim == 3 and image.shape[0] == 1:
         image = image[0]
     if image.ndim != 2:
@@ -63,12 +61,7 @@ def read_image(path: Path) -> np.ndarray:
 
 def _read_nifti(path: Path) -> np.ndarray:
     """An image (U, V) with any number of axes of length 1 behind, as (V, U); other shapes as they are."""
-    import nibabel
-
-    try:
-        image = np.asarray(nibabel.load(path).dataobj)
-    except nibabel.filebasedimages.ImageFileError as error:
-        raise ValueError(str(error)) from error
+    image = np.asarray(open_nifti(path).dataobj)
     return image.reshape(image.shape[:2]).T if image.size == np.prod(image.shape[:2]) else image
 
 

@@ -20,10 +20,16 @@ class CosineSchedule:
 
     offset: the small s that keeps alpha_bar(0) below 1.
     floor: alpha_bar stays in [floor, 1 - floor], so that both square roots stay away from zero.
+    Raises ValueError for others.
     """
 
     offset: float = 0.008
     floor: float = 1e-4
+
+    def __post_init__(self):
+        if not (0 <= self.offset < math.inf and 0 < self.floor < 0.5):
+            raise ValueError("a schedule needs an offset of at least 0 and a floor between 0 and 0.5, but "
+                             f"{self.offset} and {self.floor} were given")
 
     def alpha_bar(self, t: float | Tensor) -> Tensor:
         """Share of signal variance at time t in [0, 1]; same shape, dtype and device as t."""

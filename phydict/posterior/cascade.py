@@ -12,7 +12,7 @@ from torch.nn.functional import interpolate
 from phydict.grid import Grid
 from phydict.posterior.likelihood import ProximalCG
 from phydict.posterior.measurement import Measurement
-from phydict.posterior.posterior import Counted, Posterior
+from phydict.posterior.posterior import Counted, Posterior, check_guidance
 from phydict.posterior.sampler import PriorOnly, Sampler
 from phydict.posterior.split_gibbs import SplitGibbs, noise_like
 from phydict.precision import check_precision, resolve_precision
@@ -50,7 +50,9 @@ class CascadePosterior(Reconstructor):
     precision: str = "auto"
 
     def __post_init__(self):
+        super().__post_init__()
         check_precision(self.precision)
+        check_guidance(self.guidance)
         if not 0 <= self.level <= 1:
             raise ValueError(f"the noise of the base estimate is a level in [0, 1], but {self.noise} was given")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -17,6 +18,7 @@ from phydict.posterior.split_gibbs import SplitGibbs, noise_like
 from phydict.precision import check_precision, precision_name
 from phydict.prior import Prior
 from phydict.profiling import stage
+from phydict.reading import check_memory
 from phydict.reconstructor import Guard, Reconstruction, Reconstructor, Stopwatch, misfits
 from phydict.units import MU_WATER
 from phydict.xray import Projector
@@ -58,11 +60,16 @@ class Posterior(Reconstructor):
     batch: int = 4
 
     def __post_init__(self):
+        super().__post_init__()
         check_precision(self.precision)
+        check_guidance(self.guidance)
         for name in ("samples", "batch"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is a number of reconstructions, 1 or more, but {getattr(self, name)} was "
                                  "given")
+
+        size = self.prior.state_channels * math.prod(self.prior.grid.shape)
+        check_memory(4 * self.samples * size, f"samples={self.samples} states of {size:,} numbers", "draw fewer")
 
     @property
     def grid(self) -> Grid:
@@ -129,6 +136,12 @@ class Posterior(Reconstructor):
             projector_calls=measurement.calls, masks=((state[1:] + 1) / 2).cpu(), deviation=deviation,
             diverged_at=guard.diverged_at, scatter=measurement.scatter,
             precision=precision_name(self.precision, xrays))
+
+
+def check_guidance(guidance: float) -> None:
+    """Raises ValueError unless the scale of classifier-free guidance is at least 0 and finite."""
+    if not 0 <= guidance < math.inf:
+        raise ValueError(f"the guidance scale is at least 0 and finite, but {guidance} was given")
 
 
 def sample_seed(seed: int, i: int) -> int:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import reprlib
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from torch import Tensor
+from torch import Tensor, nn
 
 from phydict.atomic import whole_file
 from phydict.checksum import file_crc32
@@ -24,6 +26,7 @@ from phydict.prior.prior import STATE, Prior
 from phydict.prior.super_resolution import SuperResolution
 from phydict.prior.text import TextEncoder
 from phydict.prior.unet import VolumeUNet
+from phydict.reading import not_written, reason
 from phydict.shipped import own_or_shipped, shipped
 from phydict.units import HUWindow
 
@@ -65,7 +68,7 @@ def _write(path: Path, header: dict, weights: dict[str, Tensor], dtype: torch.dt
         with whole_file(path) as part:
             save_file(tensors, part, {"phydict": json.dumps(header)})
     except (SafetensorError, OSError) as error:
-        raise OSError(f"'{path}' could not be written ({error}): free some space, or give another place") from error
+        raise not_written(f"'{path}'", error, "give another place") from error
 
 
 def describe(prior: Prior) -> dict:
@@ -106,10 +109,11 @@ def load_prior(path: str | Path | MedSynCheckpoint = DEFAULT_PRIOR, device: str 
     header, weights = _read(path, "base", device)
     try:
         prior = build_prior(header, weights)
+        if header["text"] is not None:
+            _check_text(header["text"])
+            prior.load_text = lambda: _load_text(path, header["text"])
     except ValueError as error:
         raise ValueError(f"'{path}' contradicts itself: {error}") from error
-    if header["text"]:
-        prior.load_text = lambda: _load_text(path, header["text"])
     return prior.to(device).eval().requires_grad_(False)
 
 
@@ -139,10 +143,10 @@ def _read(path: Path, stage: str, device: str) -> tuple[dict, dict[str, Tensor]]
         with safe_open(path, "pt", device=device) as file:
             header = json.loads((file.metadata() or {}).get("phydict", "{}"))
             weights = {k: file.get_tensor(k) for k in file.keys() if not k.startswith("text.")}
-    except (SafetensorError, OSError, ValueError) as error:
-        raise ValueError(f"'{path}' is truncated or not a safetensors file ({error}): copy it again, "
+    except Exception as error:  # whatever a damaged file leads its readers to
+        raise ValueError(f"'{path}' is truncated or not a safetensors file ({reason(error)}): copy it again, "
                          "or export it from its training checkpoint") from error
-    if header.get("format") != FORMAT:
+    if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise ValueError(f"'{path}' carries no phydict prior of format {FORMAT}: give a file that save_prior wrote")
     check_stage(header, stage, f"'{path}'")
     check_finite(weights, path)
@@ -162,7 +166,8 @@ def check_stage(header: dict, stage: str, name: str) -> None:
     """Raises ValueError where the header of the file `name` is of another stage."""
     found = header.get("stage", "base")
     if found != stage:
-        raise ValueError(f"{name} is {STAGES.get(found, found)}, but {STAGES[stage]} is needed here: give the file of "
+        kind = STAGES.get(found) if isinstance(found, str) else None
+        raise ValueError(f"{name} is {kind or f'of stage {reprlib.repr(found)}'}, but {STAGES[stage]} is needed here: give the file of "
                          "that stage")
 
 
@@ -188,15 +193,14 @@ def build_prior(header: dict, weights: dict[str, Tensor]) -> Prior:
 
     Raises ValueError where header and weights do not fit together.
     """
-    try:
-        prior = Prior(VolumeUNet(**header["network"]), Grid(**header["grid"]), HUWindow(*header["hu_window"]),
-                      schedule=CosineSchedule(**header["schedule"]), sigma_data=header["sigma_data"],
-                      skip_std=header["skip_std"],
-                      detail=DetailNetwork(**header["detail"]) if "detail" in header else None)
-        prior.load_state_dict({k: w.float() for k, w in weights.items() if not k.startswith("text.")})
-    except (KeyError, TypeError, RuntimeError) as error:
-        raise ValueError(f"the weights are not those of the network that the header describes ({error})") from error
-    return prior
+    def made() -> Prior:
+        return Prior(VolumeUNet(**header["network"]), Grid(**header["grid"]), HUWindow(*header["hu_window"]),
+                     schedule=CosineSchedule(**header["schedule"]), sigma_data=_number(header, "sigma_data"),
+                     skip_std=_number(header, "skip_std"),
+                     detail=DetailNetwork(**header["detail"]) if "detail" in header else None)
+
+    weights = {k: w.float() for k, w in weights.items() if not k.startswith("text.")}
+    return _built(made, weights, header, ("network", "detail"))
 
 
 def build_super_resolution(header: dict, weights: dict[str, Tensor]) -> SuperResolution:
@@ -204,23 +208,87 @@ def build_super_resolution(header: dict, weights: dict[str, Tensor]) -> SuperRes
 
     Raises ValueError where header and weights do not fit together.
     """
+    def made() -> SuperResolution:
+        return SuperResolution(
+            LocalUNet(**header["network"]), Grid(**header["grid"]), HUWindow(*header["hu_window"]),
+            _whole(header, "factor"), len(header["coarse_state"]), CosineSchedule(**header["schedule"]),
+            _number(header, "detail_std"), _number(header, "skip_std"))
+
+    return _built(made, {k: w.float() for k, w in weights.items()}, header, ("network",))
+
+
+def _built(made: Callable[[], nn.Module], weights: dict[str, Tensor], header: dict,
+           networks: tuple[str, ...]) -> nn.Module:
+    """What `made` makes of a header, with these weights. What does not fit them is refused before it takes memory.
+
+    networks: the header's keys whose values are settings of networks.
+    """
     try:
-        fine = SuperResolution(
-            LocalUNet(**header["network"]), Grid(**header["grid"]), HUWindow(*header["hu_window"]), header["factor"],
-            len(header["coarse_state"]), CosineSchedule(**header["schedule"]), header["detail_std"],
-            header["skip_std"])
-        fine.load_state_dict({k: w.float() for k, w in weights.items()})
-    except (KeyError, TypeError, RuntimeError) as error:
-        raise ValueError(f"the weights are not those of the network that the header describes ({error})") from error
-    return fine
+        for name in networks:
+            if name in header:
+                _check_sizes(name, header[name], weights)
+        with torch.device("meta"):
+            shapes = {k: w.shape for k, w in made().state_dict().items()}
+        unlike = [k for k in shapes.keys() | weights.keys() if k not in shapes or k not in weights
+                  or shapes[k] != weights[k].shape]
+        if unlike:
+            raise ValueError(f"{len(unlike)} of them are missing, unexpected or of another shape, such as {min(unlike)}")
+        stage = made()
+        stage.load_state_dict(weights)
+    except Exception as error:  # of whatever kind: it is the header that leads to it
+        lacks = f"the header lacks {error}" if isinstance(error, KeyError) else reason(error)
+        raise ValueError(f"the weights are not those of the network that the header describes ({lacks})") from error
+    return stage
+
+
+def _check_sizes(name: str, settings: dict, weights: dict[str, Tensor]) -> None:
+    """Raises ValueError where a network's settings hold anything larger than its weights have of it."""
+    most = max([len(weights), *(n for w in weights.values() for n in w.shape)])
+    for key, value in settings.items():
+        values = value if isinstance(value, list) else [value]
+        if len(values) > most or not all(isinstance(n, int) and 0 <= n <= most for n in values):
+            raise ValueError(f"{name}.{key} is {reprlib.repr(value)}")
+
+
+def _number(header: dict, key: str) -> float:
+    if isinstance(header[key], bool) or not isinstance(header[key], int | float) or not 0 < header[key] < 1e6:
+        raise ValueError(f"{key} is {reprlib.repr(header[key])}, where a positive number is needed")
+    return header[key]
+
+
+def _whole(header: dict, key: str) -> int:
+    if type(header[key]) is not int or not 0 < header[key] < 2**16:
+        raise ValueError(f"{key} is {reprlib.repr(header[key])}, where a positive whole number is needed")
+    return header[key]
+
+
+def _check_text(text: dict) -> None:
+    """Raises ValueError unless a header's "text" is what `describe` writes."""
+    keys = ("source", "length", "width", "layers", "vocabulary")
+    if not isinstance(text, dict) or any(key not in text for key in keys):
+        raise ValueError(f"text is {reprlib.repr(text)}, where {', '.join(keys)} are needed")
+    for key in ("length", "width", "layers"):
+        _whole(text, key)
+    if "padded_to" in text:
+        _whole(text, "padded_to")
+    words = text["vocabulary"]
+    if not isinstance(text["source"], str | None) or text["source"] is None and not (
+            isinstance(words, list) and all(isinstance(word, str) for word in words)):
+        raise ValueError(f"text.source is {reprlib.repr(text['source'])} and text.vocabulary {reprlib.repr(words)}, where "
+                         "one of them names a text encoder or lists words")
 
 
 def build_text(text: dict, weights: dict[str, Tensor]) -> TextEncoder:
     """The text encoder of a header's "text", frozen; `weights` ("text.") are used unless it is a pretrained one."""
     if text["source"]:
         return TextEncoder.pretrained(text["source"], text["length"], text.get("padded_to"))
-    encoder = TextEncoder.small(text["vocabulary"], text["width"], text["layers"], text["length"])
-    encoder.load_state_dict({k.removeprefix("text."): w.float() for k, w in weights.items() if k.startswith("text.")})
+    weights = {k.removeprefix("text."): w.float() for k, w in weights.items() if k.startswith("text.")}
+    try:
+        _check_sizes("text", {key: text[key] for key in ("length", "width", "layers")}, weights)
+        encoder = TextEncoder.small(text["vocabulary"], text["width"], text["layers"], text["length"])
+        encoder.load_state_dict(weights)
+    except Exception as error:  # of whatever kind: it is the header that leads to it
+        raise ValueError(f"the text encoder is not the one that the header describes ({reason(error)})") from error
     encoder.trainable = False
     return encoder.eval().requires_grad_(False)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import reprlib
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,13 +11,17 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from phydict.grid import Grid
+from phydict.grid import Grid, whole_sizes
+from phydict.reading import check_memory
+from phydict.yaml_file import read_yaml
 
 VECTOR_KEYS = ("sources", "detectors", "u", "v", "shape")
 ORBIT_KEYS = ("views", "source_to_detector", "source_to_isocentre", "shape", "pixel")
 ORBIT_OPTIONS = ("start_degrees", "arc_degrees", "start", "arc")
 MOST_RADIANS = 4 * math.pi
 """An angle in radians beyond two turns was meant in degrees."""
+MOST_MM = 1e9
+"""No length is this long: it would be that of a mistake, and overflow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,9 +41,11 @@ class ConeBeam:
     shape: tuple[int, int]
 
     def __post_init__(self):
-        shape = tuple(int(n) for n in np.atleast_1d(self.shape))
-        if len(shape) != 2 or min(shape) < 1:
-            raise ValueError(f"a detector needs two positive sizes (rows, columns), but {self.shape} was given")
+        shape = whole_sizes(self.shape)
+        if shape is None or len(shape) != 2:
+            raise ValueError(f"a detector needs two positive sizes (rows, columns), whole numbers, but {self.shape} was "
+                             "given")
+        _check_room(len(np.atleast_1d(self.sources)), shape)
         object.__setattr__(self, "shape", shape)
         for name in ("sources", "detectors", "u", "v"):
             value = np.array(getattr(self, name), float) + 0.0  # no negative zeros
@@ -47,8 +54,10 @@ class ConeBeam:
             if len(value) != len(np.asarray(self.sources)):
                 raise ValueError(f"a beam has {len(self.sources)} sources, but {len(value)} rows in {name}; "
                                  "give one row per view")
-            if not np.isfinite(value).all():
-                raise ValueError(f"a beam's {name} must be finite numbers in mm, but {value.tolist()} was given")
+            if not (np.abs(value) < MOST_MM).all():
+                wrong = int((~(np.abs(value) < MOST_MM).all(1)).argmax())
+                raise ValueError(f"a beam's {name} must be finite numbers in mm, less than {MOST_MM:g}, but view {wrong} "
+                                 f"has {value[wrong].tolist()}")
             value.setflags(write=False)
             object.__setattr__(self, name, value)
         width, height = np.linalg.norm(self.u, axis=1), np.linalg.norm(self.v, axis=1)
@@ -75,15 +84,16 @@ class ConeBeam:
         Raises ValueError unless views >= 1 and 0 < source_to_isocentre < source_to_detector and pixel > 0, and for an
         angle given twice or in radians beyond two turns.
         """
-        if isinstance(views, str) or views != int(views) or views < 1:
+        count, sizes = whole_sizes(views), whole_sizes(shape)
+        if count is None or len(count) != 1:
             raise ValueError(f"an orbit needs at least one view, a whole number, but views={views!r} was given")
-        if not 0 < source_to_isocentre < source_to_detector:
+        if sizes is not None and len(sizes) == 2:
+            _check_room(count[0], sizes)
+        if not 0 < source_to_isocentre < source_to_detector < MOST_MM:
             raise ValueError(f"the isocentre must lie between source and detector, but source_to_isocentre="
                              f"{source_to_isocentre} mm and source_to_detector={source_to_detector} mm were given; "
                              "correct them, both from the source and in mm")
-        height, width = np.broadcast_to(np.asarray(pixel, float), 2)
-        if not (height > 0 and width > 0):
-            raise ValueError(f"pixel must be (row height, column width) > 0 in mm, but {pixel} was given")
+        height, width = pixel_sizes(pixel)
         first, turn = _radians("start", start, start_degrees, 0.0), _radians("arc", arc, arc_degrees, 2 * math.pi)
         angle = first + turn * np.arange(int(views)) / int(views)
         cos, sin = np.round(np.cos(angle), 15), np.round(np.sin(angle), 15)  # exact zeros at right angles
@@ -213,10 +223,7 @@ class ConeBeam:
         path = Path(path)
         if not path.is_file():
             raise FileNotFoundError(f"there is no geometry file {path}; write one with ConeBeam.save or by hand")
-        try:
-            content = yaml.safe_load(path.read_text())
-        except yaml.YAMLError as error:
-            raise ValueError(f"{path} is not valid YAML: {error}") from error
+        content = read_yaml(path)
         try:
             beam = content.get("beam", content) if isinstance(content, dict) else content
             return cls.from_dict(beam)
@@ -226,20 +233,16 @@ class ConeBeam:
     @classmethod
     def from_dict(cls, content: dict) -> ConeBeam:
         """The beam of a mapping in one of the two forms that `load` reads. Raises ValueError naming the key."""
-        try:
-            if not isinstance(content, dict) or "orbit" not in content:
-                _check_keys(content, VECTOR_KEYS, ())
-                for key, value in content.items():
-                    _check_numbers(key, value)
-                return cls(**content)
-            _check_keys(content, ("orbit",), ())
-            orbit = content["orbit"]
-            _check_keys(orbit, ORBIT_KEYS, ORBIT_OPTIONS)
-            for key, value in orbit.items():
-                _check_numbers(key, value)
-            return cls.orbit(**orbit)
-        except TypeError as error:
-            raise ValueError(f"a beam's values are numbers and lists of numbers ({error})") from error
+        if not isinstance(content, dict) or "orbit" not in content:
+            _check_keys(content, VECTOR_KEYS, ())
+            return cls(**{key: _numbers(key, value) for key, value in content.items()})
+        _check_keys(content, ("orbit",), ())
+        orbit = content["orbit"]
+        _check_keys(orbit, ORBIT_KEYS, ORBIT_OPTIONS)
+        for key, value in orbit.items():
+            if np.ndim(_numbers(key, value)) and key not in ("shape", "pixel"):
+                raise ValueError(f"{key} is one number, but {reprlib.repr(value)} was given")
+        return cls.orbit(**orbit)
 
 
 def _radians(name: str, radians: float | None, degrees: float | None, otherwise: float) -> float:
@@ -252,20 +255,44 @@ def _radians(name: str, radians: float | None, degrees: float | None, otherwise:
     return math.radians(degrees) if degrees is not None else otherwise if radians is None else radians
 
 
-def _check_numbers(key: str, value) -> None:
+def pixel_sizes(pixel) -> tuple[float, float]:
+    """(row height, column width) in mm of one number or two. Raises ValueError where they are not positive and finite."""
     try:
-        np.asarray(value, float)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{key} is a number or a list of numbers without units, but {value!r} was given") from error
+        height, width = map(float, np.broadcast_to(_numbers("pixel", pixel), 2))
+    except ValueError:
+        height = width = 0.0
+    if not (0 < height < MOST_MM and 0 < width < MOST_MM):
+        raise ValueError(f"pixel must be (row height, column width) > 0 in mm, but {reprlib.repr(pixel)} was given")
+    return height, width
+
+
+def _check_room(views: int, shape: tuple[int, int]) -> None:
+    check_memory(views * (8 * 12 + 4 * math.prod(shape)), f"{views:,} views of {shape[0]:,} x {shape[1]:,} pixels",
+                 "give fewer views or pixels")
+
+
+def _numbers(key: str, value) -> float | np.ndarray:
+    """A number, or a regular list of numbers as an array, all finite. Raises ValueError naming the key."""
+    try:
+        found = np.asarray(value)
+    except ValueError:  # lists of different lengths
+        found = np.asarray(None)
+    if found.dtype.kind not in "iuf":
+        raise ValueError(f"{key} is a number or a list of numbers without units and quotes, but {reprlib.repr(value)} "
+                         "was given")
+    if not np.isfinite(found).all():
+        raise ValueError(f"{key} must be finite, but {reprlib.repr(value)} was given")
+    return found if found.ndim else found.item()
 
 
 def _check_keys(content, required: tuple[str, ...], optional: tuple[str, ...]) -> None:
     if not isinstance(content, dict):
-        raise ValueError(f"a mapping with the keys {', '.join(required)} was expected, but {content!r} was found")
+        raise ValueError(f"a mapping with the keys {', '.join(required)} was expected, but "
+                         f"{reprlib.repr(content)} was found")
     allowed = ", ".join(required + optional)
     for key in content:
         if key not in required + optional:
-            raise ValueError(f"unknown key {key!r}; the keys are {allowed}")
+            raise ValueError(f"unknown key {reprlib.repr(key)}; the keys are {allowed}")
     for key in required:
         if key not in content:
             raise ValueError(f"missing key {key!r}; the keys are {allowed}")

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from phydict.reading import read_npy, read_text, reading
 from phydict.xray.geometry import ConeBeam
 from phydict.xray.rtk import check_beam, read_rtk, write_rtk
 
@@ -81,19 +82,16 @@ def _ending(path: Path) -> str:
 
 
 def _read_npy(path: Path) -> np.ndarray:
-    try:
-        return np.load(path, allow_pickle=False).astype(float)
-    except (OSError, EOFError, ValueError) as error:
-        raise ValueError(f"{path} cannot be read as an array of numbers ({error}); save cone_vec with numpy.save"
-                         ) from error
+    with reading(path, "save cone_vec, (views, 12) numbers, with numpy.save"):
+        vectors = read_npy(path)
+        if vectors.dtype.kind not in "iuf":
+            raise ValueError(f"it holds values of type {vectors.dtype}")
+        return vectors.astype(float)
 
 
 def _read_table(path: Path) -> np.ndarray:
-    try:
-        rows = [re.split(r"[,;\s]+", line.strip(" ,;\t")) for line in path.read_text(encoding="utf-8-sig").splitlines()
-                if line.strip() and not line.startswith("#")]
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path} is not UTF-8 text ({error}); save it as UTF-8") from error
+    rows = [re.split(r"[,;\s]+", line.strip(" ,;\t")) for line in read_text(path).splitlines()
+            if line.strip() and not line.startswith("#")]
     columns = list(COLUMNS)
     if rows and rows[0][0][:1].isalpha():
         columns = [name.lower() for name in rows.pop(0)]

@@ -16,12 +16,14 @@ Source: RTK's documentation of the geometry; IEC 61217.
 from __future__ import annotations
 
 import math
+import reprlib
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 
-from phydict.xray.geometry import ConeBeam
+from phydict.reading import read_text, reason
+from phydict.xray.geometry import ConeBeam, pixel_sizes
 
 FIXED_TO_RAS = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 PARAMETERS = ("SourceToIsocenterDistance", "SourceToDetectorDistance", "GantryAngle", "OutOfPlaneAngle", "InPlaneAngle",
@@ -36,19 +38,15 @@ def read_rtk(path: str | Path, shape: tuple[int, int], pixel: float | tuple[floa
     shape: (V, U) pixels and pixel: (row height, column width) in mm of the projections, which the file does not hold.
     Raises ValueError naming the file for other XML, missing or zero distances, and detectors that are not flat.
     """
+    text = read_text(path)
     try:
-        root = ElementTree.parse(path).getroot()
-    except ElementTree.ParseError as error:
-        raise ValueError(f"{path} is not valid XML: {error}") from error
+        root = ElementTree.fromstring(text)
+    except Exception as error:  # an entity, an encoding or a nesting that the parser refuses, each in its own way
+        raise ValueError(f"{path} is not valid XML: {reason(error)}") from error
     if root.tag != ROOT or root.get("version") not in ("2", "3"):
         raise ValueError(f"{path} holds <{root.tag} version={root.get('version')}>, but RTK's <{ROOT}> of version 2 or "
                          "3 was expected; write it again with a current RTK")
-    try:
-        height, width = np.broadcast_to(np.asarray(pixel, float), 2)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"pixel must be (row height, column width) in mm, but {pixel} was given") from error
-    if not (height > 0 and width > 0):
-        raise ValueError(f"pixel must be (row height, column width) > 0 in mm, but {pixel} was given")
+    height, width = pixel_sizes(pixel)
     stated = {name: 0.0 for name in PARAMETERS if name not in NEEDED}
     poses = []
     for element in root:
@@ -100,8 +98,11 @@ def _numbers(path, elements) -> dict[str, float]:
             continue  # the matrix follows from the parameters; collimation does not move a ray
         try:
             values[element.tag] = float(element.text)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"{path}: <{element.tag}> must hold a number, but {element.text!r} was found") from error
+        except (TypeError, ValueError):
+            values[element.tag] = math.nan
+        if not math.isfinite(values[element.tag]):
+            raise ValueError(f"{path}: <{element.tag}> must hold a number, but {reprlib.repr(element.text)} was "
+                             "found; give a finite one")
     if values.pop("RadiusCylindricalDetector", 0.0):
         raise ValueError(f"{path} describes a cylindrical detector; resample the projections to a flat one")
     return values

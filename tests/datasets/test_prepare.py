@@ -383,7 +383,7 @@ def test_a_changed_input_is_prepared_again_and_other_settings_are_refused(tmp_pa
     with pytest.raises(ValueError, match="was prepared with other settings"):
         prepare_folder(tmp_path / "in", tmp_path / "out", Settings(voxels=16))
     (tmp_path / "out/a" / RECORD).write_text("{")
-    with pytest.raises(ValueError, match="case.json is damaged .* prepare that CT again"):
+    with pytest.raises(ValueError, match="case.json cannot be read .* prepare that CT again"):
         find_cts(tmp_path / "out")
 
 
@@ -414,7 +414,7 @@ def test_a_full_disk_while_caching_is_one_sentence_and_leaves_nothing(tmp_path, 
 
     monkeypatch.setattr(cache.np, "savez_compressed", half)
     cases = CTCases(find_cts(tmp_path / "a.nii.gz"), tmp_path / "cache", Grid.cube(32))
-    with pytest.raises(OSError, match="could not be cached \\(No space left on device\\): free some space, or give"):
+    with pytest.raises(OSError, match="could not be written \\(No space left on device\\): free some space, or give"):
         cases[0]
     assert not [*(tmp_path / "cache").iterdir()]
 

@@ -11,7 +11,6 @@ from huggingface_hub import HfApi
 from safetensors.torch import save_file
 from transformers import BertConfig, BertModel
 
-from phydict.prior import bert_files
 from phydict.prior.bert_files import load_bert
 from prior.tiny import REPORTS, write_cxr_bert
 

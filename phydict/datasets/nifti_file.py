@@ -1,0 +1,38 @@
+"""NIfTI files as they are opened: one number per voxel, and no more voxels than the file can hold."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from phydict.reading import check_memory
+
+if TYPE_CHECKING:
+    from nibabel.spatialimages import SpatialImage
+
+MOST_SQUEEZED = 1100
+"""Times by which gzip can shrink a file at most."""
+
+
+def open_nifti(path: Path) -> SpatialImage:
+    """A NIfTI image whose voxels are not read yet. For use inside `reading`.
+
+    Raises ValueError for voxels that are not one real number each, and for more of them than the file or this machine
+    can hold.
+    """
+    import nibabel
+
+    image = nibabel.load(path)
+    shape, kind = image.header.get_data_shape(), image.get_data_dtype()
+    if kind.kind not in "iuf":
+        raise ValueError(f"its voxels are of type {kind}, such as colours or complex numbers; one real number each is "
+                         "needed")
+    if min(shape, default=0) < 1:
+        raise ValueError(f"its header gives it the shape {tuple(shape)}")
+    needed, size = math.prod(map(int, shape)) * kind.itemsize, path.stat().st_size
+    if needed > size * (MOST_SQUEEZED if path.name.lower().endswith(".gz") else 1):
+        raise ValueError(f"its header promises {needed:,} bytes of voxels, shape {tuple(shape)}, but the file has {size:,}"
+                         ": it is truncated or damaged")
+    check_memory(math.prod(map(int, shape)) * (kind.itemsize + 8), f"its shape {tuple(shape)}", "give a smaller one")
+    return image

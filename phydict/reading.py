@@ -1,0 +1,86 @@
+"""Reading what users give: no more than a file holds or memory takes, and whatever is wrong with it in one sentence."""
+
+from __future__ import annotations
+
+import errno
+import math
+import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+MOST_TEXT = 2**24
+"""Bytes of the longest text that is read whole: a geometry, settings, a report, a list of ids."""
+
+
+class Unreadable(ValueError):
+    """A file of a user's that cannot be read, in one sentence that names it."""
+
+
+@contextmanager
+def reading(name: object, advice: str) -> Iterator[None]:
+    """Whatever a library raises inside while it reads `name` becomes Unreadable: what is wrong, and `advice`.
+
+    For the reading alone: errors of what is computed from a file stay as they are.
+    """
+    try:
+        yield
+    except Unreadable:
+        raise
+    except Exception as error:
+        raise Unreadable(f"{name} cannot be read ({reason(error)}); {advice}") from error
+
+
+def not_written(what: str, error: Exception, instead: str) -> OSError:
+    """The error of `what` that could not be written: its reason, to free space where a disk is full, and `instead`."""
+    full = getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT) or re.search(
+        rf"os error ({errno.ENOSPC}|{errno.EDQUOT})\b", str(error))
+    return OSError(f"{what} could not be written ({reason(error)}): {'free some space, or ' if full else ''}{instead}")
+
+
+def reason(error: Exception) -> str:
+    """An error in a few words, its kind among them where that is not for users."""
+    if isinstance(error, RecursionError):
+        return "it is nested too deeply"
+    said = " ".join(str(getattr(error, "strerror", None) or error).split())[:300]
+    if isinstance(error, MemoryError):
+        return f"it asks for more memory than there is: {said}" if said else "it asks for more memory than there is"
+    plain = isinstance(error, ValueError | OSError | EOFError | SyntaxError) or type(error).__module__ != "builtins"
+    return said if said and plain else f"{type(error).__name__} {said}".strip()
+
+
+def read_text(path: str | Path) -> str:
+    """The text of a UTF-8 file. Raises ValueError naming it where it is another or longer than MOST_TEXT, and OSError
+    as `open` does."""
+    path = Path(path)
+    size = path.stat().st_size
+    if size > MOST_TEXT:
+        raise ValueError(f"{path} has {size:,} bytes, but no more than {MOST_TEXT:,} of text are read; give another file")
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path} is not UTF-8 text ({error}); save it as UTF-8") from error
+
+
+def read_npy(path: str | Path) -> np.ndarray:
+    """The array in a .npy file. For use inside `reading`: raises ValueError where the file is shorter than its header
+    promises, before anything is made for it, and whatever a damaged one leads NumPy to."""
+    with open(path, "rb") as stream:
+        version = np.lib.format.read_magic(stream)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, kind = read(stream)
+        promised, held = math.prod(shape) * kind.itemsize, os.fstat(stream.fileno()).st_size - stream.tell()
+    if promised > held:
+        raise ValueError(f"its header promises {promised:,} bytes, shape {shape}, but the file has {held:,}")
+    return np.load(path, allow_pickle=False)
+
+
+def check_memory(needed: int, what: str, advice: str) -> None:
+    """Raises ValueError, with both numbers, where `what` takes more bytes than this machine has memory."""
+    there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if needed > there:
+        raise ValueError(f"{what} would take {needed / 2**30:,.1f} GiB of memory, but this machine has "
+                         f"{there / 2**30:,.1f}; {advice}")

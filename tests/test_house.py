@@ -28,8 +28,8 @@ from phydict.xray import ConeBeam, Ideal, Polychromatic
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "phydict"
 FLOORS = {
-    "units": 0, "grid": 0, "atomic": 0, "checksum": 0, "progress": 0, "profiling": 0, "precision": 0, "shipped": 0,
-    "reading": 0, "yaml_file": 1,
+    "units": 0, "atomic": 0, "checksum": 0, "progress": 0, "profiling": 0, "precision": 0, "shipped": 0,
+    "reading": 0, "grid": 1, "yaml_file": 1,
     "xray": 2, "diffusion": 2, "command_line": 2,
     "prior": 3, "datasets": 3, "reconstructor": 3,
     "posterior": 4, "baselines": 4, "evaluation": 4,

@@ -179,7 +179,7 @@ def quiet() -> Iterator[None]:
 
 @contextmanager
 def noted(found: list[str], name: str) -> Iterator[None]:
-    """Adds to `found`, each once, the sentences of the UserWarnings given inside, and shows them with the case's name."""
+    """Adds to `found`, each once, what the UserWarnings given inside say, and shows them with the name of the case."""
     with warnings.catch_warnings():
         show = warnings.showwarning
 

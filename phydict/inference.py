@@ -229,7 +229,8 @@ class ReconstructionTask(lightning.LightningModule):
                 "mu_water": case.get("mu_water", self.reconstructor.mu_water), "views": len(result.xrays),
                 "precision": result.precision, "instruction_set": instruction_set(self.device),
                 "grid": result.grid.to_dict(), "seed": result.seed,
-                "warnings": case["warnings"], "report": case["report"], "source": case["source"], "settings": self.settings, "versions": versions()}
+                "warnings": case["warnings"], "report": case["report"], "source": case["source"],
+                "settings": self.settings, "versions": versions()}
 
     def summarise(self) -> None:
         """Prints and writes the scores of this run's cases. Raises ValueError, naming them, where some have failed."""

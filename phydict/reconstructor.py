@@ -177,8 +177,8 @@ def check_air(xrays: Tensor) -> None:
     share = (sides > (high - 0.1 * (high - low))[:, None]).float().mean(1)
     if share.median() > 0.5:
         warnings.warn("the X-rays are densest at their left and right sides, where air should be seen, as inverted "
-                      "images are: turn them by a negative `scale` with an `offset`, or by the other `bright_is_dense`, "
-                      "or cut off what a collimator covered", stacklevel=3)
+                      "images are: turn them by a negative `scale` with an `offset`, or by the other "
+                      "`bright_is_dense`, or cut off what a collimator covered", stacklevel=3)
 
 
 def check_line_integrals(xrays: Tensor) -> None:

@@ -46,7 +46,8 @@ class Throughput(lightning.Callback):
             self.peak = matmul_peak(module.device, low) / 1e12
         weights = sum(weight.numel() for weight in module.prior.parameters() if weight.requires_grad)
         _tell(f"training {weights / 1e6:.3g} M weights in {precision} on {instructions}: a sample costs "
-              f"{self.flop / 1e9:.3g} GFLOP forward and backward; a {precision} matrix product reaches {self.peak:.3g} TFLOP/s on this device")
+              f"{self.flop / 1e9:.3g} GFLOP forward and backward; a {precision} matrix product reaches {self.peak:.3g} "
+              "TFLOP/s on this device")
 
     def on_train_batch_start(self, trainer, module, batch, _) -> None:
         if not self.flop:

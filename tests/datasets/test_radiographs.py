@@ -259,8 +259,8 @@ def test_a_shared_geometry_and_an_intensity_argument_replace_the_folders_own(tmp
     folder = write(tmp_path / "case", stored, "png", nonsense=1)
     shared = tmp_path / "shared.yaml"
     shared.write_text(yaml.safe_dump({"orbit": ORBIT}))
-    case = load_xrays(folder, geometry=shared, intensity=Intensity("line_integrals", scale=2.0))
-    assert (case["xrays"].numpy() == 2.0 * stored).all()
+    case = load_xrays(folder, geometry=shared, intensity=Intensity("line_integrals", scale=0.5))
+    assert (case["xrays"].numpy() == 0.5 * stored).all()
 
 
 def test_find_xrays_takes_a_case_or_a_folder_of_cases(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import reprlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -69,7 +70,10 @@ class Grid:
     def cube(cls, voxels: int, side: float = 384.0) -> Grid:
         """`voxels`^3 voxels over a cube of `side` mm centred on the isocentre."""
         if whole_sizes(voxels) is None:
-            raise ValueError(f"a cube has a whole number of voxels along each side, 1 or more, but {voxels} was given")
+            raise ValueError(f"a cube has a whole number of voxels along each side, 1 or more, but "
+                             f"{reprlib.repr(voxels)} was given")
+        if not 1e-3 < side < 1e6:
+            raise ValueError(f"the side of a cube of voxels is a length in mm, but {side:g} was given")
         return cls((voxels,) * 3, (side / voxels,) * 3)
 
     @property

@@ -95,6 +95,8 @@ class ReconstructionTask(lightning.LightningModule):
                 self.settings["precision"] = precision
         self.fine = None
         if super_resolution:
+            if not 0 < fine_memory < 2**20:
+                raise ValueError(f"model.fine_memory is an amount in GiB, above 0, but {fine_memory:g} was given")
             self.fine = load_super_resolution(super_resolution)
             self.fine.memory = int(fine_memory * 2**30)
             self.grid = self.fine.grid

@@ -36,45 +36,46 @@ OVERRIDES = ("source_to_detector", "source_to_isocentre", "pixel", "primary_degr
 
 
 def tags_beam(tags: list[DicomTags], shape: tuple[int, int], overrides: dict | None = None,
-              turned: bool = False) -> ConeBeam:
+              turned: bool = False, source: str = "`dicom:`") -> ConeBeam:
     """The beam of the frames whose tags are given, for images of `shape` (V, U).
 
     overrides: values to use instead of the tags', one for all frames or a list with one per frame, by the names of
     OVERRIDES. turned: the images were turned by a quarter since they were stored, so that rows have become columns.
+    source: where the overrides stand, for messages.
     Raises ValueError naming the frame and the tags that are missing, zero or contradictory.
     """
-    stated = _per_frame(overrides or {}, len(tags))
+    stated = _per_frame(overrides or {}, len(tags), source)
     poses = [_pose(frame, {name: values[k] for name, values in stated.items()}, turned)
              for k, frame in enumerate(tags)]
     return ConeBeam(*(np.stack(part) for part in zip(*poses)), shape)
 
 
-def _per_frame(overrides: dict, frames: int) -> dict[str, list]:
+def _per_frame(overrides: dict, frames: int, source: str) -> dict[str, list]:
     """Every override as a list with one value per frame."""
     unknown = [reprlib.repr(name) for name in overrides if name not in OVERRIDES]
     if unknown:
-        raise ValueError(f"unknown key {', '.join(unknown)} in `dicom:`; the keys are {', '.join(OVERRIDES)}")
+        raise ValueError(f"unknown key {', '.join(unknown)} in {source}; the keys are {', '.join(OVERRIDES)}")
     stated = {}
     for name, value in overrides.items():
         alone = not isinstance(value, list) or (name == "pixel" and not any(isinstance(part, list) for part in value))
         values = [value] * frames if alone else value
         if len(values) != frames:
-            raise ValueError(f"`{name}` in `dicom:` has {len(values)} values for {frames} views; give one, or one each")
-        stated[name] = [_stated(name, value) for value in values]
+            raise ValueError(f"`{name}` in {source} has {len(values)} values for {frames} views; give one, or one each")
+        stated[name] = [_stated(name, value, source) for value in values]
     return stated
 
 
-def _stated(name: str, value):
+def _stated(name: str, value, source: str):
     """One frame's value of an override. Raises ValueError where it is of the wrong kind."""
     if name == "patient_orientation":
         if not isinstance(value, str):
-            raise ValueError(f"`{name}` in `dicom:` is a text such as 'L\\F', but {reprlib.repr(value)} was "
+            raise ValueError(f"`{name}` in {source} is a text such as 'L\\F', but {reprlib.repr(value)} was "
                              "given")
         return value
     parts = value if name == "pixel" and isinstance(value, list) and len(value) == 2 else [value]
     if not all(isinstance(part, int | float) and not isinstance(part, bool) and abs(part) < MOST_MM for part in parts):
         wanted = "[row height, column width]" if name == "pixel" else "a number"
-        raise ValueError(f"`{name}` in `dicom:` needs {wanted}, but {reprlib.repr(value)} was given")
+        raise ValueError(f"`{name}` in {source} needs {wanted}, but {reprlib.repr(value)} was given")
     return float(value) if name != "pixel" else (float(parts[0]), float(parts[-1]))
 
 

@@ -22,6 +22,8 @@ from phydict.units import HUWindow
 
 AIR = -1000.0
 SEGMENTATION_MM = 2.0
+LARGEST_VOXEL, FURTHEST = 100.0, 1e6
+"""mm that no voxel's side and no CT's distance from its origin reach."""
 LEAST_SLICES = 8
 """Fewer are a scout or a test image, from which no lungs can be found."""
 
@@ -104,9 +106,13 @@ def _check_header(path: Path, header, calibration: Calibration | None) -> None:
     if not any(codes):
         raise ValueError(f"{path} does not say how the patient lies (neither sform nor qform is set); convert it from "
                          "DICOM again, or read CT-RATE v1 files with data.fixed false and their metadata table")
-    axes = header.get_best_affine()[:3, :3]
+    affine = header.get_best_affine()
+    axes = affine[:3, :3]
     if not np.isfinite(axes).all() or abs(np.linalg.det(axes)) < 1e-6:
         raise ValueError(f"{path} has voxels without volume (affine {axes.tolist()}); convert it from DICOM again")
+    if not (np.abs(affine[:3]) < FURTHEST).all() or np.linalg.norm(axes, axis=0).max() > LARGEST_VOXEL:
+        raise ValueError(f"{path} has voxels of {np.linalg.norm(axes, axis=0).max():g} mm, or lies at "
+                         f"{affine[:3, 3].tolist()} mm, which no CT does; convert it from DICOM again")
     if np.allclose(axes, np.eye(3)) and shape[0] >= 512:
         warnings.warn(f"{path} has the blank header of CT-RATE v1 (1 mm voxels, identity axes); "
                       "read such files with data.fixed false and their metadata table", stacklevel=3)

@@ -83,7 +83,8 @@ class Description:
             if not tags:
                 raise ValueError(f"{self.source} leaves the beam to DICOM's tags, but the images are not DICOM; state "
                                  "`beam:`")
-            return tags_beam(tags, shape, (self.beam or {}).get("dicom"), self.orientation.turned)
+            return tags_beam(tags, shape, (self.beam or {}).get("dicom"), self.orientation.turned,
+                             f"`dicom:` of {self.source}")
         if "file" in self.beam:
             return read_beam(self.source.parent / self.beam["file"], shape, self.beam.get("pixel"))
         try:

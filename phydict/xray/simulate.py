@@ -57,7 +57,7 @@ class Ideal(Simulator):
     photons: float | None = None
 
     def __post_init__(self):
-        if not self.noise >= 0:
+        if not 0 <= self.noise < math.inf:
             raise ValueError(f"noise is a fraction >= 0 of the largest line integral, but {self.noise} was given")
         check_photons(self.photons)
 

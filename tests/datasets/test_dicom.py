@@ -84,7 +84,8 @@ def test_the_detector_stands_where_the_positioner_angles_say(tmp_path, primary, 
 
 def test_files_of_single_frames_keep_their_own_angles_in_natural_order(tmp_path):
     for k, primary in enumerate(range(0, 330, 30)):
-        write_dicom(tmp_path / f"IM{k}", np.full(SHAPE, k, np.uint16), **angled(float(-primary)))  # no ending
+        image = np.arange(np.prod(SHAPE), dtype=np.uint16).reshape(SHAPE) + np.uint16(k)
+        write_dicom(tmp_path / f"IM{k}", image, **angled(float(-primary)))  # no ending
     case = load_xrays(find_xrays(tmp_path)[0], intensity=LINES)
     assert case["xrays"][:, 0, 0].tolist() == pytest.approx([1e-3 * k for k in range(11)])
     assert case["beam"].same_as(ConeBeam.orbit(12, 1020, 740, SHAPE, PIXEL).select(slice(11)), 1e-6)
@@ -235,9 +236,9 @@ def test_impossible_tags_are_explained(tmp_path, tags, sentence):
 def test_wrong_overrides_are_explained(tmp_path):
     folder = one(tmp_path, **angled(0.0))
     fails("unknown key 'sod' in `dicom:`", described(folder, beam={"dicom": {"sod": 3}}), intensity=LINES)
-    fails("`primary_degrees` in `dicom:` has 2 values for 1 views",
+    fails("`primary_degrees` in `dicom:` of .*geometry.yaml has 2 values for 1 views",
           described(folder, beam={"dicom": {"primary_degrees": [0, 1]}}), intensity=LINES)
-    fails("`source_to_detector` in `dicom:` needs a number, but 'far'",
+    fails("`source_to_detector` in `dicom:` of .*geometry.yaml needs a number, but 'far'",
           described(folder, beam={"dicom": {"source_to_detector": "far"}}), intensity=LINES)
     fails(r"`pixel` in `dicom:` needs .row height, column width., but",
           described(folder, beam={"dicom": {"pixel": [1, 2, 3]}}), intensity=LINES)

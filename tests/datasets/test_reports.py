@@ -81,7 +81,8 @@ def test_table_file_and_call_give_a_prior_the_same_report(tmp_path):
     table = tmp_path / "reports.csv"
     table.write_text('VolumeName,Findings_EN,Impressions_EN\na.nii.gz,"Nodule,\n 4 mm.",Benign nodule.\n')
     beam = ConeBeam.orbit(1, 1020.0, 740.0, (4, 4), (100.0, 100.0))
-    save_xrays(tmp_path / "xrays", torch.ones(1, 4, 4), beam)
+    xrays = torch.arange(16.0).view(1, 4, 4)
+    save_xrays(tmp_path / "xrays", xrays, beam)
     whole = "FINDINGS: Nodule, 4 mm.\nIMPRESSION: Benign nodule.\n"
     (tmp_path / "xrays" / "report.txt").write_text("\ufeff" + whole, encoding="utf-8")
     seen = []
@@ -90,5 +91,5 @@ def test_table_file_and_call_give_a_prior_the_same_report(tmp_path):
         def reconstruct(self, xrays, projector, report="", *_):
             seen.append(report)
 
-    phydict.reconstruct(torch.ones(1, 4, 4), beam, method=Listening(), report=whole, grid=Grid.cube(4))
+    phydict.reconstruct(xrays, beam, method=Listening(), report=whole, grid=Grid.cube(4))
     assert read_reports(table)["a"] == load_xrays(tmp_path / "xrays")["report"] == seen[0] == LAYOUT

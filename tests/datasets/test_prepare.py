@@ -21,7 +21,7 @@ import torch
 from dicom_files import write_ct_series, write_dicom
 
 from phydict.datamodule import PriorData
-from phydict.datasets import cache, prepared
+from phydict.datasets import cache
 from phydict.datasets.ct_rate import CTCases, find_cts, load_case, patient_of
 from phydict.datasets.ct_rate_tables import read_calibrations, read_reports
 from phydict.datasets.ct_series import find_series, load_series
@@ -387,7 +387,7 @@ def test_a_full_disk_stops_the_preparation_with_one_sentence_and_nothing_half_wr
     def later(image, path):
         return full() if "1" in path.parent.name.split(".")[1] and path.name == "lung.nii.gz" else whole(image, path)
 
-    monkeypatch.setattr(prepared.nibabel, "save", later)
+    monkeypatch.setattr(nibabel, "save", later)
     with pytest.raises(OSError, match="the case .*1 could not be written \\(No space left on device\\): free some sp"):
         prepare_folder(tmp_path / "in", tmp_path / "out", SMALL)
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["0"], "the finished case stays, alone"

@@ -48,8 +48,8 @@ class Results:
         self.file, self.planned = folder / RESULTS, planned
         others = [file.name for file in folder.glob("*") if file.suffix == ".png" or file.name in TABLES]
         if others and not self.file.exists():
-            raise ValueError(f"{folder} holds {others[0]}, but no {RESULTS} of this command, and is not written to: give "
-                             "another out, or move that away")
+            raise ValueError(f"{folder} holds {others[0]}, but no {RESULTS} of this command, and is not written to: "
+                             "give another out, or move that away")
         found = {row.get("key"): row for row in read_csv(self.file)}
         if None in found:
             raise ValueError(f"{self.file} has rows without a key, so that it is no table of this command: give "

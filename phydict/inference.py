@@ -335,7 +335,7 @@ def main(args: list[str] | None = None) -> None:
         return ablate(args[1:])
     with one_sentence_errors(MisconfigurationException), quiet():
         check_options(args)
-        check_command(args, COMMANDS, InferenceCLI.subcommands(), "python infer.py predict -c "
+        check_command(args, COMMANDS, InferenceCLI.subcommands(), "predict -c "
                       "configs/reconstruct/phydict_fast.yaml --data.xrays data/example/xrays")
         check_configured(args, ("--model", "--model.method", "--model.method.class_path"),
                          "configs/reconstruct/phydict_fast.yaml")

@@ -223,7 +223,7 @@ def main(args: list[str] | None = None) -> None:
         elif given[:1] == ["inspect-prior"]:
             auto_cli(print_prior, args=given[1:], exit_on_error=False, allow_abbrev=False)
         else:
-            check_command(given, COMMANDS, PriorCLI.subcommands(), "python train.py fit -c configs/prior/phantom.yaml")
+            check_command(given, COMMANDS, PriorCLI.subcommands(), "fit -c configs/prior/phantom.yaml")
             given = with_configurations(given, ("prior",))
             PriorCLI(*STAGES[stage_of(given)], args=given, seed_everything_default=0,
                      save_config_kwargs={"overwrite": True},

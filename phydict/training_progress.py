@@ -19,19 +19,18 @@ class TrainingProgress(lightning.Callback):
     """
 
     def __init__(self, interval: float = 60.0):
-        console = Console(stderr=True)
-        self.interval, self.live = interval, console.is_terminal
+        self.interval, self.bar = interval, None
+
+    def on_train_start(self, trainer, module) -> None:
+        console, self.spoke, self.said = Console(stderr=True), time.monotonic(), -1
+        self.live = console.is_terminal and trainer.is_global_zero
         self.bar = Progress(TextColumn("training"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
                             TimeRemainingColumn(), TextColumn("{task.description}"), console=console,
                             disable=not self.live)
-
-    def on_train_start(self, trainer, module) -> None:
-        self.spoke, self.said = time.monotonic(), -1
         steps = trainer.estimated_stepping_batches
         self.total = steps if math.isfinite(steps) and steps > 0 else None
         self.task = self.bar.add_task("", total=self.total, completed=trainer.global_step)
-        if self.live and trainer.is_global_zero:
-            self.bar.start()
+        self.bar.start()
 
     def on_train_batch_end(self, trainer, module, outputs, batch, index) -> None:
         self.bar.update(self.task, completed=trainer.global_step, description=_logged(trainer))
@@ -47,7 +46,8 @@ class TrainingProgress(lightning.Callback):
         self.bar.stop()
 
     def on_exception(self, trainer, module, exception) -> None:
-        self.bar.stop()
+        if self.bar:
+            self.bar.stop()
 
     def _line(self, trainer) -> None:
         """A line about the present step, once."""

@@ -849,7 +849,7 @@ def test_a_prior_refuses_xrays_of_another_grid(prior):
 
 
 @pytest.mark.parametrize("args, words", [
-    ([], ["predict", "test", "ablate", "infer.py predict -c"]), (["reconstruct"], ["'reconstruct'", "ablate"]),
+    ([], ["predict", "test", "ablate", "such as: predict -c"]), (["reconstruct"], ["'reconstruct'", "ablate"]),
     (["--data.xrays", "somewhere"], ["predict", "test", "ablate"]), (["predict"], ["-c configs/reconstruct/"]),
     (["test", "--data.cts", "phantom"], ["-c configs/reconstruct/"]), (["ablate"], ["-c configs/ablate/"]),
     (["ablate", "--phantoms", "3"], ["-c configs/ablate/"])], ids=lambda value: " ".join(value)[:20])

@@ -6,6 +6,7 @@ import errno
 import logging
 import os
 import re
+import reprlib
 import sys
 import tempfile
 import warnings
@@ -122,7 +123,7 @@ def check_apart(output: Path, option: str, inputs: Iterable[Path]) -> None:
             raise ValueError(f"the output {output} {how} the input {given}: give another {option}")
 
 
-def read_configurations(args: Sequence[str]) -> list[object]:
+def read_configurations(args: Sequence[str]) -> list[dict]:
     """What the configuration files hold that a command line names with -c or --config, in their order.
 
     They are read as `read_yaml` reads, so that what it refuses never reaches the command line's own parser. Files that
@@ -131,7 +132,14 @@ def read_configurations(args: Sequence[str]) -> list[object]:
     look = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     look.add_argument("--config", "-c", action="append", default=[])
     given, _ = look.parse_known_args(list(args))
-    return [read_yaml(file) for file in given.config if os.path.isfile(file)]
+    found = {file: read_yaml(file) for file in given.config if os.path.isfile(file)}
+    for file, settings in found.items():
+        if not isinstance(settings, dict):
+            raise ValueError(f"{file} holds no settings: it is a mapping, such as `model: {{...}}`")
+        for name in ("model", "data", "trainer"):
+            if not isinstance(settings.get(name, {}), dict):
+                raise ValueError(f"{file}: `{name}` is a mapping of settings, but {reprlib.repr(settings[name])} was given")
+    return list(found.values())
 
 
 def check_options(args: Sequence[str]) -> None:

@@ -23,6 +23,9 @@ PHANTOM_VERSION = 2
 HELD_OUT_PHANTOM = 1_000_000
 """Phantoms with this seed and above are never trained on."""
 
+MOST_DRAWS = 10_000_000
+"""Draws of an epoch are listed before it begins."""
+
 KEYS = ("volume", "masks", "has_masks", "report")
 """The parts of a Case that training needs."""
 
@@ -106,6 +109,9 @@ class PriorData(lightning.LightningDataModule):
                  window: tuple[float, float] = (-1000.0, 1000.0)):
         super().__init__()
         check_seed(seed)
+        for name, value, least in (("epoch_size", epoch_size, 1), ("batch_size", batch_size, 1), ("workers", workers, 0)):
+            if not least <= value <= MOST_DRAWS:
+                raise ValueError(f"data.{name} lies between {least} and {MOST_DRAWS:,}, but {value:,} was given")
         if not cts and not phantoms:
             raise ValueError("there is nothing to train on: give data.cts, or data.phantoms above 0")
         if phantoms < 0 or not 0 <= ct_fraction <= 1:

@@ -58,11 +58,18 @@ def read_text(path: str | Path) -> str:
     path = Path(path)
     size = path.stat().st_size
     if size > MOST_TEXT:
-        raise ValueError(f"{path} has {size:,} bytes, but no more than {MOST_TEXT:,} of text are read; give another file")
+        raise Unreadable(f"{path} has {size:,} bytes, but no more than {MOST_TEXT:,} of text are read; give another file")
     try:
         return path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path} is not UTF-8 text ({error}); save it as UTF-8") from error
+        raise Unreadable(f"{path} is not UTF-8 text ({error}); save it as UTF-8") from error
+
+
+def read_ids(path: str | Path, option: str) -> list[str]:
+    """The ids in a text file, apart by white space; `option` is what names the file. Raises as `read_text` does."""
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"there is no file {path}: give another {option}, a text file of case ids")
+    return read_text(path).split()
 
 
 def read_npy(path: str | Path) -> np.ndarray:

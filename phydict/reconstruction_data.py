@@ -19,7 +19,7 @@ from phydict.datamodule import HELD_OUT_PHANTOM, PHANTOM_VERSION
 from phydict.datasets import CTFile, find_cts, find_xrays, load_case, load_xrays, phantom_case
 from phydict.evaluation import volume_metrics
 from phydict.grid import Grid
-from phydict.reading import read_text
+from phydict.reading import read_ids
 from phydict.reconstructor import describe
 from phydict.shipped import own_or_shipped
 from phydict.units import HUWindow
@@ -136,7 +136,7 @@ class ReconstructionData(lightning.LightningDataModule):
     def _chosen(self, cts: list[CTFile]) -> list[CTFile]:
         if not self.only:
             return cts
-        wanted = set(read_text(self.only).split())
+        wanted = set(read_ids(self.only, "data.only"))
         missing = wanted - {ct.id for ct in cts}
         if missing or not wanted:
             raise ValueError(f"data.only ({self.only}) names {', '.join(sorted(missing)[:3]) or 'no case'}, which "

@@ -23,7 +23,7 @@ from phydict.command_line import (
 from phydict.datamodule import PriorData
 from phydict.precision import PRECISIONS, resolve_precision, trainer_precision
 from phydict.prior import save_prior, save_super_resolution
-from phydict.prior.checkpoint import build_prior, build_super_resolution, build_text, is_saved_prior
+from phydict.prior.checkpoint import build_prior, build_super_resolution, build_text, has_text, is_saved_prior
 from phydict.prior.finite import check_finite
 from phydict.prior.pretrained import inspect_prior, read_torch
 from phydict.prior_training import PriorTraining
@@ -39,6 +39,10 @@ BEST, HELD_OUT = "best.ckpt", "held_out.txt"
 saw."""
 
 
+RESUMED = ("epoch", "global_step", "loops", "optimizer_states", "lr_schedulers", "callbacks")
+"""What a checkpoint must hold beside the weights for its training to go on."""
+
+
 def read_checkpoint(path: str | Path) -> dict:
     """A checkpoint that training wrote. Raises FileNotFoundError, or ValueError when it is truncated, holds code, is
     another's or holds weights that are not finite."""
@@ -47,6 +51,13 @@ def read_checkpoint(path: str | Path) -> dict:
     checkpoint = read_torch(path)
     if not isinstance(checkpoint, dict) or "phydict" not in checkpoint:
         raise ValueError(f"{path} is no checkpoint of a prior: give a .ckpt file that training wrote")
+    header, weights = checkpoint["phydict"], checkpoint.get("state_dict")
+    stage = header.get("stage", "base") if isinstance(header, dict) else None
+    if not isinstance(stage, str) or stage not in STAGES:
+        raise ValueError(f"{path} is damaged: its header is {reprlib.repr(header)}; give another checkpoint")
+    if not isinstance(weights, dict) or not all(isinstance(name, str) for name in weights) or not all(
+            isinstance(weight, torch.Tensor) for name, weight in weights.items() if name.startswith(("prior.", "text."))):
+        raise ValueError(f"{path} is damaged: its weights are {reprlib.repr(weights)}; give another checkpoint")
     for state in ("state_dict", "current_model_state"):
         check_finite(checkpoint.get(state, {}), path)
     return checkpoint
@@ -70,12 +81,12 @@ def export_prior(checkpoint: str, out: str, overwrite: bool = False) -> None:
     content = read_checkpoint(checkpoint)
     header = content["phydict"]
     weights = {k.removeprefix("prior."): w for k, w in content["state_dict"].items() if k.startswith("prior.")}
-    training = header.get("training", {"steps": content["global_step"]})
+    training = header.get("training", {"steps": content.get("global_step")})
     if header.get("stage") == "super_resolution":
         save_super_resolution(build_super_resolution(header, weights), out, training)
     else:
         prior = build_prior(header, weights)
-        if header["text"]:
+        if has_text(header):
             prior.text = build_text(header["text"], {k: w for k, w in weights.items() if k.startswith("text.")})
         save_prior(prior, out, training)
     print(f"prior in {out}")
@@ -105,8 +116,7 @@ def stage_of(args: list[str]) -> str:
     look.add_argument("--stage")
     given, _ = look.parse_known_args(args)
     stages = [given.stage] if given.stage else []
-    stages += [settings["stage"] for settings in reversed(read_configurations(args))
-               if isinstance(settings, dict) and "stage" in settings]
+    stages += [settings["stage"] for settings in reversed(read_configurations(args)) if "stage" in settings]
     stage = stages[0] if stages else "base"
     if not isinstance(stage, str) or stage not in STAGES:
         raise ValueError(f"the stages that can be trained are {' and '.join(STAGES)}, but {reprlib.repr(stage)} was given")
@@ -210,7 +220,10 @@ class PriorCLI(LightningCLI):
         check_writable(Path(self.config[command].out), "--out")
         checkpoint = self.config[command].ckpt_path
         if checkpoint and checkpoint not in ("last", "best"):
-            read_checkpoint(checkpoint)
+            lacks = [part for part in RESUMED if part not in read_checkpoint(checkpoint)]
+            if lacks:
+                raise ValueError(f"{checkpoint} lacks {', '.join(lacks)}, and cannot be gone on from: give the last.ckpt "
+                                 "of a training")
 
 
 def main(args: list[str] | None = None) -> None:

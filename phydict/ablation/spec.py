@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
@@ -19,7 +20,7 @@ from phydict.methods import METHODS
 from phydict.posterior import Sampler
 from phydict.prior import DEFAULT_PRIOR, fingerprint, load_prior
 from phydict.reconstruction_data import ReconstructionData
-from phydict.reconstructor import Reconstructor, describe
+from phydict.reconstructor import Reconstructor, check_seed, describe
 from phydict.shipped import configuration
 from phydict.units import HUWindow
 from phydict.xray import Ideal, Polychromatic, Simulator
@@ -27,6 +28,9 @@ from phydict.yaml_file import read_yaml
 
 SIDE = 560.0
 """mm along each side of the simulated detector unless the size of its pixels is given."""
+
+MOST_TRIALS = 10_000
+"""Combinations of the values of a product's axes."""
 
 SIMULATORS: dict[str, Simulator] = {"ideal": Ideal(), "polychromatic": Polychromatic()}
 
@@ -60,6 +64,10 @@ class Cases:
         if (self.cts is None) == (self.phantoms is None):
             raise ValueError("the cases are those of a folder, cts, or a number of phantoms: give exactly one of the "
                              "two, in the file or on the command line")
+        if self.phantoms is not None and type(self.phantoms) is not int:
+            raise ValueError(f"phantoms is a whole number without quotes, but {self.phantoms!r} was given")
+        for name in ("cts", "only", "reports"):
+            _check_path(getattr(self, name), name)
 
     def data(self, **settings) -> ReconstructionData:
         """The simulated X-rays of these cases."""
@@ -157,12 +165,13 @@ def _specification(content, given: Mapping) -> Specification:
     methods = _mapping(content.get("methods"), "methods")
     for name, changes in methods.items():
         of = _mapping(changes, f"methods.{name}").get("of", name)
-        if of not in METHODS:
+        if not isinstance(of, str) or of not in METHODS:
             raise ValueError(f"methods.{name}: there is no method {of!r} to change: give `of`, one of "
                              f"{', '.join(METHODS)}")
     cases = Cases(*(content.get(name) for name in ("cts", "phantoms", "only", "reports")))
-    if "out" not in content:
+    if content.get("out") is None:
         raise ValueError("there is no folder for the results: give out, in the file or as --out")
+    _check_path(content["out"], "out")
     products = content.get("products", [{"axes": content.get("axes", {})}])
     if not isinstance(products, list) or not products:
         raise ValueError(f"products is a list of bases and axes, but {products!r} was given")
@@ -194,6 +203,8 @@ def _trials(base: Mapping, axes: Mapping, methods: Mapping, cases: Cases) -> tup
     for name, values in axes.items():
         if not isinstance(values, list) or not values:
             raise ValueError(f"the axis {name} is a list of at least one value, but {values!r} was given")
+    if (count := math.prod(map(len, axes.values()))) > MOST_TRIALS:
+        raise ValueError(f"the axes stand for {count:,} combinations, but at most {MOST_TRIALS:,} are run: shorten them")
     found, used = [], set()
     for values in product(*axes.values()):
         mine = dict(zip(axes, values))
@@ -220,6 +231,10 @@ def _trials(base: Mapping, axes: Mapping, methods: Mapping, cases: Cases) -> tup
 def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
     """The trial of some settings, and the names of those that mean anything to it."""
     given = {name: parsed(SETTINGS[name][0], value, name) for name, value in settings.items() if name in SETTINGS}
+    for name, value in given.items():
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ValueError(f"{name} must be a finite number, but {value} was given")
+    check_seed(given.get("seed", 0))
     base = METHODS[of]
     simulator = SIMULATORS.get(given.get("simulator", "ideal"))
     if simulator is None:
@@ -352,6 +367,11 @@ def _mapping(value, name: str) -> Mapping:
     if not isinstance(value, dict):
         raise ValueError(f"{name} is a mapping of names to values, but {value!r} was given")
     return value
+
+
+def _check_path(value, name: str) -> None:
+    if not isinstance(value, str | None):
+        raise ValueError(f"{name} is the name of a file or folder, but {value!r} was given")
 
 
 def _check_keys(value, keys: Sequence[str], what: str) -> None:

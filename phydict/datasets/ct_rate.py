@@ -24,7 +24,7 @@ from phydict.datasets.prepared import VOLUME, is_prepared, read_prepared, read_r
 from phydict.datasets.segmentations import is_segmentation
 from phydict.datasets.transforms import Calibration, case_id, prepare_ct
 from phydict.grid import Grid
-from phydict.reading import read_text
+from phydict.reading import read_ids
 from phydict.units import HUWindow
 
 NAME = re.compile(r"(?P<patient>(?:train|valid)_\d+)_(?P<scan>[a-z]+)_(?P<reconstruction>\d+)", re.IGNORECASE)
@@ -78,7 +78,7 @@ def find_cts(root: str | Path, reports: str | Path | None = None, metadata: str 
         elif id in files:
             raise ValueError(f"{files[id]} and {path} would both become case {id}; rename one of them")
         files[id] = path
-    for line in read_text(exclude).split() if exclude else ():
+    for line in read_ids(exclude, "data.exclude") if exclude else ():
         files.pop(case_id(line), None)
     ids = sorted(files, key=natural_order)
     if first_reconstruction:

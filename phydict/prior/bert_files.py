@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
+import reprlib
 from pathlib import Path
-from pickle import UnpicklingError
 from typing import TYPE_CHECKING
 
 import torch
-from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
 
@@ -16,6 +15,8 @@ if TYPE_CHECKING:
     from transformers import BertModel, BertTokenizer
 
 from phydict.prior.finite import check_finite
+
+from phydict.reading import reading, reason
 
 CONFIG = "config.json"
 WEIGHTS = ("model.safetensors", "pytorch_model.bin")
@@ -49,12 +50,17 @@ def load_bert(source: str | Path) -> tuple[BertTokenizer, BertModel]:
         config = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
         config.pop("model_type", None)
         config["max_position_embeddings"] = len(weights["embeddings.position_embeddings.weight"])
+        most = max([len(weights), *(n for weight in weights.values() for n in weight.shape)])
+        for size in ("hidden_size", "num_hidden_layers", "intermediate_size", "vocab_size"):
+            if not 0 < config.get(size, 1) <= most:
+                raise ValueError(f"{size} is {reprlib.repr(config[size])}")
         bert = BertModel(BertConfig.from_dict(config), add_pooling_layer=False)
         bert.load_state_dict(weights)
-    except (KeyError, AttributeError, TypeError, ValueError, RuntimeError) as error:
+    except Exception as error:  # whatever the two files lead their readers to
         raise ValueError(f"the weights in '{folder}' are not those of the BERT that its {CONFIG} describes "
-                         f"({' '.join(str(error).split())[:300]}): give the files of one model") from error
-    tokenizer = BertTokenizer.from_pretrained(folder, local_files_only=True)
+                         f"({reason(error)}): give the files of one model") from error
+    with reading(f"the vocabulary in '{folder}'", f"give {' or '.join(VOCABULARY)} of that BERT"):
+        tokenizer = BertTokenizer.from_pretrained(folder, local_files_only=True)
     if len(tokenizer) > bert.config.vocab_size:
         raise ValueError(f"the vocabulary in '{folder}' has {len(tokenizer)} words, but the BERT knows "
                          f"{bert.config.vocab_size}: give the vocabulary that belongs to it")
@@ -110,11 +116,13 @@ def _read_weights(file: Path) -> dict[str, Tensor]:
     """The encoder's weights under BertModel's own names."""
     try:
         weights = load_file(file) if file.suffix == ".safetensors" else torch.load(file, "cpu", weights_only=True)
-    except (SafetensorError, UnpicklingError, RuntimeError, EOFError, OSError) as error:
+    except Exception as error:  # whatever a damaged file leads its readers to
         raise ValueError(f"'{file}' is truncated or holds more than weights, and code in it is never run: copy it "
                          "again, or give it as model.safetensors") from error
     named = {}
     for name, weight in weights.items() if isinstance(weights, dict) else ():
+        if not isinstance(name, str) or not isinstance(weight, Tensor):
+            continue
         name = name.removeprefix("module.").removeprefix("bert.")
         for old, new in OLD_NAMES.items():
             name = name.replace(old, new)

@@ -109,8 +109,7 @@ def load_prior(path: str | Path | MedSynCheckpoint = DEFAULT_PRIOR, device: str 
     header, weights = _read(path, "base", device)
     try:
         prior = build_prior(header, weights)
-        if header["text"] is not None:
-            _check_text(header["text"])
+        if has_text(header):
             prior.load_text = lambda: _load_text(path, header["text"])
     except ValueError as error:
         raise ValueError(f"'{path}' contradicts itself: {error}") from error
@@ -262,11 +261,13 @@ def _whole(header: dict, key: str) -> int:
     return header[key]
 
 
-def _check_text(text: dict) -> None:
-    """Raises ValueError unless a header's "text" is what `describe` writes."""
-    keys = ("source", "length", "width", "layers", "vocabulary")
+def has_text(header: dict) -> bool:
+    """Whether a header describes a text encoder. Raises ValueError where "text" is not what `describe` writes."""
+    text, keys = header.get("text", "missing"), ("source", "length", "width", "layers", "vocabulary")
+    if text is None:
+        return False
     if not isinstance(text, dict) or any(key not in text for key in keys):
-        raise ValueError(f"text is {reprlib.repr(text)}, where {', '.join(keys)} are needed")
+        raise ValueError(f"text is {reprlib.repr(text)}, where {', '.join(keys)} are needed, or null")
     for key in ("length", "width", "layers"):
         _whole(text, key)
     if "padded_to" in text:
@@ -276,6 +277,7 @@ def _check_text(text: dict) -> None:
             isinstance(words, list) and all(isinstance(word, str) for word in words)):
         raise ValueError(f"text.source is {reprlib.repr(text['source'])} and text.vocabulary {reprlib.repr(words)}, where "
                          "one of them names a text encoder or lists words")
+    return True
 
 
 def build_text(text: dict, weights: dict[str, Tensor]) -> TextEncoder:

@@ -16,13 +16,14 @@ from pathlib import Path
 from pickle import UnpicklingError
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from torch import Tensor
 
 from phydict.prior.finite import check_finite
 from phydict.prior.medsyn import (
     GROUPS, HEAD_WIDTH, MedSynPrior, MedSynSuperResolution, SliceUNet, SuperResolutionUNet, TextUNet)
 from phydict.prior.text import TextEncoder
+from phydict.reading import reason
 
 FILES = {"ema": ("model_1.safetensors", "pytorch_model_1.bin"), "online": ("model.safetensors", "pytorch_model.bin")}
 """Names of accelerate's files by what they hold, where a folder comes straight from MedSyn's training."""
@@ -269,7 +270,7 @@ def is_medsyn(path: str | Path) -> bool:
     try:
         with safe_open(path, "pt") as file:
             return any("init_conv" in name for name in file.keys())
-    except (SafetensorError, OSError):
+    except Exception:  # whatever a damaged file leads to: `load_prior` says what
         return False
 
 
@@ -285,8 +286,8 @@ def read_tensors(file: Path, shapes_only: bool = False) -> dict[str, Tensor]:
                     return {name: torch.empty(opened.get_slice(name).get_shape(), device="meta")
                             for name in opened.keys()}
                 return {name: opened.get_tensor(name) for name in opened.keys()}
-        except (SafetensorError, OSError) as error:
-            raise ValueError(f"'{file}' is truncated or not a safetensors file ({error}): copy it again") from error
+        except Exception as error:  # whatever a damaged file leads to
+            raise ValueError(f"'{file}' is truncated or not a safetensors file ({reason(error)}): copy it again") from error
     content = read_torch(file)
     if isinstance(content, dict) and "phydict" in content:
         raise ValueError(f"'{file}' is a checkpoint of phydict's training: make it a prior with train.py export")
@@ -310,7 +311,7 @@ def read_torch(file: str | Path) -> object:
         reason = f"asks for code ({asked[1]})" if asked else "is no file of weights (perhaps a pickle with code)"
         raise ValueError(f"'{file}' {reason} and was refused, since only weights are read: give a .safetensors file, "
                          "or tensors alone as torch.save writes them") from error
-    except (RuntimeError, EOFError, OSError) as error:
+    except Exception as error:  # whatever a damaged file leads to
         raise ValueError(f"'{file}' is truncated or damaged: copy it again") from error
 
 
@@ -354,8 +355,8 @@ def _inspect_file(file: Path) -> dict[str, str]:
         else:
             found = MedSynWeights.sort(entries)
             report, used = _inspect_medsyn(found, entries), [name for name in entries if name not in found.ignored]
-    except ValueError as error:
-        return {"kind": "unknown: " + " ".join(str(error).removeprefix(f"'{file}' ").split())}
+    except Exception as error:  # whatever a file that is none of these leads to
+        return {"kind": "unknown: " + reason(error).removeprefix(f"'{file}' ")}
     if file.suffix == ".safetensors":
         with safe_open(file, "pt") as opened:
             for name in used:

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 PRECISIONS = ("auto", "float32", "bfloat16")
-"""What a user may ask for. "auto" is bfloat16 where the hardware computes it and float32 elsewhere; a float64 state stays
-float64 unless bfloat16 is asked for."""
+"""What a user may ask for. "auto" is bfloat16 where the hardware computes it and float32 elsewhere; a float64 state
+stays float64 unless bfloat16 is asked for."""
 
 SLOWER = {"AVX2": 200, "AVX512": 2}
 """How many times slower than float32 a network is in bfloat16 on CPUs that lack its instructions, by what they have:

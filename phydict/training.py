@@ -156,8 +156,8 @@ class PriorCLI(LightningCLI):
         parser.add_argument("--out", default="runs/prior", help="folder for checkpoint, logs and samples")
         parser.add_argument("--stage", default="base", choices=list(STAGES), help="which stage of a cascade to train")
         parser.add_argument("--precision", default="auto", choices=list(PRECISIONS),
-                            help="of the network: bfloat16 where the device computes it and float32 elsewhere (auto), or "
-                                 "one of the two; trainer.precision takes Lightning's own names instead")
+                            help="of the network: bfloat16 where the device computes it and float32 elsewhere (auto), "
+                                 "or one of the two; trainer.precision takes Lightning's own names instead")
         parser.add_lightning_class_args(ModelCheckpoint, "checkpoint")
         parser.set_defaults({"checkpoint.filename": "last", "checkpoint.enable_version_counter": False,
                              "checkpoint.every_n_epochs": 1, "checkpoint.save_on_train_epoch_end": True})
@@ -181,7 +181,8 @@ class PriorCLI(LightningCLI):
         plugins = [*(asked if isinstance(asked, list) else [asked]), WholeCheckpoints()]
         logger = CSVLogger(self._get(self.config, "out"), name="logs")
         trainer = self._get(self.config_init, "trainer")
-        device = torch.device("cpu" if trainer.accelerator == "cpu" else torch.accelerator.current_accelerator() or "cpu")
+        found = None if trainer.accelerator == "cpu" else torch.accelerator.current_accelerator()
+        device = found or torch.device("cpu")
         if trainer.precision is None:
             kwargs["precision"] = trainer_precision(self._get(self.config, "precision"), device)
         elif "bf16" in str(trainer.precision):

@@ -86,7 +86,8 @@ def test_a_cpu_limited_to_avx2_decides_for_float32():
             "x = torch.zeros(1);"
             "print(json.dumps([torch.backends.cpu.get_cpu_capability(), torch.ops.mkldnn._is_mkldnn_bf16_supported(),"
             "precision_name('auto', x), instruction_set(cpu)]))")
-    done = subprocess.run([sys.executable, "-c", code], env=os.environ | AVX2, capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", code], env=os.environ | AVX2, stdout=subprocess.PIPE, text=True,
+                          check=True)
     assert json.loads(done.stdout.splitlines()[-1]) == ["AVX2", False, "float32", "AVX2"]
 
 

@@ -35,9 +35,10 @@ def main(args: list[str] | None = None) -> None:
 
 
 def _parser() -> ArgumentParser:
-    parser = ArgumentParser(prog=f"{Path(sys.argv[0]).name} ablate", exit_on_error=False, allow_abbrev=False, description=(
-        "Compare methods on the same X-rays: every combination of settings that a file names, one row of results each, "
-        "then tables and plots."))
+    parser = ArgumentParser(
+        prog=f"{Path(sys.argv[0]).name} ablate", exit_on_error=False, allow_abbrev=False,
+        description="Compare methods on the same X-rays: every combination of settings that a file names, one row of "
+                    "results each, then tables and plots.")
     parser.add_argument("-c", "--config", required=True,
                         help="what to compare: a YAML file, or the name of a shipped one, such as pareto")
     parser.add_argument("--cts", type=str, help="a NIfTI file or a folder of CTs, instead of the file's cases")

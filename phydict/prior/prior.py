@@ -122,7 +122,8 @@ class Prior(nn.Module):
     def bind(self, report: str = "", guidance: float = 1.0, precision: str = "auto") -> BoundPrior:
         """The denoiser of one report, with classifier-free guidance of the given scale inside (1 = none).
 
-        precision: see phydict.precision. Warns, once for each report, where it is cut or in words that the text encoder does not know.
+        precision: see phydict.precision. Warns, once for each report, where it is cut or in words that the text
+        encoder does not know.
         """
         if guidance < 0:
             raise ValueError(f"the guidance scale is at least 0, but {guidance} was given")

@@ -193,7 +193,7 @@ def build_prior(header: dict, weights: dict[str, Tensor]) -> Prior:
     Raises ValueError where header and weights do not fit together.
     """
     def made() -> Prior:
-        return Prior(VolumeUNet(**header["network"]), Grid(**header["grid"]), HUWindow(*header["hu_window"]),
+        return Prior(VolumeUNet(**header["network"]), Grid(**header["grid"]), _window(header),
                      schedule=CosineSchedule(**header["schedule"]), sigma_data=_number(header, "sigma_data"),
                      skip_std=_number(header, "skip_std"),
                      detail=DetailNetwork(**header["detail"]) if "detail" in header else None)
@@ -209,7 +209,7 @@ def build_super_resolution(header: dict, weights: dict[str, Tensor]) -> SuperRes
     """
     def made() -> SuperResolution:
         return SuperResolution(
-            LocalUNet(**header["network"]), Grid(**header["grid"]), HUWindow(*header["hu_window"]),
+            LocalUNet(**header["network"]), Grid(**header["grid"]), _window(header),
             _whole(header, "factor"), len(header["coarse_state"]), CosineSchedule(**header["schedule"]),
             _number(header, "detail_std"), _number(header, "skip_std"))
 
@@ -253,6 +253,13 @@ def _number(header: dict, key: str) -> float:
     if isinstance(header[key], bool) or not isinstance(header[key], int | float) or not 0 < header[key] < 1e6:
         raise ValueError(f"{key} is {reprlib.repr(header[key])}, where a positive number is needed")
     return header[key]
+
+
+def _window(header: dict) -> HUWindow:
+    ends = header["hu_window"]
+    if not isinstance(ends, list) or len(ends) != 2:
+        raise ValueError(f"hu_window is {reprlib.repr(ends)}, where two numbers are needed")
+    return HUWindow(*ends)
 
 
 def _whole(header: dict, key: str) -> int:

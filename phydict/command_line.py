@@ -142,19 +142,6 @@ def read_configurations(args: Sequence[str]) -> list[dict]:
     return list(found.values())
 
 
-def check_options(args: Sequence[str]) -> None:
-    """Raises ValueError where a command line gives one option two values; configuration files may follow each other."""
-    given = {}
-    several = any(arg.partition("=")[0].endswith("+") for arg in args)  # values appended to a list may have own settings
-    for arg, following in zip(args, [*args[1:], "--"]):
-        name, joined, value = arg.partition("=")
-        if not name.startswith("--") or name == "--config" or several:
-            continue
-        value = value if joined else "" if following.startswith("--") else following
-        if given.setdefault(name, value) != value:
-            raise ValueError(f"{name} is given twice, as {given[name]} and as {value}: keep one of them")
-
-
 def sentence(error: Exception) -> str:
     """An error's message on one line, without what loader processes and the argument parser wrap around it."""
     text = str(error).strip()

@@ -27,7 +27,7 @@ from torch import Tensor
 from phydict.ablation import main as ablate
 from phydict.case_results import CaseResults
 from phydict.command_line import (
-    TRACEBACK, check_apart, check_command, check_configured, check_options, check_writable, noted, one_sentence_errors,
+    TRACEBACK, check_apart, check_command, check_configured, check_writable, noted, one_sentence_errors,
     quiet, read_configurations, sentence, with_configurations)
 from phydict.datasets import load_xrays
 from phydict.dry_run import dry_run
@@ -334,7 +334,6 @@ def main(args: list[str] | None = None) -> None:
     if args[:1] == ["ablate"]:
         return ablate(args[1:])
     with one_sentence_errors(MisconfigurationException), quiet():
-        check_options(args)
         check_command(args, COMMANDS, InferenceCLI.subcommands(), "predict -c "
                       "configs/reconstruct/phydict_fast.yaml --data.xrays data/example/xrays")
         check_configured(args, ("--model", "--model.method", "--model.method.class_path"),

@@ -19,7 +19,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from phydict.atomic import whole_file
 from phydict.command_line import (
-    check_command, check_options, check_writable, one_sentence_errors, quiet, read_configurations, with_configurations)
+    check_command, check_writable, one_sentence_errors, quiet, read_configurations, with_configurations)
 from phydict.datamodule import PriorData
 from phydict.precision import PRECISIONS, resolve_precision, trainer_precision
 from phydict.prior import save_prior, save_super_resolution
@@ -231,7 +231,6 @@ def main(args: list[str] | None = None) -> None:
     """Command line of training: fit, validate, export, inspect-prior. A bad input ends in one sentence and code 2."""
     given = sys.argv[1:] if args is None else args
     with one_sentence_errors(MisconfigurationException, to_go_on="add --ckpt_path and the run's last.ckpt"), quiet():
-        check_options(given)
         if given[:1] == ["export"]:
             auto_cli(export_prior, args=given[1:], as_positional=False, exit_on_error=False, allow_abbrev=False)
         elif given[:1] == ["inspect-prior"]:

@@ -286,7 +286,7 @@ def test_arguments_and_files_that_cannot_be_meant_are_one_sentence(tmp_path, cap
     file = write(tmp_path, axes={"method": ["trace"]})
     assert "nowhere" in refusal(capsys, ["ablate", "-c", str(file), "--cts", str(tmp_path / "nowhere")])
     (tmp_path / "bad.yaml").write_text("axes: [")
-    assert "bad.yaml is no YAML" in refusal(capsys, ["ablate", "-c", str(tmp_path / "bad.yaml")])
+    assert "bad.yaml is not valid YAML" in refusal(capsys, ["ablate", "-c", str(tmp_path / "bad.yaml")])
     with alone_in(tmp_path / "out"):
         assert "another run" in refusal(capsys, ["ablate", "-c", str(file)])
     (tmp_path / "out" / "results.csv").write_text("case,method\na,b\n")

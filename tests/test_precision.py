@@ -50,7 +50,7 @@ def test_the_hardware_decides_unless_someone_asks(hardware, asked, able, state, 
 def test_slow_bfloat16_runs_and_warns_once_with_the_factor(hardware, monkeypatch):
     hardware(False)
     monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX2")
-    with pytest.warns(UserWarning, match="AVX2 does not compute it.*about 200 times slower"):
+    with pytest.warns(RuntimeWarning, match="AVX2 does not compute it.*about 200 times slower"):
         assert resolve_precision("bfloat16", CPU) == torch.bfloat16
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -61,7 +61,7 @@ def test_a_gpu_without_bfloat16_computes_in_float32_and_is_named_once(monkeypatc
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: including_emulation)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "an old GPU")
     gpu = torch.device("cuda")
-    with pytest.warns(UserWarning, match="an old GPU does not compute bfloat16: networks run in float32"):
+    with pytest.warns(RuntimeWarning, match="an old GPU does not compute bfloat16: networks run in float32"):
         assert resolve_precision("auto", gpu) == torch.float32
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -41,7 +41,7 @@ def test_flop_are_counted_without_touching_the_prior():
 def test_rates_follow_from_one_another(cache, tmp_path, capsys):  # noqa: F811
     main(arguments(tmp_path, cache, "--trainer.max_epochs=1", "--trainer.limit_val_batches=0", "--throughput.peak=0.5"))
     said = capsys.readouterr().err
-    assert f"training in float32 on {instruction_set(torch.device('cpu'))}: a sample costs" in said
+    assert f"weights in float32 on {instruction_set(torch.device('cpu'))}: a sample costs" in said
     assert "GFLOP forward and backward" in said and "0.5 TFLOP/s" in said
     with next(tmp_path.glob("logs/**/metrics.csv")).open() as file:
         rows = [{key: float(value) for key, value in row.items() if value} for row in csv.DictReader(file)]

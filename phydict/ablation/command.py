@@ -13,7 +13,7 @@ from phydict.ablation.run import RESULTS, alone_in, run
 from phydict.ablation.spec import read_specification
 from phydict.ablation.summary import entries
 from phydict.ablation.tables import all_tables, write_tables
-from phydict.command_line import check_configured, check_options, check_writable, one_sentence_errors, quiet
+from phydict.command_line import check_configured, check_writable, one_sentence_errors, quiet
 from phydict.progress import CaseProgress
 
 
@@ -21,7 +21,6 @@ def main(args: list[str] | None = None) -> None:
     """infer.py ablate -c <file>. A bad input ends in one sentence and exit code 2; a run that was stopped goes on."""
     with one_sentence_errors(), quiet():
         check_configured(sys.argv[1:] if args is None else args, (), "configs/ablate/pareto.yaml")
-        check_options(sys.argv[1:] if args is None else args)
         given = _parser().parse_args(args).as_dict()
         device = given.pop("device") or ("cuda" if torch.cuda.is_available() else "cpu")
         specification = read_specification(given.pop("config"), **given)

@@ -240,7 +240,7 @@ def test_wrong_overrides_are_explained(tmp_path):
           described(folder, beam={"dicom": {"primary_degrees": [0, 1]}}), intensity=LINES)
     fails("`source_to_detector` in `dicom:` of .*geometry.yaml needs a number, but 'far'",
           described(folder, beam={"dicom": {"source_to_detector": "far"}}), intensity=LINES)
-    fails(r"`pixel` in `dicom:` needs .row height, column width., but",
+    fails(r"`pixel` in `dicom:` of .*geometry.yaml needs .row height, column width., but",
           described(folder, beam={"dicom": {"pixel": [1, 2, 3]}}), intensity=LINES)
     fails("unknown key 'orbit' in `beam:`", described(folder, beam={"dicom": {}, "orbit": {}}), intensity=LINES)
 

@@ -16,7 +16,7 @@ stays float64 unless bfloat16 is asked for."""
 
 SLOWER = {"AVX2": 200, "AVX512": 2}
 """How many times slower than float32 a network is in bfloat16 on CPUs that lack its instructions, by what they have:
-AVX2, measured on a Zen 3; AVX-512, tests/benchmark/machine.csv."""
+AVX2, measured on a Zen 3; AVX-512, with oneDNN kept from bfloat16's instructions."""
 
 
 def check_precision(precision: str) -> None:

@@ -7,16 +7,17 @@ from collections.abc import Callable
 from numba import njit
 
 
-def compiled(fastmath: bool | set[str] = False) -> Callable[[Callable], Callable]:
-    """Compiles a function at its first call; it runs without the GIL, with such liberties in arithmetic as `fastmath`.
+def compiled(fastmath: bool | set[str] = False, parallel: bool = False) -> Callable[[Callable], Callable]:
+    """Compiles a function at its first call; it runs without the GIL, with such liberties in arithmetic as `fastmath`,
+    and its prange loops on several threads where `parallel` says so.
 
     The machine code is kept for other processes in NUMBA_CACHE_DIR, beside the source or in the user's cache folder,
     the first of them that can be written to; where none can, every process compiles anew.
     """
     def decorate(function: Callable) -> Callable:
         try:
-            return njit(nogil=True, cache=True, fastmath=fastmath)(function)
+            return njit(nogil=True, cache=True, fastmath=fastmath, parallel=parallel)(function)
         except RuntimeError:  # numba found no such folder
-            return njit(nogil=True, fastmath=fastmath)(function)
+            return njit(nogil=True, fastmath=fastmath, parallel=parallel)(function)
 
     return decorate

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numba
 import numpy as np
 import torch
 
@@ -85,6 +86,7 @@ class Separable:
         if mu.device.type != "cpu":
             return self.sparse.forward(mu)
         xrays = mu.new_empty(len(mu), self.beam.views, *self.beam.shape)
+        _set_threads()
         separable_cpu.project(_array(mu), xrays.numpy(), *self.rays)
         return xrays
 
@@ -92,7 +94,7 @@ class Separable:
         if xrays.device.type != "cpu":
             return self.sparse.adjoint(xrays)
         mu = xrays.new_zeros(len(xrays), *self.grid.shape)
-        separable_cpu.backproject(mu.numpy(), _array(xrays), *self.rays)
+        separable_cpu.backproject(mu.numpy(), _array(xrays), _set_threads(), *self.rays)
         return mu
 
     @property
@@ -109,3 +111,13 @@ def _steps(count: int) -> np.ndarray:
 
 def _array(x: torch.Tensor) -> np.ndarray:
     return np.ascontiguousarray(x.detach().numpy())
+
+
+def _set_threads() -> int:
+    """The number of threads that torch uses, told to numba, whose first start sets OpenMP's, and so torch's, to all."""
+    asked = torch.get_num_threads()
+    threads = min(asked, numba.config.NUMBA_NUM_THREADS)
+    numba.set_num_threads(threads)
+    if torch.get_num_threads() != asked:
+        torch.set_num_threads(asked)
+    return threads

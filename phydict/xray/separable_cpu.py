@@ -11,11 +11,9 @@ Arrays that the inner loops touch are flat with unsigned indices: only then are 
 from __future__ import annotations
 
 import numpy as np
-import torch
-from numba import uint64
+from numba import prange, uint64
 
 from phydict.xray.compiled import compiled
-from phydict.xray.tracer import run
 
 FAST = {"reassoc", "contract", "arcp", "nsz"}
 """Liberties of the compiler: order of sums and fused products, but NaN and infinity are kept."""
@@ -23,44 +21,60 @@ FAST = {"reassoc", "contract", "arcp", "nsz"}
 LANES = 32
 """Columns of pixels that one pass carries."""
 
-TASKS = 4
-"""Parts of the work of `project` for each thread, at least, where the columns suffice; they differ in length."""
 
-
+@compiled(fastmath=FAST, parallel=True)
 def project(volumes, xrays, starts, columns, rows, planes):
-    """Fills xrays (B, K, V, U) with the projections of volumes (B, X, Y, Z), on torch's number of threads.
+    """Fills xrays (B, K, V, U) with the projections of volumes (B, X, Y, Z).
 
     The rays are those of phydict.xray.separable.Rays.
     """
-    cases, views, _, width = xrays.shape
-    groups, parts = -(-width // LANES), -(-TASKS * torch.get_num_threads() // max(1, cases * views))
-    span = LANES * -(-groups // parts)
-    run([(_project_columns, volume, xrays[case, view], first, min(first + span, width), *filled, starts[view],
-          columns[view], rows[view], planes[view])
-         for case, volume in enumerate(volumes) for filled in [_filled(volume)]
-         for view in range(views) for first in range(0, width, span)])
+    cases, views, height, width = xrays.shape
+    groups = (width + LANES - 1) // LANES
+    filled = np.zeros((cases, volumes.shape[1] + 1, volumes.shape[2] + 1), np.bool_)
+    extents = np.empty((cases, 2), np.int64)
+    for case in range(cases):
+        _find_filled(volumes[case], filled[case], extents[case])
+    for task in prange(cases * views * groups):
+        case, rest = task // (views * groups), task % (views * groups)
+        view, first = rest // groups, rest % groups * LANES
+        _project_group(volumes[case], xrays[case, view], first, filled[case].reshape(-1), extents[case], starts[view],
+                       columns[view], rows[view], planes[view])
 
 
-def backproject(volumes, xrays, starts, columns, rows, planes):
-    """Adds the adjoint of xrays (B, K, V, U) to volumes (B, X, Y, Z), in as many axial slabs as torch has threads."""
-    slabs, (_, nx, ny, nz) = torch.get_num_threads(), volumes.shape
-    everywhere = np.ones((nx + 1) * (ny + 1), np.bool_)
-    run([(_backproject_slab, volume, images, slab * nz // slabs, (slab + 1) * nz // slabs, everywhere, starts, columns,
-          rows, planes)
-         for volume, images in zip(volumes, xrays) for slab in range(slabs)])
+@compiled(fastmath=FAST, parallel=True)
+def backproject(volumes, xrays, slabs, starts, columns, rows, planes):
+    """Adds the adjoint of xrays (B, K, V, U) to volumes (B, X, Y, Z), in so many axial slabs at once."""
+    cases, views = xrays.shape[:2]
+    nz = volumes.shape[3]
+    everywhere = np.ones((volumes.shape[1] + 1) * (volumes.shape[2] + 1), np.bool_)
+    for task in prange(cases * slabs):
+        case, slab = task // slabs, task % slabs
+        low, high = slab * nz // slabs, (slab + 1) * nz // slabs
+        for view in range(views):
+            _backproject_slab(volumes[case], xrays[case, view], low, high, everywhere, starts[view], columns[view],
+                              rows[view], planes[view])
 
 
-def _filled(volume: np.ndarray) -> tuple[np.ndarray, int, int]:
-    """Which cells (X + 1, Y + 1, flat) between voxel columns have a column with values among their four corners, and
-    the slices low <= z < high that hold all values."""
-    values = volume != 0
-    columns, slices = values.any(2), np.flatnonzero(values.any((0, 1)))
-    nx, ny = columns.shape
-    cells = np.zeros((nx + 1, ny + 1), np.bool_)
-    for i in range(2):
-        for j in range(2):
-            cells[i:i + nx, j:j + ny] |= columns
-    return cells.reshape(-1), int(slices[0]) if len(slices) else 0, int(slices[-1]) + 1 if len(slices) else 0
+@compiled()
+def _find_filled(volume, filled, extent):
+    """Mark the cells (X + 1, Y + 1) between voxel columns that have a column with values among their four corners,
+    and find the slices extent[0] <= z < extent[1] that hold all values."""
+    nx, ny, nz = volume.shape
+    low, high = nz, 0
+    for i in range(nx):
+        for j in range(ny):
+            line = volume[i, j]
+            first = 0
+            while first < nz and line[first] == 0:
+                first += 1
+            if first == nz:
+                continue
+            last = nz
+            while line[last - 1] == 0:
+                last -= 1
+            low, high = min(low, first), max(high, last)
+            filled[i:i + 2, j:j + 2] = True
+    extent[0], extent[1] = min(low, high), high
 
 
 @compiled(fastmath=FAST)
@@ -97,42 +111,77 @@ def _rows_within(start, rows, far, low, high):
 
 
 @compiled(fastmath=FAST)
-def _project_columns(volume, image, begin, end, filled, low, high, start, columns, rows, planes):
-    """Fills the columns begin <= c < end of a view's image (V, U)."""
+def _project_group(volume, image, first, filled, extent, start, columns, rows, planes):
     nx, ny, nz = volume.shape
-    thick, height = high - low, image.shape[0]
+    low, high = extent[0], extent[1]
+    thick = high - low
+    height, lanes = image.shape[0], min(LANES, image.shape[1] - first)
     flat = volume.reshape(-1)
     cells, weights = np.empty(LANES, np.int64), np.empty((4, LANES), volume.dtype)
     line = np.empty(thick, volume.dtype)
     lines = np.zeros((thick + 2) * LANES, volume.dtype)
-    sums = np.empty(height * LANES, volume.dtype)
-    for first in range(begin, end, LANES):
-        lanes = min(LANES, end - first)
-        sums[:] = 0
+    sums = np.zeros(height * LANES, volume.dtype)
+    for d in range(int(planes[2])):
+        far = planes[0] + d * planes[1]
+        if not _hits(start, columns, far, volume.shape, first, lanes, filled, cells, weights):
+            continue
+        for c in range(lanes):
+            i, j = cells[c] // (ny + 1) - 1, cells[c] % (ny + 1) - 1
+            if cells[c] < 0:
+                line[:] = 0
+            elif 0 <= i < nx - 1 and 0 <= j < ny - 1:
+                p = uint64((i * ny + j) * nz + low)
+                q, r, s = p + uint64(nz), p + uint64(ny * nz), p + uint64((ny + 1) * nz)
+                v, w, x, y = weights[0, c], weights[1, c], weights[2, c], weights[3, c]
+                for z in range(uint64(thick)):
+                    line[z] = v * flat[p + z] + w * flat[q + z] + x * flat[r + z] + y * flat[s + z]
+            else:
+                line[:] = 0
+                for corner in range(4):
+                    a, b = i + corner // 2, j + corner % 2
+                    if 0 <= a < nx and 0 <= b < ny:
+                        p, w = uint64((a * ny + b) * nz + low), weights[corner, c]
+                        for z in range(uint64(thick)):
+                            line[z] += w * flat[p + z]
+            for z in range(thick):
+                lines[(z + 1) * LANES + c] = line[z]
+        top, bottom = _rows_within(start, rows, far, low - 1, high)
+        for v in range(top, bottom):
+            at = start[2] + rows[v, 0] * far + 1 - low
+            if 0 < at < thick + 1:
+                k = int(at)
+                f = volume.dtype.type(at - k)
+                here, row = uint64(k * LANES), uint64(v * LANES)
+                for lane in range(LANES):
+                    c = uint64(lane)
+                    value = lines[here + c]
+                    sums[row + c] += value + f * (lines[here + c + uint64(LANES)] - value)
+    for v in range(height):
+        for c in range(lanes):
+            image[v, first + c] = sums[v * LANES + c] * _length(columns[first + c], rows[v], planes[1])
+
+
+@compiled(fastmath=FAST)
+def _backproject_slab(volume, image, low, high, everywhere, start, columns, rows, planes):
+    nx, ny, nz = volume.shape
+    thick = high - low
+    height, width = image.shape
+    flat = volume.reshape(-1)
+    cells, weights = np.empty(LANES, np.int64), np.empty((4, LANES), volume.dtype)
+    line = np.empty(thick, volume.dtype)
+    lines = np.empty((thick + 2) * LANES, volume.dtype)
+    values = np.empty(height * LANES, volume.dtype)
+    for first in range(0, width, LANES):
+        lanes = min(LANES, width - first)
+        values[:] = 0
+        for v in range(height):
+            for c in range(lanes):
+                values[v * LANES + c] = image[v, first + c] * _length(columns[first + c], rows[v], planes[1])
         for d in range(int(planes[2])):
             far = planes[0] + d * planes[1]
-            if not _hits(start, columns, far, volume.shape, first, lanes, filled, cells, weights):
+            if not _hits(start, columns, far, volume.shape, first, lanes, everywhere, cells, weights):
                 continue
-            for c in range(lanes):
-                i, j = cells[c] // (ny + 1) - 1, cells[c] % (ny + 1) - 1
-                if cells[c] < 0:
-                    line[:] = 0
-                elif 0 <= i < nx - 1 and 0 <= j < ny - 1:
-                    p = uint64((i * ny + j) * nz + low)
-                    q, r, s = p + uint64(nz), p + uint64(ny * nz), p + uint64((ny + 1) * nz)
-                    v, w, x, y = weights[0, c], weights[1, c], weights[2, c], weights[3, c]
-                    for z in range(uint64(thick)):
-                        line[z] = v * flat[p + z] + w * flat[q + z] + x * flat[r + z] + y * flat[s + z]
-                else:
-                    line[:] = 0
-                    for corner in range(4):
-                        a, b = i + corner // 2, j + corner % 2
-                        if 0 <= a < nx and 0 <= b < ny:
-                            p, w = uint64((a * ny + b) * nz + low), weights[corner, c]
-                            for z in range(uint64(thick)):
-                                line[z] += w * flat[p + z]
-                for z in range(thick):
-                    lines[(z + 1) * LANES + c] = line[z]
+            lines[:] = 0
             top, bottom = _rows_within(start, rows, far, low - 1, high)
             for v in range(top, bottom):
                 at = start[2] + rows[v, 0] * far + 1 - low
@@ -142,61 +191,21 @@ def _project_columns(volume, image, begin, end, filled, low, high, start, column
                     here, row = uint64(k * LANES), uint64(v * LANES)
                     for lane in range(LANES):
                         c = uint64(lane)
-                        value = lines[here + c]
-                        sums[row + c] += value + f * (lines[here + c + uint64(LANES)] - value)
-        for v in range(height):
+                        above = f * values[row + c]
+                        lines[here + c] += values[row + c] - above
+                        lines[here + c + uint64(LANES)] += above
             for c in range(lanes):
-                image[v, first + c] = sums[v * LANES + c] * _length(columns[first + c], rows[v], planes[1])
-
-
-@compiled(fastmath=FAST)
-def _backproject_slab(volume, images, low, high, everywhere, starts, columns, rows, planes):
-    """Adds the adjoint of a case's images (K, V, U) to the slices low <= z < high of its volume."""
-    nx, ny, nz = volume.shape
-    thick = high - low
-    views, height, width = images.shape
-    flat = volume.reshape(-1)
-    cells, weights = np.empty(LANES, np.int64), np.empty((4, LANES), volume.dtype)
-    line = np.empty(thick, volume.dtype)
-    lines = np.empty((thick + 2) * LANES, volume.dtype)
-    values = np.empty(height * LANES, volume.dtype)
-    for view in range(views):
-        image, start, column, row, step = images[view], starts[view], columns[view], rows[view], planes[view, 1]
-        for first in range(0, width, LANES):
-            lanes = min(LANES, width - first)
-            values[:] = 0
-            for v in range(height):
-                for c in range(lanes):
-                    values[v * LANES + c] = image[v, first + c] * _length(column[first + c], row[v], step)
-            for d in range(int(planes[view, 2])):
-                far = planes[view, 0] + d * step
-                if not _hits(start, column, far, volume.shape, first, lanes, everywhere, cells, weights):
+                if cells[c] < 0:
                     continue
-                lines[:] = 0
-                top, bottom = _rows_within(start, row, far, low - 1, high)
-                for v in range(top, bottom):
-                    at = start[2] + row[v, 0] * far + 1 - low
-                    if 0 < at < thick + 1:
-                        k = int(at)
-                        f = volume.dtype.type(at - k)
-                        here, there = uint64(k * LANES), uint64(v * LANES)
-                        for lane in range(LANES):
-                            c = uint64(lane)
-                            above = f * values[there + c]
-                            lines[here + c] += values[there + c] - above
-                            lines[here + c + uint64(LANES)] += above
-                for c in range(lanes):
-                    if cells[c] < 0:
-                        continue
-                    for z in range(thick):
-                        line[z] = lines[(z + 1) * LANES + c]
-                    i, j = cells[c] // (ny + 1) - 1, cells[c] % (ny + 1) - 1
-                    for corner in range(4):
-                        a, b = i + corner // 2, j + corner % 2
-                        if 0 <= a < nx and 0 <= b < ny:
-                            p, w = uint64((a * ny + b) * nz + low), weights[corner, c]
-                            for z in range(uint64(thick)):
-                                flat[p + z] += w * line[z]
+                for z in range(thick):
+                    line[z] = lines[(z + 1) * LANES + c]
+                i, j = cells[c] // (ny + 1) - 1, cells[c] % (ny + 1) - 1
+                for corner in range(4):
+                    a, b = i + corner // 2, j + corner % 2
+                    if 0 <= a < nx and 0 <= b < ny:
+                        p, w = uint64((a * ny + b) * nz + low), weights[corner, c]
+                        for z in range(uint64(thick)):
+                            flat[p + z] += w * line[z]
 
 
 @compiled(fastmath=FAST)

@@ -6,7 +6,7 @@ Each row is a process of its own, on the CPU: one network call of the shipped pr
 network), and of other shapes of the network, untrained; the default's reconstruction of the embedded example; a
 training step of two phantoms. `limited` rows run with ONEDNN_MAX_CPU_ISA=AVX2 and ATEN_CPU_CAPABILITY=avx2, which keep
 a newer processor from more than AVX2. `first` is a process' first time, for a reconstruction with numba's cache empty;
-`seconds` is the fastest of the times after it. bfloat16 on AVX2 alone is measured by one call.
+`seconds` is the fastest of the times after it.
 
 Errors: of a network call, the root mean square in HU from float64; of a reconstruction, `psnr` (dB) against the CT that
 the example's X-rays were made of; of a training step, the first loss. Writes machine.csv beside this file.
@@ -25,7 +25,7 @@ AVX2 = {"ONEDNN_MAX_CPU_ISA": "AVX2", "ATEN_CPU_CAPABILITY": "avx2"}
 SHAPES = {"24-48-96": (24, 48, 96), "32-64-128": (32, 64, 128), "32-64-128-128": (32, 64, 128, 128),
           "16-48-128": (16, 48, 128)}
 """Widths of the network's levels; attention in the deepest."""
-REPEATS = 5
+REPEATS = 3
 
 
 def timed(work, repeats: int) -> tuple[float, float | None, object]:
@@ -99,11 +99,11 @@ def measure(what: str, precision: str, threads: int, repeats: int) -> dict:
             "threads": threads} | found
 
 
-def in_a_process(what: str, precision: str, threads: int, limited: bool, repeats: int = REPEATS) -> dict:
+def in_a_process(what: str, precision: str, threads: int, limited: bool) -> dict:
     """One row, from a process of its own with an empty cache of compiled kernels."""
     with tempfile.TemporaryDirectory() as cache:
         settings = {"NUMBA_CACHE_DIR": cache, "OMP_NUM_THREADS": str(threads), "NUMBA_NUM_THREADS": str(threads)}
-        done = subprocess.run([sys.executable, __file__, what, precision, str(threads), str(repeats)], check=True,
+        done = subprocess.run([sys.executable, __file__, what, precision, str(threads), str(REPEATS)], check=True,
                               env=os.environ | settings | (AVX2 if limited else {}), stdout=subprocess.PIPE, text=True)
     row = json.loads(done.stdout.splitlines()[-1])
     row["limited"] = limited
@@ -124,5 +124,4 @@ if __name__ == "__main__":
         rows.append(in_a_process(what, precision, threads, limited))
     for shape, (limited, precision) in product(SHAPES, ((False, "bfloat16"), (True, "float32"))):
         rows.append(in_a_process(f"network call, {shape}", precision, 2, limited))
-    rows.append(in_a_process("network call", "bfloat16", 2, True, repeats=0))
     write_csv(Path(__file__).with_suffix(".csv"), rows)

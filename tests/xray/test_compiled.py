@@ -12,7 +12,8 @@ import torch
 import phydict
 from phydict.grid import Grid
 from phydict.xray import ConeBeam, Projector
-from phydict.xray.separable_cpu import _backproject_slab, _project_columns
+from phydict.xray.separable_cpu import backproject as backproject_loop
+from phydict.xray.separable_cpu import project as project_loop
 
 CODE = """if True:
     import numpy as np
@@ -41,5 +42,5 @@ def test_loops_are_compiled_once_for_each_precision():
         for x in (torch.rand(2, 1, 8, 8, 8), torch.rand(1, 1, 8, 8, 8).transpose(2, 3), torch.zeros(1, 1, 8, 8, 8)):
             for kind in (torch.float32, torch.float64):
                 project.T(project(x.to(kind)))
-    for loop in (_project_columns, _backproject_slab):
+    for loop in (project_loop, backproject_loop):
         assert len(loop.signatures) == 2

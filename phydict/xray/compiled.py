@@ -6,6 +6,10 @@ from collections.abc import Callable
 
 from numba import njit
 
+LOOPS_ALONE = {"prange": True} | dict.fromkeys(
+    ("comprehension", "reduction", "inplace_binop", "setitem", "numpy", "stencil", "fusion"), False)
+"""What numba runs on several threads: prange loops, but not array expressions, whose compilation takes seconds."""
+
 
 def compiled(fastmath: bool | set[str] = False, parallel: bool = False) -> Callable[[Callable], Callable]:
     """Compiles a function at its first call; it runs without the GIL, with such liberties in arithmetic as `fastmath`,
@@ -14,10 +18,12 @@ def compiled(fastmath: bool | set[str] = False, parallel: bool = False) -> Calla
     The machine code is kept for other processes in NUMBA_CACHE_DIR, beside the source or in the user's cache folder,
     the first of them that can be written to; where none can, every process compiles anew.
     """
+    threads = LOOPS_ALONE if parallel else False
+
     def decorate(function: Callable) -> Callable:
         try:
-            return njit(nogil=True, cache=True, fastmath=fastmath, parallel=parallel)(function)
+            return njit(nogil=True, cache=True, fastmath=fastmath, parallel=threads)(function)
         except RuntimeError:  # numba found no such folder
-            return njit(nogil=True, fastmath=fastmath, parallel=parallel)(function)
+            return njit(nogil=True, fastmath=fastmath, parallel=threads)(function)
 
     return decorate

@@ -1,0 +1,155 @@
+"""Golden figures: what every method, twenty steps of training and every committed table gave, and still has to give.
+
+    python tests/test_golden.py     # writes golden.json anew: after a change of results that is meant, and told of
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import pytest
+import torch
+from prior.tiny import tiny_prior, tiny_super_resolution
+from test_training import arguments, losses
+
+from phydict.ablation.summary import entries
+from phydict.ablation.tables import all_tables
+from phydict.evaluation import read_csv
+from phydict.grid import Grid
+from phydict.methods import METHODS, RELEASED_STEPS, reconstruct
+from phydict.posterior import CascadePosterior, GradientSteps, Posterior, Reward, Sampler
+from phydict.prior import Cascade
+from phydict.training import main
+from phydict.xray import ConeBeam, Projector
+
+HERE = Path(__file__).parent
+GOLDEN = HERE / "golden.json"
+BEAM = ConeBeam.orbit(3, 1020, 740, (28, 28), 20.0)
+FINE = Grid.cube(32)
+ON_THE_EXAMPLE = [name for name in METHODS if name not in ("phydict_paper", "phydict_released")]
+
+
+def xrays(dtype: torch.dtype) -> torch.Tensor:
+    """Line integrals (K, V, U) of a block of soft tissue with a hollow, with a little noise."""
+    mu = torch.zeros(1, 1, *FINE.shape, dtype=torch.float64)
+    mu[:, :, 6:26, 8:24, 4:28] = 0.02
+    mu[:, :, 9:14, 12:19, 10:23] = 0.005
+    y = Projector(FINE, BEAM, full_detector=True)(mu)[0]
+    return (y + 0.01 * torch.randn(y.shape, generator=torch.Generator().manual_seed(3), dtype=y.dtype)).to(dtype)
+
+
+def method(name: str) -> Sampler:
+    """A named method; those with LPIPS, whose backbone is not shipped, with squared residuals alone."""
+    if name == "phydict_paper":
+        return replace(METHODS[name], likelihood=GradientSteps(reward=Reward(squared=1.0)))
+    if name == "phydict_released":
+        steps = replace(RELEASED_STEPS, reward=replace(RELEASED_STEPS.reward, lpips=0.0))
+        return replace(METHODS[name], likelihood=steps, final_likelihood=steps)
+    return METHODS[name]
+
+
+def on_the_tiny_grid(name: str, dtype: torch.dtype, scene: str = "plain") -> dict:
+    """Figures of a method in 16^3 voxels, from line integrals (plain) or display values, with a report, of several
+    samples, or in two stages, of which the second is computed in single precision alone."""
+    chosen, prior = method(name), tiny_prior(detail=True).to(dtype)
+    if scene == "cascade":
+        chosen = CascadePosterior(Cascade(prior, tiny_super_resolution().to(dtype)), chosen, precision="float32")
+    elif isinstance(chosen, Sampler):
+        chosen = Posterior(prior, chosen, guidance=2.0 if scene == "report" else 1.0, precision="float32",
+                           samples=2 if scene == "samples" else 1)
+    grid = chosen.grid if hasattr(chosen, "grid") else Grid.cube(16)
+    y = xrays(dtype)
+    projector = Projector(grid, BEAM, full_detector=True)
+    y = 0.3 * y + 0.1 if scene == "display" else y
+    found = chosen.reconstruct(y, projector, "Small nodule in the left upper lobe." if scene == "report" else "",
+                               scene == "display", seed=7)
+    return figures(found)
+
+
+def on_the_example(name: str) -> dict:
+    """Figures of a method at its full settings on the embedded example, in float32."""
+    from phydict.datasets import load_xrays
+
+    case = load_xrays(HERE.parent / "data" / "example" / "xrays")
+    return figures(reconstruct(case["xrays"], case["beam"], method=method(name), report=case["report"], seed=0,
+                               precision="float32"))
+
+
+def figures(found) -> dict:
+    """What tells one volume from another, in HU: mean, deviation, and the values at seven voxels; and its counts."""
+    volume = found.volume.double()
+    voxels = volume.flatten()[torch.linspace(0, volume.numel() - 1, 9).long()[1:-1]]
+    told = {"mean": float(volume.mean()), "std": float(volume.std()), "voxels": voxels.tolist(),
+            "misfit": found.misfit, "network_calls": found.network_calls, "projector_calls": found.projector_calls}
+    return told | ({"deviation": float(found.deviation.mean())} if found.deviation is not None else {})
+
+
+def training(folder: Path) -> list[float]:
+    """The losses of twenty steps."""
+    main(arguments(folder / "run", folder / "cache", "--trainer.max_epochs=5", "--trainer.limit_val_batches=0"))
+    return [float(value) for _, value in sorted(losses(folder / "run").items())]
+
+
+def scenes() -> list[tuple[str, str]]:
+    return [(name, "plain") for name in METHODS] + [
+        (name, "display") for name in ("phydict_fast", "dds", "sirt", "cgls", "tv", "diffvox")] + [
+        ("phydict_fast", "report"), ("phydict_fast", "samples"), ("phydict_fast", "cascade")]
+
+
+def assert_same(found: dict, golden: dict, tolerance: float, hu: float) -> None:
+    """Figures agree: HU to `hu`, all others to a relative tolerance, counts exactly."""
+    assert found.keys() == golden.keys()
+    for name, value in golden.items():
+        if isinstance(value, int):
+            assert found[name] == value, name
+        else:
+            within = {"rel": tolerance} if name == "misfit" else {"abs": hu}
+            assert found[name] == pytest.approx(value, **within), name
+
+
+@pytest.fixture(scope="module")
+def golden() -> dict:
+    return json.loads(GOLDEN.read_text())
+
+
+@pytest.mark.parametrize(("name", "scene"), [case for case in scenes() if case[1] != "cascade"])
+def test_a_method_gives_its_golden_figures_in_double_precision(golden, name, scene):
+    assert_same(on_the_tiny_grid(name, torch.float64, scene), golden[f"{name}, {scene}"], 1e-6, 1e-3)
+
+
+@pytest.mark.parametrize(("name", "scene"), [case for case in scenes() if case[0] in ("phydict_fast", "dds", "sirt", "fdk", "cgls", "tv", "diffvox")])
+def test_a_method_gives_its_golden_figures_in_single_precision(golden, name, scene):
+    assert_same(on_the_tiny_grid(name, torch.float32, scene), golden[f"{name}, {scene}"], 1e-3, 1.0)
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[] if name in ("phydict_fast", "cgls") else [pytest.mark.slow])
+                                  for name in ON_THE_EXAMPLE])
+def test_a_method_gives_its_golden_figures_on_the_example(golden, name):
+    assert_same(on_the_example(name), golden[f"{name}, example"], 1e-3, 2.0)
+
+
+def test_training_gives_its_golden_losses(golden, tmp_path):
+    found = training(tmp_path)
+    assert len(found) == 20 and all(math.isfinite(loss) for loss in found)
+    assert found == pytest.approx(golden["losses"], rel=1e-3)
+
+
+@pytest.mark.parametrize("results", sorted(HERE.glob("benchmark/*/results.csv")), ids=lambda file: file.parent.name)
+def test_committed_results_give_their_committed_tables_byte_for_byte(results):
+    rows = read_csv(results)
+    tables = "\n".join(table.markdown() for table in all_tables(entries(rows), rows))
+    assert tables == (results.parent / "tables.md").read_text()
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    written = {f"{name}, {scene}": on_the_tiny_grid(
+        name, torch.float32 if scene == "cascade" else torch.float64, scene) for name, scene in scenes()}
+    written |= {f"{name}, example": on_the_example(name) for name in ON_THE_EXAMPLE}
+    with TemporaryDirectory() as folder:
+        written["losses"] = training(Path(folder))
+    GOLDEN.write_text(json.dumps(written, indent=1) + "\n")

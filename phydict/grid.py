@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from phydict.reading import check_memory
+from phydict.runtime.reading import check_memory
 
 
 def whole_sizes(values) -> tuple[int, ...] | None:

@@ -14,9 +14,9 @@ from phydict.grid import Grid
 from phydict.posterior import (
     DAPS, DDS, DPS, CascadePosterior, DiffPIR, ExactDraw, GradientSteps, PnPDM, Posterior, PriorOnly, ProximalCG,
     Reward, Sampler, SplitGibbs)
-from phydict.precision import check_precision
+from phydict.runtime.precision import check_precision
 from phydict.prior import DEFAULT_PRIOR, Cascade, Prior, SuperResolution, load_prior, load_super_resolution
-from phydict.reconstructor import Reconstruction, Reconstructor, check_air, check_seed, check_xrays
+from phydict.reconstruction import Reconstruction, Reconstructor, check_air, check_seed, check_xrays
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector, binned, binning
 
@@ -64,7 +64,7 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: Prior | str | Pa
     whether the X-rays guide that stage too; fine_sampler: how (None: CascadePosterior's own); fine_noise: its noise
     (None: the stage's own).
     samples: how many to draw; of several, the result is the mean, with their standard deviation as a map of trust.
-    precision: of the networks, one of phydict.precision.PRECISIONS. Raises ValueError for what cannot be meant.
+    precision: of the networks, one of phydict.runtime.precision.PRECISIONS. Raises ValueError for what cannot be meant.
     """
     check_precision(precision)
     if isinstance(method, str):

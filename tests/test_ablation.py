@@ -29,7 +29,7 @@ from phydict.inference import main
 from phydict.methods import METHODS
 from phydict.posterior import DAPS, SplitGibbs
 from phydict.prior import save_prior
-from phydict.reconstructor import Stopwatch
+from phydict.reconstruction import Stopwatch
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import ConeBeam, Projector
 

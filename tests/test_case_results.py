@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from phydict.atomic import ASIDE
-from phydict.case_results import RECORD, CaseResults
+from phydict.runtime.files import ASIDE
+from phydict.inference.results import RECORD, CaseResults
 
 SETTINGS = {"seed": 0}
 

@@ -6,9 +6,9 @@ import warnings
 
 import pytest
 
-from phydict.command_line import noted, one_sentence_errors, quiet, with_configurations
+from phydict.runtime.console import noted, one_sentence_errors, quiet, with_configurations
 from phydict.inference import main as infer
-from phydict.shipped import shipped
+from phydict.runtime.shipped import shipped
 from phydict.training import main as train
 
 

@@ -16,7 +16,7 @@ from phydict.diffusion import CosineSchedule, GaussianDenoiser
 from phydict.methods import reconstructor
 from phydict.posterior import (
     DAPS, DDS, DPS, DiffPIR, ExactDraw, GradientSteps, Langevin, PnPDM, Posterior, PriorOnly, ProximalCG, SplitGibbs)
-from phydict.reconstructor import misfits, risen_from
+from phydict.reconstruction import misfits, risen_from
 from phydict.xray import Ideal
 
 pytestmark = [pytest.mark.filterwarnings(f"ignore:{said}") for said in

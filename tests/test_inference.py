@@ -30,7 +30,7 @@ from phydict.grid import Grid
 from phydict.inference import main
 from phydict.methods import reconstruct, reconstructor
 from phydict.posterior import PriorOnly
-from phydict.precision import instruction_set
+from phydict.runtime.precision import instruction_set
 from phydict.prior import LocalUNet, Prior, SuperResolution, VolumeUNet, save_prior, save_super_resolution
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import ConeBeam, Ideal, Polychromatic, Projector
@@ -896,7 +896,7 @@ def test_a_read_only_disk_is_one_sentence(measured, tmp_path, capsys, monkeypatc
     def refuse(**_):
         raise OSError(30, "Read-only file system")
 
-    monkeypatch.setattr("phydict.command_line.tempfile.TemporaryFile", refuse)
+    monkeypatch.setattr("phydict.runtime.console.tempfile.TemporaryFile", refuse)
     said = refusal(capsys, sirt("predict", tmp_path / "out", f"--data.xrays={measured}"))
     assert "Read-only file system" in said and not (tmp_path / "out").exists()
 

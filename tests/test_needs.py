@@ -16,7 +16,7 @@ from phydict import METHODS, ConeBeam, Grid, reconstruct
 from phydict.methods import fit_to_grid, reconstructor
 from phydict.posterior import DPS, GradientSteps, Posterior, Reward, Sampler
 from phydict.prior import save_prior
-from phydict.profiling import profiled, stage
+from phydict.runtime.profiling import profiled, stage
 from phydict.xray import Projector
 from posterior.test_posterior import BEAM, views
 
@@ -45,7 +45,7 @@ print(json.dumps({"modules": sorted(sys.modules), "networks": networks}))
 """
 
 NEVER = ("lightning", "pytorch_lightning", "tensorboard", "lungmask", "itk", "ignite", "phydict.training",
-         "phydict.datamodule", "phydict.prior_training", "phydict.inference")
+         "phydict.training.data", "phydict.training.base", "phydict.inference")
 """Of use to training, to tables and to other files, and to no reconstruction in memory. MONAI is not among them,
 nor are transformers and lpips: the networks are MONAI's, which imports all of itself and those two with it."""
 PRESETS = ("sirt", "fdk", "phydict_fast", "phydict_paper", "phydict_released")

@@ -16,7 +16,7 @@ from setuptools.dist import Distribution
 import phydict
 from phydict import inference, training
 from phydict.prior import DEFAULT_PRIOR, fingerprint, load_prior, save_prior
-from phydict.shipped import own_or_shipped, shipped
+from phydict.runtime.shipped import own_or_shipped, shipped
 
 ROOT = Path(__file__).parents[1]
 SHIPPED = sorted(
@@ -82,7 +82,7 @@ def test_the_default_prior_is_the_shipped_one_unless_the_folder_has_its_own(tmp_
 SCRIPT = """if True:
     import torch
     import phydict
-    from phydict.shipped import PACKAGE
+    from phydict.runtime.shipped import PACKAGE
     from phydict.xray import Grid, Polychromatic, Projector
 
     assert PACKAGE.parent.name == "site-packages" and phydict.__version__

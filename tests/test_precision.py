@@ -14,7 +14,7 @@ from prior.tiny import tiny_prior
 from phydict import precision
 from phydict.baselines import SIRT
 from phydict.posterior import Posterior, PriorOnly
-from phydict.precision import (
+from phydict.runtime.precision import (
     computes_bfloat16, instruction_set, network_precision, precision_name, resolve_precision)
 
 CPU = torch.device("cpu")
@@ -82,7 +82,7 @@ def test_another_precision_is_refused_in_a_sentence(given):
 
 @X86
 def test_a_cpu_limited_to_avx2_decides_for_float32():
-    code = ("import json, torch; from phydict.precision import *; cpu = torch.device('cpu');"
+    code = ("import json, torch; from phydict.runtime.precision import *; cpu = torch.device('cpu');"
             "x = torch.zeros(1);"
             "print(json.dumps([torch.backends.cpu.get_cpu_capability(), torch.ops.mkldnn._is_mkldnn_bf16_supported(),"
             "precision_name('auto', x), instruction_set(cpu)]))")

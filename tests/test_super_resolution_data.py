@@ -10,7 +10,7 @@ import torch
 
 from phydict.datasets import phantom_case
 from phydict.grid import Grid
-from phydict.super_resolution_data import Crops, PhantomVolumes, SuperResolutionData, mapped_volume
+from phydict.training.crops import Crops, PhantomVolumes, SuperResolutionData, mapped_volume
 from phydict.units import HUWindow
 
 RAMP = (np.arange(16**3).reshape(16, 16, 16) / 16**3).astype(np.float16)

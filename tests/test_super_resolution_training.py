@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from phydict.prior import LocalUNet, load_super_resolution, save_prior, save_super_resolution
-from phydict.super_resolution_data import SuperResolutionData
+from phydict.training.crops import SuperResolutionData
 from phydict.training import SuperResolutionTraining, main, stage_of
 from prior.tiny import tiny_prior, tiny_super_resolution
 

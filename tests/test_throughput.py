@@ -8,9 +8,9 @@ from prior.tiny import tiny_prior
 from test_training import arguments, cache  # noqa: F401
 
 from phydict.grid import Grid
-from phydict.precision import instruction_set
+from phydict.runtime.precision import instruction_set
 from phydict.prior import Prior, VolumeUNet
-from phydict.throughput import Throughput, sample_flop
+from phydict.training.throughput import Throughput, sample_flop
 from phydict.training import main
 from phydict.units import HUWindow
 

@@ -17,11 +17,11 @@ import pytest
 import torch
 from torch.utils.data import default_collate
 
-from phydict.datamodule import CachedPhantoms, PriorData
+from phydict.training.data import CachedPhantoms, PriorData
 from phydict.datasets import Thorax, phantom_case
 from phydict.grid import Grid
 from phydict.prior import VolumeUNet, load_prior, save_prior
-from phydict.prior_training import reconstruction_scores
+from phydict.training.base import reconstruction_scores
 from phydict.training import PriorTraining, main
 from phydict.units import HUWindow
 from prior.medsyn_files import entries, text_unet, write
@@ -214,7 +214,7 @@ def test_validation_logs_every_noise_level_and_paints_a_montage(straight):
 
 def test_the_checkpoint_that_reconstructs_best_is_kept(tmp_path, cache, monkeypatch):
     scores = iter((10.0, 30.0, 20.0))
-    monkeypatch.setattr("phydict.prior_training.reconstruction_scores",
+    monkeypatch.setattr("phydict.training.base.reconstruction_scores",
                         lambda *_: {"psnr": next(scores), "ssim": 0.5})
     main(arguments(tmp_path, cache, "--trainer.max_epochs=3"))
     best = torch.load(tmp_path / "best.ckpt", map_location="cpu", weights_only=True)

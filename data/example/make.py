@@ -9,7 +9,7 @@ import torch
 
 from phydict import ConeBeam, Grid, HUWindow, Projector
 from phydict.datasets import phantom_case, save_xrays
-from phydict.reconstructor import save_nifti
+from phydict.reconstruction import save_nifti
 from phydict.xray import Ideal
 
 SEED = 1_000_117

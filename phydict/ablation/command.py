@@ -13,8 +13,8 @@ from phydict.ablation.run import RESULTS, alone_in, run
 from phydict.ablation.spec import read_specification
 from phydict.ablation.summary import entries
 from phydict.ablation.tables import all_tables, write_tables
-from phydict.command_line import check_configured, check_writable, one_sentence_errors, quiet
-from phydict.progress import CaseProgress
+from phydict.runtime.console import check_configured, check_writable, one_sentence_errors, quiet
+from phydict.runtime.progress import CaseProgress
 
 
 def main(args: list[str] | None = None) -> None:

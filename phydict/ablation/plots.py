@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from phydict.ablation.summary import SHOWN_MEASURES, Entry, best_settings, conditions, told
 from phydict.ablation.tables import deltas, headed
-from phydict.atomic import whole_file
+from phydict.runtime.files import whole_file
 
 COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f", "#bcbd22", "#17becf",
            "#005f40", "#b15928", "#6a3d9a", "#ff1493")

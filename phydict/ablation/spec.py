@@ -19,12 +19,12 @@ from phydict.grid import Grid
 from phydict.methods import METHODS
 from phydict.posterior import Sampler
 from phydict.prior import DEFAULT_PRIOR, fingerprint, load_prior
-from phydict.reconstruction_data import ReconstructionData
-from phydict.reconstructor import Reconstructor, check_seed, describe
-from phydict.shipped import configuration
+from phydict.inference.data import ReconstructionData
+from phydict.reconstruction import Reconstructor, check_seed, describe
+from phydict.runtime.shipped import configuration
 from phydict.units import HUWindow
 from phydict.xray import Ideal, Polychromatic, Simulator
-from phydict.yaml_file import read_yaml
+from phydict.runtime.yaml_file import read_yaml
 
 SIDE = 560.0
 """mm along each side of the simulated detector unless the size of its pixels is given."""

@@ -9,8 +9,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from phydict.profiling import stage
-from phydict.reconstructor import (
+from phydict.runtime.profiling import stage
+from phydict.reconstruction import (
     Guard, Reconstruction, Reconstructor, Stopwatch, check_line_integrals, check_xrays, misfits)
 from phydict.units import HUWindow, mu_to_hu
 from phydict.xray import Projector

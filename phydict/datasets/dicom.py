@@ -2,7 +2,7 @@
 
 Pixels: rescale slope and intercept, or the modality LUT, are applied; the VOI window, a choice for the eye, never is.
 MONOCHROME1 says how values are shown, so it inverts display images alone. Tags are looked for in a frame's own
-functional groups, in the shared ones, and in the file. The beam they state is phydict.datasets.dicom_beam's.
+functional groups, in the shared ones, and in the file. The beam they state is phydict.datasets.radiographs.dicom_beam's.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pydicom.multival import MultiValue
 from pydicom.pixels import apply_modality_lut
 
 from phydict.datasets.intensity import Intensity
-from phydict.reading import check_memory, reading
+from phydict.runtime.reading import check_memory, reading
 
 VIEW_POSITIONS = {"PA": 0.0, "LL": 90.0, "AP": 180.0, "RL": -90.0}
 

@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from phydict.reading import check_memory
+from phydict.runtime.reading import check_memory
 
 if TYPE_CHECKING:
     from nibabel.spatialimages import SpatialImage

@@ -1,7 +1,7 @@
 """How good a reconstruction is: volume metrics, result tables and picture panels."""
 
 from phydict.evaluation.gallery import method_panel, panel
-from phydict.evaluation.geometry_page import agreement, geometry_page, view_sides
+from phydict.inference.geometry_page import agreement, geometry_page, view_sides
 from phydict.evaluation.metrics import RANGE, CaseMetrics, volume_metrics
 from phydict.evaluation.tables import markdown, read_csv, rich_table, summarise, write_csv
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from rich.table import Table
 
-from phydict.atomic import whole_file
+from phydict.runtime.files import whole_file
 from phydict.evaluation.metrics import MEASURES, RANGE, SIGMA, TAPS, Measure
 from phydict.grid import Grid
 from phydict.units import HUWindow

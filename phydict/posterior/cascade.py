@@ -10,14 +10,14 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from phydict.grid import Grid
-from phydict.posterior.likelihood import ProximalCG
+from phydict.posterior.likelihood.likelihood import ProximalCG
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.posterior import Counted, Posterior, check_guidance
-from phydict.posterior.sampler import PriorOnly, Sampler
-from phydict.posterior.split_gibbs import SplitGibbs, noise_like
-from phydict.precision import check_precision, resolve_precision
+from phydict.posterior.samplers.sampler import PriorOnly, Sampler
+from phydict.posterior.samplers.split_gibbs import SplitGibbs, noise_like
+from phydict.runtime.precision import check_precision, resolve_precision
 from phydict.prior import Cascade
-from phydict.reconstructor import Guard, Reconstruction, Reconstructor, Stopwatch, misfits
+from phydict.reconstruction import Guard, Reconstruction, Reconstructor, Stopwatch, misfits
 from phydict.units import MU_WATER
 from phydict.xray import Projector, binned, binning
 

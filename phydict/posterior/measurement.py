@@ -9,8 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from phydict.profiling import stage
-from phydict.reconstructor import check_line_integrals, check_xrays
+from phydict.runtime.profiling import stage
+from phydict.reconstruction import check_line_integrals, check_xrays
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import Projector
 from phydict.xray.calibration import match_views, subtract_scatter

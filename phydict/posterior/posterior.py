@@ -13,13 +13,13 @@ from torch import Tensor
 from phydict.diffusion import Denoiser
 from phydict.grid import Grid
 from phydict.posterior.measurement import Measurement
-from phydict.posterior.sampler import Sampler
-from phydict.posterior.split_gibbs import SplitGibbs, noise_like
-from phydict.precision import check_precision, precision_name
+from phydict.posterior.samplers.sampler import Sampler
+from phydict.posterior.samplers.split_gibbs import SplitGibbs, noise_like
+from phydict.runtime.precision import check_precision, precision_name
 from phydict.prior import Prior
-from phydict.profiling import stage
-from phydict.reading import check_memory
-from phydict.reconstructor import Guard, Reconstruction, Reconstructor, Stopwatch, misfits
+from phydict.runtime.profiling import stage
+from phydict.runtime.reading import check_memory
+from phydict.reconstruction import Guard, Reconstruction, Reconstructor, Stopwatch, misfits
 from phydict.units import MU_WATER
 from phydict.xray import Projector
 
@@ -43,7 +43,7 @@ class Posterior(Reconstructor):
     """Reconstructs by sampling p(x | Y, report) under a prior.
 
     sampler: how; guidance: classifier-free guidance scale used when a report is given; mu_water: 1/mm;
-    precision: of the denoiser, see phydict.precision;
+    precision: of the denoiser, see phydict.runtime.precision;
     samples: how many are drawn. One is the sampler's own result; of several, drawn by its `randomised` settings, the
     volume is the mean, and their standard deviation says where not to trust it. batch: how many of them go through
     the denoiser at once, where the sampler allows it; fewer need less memory. Sample i depends neither on samples nor,

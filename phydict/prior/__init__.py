@@ -1,13 +1,13 @@
 """The diffusion prior of CT: networks, report encoder, cascade, and their files with grid and HU window."""
 
 from phydict.prior.cascade import Cascade
-from phydict.prior.checkpoint import (
+from phydict.prior.files import (
     DEFAULT_PRIOR, describe, describe_super_resolution, file_read, fingerprint, load_prior, load_super_resolution,
     save_prior, save_super_resolution)
 from phydict.prior.detail import DetailNetwork
 from phydict.prior.local_unet import LocalUNet
-from phydict.prior.medsyn import MedSynPrior, MedSynSuperResolution
-from phydict.prior.pretrained import MedSynCheckpoint, inspect_prior
+from phydict.prior.medsyn.prior import MedSynPrior, MedSynSuperResolution
+from phydict.prior.medsyn.checkpoint import MedSynCheckpoint, inspect_prior
 from phydict.prior.prior import STATE, BoundPrior, Prior
 from phydict.prior.super_resolution import SuperResolution
 from phydict.prior.text import TextEncoder, learn_vocabulary

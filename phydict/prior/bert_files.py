@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 from phydict.prior.finite import check_finite
 
-from phydict.reading import reading, reason
+from phydict.runtime.reading import reading, reason
 
 CONFIG = "config.json"
 WEIGHTS = ("model.safetensors", "pytorch_model.bin")

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from phydict.diffusion import CosineSchedule, guided
 from phydict.grid import Grid
-from phydict.precision import network_precision
+from phydict.runtime.precision import network_precision
 from phydict.prior.detail import DetailNetwork
 from phydict.prior.text import TextEncoder
 from phydict.prior.unet import VolumeUNet
@@ -122,7 +122,7 @@ class Prior(nn.Module):
     def bind(self, report: str = "", guidance: float = 1.0, precision: str = "auto") -> BoundPrior:
         """The denoiser of one report, with classifier-free guidance of the given scale inside (1 = none).
 
-        precision: see phydict.precision. Warns, once for each report, where it is cut or in words that the text
+        precision: see phydict.runtime.precision. Warns, once for each report, where it is cut or in words that the text
         encoder does not know.
         """
         if guidance < 0:

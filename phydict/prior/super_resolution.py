@@ -11,7 +11,7 @@ from torch.nn.functional import interpolate
 
 from phydict.diffusion import CosineSchedule
 from phydict.grid import Grid
-from phydict.precision import network_precision
+from phydict.runtime.precision import network_precision
 from phydict.prior.local_unet import LocalUNet
 from phydict.prior.tiles import Tiles
 from phydict.units import HUWindow
@@ -95,7 +95,7 @@ class SuperResolution(nn.Module):
              draw: torch.Generator | None = None) -> BoundSuperResolution:
         """The denoiser given a coarse state (B, C, x, y, z) with Gaussian noise of the level `noise`.
 
-        precision: see phydict.precision. draw: what the noise, added here, is drawn from; None: `coarse` carries it
+        precision: see phydict.runtime.precision. draw: what the noise, added here, is drawn from; None: `coarse` carries it
         already. Raises ValueError for a level outside [0, 1] or too few channels.
         """
         if not 0 <= noise <= 1:

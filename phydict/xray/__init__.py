@@ -4,7 +4,7 @@ from phydict.grid import Grid
 from phydict.xray.binning import binned, binning
 from phydict.xray.geometry import ConeBeam
 from phydict.xray.polychromatic import Polychromatic
-from phydict.xray.projector import Projector
+from phydict.xray.projectors.projector import Projector
 from phydict.xray.simulate import Ideal, Simulator
 from phydict.xray.spectrum import Spectrum
 

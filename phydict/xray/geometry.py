@@ -12,8 +12,8 @@ import numpy as np
 import yaml
 
 from phydict.grid import Grid, whole_sizes
-from phydict.reading import check_memory
-from phydict.yaml_file import read_yaml
+from phydict.runtime.reading import check_memory
+from phydict.runtime.yaml_file import read_yaml
 
 VECTOR_KEYS = ("sources", "detectors", "u", "v", "shape")
 ORBIT_KEYS = ("views", "source_to_detector", "source_to_isocentre", "shape", "pixel")

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from phydict.reading import read_npy, read_text, reading
+from phydict.runtime.reading import read_npy, read_text, reading
 from phydict.xray.geometry import ConeBeam
 from phydict.xray.rtk import check_beam, read_rtk, write_rtk
 

@@ -21,7 +21,7 @@ from phydict.units import mu_to_hu
 from phydict.xray.geometry import ConeBeam
 from phydict.xray.materials import MATERIALS, partial_densities
 from phydict.xray.noise import normal, poisson
-from phydict.xray.projector import Projector
+from phydict.xray.projectors.projector import Projector
 from phydict.xray.simulate import Simulator, check_photons
 from phydict.xray.spectrum import Spectrum, attenuation, mass_attenuation
 

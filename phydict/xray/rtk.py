@@ -22,7 +22,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from phydict.reading import read_text, reason
+from phydict.runtime.reading import read_text, reason
 from phydict.xray.geometry import ConeBeam, pixel_sizes
 
 FIXED_TO_RAS = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])

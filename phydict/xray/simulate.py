@@ -11,7 +11,7 @@ import torch
 
 from phydict.units import MU_WATER
 from phydict.xray.noise import normal, poisson
-from phydict.xray.projector import Projector
+from phydict.xray.projectors.projector import Projector
 
 
 class Simulator(ABC):

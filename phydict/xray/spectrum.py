@@ -10,7 +10,7 @@ from functools import cache
 
 import numpy as np
 
-from phydict.shipped import shipped
+from phydict.runtime.shipped import shipped
 
 DENSITIES = {"water": 1.0, "soft_tissue": 1.06, "bone": 1.92, "titanium": 4.54, "aluminium": 2.699,
              "caesium_iodide": 4.51, "air": 1.205e-3}

@@ -25,14 +25,14 @@ from lightning.pytorch.callbacks import EMAWeightAveraging, ModelCheckpoint
 from torch import nn
 from torch.utils.data import Dataset
 
-from phydict.command_line import quiet
-from phydict.datamodule import PriorData
-from phydict.datasets.cache import read_arrays, write_arrays
+from phydict.runtime.console import quiet
+from phydict.training.data import PriorData
+from phydict.datasets.cts.cache import read_arrays, write_arrays
 from phydict.evaluation import read_csv, write_csv
-from phydict.precision import trainer_precision
+from phydict.runtime.precision import trainer_precision
 from phydict.prior import Prior, VolumeUNet
-from phydict.prior_training import PriorTraining, reconstruction_scores
-from phydict.stage_training import denoising_errors
+from phydict.training.base import PriorTraining, reconstruction_scores
+from phydict.training.stage import denoising_errors
 from phydict.training import CHECKPOINT
 
 FILE = Path(__file__).with_suffix(".csv")

@@ -31,13 +31,13 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from phydict import METHODS, ConeBeam, Grid, HUWindow, Projector, load_prior, reconstruct
-from phydict.command_line import sentence
+from phydict.runtime.console import sentence
 from phydict.datasets import prepare_ct
 from phydict.evaluation import read_csv, volume_metrics, write_csv
 from phydict.methods import DEFAULT_PRIOR, fit_to_grid
 from phydict.posterior import Posterior
 from phydict.prior import Prior
-from phydict.reconstructor import Reconstruction, worst_view
+from phydict.reconstruction import Reconstruction, worst_view
 from phydict.xray import Ideal
 
 OUT = Path(__file__).with_suffix(".csv")

@@ -75,7 +75,7 @@ def training_step(precision: str, repeats: int) -> dict:
     from torch.utils.data import DataLoader
     from training import BATCH, STEPS, WARM_UP, example_cases, our_steps
 
-    from phydict.command_line import quiet
+    from phydict.runtime.console import quiet
 
     with quiet():
         clock = our_steps(DataLoader(example_cases() * (STEPS + WARM_UP), BATCH),
@@ -87,7 +87,7 @@ def measure(what: str, precision: str, threads: int, repeats: int) -> dict:
     """One row, in this process."""
     import torch
 
-    from phydict.precision import instruction_set
+    from phydict.runtime.precision import instruction_set
 
     torch.set_num_threads(threads)
     kind, _, shape = what.partition(", ")

@@ -16,7 +16,7 @@ from pathlib import Path
 import torch
 
 from phydict.evaluation import write_csv
-from phydict.prior.medsyn import MedSynPrior, MedSynSuperResolution, SuperResolutionUNet, TextUNet
+from phydict.prior.medsyn.prior import MedSynPrior, MedSynSuperResolution, SuperResolutionUNet, TextUNet
 
 WIDTHS, VOXELS = {1: 160, 2: 56}, {1: 64, 2: 128}
 

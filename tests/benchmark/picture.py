@@ -17,7 +17,7 @@ from phydict import HUWindow
 from phydict.datasets import find_cts, prepare_ct
 from phydict.evaluation import method_panel, read_csv
 from phydict.grid import Grid
-from phydict.posterior.reward import load_lpips
+from phydict.posterior.likelihood.reward import load_lpips
 
 ROOT = Path(__file__).parents[2]
 WITHOUT_LPIPS = ("--model.method.init_args.likelihood.init_args.reward.lpips", "0",

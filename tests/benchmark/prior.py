@@ -13,12 +13,12 @@ from statistics import mean
 import torch
 
 from phydict import load_prior
-from phydict.datamodule import HELD_OUT_PHANTOM
+from phydict.training.data import HELD_OUT_PHANTOM
 from phydict.datasets import find_cts, phantom_case, prepare_ct
 from phydict.evaluation import write_csv
 from phydict.methods import DEFAULT_PRIOR
 from phydict.prior import Prior
-from phydict.stage_training import NOISE_LEVELS, denoising_errors
+from phydict.training.stage import NOISE_LEVELS, denoising_errors
 
 
 def errors(name: str, prior: Prior, cts: list) -> list[dict]:

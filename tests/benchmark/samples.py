@@ -19,11 +19,11 @@ from realism import GRID, Case, ct, phantom
 from scipy.linalg import sqrtm
 
 from phydict import load_prior
-from phydict.datamodule import HELD_OUT_PHANTOM
+from phydict.training.data import HELD_OUT_PHANTOM
 from phydict.datasets import find_cts
 from phydict.evaluation import method_panel, write_csv
 from phydict.methods import DEFAULT_PRIOR
-from phydict.posterior.sampler import descend
+from phydict.posterior.samplers.sampler import descend
 from phydict.prior import Prior
 
 ITERATIONS = 50

@@ -14,7 +14,7 @@ from statistics import mean
 import torch
 
 import phydict
-from phydict.datamodule import HELD_OUT_PHANTOM
+from phydict.training.data import HELD_OUT_PHANTOM
 from phydict.datasets import Thorax, pathology_region, phantom_case, report, wrong_side
 from phydict.evaluation import volume_metrics, write_csv
 from phydict.methods import DEFAULT_PRIOR

@@ -20,7 +20,7 @@ from phydict.datasets import CTFile, find_cts, prepare_ct
 from phydict.evaluation import read_csv, volume_metrics, write_csv
 from phydict.grid import Grid
 from phydict.methods import fit_to_grid
-from phydict.reconstructor import Reconstructor, describe
+from phydict.reconstruction import Reconstructor, describe
 from phydict.xray import ConeBeam, Ideal, Projector
 
 FILE = Path(__file__).with_name("tune_baselines.csv")

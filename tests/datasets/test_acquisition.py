@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from phydict.datasets.acquisition import LEAST_BLOOD, change_contrast, cut_field, without_table
-from phydict.datasets.augment import Augmentation, augment
-from phydict.datasets.phantom import Thorax, build, phantom_case, without
+from phydict.datasets.cts.acquisition import LEAST_BLOOD, change_contrast, cut_field, without_table
+from phydict.datasets.cts.augment import Augmentation, augment
+from phydict.datasets.phantoms.phantom import Thorax, build, phantom_case, without
 from phydict.grid import Grid
 from phydict.units import HUWindow
 

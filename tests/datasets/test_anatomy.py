@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from phydict.datasets.anatomy import lung_box_centre, segment
-from phydict.datasets.phantom import phantom_case
+from phydict.datasets.cts.anatomy import lung_box_centre, segment
+from phydict.datasets.phantoms.phantom import phantom_case
 from phydict.grid import Grid
 from phydict.units import HUWindow
 

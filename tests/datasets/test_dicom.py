@@ -14,7 +14,7 @@ from pydicom.dataset import Dataset
 from pydicom.sequence import Sequence
 
 from phydict.datasets.intensity import Intensity
-from phydict.datasets.radiographs import find_xrays, load_xrays
+from phydict.datasets.radiographs.radiographs import find_xrays, load_xrays
 from phydict.xray.geometry import ConeBeam
 
 SHAPE, PIXEL = (6, 5), (70.0, 80.0)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from phydict.datasets.findings import FOCAL, KINDS, PLEURAL
-from phydict.datasets.phantom import (Finding, Thorax, build, pathology_region, phantom_case, report, without,
+from phydict.datasets.phantoms.findings import FOCAL, KINDS, PLEURAL
+from phydict.datasets.phantoms.phantom import (Finding, Thorax, build, pathology_region, phantom_case, report, without,
                                       wrong_side)
 from phydict.grid import Grid
 

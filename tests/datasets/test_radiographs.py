@@ -12,7 +12,7 @@ import yaml
 from PIL import Image
 
 from phydict.datasets.intensity import Intensity
-from phydict.datasets.radiographs import find_xrays, load_xrays, save_xrays
+from phydict.datasets.radiographs.radiographs import find_xrays, load_xrays, save_xrays
 from phydict.xray.geometry import ConeBeam
 from phydict.xray.geometry_files import write_beam
 

@@ -9,7 +9,7 @@ from scipy.optimize import lsq_linear
 from phydict.datasets import phantom_case
 from phydict.grid import Grid
 from phydict.posterior import GradientSteps, Measurement, ProximalCG, Reward
-from phydict.posterior.smoothed_tv import Majoriser, smoothed_tv
+from phydict.linalg.total_variation import Majoriser, smoothed_tv
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 from posterior.dense import N, SHAPE, DenseMeasurement, measurement

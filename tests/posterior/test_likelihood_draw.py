@@ -6,7 +6,7 @@ from laws import random_like
 
 from phydict.grid import Grid
 from phydict.posterior import ExactDraw, Langevin, Measurement
-from phydict.posterior.conjugate_gradients import conjugate_gradients, nearest_fit
+from phydict.linalg.conjugate_gradients import conjugate_gradients, nearest_fit
 from phydict.posterior.normalised import NormalisedMeasurement
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector

@@ -5,7 +5,7 @@ import torch
 from laws import random_like
 
 from phydict.diffusion import CosineSchedule, ddim, noise_in, renoise
-from phydict.posterior.noise_levels import partly_renewed, polynomial_levels, times_of, walk
+from phydict.posterior.samplers.noise_levels import partly_renewed, polynomial_levels, times_of, walk
 from posterior.dense import FINE, N, SHAPE, denoiser, moments
 
 SCHEDULE, V = CosineSchedule(), 0.04

@@ -11,7 +11,7 @@ from laws import random_like
 from phydict.grid import Grid
 from phydict.posterior import GradientSteps, Posterior, PriorOnly, ProximalCG, SplitGibbs
 from phydict.prior import load_prior, save_prior
-from phydict.reconstructor import describe
+from phydict.reconstruction import describe
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 from prior.tiny import REPORTS, tiny_prior

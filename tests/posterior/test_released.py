@@ -8,7 +8,7 @@ from phydict.diffusion import GaussianDenoiser
 from phydict.grid import Grid
 from phydict.methods import METHODS
 from phydict.posterior import GradientSteps, Measurement, Posterior, Reward, SplitGibbs
-from phydict.posterior.reward import finer
+from phydict.posterior.likelihood.reward import finer
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 from posterior.dense import FINE, SHAPE, denoiser, measurement

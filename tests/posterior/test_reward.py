@@ -9,7 +9,7 @@ from laws import random_like
 
 from phydict.grid import Grid
 from phydict.posterior import GradientSteps, Measurement, Reward
-from phydict.posterior.reward import load_lpips
+from phydict.posterior.likelihood.reward import load_lpips
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 

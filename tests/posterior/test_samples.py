@@ -9,7 +9,7 @@ from laws import random_like
 from phydict import reconstruct
 from phydict.posterior import Measurement, Posterior, PriorOnly, ProximalCG, SplitGibbs
 from phydict.posterior.posterior import sample_seed
-from phydict.posterior.split_gibbs import noise_like
+from phydict.posterior.samplers.split_gibbs import noise_like
 from posterior.dense import N, SHAPE, measurement
 from posterior.test_posterior import BEAM, PROJECTOR, views
 from prior.tiny import tiny_prior

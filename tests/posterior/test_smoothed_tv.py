@@ -4,7 +4,7 @@ import pytest
 import torch
 from laws import random_like
 
-from phydict.posterior.smoothed_tv import Majoriser, differences, differences_adjoint, smoothed_tv
+from phydict.linalg.total_variation import Majoriser, differences, differences_adjoint, smoothed_tv
 
 X = random_like((2, 1, 3, 4, 5), seed=1)
 OTHER = random_like((2, 1, 3, 4, 5), seed=2)

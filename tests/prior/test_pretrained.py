@@ -15,7 +15,7 @@ from phydict.inference import InferenceCLI, ReconstructionData, ReconstructionTa
 from phydict.prior import (
     MedSynCheckpoint, TextEncoder, file_read, fingerprint, inspect_prior, load_prior, load_super_resolution,
     save_prior)
-from phydict.prior.medsyn import MedSynPrior, MedSynSuperResolution
+from phydict.prior.medsyn.prior import MedSynPrior, MedSynSuperResolution
 from phydict.units import HUWindow
 from prior.medsyn_files import entries, super_resolution_unet, text_unet, write
 from prior.tiny import tiny_prior

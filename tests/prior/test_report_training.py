@@ -7,7 +7,7 @@ import torch
 
 from phydict.grid import Grid
 from phydict.prior import Prior, TextEncoder, VolumeUNet, learn_vocabulary
-from phydict.prior.report_training import learn_findings, learn_sketch
+from phydict.training.reports import learn_findings, learn_sketch
 from phydict.units import HUWindow
 
 SIDES = ("right", "left")

@@ -12,8 +12,8 @@ import torch
 import phydict
 from phydict.grid import Grid
 from phydict.xray import ConeBeam, Projector
-from phydict.xray.separable_cpu import backproject as backproject_loop
-from phydict.xray.separable_cpu import project as project_loop
+from phydict.xray.projectors.separable_cpu import backproject as backproject_loop
+from phydict.xray.projectors.separable_cpu import project as project_loop
 
 CODE = """if True:
     import numpy as np

@@ -7,7 +7,7 @@ from laws import assert_adjoint, random_like
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from phydict.xray import ConeBeam, Grid, Projector
-from phydict.xray.separable import Separable
+from phydict.xray.projectors.separable import Separable
 
 pytestmark = pytest.mark.filterwarnings("ignore:the detector's pixels are finer")
 

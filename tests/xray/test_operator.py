@@ -11,9 +11,9 @@ import torch
 from laws import assert_adjoint, assert_gradient_is_adjoint, assert_linear, random_like
 
 from phydict.xray import ConeBeam, Grid, Projector
-from phydict.xray.joseph import Joseph
-from phydict.xray.separable import Separable
-from phydict.xray.system_matrix import SystemMatrix
+from phydict.xray.projectors.joseph import Joseph
+from phydict.xray.projectors.separable import Separable
+from phydict.xray.projectors.system_matrix import SystemMatrix
 
 pytestmark = pytest.mark.filterwarnings("ignore:the detector's pixels are finer")
 
@@ -64,13 +64,13 @@ def test_the_transpose_is_the_exact_adjoint_for_tilted_detectors(method):
 def test_slabs_do_not_show_in_a_tracers_adjoint(method, beam, monkeypatch):
     A, y = Projector(GRIDS["anisotropic"], beam, method), random_like((1, beam.views, *beam.shape))
     whole = A.T(y)
-    monkeypatch.setattr("phydict.xray.tracer.SLAB", 3)
+    monkeypatch.setattr("phydict.xray.projectors.tracer.SLAB", 3)
     torch.testing.assert_close(A.T(y), whole, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("grid", GRIDS.values(), ids=GRIDS.keys())
 def test_sparse_products_are_the_compiled_separable_operator(grid, monkeypatch):
-    monkeypatch.setattr("phydict.xray.separable_sparse.BLOCK_VALUES", 5000)
+    monkeypatch.setattr("phydict.xray.projectors.separable_sparse.BLOCK_VALUES", 5000)
     beam = ConeBeam.orbit(3, 1020, 740, (23, 71), (19.0, 7.0), start=0.3)
     A = Separable(grid, beam)
     mu, y = random_like((2, *grid.shape)), random_like((2, 3, *beam.shape))

@@ -1,0 +1,247 @@
+"""Training a prior from the command line: pairs with train.py."""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import reprlib
+import sys
+from pathlib import Path
+
+import lightning
+import torch
+from jsonargparse import auto_cli
+from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.cli import LightningCLI
+from lightning.pytorch.loggers import CSVLogger
+from lightning.pytorch.plugins.io import TorchCheckpointIO
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
+
+from phydict.runtime.files import whole_file
+from phydict.runtime.console import (
+    check_command, check_writable, one_sentence_errors, quiet, read_configurations, with_configurations)
+from phydict.training.data import PriorData
+from phydict.runtime.precision import PRECISIONS, resolve_precision, trainer_precision
+from phydict.prior import save_prior, save_super_resolution
+from phydict.prior.files import build_prior, build_super_resolution, build_text, has_text, is_saved_prior
+from phydict.prior.finite import check_finite
+from phydict.prior.medsyn.checkpoint import inspect_prior, read_torch
+from phydict.training.base import PriorTraining
+from phydict.runtime.reading import not_written
+from phydict.training.stage import CHECKPOINT
+from phydict.training.crops import SuperResolutionData
+from phydict.training.super_resolution import SuperResolutionTraining
+from phydict.training.throughput import Throughput
+from phydict.training.progress import TrainingProgress
+
+BEST, HELD_OUT = "best.ckpt", "held_out.txt"
+"""Files of a training's folder: what reconstructed the held-out cases best, and the ids of the CTs that it never
+saw."""
+
+
+RESUMED = ("epoch", "global_step", "loops", "optimizer_states", "lr_schedulers", "callbacks")
+"""What a checkpoint must hold beside the weights for its training to go on."""
+
+
+def read_checkpoint(path: str | Path) -> dict:
+    """A checkpoint that training wrote. Raises FileNotFoundError, or ValueError when it is truncated, holds code, is
+    another's or holds weights that are not finite."""
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"there is no checkpoint {path}: give a .ckpt file that training wrote")
+    checkpoint = read_torch(path)
+    if not isinstance(checkpoint, dict) or "phydict" not in checkpoint:
+        raise ValueError(f"{path} is no checkpoint of a prior: give a .ckpt file that training wrote")
+    header, weights = checkpoint["phydict"], checkpoint.get("state_dict")
+    stage = header.get("stage", "base") if isinstance(header, dict) else None
+    if not isinstance(stage, str) or stage not in STAGES:
+        raise ValueError(f"{path} is damaged: its header is {reprlib.repr(header)}; give another checkpoint")
+    if not isinstance(weights, dict) or not all(isinstance(name, str) for name in weights) or not all(
+            isinstance(weight, torch.Tensor) for name, weight in weights.items() if name.startswith(("prior.", "text."))):
+        raise ValueError(f"{path} is damaged: its weights are {reprlib.repr(weights)}; give another checkpoint")
+    for state in ("state_dict", "current_model_state"):
+        check_finite(checkpoint.get(state, {}), path)
+    return checkpoint
+
+
+def export_prior(checkpoint: str, out: str, overwrite: bool = False) -> None:
+    """Write the averaged weights of a training checkpoint as a prior, or a super-resolution stage, for reconstruction.
+
+    Args:
+        checkpoint: the .ckpt file that training wrote
+        out: the .safetensors file to write
+        overwrite: whether a prior or stage that is there already is replaced
+    """
+    if Path(out).suffix != ".safetensors":
+        raise ValueError(f"a prior is a .safetensors file, but {out} was given: give a name with that ending")
+    check_writable(Path(out), "--out", file=True)
+    if Path(out).exists() and not is_saved_prior(out):
+        raise ValueError(f"{out} is there already, is no prior of phydict's, and is not replaced: give another --out")
+    if Path(out).exists() and not overwrite:
+        raise ValueError(f"{out} is a prior already: add --overwrite true to replace it, or give another --out")
+    content = read_checkpoint(checkpoint)
+    header = content["phydict"]
+    weights = {k.removeprefix("prior."): w for k, w in content["state_dict"].items() if k.startswith("prior.")}
+    training = header.get("training", {"steps": content.get("global_step")})
+    if header.get("stage") == "super_resolution":
+        save_super_resolution(build_super_resolution(header, weights), out, training)
+    else:
+        prior = build_prior(header, weights)
+        if has_text(header):
+            prior.text = build_text(header["text"], {k: w for k, w in weights.items() if k.startswith("text.")})
+        save_prior(prior, out, training)
+    print(f"prior in {out}")
+
+
+def print_prior(path: str) -> None:
+    """Tell what a file or folder is: a prior, a checkpoint of its training, or one of MedSyn's networks, and whether
+    it is whole.
+
+    Args:
+        path: the file or folder
+    """
+    for file, properties in inspect_prior(path).items():
+        print(file, *(f"  {name}: {value}" for name, value in properties.items()), sep="\n")
+
+
+COMMANDS = {"fit": "train a prior", "validate": "measure one on held-out cases", "export": "checkpoint -> prior",
+            "inspect-prior": "what a file is"}
+
+STAGES = {"base": (PriorTraining, PriorData), "super_resolution": (SuperResolutionTraining, SuperResolutionData)}
+"""What trains a stage, and on which data."""
+
+
+def stage_of(args: list[str]) -> str:
+    """The stage that a command line trains: its --stage, or the `stage` of the last configuration file with one."""
+    look = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    look.add_argument("--stage")
+    given, _ = look.parse_known_args(args)
+    stages = [given.stage] if given.stage else []
+    stages += [settings["stage"] for settings in reversed(read_configurations(args)) if "stage" in settings]
+    stage = stages[0] if stages else "base"
+    if not isinstance(stage, str) or stage not in STAGES:
+        raise ValueError(f"the stages that can be trained are {' and '.join(STAGES)}, but {reprlib.repr(stage)} was given")
+    return stage
+
+
+class WholeCheckpoints(TorchCheckpointIO):
+    """Checkpoints that take the last one's place only when they are complete, whatever stops the writing."""
+
+    def save_checkpoint(self, checkpoint: dict, path: str | Path, storage_options: object = None) -> None:
+        try:
+            with whole_file(Path(path)) as part:
+                torch.save(checkpoint, part)
+        except (OSError, RuntimeError) as error:
+            if isinstance(error, RuntimeError):  # torch's words for a write that was cut short
+                error = OSError(errno.ENOSPC, "perhaps the disk is full")
+            raise not_written(f"the checkpoint {path}", error, "give another --out, and go on from the last one, if there "
+                              "is one, with --ckpt_path") from error
+
+
+class BestCheckpoint(ModelCheckpoint):
+    """Keeps the weights with the best score so far, where validation gives one."""
+
+    def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        if self.monitor in trainer.callback_metrics:
+            super().on_validation_end(trainer, pl_module)
+
+
+class PriorCLI(LightningCLI):
+    """fit and validate; ties the data's grid and HU window to the model's, and writes everything below `out`."""
+
+    @staticmethod
+    def subcommands() -> dict[str, set[str]]:
+        return {name: LightningCLI.subcommands()[name] for name in ("fit", "validate")}
+
+    def add_arguments_to_parser(self, parser) -> None:
+        parser.add_argument("--out", default="runs/prior", help="folder for checkpoint, logs and samples")
+        parser.add_argument("--stage", default="base", choices=list(STAGES), help="which stage of a cascade to train")
+        parser.add_argument("--precision", default="auto", choices=list(PRECISIONS),
+                            help="of the network: bfloat16 where the device computes it and float32 elsewhere (auto), "
+                                 "or one of the two; trainer.precision takes Lightning's own names instead")
+        parser.add_lightning_class_args(ModelCheckpoint, "checkpoint")
+        parser.set_defaults({"checkpoint.filename": "last", "checkpoint.enable_version_counter": False,
+                             "checkpoint.every_n_epochs": 1, "checkpoint.save_on_train_epoch_end": True})
+        parser.add_lightning_class_args(Throughput, "throughput")
+        parser.add_lightning_class_args(TrainingProgress, "progress")
+        parser.link_arguments("out", "checkpoint.dirpath")
+        parser.link_arguments("out", "trainer.default_root_dir")
+        for name in ("voxels", "side", "window"):
+            parser.link_arguments(f"model.{name}", f"data.{name}")
+        if self.model_class is PriorTraining:
+            parser.link_arguments("data.reports", "model.reports", apply_on="instantiate")
+            parser.add_lightning_class_args(BestCheckpoint, "best")
+            parser.set_defaults({"best.filename": Path(BEST).stem, "best.enable_version_counter": False,
+                                 "best.monitor": "val/psnr", "best.mode": "max", "best.save_on_train_epoch_end": False})
+            parser.link_arguments("out", "best.dirpath")
+        else:
+            parser.link_arguments("model.factor", "data.factor")
+
+    def instantiate_trainer(self, **kwargs) -> lightning.Trainer:
+        asked = self._get(self.config_init, "trainer").plugins or []
+        plugins = [*(asked if isinstance(asked, list) else [asked]), WholeCheckpoints()]
+        logger = CSVLogger(self._get(self.config, "out"), name="logs")
+        trainer = self._get(self.config_init, "trainer")
+        found = None if trainer.accelerator == "cpu" else torch.accelerator.current_accelerator()
+        device = found or torch.device("cpu")
+        if trainer.precision is None:
+            kwargs["precision"] = trainer_precision(self._get(self.config, "precision"), device)
+        elif "bf16" in str(trainer.precision):
+            resolve_precision("bfloat16", device)  # warns where that is slow
+        return super().instantiate_trainer(logger=logger, plugins=plugins, **kwargs)
+
+    def before_fit(self) -> None:
+        out, resumed = Path(self.config.fit.out), self.config.fit.ckpt_path
+        if resumed and (resumed in ("last", "best") or Path(resumed).resolve().parent == out.resolve()):
+            return
+        for name in (CHECKPOINT, BEST):
+            if (out / name).exists():
+                raise ValueError(f"{out} holds a training already: go on with --ckpt_path {out / name}, or give "
+                                 "another folder with --out")
+        if resumed:
+            return
+        if self.trainer.is_global_zero and self.datamodule.held_out:
+            held_out = "".join(f"{case}\n" for case in self.datamodule.held_out)
+            file = out / HELD_OUT
+            if file.exists() and file.read_bytes() != held_out.encode():
+                raise ValueError(f"{file} is there already and names other cases than this training holds out: move "
+                                 "it away, or give another folder with --out")
+            with whole_file(file) as part:
+                part.write_text(held_out)
+        self.model.learn_reports(self.datamodule)
+
+    def before_validate(self) -> None:
+        if not (self.config.validate.ckpt_path or self.config.validate.model.initial):
+            raise ValueError("validate needs trained weights: give --ckpt_path, or a prior's file as model.initial")
+
+    def parse_arguments(self, parser, args) -> None:
+        super().parse_arguments(parser, args)
+        command = self.config.get("subcommand")  # none where nothing is run
+        if not command:
+            return
+        check_writable(Path(self.config[command].out), "--out")
+        checkpoint = self.config[command].ckpt_path
+        if checkpoint and checkpoint not in ("last", "best"):
+            lacks = [part for part in RESUMED if part not in read_checkpoint(checkpoint)]
+            if lacks:
+                raise ValueError(f"{checkpoint} lacks {', '.join(lacks)}, and cannot be gone on from: give the last.ckpt "
+                                 "of a training")
+
+
+def main(args: list[str] | None = None) -> None:
+    """Command line of training: fit, validate, export, inspect-prior. A bad input ends in one sentence and code 2."""
+    given = sys.argv[1:] if args is None else args
+    with one_sentence_errors(MisconfigurationException, to_go_on="add --ckpt_path and the run's last.ckpt"), quiet():
+        if given[:1] == ["export"]:
+            auto_cli(export_prior, args=given[1:], as_positional=False, exit_on_error=False, allow_abbrev=False)
+        elif given[:1] == ["inspect-prior"]:
+            auto_cli(print_prior, args=given[1:], exit_on_error=False, allow_abbrev=False)
+        else:
+            check_command(given, COMMANDS, PriorCLI.subcommands(), "fit -c configs/prior/phantom.yaml")
+            given = with_configurations(given, ("prior",))
+            PriorCLI(*STAGES[stage_of(given)], args=given, seed_everything_default=0,
+                     save_config_kwargs={"overwrite": True},
+                     trainer_defaults={"enable_progress_bar": False, "enable_model_summary": False},
+                     parser_kwargs={"exit_on_error": False, "allow_abbrev": False, "description": (
+                         "Train a prior of chest CT. Two more commands: `export --checkpoint <last.ckpt> --out "
+                         "<prior.safetensors>` writes what a training learnt as a prior for reconstruction, and "
+                         "`inspect-prior <path>` tells what a file or folder is.")})

@@ -1,0 +1,1 @@
+"""Chest CTs: files, preparation, augmentation."""

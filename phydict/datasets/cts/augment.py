@@ -1,0 +1,153 @@
+"""Random change of a patient's anatomy and of how it was scanned, for learning from few CTs."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, fields, replace
+
+import torch
+
+from phydict.datasets.cts.acquisition import change_contrast, cut_field, without_table
+from phydict.datasets.cts.transforms import AIR
+from phydict.grid import Grid
+from phydict.units import HUWindow
+
+
+NAMES_A_SIDE = re.compile(r"\b(left|right|middle lobe|lingula\w*|[LR](UL|ML|LL)?)\b", re.IGNORECASE)
+"""What makes an English report one of a side."""
+
+FIELD_MM, FIELD_SHIFT_MM = (310.0, 400.0), 15.0
+"""Diameters of the scanner's field that `Augmentation.field` draws, and how far it lies off the grid's centre."""
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """How strong random changes of a patient are; 0 leaves that kind out. `Augmentation.none()` changes nothing.
+
+    rotation: degrees about any axis. scale: share of the size, along each axis. shift: mm. waves: mm, amplitude of
+    the slowest bending. gain: share of HU + 1000. offset: HU, in tissue only. contrast: HU, in blood only.
+    table: share of the cases whose table and clothes are taken away. field: share of the cases cut by a scanner's
+    circular field of view of 310 to 400 mm.
+    mirror: share of the cases mirrored left to right among those whose report is empty or names no side (in English),
+    in [0, 1]. It is 0 unless asked for, since a thorax is not symmetric: a mirrored one has its heart on the right.
+    Nothing is ever turned upside down or back to front.
+    """
+
+    rotation: float = 8.0
+    scale: float = 0.1
+    shift: float = 20.0
+    waves: float = 2.5
+    gain: float = 0.03
+    offset: float = 20.0
+    contrast: float = 60.0
+    table: float = 0.2
+    field: float = 0.15
+    mirror: float = 0.0
+
+    def __post_init__(self):
+        negative = [name for name, value in vars(self).items() if not value >= 0]
+        if negative:
+            raise ValueError(f"augmentation strengths are not negative, but {negative[0]} is "
+                             f"{vars(self)[negative[0]]}: give 0 for none")
+        if self.scale > 0.5 or self.gain > 0.5 or self.rotation > 45:
+            raise ValueError("augmentation is for small changes: rotation up to 45 degrees, scale and gain up to 0.5, "
+                             f"but {self.rotation}, {self.scale} and {self.gain} were given")
+        over = [name for name in ("table", "field", "mirror") if getattr(self, name) > 1]
+        if over:
+            raise ValueError(f"augmentation's {over[0]} is a share of the cases, in [0, 1], but "
+                             f"{getattr(self, over[0])} was given")
+
+    @classmethod
+    def none(cls) -> Augmentation:
+        return cls(**{field.name: 0.0 for field in fields(cls)})
+
+
+@dataclass(frozen=True)
+class Deformation:
+    """A small random change of a patient: pose, size, shape and HU.
+
+    rotation: (3,) radians about x, y, z. scale: (3,). shift: (3,) mm. waves: (3, 4, 4, 4) mm, amplitudes of cosines
+    of up to 1.5 periods over the grid. gain: factor of HU + 1000. offset: HU, in tissue only. mirrored: left to right.
+    """
+
+    rotation: torch.Tensor
+    scale: torch.Tensor
+    shift: torch.Tensor
+    waves: torch.Tensor
+    gain: float
+    offset: float
+    mirrored: bool = False
+
+    @classmethod
+    def draw(cls, seed: int | torch.Generator, strength: Augmentation = Augmentation()) -> Deformation:
+        """Within `strength`; without its mirroring, which depends on the report, and its changes of the scan."""
+        generator = seed if isinstance(seed, torch.Generator) else torch.Generator().manual_seed(int(seed))
+
+        def uniform(size, bound):
+            return (2 * torch.rand(size, generator=generator) - 1) * bound
+
+        waves = torch.randn((3, 4, 4, 4), generator=generator)
+        frequency = torch.stack(torch.meshgrid(*[torch.arange(4.0)] * 3, indexing="ij")).pow(2).sum(0)
+        waves = torch.where((frequency > 0) & (frequency <= 9), waves * strength.waves / (1 + frequency.sqrt()), 0.0)
+        return cls(uniform(3, math.radians(strength.rotation) / math.sqrt(3)), 1 + uniform(3, strength.scale),
+                   uniform(3, strength.shift / math.sqrt(3)), waves, 1 + float(uniform(1, strength.gain)),
+                   float(uniform(1, strength.offset)))
+
+    def sample_points(self, grid: Grid) -> torch.Tensor:
+        """(X, Y, Z, 3) mm from the grid's centre, along its axes: where the deformed voxels take their values."""
+        axes = [(torch.arange(n) - (n - 1) / 2) * s for n, s in zip(grid.shape, grid.spacing)]
+        points = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
+        a, b, c = self.rotation.tolist()
+        turn = torch.linalg.matrix_exp(torch.tensor([[0, -c, b], [c, 0, -a], [-b, a, 0]]))
+        cosines = [torch.cos(math.pi * torch.arange(4.0) * (torch.arange(n)[:, None] + 0.5) / n) for n in grid.shape]
+        waves = self.waves
+        for basis in cosines:
+            waves = torch.tensordot(waves, basis, dims=([1], [1]))
+        return (points @ turn.T) * self.scale + self.shift + waves.movedim(0, -1)
+
+    def apply(self, case: dict, grid: Grid, window: HUWindow) -> dict:
+        """The deformed Case; volume and masks are sampled at the same points, air and zeros outside."""
+        half = torch.tensor([n * s / 2 for n, s in zip(grid.shape, grid.spacing)])
+        points = (self.sample_points(grid) / half).flip(-1)[None]  # grid_sample wants z, y, x of the last axis first
+        air = float(window.to_range(torch.tensor(AIR)))
+        state = torch.cat([case["volume"] - air, case["masks"]])
+        state = state.flip(1) if self.mirrored else state
+        state = torch.nn.functional.grid_sample(state[None], points, padding_mode="zeros", align_corners=False)[0]
+        hu = window.to_hu(state[:1] + air)
+        hu = AIR + self.gain * (hu - AIR) + self.offset * ((hu - AIR) / 200).clamp(0, 1)
+        moved = {key: value for key, value in case.items() if key not in ("affine", "centred_on")}
+        return moved | {"volume": window.to_range(hu), "masks": state[1:].clamp(0, 1)}
+
+
+def augment(case: dict, seed: int | torch.Generator, grid: Grid = Grid.cube(64), window: HUWindow = HUWindow(),
+            strength: Augmentation = Augmentation()) -> dict:
+    """A Case deformed by `Deformation.draw(seed, strength)`; the same integer seed gives the same Case.
+
+    The place in the source CT ("affine") is dropped. Raises ValueError for a Case on another grid or with X-rays.
+    """
+    if tuple(case["volume"].shape[1:]) != grid.shape:
+        raise ValueError(f"the case has {tuple(case['volume'].shape[1:])} voxels, but the grid {grid.shape} was given; "
+                         "give the grid the case was prepared on")
+    if "xrays" in case:
+        raise ValueError(f"case {case['id']} holds X-rays of the undeformed patient; deform it before projecting")
+    generator = seed if isinstance(seed, torch.Generator) else torch.Generator().manual_seed(int(seed))
+    deformation = Deformation.draw(generator, strength)
+    if strength.mirror and not NAMES_A_SIDE.search(case["report"]):
+        mirrored = bool(torch.rand(1, generator=generator) < strength.mirror)
+        deformation = replace(deformation, mirrored=mirrored)
+    return _rescanned(deformation.apply(case, grid, window), generator, grid, window, strength)
+
+
+def _rescanned(case: dict, generator: torch.Generator, grid: Grid, window: HUWindow, strength: Augmentation) -> dict:
+    """The Case with another contrast of the blood, without its table, or in a smaller field of view, by chance."""
+    chance, amount, diameter, *centre = torch.rand(6, generator=generator).split((2, 1, 1, 1, 1))
+    hu, masks = window.to_hu(case["volume"]), case["masks"]
+    if chance[0] < strength.table:
+        hu = without_table(hu, grid)
+    if strength.contrast:
+        hu = change_contrast(hu, masks, strength.contrast * (2 * float(amount) - 1))
+    if chance[1] < strength.field:
+        middle = tuple(FIELD_SHIFT_MM * (2 * float(place) - 1) for place in centre)
+        hu, masks = cut_field(hu, masks, grid, FIELD_MM[0] + float(diameter) * (FIELD_MM[1] - FIELD_MM[0]), middle)
+    return case | {"volume": window.to_range(hu), "masks": masks}

@@ -1,0 +1,215 @@
+"""CT-RATE's folders, or any folder of chest CTs as NIfTI, as a list of Cases cached on disk.
+
+CT-RATE (arXiv 2403.17834) names its volumes (train|valid)_<patient>_<scan>_<reconstruction>.nii.gz. Its v2 files
+(`*_fixed` folders) carry their own HU and spacing: `fixed=True` trusts the header. The headers of v1 are blank:
+`fixed=False` takes HU scale, spacing and orientation from the metadata table.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch.utils.data import Dataset
+
+from phydict.datasets.cts.cache import read_arrays, write_arrays
+from phydict.datasets.cts.ct_rate_tables import read_calibrations, read_reports
+from phydict.datasets.natural_order import natural_order
+from phydict.datasets.cts.prepared import VOLUME, is_prepared, read_prepared, read_record
+from phydict.datasets.cts.segmentations import is_segmentation
+from phydict.datasets.cts.transforms import Calibration, case_id, prepare_ct
+from phydict.grid import Grid
+from phydict.runtime.reading import read_ids
+from phydict.units import HUWindow
+
+NAME = re.compile(r"(?P<patient>(?:train|valid)_\d+)_(?P<scan>[a-z]+)_(?P<reconstruction>\d+)", re.IGNORECASE)
+CACHE_VERSION = 1
+"""Raise it when `prepare_ct` changes its result, so that older caches are not read."""
+
+
+@dataclass(frozen=True)
+class CTFile:
+    """A CT on disk. report: "" where there is none. calibration: None where the file's own header is trusted."""
+
+    path: Path
+    id: str
+    report: str = ""
+    calibration: Calibration | None = None
+
+
+def patient_of(id: str) -> str:
+    """The patient of a Case id: CT-RATE's train_12 of train_12_a_1, `folder` of `folder__name`, else the id itself."""
+    match = NAME.fullmatch(id)
+    return match["patient"] if match else id.split("__")[0]
+
+
+def scan_of(id: str) -> str:
+    """CT-RATE's scan train_12_a of train_12_a_1, else the id itself."""
+    match = NAME.fullmatch(id)
+    return f"{match['patient']}_{match['scan']}" if match else id
+
+
+def find_cts(root: str | Path, reports: str | Path | None = None, metadata: str | Path | None = None,
+             fixed: bool = True, first_reconstruction: bool = False,
+             exclude: str | Path | None = None) -> list[CTFile]:
+    """The CTs under `root`, a .nii or .nii.gz file or a folder of any depth, in natural order.
+
+    reports, metadata: CT-RATE's CSV tables or folders of them; left out, radiology_text_reports/ (and, for
+    fixed=False, metadata/) is looked for in `root` and the three folders above it. No reports at all is fine.
+    fixed: trust the headers; False reads CT-RATE v1 by its metadata. Where the folder holds both versions of a volume,
+    the one `fixed` asks for is kept. first_reconstruction: keep one volume per scan. exclude: a text file of volume
+    names to leave out (CT-RATE's no_chest_*.txt).
+    Segmentations beside CTs are passed over. Of cases prepared by data/prepare_cts.py the volume alone is taken, with
+    their own ids, and with their own reports where no table has one.
+    Ids are file names without ending; outside CT-RATE's names, a file in a subfolder gets `<first subfolder>__<name>`.
+    Raises FileNotFoundError where there is no NIfTI, ValueError for ids found twice and v1 volumes without metadata.
+    """
+    root = Path(root)
+    files = {}
+    for path in _nifti_files(root):
+        id = _id(path, root)
+        if id in files and NAME.fullmatch(id) and _is_fixed(path) != _is_fixed(files[id]):
+            path = path if _is_fixed(path) == fixed else files[id]
+        elif id in files:
+            raise ValueError(f"{files[id]} and {path} would both become case {id}; rename one of them")
+        files[id] = path
+    for line in read_ids(exclude, "data.exclude") if exclude else ():
+        files.pop(case_id(line), None)
+    ids = sorted(files, key=natural_order)
+    if first_reconstruction:
+        ids = [id for n, id in enumerate(ids) if n == 0 or scan_of(ids[n - 1]) != scan_of(id)]
+    if not ids:
+        raise FileNotFoundError(f"every CT in {root} is excluded by {exclude}; give another list or folder")
+    reports = reports or _beside(root, "radiology_text_reports")
+    texts = read_reports(reports) if reports else {}
+    by_scan = {scan_of(id): text for id, text in texts.items()}
+    found = {id: texts.get(id, by_scan.get(scan_of(id))) for id in ids}
+    cts = [CTFile(files[id], id, _own_report(files[id]) if text is None else text) for id, text in found.items()]
+    return cts if fixed else _calibrated(cts, metadata or _beside(root, "metadata"))
+
+
+def _calibrated(cts: list[CTFile], metadata: str | Path | None) -> list[CTFile]:
+    if metadata is None:
+        raise ValueError("headers that are not fixed need CT-RATE's metadata table, but none was given or found; "
+                             "give it as data.metadata")
+    table = read_calibrations(metadata)
+    missing = [ct.id for ct in cts if ct.id not in table]
+    if missing:
+        raise ValueError(f"{len(missing)} of {len(cts)} volumes are not in the metadata {metadata}, the first is "
+                         f"{missing[0]}; give the table of these volumes, or data.fixed true if they are right")
+    return [replace(ct, calibration=table[ct.id]) for ct in cts]
+
+
+def _nifti_files(root: Path) -> list[Path]:
+    if root.is_file():
+        if not root.name.lower().endswith((".nii", ".nii.gz")):
+            raise FileNotFoundError(f"{root} is not a NIfTI file; give a .nii or .nii.gz file, or a folder of them")
+        return [root]
+    if not root.is_dir():
+        raise FileNotFoundError(f"there is no folder or file {root}; give the folder that holds the CTs")
+    every = [p for p in root.rglob("*") if p.is_file()
+             and not any(part.startswith(".") for part in p.relative_to(root).parts)]
+    found = sorted(p for p in every if p.name.lower().endswith((".nii", ".nii.gz")) and not is_segmentation(p)
+                   and (p.name == VOLUME or not is_prepared(p)))
+    if not found:
+        held = f"its {len(every)} files are of other kinds" if every else "it is empty"
+        raise FileNotFoundError(f"there is no .nii or .nii.gz file in {root} ({held}); give a folder of NIfTI CTs, or "
+                                "prepare DICOM series with data/prepare_cts.py first")
+    return found
+
+
+def _id(path: Path, root: Path) -> str:
+    if is_prepared(path):
+        return path.absolute().parent.name
+    name = case_id(path)
+    inner = path.relative_to(root).parts if root.is_dir() else ()
+    return name if NAME.fullmatch(name) or len(inner) < 2 else f"{inner[0]}__{name}"
+
+
+def _own_report(path: Path) -> str:
+    return read_record(path)["report"] if is_prepared(path) else ""
+
+
+def _is_fixed(path: Path) -> bool:
+    return any(part.endswith("_fixed") for part in path.parts)
+
+
+def _beside(root: Path, name: str) -> Path | None:
+    places = [folder / name for folder in (root, *root.absolute().parents[:3])]
+    return next((place for place in places if place.is_dir() and any(place.glob("*.csv"))), None)
+
+
+def split_by_patient(ids: list[str], fraction: float, seed: int = 0) -> tuple[list[str], list[str]]:
+    """(training ids, held-out ids): about `fraction` of the patients are held out, all their scans together.
+
+    With two or more patients and 0 < fraction < 1 neither side is empty.
+    Raises ValueError for a fraction outside [0, 1].
+    """
+    if not 0 <= fraction <= 1:
+        raise ValueError(f"the held-out fraction must lie in [0, 1], but {fraction} was given")
+    patients = sorted({patient_of(id) for id in ids})
+    count = round(fraction * len(patients))
+    if 0 < fraction < 1 and len(patients) > 1:
+        count = min(max(count, 1), len(patients) - 1)
+    held = {patients[i] for i in np.random.default_rng(seed).permutation(len(patients))[:count]}
+    return [id for id in ids if patient_of(id) not in held], [id for id in ids if patient_of(id) in held]
+
+
+def load_case(ct: CTFile, grid: Grid, window: HUWindow) -> dict:
+    """The Case of a CT, prepared now or read as it was prepared. Raises what `prepare_ct` and `read_prepared` raise."""
+    case = read_prepared(ct.path, grid, window) if is_prepared(ct.path) else prepare_ct(
+        ct.path, grid, window, id=ct.id, calibration=ct.calibration)
+    return case | {"id": ct.id, "report": ct.report}
+
+
+class CTCases(Dataset):
+    """Cases prepared from CT files, one by one when first asked for, then read from a cache folder.
+
+    cts: what `find_cts` returns. cache: a folder for the prepared cases, made when missing; None keeps nothing. A case
+    is prepared anew when its file, grid, window or calibration changes. Volumes are stored to half precision (0.5 HU),
+    masks to 1/255; a case is the same before and after caching. The folder of the CTs is never written to.
+    """
+
+    def __init__(self, cts: list[CTFile], cache: str | Path | None, grid: Grid = Grid.cube(64),
+                 window: HUWindow = HUWindow()):
+        self.cts, self.grid, self.window = list(cts), grid, window
+        self.cache = None if cache is None else Path(cache)
+        if self.cache is not None:
+            self.cache.mkdir(parents=True, exist_ok=True)
+
+    def __len__(self) -> int:
+        return len(self.cts)
+
+    def __getitem__(self, index: int) -> dict:
+        ct = self.cts[index]
+        file = self.cache and self.cache / f"{ct.id}-{self._key(ct)}.npz"
+        packed = file and read_arrays(file)
+        if packed is None:
+            packed = _pack(load_case(ct, self.grid, self.window))
+            if file:
+                write_arrays(file, packed)
+        return _unpack(packed) | {"id": ct.id, "report": ct.report}
+
+    def _key(self, ct: CTFile) -> str:
+        stat = ct.path.stat()
+        parts = [CACHE_VERSION, str(ct.path.resolve()), stat.st_mtime_ns, stat.st_size, self.grid.to_dict(),
+                 asdict(self.window), asdict(ct.calibration) if ct.calibration else None]
+        return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]
+
+
+def _pack(case: dict) -> dict[str, np.ndarray]:
+    return {"volume": case["volume"].numpy().astype(np.float16),
+            "masks": (case["masks"].numpy() * 255).round().astype(np.uint8), "has_masks": case["has_masks"].numpy(),
+            "affine": case["affine"].numpy(), "centred_on": np.array(case["centred_on"])}
+
+
+def _unpack(packed: dict[str, np.ndarray]) -> dict:
+    return {"volume": torch.from_numpy(packed["volume"].astype(np.float32)),
+            "masks": torch.from_numpy(packed["masks"].astype(np.float32) / 255),
+            "has_masks": torch.from_numpy(packed["has_masks"]), "affine": torch.from_numpy(packed["affine"]),
+            "centred_on": str(packed["centred_on"])}

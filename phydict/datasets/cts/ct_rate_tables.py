@@ -1,0 +1,84 @@
+"""CT-RATE's tables: reports, and DICOM values."""
+
+from __future__ import annotations
+
+import csv
+import math
+import reprlib
+from pathlib import Path
+
+from phydict.datasets.reports import join_report
+from phydict.datasets.cts.transforms import Calibration, case_id
+
+
+def read_reports(path: str | Path) -> dict[str, str]:
+    """Reports by volume name (without .nii.gz) from one CT-RATE CSV, or from all CSVs of a folder.
+
+    Columns VolumeName, Findings_EN, Impressions_EN; a report is laid out by `join_report`. Raises FileNotFoundError,
+    and ValueError for missing columns and for volumes without a name or with two rows.
+    """
+    rows = _rows(path, ("VolumeName", "Findings_EN", "Impressions_EN"))
+    return {case_id(row["VolumeName"]): join_report(row["Findings_EN"], row["Impressions_EN"]) for row in rows}
+
+
+def read_calibrations(path: str | Path) -> dict[str, Calibration]:
+    """HU scale, spacing and orientation by volume name from CT-RATE's metadata CSV, or from all CSVs of a folder.
+
+    Raises FileNotFoundError, and ValueError for missing columns, numbers that cannot be read and volumes
+    with two rows.
+    """
+    columns = ("VolumeName", "RescaleSlope", "RescaleIntercept", "XYSpacing", "ZSpacing")
+    calibrations = {}
+    for row in _rows(path, columns):
+        slope, intercept, z_mm = (_numbers(path, row, name, 1)[0] for name in ("RescaleSlope", "RescaleIntercept",
+                                                                               "ZSpacing"))
+        spacing = (*_numbers(path, row, "XYSpacing", 2), z_mm)
+        if min(spacing) <= 0:
+            raise ValueError(f"the metadata of {row['VolumeName']} in {path} give it voxels of {spacing} mm; correct "
+                             "XYSpacing and ZSpacing")
+        orientation = _numbers(path, row, "ImageOrientationPatient", 6) if row.get("ImageOrientationPatient") else ()
+        calibrations[case_id(row["VolumeName"])] = Calibration(slope, intercept, spacing, *filter(None, [orientation]))
+    return calibrations
+
+
+def _numbers(path: str | Path, row: dict[str, str], column: str, count: int) -> tuple[float, ...]:
+    """The finite numbers in one field: "1.5", or "[0.7, 0.7]" where there are several."""
+    written = str(row[column])
+    try:
+        found = tuple(map(float, written.strip(" []").split(",")))
+    except ValueError:
+        found = ()
+    if len(found) != count or not all(map(math.isfinite, found)):
+        raise ValueError(f"the metadata of {row['VolumeName']} in {path} cannot be read: {column} must be {count} finite "
+                         f"number{'s' * (count > 1)}, but {reprlib.repr(written)} was found")
+    return found
+
+
+def _rows(path: str | Path, columns: tuple[str, ...]) -> list[dict[str, str]]:
+    path = Path(path)
+    files = sorted(path.glob("*.csv")) if path.is_dir() else [path]
+    if not files or not files[0].is_file():
+        raise FileNotFoundError(f"there is no CSV table at {path}; give a .csv file or a folder that holds some")
+    rows = {}
+    for file in files:
+        for number, row in enumerate(_table(file, columns), 2):
+            id = case_id(row["VolumeName"] or "")
+            if not id:
+                raise ValueError(f"row {number} of {file} has no VolumeName; fill it in or remove that row")
+            if id in rows:
+                raise ValueError(f"{id} has two rows, the second in row {number} of {file}; keep one row per volume")
+            rows[id] = row
+    return list(rows.values())
+
+
+def _table(file: Path, columns: tuple[str, ...]) -> list[dict[str, str]]:
+    try:
+        with file.open(newline="", encoding="utf-8-sig") as lines:
+            table = csv.DictReader(lines)
+            rows, found = list(table), table.fieldnames or ()
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{file} cannot be read as a table ({error}); save it as CSV in UTF-8") from error
+    missing = [name for name in columns if name not in found]
+    if missing:
+        raise ValueError(f"{file} lacks the columns {', '.join(missing)}; CT-RATE's tables have {', '.join(columns)}")
+    return rows

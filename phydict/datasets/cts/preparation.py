@@ -1,0 +1,320 @@
+"""From folders of CTs, DICOM or NIfTI, to prepared cases: in parallel, resumable, with a summary of what was rejected.
+
+The space `medsyn` approximates MedSyn's (10.1109/TMI.2024.3415032), which registers each patient's lungs to those of an
+atlas by an affine map: here the box around the lungs is scaled along each axis and moved onto the atlas' box. Rotation
+and shear of the registration are left out, and voxels are averages where MedSyn interpolates.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import multiprocessing
+import os
+import signal
+import threading
+import warnings
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from phydict.runtime.files import remove_leftovers, whole_file, whole_folder
+from phydict.datasets.cts.anatomy import MASKS, body_mask, lung_box_centre, lung_box_size, segment
+from phydict.datasets.cts.ct_rate import CTFile, find_cts
+from phydict.datasets.cts.ct_series import Series, find_series, load_series
+from phydict.datasets.cts.prepared import VOLUME, read_record, write_prepared
+from phydict.datasets.cts.segmentations import lungs_by_lungmask, read_segmentation, segmentations_beside
+from phydict.datasets.cts.transforms import (AIR, SEGMENTATION_MM, case_id, centred, check_hu, covering_grid, load_ct,
+                                         to_grid)
+from phydict.grid import Grid
+from phydict.runtime.progress import CaseProgress
+from phydict.runtime.reading import not_written
+
+SUMMARY = "summary.csv"
+COLUMNS = ("id", "status", "reason", "remark", "source", "kind", "slices", "spacing_x_mm", "spacing_y_mm",
+           "spacing_z_mm", "extent_z_mm", "lungs_by", "lung_ml", "lungs_inside", "lung_width_mm", "lung_depth_mm",
+           "lung_height_mm", "masks", "window_low", "window_high")
+SPACES, SEGMENTERS = ("patient", "medsyn"), ("threshold", "lungmask")
+ATLAS_MM = (316.0, 316.0, 292.0)
+"""MedSyn's atlas volume, right-left, posterior-anterior and inferior-superior."""
+ATLAS_LUNGS_MM = (275.0, 193.0, 256.0)
+"""The box around the atlas' lungs, an assumption, because the atlas may not be shipped: the mean over seven uncut CTs
+of LIDC-IDRI, placed in the middle of the atlas volume. `atlas_lungs` measures a copy of the atlas instead."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a prepared case is to be.
+
+    voxels: per side of the box. side: mm of the cube in the space `patient`. window: HU, recorded and not applied.
+    space: patient or medsyn. segmenter: of CTs without a segmentation beside them, threshold or lungmask.
+    atlas_lungs_mm, atlas_offset_mm: of MedSyn's atlas, the box around the lungs, and where its middle lies from the
+    volume's middle.
+    """
+
+    voxels: int = 256
+    side: float = 384.0
+    window: tuple[float, float] = (-1000.0, 1000.0)
+    space: str = "patient"
+    segmenter: str = "threshold"
+    atlas_lungs_mm: tuple[float, float, float] = ATLAS_LUNGS_MM
+    atlas_offset_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self):
+        if self.voxels < 8 or self.side <= 0:
+            raise ValueError(f"a case needs at least 8 voxels and a side above 0 mm, but {self.voxels} voxels and "
+                             f"{self.side} mm were given")
+        if not self.window[0] < self.window[1]:
+            raise ValueError(f"an HU window needs low < high, but {list(self.window)} was given")
+        for name, value, values in (("space", self.space, SPACES), ("segmenter", self.segmenter, SEGMENTERS)):
+            if value not in values:
+                raise ValueError(f"{name} is {' or '.join(values)}, but {value!r} was given")
+
+    @property
+    def extent(self) -> tuple[float, float, float]:
+        """Edge lengths in mm of the box, in the space's own millimetres."""
+        return (self.side,) * 3 if self.space == "patient" else ATLAS_MM
+
+    @property
+    def outside(self) -> float:
+        """HU where there is no scan, and the least that is kept."""
+        return min(AIR, self.window[0]) if self.space == "medsyn" else AIR
+
+    def grid(self, lung_centre: np.ndarray, lung_mm: np.ndarray) -> Grid:
+        """The voxels in the patient's world, for lungs in a box of `lung_mm` (3,) around `lung_centre` (3,)."""
+        shape, extent = (self.voxels,) * 3, np.asarray(self.extent)
+        if self.space == "patient":
+            return centred(Grid(shape, extent / shape), lung_centre)
+        shrink = lung_mm / self.atlas_lungs_mm
+        return centred(Grid(shape, extent * shrink / shape), lung_centre - shrink * self.atlas_offset_mm)
+
+
+def atlas_lungs(mask: Path) -> dict:
+    """Settings' atlas_lungs_mm and atlas_offset_mm by a copy of MedSyn's atlas lung mask (NIfTI).
+
+    Raises ValueError where it cannot be read, is empty or is not of the atlas' size.
+    """
+    lungs, affine = load_ct(mask)
+    volume = Grid(lungs.shape, affine=affine)
+    if not (lungs > 0.5).any() or not np.allclose(volume.extent, ATLAS_MM, atol=2):
+        raise ValueError(f"{mask} is not MedSyn's atlas: a lung mask of {' x '.join(f'{n:g}' for n in ATLAS_MM)} mm "
+                         f"was expected, but its box has {' x '.join(f'{n:g}' for n in volume.extent)} mm")
+    offset = lung_box_centre(lungs, affine) - volume.centre
+    return {"atlas_lungs_mm": tuple(lung_box_size(lungs, volume.spacing).tolist()),
+            "atlas_offset_mm": tuple(offset.tolist())}
+
+
+@dataclass(frozen=True)
+class Source:
+    """A CT to prepare. beside: its path without ending, beside which segmentations lie."""
+
+    id: str
+    ct: CTFile | Series
+    beside: Path
+
+    @property
+    def is_dicom(self) -> bool:
+        return isinstance(self.ct, Series)
+
+    @property
+    def place(self) -> Path:
+        return self.ct.folder if self.is_dicom else self.ct.path
+
+    def load(self) -> tuple[np.ndarray, np.ndarray]:
+        """HU (X, Y, Z) in RAS+ and the affine. Raises ValueError and OSError."""
+        return load_series(self.ct) if self.is_dicom else load_ct(self.ct.path, self.ct.calibration)
+
+    def fingerprint(self) -> dict:
+        """What tells this input from another: its files' number and bytes, those of its segmentations included."""
+        files = [*(self.ct.files if self.is_dicom else (self.ct.path,)),
+                 *(file for files in segmentations_beside(self.beside).values() for file in files)]
+        return {"files": len(files), "bytes": sum(file.stat().st_size for file in files)}
+
+
+def find_sources(root: Path, **tables) -> list[Source]:
+    """Every DICOM series and NIfTI CT below `root`; tables: as for `find_cts`.
+
+    A series is named as a NIfTI file in its folder's place would be, `<first subfolder>__<folder>`; where that is not
+    enough, by all its folders, then with its SeriesNumber, then with a count.
+    Raises FileNotFoundError where there is none, and what `find_cts` raises.
+    """
+    series = find_series(root) if root.is_dir() else []
+    try:
+        cts = find_cts(root, **tables)
+    except FileNotFoundError:
+        if not series:
+            raise FileNotFoundError(f"there is no CT in {root}; give a NIfTI file, or a folder that holds NIfTI files "
+                                    "or DICOM series") from None
+        cts = []
+    sources = [Source(ct.id, ct, ct.path.with_name(case_id(ct.path))) for ct in cts]
+    return sources + _named(series, root, {ct.id for ct in cts})
+
+
+def _named(series: list[Series], root: Path, taken: set[str]) -> list[Source]:
+    def forms(s: Series) -> tuple[str, ...]:
+        parts = s.folder.relative_to(root).parts or (s.folder.absolute().name,)
+        short, full = "__".join(dict.fromkeys((parts[0], parts[-1]))), "__".join(parts)
+        return short, full, "__".join(part for part in (full, s.number) if part)
+
+    counts = [Counter(names) for names in zip(*(forms(s) for s in series))]
+    folders = Counter(s.folder for s in series)
+    sources = []
+    for s in series:
+        names = forms(s)
+        id = next((name for name, count in zip(names, counts) if count[name] == 1 and name not in taken), names[-1])
+        n = 1
+        while id in taken:
+            n += 1
+            id = f"{names[-1]}__{n}"
+        taken.add(id)
+        name = s.folder.absolute().name + (f"__{s.number}" if folders[s.folder] > 1 else "")
+        sources.append(Source(id, s, s.folder.absolute().with_name(name)))
+    return sources
+
+
+def prepare_folder(cts: str | Path, out: str | Path, settings: Settings = Settings(), workers: int = 1,
+                   **tables) -> list[dict]:
+    """Prepares every CT below `cts` into `out`, one folder each, and writes out/summary.csv.
+
+    Finished cases are kept where their input is the same; a case appears only when it is complete. workers: processes.
+    tables: reports, metadata, fixed, first_reconstruction and exclude, as for `find_cts`.
+    Returns the summary's rows, by COLUMNS, status being prepared or rejected.
+    Raises ValueError for folders inside each other and for an `out` of other settings, and OSError, in one sentence,
+    where a case cannot be written; a CT that cannot be prepared is rejected with the reason.
+    """
+    root, out = Path(cts), Path(out)
+    if out.resolve().is_relative_to(root.resolve()) or root.resolve().is_relative_to(out.resolve()):
+        raise ValueError(f"the CTs' folder {root} and the output folder {out} lie inside each other; "
+                         "give an output folder elsewhere")
+    if workers < 1:
+        raise ValueError(f"workers must be at least 1, but {workers} was given")
+    sources = find_sources(root, **tables)
+    remove_leftovers(out)
+    rows = {source.id: row for source in sources if (row := _finished(source, out, settings)) is not None}
+    left = [source for source in sources if source.id not in rows]
+    with CaseProgress() as progress:
+        progress.begin("CTs", len(left), verb="prepare")
+        for row in _prepared(left, out, settings, workers):
+            rows[row["id"]] = row
+            progress.case(row["id"])
+            progress.finished(row["status"] + (f": {row['reason']}" if row["reason"] else ""))
+    rows = [rows[source.id] for source in sources]
+    _write_summary(out / SUMMARY, rows)
+    return rows
+
+
+def _finished(source: Source, out: Path, settings: Settings) -> dict | None:
+    """The row of a case that is already there and of this input, else None."""
+    folder = out / source.id
+    if not folder.exists():
+        return None
+    record = read_record(folder / VOLUME)
+    if record.get("settings") != json.loads(json.dumps(asdict(settings))):
+        raise ValueError(f"{folder} was prepared with other settings; give another output folder, or remove that one")
+    try:
+        return record.get("row") if record.get("fingerprint") == source.fingerprint() else None
+    except ValueError:
+        return None
+
+
+def _prepared(sources: list[Source], out: Path, settings: Settings, workers: int) -> Iterator[dict]:
+    if workers == 1 or len(sources) < 2:
+        yield from (prepare_source(source, out, settings) for source in sources)
+        return
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # read when a process starts: one thread for each of these
+    pool = ProcessPoolExecutor(min(workers, len(sources)), multiprocessing.get_context("spawn"), _end_with_parent)
+    try:
+        for done in as_completed([pool.submit(prepare_source, source, out, settings) for source in sources]):
+            yield done.result()
+    except BrokenProcessPool as error:
+        raise OSError("a worker process ended before its case was done, perhaps for want of memory; give fewer workers "
+                      "and run the same command again, finished cases are kept") from error
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _end_with_parent() -> None:
+    """In a worker: leaves Ctrl-C to the parent, and ends when the parent does."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
+
+
+def prepare_source(source: Source, out: Path, settings: Settings) -> dict:
+    """Prepares one CT into out/<id>; returns its row of the summary, in which it may be rejected.
+
+    Raises OSError, in one sentence, where the case cannot be written; nothing of it is left then.
+    """
+    row = dict.fromkeys(COLUMNS, "") | {"id": source.id, "source": str(source.place),
+                                        "kind": "DICOM" if source.is_dicom else "NIfTI"}
+    with warnings.catch_warnings(record=True) as remarks:
+        warnings.simplefilter("always", UserWarning)
+        try:
+            grid, images, facts = _place(*source.load(), segmentations_beside(source.beside), settings)
+            fingerprint = source.fingerprint()
+        except (ValueError, OSError) as error:
+            facts = {"status": "rejected", "reason": " ".join(str(error).split())}
+        row["remark"] = "; ".join(str(w.message) for w in remarks if w.category is UserWarning)
+    if "reason" in facts:
+        return row | facts
+    row |= facts | {"status": "prepared", "window_low": settings.window[0], "window_high": settings.window[1]}
+    record = {"id": source.id, "space": settings.space, "extent": settings.extent, "window": settings.window,
+              "report": "" if source.is_dicom else source.ct.report, "settings": asdict(settings),
+              "fingerprint": fingerprint, "row": row}
+    try:
+        with whole_folder(out / source.id) as partial:
+            write_prepared(partial, grid, images, record)
+    except OSError as error:
+        raise not_written(f"the case {out / source.id}", error, "give another output folder, and run the same command "
+                          "again, finished cases are kept") from error
+    return row
+
+
+def _place(hu: np.ndarray, affine: np.ndarray, beside: dict[str, tuple[Path, ...]],
+           settings: Settings) -> tuple[Grid, dict[str, np.ndarray], dict]:
+    """The grid of a case, its images on that grid ("ct" in HU, masks), and what the summary says of it.
+
+    Raises ValueError where no lungs are found or a segmentation does not fit.
+    """
+    spacing = np.linalg.norm(affine[:3, :3], axis=0)
+    facts = {"slices": hu.shape[2]} | {f"spacing_{a}_mm": round(float(s), 4) for a, s in zip("xyz", spacing)}
+    facts["extent_z_mm"] = round(float(spacing[2] * hu.shape[2]), 1)
+    check_hu(hu, "the CT")
+    hu = hu.clip(settings.outside)
+    work = covering_grid(hu.shape, affine, SEGMENTATION_MM)
+    coarse = to_grid(hu, affine, work, settings.outside)
+    found, known = segment(coarse, work.spacing)
+    masks = {name: (mask, work.affine) for name, mask, here in zip(MASKS, found, known) if here}
+    masks["body"] = body_mask(coarse, work.spacing), work.affine
+    facts["lungs_by"] = "file" if "lung" in beside else settings.segmenter
+    if facts["lungs_by"] == "lungmask":
+        masks["lung"] = lungs_by_lungmask(hu), affine
+    masks |= {name: (read_segmentation(files, hu.shape, affine), affine) for name, files in beside.items()}
+    lung = to_grid(masks["lung"][0], masks["lung"][1], work, 0.0) if "lung" in masks else np.zeros(1)
+    if not (lung > 0.5).any():
+        raise ValueError("no lungs were found; give a chest CT, or lay a lung segmentation beside it")
+    size = lung_box_size(lung, work.spacing)
+    grid = settings.grid(lung_box_centre(lung, work.affine), size)
+    images = {"ct": to_grid(hu, affine, grid, settings.outside)}
+    images |= {name: to_grid(mask, place, grid, 0.0) for name, (mask, place) in masks.items()}
+    volume = lung.sum() * np.prod(work.spacing)
+    facts |= {"lung_ml": round(float(volume) / 1000), "masks": " ".join(masks),
+              "lungs_inside": round(min(1.0, float(images["lung"].sum() * np.prod(grid.spacing) / volume)), 3)}
+    facts |= {f"lung_{side}_mm": float(n) for side, n in zip(("width", "depth", "height"), size)}
+    return grid, images, facts
+
+
+def _write_summary(file: Path, rows: list[dict]) -> None:
+    try:
+        with whole_file(file) as part, part.open("w", newline="", encoding="utf-8") as stream:
+            table = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
+            table.writeheader()
+            table.writerows(rows)
+    except OSError as error:
+        raise not_written(f"the summary {file}", error, "give another output folder, and run the same command again, "
+                          "finished cases are kept") from error

@@ -1,0 +1,78 @@
+"""Masks by other segmenters: their files beside a CT, and lungmask where it is installed.
+
+Beside a CT `name.nii.gz`, or beside a DICOM series' folder `name`, these are read (where the folder holds several
+series, `name__<SeriesNumber>`); they must lie on the CT's own voxels:
+
+    name_lungmask.nii.gz       lungmask's labels (doi:10.1186/s41747-020-00173-2): every label above 0 is lung
+    name_totalsegmentator/     TotalSegmentator's folder (doi:10.1148/ryai.230024), one file per structure:
+        lung_{upper,lower}_lobe_{left,right}.nii.gz, lung_middle_lobe_right.nii.gz      lungs
+        lung_trachea_bronchia.nii.gz, else trachea.nii.gz                               airway
+        lung_vessels.nii.gz                                                             vessels
+        body.nii.gz                                                                     body
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from phydict.datasets.cts.transforms import load_ct
+
+LUNGMASK, TOTALSEGMENTATOR = "_lungmask", "_totalsegmentator"
+LOBES = ("lung_upper_lobe_left", "lung_lower_lobe_left", "lung_upper_lobe_right", "lung_middle_lobe_right",
+         "lung_lower_lobe_right")
+
+
+def is_segmentation(path: Path) -> bool:
+    """Whether a NIfTI file is, by its name or folder, one of those that lie beside a CT."""
+    return path.name.lower().endswith((f"{LUNGMASK}.nii.gz", f"{LUNGMASK}.nii")) \
+        or path.parent.name.endswith(TOTALSEGMENTATOR)
+
+
+def segmentations_beside(ct: Path) -> dict[str, tuple[Path, ...]]:
+    """The files beside `ct` (its path without ending) by what they show: lung, airway, vessel, body; often none.
+
+    Raises ValueError where some of the lungs' lobes are missing.
+    """
+    folder = ct.with_name(ct.name + TOTALSEGMENTATOR)
+    named = [ct.with_name(f"{ct.name}{LUNGMASK}{ending}") for ending in (".nii.gz", ".nii")]
+    lungmask = tuple(path for path in named if path.is_file())[:1]
+    lobes = tuple(path for path in (folder / f"{lobe}.nii.gz" for lobe in LOBES) if path.is_file())
+    if not lungmask and 0 < len(lobes) < len(LOBES):
+        raise ValueError(f"{folder} holds {len(lobes)} of the {len(LOBES)} lobes of the lungs; segment all of them "
+                         "(roi_subset), or remove these")
+    found = {"lung": lungmask or lobes}
+    for name, files in (("airway", ("lung_trachea_bronchia", "trachea")), ("vessel", ("lung_vessels",)),
+                        ("body", ("body",))):
+        found[name] = tuple(path for path in (folder / f"{file}.nii.gz" for file in files) if path.is_file())[:1]
+    return {name: files for name, files in found.items() if files}
+
+
+def read_segmentation(files: tuple[Path, ...], shape, affine: np.ndarray) -> np.ndarray:
+    """The union of label files as a mask (X, Y, Z) bool on the voxels of a CT of `shape` with its 4x4 affine.
+
+    Raises ValueError where a file cannot be read or does not lie on these voxels.
+    """
+    union = np.zeros(shape, bool)
+    for file in files:
+        labels, place = load_ct(file)
+        if labels.shape != tuple(shape) or not np.allclose(place, affine, atol=0.01):
+            raise ValueError(f"{file} does not lie on its CT's voxels ({labels.shape} instead of {tuple(shape)}, or "
+                             "another place); segment this CT again, or remove that file")
+        union |= labels > 0.5
+    return union
+
+
+def lungs_by_lungmask(hu: np.ndarray) -> np.ndarray:
+    """The lungs (X, Y, Z) bool of HU (X, Y, Z) in RAS+ by lungmask's R231, which fetches its weights at first use.
+
+    Raises ValueError where lungmask is not installed.
+    """
+    try:
+        from lungmask import LMInferer
+    except ImportError as error:
+        raise ValueError("the segmenter lungmask is not installed; pip install 'phydict[lungmask]', or use the "
+                         "threshold segmenter") from error
+    labels = LMInferer(tqdm_disable=True).apply(np.ascontiguousarray(hu[::-1, ::-1].transpose(2, 1, 0)))  # as S, P, L
+    return np.asarray(labels).transpose(2, 1, 0)[::-1, ::-1] > 0

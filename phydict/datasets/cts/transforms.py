@@ -1,0 +1,244 @@
+"""From a CT file to a Case: reading, resampling by voxel averages, and the HU window.
+
+Resampling: every new voxel is the exact mean, over its box, of the linear interpolation between the old voxels. It is
+anti-aliased when shrinking, smooth when enlarging, and every old voxel keeps its weight, so means are preserved.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import scipy
+
+from phydict.datasets.cts.anatomy import lung_box_centre, segment
+from phydict.datasets.nifti_file import open_nifti
+from phydict.grid import Grid
+from phydict.runtime.reading import reading
+from phydict.units import HUWindow
+
+AIR = -1000.0
+SEGMENTATION_MM = 2.0
+LARGEST_VOXEL, FURTHEST = 100.0, 1e6
+"""mm that no voxel's side and no CT's distance from its origin reach."""
+LEAST_SLICES = 8
+"""Fewer are a scout or a test image, from which no lungs can be found."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What the blank header of a CT-RATE v1 volume lacks, from its metadata table.
+
+    slope, intercept: HU = slope * stored + intercept. spacing: (columns, rows, slices) mm.
+    orientation: DICOM's row and column direction cosines; the stored axes are columns, rows, slices.
+    """
+
+    slope: float
+    intercept: float
+    spacing: tuple[float, float, float]
+    orientation: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+
+    def affine(self) -> np.ndarray:
+        """4x4 index -> RAS+ mm, origin at voxel (0, 0, 0)."""
+        columns, rows = np.asarray(self.orientation[:3], float), np.asarray(self.orientation[3:], float)
+        affine = np.eye(4)
+        affine[:3, :3] = np.diag([-1.0, -1.0, 1.0]) @ np.stack([columns, rows, np.cross(columns, rows)], 1)
+        affine[:3, :3] *= self.spacing
+        return affine
+
+
+def load_ct(path: str | Path, calibration: Calibration | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Read a NIfTI CT and turn its axes to RAS+.
+
+    calibration: for files without a usable header (CT-RATE v1) HU scale and spacing come from it instead.
+    Returns HU (X, Y, Z) float32 and the 4x4 index -> world mm affine.
+    Raises FileNotFoundError, and ValueError naming the file where it cannot be read, is not one 3D volume, has
+    fewer than LEAST_SLICES slices, no orientation, or holds NaN or infinite values.
+    """
+    from monai.data import NibabelReader
+
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no CT file {path}; give a .nii or .nii.gz file that exists")
+    with reading(path, "convert it to NIfTI, or download it, again"):
+        header = open_nifti(path).header
+    _check_header(path, header, calibration)
+    reader = NibabelReader(squeeze_non_spatial_dims=True)
+    with reading(f"the voxels of {path}", "the file seems truncated or damaged: download or convert it again"):
+        stored, meta = reader.get_data(reader.read(path))
+        hu, affine = np.array(stored, np.float32), meta["affine"]
+    if calibration is not None:
+        hu, affine = hu * np.float32(calibration.slope) + np.float32(calibration.intercept), calibration.affine()
+    hu, affine = to_ras(hu, affine)
+    bad = hu.size - int(np.isfinite(hu).sum())
+    if bad:
+        raise ValueError(f"{path} holds {bad} NaN or infinite voxels; replace them, by -1000 HU where there is no data")
+    return hu, affine
+
+
+def to_ras(volume: np.ndarray, affine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A volume (X, Y, Z) with its axes permuted and flipped to RAS+, without interpolation; and its new affine."""
+    from monai.data import MetaTensor
+    from monai.transforms import Orientationd
+
+    image = MetaTensor(torch.from_numpy(np.ascontiguousarray(volume, np.float32))[None], affine=affine)
+    image = Orientationd("ct", axcodes="RAS", labels=None)({"ct": image})["ct"]
+    return image.as_tensor()[0].numpy(), image.affine.numpy().astype(float)
+
+
+def _check_header(path: Path, header, calibration: Calibration | None) -> None:
+    shape = header.get_data_shape()
+    while len(shape) > 3 and shape[-1] == 1:
+        shape = shape[:-1]
+    if len(shape) != 3:
+        raise ValueError(f"{path} is {len(shape)}D with shape {tuple(shape)}; give one 3D volume per file")
+    if min(shape) < 2:
+        raise ValueError(f"{path} is a single 2D slice with shape {tuple(shape)}; give a 3D volume")
+    if min(shape) < LEAST_SLICES:
+        raise ValueError(f"{path} has {min(shape)} slices (its shape is {tuple(shape)}), but a chest CT has at least "
+                         f"{LEAST_SLICES}; give the whole series")
+    if calibration is not None:
+        return
+    codes = [int(header[name]) for name in ("sform_code", "qform_code") if name in header]
+    if not any(codes):
+        raise ValueError(f"{path} does not say how the patient lies (neither sform nor qform is set); convert it from "
+                         "DICOM again, or read CT-RATE v1 files with data.fixed false and their metadata table")
+    affine = header.get_best_affine()
+    axes = affine[:3, :3]
+    if not np.isfinite(axes).all() or abs(np.linalg.det(axes)) < 1e-6:
+        raise ValueError(f"{path} has voxels without volume (affine {axes.tolist()}); convert it from DICOM again")
+    if not (np.abs(affine[:3]) < FURTHEST).all() or np.linalg.norm(axes, axis=0).max() > LARGEST_VOXEL:
+        raise ValueError(f"{path} has voxels of {np.linalg.norm(axes, axis=0).max():g} mm, or lies at "
+                         f"{affine[:3, 3].tolist()} mm, which no CT does; convert it from DICOM again")
+    if np.allclose(axes, np.eye(3)) and shape[0] >= 512:
+        warnings.warn(f"{path} has the blank header of CT-RATE v1 (1 mm voxels, identity axes); "
+                      "read such files with data.fixed false and their metadata table", stacklevel=3)
+
+
+def check_hu(hu: np.ndarray, name: str) -> None:
+    """Warn where air is not near -1000 or hardly any tissue is left: the numbers are then hardly HU."""
+    sample = hu[::3, ::3, ::3].clip(AIR, 3000)
+    low = sample[sample < -300]
+    tissue = float((sample > -200).mean())
+    counts, edges = np.histogram(low, bins=35, range=(AIR, -300))
+    mode = edges[counts.argmax()] + 10
+    if not low.size or mode > -900:
+        found = f"the most frequent value below -300 is {mode:.0f}" if low.size else "no value lies below -300"
+        warnings.warn(f"{name} does not look like HU: {found}, but air should lie near -1000; check slope, intercept "
+                      "and whether `fixed` is right", stacklevel=3)
+    elif tissue < 0.01:
+        warnings.warn(f"{name} does not look like HU: only {100 * tissue:.1f} % of it lies above -200; it may have "
+                      "been rescaled twice, check whether `fixed` is right", stacklevel=3)
+
+
+def to_grid(volume: np.ndarray, affine: np.ndarray, grid: Grid, pad: float) -> np.ndarray:
+    """Resample a volume (X, Y, Z) with its 4x4 affine onto `grid` by voxel averages; `pad` lies outside.
+
+    Where the axes are parallel the averages are exact. Otherwise the volume is averaged along its own axes to half
+    the grid's spacing, interpolated linearly at eight points per new voxel, and those are averaged.
+    """
+    relative = np.linalg.inv(affine) @ grid.affine
+    scale = np.diag(relative)[:3]
+    slant = (np.abs(relative[:3, :3] - np.diag(scale)) @ np.asarray(grid.shape)).max()
+    if slant < 0.1:
+        return _average(volume, relative[:3, 3], scale, grid.shape, pad)
+    spacing = np.linalg.norm(affine[:3, :3], axis=0)
+    step = np.maximum(1.0, min(grid.spacing) / 2 / spacing)
+    shape = np.ceil(np.asarray(volume.shape) / step).astype(int) + 1
+    first = (np.asarray(volume.shape) - 1) / 2 - step * (shape - 1) / 2
+    volume = _average(volume, first, step, shape, pad)
+    half = np.eye(4)
+    half[:3, :3] /= 2
+    half[:3, 3] = -0.25
+    fine = relative @ half
+    fine[:3] /= step[:, None]
+    fine[:3, 3] -= first / step
+    fine = scipy.ndimage.affine_transform(volume, fine[:3, :3], fine[:3, 3], tuple(2 * n for n in grid.shape), order=1,
+                                          mode="constant", cval=pad)
+    x, y, z = grid.shape
+    return fine.reshape(x, 2, y, 2, z, 2).mean((1, 3, 5))
+
+
+def _average(volume, first, step, shape, pad: float) -> np.ndarray:
+    """Means over boxes of `step` old voxels, the first centred at the old index `first`, along the volume's axes."""
+    weights = [_weights(n, f, s, m) for n, f, s, m in zip(volume.shape, first, step, shape)]
+    inside = np.einsum("i,j,k->ijk", *(w.sum(1) for w in weights))
+    x, y, z = weights
+    volume = np.asarray(volume, np.float32)
+    volume = (volume.reshape(-1, volume.shape[2]) @ z.T).reshape(*volume.shape[:2], -1)
+    volume = y @ volume
+    volume = (x @ volume.reshape(volume.shape[0], -1)).reshape(inside.shape)
+    return volume + np.float32(pad) * (1 - inside)
+
+
+def _weights(old: int, first: float, step: float, new: int) -> np.ndarray:
+    """(new, old): the integral of each old voxel's hat function over each new voxel, over the new voxel's width."""
+    centre = first + step * np.arange(new)[:, None] - np.arange(old)
+    width = abs(step)
+
+    def integral(u):
+        u = u.clip(-1, 1)
+        return 0.5 + u - np.sign(u) * u**2 / 2
+
+    return ((integral(centre + width / 2) - integral(centre - width / 2)) / width).astype(np.float32)
+
+
+def covering_grid(shape, affine: np.ndarray, spacing: float) -> Grid:
+    """The grid along the world's axes with `spacing` mm that covers a volume of `shape` with its 4x4 affine."""
+    ends = np.stack(np.meshgrid(*[(-0.5, n - 0.5) for n in shape], indexing="ij"), -1).reshape(-1, 3)
+    corners = ends @ affine[:3, :3].T + affine[:3, 3]
+    low, high = corners.min(0), corners.max(0)
+    voxels = np.maximum(1, np.ceil((high - low) / spacing - 1e-6).astype(int))
+    cover = np.diag([spacing, spacing, spacing, 1.0])
+    cover[:3, 3] = (low + high) / 2 - spacing * (voxels - 1) / 2
+    return Grid(tuple(voxels), affine=cover)
+
+
+def centred(grid: Grid, centre: np.ndarray) -> Grid:
+    """`grid` moved so that its centre lies at the world position `centre` (3,) in mm."""
+    affine = grid.affine.copy()
+    affine[:3, 3] += centre - grid.centre
+    return Grid(grid.shape, affine=affine)
+
+
+def case_id(path: str | Path) -> str:
+    """A file's name without .nii or .nii.gz."""
+    name = Path(path).name
+    for ending in (".nii.gz", ".nii"):
+        if name.lower().endswith(ending):
+            return name[: -len(ending)]
+    return name
+
+
+def prepare_ct(ct: str | Path | tuple[np.ndarray, np.ndarray], grid: Grid = Grid.cube(64),
+               window: HUWindow = HUWindow(), report: str = "", id: str | None = None,
+               calibration: Calibration | None = None) -> dict:
+    """A Case from a CT file, or from (hu, affine): the grid's box centred on the lungs, -1000 HU outside the scan.
+
+    Returns {"id", "volume" (1,X,Y,Z) in [-1,1], "masks" (3,X,Y,Z) in [0,1] for lung, airway, vessel, "has_masks" (3,),
+    "report", "affine" (4,4) float64: the voxels' place in the CT's own world, "centred_on": "lungs" or "volume"}.
+    Without lungs the box is centred on the scan, with a warning. Raises what `load_ct` raises.
+    """
+    hu, affine = ct if isinstance(ct, tuple) else load_ct(ct, calibration)
+    name = id or ("the CT" if isinstance(ct, tuple) else case_id(ct))
+    check_hu(hu, name)
+    hu = hu.clip(AIR)
+    work = covering_grid(hu.shape, affine, SEGMENTATION_MM)
+    masks, known = segment(to_grid(hu, affine, work, AIR), work.spacing)
+    if known[0]:
+        centre = lung_box_centre(masks[0], work.affine)
+    else:
+        centre = affine[:3, :3] @ ((np.asarray(hu.shape) - 1) / 2) + affine[:3, 3]
+        size = " x ".join(f"{length:.0f}" for length in np.linalg.norm(affine[:3, :3], axis=0) * hu.shape)
+        warnings.warn(f"no lungs were found in {name}, a scan of {size} mm; its volume is centred on the scan and its "
+                      "masks are unknown", stacklevel=2)
+    target = centred(grid, centre)
+    volume = window.to_range(to_grid(hu, affine, target, AIR))
+    masks = np.stack([to_grid(m, work.affine, target, 0.0) for m in masks]).clip(0, 1)
+    return {"id": name, "volume": torch.from_numpy(volume.astype(np.float32))[None],
+            "masks": torch.from_numpy(masks.astype(np.float32)), "has_masks": torch.from_numpy(known),
+            "report": report, "affine": torch.from_numpy(target.affine.copy()),
+            "centred_on": "lungs" if known[0] else "volume"}

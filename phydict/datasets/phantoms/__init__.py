@@ -1,0 +1,1 @@
+"""Procedural thoraxes and their reports."""

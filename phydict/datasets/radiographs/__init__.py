@@ -1,0 +1,1 @@
+"""Measured X-rays: images, DICOM, descriptions."""

@@ -1,0 +1,153 @@
+"""geometry.yaml: where the X-rays of a folder were taken, what their pixels mean and what way their images are turned.
+
+    beam: {orbit: {...}}                               ConeBeam's YAML, which may also stand at the top level
+    beam: {file: geometry.xml, pixel: [1.25, 1.25]}    a file that phydict.xray.geometry_files reads, beside this one;
+                                                       pixel is for RTK's XML alone
+    beam: {dicom: {source_to_isocentre: 765.0}}        values used instead of tags; see phydict.datasets.radiographs.dicom_beam
+    intensity: {kind: counts, air: 50000}              see phydict.datasets.intensity
+    orientation: {rotate_degrees: 0, flip_rows: false, flip_columns: false}
+
+Without `beam:` the tags of DICOM images decide. Rotation is clockwise, in quarters, and comes before the flips. The
+beam, wherever it comes from, is that of the images once they are turned.
+"""
+
+from __future__ import annotations
+
+import reprlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from phydict.datasets.dicom import DicomTags
+from phydict.datasets.radiographs.dicom_beam import tags_beam
+from phydict.datasets.intensity import KINDS, Intensity, is_file_name
+from phydict.xray.geometry import ConeBeam, pixel_sizes
+from phydict.xray.geometry_files import read_beam
+from phydict.runtime.yaml_file import read_yaml
+
+GEOMETRY = "geometry.yaml"
+
+
+@dataclass(frozen=True)
+class Orientation:
+    """How stored images are turned until row 0 is superior: clockwise by rotate_degrees, then flipped."""
+
+    rotate_degrees: int = 0
+    flip_rows: bool = False
+    flip_columns: bool = False
+
+    def __post_init__(self):
+        flips = [self.flip_rows, self.flip_columns]
+        if not all(isinstance(flip, bool) for flip in flips):
+            raise ValueError(f"flip_rows and flip_columns are true or false, but {flips} was given")
+        if isinstance(self.rotate_degrees, bool) or self.rotate_degrees not in (0, 90, 180, 270):
+            raise ValueError(f"rotate_degrees is 0, 90, 180 or 270, but {self.rotate_degrees!r} was given")
+        object.__setattr__(self, "rotate_degrees", int(self.rotate_degrees))
+
+    @property
+    def turned(self) -> bool:
+        """Whether rows become columns."""
+        return self.rotate_degrees in (90, 270)
+
+    def shape(self, stored: tuple[int, int]) -> tuple[int, int]:
+        """The shape (V, U) of a stored image once it is turned."""
+        return stored[::-1] if self.turned else stored
+
+    def apply(self, images: np.ndarray) -> np.ndarray:
+        """Images (K, V, U), turned."""
+        images = np.rot90(images, -(self.rotate_degrees // 90), axes=(1, 2))
+        return images[:, ::-1 if self.flip_rows else 1, ::-1 if self.flip_columns else 1]
+
+
+@dataclass(frozen=True)
+class Description:
+    """What one geometry file says. source: the file; beam: its mapping, None where the tags of DICOM images decide."""
+
+    source: Path
+    beam: dict | None = None
+    intensity: Intensity | None = None
+    orientation: Orientation = Orientation()
+
+    @property
+    def views(self) -> int | None:
+        """How many views the beam's mapping states, None where other files do or it states none that can be counted."""
+        beam = self.beam or {}
+        if isinstance(beam.get("orbit"), dict):
+            return beam["orbit"]["views"] if type(beam["orbit"].get("views")) is int else None
+        return len(beam["sources"]) if isinstance(beam.get("sources"), list) else None
+
+    def beam_of(self, shape: tuple[int, int], tags: list[DicomTags]) -> ConeBeam:
+        """The beam for images of `shape` (V, U), turned, and their DICOM tags, if any. Raises ValueError."""
+        if self.beam is None or "dicom" in self.beam:
+            if not tags:
+                raise ValueError(f"{self.source} leaves the beam to DICOM's tags, but the images are not DICOM; state "
+                                 "`beam:`")
+            return tags_beam(tags, shape, (self.beam or {}).get("dicom"), self.orientation.turned,
+                             f"`dicom:` of {self.source}")
+        if "file" in self.beam:
+            return read_beam(self.source.parent / self.beam["file"], shape, self.beam.get("pixel"))
+        try:
+            return ConeBeam.from_dict(self.beam)
+        except ValueError as error:
+            raise ValueError(f"{self.source}: {error}") from error
+
+    def reference_files(self, intensity: Intensity | None) -> dict[str, list[Path]]:
+        """The flat and dark images that an intensity names, beside the geometry file."""
+        names = intensity.references if intensity else {}
+        return {name: [self.source.parent / file for file in files] for name, files in names.items()}
+
+
+def read_description(path: Path, needed: bool = True) -> Description:
+    """Read geometry.yaml, or a file of another program's geometry, whose name becomes the beam's `file`.
+
+    needed: whether a missing file is an error; otherwise DICOM's tags say everything.
+    Raises FileNotFoundError, and ValueError naming the file and the key.
+    """
+    if not path.is_file():
+        if not needed:
+            return Description(path)
+        raise FileNotFoundError(f"there is no geometry file {path}; write one with `beam:` and `intensity:` beside the "
+                                "images, or give geometry=")
+    if path.suffix.lower() not in (".yaml", ".yml"):
+        return Description(path, {"file": path.name})
+    content = read_yaml(path)
+    if not isinstance(content, dict):
+        raise ValueError(f"{path} must hold `beam:`, and may hold `intensity:` and `orientation:`")
+    intensity, orientation = content.pop("intensity", None) or {}, content.pop("orientation", None) or {}
+    if "beam" in content and len(content) > 1:
+        unknown = ", ".join(reprlib.repr(key) for key in content if key != "beam")
+        raise ValueError(f"{path}: unknown key {unknown}; the keys are beam, intensity, orientation")
+    beam = content.get("beam", content or None)
+    _check_beam(path, beam)
+    for block, value, kind in (("intensity", intensity, Intensity), ("orientation", orientation, Orientation)):
+        keys = tuple(kind.__dataclass_fields__)
+        unknown = [reprlib.repr(key) for key in value if key not in keys] if isinstance(value, dict) else [
+            reprlib.repr(value)]
+        if unknown:
+            raise ValueError(f"{path}: unknown {', '.join(unknown)} in `{block}:`; the keys are {', '.join(keys)}")
+    if intensity and "kind" not in intensity:
+        raise ValueError(f"{path}: `intensity:` needs `kind`, one of {', '.join(KINDS)}")
+    try:
+        return Description(path, beam, Intensity(**intensity) if intensity else None, Orientation(**orientation))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _check_beam(path: Path, beam) -> None:
+    """Raises ValueError unless `beam` is of a known form: the values are checked when the beam is built."""
+    if beam is not None and not isinstance(beam, dict):
+        raise ValueError(f"{path}: `beam:` must be a mapping, but {reprlib.repr(beam)} was found")
+    for key, allowed in (("file", ("file", "pixel")), ("dicom", ("dicom",))):
+        unknown = [reprlib.repr(name) for name in beam or {} if key in beam and name not in allowed]
+        if unknown:
+            raise ValueError(f"{path}: unknown key {', '.join(unknown)} in `beam:`; the keys are {', '.join(allowed)}")
+    if beam and not is_file_name(beam.get("file", "")):
+        raise ValueError(f"{path}: `file:` is the name of a geometry file, but {reprlib.repr(beam['file'])} was found")
+    if beam and "file" in beam and beam.get("pixel") is not None:
+        try:
+            pixel_sizes(beam["pixel"])
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
+    if beam and not isinstance(beam.get("dicom", {}), dict):
+        raise ValueError(f"{path}: `dicom:` must be a mapping, but {reprlib.repr(beam['dicom'])} was found")

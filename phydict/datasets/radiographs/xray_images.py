@@ -1,0 +1,86 @@
+"""One X-ray image per file: PNG, TIFF, NPY and NIfTI with their stored pixel type; which files are DICOM."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from phydict.datasets.natural_order import natural_order
+from phydict.datasets.nifti_file import open_nifti
+from phydict.runtime.reading import read_npy, reading
+
+DICOM = (".dcm", ".dicom", ".ima")
+ENDINGS = (".png", ".tif", ".tiff", ".npy", ".nii", ".nii.gz", *DICOM)
+GREY = ("L", "I;16", "I;16B", "I;16L", "I", "F")
+
+
+def image_files(folder: Path) -> list[Path]:
+    """The X-ray images of a folder in the natural order of their names; DICOM files need no ending."""
+    found = (p for p in folder.iterdir() if p.is_file() and not p.name.startswith(".")
+             and (p.name.lower().endswith(ENDINGS) or is_dicom(p)))
+    return sorted(found, key=lambda p: natural_order(p.name))
+
+
+def is_dicom(path: Path) -> bool:
+    """Whether a file's name or its first bytes say that it is DICOM."""
+    if path.name == "DICOMDIR":  # the index of a disc
+        return False
+    if path.name.lower().endswith(DICOM):
+        return True
+    with path.open("rb") as stream:
+        return stream.read(132)[128:] == b"DICM"
+
+
+def read_image(path: Path) -> np.ndarray:
+    """One image (V, U) with its stored pixel type.
+
+    Raises ValueError naming the file where it cannot be read, is not one grey image, or holds values that are not
+    finite numbers.
+    """
+    name = path.name.lower()
+    with reading(f"the image {path}", "export it again"):
+        if name.endswith(".npy"):
+            image = read_npy(path)
+        elif name.endswith((".nii", ".nii.gz")):
+            image = _read_nifti(path)
+        else:
+            image = _read_picture(path)
+    if image.ndim == 3 and image.shape[0] == 1:
+        image = image[0]
+    if image.ndim != 2:
+        raise ValueError(f"{path} has shape {image.shape}; give one 2D image per view")
+    if not (np.issubdtype(image.dtype, np.integer) or np.issubdtype(image.dtype, np.floating)):
+        raise ValueError(f"{path} holds pixels of type {image.dtype}; give integers or floating-point numbers")
+    bad = image.size - int(np.isfinite(image).sum())
+    if bad:
+        raise ValueError(f"{path} holds {bad} NaN or infinite pixels; give finite values everywhere")
+    return image
+
+
+def _read_nifti(path: Path) -> np.ndarray:
+    """An image (U, V) with any number of axes of length 1 behind, as (V, U); other shapes as they are."""
+    image = np.asarray(open_nifti(path).dataobj)
+    return image.reshape(image.shape[:2]).T if image.size == np.prod(image.shape[:2]) else image
+
+
+def _read_picture(path: Path) -> np.ndarray:
+    """A grey PNG or TIFF; colours are allowed where all channels are equal."""
+    header = path.read_bytes()[:26]
+    if header[1:4] == b"PNG" and len(header) == 26 and header[24] == 16 and header[25] != 0:
+        raise ValueError("16-bit colour would be cut to 8 bit; store it as 16-bit grey")
+    with Image.open(path) as image:
+        if getattr(image, "n_frames", 1) > 1:
+            raise ValueError(f"it holds {image.n_frames} pages; store one image per file")
+        image.load()
+        if image.mode in GREY:
+            pixels = np.asarray(image)
+            sixteen = image.mode.startswith("I;16") or (image.mode == "I" and image.format == "PNG")
+            return pixels.astype(np.uint16) if sixteen else pixels
+        pixels = np.asarray(image.convert("RGBA"))
+    if (pixels[..., 3] != 255).any():
+        raise ValueError("it is partly transparent; store it as grey without transparency")
+    if (pixels[..., :1] != pixels[..., :3]).any():
+        raise ValueError("its colour channels differ; store it as grey")
+    return pixels[..., 0]

@@ -1,0 +1,203 @@
+"""Lightning data for inference: X-ray folders, or CTs and phantoms to simulate X-rays of."""
+
+from __future__ import annotations
+
+import os
+import zlib
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import lightning
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
+
+from phydict.runtime.checksum import file_crc32
+from phydict.runtime.console import noted
+from phydict.training.data import HELD_OUT_PHANTOM, PHANTOM_VERSION
+from phydict.datasets import CTFile, find_cts, find_xrays, load_case, load_xrays, phantom_case
+from phydict.evaluation import volume_metrics
+from phydict.grid import Grid
+from phydict.runtime.reading import read_ids
+from phydict.reconstruction import describe
+from phydict.runtime.shipped import own_or_shipped
+from phydict.units import HUWindow
+from phydict.xray import ConeBeam, Ideal, Projector, Simulator
+
+
+MOST_PHANTOMS = 100_000
+
+
+class Listed(Dataset):
+    """Cases made on demand, of (id, what identifies its data, function) triples, with the warnings that it took."""
+
+    def __init__(self, makers: list):
+        self.makers = makers
+
+    def __len__(self) -> int:
+        return len(self.makers)
+
+    def __getitem__(self, i: int) -> dict:
+        name, source, make = self.makers[i]
+        case = {"id": name, "index": i, "source": source, "warnings": []}
+        try:
+            with noted(case["warnings"], name):
+                return make() | case
+        except (ValueError, OSError) as error:  # the task decides what becomes of it
+            return case | {"error": error}
+
+
+class ReconstructionData(lightning.LightningDataModule):
+    """What to reconstruct.
+
+    Args:
+        xrays: for predict, a folder of X-ray images with geometry.yaml, or a folder of such folders
+        geometry: a geometry file used instead of theirs
+        cts: for test, a NIfTI file or a folder of CTs, or the word phantom
+        reports: CT-RATE's table of reports, or the folder it is in; none given: looked for beside the CTs
+        metadata: CT-RATE's metadata table, needed where headers are not fixed
+        fixed: whether the NIfTI headers are right (CT-RATE's *_fixed folders and ordinary archives)
+        only: a text file of the case ids to test, such as the held_out.txt of a training; none given: all
+        first_reconstruction: keep one volume per scan
+        exclude: a text file of case ids to leave out
+        phantoms: how many phantoms where cts is the word phantom
+        with_report: whether the cases' reports are used
+        views: simulated views, on a full circle from anterior
+        source_to_detector: mm
+        source_to_isocentre: mm
+        detector: rows and columns of simulated pixels
+        pixel: mm from row to row and from column to column
+        simulator: how X-rays are made of a CT (configs/simulate)
+        simulation_voxels: voxels per side of the volume that X-rays are made of; none given: the reconstruction's own
+            grid, which is an inverse crime; more lessens it
+    """
+
+    def __init__(self, xrays: str | None = None, geometry: str | None = None, cts: str | None = None,
+                 reports: str | None = None, metadata: str | None = None, fixed: bool = True, only: str | None = None,
+                 first_reconstruction: bool = False, exclude: str | None = None, phantoms: int = 4,
+                 with_report: bool = True, views: int = 8, source_to_detector: float = 1020.0,
+                 source_to_isocentre: float = 740.0, detector: tuple[int, int] = (448, 448),
+                 pixel: tuple[float, float] = (1.25, 1.25), simulator: Simulator = Ideal(),
+                 simulation_voxels: int | None = None):
+        super().__init__()
+        if not 1 <= phantoms <= MOST_PHANTOMS:
+            raise ValueError(f"data.phantoms lies between 1 and {MOST_PHANTOMS:,}, but {phantoms:,} was given")
+        if simulation_voxels is not None and simulation_voxels < 1:
+            raise ValueError(f"data.simulation_voxels must be at least 1, but {simulation_voxels} was given: leave it out "
+                             "for the reconstruction's own")
+        self.xrays, self.geometry, self.cts, self.phantoms, self.only = xrays, geometry, cts, phantoms, only
+        self.tables = {"reports": reports, "metadata": metadata, "fixed": fixed,
+                       "first_reconstruction": first_reconstruction, "exclude": exclude}
+        self.with_report, self.simulator, self.simulation_voxels = with_report, simulator, simulation_voxels
+        self.beam = ConeBeam.orbit(views, source_to_detector, source_to_isocentre, detector, pixel)
+        self.orbit = {"views": views, "source_to_detector": source_to_detector,
+                      "source_to_isocentre": source_to_isocentre, "detector": detector, "pixel": pixel}
+
+    def settings(self, stage: str) -> dict:
+        """What, beside the cases themselves, decides the X-rays that a stage (predict, test) reconstructs from."""
+        if stage == "predict":
+            return {"with_report": self.with_report, "geometry": self.geometry}
+        return {"with_report": self.with_report, **self.orbit, "simulator": describe(self.simulator),
+                "simulation_voxels": self.simulation_voxels}
+
+    def xray_cases(self) -> dict[str, Path]:
+        """Id -> folder of X-rays. Raises ValueError without data.xrays."""
+        if not self.xrays:
+            raise ValueError("predict needs data.xrays: a folder of X-ray images with geometry.yaml")
+        return {Path(os.path.abspath(folder)).name: folder for folder in find_xrays(self.xrays)}
+
+    def inputs(self, stage: str) -> list[Path]:
+        """The files and folders that a stage (predict, test) reads its cases from."""
+        if stage == "predict":
+            cases = self.xray_cases()
+            return [Path(self.xrays), *cases.values()]
+        return [Path(self.cts)] if self.cts and self.cts != "phantom" else []
+
+    def predict_dataloader(self) -> DataLoader:
+        return self._loader([(name, self._xrays_source(folder), lambda f=folder: load_xrays(f, self.geometry))
+                             for name, folder in self.xray_cases().items()])
+
+    def test_dataloader(self) -> DataLoader:
+        task = self.trainer.lightning_module
+        return self._loader(self.test_cases(task.grid, task.window))
+
+    def test_cases(self, grid: Grid, window: HUWindow) -> list[tuple[str, str, Callable[[], dict]]]:
+        """The CTs or phantoms of test: id, what identifies its data, and the function that makes it on `grid`."""
+        if not self.cts:
+            raise ValueError("test needs data.cts: a NIfTI file, a folder of CTs, or the word phantom")
+        if self.cts == "phantom":
+            return [(f"phantom-{seed:06d}", f"phantom version {PHANTOM_VERSION}", lambda s=seed: self._with_fine(
+                        grid, lambda g: phantom_case(s, g, window)))
+                    for seed in range(HELD_OUT_PHANTOM, HELD_OUT_PHANTOM + self.phantoms)]
+        return [(ct.id, _ct_source(ct), lambda c=ct: self._with_fine(grid, lambda g: load_case(c, g, window)))
+                for ct in self._chosen(find_cts(self.cts, **self.tables))]
+
+    def _chosen(self, cts: list[CTFile]) -> list[CTFile]:
+        if not self.only:
+            return cts
+        wanted = set(read_ids(self.only, "data.only"))
+        missing = wanted - {ct.id for ct in cts}
+        if missing or not wanted:
+            raise ValueError(f"data.only ({self.only}) names {', '.join(sorted(missing)[:3]) or 'no case'}, which "
+                             f"data.cts ({self.cts}) does not hold: correct the list, or give its folder")
+        return [ct for ct in cts if ct.id in wanted]
+
+    def _xrays_source(self, folder: Path) -> str:
+        """What identifies a folder's X-rays: a checksum of its files and of the geometry used instead of its own."""
+        crc = 0
+        files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+        for file in [*files, own_or_shipped(self.geometry)] if self.geometry else files:
+            named = zlib.crc32(file.name.encode(), crc)
+            crc = file_crc32(file, named) if file.is_file() else named
+        return f"files crc32 {crc:08x}"
+
+    def simulate(self, case: dict, seed: int, grid: Grid, window: HUWindow, device: torch.device) -> Tensor:
+        """X-rays (K, V, U) of a CT case, made on `device`."""
+        source = case.get("fine", case["volume"]).to(device)
+        fine = _divided(grid, tuple(source.shape[-3:]))
+        return self.simulator(Projector(fine, self.beam, full_detector=True), window.to_mu(source)[None], seed)[0]
+
+    def _with_fine(self, grid: Grid, make: Callable[[Grid], dict]) -> dict:
+        """A case; where X-rays are made of a finer volume, that one as "fine", and its block means as the truth."""
+        if not self.simulation_voxels:
+            return make(grid)
+        voxels, factor = self.simulation_voxels, self.simulation_voxels // grid.shape[0]
+        if voxels != factor * grid.shape[0]:
+            raise ValueError(f"data.simulation_voxels must be a multiple of the reconstruction's {grid.shape[0]} "
+                             f"voxels, but {voxels} was given")
+        fine = make(_divided(grid, tuple(factor * n for n in grid.shape)))["volume"]
+        return make(grid) | {"fine": fine, "volume": torch.nn.functional.avg_pool3d(fine, factor)}
+
+    def transfer_batch_to_device(self, batch: dict, device: torch.device, dataloader_idx: int) -> dict:
+        return batch  # a case holds its beam, which has no device; its X-rays are moved when they are reconstructed
+
+    def _loader(self, makers: list[tuple]) -> DataLoader:
+        left = set(self.trainer.lightning_module.unfinished({name: source for name, source, _ in makers}))
+        cases = Listed([maker for maker in makers if maker[0] in left])
+        self.trainer.strategy.barrier()  # every process has looked before any process finishes a case
+        return DataLoader(cases, None)
+
+
+def case_scores(volume: Tensor, misfit: float, case: dict, window: HUWindow) -> dict[str, float]:
+    """Scores of a reconstructed volume (X, Y, Z) in HU against the CT case that its X-rays were made of."""
+    lung = case["masks"][None, :1].cpu() if bool(case["has_masks"][0]) else None
+    return volume_metrics(volume[None, None], window.to_hu(case["volume"])[None].cpu(), lung) | {"misfit": misfit}
+
+
+def _divided(grid: Grid, shape: tuple[int, int, int]) -> Grid:
+    """The same box in other voxels, centred on the isocentre."""
+    return Grid(shape, tuple(grid.extent / shape))
+
+
+def _ct_source(ct: CTFile) -> str:
+    """What identifies a CT and its report, wherever the file lies."""
+    stat, report = ct.path.stat(), zlib.crc32(ct.report.encode())
+    contents = _crc32_of(ct.path, stat.st_size, stat.st_mtime_ns)
+    return f"{ct.path.name}, crc32 {contents:08x}, {ct.calibration}, report crc32 {report:08x}"
+
+
+@cache
+def _crc32_of(path: Path, size: int, modified: int) -> int:
+    """A file's checksum, read once for all the acquisitions of a comparison while the file stays as it is."""
+    return file_crc32(path)

@@ -1,0 +1,43 @@
+"""A look before the time is spent: a case's geometry drawn, its X-rays beside those of a standard thorax."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import torch
+
+from phydict.datasets import Thorax, build
+from phydict.evaluation import agreement, geometry_page, view_sides
+from phydict.grid import Grid
+from phydict.methods import binned, binning
+from phydict.reconstruction import check_air, check_xrays
+from phydict.units import hu_to_mu
+from phydict.xray import Projector
+
+
+def dry_run(path: str | Path, case: dict, grid: Grid) -> list[str]:
+    """Write the geometry page of an X-ray Case as PNG; returns one line per view that says what is seen in it, and
+    warns of views that look mirrored.
+
+    grid: where a reconstruction would put its voxels. Raises ValueError where X-rays, geometry and grid do not fit.
+    """
+    beam = case["beam"]
+    check_xrays(case["xrays"], beam)
+    check_air(case["xrays"])
+    beam.check(grid)
+    beam.check_scale(grid)
+    factor = binning(grid, beam)
+    coarse = beam.binned(factor)
+    hu = build(Thorax.standard(), grid)[0]
+    thorax = Projector(grid, coarse)(hu_to_mu(torch.from_numpy(hu))[None, None])[0].numpy()
+    xrays = binned(case["xrays"].float(), factor).numpy()
+    geometry_page(path, coarse, grid, xrays, thorax, hu, title=case["id"])
+    said = [agreement(*pair) for pair in zip(xrays, thorax)]
+    mirrored = [str(k) for k, words in enumerate(said, 1) if words.endswith("with flip_columns changed")]
+    if mirrored:
+        warnings.warn(f"{case['id']}: view {', '.join(mirrored)} agrees better with a standard thorax when mirrored: "
+                      "check on which side the source stands, for a left lateral (LL) view at the patient's right, 270 "
+                      "degrees of an orbit, or change flip_columns", stacklevel=2)
+    return [f"{case['id']} view {k}: {sides}; {words}"
+            for k, (sides, words) in enumerate(zip(view_sides(coarse, grid), said), 1)]

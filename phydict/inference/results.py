@@ -1,0 +1,164 @@
+"""The finished cases of one method on disk: each one a folder that appears whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+from phydict.runtime.files import remove_leftovers, undisturbed, whole_file, whole_folder
+from phydict.evaluation import markdown, write_csv
+from phydict.runtime.reading import not_written
+
+RECORD = "reconstruction.json"
+"""The file that marks a case as finished."""
+
+UNLISTED = ("volume.nii.gz", "deviation.nii.gz", "panel.png")
+"""The files, beside the record, of cases whose record does not list them, as older ones do not."""
+
+TABLE = "results.csv"
+
+
+class Finished(NamedTuple):
+    """A finished case: its record, and which file that is, by which two results of the same are told apart."""
+
+    record: dict
+    file: tuple[int, int]
+
+
+class CaseResults:
+    """Finished cases below `folder`, one folder each.
+
+    A case is finished with certain settings and a certain source (what identifies its input); both are kept in its
+    record, so that a result is never taken for that of other settings or of other data. A result takes the place of
+    another only with `overwrite`, only when it is complete, and only where that one was there when the work began and
+    its folder holds nothing but what its record lists.
+    """
+
+    def __init__(self, folder: Path, overwrite: bool = False):
+        self.folder, self.overwrite = folder, overwrite
+        self._sources: dict[str, str] = {}
+        self._settings: dict = {}
+        self._before: dict[str, Finished | None] = {}
+
+    def unfinished(self, sources: dict[str, str], settings: dict) -> list[str]:
+        """Of the cases, id -> source, those that remain to be done; all of them with `overwrite`.
+
+        Removes what killed processes left. Raises ValueError where what is in the place of a case or of the table must
+        stay: what this project did not write, and without `overwrite` a result of other settings or another source.
+        """
+        remove_leftovers(self.folder)
+        self._check_table()
+        self._sources, self._settings = sources, json.loads(json.dumps(settings))
+        with undisturbed(self.folder):
+            self._before = {case: self._there(case) for case in sources}
+        for case, there in self._before.items():
+            if there and self.overwrite:
+                self._check_own(case, there)
+            elif there and (other := self._other(case, there)):
+                raise ValueError(f"{self.folder / case} was finished with other {other}: set model.overwrite to true, "
+                                 "or give another model.out")
+        return [case for case, there in self._before.items() if self.overwrite or not there]
+
+    def missing(self) -> list[str]:
+        """Of the cases that `unfinished` was asked for, those that are not finished as they should be by now."""
+        with undisturbed(self.folder):
+            now = {case: self._there(case) for case in self._sources}
+        return [case for case, there in now.items()
+                if not there or self._other(case, there) or self.overwrite and self._is_unchanged(case, there)]
+
+    def write(self, case: str, record: dict, write_files: Callable[[Path], None]) -> None:
+        """Makes a case's folder: `write_files` fills it, the record, which lists them, completes it, then it takes its
+        place, unless another process has finished the same case since `unfinished`.
+
+        Raises OSError, in one sentence, where it cannot be written, and ValueError where something else has come to be
+        in its place.
+        """
+        final = self.folder / case
+        try:
+            with whole_folder(final, lambda: self._is_free(case)) as partial:
+                write_files(partial)
+                files = sorted(file.name for file in partial.iterdir())
+                (partial / RECORD).write_text(json.dumps(record | {"files": files}, indent=1))
+        except OSError as error:
+            raise not_written(f"the case {final}", error, "give another model.out") from error
+
+    def summarise(self, cases: Iterable[str]) -> list[dict]:
+        """One row of scores per finished case that was scored; written as results.csv and results.md."""
+        rows = []
+        for case in cases:
+            record = self._there(case).record
+            if record["scores"]:
+                rows.append({"case": case, "method": record["method"], "views": record["views"],
+                             "grid": "x".join(map(str, record["grid"]["shape"]))} | record["scores"] | {
+                                 "seconds": sum(record["seconds"].values()), "network_calls": record["network_calls"],
+                                 "projector_calls": record["projector_calls"],
+                                 "precision": record.get("precision"),
+                                 "instruction_set": record.get("instruction_set"),
+                                 "warning": "; ".join(record.get("warnings", [])) or None})
+        if rows:
+            write_csv(self.folder / TABLE, rows)
+            with whole_file(self.folder / "results.md") as part:
+                part.write_text(markdown(rows))
+        return rows
+
+    def _there(self, case: str) -> Finished | None:
+        """The finished case in its place, None where nothing is. Raises ValueError for anything else."""
+        folder = self.folder / case
+        if not os.path.lexists(folder):
+            return None
+        try:
+            stat = (folder / RECORD).stat()
+            record = json.loads((folder / RECORD).read_text())
+            record["settings"], record["source"], record["scores"], set(record.get("files", UNLISTED))
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise ValueError(f"{folder} is in the place of a case, but its {RECORD} is missing or damaged, and it is "
+                             "not replaced: move it away, or give another model.out") from error
+        return Finished(record, (stat.st_ino, stat.st_mtime_ns))
+
+    def _other(self, case: str, there: Finished) -> str:
+        """In what a finished case differs from what is asked for; empty where it does not."""
+        same = {"settings": there.record["settings"] == self._settings,
+                "data": there.record["source"] == self._sources[case]}
+        return " and ".join(what for what in same if not same[what])
+
+    def _is_unchanged(self, case: str, there: Finished) -> bool:
+        """Whether a finished case is the one that was there when `unfinished` looked."""
+        before = self._before[case]
+        return before is not None and before.file == there.file
+
+    def _check_own(self, case: str, there: Finished) -> None:
+        """Raises ValueError where a finished case's folder is not this project's alone, so that it must stay."""
+        folder = self.folder / case
+        strange = {file.name for file in folder.iterdir()} - {RECORD, *there.record.get("files", UNLISTED)}
+        if folder.is_symlink() or strange:
+            what = f"holds {', '.join(sorted(strange)[:3])}, which no reconstruction wrote" if strange else "is a link"
+            raise ValueError(f"{folder} {what}, and is not replaced: move that away, or give another model.out")
+
+    def _is_free(self, case: str) -> bool:
+        """Whether a result takes its place: not where another process has put the same there. Raises ValueError where
+        something else has come to be there."""
+        there = self._there(case)
+        if there is None:
+            return True
+        if self._is_unchanged(case, there):
+            self._check_own(case, there)
+            return True
+        if other := self._other(case, there):
+            raise ValueError(f"another process has finished {self.folder / case} with other {other} in the meantime, "
+                             "and that result stays: give another model.out")
+        return False
+
+    def _check_table(self) -> None:
+        """Raises ValueError where a table of someone else's would be replaced."""
+        table, page = self.folder / TABLE, self.folder / "results.md"
+        if table.is_file():
+            with table.open("rb") as file:
+                own = file.read(12) == b"case,method,"
+        else:
+            own = not os.path.lexists(page)
+        if not own:
+            raise ValueError(f"{table if table.is_file() else page} is no table of this command, and is not replaced: "
+                             "move it away, or give another model.out")

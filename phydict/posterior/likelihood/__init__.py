@@ -1,0 +1,1 @@
+"""What moves a state towards the X-rays."""

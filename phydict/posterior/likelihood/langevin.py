@@ -1,0 +1,51 @@
+"""Unadjusted Langevin dynamics on the likelihood times a Gaussian around the prior's estimate."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from phydict.posterior.likelihood.likelihood_draw import LikelihoodDraw
+from phydict.posterior.normalised import NormalisedMeasurement
+from phydict.posterior.samplers.split_gibbs import noise_like
+
+
+def langevin(score: Callable[[Tensor], Tensor], z: Tensor, step: float, iterations: int,
+             draw: torch.Generator) -> Tensor:
+    """z <- z + step score(z) + sqrt(2 step) noise, `iterations` times; score is the gradient of the log density."""
+    for _ in range(iterations):
+        z = z + step * score(z) + (2 * step) ** 0.5 * noise_like(z, draw)
+    return z
+
+
+@dataclass(frozen=True)
+class Langevin(LikelihoodDraw):
+    """Langevin steps from the estimate, as published with DAPS and PnP-DM.
+
+    iterations; step: their size, for an operator of norm 1; last_share: the share of it that is left at the end of the
+    sampling, to which it shrinks linearly. A step is cut to 1 / (1 / noise^2 + 1 / spread^2), beyond which
+    the dynamics overshoot, and at twice which they diverge. Short of convergence z stays near the estimate; a
+    direction of precision p then has variance 1 / p / (1 - step p / 2) instead of 1 / p.
+    """
+
+    iterations: int = 100
+    step: float = 1e-4
+    last_share: float = 0.01
+
+    def __post_init__(self):
+        if self.iterations < 1 or not self.step > 0 or not 0 < self.last_share <= 1:
+            raise ValueError("Langevin dynamics need at least 1 iteration, a step above 0 and a last_share in (0, 1], "
+                             f"but {self.iterations}, {self.step} and {self.last_share} were given")
+
+    def __call__(self, measurement: NormalisedMeasurement, x0: Tensor, spread: float, draw: torch.Generator,
+                 progress: float) -> Tensor:
+        step = min(self.step * (1 - progress * (1 - self.last_share)), 1 / (measurement.noise**-2 + spread**-2))
+
+        def score(z: Tensor) -> Tensor:
+            misfit = measurement.adjoint(measurement.y - measurement.project(z))
+            return misfit / measurement.noise**2 + (x0 - z) / spread**2
+
+        return langevin(score, x0, step, self.iterations, draw)

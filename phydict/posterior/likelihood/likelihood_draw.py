@@ -1,0 +1,45 @@
+"""Draws from the likelihood times a Gaussian around the prior's estimate: the step that DAPS and PnP-DM share."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from phydict.linalg.conjugate_gradients import nearest_fit
+from phydict.posterior.normalised import NormalisedMeasurement
+from phydict.posterior.samplers.split_gibbs import noise_like
+
+
+class LikelihoodDraw(ABC):
+    """Draws z ~ exp(-|P(z) - y|^2 / (2 noise^2) - |z - x0|^2 / (2 spread^2)).
+
+    x0 and z (B, 1, X, Y, Z); progress: how much of the sampling is done, in [0, 1).
+    """
+
+    @abstractmethod
+    def __call__(self, measurement: NormalisedMeasurement, x0: Tensor, spread: float, draw: torch.Generator,
+                 progress: float) -> Tensor: ...
+
+
+@dataclass(frozen=True)
+class ExactDraw(LikelihoodDraw):
+    """The draw itself, since it is Gaussian: data and estimate are perturbed by their noise, then fitted.
+
+    iterations, tolerance: of the conjugate gradients, which start at the perturbed estimate: what the X-rays do not
+    see has its full spread at once, and few iterations suffice for the rest. Exact with as many iterations as the
+    operator has singular values. Perturb and optimise: Papandreou & Yuille 2010; cut short, Gilavert et
+    al. 2015, arXiv:1409.0606.
+    """
+
+    iterations: int = 30
+    tolerance: float = 1e-4
+
+    def __call__(self, measurement: NormalisedMeasurement, x0: Tensor, spread: float, draw: torch.Generator,
+                 progress: float) -> Tensor:
+        start = x0 + spread * noise_like(x0, draw)
+        y = measurement.y.expand(len(x0), *measurement.y.shape[1:])
+        y = y + measurement.noise * noise_like(y, draw)
+        return nearest_fit(measurement, start, (measurement.noise / spread) ** 2, self.iterations, self.tolerance, y)

@@ -1,0 +1,47 @@
+"""Grids of noise levels, as times of a schedule, and walks along them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from phydict.diffusion import CosineSchedule, Denoiser, noise_in, renoise
+from phydict.posterior.samplers.split_gibbs import noise_like
+
+
+def polynomial_levels(high: float, low: float, n: int, power: float = 7.0) -> list[float]:
+    """n noise levels sigma from `high` down to `low`, evenly spaced in sigma^(1/power) (Karras et al. 2022,
+    arXiv:2206.00364, Eq. 5); one level is `high`."""
+    ends = high ** (1 / power), low ** (1 / power)
+    return [(ends[0] + (ends[1] - ends[0]) * i / max(n - 1, 1)) ** power for i in range(n)]
+
+
+def times_of(schedule: CosineSchedule, levels: Sequence[float]) -> list[float]:
+    """The times of noise levels, clipped to the schedule's range; levels that fall together are one."""
+    return list(dict.fromkeys(schedule.time(sigma) for sigma in levels))
+
+
+def partly_renewed(schedule: CosineSchedule, x0: Tensor, eps: Tensor, s: float, kept: float,
+                   draw: torch.Generator) -> Tensor:
+    """The clean state x0 at time s, with noise of which `kept` in [0, 1] is eps and the rest new: renoise(x0, s,
+    kept eps + sqrt(1 - kept^2) noise). kept 1 is DDIM, 0 forgets the path."""
+    if kept < 1:
+        eps = kept * eps + (1 - kept**2) ** 0.5 * noise_like(eps, draw)
+    return renoise(schedule, x0, s, eps)
+
+
+def walk(denoiser: Denoiser, x: Tensor, times: Sequence[float], draw: torch.Generator | None = None) -> Tensor:
+    """The clean end, in [-1, 1], of the state x at times[0] that is taken down through the prior's noise levels.
+
+    Without `draw` along the probability flow (DDIM); with it by ancestral steps, whose end is a draw from
+    p(x_0 | x) as they become many (Ho et al. 2020, arXiv:2006.11239).
+    """
+    schedule = denoiser.schedule
+    for t, s in zip(times, [*times[1:], None]):
+        x0 = denoiser.denoise(x, t).clamp(-1, 1)
+        if s is not None:
+            kept = 1.0 if draw is None else float(schedule.sigma(s) / schedule.sigma(t))
+            x = partly_renewed(schedule, x0, noise_in(schedule, x0, x, t), s, kept, draw)
+    return x0

@@ -1,0 +1,87 @@
+"""PnP-DM: Gibbs sampling of a clean state and its copy near it, one under the prior, one under the X-rays.
+
+| here                            | publication                                                          |
+|---------------------------------|----------------------------------------------------------------------|
+| likelihood(m, x, rho, draw)     | z ~ exp(-|P(z) - y|^2 / (2 sigma_y^2) - |z - x|^2 / (2 rho^2))       |
+| walk(denoiser, z, times, draw)  | x ~ p(x) exp(-|x - z|^2 / (2 rho^2)), by diffusion from level rho    |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from phydict.diffusion import Denoiser
+from phydict.posterior.likelihood.likelihood_draw import ExactDraw, LikelihoodDraw
+from phydict.posterior.measurement import Measurement
+from phydict.posterior.samplers.noise_levels import polynomial_levels, times_of, walk
+from phydict.posterior.normalised import NormalisedMeasurement, check_noise
+from phydict.posterior.samplers.sampler import Sampler
+
+
+@dataclass(frozen=True)
+class PnPDM(Sampler):
+    """Wu et al. 2024, plug-and-play diffusion models.
+
+    iterations: of the Gibbs sampler; rho_max, decay, rho_min: coupling of the two, rho_max decay^k but not below
+    rho_min; levels, sigma_max, sigma_min: the polynomial grid of noise levels, of which each prior step takes rho and
+    those below it; stochastic: whether the prior step draws, as the Gibbs sampler asks, or follows the probability
+    flow, which is published too; likelihood: ExactDraw, published for linear operators, or Langevin, for others;
+    noise: standard deviation of the line integrals' error; burn_in, thinning: the result is the mean of every
+    `thinning`-th state after the first burn_in ones: the posterior mean. For one draw: burn_in iterations - 1 and
+    thinning 1.
+
+    With many levels its states tend to p(x | y) for data whose noise has the covariance noise^2 I + rho_min^2 A A'.
+    """
+
+    citation = ("Wu et al., Principled Probabilistic Imaging using Diffusion Models as Plug-and-Play Priors, NeurIPS "
+                "2024, arXiv:2405.18782")
+
+    iterations: int = 100
+    rho_max: float = 10.0
+    decay: float = 0.9
+    rho_min: float = 0.1
+    levels: int = 100
+    sigma_max: float = 80.0
+    sigma_min: float = 0.002
+    stochastic: bool = True
+    likelihood: LikelihoodDraw = field(default_factory=ExactDraw)
+    noise: float = 0.02
+    burn_in: int = 40
+    thinning: int = 3
+
+    def __post_init__(self):
+        check_noise(self.noise)
+        if not 0 < self.rho_min <= self.rho_max or not 0 < self.decay <= 1:
+            raise ValueError("PnP-DM needs 0 < rho_min <= rho_max and a decay in (0, 1], but "
+                             f"{self.rho_min}, {self.rho_max} and {self.decay} were given")
+        if self.levels < 1 or not 0 < self.sigma_min <= self.sigma_max:
+            raise ValueError("PnP-DM needs at least 1 level and 0 < sigma_min <= sigma_max, but "
+                             f"{self.levels}, {self.sigma_min} and {self.sigma_max} were given")
+        if self.thinning < 1 or not 0 <= self.burn_in <= self.iterations - self.thinning:
+            raise ValueError("PnP-DM keeps every thinning-th state after burn_in, which leaves none of "
+                             f"{self.iterations} iterations with burn_in {self.burn_in} and thinning {self.thinning}")
+
+    def steps(self) -> int:
+        return self.iterations
+
+    def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, draw: torch.Generator,
+               on_step: Callable[[], None] = lambda: None) -> Tensor:
+        m, schedule = NormalisedMeasurement(measurement, self.noise), denoiser.schedule
+        grid = polynomial_levels(self.sigma_max, self.sigma_min, self.levels)
+        total, kept = torch.zeros_like(x), 0
+        for i in range(self.iterations):
+            rho = max(self.rho_max * self.decay**i, self.rho_min)
+            times = times_of(schedule, [rho, *(sigma for sigma in grid if sigma < rho)])
+            rho = float(schedule.sigma(times[0]))
+            z = torch.cat([self.likelihood(m, x[:, :1], rho, draw, i / self.iterations), x[:, 1:]], 1)
+            signal, _ = schedule.scales(times[0])
+            x = walk(denoiser, signal.to(z) * z, times, draw if self.stochastic else None)
+            measurement.calibrate(x[:, :1])
+            if i >= self.burn_in and (i - self.burn_in) % self.thinning == self.thinning - 1:
+                total, kept = total + x, kept + 1
+            on_step()
+        return total / kept

@@ -1,0 +1,1 @@
+"""MedSyn's networks and files."""

@@ -1,0 +1,192 @@
+"""What both command lines share: bad input ends in one clear sentence, and the console shows only what matters."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import re
+import reprlib
+import sys
+import tempfile
+import warnings
+from argparse import ArgumentError, ArgumentParser
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from phydict.runtime.shipped import configuration
+from phydict.runtime.yaml_file import read_yaml
+
+NOISE = (".*does not have many workers", ".*LeafSpec.*is deprecated", ".*is smaller than the logging interval",
+         "Total length of `DataLoader` across ranks is zero", "Checkpoint directory .* exists and is not empty",
+         "It is recommended to use `self.log", "Using `DistributedSampler` with the dataloaders",
+         ".*args parameter is intended to run from within Python", "predict returned None",
+         "You're resuming from a checkpoint that ended before the epoch ended",
+         "You're using the WeightAveraging callback with a model that overrides the configure_model",
+         r"Found \d+ module\(s\) in eval mode at the start of training")
+"""Warnings that tell a user of the command lines nothing to act on."""
+
+CONFIGURATION = ("-c", "--config")
+"""The option that names a configuration file."""
+
+
+TRACEBACK = "PHYDICT_TRACEBACK"
+"""The environment variable that, where it is set, lets every error show its trace."""
+
+
+@contextmanager
+def one_sentence_errors(*also: type[Exception], to_go_on: str = "run the same command again") -> Iterator[None]:
+    """Prints bad arguments, ValueError, OSError, FloatingPointError and `also` as one sentence and exits with code 2;
+    the environment variable PHYDICT_TRACEBACK=1 shows the trace instead. A run that a signal stopped says how to go on
+    and exits with code 130 (SIGINT) or 143 (SIGTERM)."""
+    try:
+        yield
+    except (KeyboardInterrupt, SystemExit) as stop:  # Lightning exits with 1 on SIGINT and without a code on SIGTERM
+        interrupted = isinstance(stop, KeyboardInterrupt) or isinstance(stop.__context__, KeyboardInterrupt)
+        if not interrupted and stop.code is not None:
+            raise
+        print(f"stopped by a signal; to go on, {to_go_on}", file=sys.stderr)
+        raise SystemExit(130 if interrupted else 143) from None
+    except (ValueError, OSError, FloatingPointError, ArgumentError, *also) as error:
+        if os.environ.get(TRACEBACK):
+            raise
+        full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
+        said = f"{sentence(error)}: free some space; to go on, {to_go_on}" if full else sentence(error)
+        print(f"error: {said}", file=sys.stderr)
+        raise SystemExit(2) from None
+    except RuntimeError as error:
+        if os.environ.get(TRACEBACK) or not re.search("Connection (closed|reset) by peer", str(error)):
+            raise
+        print("stopped, because another process of this run ended; its message says why", file=sys.stderr)
+        raise SystemExit(2) from None
+
+
+def with_configurations(args: list[str], kinds: tuple[str, ...]) -> list[str]:
+    """Arguments with the place of every configuration (-c, --config) that is a shipped one by its path or its name; see
+    `phydict.runtime.shipped.configuration`, which raises ValueError for those that are nowhere."""
+    def place(given: str) -> str:
+        return given if ":" in given else str(configuration(given, kinds))  # "key: value" is YAML itself
+
+    out = []
+    for before, arg in zip(["", *args], args):
+        option, equals, value = arg.partition("=")
+        if before in CONFIGURATION:
+            arg = place(arg)
+        elif equals and option in CONFIGURATION:
+            arg = f"{option}={place(value)}"
+        out.append(arg)
+    return out
+
+
+def check_command(args: Sequence[str], commands: Mapping[str, str], anywhere: Collection[str], example: str) -> None:
+    """Raises ValueError, in one sentence that names `commands`, name -> what it does, and an example, where no argument
+    is one of those that may stand `anywhere`, and none asks for help."""
+    if not any(arg in anywhere or arg in ("-h", "--help") or arg.startswith("--print_config") for arg in args):
+        told = ", ".join(f"{name} ({what})" for name, what in commands.items())
+        raise ValueError(f"the first word says what to do, but {repr(args[0]) if args else 'none'} was given: use one "
+                         f"of {told}; such as: {example}")
+
+
+def check_configured(args: Sequence[str], options: Collection[str], example: str) -> None:
+    """Raises ValueError where `args` hold none of the options that say what to run, and do not ask for help."""
+    options = ("-c", "--config", "-h", "--help", *options)
+    if not any(arg.partition("=")[0] in options or arg.startswith("-c") for arg in args):
+        raise ValueError(f"no configuration file was given: add -c <file>, such as -c {example}")
+
+
+def check_writable(path: Path, option: str, file: bool = False) -> None:
+    """Raises ValueError, in one sentence, unless a folder (or a file) can be written at `path`, which need not exist
+    yet; `option` is what the user should change."""
+    there = path.absolute()
+    if file and there.is_dir():
+        raise ValueError(f"{path} is a folder, but a file is to be written: give another {option}")
+    there = there.parent if file else there
+    while not there.exists():
+        there = there.parent
+    try:
+        with tempfile.TemporaryFile(dir=there):
+            pass
+    except OSError as error:
+        reason = "is a file" if there.is_file() else f"cannot be written to ({error.strerror})"
+        raise ValueError(f"{path} cannot be written because {there} {reason}: give another {option}") from error
+
+
+def check_apart(output: Path, option: str, inputs: Iterable[Path]) -> None:
+    """Raises ValueError, in one sentence, where `output` is one of the inputs, lies inside one or holds one, wherever
+    links lead; `option` is what the user should change."""
+    there = Path(os.path.realpath(output))
+    for given in inputs:
+        here = Path(os.path.realpath(given))
+        if there.is_relative_to(here) or here.is_relative_to(there):
+            how = "is" if there == here else "lies inside" if there.is_relative_to(here) else "holds"
+            raise ValueError(f"the output {output} {how} the input {given}: give another {option}")
+
+
+def read_configurations(args: Sequence[str]) -> list[dict]:
+    """What the configuration files hold that a command line names with -c or --config, in their order.
+
+    They are read as `read_yaml` reads, so that what it refuses never reaches the command line's own parser. Files that
+    are not there are left to that. Raises ValueError.
+    """
+    look = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    look.add_argument("--config", "-c", action="append", default=[])
+    given, _ = look.parse_known_args(list(args))
+    found = {file: read_yaml(file) for file in given.config if os.path.isfile(file)}
+    for file, settings in found.items():
+        if not isinstance(settings, dict):
+            raise ValueError(f"{file} holds no settings: it is a mapping, such as `model: {{...}}`")
+        for name in ("model", "data", "trainer"):
+            if not isinstance(settings.get(name, {}), dict):
+                raise ValueError(f"{file}: `{name}` is a mapping of settings, but {reprlib.repr(settings[name])} was given")
+    return list(found.values())
+
+
+def sentence(error: Exception) -> str:
+    """An error's message on one line, without what loader processes and the argument parser wrap around it."""
+    text = str(error).strip()
+    if text.startswith("Caught "):  # a loader process sends its whole trace; the last line holds the message
+        text = text.splitlines()[-1].partition(": ")[2]
+    if "Does not validate against any of the Union" in text:
+        reasons = re.split(r"\n\s*- ", text.partition("Given value type")[0])[1:]
+        reasons = [reason for reason in reasons if "does not correspond to a subclass" not in reason] or reasons
+        text = text.partition("Does not validate")[0] + "; ".join(reasons)
+    return " ".join(text.split())
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Lightning's hints and the warnings of NOISE are silent inside, and other warnings take one line."""
+    loggers = [logging.getLogger(name) for name in ("lightning.pytorch", "lightning.fabric")]
+    levels = [logger.level for logger in loggers]
+    with warnings.catch_warnings():
+        warnings.showwarning = _show
+        for message in NOISE:
+            warnings.filterwarnings("ignore", message)
+        for logger in loggers:
+            logger.setLevel(logging.WARNING)
+        try:
+            yield
+        finally:
+            for logger, level in zip(loggers, levels):
+                logger.setLevel(level)
+
+
+@contextmanager
+def noted(found: list[str], name: str) -> Iterator[None]:
+    """Adds to `found`, each once, what the UserWarnings given inside say, and shows them with the name of the case."""
+    with warnings.catch_warnings():
+        show = warnings.showwarning
+
+        def keep(message: Warning | str, category: type[Warning], *where) -> None:
+            text = " ".join(str(message).split())
+            if category is UserWarning and text not in found:
+                found.append(text)
+            show(message if name in text else f"{name}: {text}", category, *where)
+
+        warnings.showwarning = keep
+        yield
+
+
+def _show(message: Warning | str, *_) -> None:
+    print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)

@@ -1,0 +1,188 @@
+"""Training the base prior: its text first, then denoising."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from pathlib import Path
+
+import torch
+from lightning.pytorch.callbacks import WeightAveraging
+from lightning.pytorch.utilities import rank_zero_only
+from torch import Tensor
+
+from phydict.training.data import PriorData
+from phydict.diffusion import Denoiser
+from phydict.evaluation import method_panel, volume_metrics
+from phydict.grid import Grid
+from phydict.methods import reconstruct
+from phydict.prior import DetailNetwork, Prior, TextEncoder, VolumeUNet, describe, learn_vocabulary, load_prior
+from phydict.training.reports import learn_findings, learn_sketch
+from phydict.training.sharding import shard
+from phydict.training.stage import StageTraining
+from phydict.units import HUWindow
+from phydict.xray import ConeBeam, Ideal, Projector
+
+
+class PriorTraining(StageTraining):
+    """Learns a Prior, first its text, then denoising.
+
+    Args:
+        network: the UNet; none given: the default VolumeUNet
+        text: "small" for a BERT that learns reports first (none where the data have no reports), a folder or hub id
+            for a frozen one, "none" for a prior without text
+        text_length: tokens of a report that a frozen text reads
+        text_padded_to: 2048, with text_length 192, for contexts as MedSyn's; none given: padding is hidden
+        reports: texts that the small BERT's vocabulary is learnt from (taken from the data)
+        detail: the network for what the UNet's blocks of voxels cannot hold; none given: the default DetailNetwork
+        voxels: voxels along each side of the cube
+        side: side of the cube in mm
+        window: HU that the prior's range [-1, 1] stands for
+        sigma_data: standard deviation of the data in the prior's range
+        text_dropout: share of reports replaced by the null context, in [0, 1]
+        mask_weight: weight of the anatomy masks' error beside the CT's
+        learning_rate: of AdamW
+        weight_decay: of AdamW
+        warmup: steps over which the learning rate rises
+        decay_from: step at which a linear decay of the learning rate to zero begins
+        decay_steps: length of that decay in steps; 0: no decay
+        text_steps: steps of each task by which a small BERT learns reports before denoising begins; 0: it learns by
+            denoising
+        montage_steps: noise levels of the samples that validation paints; 0: none
+        validation_views: X-rays from which validation reconstructs each held-out case by phydict_fast, to tell which
+            weights are best; 0: none, as where weights are spread over devices
+        gradient_checkpointing: less memory for a second computation of each block's activations
+        channels_last: lay the network's channels side by side in memory
+        compile: run the network through torch.compile
+        initial: a prior's file to go on from, which then decides the networks and the text; one without a detail
+            network is given this training's
+        seed: of times, noise and text dropout
+    """
+
+    def __init__(self, network: VolumeUNet | None = None, text: str = "small", text_length: int = 128,
+                 text_padded_to: int | None = None, reports: list[str] | None = None,
+                 detail: DetailNetwork | None = None, voxels: int = 64, side: float = 384.0,
+                 window: tuple[float, float] = (-1000.0, 1000.0), sigma_data: float = 0.5,
+                 text_dropout: float = 0.1, mask_weight: float = 0.1, learning_rate: float = 5e-4,
+                 weight_decay: float = 0.01, warmup: int = 100, decay_from: int = 0, decay_steps: int = 0,
+                 text_steps: int = 600, montage_steps: int = 16, validation_views: int = 4,
+                 gradient_checkpointing: bool = False, channels_last: bool = True, compile: bool = False,
+                 initial: str | None = None, seed: int = 0):
+        if validation_views < 0:
+            raise ValueError(f"model.validation_views must not be negative, but {validation_views} was given")
+        network = network or VolumeUNet()
+        encoder = None
+        if text == "small" and not reports:
+            warnings.warn("the data have no reports: this prior will know no text")
+        elif text == "small":
+            encoder = TextEncoder.small(learn_vocabulary(reports), network.context_dim)
+        elif text != "none":
+            encoder = TextEncoder.pretrained(text, text_length, text_padded_to)
+        prior = Prior(network, Grid.cube(voxels, side), HUWindow(*window), encoder, sigma_data=sigma_data,
+                      detail=detail or DetailNetwork(network.state_channels))
+        super().__init__(prior, sigma_data, learning_rate, weight_decay, warmup, decay_from, decay_steps, montage_steps,
+                         seed, mask_weight)
+        if initial:
+            self._start_from(load_prior(initial), initial)
+        if self.prior.text is not None and reports:
+            self.prior.text.check(reports)
+        self.prior.network.run_with(gradient_checkpointing, channels_last, compile)
+        self.text_dropout, self.text_steps, self.validation_views = text_dropout, text_steps, validation_views
+
+    def _start_from(self, prior: Prior, path: str) -> None:
+        if not isinstance(prior, Prior):
+            raise ValueError(f"training goes on from priors of phydict's own, but {path} is MedSyn's: leave out "
+                             "model.initial")
+        if not prior.grid.same_as(self.prior.grid) or prior.window != self.prior.window:
+            raise ValueError(f"the prior {path} has another grid or HU window than this training: "
+                             "set model.voxels, model.side and model.window to its own")
+        if prior.load_text is not None:
+            prior.text = prior.load_text()
+            prior.text.trainable = prior.text.source is None
+        prior.detail = prior.detail or self.prior.detail
+        self.prior = prior.train().requires_grad_(True)
+        if prior.text is not None:
+            prior.text.requires_grad_(prior.text.trainable)
+
+    def configure_model(self) -> None:
+        mesh = self.device_mesh  # only of a strategy that spreads the weights
+        if mesh is None:
+            return
+        if any(isinstance(callback, WeightAveraging) for callback in self.trainer.callbacks):
+            raise ValueError("spread weights cannot be averaged: train without EMAWeightAveraging "
+                             "(trainer.callbacks: null), as configs/prior/fsdp.yaml does")
+        # A spread optimizer goes on only if it has moved each of its weights: those that denoising leaves alone rest.
+        self.prior.network.text_map.to_sketch.requires_grad_(False)
+        if self.prior.text is not None and self.text_steps:
+            self.prior.text.requires_grad_(False)
+        shard(self.prior, mesh["data_parallel"])
+
+    def _condition(self, batch: dict, x0: Tensor, draws: list[torch.Generator]) -> tuple[Tensor, ...]:
+        reports = batch["report"] if self.prior.text is not None else [""] * len(x0)
+        keep = [float(torch.rand(1, generator=draw)) >= self.text_dropout for draw in draws]
+        return (self.prior.context([r if k else "" for r, k in zip(reports, keep)]),)
+
+    def _bound(self, batch: dict, x0: Tensor) -> Denoiser:
+        return self.prior.bind(batch["report"][0] if self.prior.text is not None else "")
+
+    def _describe(self) -> dict:
+        return describe(self.prior)
+
+    def validation_step(self, batch: dict, index: int) -> None:
+        super().validation_step(batch, index)
+        if not self.validation_views or self.device_mesh is not None:
+            return
+        with torch.autocast(self.device.type, enabled=False):
+            scores = reconstruction_scores(self.prior, batch["volume"], self.validation_views, index)
+        for name in ("psnr", "ssim"):
+            self.log(f"val/{name}", scores[name], prog_bar=name == "psnr", sync_dist=True, batch_size=1)
+
+    def _paint(self, file: Path, batch: dict, x0: Tensor, sample: Tensor) -> None:
+        window = self.prior.window
+        method_panel(file, {"prior sample": window.to_hu(sample[0, 0].cpu())}, window.to_hu(x0[0, 0].cpu()),
+                     self.prior.grid, title=batch["report"][0][:80] or "no report")
+
+    def learn_reports(self, data: PriorData) -> None:
+        """Teaches a small report encoder and the text map, once, before the first denoising step.
+
+        It belongs before `fit`, since distributed training watches every backward pass from there on.
+        """
+        text = self.prior.text
+        if text is None or not text.trainable or not self.text_steps:
+            return
+        reports, labels = data.labelled_reports()
+        if reports:
+            losses = learn_findings(text, reports, labels, self.text_steps, self.seed)
+            _tell(f"report encoder learns findings: loss {losses[0]:.3f} -> {losses[-1]:.3f}")
+        _tell("preparing what reports imply")
+        reports, maps = data.sketches(self.prior.network.text_map.cells)
+        if reports:
+            losses = learn_sketch(self.prior, reports, maps, self.text_steps, self.seed)
+            _tell(f"text map learns what reports imply: squared error {losses[0]:.3f} -> {losses[-1]:.3f} of its "
+                  "variance")
+
+    def on_fit_start(self) -> None:
+        if self.prior.text is not None and self.text_steps:
+            self.prior.text.trainable = False  # what it learnt stays, while the UNet learns to use it
+
+    def _state(self, batch: dict) -> tuple[Tensor, Tensor]:
+        channels = self.prior.network.state_channels
+        x0 = torch.cat([batch["volume"], 2 * batch["masks"] - 1], 1)[:, :channels]
+        known = self.mask_weight * batch["has_masks"].float()
+        weight = torch.cat([torch.ones_like(known[:, :1]), known], 1)[:, :channels]
+        return x0, weight[..., None, None, None]
+
+
+def reconstruction_scores(prior: Prior, ct: Tensor, views: int, seed: int) -> dict[str, float]:
+    """SSIM, PSNR (dB) and MAE (HU) of phydict_fast's reconstruction, without a report, from ideal X-rays of a CT
+    (1, 1, X, Y, Z) in the prior's range, on an orbit that is the benchmarks' where the cube has 384 mm."""
+    scale = prior.grid.shape[0] * prior.grid.spacing[0] / 384
+    beam = ConeBeam.orbit(views, 1020 * scale, 740 * scale, (448, 448), 1.25 * scale)
+    exact = Projector(prior.grid, beam, device=ct.device, full_detector=True)
+    found = reconstruct(Ideal()(exact, prior.window.to_mu(ct), seed)[0], beam, prior, seed=seed)
+    return volume_metrics(found.volume[None, None], prior.window.to_hu(ct))
+
+
+@rank_zero_only
+def _tell(message: str) -> None:
+    print(message, file=sys.stderr)

@@ -1,0 +1,122 @@
+"""Lightning data for training a super-resolution stage: crops of fine CTs and phantoms."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import ConcatDataset, Dataset
+
+from phydict.training.data import HELD_OUT_PHANTOM, CachedPhantoms, PriorData
+from phydict.datasets import CTCases, Deformation, phantom_case, prepare_ct
+from phydict.datasets.cts.cache import write_array
+from phydict.datasets.cts.transforms import AIR
+from phydict.units import HUWindow
+
+
+def mapped_volume(file: Path, make: Callable[[], Tensor]) -> np.ndarray:
+    """The volume (X, Y, Z) that a file keeps in half precision, made when missing or damaged; read only where used."""
+    if file.is_file():
+        try:
+            return np.load(file, mmap_mode="r")
+        except (ValueError, EOFError) as error:
+            warnings.warn(f"the cached volume {file} cannot be read ({error}); it is prepared again", stacklevel=3)
+    write_array(file, make().numpy().astype(np.float16))
+    return np.load(file, mmap_mode="r")
+
+
+class PhantomVolumes(CachedPhantoms):
+    """The CTs alone of CachedPhantoms, as `mapped_volume`s."""
+
+    def __getitem__(self, i: int) -> np.ndarray:
+        seed = self.first_seed + i
+        return mapped_volume(self.folder / f"{seed:07d}.npy",
+                             lambda: phantom_case(seed, self.grid, self.window)["volume"][0])
+
+
+class CTVolumes(CTCases):
+    """The CTs alone of CTCases, as `mapped_volume`s."""
+
+    def __getitem__(self, index: int) -> np.ndarray:
+        ct = self.cts[index]
+        return mapped_volume(self.cache / f"{ct.id}-{self._key(ct)}.npy", lambda: prepare_ct(
+            ct.path, self.grid, self.window, id=ct.id, calibration=ct.calibration)["volume"][0])
+
+
+class Crops(Dataset):
+    """Random cubes of volumes: draw n of epoch e is the same on every machine.
+
+    A crop starts at a multiple of `align` voxels; mere air is drawn again, up to three times. augmented: mirrored left
+    to right half the time, with a small change of HU (the super-resolution stage sees too little of the body for a
+    side to matter).
+    """
+
+    def __init__(self, cts: Dataset, phantoms: Dataset, ct_fraction: float, window: HUWindow, size: int, align: int,
+                 length: int, epoch: int, seed: int, augmented: bool = True):
+        self.cts, self.phantoms, self.ct_fraction, self.window = cts, phantoms, ct_fraction, window
+        self.size, self.align, self.length, self.epoch, self.seed = size, align, length, epoch, seed
+        self.augmented = augmented
+
+    def __len__(self) -> int:
+        return self.length
+
+    def __getitem__(self, i: int) -> dict:
+        draw = np.random.default_rng((self.seed, self.epoch, i))
+        from_ct = len(self.phantoms) == 0 or (len(self.cts) > 0 and draw.random() < self.ct_fraction)
+        source = self.cts if from_ct else self.phantoms
+        volume = source[int(draw.integers(len(source)))]
+        for _ in range(4):
+            crop = self._crop(volume, draw)
+            if crop.std() > 0.05:
+                break
+        return {"volume": self._augment(crop, draw) if self.augmented else crop}
+
+    def _crop(self, volume: np.ndarray, draw: np.random.Generator) -> Tensor:
+        starts = [self.align * int(draw.integers((n - self.size) // self.align + 1)) for n in volume.shape]
+        cut = volume[tuple(slice(start, start + self.size) for start in starts)]
+        return torch.from_numpy(cut.astype(np.float32))[None]
+
+    def _augment(self, crop: Tensor, draw: np.random.Generator) -> Tensor:
+        change = Deformation.draw(int(draw.integers(2**31)))
+        air = (self.window.to_hu(crop) - AIR).clamp(min=0)
+        crop = self.window.to_range(AIR + change.gain * air + change.offset * (air / 200).clamp(max=1))
+        return crop.flip(1) if draw.random() < 0.5 else crop
+
+
+class SuperResolutionData(PriorData):
+    """Crops for training a super-resolution stage.
+
+    Volumes are cached in half precision without compression, so that a crop is read without the rest: 34 MB for 256^3.
+
+    Args:
+        crop: voxels along each side of a crop
+        factor: tied to model.factor
+        validation_crops: fixed crops of each held-out volume that validate
+    """
+
+    def __init__(self, crop: int = 96, factor: int = 4, validation_crops: int = 4, phantoms: int = 32,
+                 validation_phantoms: int = 2, voxels: int = 256, **kwargs):
+        super().__init__(phantoms=phantoms, validation_phantoms=validation_phantoms, voxels=voxels, **kwargs)
+        if not 0 < crop <= voxels or crop % factor:
+            raise ValueError(f"data.crop is a multiple of the factor {factor}, up to the {voxels} voxels of a volume, "
+                             f"but {crop} was given")
+        self.crop, self.factor = crop, factor
+        cache = self.cts.cache
+        held_out = self.validation.datasets[1].cts
+        self.phantoms = PhantomVolumes(0, phantoms, self.grid, self.window, cache)
+        self.cts = CTVolumes(self.cts.cts, cache, self.grid, self.window)
+        self.validation = ConcatDataset([self._fixed([], [], 0)] + [
+            self._fixed([], PhantomVolumes(HELD_OUT_PHANTOM + i, 1, self.grid, self.window, cache), validation_crops)
+            for i in range(validation_phantoms)] + [
+            self._fixed(CTVolumes([ct], cache, self.grid, self.window), [], validation_crops) for ct in held_out])
+
+    def _fixed(self, cts: Dataset | list, phantoms: Dataset | list, count: int) -> Crops:
+        return Crops(cts, phantoms, 1.0, self.window, self.crop, self.factor, count, 0, 0, augmented=False)
+
+    def draws(self, epoch: int) -> Dataset:
+        return Crops(self.cts, self.phantoms, self.ct_fraction, self.window, self.crop, self.factor, self.epoch_size,
+                     epoch, self.seed)

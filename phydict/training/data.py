@@ -1,0 +1,202 @@
+"""Lightning data for training a prior: a user's CTs, phantoms, or both."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import lightning
+import numpy as np
+import torch
+from torch.utils.data import ConcatDataset, DataLoader, Dataset, DistributedSampler
+
+from phydict.datasets import Augmentation, CTCases, Thorax, augment, find_cts, phantom_case, report, split_by_patient
+from phydict.datasets.cts.cache import read_arrays, write_arrays
+from phydict.datasets.phantoms.phantom import change_by_findings
+from phydict.grid import Grid
+from phydict.reconstruction import check_seed
+from phydict.units import HUWindow
+
+PHANTOM_VERSION = 2
+"""Raised whenever a phantom of the same seed comes out differently, so that cached ones are made anew."""
+
+HELD_OUT_PHANTOM = 1_000_000
+"""Phantoms with this seed and above are never trained on."""
+
+MOST_DRAWS = 10_000_000
+"""Draws of an epoch are listed before it begins."""
+
+KEYS = ("volume", "masks", "has_masks", "report")
+"""The parts of a Case that training needs."""
+
+
+class CachedPhantoms(Dataset):
+    """Phantom cases of consecutive seeds, each built when first asked for and then kept as a file in `cache`."""
+
+    def __init__(self, first_seed: int, count: int, grid: Grid, window: HUWindow, cache: Path):
+        self.first_seed, self.count, self.grid, self.window = first_seed, count, grid, window
+        size = "x".join(map(str, grid.shape))
+        self.folder = cache / f"phantoms{PHANTOM_VERSION}-{size}-{grid.spacing[0]:g}mm-{window.low:g}-{window.high:g}"
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, i: int) -> dict:
+        seed = self.first_seed + i
+        file = self.folder / f"{seed:07d}.npz"
+        stored = read_arrays(file)
+        if stored is None:
+            case = phantom_case(seed, self.grid, self.window)
+            stored = {"volume": case["volume"].numpy().astype(np.float16),
+                      "masks": (255 * case["masks"].numpy()).round().astype(np.uint8)}
+            write_arrays(file, stored)
+        masks = torch.from_numpy(stored["masks"].astype(np.float32) / 255)
+        return {"volume": torch.from_numpy(stored["volume"].astype(np.float32)), "masks": masks,
+                "has_masks": torch.ones(len(masks), dtype=torch.bool), "report": report(Thorax.draw(seed))}
+
+
+class MixedCases(Dataset):
+    """One epoch of deformed draws from CTs and phantoms; draw n of epoch e is the same on every machine."""
+
+    def __init__(self, cts: Sequence, phantoms: Sequence, ct_fraction: float, grid: Grid, window: HUWindow,
+                 length: int, epoch: int, seed: int, augmentation: Augmentation = Augmentation()):
+        self.cts, self.phantoms, self.ct_fraction, self.grid, self.window = cts, phantoms, ct_fraction, grid, window
+        self.length, self.epoch, self.seed, self.augmentation = length, epoch, seed, augmentation
+
+    def __len__(self) -> int:
+        return self.length
+
+    def __getitem__(self, i: int) -> dict:
+        draw = np.random.default_rng((self.seed, self.epoch, i))
+        from_ct = len(self.phantoms) == 0 or (len(self.cts) > 0 and draw.random() < self.ct_fraction)
+        source = self.cts if from_ct else self.phantoms
+        case = source[int(draw.integers(len(source)))]
+        return _training_parts(augment(case, int(draw.integers(2**31)), self.grid, self.window, self.augmentation))
+
+
+class PriorData(lightning.LightningDataModule):
+    """Cases for training a prior.
+
+    Args:
+        cts: a NIfTI file, or a folder of any depth in CT-RATE's layout or any other
+        reports: CT-RATE's table of reports, or the folder it is in; none given: looked for beside the CTs
+        metadata: CT-RATE's metadata table, needed where headers are not fixed
+        fixed: whether the NIfTI headers are right (CT-RATE's *_fixed folders and ordinary archives)
+        first_reconstruction: keep one volume per scan
+        exclude: a text file of case ids to leave out
+        holdout: CTs whose id contains one of these words validate instead of training
+        holdout_fraction: share of the patients that validate instead of training, in [0, 1]
+        phantoms: number of different phantoms
+        ct_fraction: share of draws taken from the CTs, in [0, 1]
+        validation_phantoms: phantoms, never trained on, that validate
+        epoch_size: draws per epoch
+        batch_size: draws per step on each device
+        workers: loader processes per device
+        cache: folder for prepared cases, never inside the CTs' folder
+        augmentation: strengths of the random changes of each draw
+        seed: of the draws and of the split into patients
+        voxels: tied to model.voxels
+        side: tied to model.side
+        window: tied to model.window
+    """
+
+    def __init__(self, cts: str | None = None, reports: str | None = None, metadata: str | None = None,
+                 fixed: bool = True, first_reconstruction: bool = False, exclude: str | None = None,
+                 holdout: list[str] | None = None, holdout_fraction: float = 0.0, phantoms: int = 2000,
+                 ct_fraction: float = 0.5, validation_phantoms: int = 6, epoch_size: int = 400, batch_size: int = 4,
+                 workers: int = 0, cache: str = "runs/cache", augmentation: Augmentation = Augmentation(),
+                 seed: int = 0, voxels: int = 64, side: float = 384.0,
+                 window: tuple[float, float] = (-1000.0, 1000.0)):
+        super().__init__()
+        check_seed(seed)
+        for name, value, least in (("epoch_size", epoch_size, 1), ("batch_size", batch_size, 1), ("workers", workers, 0)):
+            if not least <= value <= MOST_DRAWS:
+                raise ValueError(f"data.{name} lies between {least} and {MOST_DRAWS:,}, but {value:,} was given")
+        if not cts and not phantoms:
+            raise ValueError("there is nothing to train on: give data.cts, or data.phantoms above 0")
+        if phantoms < 0 or not 0 <= ct_fraction <= 1:
+            raise ValueError("data.phantoms must not be negative and data.ct_fraction lies in [0, 1], but "
+                             f"{phantoms} and {ct_fraction} were given")
+        if cts and Path(cache).resolve().is_relative_to(Path(cts).resolve()):
+            raise ValueError(f"data.cache {cache} lies inside data.cts {cts}: give a folder elsewhere")
+        window = HUWindow(*window)
+        self.grid, self.window = Grid.cube(voxels, side), window
+        self.phantoms = CachedPhantoms(0, phantoms, self.grid, window, Path(cache))
+        files = find_cts(cts, reports, metadata, fixed, first_reconstruction, exclude) if cts else []
+        for word in holdout or []:
+            if not any(word in f.id for f in files):
+                raise ValueError(f"data.holdout names '{word}', but no CT has that in its id"
+                                 + (f" (the first id is {files[0].id})" if files else "") + ": correct or remove it")
+        validating = set(split_by_patient([f.id for f in files], holdout_fraction, seed)[1])
+        held_out = [f for f in files if f.id in validating or any(word in f.id for word in holdout or [])]
+        if len(held_out) == len(files) and not phantoms:
+            raise ValueError("there is nothing to train on: data.holdout holds out every CT, and data.phantoms is 0")
+        self.held_out = [f.id for f in held_out]
+        validating = set(self.held_out)
+        self.cts = CTCases([f for f in files if f.id not in validating], cache, self.grid, window)
+        self.validation = ConcatDataset([
+            CachedPhantoms(HELD_OUT_PHANTOM, validation_phantoms, self.grid, window, Path(cache)),
+            CTCases(held_out, cache, self.grid, window)])
+        self.reports = [f.report for f in files if f.report]
+        self.reports += [report(Thorax.draw(s)) for s in range(min(phantoms, 1000))]
+        self.ct_fraction, self.epoch_size, self.seed = ct_fraction, epoch_size, seed
+        self.batch_size, self.workers, self.augmentation = batch_size, workers, augmentation
+
+    def labelled_reports(self, count: int = 6000) -> tuple[list[str], torch.Tensor]:
+        """Reports of phantoms and which findings (kind, side, lobe) each has: labels (N, F). None without phantoms."""
+        thoraxes = [Thorax.draw(seed) for seed in range(count if len(self.phantoms) else 0)]
+        findings = [{(f.kind, f.side, f.lobe) for f in thorax.findings} for thorax in thoraxes]
+        columns = sorted(set().union(*findings))
+        labels = torch.tensor([[float(column in own) for column in columns] for own in findings])
+        return [report(thorax) for thorax in thoraxes], labels
+
+    def sketches(self, cells: int, most: int = 1500) -> tuple[list[str], torch.Tensor]:
+        """What reports imply, for at most so many cases that have one: reports, and maps (N, 1, cells^3).
+
+        Of a phantom, the map is what its findings change, averaged over cells; where there are none, it is how a CT
+        departs from the mean of the CTs. Both are in the prior's range.
+        """
+        if len(self.phantoms):
+            count = min(most, len(self.phantoms))
+            reports = [report(Thorax.draw(seed)) for seed in range(count)]
+            file = self.phantoms.folder / f"effects-{cells}-{count}.npz"
+            stored = read_arrays(file)
+            if stored is None:
+                stored = {"effects": np.stack([self._effect(seed, cells) for seed in range(count)])}
+                write_arrays(file, stored)
+            return reports, torch.from_numpy(stored["effects"])
+        cases = [self.cts[i] for i, ct in enumerate(self.cts.cts) if ct.report][:most]
+        coarse = [torch.nn.functional.adaptive_avg_pool3d(case["volume"], cells) for case in cases]
+        coarse = torch.stack(coarse) if cases else torch.zeros(0, 1, cells, cells, cells)
+        return [case["report"] for case in cases], coarse - coarse.mean(0)
+
+    def _effect(self, seed: int, cells: int) -> np.ndarray:
+        thorax, grid = Thorax.draw(seed), Grid.cube(2 * cells, self.grid.extent[0])
+        change = change_by_findings(thorax, grid) / self.window.half_width
+        return change.reshape(1, cells, 2, cells, 2, cells, 2).mean((2, 4, 6)).astype(np.float32)
+
+    def train_dataloader(self) -> DataLoader:
+        least = self.batch_size * self.trainer.world_size
+        if self.epoch_size < least:
+            raise ValueError(f"data.epoch_size is {self.epoch_size}, less than one batch on every device ({least}): "
+                             "raise it, or lower data.batch_size")
+        # Lightning's own sampler would shuffle: several processes take turns, so that each step sees what one would.
+        draws = self.draws(self.trainer.current_epoch)
+        turns = DistributedSampler(draws, self.trainer.world_size, self.trainer.global_rank, shuffle=False)
+        return DataLoader(draws, self.batch_size, sampler=turns, num_workers=self.workers, drop_last=True)
+
+    def draws(self, epoch: int) -> Dataset:
+        """What is trained on in an epoch."""
+        return MixedCases(self.cts, self.phantoms, self.ct_fraction, self.grid, self.window, self.epoch_size, epoch,
+                          self.seed, self.augmentation)
+
+    def val_dataloader(self) -> DataLoader:
+        return DataLoader(self.validation, 1, collate_fn=_collate, num_workers=self.workers)
+
+
+def _training_parts(case: dict) -> dict:
+    return {key: case[key] for key in KEYS if key in case}
+
+
+def _collate(cases: list[dict]) -> dict:
+    return torch.utils.data.default_collate([_training_parts(case) for case in cases])

@@ -1,0 +1,89 @@
+"""Training the super-resolution stage, on crops."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool3d
+
+from phydict.diffusion import Denoiser
+from phydict.evaluation import method_panel
+from phydict.grid import Grid
+from phydict.prior import LocalUNet, SuperResolution, describe_super_resolution, load_super_resolution
+from phydict.training.stage import StageTraining
+from phydict.units import HUWindow
+
+
+class SuperResolutionTraining(StageTraining):
+    """Learns a SuperResolution from crops; a crop's block means are its coarse volume.
+
+    Args:
+        network: the UNet; none given: the default LocalUNet
+        voxels: voxels along each side of the fine cube
+        factor: fine voxels along each side of a coarse one
+        side: side of the cube in mm
+        window: HU that the prior's range [-1, 1] stands for
+        detail_std: standard deviation, in the prior's range, of what the fine CT adds to the coarse one
+        most_noise: highest level of the noise that the coarse volume is given, in [0, 1]
+        learning_rate: of AdamW
+        weight_decay: of AdamW
+        warmup: steps over which the learning rate rises
+        decay_from: step at which a linear decay of the learning rate to zero begins
+        decay_steps: length of that decay in steps; 0: no decay
+        montage_steps: noise levels of the samples that validation paints; 0: none
+        initial: a stage's file to go on from, which then decides the network
+        seed: of times and noise
+    """
+
+    def __init__(self, network: LocalUNet | None = None, voxels: int = 256, factor: int = 4, side: float = 384.0,
+                 window: tuple[float, float] = (-1000.0, 1000.0), detail_std: float = 0.08, most_noise: float = 0.3,
+                 learning_rate: float = 5e-4, weight_decay: float = 0.01, warmup: int = 100, decay_from: int = 0,
+                 decay_steps: int = 0, montage_steps: int = 16, initial: str | None = None, seed: int = 0):
+        if not 0 <= most_noise <= 1:
+            raise ValueError(f"model.most_noise lies in [0, 1], but {most_noise} was given")
+        fine = SuperResolution(network or LocalUNet(), Grid.cube(voxels, side), HUWindow(*window), factor,
+                               detail_std=detail_std)
+        if initial:
+            first = load_super_resolution(initial)
+            if not first.grid.same_as(fine.grid) or first.window != fine.window or first.factor != factor:
+                raise ValueError(f"the stage {initial} has another grid, HU window or factor than this training: set "
+                                 "model.voxels, model.side, model.window and model.factor to its own")
+            fine = first.train().requires_grad_(True)
+        super().__init__(fine, fine.detail_std, learning_rate, weight_decay, warmup, decay_from, decay_steps,
+                         montage_steps, seed)
+        self.most_noise = most_noise
+
+    def configure_model(self) -> None:
+        if self.device_mesh is not None:
+            raise ValueError("a super-resolution stage is too small to spread its weights over devices: train it with "
+                             "configs/prior/ddp.yaml instead of fsdp.yaml")
+
+    def _state(self, batch: dict) -> tuple[Tensor, Tensor]:
+        return batch["volume"], torch.ones(len(batch["volume"]), 1, 1, 1, 1, device=self.device)
+
+    def _condition(self, batch: dict, x0: Tensor, draws: list[torch.Generator]) -> tuple[Tensor, ...]:
+        coarse = avg_pool3d(x0, self.prior.factor)
+        level = self.most_noise * torch.cat([torch.rand(1, generator=draw) for draw in draws]).to(self.device)
+        noise = torch.stack([torch.randn(coarse.shape[1:], generator=draw) for draw in draws]).to(self.device)
+        return self.prior.upsample(coarse + level.view(-1, 1, 1, 1, 1) * noise), level
+
+    def _bound(self, batch: dict, x0: Tensor) -> Denoiser:
+        return self.prior.bind(avg_pool3d(x0, self.prior.factor))
+
+    def _describe(self) -> dict:
+        return describe_super_resolution(self.prior)
+
+    def validation_step(self, batch: dict, index: int) -> None:
+        super().validation_step(batch, index)
+        x0 = batch["volume"]
+        lacking = (self.prior.upsample(avg_pool3d(x0, self.prior.factor)) - x0).square().mean().sqrt()
+        self.log("val/rmse_hu_upsampled", lacking * self.prior.window.half_width, sync_dist=True, batch_size=len(x0))
+
+    def _paint(self, file: Path, batch: dict, x0: Tensor, sample: Tensor) -> None:
+        upsampled = self.prior.upsample(avg_pool3d(x0, self.prior.factor))
+        volumes = {"coarse, upsampled": upsampled, "sample": sample}
+        to_hu = self.prior.window.to_hu
+        method_panel(file, {name: to_hu(volume[0, 0].cpu()) for name, volume in volumes.items()},
+                     to_hu(x0[0, 0].cpu()), Grid(x0.shape[2:], self.prior.grid.spacing), title="crop")

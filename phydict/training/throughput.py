@@ -1,0 +1,92 @@
+"""How fast a training is, beside what its machine can do at best."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+
+import lightning
+import torch
+from lightning.pytorch.utilities import rank_zero_only
+from torch.utils.flop_counter import FlopCounterMode
+
+from phydict.runtime.precision import instruction_set
+from phydict.prior import Prior, SuperResolution
+
+REPEATS = 5
+"""Matrix products of which the fastest counts."""
+
+
+class Throughput(lightning.Callback):
+    """Logs samples/s and TFLOP/s of all processes together, and tells at the start what they are to be compared with.
+
+    FLOP are those of the network's forward and backward pass, a multiplication and an addition counting two; what
+    gradient checkpointing computes twice counts once.
+
+    Args:
+        peak: TFLOP/s that one device reaches at best; none given: measured by a matrix product in the training's
+            precision when training starts
+    """
+
+    def __init__(self, peak: float | None = None):
+        if peak is not None and not peak > 0:
+            raise ValueError(f"throughput.peak is a positive number of TFLOP/s, but {peak} was given: leave it out to "
+                             "have it measured")
+        self.peak, self.began, self.flop = peak, None, 0
+
+    def on_fit_start(self, trainer, module) -> None:
+        self.began, self.flop = None, 0
+
+    def _tell_costs(self, trainer, module, shape: tuple[int, ...]) -> None:
+        self.flop = sample_flop(module.prior, shape)
+        low = torch.bfloat16 if "bf16" in str(trainer.precision) else torch.float32
+        precision, instructions = str(low).removeprefix("torch."), instruction_set(module.device)
+        if self.peak is None:
+            self.peak = matmul_peak(module.device, low) / 1e12
+        weights = sum(weight.numel() for weight in module.prior.parameters() if weight.requires_grad)
+        _tell(f"training {weights / 1e6:.3g} M weights in {precision} on {instructions}: a sample costs "
+              f"{self.flop / 1e9:.3g} GFLOP forward and backward; a {precision} matrix product reaches {self.peak:.3g} "
+              "TFLOP/s on this device")
+
+    def on_train_batch_start(self, trainer, module, batch, _) -> None:
+        if not self.flop:
+            self._tell_costs(trainer, module, batch["volume"].shape[2:])
+        now, samples = time.perf_counter(), len(batch["volume"])
+        if self.began is not None:
+            rate = samples * trainer.world_size / (now - self.began)
+            tflops = rate * self.flop / 1e12
+            module.log("samples_per_s", rate, prog_bar=True, batch_size=samples)
+            module.log("tflop_per_s", tflops, prog_bar=True, batch_size=samples)
+            module.log("share_of_peak", tflops / (self.peak * trainer.world_size), batch_size=samples)
+        self.began = now
+
+
+@rank_zero_only
+def _tell(message: str) -> None:
+    print(message, file=sys.stderr)
+
+
+def sample_flop(prior: Prior | SuperResolution, shape: Sequence[int]) -> int:
+    """FLOP of the network's forward and backward pass over one state of `shape` voxels; nothing is computed. What a
+    prior's detail network does, a tenth of it by default, is not counted."""
+    with torch.device("meta"):
+        network = type(prior.network)(**prior.network.settings)
+        inputs = prior.network_inputs(shape)
+    with FlopCounterMode(display=False) as counter:
+        network(*inputs).sum().backward()
+    return counter.get_total_flops()
+
+
+def matmul_peak(device: torch.device, dtype: torch.dtype) -> float:
+    """FLOP/s of the fastest of a few square matrix products on `device`."""
+    n = 1024 if device.type == "cpu" else 8192
+    a, b = torch.rand(2, n, n, device=device).to(dtype)
+    seconds = []
+    for _ in range(REPEATS + 1):
+        began = time.perf_counter()
+        a @ b
+        if device.type != "cpu":
+            torch.accelerator.synchronize(device)
+        seconds.append(time.perf_counter() - began)
+    return 2 * n**3 / min(seconds)

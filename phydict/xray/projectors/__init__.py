@@ -1,0 +1,1 @@
+"""Line integrals and their exact adjoints, one file per way to compute them."""

@@ -1,0 +1,167 @@
+"""The linear map from attenuation to X-rays, its exact adjoint, and autograd through both."""
+
+from __future__ import annotations
+
+import warnings
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+
+from phydict.grid import Grid
+from phydict.xray.binning import binning
+from phydict.xray.geometry import VECTOR_KEYS, ConeBeam
+
+if TYPE_CHECKING:  # they bring a compiler, so that each is imported where it is first needed
+    from phydict.xray.projectors.eq4 import Eq4
+    from phydict.xray.projectors.joseph import Joseph
+    from phydict.xray.projectors.separable import Separable
+    from phydict.xray.projectors.siddon import Siddon
+    from phydict.xray.projectors.system_matrix import SystemMatrix
+
+METHODS = ("auto", "separable", "siddon", "eq4", "joseph", "matrix")
+
+MEMORY = 2**29
+"""Bytes that a projector may hold beside volume and X-rays, unless told otherwise."""
+
+KEPT = 2
+"""Operators, with all that they computed from their geometry, that are kept for the next projector of the same one."""
+
+
+class Projector:
+    """A: attenuation mu (B, 1, X, Y, Z) in 1/mm on `grid` -> line integrals (B, K, V, U) along the rays of `beam`.
+
+    `A(mu)` and the exact adjoint `A.T(xrays)` are differentiable (to any order) in float32 and float64; geometry is
+    computed once, in float64, and shared by projectors of the same grid and beam. mu is 0 outside the grid.
+    method:
+        "separable": trilinear volumes, upright detectors, any device; the fast one (phydict.xray.projectors.separable);
+        "siddon": piecewise-constant voxels exactly, any pose, computed on the CPU (phydict.xray.projectors.siddon);
+        "eq4": the paper's Eq. 4 to the letter, any pose, computed on the CPU (phydict.xray.projectors.eq4);
+        "joseph": plane sweep with bilinear samples, any pose and device (phydict.xray.projectors.joseph);
+        "matrix": what siddon computes, as a stored matrix, any pose and device (phydict.xray.projectors.system_matrix);
+        "auto": separable for upright detectors; else the matrix if it fits, else siddon on the CPU and joseph on other
+            devices. `A.method` tells which one runs and `A.reason` why.
+    memory: bytes that the stored matrix, or the plane sweep's temporaries and rays, may take. The other methods hold
+        little: the separable one, on other devices than the CPU, the sparse factors of every view (some 15 MB each at
+        256^3 voxels, 448^2 pixels and float32), which the budget does not count.
+    device: where A will be used, for "auto" to choose by; None for the CPU.
+    full_detector: that every pixel is wanted, so that no warning is due where the detector is finer than the grid.
+    Raises ValueError when a source or detector lies inside the volume, the method does not suit the beam, or the
+    matrix does not fit the memory.
+    """
+
+    def __init__(self, grid: Grid, beam: ConeBeam, method: str = "auto", memory: int = MEMORY,
+                 device: torch.device | str | None = None, full_detector: bool = False):
+        if method not in METHODS:
+            raise ValueError(f"there is no projector method {method!r}; choose one of {', '.join(METHODS)}")
+        if not memory > 0:
+            raise ValueError(f"memory is a budget in bytes > 0, but {memory} was given")
+        beam.check(grid)
+        if not full_detector and (factor := binning(grid, beam)) > 1:
+            warnings.warn(f"the detector's pixels are finer than this grid can resolve: beam.binned({factor}) and "
+                          f"phydict.xray.binned(xrays, {factor}) measure the same in less time; full_detector=True "
+                          "keeps every pixel without this warning", stacklevel=2)
+        self.grid, self.beam = grid, beam
+        self._engine = _engine(grid, beam, method, int(memory), torch.device(device or "cpu").type)
+        self.method, self.reason = self._engine.method, self._engine.reason
+
+    def __call__(self, mu: torch.Tensor) -> torch.Tensor:
+        """Line integrals (B, K, V, U) of mu (B, 1, X, Y, Z)."""
+        _check(mu, (1, *self.grid.shape), "mu")
+        return _Linear.apply(mu[:, 0], self._engine.operator, False)
+
+    def T(self, xrays: torch.Tensor) -> torch.Tensor:
+        """The exact adjoint: xrays (B, K, V, U) -> (B, 1, X, Y, Z), with <A mu, y> = <mu, A.T y>."""
+        _check(xrays, (self.beam.views, *self.beam.shape), "xrays")
+        return _Linear.apply(xrays, self._engine.operator, True)[:, None]
+
+    def norm(self) -> float:
+        """The largest singular value of A, by power iteration to a relative change of 1e-5 (computed once).
+
+        A has no negative weights, so its leading singular vector has none either and a constant start reaches it.
+        """
+        if self._engine.norm is None:
+            mu = torch.ones(1, 1, *self.grid.shape)
+            norm, last = 0.0, -1.0
+            for _ in range(200):
+                if abs(norm - last) <= 1e-5 * norm:
+                    break
+                mu, last = self.T(self(mu / mu.norm())), norm
+                norm = float(mu.norm()) ** 0.5
+            self._engine.norm = norm
+        return self._engine.norm
+
+
+@dataclass
+class _Engine:
+    """What projectors of the same grid and beam share: the operator, why it was chosen, and its norm once known."""
+
+    operator: Eq4 | Joseph | Separable | Siddon | SystemMatrix
+    method: str
+    reason: str
+    norm: float | None = None
+
+
+_engines: OrderedDict[tuple, _Engine] = OrderedDict()
+
+
+def _engine(grid: Grid, beam: ConeBeam, method: str, memory: int, device: str) -> _Engine:
+    """The engine for a geometry, from among those last used if it is there."""
+    key = (method, memory, device, grid.shape, grid.affine.tobytes(), beam.shape,
+           *(getattr(beam, name).tobytes() for name in VECTOR_KEYS[:4]))
+    if key not in _engines:
+        chosen, reason = _choose(grid, beam, memory, device) if method == "auto" else (method, "it was asked for")
+        _engines[key] = _Engine(_operator(grid, beam, chosen, memory), chosen, reason)
+    _engines.move_to_end(key)
+    while len(_engines) > KEPT:
+        _engines.popitem(last=False)
+    return _engines[key]
+
+
+def _choose(grid: Grid, beam: ConeBeam, memory: int, device: str) -> tuple[str, str]:
+    """The method for a geometry, a memory budget and a device, and a sentence that says why."""
+    if beam.is_upright(grid):
+        return "separable", "the detectors stand upright on the grid, where the separable projector is the fastest"
+    from phydict.xray.projectors.system_matrix import SystemMatrix
+
+    needed = SystemMatrix.bytes_for(grid, beam, torch.float64)
+    if needed <= memory:
+        return "matrix", (f"the detectors are tilted, and the system matrix takes at most {needed:,} bytes of the "
+                          f"budget of {memory:,}")
+    chosen, why = ("siddon", "ray tracing is compiled for the CPU") if device == "cpu" else (
+        "joseph", f"the plane sweep runs on {device}")
+    return chosen, (f"the detectors are tilted, the system matrix would take {needed:,} bytes of a budget of "
+                    f"{memory:,}, and {why}")
+
+
+def _operator(grid: Grid, beam: ConeBeam, method: str, memory: int):
+    from phydict.xray.projectors.eq4 import Eq4
+    from phydict.xray.projectors.joseph import Joseph
+    from phydict.xray.projectors.separable import Separable
+    from phydict.xray.projectors.siddon import Siddon
+    from phydict.xray.projectors.system_matrix import SystemMatrix
+
+    if method in ("joseph", "matrix"):
+        return {"joseph": Joseph, "matrix": SystemMatrix}[method](grid, beam, memory)
+    return {"separable": Separable, "siddon": Siddon, "eq4": Eq4}[method](grid, beam)
+
+
+class _Linear(torch.autograd.Function):
+    """y = A x or A' x; the gradient of the one is the other, so nothing is stored."""
+
+    @staticmethod
+    def forward(ctx, x, operator, transposed):
+        ctx.operator, ctx.transposed = operator, transposed
+        return operator.adjoint(x) if transposed else operator.forward(x)
+
+    @staticmethod
+    def backward(ctx, gradient):
+        return _Linear.apply(gradient, ctx.operator, not ctx.transposed), None, None
+
+
+def _check(x: torch.Tensor, shape: tuple[int, ...], name: str) -> None:
+    if tuple(x.shape[1:]) != shape or x.ndim != len(shape) + 1:
+        raise ValueError(f"{name} must be (batch, {', '.join(map(str, shape))}), but shape {tuple(x.shape)} was given")
+    if x.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"{name} must be float32 or float64, but {x.dtype} was given; convert it with .float()")

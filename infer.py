@@ -1,6 +1,6 @@
 """Reconstruct: python infer.py predict -c configs/reconstruct/phydict_fast.yaml --data.xrays <folder>"""
 
-from phydict.inference import main
+from phydict.cli.infer import main
 
 if __name__ == "__main__":
     main()

@@ -5,8 +5,8 @@ from pathlib import Path
 
 from jsonargparse import auto_cli
 
-from phydict.runtime.console import check_writable, one_sentence_errors, quiet
 from phydict.datasets.cts.preparation import SUMMARY, Settings, atlas_lungs, prepare_folder
+from phydict.runtime.console import check_writable, one_sentence_errors, quiet
 
 
 def prepare(cts: str, out: str, voxels: int = 256, side: float = 384.0, space: str = "patient",

@@ -23,7 +23,7 @@ from phydict.datasets import load_xrays
 from phydict.grid import Grid
 from phydict.methods import METHODS, reconstruct
 from phydict.prior import load_prior, save_prior
-from phydict.reconstruction import case_seed
+from phydict.runtime.seeds import case_seed
 from phydict.units import HUWindow, hu_to_mu, mu_to_hu
 from phydict.xray import ConeBeam, Projector
 

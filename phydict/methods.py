@@ -12,13 +12,28 @@ from phydict.baselines import CGLS, FDK, FISTATV, SIRT, DiffVox
 from phydict.datasets import format_report
 from phydict.grid import Grid
 from phydict.posterior import (
-    DAPS, DDS, DPS, CascadePosterior, DiffPIR, ExactDraw, GradientSteps, PnPDM, Posterior, PriorOnly, ProximalCG,
-    Reward, Sampler, SplitGibbs)
-from phydict.runtime.precision import check_precision
+    DAPS,
+    DDS,
+    DPS,
+    CascadePosterior,
+    DiffPIR,
+    ExactDraw,
+    GradientSteps,
+    PnPDM,
+    Posterior,
+    PriorOnly,
+    ProximalCG,
+    Reward,
+    Sampler,
+    SplitGibbs,
+)
 from phydict.prior import DEFAULT_PRIOR, Cascade, Prior, SuperResolution, load_prior, load_super_resolution
-from phydict.reconstruction import Reconstruction, Reconstructor, check_air, check_seed, check_xrays
+from phydict.reconstruction import Reconstruction, Reconstructor
+from phydict.runtime.precision import check_precision
+from phydict.runtime.seeds import check_seed
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector, binned, binning
+from phydict.xray.checks import check_air, check_xrays
 
 RELEASED_STEPS = GradientSteps(learning_rate=0.01, prior_mean=True, reward=Reward(
     lpips=0.5, random_backbone=True, dropout=True, squared=0.1, pixel_mean=True, view_sum=True, standardise=True,

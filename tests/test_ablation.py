@@ -22,14 +22,14 @@ from phydict.ablation.summary import entries
 from phydict.ablation.tables import Table, all_tables, ranks
 from phydict.ablation.timing import TimedProjector
 from phydict.baselines.baseline import Baseline
+from phydict.cli.infer import main
 from phydict.evaluation import read_csv
 from phydict.evaluation.metrics import MEASURES
 from phydict.grid import Grid
-from phydict.inference import main
 from phydict.methods import METHODS
 from phydict.posterior import DAPS, SplitGibbs
 from phydict.prior import save_prior
-from phydict.reconstruction import Stopwatch
+from phydict.runtime.profiling import Stopwatch
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import ConeBeam, Projector
 

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from phydict.runtime.files import ASIDE
 from phydict.inference.results import RECORD, CaseResults
+from phydict.runtime.files import ASIDE
 
 SETTINGS = {"seed": 0}
 

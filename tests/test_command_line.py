@@ -6,10 +6,10 @@ import warnings
 
 import pytest
 
+from phydict.cli.infer import main as infer
+from phydict.cli.train import main as train
 from phydict.runtime.console import noted, one_sentence_errors, quiet, with_configurations
-from phydict.inference import main as infer
 from phydict.runtime.shipped import shipped
-from phydict.training import main as train
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])

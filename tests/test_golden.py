@@ -18,12 +18,12 @@ from test_training import arguments, losses
 
 from phydict.ablation.summary import entries
 from phydict.ablation.tables import all_tables
+from phydict.cli.train import main
 from phydict.evaluation import read_csv
 from phydict.grid import Grid
 from phydict.methods import METHODS, RELEASED_STEPS, reconstruct
 from phydict.posterior import CascadePosterior, GradientSteps, Posterior, Reward, Sampler
 from phydict.prior import Cascade
-from phydict.training import main
 from phydict.xray import ConeBeam, Projector
 
 HERE = Path(__file__).parent

@@ -13,11 +13,24 @@ from prior.tiny import REPORTS, tiny_prior
 from phydict import METHODS, ConeBeam, Grid, HUWindow, Projector, reconstruct
 from phydict.baselines import CGLS, FISTATV, SIRT, DiffVox
 from phydict.diffusion import CosineSchedule, GaussianDenoiser
+from phydict.guard import risen_from
 from phydict.methods import reconstructor
 from phydict.posterior import (
-    DAPS, DDS, DPS, DiffPIR, ExactDraw, GradientSteps, Langevin, PnPDM, Posterior, PriorOnly, ProximalCG, SplitGibbs)
-from phydict.reconstruction import misfits, risen_from
+    DAPS,
+    DDS,
+    DPS,
+    DiffPIR,
+    ExactDraw,
+    GradientSteps,
+    Langevin,
+    PnPDM,
+    Posterior,
+    PriorOnly,
+    ProximalCG,
+    SplitGibbs,
+)
 from phydict.xray import Ideal
+from phydict.xray.residuals import misfits
 
 pytestmark = [pytest.mark.filterwarnings(f"ignore:{said}") for said in
               ("no volume was found", "the largest line integral", "the misfit rose")]

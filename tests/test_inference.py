@@ -19,23 +19,23 @@ import torch
 import yaml
 from dicom_files import orbit_tags, write_dicom
 from PIL import Image
+from prior.medsyn_files import entries, super_resolution_unet, text_unet, write
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 import phydict
 from phydict.baselines import SIRT
+from phydict.cli.infer import main
 from phydict.datasets import load_xrays, phantom_case, prepare_ct, save_xrays
 from phydict.evaluation import volume_metrics
 from phydict.grid import Grid
-from phydict.inference import main
 from phydict.methods import reconstruct, reconstructor
 from phydict.posterior import PriorOnly
-from phydict.runtime.precision import instruction_set
 from phydict.prior import LocalUNet, Prior, SuperResolution, VolumeUNet, save_prior, save_super_resolution
+from phydict.runtime.precision import instruction_set
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import ConeBeam, Ideal, Polychromatic, Projector
 from phydict.xray.geometry_files import write_beam
-from prior.medsyn_files import entries, super_resolution_unet, text_unet, write
 
 ROOT = Path(__file__).parents[1]
 CONFIGS = ROOT / "configs" / "reconstruct"

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from posterior.test_posterior import BEAM, views
 from prior.tiny import REPORTS, tiny_prior
 
 from phydict import METHODS, ConeBeam, Grid, reconstruct
@@ -18,7 +19,6 @@ from phydict.posterior import DPS, GradientSteps, Posterior, Reward, Sampler
 from phydict.prior import save_prior
 from phydict.runtime.profiling import profiled, stage
 from phydict.xray import Projector
-from posterior.test_posterior import BEAM, views
 
 ROOT = Path(__file__).parents[1]
 
@@ -44,8 +44,8 @@ for name, report in json.loads(sys.argv[2]):
 print(json.dumps({"modules": sorted(sys.modules), "networks": networks}))
 """
 
-NEVER = ("lightning", "pytorch_lightning", "tensorboard", "lungmask", "itk", "ignite", "phydict.training",
-         "phydict.training.data", "phydict.training.base", "phydict.inference")
+NEVER = ("lightning", "pytorch_lightning", "tensorboard", "lungmask", "itk", "ignite", "phydict.training", "phydict.cli",
+         "phydict.inference")
 """Of use to training, to tables and to other files, and to no reconstruction in memory. MONAI is not among them,
 nor are transformers and lpips: the networks are MONAI's, which imports all of itself and those two with it."""
 PRESETS = ("sirt", "fdk", "phydict_fast", "phydict_paper", "phydict_released")

@@ -14,7 +14,7 @@ from prior.tiny import tiny_prior
 from setuptools.dist import Distribution
 
 import phydict
-from phydict import inference, training
+from phydict.cli import infer, train
 from phydict.prior import DEFAULT_PRIOR, fingerprint, load_prior, save_prior
 from phydict.runtime.shipped import own_or_shipped, shipped
 
@@ -48,7 +48,7 @@ def test_the_version_is_the_same_everywhere(distribution):
 
 
 @pytest.mark.parametrize("command, file, main", [
-    ("phydict-train", "train.py", training.main), ("phydict-infer", "infer.py", inference.main)])
+    ("phydict-train", "train.py", train.main), ("phydict-infer", "infer.py", infer.main)])
 def test_a_command_is_what_its_script_in_the_checkout_runs(command, file, main):
     module, name = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"][command].split(":")
     assert getattr(import_module(module), name) is main

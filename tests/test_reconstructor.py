@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from phydict.reconstruction import misfits
+from phydict.xray.residuals import misfits
 
 Y = torch.rand(3, 5, 4, generator=torch.Generator().manual_seed(0)) + 0.1
 

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-
-from phydict.prior import LocalUNet, load_super_resolution, save_prior, save_super_resolution
-from phydict.training.crops import SuperResolutionData
-from phydict.training import SuperResolutionTraining, main, stage_of
 from prior.tiny import tiny_prior, tiny_super_resolution
+
+from phydict.cli.train import main, stage_of
+from phydict.prior import LocalUNet, load_super_resolution, save_prior, save_super_resolution
+from phydict.training import SuperResolutionTraining
+from phydict.training.crops import SuperResolutionData
 
 CONFIG = Path(__file__).parents[1] / "configs" / "prior" / "super_resolution.yaml"
 BASE_CONFIG = CONFIG.with_name("phantom.yaml")

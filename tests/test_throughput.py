@@ -7,11 +7,11 @@ import torch
 from prior.tiny import tiny_prior
 from test_training import arguments, cache  # noqa: F401
 
+from phydict.cli.train import main
 from phydict.grid import Grid
-from phydict.runtime.precision import instruction_set
 from phydict.prior import Prior, VolumeUNet
+from phydict.runtime.precision import instruction_set
 from phydict.training.throughput import Throughput, sample_flop
-from phydict.training import main
 from phydict.units import HUWindow
 
 

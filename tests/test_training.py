@@ -15,17 +15,19 @@ import nibabel
 import numpy as np
 import pytest
 import torch
-from torch.utils.data import default_collate
-
-from phydict.training.data import CachedPhantoms, PriorData
-from phydict.datasets import Thorax, phantom_case
-from phydict.grid import Grid
-from phydict.prior import VolumeUNet, load_prior, save_prior
-from phydict.training.base import reconstruction_scores
-from phydict.training import PriorTraining, main
-from phydict.units import HUWindow
 from prior.medsyn_files import entries, text_unet, write
 from prior.tiny import tiny_prior
+from torch.utils.data import default_collate
+
+from phydict.cli.train import main
+from phydict.datasets import Thorax, phantom_case
+from phydict.datasets.phantoms.cached import CachedPhantoms
+from phydict.grid import Grid
+from phydict.prior import VolumeUNet, load_prior, save_prior
+from phydict.training import PriorTraining
+from phydict.training.base import reconstruction_scores
+from phydict.training.data import PriorData
+from phydict.units import HUWindow
 
 CONFIG = Path(__file__).parents[1] / "configs" / "prior" / "phantom.yaml"
 TINY = ["--model.network.class_path=phydict.prior.VolumeUNet", "--model.network.init_args.channels=[8,8]",
@@ -95,7 +97,7 @@ def test_the_loss_falls(tmp_path, cache):
 def test_a_log_file_tells_steps_in_whole_lines_and_nothing_of_lightnings(tmp_path, cache):
     for more in (["--trainer.max_steps=3"], ["--trainer.max_steps=6", f"--ckpt_path={tmp_path / 'last.ckpt'}"]):
         args = [arg for arg in arguments(tmp_path, cache, "--progress.interval=0") if "enable_" not in arg]
-        run = subprocess.run([sys.executable, "-c", "from phydict.training import main; main()", *args, *more],
+        run = subprocess.run([sys.executable, "-c", "from phydict.cli.train import main; main()", *args, *more],
                              capture_output=True, text=True, cwd=CONFIG.parents[2], timeout=300)
         assert run.returncode == 0, run.stderr[-2000:]
         said = (run.stdout + run.stderr).splitlines()
@@ -107,7 +109,8 @@ def test_a_log_file_tells_steps_in_whole_lines_and_nothing_of_lightnings(tmp_pat
 def test_a_killed_run_goes_on_as_if_it_had_not_been(tmp_path, straight, cache):
     killed = """if True:  # a process that dies without a word in the second epoch, after the first's checkpoint
         import os, signal, sys
-        from phydict.training import PriorTraining, main
+        from phydict.training import PriorTraining
+        from phydict.cli.train import main
         step = PriorTraining.training_step
         def fatal_step(task, batch, index):
             if task.global_step == 6:
@@ -436,7 +439,8 @@ def test_two_processes_train_the_prior_that_one_would(tmp_path, cache, straight)
 
 def test_every_process_stops_where_one_of_them_has_a_loss_that_is_not_finite(tmp_path, cache):
     (tmp_path / "train.py").write_text("""if True:
-        from phydict.training import PriorTraining, main
+        from phydict.training import PriorTraining
+        from phydict.cli.train import main
         loss = PriorTraining.denoising_loss
         def broken(task, batch, key, rank, processes):
             return loss(task, batch, key, rank, processes) * (float("nan") if rank == task.global_step == 1 else 1)

@@ -14,14 +14,16 @@ import torch
 
 from phydict.ablation.spec import Specification, Trial, key, prior_of
 from phydict.ablation.timing import PeakMemory, TimedPrior, TimedProjector, WarmUp
-from phydict.runtime.console import noted, sentence
 from phydict.evaluation import read_csv, write_csv
+from phydict.inference.data import case_scores
 from phydict.methods import fit_to_grid, reconstructor
 from phydict.posterior import Sampler
+from phydict.reconstruction import Reconstruction
+from phydict.runtime.console import noted, sentence
 from phydict.runtime.precision import instruction_set
+from phydict.runtime.profiling import Stopwatch
 from phydict.runtime.progress import CaseProgress
-from phydict.inference.data import case_scores
-from phydict.reconstruction import Reconstruction, Stopwatch, case_seed
+from phydict.runtime.seeds import case_seed
 
 RESULTS, TABLES = "results.csv", ("tables.md", "tables.tex")
 """The results of a folder, and the tables that are made of them."""

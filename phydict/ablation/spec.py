@@ -16,15 +16,16 @@ from typing import get_args, get_type_hints
 from jsonargparse import ArgumentError, ArgumentParser
 
 from phydict.grid import Grid
+from phydict.inference.data import ReconstructionData
 from phydict.methods import METHODS
 from phydict.posterior import Sampler
 from phydict.prior import DEFAULT_PRIOR, fingerprint, load_prior
-from phydict.inference.data import ReconstructionData
-from phydict.reconstruction import Reconstructor, check_seed, describe
+from phydict.reconstruction import Reconstructor, describe
+from phydict.runtime.seeds import check_seed
 from phydict.runtime.shipped import configuration
+from phydict.runtime.yaml_file import read_yaml
 from phydict.units import HUWindow
 from phydict.xray import Ideal, Polychromatic, Simulator
-from phydict.runtime.yaml_file import read_yaml
 
 SIDE = 560.0
 """mm along each side of the simulated detector unless the size of its pixels is given."""

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from phydict.ablation.run import TABLES
 from phydict.ablation.summary import SHOWN_MEASURES, Entry, best_settings, conditions, told
-from phydict.runtime.files import whole_file
 from phydict.evaluation.metrics import RANGE, SIGMA, TAPS, Measure
+from phydict.runtime.files import whole_file
 
 OF_METHODS = ("ssim", "psnr", "mae_hu", "misfit", "seconds", "network_calls")
 """Columns of the table of methods."""

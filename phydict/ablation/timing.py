@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from phydict.diffusion import Denoiser
-from phydict.reconstruction import Stopwatch
+from phydict.runtime.profiling import Stopwatch
 from phydict.xray import Projector
 
 

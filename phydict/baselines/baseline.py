@@ -9,12 +9,14 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from phydict.runtime.profiling import stage
-from phydict.reconstruction import (
-    Guard, Reconstruction, Reconstructor, Stopwatch, check_line_integrals, check_xrays, misfits)
+from phydict.guard import Guard
+from phydict.reconstruction import Reconstruction, Reconstructor
+from phydict.runtime.profiling import Stopwatch, stage
 from phydict.units import HUWindow, mu_to_hu
 from phydict.xray import Projector
 from phydict.xray.calibration import match_views
+from phydict.xray.checks import check_line_integrals, check_xrays
+from phydict.xray.residuals import misfits
 
 
 class CountedProjector:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import errno
 import reprlib
 import sys
 from pathlib import Path
@@ -14,94 +13,27 @@ from jsonargparse import auto_cli
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.cli import LightningCLI
 from lightning.pytorch.loggers import CSVLogger
-from lightning.pytorch.plugins.io import TorchCheckpointIO
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
-from phydict.runtime.files import whole_file
+from phydict.cli.export import export_prior, print_prior
 from phydict.runtime.console import (
-    check_command, check_writable, one_sentence_errors, quiet, read_configurations, with_configurations)
-from phydict.training.data import PriorData
+    check_command,
+    check_writable,
+    one_sentence_errors,
+    quiet,
+    read_configurations,
+    with_configurations,
+)
+from phydict.runtime.files import whole_file
 from phydict.runtime.precision import PRECISIONS, resolve_precision, trainer_precision
-from phydict.prior import save_prior, save_super_resolution
-from phydict.prior.files import build_prior, build_super_resolution, build_text, has_text, is_saved_prior
-from phydict.prior.finite import check_finite
-from phydict.prior.medsyn.checkpoint import inspect_prior, read_torch
 from phydict.training.base import PriorTraining
-from phydict.runtime.reading import not_written
-from phydict.training.stage import CHECKPOINT
+from phydict.training.checkpoints import BEST, HELD_OUT, RESUMED, BestCheckpoint, WholeCheckpoints, read_checkpoint
 from phydict.training.crops import SuperResolutionData
+from phydict.training.data import PriorData
+from phydict.training.progress import TrainingProgress
+from phydict.training.stage import CHECKPOINT
 from phydict.training.super_resolution import SuperResolutionTraining
 from phydict.training.throughput import Throughput
-from phydict.training.progress import TrainingProgress
-
-BEST, HELD_OUT = "best.ckpt", "held_out.txt"
-"""Files of a training's folder: what reconstructed the held-out cases best, and the ids of the CTs that it never
-saw."""
-
-
-RESUMED = ("epoch", "global_step", "loops", "optimizer_states", "lr_schedulers", "callbacks")
-"""What a checkpoint must hold beside the weights for its training to go on."""
-
-
-def read_checkpoint(path: str | Path) -> dict:
-    """A checkpoint that training wrote. Raises FileNotFoundError, or ValueError when it is truncated, holds code, is
-    another's or holds weights that are not finite."""
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"there is no checkpoint {path}: give a .ckpt file that training wrote")
-    checkpoint = read_torch(path)
-    if not isinstance(checkpoint, dict) or "phydict" not in checkpoint:
-        raise ValueError(f"{path} is no checkpoint of a prior: give a .ckpt file that training wrote")
-    header, weights = checkpoint["phydict"], checkpoint.get("state_dict")
-    stage = header.get("stage", "base") if isinstance(header, dict) else None
-    if not isinstance(stage, str) or stage not in STAGES:
-        raise ValueError(f"{path} is damaged: its header is {reprlib.repr(header)}; give another checkpoint")
-    if not isinstance(weights, dict) or not all(isinstance(name, str) for name in weights) or not all(
-            isinstance(weight, torch.Tensor) for name, weight in weights.items() if name.startswith(("prior.", "text."))):
-        raise ValueError(f"{path} is damaged: its weights are {reprlib.repr(weights)}; give another checkpoint")
-    for state in ("state_dict", "current_model_state"):
-        check_finite(checkpoint.get(state, {}), path)
-    return checkpoint
-
-
-def export_prior(checkpoint: str, out: str, overwrite: bool = False) -> None:
-    """Write the averaged weights of a training checkpoint as a prior, or a super-resolution stage, for reconstruction.
-
-    Args:
-        checkpoint: the .ckpt file that training wrote
-        out: the .safetensors file to write
-        overwrite: whether a prior or stage that is there already is replaced
-    """
-    if Path(out).suffix != ".safetensors":
-        raise ValueError(f"a prior is a .safetensors file, but {out} was given: give a name with that ending")
-    check_writable(Path(out), "--out", file=True)
-    if Path(out).exists() and not is_saved_prior(out):
-        raise ValueError(f"{out} is there already, is no prior of phydict's, and is not replaced: give another --out")
-    if Path(out).exists() and not overwrite:
-        raise ValueError(f"{out} is a prior already: add --overwrite true to replace it, or give another --out")
-    content = read_checkpoint(checkpoint)
-    header = content["phydict"]
-    weights = {k.removeprefix("prior."): w for k, w in content["state_dict"].items() if k.startswith("prior.")}
-    training = header.get("training", {"steps": content.get("global_step")})
-    if header.get("stage") == "super_resolution":
-        save_super_resolution(build_super_resolution(header, weights), out, training)
-    else:
-        prior = build_prior(header, weights)
-        if has_text(header):
-            prior.text = build_text(header["text"], {k: w for k, w in weights.items() if k.startswith("text.")})
-        save_prior(prior, out, training)
-    print(f"prior in {out}")
-
-
-def print_prior(path: str) -> None:
-    """Tell what a file or folder is: a prior, a checkpoint of its training, or one of MedSyn's networks, and whether
-    it is whole.
-
-    Args:
-        path: the file or folder
-    """
-    for file, properties in inspect_prior(path).items():
-        print(file, *(f"  {name}: {value}" for name, value in properties.items()), sep="\n")
-
 
 COMMANDS = {"fit": "train a prior", "validate": "measure one on held-out cases", "export": "checkpoint -> prior",
             "inspect-prior": "what a file is"}
@@ -121,28 +53,6 @@ def stage_of(args: list[str]) -> str:
     if not isinstance(stage, str) or stage not in STAGES:
         raise ValueError(f"the stages that can be trained are {' and '.join(STAGES)}, but {reprlib.repr(stage)} was given")
     return stage
-
-
-class WholeCheckpoints(TorchCheckpointIO):
-    """Checkpoints that take the last one's place only when they are complete, whatever stops the writing."""
-
-    def save_checkpoint(self, checkpoint: dict, path: str | Path, storage_options: object = None) -> None:
-        try:
-            with whole_file(Path(path)) as part:
-                torch.save(checkpoint, part)
-        except (OSError, RuntimeError) as error:
-            if isinstance(error, RuntimeError):  # torch's words for a write that was cut short
-                error = OSError(errno.ENOSPC, "perhaps the disk is full")
-            raise not_written(f"the checkpoint {path}", error, "give another --out, and go on from the last one, if there "
-                              "is one, with --ckpt_path") from error
-
-
-class BestCheckpoint(ModelCheckpoint):
-    """Keeps the weights with the best score so far, where validation gives one."""
-
-    def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        if self.monitor in trainer.callback_metrics:
-            super().on_validation_end(trainer, pl_module)
 
 
 class PriorCLI(LightningCLI):

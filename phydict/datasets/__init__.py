@@ -4,13 +4,13 @@ from phydict.datasets.cts.anatomy import MASKS, segment
 from phydict.datasets.cts.augment import Augmentation, Deformation, augment
 from phydict.datasets.cts.ct_rate import CTCases, CTFile, find_cts, load_case, patient_of, split_by_patient
 from phydict.datasets.cts.ct_rate_tables import read_calibrations, read_reports
-from phydict.datasets.phantoms.findings import Finding
+from phydict.datasets.cts.transforms import Calibration, load_ct, prepare_ct
 from phydict.datasets.intensity import Intensity
+from phydict.datasets.phantoms.findings import Finding
 from phydict.datasets.phantoms.phantom import build, pathology_region, phantom_case
+from phydict.datasets.phantoms.thorax import Thorax, report, without, wrong_side
 from phydict.datasets.radiographs.radiographs import find_xrays, load_xrays, save_xrays
 from phydict.datasets.reports import format_report, join_report
-from phydict.datasets.phantoms.thorax import Thorax, report, without, wrong_side
-from phydict.datasets.cts.transforms import Calibration, load_ct, prepare_ct
 
 __all__ = ["Augmentation", "CTCases", "CTFile", "Calibration", "Deformation", "Finding", "Intensity", "MASKS", "Thorax",
            "augment", "build", "find_cts", "find_xrays", "format_report", "join_report", "load_case", "load_ct",

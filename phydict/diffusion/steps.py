@@ -8,6 +8,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import torch
 from torch import Tensor
 
 from phydict.diffusion.schedule import CosineSchedule
@@ -31,3 +34,13 @@ def renoise(schedule: CosineSchedule, x0: Tensor, t: float, noise: Tensor) -> Te
     """Forward diffusion of the clean state x0 to time t with the given standard normal noise."""
     signal, sigma = schedule.scales(t)
     return signal.to(x0) * x0 + sigma.to(x0) * noise
+
+Draw = torch.Generator | Sequence[torch.Generator]
+"""Where noise comes from: one generator, or one for each state of a batch."""
+
+
+def noise_like(x: Tensor, draw: Draw) -> Tensor:
+    """Standard normal noise drawn in float32 on the generator's device, so that a result depends on neither of x's."""
+    if not isinstance(draw, torch.Generator):
+        return torch.cat([noise_like(one[None], own) for one, own in zip(x, draw, strict=True)])
+    return torch.randn(x.shape, generator=draw).to(x)

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
 from phydict.grid import Grid
-from phydict.reconstruction import misfits
+from phydict.xray.residuals import misfits
 
 DISPLAY = (-1000.0, 400.0)
 """HU shown as black and as white."""

@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from rich.table import Table
 
-from phydict.runtime.files import whole_file
 from phydict.evaluation.metrics import MEASURES, RANGE, SIGMA, TAPS, Measure
 from phydict.grid import Grid
+from phydict.runtime.files import whole_file
 from phydict.units import HUWindow
 
 TEXT_COLUMNS = ("case", "method")

@@ -13,18 +13,17 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from phydict.runtime.checksum import file_crc32
-from phydict.runtime.console import noted
-from phydict.training.data import HELD_OUT_PHANTOM, PHANTOM_VERSION
 from phydict.datasets import CTFile, find_cts, find_xrays, load_case, load_xrays, phantom_case
+from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM, PHANTOM_VERSION
 from phydict.evaluation import volume_metrics
 from phydict.grid import Grid
-from phydict.runtime.reading import read_ids
 from phydict.reconstruction import describe
+from phydict.runtime.console import noted
+from phydict.runtime.files import file_crc32
+from phydict.runtime.reading import read_ids
 from phydict.runtime.shipped import own_or_shipped
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Ideal, Projector, Simulator
-
 
 MOST_PHANTOMS = 100_000
 

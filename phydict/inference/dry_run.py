@@ -8,12 +8,12 @@ from pathlib import Path
 import torch
 
 from phydict.datasets import Thorax, build
-from phydict.evaluation import agreement, geometry_page, view_sides
 from phydict.grid import Grid
-from phydict.methods import binned, binning
-from phydict.reconstruction import check_air, check_xrays
+from phydict.inference.geometry_page import agreement, geometry_page, view_sides
 from phydict.units import hu_to_mu
 from phydict.xray import Projector
+from phydict.xray.binning import binned, binning
+from phydict.xray.checks import check_air, check_xrays
 
 
 def dry_run(path: str | Path, case: dict, grid: Grid) -> list[str]:

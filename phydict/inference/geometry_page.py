@@ -13,9 +13,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from phydict.runtime.files import whole_file
 from phydict.evaluation.gallery import DISPLAY, GREY, MOST_VIEWS, PLANES, plane
 from phydict.grid import Grid
+from phydict.runtime.files import whole_file
 from phydict.xray import ConeBeam
 
 SIDES = (("right", "left"), ("anterior", "posterior"), ("superior", "inferior"))

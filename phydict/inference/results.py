@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple
 
-from phydict.runtime.files import remove_leftovers, undisturbed, whole_file, whole_folder
 from phydict.evaluation import markdown, write_csv
+from phydict.runtime.files import remove_leftovers, undisturbed, whole_file, whole_folder
 from phydict.runtime.reading import not_written
 
 RECORD = "reconstruction.json"

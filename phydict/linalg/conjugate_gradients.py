@@ -7,8 +7,6 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from phydict.posterior.normalised import NormalisedMeasurement
-
 
 def conjugate_gradients(operator: Callable[[Tensor], Tensor], right: Tensor, iterations: int,
                         tolerance: float = 1e-6) -> Tensor:
@@ -32,14 +30,3 @@ def conjugate_gradients(operator: Callable[[Tensor], Tensor], right: Tensor, ite
         previous, energy = energy, torch.where(active, residual.square().sum(over, keepdim=True), energy)
         direction = residual + torch.where(active, energy / previous, 0) * direction
     return d
-
-
-def nearest_fit(measurement: NormalisedMeasurement, x: Tensor, weight: float, iterations: int,
-                tolerance: float = 1e-6, y: Tensor | None = None) -> Tensor:
-    """argmin over z of |P(z) - y|^2 + weight |z - x|^2 by conjugate gradients from x (B, 1, X, Y, Z).
-
-    y: the measured line integrals unless others are given. weight 0: of all least-squares solutions the one nearest x.
-    """
-    residual = (measurement.y if y is None else y) - measurement.project(x)
-    return x + conjugate_gradients(lambda d: measurement.adjoint(measurement.linear(d)) + weight * d,
-                                   measurement.adjoint(residual), iterations, tolerance)

@@ -9,17 +9,22 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from phydict.diffusion.steps import noise_like
 from phydict.grid import Grid
+from phydict.guard import Guard
 from phydict.posterior.likelihood.likelihood import ProximalCG
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.posterior import Counted, Posterior, check_guidance
-from phydict.posterior.samplers.sampler import PriorOnly, Sampler
-from phydict.posterior.samplers.split_gibbs import SplitGibbs, noise_like
-from phydict.runtime.precision import check_precision, resolve_precision
+from phydict.posterior.samplers.prior_only import PriorOnly
+from phydict.posterior.samplers.sampler import Sampler
+from phydict.posterior.samplers.split_gibbs import SplitGibbs
 from phydict.prior import Cascade
-from phydict.reconstruction import Guard, Reconstruction, Reconstructor, Stopwatch, misfits
+from phydict.reconstruction import Reconstruction, Reconstructor
+from phydict.runtime.precision import check_precision, resolve_precision
+from phydict.runtime.profiling import Stopwatch
 from phydict.units import MU_WATER
 from phydict.xray import Projector, binned, binning
+from phydict.xray.residuals import misfits
 
 
 @dataclass(frozen=True)

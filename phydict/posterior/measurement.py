@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from phydict.runtime.profiling import stage
-from phydict.reconstruction import check_line_integrals, check_xrays
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import Projector
 from phydict.xray.calibration import match_views, subtract_scatter
+from phydict.xray.checks import check_line_integrals, check_xrays
 from phydict.xray.noise_level import noise_level
 
 SCATTER = 0.03

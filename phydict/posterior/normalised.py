@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from phydict.linalg.conjugate_gradients import conjugate_gradients
 from phydict.posterior.measurement import Measurement
 
 
@@ -45,3 +46,14 @@ def check_noise(noise: float) -> None:
     if not noise > 0:
         raise ValueError(f"the noise of the line integrals must be above 0, but {noise} was given: state the standard "
                          "deviation of their error, model error included")
+
+
+def nearest_fit(measurement: NormalisedMeasurement, x: Tensor, weight: float, iterations: int,
+                tolerance: float = 1e-6, y: Tensor | None = None) -> Tensor:
+    """argmin over z of |P(z) - y|^2 + weight |z - x|^2 by conjugate gradients from x (B, 1, X, Y, Z).
+
+    y: the measured line integrals unless others are given. weight 0: of all least-squares solutions the one nearest x.
+    """
+    residual = (measurement.y if y is None else y) - measurement.project(x)
+    return x + conjugate_gradients(lambda d: measurement.adjoint(measurement.linear(d)) + weight * d,
+                                   measurement.adjoint(residual), iterations, tolerance)

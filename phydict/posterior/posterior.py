@@ -11,17 +11,20 @@ import torch
 from torch import Tensor
 
 from phydict.diffusion import Denoiser
+from phydict.diffusion.steps import noise_like
 from phydict.grid import Grid
+from phydict.guard import Guard
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.samplers.sampler import Sampler
-from phydict.posterior.samplers.split_gibbs import SplitGibbs, noise_like
-from phydict.runtime.precision import check_precision, precision_name
+from phydict.posterior.samplers.split_gibbs import SplitGibbs
 from phydict.prior import Prior
-from phydict.runtime.profiling import stage
+from phydict.reconstruction import Reconstruction, Reconstructor
+from phydict.runtime.precision import check_precision, precision_name
+from phydict.runtime.profiling import Stopwatch, stage
 from phydict.runtime.reading import check_memory
-from phydict.reconstruction import Guard, Reconstruction, Reconstructor, Stopwatch, misfits
 from phydict.units import MU_WATER
 from phydict.xray import Projector
+from phydict.xray.residuals import misfits
 
 
 class Counted:

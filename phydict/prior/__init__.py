@@ -1,13 +1,23 @@
 """The diffusion prior of CT: networks, report encoder, cascade, and their files with grid and HU window."""
 
 from phydict.prior.cascade import Cascade
-from phydict.prior.files import (
-    DEFAULT_PRIOR, describe, describe_super_resolution, file_read, fingerprint, load_prior, load_super_resolution,
-    save_prior, save_super_resolution)
 from phydict.prior.detail import DetailNetwork
+from phydict.prior.files import (
+    DEFAULT_PRIOR,
+    describe,
+    describe_super_resolution,
+    file_read,
+    fingerprint,
+    load_prior,
+    load_super_resolution,
+    save_prior,
+    save_super_resolution,
+)
+from phydict.prior.inspection import inspect_prior
 from phydict.prior.local_unet import LocalUNet
-from phydict.prior.medsyn.prior import MedSynPrior, MedSynSuperResolution
-from phydict.prior.medsyn.checkpoint import MedSynCheckpoint, inspect_prior
+from phydict.prior.medsyn.checkpoint import MedSynCheckpoint
+from phydict.prior.medsyn.prior import MedSynPrior
+from phydict.prior.medsyn.super_resolution import MedSynSuperResolution
 from phydict.prior.prior import STATE, BoundPrior, Prior
 from phydict.prior.super_resolution import SuperResolution
 from phydict.prior.text import TextEncoder, learn_vocabulary

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from transformers import BertModel, BertTokenizer
 
 from phydict.prior.finite import check_finite
-
 from phydict.runtime.reading import reading, reason
 
 CONFIG = "config.json"

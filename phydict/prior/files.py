@@ -12,20 +12,26 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from phydict.runtime.files import whole_file
-from phydict.runtime.checksum import file_crc32
 from phydict.diffusion import CosineSchedule
 from phydict.grid import Grid
 from phydict.prior.detail import DetailNetwork
 from phydict.prior.finite import check_finite, not_finite
 from phydict.prior.local_unet import LocalUNet
-from phydict.prior.medsyn.prior import MedSynPrior, MedSynSuperResolution
 from phydict.prior.medsyn.checkpoint import (
-    FILES, MedSynCheckpoint, as_checkpoint, is_medsyn, load_medsyn, load_medsyn_super_resolution)
+    FILES,
+    MedSynCheckpoint,
+    as_checkpoint,
+    is_medsyn,
+    load_medsyn,
+    load_medsyn_super_resolution,
+)
+from phydict.prior.medsyn.prior import MedSynPrior
+from phydict.prior.medsyn.super_resolution import MedSynSuperResolution
 from phydict.prior.prior import STATE, Prior
 from phydict.prior.super_resolution import SuperResolution
 from phydict.prior.text import TextEncoder
 from phydict.prior.unet import VolumeUNet
+from phydict.runtime.files import file_crc32, whole_file
 from phydict.runtime.reading import not_written, reason
 from phydict.runtime.shipped import own_or_shipped, shipped
 from phydict.units import HUWindow

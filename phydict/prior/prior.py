@@ -10,10 +10,10 @@ from torch import Tensor, nn
 
 from phydict.diffusion import CosineSchedule, guided
 from phydict.grid import Grid
-from phydict.runtime.precision import network_precision
 from phydict.prior.detail import DetailNetwork
 from phydict.prior.text import TextEncoder
 from phydict.prior.unet import VolumeUNet
+from phydict.runtime.precision import network_precision
 from phydict.units import HUWindow
 
 STATE = ("ct", "lung", "airway", "vessel")

@@ -11,9 +11,9 @@ from torch.nn.functional import interpolate
 
 from phydict.diffusion import CosineSchedule
 from phydict.grid import Grid
-from phydict.runtime.precision import network_precision
 from phydict.prior.local_unet import LocalUNet
 from phydict.prior.tiles import Tiles
+from phydict.runtime.precision import network_precision
 from phydict.units import HUWindow
 
 

@@ -6,6 +6,7 @@ import fcntl
 import os
 import shutil
 import socket
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -121,3 +122,12 @@ def _runs(process: int) -> bool:
     except PermissionError:
         pass
     return True
+
+
+def file_crc32(path: Path, start: int = 0) -> int:
+    """CRC-32 of a file's bytes, going on from the checksum `start`; read in pieces, so that any size fits in memory."""
+    crc = start
+    with path.open("rb") as file:
+        while piece := file.read(2**24):
+            crc = zlib.crc32(piece, crc)
+    return crc

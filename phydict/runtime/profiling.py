@@ -110,3 +110,19 @@ def _peaks() -> tuple[float, float]:
         unit = 1 if sys.platform == "darwin" else 1024
         process = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
     return process, device
+
+
+class Stopwatch:
+    """Seconds spent per named stage of a reconstruction."""
+
+    def __init__(self):
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        began = time.perf_counter()
+        try:
+            with stage(name):
+                yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began

@@ -11,12 +11,12 @@ from lightning.pytorch.callbacks import WeightAveraging
 from lightning.pytorch.utilities import rank_zero_only
 from torch import Tensor
 
-from phydict.training.data import PriorData
 from phydict.diffusion import Denoiser
 from phydict.evaluation import method_panel, volume_metrics
 from phydict.grid import Grid
 from phydict.methods import reconstruct
 from phydict.prior import DetailNetwork, Prior, TextEncoder, VolumeUNet, describe, learn_vocabulary, load_prior
+from phydict.training.data import PriorData
 from phydict.training.reports import learn_findings, learn_sketch
 from phydict.training.sharding import shard
 from phydict.training.stage import StageTraining

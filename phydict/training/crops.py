@@ -11,10 +11,11 @@ import torch
 from torch import Tensor
 from torch.utils.data import ConcatDataset, Dataset
 
-from phydict.training.data import HELD_OUT_PHANTOM, CachedPhantoms, PriorData
 from phydict.datasets import CTCases, Deformation, phantom_case, prepare_ct
 from phydict.datasets.cts.cache import write_array
 from phydict.datasets.cts.transforms import AIR
+from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM, CachedPhantoms
+from phydict.training.data import PriorData
 from phydict.units import HUWindow
 
 

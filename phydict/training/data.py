@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import lightning
@@ -10,69 +9,17 @@ import numpy as np
 import torch
 from torch.utils.data import ConcatDataset, DataLoader, Dataset, DistributedSampler
 
-from phydict.datasets import Augmentation, CTCases, Thorax, augment, find_cts, phantom_case, report, split_by_patient
+from phydict.datasets import Augmentation, CTCases, Thorax, find_cts, report, split_by_patient
 from phydict.datasets.cts.cache import read_arrays, write_arrays
+from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM, CachedPhantoms
 from phydict.datasets.phantoms.phantom import change_by_findings
 from phydict.grid import Grid
-from phydict.reconstruction import check_seed
+from phydict.runtime.seeds import check_seed
+from phydict.training.draws import MixedCases, _training_parts
 from phydict.units import HUWindow
-
-PHANTOM_VERSION = 2
-"""Raised whenever a phantom of the same seed comes out differently, so that cached ones are made anew."""
-
-HELD_OUT_PHANTOM = 1_000_000
-"""Phantoms with this seed and above are never trained on."""
 
 MOST_DRAWS = 10_000_000
 """Draws of an epoch are listed before it begins."""
-
-KEYS = ("volume", "masks", "has_masks", "report")
-"""The parts of a Case that training needs."""
-
-
-class CachedPhantoms(Dataset):
-    """Phantom cases of consecutive seeds, each built when first asked for and then kept as a file in `cache`."""
-
-    def __init__(self, first_seed: int, count: int, grid: Grid, window: HUWindow, cache: Path):
-        self.first_seed, self.count, self.grid, self.window = first_seed, count, grid, window
-        size = "x".join(map(str, grid.shape))
-        self.folder = cache / f"phantoms{PHANTOM_VERSION}-{size}-{grid.spacing[0]:g}mm-{window.low:g}-{window.high:g}"
-
-    def __len__(self) -> int:
-        return self.count
-
-    def __getitem__(self, i: int) -> dict:
-        seed = self.first_seed + i
-        file = self.folder / f"{seed:07d}.npz"
-        stored = read_arrays(file)
-        if stored is None:
-            case = phantom_case(seed, self.grid, self.window)
-            stored = {"volume": case["volume"].numpy().astype(np.float16),
-                      "masks": (255 * case["masks"].numpy()).round().astype(np.uint8)}
-            write_arrays(file, stored)
-        masks = torch.from_numpy(stored["masks"].astype(np.float32) / 255)
-        return {"volume": torch.from_numpy(stored["volume"].astype(np.float32)), "masks": masks,
-                "has_masks": torch.ones(len(masks), dtype=torch.bool), "report": report(Thorax.draw(seed))}
-
-
-class MixedCases(Dataset):
-    """One epoch of deformed draws from CTs and phantoms; draw n of epoch e is the same on every machine."""
-
-    def __init__(self, cts: Sequence, phantoms: Sequence, ct_fraction: float, grid: Grid, window: HUWindow,
-                 length: int, epoch: int, seed: int, augmentation: Augmentation = Augmentation()):
-        self.cts, self.phantoms, self.ct_fraction, self.grid, self.window = cts, phantoms, ct_fraction, grid, window
-        self.length, self.epoch, self.seed, self.augmentation = length, epoch, seed, augmentation
-
-    def __len__(self) -> int:
-        return self.length
-
-    def __getitem__(self, i: int) -> dict:
-        draw = np.random.default_rng((self.seed, self.epoch, i))
-        from_ct = len(self.phantoms) == 0 or (len(self.cts) > 0 and draw.random() < self.ct_fraction)
-        source = self.cts if from_ct else self.phantoms
-        case = source[int(draw.integers(len(source)))]
-        return _training_parts(augment(case, int(draw.integers(2**31)), self.grid, self.window, self.augmentation))
-
 
 class PriorData(lightning.LightningDataModule):
     """Cases for training a prior.
@@ -192,10 +139,6 @@ class PriorData(lightning.LightningDataModule):
 
     def val_dataloader(self) -> DataLoader:
         return DataLoader(self.validation, 1, collate_fn=_collate, num_workers=self.workers)
-
-
-def _training_parts(case: dict) -> dict:
-    return {key: case[key] for key in KEYS if key in case}
 
 
 def _collate(cases: list[dict]) -> dict:

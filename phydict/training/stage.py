@@ -10,12 +10,12 @@ import lightning
 import torch
 from torch import Tensor
 
-from phydict.training.data import PriorData
 from phydict.diffusion import Denoiser, renoise
 from phydict.posterior import descend
 from phydict.prior import Prior, SuperResolution
 from phydict.prior.files import check_stage
 from phydict.prior.finite import not_finite
+from phydict.training.data import PriorData
 from phydict.units import HUWindow
 
 CHECKPOINT = "last.ckpt"

@@ -11,8 +11,8 @@ import torch
 from lightning.pytorch.utilities import rank_zero_only
 from torch.utils.flop_counter import FlopCounterMode
 
-from phydict.runtime.precision import instruction_set
 from phydict.prior import Prior, SuperResolution
+from phydict.runtime.precision import instruction_set
 
 REPEATS = 5
 """Matrix products of which the fastest counts."""

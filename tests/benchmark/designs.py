@@ -25,15 +25,14 @@ from lightning.pytorch.callbacks import EMAWeightAveraging, ModelCheckpoint
 from torch import nn
 from torch.utils.data import Dataset
 
-from phydict.runtime.console import quiet
-from phydict.training.data import PriorData
 from phydict.datasets.cts.cache import read_arrays, write_arrays
 from phydict.evaluation import read_csv, write_csv
-from phydict.runtime.precision import trainer_precision
 from phydict.prior import Prior, VolumeUNet
+from phydict.runtime.console import quiet
+from phydict.runtime.precision import trainer_precision
 from phydict.training.base import PriorTraining, reconstruction_scores
-from phydict.training.stage import denoising_errors
-from phydict.training import CHECKPOINT
+from phydict.training.data import PriorData
+from phydict.training.stage import CHECKPOINT, denoising_errors
 
 FILE = Path(__file__).with_suffix(".csv")
 HELD_OUT_CT = "LIDC-IDRI-0004"

@@ -31,13 +31,15 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from phydict import METHODS, ConeBeam, Grid, HUWindow, Projector, load_prior, reconstruct
-from phydict.runtime.console import sentence
 from phydict.datasets import prepare_ct
 from phydict.evaluation import read_csv, volume_metrics, write_csv
-from phydict.methods import DEFAULT_PRIOR, fit_to_grid
+from phydict.guard import worst_view
+from phydict.methods import fit_to_grid
 from phydict.posterior import Posterior
 from phydict.prior import Prior
-from phydict.reconstruction import Reconstruction, worst_view
+from phydict.prior.files import DEFAULT_PRIOR
+from phydict.reconstruction import Reconstruction
+from phydict.runtime.console import sentence
 from phydict.xray import Ideal
 
 OUT = Path(__file__).with_suffix(".csv")

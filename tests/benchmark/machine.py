@@ -41,8 +41,8 @@ def timed(work, repeats: int) -> tuple[float, float | None, object]:
 def network_call(precision: str, repeats: int, channels: tuple[int, ...] | None) -> dict:
     import torch
 
-    from phydict.methods import DEFAULT_PRIOR
     from phydict.prior import DetailNetwork, Prior, VolumeUNet, load_prior
+    from phydict.prior.files import DEFAULT_PRIOR
 
     prior = load_prior(DEFAULT_PRIOR)
     torch.manual_seed(0)

@@ -16,7 +16,9 @@ from pathlib import Path
 import torch
 
 from phydict.evaluation import write_csv
-from phydict.prior.medsyn.prior import MedSynPrior, MedSynSuperResolution, SuperResolutionUNet, TextUNet
+from phydict.prior.medsyn.networks import SuperResolutionUNet, TextUNet
+from phydict.prior.medsyn.prior import MedSynPrior
+from phydict.prior.medsyn.super_resolution import MedSynSuperResolution
 
 WIDTHS, VOXELS = {1: 160, 2: 56}, {1: 64, 2: 128}
 

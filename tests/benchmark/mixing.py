@@ -21,7 +21,7 @@ from designs import scores
 from phydict.datasets import find_cts, prepare_ct
 from phydict.evaluation import read_csv, write_csv
 from phydict.prior import load_prior
-from phydict.training import CHECKPOINT
+from phydict.training.stage import CHECKPOINT
 
 FILE = Path(__file__).with_suffix(".csv")
 ROOT = Path(__file__).parents[2]

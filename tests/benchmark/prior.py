@@ -13,11 +13,11 @@ from statistics import mean
 import torch
 
 from phydict import load_prior
-from phydict.training.data import HELD_OUT_PHANTOM
 from phydict.datasets import find_cts, phantom_case, prepare_ct
+from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM
 from phydict.evaluation import write_csv
-from phydict.methods import DEFAULT_PRIOR
 from phydict.prior import Prior
+from phydict.prior.files import DEFAULT_PRIOR
 from phydict.training.stage import NOISE_LEVELS, denoising_errors
 
 

@@ -26,9 +26,9 @@ import torch
 from scipy import ndimage
 from scipy.stats import rankdata, wasserstein_distance
 
-from phydict.training.data import HELD_OUT_PHANTOM
 from phydict.datasets import Thorax, build, find_cts, prepare_ct, without
 from phydict.datasets.cts.anatomy import body_mask
+from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM
 from phydict.evaluation import write_csv
 from phydict.grid import Grid
 from phydict.units import HUWindow

@@ -19,12 +19,12 @@ from realism import GRID, Case, ct, phantom
 from scipy.linalg import sqrtm
 
 from phydict import load_prior
-from phydict.training.data import HELD_OUT_PHANTOM
 from phydict.datasets import find_cts
+from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM
 from phydict.evaluation import method_panel, write_csv
-from phydict.methods import DEFAULT_PRIOR
 from phydict.posterior.samplers.sampler import descend
 from phydict.prior import Prior
+from phydict.prior.files import DEFAULT_PRIOR
 
 ITERATIONS = 50
 

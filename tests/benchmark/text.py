@@ -14,10 +14,10 @@ from statistics import mean
 import torch
 
 import phydict
-from phydict.training.data import HELD_OUT_PHANTOM
 from phydict.datasets import Thorax, pathology_region, phantom_case, report, wrong_side
+from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM
 from phydict.evaluation import volume_metrics, write_csv
-from phydict.methods import DEFAULT_PRIOR
+from phydict.prior.files import DEFAULT_PRIOR
 from phydict.xray import Ideal
 
 VOXEL_ML = 0.216

@@ -22,13 +22,13 @@ from monai.inferers import DiffusionInferer
 from monai.networks.schedulers import DDPMScheduler
 from torch.utils.data import DataLoader
 
-from phydict.runtime.console import quiet
 from phydict.datasets import phantom_case
 from phydict.evaluation import write_csv
-from phydict.methods import DEFAULT_PRIOR
 from phydict.prior import VolumeUNet, load_prior
-from phydict.training.throughput import matmul_peak, sample_flop
+from phydict.prior.files import DEFAULT_PRIOR
+from phydict.runtime.console import quiet
 from phydict.training import PriorTraining
+from phydict.training.throughput import matmul_peak, sample_flop
 
 BATCH, STEPS, WARM_UP = 2, 8, 1
 

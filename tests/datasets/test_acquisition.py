@@ -10,7 +10,8 @@ import torch
 
 from phydict.datasets.cts.acquisition import LEAST_BLOOD, change_contrast, cut_field, without_table
 from phydict.datasets.cts.augment import Augmentation, augment
-from phydict.datasets.phantoms.phantom import Thorax, build, phantom_case, without
+from phydict.datasets.phantoms.phantom import build, phantom_case
+from phydict.datasets.phantoms.thorax import Thorax, without
 from phydict.grid import Grid
 from phydict.units import HUWindow
 

@@ -14,11 +14,10 @@ import numpy as np
 import pytest
 import torch
 
+from phydict.datasets.cts.augment import Augmentation, Deformation, augment
 from phydict.datasets.cts.ct_rate import CTCases, find_cts, patient_of, split_by_patient
 from phydict.datasets.cts.ct_rate_tables import read_reports
-from phydict.datasets.cts.augment import Augmentation, Deformation, augment
-from phydict.datasets.cts.transforms import (AIR, Calibration, covering_grid, load_ct, prepare_ct,
-                                         to_grid)
+from phydict.datasets.cts.transforms import AIR, Calibration, covering_grid, load_ct, prepare_ct, to_grid
 from phydict.grid import Grid
 from phydict.units import HUWindow
 

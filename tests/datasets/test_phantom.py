@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from phydict.datasets.phantoms.findings import FOCAL, KINDS, PLEURAL
-from phydict.datasets.phantoms.phantom import (Finding, Thorax, build, pathology_region, phantom_case, report, without,
-                                      wrong_side)
+from phydict.datasets.phantoms.findings import FOCAL, KINDS, PLEURAL, Finding
+from phydict.datasets.phantoms.phantom import build, pathology_region, phantom_case
+from phydict.datasets.phantoms.thorax import Thorax, report, without, wrong_side
 from phydict.grid import Grid
 
 COARSE = Grid.cube(32)

@@ -20,15 +20,15 @@ import pytest
 import torch
 from dicom_files import write_ct_series, write_dicom
 
-from phydict.training.data import PriorData
-from phydict.datasets import cache
+from phydict.datasets.cts import cache
 from phydict.datasets.cts.ct_rate import CTCases, find_cts, load_case, patient_of
 from phydict.datasets.cts.ct_rate_tables import read_calibrations, read_reports
 from phydict.datasets.cts.ct_series import find_series, load_series
-from phydict.datasets.cts.prepared import RECORD, read_prepared
 from phydict.datasets.cts.preparation import ATLAS_LUNGS_MM, ATLAS_MM, SUMMARY, Settings, atlas_lungs, prepare_folder
+from phydict.datasets.cts.prepared import RECORD, read_prepared
 from phydict.datasets.cts.transforms import AIR, load_ct, prepare_ct, to_grid
 from phydict.grid import Grid
+from phydict.training.data import PriorData
 from phydict.units import HUWindow
 
 ROOT = Path(__file__).parents[2]

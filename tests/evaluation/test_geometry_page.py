@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from phydict.datasets import Thorax, build
-from phydict.inference.geometry_page import agreement, body_side, geometry_page, view_sides
 from phydict.grid import Grid
+from phydict.inference.geometry_page import agreement, body_side, geometry_page, view_sides
 from phydict.units import hu_to_mu
 from phydict.xray import ConeBeam, Projector
 

@@ -5,6 +5,8 @@ from dataclasses import dataclass, replace
 import pytest
 import torch
 from laws import random_like
+from prior.medsyn_files import super_resolution_unet
+from prior.tiny import tiny_prior, tiny_super_resolution
 from torch.nn.functional import interpolate
 
 from phydict.diffusion import CosineSchedule, GaussianDenoiser
@@ -13,8 +15,6 @@ from phydict.posterior import CascadePosterior, Posterior, PriorOnly, ProximalCG
 from phydict.prior import Cascade, MedSynSuperResolution
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector, binned
-from prior.medsyn_files import super_resolution_unet
-from prior.tiny import tiny_prior, tiny_super_resolution
 
 BEAM = ConeBeam.orbit(4, 1020, 740, (56, 56), 10.0)
 FINE = Grid.cube(32)

@@ -5,7 +5,7 @@ import torch
 from laws import random_like
 
 from phydict.posterior import DiffPIR
-from posterior.dense import FINE, N, SHAPE, condition, denoiser, measurement, moments, propagate
+from posterior.dense import FINE, SHAPE, N, condition, denoiser, measurement, moments, propagate
 
 V, NOISE = 0.04, 0.3
 X = random_like((1, *SHAPE), seed=10)

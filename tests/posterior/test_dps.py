@@ -3,12 +3,12 @@
 import pytest
 import torch
 from laws import random_like
+from prior.tiny import tiny_prior
 
 from phydict.grid import Grid
 from phydict.posterior import DPS, Posterior
 from phydict.xray import ConeBeam, Projector
-from posterior.dense import FINE, N, SHAPE, denoiser, measurement, moments
-from prior.tiny import tiny_prior
+from posterior.dense import FINE, SHAPE, N, denoiser, measurement, moments
 
 V = 0.04
 X = random_like((1, *SHAPE), seed=10)

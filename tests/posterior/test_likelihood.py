@@ -8,11 +8,11 @@ from scipy.optimize import lsq_linear
 
 from phydict.datasets import phantom_case
 from phydict.grid import Grid
-from phydict.posterior import GradientSteps, Measurement, ProximalCG, Reward
 from phydict.linalg.total_variation import Majoriser, smoothed_tv
+from phydict.posterior import GradientSteps, Measurement, ProximalCG, Reward
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
-from posterior.dense import N, SHAPE, DenseMeasurement, measurement
+from posterior.dense import SHAPE, DenseMeasurement, N, measurement
 
 X0 = 0.3 * random_like((1, *SHAPE), seed=20)
 

@@ -5,12 +5,12 @@ import torch
 from laws import random_like
 
 from phydict.grid import Grid
+from phydict.linalg.conjugate_gradients import conjugate_gradients
 from phydict.posterior import ExactDraw, Langevin, Measurement
-from phydict.linalg.conjugate_gradients import conjugate_gradients, nearest_fit
-from phydict.posterior.normalised import NormalisedMeasurement
+from phydict.posterior.normalised import NormalisedMeasurement, nearest_fit
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
-from posterior.dense import N, SHAPE, DenseMeasurement, condition, measurement, moments
+from posterior.dense import SHAPE, DenseMeasurement, N, condition, measurement, moments
 
 X0 = 0.3 * random_like((1, *SHAPE), seed=20)
 NOISE = 0.3

@@ -6,7 +6,7 @@ from laws import random_like
 
 from phydict.diffusion import CosineSchedule, ddim, noise_in, renoise
 from phydict.posterior.samplers.noise_levels import partly_renewed, polynomial_levels, times_of, walk
-from posterior.dense import FINE, N, SHAPE, denoiser, moments
+from posterior.dense import FINE, SHAPE, N, denoiser, moments
 
 SCHEDULE, V = CosineSchedule(), 0.04
 

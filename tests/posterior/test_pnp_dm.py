@@ -5,7 +5,7 @@ import torch
 from laws import random_like
 
 from phydict.posterior import ExactDraw, Langevin, PnPDM
-from posterior.dense import N, SHAPE, condition, denoiser, measurement, moments
+from posterior.dense import SHAPE, N, condition, denoiser, measurement, moments
 
 V, NOISE = 0.04, 0.3
 EXACT = {"likelihood": ExactDraw(20, 1e-12), "noise": NOISE}

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from laws import random_like
+from prior.tiny import REPORTS, tiny_prior
 
 from phydict.grid import Grid
 from phydict.posterior import GradientSteps, Posterior, PriorOnly, ProximalCG, SplitGibbs
@@ -14,7 +15,6 @@ from phydict.prior import load_prior, save_prior
 from phydict.reconstruction import describe
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
-from prior.tiny import REPORTS, tiny_prior
 
 BEAM = ConeBeam.orbit(4, 1020, 740, (14, 14), 40.0)
 GRID = Grid.cube(16)

@@ -6,7 +6,7 @@ from laws import random_like
 
 from phydict.diffusion import GaussianDenoiser, renoise
 from phydict.posterior import PriorOnly, descend
-from posterior.dense import FINE, N, SHAPE, denoiser, propagate
+from posterior.dense import FINE, SHAPE, N, denoiser, propagate
 
 VARIANCES = torch.tensor([0.01, 0.02, 0.03, 0.04, 0.05, 0.06]).double().view(1, *SHAPE)
 

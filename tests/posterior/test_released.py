@@ -3,6 +3,7 @@
 import pytest
 import torch
 from laws import random_like
+from prior.tiny import tiny_prior
 
 from phydict.diffusion import GaussianDenoiser
 from phydict.grid import Grid
@@ -12,7 +13,6 @@ from phydict.posterior.likelihood.reward import finer
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 from posterior.dense import FINE, SHAPE, denoiser, measurement
-from prior.tiny import tiny_prior
 
 WINDOW = HUWindow(-1000, 600)
 BEAM = ConeBeam.orbit(3, 1020, 740, (7, 9), 60.0)

@@ -5,14 +5,14 @@ from dataclasses import replace
 import pytest
 import torch
 from laws import random_like
+from prior.tiny import tiny_prior
 
 from phydict import reconstruct
+from phydict.diffusion.steps import noise_like
 from phydict.posterior import Measurement, Posterior, PriorOnly, ProximalCG, SplitGibbs
 from phydict.posterior.posterior import sample_seed
-from phydict.posterior.samplers.split_gibbs import noise_like
-from posterior.dense import N, SHAPE, measurement
+from posterior.dense import SHAPE, N, measurement
 from posterior.test_posterior import BEAM, PROJECTOR, views
-from prior.tiny import tiny_prior
 
 SAMPLER = SplitGibbs(4, ProximalCG(3), ProximalCG(3), warm_start=0.7, fresh_noise=0.0, randomised_noise=0.6)
 

@@ -8,7 +8,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from phydict.prior.medsyn.prior import SliceUNet, SuperResolutionUNet, TextUNet
+from phydict.prior.medsyn.networks import SliceUNet, SuperResolutionUNet, TextUNet
 
 SMALL = {"width": 8, "multipliers": (1, 2), "heads": 1}
 

@@ -18,8 +18,16 @@ from phydict.grid import Grid
 from phydict.methods import reconstructor
 from phydict.posterior import PriorOnly, ProximalCG, SplitGibbs
 from phydict.prior import MedSynPrior, MedSynSuperResolution, TextEncoder, learn_vocabulary
-from phydict.prior.medsyn.prior import (
-    ChannelNorm, SelfAttention, Sinusoid, SuperResolutionUNet, TextUNet, atlas_grid, from_slices, to_slices)
+from phydict.prior.medsyn.networks import (
+    ChannelNorm,
+    SelfAttention,
+    Sinusoid,
+    SuperResolutionUNet,
+    TextUNet,
+    from_slices,
+    to_slices,
+)
+from phydict.prior.medsyn.prior import atlas_grid
 from phydict.xray import ConeBeam
 from prior.medsyn_files import super_resolution_unet, text_unet
 from prior.peak import Peak

@@ -10,12 +10,21 @@ import yaml
 from laws import random_like
 from safetensors import safe_open
 
+from phydict.cli.infer import InferenceCLI
 from phydict.grid import Grid
-from phydict.inference import InferenceCLI, ReconstructionData, ReconstructionTask
+from phydict.inference import ReconstructionData, ReconstructionTask
 from phydict.prior import (
-    MedSynCheckpoint, TextEncoder, file_read, fingerprint, inspect_prior, load_prior, load_super_resolution,
-    save_prior)
-from phydict.prior.medsyn.prior import MedSynPrior, MedSynSuperResolution
+    MedSynCheckpoint,
+    TextEncoder,
+    file_read,
+    fingerprint,
+    inspect_prior,
+    load_prior,
+    load_super_resolution,
+    save_prior,
+)
+from phydict.prior.medsyn.prior import MedSynPrior
+from phydict.prior.medsyn.super_resolution import MedSynSuperResolution
 from phydict.units import HUWindow
 from prior.medsyn_files import entries, super_resolution_unet, text_unet, write
 from prior.tiny import tiny_prior

@@ -13,7 +13,6 @@ from phydict.datasets.cts.transforms import AIR
 from phydict.grid import Grid
 from phydict.units import HUWindow
 
-
 NAMES_A_SIDE = re.compile(r"\b(left|right|middle lobe|lingula\w*|[LR](UL|ML|LL)?)\b", re.IGNORECASE)
 """What makes an English report one of a side."""
 

@@ -19,10 +19,10 @@ from torch.utils.data import Dataset
 
 from phydict.datasets.cts.cache import read_arrays, write_arrays
 from phydict.datasets.cts.ct_rate_tables import read_calibrations, read_reports
-from phydict.datasets.natural_order import natural_order
 from phydict.datasets.cts.prepared import VOLUME, is_prepared, read_prepared, read_record
 from phydict.datasets.cts.segmentations import is_segmentation
 from phydict.datasets.cts.transforms import Calibration, case_id, prepare_ct
+from phydict.datasets.natural_order import natural_order
 from phydict.grid import Grid
 from phydict.runtime.reading import read_ids
 from phydict.units import HUWindow

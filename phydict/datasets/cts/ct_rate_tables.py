@@ -7,8 +7,8 @@ import math
 import reprlib
 from pathlib import Path
 
-from phydict.datasets.reports import join_report
 from phydict.datasets.cts.transforms import Calibration, case_id
+from phydict.datasets.reports import join_report
 
 
 def read_reports(path: str | Path) -> dict[str, str]:

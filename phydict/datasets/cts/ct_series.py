@@ -15,9 +15,9 @@ import numpy as np
 import pydicom
 from pydicom.errors import InvalidDicomError
 
+from phydict.datasets.cts.transforms import LEAST_SLICES, to_ras
 from phydict.datasets.dicom import read_dicom
 from phydict.datasets.natural_order import natural_order
-from phydict.datasets.cts.transforms import LEAST_SLICES, to_ras
 from phydict.runtime.reading import reading
 
 NEEDED = {"ImagePositionPatient": 3, "ImageOrientationPatient": 6, "PixelSpacing": 2, "RescaleSlope": 1,

@@ -23,15 +23,23 @@ from pathlib import Path
 
 import numpy as np
 
-from phydict.runtime.files import remove_leftovers, whole_file, whole_folder
 from phydict.datasets.cts.anatomy import MASKS, body_mask, lung_box_centre, lung_box_size, segment
 from phydict.datasets.cts.ct_rate import CTFile, find_cts
 from phydict.datasets.cts.ct_series import Series, find_series, load_series
 from phydict.datasets.cts.prepared import VOLUME, read_record, write_prepared
 from phydict.datasets.cts.segmentations import lungs_by_lungmask, read_segmentation, segmentations_beside
-from phydict.datasets.cts.transforms import (AIR, SEGMENTATION_MM, case_id, centred, check_hu, covering_grid, load_ct,
-                                         to_grid)
+from phydict.datasets.cts.transforms import (
+    AIR,
+    SEGMENTATION_MM,
+    case_id,
+    centred,
+    check_hu,
+    covering_grid,
+    load_ct,
+    to_grid,
+)
 from phydict.grid import Grid
+from phydict.runtime.files import remove_leftovers, whole_file, whole_folder
 from phydict.runtime.progress import CaseProgress
 from phydict.runtime.reading import not_written
 

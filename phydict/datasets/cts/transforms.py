@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 import scipy
+import torch
 
 from phydict.datasets.cts.anatomy import lung_box_centre, segment
 from phydict.datasets.nifti_file import open_nifti

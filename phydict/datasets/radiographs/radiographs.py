@@ -18,9 +18,9 @@ from PIL import Image
 from phydict.datasets.dicom import DicomTags, read_dicom, shown, tags_intensity
 from phydict.datasets.intensity import KINDS, Intensity
 from phydict.datasets.natural_order import natural_order
-from phydict.datasets.reports import format_report
 from phydict.datasets.radiographs.xray_description import GEOMETRY, Description, read_description
 from phydict.datasets.radiographs.xray_images import ENDINGS, image_files, is_dicom, read_image
+from phydict.datasets.reports import format_report
 from phydict.runtime.reading import read_text
 from phydict.runtime.shipped import own_or_shipped
 from phydict.xray.geometry import ConeBeam

@@ -20,11 +20,11 @@ from pathlib import Path
 import numpy as np
 
 from phydict.datasets.dicom import DicomTags
-from phydict.datasets.radiographs.dicom_beam import tags_beam
 from phydict.datasets.intensity import KINDS, Intensity, is_file_name
+from phydict.datasets.radiographs.dicom_beam import tags_beam
+from phydict.runtime.yaml_file import read_yaml
 from phydict.xray.geometry import ConeBeam, pixel_sizes
 from phydict.xray.geometry_files import read_beam
-from phydict.runtime.yaml_file import read_yaml
 
 GEOMETRY = "geometry.yaml"
 

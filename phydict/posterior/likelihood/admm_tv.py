@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from phydict.linalg.conjugate_gradients import conjugate_gradients
-from phydict.posterior.normalised import NormalisedMeasurement
 from phydict.linalg.total_variation import differences, differences_adjoint
+from phydict.posterior.normalised import NormalisedMeasurement
 
 AXES = {"x": 2, "y": 3, "z": 4}
 

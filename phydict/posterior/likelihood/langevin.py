@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from phydict.diffusion.steps import noise_like
 from phydict.posterior.likelihood.likelihood_draw import LikelihoodDraw
 from phydict.posterior.normalised import NormalisedMeasurement
-from phydict.posterior.samplers.split_gibbs import noise_like
 
 
 def langevin(score: Callable[[Tensor], Tensor], z: Tensor, step: float, iterations: int,

@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from phydict.posterior.measurement import Measurement
-from phydict.posterior.likelihood.reward import Reward
 from phydict.linalg.total_variation import Majoriser
+from phydict.posterior.likelihood.reward import Reward
+from phydict.posterior.measurement import Measurement
 
 
 class LikelihoodStep(ABC):

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from phydict.linalg.conjugate_gradients import nearest_fit
-from phydict.posterior.normalised import NormalisedMeasurement
-from phydict.posterior.samplers.split_gibbs import noise_like
+from phydict.diffusion.steps import noise_like
+from phydict.posterior.normalised import NormalisedMeasurement, nearest_fit
 
 
 class LikelihoodDraw(ABC):

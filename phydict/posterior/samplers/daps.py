@@ -16,13 +16,13 @@ import torch
 from torch import Tensor
 
 from phydict.diffusion import Denoiser, renoise
+from phydict.diffusion.steps import noise_like
 from phydict.posterior.likelihood.langevin import Langevin
 from phydict.posterior.likelihood.likelihood_draw import LikelihoodDraw
 from phydict.posterior.measurement import Measurement
-from phydict.posterior.samplers.noise_levels import polynomial_levels, times_of, walk
 from phydict.posterior.normalised import NormalisedMeasurement, check_noise
+from phydict.posterior.samplers.noise_levels import polynomial_levels, times_of, walk
 from phydict.posterior.samplers.sampler import Sampler
-from phydict.posterior.samplers.split_gibbs import noise_like
 
 
 @dataclass(frozen=True)

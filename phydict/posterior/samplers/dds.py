@@ -18,10 +18,9 @@ from torch import Tensor
 
 from phydict.diffusion import Denoiser, noise_in
 from phydict.posterior.likelihood.admm_tv import ADMMTV
-from phydict.linalg.conjugate_gradients import nearest_fit
 from phydict.posterior.measurement import Measurement
+from phydict.posterior.normalised import NormalisedMeasurement, nearest_fit
 from phydict.posterior.samplers.noise_levels import partly_renewed
-from phydict.posterior.normalised import NormalisedMeasurement
 from phydict.posterior.samplers.sampler import Sampler
 
 

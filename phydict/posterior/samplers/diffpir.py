@@ -16,10 +16,9 @@ import torch
 from torch import Tensor
 
 from phydict.diffusion import Denoiser, noise_in
-from phydict.linalg.conjugate_gradients import nearest_fit
 from phydict.posterior.measurement import Measurement
+from phydict.posterior.normalised import NormalisedMeasurement, check_noise, nearest_fit
 from phydict.posterior.samplers.noise_levels import partly_renewed
-from phydict.posterior.normalised import NormalisedMeasurement, check_noise
 from phydict.posterior.samplers.sampler import Sampler
 
 

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from phydict.diffusion import Denoiser, noise_in
 from phydict.posterior.measurement import Measurement
-from phydict.posterior.samplers.noise_levels import partly_renewed
 from phydict.posterior.normalised import NormalisedMeasurement
+from phydict.posterior.samplers.noise_levels import partly_renewed
 from phydict.posterior.samplers.sampler import Sampler
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from phydict.diffusion import CosineSchedule, Denoiser, noise_in, renoise
-from phydict.posterior.samplers.split_gibbs import noise_like
+from phydict.diffusion.steps import noise_like
 
 
 def polynomial_levels(high: float, low: float, n: int, power: float = 7.0) -> list[float]:

@@ -17,8 +17,8 @@ from torch import Tensor
 from phydict.diffusion import Denoiser
 from phydict.posterior.likelihood.likelihood_draw import ExactDraw, LikelihoodDraw
 from phydict.posterior.measurement import Measurement
-from phydict.posterior.samplers.noise_levels import polynomial_levels, times_of, walk
 from phydict.posterior.normalised import NormalisedMeasurement, check_noise
+from phydict.posterior.samplers.noise_levels import polynomial_levels, times_of, walk
 from phydict.posterior.samplers.sampler import Sampler
 
 

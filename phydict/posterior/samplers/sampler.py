@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-import torch
 from torch import Tensor
 
 from phydict.diffusion import Denoiser, ddim
+from phydict.diffusion.steps import Draw
 
 if TYPE_CHECKING:
     from phydict.posterior.measurement import Measurement
-
-Draw = torch.Generator | Sequence[torch.Generator]
-"""Where noise comes from: one generator, or one for each state of a batch."""
-
 
 class Sampler(ABC):
     """Settings of a sampling method; `sample` turns noise into a clean state.
@@ -46,30 +41,6 @@ class Sampler(ABC):
     def randomised(self) -> Sampler:
         """The settings of which independent runs differ as far as the posterior is wide; these, unless overridden."""
         return self
-
-
-@dataclass(frozen=True)
-class PriorOnly(Sampler):
-    """A sample of the prior that ignores the X-rays: deterministic DDIM with `iterations` noise levels.
-
-    at_zero: denoise once more at time 0; None: where the prior's own inference does, which its `ends_at_zero` says.
-    """
-
-    citation = "Song, Meng & Ermon, Denoising Diffusion Implicit Models, ICLR 2021, arXiv:2010.02502"
-
-    iterations: int = 50
-    at_zero: bool | None = None
-    batches = True
-
-    def steps(self) -> int:
-        return self.iterations + bool(self.at_zero)
-
-    def suited(self, prior: object) -> PriorOnly:
-        return self if self.at_zero is not None else replace(self, at_zero=getattr(prior, "ends_at_zero", False))
-
-    def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, draw: Draw,
-               on_step: Callable[[], None] = lambda: None) -> Tensor:
-        return descend(denoiser, x, self.iterations, on_step=on_step, at_zero=self.suited(denoiser).at_zero)
 
 
 def descend(denoiser: Denoiser, x: Tensor, iterations: int, start: float = 1.0,

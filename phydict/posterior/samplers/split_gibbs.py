@@ -17,9 +17,10 @@ import torch
 from torch import Tensor
 
 from phydict.diffusion import Denoiser, ddim, renoise
+from phydict.diffusion.steps import Draw, noise_like
 from phydict.posterior.likelihood.likelihood import LikelihoodStep, ProximalCG
 from phydict.posterior.measurement import Measurement
-from phydict.posterior.samplers.sampler import Draw, Sampler, descend
+from phydict.posterior.samplers.sampler import Sampler, descend
 
 MISSED = 2.5
 """Times their noise that X-rays are missed by before scatter is looked for: on the CTs that it was chosen on, ideal
@@ -168,10 +169,3 @@ class SplitGibbs(Sampler):
         """Standard deviation of x_0 given x_t under independent components of prior_std."""
         a, s = (float(w) for w in denoiser.schedule.scales(t))
         return self.prior_std * s / (s**2 + (a * self.prior_std) ** 2) ** 0.5
-
-
-def noise_like(x: Tensor, draw: Draw) -> Tensor:
-    """Standard normal noise drawn in float32 on the generator's device, so that a result depends on neither of x's."""
-    if not isinstance(draw, torch.Generator):
-        return torch.cat([noise_like(one[None], own) for one, own in zip(x, draw, strict=True)])
-    return torch.randn(x.shape, generator=draw).to(x)

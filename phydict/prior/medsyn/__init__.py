@@ -1,1 +1,1 @@
-"""MedSyn's networks and files."""
+"""MedSyn's two networks and their files, as priors."""

@@ -24,8 +24,8 @@ import numpy as np
 import torch
 
 from phydict.grid import Grid
-from phydict.xray import separable_cpu
 from phydict.xray.geometry import ConeBeam
+from phydict.xray.projectors import separable_cpu
 from phydict.xray.projectors.separable_sparse import SparseFactors
 
 

@@ -14,9 +14,9 @@ import torch
 from scipy.sparse import csr_array
 
 from phydict.grid import Grid
+from phydict.xray.geometry import ConeBeam
 from phydict.xray.projectors.compiled import compiled
 from phydict.xray.projectors.csr import csr_tensor, index_type
-from phydict.xray.geometry import ConeBeam
 from phydict.xray.projectors.tracer import aim, enter, nearest, ray_lengths, rays_in_voxels, run
 
 

@@ -19,8 +19,8 @@ import numpy as np
 import torch
 
 from phydict.grid import Grid
-from phydict.xray.projectors.compiled import compiled
 from phydict.xray.geometry import ConeBeam
+from phydict.xray.projectors.compiled import compiled
 
 SLAB = 8
 """Voxels along the third axis that one task of the adjoint writes."""

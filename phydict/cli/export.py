@@ -1,0 +1,58 @@
+"""Two commands about files: checkpoint to prior, and what a file is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from phydict.prior.files import (
+    build_prior,
+    build_super_resolution,
+    build_text,
+    has_text,
+    is_saved_prior,
+    save_prior,
+    save_super_resolution,
+)
+from phydict.prior.inspection import inspect_prior
+from phydict.runtime.console import check_writable
+from phydict.training.checkpoints import read_checkpoint
+
+
+def export_prior(checkpoint: str, out: str, overwrite: bool = False) -> None:
+    """Write the averaged weights of a training checkpoint as a prior, or a super-resolution stage, for reconstruction.
+
+    Args:
+        checkpoint: the .ckpt file that training wrote
+        out: the .safetensors file to write
+        overwrite: whether a prior or stage that is there already is replaced
+    """
+    if Path(out).suffix != ".safetensors":
+        raise ValueError(f"a prior is a .safetensors file, but {out} was given: give a name with that ending")
+    check_writable(Path(out), "--out", file=True)
+    if Path(out).exists() and not is_saved_prior(out):
+        raise ValueError(f"{out} is there already, is no prior of phydict's, and is not replaced: give another --out")
+    if Path(out).exists() and not overwrite:
+        raise ValueError(f"{out} is a prior already: add --overwrite true to replace it, or give another --out")
+    content = read_checkpoint(checkpoint)
+    header = content["phydict"]
+    weights = {k.removeprefix("prior."): w for k, w in content["state_dict"].items() if k.startswith("prior.")}
+    training = header.get("training", {"steps": content.get("global_step")})
+    if header.get("stage") == "super_resolution":
+        save_super_resolution(build_super_resolution(header, weights), out, training)
+    else:
+        prior = build_prior(header, weights)
+        if has_text(header):
+            prior.text = build_text(header["text"], {k: w for k, w in weights.items() if k.startswith("text.")})
+        save_prior(prior, out, training)
+    print(f"prior in {out}")
+
+
+def print_prior(path: str) -> None:
+    """Tell what a file or folder is: a prior, a checkpoint of its training, or one of MedSyn's networks, and whether
+    it is whole.
+
+    Args:
+        path: the file or folder
+    """
+    for file, properties in inspect_prior(path).items():
+        print(file, *(f"  {name}: {value}" for name, value in properties.items()), sep="\n")

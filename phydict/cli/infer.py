@@ -1,0 +1,115 @@
+"""The command line of reconstruction: pairs with infer.py."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from lightning.pytorch.cli import LightningCLI
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
+
+from phydict.ablation import main as ablate
+from phydict.datasets.radiographs.radiographs import load_xrays
+from phydict.inference.data import ReconstructionData
+from phydict.inference.dry_run import dry_run
+from phydict.inference.task import ReconstructionTask
+from phydict.runtime.console import (
+    check_apart,
+    check_command,
+    check_configured,
+    noted,
+    one_sentence_errors,
+    quiet,
+    read_configurations,
+    sentence,
+    with_configurations,
+)
+
+COMMANDS = {"predict": "X-rays -> volumes", "test": "CTs -> X-rays -> volumes and scores",
+            "ablate": "methods compared on the same X-rays"}
+
+
+class InferenceCLI(LightningCLI):
+    """predict and test only; no logs, no checkpoints, gradients allowed inside the steps."""
+
+    @staticmethod
+    def subcommands() -> dict[str, set[str]]:
+        unused = {"model", "dataloaders", "datamodule", "ckpt_path", "weights_only"}
+        return {"predict": unused | {"return_predictions"}, "test": unused | {"verbose"}}
+
+    def _prepare_subcommand_parser(self, klass: type, subcommand: str, **kwargs):
+        parser = super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
+        parser.add_argument("--profile", action="store_true",
+                            help="print the seconds and the peak memory of every stage of each case")
+        if subcommand == "predict":
+            parser.add_argument("--dry_run", action="store_true",
+                                help="draw the geometry of every case and reconstruct nothing")
+        return parser
+
+    @property
+    def dry_run(self) -> bool:
+        """Whether the geometry is drawn and nothing reconstructed."""
+        return bool(self._get(self.config, "dry_run", False))
+
+    @property
+    def profile(self) -> bool:
+        """Whether each case's stages are timed and their memory measured."""
+        return bool(self._get(self.config, "profile", False))
+
+    def predict(self, model: ReconstructionTask, datamodule: ReconstructionData) -> None:
+        """Reconstruct X-rays, or draw their geometry."""
+        if self.dry_run:
+            check_apart(model.pages, "model.out", datamodule.inputs("predict"))
+            self._draw(datamodule.xray_cases(), model, datamodule.geometry)
+            return
+        model.profile = self.profile
+        with model.progress:
+            self.trainer.predict(model, datamodule=datamodule, return_predictions=False)
+
+    @staticmethod
+    def _draw(folders: dict[str, Path], model: ReconstructionTask, geometry: str | None) -> None:
+        """The page of every case, id -> folder. Raises ValueError, naming them, where some cannot be drawn."""
+        bad = []
+        for name, folder in folders.items():
+            try:
+                with noted([], name):
+                    case = load_xrays(folder, geometry) | {"id": name}
+                    print(*dry_run(model.pages / f"{name}.png", case, model.grid), sep="\n")
+            except (ValueError, OSError) as error:
+                if len(folders) == 1:
+                    raise
+                bad.append(name)
+                print(f"error: {name}: {sentence(error)}", file=sys.stderr)
+        print(f"pages in {model.pages}")
+        if bad:
+            raise ValueError(f"{len(bad)} of {len(folders)} cases cannot be reconstructed ({', '.join(bad)}): see the "
+                             "messages above")
+
+    def test(self, model: ReconstructionTask, datamodule: ReconstructionData) -> None:
+        """Simulate the X-rays of CTs, reconstruct and score them."""
+        model.profile = self.profile
+        with model.progress:
+            self.trainer.test(model, datamodule=datamodule, verbose=False)
+
+
+def main(args: list[str] | None = None) -> None:
+    """Command line of inference: predict, test, ablate. A bad input ends in one sentence and exit code 2."""
+    args = sys.argv[1:] if args is None else args
+    if args[:1] == ["ablate"]:
+        return ablate(args[1:])
+    with one_sentence_errors(MisconfigurationException), quiet():
+        check_command(args, COMMANDS, InferenceCLI.subcommands(), "predict -c "
+                      "configs/reconstruct/phydict_fast.yaml --data.xrays data/example/xrays")
+        check_configured(args, ("--model", "--model.method", "--model.method.class_path"),
+                         "configs/reconstruct/phydict_fast.yaml")
+        args = with_configurations(args, ("reconstruct", "simulate"))
+        read_configurations(args)
+        cli = InferenceCLI(
+            ReconstructionTask, ReconstructionData, args=args, seed_everything_default=0, save_config_callback=None,
+            parser_kwargs={"exit_on_error": False, "allow_abbrev": False, "description": (
+                "Reconstruct chest CTs from X-rays. A third subcommand, ablate, compares methods: ablate --help.")},
+            trainer_defaults={"inference_mode": False, "logger": False, "enable_progress_bar": False,
+                              "enable_checkpointing": False, "enable_model_summary": False, "accelerator": "auto",
+                              "devices": 1})
+        if cli.trainer.is_global_zero and not cli.dry_run:
+            cli.model.summarise()

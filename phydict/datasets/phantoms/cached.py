@@ -1,0 +1,46 @@
+"""Phantoms as a dataset, each built once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch.utils.data import Dataset
+
+from phydict.datasets.cts.cache import read_arrays, write_arrays
+from phydict.datasets.phantoms.phantom import phantom_case
+from phydict.datasets.phantoms.thorax import Thorax, report
+from phydict.grid import Grid
+from phydict.units import HUWindow
+
+PHANTOM_VERSION = 2
+"""Raised whenever a phantom of the same seed comes out differently, so that cached ones are made anew."""
+
+HELD_OUT_PHANTOM = 1_000_000
+"""Phantoms with this seed and above are never trained on."""
+
+
+class CachedPhantoms(Dataset):
+    """Phantom cases of consecutive seeds, each built when first asked for and then kept as a file in `cache`."""
+
+    def __init__(self, first_seed: int, count: int, grid: Grid, window: HUWindow, cache: Path):
+        self.first_seed, self.count, self.grid, self.window = first_seed, count, grid, window
+        size = "x".join(map(str, grid.shape))
+        self.folder = cache / f"phantoms{PHANTOM_VERSION}-{size}-{grid.spacing[0]:g}mm-{window.low:g}-{window.high:g}"
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, i: int) -> dict:
+        seed = self.first_seed + i
+        file = self.folder / f"{seed:07d}.npz"
+        stored = read_arrays(file)
+        if stored is None:
+            case = phantom_case(seed, self.grid, self.window)
+            stored = {"volume": case["volume"].numpy().astype(np.float16),
+                      "masks": (255 * case["masks"].numpy()).round().astype(np.uint8)}
+            write_arrays(file, stored)
+        masks = torch.from_numpy(stored["masks"].astype(np.float32) / 255)
+        return {"volume": torch.from_numpy(stored["volume"].astype(np.float32)), "masks": masks,
+                "has_masks": torch.ones(len(masks), dtype=torch.bool), "report": report(Thorax.draw(seed))}

@@ -1,0 +1,84 @@
+"""What a file is: a prior, a checkpoint of its training, or one of MedSyn's networks, and whether it is whole."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from safetensors import safe_open
+from torch import Tensor
+
+from phydict.prior.finite import check_finite
+from phydict.prior.medsyn.checkpoint import FILES, STAGES, MedSynWeights, default_kind, files_in, listed, read_tensors
+from phydict.prior.medsyn.networks import TextUNet
+from phydict.prior.tensors import read_torch
+from phydict.runtime.reading import reason
+
+
+def inspect_prior(path: str | Path) -> dict[str, dict[str, str]]:
+    """What a file or folder is, as file -> {property: value}; nothing is run, and tensors are not kept.
+
+    Told apart: priors and training checkpoints of phydict, MedSyn's two stages, and others, with the reason why they
+    are none of these. Raises FileNotFoundError where nothing is there, and ValueError where weights are not finite.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"there is nothing at '{path}': give a prior's file, a checkpoint or MedSyn's folder")
+    if path.is_file():
+        return {str(path): _inspect_file(path)}
+    held = files_in(path)
+    chosen = default_kind(held)
+    found = {str(file): {"by its name": kind + (", read by default" if kind == chosen else "")} | _inspect_file(file)
+             for kind, file in held.items()}
+    names = [name for both in FILES.values() for name in both]
+    return found or {str(path): {"kind": f"unknown: the folder holds no {' or '.join(names)}, nor <N>_ckpt folders"}}
+
+
+def _inspect_file(file: Path) -> dict[str, str]:
+    try:
+        if file.suffix == ".safetensors":
+            entries = read_tensors(file, shapes_only=True)
+            with safe_open(file, "pt") as opened:
+                header = json.loads((opened.metadata() or {}).get("phydict", "null"))
+        else:
+            content = read_torch(file)
+            header = content.get("phydict") if isinstance(content, dict) else None
+            entries = content.get("state_dict", {}) if header else read_tensors(file)
+        if header:
+            report, used = _inspect_phydict(header, entries, file.suffix == ".safetensors"), [*entries]
+        else:
+            found = MedSynWeights.sort(entries)
+            report, used = _inspect_medsyn(found, entries), [name for name in entries if name not in found.ignored]
+    except Exception as error:  # whatever a file that is none of these leads to
+        return {"kind": "unknown: " + reason(error).removeprefix(f"'{file}' ")}
+    if file.suffix == ".safetensors":
+        with safe_open(file, "pt") as opened:
+            for name in used:
+                check_finite({name: opened.get_tensor(name)}, file)
+    else:
+        check_finite({name: entries[name] for name in used}, file)
+    return report
+
+
+def _inspect_phydict(header: dict, entries: dict[str, Tensor], finished: bool) -> dict[str, str]:
+    text = header.get("text") or {}
+    return {"kind": "phydict prior" if finished else "phydict training checkpoint (train.py export makes it a prior)",
+            "stage": str(header.get("stage", "base")),
+            "grid": " x ".join(map(str, header.get("grid", {}).get("shape", "?"))),
+            "HU window": " to ".join(f"{hu:g}" for hu in header.get("hu_window", ())),
+            "text": text.get("source") or ("its own" if text else "none"),
+            "parameters": f"{sum(tensor.numel() for tensor in entries.values()):,}",
+            "training": json.dumps(header.get("training", {}))}
+
+
+def _inspect_medsyn(found: MedSynWeights, entries: dict[str, Tensor]) -> dict[str, str]:
+    parameters = sum(weight.numel() for weight in found.network.parameters())
+    report = {"kind": f"MedSyn's {STAGES[found.stage]}", "width": " ".join(map(str, found.network.widths)),
+              "parameters": f"{parameters:,}", "entries": str(len(entries)),
+              "prefix": next(iter(entries)).partition("denoise_fn.")[0] + "denoise_fn."
+              if any("denoise_fn." in name for name in entries) else "none"}
+    if found.stage == 1:
+        report["names of the shared self-attention"] = f"{found.tied} of {2 * TextUNet.REPEATS}"
+    if found.ignored:
+        report["ignored"] = f"{len(found.ignored)} ({listed(found.ignored)})"
+    return report | {"fits": f"no: {found.misfits}" if found.misfits else "yes"}

@@ -1,0 +1,67 @@
+"""The files of a training: checkpoints that are whole, the best of them, and what a read one must hold."""
+
+from __future__ import annotations
+
+import errno
+import reprlib
+from pathlib import Path
+
+import lightning
+import torch
+from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.plugins.io import TorchCheckpointIO
+
+from phydict.prior.files import STAGES
+from phydict.prior.finite import check_finite
+from phydict.prior.tensors import read_torch
+from phydict.runtime.files import whole_file
+from phydict.runtime.reading import not_written
+
+BEST, HELD_OUT = "best.ckpt", "held_out.txt"
+"""Files of a training's folder: what reconstructed the held-out cases best, and the ids of the CTs that it never
+saw."""
+
+RESUMED = ("epoch", "global_step", "loops", "optimizer_states", "lr_schedulers", "callbacks")
+"""What a checkpoint must hold beside the weights for its training to go on."""
+
+
+def read_checkpoint(path: str | Path) -> dict:
+    """A checkpoint that training wrote. Raises FileNotFoundError, or ValueError when it is truncated, holds code, is
+    another's or holds weights that are not finite."""
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"there is no checkpoint {path}: give a .ckpt file that training wrote")
+    checkpoint = read_torch(path)
+    if not isinstance(checkpoint, dict) or "phydict" not in checkpoint:
+        raise ValueError(f"{path} is no checkpoint of a prior: give a .ckpt file that training wrote")
+    header, weights = checkpoint["phydict"], checkpoint.get("state_dict")
+    stage = header.get("stage", "base") if isinstance(header, dict) else None
+    if not isinstance(stage, str) or stage not in STAGES:
+        raise ValueError(f"{path} is damaged: its header is {reprlib.repr(header)}; give another checkpoint")
+    if not isinstance(weights, dict) or not all(isinstance(name, str) for name in weights) or not all(
+            isinstance(weight, torch.Tensor) for name, weight in weights.items() if name.startswith(("prior.", "text."))):
+        raise ValueError(f"{path} is damaged: its weights are {reprlib.repr(weights)}; give another checkpoint")
+    for state in ("state_dict", "current_model_state"):
+        check_finite(checkpoint.get(state, {}), path)
+    return checkpoint
+
+
+class WholeCheckpoints(TorchCheckpointIO):
+    """Checkpoints that take the last one's place only when they are complete, whatever stops the writing."""
+
+    def save_checkpoint(self, checkpoint: dict, path: str | Path, storage_options: object = None) -> None:
+        try:
+            with whole_file(Path(path)) as part:
+                torch.save(checkpoint, part)
+        except (OSError, RuntimeError) as error:
+            if isinstance(error, RuntimeError):  # torch's words for a write that was cut short
+                error = OSError(errno.ENOSPC, "perhaps the disk is full")
+            raise not_written(f"the checkpoint {path}", error, "give another --out, and go on from the last one, if there "
+                              "is one, with --ckpt_path") from error
+
+
+class BestCheckpoint(ModelCheckpoint):
+    """Keeps the weights with the best score so far, where validation gives one."""
+
+    def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        if self.monitor in trainer.callback_metrics:
+            super().on_validation_end(trainer, pl_module)

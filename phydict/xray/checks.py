@@ -1,0 +1,53 @@
+"""What X-rays must be, and what makes them doubtful."""
+
+from __future__ import annotations
+
+import warnings
+
+import torch
+from torch import Tensor
+
+from phydict.xray.geometry import ConeBeam
+
+CHEST = 1.0, 20.0
+"""Between these lies the largest line integral of a chest: 50 mm and 1 m of water."""
+
+def check_xrays(xrays: Tensor, beam: ConeBeam) -> None:
+    """Raises ValueError unless the X-rays (K, V, U) are finite, as many and as large as the beam's views, and none of
+    them is blank, but for X-rays that are 0 everywhere."""
+    expected = (beam.views, *beam.shape)
+    if tuple(xrays.shape) != expected:
+        raise ValueError(f"the geometry describes {expected[0]} views of {expected[1]} x {expected[2]} pixels, "
+                         f"but the X-rays have shape {tuple(xrays.shape)}: give images and geometry that match")
+    if not xrays.isfinite().all():
+        raise ValueError("the X-rays contain NaN or infinite pixels: repair or remove those views first")
+    blank = xrays.flatten(1).amin(1) == xrays.flatten(1).amax(1)
+    if blank.any() and xrays.any():
+        which = "every view" if blank.all() else f"view {int(blank.nonzero()[0])}"
+        raise ValueError(f"{which} holds the same value in every pixel, as a missing or saturated image does: leave it "
+                         "out of the X-rays and of the geometry")
+
+
+def check_air(xrays: Tensor) -> None:
+    """Warns where views (K, V, U) look inverted: more than half of the pixels in their outermost columns, where air is
+    seen, or what is thin where the detector is narrow, lie in the uppermost tenth of their range (median view)."""
+    views = xrays.float().flatten(1)
+    views = views[:, ::max(1, views.shape[1] // 10_000)]
+    rank = max(1, views.shape[1] // 100)
+    low, high = views.kthvalue(rank).values, views.kthvalue(views.shape[1] + 1 - rank).values
+    width = max(1, xrays.shape[2] // 50)
+    sides = torch.cat([xrays[..., :width], xrays[..., -width:]], -1).flatten(1)
+    share = (sides > (high - 0.1 * (high - low))[:, None]).float().mean(1)
+    if share.median() > 0.5:
+        warnings.warn("the X-rays are densest at their left and right sides, where air should be seen, as inverted "
+                      "images are: turn them by a negative `scale` with an `offset`, or by the other "
+                      "`bright_is_dense`, or cut off what a collimator covered", stacklevel=3)
+
+
+def check_line_integrals(xrays: Tensor) -> None:
+    """Warns of line integrals that no chest has."""
+    largest = float(xrays.max())
+    if not CHEST[0] < largest < CHEST[1]:
+        warnings.warn(f"the largest line integral is {largest:.3g}, but those of a chest lie between {CHEST[0]:g} and "
+                      f"{CHEST[1]:g}: check that the X-rays are line integrals of attenuation in 1/mm along mm, or "
+                      "give display: true where they are display values", stacklevel=3)

@@ -1,0 +1,25 @@
+"""How well line integrals fit: relative residuals."""
+
+from __future__ import annotations
+
+import math
+
+from torch import Tensor
+
+NOTHING = 1e-3
+"""A line integral, 0.05 mm of water, below which misfits are not relative to what is measured, but to this."""
+
+
+def misfits(reprojection: Tensor, xrays: Tensor) -> dict:
+    """Relative residual |P - y| / |y| of line integrals (K, V, U): over all views and per view."""
+    residual, size = view_norms(reprojection - xrays), view_sizes(xrays)
+    return {"misfit": float(residual.norm() / size.norm()), "misfit_per_view": (residual / size).tolist()}
+
+
+def view_norms(views: Tensor) -> Tensor:
+    return views.flatten(-2).norm(dim=-1)
+
+
+def view_sizes(xrays: Tensor) -> Tensor:
+    """Norms (..., K) of views (..., K, V, U), of which none counts as smaller than one of NOTHING in every pixel."""
+    return view_norms(xrays).clamp(min=NOTHING * math.sqrt(xrays.shape[-1] * xrays.shape[-2]))

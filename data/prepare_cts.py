@@ -6,7 +6,7 @@ from pathlib import Path
 from jsonargparse import auto_cli
 
 from phydict.datasets.cts.preparation import SUMMARY, Settings, atlas_lungs, prepare_folder
-from phydict.runtime.console import check_writable, one_sentence_errors, quiet
+from phydict.runtime.console import check_writable, cli_errors, quiet
 
 
 def prepare(cts: str, out: str, voxels: int = 256, side: float = 384.0, space: str = "patient",
@@ -44,7 +44,7 @@ def prepare(cts: str, out: str, voxels: int = 256, side: float = 384.0, space: s
 
 def main(args: list[str] | None = None) -> None:
     """Command line; a bad input ends in one sentence and exit code 2."""
-    with one_sentence_errors(), quiet():
+    with cli_errors(), quiet():
         auto_cli(prepare, args=args, as_positional=True)
 
 

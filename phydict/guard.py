@@ -12,23 +12,23 @@ from torch import Tensor
 
 from phydict.xray.residuals import view_norms, view_sizes
 
-EMPTY, RISE, RISEN = 1.0, 2.0, 0.1
-"""A misfit has risen where it is more than RISE times its smallest so far, that of an empty volume included, and more
-than RISEN."""
+EMPTY_MISFIT, RISE_FACTOR, RISE_MIN = 1.0, 2.0, 0.1
+"""A misfit has risen where it is more than RISE_FACTOR times its smallest so far, that of an empty volume included, and more
+than RISE_MIN."""
 
-ALONE, LARGE = 2.0, 0.1
-"""Where a view's misfit is more than ALONE times the median of all, that view is doubted; where the misfit is more than
-LARGE, all of them are."""
+OUTLIER_RATIO, BAD_FIT = 2.0, 0.1
+"""Where a view's misfit is more than OUTLIER_RATIO times the median of all, that view is doubted; where the misfit is more than
+BAD_FIT, all of them are."""
 
 
 class Operator(Protocol):
     """What a Guard asks of a case's operator.
 
-    y: the X-rays (1, K, V, U); seen: the last projections (B, K, V, U) of volumes, not of directions, or None.
+    y: the X-rays (1, K, V, U); last_projection: the last projections (B, K, V, U) of volumes, not of directions, or None.
     """
 
     y: Tensor
-    seen: Tensor | None
+    last_projection: Tensor | None
 
 
 class Guard:
@@ -42,27 +42,27 @@ class Guard:
         self.operator, self.on_step, self.steps = operator, on_step, steps
         self.estimate: Tensor | None = None
         self.diverged_at: int | None = None
-        self.begin()
+        self.reset()
 
-    def begin(self) -> None:
+    def reset(self) -> None:
         """Steps are counted from 1 again: further samples are drawn."""
-        self.step, self.misfits, self.operator.seen = 0, {}, None
+        self.step, self.misfits, self.operator.last_projection = 0, {}, None
 
     def __call__(self) -> None:
         """A step is done. Raises FloatingPointError where what was estimated or projected in it is not finite."""
         self.step += 1
-        seen, self.operator.seen = self.operator.seen, None
+        projection, self.operator.last_projection = self.operator.last_projection, None
         estimate, self.estimate = self.estimate, None
         if estimate is not None:
             self._check(estimate)
-        if seen is not None:
+        if projection is not None:
             y = self.operator.y
-            misfit = (view_norms(seen - y).norm(dim=-1) / view_sizes(y).norm(dim=-1)).max()
+            misfit = (view_norms(projection - y).norm(dim=-1) / view_sizes(y).norm(dim=-1)).max()
             self._check(misfit)
             self.misfits[self.step] = float(misfit)
         self.on_step()
 
-    def end(self, volumes: Tensor, misfit: float | None = None) -> None:
+    def finish(self, volumes: Tensor, misfit: float | None = None) -> None:
         """The last step is done and gave `volumes`, of this misfit if it is known.
 
         Raises FloatingPointError where they are not finite, and warns where the misfit has risen.
@@ -75,20 +75,20 @@ class Guard:
         risen = risen_from(self.misfits)
         if risen is not None and self.diverged_at is None:
             self.diverged_at = risen
-            before = min([EMPTY, *(value for step, value in self.misfits.items() if step < risen)])
+            before = min([EMPTY_MISFIT, *(value for step, value in self.misfits.items() if step < risen)])
             now = list(self.misfits.values())[-1]
             warnings.warn(f"the misfit rose from {before:.3g} to {now:.3g}, from step {risen} of {self.steps} on: the "
                           "volume went away from the X-rays", stacklevel=3)
 
-    def doubt(self, misfit: float, misfit_per_view: Sequence[float]) -> None:
+    def check_fit(self, misfit: float, misfit_per_view: Sequence[float]) -> None:
         """Warns where a method that looked at the X-rays and did not diverge fits one view, or all, badly."""
         if not self.misfits or self.diverged_at is not None:
             return
         view, ratio = worst_view(misfit_per_view)
-        if ratio > ALONE and misfit_per_view[view] > 0.01:
+        if ratio > OUTLIER_RATIO and misfit_per_view[view] > 0.01:
             warnings.warn(f"view {view} (counted from 0) fits {ratio:.1f} times worse than the median view: check "
                           "whether it is flipped, shifted or another's, and its geometry", stacklevel=3)
-        elif misfit > LARGE:
+        elif misfit > BAD_FIT:
             warnings.warn(f"no volume was found that explains the X-rays (misfit {misfit:.2g}): check their scale and "
                           "geometry, that they are not display values, and that the body fits into the volume",
                           stacklevel=3)
@@ -107,8 +107,8 @@ def worst_view(misfit_per_view: Sequence[float]) -> tuple[int, float]:
 
 def risen_from(misfits: dict[int, float]) -> int | None:
     """Of misfits by step, the first step of those at the end that had all risen above what was reached before."""
-    smallest, first = EMPTY, None
+    smallest, first = EMPTY_MISFIT, None
     for step, misfit in misfits.items():
-        risen = misfit > max(RISE * smallest, RISEN)
+        risen = misfit > max(RISE_FACTOR * smallest, RISE_MIN)
         first, smallest = (first or step) if risen else None, min(smallest, misfit)
     return first

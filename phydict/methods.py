@@ -42,15 +42,15 @@ RELEASED_STEPS = GradientSteps(learning_rate=0.01, prior_mean=True, reward=Rewar
 
 METHODS: dict[str, Sampler | Reconstructor] = {
     "phydict_fast": SplitGibbs(
-        iterations=10, warm_start=0.97, last=0.15, fresh_noise=0.4, overshoot=0.5, randomised_noise=1.0, scatter=True,
-        likelihood=ProximalCG(iterations=7, restarts=1, variation=10.0, edge=0.003),
-        final_likelihood=ProximalCG(iterations=10, restarts=5, refit=True, weighted=True, variation=10.0,
-                                    edge=0.003)),
-    "phydict_paper": SplitGibbs(iterations=50, likelihood=GradientSteps(reward=Reward(lpips=1.0)), refine_from=0.8,
-                                refine_iterations=40, full_detector=True),
+        iterations=10, t_start=0.97, t_end=0.15, noise_fraction=0.4, momentum=0.5, sampling_noise=1.0, scatter=True,
+        likelihood=ProximalCG(iterations=7, restarts=1, tv_weight=10.0, tv_eps=0.003),
+        final_likelihood=ProximalCG(iterations=10, restarts=5, refit_scatter=True, weighted_least_squares=True, tv_weight=10.0,
+                                    tv_eps=0.003)),
+    "phydict_paper": SplitGibbs(iterations=50, likelihood=GradientSteps(reward=Reward(lpips=1.0)), ec_delta=0.8,
+                                ec_steps=40, full_detector=True),
     "phydict_released": SplitGibbs(
-        iterations=50, likelihood=RELEASED_STEPS, final_likelihood=RELEASED_STEPS, refine_from=0.8,
-        refine_iterations=40, full_detector=True, clip=False, at_zero=True),
+        iterations=50, likelihood=RELEASED_STEPS, final_likelihood=RELEASED_STEPS, ec_delta=0.8,
+        ec_steps=40, full_detector=True, clip=False, final_denoise=True),
     "daps": DAPS(levels=25, sigma_min=0.02, flow_steps=2, likelihood=ExactDraw(iterations=10), prior_std=0.5),
     "pnp_dm": PnPDM(iterations=30, decay=0.85, levels=12, likelihood=ExactDraw(iterations=10), burn_in=24, thinning=1),
     "diffpir": DiffPIR(iterations=100),
@@ -68,15 +68,15 @@ METHODS: dict[str, Sampler | Reconstructor] = {
 
 def reconstructor(method: str | Sampler | Reconstructor, prior: Prior | str | Path | None = None,
                   guidance: float = 1.0, name: str | None = None,
-                  super_resolution: SuperResolution | str | Path | None = None, guide_fine: bool = True,
-                  fine_sampler: Sampler | None = None, fine_noise: float | None = None, samples: int = 1,
+                  super_resolution: SuperResolution | str | Path | None = None, sr_guided: bool = True,
+                  sr_sampler: Sampler | None = None, sr_noise_augmentation: float | None = None, samples: int = 1,
                   precision: str = "auto") -> Reconstructor:
     """A method ready to reconstruct: a name of METHODS, a sampler (which needs a prior), or a Reconstructor.
 
     prior: a Prior or the file it is in; None for the shipped one. It is only loaded by methods that need it. name: what
     the result calls the method (None: its own name).
-    super_resolution: the second stage of a cascade, or its file; None reconstructs on the prior's own grid. guide_fine:
-    whether the X-rays guide that stage too; fine_sampler: how (None: CascadePosterior's own); fine_noise: its noise
+    super_resolution: the second stage of a cascade, or its file; None reconstructs on the prior's own grid. sr_guided:
+    whether the X-rays guide that stage too; sr_sampler: how (None: CascadePosterior's own); sr_noise_augmentation: its noise
     (None: the stage's own).
     samples: how many to draw; of several, the result is the mean, with their standard deviation as a map of trust.
     precision: of the networks, one of phydict.runtime.precision.PRECISIONS. Raises ValueError for what cannot be meant.
@@ -106,9 +106,9 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: Prior | str | Pa
                          "super_resolution: leave one of the two out")
     if isinstance(super_resolution, str | Path):
         super_resolution = load_super_resolution(super_resolution)
-    ready = CascadePosterior(Cascade(prior, super_resolution), method, guide_fine, noise=fine_noise, guidance=guidance,
+    ready = CascadePosterior(Cascade(prior, super_resolution), method, sr_guided, noise=sr_noise_augmentation, guidance=guidance,
                              name=name, precision=precision)
-    return replace(ready, fine_sampler=fine_sampler) if fine_sampler else ready
+    return replace(ready, sr_sampler=sr_sampler) if sr_sampler else ready
 
 
 def fit_to_grid(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam) -> tuple[Tensor, Projector]:
@@ -130,14 +130,14 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: Prior | str | Path | None 
                 display: bool = False, seed: int = 0, guidance: float = 1.0, mu_water: float | None = None,
                 grid: Grid = Grid.cube(64), on_step=lambda: None,
                 super_resolution: SuperResolution | str | Path | None = None,
-                guide_fine: bool = True, samples: int = 1, precision: str = "auto") -> Reconstruction:
+                sr_guided: bool = True, samples: int = 1, precision: str = "auto") -> Reconstruction:
     """A CT volume from X-rays (K, V, U) and their geometry.
 
     xrays: tensor or array of line integrals; with display=True, of display values with an unknown gain and offset per
     view. grid: for methods without a prior; others work on their prior's.
     prior: a Prior, a file, or None for the shipped one; report: radiology text, if any, which `format_report` lays out.
     mu_water: attenuation in 1/mm that water has in the X-rays (None: the method's own, near 65 keV).
-    super_resolution, guide_fine: the second stage of a cascade, as for `reconstructor`; the volume is then on its grid.
+    super_resolution, sr_guided: the second stage of a cascade, as for `reconstructor`; the volume is then on its grid.
     samples: more than one gives their mean, and `deviation`, a map of how far they differ, as for `reconstructor`.
     precision: of the networks; "auto" is bfloat16 where the device computes it, float32 elsewhere.
     A detector finer than the grid can use is binned. Raises ValueError when X-rays, geometry and prior do not fit.
@@ -147,9 +147,9 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: Prior | str | Path | None 
     if not isinstance(report, str | None):
         raise ValueError(f"the report must be text, but {report!r} was given")
     check_seed(seed)
-    ready = reconstructor(method, prior, guidance, super_resolution=super_resolution, guide_fine=guide_fine,
+    ready = reconstructor(method, prior, guidance, super_resolution=super_resolution, sr_guided=sr_guided,
                           samples=samples, precision=precision)
-    ready = ready if mu_water is None else ready.assuming(mu_water)
+    ready = ready if mu_water is None else ready.with_mu_water(mu_water)
     grid = ready.grid if isinstance(ready, Posterior | CascadePosterior) else grid
     xrays, projector = fit_to_grid(ready, grid, torch.as_tensor(xrays), beam)
     return ready.reconstruct(xrays, projector, format_report(report), display, seed, on_step)

@@ -12,7 +12,7 @@ import numpy as np
 from torch import Tensor
 
 from phydict.grid import Grid
-from phydict.runtime.files import whole_file
+from phydict.runtime.files import atomic_write
 from phydict.units import MU_WATER
 from phydict.xray import Projector
 
@@ -61,7 +61,7 @@ def save_nifti(path: str | Path, volume: np.ndarray, grid: Grid) -> None:
     image.header.set_xyzt_units("mm", "sec")
     image.set_sform(grid.affine, code="scanner")
     image.set_qform(grid.affine, code="scanner")
-    with whole_file(Path(path)) as part:
+    with atomic_write(Path(path)) as part:
         nibabel.save(image, part)
 
 
@@ -82,7 +82,7 @@ class Reconstructor(ABC):
             raise ValueError(f"mu_water, the attenuation of water in 1/mm, is above 0 and about {MU_WATER}, but "
                              f"{self.mu_water} was given")
 
-    def assuming(self, mu_water: float) -> Reconstructor:
+    def with_mu_water(self, mu_water: float) -> Reconstructor:
         """The same method for X-rays in which water attenuates `mu_water` in 1/mm."""
         return replace(self, mu_water=mu_water)
 

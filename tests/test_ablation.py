@@ -196,10 +196,10 @@ def test_a_method_that_gives_up_is_a_row_with_its_sentence(tmp_path, monkeypatch
 def test_a_setting_that_means_nothing_to_a_method_does_not_multiply_it(tmp_path):
     trials = read_specification(write(
         tmp_path, base=TINY | {"voxels": 64}, axes={"method": ["sirt", "phydict_fast"], "guidance": [1, 2],
-                                                    "method.warm_start": [0.2, 0.4]})).trials
+                                                    "method.t_start": [0.2, 0.4]})).trials
     assert [trial.name for trial in trials] == ["sirt"] + ["phydict_fast"] * 4
-    assert "guidance" not in trials[0].columns and trials[-1].columns["method.warm_start"] == 0.4
-    assert trials[-1].guidance == 2.0 and trials[-1].method.warm_start == 0.4
+    assert "guidance" not in trials[0].columns and trials[-1].columns["method.t_start"] == 0.4
+    assert trials[-1].guidance == 2.0 and trials[-1].method.t_start == 0.4
 
 
 def test_methods_without_a_prior_take_the_grid_and_window_of_those_with_one(tmp_path):
@@ -231,7 +231,7 @@ def test_delta_keeps_the_length_of_a_step():
     assert refined_from(paper, 0.8) == paper
     for delta in (0.1, 0.5, 0.99):
         method = refined_from(SplitGibbs(100), delta)
-        assert method.refine_from / method.refine_iterations == pytest.approx(1 / 100)
+        assert method.ec_delta / method.ec_steps == pytest.approx(1 / 100)
     assert refined_from(paper, 0.0).steps() == paper.iterations
 
 

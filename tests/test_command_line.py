@@ -8,13 +8,13 @@ import pytest
 
 from phydict.cli.infer import main as infer
 from phydict.cli.train import main as train
-from phydict.runtime.console import noted, one_sentence_errors, quiet, with_configurations
+from phydict.runtime.console import cli_errors, noted, quiet, with_configurations
 from phydict.runtime.shipped import shipped
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
 def test_a_full_disk_is_one_sentence_that_says_how_to_go_on(number, capsys):
-    with pytest.raises(SystemExit) as stopped, one_sentence_errors(to_go_on="add --ckpt_path"):
+    with pytest.raises(SystemExit) as stopped, cli_errors(to_go_on="add --ckpt_path"):
         raise OSError(number, os.strerror(number), "metrics.csv")
     said = capsys.readouterr().err
     assert stopped.value.code == 2 and said.count("\n") == 1

@@ -38,8 +38,8 @@ GRID = Grid.cube(16)
 BEAM = ConeBeam.orbit(8, 1020, 740, (24, 24), 24.0)
 FAST = METHODS["phydict_fast"]
 SAMPLERS = {
-    "fast": FAST, "paper": SplitGibbs(4, GradientSteps(), refine_from=0.3, refine_iterations=2),
-    "released": replace(METHODS["phydict_released"], iterations=2, refine_iterations=2),
+    "fast": FAST, "paper": SplitGibbs(4, GradientSteps(), ec_delta=0.3, ec_steps=2),
+    "released": replace(METHODS["phydict_released"], iterations=2, ec_steps=2),
     "daps": DAPS(levels=3, flow_steps=1, likelihood=ExactDraw(3), prior_std=0.5),
     "daps langevin": DAPS(levels=3, flow_steps=1, likelihood=Langevin(5)),
     "pnp_dm": PnPDM(iterations=4, decay=0.5, levels=3, likelihood=ExactDraw(3), burn_in=2, thinning=1),
@@ -228,12 +228,12 @@ def test_a_contradictory_report_at_any_guidance_ends_finite_and_x_rays_are_met_a
 
 @pytest.mark.parametrize("delta", [0.0, 0.01, 0.99])
 def test_extra_compute_from_any_delta_ends_finite_in_the_priors_range(prior, delta):
-    volume = reconstruct(CLEAN, BEAM, prior, replace(FAST, refine_from=delta, refine_iterations=2)).volume
+    volume = reconstruct(CLEAN, BEAM, prior, replace(FAST, ec_delta=delta, ec_steps=2)).volume
     assert volume.isfinite().all() and volume.min() >= -1000 and volume.max() <= 600
 
 
 @pytest.mark.parametrize("make", [
-    lambda n: replace(FAST, iterations=n, warm_start=1.0, last=None), lambda n: PriorOnly(n), lambda n: DPS(n, 1.0),
+    lambda n: replace(FAST, iterations=n, t_start=1.0, t_end=None), lambda n: PriorOnly(n), lambda n: DPS(n, 1.0),
     lambda n: DDS(n), lambda n: DiffPIR(n), lambda n: DAPS(n, flow_steps=1, likelihood=ExactDraw(3), prior_std=0.5),
     lambda n: PnPDM(n, levels=2, likelihood=ExactDraw(3), burn_in=n - 1, thinning=1)],
     ids=["fast", "prior", "dps", "dds", "diffpir", "daps", "pnp_dm"])
@@ -264,7 +264,7 @@ def test_denoisers_in_bf16_fp32_and_fp64_agree(prior):
 
 
 def test_seeds_differ_less_where_the_x_rays_say_more(prior):
-    method = replace(FAST, randomised_noise=1.0)
+    method = replace(FAST, sampling_noise=1.0)
 
     def spread(beam: ConeBeam) -> float:
         return float(reconstruct(views(beam=beam), beam, prior, method, samples=4).deviation.mean())
@@ -327,8 +327,8 @@ def test_descent_that_is_too_fast_is_told_with_the_step_from_which_the_misfit_ro
 
 
 def test_the_step_at_which_a_rise_began_is_told_where_the_last_steps_forget_the_x_rays(prior):
-    sampler = SplitGibbs(4, ProximalCG(10), ProximalCG(10), warm_start=0.3, last=0.15, refine_from=0.99,
-                         refine_iterations=3)
+    sampler = SplitGibbs(4, ProximalCG(10), ProximalCG(10), t_start=0.3, t_end=0.15, ec_delta=0.99,
+                         ec_steps=3)
     with pytest.warns(UserWarning, match="from step 5 of 7 on"):
         result = reconstruct(CLEAN, BEAM, prior, sampler)
     assert result.diverged_at == 5 and result.misfit > 0.1

@@ -159,7 +159,7 @@ def test_every_simulator_goes_with_every_method(inference, preset, config):
     cli = inference(preset, config)
     assert cli.datamodule.simulator == {"ideal": Ideal(), "polychromatic": Polychromatic()}[config.stem]
     assert cli.model.method_name == preset.stem
-    ready = cli.model.reconstructor.assuming(cli.datamodule.simulator.effective_mu_water)
+    ready = cli.model.reconstructor.with_mu_water(cli.datamodule.simulator.effective_mu_water)
     assert ready.mu_water == cli.datamodule.simulator.effective_mu_water and ready.name == preset.stem
 
 
@@ -217,7 +217,7 @@ def test_an_unknown_key_is_an_error_that_names_it(tmp_path, monkeypatch, capsys,
     assert key in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("settings", [{"iterations": 0}, {"warm_start": 2.0}])
+@pytest.mark.parametrize("settings", [{"iterations": 0}, {"t_start": 2.0}])
 def test_an_impossible_setting_is_an_error_that_says_why(tmp_path, monkeypatch, capsys, settings):
     monkeypatch.chdir(tmp_path)
     method = {"class_path": "phydict.posterior.SplitGibbs", "init_args": settings}

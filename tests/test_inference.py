@@ -803,7 +803,7 @@ def test_a_bad_prior_is_one_sentence(case, prior, measured, tmp_path, capsys):
 @pytest.mark.parametrize("guided", [True, False])
 def test_a_second_stage_is_scored_on_the_fine_grid(guided, prior, fine, cts, tmp_path):
     main(with_prior("test", tmp_path, prior, f"--data.cts={cts / 'a.nii.gz'}", *ORBIT,
-                    f"--model.super_resolution={fine}", f"--model.guide_fine={guided}", "--model.fine_memory=1"))
+                    f"--model.super_resolution={fine}", f"--model.sr_guided={guided}", "--model.sr_memory=1"))
     folder = tmp_path / "prior_only" / "a"
     found, said = nibabel.load(folder / "volume.nii.gz"), record(folder)
     assert found.shape == (32, 32, 32) and found.header.get_zooms() == (12.0, 12.0, 12.0)
@@ -820,8 +820,8 @@ def test_medsyns_second_stage_is_refused_before_anything_is_done_where_it_takes_
     base = write(tmp_path / "base" / "model_1.safetensors", entries(text_unet()))
     second = write(tmp_path / "second" / "model.safetensors", entries(super_resolution_unet())).parent
     said = refusal(capsys, with_prior("predict", tmp_path / "out", base, f"--data.xrays={measured}",
-                                      f"--model.super_resolution={second}", "--model.fine_memory=1"))
-    assert "(256, 256, 256)" in said and "1 GiB are allowed" in said and "--model.fine_memory " in said
+                                      f"--model.super_resolution={second}", "--model.sr_memory=1"))
+    assert "(256, 256, 256)" in said and "1 GiB are allowed" in said and "--model.sr_memory " in said
     assert not (tmp_path / "out").exists()
 
 
@@ -958,7 +958,7 @@ def test_the_record_says_whether_the_misfit_rose(measured, tmp_path, monkeypatch
 
     def worse(self, A, y, on_step):
         density = solve(self, A, y, on_step)
-        A.seen = 9 * y
+        A.last_projection = 9 * y
         on_step()
         return 9 * density
 

@@ -169,16 +169,16 @@ def test_a_super_resolution_stage_makes_it_a_cascade_on_the_fine_grid(tmp_path):
     beam = ConeBeam.orbit(3, 1020, 740, (28, 28), 20.0)
     views = ball(beam, 90.0)
     results = [reconstruct(views, beam, tiny_prior(False), PriorOnly(2), super_resolution=tmp_path / "fine.safetensors",
-                           guide_fine=guide) for guide in (True, False)]
+                           sr_guided=guide) for guide in (True, False)]
     assert all(result.grid.same_as(Grid.cube(32)) for result in results)
     assert results[0].misfit < 0.5 * results[1].misfit
     ready = reconstructor(PriorOnly(2), tiny_prior(False), 1.0, "two", tiny_super_resolution(), True, PriorOnly(3), 0.1)
-    assert isinstance(ready, CascadePosterior) and ready.fine_sampler == PriorOnly(3) and ready.noise == 0.1
-    assert ready.name == "two" and ready.assuming(0.018).mu_water == 0.018
+    assert isinstance(ready, CascadePosterior) and ready.sr_sampler == PriorOnly(3) and ready.noise == 0.1
+    assert ready.name == "two" and ready.with_mu_water(0.018).mu_water == 0.018
 
 
 def test_a_method_without_a_prior_takes_no_second_stage():
     with pytest.raises(ValueError, match="SIRT has none"):
         reconstructor("sirt", super_resolution=tiny_super_resolution())
     with pytest.raises(ValueError, match=r"in \[0, 1\]"):
-        reconstructor(PriorOnly(2), tiny_prior(False), super_resolution=tiny_super_resolution(), fine_noise=1.5)
+        reconstructor(PriorOnly(2), tiny_prior(False), super_resolution=tiny_super_resolution(), sr_noise_augmentation=1.5)

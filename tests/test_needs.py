@@ -37,7 +37,7 @@ for name, report in json.loads(sys.argv[2]):
     method = phydict.METHODS[name]
     if name == "phydict_paper":
         method = replace(method, likelihood=GradientSteps(reward=Reward(lpips=0.0)))
-    few = {key: 2 for key in ("iterations", "refine_iterations") if hasattr(method, key)}
+    few = {key: 2 for key in ("iterations", "ec_steps") if hasattr(method, key)}
     made.clear()
     phydict.reconstruct(xrays, beam, sys.argv[1], replace(method, **few), report=report, grid=phydict.Grid.cube(16))
     networks[f"{name} {report}".strip()] = sorted(made)
@@ -105,7 +105,7 @@ class Watched:
 
 
 def reduced(method: Sampler) -> Sampler:
-    few = {"iterations": 2, "refine_iterations": 2, "levels": 2, "burn_in": 1, "thinning": 1}
+    few = {"iterations": 2, "ec_steps": 2, "levels": 2, "burn_in": 1, "thinning": 1}
     method = replace(method, **{key: value for key, value in few.items() if hasattr(method, key)})
     if hasattr(method, "likelihood") and isinstance(method.likelihood, GradientSteps):
         method = replace(method, likelihood=GradientSteps(reward=Reward()), final_likelihood=None)

@@ -10,14 +10,14 @@ import torch
 
 from phydict.datasets import phantom_case
 from phydict.grid import Grid
-from phydict.training.crops import Crops, PhantomVolumes, SuperResolutionData, mapped_volume
+from phydict.training.crops import CropDataset, PhantomVolumes, SuperResolutionData, mapped_volume
 from phydict.units import HUWindow
 
 RAMP = (np.arange(16**3).reshape(16, 16, 16) / 16**3).astype(np.float16)
 
 
 def crops(size=8, align=4, augmented=False, seed=0, epoch=0):
-    return Crops([], [RAMP], 0.0, HUWindow(), size, align, 40, epoch, seed, augmented)
+    return CropDataset([], [RAMP], 0.0, HUWindow(), size, align, 40, epoch, seed, augmented)
 
 
 def test_a_crop_is_a_piece_of_its_volume_that_starts_at_a_whole_coarse_voxel():
@@ -48,14 +48,14 @@ def test_augmentation_mirrors_and_changes_hu_a_little_but_never_air():
         assert min(straight, flipped) < 0.03 * 2000 + 20 + 1
         mirrored += flipped < straight
     assert 8 < mirrored < 32
-    air = Crops([], [np.full((16, 16, 16), -1, np.float16)], 0.0, HUWindow(), 8, 4, 3, 0, 0)
+    air = CropDataset([], [np.full((16, 16, 16), -1, np.float16)], 0.0, HUWindow(), 8, 4, 3, 0, 0)
     assert all((air[i]["volume"] == -1).all() for i in range(3))
 
 
 def test_mere_air_is_rarely_drawn():
     volume = np.full((32, 32, 32), -1, np.float16)
     volume[:16] += np.random.default_rng(0).random((16, 32, 32)).astype(np.float16)
-    drawn = Crops([], [volume], 0.0, HUWindow(), 8, 4, 100, 0, 0, False)
+    drawn = CropDataset([], [volume], 0.0, HUWindow(), 8, 4, 100, 0, 0, False)
     assert sum(float(drawn[i]["volume"].std()) < 0.05 for i in range(100)) < 20
 
 

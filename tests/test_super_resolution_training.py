@@ -19,7 +19,7 @@ CONFIG = Path(__file__).parents[1] / "configs" / "prior" / "super_resolution.yam
 BASE_CONFIG = CONFIG.with_name("phantom.yaml")
 TINY = ["--model.network.class_path=phydict.prior.LocalUNet", "--model.network.init_args.block=2",
         "--model.network.init_args.channels=[8,8]", "--model.voxels=32", "--model.factor=2", "--model.warmup=2",
-        "--model.montage_steps=2", "--data.phantoms=2", "--data.validation_phantoms=1", "--data.validation_crops=1",
+        "--model.preview_steps=2", "--data.phantoms=2", "--data.validation_phantoms=1", "--data.validation_crops=1",
         "--data.crop=16", "--data.epoch_size=8", "--data.batch_size=2", "--trainer.accelerator=cpu",
         "--trainer.devices=1", "--trainer.precision=32", "--trainer.max_steps=-1", "--trainer.log_every_n_steps=1",
         "--trainer.check_val_every_n_epoch=1", "--trainer.enable_progress_bar=false",

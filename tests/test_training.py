@@ -32,7 +32,7 @@ from phydict.units import HUWindow
 CONFIG = Path(__file__).parents[1] / "configs" / "prior" / "phantom.yaml"
 TINY = ["--model.network.class_path=phydict.prior.VolumeUNet", "--model.network.init_args.channels=[8,8]",
         "--model.network.init_args.attention=[false,true]", "--model.network.init_args.head_channels=8",
-        "--model.voxels=16", "--model.text_steps=2", "--model.warmup=2", "--model.montage_steps=2", "--data.phantoms=4",
+        "--model.voxels=16", "--model.text_pretrain_steps=2", "--model.warmup=2", "--model.preview_steps=2", "--data.phantoms=4",
         "--data.validation_phantoms=1", "--data.epoch_size=8", "--data.batch_size=2", "--trainer.accelerator=cpu",
         "--trainer.devices=1", "--precision=float32", "--trainer.max_steps=-1", "--trainer.log_every_n_steps=1",
         "--trainer.check_val_every_n_epoch=1", "--trainer.enable_progress_bar=false",
@@ -528,8 +528,8 @@ def test_training_goes_on_from_a_prior_and_refuses_one_of_another_grid(tmp_path)
 
 def test_a_phantoms_sketch_is_the_change_its_findings_make_where_they_are(cache):
     data = PriorData(phantoms=30, cache=str(cache))
-    reports, maps = data.sketches(8)
-    again = data.sketches(8)[1]  # from the cache
+    reports, maps = data.finding_maps(8)
+    again = data.finding_maps(8)[1]  # from the cache
     assert torch.equal(maps, again) and len(reports) == len(maps) == 30
     for seed, change in enumerate(maps):
         findings = Thorax.draw(seed).findings

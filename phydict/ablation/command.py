@@ -13,13 +13,13 @@ from phydict.ablation.run import RESULTS, alone_in, run
 from phydict.ablation.spec import read_specification
 from phydict.ablation.summary import entries
 from phydict.ablation.tables import all_tables, write_tables
-from phydict.runtime.console import check_configured, check_writable, one_sentence_errors, quiet
+from phydict.runtime.console import check_configured, check_writable, cli_errors, quiet
 from phydict.runtime.progress import CaseProgress
 
 
 def main(args: list[str] | None = None) -> None:
     """infer.py ablate -c <file>. A bad input ends in one sentence and exit code 2; a run that was stopped goes on."""
-    with one_sentence_errors(), quiet():
+    with cli_errors(), quiet():
         check_configured(sys.argv[1:] if args is None else args, (), "configs/ablate/pareto.yaml")
         given = _parser().parse_args(args).as_dict()
         device = given.pop("device") or ("cuda" if torch.cuda.is_available() else "cpu")

@@ -11,9 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from phydict.ablation.summary import SHOWN_MEASURES, Entry, best_settings, conditions, told
+from phydict.ablation.summary import SHOWN_MEASURES, Entry, best_settings, conditions, format_settings
 from phydict.ablation.tables import deltas, headed
-from phydict.runtime.files import whole_file
+from phydict.runtime.files import atomic_write
 
 COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f", "#bcbd22", "#17becf",
            "#005f40", "#b15928", "#6a3d9a", "#ff1493")
@@ -26,13 +26,13 @@ def write_plots(folder: Path, found: Sequence[Entry]) -> list[Path]:
     written, style = [], styles(found)
     for condition, group in conditions(found):
         own = [entry for entry in group if entry.complete]
-        where = ", ".join(told(condition))
+        where = ", ".join(format_settings(condition))
         if len(own) > 1:
             written.append(_draw(folder, f"pareto {where}", 2, lambda axes: _pareto(axes, own, where, style)))
             written.append(_draw(folder, f"stages {where}", 1, lambda axes: _stages(axes[0], own, where)))
     for rest, group in conditions(found, without="views"):
         if len({entry.condition.get("views") for entry in group}) > 1:
-            written.append(_draw(folder, f"views {' '.join(told(rest))}", 2, lambda axes: _views(axes, group, style)))
+            written.append(_draw(folder, f"views {' '.join(format_settings(rest))}", 2, lambda axes: _views(axes, group, style)))
     curves = [(label, group) for label, group in deltas(found) if len(group) > 1]
     if curves:
         written.append(_draw(folder, "delta", 2, lambda axes: _deltas(axes, curves)))
@@ -61,7 +61,7 @@ def _draw(folder: Path, name: str, panels: int, draw: Callable[[Sequence[Axes]],
     FigureCanvasAgg(figure)
     draw(figure.subplots(1, panels, squeeze=False)[0])
     path = folder / (re.sub(r"[^\w.]+", "_", name.strip()) + ".png")
-    with whole_file(path) as part:
+    with atomic_write(path) as part:
         figure.savefig(part, format="png")
     return path
 
@@ -85,10 +85,10 @@ def _pareto(axes: Sequence[Axes], group: Sequence[Entry], where: str, style: dic
 
 def _views(axes: Sequence[Axes], group: Sequence[Entry], style: dict) -> None:
     for ax, name in zip(axes, ("psnr", "ssim")):
-        labels = {", ".join([e.method, *told(e.settings)]): e.method for e in group}
+        labels = {", ".join([e.method, *format_settings(e.settings)]): e.method for e in group}
         for label, method in labels.items():
             own = sorted((e.condition["views"], e.means[name]) for e in group
-                         if e.complete and ", ".join([e.method, *told(e.settings)]) == label)
+                         if e.complete and ", ".join([e.method, *format_settings(e.settings)]) == label)
             if own:
                 ax.plot(*zip(*own), **style[method], markersize=5, label=label)
         views = sorted({e.condition["views"] for e in group})

@@ -113,17 +113,17 @@ def run(specification: Specification, device: torch.device, progress: CaseProgre
     print(f"{len(planned) - left} of {len(planned)} rows are there already, {left} are to be run")
     if results.others:
         print(f"{len(results.others)} rows of other settings or data are kept in {results.file} and left out of tables")
-    bench = Bench(device)
+    bench = Runner(device)
     progress.begin("ablate", left, verb="run")
     for case, work in cases.items():
         groups: dict[str, list] = {}
-        made = Made()
+        made = CaseCache()
         for trial, name, make in work:
             if name not in results.done:
                 groups.setdefault(trial.acquisition(), []).append((trial, name, make))
         for group in groups.values():
             first, _, make = group[0]
-            scene = _attempt(lambda: Scene(case, first, made.case(case, first, make), device))
+            scene = _attempt(lambda: MeasuredCase(case, first, made.case(case, first, make), device))
             for trial, name, _ in group:
                 progress.case(f"{case}: {trial.label}")
                 measured = scene if isinstance(scene, dict) else bench.measure(trial, scene, progress.advance)
@@ -134,7 +134,7 @@ def run(specification: Specification, device: torch.device, progress: CaseProgre
     return results.rows
 
 
-class Made:
+class CaseCache:
     """One case as trials need it, made once for each grid, HU window and voxels of its simulation."""
 
     def __init__(self):
@@ -151,7 +151,7 @@ class Made:
         return self._kept[like]
 
 
-class Scene:
+class MeasuredCase:
     """One case under one acquisition: X-rays for all methods, and the truth, which no method is shown."""
 
     def __init__(self, case: str, trial: Trial, made: dict, device: torch.device):
@@ -169,13 +169,13 @@ class Scene:
         return self.truth["report"] if reads and trial.data.with_report else ""
 
 
-class Bench:
+class Runner:
     """Runs trials and measures them; what only a first call costs is spent before the clock runs."""
 
     def __init__(self, device: torch.device):
         self.device, self.warm = device, set()
 
-    def measure(self, trial: Trial, scene: Scene, on_step: Callable[[], None]) -> dict:
+    def measure(self, trial: Trial, scene: MeasuredCase, on_step: Callable[[], None]) -> dict:
         """The measured columns of one trial on one case."""
         if (state := str(trial.identity() | {"seed": None})) not in self.warm:
             self.warm.add(state)
@@ -187,7 +187,7 @@ class Bench:
             measured = _attempt(lambda: self._measured(trial, scene, on_step))
         return measured | {"warning": "; ".join(warned) or None}
 
-    def _measured(self, trial: Trial, scene: Scene, on_step: Callable[[], None]) -> dict:
+    def _measured(self, trial: Trial, scene: MeasuredCase, on_step: Callable[[], None]) -> dict:
         watch, memory = Stopwatch(), PeakMemory(self.device)
         result = self._reconstruct(trial, scene, watch, on_step)
         peak, finite = memory.mb(), bool(result.volume.isfinite().all())
@@ -201,13 +201,13 @@ class Bench:
             "device": self.device.type, "threads": torch.get_num_threads(), "precision": result.precision,
             "instruction_set": instruction_set(self.device)}
 
-    def _reconstruct(self, trial: Trial, scene: Scene, watch: Stopwatch, on_step: Callable[[], None]) -> Reconstruction:
+    def _reconstruct(self, trial: Trial, scene: MeasuredCase, watch: Stopwatch, on_step: Callable[[], None]) -> Reconstruction:
         seed = case_seed(trial.seed, scene.case)
         torch.manual_seed(seed)
         prior = TimedPrior(_on(trial.prior, self.device), watch) if isinstance(trial.method, Sampler) else None
         ready = reconstructor(trial.method, prior, trial.guidance, trial.name, samples=trial.samples)
         xrays, projector = fit_to_grid(ready, scene.grid, scene.xrays.clone(), scene.beam)
-        return ready.assuming(scene.mu_water).reconstruct(
+        return ready.with_mu_water(scene.mu_water).reconstruct(
             xrays, TimedProjector(projector, watch), scene.report(trial), False, seed, on_step)
 
 

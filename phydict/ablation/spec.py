@@ -45,10 +45,10 @@ SETTINGS: dict[str, tuple[type, object]] = {
     "delta": (float | None, None)}
 """Type and default of what an axis may be; beside these, method.<field> and simulator.<field>."""
 
-OF_A_PRIOR = ("prior", "guidance", "samples", "delta", "report")
+PRIOR_SETTINGS = ("prior", "guidance", "samples", "delta", "report")
 """Settings that mean nothing to a method without a prior."""
 
-SHOWN = ("method", "views", "simulator", "detector", "seed", "guidance", "samples")
+DEFAULT_COLUMNS = ("method", "views", "simulator", "detector", "seed", "guidance", "samples")
 """Settings that the table of results always has as columns; others where a specification gives them."""
 
 
@@ -250,12 +250,12 @@ def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
         method, simulator = (changed(own[part], changes[part], part) for part in own)
     except ValueError as error:
         raise ValueError(f"{settings['method']}: {error}") from error
-    if not isinstance(method, Sampler) or not has_field(method, ["refine_from"]):
+    if not isinstance(method, Sampler) or not has_field(method, ["ec_delta"]):
         given.pop("delta", None)
     if given.get("delta") is not None:
-        method = refined_from(method, given["delta"], "refine_iterations" in changes["method"])
+        method = refined_from(method, given["delta"], "ec_steps" in changes["method"])
     if not isinstance(method, Sampler):
-        given = {name: value for name, value in given.items() if name not in OF_A_PRIOR}
+        given = {name: value for name, value in given.items() if name not in PRIOR_SETTINGS}
     value = {name: default for name, (_, default) in SETTINGS.items()} | given
     if value["detector"] < 1:
         raise ValueError("detector is a number of pixels along each side, 1 or more, but "
@@ -268,7 +268,7 @@ def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
     with_prior = isinstance(method, Sampler)
     overrides = {f"{part}.{path}": plain(field_of({"method": method, "simulator": simulator}[part], path.split(".")))
                  for part, paths in changes.items() for path in paths}
-    columns = {name: value[name] for name in SHOWN if name in given or name not in OF_A_PRIOR or with_prior}
+    columns = {name: value[name] for name in DEFAULT_COLUMNS if name in given or name not in PRIOR_SETTINGS or with_prior}
     columns |= {name: given[name] for name in SETTINGS if name in given and name not in columns} | overrides
     trial = Trial(columns, method, data, value["prior"] if with_prior else None, value["guidance"], value["samples"],
                   value["seed"], value["voxels"], value["side"])
@@ -279,8 +279,8 @@ def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
 def refined_from(method: Sampler, delta: float, keep_iterations: bool = False) -> Sampler:
     """A method with Extra Compute from `delta`, 0 for none, in steps of the length of the first pass' unless its
     number of steps is to be kept."""
-    iterations = method.refine_iterations if keep_iterations else max(1, round(delta * method.iterations))
-    return replace(method, refine_from=delta, refine_iterations=iterations if delta else method.refine_iterations)
+    iterations = method.ec_steps if keep_iterations else max(1, round(delta * method.iterations))
+    return replace(method, ec_delta=delta, ec_steps=iterations if delta else method.ec_steps)
 
 
 def has_field(settings, path: Sequence[str]) -> bool:

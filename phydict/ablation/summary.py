@@ -19,7 +19,7 @@ SHOWN_MEASURES = MEASURES | {"network_calls": Measure("network calls", None, 0),
 OF_A_METHOD = ("method", "prior", "guidance", "samples", "delta", "report")
 """Columns that, with method.<field>, tell one method's settings; all others but seeds tell the X-rays."""
 
-NEITHER = (*MEASURED, "case", "key", "seed", "grid")
+NON_SETTING_COLUMNS = (*MEASURED, "case", "key", "seed", "grid")
 
 
 @dataclass(frozen=True)
@@ -46,16 +46,16 @@ class Entry:
     @property
     def label(self) -> str:
         """The method with its settings, and how many cases it has where some are missing."""
-        return ", ".join([self.method, *told(self.settings)]) + (
+        return ", ".join([self.method, *format_settings(self.settings)]) + (
             f" ({self.cases} of {self.of} cases)" if 0 < self.cases < self.of else "")
 
 
-def told(settings: Mapping) -> list[str]:
+def format_settings(settings: Mapping) -> list[str]:
     """Settings in words: "K = 8", "iterations 50"."""
-    return [_told(name, f"{value:g}" if isinstance(value, float) else str(value)) for name, value in settings.items()]
+    return [_format_setting(name, f"{value:g}" if isinstance(value, float) else str(value)) for name, value in settings.items()]
 
 
-def _told(name: str, value: str) -> str:
+def _format_setting(name: str, value: str) -> str:
     if name == "simulator":
         return value
     return f"K = {value}" if name == "views" else f"{name.split('.', 1)[-1].replace('_', ' ')} {value}"
@@ -67,7 +67,7 @@ def entries(rows: Iterable[Mapping]) -> list[Entry]:
     The condition of an entry is what differs among the rows' X-rays.
     """
     rows = list(rows)
-    names = [name for name in dict.fromkeys(k for row in rows for k in row) if name not in NEITHER]
+    names = [name for name in dict.fromkeys(k for row in rows for k in row) if name not in NON_SETTING_COLUMNS]
     mine = [name for name in names if name in OF_A_METHOD or name.startswith("method.")]
     varying = _varying(rows, [name for name in names if name not in mine])
     own = {method: _varying([row for row in rows if row["method"] == method], [n for n in mine if n != "method"])

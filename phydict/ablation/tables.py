@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from phydict.ablation.run import TABLES
-from phydict.ablation.summary import SHOWN_MEASURES, Entry, best_settings, conditions, told
+from phydict.ablation.summary import SHOWN_MEASURES, Entry, best_settings, conditions, format_settings
 from phydict.evaluation.metrics import RANGE, SIGMA, TAPS, Measure
-from phydict.runtime.files import whole_file
+from phydict.runtime.files import atomic_write
 
 OF_METHODS = ("ssim", "psnr", "mae_hu", "misfit", "seconds", "network_calls")
 """Columns of the table of methods."""
@@ -93,10 +93,10 @@ def views_tables(found: Sequence[Entry], notes: Sequence[str] = ()) -> list[Tabl
         for name in OF_VIEWS:
             measure, lines = SHOWN_MEASURES[name], {}
             for entry in group:
-                ranked, values = lines.setdefault(", ".join([entry.method, *told(entry.settings)]), ([], {}))
+                ranked, values = lines.setdefault(", ".join([entry.method, *format_settings(entry.settings)]), ([], {}))
                 ranked.append(entry.complete or not entry.cases)
                 values[entry.condition["views"]] = entry.means.get(name, math.nan)
-            title = ", ".join([f"{headed(measure)} against the number of views", *told(rest)])
+            title = ", ".join([f"{headed(measure)} against the number of views", *format_settings(rest)])
             tables.append(Table(title, ["method", *(f"K = {k}" for k in views)], [measure] * len(views),
                                 [(label, all(ranked), [values.get(k, math.nan) for k in views])
                                  for label, (ranked, values) in lines.items()], [*notes, *reasons(group)]))
@@ -122,7 +122,7 @@ def deltas(found: Sequence[Entry]) -> list[tuple[str, list[Entry]]]:
     for entry in found:
         if "delta" in entry.settings:
             others = {name: value for name, value in entry.settings.items() if name != "delta"}
-            label = ", ".join([entry.method, *told(others), *told(entry.condition)])
+            label = ", ".join([entry.method, *format_settings(others), *format_settings(entry.condition)])
             groups.setdefault(label, []).append(entry)
     return [(label, sorted(group, key=lambda entry: entry.settings["delta"])) for label, group in groups.items()]
 
@@ -131,7 +131,7 @@ def all_tables(found: Sequence[Entry], rows: Sequence[dict]) -> list[Table]:
     """Every table that the entries of some rows allow."""
     note, tables = [caption(rows), *doubts(rows)], []
     for condition, group in conditions(found):
-        where = ", ".join(told(condition)) or ", ".join(told({k: rows[0][k] for k in ("views", "simulator")}))
+        where = ", ".join(format_settings(condition)) or ", ".join(format_settings({k: rows[0][k] for k in ("views", "simulator")}))
         best = best_settings(group)
         if len(best) < len(group):
             tables.append(method_table(best, f"Methods, {where}: each at its setting of highest mean PSNR", [
@@ -151,7 +151,7 @@ def write_tables(folder: Path, tables: Sequence[Table]) -> list[Path]:
     files = {markdown: "\n".join(table.markdown() for table in tables),
              latex: "% needs \\usepackage{booktabs}\n" + "\n".join(table.latex() for table in tables)}
     for path, text in files.items():
-        with whole_file(path) as part:
+        with atomic_write(path) as part:
             part.write_text(text)
     return list(files)
 

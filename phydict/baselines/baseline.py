@@ -19,17 +19,17 @@ from phydict.xray.checks import check_line_integrals, check_xrays
 from phydict.xray.residuals import misfits
 
 
-class CountedProjector:
+class CountingProjector:
     """A projector, with `calls`: how often it or its adjoint ran over all views; `y`, the X-rays in mm of water, and
-    `seen`, what it last made of a density."""
+    `last_projection`, what it last made of a density."""
 
     def __init__(self, projector: Projector):
         self.grid, self.beam, self._projector, self.calls = projector.grid, projector.beam, projector, 0
-        self.y = self.seen = None
+        self.y = self.last_projection = None
 
     def __call__(self, density: Tensor) -> Tensor:
-        self.seen = self.linear(density)
-        return self.seen
+        self.last_projection = self.linear(density)
+        return self.last_projection
 
     def linear(self, d: Tensor) -> Tensor:
         """The same of directions and test volumes, which are no estimates."""
@@ -54,13 +54,13 @@ class Baseline(Reconstructor):
     name: str
 
     @abstractmethod
-    def solve(self, A: CountedProjector, y: Tensor, on_step: Callable[[], None]) -> Tensor:
+    def solve(self, A: CountingProjector, y: Tensor, on_step: Callable[[], None]) -> Tensor:
         """Density relative to water (1, 1, X, Y, Z) of line integrals y (1, K, V, U) in mm of water."""
 
     @torch.no_grad()
     def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,
                     seed: int = 0, on_step: Callable[[], None] = lambda: None) -> Reconstruction:
-        watch, A = Stopwatch(), CountedProjector(projector)
+        watch, A = Stopwatch(), CountingProjector(projector)
         check_xrays(xrays, A.beam)
         if not display:
             check_line_integrals(xrays)
@@ -74,15 +74,15 @@ class Baseline(Reconstructor):
         with watch.stage("score"):
             reprojection, measured = (self.mu_water * views[0].cpu() for views in (A(density), y))
             found = misfits(reprojection, measured)
-            guard.end(density, found["misfit"])
-            guard.doubt(**found)
+            guard.finish(density, found["misfit"])
+            guard.check_fit(**found)
         return Reconstruction(
             volume=mu_to_hu(density[0, 0], 1.0).cpu(), grid=A.grid, method=self.name, seed=seed,
             **found, seconds=watch.seconds, xrays=measured, reprojection=reprojection,
             projector_calls=A.calls, diverged_at=guard.diverged_at)
 
 
-def empty(A: CountedProjector, y: Tensor) -> Tensor:
+def empty(A: CountingProjector, y: Tensor) -> Tensor:
     """A volume of zeros (1, 1, X, Y, Z), of the type and on the device of y."""
     return torch.zeros(1, 1, *A.grid.shape).to(y)
 
@@ -97,7 +97,7 @@ def clip(density: Tensor, window: HUWindow | None) -> Tensor:
     return density.clamp(*bounds(window))
 
 
-def norm(A: CountedProjector, y: Tensor) -> float:
+def norm(A: CountingProjector, y: Tensor) -> float:
     """The largest singular value of A, by power iteration to a relative change of 1e-4.
 
     A has no negative weights, so its leading singular vector has none either and a constant start reaches it.
@@ -111,7 +111,7 @@ def norm(A: CountedProjector, y: Tensor) -> float:
     return norm
 
 
-def typical_chest(projector: Projector | CountedProjector) -> Tensor:
+def typical_chest(projector: Projector | CountingProjector) -> Tensor:
     """Density relative to water (1, 1, X, Y, Z) of an upright elliptic cylinder, 320 x 220 mm, with two lungs."""
     grid = projector.grid
     index = torch.stack(torch.meshgrid(*[torch.arange(n) for n in grid.shape], indexing="ij"), -1).double()

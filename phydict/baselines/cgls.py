@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from phydict.baselines.baseline import Baseline, CountedProjector, bounds, clip, empty
+from phydict.baselines.baseline import Baseline, CountingProjector, bounds, clip, empty
 from phydict.units import MU_WATER, HUWindow
 
 
@@ -40,28 +40,28 @@ class CGLS(Baseline):
     def steps(self) -> int:
         return self.iterations * self.restarts
 
-    def solve(self, A: CountedProjector, y: Tensor, on_step: Callable[[], None]) -> Tensor:
+    def solve(self, A: CountingProjector, y: Tensor, on_step: Callable[[], None]) -> Tensor:
         low, high = bounds(self.window)
         density = clip(empty(A, y), self.window)
         for _ in range(self.restarts):
             residual = y - A(density)
-            downhill = A.T(residual)
-            free = ~((density <= low) & (downhill < 0) | (density >= high) & (downhill > 0))
-            density = clip(self._descend(A, density, residual, downhill, free, on_step), self.window)
+            negative_gradient = A.T(residual)
+            inactive_mask = ~((density <= low) & (negative_gradient < 0) | (density >= high) & (negative_gradient > 0))
+            density = clip(self._descend(A, density, residual, negative_gradient, inactive_mask, on_step), self.window)
         return density
 
-    def _descend(self, A: CountedProjector, density: Tensor, residual: Tensor, downhill: Tensor, free: Tensor,
+    def _descend(self, A: CountingProjector, density: Tensor, residual: Tensor, negative_gradient: Tensor, inactive_mask: Tensor,
                  on_step: Callable[[], None]) -> Tensor:
-        """Conjugate gradients over the free voxels, from `density`, whose residual and downhill direction are given."""
-        downhill = direction = downhill * free
-        energy = start = downhill.square().sum()
+        """Conjugate gradients over the free voxels, from `density`, whose residual and negative_gradient direction are given."""
+        negative_gradient = direction = negative_gradient * inactive_mask
+        energy = start = negative_gradient.square().sum()
         for _ in range(self.iterations):
             if energy > 1e-12 * start:
                 seen = A.linear(direction)
                 step = energy / seen.square().sum()
                 density, residual = density + step * direction, residual - step * seen
-                downhill = A.T(residual) * free
-                previous, energy = energy, downhill.square().sum()
-                direction = downhill + energy / previous * direction
+                negative_gradient = A.T(residual) * inactive_mask
+                previous, energy = energy, negative_gradient.square().sum()
+                direction = negative_gradient + energy / previous * direction
             on_step()
         return density

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from phydict.baselines.baseline import Baseline, CountedProjector, clip, empty
+from phydict.baselines.baseline import Baseline, CountingProjector, clip, empty
 from phydict.units import MU_WATER, HUWindow
 
 SHIFT, SHARPNESS = 0.3, 20.0
@@ -50,7 +50,7 @@ class DiffVox(Baseline):
         return self.iterations
 
     @torch.enable_grad()
-    def solve(self, A: CountedProjector, y: Tensor, on_step: Callable[[], None]) -> Tensor:
+    def solve(self, A: CountingProjector, y: Tensor, on_step: Callable[[], None]) -> Tensor:
         x = empty(A, y).requires_grad_()
         adam = torch.optim.Adam([x], self.learning_rate)
         cycle = torch.optim.lr_scheduler.OneCycleLR(adam, self.learning_rate, self.iterations,

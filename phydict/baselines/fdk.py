@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from phydict.baselines.baseline import Baseline, CountedProjector, clip, empty
+from phydict.baselines.baseline import Baseline, CountingProjector, clip, empty
 from phydict.baselines.orbit import Orbit
 from phydict.grid import Grid
 from phydict.units import MU_WATER, HUWindow
@@ -44,7 +44,7 @@ class FDK(Baseline):
     def steps(self) -> int:
         return 1
 
-    def solve(self, A: CountedProjector, y: Tensor, on_step: Callable[[], None]) -> Tensor:
+    def solve(self, A: CountingProjector, y: Tensor, on_step: Callable[[], None]) -> Tensor:
         beam, grid = A.beam, A.grid
         orbit = Orbit.of(beam, grid)
         density = empty(A, y)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from phydict.baselines.baseline import Baseline, CountedProjector, empty
+from phydict.baselines.baseline import Baseline, CountingProjector, empty
 from phydict.units import MU_WATER
 
 
@@ -35,7 +35,7 @@ class SIRT(Baseline):
     def steps(self) -> int:
         return self.iterations
 
-    def solve(self, A: CountedProjector, y: Tensor, on_step: Callable[[], None]) -> Tensor:
+    def solve(self, A: CountingProjector, y: Tensor, on_step: Callable[[], None]) -> Tensor:
         density = empty(A, y)
         sums = A.linear(density + 1), A.T(torch.ones_like(y))
         rows, columns = (1 / w.clamp(min=1e-6 * float(w.max())) for w in sums)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from phydict.baselines.baseline import Baseline, CountedProjector, clip, empty, norm
+from phydict.baselines.baseline import Baseline, CountingProjector, clip, empty, norm
 from phydict.units import MU_WATER, HUWindow
 
 
@@ -46,7 +46,7 @@ class FISTATV(Baseline):
     def steps(self) -> int:
         return self.iterations
 
-    def solve(self, A: CountedProjector, y: Tensor, on_step: Callable[[], None]) -> Tensor:
+    def solve(self, A: CountingProjector, y: Tensor, on_step: Callable[[], None]) -> Tensor:
         lipschitz = max(1.02 * norm(A, y) ** 2, 1e-30)  # power iteration approaches the norm from below
         scales = finest_to_own(A.grid.spacing)
         x = ahead = clip(empty(A, y), self.window)

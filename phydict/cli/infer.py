@@ -17,8 +17,8 @@ from phydict.runtime.console import (
     check_apart,
     check_command,
     check_configured,
+    cli_errors,
     noted,
-    one_sentence_errors,
     quiet,
     read_configurations,
     sentence,
@@ -97,7 +97,7 @@ def main(args: list[str] | None = None) -> None:
     args = sys.argv[1:] if args is None else args
     if args[:1] == ["ablate"]:
         return ablate(args[1:])
-    with one_sentence_errors(MisconfigurationException), quiet():
+    with cli_errors(MisconfigurationException), quiet():
         check_command(args, COMMANDS, InferenceCLI.subcommands(), "predict -c "
                       "configs/reconstruct/phydict_fast.yaml --data.xrays data/example/xrays")
         check_configured(args, ("--model", "--model.method", "--model.method.class_path"),

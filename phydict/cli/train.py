@@ -19,12 +19,12 @@ from phydict.cli.export import export_prior, print_prior
 from phydict.runtime.console import (
     check_command,
     check_writable,
-    one_sentence_errors,
+    cli_errors,
     quiet,
     read_configurations,
     with_configurations,
 )
-from phydict.runtime.files import whole_file
+from phydict.runtime.files import atomic_write
 from phydict.runtime.precision import PRECISIONS, resolve_precision, trainer_precision
 from phydict.training.base import PriorTraining
 from phydict.training.checkpoints import BEST, HELD_OUT, RESUMED, BestCheckpoint, WholeCheckpoints, read_checkpoint
@@ -115,7 +115,7 @@ class PriorCLI(LightningCLI):
             if file.exists() and file.read_bytes() != held_out.encode():
                 raise ValueError(f"{file} is there already and names other cases than this training holds out: move "
                                  "it away, or give another folder with --out")
-            with whole_file(file) as part:
+            with atomic_write(file) as part:
                 part.write_text(held_out)
         self.model.learn_reports(self.datamodule)
 
@@ -140,7 +140,7 @@ class PriorCLI(LightningCLI):
 def main(args: list[str] | None = None) -> None:
     """Command line of training: fit, validate, export, inspect-prior. A bad input ends in one sentence and code 2."""
     given = sys.argv[1:] if args is None else args
-    with one_sentence_errors(MisconfigurationException, to_go_on="add --ckpt_path and the run's last.ckpt"), quiet():
+    with cli_errors(MisconfigurationException, to_go_on="add --ckpt_path and the run's last.ckpt"), quiet():
         if given[:1] == ["export"]:
             auto_cli(export_prior, args=given[1:], as_positional=False, exit_on_error=False, allow_abbrev=False)
         elif given[:1] == ["inspect-prior"]:

@@ -35,12 +35,12 @@ def renoise(schedule: CosineSchedule, x0: Tensor, t: float, noise: Tensor) -> Te
     signal, sigma = schedule.scales(t)
     return signal.to(x0) * x0 + sigma.to(x0) * noise
 
-Draw = torch.Generator | Sequence[torch.Generator]
+Generators = torch.Generator | Sequence[torch.Generator]
 """Where noise comes from: one generator, or one for each state of a batch."""
 
 
-def noise_like(x: Tensor, draw: Draw) -> Tensor:
+def noise_like(x: Tensor, generator: Generators) -> Tensor:
     """Standard normal noise drawn in float32 on the generator's device, so that a result depends on neither of x's."""
-    if not isinstance(draw, torch.Generator):
-        return torch.cat([noise_like(one[None], own) for one, own in zip(x, draw, strict=True)])
-    return torch.randn(x.shape, generator=draw).to(x)
+    if not isinstance(generator, torch.Generator):
+        return torch.cat([noise_like(one[None], own) for one, own in zip(x, generator, strict=True)])
+    return torch.randn(x.shape, generator=generator).to(x)

@@ -17,7 +17,7 @@ from rich.table import Table
 
 from phydict.evaluation.metrics import MEASURES, RANGE, SIGMA, TAPS, Measure
 from phydict.grid import Grid
-from phydict.runtime.files import whole_file
+from phydict.runtime.files import atomic_write
 from phydict.units import HUWindow
 
 TEXT_COLUMNS = ("case", "method")
@@ -34,7 +34,7 @@ def write_csv(path: str | Path, rows: Iterable[Mapping]) -> None:
     rows = list(rows)
     seen = dict.fromkeys(key for row in rows for key in row)
     columns = [name for name in TEXT_COLUMNS if name in seen] + [name for name in seen if name not in TEXT_COLUMNS]
-    with whole_file(Path(path)) as part, part.open("w", newline="", encoding="utf-8") as file:
+    with atomic_write(Path(path)) as part, part.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
         writer.writerows([_to_text(row.get(name)) for name in columns] for row in rows)

@@ -28,7 +28,7 @@ from phydict.xray import ConeBeam, Ideal, Projector, Simulator
 MOST_PHANTOMS = 100_000
 
 
-class Listed(Dataset):
+class LazyCases(Dataset):
     """Cases made on demand, of (id, what identifies its data, function) triples, with the warnings that it took."""
 
     def __init__(self, makers: list):
@@ -173,7 +173,7 @@ class ReconstructionData(lightning.LightningDataModule):
 
     def _loader(self, makers: list[tuple]) -> DataLoader:
         left = set(self.trainer.lightning_module.unfinished({name: source for name, source, _ in makers}))
-        cases = Listed([maker for maker in makers if maker[0] in left])
+        cases = LazyCases([maker for maker in makers if maker[0] in left])
         self.trainer.strategy.barrier()  # every process has looked before any process finishes a case
         return DataLoader(cases, None)
 

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from phydict.evaluation.gallery import DISPLAY, GREY, MOST_VIEWS, PLANES, plane
 from phydict.grid import Grid
-from phydict.runtime.files import whole_file
+from phydict.runtime.files import atomic_write
 from phydict.xray import ConeBeam
 
 SIDES = (("right", "left"), ("anterior", "posterior"), ("superior", "inferior"))
@@ -90,7 +90,7 @@ def geometry_page(path: str | Path, beam: ConeBeam, grid: Grid, xrays: np.ndarra
         bottom.set_xlabel(agreement(xrays[k], thorax[k]).replace(", ", ",\n").replace(" with ", "\nwith "), fontsize=8)
     cells[0, 0].set_ylabel("your X-rays", fontsize=9)
     cells[1, 0].set_ylabel("a standard thorax", fontsize=9)
-    with whole_file(Path(path)) as part:
+    with atomic_write(Path(path)) as part:
         figure.savefig(part, format="png", metadata={"Software": SIGNED})
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from phydict.evaluation import markdown, write_csv
-from phydict.runtime.files import remove_leftovers, undisturbed, whole_file, whole_folder
+from phydict.runtime.files import atomic_directory, atomic_write, remove_leftovers, undisturbed
 from phydict.runtime.reading import not_written
 
 RECORD = "reconstruction.json"
@@ -78,7 +78,7 @@ class CaseResults:
         """
         final = self.folder / case
         try:
-            with whole_folder(final, lambda: self._is_free(case)) as partial:
+            with atomic_directory(final, lambda: self._is_free(case)) as partial:
                 write_files(partial)
                 files = sorted(file.name for file in partial.iterdir())
                 (partial / RECORD).write_text(json.dumps(record | {"files": files}, indent=1))
@@ -100,7 +100,7 @@ class CaseResults:
                                  "warning": "; ".join(record.get("warnings", [])) or None})
         if rows:
             write_csv(self.folder / TABLE, rows)
-            with whole_file(self.folder / "results.md") as part:
+            with atomic_write(self.folder / "results.md") as part:
                 part.write_text(markdown(rows))
         return rows
 

@@ -50,12 +50,12 @@ class ReconstructionTask(lightning.LightningModule):
         prior: the prior's file, or a file or folder of MedSyn's, read where the method is a Sampler
         guidance: scale of classifier-free guidance when a report is given; 1: none
         super_resolution: file of a cascade's second stage, which refines what the prior gives; none given: none
-        guide_fine: whether the X-rays guide the second stage too
-        fine_sampler: how they do; none given: the cascade's own
-        fine_noise: level in [0, 1] of the noise that the prior's estimate is given before the second stage sees it;
+        sr_guided: whether the X-rays guide the second stage too
+        sr_sampler: how they do; none given: the cascade's own
+        sr_noise_augmentation: level in [0, 1] of the noise that the prior's estimate is given before the second stage sees it;
             none given: the stage's own, 0.05, or 0 for MedSyn's
         samples: how many are drawn; of several the volume is the mean, and deviation.nii.gz their standard deviation
-        fine_memory: GiB that the second stage's network may take; it works in tiles where the whole takes more, and
+        sr_memory: GiB that the second stage's network may take; it works in tiles where the whole takes more, and
             MedSyn's, which cannot, is refused
         precision: of the networks: auto (bfloat16 where the device computes it), float32 or bfloat16
         out: output folder; cases go to <out>/<name>/<case>
@@ -67,8 +67,8 @@ class ReconstructionTask(lightning.LightningModule):
 
     def __init__(self, method: Sampler | Reconstructor, name: str,
                  prior: str | MedSynCheckpoint = str(DEFAULT_PRIOR), guidance: float = 1.0,
-                 super_resolution: str | MedSynCheckpoint | None = None, guide_fine: bool = True,
-                 fine_sampler: Sampler | None = None, fine_noise: float | None = None, fine_memory: float = 4.0,
+                 super_resolution: str | MedSynCheckpoint | None = None, sr_guided: bool = True,
+                 sr_sampler: Sampler | None = None, sr_noise_augmentation: float | None = None, sr_memory: float = 4.0,
                  out: str = "runs/reconstructions", overwrite: bool = False, seed: int = 0, voxels: int = 64,
                  side: float = 384.0, samples: int = 1, precision: str = "auto"):
         super().__init__()
@@ -90,16 +90,16 @@ class ReconstructionTask(lightning.LightningModule):
                 self.settings["precision"] = precision
         self.fine = None
         if super_resolution:
-            if not 0 < fine_memory < 2**20:
-                raise ValueError(f"model.fine_memory is an amount in GiB, above 0, but {fine_memory:g} was given")
+            if not 0 < sr_memory < 2**20:
+                raise ValueError(f"model.sr_memory is an amount in GiB, above 0, but {sr_memory:g} was given")
             self.fine = load_super_resolution(super_resolution)
-            self.fine.memory = int(fine_memory * 2**30)
+            self.fine.memory = int(sr_memory * 2**30)
             self.grid = self.fine.grid
-        self.reconstructor = reconstructor(method, self.prior, guidance, name, self.fine, guide_fine, fine_sampler,
-                                           fine_noise, samples, precision)
+        self.reconstructor = reconstructor(method, self.prior, guidance, name, self.fine, sr_guided, sr_sampler,
+                                           sr_noise_augmentation, samples, precision)
         if isinstance(self.reconstructor, CascadePosterior):
             self.settings |= _identity("super_resolution", super_resolution) | {
-                "fine_noise": self.reconstructor.level, "second": describe(self.reconstructor.second)}
+                "sr_noise_augmentation": self.reconstructor.level, "second": describe(self.reconstructor.second)}
         self.metrics = CaseMetrics([name])
         self.progress = CaseProgress()
         self.cases: list[str] = []
@@ -198,7 +198,7 @@ class ReconstructionTask(lightning.LightningModule):
     def _reconstruct(self, case: dict, seed: int) -> Reconstruction:
         with stage("fit to grid"):
             xrays, projector = fit_to_grid(self.reconstructor, self.grid, case["xrays"].to(self.device), case["beam"])
-        ready = self.reconstructor.assuming(case["mu_water"]) if "mu_water" in case else self.reconstructor
+        ready = self.reconstructor.with_mu_water(case["mu_water"]) if "mu_water" in case else self.reconstructor
         return ready.reconstruct(xrays, projector, case["report"], case.get("display", False), seed,
                                  self.progress.advance)
 

@@ -19,20 +19,20 @@ def differences_adjoint(d: list[Tensor], axes: Sequence[int] = (2, 3, 4)) -> Ten
     return -sum(pad(one, [0, 0] * (4 - axis) + [1, 1]).diff(dim=axis) for axis, one in zip(axes, d))
 
 
-def smoothed_tv(x: Tensor, edge: float) -> Tensor:
-    """The sum over voxels of sqrt(|forward differences|^2 + edge^2)."""
-    return (edge**2 + _squared_slope(x)).sqrt().sum()
+def smoothed_tv(x: Tensor, eps: float) -> Tensor:
+    """The sum over voxels of sqrt(|forward differences|^2 + eps^2)."""
+    return (eps**2 + _squared_slope(x)).sqrt().sum()
 
 
-class Majoriser:
-    """The quadratic sum over voxels of w |forward differences|^2 / 2, w = 1 / sqrt(slope^2 + edge^2) taken at `x`.
+class TVQuadraticMajorizer:
+    """The quadratic sum over voxels of w |forward differences|^2 / 2, w = 1 / sqrt(slope^2 + eps^2) taken at `x`.
 
     Up to a constant it lies above the smoothed total variation and has its value and gradient at x, so that minimising
     it lowers the variation (lagged diffusivity, Vogel & Oman 1996, doi:10.1137/0917016).
     """
 
-    def __init__(self, x: Tensor, edge: float):
-        w = 1 / (edge**2 + _squared_slope(x)).sqrt()
+    def __init__(self, x: Tensor, eps: float):
+        w = 1 / (eps**2 + _squared_slope(x)).sqrt()
         self.weights = [w.narrow(axis, 0, w.shape[axis] - 1) for axis in (2, 3, 4)]
 
     def gradient(self, x: Tensor) -> Tensor:

@@ -14,9 +14,9 @@ from phydict.posterior.samplers.diffpir import DiffPIR
 from phydict.posterior.samplers.dps import DPS
 from phydict.posterior.samplers.pnp_dm import PnPDM
 from phydict.posterior.samplers.prior_only import PriorOnly
-from phydict.posterior.samplers.sampler import Sampler, descend
+from phydict.posterior.samplers.sampler import Sampler, ddim_sample
 from phydict.posterior.samplers.split_gibbs import SplitGibbs
 
 __all__ = ["ADMMTV", "CascadePosterior", "DAPS", "DDS", "DPS", "DiffPIR", "ExactDraw", "GradientSteps", "Langevin",
            "LikelihoodDraw", "LikelihoodStep", "Measurement", "PnPDM", "Posterior", "PriorOnly", "ProximalCG", "Reward",
-           "Sampler", "SplitGibbs", "descend"]
+           "Sampler", "SplitGibbs", "ddim_sample"]

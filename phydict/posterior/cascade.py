@@ -14,7 +14,7 @@ from phydict.grid import Grid
 from phydict.guard import Guard
 from phydict.posterior.likelihood.likelihood import ProximalCG
 from phydict.posterior.measurement import Measurement
-from phydict.posterior.posterior import Counted, Posterior, check_guidance
+from phydict.posterior.posterior import CountingDenoiser, Posterior, check_guidance
 from phydict.posterior.samplers.prior_only import PriorOnly
 from phydict.posterior.samplers.sampler import Sampler
 from phydict.posterior.samplers.split_gibbs import SplitGibbs
@@ -31,7 +31,7 @@ from phydict.xray.residuals import misfits
 class CascadePosterior(Reconstructor):
     """Samples p(x | Y, report) under a cascade: the base stage by `sampler`, then the fine stage given its estimate.
 
-    guide_fine: whether the X-rays guide the fine stage too, by `fine_sampler`, as in the paper; else `unguided` samples
+    sr_guided: whether the X-rays guide the fine stage too, by `sr_sampler`, as in the paper; else `unguided` samples
     it from the base estimate alone, as in the authors' release. noise: level of the Gaussian noise that the base
     estimate is given before the fine stage sees it, in [0, 1] (noise augmentation): more trusts it less; None: the fine
     stage's `default_noise`. The rest as for Posterior; a base sampler that wants the full detector gives it to both
@@ -42,11 +42,11 @@ class CascadePosterior(Reconstructor):
 
     cascade: Cascade
     sampler: Sampler = field(default_factory=SplitGibbs)
-    guide_fine: bool = True
-    fine_sampler: Sampler = SplitGibbs(
-        iterations=2, warm_start=0.3, last=0.15, fresh_noise=0.0, prior_std=0.2,
-        likelihood=ProximalCG(iterations=5, restarts=2, variation=10.0, edge=0.003),
-        final_likelihood=ProximalCG(iterations=10, restarts=2, variation=10.0, edge=0.003))
+    sr_guided: bool = True
+    sr_sampler: Sampler = SplitGibbs(
+        iterations=2, t_start=0.3, t_end=0.15, noise_fraction=0.0, prior_std=0.2,
+        likelihood=ProximalCG(iterations=5, restarts=2, tv_weight=10.0, tv_eps=0.003),
+        final_likelihood=ProximalCG(iterations=10, restarts=2, tv_weight=10.0, tv_eps=0.003))
     unguided: Sampler = PriorOnly(20)
     noise: float | None = None
     guidance: float = 1.0
@@ -64,12 +64,12 @@ class CascadePosterior(Reconstructor):
     @property
     def grid(self) -> Grid:
         """Where the reconstructed volumes live."""
-        return self.cascade.fine.grid
+        return self.cascade.super_resolution.grid
 
     @property
     def level(self) -> float:
         """The level of the noise that the base estimate is given."""
-        return self.cascade.fine.default_noise if self.noise is None else self.noise
+        return self.cascade.super_resolution.default_noise if self.noise is None else self.noise
 
     @property
     def full_detector(self) -> bool:
@@ -78,7 +78,7 @@ class CascadePosterior(Reconstructor):
     @property
     def second(self) -> Sampler:
         """What samples the fine stage."""
-        return (self.fine_sampler if self.guide_fine else self.unguided).suited(self.cascade.fine)
+        return (self.sr_sampler if self.sr_guided else self.unguided).suited(self.cascade.super_resolution)
 
     @property
     def citation(self) -> str:
@@ -90,12 +90,12 @@ class CascadePosterior(Reconstructor):
     def check_memory(self, device: torch.device, state: torch.dtype = torch.float32) -> None:
         """Raises ValueError where the fine stage, for states of type `state` on `device`, does not fit into the memory
         that it may take."""
-        self.cascade.fine.check_memory(resolve_precision(self.precision, device, state))
+        self.cascade.super_resolution.check_memory(resolve_precision(self.precision, device, state))
 
     @torch.no_grad()
     def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,
                     seed: int = 0, on_step: Callable[[], None] = lambda: None) -> Reconstruction:
-        fine, watch = self.cascade.fine, Stopwatch()
+        fine, watch = self.cascade.super_resolution, Stopwatch()
         if not fine.grid.same_as(projector.grid):
             raise ValueError(
                 f"the super-resolution stage makes {fine.grid.shape} voxels of {fine.grid.spacing} mm, but the X-rays "
@@ -104,27 +104,27 @@ class CascadePosterior(Reconstructor):
         with watch.stage("base"):
             base = self._base(xrays, projector, report, display, seed, on_step)
         with watch.stage("prepare"):
-            draw = torch.Generator().manual_seed(seed + 1)
+            generator = torch.Generator().manual_seed(seed + 1)
             state = torch.cat([fine.window.to_range(base.volume)[None], 2 * base.masks - 1])[None].to(xrays)
             state = state[:, :fine.coarse_channels]
             measurement = Measurement(projector, xrays, fine.window, display, self.mu_water)
             if base.scatter:
-                measurement.seek_scatter(True)
-                measurement.correct(measurement.project(fine.upsample(state)[:, :1]))
-                measurement.scattered = False  # what the base stage tells of is kept
+                measurement.reset_scatter(True)
+                measurement.subtract_scatter(measurement.project(fine.upsample(state)[:, :1]))
+                measurement.scatter_enabled = False  # what the base stage tells of is kept
             guard = Guard(measurement, on_step, self.second.steps())
-            denoiser = Counted(fine.bind(state, self.level, self.precision, draw), guard)
-            x = noise_like(torch.empty(1, fine.state_channels, *fine.grid.shape, device=xrays.device), draw)
+            denoiser = CountingDenoiser(fine.bind(state, self.level, self.precision, generator), guard)
+            x = noise_like(torch.empty(1, fine.state_channels, *fine.grid.shape, device=xrays.device), generator)
         with watch.stage("sample"):
-            state = self.second.sample(denoiser, measurement, x, draw, guard)
+            state = self.second.sample(denoiser, measurement, x, generator, guard)
         with watch.stage("score"):
             ct = state[:, :1]
-            measurement.calibrate(ct)
+            measurement.match_gain_offset(ct)
             reprojection = measurement.project(ct)[0].cpu()
             measured = measurement.y[0].cpu()
             found = misfits(reprojection, measured)
-            guard.end(state, found["misfit"])
-            guard.doubt(**found)
+            guard.finish(state, found["misfit"])
+            guard.check_fit(**found)
             masks = interpolate(base.masks[None], fine.grid.shape, mode="trilinear")[0]
             masks[:fine.state_channels - 1] = ((state[0, 1:] + 1) / 2).cpu()
         return Reconstruction(

@@ -16,10 +16,10 @@ from phydict.xray.calibration import match_views, subtract_scatter
 from phydict.xray.checks import check_line_integrals, check_xrays
 from phydict.xray.noise_level import noise_level
 
-SCATTER = 0.03
+MIN_SCATTER_FRACTION = 0.03
 """The mean share of scatter in the signal from which it is believed: on the CTs that it was chosen on, X-rays without
 scatter look like 0.027 at most."""
-DARKEST = 30.0
+MAX_LINE_INTEGRAL = 30.0
 """Line integrals above which no photon comes through, so that they hold no scatter either."""
 
 
@@ -28,8 +28,8 @@ class Measurement:
 
     noise: standard deviation of the noise of y, as a share of its largest value or, as a tensor that expands to
     (K, V, U), of each pixel; None: estimated from y where it is needed.
-    scattered: whether `correct` subtracts scatter; calls: how many times A or its adjoint ran over all views, per
-    volume of a batch; seen: what `project` last gave.
+    scatter_enabled: whether `subtract_scatter` subtracts scatter; calls: how many times A or its adjoint ran over all views, per
+    volume of a batch; last_projection: what `project` last gave.
     """
 
     def __init__(self, projector: Projector, xrays: Tensor, window: HUWindow, display: bool = False,
@@ -42,15 +42,15 @@ class Measurement:
         self.slope, self.offset = window.mu_affine(mu_water)
         self.background = self.offset * projector(torch.ones(1, 1, *projector.grid.shape).to(xrays))
         self.y = xrays[None]
-        self.scattered = False
-        self.calls, self.seen = 1, None
+        self.scatter_enabled = False
+        self.calls, self.last_projection = 1, None
 
     def project(self, x: Tensor) -> Tensor:
         """P(x): line integrals (B, K, V, U) of the CT x."""
         self.calls += len(x)
         with stage("projector"):
             projected = self.slope * self.projector(x) + self.background
-        self.seen = projected.detach()
+        self.last_projection = projected.detach()
         return projected
 
     def linear(self, d: Tensor) -> Tensor:
@@ -77,37 +77,37 @@ class Measurement:
         level = self.noise if isinstance(self.noise, Tensor) else self.noise * self.y.max()
         return level.square().expand(self.y.shape[1:])
 
-    def missed(self, x: Tensor) -> Tensor:
+    def normalised_residual(self, x: Tensor) -> Tensor:
         """By how many times their noise the CTs x miss the X-rays, about 1 for the truth: (B, 1, 1, 1, 1)."""
-        missed = (self.project(x) - self.y).flatten(1).norm(dim=1)
-        return (missed / self.noise_variance.sum().clamp(min=1e-12).sqrt()).view(-1, 1, 1, 1, 1)
+        residual = (self.project(x) - self.y).flatten(1).norm(dim=1)
+        return (residual / self.noise_variance.sum().clamp(min=1e-12).sqrt()).view(-1, 1, 1, 1, 1)
 
-    def calibrate(self, x: Tensor) -> None:
+    def match_gain_offset(self, x: Tensor) -> None:
         """Where the views are display values: refit their gain and offset to the projections of the CT x."""
         if self.display is not None:
             self.y = match_views(self.display, self.project(x))
 
     @property
-    def may_scatter(self) -> bool:
-        """Whether the X-rays can hold scatter that `correct` could find: not display values, whose offset has taken it,
-        nor X-rays of which no signal is left (DARKEST)."""
-        return self.display is None and bool(self.measured.max() < DARKEST)
+    def can_estimate_scatter(self) -> bool:
+        """Whether the X-rays can hold scatter that `subtract_scatter` could find: not display values, whose offset has taken it,
+        nor X-rays of which no signal is left (MAX_LINE_INTEGRAL)."""
+        return self.display is None and bool(self.measured.max() < MAX_LINE_INTEGRAL)
 
-    def seek_scatter(self, seek: bool) -> None:
-        """Forget what was subtracted, and from now on let `correct` subtract scatter or not."""
-        self.y, self.scattered = self.measured, seek and self.may_scatter
+    def reset_scatter(self, enabled: bool) -> None:
+        """Forget what was subtracted, and from now on let `subtract_scatter` subtract scatter or not."""
+        self.y, self.scatter_enabled = self.measured, enabled and self.can_estimate_scatter
 
-    def correct(self, reprojection: Tensor) -> None:
-        """Where scatter is sought, subtract what the projections P(x) tell of, if it is SCATTER of the signal on
+    def subtract_scatter(self, reprojection: Tensor) -> None:
+        """Where scatter is sought, subtract what the projections P(x) tell of, if it is MIN_SCATTER_FRACTION of the signal on
         average or more."""
-        if self.scattered:
+        if self.scatter_enabled:
             corrected = subtract_scatter(self.measured, reprojection)
-            self.y = torch.where(self._share(corrected) < SCATTER, self.measured, corrected)
+            self.y = torch.where(self._share(corrected) < MIN_SCATTER_FRACTION, self.measured, corrected)
 
     @property
     def scatter(self) -> float:
         """The mean share of the signal that is now subtracted as scatter."""
-        return float(self._share(self.y).mean()) if self.scattered else 0.0
+        return float(self._share(self.y).mean()) if self.scatter_enabled else 0.0
 
     def _share(self, corrected: Tensor) -> Tensor:
         return 1 - torch.exp(self.measured - corrected).mean((1, 2, 3), keepdim=True)

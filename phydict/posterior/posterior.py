@@ -27,7 +27,7 @@ from phydict.xray import Projector
 from phydict.xray.residuals import misfits
 
 
-class Counted:
+class CountingDenoiser:
     """A denoiser that counts its calls, one for each state of a batch, and shows a guard what it estimates."""
 
     def __init__(self, denoiser: Denoiser, guard: Guard):
@@ -47,7 +47,7 @@ class Posterior(Reconstructor):
 
     sampler: how; guidance: classifier-free guidance scale used when a report is given; mu_water: 1/mm;
     precision: of the denoiser, see phydict.runtime.precision;
-    samples: how many are drawn. One is the sampler's own result; of several, drawn by its `randomised` settings, the
+    samples: how many are drawn. One is the sampler's own result; of several, drawn by its `for_sampling` settings, the
     volume is the mean, and their standard deviation says where not to trust it. batch: how many of them go through
     the denoiser at once, where the sampler allows it; fewer need less memory. Sample i depends neither on samples nor,
     but for rounding, on batch.
@@ -102,36 +102,36 @@ class Posterior(Reconstructor):
         seeds = [sample_seed(seed, i) for i in range(self.samples)]
         together = self.batch if self.sampler.batches else 1
         sampler = self.sampler.suited(prior)
-        sampler = sampler.randomised() if self.samples > 1 else sampler
+        sampler = sampler.for_sampling() if self.samples > 1 else sampler
         with watch.stage("prepare"):
             measurement = Measurement(projector, xrays, prior.window, display, self.mu_water)
             guard = Guard(measurement, on_step, sampler.steps())
-            denoiser = Counted(prior.bind(report, self.guidance, self.precision), guard)
+            denoiser = CountingDenoiser(prior.bind(report, self.guidance, self.precision), guard)
             state = torch.empty(1, prior.state_channels, *prior.grid.shape, device=xrays.device)
         with watch.stage("sample"):
             states = []
             for first in range(0, self.samples, together):
-                guard.begin()
-                draws = [torch.Generator().manual_seed(s) for s in seeds[first:first + together]]
-                x = noise_like(state.expand(len(draws), -1, -1, -1, -1), draws).to(xrays.dtype)
-                draw = draws if len(draws) > 1 else draws[0]
-                states.append(sampler.sample(denoiser, measurement, x, draw, guard))
+                guard.reset()
+                generators = [torch.Generator().manual_seed(s) for s in seeds[first:first + together]]
+                x = noise_like(state.expand(len(generators), -1, -1, -1, -1), generators).to(xrays.dtype)
+                generator = generators if len(generators) > 1 else generators[0]
+                states.append(sampler.sample(denoiser, measurement, x, generator, guard))
                 if self.samples > 1:
-                    guard.end(states[-1])
+                    guard.finish(states[-1])
             states = torch.cat(states)
         with watch.stage("score"):
             state, ct = states.mean(0), states[:, :1].mean(0, keepdim=True)
-            measurement.calibrate(ct)
+            measurement.match_gain_offset(ct)
             reprojection = measurement.project(ct)
-            measurement.correct(reprojection)
+            measurement.subtract_scatter(reprojection)
             reprojection = reprojection[0].cpu()
             measured = measurement.y[0].cpu()
             found, deviation = misfits(reprojection, measured), None
             if self.samples == 1:
-                guard.end(states, found["misfit"])
+                guard.finish(states, found["misfit"])
             else:
                 deviation = (prior.window.half_width * states[:, 0].std(0)).cpu()
-            guard.doubt(**found)
+            guard.check_fit(**found)
         return Reconstruction(
             volume=prior.window.to_hu(ct[0, 0]).cpu(), grid=prior.grid, method=self.name, seed=seed,
             **found, seconds=watch.seconds, xrays=measured, reprojection=reprojection,

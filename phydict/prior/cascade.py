@@ -18,10 +18,10 @@ class Cascade:
     """
 
     base: Prior
-    fine: SuperResolution
+    super_resolution: SuperResolution
 
     def __post_init__(self):
-        base, fine = self.base, self.fine
+        base, fine = self.base, self.super_resolution
         if not np.allclose(base.grid.extent, fine.grid.extent) or not np.allclose(base.grid.centre, fine.grid.centre):
             raise ValueError(f"the base prior's cube has sides of {_mm(base)} mm and the super-resolution stage's of "
                              f"{_mm(fine)} mm, or another centre: use stages trained with the same model.side")

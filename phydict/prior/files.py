@@ -31,7 +31,7 @@ from phydict.prior.prior import STATE, Prior
 from phydict.prior.super_resolution import SuperResolution
 from phydict.prior.text import TextEncoder
 from phydict.prior.unet import VolumeUNet
-from phydict.runtime.files import file_crc32, whole_file
+from phydict.runtime.files import atomic_write, file_crc32
 from phydict.runtime.reading import not_written, reason
 from phydict.runtime.shipped import own_or_shipped, shipped
 from phydict.units import HUWindow
@@ -71,7 +71,7 @@ def _write(path: Path, header: dict, weights: dict[str, Tensor], dtype: torch.dt
     if broken := not_finite(tensors):
         raise ValueError(f"'{path}' was not written, since its weights are not finite in {dtype}: {broken}")
     try:
-        with whole_file(path) as part:
+        with atomic_write(path) as part:
             save_file(tensors, part, {"phydict": json.dumps(header)})
     except (SafetensorError, OSError) as error:
         raise not_written(f"'{path}'", error, "give another place") from error

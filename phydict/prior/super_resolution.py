@@ -92,10 +92,10 @@ class SuperResolution(nn.Module):
 
     @torch.no_grad()
     def bind(self, coarse: Tensor, noise: float = 0.0, precision: str = "auto",
-             draw: torch.Generator | None = None) -> BoundSuperResolution:
+             generator: torch.Generator | None = None) -> BoundSuperResolution:
         """The denoiser given a coarse state (B, C, x, y, z) with Gaussian noise of the level `noise`.
 
-        precision: see phydict.runtime.precision. draw: what the noise, added here, is drawn from; None: `coarse` carries it
+        precision: see phydict.runtime.precision. generator: what the noise, added here, is drawn from; None: `coarse` carries it
         already. Raises ValueError for a level outside [0, 1] or too few channels.
         """
         if not 0 <= noise <= 1:
@@ -103,8 +103,8 @@ class SuperResolution(nn.Module):
         if coarse.shape[1] < self.coarse_channels:
             raise ValueError(f"this super-resolution stage needs {self.coarse_channels} coarse channels, but "
                              f"{coarse.shape[1]} were given")
-        if draw is not None:
-            coarse = coarse + noise * torch.randn(coarse.shape, generator=draw).to(coarse)
+        if generator is not None:
+            coarse = coarse + noise * torch.randn(coarse.shape, generator=generator).to(coarse)
         return BoundSuperResolution(self, self.upsample(coarse), noise, precision)
 
 

@@ -36,7 +36,7 @@ TRACEBACK = "PHYDICT_TRACEBACK"
 
 
 @contextmanager
-def one_sentence_errors(*also: type[Exception], to_go_on: str = "run the same command again") -> Iterator[None]:
+def cli_errors(*also: type[Exception], to_go_on: str = "run the same command again") -> Iterator[None]:
     """Prints bad arguments, ValueError, OSError, FloatingPointError and `also` as one sentence and exits with code 2;
     the environment variable PHYDICT_TRACEBACK=1 shows the trace instead. A run that a signal stopped says how to go on
     and exits with code 130 (SIGINT) or 143 (SIGTERM)."""

@@ -16,7 +16,7 @@ ASIDE = ".set-aside-by-phydict"
 
 
 @contextmanager
-def whole_file(final: Path) -> Iterator[Path]:
+def atomic_write(final: Path) -> Iterator[Path]:
     """A path of the same ending to write to; when the block ends well that file takes `final`'s place, else it is
     removed."""
     final.parent.mkdir(parents=True, exist_ok=True)
@@ -30,7 +30,7 @@ def whole_file(final: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def whole_folder(final: Path, wanted: Callable[[], bool] = lambda: True) -> Iterator[Path]:
+def atomic_directory(final: Path, wanted: Callable[[], bool] = lambda: True) -> Iterator[Path]:
     """A folder to fill; when the block ends well that folder takes `final`'s place, else it is removed.
 
     wanted: asked when all is written and no other process is at it, so that what is in `final`'s place then can be

@@ -20,7 +20,7 @@ _running: Profile | None = None
 
 
 @dataclass
-class Use:
+class StageUsage:
     """What a stage took in all its calls: seconds, and the peaks in MB of the process and of the device."""
 
     calls: int = 0
@@ -33,14 +33,14 @@ class Profile:
     """Uses by stage; a stage inside another is named `outer / inner`, and its peak counts for both."""
 
     def __init__(self):
-        self.uses: dict[str, Use] = {}
+        self.uses: dict[str, StageUsage] = {}
         self._open: list[str] = []
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         self._mark()
         self._open.append(f"{self._open[-1]} / {name}" if self._open else name)
-        use = self.uses.setdefault(self._open[-1], Use())
+        use = self.uses.setdefault(self._open[-1], StageUsage())
         began = time.perf_counter()
         try:
             yield

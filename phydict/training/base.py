@@ -46,9 +46,9 @@ class PriorTraining(StageTraining):
         warmup: steps over which the learning rate rises
         decay_from: step at which a linear decay of the learning rate to zero begins
         decay_steps: length of that decay in steps; 0: no decay
-        text_steps: steps of each task by which a small BERT learns reports before denoising begins; 0: it learns by
+        text_pretrain_steps: steps of each task by which a small BERT learns reports before denoising begins; 0: it learns by
             denoising
-        montage_steps: noise levels of the samples that validation paints; 0: none
+        preview_steps: noise levels of the samples that validation paints; 0: none
         validation_views: X-rays from which validation reconstructs each held-out case by phydict_fast, to tell which
             weights are best; 0: none, as where weights are spread over devices
         gradient_checkpointing: less memory for a second computation of each block's activations
@@ -65,7 +65,7 @@ class PriorTraining(StageTraining):
                  window: tuple[float, float] = (-1000.0, 1000.0), sigma_data: float = 0.5,
                  text_dropout: float = 0.1, mask_weight: float = 0.1, learning_rate: float = 5e-4,
                  weight_decay: float = 0.01, warmup: int = 100, decay_from: int = 0, decay_steps: int = 0,
-                 text_steps: int = 600, montage_steps: int = 16, validation_views: int = 4,
+                 text_pretrain_steps: int = 600, preview_steps: int = 16, validation_views: int = 4,
                  gradient_checkpointing: bool = False, channels_last: bool = True, compile: bool = False,
                  initial: str | None = None, seed: int = 0):
         if validation_views < 0:
@@ -80,14 +80,14 @@ class PriorTraining(StageTraining):
             encoder = TextEncoder.pretrained(text, text_length, text_padded_to)
         prior = Prior(network, Grid.cube(voxels, side), HUWindow(*window), encoder, sigma_data=sigma_data,
                       detail=detail or DetailNetwork(network.state_channels))
-        super().__init__(prior, sigma_data, learning_rate, weight_decay, warmup, decay_from, decay_steps, montage_steps,
+        super().__init__(prior, sigma_data, learning_rate, weight_decay, warmup, decay_from, decay_steps, preview_steps,
                          seed, mask_weight)
         if initial:
             self._start_from(load_prior(initial), initial)
         if self.prior.text is not None and reports:
             self.prior.text.check(reports)
         self.prior.network.run_with(gradient_checkpointing, channels_last, compile)
-        self.text_dropout, self.text_steps, self.validation_views = text_dropout, text_steps, validation_views
+        self.text_dropout, self.text_pretrain_steps, self.validation_views = text_dropout, text_pretrain_steps, validation_views
 
     def _start_from(self, prior: Prior, path: str) -> None:
         if not isinstance(prior, Prior):
@@ -113,16 +113,16 @@ class PriorTraining(StageTraining):
                              "(trainer.callbacks: null), as configs/prior/fsdp.yaml does")
         # A spread optimizer goes on only if it has moved each of its weights: those that denoising leaves alone rest.
         self.prior.network.text_map.to_sketch.requires_grad_(False)
-        if self.prior.text is not None and self.text_steps:
+        if self.prior.text is not None and self.text_pretrain_steps:
             self.prior.text.requires_grad_(False)
         shard(self.prior, mesh["data_parallel"])
 
-    def _condition(self, batch: dict, x0: Tensor, draws: list[torch.Generator]) -> tuple[Tensor, ...]:
+    def _condition(self, batch: dict, x0: Tensor, generators: list[torch.Generator]) -> tuple[Tensor, ...]:
         reports = batch["report"] if self.prior.text is not None else [""] * len(x0)
-        keep = [float(torch.rand(1, generator=draw)) >= self.text_dropout for draw in draws]
+        keep = [float(torch.rand(1, generator=generator)) >= self.text_dropout for generator in generators]
         return (self.prior.context([r if k else "" for r, k in zip(reports, keep)]),)
 
-    def _bound(self, batch: dict, x0: Tensor) -> Denoiser:
+    def _denoiser(self, batch: dict, x0: Tensor) -> Denoiser:
         return self.prior.bind(batch["report"][0] if self.prior.text is not None else "")
 
     def _describe(self) -> dict:
@@ -137,7 +137,7 @@ class PriorTraining(StageTraining):
         for name in ("psnr", "ssim"):
             self.log(f"val/{name}", scores[name], prog_bar=name == "psnr", sync_dist=True, batch_size=1)
 
-    def _paint(self, file: Path, batch: dict, x0: Tensor, sample: Tensor) -> None:
+    def _write_preview(self, file: Path, batch: dict, x0: Tensor, sample: Tensor) -> None:
         window = self.prior.window
         method_panel(file, {"prior sample": window.to_hu(sample[0, 0].cpu())}, window.to_hu(x0[0, 0].cpu()),
                      self.prior.grid, title=batch["report"][0][:80] or "no report")
@@ -148,24 +148,24 @@ class PriorTraining(StageTraining):
         It belongs before `fit`, since distributed training watches every backward pass from there on.
         """
         text = self.prior.text
-        if text is None or not text.trainable or not self.text_steps:
+        if text is None or not text.trainable or not self.text_pretrain_steps:
             return
         reports, labels = data.labelled_reports()
         if reports:
-            losses = learn_findings(text, reports, labels, self.text_steps, self.seed)
+            losses = learn_findings(text, reports, labels, self.text_pretrain_steps, self.seed)
             _tell(f"report encoder learns findings: loss {losses[0]:.3f} -> {losses[-1]:.3f}")
         _tell("preparing what reports imply")
-        reports, maps = data.sketches(self.prior.network.text_map.cells)
+        reports, maps = data.finding_maps(self.prior.network.text_map.cells)
         if reports:
-            losses = learn_sketch(self.prior, reports, maps, self.text_steps, self.seed)
+            losses = learn_sketch(self.prior, reports, maps, self.text_pretrain_steps, self.seed)
             _tell(f"text map learns what reports imply: squared error {losses[0]:.3f} -> {losses[-1]:.3f} of its "
                   "variance")
 
     def on_fit_start(self) -> None:
-        if self.prior.text is not None and self.text_steps:
+        if self.prior.text is not None and self.text_pretrain_steps:
             self.prior.text.trainable = False  # what it learnt stays, while the UNet learns to use it
 
-    def _state(self, batch: dict) -> tuple[Tensor, Tensor]:
+    def _clean_state(self, batch: dict) -> tuple[Tensor, Tensor]:
         channels = self.prior.network.state_channels
         x0 = torch.cat([batch["volume"], 2 * batch["masks"] - 1], 1)[:, :channels]
         known = self.mask_weight * batch["has_masks"].float()

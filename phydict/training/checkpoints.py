@@ -14,7 +14,7 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from phydict.prior.files import STAGES
 from phydict.prior.finite import check_finite
 from phydict.prior.tensors import read_torch
-from phydict.runtime.files import whole_file
+from phydict.runtime.files import atomic_write
 from phydict.runtime.reading import not_written
 
 BEST, HELD_OUT = "best.ckpt", "held_out.txt"
@@ -50,7 +50,7 @@ class WholeCheckpoints(TorchCheckpointIO):
 
     def save_checkpoint(self, checkpoint: dict, path: str | Path, storage_options: object = None) -> None:
         try:
-            with whole_file(Path(path)) as part:
+            with atomic_write(Path(path)) as part:
                 torch.save(checkpoint, part)
         except (OSError, RuntimeError) as error:
             if isinstance(error, RuntimeError):  # torch's words for a write that was cut short

@@ -48,7 +48,7 @@ class CTVolumes(CTCases):
             ct.path, self.grid, self.window, id=ct.id, calibration=ct.calibration)["volume"][0])
 
 
-class Crops(Dataset):
+class CropDataset(Dataset):
     """Random cubes of volumes: draw n of epoch e is the same on every machine.
 
     A crop starts at a multiple of `align` voxels; mere air is drawn again, up to three times. augmented: mirrored left
@@ -84,7 +84,7 @@ class Crops(Dataset):
     def _augment(self, crop: Tensor, draw: np.random.Generator) -> Tensor:
         change = Deformation.draw(int(draw.integers(2**31)))
         air = (self.window.to_hu(crop) - AIR).clamp(min=0)
-        crop = self.window.to_range(AIR + change.gain * air + change.offset * (air / 200).clamp(max=1))
+        crop = self.window.to_range(AIR + change.hu_scale * air + change.hu_offset * (air / 200).clamp(max=1))
         return crop.flip(1) if draw.random() < 0.5 else crop
 
 
@@ -115,9 +115,9 @@ class SuperResolutionData(PriorData):
             for i in range(validation_phantoms)] + [
             self._fixed(CTVolumes([ct], cache, self.grid, self.window), [], validation_crops) for ct in held_out])
 
-    def _fixed(self, cts: Dataset | list, phantoms: Dataset | list, count: int) -> Crops:
-        return Crops(cts, phantoms, 1.0, self.window, self.crop, self.factor, count, 0, 0, augmented=False)
+    def _fixed(self, cts: Dataset | list, phantoms: Dataset | list, count: int) -> CropDataset:
+        return CropDataset(cts, phantoms, 1.0, self.window, self.crop, self.factor, count, 0, 0, augmented=False)
 
     def draws(self, epoch: int) -> Dataset:
-        return Crops(self.cts, self.phantoms, self.ct_fraction, self.window, self.crop, self.factor, self.epoch_size,
+        return CropDataset(self.cts, self.phantoms, self.ct_fraction, self.window, self.crop, self.factor, self.epoch_size,
                      epoch, self.seed)

@@ -97,7 +97,7 @@ class PriorData(lightning.LightningDataModule):
         labels = torch.tensor([[float(column in own) for column in columns] for own in findings])
         return [report(thorax) for thorax in thoraxes], labels
 
-    def sketches(self, cells: int, most: int = 1500) -> tuple[list[str], torch.Tensor]:
+    def finding_maps(self, cells: int, most: int = 1500) -> tuple[list[str], torch.Tensor]:
         """What reports imply, for at most so many cases that have one: reports, and maps (N, 1, cells^3).
 
         Of a phantom, the map is what its findings change, averaged over cells; where there are none, it is how a CT

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from phydict.diffusion import Denoiser, renoise
-from phydict.posterior import descend
+from phydict.posterior import ddim_sample
 from phydict.prior import Prior, SuperResolution
 from phydict.prior.files import check_stage
 from phydict.prior.finite import not_finite
@@ -28,29 +28,29 @@ NOISE_LEVELS = (0.1, 0.3, 0.5, 0.7, 0.9)
 class StageTraining(lightning.LightningModule, ABC):
     """Learns one stage by denoising: squared error of x0 at all noise levels, up to four times heavier at the low ones.
 
-    A stage says what a batch's clean state is (`_state`), what its network is told beside it (`_condition`), and what
-    denoises a held-out case (`_bound`). Its network is `self.prior`.
+    A stage says what a batch's clean state is (`_clean_state`), what its network is told beside it (`_condition`), and what
+    denoises a held-out case (`_denoiser`). Its network is `self.prior`.
     """
 
     def __init__(self, prior: Prior | SuperResolution, typical_std: float, learning_rate: float, weight_decay: float,
-                 warmup: int, decay_from: int, decay_steps: int, montage_steps: int, seed: int,
+                 warmup: int, decay_from: int, decay_steps: int, preview_steps: int, seed: int,
                  mask_weight: float = 0.0):
         super().__init__()
-        self.prior, self.typical_std, self.montage_steps = prior, typical_std, montage_steps
+        self.prior, self.typical_std, self.preview_steps = prior, typical_std, preview_steps
         self.learning_rate, self.weight_decay = learning_rate, weight_decay
         self.warmup, self.decay_from, self.decay_steps = warmup, decay_from, decay_steps
         self.seed, self.mask_weight, self.samples = seed, mask_weight, 0
 
     @abstractmethod
-    def _state(self, batch: dict) -> tuple[Tensor, Tensor]:
+    def _clean_state(self, batch: dict) -> tuple[Tensor, Tensor]:
         """The clean state (B, C, X, Y, Z) of a batch and the weight of each channel's error (B, C, 1, 1, 1)."""
 
     @abstractmethod
-    def _condition(self, batch: dict, x0: Tensor, draws: list[torch.Generator]) -> tuple[Tensor, ...]:
+    def _condition(self, batch: dict, x0: Tensor, generators: list[torch.Generator]) -> tuple[Tensor, ...]:
         """What the network is told beside the noisy state and its time; one source of randomness per sample."""
 
     @abstractmethod
-    def _bound(self, batch: dict, x0: Tensor) -> Denoiser:
+    def _denoiser(self, batch: dict, x0: Tensor) -> Denoiser:
         """The denoiser of a held-out case."""
 
     @abstractmethod
@@ -76,13 +76,13 @@ class StageTraining(lightning.LightningModule, ABC):
         Times, noise and what else is random follow from `key` and each sample's place in the batch that all `processes`
         share in turns, so that a resumed run repeats an uninterrupted one, and several processes do what one would.
         """
-        x0, weight = self._state(batch)
+        x0, weight = self._clean_state(batch)
         places = range(rank, len(x0) * processes, processes)
-        draws = [torch.Generator().manual_seed(hash((*key, place)) % 2**31) for place in places]
-        u = torch.cat([torch.rand(1, generator=draw) for draw in draws])
+        generators = [torch.Generator().manual_seed(hash((*key, place)) % 2**31) for place in places]
+        u = torch.cat([torch.rand(1, generator=generator) for generator in generators])
         t = ((torch.tensor(places) + u) / (len(x0) * processes)).to(self.device)
-        noise = torch.stack([torch.randn(x0.shape[1:], generator=draw) for draw in draws]).to(self.device)
-        told = self._condition(batch, x0, draws)
+        noise = torch.stack([torch.randn(x0.shape[1:], generator=generator) for generator in generators]).to(self.device)
+        told = self._condition(batch, x0, generators)
         a, s = (w.float().view(-1, 1, 1, 1, 1) for w in self.prior.schedule.scales(t.double()))
         error = (self.prior(a * x0 + s * noise, t, *told) - x0).square()
         unit = self.prior.preconditioning(t)[1].clamp(min=self.typical_std / 2) ** -2
@@ -110,10 +110,10 @@ class StageTraining(lightning.LightningModule, ABC):
         return f"the last good checkpoint is {last}, so go on from it with --ckpt_path, or {anew}"
 
     def validation_step(self, batch: dict, index: int) -> None:
-        x0, _ = self._state(batch)
-        draw = torch.Generator().manual_seed(index)
-        noise = torch.randn(x0.shape, generator=draw).to(self.device)
-        denoiser = self._bound(batch, x0)
+        x0, _ = self._clean_state(batch)
+        generator = torch.Generator().manual_seed(index)
+        noise = torch.randn(x0.shape, generator=generator).to(self.device)
+        denoiser = self._denoiser(batch, x0)
         errors = denoising_errors(denoiser, x0, noise, self.prior.window)
         for t, error in errors.items():
             self.log(f"val/rmse_hu_t{t}", error, sync_dist=True, batch_size=len(x0))
@@ -121,14 +121,14 @@ class StageTraining(lightning.LightningModule, ABC):
         self.log("val/rmse_hu", mean, prog_bar=True, sync_dist=True, batch_size=len(x0))
         self.log("samples", float(self.samples), rank_zero_only=True, batch_size=len(x0))
         folder = Path(self.trainer.log_dir or self.trainer.default_root_dir) / "samples"  # asks every process
-        painted = index < 2 and self.montage_steps
+        painted = index < 2 and self.preview_steps
         if painted and (self.trainer.is_global_zero or self.device_mesh):  # spread weights need every process's help
-            sample = descend(denoiser, noise, self.montage_steps)
+            sample = ddim_sample(denoiser, noise, self.preview_steps)
         if painted and self.trainer.is_global_zero:
-            self._paint(folder / f"step{self.global_step:06d}_{index}.png", batch, x0, sample)
+            self._write_preview(folder / f"step{self.global_step:06d}_{index}.png", batch, x0, sample)
 
     @abstractmethod
-    def _paint(self, file: Path, batch: dict, x0: Tensor, sample: Tensor) -> None:
+    def _write_preview(self, file: Path, batch: dict, x0: Tensor, sample: Tensor) -> None:
         """Writes a picture of a held-out case and a sample."""
 
     def configure_optimizers(self) -> dict:

@@ -32,7 +32,7 @@ class SuperResolutionTraining(StageTraining):
         warmup: steps over which the learning rate rises
         decay_from: step at which a linear decay of the learning rate to zero begins
         decay_steps: length of that decay in steps; 0: no decay
-        montage_steps: noise levels of the samples that validation paints; 0: none
+        preview_steps: noise levels of the samples that validation paints; 0: none
         initial: a stage's file to go on from, which then decides the network
         seed: of times and noise
     """
@@ -40,7 +40,7 @@ class SuperResolutionTraining(StageTraining):
     def __init__(self, network: LocalUNet | None = None, voxels: int = 256, factor: int = 4, side: float = 384.0,
                  window: tuple[float, float] = (-1000.0, 1000.0), detail_std: float = 0.08, most_noise: float = 0.3,
                  learning_rate: float = 5e-4, weight_decay: float = 0.01, warmup: int = 100, decay_from: int = 0,
-                 decay_steps: int = 0, montage_steps: int = 16, initial: str | None = None, seed: int = 0):
+                 decay_steps: int = 0, preview_steps: int = 16, initial: str | None = None, seed: int = 0):
         if not 0 <= most_noise <= 1:
             raise ValueError(f"model.most_noise lies in [0, 1], but {most_noise} was given")
         fine = SuperResolution(network or LocalUNet(), Grid.cube(voxels, side), HUWindow(*window), factor,
@@ -52,7 +52,7 @@ class SuperResolutionTraining(StageTraining):
                                  "model.voxels, model.side, model.window and model.factor to its own")
             fine = first.train().requires_grad_(True)
         super().__init__(fine, fine.detail_std, learning_rate, weight_decay, warmup, decay_from, decay_steps,
-                         montage_steps, seed)
+                         preview_steps, seed)
         self.most_noise = most_noise
 
     def configure_model(self) -> None:
@@ -60,16 +60,16 @@ class SuperResolutionTraining(StageTraining):
             raise ValueError("a super-resolution stage is too small to spread its weights over devices: train it with "
                              "configs/prior/ddp.yaml instead of fsdp.yaml")
 
-    def _state(self, batch: dict) -> tuple[Tensor, Tensor]:
+    def _clean_state(self, batch: dict) -> tuple[Tensor, Tensor]:
         return batch["volume"], torch.ones(len(batch["volume"]), 1, 1, 1, 1, device=self.device)
 
-    def _condition(self, batch: dict, x0: Tensor, draws: list[torch.Generator]) -> tuple[Tensor, ...]:
+    def _condition(self, batch: dict, x0: Tensor, generators: list[torch.Generator]) -> tuple[Tensor, ...]:
         coarse = avg_pool3d(x0, self.prior.factor)
-        level = self.most_noise * torch.cat([torch.rand(1, generator=draw) for draw in draws]).to(self.device)
-        noise = torch.stack([torch.randn(coarse.shape[1:], generator=draw) for draw in draws]).to(self.device)
+        level = self.most_noise * torch.cat([torch.rand(1, generator=generator) for generator in generators]).to(self.device)
+        noise = torch.stack([torch.randn(coarse.shape[1:], generator=generator) for generator in generators]).to(self.device)
         return self.prior.upsample(coarse + level.view(-1, 1, 1, 1, 1) * noise), level
 
-    def _bound(self, batch: dict, x0: Tensor) -> Denoiser:
+    def _denoiser(self, batch: dict, x0: Tensor) -> Denoiser:
         return self.prior.bind(avg_pool3d(x0, self.prior.factor))
 
     def _describe(self) -> dict:
@@ -81,7 +81,7 @@ class SuperResolutionTraining(StageTraining):
         lacking = (self.prior.upsample(avg_pool3d(x0, self.prior.factor)) - x0).square().mean().sqrt()
         self.log("val/rmse_hu_upsampled", lacking * self.prior.window.half_width, sync_dist=True, batch_size=len(x0))
 
-    def _paint(self, file: Path, batch: dict, x0: Tensor, sample: Tensor) -> None:
+    def _write_preview(self, file: Path, batch: dict, x0: Tensor, sample: Tensor) -> None:
         upsampled = self.prior.upsample(avg_pool3d(x0, self.prior.factor))
         volumes = {"coarse, upsampled": upsampled, "sample": sample}
         to_hu = self.prior.window.to_hu

@@ -6,7 +6,7 @@ import math
 
 from torch import Tensor
 
-NOTHING = 1e-3
+EPS_LINE_INTEGRAL = 1e-3
 """A line integral, 0.05 mm of water, below which misfits are not relative to what is measured, but to this."""
 
 
@@ -21,5 +21,5 @@ def view_norms(views: Tensor) -> Tensor:
 
 
 def view_sizes(xrays: Tensor) -> Tensor:
-    """Norms (..., K) of views (..., K, V, U), of which none counts as smaller than one of NOTHING in every pixel."""
-    return view_norms(xrays).clamp(min=NOTHING * math.sqrt(xrays.shape[-1] * xrays.shape[-2]))
+    """Norms (..., K) of views (..., K, V, U), of which none counts as smaller than one of EPS_LINE_INTEGRAL in every pixel."""
+    return view_norms(xrays).clamp(min=EPS_LINE_INTEGRAL * math.sqrt(xrays.shape[-1] * xrays.shape[-2]))

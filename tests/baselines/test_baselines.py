@@ -7,7 +7,7 @@ import torch
 from laws import random_like
 
 from phydict.baselines import CGLS, FDK, FISTATV, SIRT, DiffVox
-from phydict.baselines.baseline import CountedProjector, norm, typical_chest
+from phydict.baselines.baseline import CountingProjector, norm, typical_chest
 from phydict.grid import Grid
 from phydict.units import MU_WATER, HUWindow, hu_to_mu
 from phydict.xray import ConeBeam, Projector
@@ -62,7 +62,7 @@ def test_misfit_and_reprojection_are_those_of_the_volume(method):
 
 
 def test_what_water_attenuates_does_not_change_hu_once_it_is_stated(method):
-    hard = method.assuming(0.85 * MU_WATER).reconstruct(0.85 * views(), CHEST).volume
+    hard = method.with_mu_water(0.85 * MU_WATER).reconstruct(0.85 * views(), CHEST).volume
     torch.testing.assert_close(hard, method.reconstruct(views(), CHEST).volume, rtol=1e-3, atol=0.5)
 
 
@@ -130,4 +130,4 @@ def test_the_norm_is_the_largest_singular_value():
     small = Projector(Grid.cube(4, 300.0), ConeBeam.orbit(3, 1020, 740, (5, 5), 90.0, start=0.2))
     matrix = torch.cat([small(e.view(1, 1, 4, 4, 4)).flatten(1) for e in torch.eye(64).double()])
     y = torch.zeros(1, 3, 5, 5).double()
-    assert norm(CountedProjector(small), y) == pytest.approx(float(torch.linalg.matrix_norm(matrix, 2)), rel=1e-3)
+    assert norm(CountingProjector(small), y) == pytest.approx(float(torch.linalg.matrix_norm(matrix, 2)), rel=1e-3)

@@ -30,7 +30,7 @@ def compared(stage: str, views: int, cts: str) -> list[dict]:
     """One row for each way to the fine grid and each CT."""
     fine, rows = load_super_resolution(stage), []
     runs = {"upsampled": [f"--data.simulation_voxels={fine.grid.shape[0]}"],
-            "unguided": [f"--model.super_resolution={stage}", "--model.guide_fine=false"],
+            "unguided": [f"--model.super_resolution={stage}", "--model.sr_guided=false"],
             "guided": [f"--model.super_resolution={stage}"]}
     with tempfile.TemporaryDirectory() as out:
         for name, arguments in runs.items():

@@ -48,7 +48,7 @@ COLUMNS = ("case", "method", "ssim", "psnr", "mae_hu", "misfit", "worst_view_mis
            "difference_hu", "said")
 GRID, WINDOW, BEAM = Grid.cube(64), HUWindow(), ConeBeam.orbit(8, 1020, 740, (448, 448), 1.25)
 FAST = METHODS["phydict_fast"]
-SAMPLED = replace(FAST, randomised_noise=1.0)
+SAMPLED = replace(FAST, sampling_noise=1.0)
 CONTRADICTION = "Findings: There is a large right pneumothorax. Impression: Large right pneumothorax."
 AGREEMENT = "Findings: The lungs are clear. Impression: No acute abnormality in the thorax."
 
@@ -187,8 +187,8 @@ class HardCases:
             yield f"report that agrees, guidance {guidance:g}", lambda g=guidance: self._with(
                 report=AGREEMENT, guidance=g)
         for delta in (0.0, 0.01, 0.99):
-            yield f"delta {delta:g}", lambda d=delta: self._with(replace(FAST, refine_from=d, refine_iterations=4))
-        yield "1 noise level", lambda: self._with(replace(FAST, iterations=1, warm_start=1.0, last=None))
+            yield f"delta {delta:g}", lambda d=delta: self._with(replace(FAST, ec_delta=d, ec_steps=4))
+        yield "1 noise level", lambda: self._with(replace(FAST, iterations=1, t_start=1.0, t_end=None))
         yield "2 noise levels", lambda: self._with(replace(FAST, iterations=2))
 
     def _many_steps(self):

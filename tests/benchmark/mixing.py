@@ -32,7 +32,7 @@ def trained(initial: str, cts: str, left_out: list[str], fraction: float, steps:
     """The file of a prior that went on from `initial` for `steps` steps of two draws."""
     last, file = out / CHECKPOINT, out / "prior.safetensors"
     if not file.exists():
-        settings = {"out": out, "model.initial": initial, "model.text_steps": 0, "model.learning_rate": 1e-3,
+        settings = {"out": out, "model.initial": initial, "model.text_pretrain_steps": 0, "model.learning_rate": 1e-3,
                     "model.warmup": 30, "model.decay_from": steps // 2, "model.decay_steps": steps - steps // 2,
                     "data.cts": cts, "data.holdout": f"[{','.join(left_out)}]", "data.ct_fraction": fraction,
                     "data.batch_size": 2, "data.epoch_size": 100, "trainer.max_steps": steps,

@@ -22,7 +22,7 @@ from phydict import load_prior
 from phydict.datasets import find_cts
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM
 from phydict.evaluation import method_panel, write_csv
-from phydict.posterior.samplers.sampler import descend
+from phydict.posterior.samplers.sampler import ddim_sample
 from phydict.prior import Prior
 from phydict.prior.files import DEFAULT_PRIOR
 
@@ -34,7 +34,7 @@ def samples(prior: Prior, count: int) -> list[Case]:
     found, shape = [], (1, prior.state_channels, *prior.grid.shape)
     for seed in range(count):
         noise = torch.randn(shape, generator=torch.Generator().manual_seed(seed))
-        x0 = descend(prior.bind(), noise, ITERATIONS)[0]
+        x0 = ddim_sample(prior.bind(), noise, ITERATIONS)[0]
         found.append(Case(f"sample {seed}", prior.window.to_hu(x0[0]).numpy(), ((x0[1:] + 1) / 2).numpy()))
     return found
 

@@ -97,7 +97,7 @@ def new_task(**flags) -> PriorTraining:
     torch.manual_seed(0)
     prior = load_prior(DEFAULT_PRIOR)
     return PriorTraining(text="none", initial=str(DEFAULT_PRIOR), voxels=prior.grid.shape[0], side=prior.grid.extent[0],
-                         window=(prior.window.low, prior.window.high), montage_steps=0, **flags)
+                         window=(prior.window.low, prior.window.high), preview_steps=0, **flags)
 
 
 def example_cases() -> list[dict]:

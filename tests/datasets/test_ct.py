@@ -403,12 +403,12 @@ def test_a_deformation_of_nothing_changes_nothing(case):
 def test_augmentation_of_no_strength_changes_nothing_and_each_strength_is_its_own_bound(case):
     new = augment(case, 3, GRID, strength=Augmentation.none())
     torch.testing.assert_close(new["volume"], case["volume"], atol=1e-4, rtol=0)
-    for name in ("rotation", "scale", "shift", "waves", "gain", "offset"):
+    for name in ("rotation", "scale", "shift", "elastic_mm", "gain", "offset"):
         weak = dataclasses.replace(Augmentation(), **{name: getattr(Augmentation(), name) / 100})
         for seed in range(10):
             usual, less = (vars(Deformation.draw(seed, strength)) for strength in (Augmentation(), weak))
             rest = 1 if name in ("scale", "gain") else 0
-            for part in ("rotation", "scale", "shift", "waves", "gain", "offset"):
+            for part in ("rotation", "scale", "shift", "elastic_mm", "gain", "offset"):
                 factor = 0.01 if part == name else 1
                 torch.testing.assert_close(torch.as_tensor(less[part] - rest * (part == name)),
                                            factor * torch.as_tensor(usual[part] - rest * (part == name)),
@@ -424,7 +424,7 @@ def test_hu_changes_spare_air_and_scale_tissue(case):
         air, tissue = old < -999.9, (old > -790) & (old < 900)
         assert air.any() and tissue.any()
         torch.testing.assert_close(new[air], old[air], atol=0.3, rtol=0)
-        expected = move.gain * (old[tissue] + 1000) - 1000 + move.offset
+        expected = move.hu_scale * (old[tissue] + 1000) - 1000 + move.hu_offset
         torch.testing.assert_close(new[tissue], expected, atol=0.5, rtol=0)
 
 

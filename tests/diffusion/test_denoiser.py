@@ -18,9 +18,9 @@ def test_the_gaussian_denoiser_is_the_regression_of_the_clean_state_on_the_noisy
     slope = float(torch.cov(torch.stack([x0, x]))[0, 1] / x.var())
     level = float(x0.mean() - slope * x.mean())
     denoiser = GaussianDenoiser(torch.tensor(mean).double(), torch.tensor(variance).double())
-    at_zero, at_one = denoiser.denoise(torch.tensor([0.0, 1.0]).double(), t).tolist()
-    assert at_zero == pytest.approx(level, abs=0.003)
-    assert at_one - at_zero == pytest.approx(slope, abs=0.003)
+    final_denoise, at_one = denoiser.denoise(torch.tensor([0.0, 1.0]).double(), t).tolist()
+    assert final_denoise == pytest.approx(level, abs=0.003)
+    assert at_one - final_denoise == pytest.approx(slope, abs=0.003)
 
 
 def test_a_certain_prior_and_pure_noise_both_give_the_mean_and_no_noise_gives_the_state():

@@ -19,7 +19,7 @@ from phydict.xray import ConeBeam, Projector, binned
 BEAM = ConeBeam.orbit(4, 1020, 740, (56, 56), 10.0)
 FINE = Grid.cube(32)
 PROJECTOR = Projector(FINE, BEAM, full_detector=True)
-SAMPLER = SplitGibbs(3, ProximalCG(4), ProximalCG(4), warm_start=0.5, last=0.3, fresh_noise=0.0)
+SAMPLER = SplitGibbs(3, ProximalCG(4), ProximalCG(4), t_start=0.5, t_end=0.3, noise_fraction=0.0)
 
 
 @dataclass
@@ -39,7 +39,7 @@ class GaussianStage:
     def check_memory(self, dtype):
         pass
 
-    def bind(self, coarse, noise=0.0, precision="auto", draw=None):
+    def bind(self, coarse, noise=0.0, precision="auto", generator=None):
         return GaussianDenoiser(self.upsample(coarse), torch.tensor(self.variance), self.schedule)
 
 
@@ -72,7 +72,7 @@ def base_alone(xrays, seed=3):
 
 
 def test_unguided_and_without_detail_it_is_the_base_stages_result_upsampled(xrays):
-    method = gaussian(1e-12, guide_fine=False, noise=0.0)
+    method = gaussian(1e-12, sr_guided=False, noise=0.0)
     found = method.reconstruct(xrays, PROJECTOR, seed=3)
     expected = HUWindow(-1000, 600).to_hu(base_alone(xrays))[0, 0]
     torch.testing.assert_close(found.volume, expected, atol=0.1, rtol=0)
@@ -83,19 +83,19 @@ def test_guided_it_is_the_posterior_mean_of_a_gaussian_stage(xrays):
     """At time 1 the state tells nothing: one likelihood step there ends at the mean of p(x | coarse, Y)."""
     solve = ProximalCG(iterations=300, restarts=20, noise=1.0, tolerance=1e-7)
     one = SplitGibbs(1, ProximalCG(), final_likelihood=solve, prior_std=0.1)
-    found = gaussian(0.01, fine_sampler=one, noise=0.0).reconstruct(xrays, PROJECTOR, seed=3)
+    found = gaussian(0.01, sr_sampler=one, noise=0.0).reconstruct(xrays, PROJECTOR, seed=3)
     x, mean = HUWindow(-1000, 600).to_range(found.volume)[None, None], base_alone(xrays).clamp(-1, 1)
     slope, offset = HUWindow(-1000, 600).mu_affine()
     residual = xrays[None] - PROJECTOR(slope * x + offset)
-    downhill = slope * PROJECTOR.T(residual) + (mean - x) / 0.1**2
+    negative_gradient = slope * PROJECTOR.T(residual) + (mean - x) / 0.1**2
     inside = x.abs() < 1 - 1e-6
     assert inside.float().mean() > 0.1
     start = slope * PROJECTOR.T(xrays[None] - PROJECTOR(slope * mean + offset))
-    assert downhill[inside].norm() < 5e-3 * start[inside].norm()
+    assert negative_gradient[inside].norm() < 5e-3 * start[inside].norm()
 
 
 def test_the_xrays_guide_the_fine_stage_only_if_asked(xrays):
-    guided, unguided = (gaussian(guide_fine=flag).reconstruct(xrays, PROJECTOR, seed=3) for flag in (True, False))
+    guided, unguided = (gaussian(sr_guided=flag).reconstruct(xrays, PROJECTOR, seed=3) for flag in (True, False))
     assert guided.misfit < 0.3 * unguided.misfit
     assert guided.projector_calls > unguided.projector_calls
 
@@ -110,8 +110,8 @@ def test_display_values_are_calibrated_at_both_stages(xrays):
 
 @pytest.mark.parametrize("scatter", [0.0, 0.05])
 def test_scatter_that_the_base_stage_finds_is_subtracted_at_both_stages(xrays, scatter):
-    step = ProximalCG(10, 5, refit=True)
-    base = SplitGibbs(3, ProximalCG(4), step, warm_start=0.5, last=0.3, fresh_noise=0.0, scatter=True)
+    step = ProximalCG(10, 5, refit_scatter=True)
+    base = SplitGibbs(3, ProximalCG(4), step, t_start=0.5, t_end=0.3, noise_fraction=0.0, scatter=True)
     measured = -torch.log(torch.exp(-xrays) + scatter) + 0.005 * random_like(xrays.shape, torch.float32)
     found = replace(gaussian(), sampler=base).reconstruct(measured, PROJECTOR, seed=3)
     if scatter:
@@ -130,8 +130,8 @@ def medsyn_stage():
 
 @pytest.mark.parametrize("guide", [True, False])
 def test_medsyns_second_stage_goes_on_where_the_base_stage_found_scatter(xrays, guide):
-    step = ProximalCG(10, 5, refit=True)
-    base = SplitGibbs(3, ProximalCG(4), step, warm_start=0.5, last=0.3, fresh_noise=0.0, scatter=True)
+    step = ProximalCG(10, 5, refit_scatter=True)
+    base = SplitGibbs(3, ProximalCG(4), step, t_start=0.5, t_end=0.3, noise_fraction=0.0, scatter=True)
     measured = -torch.log(torch.exp(-xrays) + 0.05) + 0.005 * random_like(xrays.shape, torch.float32)
     method = CascadePosterior(Cascade(tiny_prior(False), medsyn_stage()), base, guide, unguided=PriorOnly(2))
     found = method.reconstruct(measured, PROJECTOR, seed=3)
@@ -150,7 +150,7 @@ def test_a_second_stage_without_enough_memory_is_refused_before_the_first_is_run
     steps, stage = [], medsyn_stage()
     stage.memory = 2**20
     method = CascadePosterior(Cascade(tiny_prior(False), stage), SAMPLER)
-    with pytest.raises(ValueError, match="fine_memory"):
+    with pytest.raises(ValueError, match="sr_memory"):
         method.reconstruct(xrays, PROJECTOR, on_step=lambda: steps.append(1))
     assert not steps
 
@@ -175,7 +175,7 @@ def test_in_tiles_the_result_is_that_of_the_whole_within_a_tolerance(cascade, xr
     tiled.memory = int(17**3 * tiled.network.bytes_per_voxel)
     assert len(tiled.tiles().starts(32)) == 3
     for guide in (True, False):
-        whole, parts = (replace(method, cascade=Cascade(cascade.base, fine), guide_fine=guide).reconstruct(
+        whole, parts = (replace(method, cascade=Cascade(cascade.base, fine), sr_guided=guide).reconstruct(
             xrays, PROJECTOR, seed=3).volume for fine in (cascade.fine, tiled))
         assert 0 < (whole - parts).square().mean().sqrt() < 0.02 * whole.std()
 
@@ -208,5 +208,5 @@ def test_xrays_of_another_grid_are_refused(cascade, xrays):
 def test_a_stage_that_wants_the_full_detector_gets_it(cascade):
     full = replace(SAMPLER, full_detector=True)
     assert CascadePosterior(cascade, full).full_detector
-    assert CascadePosterior(cascade, SAMPLER, fine_sampler=full).full_detector
-    assert not CascadePosterior(cascade, SAMPLER, False, fine_sampler=full).full_detector
+    assert CascadePosterior(cascade, SAMPLER, sr_sampler=full).full_detector
+    assert not CascadePosterior(cascade, SAMPLER, False, sr_sampler=full).full_detector

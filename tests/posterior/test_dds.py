@@ -24,16 +24,16 @@ def test_without_renewal_it_samples_the_posterior_of_exact_data(gamma):
     assert (spread - covariance).norm() < 0.05 * covariance.norm()
 
 
-@pytest.mark.parametrize("renewed", [0.5, 0.85])
-def test_with_renewal_the_mean_stays_and_the_spread_is_a_known_share(renewed):
+@pytest.mark.parametrize("eta", [0.5, 0.85])
+def test_with_renewal_the_mean_stays_and_the_spread_is_a_known_share(eta):
     mean, covariance = condition(measurement(), denoiser(V).mean, V, 1e-5)
-    found, spread = moments(sample(DDS(400, renewed, 6), random_like((4000, *SHAPE), seed=11)))
+    found, spread = moments(sample(DDS(400, eta, 6), random_like((4000, *SHAPE), seed=11)))
     torch.testing.assert_close(found, mean, atol=0.012, rtol=0)
-    expected = (1 + (1 - renewed**2) ** 0.5) / 2 * covariance
+    expected = (1 + (1 - eta**2) ** 0.5) / 2 * covariance
     assert (spread - expected).norm() < 0.08 * covariance.norm()
 
 
-@pytest.mark.parametrize("settings", [{"renewed": 0.0}, {"renewed": 0.85}, {"gamma": 1.0}])
+@pytest.mark.parametrize("settings", [{"eta": 0.0}, {"eta": 0.85}, {"gamma": 1.0}])
 def test_more_levels_and_more_conjugate_gradients_never_raise_the_misfit_of_exact_data(settings):
     m = measurement()
     m.y = m.project(denoiser(V).mean + V**0.5 * X)
@@ -89,7 +89,7 @@ def test_the_dual_lives_across_passes_and_not_across_samplings():
 def test_without_weight_total_variation_leaves_the_fit_and_with_much_it_flattens_along_its_axes_alone():
     m = measurement(6)
     m.y = m.project(0.3 * X)
-    settings = {"iterations": 200, "renewed": 0.0, "cg_iterations": 20}
+    settings = {"iterations": 200, "eta": 0.0, "cg_iterations": 20}
     fitted = sample(DDS(**settings, tv=ADMMTV(0.0, 0.1)), data=m)
     torch.testing.assert_close(m.project(fitted), m.y, atol=1e-2, rtol=0)
     flat = sample(DDS(**settings, tv=ADMMTV(100.0, 10.0, "z")), data=m)
@@ -97,7 +97,7 @@ def test_without_weight_total_variation_leaves_the_fit_and_with_much_it_flattens
 
 
 @pytest.mark.parametrize("settings, message", [
-    ({"iterations": 0}, "at least 1"), ({"renewed": 1.5}, "1.5"), ({"gamma": 0.0}, "gamma above 0"),
+    ({"iterations": 0}, "at least 1"), ({"eta": 1.5}, "1.5"), ({"gamma": 0.0}, "gamma above 0"),
     ({"gamma": 1.0, "tv": ADMMTV()}, "leave one out")])
 def test_impossible_settings_are_refused(settings, message):
     with pytest.raises(ValueError, match=message):

@@ -24,20 +24,20 @@ def test_one_level_is_the_minimiser_of_its_own_objective(trust):
     torch.testing.assert_close(found.flatten(), expected, atol=1e-6, rtol=0)
 
 
-@pytest.mark.parametrize("trust, renewed", [(1.0, 0.5), (1.0, 1.0), (4.0, 0.5)])
-def test_the_mean_tends_to_the_posteriors_and_the_spread_to_a_known_share_of_it(trust, renewed):
+@pytest.mark.parametrize("trust, zeta", [(1.0, 0.5), (1.0, 1.0), (4.0, 0.5)])
+def test_the_mean_tends_to_the_posteriors_and_the_spread_to_a_known_share_of_it(trust, zeta):
     mean, covariance = condition(measurement(), denoiser(V).mean, V, NOISE * trust**0.5)
-    samples = sample(DiffPIR(600, 1.0, trust, renewed, NOISE, 6), random_like((4000, *SHAPE), seed=11))
+    samples = sample(DiffPIR(600, 1.0, trust, zeta, NOISE, 6), random_like((4000, *SHAPE), seed=11))
     found, spread = moments(samples)
     torch.testing.assert_close(found, mean, atol=0.012, rtol=0)
-    expected = (1 + (1 - renewed) ** 0.5) / 2 * covariance
+    expected = (1 + (1 - zeta) ** 0.5) / 2 * covariance
     assert (spread - expected).norm() < 0.08 * covariance.norm()
 
 
 def test_with_exact_data_and_no_renewal_it_samples_the_posterior():
     m, tiny = measurement(), 1e-5
     mean, covariance = condition(m, denoiser(V).mean, V, tiny)
-    found, spread = propagate(lambda x: sample(DiffPIR(200, 1.0, renewed=0.0, noise=tiny, cg_iterations=20), x))
+    found, spread = propagate(lambda x: sample(DiffPIR(200, 1.0, zeta=0.0, noise=tiny, cg_iterations=20), x))
     torch.testing.assert_close(found, mean, atol=1e-4, rtol=0)
     assert (spread - covariance).norm() < 0.05 * covariance.norm()
 
@@ -45,7 +45,7 @@ def test_with_exact_data_and_no_renewal_it_samples_the_posterior():
 def test_data_without_weight_leave_the_prior():
     errors = []
     for n in (100, 400):
-        _, spread = propagate(lambda x: sample(DiffPIR(n, renewed=0.0, noise=1e7), x))
+        _, spread = propagate(lambda x: sample(DiffPIR(n, zeta=0.0, noise=1e7), x))
         errors.append(float((spread / V - torch.eye(N).double()).norm() / N**0.5))
     assert errors[1] < 0.3 and errors[0] / errors[1] > 2  # the published spacing leaves a long last step
 
@@ -73,7 +73,7 @@ def test_the_result_depends_on_the_seed_alone():
 
 
 @pytest.mark.parametrize("settings", [
-    {"iterations": 0}, {"trust": 0.0}, {"spacing": -1.0}, {"renewed": 1.5}, {"noise": 0.0}])
+    {"iterations": 0}, {"trust": 0.0}, {"spacing": -1.0}, {"zeta": 1.5}, {"noise": 0.0}])
 def test_impossible_settings_are_refused(settings):
     with pytest.raises(ValueError, match=str(next(iter(settings.values())))):
         DiffPIR(**settings)

@@ -8,7 +8,7 @@ from scipy.optimize import lsq_linear
 
 from phydict.datasets import phantom_case
 from phydict.grid import Grid
-from phydict.linalg.total_variation import Majoriser, smoothed_tv
+from phydict.linalg.total_variation import TVQuadraticMajorizer, smoothed_tv
 from phydict.posterior import GradientSteps, Measurement, ProximalCG, Reward
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
@@ -167,22 +167,22 @@ def test_with_total_variation_every_restart_lowers_the_objective_and_they_end_wh
                      + 2 * variation * smoothed_tv(z, edge))
 
     def after(restarts):
-        return ProximalCG(20, restarts, noise, 1e-13, variation=variation, edge=edge)(m, X0, spread)
+        return ProximalCG(20, restarts, noise, 1e-13, tv_weight=variation, tv_eps=edge)(m, X0, spread)
 
     values = [objective(X0), *(objective(after(n)) for n in range(1, 8))]
     assert all(later < earlier for earlier, later in zip(values, values[1:]))
     z = after(300)
     gradient = (m.adjoint(m.project(z) - m.y) / noise**2 + (z - X0) / spread**2
-                + variation * Majoriser(z, edge).gradient(z))
+                + variation * TVQuadraticMajorizer(z, edge).gradient(z))
     assert gradient.abs().max() < 1e-6
 
 
 def test_much_total_variation_leaves_a_constant():
-    z = ProximalCG(20, 50, 0.3, 1e-13, variation=1e4, edge=0.01)(measurement(4), X0, 0.5)
+    z = ProximalCG(20, 50, 0.3, 1e-13, tv_weight=1e4, tv_eps=0.01)(measurement(4), X0, 0.5)
     assert z.max() - z.min() < 1e-3
 
 
-@pytest.mark.parametrize("wrong, message", [({"variation": -1.0}, "variation"), ({"edge": 0.0}, "edge")])
+@pytest.mark.parametrize("wrong, message", [({"tv_weight": -1.0}, "tv_weight"), ({"tv_eps": 0.0}, "tv_eps")])
 def test_impossible_total_variation_is_refused(wrong, message):
     with pytest.raises(ValueError, match=message):
         ProximalCG(**wrong)
@@ -195,8 +195,8 @@ def test_refitting_the_scatter_comes_nearer_to_the_truth_and_without_scatter_cha
             m, _, truth = chest_measurement(0.0, 0.0)
             y = -torch.log(torch.exp(-m.y[0]) + scatter) if scatter else m.y[0]
             m = Measurement(m.projector, y, HUWindow(), noise=0.0)
-            m.seek_scatter(True)
-            z = ProximalCG(10, 5, refit=refit, variation=15.0)(m, truth * 0.9 - 0.1, 0.3)
+            m.reset_scatter(True)
+            z = ProximalCG(10, 5, refit_scatter=refit, tv_weight=15.0)(m, truth * 0.9 - 0.1, 0.3)
             errors.append(float((z - truth).norm()))
         assert errors[1] < 0.8 * errors[0] if scatter else errors[1] == errors[0]
 
@@ -207,7 +207,7 @@ def test_weighted_each_pixel_counts_by_its_own_noise():
     precision = 1 / (noise**2 + m.noise_variance)
     normal = m.matrix.T * precision @ m.matrix + torch.eye(N).double() / spread**2
     right = m.matrix.T * precision @ (m.y[0] - m.background) + X0.flatten() / spread**2
-    z = ProximalCG(40, noise=noise, tolerance=1e-13, weighted=True)(m, X0, spread)
+    z = ProximalCG(40, noise=noise, tolerance=1e-13, weighted_least_squares=True)(m, X0, spread)
     torch.testing.assert_close(z.flatten(), torch.linalg.solve(normal, right), atol=1e-8, rtol=0)
 
 
@@ -220,6 +220,6 @@ def test_weighting_comes_nearer_to_the_truth_where_few_photons_arrive_and_withou
             if photons:
                 y = y + (y.exp() / photons).sqrt() * random_like(y.shape, torch.float32, seed=3)
             m = Measurement(m.projector, y, HUWindow(), noise=given)
-            z = ProximalCG(10, 5, weighted=weighted, variation=10.0)(m, truth * 0.9 - 0.1, 0.3)
+            z = ProximalCG(10, 5, weighted_least_squares=weighted, tv_weight=10.0)(m, truth * 0.9 - 0.1, 0.3)
             errors.append(float((z - truth).norm()))
         assert errors[1] < 0.5 * errors[0] if photons else errors[1] == errors[0]

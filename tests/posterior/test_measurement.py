@@ -40,15 +40,15 @@ def test_air_projects_to_nothing():
 def test_line_integrals_are_left_alone_and_display_values_take_the_references_contrast_view_by_view():
     x = random_like(SHAPE, seed=5).clamp(-1, 1)
     kept = Measurement(PROJECTOR, Y, HUWindow())
-    kept.calibrate(x)
+    kept.match_gain_offset(x)
     assert torch.equal(kept.y[0], Y)
     gains, offsets = torch.tensor([0.2, 3.0, 90.0]).view(3, 1, 1), torch.tensor([-7.0, 0.5, 100.0]).view(3, 1, 1)
     truth = kept.project(x)[0]
     shown = Measurement(PROJECTOR, gains * truth + offsets, HUWindow(), display=True)
-    shown.calibrate(x)
+    shown.match_gain_offset(x)
     torch.testing.assert_close(shown.y[0], truth)
-    shown.calibrate(0.5 * x)  # always from the display values, never from the last guess
-    shown.calibrate(x)
+    shown.match_gain_offset(0.5 * x)  # always from the display values, never from the last guess
+    shown.match_gain_offset(x)
     torch.testing.assert_close(shown.y[0], truth)
 
 
@@ -56,7 +56,7 @@ def test_a_nearly_flat_display_view_stays_finite():
     flat = torch.full((3, 7, 9), 0.4).double()
     flat[:, 0, 0] += 1e-14
     m = Measurement(PROJECTOR, flat, HUWindow(), display=True)
-    m.calibrate(torch.zeros(SHAPE).double())
+    m.match_gain_offset(torch.zeros(SHAPE).double())
     assert m.y.isfinite().all()
 
 
@@ -94,15 +94,15 @@ def test_scatter_is_subtracted_where_it_is_sought_and_there_is_enough_of_it_and_
     for scatter, seen in ((0.0, False), (0.002, False), (0.03, True)):
         measured = -torch.log(torch.exp(-clean) + scatter)
         m = measurement(measured)
-        m.correct(clean[None])  # not sought
+        m.subtract_scatter(clean[None])  # not sought
         assert torch.equal(m.y[0], measured)
-        m.seek_scatter(True)
-        m.correct(clean[None])
+        m.reset_scatter(True)
+        m.subtract_scatter(clean[None])
         torch.testing.assert_close(m.y[0], clean if seen else measured, atol=1e-3, rtol=0)
         assert seen or torch.equal(m.y[0], measured)
-        m.correct(clean[None])  # always from what was measured
+        m.subtract_scatter(clean[None])  # always from what was measured
         torch.testing.assert_close(m.y[0], clean if seen else measured, atol=1e-3, rtol=0)
-        m.seek_scatter(False)
+        m.reset_scatter(False)
         assert torch.equal(m.y[0], measured)
 
 
@@ -110,9 +110,9 @@ def test_display_values_have_no_scatter_to_subtract():
     clean, measurement = chest_views()
     m = measurement(-torch.log(torch.exp(-clean) + 0.05), display=True)
     before = m.y
-    m.seek_scatter(True)
-    m.correct(clean[None])
-    assert not m.may_scatter and torch.equal(m.y, before)
+    m.reset_scatter(True)
+    m.subtract_scatter(clean[None])
+    assert not m.can_estimate_scatter and torch.equal(m.y, before)
 
 
 def test_the_truth_is_missed_by_the_noise_and_each_state_of_a_batch_by_its_own():
@@ -120,6 +120,6 @@ def test_the_truth_is_missed_by_the_noise_and_each_state_of_a_batch_by_its_own()
     clean = Measurement(PROJECTOR, Y, HUWindow()).project(truth)[0]
     noisy = clean + level * random_like(clean.shape, seed=4)
     m = Measurement(PROJECTOR, noisy, HUWindow(), noise=level / float(noisy.max()))
-    missed = m.missed(torch.cat([truth, truth + 0.1]))
+    missed = m.normalised_residual(torch.cat([truth, truth + 0.1]))
     assert float(missed[0]) == pytest.approx(1, abs=0.15) and float(missed[1]) > 3
-    torch.testing.assert_close(missed, torch.cat([m.missed(truth), m.missed(truth + 0.1)]))
+    torch.testing.assert_close(missed, torch.cat([m.normalised_residual(truth), m.normalised_residual(truth + 0.1)]))

@@ -5,7 +5,7 @@ import torch
 from laws import random_like
 
 from phydict.diffusion import CosineSchedule, ddim, noise_in, renoise
-from phydict.posterior.samplers.noise_levels import partly_renewed, polynomial_levels, times_of, walk
+from phydict.posterior.samplers.noise_levels import denoise_along, polynomial_levels, stochastic_ddim_step, times_of
 from posterior.dense import FINE, SHAPE, N, denoiser, moments
 
 SCHEDULE, V = CosineSchedule(), 0.04
@@ -36,13 +36,13 @@ def test_the_noise_in_a_state_is_what_was_put_in_and_kept_whole_it_is_ddim():
     x0, eps = random_like((1, *SHAPE), seed=1), random_like((1, *SHAPE), seed=2)
     x = renoise(SCHEDULE, x0, 0.6, eps)
     torch.testing.assert_close(noise_in(SCHEDULE, x0, x, 0.6), eps)
-    torch.testing.assert_close(partly_renewed(SCHEDULE, x0, eps, 0.3, 1.0, None), ddim(SCHEDULE, x0, x, 0.6, 0.3))
+    torch.testing.assert_close(stochastic_ddim_step(SCHEDULE, x0, eps, 0.3, 1.0, None), ddim(SCHEDULE, x0, x, 0.6, 0.3))
 
 
 @pytest.mark.parametrize("kept", [0.0, 0.5, 0.9])
 def test_partly_renewed_noise_keeps_its_variance_and_its_correlation(kept):
     eps = random_like((1, 100000), seed=3)
-    new = partly_renewed(SCHEDULE, torch.zeros_like(eps), eps, 0.5, kept, torch.Generator().manual_seed(0))
+    new = stochastic_ddim_step(SCHEDULE, torch.zeros_like(eps), eps, 0.5, kept, torch.Generator().manual_seed(0))
     new = new / SCHEDULE.scales(0.5)[1]
     assert float(new.std()) == pytest.approx(1, abs=0.01)
     assert float((new * eps).mean()) == pytest.approx(kept, abs=0.012)
@@ -54,7 +54,7 @@ def test_an_ancestral_walk_draws_from_the_clean_states_given_the_noisy_one(rho):
     a, s = (float(w) for w in FINE.scales(t))
     x = a * prior.mean + 0.3 * s * random_like((1, *SHAPE), seed=5)
     times = times_of(FINE, polynomial_levels(rho, 0.002, 200))
-    found, spread = moments(walk(prior, x.expand(4000, *SHAPE), times, torch.Generator().manual_seed(0)))
+    found, spread = moments(denoise_along(prior, x.expand(4000, *SHAPE), times, torch.Generator().manual_seed(0)))
     torch.testing.assert_close(found, prior.denoise(x, t).flatten(), atol=0.012, rtol=0)
     expected = V * rho**2 / (V + rho**2) * torch.eye(N).double()
     assert (spread - expected).norm() < 0.08 * expected.norm()
@@ -62,6 +62,6 @@ def test_an_ancestral_walk_draws_from_the_clean_states_given_the_noisy_one(rho):
 
 def test_a_walk_along_the_probability_flow_of_one_level_is_the_estimate_and_of_many_keeps_the_priors_variance():
     prior, x = denoiser(V), random_like((4000, *SHAPE), seed=6)
-    assert torch.equal(walk(prior, x, [0.7]), prior.denoise(x, 0.7))
-    _, spread = moments(walk(prior, x, times_of(FINE, polynomial_levels(900.0, 0.002, 300))))
+    assert torch.equal(denoise_along(prior, x, [0.7]), prior.denoise(x, 0.7))
+    _, spread = moments(denoise_along(prior, x, times_of(FINE, polynomial_levels(900.0, 0.002, 300))))
     assert (spread / V - torch.eye(N).double()).norm() < 0.08 * N**0.5

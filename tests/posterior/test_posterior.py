@@ -19,10 +19,10 @@ from phydict.xray import ConeBeam, Projector
 BEAM = ConeBeam.orbit(4, 1020, 740, (14, 14), 40.0)
 GRID = Grid.cube(16)
 PROJECTOR = Projector(GRID, BEAM)
-FAST = SplitGibbs(8, ProximalCG(4), ProximalCG(4), warm_start=0.7)
+FAST = SplitGibbs(8, ProximalCG(4), ProximalCG(4), t_start=0.7)
 SAMPLERS = {
-    "fast": FAST, "noisy": SplitGibbs(6, fresh_noise=0.2), "paper": SplitGibbs(
-        5, GradientSteps(), refine_from=0.5, refine_iterations=3), "prior": PriorOnly(5)}
+    "fast": FAST, "noisy": SplitGibbs(6, noise_fraction=0.2), "paper": SplitGibbs(
+        5, GradientSteps(), ec_delta=0.5, ec_steps=3), "prior": PriorOnly(5)}
 
 
 def views(seed=0):

@@ -5,7 +5,7 @@ import torch
 from laws import random_like
 
 from phydict.diffusion import GaussianDenoiser, renoise
-from phydict.posterior import PriorOnly, descend
+from phydict.posterior import PriorOnly, ddim_sample
 from posterior.dense import FINE, SHAPE, N, denoiser, propagate
 
 VARIANCES = torch.tensor([0.01, 0.02, 0.03, 0.04, 0.05, 0.06]).double().view(1, *SHAPE)
@@ -39,20 +39,20 @@ def test_components_do_not_mix():
 def test_a_descent_from_a_time_between_brings_the_noised_prior_back_to_the_prior():
     start, n = 0.6, 400
     a, s = (float(w) for w in FINE.scales(start))
-    gain = propagate(lambda x: descend(prior(), a * prior().mean + s * x, n, start))[1].diagonal() / s**2
+    gain = propagate(lambda x: ddim_sample(prior(), a * prior().mean + s * x, n, start))[1].diagonal() / s**2
     noised = a**2 * VARIANCES.flatten() + s**2
     torch.testing.assert_close(gain * noised, VARIANCES.flatten(), rtol=0.03, atol=0)
 
 
 def test_one_step_from_pure_noise_is_the_mean_and_many_runs_are_the_same():
     x = random_like((1, *SHAPE), seed=5)
-    assert (descend(prior(), x, 1) - prior().mean).abs().max() < 1e-3
-    assert torch.equal(descend(prior(), x, 30), descend(prior(), x, 30))
+    assert (ddim_sample(prior(), x, 1) - prior().mean).abs().max() < 1e-3
+    assert torch.equal(ddim_sample(prior(), x, 30), ddim_sample(prior(), x, 30))
 
 
 def test_samples_stay_in_the_priors_range():
     wide = GaussianDenoiser(torch.full((1, *SHAPE), 0.9).double(), torch.tensor(4.0).double(), FINE)
-    sample = descend(wide, 3 * random_like((1, *SHAPE), seed=6), 20)
+    sample = ddim_sample(wide, 3 * random_like((1, *SHAPE), seed=6), 20)
     assert sample.max() == 1 and sample.min() == -1
 
 
@@ -64,4 +64,4 @@ def test_on_step_is_called_once_per_step():
 
 def test_a_descent_of_no_steps_is_refused():
     with pytest.raises(ValueError, match="at least one step"):
-        descend(prior(), renoise(FINE, prior().mean, 0.5, torch.ones(N).double().view(1, *SHAPE)), 0, 0.5)
+        ddim_sample(prior(), renoise(FINE, prior().mean, 0.5, torch.ones(N).double().view(1, *SHAPE)), 0, 0.5)

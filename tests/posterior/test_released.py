@@ -116,7 +116,7 @@ def test_the_last_call_is_the_denoisers_at_time_zero():
 
     prior = Watched(denoiser().mean, denoiser().variance, FINE)
     x = random_like((1, *SHAPE), seed=10)
-    found = SplitGibbs(**settings, at_zero=True, refine_from=0.6, refine_iterations=3).sample(
+    found = SplitGibbs(**settings, final_denoise=True, ec_delta=0.6, ec_steps=3).sample(
         prior, measurement(), x, torch.Generator().manual_seed(0))
     assert [t for t, _, _ in calls] == pytest.approx([1.0, 0.75, 0.5, 0.25, 0.0, 0.6, 0.4, 0.2, 0.0])
     assert torch.equal(found, calls[-1][2])
@@ -149,8 +149,8 @@ def test_the_released_settings_run_and_answer_to_the_views():
     settings = METHODS["phydict_released"]
     mu = torch.zeros(1, 1, 16, 16, 16)
     mu[:, :, 3:13, 4:12] = 0.02
-    short = SplitGibbs(3, settings.likelihood, settings.final_likelihood, refine_from=0.8, refine_iterations=2,
-                       clip=False, at_zero=True)
+    short = SplitGibbs(3, settings.likelihood, settings.final_likelihood, ec_delta=0.8, ec_steps=2,
+                       clip=False, final_denoise=True)
     results = [Posterior(tiny_prior(), short).reconstruct(xrays, projector, seed=3).volume
                for xrays in (projector(mu)[0], projector(mu)[0], projector(mu.flip(2, 3, 4))[0] ** 2)]
     assert torch.equal(results[0], results[1]) and not torch.allclose(results[0], results[2])

@@ -14,7 +14,7 @@ from phydict.posterior.posterior import sample_seed
 from posterior.dense import SHAPE, N, measurement
 from posterior.test_posterior import BEAM, PROJECTOR, views
 
-SAMPLER = SplitGibbs(4, ProximalCG(3), ProximalCG(3), warm_start=0.7, fresh_noise=0.0, randomised_noise=0.6)
+SAMPLER = SplitGibbs(4, ProximalCG(3), ProximalCG(3), t_start=0.7, noise_fraction=0.0, sampling_noise=0.6)
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def drawn(method, n, batch=4, display=False):
 @pytest.mark.parametrize("display", [False, True])
 def test_mean_and_deviation_are_those_of_samples_that_do_not_depend_on_their_number_or_on_how_they_are_batched(
         method, display):
-    alone = replace(method, sampler=SAMPLER.randomised())
+    alone = replace(method, sampler=SAMPLER.for_sampling())
     single = torch.stack([alone.reconstruct(views(), PROJECTOR, display=display, seed=sample_seed(5, i)).volume
                           for i in range(3)])
     for n, batch in ((2, 4), (3, 1), (3, 2), (3, 3)):

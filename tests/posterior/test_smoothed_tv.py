@@ -4,7 +4,7 @@ import pytest
 import torch
 from laws import random_like
 
-from phydict.linalg.total_variation import Majoriser, differences, differences_adjoint, smoothed_tv
+from phydict.linalg.total_variation import TVQuadraticMajorizer, differences, differences_adjoint, smoothed_tv
 
 X = random_like((2, 1, 3, 4, 5), seed=1)
 OTHER = random_like((2, 1, 3, 4, 5), seed=2)
@@ -26,18 +26,18 @@ def test_of_a_step_it_is_the_area_times_the_height():
 def test_the_majorisers_gradient_where_it_touches_is_the_variations():
     x = X.clone().requires_grad_(True)
     smoothed_tv(x, EDGE).backward()
-    torch.testing.assert_close(Majoriser(X, EDGE).gradient(X), x.grad)
+    torch.testing.assert_close(TVQuadraticMajorizer(X, EDGE).gradient(X), x.grad)
 
 
 @pytest.mark.parametrize("far", [0.01, 1.0, 30.0])
 def test_the_majoriser_lies_above_the_variation(far):
-    m, moved = Majoriser(X, EDGE), X + far * OTHER
+    m, moved = TVQuadraticMajorizer(X, EDGE), X + far * OTHER
     rise = ((m.gradient(moved) * moved).sum() - (m.gradient(X) * X).sum()) / 2
     assert smoothed_tv(moved, EDGE) - smoothed_tv(X, EDGE) <= rise
 
 
 def test_the_diagonal_is_what_a_voxel_alone_makes_of_itself():
-    m, found = Majoriser(X[:1], EDGE), torch.zeros_like(X[:1])
+    m, found = TVQuadraticMajorizer(X[:1], EDGE), torch.zeros_like(X[:1])
     for place in range(found.numel()):
         alone = torch.zeros_like(found)
         alone.view(-1)[place] = 1
@@ -46,6 +46,6 @@ def test_the_diagonal_is_what_a_voxel_alone_makes_of_itself():
 
 
 def test_constants_cost_nothing_and_each_state_of_a_batch_is_its_own():
-    m = Majoriser(X, EDGE)
+    m = TVQuadraticMajorizer(X, EDGE)
     assert m.gradient(torch.full_like(X, 3.0)).abs().max() < 1e-12
-    torch.testing.assert_close(m.gradient(OTHER)[:1], Majoriser(X[:1], EDGE).gradient(OTHER[:1]))
+    torch.testing.assert_close(m.gradient(OTHER)[:1], TVQuadraticMajorizer(X[:1], EDGE).gradient(OTHER[:1]))

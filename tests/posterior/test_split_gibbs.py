@@ -9,7 +9,7 @@ from laws import random_like
 from phydict.datasets import phantom_case
 from phydict.diffusion import CosineSchedule, GaussianDenoiser, renoise
 from phydict.grid import Grid
-from phydict.posterior import LikelihoodStep, Measurement, PriorOnly, ProximalCG, SplitGibbs, descend
+from phydict.posterior import LikelihoodStep, Measurement, PriorOnly, ProximalCG, SplitGibbs, ddim_sample
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 from posterior.dense import FINE, SHAPE, DenseMeasurement, condition, denoiser, measurement, propagate
@@ -23,7 +23,7 @@ X = random_like((1, *SHAPE), seed=10)
 class NoData(LikelihoodStep):
     """A likelihood that knows nothing."""
 
-    def __call__(self, measurement, x0, spread):
+    def __call__(self, measurement, x0, x0_std):
         return x0
 
 
@@ -40,7 +40,7 @@ def test_one_likelihood_step_is_the_exact_posterior_mean_given_the_noisy_state_a
     prior, m = denoiser(V), measurement()
     a, s = (float(w) for w in FINE.scales(t))
     x = a * prior.mean + 0.2 * X
-    spread = sampler().spread(prior, t)
+    spread = sampler().x0_std(prior, t)
     assert spread**2 == pytest.approx(V * s**2 / (a**2 * V + s**2))  # the variance of x_0 given x_t
     z = EXACT(m, prior.denoise(x, t), spread)
     # the same mean from one stacked observation of x_0: x_t = a x_0 + s eps, and y
@@ -105,11 +105,11 @@ def test_estimates_stay_in_the_priors_range():
     assert found.max() == 1
 
 
-@pytest.mark.parametrize("warm_start", [0.4, 0.7])
-def test_a_warm_start_keeps_the_posterior_mean_and_counts_its_steps(warm_start):
-    warm = sampler(20, warm_start=warm_start, final_likelihood=EXACT)
+@pytest.mark.parametrize("t_start", [0.4, 0.7])
+def test_a_warm_start_keeps_the_posterior_mean_and_counts_its_steps(t_start):
+    warm = sampler(20, t_start=t_start, final_likelihood=EXACT)
     pairs = warm.times(denoiser())
-    assert len(pairs) == 20 and pairs[0] == (1.0, warm_start) and pairs[-1][1] == 0
+    assert len(pairs) == 20 and pairs[0] == (1.0, t_start) and pairs[-1][1] == 0
     assert [s for _, s in pairs[:-1]] == [t for t, _ in pairs[1:]]
     mean, covariance = condition(measurement(), denoiser(V).mean, V, NOISE)
     found, spread = propagate(lambda x: sample(warm, x))
@@ -118,11 +118,11 @@ def test_a_warm_start_keeps_the_posterior_mean_and_counts_its_steps(warm_start):
 
 
 def test_a_warm_start_at_one_is_the_plain_descent():
-    assert torch.equal(sample(sampler(12, warm_start=1.0)), sample(sampler(12)))
+    assert torch.equal(sample(sampler(12, t_start=1.0)), sample(sampler(12)))
 
 
 def test_refining_from_zero_is_the_identity():
-    assert torch.equal(sample(sampler(12, refine_from=0.0, refine_iterations=9)), sample(sampler(12)))
+    assert torch.equal(sample(sampler(12, ec_delta=0.0, ec_steps=9)), sample(sampler(12)))
 
 
 def test_refining_a_little_keeps_the_sample_and_refining_from_near_one_forgets_it():
@@ -131,7 +131,7 @@ def test_refining_a_little_keeps_the_sample_and_refining_from_near_one_forgets_i
     apart = (plain[0] - plain[1]).norm()
 
     def refined(delta):
-        return [sample(sampler(refine_from=delta, refine_iterations=30), data=m) for m in (measurement(), other)]
+        return [sample(sampler(ec_delta=delta, ec_steps=30), data=m) for m in (measurement(), other)]
 
     little, much = refined(0.001), refined(0.999)
     assert (little[0] - plain[0]).norm() < 0.15 * apart
@@ -141,36 +141,36 @@ def test_refining_a_little_keeps_the_sample_and_refining_from_near_one_forgets_i
 def test_refining_is_the_prior_seen_from_the_renoised_sample():
     noise = torch.randn(X.shape, generator=torch.Generator().manual_seed(0), dtype=X.dtype)
     start = renoise(FINE, sample(sampler()), 0.8, noise)
-    expected = descend(denoiser(V), start, 15, 0.8)
-    torch.testing.assert_close(sample(sampler(refine_from=0.8, refine_iterations=15)), expected)
+    expected = ddim_sample(denoiser(V), start, 15, 0.8)
+    torch.testing.assert_close(sample(sampler(ec_delta=0.8, ec_steps=15)), expected)
 
 
 def test_without_fresh_noise_nothing_is_drawn_and_with_it_the_draw_decides():
-    for drawless in (sampler(), sampler(fresh_noise=0.0)):
+    for drawless in (sampler(), sampler(noise_fraction=0.0)):
         torch.testing.assert_close(sample(drawless, seed=1), sample(drawless, seed=2), rtol=0, atol=1e-12)
-    noisy = sampler(fresh_noise=0.5)
+    noisy = sampler(noise_fraction=0.5)
     assert torch.equal(sample(noisy, seed=1), sample(noisy, seed=1))
     assert not torch.allclose(sample(noisy, seed=1), sample(noisy, seed=2))
 
 
-@pytest.mark.parametrize("path", [{}, {"warm_start": 0.4, "last": 0.2}, {"overshoot": 0.75},
-                                  {"refine_from": 0.9, "refine_iterations": 20, "refine_guided": True},
-                                  {"last": 0.2, "refine_from": 0.5, "refine_iterations": 20, "refine_guided": True}])
+@pytest.mark.parametrize("path", [{}, {"t_start": 0.4, "t_end": 0.2}, {"momentum": 0.75},
+                                  {"ec_delta": 0.9, "ec_steps": 20, "ec_guided": True},
+                                  {"t_end": 0.2, "ec_delta": 0.5, "ec_steps": 20, "ec_guided": True}])
 def test_a_descent_without_noise_ends_at_the_posterior_mean(path):
     mean, _ = condition(measurement(), denoiser(V).mean, V, NOISE)
-    found = sample(sampler(20, fresh_noise=0.0, final_likelihood=EXACT, **path))
+    found = sample(sampler(20, noise_fraction=0.0, final_likelihood=EXACT, **path))
     torch.testing.assert_close(found.flatten(), mean.flatten(), atol=2e-3, rtol=0)
 
 
 def test_the_last_level_is_where_the_settings_say():
-    times = sampler(5, warm_start=0.5, last=0.2).times(denoiser(V))
+    times = sampler(5, t_start=0.5, t_end=0.2).times(denoiser(V))
     assert [t for t, _ in times] == pytest.approx([1.0, 0.5, 0.4, 0.3, 0.2]) and times[-1][1] == 0
 
 
 @pytest.mark.parametrize("settings", [
-    sampler(9), sampler(9, warm_start=0.5), sampler(9, refine_from=0.4, refine_iterations=5),
-    sampler(9, refine_from=0.4, refine_iterations=5, refine_guided=True, at_zero=True),
-    sampler(9, last=0.2, refine_from=0.1, refine_iterations=5, refine_guided=True)])
+    sampler(9), sampler(9, t_start=0.5), sampler(9, ec_delta=0.4, ec_steps=5),
+    sampler(9, ec_delta=0.4, ec_steps=5, ec_guided=True, final_denoise=True),
+    sampler(9, t_end=0.2, ec_delta=0.1, ec_steps=5, ec_guided=True)])
 def test_on_step_is_called_as_often_as_promised(settings):
     calls = []
     settings.sample(denoiser(V), measurement(), X, torch.Generator(), lambda: calls.append(1))
@@ -178,18 +178,18 @@ def test_on_step_is_called_as_often_as_promised(settings):
 
 
 @pytest.mark.parametrize("settings, message", [
-    ({"iterations": 0}, "at least one iteration"), ({"warm_start": 0.0}, "warm_start"),
-    ({"warm_start": 1.2}, "warm_start"),
-    ({"refine_from": 1.0}, "refine_from"), ({"refine_from": -0.1}, "refine_from")])
+    ({"iterations": 0}, "at least one iteration"), ({"t_start": 0.0}, "t_start"),
+    ({"t_start": 1.2}, "t_start"),
+    ({"ec_delta": 1.0}, "ec_delta"), ({"ec_delta": -0.1}, "ec_delta")])
 def test_impossible_settings_are_refused(settings, message):
     with pytest.raises(ValueError, match=message):
         SplitGibbs(**settings)
 
 
 @pytest.mark.parametrize("settings", [
-    {"refine_from": 0.8, "refine_iterations": 0}, {"iterations": 1, "warm_start": 0.7},
-    {"fresh_noise": 1.5}, {"fresh_noise": -0.1}, {"overshoot": 0.5},
-    {"fresh_noise": 0.0, "overshoot": 1.5}, {"last": 0.8, "warm_start": 0.5}])
+    {"ec_delta": 0.8, "ec_steps": 0}, {"iterations": 1, "t_start": 0.7},
+    {"noise_fraction": 1.5}, {"noise_fraction": -0.1}, {"momentum": 0.5},
+    {"noise_fraction": 0.0, "momentum": 1.5}, {"t_end": 0.8, "t_start": 0.5}])
 def test_settings_that_contradict_each_other_are_refused_before_the_long_computation(settings):
     with pytest.raises(ValueError):
         SplitGibbs(**settings)
@@ -209,8 +209,8 @@ def test_scatter_is_looked_for_where_the_xrays_are_missed_and_otherwise_costs_an
     y = -torch.log(torch.exp(-projector(window.to_mu(truth))[0]) + scatter)
     y = y + 0.005 * random_like(y.shape, torch.float32)
     prior = GaussianDenoiser(0.8 * truth, torch.tensor(0.04))
-    settings = SplitGibbs(4, ProximalCG(noise=0.02), ProximalCG(10, 5, noise=0.02, refit=True),
-                          warm_start=0.9, last=0.2, fresh_noise=0.0)
+    settings = SplitGibbs(4, ProximalCG(noise=0.02), ProximalCG(10, 5, noise=0.02, refit_scatter=True),
+                          t_start=0.9, t_end=0.2, noise_fraction=0.0)
     found = {}
     for seek in (False, True):
         m = Measurement(projector, y, window, noise=0.005 / float(y.max()))

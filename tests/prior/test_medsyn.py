@@ -230,7 +230,7 @@ XRAYS = torch.linspace(1.5, 2.5, 288).view(2, 12, 12)
 
 
 @pytest.mark.parametrize("sampler", [PriorOnly(2), SplitGibbs(2), SplitGibbs(
-    2, warm_start=0.3, last=0.2, fresh_noise=0.0, final_likelihood=ProximalCG(2))], ids=["prior", "ddim", "fast"])
+    2, t_start=0.3, last=0.2, noise_fraction=0.0, final_likelihood=ProximalCG(2))], ids=["prior", "ddim", "fast"])
 def test_every_sampler_works_with_it(sampler):
     result = reconstruct(XRAYS, BEAM, prior(), sampler, report="a report", seed=3)
     assert result.volume.shape == (8, 4, 6) and -1024 <= result.volume.min() < result.volume.max() <= 600
@@ -259,16 +259,16 @@ def test_sampled_alone_it_ends_as_medsyns_inference_does():
 
 
 def test_the_last_call_can_be_left_out_and_other_priors_make_none():
-    assert reconstructor(PriorOnly(5, at_zero=False), prior()).steps() == 5
+    assert reconstructor(PriorOnly(5, final_denoise=False), prior()).steps() == 5
     assert reconstructor(PriorOnly(5), tiny_prior(False)).steps() == 5
-    assert reconstructor(PriorOnly(5, at_zero=True), tiny_prior(False)).steps() == 6
+    assert reconstructor(PriorOnly(5, final_denoise=True), tiny_prior(False)).steps() == 6
 
 
 def test_the_second_stages_noise_takes_its_share_of_the_coarse_state_on_fine_voxels():
     fine, coarse = MedSynSuperResolution(super_resolution_unet(), GRID), random_like((1, 4, 2, 1, 3), torch.float32)
     noise = torch.randn(1, 4, 8, 4, 12, generator=torch.Generator().manual_seed(5))
     for share in (0.0, 0.1, 1.0):
-        given = fine.bind(coarse, share, draw=torch.Generator().manual_seed(5)).coarse
+        given = fine.bind(coarse, share, generator=torch.Generator().manual_seed(5)).coarse
         torch.testing.assert_close(given, (1 - share) * fine.upsample(coarse) + share * noise)
     assert torch.equal(fine.bind(coarse, 0.1).coarse, fine.upsample(coarse))  # it carries its noise already
 
@@ -298,7 +298,7 @@ def test_the_stated_memory_is_that_of_a_measured_call():
 def test_a_second_stage_that_needs_more_memory_than_it_may_take_says_how_much_it_needs():
     with torch.device("meta"):
         fine = MedSynSuperResolution(SuperResolutionUNet())
-    with pytest.raises(ValueError, match=r"256.* about 36 GiB in float32, but 4 GiB .*--model.fine_memory 36") as error:
+    with pytest.raises(ValueError, match=r"256.* about 36 GiB in float32, but 4 GiB .*--model.sr_memory 36") as error:
         fine.check_memory(torch.float32)
     assert "\n" not in str(error.value)
     with pytest.raises(ValueError, match="about 18.5 GiB in bfloat16"):

@@ -6,7 +6,7 @@ from laws import random_like
 from torch.nn.functional import avg_pool3d
 
 from phydict.grid import Grid
-from phydict.posterior import descend
+from phydict.posterior import ddim_sample
 from phydict.prior import LocalUNet, SuperResolution
 from phydict.units import HUWindow
 from prior.peak import Peak
@@ -87,7 +87,7 @@ def test_a_sample_in_tiles_is_that_of_the_whole_and_the_same_bits_each_time():
     noise = X[..., :16, :16].repeat(1, 1, 5, 1, 1)[:, :, :144]
 
     def sample(fine):
-        return descend(fine.bind(coarse, 0.05, precision="float32"), noise, 2)
+        return ddim_sample(fine.bind(coarse, 0.05, precision="float32"), noise, 2)
 
     expected = sample(long_stage(8))
     detail = (expected - long_stage(8).upsample(coarse)).std()
@@ -149,7 +149,7 @@ def test_memory_that_holds_no_tile_is_refused_before_anything_is_denoised():
 def test_noise_drawn_for_the_coarse_volume_is_added_to_it():
     fine, draw = tiny_super_resolution(), torch.Generator().manual_seed(5)
     noisy = COARSE + 0.2 * torch.randn(COARSE.shape, generator=torch.Generator().manual_seed(5))
-    given, drawn = fine.bind(noisy, 0.2), fine.bind(COARSE, 0.2, draw=draw)
+    given, drawn = fine.bind(noisy, 0.2), fine.bind(COARSE, 0.2, generator=draw)
     assert torch.equal(given.upsampled, drawn.upsampled) and given.noise == drawn.noise == 0.2
 
 

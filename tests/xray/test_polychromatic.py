@@ -219,7 +219,7 @@ def test_the_stated_attenuation_gives_water_its_hu_back(kvp):
     inside = (slice(6, 10),) * 3
 
     def error(mu_water: float) -> float:
-        volume = SIRT(40).assuming(mu_water).reconstruct(xrays, projector).volume
+        volume = SIRT(40).with_mu_water(mu_water).reconstruct(xrays, projector).volume
         return abs(float(volume[inside].mean()))
 
     assert error(simulate.effective_mu_water) < 25

@@ -24,8 +24,8 @@ FIELD_MM, FIELD_SHIFT_MM = (310.0, 400.0), 15.0
 class Augmentation:
     """How strong random changes of a patient are; 0 leaves that kind out. `Augmentation.none()` changes nothing.
 
-    rotation: degrees about any axis. scale: share of the size, along each axis. shift: mm. waves: mm, amplitude of
-    the slowest bending. gain: share of HU + 1000. offset: HU, in tissue only. contrast: HU, in blood only.
+    rotation: degrees about any axis. scale: share of the size, along each axis. shift: mm. elastic_mm: mm, amplitude of
+    the slowest bending. hu_scale: share of HU + 1000. hu_offset: HU, in tissue only. contrast: HU, in blood only.
     table: share of the cases whose table and clothes are taken away. field: share of the cases cut by a scanner's
     circular field of view of 310 to 400 mm.
     mirror: share of the cases mirrored left to right among those whose report is empty or names no side (in English),
@@ -36,9 +36,9 @@ class Augmentation:
     rotation: float = 8.0
     scale: float = 0.1
     shift: float = 20.0
-    waves: float = 2.5
-    gain: float = 0.03
-    offset: float = 20.0
+    elastic_mm: float = 2.5
+    hu_scale: float = 0.03
+    hu_offset: float = 20.0
     contrast: float = 60.0
     table: float = 0.2
     field: float = 0.15
@@ -49,9 +49,9 @@ class Augmentation:
         if negative:
             raise ValueError(f"augmentation strengths are not negative, but {negative[0]} is "
                              f"{vars(self)[negative[0]]}: give 0 for none")
-        if self.scale > 0.5 or self.gain > 0.5 or self.rotation > 45:
+        if self.scale > 0.5 or self.hu_scale > 0.5 or self.rotation > 45:
             raise ValueError("augmentation is for small changes: rotation up to 45 degrees, scale and gain up to 0.5, "
-                             f"but {self.rotation}, {self.scale} and {self.gain} were given")
+                             f"but {self.rotation}, {self.scale} and {self.hu_scale} were given")
         over = [name for name in ("table", "field", "mirror") if getattr(self, name) > 1]
         if over:
             raise ValueError(f"augmentation's {over[0]} is a share of the cases, in [0, 1], but "
@@ -66,16 +66,16 @@ class Augmentation:
 class Deformation:
     """A small random change of a patient: pose, size, shape and HU.
 
-    rotation: (3,) radians about x, y, z. scale: (3,). shift: (3,) mm. waves: (3, 4, 4, 4) mm, amplitudes of cosines
-    of up to 1.5 periods over the grid. gain: factor of HU + 1000. offset: HU, in tissue only. mirrored: left to right.
+    rotation: (3,) radians about x, y, z. scale: (3,). shift: (3,) mm. elastic_mm: (3, 4, 4, 4) mm, amplitudes of cosines
+    of up to 1.5 periods over the grid. hu_scale: factor of HU + 1000. hu_offset: HU, in tissue only. mirrored: left to right.
     """
 
     rotation: torch.Tensor
     scale: torch.Tensor
     shift: torch.Tensor
-    waves: torch.Tensor
-    gain: float
-    offset: float
+    elastic_mm: torch.Tensor
+    hu_scale: float
+    hu_offset: float
     mirrored: bool = False
 
     @classmethod
@@ -86,12 +86,12 @@ class Deformation:
         def uniform(size, bound):
             return (2 * torch.rand(size, generator=generator) - 1) * bound
 
-        waves = torch.randn((3, 4, 4, 4), generator=generator)
+        elastic_mm = torch.randn((3, 4, 4, 4), generator=generator)
         frequency = torch.stack(torch.meshgrid(*[torch.arange(4.0)] * 3, indexing="ij")).pow(2).sum(0)
-        waves = torch.where((frequency > 0) & (frequency <= 9), waves * strength.waves / (1 + frequency.sqrt()), 0.0)
+        elastic_mm = torch.where((frequency > 0) & (frequency <= 9), elastic_mm * strength.elastic_mm / (1 + frequency.sqrt()), 0.0)
         return cls(uniform(3, math.radians(strength.rotation) / math.sqrt(3)), 1 + uniform(3, strength.scale),
-                   uniform(3, strength.shift / math.sqrt(3)), waves, 1 + float(uniform(1, strength.gain)),
-                   float(uniform(1, strength.offset)))
+                   uniform(3, strength.shift / math.sqrt(3)), elastic_mm, 1 + float(uniform(1, strength.hu_scale)),
+                   float(uniform(1, strength.hu_offset)))
 
     def sample_points(self, grid: Grid) -> torch.Tensor:
         """(X, Y, Z, 3) mm from the grid's centre, along its axes: where the deformed voxels take their values."""
@@ -100,10 +100,10 @@ class Deformation:
         a, b, c = self.rotation.tolist()
         turn = torch.linalg.matrix_exp(torch.tensor([[0, -c, b], [c, 0, -a], [-b, a, 0]]))
         cosines = [torch.cos(math.pi * torch.arange(4.0) * (torch.arange(n)[:, None] + 0.5) / n) for n in grid.shape]
-        waves = self.waves
+        elastic_mm = self.elastic_mm
         for basis in cosines:
-            waves = torch.tensordot(waves, basis, dims=([1], [1]))
-        return (points @ turn.T) * self.scale + self.shift + waves.movedim(0, -1)
+            elastic_mm = torch.tensordot(elastic_mm, basis, dims=([1], [1]))
+        return (points @ turn.T) * self.scale + self.shift + elastic_mm.movedim(0, -1)
 
     def apply(self, case: dict, grid: Grid, window: HUWindow) -> dict:
         """The deformed Case; volume and masks are sampled at the same points, air and zeros outside."""
@@ -114,7 +114,7 @@ class Deformation:
         state = state.flip(1) if self.mirrored else state
         state = torch.nn.functional.grid_sample(state[None], points, padding_mode="zeros", align_corners=False)[0]
         hu = window.to_hu(state[:1] + air)
-        hu = AIR + self.gain * (hu - AIR) + self.offset * ((hu - AIR) / 200).clamp(0, 1)
+        hu = AIR + self.hu_scale * (hu - AIR) + self.hu_offset * ((hu - AIR) / 200).clamp(0, 1)
         moved = {key: value for key, value in case.items() if key not in ("affine", "centred_on")}
         return moved | {"volume": window.to_range(hu), "masks": state[1:].clamp(0, 1)}
 

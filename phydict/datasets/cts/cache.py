@@ -10,7 +10,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from phydict.runtime.files import whole_file
+from phydict.runtime.files import atomic_write
 from phydict.runtime.reading import not_written, reason
 
 
@@ -35,7 +35,7 @@ def write_array(file: Path, array: np.ndarray) -> None:
 @contextmanager
 def _cached(file: Path) -> Iterator[BinaryIO]:
     try:
-        with whole_file(file) as part, part.open("wb") as stream:
+        with atomic_write(file) as part, part.open("wb") as stream:
             yield stream
     except OSError as error:
         raise not_written(f"the prepared case {file} of the cache", error, "give another data.cache") from error

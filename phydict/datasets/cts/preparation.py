@@ -39,7 +39,7 @@ from phydict.datasets.cts.transforms import (
     to_grid,
 )
 from phydict.grid import Grid
-from phydict.runtime.files import remove_leftovers, whole_file, whole_folder
+from phydict.runtime.files import atomic_directory, atomic_write, remove_leftovers
 from phydict.runtime.progress import CaseProgress
 from phydict.runtime.reading import not_written
 
@@ -275,7 +275,7 @@ def prepare_source(source: Source, out: Path, settings: Settings) -> dict:
               "report": "" if source.is_dicom else source.ct.report, "settings": asdict(settings),
               "fingerprint": fingerprint, "row": row}
     try:
-        with whole_folder(out / source.id) as partial:
+        with atomic_directory(out / source.id) as partial:
             write_prepared(partial, grid, images, record)
     except OSError as error:
         raise not_written(f"the case {out / source.id}", error, "give another output folder, and run the same command "
@@ -319,7 +319,7 @@ def _place(hu: np.ndarray, affine: np.ndarray, beside: dict[str, tuple[Path, ...
 
 def _write_summary(file: Path, rows: list[dict]) -> None:
     try:
-        with whole_file(file) as part, part.open("w", newline="", encoding="utf-8") as stream:
+        with atomic_write(file) as part, part.open("w", newline="", encoding="utf-8") as stream:
             table = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
             table.writeheader()
             table.writerows(rows)

@@ -14,10 +14,10 @@ from phydict.posterior.normalised import NormalisedMeasurement
 
 
 def langevin(score: Callable[[Tensor], Tensor], z: Tensor, step: float, iterations: int,
-             draw: torch.Generator) -> Tensor:
+             generator: torch.Generator) -> Tensor:
     """z <- z + step score(z) + sqrt(2 step) noise, `iterations` times; score is the gradient of the log density."""
     for _ in range(iterations):
-        z = z + step * score(z) + (2 * step) ** 0.5 * noise_like(z, draw)
+        z = z + step * score(z) + (2 * step) ** 0.5 * noise_like(z, generator)
     return z
 
 
@@ -26,7 +26,7 @@ class Langevin(LikelihoodDraw):
     """Langevin steps from the estimate, as published with DAPS and PnP-DM.
 
     iterations; step: their size, for an operator of norm 1; last_share: the share of it that is left at the end of the
-    sampling, to which it shrinks linearly. A step is cut to 1 / (1 / noise^2 + 1 / spread^2), beyond which
+    sampling, to which it shrinks linearly. A step is cut to 1 / (1 / noise^2 + 1 / x0_std^2), beyond which
     the dynamics overshoot, and at twice which they diverge. Short of convergence z stays near the estimate; a
     direction of precision p then has variance 1 / p / (1 - step p / 2) instead of 1 / p.
     """
@@ -40,12 +40,12 @@ class Langevin(LikelihoodDraw):
             raise ValueError("Langevin dynamics need at least 1 iteration, a step above 0 and a last_share in (0, 1], "
                              f"but {self.iterations}, {self.step} and {self.last_share} were given")
 
-    def __call__(self, measurement: NormalisedMeasurement, x0: Tensor, spread: float, draw: torch.Generator,
+    def __call__(self, measurement: NormalisedMeasurement, x0: Tensor, x0_std: float, generator: torch.Generator,
                  progress: float) -> Tensor:
-        step = min(self.step * (1 - progress * (1 - self.last_share)), 1 / (measurement.noise**-2 + spread**-2))
+        step = min(self.step * (1 - progress * (1 - self.last_share)), 1 / (measurement.noise**-2 + x0_std**-2))
 
         def score(z: Tensor) -> Tensor:
             misfit = measurement.adjoint(measurement.y - measurement.project(z))
-            return misfit / measurement.noise**2 + (x0 - z) / spread**2
+            return misfit / measurement.noise**2 + (x0 - z) / x0_std**2
 
-        return langevin(score, x0, step, self.iterations, draw)
+        return langevin(score, x0, step, self.iterations, generator)

@@ -14,35 +14,35 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from phydict.linalg.total_variation import Majoriser
+from phydict.linalg.total_variation import TVQuadraticMajorizer
 from phydict.posterior.likelihood.reward import Reward
 from phydict.posterior.measurement import Measurement
 
 
 class LikelihoodStep(ABC):
-    """z = step(measurement, x0, spread): x0 and z (B, 1, X, Y, Z); spread is the standard deviation of x0's error."""
+    """z = step(measurement, x0, x0_std): x0 and z (B, 1, X, Y, Z); x0_std is the standard deviation of x0's error."""
 
     @abstractmethod
-    def __call__(self, measurement: Measurement, x0: Tensor, spread: float) -> Tensor: ...
+    def __call__(self, measurement: Measurement, x0: Tensor, x0_std: float) -> Tensor: ...
 
 
 @dataclass(frozen=True)
 class ProximalCG(LikelihoodStep):
-    """Towards argmin over z in [-1, 1] of |P(z) - y|^2 / noise^2 + |z - x0|^2 / spread^2 + 2 variation TV(z), by
+    """Towards argmin over z in [-1, 1] of |P(z) - y|^2 / noise^2 + |z - x0|^2 / x0_std^2 + 2 tv_weight TV(z), by
     conjugate gradients.
 
     Starts at x0. Each restart frees the voxels that are inside the range or pulled back into it, runs conjugate
     gradients on them and clips: air stays air, which is worth more than many iterations without the bounds. With a
-    Gaussian prior, no variation, bounds that do not act and enough iterations this is exactly E[x_0 | x_t, y]; few
-    iterations regularise, since what the views see best is corrected first. TV(z) sums sqrt(slope^2 + edge^2) over the
+    Gaussian prior, no total variation, bounds that do not act and enough iterations this is exactly E[x_0 | x_t, y]; few
+    iterations regularise, since what the views see best is corrected first. TV(z) sums sqrt(slope^2 + tv_eps^2) over the
     voxels.
 
     iterations: per restart, at most; restarts; noise: standard deviation of the line integrals' error (noise and
     model); tolerance: a restart ends once its residual has shrunk by this factor;
-    refit: whether each restart refits the scatter of a measurement in which it is sought;
-    weighted: whether the variance of each pixel's own noise is added to noise^2, so that pixels which few photons reach
+    refit_scatter: whether each restart refits the scatter of a measurement in which it is sought;
+    weighted_least_squares: whether the variance of each pixel's own noise is added to noise^2, so that pixels which few photons reach
     count less (Thibault et al. 2007, doi:10.1118/1.2789499);
-    variation: weight of the total variation TV, 0 for none; each restart replaces it by the quadratic that touches it
+    tv_weight: weight of the total variation TV, 0 for none; each restart replaces it by the quadratic that touches it
     there (Vogel & Oman 1996, doi:10.1137/0917016), so the last step wants several, and conjugate gradients are
     preconditioned by the diagonal of that quadratic, which differs by orders between flat parts and edges; edge:
     differences between neighbours, in the prior's range, below which TV is smooth.
@@ -54,41 +54,41 @@ class ProximalCG(LikelihoodStep):
     restarts: int = 2
     noise: float = 0.02
     tolerance: float = 1e-6
-    refit: bool = False
-    weighted: bool = False
-    variation: float = 0.0
-    edge: float = 0.01
+    refit_scatter: bool = False
+    weighted_least_squares: bool = False
+    tv_weight: float = 0.0
+    tv_eps: float = 0.01
 
     def __post_init__(self):
-        if not self.variation >= 0 or not self.edge > 0:
-            raise ValueError("total variation needs a weight variation >= 0, 0 for none, and an edge > 0, but "
-                             f"{self.variation} and {self.edge} were given")
+        if not self.tv_weight >= 0 or not self.tv_eps > 0:
+            raise ValueError("total variation needs a tv_weight >= 0, 0 for none, and a tv_eps > 0, but "
+                             f"{self.tv_weight} and {self.tv_eps} were given")
 
-    def __call__(self, measurement: Measurement, x0: Tensor, spread: float) -> Tensor:
-        weight = (self.noise / spread) ** 2
+    def __call__(self, measurement: Measurement, x0: Tensor, x0_std: float) -> Tensor:
+        weight = (self.noise / x0_std) ** 2
         z = x0.clamp(-1, 1)
-        trust = 1 / (1 + measurement.noise_variance / self.noise**2) if self.weighted else 1.0
-        steepness = self.noise**2 * self.variation
+        weights = 1 / (1 + measurement.noise_variance / self.noise**2) if self.weighted_least_squares else 1.0
+        tv_scale = self.noise**2 * self.tv_weight
         for _ in range(self.restarts):
             reprojection = measurement.project(z)
-            if self.refit:
-                measurement.correct(reprojection)
-            downhill = measurement.adjoint(trust * (measurement.y - reprojection)) + weight * (x0 - z)
-            tv = Majoriser(z, self.edge) if steepness else None
+            if self.refit_scatter:
+                measurement.subtract_scatter(reprojection)
+            negative_gradient = measurement.adjoint(weights * (measurement.y - reprojection)) + weight * (x0 - z)
+            tv = TVQuadraticMajorizer(z, self.tv_eps) if tv_scale else None
             if tv:
-                downhill = downhill - steepness * tv.gradient(z)
+                negative_gradient = negative_gradient - tv_scale * tv.gradient(z)
 
             def penalty(d, tv=tv):
-                return weight * d + steepness * tv.gradient(d) if tv else weight * d
+                return weight * d + tv_scale * tv.gradient(d) if tv else weight * d
 
-            free = ~((z <= -1) & (downhill < 0) | (z >= 1) & (downhill > 0))
-            scale = 1 / (weight + steepness * tv.diagonal()) if tv else torch.ones_like(z)
-            z = (z + self._solve(measurement, downhill * free, scale * free, penalty, trust)).clamp(-1, 1)
+            inactive_mask = ~((z <= -1) & (negative_gradient < 0) | (z >= 1) & (negative_gradient > 0))
+            scale = 1 / (weight + tv_scale * tv.diagonal()) if tv else torch.ones_like(z)
+            z = (z + self._solve(measurement, negative_gradient * inactive_mask, scale * inactive_mask, penalty, weights)).clamp(-1, 1)
         return z
 
     def _solve(self, measurement: Measurement, residual: Tensor, scale: Tensor, penalty: Callable[[Tensor], Tensor],
-               trust: Tensor | float) -> Tensor:
-        """Preconditioned conjugate gradients for A' trust A d + penalty(d) = residual over the voxels with a scale
+               weights: Tensor | float) -> Tensor:
+        """Preconditioned conjugate gradients for A' W A d + penalty(d) = residual over the voxels with a scale
         above 0, from zero; scale: the inverse of the penalty's diagonal, up to a factor."""
         scaled, d = scale * residual, torch.zeros_like(residual)
         direction, energy = scaled, _dot(residual, scaled)
@@ -97,7 +97,7 @@ class ProximalCG(LikelihoodStep):
             going = energy > stop
             if not going.any():
                 break
-            curved = measurement.adjoint(trust * measurement.linear(direction)) + penalty(direction)
+            curved = measurement.adjoint(weights * measurement.linear(direction)) + penalty(direction)
             step = torch.where(going, energy / _dot(direction, curved), 0)
             d += step * direction
             residual = residual - step * curved
@@ -117,7 +117,7 @@ class GradientSteps(LikelihoodStep):
     """The paper's step: a few Adam steps on J(Y, z) + |z - x0|^2 / rho, started at x0.
 
     The text gives two gradient steps of 0.1 and rho = 1; Adam is what the authors' release uses, with a fresh state
-    at every time. The spread is not used. adam: else plain gradient descent, which diverges unless
+    at every time. x0_std is not used. adam: else plain gradient descent, which diverges unless
     learning_rate (1 / rho + |A|^2 / K) < 1, with |A| the operator's norm and K the number of views.
     prior_mean: the mean over voxels of |z - x0|^2 instead of the sum, as in the release.
     """
@@ -129,7 +129,7 @@ class GradientSteps(LikelihoodStep):
     adam: bool = True
     prior_mean: bool = False
 
-    def __call__(self, measurement: Measurement, x0: Tensor, spread: float) -> Tensor:
+    def __call__(self, measurement: Measurement, x0: Tensor, x0_std: float) -> Tensor:
         with torch.enable_grad():
             z = x0.detach().clone().requires_grad_(True)
             optimiser = (torch.optim.Adam if self.adam else torch.optim.SGD)([z], self.learning_rate)

@@ -13,13 +13,13 @@ from phydict.posterior.normalised import NormalisedMeasurement, nearest_fit
 
 
 class LikelihoodDraw(ABC):
-    """Draws z ~ exp(-|P(z) - y|^2 / (2 noise^2) - |z - x0|^2 / (2 spread^2)).
+    """Draws z ~ exp(-|P(z) - y|^2 / (2 noise^2) - |z - x0|^2 / (2 x0_std^2)).
 
     x0 and z (B, 1, X, Y, Z); progress: how much of the sampling is done, in [0, 1).
     """
 
     @abstractmethod
-    def __call__(self, measurement: NormalisedMeasurement, x0: Tensor, spread: float, draw: torch.Generator,
+    def __call__(self, measurement: NormalisedMeasurement, x0: Tensor, x0_std: float, generator: torch.Generator,
                  progress: float) -> Tensor: ...
 
 
@@ -36,9 +36,9 @@ class ExactDraw(LikelihoodDraw):
     iterations: int = 30
     tolerance: float = 1e-4
 
-    def __call__(self, measurement: NormalisedMeasurement, x0: Tensor, spread: float, draw: torch.Generator,
+    def __call__(self, measurement: NormalisedMeasurement, x0: Tensor, x0_std: float, generator: torch.Generator,
                  progress: float) -> Tensor:
-        start = x0 + spread * noise_like(x0, draw)
+        start = x0 + x0_std * noise_like(x0, generator)
         y = measurement.y.expand(len(x0), *measurement.y.shape[1:])
-        y = y + measurement.noise * noise_like(y, draw)
-        return nearest_fit(measurement, start, (measurement.noise / spread) ** 2, self.iterations, self.tolerance, y)
+        y = y + measurement.noise * noise_like(y, generator)
+        return nearest_fit(measurement, start, (measurement.noise / x0_std) ** 2, self.iterations, self.tolerance, y)

@@ -2,8 +2,8 @@
 
 | here                             | publication                                                    |
 |----------------------------------|----------------------------------------------------------------|
-| walk(denoiser, x, times)         | x0hat(x_t) by the probability flow                             |
-| likelihood(m, x0, spread, draw)  | x_0 ~ p(x_0 | x_t, y), p(x_0 | x_t) as N(x0hat, spread^2)      |
+| denoise_along(denoiser, x, times)         | x0hat(x_t) by the probability flow                             |
+| likelihood(m, x0, x0_std, generator) | x_0 ~ p(x_0 | x_t, y), p(x_0 | x_t) as N(x0hat, x0_std^2)      |
 | renoise(z, s, noise)             | x_s ~ N(x_0, sigma_s^2)                                        |
 """
 
@@ -21,7 +21,7 @@ from phydict.posterior.likelihood.langevin import Langevin
 from phydict.posterior.likelihood.likelihood_draw import LikelihoodDraw
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.normalised import NormalisedMeasurement, check_noise
-from phydict.posterior.samplers.noise_levels import polynomial_levels, times_of, walk
+from phydict.posterior.samplers.noise_levels import denoise_along, polynomial_levels, times_of
 from phydict.posterior.samplers.sampler import Sampler
 
 
@@ -67,11 +67,11 @@ class DAPS(Sampler):
     def steps(self) -> int:
         return self.levels
 
-    def spread(self, sigma: float) -> float:
+    def x0_std(self, sigma: float) -> float:
         """Standard deviation of x_0 around its estimate at noise level sigma."""
         return sigma if self.prior_std is None else sigma / (1 + (sigma / self.prior_std) ** 2) ** 0.5
 
-    def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, draw: torch.Generator,
+    def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, generator: torch.Generator,
                on_step: Callable[[], None] = lambda: None) -> Tensor:
         m, schedule = NormalisedMeasurement(measurement, self.noise), denoiser.schedule
         sigmas = [float(schedule.sigma(schedule.time(s)))
@@ -80,9 +80,9 @@ class DAPS(Sampler):
         for i, sigma in enumerate(sigmas):
             x = renoise(schedule, z, schedule.time(sigma), noise)
             flow = polynomial_levels(sigma, min(self.flow_end, sigma), self.flow_steps)
-            x0 = walk(denoiser, x, times_of(schedule, flow))
-            measurement.calibrate(x0[:, :1])
-            ct = self.likelihood(m, x0[:, :1], self.spread(sigma), draw, i / self.levels)
-            z, noise = torch.cat([ct, x0[:, 1:]], 1), noise_like(x, draw)
+            x0 = denoise_along(denoiser, x, times_of(schedule, flow))
+            measurement.match_gain_offset(x0[:, :1])
+            ct = self.likelihood(m, x0[:, :1], self.x0_std(sigma), generator, i / self.levels)
+            z, noise = torch.cat([ct, x0[:, 1:]], 1), noise_like(x, generator)
             on_step()
         return z.clamp(-1, 1)

@@ -2,7 +2,7 @@
 
 | here                           | publication                                                     |
 |--------------------------------|-----------------------------------------------------------------|
-| noise_in, partly_renewed       | Algorithm 1, lines 4 to 6: the ancestral step                   |
+| noise_in, stochastic_ddim_step       | Algorithm 1, lines 4 to 6: the ancestral step                   |
 | scale * gradient               | line 7, x <- x' - scale grad_x |y - A x0hat(x)|, norm unsquared |
 """
 
@@ -17,7 +17,7 @@ from torch import Tensor
 from phydict.diffusion import Denoiser, noise_in
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.normalised import NormalisedMeasurement
-from phydict.posterior.samplers.noise_levels import partly_renewed
+from phydict.posterior.samplers.noise_levels import stochastic_ddim_step
 from phydict.posterior.samplers.sampler import Sampler
 
 
@@ -48,13 +48,13 @@ class DPS(Sampler):
     def steps(self) -> int:
         return self.iterations
 
-    def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, draw: torch.Generator,
+    def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, generator: torch.Generator,
                on_step: Callable[[], None] = lambda: None) -> Tensor:
         m, schedule = NormalisedMeasurement(measurement, noise=1.0), denoiser.schedule
         for t, s in schedule.steps(self.iterations):
             x0, gradient = self._estimate(denoiser, m, x, t)
             kept = float(schedule.sigma(s) / schedule.sigma(t))
-            x = partly_renewed(schedule, x0, noise_in(schedule, x0, x, t), s, kept, draw) - self.scale * gradient
+            x = stochastic_ddim_step(schedule, x0, noise_in(schedule, x0, x, t), s, kept, generator) - self.scale * gradient
             on_step()
         return (x0 - self.scale * gradient).clamp(-1, 1)
 
@@ -66,7 +66,7 @@ class DPS(Sampler):
             if not x0.requires_grad:
                 raise ValueError("DPS needs a denoiser that can be differentiated, but this one gives no gradient: use "
                                  "another sampler, or guide the prior's own grid alone")
-            m.measurement.calibrate(x0[:, :1].detach())
+            m.measurement.match_gain_offset(x0[:, :1].detach())
             misfit = (m.project(x0[:, :1]) - m.y).flatten(1).norm(dim=1)
             (gradient,) = torch.autograd.grad(misfit.sum(), x)
         m.measurement.calls += 1  # autograd's use of the adjoint

@@ -23,25 +23,25 @@ def times_of(schedule: CosineSchedule, levels: Sequence[float]) -> list[float]:
     return list(dict.fromkeys(schedule.time(sigma) for sigma in levels))
 
 
-def partly_renewed(schedule: CosineSchedule, x0: Tensor, eps: Tensor, s: float, kept: float,
-                   draw: torch.Generator) -> Tensor:
+def stochastic_ddim_step(schedule: CosineSchedule, x0: Tensor, eps: Tensor, s: float, kept: float,
+                   generator: torch.Generator) -> Tensor:
     """The clean state x0 at time s, with noise of which `kept` in [0, 1] is eps and the rest new: renoise(x0, s,
     kept eps + sqrt(1 - kept^2) noise). kept 1 is DDIM, 0 forgets the path."""
     if kept < 1:
-        eps = kept * eps + (1 - kept**2) ** 0.5 * noise_like(eps, draw)
+        eps = kept * eps + (1 - kept**2) ** 0.5 * noise_like(eps, generator)
     return renoise(schedule, x0, s, eps)
 
 
-def walk(denoiser: Denoiser, x: Tensor, times: Sequence[float], draw: torch.Generator | None = None) -> Tensor:
+def denoise_along(denoiser: Denoiser, x: Tensor, times: Sequence[float], generator: torch.Generator | None = None) -> Tensor:
     """The clean end, in [-1, 1], of the state x at times[0] that is taken down through the prior's noise levels.
 
-    Without `draw` along the probability flow (DDIM); with it by ancestral steps, whose end is a draw from
+    Without `generator` along the probability flow (DDIM); with it by ancestral steps, whose end is a draw from
     p(x_0 | x) as they become many (Ho et al. 2020, arXiv:2006.11239).
     """
     schedule = denoiser.schedule
     for t, s in zip(times, [*times[1:], None]):
         x0 = denoiser.denoise(x, t).clamp(-1, 1)
         if s is not None:
-            kept = 1.0 if draw is None else float(schedule.sigma(s) / schedule.sigma(t))
-            x = partly_renewed(schedule, x0, noise_in(schedule, x0, x, t), s, kept, draw)
+            kept = 1.0 if generator is None else float(schedule.sigma(s) / schedule.sigma(t))
+            x = stochastic_ddim_step(schedule, x0, noise_in(schedule, x0, x, t), s, kept, generator)
     return x0

@@ -2,8 +2,8 @@
 
 | here                            | publication                                                          |
 |---------------------------------|----------------------------------------------------------------------|
-| likelihood(m, x, rho, draw)     | z ~ exp(-|P(z) - y|^2 / (2 sigma_y^2) - |z - x|^2 / (2 rho^2))       |
-| walk(denoiser, z, times, draw)  | x ~ p(x) exp(-|x - z|^2 / (2 rho^2)), by diffusion from level rho    |
+| likelihood(m, x, rho, generator) | z ~ exp(-|P(z) - y|^2 / (2 sigma_y^2) - |z - x|^2 / (2 rho^2))       |
+| denoise_along(denoiser, z, times, generator) | x ~ p(x) exp(-|x - z|^2 / (2 rho^2)), by diffusion from level rho    |
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from phydict.diffusion import Denoiser
 from phydict.posterior.likelihood.likelihood_draw import ExactDraw, LikelihoodDraw
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.normalised import NormalisedMeasurement, check_noise
-from phydict.posterior.samplers.noise_levels import polynomial_levels, times_of, walk
+from phydict.posterior.samplers.noise_levels import denoise_along, polynomial_levels, times_of
 from phydict.posterior.samplers.sampler import Sampler
 
 
@@ -68,7 +68,7 @@ class PnPDM(Sampler):
     def steps(self) -> int:
         return self.iterations
 
-    def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, draw: torch.Generator,
+    def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, generator: torch.Generator,
                on_step: Callable[[], None] = lambda: None) -> Tensor:
         m, schedule = NormalisedMeasurement(measurement, self.noise), denoiser.schedule
         grid = polynomial_levels(self.sigma_max, self.sigma_min, self.levels)
@@ -77,10 +77,10 @@ class PnPDM(Sampler):
             rho = max(self.rho_max * self.decay**i, self.rho_min)
             times = times_of(schedule, [rho, *(sigma for sigma in grid if sigma < rho)])
             rho = float(schedule.sigma(times[0]))
-            z = torch.cat([self.likelihood(m, x[:, :1], rho, draw, i / self.iterations), x[:, 1:]], 1)
+            z = torch.cat([self.likelihood(m, x[:, :1], rho, generator, i / self.iterations), x[:, 1:]], 1)
             signal, _ = schedule.scales(times[0])
-            x = walk(denoiser, signal.to(z) * z, times, draw if self.stochastic else None)
-            measurement.calibrate(x[:, :1])
+            x = denoise_along(denoiser, signal.to(z) * z, times, generator if self.stochastic else None)
+            measurement.match_gain_offset(x[:, :1])
             if i >= self.burn_in and (i - self.burn_in) % self.thinning == self.thinning - 1:
                 total, kept = total + x, kept + 1
             on_step()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from torch import Tensor
 
 from phydict.diffusion import Denoiser, ddim
-from phydict.diffusion.steps import Draw
+from phydict.diffusion.steps import Generators
 
 if TYPE_CHECKING:
     from phydict.posterior.measurement import Measurement
@@ -26,9 +26,9 @@ class Sampler(ABC):
     batches = False
 
     @abstractmethod
-    def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, draw: Draw,
+    def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, generator: Generators,
                on_step: Callable[[], None] = lambda: None) -> Tensor:
-        """Noise x (B, C, X, Y, Z) at time 1 -> clean states; `draw` is the source of any further noise."""
+        """Noise x (B, C, X, Y, Z) at time 1 -> clean states; `generator` is the source of any further noise."""
 
     @abstractmethod
     def steps(self) -> int:
@@ -38,18 +38,18 @@ class Sampler(ABC):
         """These settings, with what they leave to `prior`, a prior or a denoiser, decided; these, unless overridden."""
         return self
 
-    def randomised(self) -> Sampler:
+    def for_sampling(self) -> Sampler:
         """The settings of which independent runs differ as far as the posterior is wide; these, unless overridden."""
         return self
 
 
-def descend(denoiser: Denoiser, x: Tensor, iterations: int, start: float = 1.0,
-            on_step: Callable[[], None] = lambda: None, at_zero: bool = False) -> Tensor:
+def ddim_sample(denoiser: Denoiser, x: Tensor, iterations: int, start: float = 1.0,
+            on_step: Callable[[], None] = lambda: None, final_denoise: bool = False) -> Tensor:
     """Deterministic descent of the state x from time `start` to its clean end, clipped to the prior's range.
 
-    at_zero: denoise once more at time 0.
+    final_denoise: denoise once more at time 0.
     """
-    for t, s in [*denoiser.schedule.steps(iterations, start), *[(0.0, 0.0)] * at_zero]:
+    for t, s in [*denoiser.schedule.steps(iterations, start), *[(0.0, 0.0)] * final_denoise]:
         x0 = denoiser.denoise(x, t).clamp(-1, 1)
         x = ddim(denoiser.schedule, x0, x, t, s)
         on_step()

@@ -54,15 +54,15 @@ class MedSynSuperResolution(nn.Module):
             raise ValueError(f"MedSyn's super-resolution stage denoises its {self.grid.shape} voxels at once, not in "
                              f"tiles, which takes about {gib:g} GiB in {str(dtype).removeprefix('torch.')}, but "
                              f"{self.memory / 2**30:g} GiB are allowed: where there is so much memory, allow it with "
-                             f"--model.fine_memory {gib:g} (in Python, the stage's `memory` in bytes), else leave the "
+                             f"--model.sr_memory {gib:g} (in Python, the stage's `memory` in bytes), else leave the "
                              "super-resolution stage out")
 
     def bind(self, coarse: Tensor, noise: float = 0.0, precision: str = "auto",
-             draw: torch.Generator | None = None) -> BoundSuperResolution:
+             generator: torch.Generator | None = None) -> BoundSuperResolution:
         """The denoiser of the fine states of a coarse one (B, 4, X/4, Y/4, Z/4), which may be a part of the grid's.
 
         noise: share in [0, 1] of normal noise in the coarse state (MedSyn trained with up to 0.4); the network is not
-        told. draw: what the noise is drawn from, to be (1 - noise) coarse + noise n on the fine voxels, as in MedSyn's
+        told. generator: what the noise is drawn from, to be (1 - noise) coarse + noise n on the fine voxels, as in MedSyn's
         training; None: `coarse` carries it already.
         """
         if coarse.ndim != 5 or coarse.shape[1] != self.coarse_channels:
@@ -71,8 +71,8 @@ class MedSynSuperResolution(nn.Module):
         if not 0 <= noise <= 1:
             raise ValueError(f"the coarse state's share of noise lies in [0, 1], but {noise} was given")
         upsampled = self.upsample(coarse)
-        if noise and draw is not None:
-            upsampled = torch.lerp(upsampled, torch.randn(upsampled.shape, generator=draw).to(upsampled), noise)
+        if noise and generator is not None:
+            upsampled = torch.lerp(upsampled, torch.randn(upsampled.shape, generator=generator).to(upsampled), noise)
         return BoundSuperResolution(self, upsampled, precision)
 
 

@@ -25,7 +25,7 @@ METHODS = ("auto", "separable", "siddon", "eq4", "joseph", "matrix")
 MEMORY = 2**29
 """Bytes that a projector may hold beside volume and X-rays, unless told otherwise."""
 
-KEPT = 2
+CACHE_SIZE = 2
 """Operators, with all that they computed from their geometry, that are kept for the next projector of the same one."""
 
 
@@ -114,7 +114,7 @@ def _engine(grid: Grid, beam: ConeBeam, method: str, memory: int, device: str) -
         chosen, reason = _choose(grid, beam, memory, device) if method == "auto" else (method, "it was asked for")
         _engines[key] = _Engine(_operator(grid, beam, chosen, memory), chosen, reason)
     _engines.move_to_end(key)
-    while len(_engines) > KEPT:
+    while len(_engines) > CACHE_SIZE:
         _engines.popitem(last=False)
     return _engines[key]
 

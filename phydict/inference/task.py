@@ -88,14 +88,14 @@ class ReconstructionTask(lightning.LightningModule):
                 self.settings["samples"] = samples
             if precision != "auto":
                 self.settings["precision"] = precision
-        self.fine = None
+        self.super_resolution = None
         if super_resolution:
             if not 0 < sr_memory < 2**20:
                 raise ValueError(f"model.sr_memory is an amount in GiB, above 0, but {sr_memory:g} was given")
-            self.fine = load_super_resolution(super_resolution)
-            self.fine.memory = int(sr_memory * 2**30)
-            self.grid = self.fine.grid
-        self.reconstructor = reconstructor(method, self.prior, guidance, name, self.fine, sr_guided, sr_sampler,
+            self.super_resolution = load_super_resolution(super_resolution)
+            self.super_resolution.memory = int(sr_memory * 2**30)
+            self.grid = self.super_resolution.grid
+        self.reconstructor = reconstructor(method, self.prior, guidance, name, self.super_resolution, sr_guided, sr_sampler,
                                            sr_noise_augmentation, samples, precision)
         if isinstance(self.reconstructor, CascadePosterior):
             self.settings |= _identity("super_resolution", super_resolution) | {

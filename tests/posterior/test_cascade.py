@@ -176,7 +176,7 @@ def test_in_tiles_the_result_is_that_of_the_whole_within_a_tolerance(cascade, xr
     assert len(tiled.tiles().starts(32)) == 3
     for guide in (True, False):
         whole, parts = (replace(method, cascade=Cascade(cascade.base, fine), sr_guided=guide).reconstruct(
-            xrays, PROJECTOR, seed=3).volume for fine in (cascade.fine, tiled))
+            xrays, PROJECTOR, seed=3).volume for fine in (cascade.super_resolution, tiled))
         assert 0 < (whole - parts).square().mean().sqrt() < 0.02 * whole.std()
 
 
@@ -194,7 +194,7 @@ def test_all_figures_are_finite_and_belong_to_the_volume(cascade, xrays):
     assert set(found.seconds) == {"base", "prepare", "sample", "score"}
     assert found.volume.min() >= -1000 and found.volume.max() <= 600
     assert found.masks.shape == (3, *FINE.shape) and 0 <= found.masks.min() and found.masks.max() <= 1
-    window = cascade.fine.window
+    window = cascade.super_resolution.window
     again = PROJECTOR(window.to_mu(window.to_range(found.volume))[None, None])[0]
     torch.testing.assert_close(found.reprojection, again, atol=1e-4, rtol=1e-4)
 

@@ -32,7 +32,7 @@ def stage(voxels=32, side=384.0, window=HUWindow(-1000, 600), factor=2, channels
 def test_stages_of_one_cube_and_window_make_a_cascade():
     base = tiny_prior(False)
     for fine in (stage(), stage(64, factor=4), stage(channels=4)):
-        assert Cascade(base, fine).fine is fine
+        assert Cascade(base, fine).super_resolution is fine
 
 
 @pytest.mark.parametrize("change, words", [

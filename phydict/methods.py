@@ -12,21 +12,8 @@ from phydict.baselines import CGLS, FDK, FISTATV, SIRT, DiffVox
 from phydict.datasets import format_report
 from phydict.grid import Grid
 from phydict.posterior import (
-    DAPS,
-    DDS,
-    DPS,
-    CascadePosterior,
-    DiffPIR,
-    ExactDraw,
-    GradientSteps,
-    PnPDM,
-    Posterior,
-    PriorOnly,
-    ProximalCG,
-    Reward,
-    Sampler,
-    SplitGibbs,
-)
+    DAPS, DDS, DPS, CascadePosterior, DiffPIR, ExactDraw, GradientSteps, PnPDM, Posterior, PriorOnly, ProximalCG,
+    Reward, Sampler, SplitGibbs)
 from phydict.prior import DEFAULT_PRIOR, Cascade, Prior, SuperResolution, load_prior, load_super_resolution
 from phydict.reconstruction import Reconstruction, Reconstructor
 from phydict.runtime.precision import check_precision

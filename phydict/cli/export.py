@@ -5,14 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from phydict.prior.files import (
-    build_prior,
-    build_super_resolution,
-    build_text,
-    has_text,
-    is_saved_prior,
-    save_prior,
-    save_super_resolution,
-)
+    build_prior, build_super_resolution, build_text, has_text, is_saved_prior, save_prior, save_super_resolution)
 from phydict.prior.inspection import inspect_prior
 from phydict.runtime.console import check_writable
 from phydict.training.checkpoints import read_checkpoint

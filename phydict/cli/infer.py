@@ -14,16 +14,8 @@ from phydict.inference.data import ReconstructionData
 from phydict.inference.dry_run import dry_run
 from phydict.inference.task import ReconstructionTask
 from phydict.runtime.console import (
-    check_apart,
-    check_command,
-    check_configured,
-    cli_errors,
-    noted,
-    quiet,
-    read_configurations,
-    sentence,
-    with_configurations,
-)
+    check_apart, check_command, check_configured, cli_errors, noted, quiet, read_configurations, sentence,
+    with_configurations)
 
 COMMANDS = {"predict": "X-rays -> volumes", "test": "CTs -> X-rays -> volumes and scores",
             "ablate": "methods compared on the same X-rays"}

@@ -17,13 +17,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from phydict.cli.export import export_prior, print_prior
 from phydict.runtime.console import (
-    check_command,
-    check_writable,
-    cli_errors,
-    quiet,
-    read_configurations,
-    with_configurations,
-)
+    check_command, check_writable, cli_errors, quiet, read_configurations, with_configurations)
 from phydict.runtime.files import atomic_write
 from phydict.runtime.precision import PRECISIONS, resolve_precision, trainer_precision
 from phydict.training.base import PriorTraining

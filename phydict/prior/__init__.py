@@ -3,16 +3,8 @@
 from phydict.prior.cascade import Cascade
 from phydict.prior.detail import DetailNetwork
 from phydict.prior.files import (
-    DEFAULT_PRIOR,
-    describe,
-    describe_super_resolution,
-    file_read,
-    fingerprint,
-    load_prior,
-    load_super_resolution,
-    save_prior,
-    save_super_resolution,
-)
+    DEFAULT_PRIOR, describe, describe_super_resolution, file_read, fingerprint, load_prior, load_super_resolution,
+    save_prior, save_super_resolution)
 from phydict.prior.inspection import inspect_prior
 from phydict.prior.local_unet import LocalUNet
 from phydict.prior.medsyn.checkpoint import MedSynCheckpoint

@@ -18,13 +18,7 @@ from phydict.prior.detail import DetailNetwork
 from phydict.prior.finite import check_finite, not_finite
 from phydict.prior.local_unet import LocalUNet
 from phydict.prior.medsyn.checkpoint import (
-    FILES,
-    MedSynCheckpoint,
-    as_checkpoint,
-    is_medsyn,
-    load_medsyn,
-    load_medsyn_super_resolution,
-)
+    FILES, MedSynCheckpoint, as_checkpoint, is_medsyn, load_medsyn, load_medsyn_super_resolution)
 from phydict.prior.medsyn.prior import MedSynPrior
 from phydict.prior.medsyn.super_resolution import MedSynSuperResolution
 from phydict.prior.prior import STATE, Prior

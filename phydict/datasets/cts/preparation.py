@@ -29,15 +29,7 @@ from phydict.datasets.cts.ct_series import Series, find_series, load_series
 from phydict.datasets.cts.prepared import VOLUME, read_record, write_prepared
 from phydict.datasets.cts.segmentations import lungs_by_lungmask, read_segmentation, segmentations_beside
 from phydict.datasets.cts.transforms import (
-    AIR,
-    SEGMENTATION_MM,
-    case_id,
-    centred,
-    check_hu,
-    covering_grid,
-    load_ct,
-    to_grid,
-)
+    AIR, SEGMENTATION_MM, case_id, centred, check_hu, covering_grid, load_ct, to_grid)
 from phydict.grid import Grid
 from phydict.runtime.files import atomic_directory, atomic_write, remove_leftovers
 from phydict.runtime.progress import CaseProgress

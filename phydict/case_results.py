@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple
 
-from phydict.atomic import remove_leftovers, undisturbed, whole_file, whole_folder
+from phydict.atomic import check_replaceable, remove_leftovers, undisturbed, whole_file, whole_folder
 from phydict.evaluation import markdown, write_csv
 from phydict.reading import not_written
 
@@ -131,11 +131,7 @@ class CaseResults:
 
     def _check_own(self, case: str, there: Finished) -> None:
         """Raises ValueError where a finished case's folder is not this project's alone, so that it must stay."""
-        folder = self.folder / case
-        strange = {file.name for file in folder.iterdir()} - {RECORD, *there.record.get("files", UNLISTED)}
-        if folder.is_symlink() or strange:
-            what = f"holds {', '.join(sorted(strange)[:3])}, which no reconstruction wrote" if strange else "is a link"
-            raise ValueError(f"{folder} {what}, and is not replaced: move that away, or give another model.out")
+        check_replaceable(self.folder / case, {RECORD, *there.record.get("files", UNLISTED)}, "model.out")
 
     def _is_free(self, case: str) -> bool:
         """Whether a result takes its place: not where another process has put the same there. Raises ValueError where

@@ -6,6 +6,7 @@ import argparse
 import errno
 import reprlib
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 import lightning
@@ -17,9 +18,10 @@ from lightning.pytorch.loggers import CSVLogger
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
-from phydict.atomic import whole_file
+from phydict.atomic import alone_in, whole_file
 from phydict.command_line import (
-    check_command, check_writable, one_sentence_errors, quiet, read_configurations, with_configurations)
+    check_command, check_configured, check_writable, one_sentence_errors, quiet, read_configurations,
+    with_configurations)
 from phydict.datamodule import PriorData
 from phydict.precision import PRECISIONS, resolve_precision, trainer_precision
 from phydict.prior import save_prior, save_super_resolution
@@ -28,7 +30,7 @@ from phydict.prior.finite import check_finite
 from phydict.prior.pretrained import inspect_prior, read_torch
 from phydict.prior_training import PriorTraining
 from phydict.reading import not_written
-from phydict.stage_training import CHECKPOINT
+from phydict.stage_training import CHECKPOINT, StageTraining
 from phydict.super_resolution_data import SuperResolutionData
 from phydict.super_resolution_training import SuperResolutionTraining
 from phydict.throughput import Throughput
@@ -56,7 +58,8 @@ def read_checkpoint(path: str | Path) -> dict:
     if not isinstance(stage, str) or stage not in STAGES:
         raise ValueError(f"{path} is damaged: its header is {reprlib.repr(header)}; give another checkpoint")
     if not isinstance(weights, dict) or not all(isinstance(name, str) for name in weights) or not all(
-            isinstance(weight, torch.Tensor) for name, weight in weights.items() if name.startswith(("prior.", "text."))):
+            isinstance(weight, torch.Tensor) for name, weight in weights.items()
+            if name.startswith(("prior.", "text."))):
         raise ValueError(f"{path} is damaged: its weights are {reprlib.repr(weights)}; give another checkpoint")
     for state in ("state_dict", "current_model_state"):
         check_finite(checkpoint.get(state, {}), path)
@@ -119,7 +122,8 @@ def stage_of(args: list[str]) -> str:
     stages += [settings["stage"] for settings in reversed(read_configurations(args)) if "stage" in settings]
     stage = stages[0] if stages else "base"
     if not isinstance(stage, str) or stage not in STAGES:
-        raise ValueError(f"the stages that can be trained are {' and '.join(STAGES)}, but {reprlib.repr(stage)} was given")
+        raise ValueError(f"the stages that can be trained are {' and '.join(STAGES)}, but {reprlib.repr(stage)} was "
+                         "given")
     return stage
 
 
@@ -133,8 +137,8 @@ class WholeCheckpoints(TorchCheckpointIO):
         except (OSError, RuntimeError) as error:
             if isinstance(error, RuntimeError):  # torch's words for a write that was cut short
                 error = OSError(errno.ENOSPC, "perhaps the disk is full")
-            raise not_written(f"the checkpoint {path}", error, "give another --out, and go on from the last one, if there "
-                              "is one, with --ckpt_path") from error
+            raise not_written(f"the checkpoint {path}", error, "give another --out, and go on from the last one, if "
+                              "there is one, with --ckpt_path") from error
 
 
 class BestCheckpoint(ModelCheckpoint):
@@ -189,8 +193,16 @@ class PriorCLI(LightningCLI):
             resolve_precision("bfloat16", device)  # warns where that is slow
         return super().instantiate_trainer(logger=logger, plugins=plugins, **kwargs)
 
-    def before_fit(self) -> None:
-        out, resumed = Path(self.config.fit.out), self.config.fit.ckpt_path
+    def fit(self, model: StageTraining, datamodule: PriorData, ckpt_path: str | None = None,
+            weights_only: bool | None = None) -> None:
+        """Train, alone in the folder of the run."""
+        out = Path(self.config.fit.out)
+        with alone_in(out, "--out") if self.trainer.is_global_zero else nullcontext():
+            self._begin(out, ckpt_path)
+            self.trainer.fit(model, datamodule=datamodule, ckpt_path=ckpt_path, weights_only=weights_only)
+
+    def _begin(self, out: Path, resumed: str | None) -> None:
+        """What comes before the first step. Raises ValueError where another training's files would be replaced."""
         if resumed and (resumed in ("last", "best") or Path(resumed).resolve().parent == out.resolve()):
             return
         for name in (CHECKPOINT, BEST):
@@ -223,8 +235,8 @@ class PriorCLI(LightningCLI):
         if checkpoint and checkpoint not in ("last", "best"):
             lacks = [part for part in RESUMED if part not in read_checkpoint(checkpoint)]
             if lacks:
-                raise ValueError(f"{checkpoint} lacks {', '.join(lacks)}, and cannot be gone on from: give the last.ckpt "
-                                 "of a training")
+                raise ValueError(f"{checkpoint} lacks {', '.join(lacks)}, and cannot be gone on from: give the "
+                                 "last.ckpt of a training")
 
 
 def main(args: list[str] | None = None) -> None:
@@ -237,6 +249,7 @@ def main(args: list[str] | None = None) -> None:
             auto_cli(print_prior, args=given[1:], exit_on_error=False, allow_abbrev=False)
         else:
             check_command(given, COMMANDS, PriorCLI.subcommands(), "fit -c configs/prior/phantom.yaml")
+            check_configured(given, ("--print_config",), "configs/prior/phantom.yaml")
             given = with_configurations(given, ("prior",))
             PriorCLI(*STAGES[stage_of(given)], args=given, seed_everything_default=0,
                      save_config_kwargs={"overwrite": True},

@@ -559,7 +559,8 @@ def test_a_case_depends_on_its_id_and_the_seed_alone(cts, tmp_path):
 def test_a_sample_of_the_prior_depends_on_the_seed_alone_and_is_that_of_python(prior, measured, tmp_path):
     given = ["--data.with_report=false", "--model.precision=float32"]
     main(with_prior("predict", tmp_path / "both", prior, f"--data.xrays={measured}", *given))
-    main(with_prior("predict", tmp_path / "other", prior, f"--data.xrays={measured / 'bert'}", "--model.seed=5", *given))
+    main(with_prior("predict", tmp_path / "other", prior, f"--data.xrays={measured / 'bert'}", "--model.seed=5",
+                    *given))
     case = load_xrays(measured / "bert")
     for name, seed in (("both", 0), ("other", 5)):
         expected = reconstruct(case["xrays"], case["beam"], prior, PriorOnly(2), seed=seed, precision="float32")

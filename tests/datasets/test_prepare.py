@@ -160,10 +160,12 @@ def position(paths, shift):
     (lambda p: position(p, lambda k: [0, 1.5 * k, 0]), "gantry was tilted by 14.0 degrees"),
     (lambda p: edit(p[9:10], PixelSpacing=[[5.0, 6.0]]), "PixelSpacing changes within the series"),
     (lacking, "slice005.dcm lacks RescaleIntercept"),
+    (lambda p: edit(p[9:10], PixelSpacing=[6.0]), "PixelSpacing of slice009.dcm must be 2 finite numbers"),
     (lambda p: p[7].write_bytes(p[7].read_bytes()[:1500]), "slice007.dcm cannot be read"),
     (lambda p: edit(p, ImageType=[["ORIGINAL", "PRIMARY", "LOCALIZER"]] * len(p)), "only localizer"),
     (lambda p: edit(p, NumberOfFrames=[2] * len(p)), "multi-frame")],
-    ids=["3 slices", "gap", "gaps", "twice", "uneven", "tilt", "pixels", "no rescale", "cut", "localizer", "frames"])
+    ids=["3 slices", "gap", "gaps", "twice", "uneven", "tilt", "pixels", "no rescale", "one spacing",
+         "cut", "localizer", "frames"])
 def test_a_bad_series_is_rejected_with_its_reason(tmp_path, thorax, spoil, reason):
     spoil(write_ct_series(tmp_path / "in/s", thorax, AFFINE))
     (found,) = rejected(tmp_path / "in", tmp_path / "out")

@@ -848,7 +848,7 @@ def dicom(**tags: object) -> Callable[[Path], Path]:
 
 def table_without_descriptor() -> pydicom.Dataset:
     table = pydicom.Dataset()
-    table.LUTData = [0, 1, 2]
+    table.add_new("LUTData", "US", [0, 1, 2])
     return table
 
 
@@ -968,7 +968,8 @@ def test_an_option_that_cannot_be_meant_is_one_sentence(change, words, measured,
 
 
 @pytest.mark.parametrize("change, words", [
-    ("--model.samples=1000000000", "samples=1000000000 states of"), ("--model.guidance=nan", "the guidance scale is")])
+    ("--model.samples=1000000000", "samples=1000000000 states of"), ("--model.guidance=nan", "model.guidance"),
+    ("--model.guidance=.nan", "the guidance scale is at least 0 and finite")])
 def test_an_option_of_a_prior_that_cannot_be_meant_is_one_sentence(change, words, prior, measured, tmp_path, capsys):
     said = refusal(capsys, with_prior("predict", tmp_path / "out", prior, f"--data.xrays={measured}", change))
     assert words in said and not (tmp_path / "out").exists()

@@ -301,13 +301,22 @@ def test_a_training_that_goes_on_elsewhere_overwrites_no_other(straight, cache, 
     assert (tmp_path / name).read_bytes() == b"another's"
 
 
-def test_of_two_trainings_at_once_in_one_folder_the_second_is_refused(straight, cache, tmp_path, capsys):
-    for folder, more in ((tmp_path, []), (straight, [f"--ckpt_path={straight / 'last.ckpt'}"])):
-        with alone_in(folder, "--out"):
-            before = sorted(folder.rglob("*"))
-            said = refusal(capsys, arguments(folder, cache, "--trainer.max_epochs=3", *more))
-            assert f"another run writes to {folder}: wait for its end, or give another --out" in said
-            assert sorted(folder.rglob("*")) == before
+def test_of_two_trainings_at_once_in_one_folder_the_second_is_refused(cache, tmp_path, capsys, monkeypatch):
+    short = ["--trainer.limit_train_batches=1", "--trainer.limit_val_batches=0", "--model.text=none"]
+    step, met = PriorTraining.training_step, []
+
+    def meanwhile(task, batch, index):
+        if len(met) <= task.current_epoch:
+            met.append(sorted(tmp_path.rglob("*")))
+            more = [f"--ckpt_path={tmp_path / 'last.ckpt'}"] if task.current_epoch else []
+            said = refusal(capsys, arguments(tmp_path, cache, "--trainer.max_epochs=3", *short, *more))
+            assert f"another run writes to {tmp_path}: wait for its end, or give another --out" in said
+            assert sorted(tmp_path.rglob("*")) == met[-1]
+        return step(task, batch, index)
+
+    monkeypatch.setattr(PriorTraining, "training_step", meanwhile)
+    main(arguments(tmp_path, cache, "--trainer.max_epochs=2", *short))
+    assert len(met) == 2 and checkpoint(tmp_path)["global_step"] == 2
 
 
 def test_a_killed_run_leaves_its_folder_free_even_while_its_loaders_live_on(tmp_path):
@@ -332,7 +341,7 @@ def test_a_killed_run_leaves_its_folder_free_even_while_its_loaders_live_on(tmp_
 
 @pytest.mark.parametrize("command", ["fit", "validate"])
 def test_a_missing_configuration_says_which_to_give(command, cache, tmp_path, capsys):
-    args = [command, *TINY, f"--data.cache={cache}", f"--out={tmp_path / 'run'}"]
+    args = [command, *TINY, "--trainer.max_epochs=1", f"--data.cache={cache}", f"--out={tmp_path / 'run'}"]
     assert "no configuration file was given: add -c <file>, such as -c configs/prior/phantom.yaml" in refusal(
         capsys, args)
     assert not (tmp_path / "run").exists()

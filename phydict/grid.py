@@ -37,8 +37,8 @@ class Grid:
         shape = whole_sizes(self.shape)
         if shape is None or len(shape) != 3:
             raise ValueError(f"a grid needs three positive sizes (X, Y, Z), whole numbers, but {self.shape} was given")
-        check_memory(3 * 4 * math.prod(shape), f"a reconstruction on {' x '.join(map(str, shape))} voxels, three volumes "
-                     "at least,", "give fewer voxels")
+        check_memory(3 * 4 * math.prod(shape), f"a reconstruction on {' x '.join(map(str, shape))} voxels, three "
+                     "volumes at least,", "give fewer voxels")
         if self.affine is None:
             if self.spacing is None:
                 raise ValueError("a grid needs either its spacing in mm or its index-to-world affine")

@@ -16,7 +16,6 @@ import yaml
 from prior.tiny import tiny_prior
 
 from phydict.ablation import plots, read_specification
-from phydict.ablation.run import alone_in
 from phydict.ablation.spec import changed, refined_from
 from phydict.ablation.summary import entries
 from phydict.ablation.tables import Table, all_tables, ranks
@@ -29,6 +28,7 @@ from phydict.grid import Grid
 from phydict.methods import METHODS
 from phydict.posterior import DAPS, SplitGibbs
 from phydict.prior import save_prior
+from phydict.runtime.files import alone_in
 from phydict.runtime.profiling import Stopwatch
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import ConeBeam, Projector
@@ -287,7 +287,7 @@ def test_arguments_and_files_that_cannot_be_meant_are_one_sentence(tmp_path, cap
     assert "nowhere" in refusal(capsys, ["ablate", "-c", str(file), "--cts", str(tmp_path / "nowhere")])
     (tmp_path / "bad.yaml").write_text("axes: [")
     assert "bad.yaml is not valid YAML" in refusal(capsys, ["ablate", "-c", str(tmp_path / "bad.yaml")])
-    with alone_in(tmp_path / "out"):
+    with alone_in(tmp_path / "out", "out"):
         assert "another run" in refusal(capsys, ["ablate", "-c", str(file)])
     (tmp_path / "out" / "results.csv").write_text("case,method\na,b\n")
     assert "another out" in refusal(capsys, ["ablate", "-c", str(file)])
@@ -301,7 +301,8 @@ def test_every_committed_specification_can_be_run(config):
         told = yaml.safe_load(config.read_text())["methods"]
         for views in (2, 8):
             names = {trial.name for trial in specification.trials if trial.data.beam.views == views}
-            assert {told.get(name, {}).get("of", name) for name in names} >= set(METHODS) - {"trace", "phydict_released"}
+            of = {told.get(name, {}).get("of", name) for name in names}
+            assert of >= set(METHODS) - {"trace", "phydict_released"}
 
 
 def test_parts_of_the_time_are_parts_of_it_and_calls_are_counted(tmp_path):

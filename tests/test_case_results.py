@@ -56,7 +56,7 @@ def test_an_older_record_without_a_list_is_read_and_its_case_replaced_if_nothing
     (old / RECORD).write_text(json.dumps(record()))
     assert CaseResults(old.parent).unfinished({"anna": "crc32 1"}, SETTINGS) == []
     (old / "notes.txt").write_text("mine")
-    with pytest.raises(ValueError, match="holds notes.txt, which no reconstruction wrote, and is not replaced"):
+    with pytest.raises(ValueError, match="holds notes.txt, which phydict did not write, and is not replaced"):
         begun(old.parent, overwrite=True)
     (old / "notes.txt").unlink()
     finish(begun(old.parent, overwrite=True), "new")

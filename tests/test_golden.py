@@ -121,13 +121,15 @@ def test_a_method_gives_its_golden_figures_in_double_precision(golden, name, sce
     assert_same(on_the_tiny_grid(name, torch.float64, scene), golden[f"{name}, {scene}"], 1e-6, 1e-3)
 
 
-@pytest.mark.parametrize(("name", "scene"), [case for case in scenes() if case[0] in ("phydict_fast", "dds", "sirt", "fdk", "cgls", "tv", "diffvox")])
+@pytest.mark.parametrize(("name", "scene"), [
+    case for case in scenes() if case[0] in ("phydict_fast", "dds", "sirt", "fdk", "cgls", "tv", "diffvox")])
 def test_a_method_gives_its_golden_figures_in_single_precision(golden, name, scene):
     assert_same(on_the_tiny_grid(name, torch.float32, scene), golden[f"{name}, {scene}"], 1e-3, 1.0)
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=[] if name in ("phydict_fast", "cgls") else [pytest.mark.slow])
-                                  for name in ON_THE_EXAMPLE])
+@pytest.mark.parametrize("name", [
+    pytest.param(name, marks=[] if name in ("phydict_fast", "cgls") else [pytest.mark.slow])
+    for name in ON_THE_EXAMPLE])
 def test_a_method_gives_its_golden_figures_on_the_example(golden, name):
     assert_same(on_the_example(name), golden[f"{name}, example"], 1e-3, 2.0)
 

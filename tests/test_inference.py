@@ -8,12 +8,16 @@ import os
 import resource
 import shutil
 import socket
+import struct
 import subprocess
 import sys
+import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import nibabel
 import numpy as np
+import pydicom
 import pytest
 import torch
 import yaml
@@ -559,7 +563,8 @@ def test_a_case_depends_on_its_id_and_the_seed_alone(cts, tmp_path):
 def test_a_sample_of_the_prior_depends_on_the_seed_alone_and_is_that_of_python(prior, measured, tmp_path):
     given = ["--data.with_report=false", "--model.precision=float32"]
     main(with_prior("predict", tmp_path / "both", prior, f"--data.xrays={measured}", *given))
-    main(with_prior("predict", tmp_path / "other", prior, f"--data.xrays={measured / 'bert'}", "--model.seed=5", *given))
+    main(with_prior("predict", tmp_path / "other", prior, f"--data.xrays={measured / 'bert'}", "--model.seed=5",
+                    *given))
     case = load_xrays(measured / "bert")
     for name, seed in (("both", 0), ("other", 5)):
         expected = reconstruct(case["xrays"], case["beam"], prior, PriorOnly(2), seed=seed, precision="float32")
@@ -800,6 +805,186 @@ def test_a_bad_prior_is_one_sentence(case, prior, measured, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
+GEOMETRY = """beam:
+  orbit: {views: 3, source_to_detector: 1020, source_to_isocentre: 740, shape: [24, 24], pixel: [24, 24]}
+"""
+LAUGHS = "".join(f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]\n" for a, b in zip("abcdefgh", "bcdefghi"))
+
+
+def geometry(old: str = "", new: str = "") -> Callable[[Path], object]:
+    """Writes X-rays of noise whose geometry.yaml says `new` in place of `old`."""
+    assert old in GEOMETRY
+    return lambda at: (xrays(at) / "geometry.yaml").write_text(GEOMETRY.replace(old, new) if old else new)
+
+
+def image(write: Callable[[Path], object], ending: str = "npy") -> Callable[[Path], None]:
+    """Writes X-rays of noise, the second of them by `write`."""
+    def make(at: Path) -> None:
+        (xrays(at) / "view_1.npy").unlink()
+        write(at / f"view_1.{ending}")
+    return make
+
+
+def bomb(file: Path) -> None:
+    """A PNG of 50000 x 50000 pixels in less than a hundred bytes."""
+    parts = [(b"IHDR", struct.pack(">IIBBBBB", 50_000, 50_000, 8, 0, 0, 0, 0)), (b"IDAT", zlib.compress(b"")),
+             (b"IEND", b"")]
+    file.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in parts))
+
+
+def terabytes(file: Path) -> None:
+    """A .npy file whose header promises 4 TB."""
+    with file.open("wb") as stream:
+        np.lib.format.write_array_header_1_0(stream, {"descr": "<f4", "fortran_order": False, "shape": (10**6, 10**6)})
+
+
+def dicom(**tags: object) -> Callable[[Path], Path]:
+    """Writes a DICOM run of three views with other tags."""
+    usual = orbit_tags(3, 1020.0, 740.0, (24.0, 24.0))
+    return lambda at: write_dicom(at / "run.dcm", np.ones((3, 24, 24), np.uint16), **usual | tags)
+
+
+def table_without_descriptor() -> pydicom.Dataset:
+    table = pydicom.Dataset()
+    table.add_new("LUTData", "US", [0, 1, 2])
+    return table
+
+
+SPOILT_XRAYS = {
+    "bomb": (image(bomb, "png"), ["view_1.png cannot be read", "decompression bomb"]),
+    "terabytes": (image(terabytes), ["view_1.npy cannot be read", "promises 4,000,000,000,000 bytes"]),
+    "zipped": (image(lambda file: np.savez(file.open("wb"), np.ones((24, 24)))), ["view_1.npy cannot be read"]),
+    "complex": (image(lambda file: np.save(file, np.ones((24, 24), complex))), ["view_1.npy", "type complex128"]),
+    "infinite": (geometry("1020", ".inf"), ["geometry.yaml", "source_to_detector must be finite"]),
+    "400 digits": (geometry("1020", "9" * 400), ["geometry.yaml", "source_to_detector"]),
+    "brackets": (geometry(new="beam: " + "[" * 20_000), ["geometry.yaml", "nested more than 32 levels"]),
+    "anchors": (geometry(new="a: &a [1, 2, 3, 4, 5, 6, 7, 8, 9]\n" + LAUGHS), ["geometry.yaml", "by aliases"]),
+    "many views": (geometry("views: 3", "views: 1000000000"), ["geometry.yaml", "1000000000 views", "3 images"]),
+    "quoted": (geometry("1020", "'1020'"), ["geometry.yaml", "source_to_detector", "without units and quotes"]),
+    "three sizes": (geometry("[24, 24]}", "[24, 24, 24]}"), ["geometry.yaml", "pixel must be"]),
+    "a month of 13": (geometry("1020", "2024-13-01"), ["geometry.yaml", "source_to_detector", "'2024-13-01'"]),
+    "part of a pixel": (geometry("shape: [24, 24]", "shape: [24.9, 24]"), ["geometry.yaml", "whole numbers", "24.9"]),
+    "twice": (geometry("views: 3", "views: 3, views: 4"), ["geometry.yaml", "`beam.orbit.views` is given twice"]),
+    "latin-1": (lambda at: (xrays(at) / "geometry.yaml").write_bytes(b"# \xe9\n"), ["geometry.yaml is not UTF-8"]),
+    "latin-1 report": (lambda at: (xrays(at) / "report.txt").write_bytes(b"\xe9"), ["report.txt is not UTF-8"]),
+    "one spacing": (dicom(ImagerPixelSpacing=24.0), ["run.dcm", "ImagerPixelSpacing"]),
+    "no descriptor": (dicom(ModalityLUTSequence=[table_without_descriptor()]), ["modality LUT of", "run.dcm"]),
+}
+
+
+def voxels_of(kind: object) -> Callable[[Path], object]:
+    return lambda file: write_ct(file, 0, change=lambda hu: np.zeros(hu.shape, kind))
+
+
+def endless(file: Path) -> None:
+    """A NIfTI file whose header promises 32000^3 voxels."""
+    content = bytearray(write_ct(file, 0).read_bytes())
+    content[40:48] = struct.pack("<4h", 3, 32_000, 32_000, 32_000)
+    file.write_bytes(content)
+
+
+SPOILT_CTS = {
+    "endless": (endless, ["endless.nii", "promises 131,072,000,000,000 bytes"]),
+    "colours": (voxels_of([("R", "u1"), ("G", "u1"), ("B", "u1")]), ["colours.nii", "one real number each"]),
+    "complex": (voxels_of(np.complex64), ["complex.nii", "one real number each"]),
+}
+
+
+def assert_told(capsys, args: list[str], spoilt: dict, good: Path) -> None:
+    """A run over `spoilt` cases and a good one says a sentence of each spoilt one, and writes the good one alone."""
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as stopped:
+        main(args)
+    said = capsys.readouterr().err
+    lines = [line.removeprefix("error: ") for line in said.splitlines() if line.startswith("error: ")]
+    assert stopped.value.code == 2 and "Traceback" not in said
+    assert f"{len(spoilt)} of {len(spoilt) + 1} cases were not reconstructed" in lines[-1]
+    found = dict(line.split(": ", 1) for line in lines[:-1])
+    assert sorted(found) == sorted(spoilt) and len(lines) == len(spoilt) + 1
+    wrong = {name: found[name] for name, (_, words) in spoilt.items() if any(word not in found[name] for word in words)}
+    assert not wrong
+    assert [path for path in good.parent.iterdir() if path.is_dir()] == [good] and names(good) == FILES
+
+
+def test_each_spoilt_folder_of_xrays_is_one_sentence_and_the_good_one_is_reconstructed(measured, tmp_path, capsys):
+    shutil.copytree(measured / "bert", tmp_path / "in" / "bert")
+    for name, (make, _) in SPOILT_XRAYS.items():
+        (tmp_path / "in" / name).mkdir()
+        make(tmp_path / "in" / name)
+    args = sirt("predict", tmp_path / "out", f"--data.xrays={tmp_path / 'in'}")
+    assert_told(capsys, args, SPOILT_XRAYS, tmp_path / "out" / "sirt" / "bert")
+
+
+def test_each_spoilt_ct_is_one_sentence_and_the_good_one_is_reconstructed(cts, tmp_path, capsys):
+    (tmp_path / "in").mkdir()
+    shutil.copyfile(cts / "a.nii.gz", tmp_path / "in" / "a.nii.gz")
+    for name, (make, _) in SPOILT_CTS.items():
+        make(tmp_path / "in" / f"{name}.nii")
+    args = sirt("test", tmp_path / "out", f"--data.cts={tmp_path / 'in'}", *ORBIT)
+    assert_told(capsys, args, SPOILT_CTS, tmp_path / "out" / "sirt" / "a")
+
+
+def headed(good: Path, target: Path, header: object) -> Path:
+    """A prior's file with this header, as JSON where it is no text, and changed by it where it is a function."""
+    with safe_open(good, "pt") as file:
+        known = json.loads(file.metadata()["phydict"])
+    header = header(known) if callable(header) else header
+    save_file(load_file(good), target, {"phydict": header if isinstance(header, str) else json.dumps(header)})
+    return target
+
+
+@pytest.mark.parametrize("header, words", [
+    ([], "no phydict prior of format"), (None, "no phydict prior of format"), ("[" * 100_000, "nested too deeply"),
+    (lambda known: known | {"stage": ["base"]}, "of stage ['base']"),
+    (lambda known: {key: value for key, value in known.items() if key != "text"}, "text is 'missing'"),
+    (lambda known: known | {"sigma_data": "half"}, "sigma_data is 'half'"),
+    (lambda known: known | {"network": known["network"] | {"channels": "many"}}, "network.channels is 'many'"),
+    (lambda known: known | {"grid": 3}, "the network that the header describes"),
+], ids=["list", "null", "deep", "stage", "text", "number", "channels", "grid"])
+def test_a_priors_header_that_cannot_be_is_one_sentence(header, words, prior, measured, tmp_path, capsys):
+    file = headed(prior, tmp_path / "p.safetensors", header)
+    said = refusal(capsys, with_prior("predict", tmp_path / "out", file, f"--data.xrays={measured}"))
+    assert "p.safetensors" in said and words in said and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("change, words", [
+    (["--model.voxels=0"], "a whole number of voxels"), (["--model.voxels=100000"], "GiB of memory"),
+    (["--model.seed=-1"], "a seed is a whole number"), ([f"--model.seed={2**70}"], "a seed is a whole number"),
+    (["--model.method.init_args.mu_water=0"], "mu_water"), (["--model.method.init_args.mu_water=-1"], "mu_water"),
+    (["--model.ou={tmp}/out"], "model.ou"), (["--data.xray={tmp}"], "data.xray"), (["--data.xray", "3"], "data.xray"),
+    (["--config={tmp}/twice.yaml"], "twice.yaml: `model.seed` is given twice"),
+    (["--config={tmp}/laughs.yaml"], "by aliases"), (["--config={tmp}/latin.yaml"], "latin.yaml is not UTF-8"),
+    (["--config={tmp}/deep.yaml"], "nested more than 32 levels"),
+], ids=lambda value: value[0].strip("-") if isinstance(value, list) else "")
+def test_an_option_that_cannot_be_meant_is_one_sentence(change, words, measured, tmp_path, capsys):
+    for name, text in (("twice", "model: {seed: 1, seed: 2}"), ("deep", "[" * 20_000),
+                       ("laughs", "a: &a [1, 2, 3, 4, 5, 6, 7, 8, 9]\n" + LAUGHS), ("latin", "# \xe9")):
+        (tmp_path / f"{name}.yaml").write_text(text, encoding="latin-1")
+    change = [text.format(tmp=tmp_path) for text in change]
+    said = refusal(capsys, sirt("predict", tmp_path / "out", f"--data.xrays={measured}", *change))
+    assert words in said and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("change, words", [
+    ("--model.samples=1000000000", "samples=1000000000 states of"), ("--model.guidance=nan", "model.guidance"),
+    ("--model.guidance=.nan", "the guidance scale is at least 0 and finite")])
+def test_an_option_of_a_prior_that_cannot_be_meant_is_one_sentence(change, words, prior, measured, tmp_path, capsys):
+    said = refusal(capsys, with_prior("predict", tmp_path / "out", prior, f"--data.xrays={measured}", change))
+    assert words in said and not (tmp_path / "out").exists()
+
+
+def test_a_fault_of_the_projects_own_shows_its_trace_and_on_request_every_refusal_does(measured, tmp_path, monkeypatch):
+    args = sirt("predict", tmp_path, f"--data.xrays={measured}")
+    with monkeypatch.context() as patch, pytest.raises(TypeError, match="a fault"):
+        patch.setattr(SIRT, "solve", lambda *_: exec("raise TypeError('a fault')"))
+        main(args)
+    monkeypatch.setenv("PHYDICT_TRACEBACK", "1")
+    with pytest.raises(ValueError, match="a seed is a whole number"):
+        main([*args, "--model.seed=-1"])
+
+
 @pytest.mark.parametrize("guided", [True, False])
 def test_a_second_stage_is_scored_on_the_fine_grid(guided, prior, fine, cts, tmp_path):
     main(with_prior("test", tmp_path, prior, f"--data.cts={cts / 'a.nii.gz'}", *ORBIT,
@@ -909,7 +1094,7 @@ def test_a_disk_that_fills_up_leaves_no_case_that_looks_finished(measured, tmp_p
         said = refusal(capsys, args)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert "anna" in said and "could not be written" in said
+    assert "anna" in said and "could not be written" in said and "free some space" not in said  # the disk is not full
     assert names(tmp_path / "sirt") == []
     main(args)
     assert names(tmp_path / "sirt") == ["anna", "bert"]

@@ -24,6 +24,7 @@ from phydict.datasets import Thorax, phantom_case
 from phydict.datasets.phantoms.cached import CachedPhantoms
 from phydict.grid import Grid
 from phydict.prior import VolumeUNet, load_prior, save_prior
+from phydict.runtime.files import alone_in
 from phydict.training import PriorTraining
 from phydict.training.base import reconstruction_scores
 from phydict.training.data import PriorData
@@ -103,7 +104,8 @@ def test_a_log_file_tells_steps_in_whole_lines_and_nothing_of_lightnings(tmp_pat
         said = (run.stdout + run.stderr).splitlines()
         last = f"step {more[0].split('=')[1]} of {more[0].split('=')[1]}: loss "
         assert any(line.startswith(last) and "samples_per_s" in line for line in said), said
-        assert all(line.startswith(("step ", "training ", "report ", "preparing ", "text map ", "Seed")) for line in said)
+        known = ("step ", "training ", "report ", "preparing ", "text map ", "Seed")
+        assert all(line.startswith(known) for line in said)
 
 
 def test_a_killed_run_goes_on_as_if_it_had_not_been(tmp_path, straight, cache):
@@ -300,6 +302,52 @@ def test_a_training_that_goes_on_elsewhere_overwrites_no_other(straight, cache, 
         said = refusal(capsys, arguments(tmp_path, cache, "--trainer.max_epochs=3", *more))
         assert f"--ckpt_path {tmp_path / name}" in said and "--out" in said
     assert (tmp_path / name).read_bytes() == b"another's"
+
+
+def test_of_two_trainings_at_once_in_one_folder_the_second_is_refused(cache, tmp_path, capsys, monkeypatch):
+    short = ["--trainer.limit_train_batches=1", "--trainer.limit_val_batches=0", "--model.text=none"]
+    step, met = PriorTraining.training_step, []
+
+    def meanwhile(task, batch, index):
+        if len(met) <= task.current_epoch:
+            met.append(sorted(tmp_path.rglob("*")))
+            more = [f"--ckpt_path={tmp_path / 'last.ckpt'}"] if task.current_epoch else []
+            said = refusal(capsys, arguments(tmp_path, cache, "--trainer.max_epochs=3", *short, *more))
+            assert f"another run writes to {tmp_path}: wait for its end, or give another --out" in said
+            assert sorted(tmp_path.rglob("*")) == met[-1]
+        return step(task, batch, index)
+
+    monkeypatch.setattr(PriorTraining, "training_step", meanwhile)
+    main(arguments(tmp_path, cache, "--trainer.max_epochs=2", *short))
+    assert len(met) == 2 and checkpoint(tmp_path)["global_step"] == 2
+
+
+def test_a_killed_run_leaves_its_folder_free_even_while_its_loaders_live_on(tmp_path):
+    code = """if True:
+        import os, sys, time
+        from pathlib import Path
+        from phydict.runtime.files import alone_in
+        with alone_in(Path(sys.argv[1]), "--out"):
+            if os.fork() == 0:
+                print(os.getpid(), flush=True)
+            time.sleep(60)"""
+    run = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True,
+                           cwd=CONFIG.parents[2])
+    loader = int(run.stdout.readline())
+    with pytest.raises(ValueError, match="another run"), alone_in(tmp_path, "--out"):
+        pass
+    run.kill()
+    run.wait(60)
+    with alone_in(tmp_path, "--out"):
+        os.kill(loader, signal.SIGKILL)  # was alive until now
+
+
+@pytest.mark.parametrize("command", ["fit", "validate"])
+def test_a_missing_configuration_says_which_to_give(command, cache, tmp_path, capsys):
+    args = [command, *TINY, "--trainer.max_epochs=1", f"--data.cache={cache}", f"--out={tmp_path / 'run'}"]
+    assert "no configuration file was given: add -c <file>, such as -c configs/prior/phantom.yaml" in refusal(
+        capsys, args)
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_list_of_someone_elses_is_not_replaced(cts, cache, tmp_path, capsys):

@@ -9,11 +9,12 @@ import torch
 from jsonargparse import ArgumentParser
 
 from phydict.ablation.plots import write_plots
-from phydict.ablation.run import RESULTS, alone_in, run
+from phydict.ablation.run import RESULTS, run
 from phydict.ablation.spec import read_specification
 from phydict.ablation.summary import entries
 from phydict.ablation.tables import all_tables, write_tables
 from phydict.runtime.console import check_configured, check_writable, cli_errors, quiet
+from phydict.runtime.files import alone_in
 from phydict.runtime.progress import CaseProgress
 
 
@@ -25,7 +26,7 @@ def main(args: list[str] | None = None) -> None:
         device = given.pop("device") or ("cuda" if torch.cuda.is_available() else "cpu")
         specification = read_specification(given.pop("config"), **given)
         check_writable(specification.out, "out")
-        with alone_in(specification.out), CaseProgress() as progress:
+        with alone_in(specification.out, "out"), CaseProgress() as progress:
             rows = run(specification, torch.device(device), progress)
         print(f"{len(rows)} rows in {specification.out / RESULTS}")
         found = entries(rows)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import warnings
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
 
@@ -80,18 +78,6 @@ class Results:
         """The table with the columns in one order, whatever order its rows came in."""
         order = dict.fromkeys(k for row in self.planned.values() for k in row) | dict.fromkeys((*MEASURED, "key"))
         write_csv(self.file, [{k: row.get(k) for k in order} | row for row in self.rows + self.others])
-
-
-@contextmanager
-def alone_in(folder: Path) -> Iterator[None]:
-    """Raises ValueError where another process is inside with the same folder."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with open(folder / ".lock", "a") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise ValueError(f"another run writes to {folder}: wait for its end, or give another out") from error
-        yield
 
 
 def run(specification: Specification, device: torch.device, progress: CaseProgress) -> list[dict]:

@@ -205,7 +205,8 @@ def _trials(base: Mapping, axes: Mapping, methods: Mapping, cases: Cases) -> tup
         if not isinstance(values, list) or not values:
             raise ValueError(f"the axis {name} is a list of at least one value, but {values!r} was given")
     if (count := math.prod(map(len, axes.values()))) > MOST_TRIALS:
-        raise ValueError(f"the axes stand for {count:,} combinations, but at most {MOST_TRIALS:,} are run: shorten them")
+        raise ValueError(f"the axes stand for {count:,} combinations, but at most {MOST_TRIALS:,} are run: shorten "
+                         "them")
     found, used = [], set()
     for values in product(*axes.values()):
         mine = dict(zip(axes, values))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import reprlib
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 import lightning
@@ -17,15 +18,15 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from phydict.cli.export import export_prior, print_prior
 from phydict.runtime.console import (
-    check_command, check_writable, cli_errors, quiet, read_configurations, with_configurations)
-from phydict.runtime.files import atomic_write
+    check_command, check_configured, check_writable, cli_errors, quiet, read_configurations, with_configurations)
+from phydict.runtime.files import alone_in, atomic_write
 from phydict.runtime.precision import PRECISIONS, resolve_precision, trainer_precision
 from phydict.training.base import PriorTraining
 from phydict.training.checkpoints import BEST, HELD_OUT, RESUMED, BestCheckpoint, WholeCheckpoints, read_checkpoint
 from phydict.training.crops import SuperResolutionData
 from phydict.training.data import PriorData
 from phydict.training.progress import TrainingProgress
-from phydict.training.stage import CHECKPOINT
+from phydict.training.stage import CHECKPOINT, StageTraining
 from phydict.training.super_resolution import SuperResolutionTraining
 from phydict.training.throughput import Throughput
 
@@ -45,7 +46,8 @@ def stage_of(args: list[str]) -> str:
     stages += [settings["stage"] for settings in reversed(read_configurations(args)) if "stage" in settings]
     stage = stages[0] if stages else "base"
     if not isinstance(stage, str) or stage not in STAGES:
-        raise ValueError(f"the stages that can be trained are {' and '.join(STAGES)}, but {reprlib.repr(stage)} was given")
+        raise ValueError(f"the stages that can be trained are {' and '.join(STAGES)}, but {reprlib.repr(stage)} was "
+                         "given")
     return stage
 
 
@@ -93,8 +95,16 @@ class PriorCLI(LightningCLI):
             resolve_precision("bfloat16", device)  # warns where that is slow
         return super().instantiate_trainer(logger=logger, plugins=plugins, **kwargs)
 
-    def before_fit(self) -> None:
-        out, resumed = Path(self.config.fit.out), self.config.fit.ckpt_path
+    def fit(self, model: StageTraining, datamodule: PriorData, ckpt_path: str | None = None,
+            weights_only: bool | None = None) -> None:
+        """Train, alone in the folder of the run."""
+        out = Path(self.config.fit.out)
+        with alone_in(out, "--out") if self.trainer.is_global_zero else nullcontext():
+            self._begin(out, ckpt_path)
+            self.trainer.fit(model, datamodule=datamodule, ckpt_path=ckpt_path, weights_only=weights_only)
+
+    def _begin(self, out: Path, resumed: str | None) -> None:
+        """What comes before the first step. Raises ValueError where another training's files would be replaced."""
         if resumed and (resumed in ("last", "best") or Path(resumed).resolve().parent == out.resolve()):
             return
         for name in (CHECKPOINT, BEST):
@@ -127,8 +137,8 @@ class PriorCLI(LightningCLI):
         if checkpoint and checkpoint not in ("last", "best"):
             lacks = [part for part in RESUMED if part not in read_checkpoint(checkpoint)]
             if lacks:
-                raise ValueError(f"{checkpoint} lacks {', '.join(lacks)}, and cannot be gone on from: give the last.ckpt "
-                                 "of a training")
+                raise ValueError(f"{checkpoint} lacks {', '.join(lacks)}, and cannot be gone on from: give the "
+                                 "last.ckpt of a training")
 
 
 def main(args: list[str] | None = None) -> None:
@@ -141,6 +151,7 @@ def main(args: list[str] | None = None) -> None:
             auto_cli(print_prior, args=given[1:], exit_on_error=False, allow_abbrev=False)
         else:
             check_command(given, COMMANDS, PriorCLI.subcommands(), "fit -c configs/prior/phantom.yaml")
+            check_configured(given, ("--print_config",), "configs/prior/phantom.yaml")
             given = with_configurations(given, ("prior",))
             PriorCLI(*STAGES[stage_of(given)], args=given, seed_everything_default=0,
                      save_config_kwargs={"overwrite": True},

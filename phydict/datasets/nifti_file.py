@@ -32,7 +32,7 @@ def open_nifti(path: Path) -> SpatialImage:
         raise ValueError(f"its header gives it the shape {tuple(shape)}")
     needed, size = math.prod(map(int, shape)) * kind.itemsize, path.stat().st_size
     if needed > size * (MOST_SQUEEZED if path.name.lower().endswith(".gz") else 1):
-        raise ValueError(f"its header promises {needed:,} bytes of voxels, shape {tuple(shape)}, but the file has {size:,}"
-                         ": it is truncated or damaged")
+        raise ValueError(f"its header promises {needed:,} bytes of voxels, shape {tuple(shape)}, but the file has "
+                         f"{size:,}: it is truncated or damaged")
     check_memory(math.prod(map(int, shape)) * (kind.itemsize + 8), f"its shape {tuple(shape)}", "give a smaller one")
     return image

@@ -83,8 +83,8 @@ class ReconstructionData(lightning.LightningDataModule):
         if not 1 <= phantoms <= MOST_PHANTOMS:
             raise ValueError(f"data.phantoms lies between 1 and {MOST_PHANTOMS:,}, but {phantoms:,} was given")
         if simulation_voxels is not None and simulation_voxels < 1:
-            raise ValueError(f"data.simulation_voxels must be at least 1, but {simulation_voxels} was given: leave it out "
-                             "for the reconstruction's own")
+            raise ValueError(f"data.simulation_voxels must be at least 1, but {simulation_voxels} was given: leave it "
+                             "out for the reconstruction's own")
         self.xrays, self.geometry, self.cts, self.phantoms, self.only = xrays, geometry, cts, phantoms, only
         self.tables = {"reports": reports, "metadata": metadata, "fixed": fixed,
                        "first_reconstruction": first_reconstruction, "exclude": exclude}

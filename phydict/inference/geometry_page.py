@@ -44,8 +44,8 @@ def view_sides(beam: ConeBeam, grid: Grid) -> list[str]:
 
 
 def agreement(xray: np.ndarray, thorax: np.ndarray) -> str:
-    """How well a view (V, U) correlates with the standard thorax's, and what clearly agrees better, if anything: a flip,
-    or the image inverted."""
+    """How well a view (V, U) correlates with the standard thorax's, and what clearly agrees better, if anything: a
+    flip, or the image inverted."""
     found = {name: _correlation(xray[::rows, ::columns], thorax) for name, (rows, columns) in FLIPS.items()}
     best = max(found, key=found.get)
     said = f"agreement {found['as it is']:.2f}"

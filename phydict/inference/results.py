@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from phydict.evaluation import markdown, write_csv
-from phydict.runtime.files import atomic_directory, atomic_write, remove_leftovers, undisturbed
+from phydict.runtime.files import atomic_directory, atomic_write, check_replaceable, remove_leftovers, undisturbed
 from phydict.runtime.reading import not_written
 
 RECORD = "reconstruction.json"
@@ -131,11 +131,7 @@ class CaseResults:
 
     def _check_own(self, case: str, there: Finished) -> None:
         """Raises ValueError where a finished case's folder is not this project's alone, so that it must stay."""
-        folder = self.folder / case
-        strange = {file.name for file in folder.iterdir()} - {RECORD, *there.record.get("files", UNLISTED)}
-        if folder.is_symlink() or strange:
-            what = f"holds {', '.join(sorted(strange)[:3])}, which no reconstruction wrote" if strange else "is a link"
-            raise ValueError(f"{folder} {what}, and is not replaced: move that away, or give another model.out")
+        check_replaceable(self.folder / case, {RECORD, *there.record.get("files", UNLISTED)}, "model.out")
 
     def _is_free(self, case: str) -> bool:
         """Whether a result takes its place: not where another process has put the same there. Raises ValueError where

@@ -166,8 +166,8 @@ def check_stage(header: dict, stage: str, name: str) -> None:
     found = header.get("stage", "base")
     if found != stage:
         kind = STAGES.get(found) if isinstance(found, str) else None
-        raise ValueError(f"{name} is {kind or f'of stage {reprlib.repr(found)}'}, but {STAGES[stage]} is needed here: give the file of "
-                         "that stage")
+        raise ValueError(f"{name} is {kind or f'of stage {reprlib.repr(found)}'}, but {STAGES[stage]} is needed "
+                         "here: give the file of that stage")
 
 
 def fingerprint(path: str | Path | MedSynCheckpoint) -> int:
@@ -231,7 +231,8 @@ def _built(made: Callable[[], nn.Module], weights: dict[str, Tensor], header: di
         unlike = [k for k in shapes.keys() | weights.keys() if k not in shapes or k not in weights
                   or shapes[k] != weights[k].shape]
         if unlike:
-            raise ValueError(f"{len(unlike)} of them are missing, unexpected or of another shape, such as {min(unlike)}")
+            raise ValueError(f"{len(unlike)} of them are missing, unexpected or of another shape, such as "
+                             f"{min(unlike)}")
         stage = made()
         stage.load_state_dict(weights)
     except Exception as error:  # of whatever kind: it is the header that leads to it
@@ -282,8 +283,8 @@ def has_text(header: dict) -> bool:
     words = text["vocabulary"]
     if not isinstance(text["source"], str | None) or text["source"] is None and not (
             isinstance(words, list) and all(isinstance(word, str) for word in words)):
-        raise ValueError(f"text.source is {reprlib.repr(text['source'])} and text.vocabulary {reprlib.repr(words)}, where "
-                         "one of them names a text encoder or lists words")
+        raise ValueError(f"text.source is {reprlib.repr(text['source'])} and text.vocabulary {reprlib.repr(words)}, "
+                         "where one of them names a text encoder or lists words")
     return True
 
 

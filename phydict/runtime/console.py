@@ -138,7 +138,8 @@ def read_configurations(args: Sequence[str]) -> list[dict]:
             raise ValueError(f"{file} holds no settings: it is a mapping, such as `model: {{...}}`")
         for name in ("model", "data", "trainer"):
             if not isinstance(settings.get(name, {}), dict):
-                raise ValueError(f"{file}: `{name}` is a mapping of settings, but {reprlib.repr(settings[name])} was given")
+                raise ValueError(f"{file}: `{name}` is a mapping of settings, but {reprlib.repr(settings[name])} was "
+                                 "given")
     return list(found.values())
 
 

@@ -1,4 +1,5 @@
-"""Files and folders that appear whole or not at all, whatever stops the process that writes them."""
+"""Files and folders that appear whole or not at all, whatever stops the process that writes them, and that replace
+nothing of someone else's."""
 
 from __future__ import annotations
 
@@ -7,7 +8,7 @@ import os
 import shutil
 import socket
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -65,6 +66,34 @@ def undisturbed(folder: Path) -> Iterator[None]:
         yield
     finally:
         os.close(handle)
+
+
+@contextmanager
+def alone_in(folder: Path, option: str) -> Iterator[None]:
+    """Makes the folder; raises ValueError where another process is inside with it. `option` is what the user may
+    change.
+
+    However the process ends, the next one may go in at once, even while processes that it forked live on.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(folder / ".lock", "a") as lock:
+        os.register_at_fork(after_in_child=lock.close)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise ValueError(f"another run writes to {folder}: wait for its end, or give another {option}") from error
+        except OSError:  # a file system without locks
+            pass
+        yield
+
+
+def check_replaceable(folder: Path, written: Collection[str], option: str) -> None:
+    """Raises ValueError where `folder` is a link or holds more than the files `written`, so that it must stay; `option`
+    is what the user may change instead."""
+    strange = {file.name for file in folder.iterdir()} - set(written)
+    if folder.is_symlink() or strange:
+        what = f"holds {', '.join(sorted(strange)[:3])}, which phydict did not write" if strange else "is a link"
+        raise ValueError(f"{folder} {what}, and is not replaced: move that away, or give another {option}")
 
 
 def remove_leftovers(folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""What the stages of a computation take: seconds, calls and peak memory, measured while someone asks and free otherwise.
+"""What the stages of a computation take: seconds, calls and peak memory, measured while someone asks, else free.
 
 The peak is that of the process' resident memory on Linux, where the kernel's mark can be set back before each stage;
 elsewhere it is the largest so far. On a CUDA device it is also that of the tensors there.

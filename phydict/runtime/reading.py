@@ -58,7 +58,8 @@ def read_text(path: str | Path) -> str:
     path = Path(path)
     size = path.stat().st_size
     if size > MOST_TEXT:
-        raise Unreadable(f"{path} has {size:,} bytes, but no more than {MOST_TEXT:,} of text are read; give another file")
+        raise Unreadable(f"{path} has {size:,} bytes, but no more than {MOST_TEXT:,} of text are read; give another "
+                         "file")
     try:
         return path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:

@@ -56,7 +56,8 @@ class PriorData(lightning.LightningDataModule):
                  window: tuple[float, float] = (-1000.0, 1000.0)):
         super().__init__()
         check_seed(seed)
-        for name, value, least in (("epoch_size", epoch_size, 1), ("batch_size", batch_size, 1), ("workers", workers, 0)):
+        for name, value, least in (("epoch_size", epoch_size, 1), ("batch_size", batch_size, 1),
+                                   ("workers", workers, 0)):
             if not least <= value <= MOST_DRAWS:
                 raise ValueError(f"data.{name} lies between {least} and {MOST_DRAWS:,}, but {value:,} was given")
         if not cts and not phantoms:

@@ -43,8 +43,8 @@ class ConeBeam:
     def __post_init__(self):
         shape = whole_sizes(self.shape)
         if shape is None or len(shape) != 2:
-            raise ValueError(f"a detector needs two positive sizes (rows, columns), whole numbers, but {self.shape} was "
-                             "given")
+            raise ValueError(f"a detector needs two positive sizes (rows, columns), whole numbers, but {self.shape} "
+                             "was given")
         _check_room(len(np.atleast_1d(self.sources)), shape)
         object.__setattr__(self, "shape", shape)
         for name in ("sources", "detectors", "u", "v"):
@@ -56,8 +56,8 @@ class ConeBeam:
                                  "give one row per view")
             if not (np.abs(value) < MOST_MM).all():
                 wrong = int((~(np.abs(value) < MOST_MM).all(1)).argmax())
-                raise ValueError(f"a beam's {name} must be finite numbers in mm, less than {MOST_MM:g}, but view {wrong} "
-                                 f"has {value[wrong].tolist()}")
+                raise ValueError(f"a beam's {name} must be finite numbers in mm, less than {MOST_MM:g}, but view "
+                                 f"{wrong} has {value[wrong].tolist()}")
             value.setflags(write=False)
             object.__setattr__(self, name, value)
         width, height = np.linalg.norm(self.u, axis=1), np.linalg.norm(self.v, axis=1)
@@ -154,9 +154,9 @@ class ConeBeam:
             raise ValueError(
                 f"view {k}: the {culprit} lies inside the volume or the volume extends behind it: "
                 f"source to volume centre is {centre[k]:.1f} mm and volume centre to detector is "
-                f"{distance - centre[k]:.1f} mm along the view, but the volume reaches {centre[k] - near:.1f} mm from its "
-                f"centre; {room} this source_to_detector of {distance:g} mm; move the source or the detector, or give a "
-                "smaller volume")
+                f"{distance - centre[k]:.1f} mm along the view, but the volume reaches {centre[k] - near:.1f} mm from "
+                f"its centre; {room} this source_to_detector of {distance:g} mm; move the source or the detector, or "
+                "give a smaller volume")
 
     def is_upright(self, grid: Grid) -> bool:
         """Whether every detector's columns of pixels run along the grid's third axis."""
@@ -256,7 +256,8 @@ def _radians(name: str, radians: float | None, degrees: float | None, otherwise:
 
 
 def pixel_sizes(pixel) -> tuple[float, float]:
-    """(row height, column width) in mm of one number or two. Raises ValueError where they are not positive and finite."""
+    """(row height, column width) in mm of one number or two. Raises ValueError where they are not positive and
+    finite."""
     try:
         height, width = map(float, np.broadcast_to(_numbers("pixel", pixel), 2))
     except ValueError:

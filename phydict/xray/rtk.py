@@ -87,7 +87,8 @@ def write_rtk(path: str | Path, beam: ConeBeam) -> None:
 def check_beam(function: str, path, beam) -> None:
     """Raises ValueError unless a function that writes a beam was given a path and a beam, in that order."""
     if not isinstance(beam, ConeBeam):
-        order = f"the beam first; call {function}(path, beam)" if isinstance(path, ConeBeam) else f"{beam!r} as the beam"
+        swapped = isinstance(path, ConeBeam)
+        order = f"the beam first; call {function}(path, beam)" if swapped else f"{beam!r} as the beam"
         raise ValueError(f"{function} takes a path and then a ConeBeam, but was given {order}")
 
 

@@ -7,6 +7,7 @@ import errno
 import json
 import os
 import runpy
+import shutil
 import signal
 import subprocess
 import sys
@@ -20,7 +21,7 @@ import pytest
 import torch
 from dicom_files import write_ct_series, write_dicom
 
-from phydict.datasets.cts import cache
+from phydict.datasets.cts import cache, preparation
 from phydict.datasets.cts.ct_rate import CTCases, find_cts, load_case, patient_of
 from phydict.datasets.cts.ct_rate_tables import read_calibrations, read_reports
 from phydict.datasets.cts.ct_series import find_series, load_series
@@ -159,10 +160,12 @@ def position(paths, shift):
     (lambda p: position(p, lambda k: [0, 1.5 * k, 0]), "gantry was tilted by 14.0 degrees"),
     (lambda p: edit(p[9:10], PixelSpacing=[[5.0, 6.0]]), "PixelSpacing changes within the series"),
     (lacking, "slice005.dcm lacks RescaleIntercept"),
+    (lambda p: edit(p[9:10], PixelSpacing=[6.0]), "PixelSpacing of slice009.dcm must be 2 finite numbers"),
     (lambda p: p[7].write_bytes(p[7].read_bytes()[:1500]), "slice007.dcm cannot be read"),
     (lambda p: edit(p, ImageType=[["ORIGINAL", "PRIMARY", "LOCALIZER"]] * len(p)), "only localizer"),
     (lambda p: edit(p, NumberOfFrames=[2] * len(p)), "multi-frame")],
-    ids=["3 slices", "gap", "gaps", "twice", "uneven", "tilt", "pixels", "no rescale", "cut", "localizer", "frames"])
+    ids=["3 slices", "gap", "gaps", "twice", "uneven", "tilt", "pixels", "no rescale", "one spacing",
+         "cut", "localizer", "frames"])
 def test_a_bad_series_is_rejected_with_its_reason(tmp_path, thorax, spoil, reason):
     spoil(write_ct_series(tmp_path / "in/s", thorax, AFFINE))
     (found,) = rejected(tmp_path / "in", tmp_path / "out")
@@ -385,6 +388,55 @@ def test_a_changed_input_is_prepared_again_and_other_settings_are_refused(tmp_pa
     (tmp_path / "out/a" / RECORD).write_text("{")
     with pytest.raises(ValueError, match="case.json cannot be read .* prepare that CT again"):
         find_cts(tmp_path / "out")
+
+
+def notes_inside(case):
+    (case / "notes.txt").write_text("mine")
+
+
+def strangers(case):
+    shutil.rmtree(case)
+    case.mkdir()
+    notes_inside(case)
+
+
+def linked(case):
+    case.rename(case.with_name("elsewhere"))
+    case.symlink_to(case.with_name("elsewhere"))
+
+
+def dangling(case):
+    shutil.rmtree(case)
+    case.symlink_to(case.with_name("nowhere"))
+
+
+@pytest.mark.parametrize("when", ["at the start", "when a case takes its place"])
+@pytest.mark.parametrize("change", [notes_inside, strangers, linked, dangling])
+def test_what_no_preparation_wrote_is_never_replaced(tmp_path, thorax, monkeypatch, change, when):
+    save(tmp_path / "in/a.nii", thorax)
+    prepare_folder(tmp_path / "in", tmp_path / "out", SMALL)
+    save(tmp_path / "in/a.nii", thorax[:, :, 1:])  # so that it is prepared again
+    case = tmp_path / "out/a"
+    if when == "at the start":
+        change(case)
+    else:
+        write = preparation.write_prepared
+        monkeypatch.setattr(preparation, "write_prepared", lambda *given: (write(*given), change(case)))
+    with pytest.raises(ValueError, match="out/a .* is not replaced: move .* away, or give another output folder"):
+        prepare_folder(tmp_path / "in", tmp_path / "out", SMALL)
+    assert case.is_symlink() == (change in (linked, dangling)) and case.exists() == (change is not dangling)
+    assert change in (linked, dangling) or (case / "notes.txt").read_text() == "mine"
+    assert change is not linked or (case / RECORD).is_file()
+    assert not any(path.name.startswith(".") for path in (tmp_path / "out").iterdir())
+
+
+def test_a_summary_of_someone_elses_is_never_replaced(tmp_path, thorax):
+    save(tmp_path / "in/a.nii", thorax)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / SUMMARY).write_text("patient,mine\n")
+    with pytest.raises(ValueError, match="summary.csv is no summary of prepared cases, and is not replaced"):
+        prepare_folder(tmp_path / "in", tmp_path / "out", SMALL)
+    assert (tmp_path / "out" / SUMMARY).read_text() == "patient,mine\n" and len(list((tmp_path / "out").iterdir())) == 1
 
 
 def full(*_, **__):

@@ -36,7 +36,8 @@ def test_a_chest_without_noise_has_next_to_none(chest):
 
 def test_each_view_has_its_own_and_it_grows_with_the_values():
     y = noise(torch.empty(3, 64, 64)) * torch.tensor([0.1, 1.0, 5.0]).view(3, 1, 1)
-    torch.testing.assert_close(noise_level(y).square().mean((1, 2)).sqrt(), torch.tensor([0.1, 1.0, 5.0]), rtol=0.1, atol=0)
+    torch.testing.assert_close(noise_level(y).square().mean((1, 2)).sqrt(), torch.tensor([0.1, 1.0, 5.0]), rtol=0.1,
+                               atol=0)
     torch.testing.assert_close(noise_level(7 * y), 7 * noise_level(y))
 
 

@@ -49,8 +49,8 @@ def _numbers(path: str | Path, row: dict[str, str], column: str, count: int) -> 
     except ValueError:
         found = ()
     if len(found) != count or not all(map(math.isfinite, found)):
-        raise ValueError(f"the metadata of {row['VolumeName']} in {path} cannot be read: {column} must be {count} finite "
-                         f"number{'s' * (count > 1)}, but {reprlib.repr(written)} was found")
+        raise ValueError(f"the metadata of {row['VolumeName']} in {path} cannot be read: {column} must be {count} "
+                         f"finite number{'s' * (count > 1)}, but {reprlib.repr(written)} was found")
     return found
 
 

@@ -81,8 +81,8 @@ def load_series(series: Series) -> tuple[np.ndarray, np.ndarray]:
         for keyword, count in NEEDED.items():
             value = header.get(keyword)
             if np.size(value) != count or not np.isfinite(np.asarray(value, float)).all():
-                raise ValueError(f"{keyword} of {path.name} must be {count} finite number{'s' * (count > 1)}, but {value} "
-                                 "was found; export the series again")
+                raise ValueError(f"{keyword} of {path.name} must be {count} finite number{'s' * (count > 1)}, but "
+                                 f"{value} was found; export the series again")
         if min(header.PixelSpacing) <= 0:
             raise ValueError(f"PixelSpacing of {path.name} must be positive, but {header.PixelSpacing} mm was found; "
                              "export the series again")

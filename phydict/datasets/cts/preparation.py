@@ -18,6 +18,7 @@ from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -26,12 +27,12 @@ import numpy as np
 from phydict.datasets.cts.anatomy import MASKS, body_mask, lung_box_centre, lung_box_size, segment
 from phydict.datasets.cts.ct_rate import CTFile, find_cts
 from phydict.datasets.cts.ct_series import Series, find_series, load_series
-from phydict.datasets.cts.prepared import VOLUME, read_record, write_prepared
+from phydict.datasets.cts.prepared import RECORD, VOLUME, read_record, write_prepared
 from phydict.datasets.cts.segmentations import lungs_by_lungmask, read_segmentation, segmentations_beside
 from phydict.datasets.cts.transforms import (
     AIR, SEGMENTATION_MM, case_id, centred, check_hu, covering_grid, load_ct, to_grid)
 from phydict.grid import Grid
-from phydict.runtime.files import atomic_directory, atomic_write, remove_leftovers
+from phydict.runtime.files import atomic_directory, atomic_write, check_replaceable, remove_leftovers
 from phydict.runtime.progress import CaseProgress
 from phydict.runtime.reading import not_written
 
@@ -181,11 +182,13 @@ def prepare_folder(cts: str | Path, out: str | Path, settings: Settings = Settin
                    **tables) -> list[dict]:
     """Prepares every CT below `cts` into `out`, one folder each, and writes out/summary.csv.
 
-    Finished cases are kept where their input is the same; a case appears only when it is complete. workers: processes.
+    Finished cases are kept where their input is the same; a case appears only when it is complete, and takes the place
+    of nothing but a case that was prepared here. workers: processes.
     tables: reports, metadata, fixed, first_reconstruction and exclude, as for `find_cts`.
     Returns the summary's rows, by COLUMNS, status being prepared or rejected.
-    Raises ValueError for folders inside each other and for an `out` of other settings, and OSError, in one sentence,
-    where a case cannot be written; a CT that cannot be prepared is rejected with the reason.
+    Raises ValueError for folders inside each other, for an `out` of other settings and for what no preparation wrote in
+    the place of a case or of the summary, and OSError, in one sentence, where a case cannot be written; a CT that
+    cannot be prepared is rejected with the reason.
     """
     root, out = Path(cts), Path(out)
     if out.resolve().is_relative_to(root.resolve()) or root.resolve().is_relative_to(out.resolve()):
@@ -194,6 +197,7 @@ def prepare_folder(cts: str | Path, out: str | Path, settings: Settings = Settin
     if workers < 1:
         raise ValueError(f"workers must be at least 1, but {workers} was given")
     sources = find_sources(root, **tables)
+    _check_summary(out / SUMMARY)
     remove_leftovers(out)
     rows = {source.id: row for source in sources if (row := _finished(source, out, settings)) is not None}
     left = [source for source in sources if source.id not in rows]
@@ -209,17 +213,26 @@ def prepare_folder(cts: str | Path, out: str | Path, settings: Settings = Settin
 
 
 def _finished(source: Source, out: Path, settings: Settings) -> dict | None:
-    """The row of a case that is already there and of this input, else None."""
+    """The row of a case that is already there and of this input, else None, where a new one may take its place.
+
+    Raises ValueError where what is there must stay: what no preparation wrote, and a case of other settings.
+    """
     folder = out / source.id
-    if not folder.exists():
+    if not os.path.lexists(folder):
         return None
+    if not (folder / RECORD).is_file():
+        raise ValueError(f"{folder} is in the place of a prepared case, but holds no {RECORD}, and is not replaced: "
+                         "move it away, or give another output folder")
     record = read_record(folder / VOLUME)
     if record.get("settings") != json.loads(json.dumps(asdict(settings))):
         raise ValueError(f"{folder} was prepared with other settings; give another output folder, or remove that one")
-    try:
-        return record.get("row") if record.get("fingerprint") == source.fingerprint() else None
-    except ValueError:
-        return None
+    row = record["row"]
+    with suppress(ValueError, OSError):
+        if record.get("fingerprint") == source.fingerprint():
+            return row
+    masks = str(row.get("masks", "")).split()
+    check_replaceable(folder, {RECORD, VOLUME, *(f"{mask}.nii.gz" for mask in masks)}, "output folder")
+    return None
 
 
 def _prepared(sources: list[Source], out: Path, settings: Settings, workers: int) -> Iterator[dict]:
@@ -267,7 +280,7 @@ def prepare_source(source: Source, out: Path, settings: Settings) -> dict:
               "report": "" if source.is_dicom else source.ct.report, "settings": asdict(settings),
               "fingerprint": fingerprint, "row": row}
     try:
-        with atomic_directory(out / source.id) as partial:
+        with atomic_directory(out / source.id, lambda: _finished(source, out, settings) is None) as partial:
             write_prepared(partial, grid, images, record)
     except OSError as error:
         raise not_written(f"the case {out / source.id}", error, "give another output folder, and run the same command "
@@ -307,6 +320,13 @@ def _place(hu: np.ndarray, affine: np.ndarray, beside: dict[str, tuple[Path, ...
               "lungs_inside": round(min(1.0, float(images["lung"].sum() * np.prod(grid.spacing) / volume)), 3)}
     facts |= {f"lung_{side}_mm": float(n) for side, n in zip(("width", "depth", "height"), size)}
     return grid, images, facts
+
+
+def _check_summary(file: Path) -> None:
+    """Raises ValueError where a table of someone else's would be replaced."""
+    if os.path.lexists(file) and not (file.is_file() and file.read_bytes().startswith(b"id,status,")):
+        raise ValueError(f"{file} is no summary of prepared cases, and is not replaced: move it away, or give another "
+                         "output folder")
 
 
 def _write_summary(file: Path, rows: list[dict]) -> None:

@@ -33,7 +33,8 @@ MEDSYN_AXES = np.array([[0, 0, -1, 0], [0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1.0
 def write_prepared(folder: Path, grid: Grid, images: dict[str, np.ndarray], record: dict) -> None:
     """Writes the files of one case into `folder`: "ct" in HU and masks in [0, 1], each (X, Y, Z) on `grid`.
 
-    record: holds at least "id", "space", "extent" (3,) mm of the box in the space, "window" (low, high) and "report".
+    record: holds at least "id", "space", "extent" (3,) mm of the box in the space, "window" (low, high), "report" and
+    "row", of the summary, whose "masks" names those of the images.
     """
     import nibabel
 
@@ -79,7 +80,8 @@ def read_record(path: Path) -> dict:
     file = path.parent / RECORD
     with reading(file, "remove its folder and prepare that CT again"):
         record = json.loads(read_text(file))
-        for name, kind in (("id", str), ("space", str), ("extent", list), ("window", list), ("report", str)):
+        for name, kind in (("id", str), ("space", str), ("extent", list), ("window", list), ("report", str),
+                           ("row", dict)):
             if not isinstance(record[name], kind):
                 raise ValueError(f"it is damaged: {name} is {reprlib.repr(record[name])}")
         if np.asarray(record["extent"], float).shape != (3,) or np.asarray(record["window"], float).shape != (2,):
@@ -96,7 +98,7 @@ def read_prepared(path: Path, grid: Grid, window: HUWindow) -> dict:
     Raises ValueError for a grid that is larger or finer than the prepared case, or of another space.
     """
     record = read_record(path)
-    if remark := record.get("row", {}).get("remark"):
+    if remark := record["row"].get("remark"):
         warnings.warn(f"{record['id']} was prepared with the remark: {remark}", stacklevel=2)
     hu, affine = load_ct(path)
     found = [path.parent / f"{name}.nii.gz" for name in MASKS]

@@ -136,7 +136,8 @@ def save_xrays(folder: str | Path, xrays: torch.Tensor | np.ndarray, beam: ConeB
 
 def _check_count(folder: Path, source: Path, images: int, views: int | None) -> None:
     if views not in (None, images):
-        raise ValueError(f"{folder} holds {images} images, but {source} describes {views} views; give one image per view")
+        raise ValueError(f"{folder} holds {images} images, but {source} describes {views} views; give one image per "
+                         "view")
 
 
 def _is_case(folder: Path) -> bool:

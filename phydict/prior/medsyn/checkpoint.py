@@ -291,7 +291,8 @@ def read_tensors(file: Path, shapes_only: bool = False) -> dict[str, Tensor]:
                             for name in opened.keys()}
                 return {name: opened.get_tensor(name) for name in opened.keys()}
         except Exception as error:  # whatever a damaged file leads to
-            raise ValueError(f"'{file}' is truncated or not a safetensors file ({reason(error)}): copy it again") from error
+            raise ValueError(f"'{file}' is truncated or not a safetensors file ({reason(error)}): copy it "
+                             "again") from error
     content = read_torch(file)
     if isinstance(content, dict) and "phydict" in content:
         raise ValueError(f"'{file}' is a checkpoint of phydict's training: make it a prior with train.py export")

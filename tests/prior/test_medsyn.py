@@ -223,7 +223,7 @@ XRAYS = torch.linspace(1.5, 2.5, 288).view(2, 12, 12)
 
 
 @pytest.mark.parametrize("sampler", [PriorOnly(2), SplitGibbs(2), SplitGibbs(
-    2, t_start=0.3, last=0.2, noise_fraction=0.0, final_likelihood=ProximalCG(2))], ids=["prior", "ddim", "fast"])
+    2, t_start=0.3, t_end=0.2, noise_fraction=0.0, final_likelihood=ProximalCG(2))], ids=["prior", "ddim", "fast"])
 def test_every_sampler_works_with_it(sampler):
     result = reconstruct(XRAYS, BEAM, prior(), sampler, report="a report", seed=3)
     assert result.volume.shape == (8, 4, 6) and -1024 <= result.volume.min() < result.volume.max() <= 600

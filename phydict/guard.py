@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
 from statistics import median
 from typing import Protocol
@@ -10,7 +9,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from phydict.xray.residuals import view_norms, view_sizes
+from phydict.runtime.warning import warn
+from phydict.xray.residuals import misfits, view_norms, view_sizes
 
 EMPTY_MISFIT, RISE_FACTOR, RISE_MIN = 1.0, 2.0, 0.1
 """A misfit has risen where it is more than RISE_FACTOR times its smallest so far, that of an empty volume included, and more
@@ -77,8 +77,21 @@ class Guard:
             self.diverged_at = risen
             before = min([EMPTY_MISFIT, *(value for step, value in self.misfits.items() if step < risen)])
             now = list(self.misfits.values())[-1]
-            warnings.warn(f"the misfit rose from {before:.3g} to {now:.3g}, from step {risen} of {self.steps} on: the "
-                          "volume went away from the X-rays", stacklevel=3)
+            warn(f"the misfit rose from {before:.3g} to {now:.3g}, from step {risen} of {self.steps} on: the "
+                 "volume went away from the X-rays")
+
+    def score(self, volumes: Tensor | None, reprojection: Tensor, xrays: Tensor) -> dict:
+        """The last step is done: how its result fits, as fields of a Reconstruction.
+
+        volumes: what it gave, None where parts of it were finished before; reprojection and xrays (1, K, V, U): of the
+        result, and as they were measured. Raises and warns as `finish` and `check_fit` do.
+        """
+        reprojection, xrays = reprojection[0].cpu(), xrays[0].cpu()
+        found = misfits(reprojection, xrays)
+        if volumes is not None:
+            self.finish(volumes, found["misfit"])
+        self.check_fit(**found)
+        return found | {"xrays": xrays, "reprojection": reprojection, "diverged_at": self.diverged_at}
 
     def check_fit(self, misfit: float, misfit_per_view: Sequence[float]) -> None:
         """Warns where a method that looked at the X-rays and did not diverge fits one view, or all, badly."""
@@ -86,12 +99,11 @@ class Guard:
             return
         view, ratio = worst_view(misfit_per_view)
         if ratio > OUTLIER_RATIO and misfit_per_view[view] > 0.01:
-            warnings.warn(f"view {view} (counted from 0) fits {ratio:.1f} times worse than the median view: check "
-                          "whether it is flipped, shifted or another's, and its geometry", stacklevel=3)
+            warn(f"view {view} (counted from 0) fits {ratio:.1f} times worse than the median view: check "
+                 "whether it is flipped, shifted or another's, and its geometry")
         elif misfit > BAD_FIT:
-            warnings.warn(f"no volume was found that explains the X-rays (misfit {misfit:.2g}): check their scale and "
-                          "geometry, that they are not display values, and that the body fits into the volume",
-                          stacklevel=3)
+            warn(f"no volume was found that explains the X-rays (misfit {misfit:.2g}): check their scale and "
+                 "geometry, that they are not display values, and that the body fits into the volume")
 
     def _check(self, values: Tensor) -> None:
         if not values.isfinite().all():

@@ -187,3 +187,11 @@ def test_a_method_without_a_prior_takes_no_second_stage():
         reconstructor("sirt", super_resolution=tiny_super_resolution())
     with pytest.raises(ValueError, match=r"in \[0, 1\]"):
         reconstructor(PriorOnly(2), tiny_prior(False), super_resolution=tiny_super_resolution(), sr_noise_augmentation=1.5)
+
+
+@pytest.mark.parametrize("method", ["cgls", "phydict_fast"])
+def test_a_warning_points_at_the_line_that_called(method):
+    beam = ConeBeam.orbit(3, 1020, 740, (28, 28), 20.0)
+    with pytest.warns(UserWarning, match="line integral") as found:
+        reconstruct(100 * ball(beam, 90.0), beam, tiny_prior(), method, grid=Grid.cube(16))
+    assert {warning.filename for warning in found} == {__file__}

@@ -16,7 +16,6 @@ from phydict.units import HUWindow, mu_to_hu
 from phydict.xray import Projector
 from phydict.xray.calibration import match_views
 from phydict.xray.checks import check_line_integrals, check_xrays
-from phydict.xray.residuals import misfits
 
 
 class CountingProjector:
@@ -72,14 +71,10 @@ class Baseline(Reconstructor):
             A.y, guard = y, Guard(A, on_step, self.steps())
             density = self.solve(A, y, guard)
         with watch.stage("score"):
-            reprojection, measured = (self.mu_water * views[0].cpu() for views in (A(density), y))
-            found = misfits(reprojection, measured)
-            guard.finish(density, found["misfit"])
-            guard.check_fit(**found)
+            found = guard.score(density, self.mu_water * A(density), self.mu_water * y)
         return Reconstruction(
             volume=mu_to_hu(density[0, 0], 1.0).cpu(), grid=A.grid, method=self.name, seed=seed,
-            **found, seconds=watch.seconds, xrays=measured, reprojection=reprojection,
-            projector_calls=A.calls, diverged_at=guard.diverged_at)
+            **found, seconds=watch.seconds, projector_calls=A.calls)
 
 
 def empty(A: CountingProjector, y: Tensor) -> Tensor:
@@ -95,20 +90,6 @@ def bounds(window: HUWindow | None) -> tuple[float, float]:
 def clip(density: Tensor, window: HUWindow | None) -> Tensor:
     """Density relative to water, held inside an HU window; None lets every value pass."""
     return density.clamp(*bounds(window))
-
-
-def norm(A: CountingProjector, y: Tensor) -> float:
-    """The largest singular value of A, by power iteration to a relative change of 1e-4.
-
-    A has no negative weights, so its leading singular vector has none either and a constant start reaches it.
-    """
-    density, norm, last = empty(A, y) + 1, 0.0, -1.0
-    for _ in range(50):
-        if abs(norm - last) <= 1e-4 * norm:
-            break
-        density, last = A.T(A.linear(density / density.norm())), norm
-        norm = float(density.norm()) ** 0.5
-    return norm
 
 
 def typical_chest(projector: Projector | CountingProjector) -> Tensor:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from phydict.baselines.baseline import Baseline, CountingProjector, bounds, clip, empty
+from phydict.linalg.conjugate_gradients import conjugate_gradients
 from phydict.units import MU_WATER, HUWindow
 
 
@@ -44,24 +45,12 @@ class CGLS(Baseline):
         low, high = bounds(self.window)
         density = clip(empty(A, y), self.window)
         for _ in range(self.restarts):
-            residual = y - A(density)
-            negative_gradient = A.T(residual)
-            inactive_mask = ~((density <= low) & (negative_gradient < 0) | (density >= high) & (negative_gradient > 0))
-            density = clip(self._descend(A, density, residual, negative_gradient, inactive_mask, on_step), self.window)
-        return density
-
-    def _descend(self, A: CountingProjector, density: Tensor, residual: Tensor, negative_gradient: Tensor, inactive_mask: Tensor,
-                 on_step: Callable[[], None]) -> Tensor:
-        """Conjugate gradients over the free voxels, from `density`, whose residual and negative_gradient direction are given."""
-        negative_gradient = direction = negative_gradient * inactive_mask
-        energy = start = negative_gradient.square().sum()
-        for _ in range(self.iterations):
-            if energy > 1e-12 * start:
-                seen = A.linear(direction)
-                step = energy / seen.square().sum()
-                density, residual = density + step * direction, residual - step * seen
-                negative_gradient = A.T(residual) * inactive_mask
-                previous, energy = energy, negative_gradient.square().sum()
-                direction = negative_gradient + energy / previous * direction
-            on_step()
+            steps = iter(range(self.iterations))
+            downhill = A.T(y - A(density))
+            inactive = ~((density <= low) & (downhill < 0) | (density >= high) & (downhill > 0))
+            density = clip(density + conjugate_gradients(
+                lambda d, inactive=inactive: inactive * A.T(A.linear(d)), inactive * downhill, self.iterations,
+                on_step=lambda: (next(steps), on_step())), self.window)
+            for _ in steps:  # that were not needed
+                on_step()
         return density

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 
 import torch
@@ -10,6 +9,7 @@ import torch
 from phydict.datasets import Thorax, build
 from phydict.grid import Grid
 from phydict.inference.geometry_page import agreement, geometry_page, view_sides
+from phydict.runtime.warning import warn
 from phydict.units import hu_to_mu
 from phydict.xray import Projector
 from phydict.xray.binning import binned, binning
@@ -36,8 +36,8 @@ def dry_run(path: str | Path, case: dict, grid: Grid) -> list[str]:
     said = [agreement(*pair) for pair in zip(xrays, thorax)]
     mirrored = [str(k) for k, words in enumerate(said, 1) if words.endswith("with flip_columns changed")]
     if mirrored:
-        warnings.warn(f"{case['id']}: view {', '.join(mirrored)} agrees better with a standard thorax when mirrored: "
-                      "check on which side the source stands, for a left lateral (LL) view at the patient's right, 270 "
-                      "degrees of an orbit, or change flip_columns", stacklevel=2)
+        warn(f"{case['id']}: view {', '.join(mirrored)} agrees better with a standard thorax when mirrored: "
+             "check on which side the source stands, for a left lateral (LL) view at the patient's right, 270 "
+             "degrees of an orbit, or change flip_columns")
     return [f"{case['id']} view {k}: {sides}; {words}"
             for k, (sides, words) in enumerate(zip(view_sides(coarse, grid), said), 1)]

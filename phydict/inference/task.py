@@ -11,7 +11,6 @@ import os
 import platform
 import resource
 import sys
-import warnings
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
@@ -36,6 +35,7 @@ from phydict.runtime.precision import instruction_set
 from phydict.runtime.profiling import profiled, stage
 from phydict.runtime.progress import CaseProgress
 from phydict.runtime.seeds import case_seed, check_seed
+from phydict.runtime.warning import warn
 from phydict.units import HUWindow
 
 
@@ -191,7 +191,7 @@ class ReconstructionTask(lightning.LightningModule):
         if not case["report"] or not self.trainer.datamodule.with_report:
             return ""
         if self.reads_no_text and not self.said_no_text:
-            warnings.warn("the prior was trained without text: reports are not used", stacklevel=2)
+            warn("the prior was trained without text: reports are not used")
             self.said_no_text = True
         return "" if self.reads_no_text else case["report"]
 

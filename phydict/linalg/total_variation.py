@@ -1,27 +1,64 @@
-"""Total variation, smoothed so that it has a gradient, and the quadratic that touches it from above."""
+"""Total variation: forward differences and their adjoint, the proximal step, and the quadratic that touches a smoothed
+one from above.
+
+Differences are scaled per axis: 1 / spacing makes slopes of them, 0 leaves an axis out.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-
-def differences(x: Tensor, axes: Sequence[int] = (2, 3, 4)) -> list[Tensor]:
-    """Forward differences of x (B, 1, X, Y, Z) along `axes`, each one voxel shorter along its axis."""
-    return [x.diff(dim=axis) for axis in axes]
+UNIT = (1.0, 1.0, 1.0)
 
 
-def differences_adjoint(d: list[Tensor], axes: Sequence[int] = (2, 3, 4)) -> Tensor:
-    """The adjoint of `differences`."""
-    return -sum(pad(one, [0, 0] * (4 - axis) + [1, 1]).diff(dim=axis) for axis, one in zip(axes, d))
+def differences(x: Tensor, scales: Sequence[float] = UNIT) -> Tensor:
+    """Scaled forward differences (3, B, 1, X, Y, Z) of x (B, 1, X, Y, Z) along its last three axes, 0 at the end."""
+    result = x.new_zeros(3, *x.shape)
+    for axis, scale in enumerate(scales):
+        n = x.shape[2 + axis] - 1
+        result[axis].narrow(2 + axis, 0, n).copy_(scale * x.diff(dim=2 + axis))
+    return result
 
 
-def smoothed_tv(x: Tensor, eps: float) -> Tensor:
+def differences_adjoint(p: Tensor, scales: Sequence[float] = UNIT) -> Tensor:
+    """The exact adjoint of `differences`: (3, B, 1, X, Y, Z) -> (B, 1, X, Y, Z)."""
+    result = torch.zeros_like(p[0])
+    for axis, scale in enumerate(scales):
+        n = p.shape[3 + axis] - 1
+        inner = scale * p[axis].narrow(2 + axis, 0, n)
+        result.narrow(2 + axis, 0, n).sub_(inner)
+        result.narrow(2 + axis, 1, n).add_(inner)
+    return result
+
+
+def total_variation(x: Tensor, scales: Sequence[float] = UNIT, eps: float = 0.0) -> Tensor:
     """The sum over voxels of sqrt(|forward differences|^2 + eps^2)."""
-    return (eps**2 + _squared_slope(x)).sqrt().sum()
+    return (eps**2 + sum((scale * pad(x.diff(dim=axis), [0, 0] * (4 - axis) + [0, 1])).square()
+                         for axis, scale in zip((2, 3, 4), scales))).sqrt().sum()
+
+
+def tv_proximal(v: Tensor, weight: float, scales: Sequence[float], clip: Callable[[Tensor], Tensor], iterations: int,
+                dual: Tensor) -> tuple[Tensor, Tensor]:
+    """argmin over x of |x - v|^2 / 2 + weight TV(x) where clip(x) = x, and its dual field (Beck & Teboulle 2009,
+    doi:10.1109/TIP.2009.2028250).
+
+    v: (1, 1, X, Y, Z). clip: the nearest admissible volume. dual: (3, *v.shape), where to start; zeros will do.
+    """
+    if weight == 0:
+        return clip(v), dual
+    step = 1 / (4 * sum(s**2 for s in scales) * weight)
+    ahead, momentum = dual, 1.0
+    for _ in range(iterations):
+        tried = ahead + step * differences(clip(v - weight * differences_adjoint(ahead, scales)), scales)
+        new = tried / tried.square().sum(0).sqrt().clamp(min=1)
+        following = (1 + (1 + 4 * momentum**2) ** 0.5) / 2
+        ahead = new + (momentum - 1) / following * (new - dual)
+        dual, momentum = new, following
+    return clip(v - weight * differences_adjoint(dual, scales)), dual
 
 
 class TVQuadraticMajorizer:
@@ -32,21 +69,14 @@ class TVQuadraticMajorizer:
     """
 
     def __init__(self, x: Tensor, eps: float):
-        w = 1 / (eps**2 + _squared_slope(x)).sqrt()
-        self.weights = [w.narrow(axis, 0, w.shape[axis] - 1) for axis in (2, 3, 4)]
+        self.weights = 1 / (eps**2 + differences(x).square().sum(0)).sqrt()
 
     def gradient(self, x: Tensor) -> Tensor:
         """The quadratic's gradient at x, which is linear."""
-        return differences_adjoint([w * d for w, d in zip(self.weights, differences(x))])
+        return differences_adjoint(self.weights * differences(x))
 
     def diagonal(self) -> Tensor:
         """The diagonal of the quadratic's matrix: what `gradient` makes of a voxel there itself."""
-        ends = [([0, 0] * (4 - axis) + [0, 1], [0, 0] * (4 - axis) + [1, 0]) for axis in (2, 3, 4)]
-        return sum(pad(w, below) + pad(w, above) for w, (below, above) in zip(self.weights, ends))
-
-
-def _squared_slope(x: Tensor) -> Tensor:
-    total = torch.zeros_like(x)
-    for axis, d in zip((2, 3, 4), differences(x)):
-        total.narrow(axis, 0, d.shape[axis]).add_(d.square())
-    return total
+        inner = [self.weights.narrow(axis, 0, self.weights.shape[axis] - 1) for axis in (2, 3, 4)]
+        return sum(pad(w, [0, 0] * (4 - axis) + [0, 1]) + pad(w, [0, 0] * (4 - axis) + [1, 0])
+                   for axis, w in zip((2, 3, 4), inner))

@@ -24,7 +24,6 @@ from phydict.runtime.precision import check_precision, resolve_precision
 from phydict.runtime.profiling import Stopwatch
 from phydict.units import MU_WATER
 from phydict.xray import Projector, binned, binning
-from phydict.xray.residuals import misfits
 
 
 @dataclass(frozen=True)
@@ -120,19 +119,15 @@ class CascadePosterior(Reconstructor):
         with watch.stage("score"):
             ct = state[:, :1]
             measurement.match_gain_offset(ct)
-            reprojection = measurement.project(ct)[0].cpu()
-            measured = measurement.y[0].cpu()
-            found = misfits(reprojection, measured)
-            guard.finish(state, found["misfit"])
-            guard.check_fit(**found)
+            found = guard.score(state, measurement.project(ct), measurement.y)
             masks = interpolate(base.masks[None], fine.grid.shape, mode="trilinear")[0]
             masks[:fine.state_channels - 1] = ((state[0, 1:] + 1) / 2).cpu()
         return Reconstruction(
             volume=fine.window.to_hu(ct[0, 0]).cpu(), grid=fine.grid, method=self.name, seed=seed,
-            **found, seconds=watch.seconds, xrays=measured, reprojection=reprojection,
+            **found | {"diverged_at": base.diverged_at or guard.diverged_at}, seconds=watch.seconds,
             network_calls=base.network_calls + denoiser.calls,
             projector_calls=base.projector_calls + measurement.calls, masks=masks,
-            diverged_at=base.diverged_at or guard.diverged_at, scatter=base.scatter, precision=base.precision)
+            scatter=base.scatter, precision=base.precision)
 
     def _base(self, xrays: Tensor, projector: Projector, report: str, display: bool, seed: int,
               on_step: Callable[[], None]) -> Reconstruction:

@@ -24,7 +24,6 @@ from phydict.runtime.profiling import Stopwatch, stage
 from phydict.runtime.reading import check_memory
 from phydict.units import MU_WATER
 from phydict.xray import Projector
-from phydict.xray.residuals import misfits
 
 
 class CountingDenoiser:
@@ -124,20 +123,14 @@ class Posterior(Reconstructor):
             measurement.match_gain_offset(ct)
             reprojection = measurement.project(ct)
             measurement.subtract_scatter(reprojection)
-            reprojection = reprojection[0].cpu()
-            measured = measurement.y[0].cpu()
-            found, deviation = misfits(reprojection, measured), None
-            if self.samples == 1:
-                guard.finish(states, found["misfit"])
-            else:
-                deviation = (prior.window.half_width * states[:, 0].std(0)).cpu()
-            guard.check_fit(**found)
+            found = guard.score(states if self.samples == 1 else None, reprojection, measurement.y)
+            deviation = (prior.window.half_width * states[:, 0].std(0)).cpu() if self.samples > 1 else None
         return Reconstruction(
             volume=prior.window.to_hu(ct[0, 0]).cpu(), grid=prior.grid, method=self.name, seed=seed,
-            **found, seconds=watch.seconds, xrays=measured, reprojection=reprojection,
+            **found, seconds=watch.seconds,
             network_calls=denoiser.calls * (2 if report and self.guidance != 1 else 1),
             projector_calls=measurement.calls, masks=((state[1:] + 1) / 2).cpu(), deviation=deviation,
-            diverged_at=guard.diverged_at, scatter=measurement.scatter,
+            scatter=measurement.scatter,
             precision=precision_name(self.precision, xrays))
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
@@ -12,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from phydict.prior.bert_files import load_bert
+from phydict.runtime.warning import warn
 
 if TYPE_CHECKING:
     from transformers import BertModel, BertTokenizer
@@ -68,8 +68,8 @@ class TextEncoder(nn.Module):
         tokenizer, bert = load_bert(source)
         positions, asked = bert.config.max_position_embeddings, padded_to or length
         if asked > positions:
-            warnings.warn(f"the text encoder at '{source}' knows {positions} of the {asked} positions asked for: "
-                          f"reports are cut to {positions} tokens", stacklevel=2)
+            warn(f"the text encoder at '{source}' knows {positions} of the {asked} positions asked for: "
+                 f"reports are cut to {positions} tokens")
         return cls(tokenizer, bert, min(length, positions), source=str(source),
                    padded_to=padded_to and min(padded_to, positions))
 
@@ -113,14 +113,14 @@ class TextEncoder(nn.Module):
         read = self.padded_to or self.length
         excess = [len(own) + 2 - read for own in tokens if len(own) + 2 > read]
         if excess:
-            warnings.warn(f"{len(excess)} of {len(new)} reports are longer than the {read} tokens that the text "
-                          f"encoder reads: up to {max(excess)} tokens at their end are left out", stacklevel=2)
+            warn(f"{len(excess)} of {len(new)} reports are longer than the {read} tokens that the text "
+                 f"encoder reads: up to {max(excess)} tokens at their end are left out")
         unknown = [sum(token == self.tokenizer.unk_token_id for token in own) / max(len(own), 1) for own in tokens]
         foreign = [share for share in unknown if share > FOREIGN]
         if foreign:
-            warnings.warn(f"{len(foreign)} of {len(new)} reports are in words that the text encoder does not know, up "
-                          f"to {max(foreign):.0%} of a report, and say little to it: give them in the language that "
-                          "it learnt, or leave them out", stacklevel=2)
+            warn(f"{len(foreign)} of {len(new)} reports are in words that the text encoder does not know, up "
+                 f"to {max(foreign):.0%} of a report, and say little to it: give them in the language that "
+                 "it learnt, or leave them out")
 
     def _read(self, reports: list[str]) -> tuple[Tensor, Tensor]:
         window = self.length

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 
 import torch
 from torch import Tensor
+
+from phydict.runtime.warning import warn
 
 PRECISIONS = ("auto", "float32", "bfloat16")
 """What a user may ask for. "auto" is bfloat16 where the hardware computes it and float32 elsewhere; a float64 state
@@ -90,10 +91,10 @@ def instruction_set(device: torch.device) -> str:
 def _warn_slow(device: torch.device) -> None:
     factor = SLOWER.get(torch.backends.cpu.get_cpu_capability()) if device.type == "cpu" else None
     slower = f"about {factor} times slower there than float32" if factor else "slower there than float32"
-    warnings.warn(f"bfloat16 was asked for, but {instruction_set(device)} does not compute it: networks are {slower}; "
-                  "precision auto or float32 is faster", RuntimeWarning, stacklevel=4)
+    warn(f"bfloat16 was asked for, but {instruction_set(device)} does not compute it: networks are {slower}; "
+         "precision auto or float32 is faster", RuntimeWarning)
 
 
 @cache
 def _tell_gpu(name: str) -> None:
-    warnings.warn(f"{name} does not compute bfloat16: networks run in float32", RuntimeWarning, stacklevel=4)
+    warn(f"{name} does not compute bfloat16: networks run in float32", RuntimeWarning)

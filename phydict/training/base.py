@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import warnings
 from pathlib import Path
 
 import torch
@@ -16,6 +15,7 @@ from phydict.evaluation import method_panel, volume_metrics
 from phydict.grid import Grid
 from phydict.methods import reconstruct
 from phydict.prior import DetailNetwork, Prior, TextEncoder, VolumeUNet, describe, learn_vocabulary, load_prior
+from phydict.runtime.warning import warn
 from phydict.training.data import PriorData
 from phydict.training.reports import learn_findings, learn_sketch
 from phydict.training.sharding import shard
@@ -73,7 +73,7 @@ class PriorTraining(StageTraining):
         network = network or VolumeUNet()
         encoder = None
         if text == "small" and not reports:
-            warnings.warn("the data have no reports: this prior will know no text")
+            warn("the data have no reports: this prior will know no text")
         elif text == "small":
             encoder = TextEncoder.small(learn_vocabulary(reports), network.context_dim)
         elif text != "none":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from phydict.datasets import CTCases, Deformation, phantom_case, prepare_ct
 from phydict.datasets.cts.cache import write_array
 from phydict.datasets.cts.transforms import AIR
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM, CachedPhantoms
+from phydict.runtime.warning import warn
 from phydict.training.data import PriorData
 from phydict.units import HUWindow
 
@@ -25,7 +25,7 @@ def mapped_volume(file: Path, make: Callable[[], Tensor]) -> np.ndarray:
         try:
             return np.load(file, mmap_mode="r")
         except (ValueError, EOFError) as error:
-            warnings.warn(f"the cached volume {file} cannot be read ({error}); it is prepared again", stacklevel=3)
+            warn(f"the cached volume {file} cannot be read ({error}); it is prepared again")
     write_array(file, make().numpy().astype(np.float16))
     return np.load(file, mmap_mode="r")
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import warnings
-
 import torch
 from torch import Tensor
 
+from phydict.runtime.warning import warn
 from phydict.xray.geometry import ConeBeam
 
 CHEST = 1.0, 20.0
@@ -39,15 +38,15 @@ def check_air(xrays: Tensor) -> None:
     sides = torch.cat([xrays[..., :width], xrays[..., -width:]], -1).flatten(1)
     share = (sides > (high - 0.1 * (high - low))[:, None]).float().mean(1)
     if share.median() > 0.5:
-        warnings.warn("the X-rays are densest at their left and right sides, where air should be seen, as inverted "
-                      "images are: turn them by a negative `scale` with an `offset`, or by the other "
-                      "`bright_is_dense`, or cut off what a collimator covered", stacklevel=3)
+        warn("the X-rays are densest at their left and right sides, where air should be seen, as inverted "
+             "images are: turn them by a negative `scale` with an `offset`, or by the other "
+             "`bright_is_dense`, or cut off what a collimator covered")
 
 
 def check_line_integrals(xrays: Tensor) -> None:
     """Warns of line integrals that no chest has."""
     largest = float(xrays.max())
     if not CHEST[0] < largest < CHEST[1]:
-        warnings.warn(f"the largest line integral is {largest:.3g}, but those of a chest lie between {CHEST[0]:g} and "
-                      f"{CHEST[1]:g}: check that the X-rays are line integrals of attenuation in 1/mm along mm, or "
-                      "give display: true where they are display values", stacklevel=3)
+        warn(f"the largest line integral is {largest:.3g}, but those of a chest lie between {CHEST[0]:g} and "
+             f"{CHEST[1]:g}: check that the X-rays are line integrals of attenuation in 1/mm along mm, or "
+             "give display: true where they are display values")

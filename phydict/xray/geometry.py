@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import reprlib
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +12,7 @@ import yaml
 
 from phydict.grid import Grid, whole_sizes
 from phydict.runtime.reading import check_memory
+from phydict.runtime.warning import warn
 from phydict.runtime.yaml_file import read_yaml
 
 VECTOR_KEYS = ("sources", "detectors", "u", "v", "shape")
@@ -185,7 +185,7 @@ class ConeBeam:
                     "not in cm or m, and that the pixel size is that of these images")
             if factor >= 6:
                 raise ValueError(said)
-            warnings.warn(said, stacklevel=2)
+            warn(said)
             return
 
     def _shadow(self, grid: Grid) -> tuple[np.ndarray, np.ndarray]:

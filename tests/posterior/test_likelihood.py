@@ -8,7 +8,7 @@ from scipy.optimize import lsq_linear
 
 from phydict.datasets import phantom_case
 from phydict.grid import Grid
-from phydict.linalg.total_variation import TVQuadraticMajorizer, smoothed_tv
+from phydict.linalg.total_variation import TVQuadraticMajorizer, total_variation
 from phydict.posterior import GradientSteps, Measurement, ProximalCG, Reward
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
@@ -164,7 +164,7 @@ def test_with_total_variation_every_restart_lowers_the_objective_and_they_end_wh
 
     def objective(z):
         return float((m.project(z) - m.y).square().sum() / noise**2 + (z - X0).square().sum() / spread**2
-                     + 2 * variation * smoothed_tv(z, edge))
+                     + 2 * variation * total_variation(z, eps=edge))
 
     def after(restarts):
         return ProximalCG(20, restarts, noise, 1e-13, tv_weight=variation, tv_eps=edge)(m, X0, spread)

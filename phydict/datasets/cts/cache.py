@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 
 from phydict.runtime.files import atomic_write
 from phydict.runtime.reading import not_written, reason
+from phydict.runtime.warning import warn
 
 
 def write_arrays(file: Path, arrays: dict[str, np.ndarray]) -> None:
@@ -49,5 +49,5 @@ def read_arrays(file: Path) -> dict[str, np.ndarray] | None:
         with np.load(file) as stored:
             return {name: stored[name] for name in stored.files}
     except Exception as error:  # whatever a damaged archive leads NumPy to
-        warnings.warn(f"the cached case {file} cannot be read ({reason(error)}); it is prepared again", stacklevel=3)
+        warn(f"the cached case {file} cannot be read ({reason(error)}); it is prepared again")
         return None

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import json
 import reprlib
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +22,7 @@ from phydict.datasets.cts.anatomy import MASKS
 from phydict.datasets.cts.transforms import AIR, centred, load_ct, to_grid
 from phydict.grid import Grid
 from phydict.runtime.reading import read_text, reading
+from phydict.runtime.warning import warn
 from phydict.units import HUWindow
 
 RECORD, VOLUME = "case.json", "ct.nii.gz"
@@ -99,7 +99,7 @@ def read_prepared(path: Path, grid: Grid, window: HUWindow) -> dict:
     """
     record = read_record(path)
     if remark := record["row"].get("remark"):
-        warnings.warn(f"{record['id']} was prepared with the remark: {remark}", stacklevel=2)
+        warn(f"{record['id']} was prepared with the remark: {remark}")
     hu, affine = load_ct(path)
     found = [path.parent / f"{name}.nii.gz" for name in MASKS]
     known = np.array([file.is_file() for file in found])

@@ -6,7 +6,6 @@ anti-aliased when shrinking, smooth when enlarging, and every old voxel keeps it
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from phydict.datasets.cts.anatomy import lung_box_centre, segment
 from phydict.datasets.nifti_file import open_nifti
 from phydict.grid import Grid
 from phydict.runtime.reading import reading
+from phydict.runtime.warning import warn
 from phydict.units import HUWindow
 
 AIR = -1000.0
@@ -114,8 +114,8 @@ def _check_header(path: Path, header, calibration: Calibration | None) -> None:
         raise ValueError(f"{path} has voxels of {np.linalg.norm(axes, axis=0).max():g} mm, or lies at "
                          f"{affine[:3, 3].tolist()} mm, which no CT does; convert it from DICOM again")
     if np.allclose(axes, np.eye(3)) and shape[0] >= 512:
-        warnings.warn(f"{path} has the blank header of CT-RATE v1 (1 mm voxels, identity axes); "
-                      "read such files with data.fixed false and their metadata table", stacklevel=3)
+        warn(f"{path} has the blank header of CT-RATE v1 (1 mm voxels, identity axes); "
+             "read such files with data.fixed false and their metadata table")
 
 
 def check_hu(hu: np.ndarray, name: str) -> None:
@@ -127,11 +127,11 @@ def check_hu(hu: np.ndarray, name: str) -> None:
     mode = edges[counts.argmax()] + 10
     if not low.size or mode > -900:
         found = f"the most frequent value below -300 is {mode:.0f}" if low.size else "no value lies below -300"
-        warnings.warn(f"{name} does not look like HU: {found}, but air should lie near -1000; check slope, intercept "
-                      "and whether `fixed` is right", stacklevel=3)
+        warn(f"{name} does not look like HU: {found}, but air should lie near -1000; check slope, intercept "
+             "and whether `fixed` is right")
     elif tissue < 0.01:
-        warnings.warn(f"{name} does not look like HU: only {100 * tissue:.1f} % of it lies above -200; it may have "
-                      "been rescaled twice, check whether `fixed` is right", stacklevel=3)
+        warn(f"{name} does not look like HU: only {100 * tissue:.1f} % of it lies above -200; it may have "
+             "been rescaled twice, check whether `fixed` is right")
 
 
 def to_grid(volume: np.ndarray, affine: np.ndarray, grid: Grid, pad: float) -> np.ndarray:
@@ -233,8 +233,8 @@ def prepare_ct(ct: str | Path | tuple[np.ndarray, np.ndarray], grid: Grid = Grid
     else:
         centre = affine[:3, :3] @ ((np.asarray(hu.shape) - 1) / 2) + affine[:3, 3]
         size = " x ".join(f"{length:.0f}" for length in np.linalg.norm(affine[:3, :3], axis=0) * hu.shape)
-        warnings.warn(f"no lungs were found in {name}, a scan of {size} mm; its volume is centred on the scan and its "
-                      "masks are unknown", stacklevel=2)
+        warn(f"no lungs were found in {name}, a scan of {size} mm; its volume is centred on the scan and its "
+             "masks are unknown")
     target = centred(grid, centre)
     volume = window.to_range(to_grid(hu, affine, target, AIR))
     masks = np.stack([to_grid(m, work.affine, target, 0.0) for m in masks]).clip(0, 1)

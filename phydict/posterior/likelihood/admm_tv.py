@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from phydict.linalg.conjugate_gradients import conjugate_gradients
 from phydict.linalg.total_variation import differences, differences_adjoint
 from phydict.posterior.normalised import NormalisedMeasurement
-
-AXES = {"x": 2, "y": 3, "z": 4}
 
 
 @dataclass(frozen=True)
@@ -27,7 +24,7 @@ class ADMMTV:
     axes: str = "z"
 
     def __post_init__(self):
-        if not self.axes or set(self.axes) - set(AXES) or len(set(self.axes)) < len(self.axes):
+        if not self.axes or set(self.axes) - set("xyz") or len(set(self.axes)) < len(self.axes):
             raise ValueError(f"the axes of total variation are of 'xyz', each once, but '{self.axes}' was given")
         if not self.weight >= 0 or not self.rho > 0:
             raise ValueError("total variation needs a weight of at least 0 and rho above 0, but "
@@ -42,26 +39,21 @@ class ADMMPasses:
     """Calls x -> x, one pass each; the split and the dual variable are kept from call to call, zero at first."""
 
     def __init__(self, settings: ADMMTV, x: Tensor):
-        self.settings = settings
-        self.split = [torch.zeros_like(d) for d in self._differences(x)]
-        self.dual = [torch.zeros_like(d) for d in self.split]
+        self.settings, self.scales = settings, [float(axis in settings.axes) for axis in "xyz"]
+        self.split = self.dual = x.new_zeros(3, *x.shape)
 
     def __call__(self, measurement: NormalisedMeasurement, x: Tensor, iterations: int) -> Tensor:
         """x after at most `iterations` of conjugate gradients from x, and one shrinkage."""
         rho, limit = self.settings.rho, self.settings.weight / self.settings.rho
-        pull = [z - u - d for z, u, d in zip(self.split, self.dual, self._differences(x))]
-        right = measurement.adjoint(measurement.y - measurement.project(x)) + rho * self._adjoint(pull)
-        x = x + conjugate_gradients(
-            lambda d: measurement.adjoint(measurement.linear(d)) + rho * self._adjoint(self._differences(d)),
-            right, iterations)
-        for i, d in enumerate(self._differences(x)):
-            moved = d + self.dual[i]
-            self.dual[i] = moved.clamp(-limit, limit)
-            self.split[i] = moved - self.dual[i]
+
+        def normal(d: Tensor) -> Tensor:
+            smooth = differences_adjoint(differences(d, self.scales), self.scales)
+            return measurement.adjoint(measurement.linear(d)) + rho * smooth
+
+        pull = differences_adjoint(self.split - self.dual - differences(x, self.scales), self.scales)
+        right = measurement.adjoint(measurement.y - measurement.project(x)) + rho * pull
+        x = x + conjugate_gradients(normal, right, iterations)
+        moved = differences(x, self.scales) + self.dual
+        self.dual = moved.clamp(-limit, limit)
+        self.split = moved - self.dual
         return x
-
-    def _differences(self, x: Tensor) -> list[Tensor]:
-        return differences(x, [AXES[axis] for axis in self.settings.axes])
-
-    def _adjoint(self, d: list[Tensor]) -> Tensor:
-        return differences_adjoint(d, [AXES[axis] for axis in self.settings.axes])

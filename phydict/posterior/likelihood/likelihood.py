@@ -8,12 +8,12 @@ They act on the CT channel; the other channels of the state pass through.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
+from phydict.linalg.conjugate_gradients import conjugate_gradients
 from phydict.linalg.total_variation import TVQuadraticMajorizer
 from phydict.posterior.likelihood.reward import Reward
 from phydict.posterior.measurement import Measurement
@@ -78,38 +78,15 @@ class ProximalCG(LikelihoodStep):
             if tv:
                 negative_gradient = negative_gradient - tv_scale * tv.gradient(z)
 
-            def penalty(d, tv=tv):
-                return weight * d + tv_scale * tv.gradient(d) if tv else weight * d
+            def normal(d, tv=tv):
+                fitted = measurement.adjoint(weights * measurement.linear(d)) + weight * d
+                return fitted + tv_scale * tv.gradient(d) if tv else fitted
 
             inactive_mask = ~((z <= -1) & (negative_gradient < 0) | (z >= 1) & (negative_gradient > 0))
             scale = 1 / (weight + tv_scale * tv.diagonal()) if tv else torch.ones_like(z)
-            z = (z + self._solve(measurement, negative_gradient * inactive_mask, scale * inactive_mask, penalty, weights)).clamp(-1, 1)
+            z = (z + conjugate_gradients(normal, negative_gradient * inactive_mask, self.iterations, self.tolerance,
+                                         scale * inactive_mask)).clamp(-1, 1)
         return z
-
-    def _solve(self, measurement: Measurement, residual: Tensor, scale: Tensor, penalty: Callable[[Tensor], Tensor],
-               weights: Tensor | float) -> Tensor:
-        """Preconditioned conjugate gradients for A' W A d + penalty(d) = residual over the voxels with a scale
-        above 0, from zero; scale: the inverse of the penalty's diagonal, up to a factor."""
-        scaled, d = scale * residual, torch.zeros_like(residual)
-        direction, energy = scaled, _dot(residual, scaled)
-        stop = energy * self.tolerance**2
-        for _ in range(self.iterations):
-            going = energy > stop
-            if not going.any():
-                break
-            curved = measurement.adjoint(weights * measurement.linear(direction)) + penalty(direction)
-            step = torch.where(going, energy / _dot(direction, curved), 0)
-            d += step * direction
-            residual = residual - step * curved
-            scaled = scale * residual
-            previous, energy = energy, _dot(residual, scaled)
-            direction = scaled + torch.where(going, energy / previous, 0) * direction
-        return d
-
-
-def _dot(a: Tensor, b: Tensor) -> Tensor:
-    """Inner products of the states of a batch, (B, 1, 1, 1, 1)."""
-    return (a * b).flatten(1).sum(1).view(-1, 1, 1, 1, 1)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections import OrderedDict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -10,6 +9,8 @@ from typing import TYPE_CHECKING
 import torch
 
 from phydict.grid import Grid
+from phydict.linalg.power_iteration import operator_norm
+from phydict.runtime.warning import warn
 from phydict.xray.binning import binning
 from phydict.xray.geometry import VECTOR_KEYS, ConeBeam
 
@@ -59,9 +60,9 @@ class Projector:
             raise ValueError(f"memory is a budget in bytes > 0, but {memory} was given")
         beam.check(grid)
         if not full_detector and (factor := binning(grid, beam)) > 1:
-            warnings.warn(f"the detector's pixels are finer than this grid can resolve: beam.binned({factor}) and "
-                          f"phydict.xray.binned(xrays, {factor}) measure the same in less time; full_detector=True "
-                          "keeps every pixel without this warning", stacklevel=2)
+            warn(f"the detector's pixels are finer than this grid can resolve: beam.binned({factor}) and "
+                 f"phydict.xray.binned(xrays, {factor}) measure the same in less time; full_detector=True "
+                 "keeps every pixel without this warning")
         self.grid, self.beam = grid, beam
         self._engine = _engine(grid, beam, method, int(memory), torch.device(device or "cpu").type)
         self.method, self.reason = self._engine.method, self._engine.reason
@@ -77,19 +78,9 @@ class Projector:
         return _Linear.apply(xrays, self._engine.operator, True)[:, None]
 
     def norm(self) -> float:
-        """The largest singular value of A, by power iteration to a relative change of 1e-5 (computed once).
-
-        A has no negative weights, so its leading singular vector has none either and a constant start reaches it.
-        """
+        """The largest singular value of A (computed once)."""
         if self._engine.norm is None:
-            mu = torch.ones(1, 1, *self.grid.shape)
-            norm, last = 0.0, -1.0
-            for _ in range(200):
-                if abs(norm - last) <= 1e-5 * norm:
-                    break
-                mu, last = self.T(self(mu / mu.norm())), norm
-                norm = float(mu.norm()) ** 0.5
-            self._engine.norm = norm
+            self._engine.norm = operator_norm(self, self.T, torch.ones(1, 1, *self.grid.shape))
         return self._engine.norm
 
 

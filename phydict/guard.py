@@ -13,18 +13,19 @@ from phydict.runtime.warning import warn
 from phydict.xray.residuals import misfits, view_norms, view_sizes
 
 EMPTY_MISFIT, RISE_FACTOR, RISE_MIN = 1.0, 2.0, 0.1
-"""A misfit has risen where it is more than RISE_FACTOR times its smallest so far, that of an empty volume included, and more
-than RISE_MIN."""
+"""A misfit has risen where it is more than RISE_FACTOR times its smallest so far, that of an empty volume included, and
+more than RISE_MIN."""
 
 OUTLIER_RATIO, BAD_FIT = 2.0, 0.1
-"""Where a view's misfit is more than OUTLIER_RATIO times the median of all, that view is doubted; where the misfit is more than
-BAD_FIT, all of them are."""
+"""Where a view's misfit is more than OUTLIER_RATIO times the median of all, that view is doubted; where the misfit is
+more than BAD_FIT, all of them are."""
 
 
 class Operator(Protocol):
     """What a Guard asks of a case's operator.
 
-    y: the X-rays (1, K, V, U); last_projection: the last projections (B, K, V, U) of volumes, not of directions, or None.
+    y: the X-rays (1, K, V, U); last_projection: the last projections (B, K, V, U) of volumes, not of directions, or
+    None.
     """
 
     y: Tensor

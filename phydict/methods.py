@@ -31,8 +31,8 @@ METHODS: dict[str, Sampler | Reconstructor] = {
     "phydict_fast": SplitGibbs(
         iterations=10, t_start=0.97, t_end=0.15, noise_fraction=0.4, momentum=0.5, sampling_noise=1.0, scatter=True,
         likelihood=ProximalCG(iterations=7, restarts=1, tv_weight=10.0, tv_eps=0.003),
-        final_likelihood=ProximalCG(iterations=10, restarts=5, refit_scatter=True, weighted_least_squares=True, tv_weight=10.0,
-                                    tv_eps=0.003)),
+        final_likelihood=ProximalCG(iterations=10, restarts=5, refit_scatter=True, weighted_least_squares=True,
+                                    tv_weight=10.0, tv_eps=0.003)),
     "phydict_paper": SplitGibbs(iterations=50, likelihood=GradientSteps(reward=Reward(lpips=1.0)), ec_delta=0.8,
                                 ec_steps=40, full_detector=True),
     "phydict_released": SplitGibbs(
@@ -63,8 +63,8 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: Prior | str | Pa
     prior: a Prior or the file it is in; None for the shipped one. It is only loaded by methods that need it. name: what
     the result calls the method (None: its own name).
     super_resolution: the second stage of a cascade, or its file; None reconstructs on the prior's own grid. sr_guided:
-    whether the X-rays guide that stage too; sr_sampler: how (None: CascadePosterior's own); sr_noise_augmentation: its noise
-    (None: the stage's own).
+    whether the X-rays guide that stage too; sr_sampler: how (None: CascadePosterior's own); sr_noise_augmentation: its
+    noise (None: the stage's own).
     samples: how many to draw; of several, the result is the mean, with their standard deviation as a map of trust.
     precision: of the networks, one of phydict.runtime.precision.PRECISIONS. Raises ValueError for what cannot be meant.
     """

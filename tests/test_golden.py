@@ -116,12 +116,12 @@ def golden() -> dict:
     return json.loads(GOLDEN.read_text())
 
 
-@pytest.mark.parametrize(("name", "scene"), [case for case in scenes() if case[1] != "cascade"])
+@pytest.mark.parametrize("name, scene", [case for case in scenes() if case[1] != "cascade"])
 def test_a_method_gives_its_golden_figures_in_double_precision(golden, name, scene):
     assert_same(on_the_tiny_grid(name, torch.float64, scene), golden[f"{name}, {scene}"], 1e-6, 1e-3)
 
 
-@pytest.mark.parametrize(("name", "scene"), [
+@pytest.mark.parametrize("name, scene", [
     case for case in scenes() if case[0] in ("phydict_fast", "dds", "sirt", "fdk", "cgls", "tv", "diffvox")])
 def test_a_method_gives_its_golden_figures_in_single_precision(golden, name, scene):
     assert_same(on_the_tiny_grid(name, torch.float32, scene), golden[f"{name}, {scene}"], 1e-3, 1.0)

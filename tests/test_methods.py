@@ -186,7 +186,8 @@ def test_a_method_without_a_prior_takes_no_second_stage():
     with pytest.raises(ValueError, match="SIRT has none"):
         reconstructor("sirt", super_resolution=tiny_super_resolution())
     with pytest.raises(ValueError, match=r"in \[0, 1\]"):
-        reconstructor(PriorOnly(2), tiny_prior(False), super_resolution=tiny_super_resolution(), sr_noise_augmentation=1.5)
+        reconstructor(PriorOnly(2), tiny_prior(False), super_resolution=tiny_super_resolution(),
+                      sr_noise_augmentation=1.5)
 
 
 @pytest.mark.parametrize("method", ["cgls", "phydict_fast"])

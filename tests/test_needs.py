@@ -44,8 +44,8 @@ for name, report in json.loads(sys.argv[2]):
 print(json.dumps({"modules": sorted(sys.modules), "networks": networks}))
 """
 
-NEVER = ("lightning", "pytorch_lightning", "tensorboard", "lungmask", "itk", "ignite", "phydict.training", "phydict.cli",
-         "phydict.inference")
+NEVER = ("lightning", "pytorch_lightning", "tensorboard", "lungmask", "itk", "ignite", "phydict.training",
+         "phydict.cli", "phydict.inference")
 """Of use to training, to tables and to other files, and to no reconstruction in memory. MONAI is not among them,
 nor are transformers and lpips: the networks are MONAI's, which imports all of itself and those two with it."""
 PRESETS = ("sirt", "fdk", "phydict_fast", "phydict_paper", "phydict_released")

@@ -111,7 +111,7 @@ def test_what_is_learnt_is_the_detail_of_a_crop_given_its_block_means():
     torch.testing.assert_close(level, torch.cat([0.4 * torch.rand(1, generator=draw) for draw in draws]))
     added = torch.stack([torch.randn(coarse.shape[1:], generator=draw) for draw in draws]) * level.view(-1, 1, 1, 1, 1)
     torch.testing.assert_close(upsampled, noisy.prior.upsample(coarse + added))
-    assert 0 < level.min() and level.max() <= 0.4 and level[0] != level[1]
+    assert level.min() > 0 and level.max() <= 0.4 and level[0] != level[1]
 
 
 def _draws() -> list[torch.Generator]:

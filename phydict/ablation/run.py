@@ -187,7 +187,8 @@ class Runner:
             "device": self.device.type, "threads": torch.get_num_threads(), "precision": result.precision,
             "instruction_set": instruction_set(self.device)}
 
-    def _reconstruct(self, trial: Trial, scene: MeasuredCase, watch: Stopwatch, on_step: Callable[[], None]) -> Reconstruction:
+    def _reconstruct(self, trial: Trial, scene: MeasuredCase, watch: Stopwatch,
+                     on_step: Callable[[], None]) -> Reconstruction:
         seed = case_seed(trial.seed, scene.case)
         torch.manual_seed(seed)
         prior = TimedPrior(_on(trial.prior, self.device), watch) if isinstance(trial.method, Sampler) else None

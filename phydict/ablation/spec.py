@@ -105,7 +105,7 @@ class Trial:
     def label(self) -> str:
         """The method and what was changed of it or of its X-rays; the number of views always."""
         return ", ".join([self.name, *(f"{name} {value}" for name, value in self.columns.items() if name == "views" or
-                                       name != "method" and ("." in name or value != SETTINGS[name][1]))])
+                                       (name != "method" and ("." in name or value != SETTINGS[name][1])))])
 
     def scene(self) -> tuple[Grid, HUWindow]:
         """The grid of the volume and the HU window that the truth is clipped to."""
@@ -211,7 +211,7 @@ def _trials(base: Mapping, axes: Mapping, methods: Mapping, cases: Cases) -> tup
     for values in product(*axes.values()):
         mine = dict(zip(axes, values))
         name = mine.get("method", base.get("method"))
-        if not isinstance(name, str) or name not in methods and name not in METHODS:
+        if not isinstance(name, str) or (name not in methods and name not in METHODS):
             raise ValueError(f"there is no method {name!r}: use one of {', '.join([*methods, *METHODS])}")
         changes = _dotted(methods.get(name) or {})
         of = changes.pop("of", name)

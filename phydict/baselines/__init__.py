@@ -6,4 +6,4 @@ from phydict.baselines.fdk import FDK
 from phydict.baselines.sirt import SIRT
 from phydict.baselines.tv import FISTATV
 
-__all__ = ["CGLS", "DiffVox", "FDK", "FISTATV", "SIRT"]
+__all__ = ["CGLS", "FDK", "FISTATV", "SIRT", "DiffVox"]

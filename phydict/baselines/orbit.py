@@ -74,7 +74,7 @@ class Orbit:
         it, falling to 0 over the TAPER at its ends, and 0 beyond them, so that lines seen once have w = 1: full,
         short and limited scans in one formula (Noo, Defrise, Clackdoyle & Kudo 2002, doi:10.1088/0031-9155/47/14/311).
         """
-        gaps, step, order, arc = self._steps()
+        _gaps, step, order, arc = self._steps()
         if arc >= 2 * math.pi:
             return np.full(tangents.shape, 0.5)
         start = self.angles[order[0]] - step / 2

@@ -2,7 +2,8 @@
 
 Pixels: rescale slope and intercept, or the modality LUT, are applied; the VOI window, a choice for the eye, never is.
 MONOCHROME1 says how values are shown, so it inverts display images alone. Tags are looked for in a frame's own
-functional groups, in the shared ones, and in the file. The beam they state is phydict.datasets.radiographs.dicom_beam's.
+functional groups, in the shared ones, and in the file. The beam they state is
+phydict.datasets.radiographs.dicom_beam's.
 """
 
 from __future__ import annotations

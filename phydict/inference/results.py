@@ -67,7 +67,7 @@ class CaseResults:
         with undisturbed(self.folder):
             now = {case: self._there(case) for case in self._sources}
         return [case for case, there in now.items()
-                if not there or self._other(case, there) or self.overwrite and self._is_unchanged(case, there)]
+                if not there or self._other(case, there) or (self.overwrite and self._is_unchanged(case, there))]
 
     def write(self, case: str, record: dict, write_files: Callable[[Path], None]) -> None:
         """Makes a case's folder: `write_files` fills it, the record, which lists them, completes it, then it takes its

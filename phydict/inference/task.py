@@ -52,7 +52,8 @@ class ReconstructionTask(lightning.LightningModule):
         super_resolution: file of a cascade's second stage, which refines what the prior gives; none given: none
         sr_guided: whether the X-rays guide the second stage too
         sr_sampler: how they do; none given: the cascade's own
-        sr_noise_augmentation: level in [0, 1] of the noise that the prior's estimate is given before the second stage sees it;
+        sr_noise_augmentation: level in [0, 1] of the noise that the prior's estimate is given before the second stage
+        sees it;
             none given: the stage's own, 0.05, or 0 for MedSyn's
         samples: how many are drawn; of several the volume is the mean, and deviation.nii.gz their standard deviation
         sr_memory: GiB that the second stage's network may take; it works in tiles where the whole takes more, and
@@ -123,10 +124,10 @@ class ReconstructionTask(lightning.LightningModule):
                   file=sys.stderr)
         return left
 
-    def predict_step(self, case: dict, _=None) -> None:
+    def predict_step(self, case: dict, index: int = 0) -> None:
         self._attempt(case, self._predict)
 
-    def test_step(self, case: dict, _=None) -> None:
+    def test_step(self, case: dict, index: int = 0) -> None:
         self._attempt(case, self._test)
 
     def _predict(self, case: dict) -> None:

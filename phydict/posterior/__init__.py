@@ -17,6 +17,25 @@ from phydict.posterior.samplers.prior_only import PriorOnly
 from phydict.posterior.samplers.sampler import Sampler, ddim_sample
 from phydict.posterior.samplers.split_gibbs import SplitGibbs
 
-__all__ = ["ADMMTV", "CascadePosterior", "DAPS", "DDS", "DPS", "DiffPIR", "ExactDraw", "GradientSteps", "Langevin",
-           "LikelihoodDraw", "LikelihoodStep", "Measurement", "PnPDM", "Posterior", "PriorOnly", "ProximalCG", "Reward",
-           "Sampler", "SplitGibbs", "ddim_sample"]
+__all__ = [
+           "ADMMTV",
+           "DAPS",
+           "DDS",
+           "DPS",
+           "CascadePosterior",
+           "DiffPIR",
+           "ExactDraw",
+           "GradientSteps",
+           "Langevin",
+           "LikelihoodDraw",
+           "LikelihoodStep",
+           "Measurement",
+           "PnPDM",
+           "Posterior",
+           "PriorOnly",
+           "ProximalCG",
+           "Reward",
+           "Sampler",
+           "SplitGibbs",
+           "ddim_sample",
+]

@@ -28,8 +28,8 @@ class Measurement:
 
     noise: standard deviation of the noise of y, as a share of its largest value or, as a tensor that expands to
     (K, V, U), of each pixel; None: estimated from y where it is needed.
-    scatter_enabled: whether `subtract_scatter` subtracts scatter; calls: how many times A or its adjoint ran over all views, per
-    volume of a batch; last_projection: what `project` last gave.
+    scatter_enabled: whether `subtract_scatter` subtracts scatter; calls: how many times A or its adjoint ran over all
+    views, per volume of a batch; last_projection: what `project` last gave.
     """
 
     def __init__(self, projector: Projector, xrays: Tensor, window: HUWindow, display: bool = False,
@@ -89,8 +89,8 @@ class Measurement:
 
     @property
     def can_estimate_scatter(self) -> bool:
-        """Whether the X-rays can hold scatter that `subtract_scatter` could find: not display values, whose offset has taken it,
-        nor X-rays of which no signal is left (MAX_LINE_INTEGRAL)."""
+        """Whether the X-rays can hold scatter that `subtract_scatter` could find: not display values, whose offset has
+        taken it, nor X-rays of which no signal is left (MAX_LINE_INTEGRAL)."""
         return self.display is None and bool(self.measured.max() < MAX_LINE_INTEGRAL)
 
     def reset_scatter(self, enabled: bool) -> None:
@@ -98,8 +98,8 @@ class Measurement:
         self.y, self.scatter_enabled = self.measured, enabled and self.can_estimate_scatter
 
     def subtract_scatter(self, reprojection: Tensor) -> None:
-        """Where scatter is sought, subtract what the projections P(x) tell of, if it is MIN_SCATTER_FRACTION of the signal on
-        average or more."""
+        """Where scatter is sought, subtract what the projections P(x) tell of, if it is MIN_SCATTER_FRACTION of the
+        signal on average or more."""
         if self.scatter_enabled:
             corrected = subtract_scatter(self.measured, reprojection)
             self.y = torch.where(self._share(corrected) < MIN_SCATTER_FRACTION, self.measured, corrected)

@@ -95,8 +95,8 @@ class SuperResolution(nn.Module):
              generator: torch.Generator | None = None) -> BoundSuperResolution:
         """The denoiser given a coarse state (B, C, x, y, z) with Gaussian noise of the level `noise`.
 
-        precision: see phydict.runtime.precision. generator: what the noise, added here, is drawn from; None: `coarse` carries it
-        already. Raises ValueError for a level outside [0, 1] or too few channels.
+        precision: see phydict.runtime.precision. generator: what the noise, added here, is drawn from; None: `coarse`
+        carries it already. Raises ValueError for a level outside [0, 1] or too few channels.
         """
         if not 0 <= noise <= 1:
             raise ValueError(f"the noise level of the coarse state lies in [0, 1], but {noise} was given")

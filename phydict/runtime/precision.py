@@ -44,7 +44,7 @@ def resolve_precision(precision: str, device: torch.device, state: torch.dtype =
     ValueError for a precision that is none of PRECISIONS.
     """
     check_precision(precision)
-    if precision == "float32" or precision == "auto" and state == torch.float64:
+    if precision == "float32" or (precision == "auto" and state == torch.float64):
         return state
     if computes_bfloat16(device):
         return torch.bfloat16

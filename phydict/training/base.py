@@ -46,7 +46,8 @@ class PriorTraining(StageTraining):
         warmup: steps over which the learning rate rises
         decay_from: step at which a linear decay of the learning rate to zero begins
         decay_steps: length of that decay in steps; 0: no decay
-        text_pretrain_steps: steps of each task by which a small BERT learns reports before denoising begins; 0: it learns by
+        text_pretrain_steps: steps of each task by which a small BERT learns reports before denoising begins; 0: it
+        learns by
             denoising
         preview_steps: noise levels of the samples that validation paints; 0: none
         validation_views: X-rays from which validation reconstructs each held-out case by phydict_fast, to tell which

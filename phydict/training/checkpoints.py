@@ -38,7 +38,8 @@ def read_checkpoint(path: str | Path) -> dict:
     if not isinstance(stage, str) or stage not in STAGES:
         raise ValueError(f"{path} is damaged: its header is {reprlib.repr(header)}; give another checkpoint")
     if not isinstance(weights, dict) or not all(isinstance(name, str) for name in weights) or not all(
-            isinstance(weight, torch.Tensor) for name, weight in weights.items() if name.startswith(("prior.", "text."))):
+            isinstance(weight, torch.Tensor) for name, weight in weights.items()
+            if name.startswith(("prior.", "text."))):
         raise ValueError(f"{path} is damaged: its weights are {reprlib.repr(weights)}; give another checkpoint")
     for state in ("state_dict", "current_model_state"):
         check_finite(checkpoint.get(state, {}), path)
@@ -55,8 +56,8 @@ class WholeCheckpoints(TorchCheckpointIO):
         except (OSError, RuntimeError) as error:
             if isinstance(error, RuntimeError):  # torch's words for a write that was cut short
                 error = OSError(errno.ENOSPC, "perhaps the disk is full")
-            raise not_written(f"the checkpoint {path}", error, "give another --out, and go on from the last one, if there "
-                              "is one, with --ckpt_path") from error
+            raise not_written(f"the checkpoint {path}", error, "give another --out, and resume from the last one, if there is "
+                              "one, with --ckpt_path") from error
 
 
 class BestCheckpoint(ModelCheckpoint):

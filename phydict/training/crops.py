@@ -119,5 +119,5 @@ class SuperResolutionData(PriorData):
         return CropDataset(cts, phantoms, 1.0, self.window, self.crop, self.factor, count, 0, 0, augmented=False)
 
     def draws(self, epoch: int) -> Dataset:
-        return CropDataset(self.cts, self.phantoms, self.ct_fraction, self.window, self.crop, self.factor, self.epoch_size,
-                     epoch, self.seed)
+        return CropDataset(self.cts, self.phantoms, self.ct_fraction, self.window, self.crop, self.factor,
+                           self.epoch_size, epoch, self.seed)

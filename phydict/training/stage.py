@@ -28,8 +28,8 @@ NOISE_LEVELS = (0.1, 0.3, 0.5, 0.7, 0.9)
 class StageTraining(lightning.LightningModule, ABC):
     """Learns one stage by denoising: squared error of x0 at all noise levels, up to four times heavier at the low ones.
 
-    A stage says what a batch's clean state is (`_clean_state`), what its network is told beside it (`_condition`), and what
-    denoises a held-out case (`_denoiser`). Its network is `self.prior`.
+    A stage says what a batch's clean state is (`_clean_state`), what its network is told beside it (`_condition`), and
+    what denoises a held-out case (`_denoiser`). Its network is `self.prior`.
     """
 
     def __init__(self, prior: Prior | SuperResolution, typical_std: float, learning_rate: float, weight_decay: float,
@@ -81,7 +81,7 @@ class StageTraining(lightning.LightningModule, ABC):
         generators = [torch.Generator().manual_seed(hash((*key, place)) % 2**31) for place in places]
         u = torch.cat([torch.rand(1, generator=generator) for generator in generators])
         t = ((torch.tensor(places) + u) / (len(x0) * processes)).to(self.device)
-        noise = torch.stack([torch.randn(x0.shape[1:], generator=generator) for generator in generators]).to(self.device)
+        noise = torch.stack([torch.randn(x0.shape[1:], generator=g) for g in generators]).to(self.device)
         told = self._condition(batch, x0, generators)
         a, s = (w.float().view(-1, 1, 1, 1, 1) for w in self.prior.schedule.scales(t.double()))
         error = (self.prior(a * x0 + s * noise, t, *told) - x0).square()

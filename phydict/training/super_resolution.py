@@ -65,8 +65,8 @@ class SuperResolutionTraining(StageTraining):
 
     def _condition(self, batch: dict, x0: Tensor, generators: list[torch.Generator]) -> tuple[Tensor, ...]:
         coarse = avg_pool3d(x0, self.prior.factor)
-        level = self.most_noise * torch.cat([torch.rand(1, generator=generator) for generator in generators]).to(self.device)
-        noise = torch.stack([torch.randn(coarse.shape[1:], generator=generator) for generator in generators]).to(self.device)
+        level = self.most_noise * torch.cat([torch.rand(1, generator=g) for g in generators]).to(self.device)
+        noise = torch.stack([torch.randn(coarse.shape[1:], generator=g) for g in generators]).to(self.device)
         return self.prior.upsample(coarse + level.view(-1, 1, 1, 1, 1) * noise), level
 
     def _denoiser(self, batch: dict, x0: Tensor) -> Denoiser:

@@ -21,5 +21,6 @@ def view_norms(views: Tensor) -> Tensor:
 
 
 def view_sizes(xrays: Tensor) -> Tensor:
-    """Norms (..., K) of views (..., K, V, U), of which none counts as smaller than one of EPS_LINE_INTEGRAL in every pixel."""
+    """Norms (..., K) of views (..., K, V, U), of which none counts as smaller than one of EPS_LINE_INTEGRAL in every
+    pixel."""
     return view_norms(xrays).clamp(min=EPS_LINE_INTEGRAL * math.sqrt(xrays.shape[-1] * xrays.shape[-2]))

@@ -20,7 +20,7 @@ def chest_views():
 
 
 def test_the_misfit_falls_with_the_iterations_and_is_that_of_the_volume():
-    y = CHEST((MU_WATER * random_like((1, 1, 24, 24, 24), torch.float32).abs() * typical_chest(CHEST)))[0]
+    y = CHEST(MU_WATER * random_like((1, 1, 24, 24, 24), torch.float32).abs() * typical_chest(CHEST))[0]
     results = [SIRT(n).reconstruct(y, CHEST) for n in (3, 10, 30, 100)]
     misfits = [r.misfit for r in results]
     assert misfits == sorted(misfits, reverse=True) and misfits[-1] < 0.3 * misfits[0]

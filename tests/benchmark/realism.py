@@ -32,6 +32,7 @@ from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM
 from phydict.evaluation import write_csv
 from phydict.grid import Grid
 from phydict.units import HUWindow
+import itertools
 
 GRID, WINDOW = Grid.cube(64), HUWindow()
 MM, ML = 6.0, 0.216
@@ -148,7 +149,7 @@ class Case:
         radius = np.sqrt((frequency**2).sum(0))
         along = np.abs(frequency[2]) > 0.7 * np.maximum(radius, 1e-9)
         result = {}
-        for low, high in zip(BANDS[:-1], BANDS[1:]):
+        for low, high in itertools.pairwise(BANDS):
             shell = (radius >= low) & (radius < high)
             for name, part in (("across", shell & ~along), ("along z", shell & along)):
                 result[f"power {low}-{high} per m {name} dB"] = 10 * np.log10(power[part].mean())

@@ -24,13 +24,13 @@ def phantom(request):
 
 
 def test_the_lungs_of_a_phantom_are_found(phantom):
-    grid, hu, truth, masks, known = phantom
+    _grid, _hu, truth, masks, known = phantom
     assert known.all()
     assert dice(masks[0] > 0.5, truth[0]) > 0.9
 
 
 def test_the_trachea_of_a_phantom_is_airway_and_not_lung(phantom):
-    grid, hu, truth, masks, known = phantom
+    _grid, hu, truth, masks, _known = phantom
     x, y, z = np.nonzero(truth[1] & (hu < -980))
     top = z > np.quantile(z, 0.8)
     assert masks[1][x[top], y[top], z[top]].mean() > 0.8
@@ -38,7 +38,7 @@ def test_the_trachea_of_a_phantom_is_airway_and_not_lung(phantom):
 
 
 def test_vessels_lie_inside_the_lungs_and_are_bright(phantom):
-    grid, hu, truth, masks, known = phantom
+    _grid, hu, _truth, masks, _known = phantom
     vessel = masks[2] > 0
     assert vessel.any() and (masks[0][vessel] == 1).all() and (hu[vessel] > -500).all()
 
@@ -67,7 +67,7 @@ def test_a_pocket_of_gas_in_the_body_is_not_a_lung():
 
 
 def test_a_hollow_table_is_not_a_lung():
-    hu, x, y, z = body()
+    hu, x, y, _z = body()
     hu[(np.abs(x) < 40) & (y < -33)] = -300
     hu[(np.abs(x) < 37) & (y < -34) & (y > -39)] = -850
     assert not segment(hu, 4.0)[1].any()
@@ -87,7 +87,7 @@ def test_the_volume_and_place_of_two_plain_lungs_are_right():
 
 
 def test_a_lung_open_at_the_first_and_last_slice_is_still_found():
-    hu, x, y, z = body()
+    hu, x, y, _z = body()
     lungs = ((abs(x) - 18) / 12) ** 2 + ((y - 3) / 18) ** 2 < 1
     hu[lungs] = -850
     assert segment(hu, 4.0)[0][0].sum() == pytest.approx(lungs.sum(), rel=0.1)

@@ -161,7 +161,7 @@ def test_without_lungs_the_scan_is_centred_with_a_warning():
     assert case["centred_on"] == "volume" and not case["has_masks"].any() and not case["masks"].any()
 
 
-@pytest.mark.parametrize(("wrong", "sentence"), [(lambda hu: hu + 1024, "no value lies below -300"),
+@pytest.mark.parametrize("wrong, sentence", [(lambda hu: hu + 1024, "no value lies below -300"),
                                                  (lambda hu: hu / 2, "the most frequent value below -300 is -490"),
                                                  (lambda hu: hu - 1024, "only 0.* % of it lies above -200")])
 def test_numbers_that_are_not_hu_are_warned_of(thorax, wrong, sentence):
@@ -384,13 +384,13 @@ def test_augmentation_stays_small_and_never_mirrors(case):
     moves = []
     for seed in range(10):
         new = augment(case, seed, GRID)
-        assert -1 <= new["volume"].min() and new["volume"].max() <= 1
-        assert 0 <= new["masks"].min() and new["masks"].max() <= 1
+        assert new["volume"].min() >= -1 and new["volume"].max() <= 1
+        assert new["masks"].min() >= 0 and new["masks"].max() <= 1
         assert new["volume"][0, 0, 0, 0] == -1, "air stays air"
         assert 0.65 < float(new["masks"][0].sum()) / lung < 1.5
         moves.append(np.argwhere(new["volume"][0].numpy() > 0.4).mean(0) - start)
     millimetres = 12 * np.linalg.norm(moves, axis=1)
-    assert 3 < millimetres.mean() and millimetres.max() < 60
+    assert millimetres.mean() > 3 and millimetres.max() < 60
 
 
 def test_a_deformation_of_nothing_changes_nothing(case):
@@ -428,7 +428,7 @@ def test_hu_changes_spare_air_and_scale_tissue(case):
         torch.testing.assert_close(new[tissue], expected, atol=0.5, rtol=0)
 
 
-@pytest.mark.parametrize(("report", "may"), [
+@pytest.mark.parametrize("report, may", [
     ("", True), ("No focal consolidation.", True), ("Bilateral pleural effusion.", True),
     ("Nodule, right lung.", False), ("LEFT-sided effusion", False),
     ("Consolidation of the middle lobe.", False), ("Opacity in the LLL.", False), ("Lingular atelectasis", False)])
@@ -440,7 +440,7 @@ def test_only_a_report_without_side_may_be_mirrored_and_only_on_demand(case, rep
             torch.testing.assert_close(new[key], case[key].flip(1) if mirrored else case[key], atol=1e-4, rtol=0)
 
 
-@pytest.mark.parametrize(("strength", "words"), [({"shift": -1.0}, "shift is -1"), ({"scale": 0.9}, "small changes"),
+@pytest.mark.parametrize("strength, words", [({"shift": -1.0}, "shift is -1"), ({"scale": 0.9}, "small changes"),
                                                  ({"mirror": 1.5}, "share of the cases"),
                                                  ({"table": 1.5}, "table is a share"),
                                                  ({"field": -0.1}, "field is -0.1")])

@@ -147,11 +147,11 @@ def lacking(paths):
 def position(paths, shift):
     """ImagePositionPatient moved by shift(k) for slice k."""
     first = np.array(pydicom.dcmread(paths[0]).ImagePositionPatient, float)
-    edit(paths, ImagePositionPatient=[list(first + [0, 0, 6 * k] + np.array(shift(k)))
+    edit(paths, ImagePositionPatient=[list([*first, 0, 0, 6 * k, *np.array(shift(k))])
                                       for k in range(len(paths))])
 
 
-@pytest.mark.parametrize(("spoil", "reason"), [
+@pytest.mark.parametrize("spoil, reason", [
     (lambda p: [path.unlink() for path in p[3:]], "it has 3 slices, but a chest CT has at least 8"),
     (lambda p: p[7].unlink(), "1 of its slices is missing, the first between slice006.dcm and slice008.dcm"),
     (lambda p: [path.unlink() for path in (p[7], p[20], p[21])], "3 of its slices are missing"),
@@ -236,7 +236,7 @@ def test_a_coarser_case_is_the_same_whether_prepared_so_or_read_so(tmp_path, tho
     assert (part["volume"] - inner).abs().mean() * wide.half_width < 15, "a part of the box is resampled in its place"
 
 
-@pytest.mark.parametrize(("grid", "sentence"), [
+@pytest.mark.parametrize("grid, sentence", [
     (Grid.cube(32, 400), "as a box of 384 x 384 x 384 mm, but 400 x 400 x 400 mm are asked for; .* --side 400"),
     (Grid.cube(64), "with voxels of 12 mm, but 6 mm are asked for; .* --voxels 64")])
 def test_more_than_was_prepared_is_refused(tmp_path, thorax, grid, sentence):
@@ -304,7 +304,7 @@ def test_lungmask_sees_slices_as_it_was_trained(tmp_path, thorax, monkeypatch):
 def test_medsyns_space_scales_the_lungs_box_to_the_atlas_and_leads_back(tmp_path, thorax):
     save(tmp_path / "in/a.nii.gz", np.where(thorax == -1000, -2000, thorax).astype(np.int16))
     settings = Settings(voxels=64, space="medsyn", window=(-1024.0, 600.0))
-    (row,) = prepare_folder(tmp_path / "in", tmp_path / "out", settings)
+    (_row,) = prepare_folder(tmp_path / "in", tmp_path / "out", settings)
     lung, ct = (nibabel.load(tmp_path / f"out/a/{name}.nii.gz") for name in ("lung", "ct"))
     assert nibabel.aff2axcodes(ct.affine) == ("S", "A", "L")
     voxel = np.array(ATLAS_MM)[::-1] / 64
@@ -505,7 +505,7 @@ def test_the_recipe_prints_counts_and_fails_in_one_sentence(tmp_path, thorax, ca
 
 # tables
 
-@pytest.mark.parametrize(("text", "sentence"), [
+@pytest.mark.parametrize("text, sentence", [
     ("VolumeName,Findings_EN\na,b\n", "lacks the columns Impressions_EN"),
     ("", "lacks the columns VolumeName, Findings_EN, Impressions_EN"),
     ("VolumeName,Findings_EN,Impressions_EN\na.nii.gz,x,\nb,x,\na.nii.gz,y,\n", "a has two rows, the second in row 4"),

@@ -161,7 +161,7 @@ def test_scale_and_offset_are_applied(tmp_path):
     np.testing.assert_allclose(xrays, 0.1 * pixels - 1, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize(("intensity", "sentence"), [
+@pytest.mark.parametrize("intensity, sentence", [
     ({"scale": 1.0}, "reach 6e.04, .* correct `scale`"),
     ({"scale": 1e-4, "offset": -9.0}, "median of -"),
     ({"scale": 0.0}, "scale of line integrals must not be 0"),
@@ -213,7 +213,7 @@ def test_display_images_grow_with_density_whatever_their_polarity(tmp_path):
         "kind": "display", "bright_is_dense": n == "bright"})) for n, p in (("bright", pixels), ("dark", 255 - pixels)))
     assert bright["display"] and dark["display"]
     torch.testing.assert_close(bright["xrays"], dark["xrays"])
-    assert 0 <= bright["xrays"].min() and bright["xrays"].max() <= 1
+    assert bright["xrays"].min() >= 0 and bright["xrays"].max() <= 1
     assert bright["xrays"][1, 5, 4] > bright["xrays"][0, 0, 0]
 
 
@@ -291,7 +291,7 @@ def test_missing_things_are_named(tmp_path):
     fails("holds no X-ray image", write(tmp_path / "empty", []), FileNotFoundError)
 
 
-@pytest.mark.parametrize(("blocks", "sentence"), [
+@pytest.mark.parametrize("blocks, sentence", [
     ({"beam": {"orbit": ORBIT}, "colour": 1}, "unknown key 'colour'"),
     ({"orbit": ORBIT, "colour": 1}, "unknown key 'colour'"),
     ({"orbit": ORBIT | {"distance": 3}}, "unknown key 'distance'"),

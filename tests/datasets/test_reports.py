@@ -17,7 +17,7 @@ NOTHING = [None, float("nan"), "", "  \n\t", "\u00a0", "nan", "NaN", "None", "No
 LAYOUT = "Findings: Nodule, 4 mm. Impression: Benign nodule."
 
 
-@pytest.mark.parametrize(("findings", "impression", "joined"), [
+@pytest.mark.parametrize("findings, impression, joined", [
     ("Clear\nlungs.", "Normal.", "Findings: Clear lungs. Impression: Normal."),
     ('A, "b" (c).', None, 'Findings: A, "b" (c).'),
     ("Findings: Nodule, 4 mm.", "IMPRESSION:\nBenign nodule.", LAYOUT)])

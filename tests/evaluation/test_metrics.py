@@ -131,7 +131,7 @@ def test_each_axis_is_seen_by_the_ssim():
 
 @pytest.mark.parametrize("shape", [(10, 16, 16), (8, 8, 8), (3, 4, 5), (1, 1, 1)])
 def test_small_volumes_get_a_window_that_fits(shape):
-    taps, sigma = ssim_window(shape)
+    taps, _sigma = ssim_window(shape)
     assert all(t <= n and t % 2 == 1 for t, n in zip(taps, shape))
     truth, _ = smooth_case(9)
     truth = truth[..., : shape[0], : shape[1], : shape[2]]

@@ -42,9 +42,9 @@ def test_columns_are_the_union_with_case_and_method_first(tmp_path):
 
 def test_appending_reads_the_old_rows_and_adds_columns(tmp_path):
     path = tmp_path / "t.csv"
-    for row in ROWS + [{"case": "009", "method": "fdk", "lpips": 0.25}]:
-        write_csv(path, read_csv(path) + [row])
-    assert read_csv(path) == ROWS + [{"case": "009", "method": "fdk", "lpips": 0.25}]
+    for row in [*ROWS, {"case": "009", "method": "fdk", "lpips": 0.25}]:
+        write_csv(path, [*read_csv(path), row])
+    assert read_csv(path) == [*ROWS, {"case": "009", "method": "fdk", "lpips": 0.25}]
 
 
 def test_a_truncated_file_is_named(tmp_path):
@@ -136,7 +136,7 @@ def test_seeds_of_a_case_are_averaged_before_cases():
 
 
 def test_a_metric_that_a_method_lacks_is_a_dash():
-    table = cells(markdown(ROWS + [{"case": "007", "method": "tv", "psnr": 1.0}]))
+    table = cells(markdown([*ROWS, {"case": "007", "method": "tv", "psnr": 1.0}]))
     assert table["tv"]["SSIM"] == "–" and table["tv"]["PSNR (dB)"] == "1.00"
 
 

@@ -193,7 +193,7 @@ def test_all_figures_are_finite_and_belong_to_the_volume(cascade, xrays):
     assert len(calls) == method.steps() == 3 + 2 and found.method == "both" and found.network_calls == 5
     assert set(found.seconds) == {"base", "prepare", "sample", "score"}
     assert found.volume.min() >= -1000 and found.volume.max() <= 600
-    assert found.masks.shape == (3, *FINE.shape) and 0 <= found.masks.min() and found.masks.max() <= 1
+    assert found.masks.shape == (3, *FINE.shape) and found.masks.min() >= 0 and found.masks.max() <= 1
     window = cascade.super_resolution.window
     again = PROJECTOR(window.to_mu(window.to_range(found.volume))[None, None])[0]
     torch.testing.assert_close(found.reprojection, again, atol=1e-4, rtol=1e-4)

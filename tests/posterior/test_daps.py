@@ -6,6 +6,7 @@ from laws import random_like
 
 from phydict.posterior import DAPS, ExactDraw, Langevin
 from posterior.dense import SHAPE, condition, denoiser, measurement, moments
+import itertools
 
 V, NOISE = 0.04, 0.3
 EXACT = {"likelihood": ExactDraw(20, 1e-12), "noise": NOISE}
@@ -72,10 +73,10 @@ def test_exact_data_are_met_to_the_stated_noise_by_more_levels_and_closer_by_mor
         return float((m.project(sample(settings, 2000, m)) - m.y).square().mean().sqrt())
 
     levels = [misfit(n, 6) for n in (3, 10, 30)]
-    assert all(after <= max(before, 1.05 * noise) for before, after in zip(levels, levels[1:])), levels
+    assert all(after <= max(before, 1.05 * noise) for before, after in itertools.pairwise(levels)), levels
     assert levels[-1] < 1.05 * noise
     inner = [misfit(10, n) for n in (0, 1, 2, 3)]
-    assert all(after < before for before, after in zip(inner, inner[1:])), inner
+    assert all(after < before for before, after in itertools.pairwise(inner)), inner
 
 
 def test_the_result_depends_on_the_seed_alone():

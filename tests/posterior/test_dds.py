@@ -7,6 +7,7 @@ from laws import random_like
 from phydict.posterior import ADMMTV, DDS
 from phydict.posterior.normalised import NormalisedMeasurement
 from posterior.dense import SHAPE, DenseMeasurement, condition, denoiser, measurement, moments, propagate
+import itertools
 
 V = 0.04
 X = random_like((1, *SHAPE), seed=10)
@@ -44,7 +45,7 @@ def test_more_levels_and_more_conjugate_gradients_never_raise_the_misfit_of_exac
 
     levels, inner = [misfit(n, 2) for n in (5, 20, 80)], [misfit(20, n) for n in (0, 1, 2, 3)]
     for misfits in (levels, inner):
-        assert all(after <= before for before, after in zip(misfits, misfits[1:])), misfits
+        assert all(after <= before for before, after in itertools.pairwise(misfits)), misfits
 
 
 def test_the_result_depends_on_the_seed_alone():

@@ -6,6 +6,7 @@ from laws import random_like
 
 from phydict.posterior import DiffPIR
 from posterior.dense import FINE, SHAPE, N, condition, denoiser, measurement, moments, propagate
+import itertools
 
 V, NOISE = 0.04, 0.3
 X = random_like((1, *SHAPE), seed=10)
@@ -61,7 +62,7 @@ def test_exact_data_are_met_within_the_stated_noise_and_closer_with_more_conjuga
     assert misfit(DiffPIR(30, noise=1e7)) > 4 * noise
     assert all(misfit(DiffPIR(n, noise=noise)) < noise for n in (3, 10, 30, 100))
     inner = [misfit(DiffPIR(30, noise=noise, cg_iterations=n)) for n in (0, 1, 2, 3, 4)]
-    assert all(after < before for before, after in zip(inner, inner[1:]))
+    assert all(after < before for before, after in itertools.pairwise(inner))
 
 
 def test_the_result_depends_on_the_seed_alone():

@@ -9,6 +9,7 @@ from phydict.grid import Grid
 from phydict.posterior import DPS, Posterior
 from phydict.xray import ConeBeam, Projector
 from posterior.dense import FINE, SHAPE, N, denoiser, measurement, moments
+import itertools
 
 V = 0.04
 X = random_like((1, *SHAPE), seed=10)
@@ -46,7 +47,7 @@ def test_a_longer_push_and_more_levels_never_raise_the_misfit_of_exact_data():
 
     pushed, levels = [misfit(50, scale) for scale in (0.0, 0.01, 0.02, 0.04)], [misfit(n, 0.02) for n in (20, 60, 180)]
     for misfits in (pushed, levels):
-        assert all(after < before for before, after in zip(misfits, misfits[1:])), misfits
+        assert all(after < before for before, after in itertools.pairwise(misfits)), misfits
 
 
 def test_cases_of_a_batch_do_not_mix():

@@ -13,6 +13,7 @@ from phydict.posterior import GradientSteps, Measurement, ProximalCG, Reward
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 from posterior.dense import SHAPE, DenseMeasurement, N, measurement
+import itertools
 
 X0 = 0.3 * random_like((1, *SHAPE), seed=20)
 
@@ -39,7 +40,7 @@ def test_each_iteration_lowers_the_objective_and_as_many_as_unknowns_suffice():
         return float((m.project(z) - m.y).square().sum() / noise**2 + (z - X0).square().sum() / spread**2)
 
     values = [objective(ProximalCG(k, 1, noise, 0.0)(m, X0, spread)) for k in range(N + 1)]
-    assert all(later < earlier for earlier, later in zip(values, values[1:]))
+    assert all(later < earlier for earlier, later in itertools.pairwise(values))
     assert values[-1] == pytest.approx(objective(solved(m, X0, (noise / spread) ** 2)), rel=1e-9)
     assert ProximalCG(0)(m, X0, spread).equal(X0)
 
@@ -70,7 +71,7 @@ def test_on_x_rays_every_restart_lowers_the_objective_inside_the_range(start):
     steps = [ProximalCG(restarts=k)(m, x0, 0.5) for k in range(5)]
     values = [objective(z) for z in steps]
     assert all(z.abs().max() <= 1 for z in steps) and steps[2].min() == -1  # air is reached and not passed
-    assert all(later < earlier for earlier, later in zip(values, values[1:])) and values[2] < 0.01 * values[0]
+    assert all(later < earlier for earlier, later in itertools.pairwise(values)) and values[2] < 0.01 * values[0]
 
 
 @pytest.mark.parametrize("noise", [0.02, 0.0])
@@ -170,7 +171,7 @@ def test_with_total_variation_every_restart_lowers_the_objective_and_they_end_wh
         return ProximalCG(20, restarts, noise, 1e-13, tv_weight=variation, tv_eps=edge)(m, X0, spread)
 
     values = [objective(X0), *(objective(after(n)) for n in range(1, 8))]
-    assert all(later < earlier for earlier, later in zip(values, values[1:]))
+    assert all(later < earlier for earlier, later in itertools.pairwise(values))
     z = after(300)
     gradient = (m.adjoint(m.project(z) - m.y) / noise**2 + (z - X0) / spread**2
                 + variation * TVQuadraticMajorizer(z, edge).gradient(z))

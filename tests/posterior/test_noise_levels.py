@@ -7,6 +7,7 @@ from laws import random_like
 from phydict.diffusion import CosineSchedule, ddim, noise_in, renoise
 from phydict.posterior.samplers.noise_levels import denoise_along, polynomial_levels, stochastic_ddim_step, times_of
 from posterior.dense import FINE, SHAPE, N, denoiser, moments
+import itertools
 
 SCHEDULE, V = CosineSchedule(), 0.04
 
@@ -28,7 +29,7 @@ def test_levels_are_even_in_their_root_from_one_end_to_the_other():
     levels = polynomial_levels(80.0, 0.002, 100)
     assert levels[0] == pytest.approx(80) and levels[-1] == pytest.approx(0.002) and len(levels) == 100
     roots = [sigma ** (1 / 7) for sigma in levels]
-    assert [a - b for a, b in zip(roots, roots[1:])] == pytest.approx([(roots[0] - roots[-1]) / 99] * 99)
+    assert [a - b for a, b in itertools.pairwise(roots)] == pytest.approx([(roots[0] - roots[-1]) / 99] * 99)
     assert polynomial_levels(5.0, 0.1, 1) == [pytest.approx(5.0)]
 
 

@@ -6,6 +6,7 @@ from laws import random_like
 
 from phydict.posterior import ExactDraw, Langevin, PnPDM
 from posterior.dense import SHAPE, N, condition, denoiser, measurement, moments
+import itertools
 
 V, NOISE = 0.04, 0.3
 EXACT = {"likelihood": ExactDraw(20, 1e-12), "noise": NOISE}
@@ -70,7 +71,7 @@ def test_exact_data_are_met_within_the_blur_and_closer_as_the_coupling_tightens_
 
     levels, inner = [misfit(n) for n in (20, 40, 60, 80)], [misfit(60, n) for n in (0, 1, 2, 3)]
     for misfits in (levels, inner):
-        assert all(after < before for before, after in zip(misfits, misfits[1:])), misfits
+        assert all(after < before for before, after in itertools.pairwise(misfits)), misfits
     assert levels[-1] < (2 * (noise**2 + (0.02 * m.norm())**2)) ** 0.5
 
 

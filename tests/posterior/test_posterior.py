@@ -123,7 +123,8 @@ def test_display_values_count_only_up_to_a_positive_gain_and_an_offset_per_view(
 
 def test_another_grid_is_refused_and_both_are_named(prior):
     for grid in (Grid.cube(20), Grid.cube(16, 320.0)):
-        with pytest.raises(ValueError, match=r"\(16, 16, 16\).*24.0.*\(%d, .*%s" % (grid.shape[0], grid.spacing[0])):
+        shape, spacing = str(grid.shape[0]), str(grid.spacing[0])
+        with pytest.raises(ValueError, match=rf"\(16, 16, 16\).*24.0.*\({shape}, .*{spacing}"):
             Posterior(prior, FAST).reconstruct(views(), Projector(grid, BEAM))
 
 

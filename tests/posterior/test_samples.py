@@ -73,7 +73,7 @@ def test_the_states_of_a_batch_do_not_influence_each_others_conjugate_gradients(
     together = step(m, x0, 0.5)
     for row, own in zip(together, x0):
         torch.testing.assert_close(row[None], step(m, own[None], 0.5), atol=1e-12, rtol=0)
-    assert together.isfinite().all() and N == together[0].numel()
+    assert together.isfinite().all() and together[0].numel() == N
 
 
 def test_one_generator_per_state_draws_what_each_draws_alone():

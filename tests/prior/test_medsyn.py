@@ -296,7 +296,7 @@ def test_a_second_stage_that_needs_more_memory_than_it_may_take_says_how_much_it
     assert "\n" not in str(error.value)
     with pytest.raises(ValueError, match="about 18.5 GiB in bfloat16"):
         fine.check_memory(torch.bfloat16)
-    fine.memory = int(36 * 2**30)
+    fine.memory = 36 * 2**30
     fine.check_memory(torch.float32)
 
 

@@ -6,6 +6,7 @@ from laws import random_like
 from torch.nn.functional import avg_pool3d
 
 from phydict.prior.tiles import Tiles
+import itertools
 
 CASES = [(Tiles(8, 4), 8), (Tiles(8, 4), 9), (Tiles(8, 4), 31), (Tiles(12, 4, 2), 38), (Tiles(24, 8, 4), 64),
          (Tiles(16, 8, 8), 40), (Tiles(16, 8), 7)]
@@ -26,7 +27,7 @@ def test_tiles_cover_the_axis_overlap_and_meet_the_networks_blocks(tiles, voxels
     size = min(tiles.size, voxels)
     assert starts[0] == 0 and starts[-1] + size == voxels
     assert all(start % tiles.divisor == 0 for start in starts)
-    assert all(a + size - b >= tiles.overlap and b > a for a, b in zip(starts, starts[1:]))
+    assert all(a + size - b >= tiles.overlap and b > a for a, b in itertools.pairwise(starts))
 
 
 def test_what_reaches_a_quarter_of_the_overlap_is_as_on_the_whole_volume():

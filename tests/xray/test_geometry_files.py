@@ -113,7 +113,7 @@ def test_named_columns_come_in_any_order(tmp_path):
     assert read_beam(tmp_path / "views.csv", SHAPE).same_as(beam, 1e-9)
 
 
-@pytest.mark.parametrize(("views", "options", "sentence"), [
+@pytest.mark.parametrize("views, options, sentence", [
     (["<GantryAngle>0</GantryAngle>"], {"head": ""}, "no SourceToIsocenterDistance, SourceToDetectorDistance"),
     (["<GantryAngle>0</GantryAngle><SourceToDetectorDistance>0</SourceToDetectorDistance>"], {},
      "SourceToDetectorDistance 0 mm, but both must be positive"),
@@ -145,7 +145,7 @@ def test_a_beam_and_a_path_in_each_others_place_are_told_their_order(tmp_path, w
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(("name", "text", "sentence"), [
+@pytest.mark.parametrize("name, text, sentence", [
     ("a.csv", "source_x,source_y\n1,2\n", "no column source_z, detector_x"),
     ("a.csv", "1,2,3\n", "view 0 has 3 values, but 12"),
     ("a.csv", ",".join(["1"] * 11 + ["many"]), "'many'"),

@@ -66,8 +66,9 @@ class Augmentation:
 class Deformation:
     """A small random change of a patient: pose, size, shape and HU.
 
-    rotation: (3,) radians about x, y, z. scale: (3,). shift: (3,) mm. elastic_mm: (3, 4, 4, 4) mm, amplitudes of cosines
-    of up to 1.5 periods over the grid. hu_scale: factor of HU + 1000. hu_offset: HU, in tissue only. mirrored: left to right.
+    rotation: (3,) radians about x, y, z. scale: (3,). shift: (3,) mm. elastic_mm: (3, 4, 4, 4) mm, amplitudes of
+    cosines of up to 1.5 periods over the grid. hu_scale: factor of HU + 1000. hu_offset: HU, in tissue only. mirrored:
+    left to right.
     """
 
     rotation: torch.Tensor
@@ -88,7 +89,8 @@ class Deformation:
 
         elastic_mm = torch.randn((3, 4, 4, 4), generator=generator)
         frequency = torch.stack(torch.meshgrid(*[torch.arange(4.0)] * 3, indexing="ij")).pow(2).sum(0)
-        elastic_mm = torch.where((frequency > 0) & (frequency <= 9), elastic_mm * strength.elastic_mm / (1 + frequency.sqrt()), 0.0)
+        bending = elastic_mm * strength.elastic_mm / (1 + frequency.sqrt())
+        elastic_mm = torch.where((frequency > 0) & (frequency <= 9), bending, 0.0)
         return cls(uniform(3, math.radians(strength.rotation) / math.sqrt(3)), 1 + uniform(3, strength.scale),
                    uniform(3, strength.shift / math.sqrt(3)), elastic_mm, 1 + float(uniform(1, strength.hu_scale)),
                    float(uniform(1, strength.hu_offset)))

@@ -239,7 +239,7 @@ class Thorax:
         shelf = z - self.horizontal_fissure
         return np.maximum(-above, shelf if lobe == "middle" else -shelf) + 0 * x
 
-    @lru_cache(maxsize=8)
+    @lru_cache(maxsize=8)  # noqa: B019
     def lung_points(self, side: str, count: int = 9000) -> tuple[np.ndarray, float]:
         """Points (N, 3) spread evenly inside one lung, at least 2 mm deep, and that region's volume in mm^3."""
         rng = np.random.default_rng([self.seed, 3, int(SIDES[side] > 0)])

@@ -3,9 +3,9 @@
     beam: {orbit: {...}}                               ConeBeam's YAML, which may also stand at the top level
     beam: {file: geometry.xml, pixel: [1.25, 1.25]}    a file that phydict.xray.geometry_files reads, beside this one;
                                                        pixel is for RTK's XML alone
-    beam: {dicom: {source_to_isocentre: 765.0}}        values used instead of tags; see phydict.datasets.radiographs.dicom_beam
-    intensity: {kind: counts, air: 50000}              see phydict.datasets.intensity
-    orientation: {rotate_degrees: 0, flip_rows: false, flip_columns: false}
+    beam: {dicom: {source_to_isocentre: 765.0}}        values used instead of tags; see
+    phydict.datasets.radiographs.dicom_beam intensity: {kind: counts, air: 50000}              see
+    phydict.datasets.intensity orientation: {rotate_degrees: 0, flip_rows: false, flip_columns: false}
 
 Without `beam:` the tags of DICOM images decide. Rotation is clockwise, in quarters, and comes before the flips. The
 beam, wherever it comes from, is that of the images once they are turned.

@@ -33,15 +33,15 @@ class ProximalCG(LikelihoodStep):
 
     Starts at x0. Each restart frees the voxels that are inside the range or pulled back into it, runs conjugate
     gradients on them and clips: air stays air, which is worth more than many iterations without the bounds. With a
-    Gaussian prior, no total variation, bounds that do not act and enough iterations this is exactly E[x_0 | x_t, y]; few
-    iterations regularise, since what the views see best is corrected first. TV(z) sums sqrt(slope^2 + tv_eps^2) over the
-    voxels.
+    Gaussian prior, no total variation, bounds that do not act and enough iterations this is exactly E[x_0 | x_t, y];
+    few iterations regularise, since what the views see best is corrected first. TV(z) sums sqrt(slope^2 + tv_eps^2)
+    over the voxels.
 
     iterations: per restart, at most; restarts; noise: standard deviation of the line integrals' error (noise and
     model); tolerance: a restart ends once its residual has shrunk by this factor;
     refit_scatter: whether each restart refits the scatter of a measurement in which it is sought;
-    weighted_least_squares: whether the variance of each pixel's own noise is added to noise^2, so that pixels which few photons reach
-    count less (Thibault et al. 2007, doi:10.1118/1.2789499);
+    weighted_least_squares: whether the variance of each pixel's own noise is added to noise^2, so that pixels which few
+    photons reach count less (Thibault et al. 2007, doi:10.1118/1.2789499);
     tv_weight: weight of the total variation TV, 0 for none; each restart replaces it by the quadratic that touches it
     there (Vogel & Oman 1996, doi:10.1137/0917016), so the last step wants several, and conjugate gradients are
     preconditioned by the diagonal of that quadratic, which differs by orders between flat parts and edges; edge:

@@ -54,7 +54,8 @@ class DPS(Sampler):
         for t, s in schedule.steps(self.iterations):
             x0, gradient = self._estimate(denoiser, m, x, t)
             kept = float(schedule.sigma(s) / schedule.sigma(t))
-            x = stochastic_ddim_step(schedule, x0, noise_in(schedule, x0, x, t), s, kept, generator) - self.scale * gradient
+            eps = noise_in(schedule, x0, x, t)
+            x = stochastic_ddim_step(schedule, x0, eps, s, kept, generator) - self.scale * gradient
             on_step()
         return (x0 - self.scale * gradient).clamp(-1, 1)
 

@@ -24,7 +24,7 @@ def times_of(schedule: CosineSchedule, levels: Sequence[float]) -> list[float]:
 
 
 def stochastic_ddim_step(schedule: CosineSchedule, x0: Tensor, eps: Tensor, s: float, kept: float,
-                   generator: torch.Generator) -> Tensor:
+                         generator: torch.Generator) -> Tensor:
     """The clean state x0 at time s, with noise of which `kept` in [0, 1] is eps and the rest new: renoise(x0, s,
     kept eps + sqrt(1 - kept^2) noise). kept 1 is DDIM, 0 forgets the path."""
     if kept < 1:
@@ -32,7 +32,8 @@ def stochastic_ddim_step(schedule: CosineSchedule, x0: Tensor, eps: Tensor, s: f
     return renoise(schedule, x0, s, eps)
 
 
-def denoise_along(denoiser: Denoiser, x: Tensor, times: Sequence[float], generator: torch.Generator | None = None) -> Tensor:
+def denoise_along(denoiser: Denoiser, x: Tensor, times: Sequence[float],
+                  generator: torch.Generator | None = None) -> Tensor:
     """The clean end, in [-1, 1], of the state x at times[0] that is taken down through the prior's noise levels.
 
     Without `generator` along the probability flow (DDIM); with it by ancestral steps, whose end is a draw from

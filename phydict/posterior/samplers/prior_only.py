@@ -17,7 +17,8 @@ from phydict.posterior.samplers.sampler import Sampler, ddim_sample
 class PriorOnly(Sampler):
     """A sample of the prior that ignores the X-rays: deterministic DDIM with `iterations` noise levels.
 
-    final_denoise: denoise once more at time 0; None: where the prior's own inference does, which its `ends_at_zero` says.
+    final_denoise: denoise once more at time 0; None: where the prior's own inference does, which its `ends_at_zero`
+    says.
     """
 
     citation = "Song, Meng & Ermon, Denoising Diffusion Implicit Models, ICLR 2021, arXiv:2010.02502"
@@ -30,8 +31,11 @@ class PriorOnly(Sampler):
         return self.iterations + bool(self.final_denoise)
 
     def suited(self, prior: object) -> PriorOnly:
-        return self if self.final_denoise is not None else replace(self, final_denoise=getattr(prior, "ends_at_zero", False))
+        if self.final_denoise is not None:
+            return self
+        return replace(self, final_denoise=getattr(prior, "ends_at_zero", False))
 
     def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, generator: Generators,
                on_step: Callable[[], None] = lambda: None) -> Tensor:
-        return ddim_sample(denoiser, x, self.iterations, on_step=on_step, final_denoise=self.suited(denoiser).final_denoise)
+        final_denoise = self.suited(denoiser).final_denoise
+        return ddim_sample(denoiser, x, self.iterations, on_step=on_step, final_denoise=final_denoise)

@@ -39,8 +39,8 @@ class SplitGibbs(Sampler):
     t_end: the last level's time (None: levels evenly spaced down to 0);
     noise_fraction: None for the paper's DDIM moves; else each level starts from the estimate with new noise of this
     share of the level's own: 1 decouples the levels, 0 adds none and descends to a point estimate;
-    momentum: with noise_fraction, each level starts beyond the estimate, by this share of how far it has moved since the
-    level before, so that fewer levels reach as far (heavy ball; Polyak 1964, doi:10.1016/0041-5553(64)90137-5);
+    momentum: with noise_fraction, each level starts beyond the estimate, by this share of how far it has moved since
+    the level before, so that fewer levels reach as far (heavy ball; Polyak 1964, doi:10.1016/0041-5553(64)90137-5);
     sampling_noise: the noise_fraction that takes its place, without momentum, where several samples are to show how far
     they differ; None: the same;
     prior_std: standard deviation of the state, which sets the spread of x0 at each time;
@@ -49,8 +49,8 @@ class SplitGibbs(Sampler):
     full_detector: meet the X-rays pixel by pixel instead of binned to what the grid can hold;
     clip: pull the denoiser's estimate into the prior's range before the likelihood step, not only after it;
     final_denoise: both passes end with one more call of the denoiser, at time 0 and without X-rays, as in the release;
-    scatter: where the result misses the X-rays by more than SCATTER_THRESHOLD times their noise, sample once more, subtracting the
-    scatter that each estimate tells of, and keep what that gives if it misses less.
+    scatter: where the result misses the X-rays by more than SCATTER_THRESHOLD times their noise, sample once more,
+    subtracting the scatter that each estimate tells of, and keep what that gives if it misses less.
     """
 
     citation = ("Dai, Ghosh & Batmanghelich, PhyDiCT: Plug-and-Play CT Reconstruction from Sparse X-Rays via "
@@ -83,7 +83,7 @@ class SplitGibbs(Sampler):
             raise ValueError("a t_start below 1 needs at least 2 iterations, but 1 was given")
         if self.t_end is not None and not 0 < self.t_end <= self.t_start:
             raise ValueError(f"t_end is a time above 0 and not above t_start, but {self.t_end} was given")
-        if not 0 <= self.momentum <= 1 or self.momentum and self.noise_fraction is None:
+        if not 0 <= self.momentum <= 1 or (self.momentum and self.noise_fraction is None):
             raise ValueError("momentum is a share in [0, 1], and above 0 only where noise_fraction is given, but "
                              f"{self.momentum} was given, with a noise_fraction of {self.noise_fraction}")
         for name in ("noise_fraction", "sampling_noise"):
@@ -117,7 +117,10 @@ class SplitGibbs(Sampler):
             return self._descend(denoiser, measurement, x, generator, on_step)
         measurement.reset_scatter(False)
         z = self._descend(denoiser, measurement, x, generator, on_step)
-        if measurement.can_estimate_scatter and ((residual := measurement.normalised_residual(z[:, :1])) > SCATTER_THRESHOLD).any():
+        if not measurement.can_estimate_scatter:
+            return z
+        residual = measurement.normalised_residual(z[:, :1])
+        if (residual > SCATTER_THRESHOLD).any():
             measurement.reset_scatter(True)
             again = self._descend(denoiser, measurement, x, generator)
             better = (residual > SCATTER_THRESHOLD) & (measurement.normalised_residual(again[:, :1]) < residual)
@@ -137,8 +140,8 @@ class SplitGibbs(Sampler):
         times = denoiser.schedule.steps(self.ec_steps, self.ec_delta, t_end)
         return self._guided_pass(denoiser, measurement, x, times, generator, on_step)
 
-    def _guided_pass(self, denoiser: Denoiser, measurement: Measurement, x: Tensor, times: Iterable[tuple[float, float]],
-              generator: Generators, on_step: Callable[[], None]) -> Tensor:
+    def _guided_pass(self, denoiser: Denoiser, measurement: Measurement, x: Tensor,
+                     times: Iterable[tuple[float, float]], generator: Generators, on_step: Callable[[], None]) -> Tensor:
         """The estimate after the noise levels of `times`, at each of which it meets the X-rays."""
         schedule = denoiser.schedule
         previous = None

@@ -62,8 +62,8 @@ class MedSynSuperResolution(nn.Module):
         """The denoiser of the fine states of a coarse one (B, 4, X/4, Y/4, Z/4), which may be a part of the grid's.
 
         noise: share in [0, 1] of normal noise in the coarse state (MedSyn trained with up to 0.4); the network is not
-        told. generator: what the noise is drawn from, to be (1 - noise) coarse + noise n on the fine voxels, as in MedSyn's
-        training; None: `coarse` carries it already.
+        told. generator: what the noise is drawn from, to be (1 - noise) coarse + noise n on the fine voxels, as in
+        MedSyn's training; None: `coarse` carries it already.
         """
         if coarse.ndim != 5 or coarse.shape[1] != self.coarse_channels:
             raise ValueError(f"a coarse state is (B, {self.coarse_channels}, X, Y, Z), but {tuple(coarse.shape)} was "

@@ -1,4 +1,5 @@
-"""Compiled CPU loops of the separable projector, without tables; phydict.xray.projectors.separable explains the operator.
+"""Compiled CPU loops of the separable projector, without tables; phydict.xray.projectors.separable explains the
+operator.
 
 Columns of pixels go in groups of LANES. On each depth plane the group's in-plane interpolation gives one axial line
 per column; the lines are laid side by side, so that the axial interpolation runs along the group. The adjoint runs
@@ -28,7 +29,7 @@ def project(volumes, xrays, starts, columns, rows, planes):
 
     The rays are those of phydict.xray.projectors.separable.Rays.
     """
-    cases, views, height, width = xrays.shape
+    cases, views, _height, width = xrays.shape
     groups = (width + LANES - 1) // LANES
     filled = np.zeros((cases, volumes.shape[1] + 1, volumes.shape[2] + 1), np.bool_)
     extents = np.empty((cases, 2), np.int64)

@@ -17,7 +17,8 @@ BLOCK_VALUES = 2**20
 
 
 class SparseFactors:
-    """`forward` (B, X, Y, Z) -> (B, K, V, U) and its adjoint, for rays as phydict.xray.projectors.separable.Rays has them."""
+    """`forward` (B, X, Y, Z) -> (B, K, V, U) and its adjoint, for rays as phydict.xray.projectors.separable.Rays has
+    them."""
 
     def __init__(self, grid: tuple[int, int, int], detector: tuple[int, int], starts: np.ndarray, columns: np.ndarray,
                  rows: np.ndarray, planes: np.ndarray):

@@ -1,6 +1,7 @@
 """Exact cone-beam projection of piecewise-constant voxels for any pose, compiled for the CPU, with its exact adjoint.
 
-Siddon 1985, Med Phys 12:252 (doi:10.1118/1.595715). Outside the grid mu is 0. phydict.xray.projectors.tracer walks the rays.
+Siddon 1985, Med Phys 12:252 (doi:10.1118/1.595715). Outside the grid mu is 0. phydict.xray.projectors.tracer walks the
+rays.
 """
 
 from __future__ import annotations
@@ -60,7 +61,8 @@ def _backproject(volume, images, rays, lengths, bottom, top):
 
 
 class Siddon(Tracer):
-    """Line integrals of boxes of constant mu; shapes, types and threads as phydict.xray.projectors.tracer.Tracer says."""
+    """Line integrals of boxes of constant mu; shapes, types and threads as phydict.xray.projectors.tracer.Tracer
+    says."""
 
     reach = 0
     project, backproject = staticmethod(_project), staticmethod(_backproject)

@@ -1,8 +1,8 @@
 """The exact line integrals of piecewise-constant voxels as a stored sparse matrix, for small fixed geometries.
 
-The same operator as phydict.xray.projectors.siddon, on any device: A and its transpose are built once by the compiled tracer and
-kept as CSR, so that a projection is one sparse product with one writer per result. Building costs as much as some tens
-of projections by ray tracing; it pays where one geometry is projected again and again.
+The same operator as phydict.xray.projectors.siddon, on any device: A and its transpose are built once by the compiled
+tracer and kept as CSR, so that a projection is one sparse product with one writer per result. Building costs as much as
+some tens of projections by ray tracing; it pays where one geometry is projected again and again.
 """
 
 from __future__ import annotations

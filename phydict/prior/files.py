@@ -141,7 +141,7 @@ def _read(path: Path, stage: str, device: str) -> tuple[dict, dict[str, Tensor]]
     try:
         with safe_open(path, "pt", device=device) as file:
             header = json.loads((file.metadata() or {}).get("phydict", "{}"))
-            weights = {k: file.get_tensor(k) for k in file if not k.startswith("text.")}
+            weights = {k: file.get_tensor(k) for k in file.keys() if not k.startswith("text.")}
     except Exception as error:  # whatever a damaged file leads its readers to
         raise ValueError(f"'{path}' is truncated or not a safetensors file ({reason(error)}): copy it again, "
                          "or export it from its training checkpoint") from error
@@ -305,6 +305,6 @@ def build_text(text: dict, weights: dict[str, Tensor]) -> TextEncoder:
 
 def _load_text(path: Path, text: dict) -> TextEncoder:
     with safe_open(path, "pt") as file:
-        weights = {k: file.get_tensor(k) for k in file if k.startswith("text.")}
+        weights = {k: file.get_tensor(k) for k in file.keys() if k.startswith("text.")}
     check_finite(weights, path)
     return build_text(text, weights)

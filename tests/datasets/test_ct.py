@@ -373,7 +373,7 @@ def test_augmentation_is_replayed_by_its_seed(case):
 def test_augmentation_moves_volume_and_masks_together(case):
     copies = case | {"masks": ((case["volume"] + 1) / 2).expand(3, -1, -1, -1)}
     for seed in range(5):
-        move = dataclasses.replace(Deformation.draw(seed), gain=1.0, offset=0.0)
+        move = dataclasses.replace(Deformation.draw(seed), hu_scale=1.0, hu_offset=0.0)
         new = move.apply(copies, GRID, HUWindow())
         torch.testing.assert_close(new["masks"], ((new["volume"] + 1) / 2).expand(3, -1, -1, -1), atol=1e-5, rtol=0)
 
@@ -403,12 +403,12 @@ def test_a_deformation_of_nothing_changes_nothing(case):
 def test_augmentation_of_no_strength_changes_nothing_and_each_strength_is_its_own_bound(case):
     new = augment(case, 3, GRID, strength=Augmentation.none())
     torch.testing.assert_close(new["volume"], case["volume"], atol=1e-4, rtol=0)
-    for name in ("rotation", "scale", "shift", "elastic_mm", "gain", "offset"):
+    for name in ("rotation", "scale", "shift", "elastic_mm", "hu_scale", "hu_offset"):
         weak = dataclasses.replace(Augmentation(), **{name: getattr(Augmentation(), name) / 100})
         for seed in range(10):
             usual, less = (vars(Deformation.draw(seed, strength)) for strength in (Augmentation(), weak))
-            rest = 1 if name in ("scale", "gain") else 0
-            for part in ("rotation", "scale", "shift", "elastic_mm", "gain", "offset"):
+            rest = 1 if name in ("scale", "hu_scale") else 0
+            for part in ("rotation", "scale", "shift", "elastic_mm", "hu_scale", "hu_offset"):
                 factor = 0.01 if part == name else 1
                 torch.testing.assert_close(torch.as_tensor(less[part] - rest * (part == name)),
                                            factor * torch.as_tensor(usual[part] - rest * (part == name)),
@@ -416,7 +416,7 @@ def test_augmentation_of_no_strength_changes_nothing_and_each_strength_is_its_ow
 
 
 def test_hu_changes_spare_air_and_scale_tissue(case):
-    strength = dataclasses.replace(Augmentation.none(), gain=0.03, offset=20.0)
+    strength = dataclasses.replace(Augmentation.none(), hu_scale=0.03, hu_offset=20.0)
     old = HUWindow().to_hu(case["volume"])
     for seed in range(5):
         move = Deformation.draw(seed, strength)

@@ -147,7 +147,7 @@ def lacking(paths):
 def position(paths, shift):
     """ImagePositionPatient moved by shift(k) for slice k."""
     first = np.array(pydicom.dcmread(paths[0]).ImagePositionPatient, float)
-    edit(paths, ImagePositionPatient=[list([*first, 0, 0, 6 * k, *np.array(shift(k))])
+    edit(paths, ImagePositionPatient=[list(first + [0, 0, 6 * k] + np.array(shift(k)))
                                       for k in range(len(paths))])
 
 
@@ -358,7 +358,7 @@ def test_two_workers_give_what_one_gives(tmp_path, thorax):
 def test_a_killed_run_goes_on_where_it_was(tmp_path, thorax):
     for n in range(3):
         save(tmp_path / f"in/{n}.nii.gz", thorax + np.int16(10 * n))
-    code = ("import os, signal\nfrom phydict.datasets import preparation as p\nwrite = p.write_prepared\n"
+    code = ("import os, signal\nfrom phydict.datasets.cts import preparation as p\nwrite = p.write_prepared\n"
             "def writes(folder, grid, images, record):\n"
             "    write(folder, grid, images, record)\n"
             "    if record['id'] == '1': os.kill(os.getpid(), signal.SIGKILL)\n"

@@ -17,7 +17,7 @@ from phydict.xray.projectors.separable_cpu import project as project_loop
 
 CODE = """if True:
     import numpy as np
-    from phydict.xray import tracer
+    from phydict.xray.projectors import tracer
     print(tracer.__file__, tracer.nearest(np.array([3.0, 1.0, 2.0])))"""
 
 

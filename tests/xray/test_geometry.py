@@ -198,7 +198,7 @@ def test_a_small_field_of_view_is_a_warning():
 
 def test_a_view_that_misses_the_volume_is_refused():
     beam = orbit()
-    beside = ConeBeam(beam.sources, [*beam.detectors, [0, 0, 0], [0, 0, 900], [0, 0, 0], [0, 0, 0]], beam.u, beam.v,
+    beside = ConeBeam(beam.sources, beam.detectors + [[0, 0, 0], [0, 0, 900], [0, 0, 0], [0, 0, 0]], beam.u, beam.v,
                       beam.shape)
     with pytest.raises(ValueError, match="view 1: no ray .* meets the volume"):
         beside.check_scale(Grid.cube(64))

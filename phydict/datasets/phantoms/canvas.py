@@ -65,7 +65,7 @@ class Canvas:
         """The voxels around the box low..high (mm) and their x, y, z."""
         low, high = np.asarray(low) - self.edge, np.asarray(high) + self.edge
         bend = self.thorax.bend(np.linspace(low[2], high[2], 9))
-        low, high = [*low, 0, bend.min(), 0], [*high, 0, bend.max(), 0]
+        low, high = low + [0, bend.min(), 0], high + [0, bend.max(), 0]
         corners = np.stack(np.meshgrid(*zip(low, high), indexing="ij"), -1).reshape(-1, 3) + self.thorax.offset
         index = self.grid.index(corners)
         first = np.clip(np.floor(index.min(0)).astype(int), 0, self.grid.shape)

@@ -48,7 +48,7 @@ def _rib(thorax: Thorax, number: int, side: float) -> list[Tubes]:
     points = np.concatenate([start, np.stack([x, y, z], 1)]) * [side, 1, 1]
     parts = [Tubes.chain(points, 5.2, 0.55, hu=thorax.cortex, core_hu=thorax.bone, core=0.55)]
     if number < 7:
-        front = [*_sternum_point(thorax, 44 + 0.083 * thorax.height * number), side * 16, -2, 0]
+        front = _sternum_point(thorax, 44 + 0.083 * thorax.height * number) + [side * 16, -2, 0]
         middle = (points[-1] + front) / 2 + [side * 6, 4, -6 - number]
         parts.append(Tubes.chain([points[-1], middle, front], 5.0, hu=105))
     return parts
@@ -77,9 +77,9 @@ def _shoulder(thorax: Thorax, side: float) -> list[Tubes]:
     ridge = np.array([[74, -0.95 * thorax.depth - 22, top - 48], [105, -0.75 * thorax.depth - 18, top - 16],
                       [outer + 4, -40, top + 30]])
     parts.append(Tubes.chain(ridge * mirror, 6, 0.7, hu=0.8 * thorax.cortex, core_hu=thorax.bone, core=0.3))
-    parts.append(Tubes.of((joint - [0, 0, 20]) * mirror, ([*joint, 0, 0, 20]) * mirror, 21, hu=0.7 * thorax.cortex,
+    parts.append(Tubes.of((joint - [0, 0, 20]) * mirror, (joint + [0, 0, 20]) * mirror, 21, hu=0.7 * thorax.cortex,
                           core_hu=thorax.bone, core=0.75))
-    parts.append(Tubes.of(([*joint, 0, 0, 12]) * mirror, arm_end(thorax) * mirror, 12, hu=1.1 * thorax.cortex,
+    parts.append(Tubes.of((joint + [0, 0, 12]) * mirror, arm_end(thorax) * mirror, 12, hu=1.1 * thorax.cortex,
                           core_hu=40, core=0.4))
     return parts
 

@@ -267,7 +267,7 @@ def is_medsyn(path: str | Path) -> bool:
         return path.is_file()
     try:
         with safe_open(path, "pt") as file:
-            return any("init_conv" in name for name in file)
+            return any("init_conv" in name for name in file.keys())
     except Exception:  # whatever a damaged file leads to: `load_prior` says what
         return False
 
@@ -288,8 +288,8 @@ def read_tensors(file: Path, shapes_only: bool = False) -> dict[str, Tensor]:
             with safe_open(file, "pt") as opened:
                 if shapes_only:
                     return {name: torch.empty(opened.get_slice(name).get_shape(), device="meta")
-                            for name in opened}
-                return {name: opened.get_tensor(name) for name in opened}
+                            for name in opened.keys()}
+                return {name: opened.get_tensor(name) for name in opened.keys()}
         except Exception as error:  # whatever a damaged file leads to
             raise ValueError(f"'{file}' is truncated or not a safetensors file ({reason(error)}): copy it "
                              "again") from error

@@ -655,7 +655,7 @@ def rewritten(source: Path, target: Path, **changes) -> Path:
     """A prior's file whose header says something else."""
     with safe_open(source, "pt") as file:
         header = json.loads(file.metadata()["phydict"]) | changes
-        weights = {key: file.get_tensor(key) for key in file}
+        weights = {key: file.get_tensor(key) for key in file.keys()}
     save_file(weights, target, {"phydict": json.dumps(header)})
     return target
 

@@ -33,8 +33,8 @@ MEASURED = ("status", "error", "warning", "ssim", "psnr", "mae_hu", "ssim_lung",
             "seconds", "seconds_prepare", "seconds_sample", "seconds_score", "seconds_network", "seconds_projector",
             "network_calls", "projector_calls", "peak_memory_mb", "device", "threads",
             "precision", "instruction_set")
-"""Columns that a run fills; the others are the trial's. peak_memory_mb is in MiB: since the run began, of the tensors on
-a CUDA device, else of the process."""
+"""Columns that a run fills; the others are the trial's. peak_memory_mb, in MiB, is that of the tensors on a
+CUDA device, else of the process."""
 
 
 class Results:

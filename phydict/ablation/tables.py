@@ -87,9 +87,10 @@ def _views_tables(found: Sequence[Entry], notes: Sequence[str]) -> list[Table]:
 
 def _caption(rows: Sequence[dict]) -> str:
     """What the numbers of the tables were taken from."""
-    cases = len({row["case"] for row in rows})
+    count = len({row["case"] for row in rows})
+    over = f"Mean over {count} {'case' if count == 1 else 'cases'}"
     how = " on ".join(filter(None, (listed(rows, name) for name in ("precision", "instruction_set"))))
-    return caption(f"Mean over {cases} {'case' if cases == 1 else 'cases'}", rows, {"Grid": "grid", "Seeds": "seed"}) + (
+    return caption(over, rows, {"Grid": "grid", "Seeds": "seed"}) + (
         f" Seconds: one reconstruction after a warm-up, {listed(rows, 'device') or 'none'}, threads "
         f"{listed(rows, 'threads') or 'none'}{how and f', {how}'}; loading and scoring excluded.")
 

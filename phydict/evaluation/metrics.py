@@ -125,24 +125,23 @@ class Summary(NamedTuple):
         return format(self.mean, spec) + ("" if math.isnan(self.std) else f" ± {format(self.std, spec)}")
 
 
-def over_cases(rows: Iterable[Mapping], metrics: Iterable[str]) -> dict[str, Summary]:
+def over_cases(rows: Sequence[Mapping], metrics: Iterable[str]) -> dict[str, Summary]:
     """{metric: Summary} of those metrics that some row has.
 
     Rows of one case (several seeds) are averaged first, so that each case counts once; rows without the key "case"
     count as a case each.
     """
-    cases: dict[str, dict[str, list[float]]] = {name: {} for name in metrics}
-    for n, row in enumerate(rows):
-        for name, values in cases.items():
-            if row.get(name) is not None:
-                values.setdefault(row.get("case", f"row {n}"), []).append(float(row[name]))
     result = {}
-    with np.errstate(invalid="ignore"):
-        for name, repeats in cases.items():
-            if repeats:
-                values = np.array([np.mean(r) for r in repeats.values()])
+    for name in metrics:
+        cases: dict[str, list[float]] = {}
+        for n, row in enumerate(rows):
+            if row.get(name) is not None:
+                cases.setdefault(row.get("case", f"row {n}"), []).append(float(row[name]))
+        if cases:
+            with np.errstate(invalid="ignore"):
+                values = np.array([np.mean(repeats) for repeats in cases.values()])
                 std = float(values.std(ddof=1)) if len(values) > 1 else math.nan
-                result[name] = Summary(float(values.mean()), std, len(values))
+            result[name] = Summary(float(values.mean()), std, len(values))
     return result
 
 
@@ -161,7 +160,7 @@ def summarise(rows: Iterable[Mapping], by: str = "method",
     present = {name for row in rows for name, value in row.items() if value is not None}
     if absent := [name for name in metrics or () if name not in present]:
         raise ValueError(f"no row has the metrics {absent}; the rows have {sorted(present)}")
-    return {str(group): over_cases((row for row in rows if row[by] == group), metrics or MEASURES)
+    return {str(group): over_cases([row for row in rows if row[by] == group], metrics or MEASURES)
             for group in dict.fromkeys(row[by] for row in rows)}
 
 

@@ -92,14 +92,13 @@ def mean_table(rows: Iterable[Mapping], by: str = "method", metrics: Sequence[st
     if warned := warned_cases(rows, by):
         measures.append(Measure("warned", None, 0))
         lines = [(label, ranked, [*values, len(warned.get(label, ()))]) for label, ranked, values in lines]
-    ids = {group: {row.get("case", f"row {n}") for n, row in enumerate(rows) if str(row[by]) == group}
-           for group in groups}
-    counts = sorted({len(found) for found in ids.values()})
-    over = f"n = {' to '.join(map(str, dict.fromkeys([counts[0], counts[-1]])))} cases" + (
-        " (not the same cases in every line)" if len(set(map(frozenset, ids.values()))) > 1 else "")
+    cases = {frozenset(row.get("case", f"row {n}") for n, row in enumerate(rows) if str(row[by]) == group)
+             for group in groups}
+    counts = sorted({min(map(len, cases)), max(map(len, cases))})
+    unequal = " (not the same cases in every line)" if len(cases) > 1 else ""
+    over = f"Mean ± standard deviation over n = {' to '.join(map(str, counts))} cases{unequal}"
     return Table("", [by, *(measure.heading for measure in measures)], measures, lines,
-                 [caption(f"Mean ± standard deviation over {over}", rows, {"Grid": "grid", "Views": "views"}, window),
-                  *doubts(rows, by)])
+                 [caption(over, rows, {"Grid": "grid", "Views": "views"}, window), *doubts(rows, by)])
 
 
 def caption(statistic: str, rows: Sequence[Mapping], columns: Mapping[str, str], window: HUWindow = RANGE) -> str:

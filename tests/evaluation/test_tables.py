@@ -171,12 +171,13 @@ def test_a_metric_that_a_method_lacks_is_a_dash():
     assert table["tv"]["SSIM"] == "–" and table["tv"]["PSNR (dB)"] == "1.00"
 
 
-def test_the_console_table_says_the_same():
+def test_the_tables_for_console_and_latex_say_the_same():
     console = Console(width=200, record=True, file=open(os.devnull, "w"))
     console.print(mean_table(STATED).console())
     text = console.export_text()
     for part in ("0.850 ± 0.071", "25.0 ± 7.1", "MAE (HU) ↓", "[-1000, 1000]", "Views: 8"):
         assert part in text
+    assert "\\textbf{0.850 $\\pm$ 0.071}" in mean_table(STATED).latex()
 
 
 def test_bad_requests_are_named():

@@ -105,9 +105,9 @@ def caption(statistic: str, rows: Sequence[Mapping], columns: Mapping[str, str],
     """One line that says what the numbers of a table are: a statistic of scores in an HU range, of rows that have these
     values in some columns, label -> column."""
     stated = "".join(f" {label}: {listed(rows, column) or 'not stated'}." for label, column in columns.items())
-    return (f"{statistic}; best in bold, second underlined. HU clipped to [{window.low:g}, {window.high:g}], data range "
-            f"{2 * window.half_width:g} HU; SSIM 3-D on HU from the range's low end, Gaussian of {TAPS} taps, sigma "
-            f"{SIGMA:g} voxels.{stated}")
+    return (f"{statistic}; best in bold, second underlined. HU clipped to [{window.low:g}, {window.high:g}], data "
+            f"range {2 * window.half_width:g} HU; SSIM 3-D on HU from the range's low end, Gaussian of {TAPS} taps, "
+            f"sigma {SIGMA:g} voxels.{stated}")
 
 
 def listed(rows: Sequence[Mapping], column: str) -> str:

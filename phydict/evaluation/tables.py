@@ -19,8 +19,8 @@ from phydict.units import HUWindow
 
 @dataclass(frozen=True)
 class Table:
-    """title: may be empty; header: names of the columns, the first that of the labels; measures: of each column but the
-    first; lines: a label, whether it takes part in the ranking, and a value per measure, None for none; notes."""
+    """title; header: names of the columns, the first that of the labels; measures: of each column but the first;
+    lines: a label, whether it takes part in the ranking, and a value per measure, None for none; notes."""
 
     title: str
     header: list[str]
@@ -33,20 +33,20 @@ class Table:
         lines = self._marked(("{}", "**{}**", "<u>{}</u>"), lambda text: text.replace("|", "\\|"))
         rule = ["---", *["---:"] * len(self.measures)]
         table = "\n".join(f"| {' | '.join(line)} |" for line in [self.header, rule, *lines])
-        return "\n\n".join([*filter(None, [self.title and f"### {self.title}"]), table, *self.notes]) + "\n\n"
+        return "\n\n".join([f"### {self.title}", table, *self.notes]) + "\n\n"
 
     def latex(self) -> str:
         """A tabular with booktabs' rules: best in bold, second underlined."""
         lines = self._marked(("{}", "\\textbf{{{}}}", "\\underline{{{}}}"), escaped)
         header, *body = [" & ".join(line) + " \\\\" for line in [map(escaped, self.header), *lines]]
-        notes = " ".join(map(escaped, [*filter(None, [self.title and f"{self.title}."]), *self.notes]))
+        notes = " ".join(map(escaped, [f"{self.title}.", *self.notes]))
         return "\n".join(["\\begin{table}", "\\centering", f"\\begin{{tabular}}{{l{'r' * len(self.measures)}}}",
                           "\\toprule", header, "\\midrule", *body, "\\bottomrule", "\\end{tabular}",
                           f"\\caption{{{notes}}}", "\\end{table}", ""])
 
     def console(self) -> ConsoleTable:
         """For rich's console: best in bold, second underlined."""
-        table = ConsoleTable(title=escape(self.title) or None, caption=escape("\n".join(self.notes)))
+        table = ConsoleTable(title=escape(self.title), caption=escape("\n".join(self.notes)))
         for i, name in enumerate(self.header):
             table.add_column(escape(name), justify="right" if i else "left")
         for line in self._marked(("{}", "[bold]{}[/bold]", "[underline]{}[/underline]"), escape):
@@ -97,7 +97,7 @@ def mean_table(rows: Iterable[Mapping], by: str = "method", metrics: Sequence[st
     counts = sorted({min(map(len, cases)), max(map(len, cases))})
     unequal = " (not the same cases in every line)" if len(cases) > 1 else ""
     over = f"Mean ± standard deviation over n = {' to '.join(map(str, counts))} cases{unequal}"
-    return Table("", [by, *(measure.heading for measure in measures)], measures, lines,
+    return Table(f"Scores by {by}", [by, *(measure.heading for measure in measures)], measures, lines,
                  [caption(over, rows, {"Grid": "grid", "Views": "views"}, window), *doubts(rows, by)])
 
 

@@ -1124,7 +1124,7 @@ def test_a_profile_shows_the_stages_of_every_case_and_changes_no_volume(measured
         main(sirt("predict", tmp_path / out, f"--data.xrays={measured}", *more))
         shown.append(capsys.readouterr().out)
     plain, profiled = shown
-    assert "peak MB" not in plain and profiled.count("peak MB") == 2
+    assert "peak MiB" not in plain and profiled.count("peak MiB") == 2
     for words in ("anna: sirt", "bert: sirt", "fit to grid", "sample / projector", "write"):
         assert words in profiled
     for case in ("anna", "bert"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -17,7 +18,7 @@ from phydict import METHODS, ConeBeam, Grid, reconstruct
 from phydict.methods import fit_to_grid, reconstructor
 from phydict.posterior import DPS, GradientSteps, Posterior, Reward, Sampler
 from phydict.prior import save_prior
-from phydict.runtime.profiling import profiled, stage
+from phydict.runtime.profiling import CPU, CUDA, peak_memory, profiled, stage
 from phydict.xray import Projector
 
 ROOT = Path(__file__).parents[1]
@@ -146,7 +147,18 @@ def test_without_a_profile_nothing_is_measured_and_with_one_stages_nest():
     assert list(profile.uses) == ["outer", "outer / inner"]
     outer, inner = profile.uses.values()
     assert outer.calls == inner.calls == 3 and outer.seconds >= inner.seconds > 0
-    assert outer.peak_mb >= inner.peak_mb > 0
+    assert outer.peak_mib >= inner.peak_mib > 0
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
+def test_all_memory_is_in_mib(monkeypatch):
+    with profiled() as profile, stage("held"):
+        kept = torch.ones(2**26)
+    resident = int(re.search(r"VmRSS:\s+(\d+) kB", Path("/proc/self/status").read_text())[1]) / 1024
+    assert profile.uses["held"].peak_mib == pytest.approx(resident, rel=0.02) and len(kept)
+    assert peak_memory(CPU) == pytest.approx(resident, rel=0.02)
+    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda device: 3 * 2**20)
+    assert peak_memory(CUDA) == 3
 
 
 def test_a_profile_holds_the_calls_that_a_reconstruction_reports_and_its_table_every_stage():
@@ -158,7 +170,7 @@ def test_a_profile_holds_the_calls_that_a_reconstruction_reports_and_its_table_e
     for name, seconds in result.seconds.items():
         assert profile.uses[name].seconds <= seconds
     lines = profile.table().splitlines()
-    assert len(lines) == 1 + len(profile.uses) and "peak MB" in lines[0]
+    assert len(lines) == 1 + len(profile.uses) and "peak MiB" in lines[0]
 
 
 def test_profiling_changes_nothing_in_the_result():

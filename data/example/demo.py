@@ -12,7 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 import phydict
 from phydict.datasets import load_xrays
-from phydict.evaluation import method_panel, panel, rich_table, volume_metrics, write_csv
+from phydict.evaluation import mean_table, method_panel, panel, volume_metrics, write_csv
 
 METHODS = ("phydict_fast", "prior_only", "sirt")
 
@@ -37,5 +37,5 @@ if __name__ == "__main__":
     captions = {row["method"]: f"{row['psnr']:.1f} dB, SSIM {row['ssim']:.2f}" for row in rows}
     method_panel(out / "comparison.png", volumes, truth, prior.grid, captions)
     write_csv(out / "results.csv", rows)
-    Console().print(rich_table(rows))
+    Console().print(mean_table(rows).console())
     print(f"picture: {out / 'comparison.png'}\nvolumes, X-ray fits and results.csv: {out}")

@@ -11,8 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from phydict.ablation.summary import SHOWN_MEASURES, Entry, best_settings, conditions, format_settings
-from phydict.ablation.tables import deltas, headed
+from phydict.ablation.summary import SHOWN_MEASURES, Entry, best_settings, conditions, deltas, format_settings
 from phydict.runtime.files import atomic_write
 
 COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f", "#bcbd22", "#17becf",
@@ -26,13 +25,13 @@ def write_plots(folder: Path, found: Sequence[Entry]) -> list[Path]:
     written, style = [], styles(found)
     for condition, group in conditions(found):
         own = [entry for entry in group if entry.complete]
-        where = ", ".join(format_settings(condition))
+        where = format_settings(condition)
         if len(own) > 1:
             written.append(_draw(folder, f"pareto {where}", 2, lambda axes: _pareto(axes, own, where, style)))
             written.append(_draw(folder, f"stages {where}", 1, lambda axes: _stages(axes[0], own, where)))
     for rest, group in conditions(found, without="views"):
         if len({entry.condition.get("views") for entry in group}) > 1:
-            written.append(_draw(folder, f"views {' '.join(format_settings(rest))}", 2, lambda axes: _views(axes, group, style)))
+            written.append(_draw(folder, f"views {format_settings(rest)}", 2, lambda axes: _views(axes, group, style)))
     curves = [(label, group) for label, group in deltas(found) if len(group) > 1]
     if curves:
         written.append(_draw(folder, "delta", 2, lambda axes: _deltas(axes, curves)))
@@ -78,23 +77,23 @@ def _pareto(axes: Sequence[Axes], group: Sequence[Entry], where: str, style: dic
         for i in front(points):
             ax.annotate(group[i].label, points[i], xytext=(4, 4), textcoords="offset points", fontsize=7)
         ax.set_xscale("log")
-        _dress(ax, "seconds per case", headed(SHOWN_MEASURES[name]))
+        _dress(ax, "seconds per case", SHOWN_MEASURES[name].heading)
         ax.set_title(where, fontsize=9)
     axes[-1].legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
 
 
 def _views(axes: Sequence[Axes], group: Sequence[Entry], style: dict) -> None:
     for ax, name in zip(axes, ("psnr", "ssim")):
-        labels = {", ".join([e.method, *format_settings(e.settings)]): e.method for e in group}
+        labels = {e.name: e.method for e in group}
         for label, method in labels.items():
             own = sorted((e.condition["views"], e.means[name]) for e in group
-                         if e.complete and ", ".join([e.method, *format_settings(e.settings)]) == label)
+                         if e.complete and e.name == label)
             if own:
                 ax.plot(*zip(*own), **style[method], markersize=5, label=label)
         views = sorted({e.condition["views"] for e in group})
         ax.set_xscale("log", base=2)
         ax.set_xticks(views, map(str, views))
-        _dress(ax, "views", headed(SHOWN_MEASURES[name]))
+        _dress(ax, "views", SHOWN_MEASURES[name].heading)
     axes[-1].legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
 
 
@@ -105,7 +104,7 @@ def _deltas(axes: Sequence[Axes], curves: Sequence[tuple[str, list[Entry]]]) -> 
             own = [(e.settings["delta"], e.means[name]) for e in group if e.complete]
             if own:
                 ax.plot(*zip(*own), color=COLOURS[i % len(COLOURS)], marker="o", markersize=5, label=label)
-        _dress(ax, "delta of Extra Compute (0: none)", headed(SHOWN_MEASURES[name]))
+        _dress(ax, "delta of Extra Compute (0: none)", SHOWN_MEASURES[name].heading)
     axes[-1].set_yscale("log")
     axes[-1].legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 
 from phydict.ablation.spec import Specification, Trial, key, prior_of
-from phydict.ablation.timing import PeakMemory, TimedPrior, TimedProjector, WarmUp
+from phydict.ablation.timing import TimedPrior, TimedProjector, WarmUp
 from phydict.evaluation import read_csv, write_csv
 from phydict.inference.data import case_scores
 from phydict.methods import fit_to_grid, reconstructor
@@ -19,7 +19,7 @@ from phydict.posterior import Sampler
 from phydict.reconstruction import Reconstruction
 from phydict.runtime.console import noted, sentence
 from phydict.runtime.precision import instruction_set
-from phydict.runtime.profiling import Stopwatch
+from phydict.runtime.profiling import Stopwatch, peak_memory, reset_peak_memory
 from phydict.runtime.progress import CaseProgress
 from phydict.runtime.seeds import case_seed
 
@@ -33,7 +33,8 @@ MEASURED = ("status", "error", "warning", "ssim", "psnr", "mae_hu", "ssim_lung",
             "seconds", "seconds_prepare", "seconds_sample", "seconds_score", "seconds_network", "seconds_projector",
             "network_calls", "projector_calls", "peak_memory_mb", "device", "threads",
             "precision", "instruction_set")
-"""Columns that a run fills; the others are the trial's."""
+"""Columns that a run fills; the others are the trial's. peak_memory_mb, in MiB, is that of the tensors on a
+CUDA device, else of the process."""
 
 
 class Results:
@@ -174,9 +175,9 @@ class Runner:
         return measured | {"warning": "; ".join(warned) or None}
 
     def _measured(self, trial: Trial, scene: MeasuredCase, on_step: Callable[[], None]) -> dict:
-        watch, memory = Stopwatch(), PeakMemory(self.device)
+        watch, known = Stopwatch(), reset_peak_memory(self.device)
         result = self._reconstruct(trial, scene, watch, on_step)
-        peak, finite = memory.mb(), bool(result.volume.isfinite().all())
+        peak, finite = peak_memory(self.device) if known else None, bool(result.volume.isfinite().all())
         scores = case_scores(result.volume, result.misfit, scene.truth, scene.window) if finite else {}
         return scores | {
             "status": "ok" if finite else "diverged",

@@ -6,18 +6,14 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from phydict.ablation.run import MEASURED
-from phydict.evaluation.metrics import MEASURES, Measure
+from phydict.ablation.spec import PRIOR_SETTINGS
+from phydict.evaluation.metrics import MEASURES, Measure, over_cases
 
 SHOWN_MEASURES = MEASURES | {"network_calls": Measure("network calls", None, 0),
                              "projector_calls": Measure("projector calls", None, 0),
-                             "peak_memory_mb": Measure("peak memory (MB)", False, 0)}
+                             "peak_memory_mb": Measure("peak memory (MiB)", False, 0)}
 """How the columns of results are printed."""
-
-OF_A_METHOD = ("method", "prior", "guidance", "samples", "delta", "report")
-"""Columns that, with method.<field>, tell one method's settings; all others but seeds tell the X-rays."""
 
 NON_SETTING_COLUMNS = (*MEASURED, "case", "key", "seed", "grid")
 
@@ -44,20 +40,31 @@ class Entry:
         return 0 < self.cases == self.of
 
     @property
+    def name(self) -> str:
+        """The method with its settings."""
+        return format_settings(self.method, self.settings)
+
+    @property
+    def lacking(self) -> str:
+        """How many cases it has, where some are missing."""
+        return f" ({self.cases} of {self.of} cases)" if 0 < self.cases < self.of else ""
+
+    @property
     def label(self) -> str:
         """The method with its settings, and how many cases it has where some are missing."""
-        return ", ".join([self.method, *format_settings(self.settings)]) + (
-            f" ({self.cases} of {self.of} cases)" if 0 < self.cases < self.of else "")
+        return self.name + self.lacking
 
 
-def format_settings(settings: Mapping) -> list[str]:
-    """Settings in words: "K = 8", "iterations 50"."""
-    return [_format_setting(name, f"{value:g}" if isinstance(value, float) else str(value)) for name, value in settings.items()]
+def format_settings(*parts: str | Mapping) -> str:
+    """Names, and settings in words, behind each other: "K = 8, iterations 50"."""
+    return ", ".join(text for part in parts for text in (
+        [part] if isinstance(part, str) else [_format_setting(*setting) for setting in part.items()]))
 
 
-def _format_setting(name: str, value: str) -> str:
+def _format_setting(name: str, value: object) -> str:
     if name == "simulator":
-        return value
+        return str(value)
+    value = f"{value:g}" if isinstance(value, float) else value
     return f"K = {value}" if name == "views" else f"{name.split('.', 1)[-1].replace('_', ' ')} {value}"
 
 
@@ -68,7 +75,7 @@ def entries(rows: Iterable[Mapping]) -> list[Entry]:
     """
     rows = list(rows)
     names = [name for name in dict.fromkeys(k for row in rows for k in row) if name not in NON_SETTING_COLUMNS]
-    mine = [name for name in names if name in OF_A_METHOD or name.startswith("method.")]
+    mine = [name for name in names if name in ("method", *PRIOR_SETTINGS) or name.startswith("method.")]
     varying = _varying(rows, [name for name in names if name not in mine])
     own = {method: _varying([row for row in rows if row["method"] == method], [n for n in mine if n != "method"])
            for method in dict.fromkeys(row["method"] for row in rows)}
@@ -98,20 +105,25 @@ def best_settings(found: Sequence[Entry], measure: str = "psnr") -> list[Entry]:
     return list(best.values())
 
 
+def deltas(found: Sequence[Entry]) -> list[tuple[str, list[Entry]]]:
+    """What has a curve over Extra Compute's delta: a label, and its entries from delta 0 up."""
+    groups: dict[str, list] = {}
+    for entry in found:
+        if "delta" in entry.settings:
+            others = {name: value for name, value in entry.settings.items() if name != "delta"}
+            groups.setdefault(format_settings(entry.method, others, entry.condition), []).append(entry)
+    return [(label, sorted(group, key=lambda entry: entry.settings["delta"])) for label, group in groups.items()]
+
+
 def _entry(rows: Sequence[Mapping], own: Sequence[str], varying: Sequence[str]) -> Entry:
-    first, good = rows[0], {}
-    for row in rows:
-        if row["status"] == "ok":
-            good.setdefault(row["case"], []).append(row)
-    means = {}
-    for name in SHOWN_MEASURES.keys() | {k for row in rows for k in row if k.startswith("seconds_")}:
-        values = [np.mean([row[name] for row in group]) for group in good.values() if all(name in r for r in group)]
-        if values and len(values) == len(good):
-            means[name] = float(np.mean(values))
+    first, good = rows[0], [row for row in rows if row["status"] == "ok"]
+    cases = len({row["case"] for row in good})
+    stages = {name for row in good for name in row if name.startswith("seconds_")}
+    means = {name: found.mean for name, found in over_cases(good, SHOWN_MEASURES.keys() | stages).items()
+             if found.cases == cases}
     error = next((f"{row['status']}: {row['error']}" for row in rows if row["status"] != "ok"), None)
     return Entry(first["method"], {n: first[n] for n in own if n in first},
-                 {n: first[n] for n in varying if n in first}, means, len(good), len({row["case"] for row in rows}),
-                 error)
+                 {n: first[n] for n in varying if n in first}, means, cases, len({row["case"] for row in rows}), error)
 
 
 def _varying(rows: Sequence[Mapping], names: Sequence[str]) -> list[str]:

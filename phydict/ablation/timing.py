@@ -1,11 +1,9 @@
-"""Where the time and the memory of a reconstruction go: a prior and a projector that keep a stopwatch."""
+"""Where the time of a reconstruction goes: a prior and a projector that keep a stopwatch."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -77,29 +75,6 @@ def _stage(watch: Stopwatch, name: str, x: Tensor) -> Iterator[None]:
         yield
         if x.is_cuda:
             torch.cuda.synchronize(x.device)
-
-
-class PeakMemory:
-    """The most memory that is held from here on, in MB: of the process on a CPU, of its tensors on other devices.
-
-    `mb` is None where the system does not tell: on a CPU, wherever /proc/self/clear_refs is missing.
-    """
-
-    def __init__(self, device: torch.device):
-        self.device, self.known = device, True
-        if device.type == "cuda":
-            torch.cuda.reset_peak_memory_stats(device)
-            return
-        try:
-            Path("/proc/self/clear_refs").write_text("5")
-        except OSError:
-            self.known = False
-
-    def mb(self) -> float | None:
-        if self.device.type == "cuda":
-            return torch.cuda.max_memory_allocated(self.device) / 2**20
-        found = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text()) if self.known else None
-        return int(found[1]) / 1024 if found else None
 
 
 class WarmUp:

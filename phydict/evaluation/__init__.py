@@ -1,8 +1,9 @@
 """How good a reconstruction is: volume metrics, result tables and picture panels."""
 
+from phydict.evaluation.csv_file import read_csv, write_csv
 from phydict.evaluation.gallery import method_panel, panel
-from phydict.evaluation.metrics import RANGE, CaseMetrics, volume_metrics
-from phydict.evaluation.tables import markdown, read_csv, rich_table, summarise, write_csv
+from phydict.evaluation.metrics import RANGE, CaseMetrics, summarise, volume_metrics
+from phydict.evaluation.tables import Table, mean_table
 
-__all__ = ["RANGE", "CaseMetrics", "markdown", "method_panel", "panel", "read_csv",
-           "rich_table", "summarise", "volume_metrics", "write_csv"]
+__all__ = ["RANGE", "CaseMetrics", "Table", "mean_table", "method_panel", "panel", "read_csv", "summarise",
+           "volume_metrics", "write_csv"]

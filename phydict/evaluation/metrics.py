@@ -17,9 +17,10 @@ offset.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torchmetrics import Metric
@@ -42,6 +43,11 @@ class Measure(NamedTuple):
     higher_is_better: bool | None
     decimals: int
 
+    @property
+    def heading(self) -> str:
+        """The label with the direction in which the metric is better."""
+        return self.label + {True: " ↑", False: " ↓", None: ""}[self.higher_is_better]
+
 
 MEASURES = {
     "ssim": Measure("SSIM", True, 3),
@@ -54,9 +60,6 @@ MEASURES = {
     "seconds": Measure("time (s)", False, 2),
 }
 """Every metric a table knows, in the order of its columns."""
-
-CASE_MEASURES = ("ssim", "psnr", "mae_hu", "ssim_lung", "psnr_lung", "mae_hu_lung", "misfit", "seconds")
-"""The metrics that exist for a single case."""
 
 
 def ssim_window(shape: Sequence[int]) -> tuple[list[int], list[float]]:
@@ -108,6 +111,59 @@ def volume_metrics(hu: Tensor, true_hu: Tensor, lung: Tensor | None = None,
     return {name: float(value) for name, value in result.items()}
 
 
+class Summary(NamedTuple):
+    """Mean and sample standard deviation over `cases` cases (std NaN for one case); prints as mean ± std."""
+
+    mean: float
+    std: float
+    cases: int
+
+    def __float__(self) -> float:
+        return self.mean
+
+    def __format__(self, spec: str) -> str:
+        return format(self.mean, spec) + ("" if math.isnan(self.std) else f" ± {format(self.std, spec)}")
+
+
+def over_cases(rows: Sequence[Mapping], metrics: Iterable[str]) -> dict[str, Summary]:
+    """{metric: Summary} of those metrics that some row has.
+
+    Rows of one case (several seeds) are averaged first, so that each case counts once; rows without the key "case"
+    count as a case each.
+    """
+    result = {}
+    for name in metrics:
+        cases: dict[str, list[float]] = {}
+        for n, row in enumerate(rows):
+            if row.get(name) is not None:
+                cases.setdefault(row.get("case", f"row {n}"), []).append(float(row[name]))
+        if cases:
+            with np.errstate(invalid="ignore"):
+                values = np.array([np.mean(repeats) for repeats in cases.values()])
+                std = float(values.std(ddof=1)) if len(values) > 1 else math.nan
+            result[name] = Summary(float(values.mean()), std, len(values))
+    return result
+
+
+def summarise(rows: Iterable[Mapping], by: str = "method",
+              metrics: Sequence[str] | None = None) -> dict[str, dict[str, Summary]]:
+    """{group: {metric: Summary}} by `over_cases`, groups in order of appearance.
+
+    metrics: names, or None for every known metric that some row has.
+    Raises ValueError when there is no row, a row lacks `by`, or no row has one of `metrics`.
+    """
+    rows = list(rows)
+    if not rows:
+        raise ValueError("there are no rows to summarise; evaluate at least one case first")
+    if lacking := next((row for row in rows if by not in row), None):
+        raise ValueError(f"every row needs the column {by!r} to be grouped by, but one has only {sorted(lacking)}")
+    present = {name for row in rows for name, value in row.items() if value is not None}
+    if absent := [name for name in metrics or () if name not in present]:
+        raise ValueError(f"no row has the metrics {absent}; the rows have {sorted(present)}")
+    return {str(group): over_cases([row for row in rows if row[by] == group], metrics or MEASURES)
+            for group in dict.fromkeys(row[by] for row in rows)}
+
+
 class CaseMetrics(Metric):
     """Mean and standard deviation over cases of per-case values, for several methods; safe under DDP.
 
@@ -123,7 +179,7 @@ class CaseMetrics(Metric):
     higher_is_better = None
     is_differentiable = False
 
-    def __init__(self, methods: Sequence[str], names: Sequence[str] = CASE_MEASURES):
+    def __init__(self, methods: Sequence[str], names: Sequence[str] = tuple(MEASURES)):
         super().__init__()
         self.methods, self.names = tuple(methods), tuple(names)
         # Flat float64 rows [case, method, values, present]. torchmetrics gathers an empty process as a flat tensor of
@@ -152,17 +208,14 @@ class CaseMetrics(Metric):
 
     def compute(self) -> dict[str, Tensor]:
         """Statistics over cases as a flat dict of scalars, ready for a logger."""
-        cases = self._cases()
-        result = {}
+        cases, result = self._cases(), {}
         for method in self.methods:
-            mine = [values for (_, name), values in cases.items() if name == method]
-            if mine:
-                result[f"{method}/cases"] = torch.tensor(float(len(mine)))
-            for name in self.names:
-                column = torch.tensor([values[name] for values in mine if name in values], dtype=torch.float64)
-                if len(column):
-                    result[f"{method}/{name}"] = column.mean()
-                    result[f"{method}/{name}_std"] = column.std() if len(column) > 1 else column.new_tensor(math.nan)
+            rows = [values for (_, name), values in cases.items() if name == method]
+            if rows:
+                result[f"{method}/cases"] = torch.tensor(float(len(rows)))
+            for name, found in over_cases(rows, self.names).items():
+                result[f"{method}/{name}"] = torch.tensor(found.mean, dtype=torch.float64)
+                result[f"{method}/{name}_std"] = torch.tensor(found.std, dtype=torch.float64)
         return result
 
     def _cases(self) -> dict[tuple[int, str], dict[str, float]]:

@@ -1,213 +1,139 @@
-"""Result tables: a tidy CSV with one row per case and method, and its summary as Markdown or for the console.
+"""Tables of results as Markdown, as LaTeX and for the console, the best and the second of each measure marked.
 
-A row is a dict {"case": id, "method": name, metric: value, ...}; `metrics.MEASURES` says how metrics are printed. Its
-"warning", if any, says why its numbers are to be doubted.
+A row of results is a dict {"case": id, "method": name, metric: value, ...}. Its "warning", if any, says why its numbers
+are to be doubted.
 """
 
 from __future__ import annotations
 
-import csv
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
-import numpy as np
-from rich.table import Table
+from rich.markup import escape
+from rich.table import Table as ConsoleTable
 
-from phydict.evaluation.metrics import MEASURES, RANGE, SIGMA, TAPS, Measure
-from phydict.grid import Grid
-from phydict.runtime.files import atomic_write
+from phydict.evaluation.metrics import MEASURES, RANGE, SIGMA, TAPS, Measure, Summary, summarise
 from phydict.units import HUWindow
 
-TEXT_COLUMNS = ("case", "method")
-"""Columns that are text even where they look like numbers."""
+
+@dataclass(frozen=True)
+class Table:
+    """title; header: names of the columns, the first that of the labels; measures: of each column but the first;
+    lines: a label, whether it takes part in the ranking, and a value per measure, None for none; notes."""
+
+    title: str
+    header: list[str]
+    measures: list[Measure]
+    lines: list[tuple[str, bool, list[float | Summary | None]]]
+    notes: list[str]
+
+    def markdown(self) -> str:
+        """Best in bold, second underlined."""
+        lines = self._marked(("{}", "**{}**", "<u>{}</u>"), lambda text: text.replace("|", "\\|"))
+        rule = ["---", *["---:"] * len(self.measures)]
+        table = "\n".join(f"| {' | '.join(line)} |" for line in [self.header, rule, *lines])
+        return "\n\n".join([f"### {self.title}", table, *self.notes]) + "\n\n"
+
+    def latex(self) -> str:
+        """A tabular with booktabs' rules: best in bold, second underlined."""
+        lines = self._marked(("{}", "\\textbf{{{}}}", "\\underline{{{}}}"), escaped)
+        header, *body = [" & ".join(line) + " \\\\" for line in [map(escaped, self.header), *lines]]
+        notes = " ".join(map(escaped, [f"{self.title}.", *self.notes]))
+        return "\n".join(["\\begin{table}", "\\centering", f"\\begin{{tabular}}{{l{'r' * len(self.measures)}}}",
+                          "\\toprule", header, "\\midrule", *body, "\\bottomrule", "\\end{tabular}",
+                          f"\\caption{{{notes}}}", "\\end{table}", ""])
+
+    def console(self) -> ConsoleTable:
+        """For rich's console: best in bold, second underlined."""
+        table = ConsoleTable(title=escape(self.title), caption=escape("\n".join(self.notes)))
+        for i, name in enumerate(self.header):
+            table.add_column(escape(name), justify="right" if i else "left")
+        for line in self._marked(("{}", "[bold]{}[/bold]", "[underline]{}[/underline]"), escape):
+            table.add_row(*line)
+        return table
+
+    def _marked(self, marks: Sequence[str], printed: Callable[[str], str]) -> list[list[str]]:
+        """The lines as text, each value in the mark of its place: 1 for the best, 2 for the second, else 0. Values that
+        are printed alike share a place."""
+        columns = [[printed(label) for label, _, _ in self.lines]]
+        for c, measure in enumerate(self.measures):
+            values = [values[c] for _, _, values in self.lines]
+            places = ranks([round(float(values[c]), measure.decimals) if ranked and values[c] is not None else math.nan
+                            for _, ranked, values in self.lines], measure.higher_is_better)
+            columns.append([marks[place].format(printed("–" if value is None else f"{value:.{measure.decimals}f}"))
+                            for value, place in zip(values, places)])
+        return [list(line) for line in zip(*columns)]
 
 
-def write_csv(path: str | Path, rows: Iterable[Mapping]) -> None:
-    """Write `rows` as CSV: the columns are the union of their keys, case and method first, then as they first appear.
+def ranks(values: Sequence[float], higher_is_better: bool | None) -> list[int]:
+    """1 for the best, 2 for the second best, 0 for others; the second is marked only where the best is alone; NaN takes
+    no part, and neither does a lone value."""
+    known = [value for value in values if not math.isnan(value)]
+    if higher_is_better is None or len(known) < 2:
+        return [0] * len(values)
+    best, second = sorted(known, reverse=higher_is_better)[:2]
+    return [1 if value == best else 2 if value == second else 0 for value in values]
 
-    A value that is None or left out becomes an empty field; numbers keep all their digits.
-    The file is replaced in one step, so that a killed process leaves the old file or the new one, never a part.
-    To append: `write_csv(path, read_csv(path) + new_rows)`.
+
+def mean_table(rows: Iterable[Mapping], by: str = "method", metrics: Sequence[str] | None = None,
+               window: HUWindow = RANGE) -> Table:
+    """Mean ± standard deviation over cases, a line per group; where rows have warnings, a last column counts their
+    cases.
+
+    by, metrics: as in `summarise`. window: the HU range of `volume_metrics`. The caption takes grid and views from the
+    rows' columns of these names.
     """
     rows = list(rows)
-    seen = dict.fromkeys(key for row in rows for key in row)
-    columns = [name for name in TEXT_COLUMNS if name in seen] + [name for name in seen if name not in TEXT_COLUMNS]
-    with atomic_write(Path(path)) as part, part.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns)
-        writer.writerows([_to_text(row.get(name)) for name in columns] for row in rows)
+    groups = summarise(rows, by, metrics)
+    names = [name for name in metrics or MEASURES if any(name in group for group in groups.values())]
+    measures = [MEASURES.get(name, Measure(name, None, 3)) for name in names]
+    lines = [(label, True, [group.get(name) for name in names]) for label, group in groups.items()]
+    if warned := warned_cases(rows, by):
+        measures.append(Measure("warned", None, 0))
+        lines = [(label, ranked, [*values, len(warned.get(label, ()))]) for label, ranked, values in lines]
+    cases = {frozenset(row.get("case", f"row {n}") for n, row in enumerate(rows) if str(row[by]) == group)
+             for group in groups}
+    counts = sorted({min(map(len, cases)), max(map(len, cases))})
+    unequal = " (not the same cases in every line)" if len(cases) > 1 else ""
+    over = f"Mean ± standard deviation over n = {' to '.join(map(str, counts))} cases{unequal}"
+    return Table(f"Scores by {by}", [by, *(measure.heading for measure in measures)], measures, lines,
+                 [caption(over, rows, {"Grid": "grid", "Views": "views"}, window), *doubts(rows, by)])
 
 
-def read_csv(path: str | Path) -> list[dict]:
-    """Rows of a CSV by `write_csv`, numbers as int or float; empty fields are left out; no file gives no rows.
-
-    Text that only resembles a number ("007") stays text, and so do the columns case and method.
-    Raises ValueError on a row whose number of fields is not the header's, as in a file cut off by another program.
-    """
-    path = Path(path)
-    if not path.exists():
-        return []
-    with open(path, newline="", encoding="utf-8") as file:
-        reader = csv.reader(file)
-        columns = next(reader, [])
-        rows = []
-        for fields in reader:
-            if len(fields) != len(columns):
-                raise ValueError(f"line {reader.line_num} of {path} has {len(fields)} fields, but its header has "
-                                 f"{len(columns)}; the file was cut off or edited, remove or repair that line")
-            rows.append({name: field if name in TEXT_COLUMNS else _from_text(field)
-                         for name, field in zip(columns, fields) if field != ""})
-    return rows
+def caption(statistic: str, rows: Sequence[Mapping], columns: Mapping[str, str], window: HUWindow = RANGE) -> str:
+    """One line that says what the numbers of a table are: a statistic of scores in an HU range, of rows that have these
+    values in some columns, label -> column."""
+    stated = "".join(f" {label}: {listed(rows, column) or 'not stated'}." for label, column in columns.items())
+    return (f"{statistic}; best in bold, second underlined. HU clipped to [{window.low:g}, {window.high:g}], data "
+            f"range {2 * window.half_width:g} HU; SSIM 3-D on HU from the range's low end, Gaussian of {TAPS} taps, "
+            f"sigma {SIGMA:g} voxels.{stated}")
 
 
-def _to_text(value) -> str:
-    if value is None:
-        return ""
-    value = value.item() if hasattr(value, "item") else value
-    return repr(value) if isinstance(value, float) else str(value)
+def listed(rows: Sequence[Mapping], column: str) -> str:
+    """The values of a column, each once."""
+    return ", ".join(dict.fromkeys(str(row[column]) for row in rows if row.get(column) is not None))
 
 
-def _from_text(field: str) -> int | float | str:
-    for kind in (int, float):
-        try:
-            value = kind(field)
-        except ValueError:
-            continue
-        if repr(value) == field:
-            return value
-    return field
+def warned_cases(rows: Sequence[Mapping], by: str = "method") -> dict[str, list[str]]:
+    """{group: its cases with a warning}, of groups that have any."""
+    warned: dict[str, dict] = {}
+    for row in rows:
+        if row.get("warning"):
+            warned.setdefault(str(row[by]), {})[str(row.get("case", "a row"))] = None
+    return {group: list(cases) for group, cases in warned.items()}
 
 
-class Summary(NamedTuple):
-    """One metric of one group: mean and sample standard deviation over `cases` cases (std NaN for one case)."""
-
-    mean: float
-    std: float
-    cases: int
+def doubts(rows: Sequence[Mapping], by: str = "method") -> list[str]:
+    """The note on cases with a warning, where there are any."""
+    warned = "; ".join(f"{group}: {', '.join(cases)}" for group, cases in warned_cases(rows, by).items())
+    return [f"Doubtful cases, by the column warning: {warned}."] if warned else []
 
 
-def summarise(rows: Iterable[Mapping], by: str = "method",
-              metrics: Sequence[str] | None = None) -> dict[str, dict[str, Summary]]:
-    """{group: {metric: Summary}} over cases, groups in order of appearance.
-
-    Rows of one group and case (several seeds) are averaged first, so that each case counts once; rows without
-    the key "case" count as a case each. metrics: names, or None for every known metric that some row has.
-    Raises ValueError when there is no row, a row lacks `by`, or no row has one of `metrics`.
-    """
-    rows = list(rows)
-    if not rows:
-        raise ValueError("there are no rows to summarise; evaluate at least one case first")
-    if lacking := next((row for row in rows if by not in row), None):
-        raise ValueError(f"every row needs the column {by!r} to be grouped by, but one has only {sorted(lacking)}")
-    present = {name for row in rows for name, value in row.items() if value is not None}
-    if metrics is None:
-        metrics = [name for name in MEASURES if name in present]
-    if absent := [name for name in metrics if name not in present]:
-        raise ValueError(f"no row has the metrics {absent}; the rows have {sorted(present)}")
-    result = {}
-    for group in dict.fromkeys(row[by] for row in rows):
-        mine = [(row.get("case", f"row {n}"), row) for n, row in enumerate(rows) if row[by] == group]
-        result[str(group)] = {}
-        for name in metrics:
-            cases = {}
-            for case, row in mine:
-                if row.get(name) is not None:
-                    cases.setdefault(case, []).append(float(row[name]))
-            if cases:
-                with np.errstate(invalid="ignore"):
-                    values = np.array([np.mean(repeats) for repeats in cases.values()])
-                    std = float(values.std(ddof=1)) if len(values) > 1 else math.nan
-                    result[str(group)][name] = Summary(float(values.mean()), std, len(values))
-    return result
-
-
-def markdown(rows: Iterable[Mapping], by: str = "method", metrics: Sequence[str] | None = None,
-             window: HUWindow = RANGE, grid: Grid | None = None, views: int | None = None) -> str:
-    """Markdown table of mean ± standard deviation over cases, a line per group, the best of each metric in bold; where
-    rows have warnings, a last column counts their cases.
-
-    by, metrics: as in `summarise`. window: the HU range of `volume_metrics`. grid, views: what was scored, for the
-    caption line; None takes a `grid` or `views` column of the rows, and says "not stated" where there is none.
-    """
-    rows = list(rows)
-    header, lines = _cells(rows, by, metrics)
-    text = [[f"**{cell}**" if best else cell.replace("|", "\\|") for cell, best in line] for line in lines]
-    rule = ["---"] + ["---:"] * (len(header) - 1)
-    table = "\n".join("| " + " | ".join(line) + " |" for line in [header, rule, *text])
-    return f"{table}\n\n{caption(rows, by, window, grid, views)}\n"
-
-
-def rich_table(rows: Iterable[Mapping], by: str = "method", metrics: Sequence[str] | None = None,
-               window: HUWindow = RANGE, grid: Grid | None = None, views: int | None = None) -> Table:
-    """The table of `markdown` as a rich Table for the console; same arguments."""
-    rows = list(rows)
-    header, lines = _cells(rows, by, metrics)
-    table = Table(caption=caption(rows, by, window, grid, views))
-    for name in header:
-        table.add_column(name, justify="left" if name == by else "right")
-    for line in lines:
-        table.add_row(*[f"[bold]{cell}[/bold]" if best else cell.replace("[", "\\[") for cell, best in line])
-    return table
-
-
-def caption(rows: Sequence[Mapping], by: str = "method", window: HUWindow = RANGE,
-            grid: Grid | None = None, views: int | None = None) -> str:
-    """One line that says what the numbers of a table were taken from: cases, HU range, SSIM window, grid, views, and
-    which cases have warnings."""
-    counts = {}
-    for n, row in enumerate(rows):
-        counts.setdefault(row[by], set()).add(row.get("case", f"row {n}"))
-    cases = sorted({len(ids) for ids in counts.values()})
-    over = f"n = {cases[0]} cases" if len(cases) == 1 else f"n = {cases[0]} to {cases[-1]} cases"
-    unequal = " (not the same cases in every line)" if len({frozenset(ids) for ids in counts.values()}) > 1 else ""
-    warned = dict.fromkeys(str(row.get("case", "a row")) for row in rows if row.get("warning"))
-    doubtful = f" Doubtful, by what the rows' warning says: {', '.join(warned)}." if warned else ""
-    voxels = None if grid is None else f"{_product(grid.shape)} voxels of {_product(grid.spacing)} mm"
-    return (f"Mean ± standard deviation over {over}{unequal}; best in bold. "
-            f"HU clipped to [{window.low:g}, {window.high:g}], data range {2 * window.half_width:g} HU; "
-            f"SSIM 3-D on HU from the range's low end, Gaussian of {TAPS} taps, sigma {SIGMA:g} voxels. "
-            f"Grid: {voxels or _listed(rows, 'grid')}. Views: {views or _listed(rows, 'views')}.{doubtful}")
-
-
-def _product(numbers: Sequence[float]) -> str:
-    return " x ".join(f"{n:g}" for n in numbers)
-
-
-def _listed(rows: Sequence[Mapping], column: str) -> str:
-    found = dict.fromkeys(str(row[column]) for row in rows if row.get(column) is not None)
-    return ", ".join(found) or "not stated"
-
-
-def _cells(rows: Sequence[Mapping], by: str,
-           metrics: Sequence[str] | None) -> tuple[list[str], list[list[tuple[str, bool]]]]:
-    """Header, and per group its cells as (text, whether it is the best); means equal as printed share the place."""
-    summaries = summarise(rows, by, metrics)
-    names = list(dict.fromkeys(name for group in summaries.values() for name in group))
-    header, lines = [by], [[(group, False)] for group in summaries]
-    for name in names:
-        measure = MEASURES.get(name, Measure(name, None, 3))
-        arrow = {True: " ↑", False: " ↓", None: ""}[measure.higher_is_better]
-        header.append(measure.label + arrow)
-        printed = [round(group[name].mean, measure.decimals) if name in group else math.nan
-                   for group in summaries.values()]
-        ranked = [value for value in printed if not math.isnan(value)]
-        best = None
-        if measure.higher_is_better is not None and len(summaries) > 1 and ranked:
-            best = max(ranked) if measure.higher_is_better else min(ranked)
-        for line, group, value in zip(lines, summaries.values(), printed):
-            line.append((_value(group.get(name), measure.decimals), value == best))
-    if any(row.get("warning") for row in rows):
-        header.append("warned")
-        for line, group in zip(lines, summaries):
-            line.append((str(len({row.get("case") for row in rows if str(row[by]) == group and row.get("warning")})),
-                         False))
-    return header, lines
-
-
-def _value(summary: Summary | None, decimals: int) -> str:
-    if summary is None:
-        return "–"
-    spread = "" if math.isnan(summary.std) else f" ± {summary.std:.{decimals}f}"
-    return f"{summary.mean:.{decimals}f}{spread}"
+def escaped(text: str) -> str:
+    """Text as LaTeX prints it."""
+    for plain, printed in (("\\", "\\textbackslash "), ("&", "\\&"), ("%", "\\%"), ("_", "\\_"), ("#", "\\#"),
+                           ("{", "\\{"), ("}", "\\}"), ("~", "\\textasciitilde "), ("^", "\\textasciicircum "),
+                           ("↑", "$\\uparrow$"), ("↓", "$\\downarrow$"), ("±", "$\\pm$"), ("–", "--")):
+        text = text.replace(plain, printed)
+    return text

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple
 
-from phydict.evaluation import markdown, write_csv
+from phydict.evaluation import mean_table, write_csv
 from phydict.runtime.files import atomic_directory, atomic_write, check_replaceable, remove_leftovers, undisturbed
 from phydict.runtime.reading import not_written
 
@@ -101,7 +101,7 @@ class CaseResults:
         if rows:
             write_csv(self.folder / TABLE, rows)
             with atomic_write(self.folder / "results.md") as part:
-                part.write_text(markdown(rows))
+                part.write_text(mean_table(rows).markdown())
         return rows
 
     def _there(self, case: str) -> Finished | None:

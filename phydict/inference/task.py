@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import platform
-import resource
 import sys
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -22,7 +21,7 @@ from lightning.pytorch.utilities.exceptions import SIGTERMException
 from rich.console import Console
 from torch import Tensor
 
-from phydict.evaluation import CaseMetrics, panel, rich_table
+from phydict.evaluation import CaseMetrics, mean_table, panel
 from phydict.grid import Grid
 from phydict.inference.data import case_scores
 from phydict.inference.results import CaseResults
@@ -32,7 +31,7 @@ from phydict.prior import DEFAULT_PRIOR, MedSynCheckpoint, file_read, fingerprin
 from phydict.reconstruction import Reconstruction, Reconstructor, describe, save_nifti
 from phydict.runtime.console import TRACEBACK, check_apart, check_writable, noted, sentence
 from phydict.runtime.precision import instruction_set
-from phydict.runtime.profiling import profiled, stage
+from phydict.runtime.profiling import CPU, peak_memory, profiled, stage
 from phydict.runtime.progress import CaseProgress
 from phydict.runtime.seeds import case_seed, check_seed
 from phydict.runtime.warning import warn
@@ -217,13 +216,13 @@ class ReconstructionTask(lightning.LightningModule):
         self.progress.finished(f"{sum(result.seconds.values()):.1f} s, misfit {result.misfit:.4f}")
 
     def _record(self, case: dict, result: Reconstruction, scores: dict | None) -> dict:
-        """All that is known of a finished case, as plain JSON values."""
+        """All that is known of a finished case, as plain JSON values; process_peak_memory_mb is in MiB."""
         return {"case": case["id"], "method": self.method_name,
                 "citation": self.reconstructor.citation, "scores": scores, "misfit": result.misfit,
                 "misfit_per_view": result.misfit_per_view, "diverged_at": result.diverged_at, "scatter": result.scatter,
                 "seconds": result.seconds, "network_calls": result.network_calls,
                 "projector_calls": result.projector_calls,
-                "process_peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+                "process_peak_memory_mb": peak_memory(CPU),
                 "mu_water": case.get("mu_water", self.reconstructor.mu_water), "views": len(result.xrays),
                 "precision": result.precision, "instruction_set": instruction_set(self.device),
                 "grid": result.grid.to_dict(), "seed": result.seed,
@@ -237,7 +236,7 @@ class ReconstructionTask(lightning.LightningModule):
         if rows:
             console = Console()
             console.width = max(console.width, 80 if console.is_terminal else 120)
-            console.print(rich_table(rows))
+            console.print(mean_table(rows).console())
         print(f"results in {self.results.folder}")
         if missing:
             raise ValueError(f"{len(missing)} of {len(self.cases)} cases were not reconstructed "

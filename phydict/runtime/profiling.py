@@ -6,6 +6,7 @@ elsewhere it is the largest so far. On a CUDA device it is also that of the tens
 
 from __future__ import annotations
 
+import re
 import resource
 import sys
 import time
@@ -16,17 +17,22 @@ from pathlib import Path
 
 import torch
 
+MIB = 2**20
+"""Bytes in the unit that every amount of memory is measured in, whatever name its column has kept."""
+
+CPU, CUDA = torch.device("cpu"), torch.device("cuda")
+
 _running: Profile | None = None
 
 
 @dataclass
 class StageUsage:
-    """What a stage took in all its calls: seconds, and the peaks in MB of the process and of the device."""
+    """What a stage took in all its calls: seconds, and the peaks in MiB of the process and of the device."""
 
     calls: int = 0
     seconds: float = 0.0
-    peak_mb: float = 0.0
-    device_mb: float = 0.0
+    peak_mib: float = 0.0
+    device_mib: float = 0.0
 
 
 class Profile:
@@ -54,19 +60,22 @@ class Profile:
     def _mark(self) -> None:
         """Gives the peaks since the last mark to every open stage."""
         _wait()
-        process, device = _peaks()
+        process, device = peak_memory(CPU), peak_memory(CUDA) if torch.cuda.is_initialized() else 0.0
+        reset_peak_memory(CPU)
+        if torch.cuda.is_initialized():
+            reset_peak_memory(CUDA)
         for name in self._open:
             use = self.uses[name]
-            use.peak_mb, use.device_mb = max(use.peak_mb, process), max(use.device_mb, device)
+            use.peak_mib, use.device_mib = max(use.peak_mib, process), max(use.device_mib, device)
 
     def table(self) -> str:
         """One line per stage."""
-        on_device = any(use.device_mb for use in self.uses.values())
+        on_device = any(use.device_mib for use in self.uses.values())
         width = max((len(name) for name in self.uses), default=5)
-        lines = [f"{'stage':{width}s}  {'calls':>6s}  {'seconds':>8s}  {'peak MB':>8s}" + "  device MB" * on_device]
+        lines = [f"{'stage':{width}s}  {'calls':>6s}  {'seconds':>8s}  {'peak MiB':>8s}" + "  device MiB" * on_device]
         for name, use in self.uses.items():
-            lines.append(f"{name:{width}s}  {use.calls:6d}  {use.seconds:8.3f}  {use.peak_mb:8.0f}"
-                         + f"  {use.device_mb:9.0f}" * on_device)
+            lines.append(f"{name:{width}s}  {use.calls:6d}  {use.seconds:8.3f}  {use.peak_mib:8.0f}"
+                         + f"  {use.device_mib:10.0f}" * on_device)
         return "\n".join(lines)
 
 
@@ -96,20 +105,27 @@ def _wait() -> None:
         torch.cuda.synchronize()
 
 
-def _peaks() -> tuple[float, float]:
-    """Peaks in MB, of the process and of the CUDA device, since the last call."""
-    device = 0.0
-    if torch.cuda.is_initialized():
-        device = torch.cuda.max_memory_allocated() / 1e6
-        torch.cuda.reset_peak_memory_stats()
+def reset_peak_memory(device: torch.device) -> bool:
+    """Begins `peak_memory` anew; False where the system does not let that of a process be, as outside Linux."""
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+        return True
     try:
-        lines = Path("/proc/self/status").read_text().splitlines()
-        process = next(int(line.split()[1]) * 1024 / 1e6 for line in lines if line.startswith("VmHWM"))
         Path("/proc/self/clear_refs").write_text("5")
-    except (OSError, StopIteration):
+    except OSError:
+        return False
+    return True
+
+
+def peak_memory(device: torch.device) -> float:
+    """The most memory in MiB since `reset_peak_memory`: of the tensors on a CUDA device, of the process on others."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device) / MIB
+    try:
+        return int(re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())[1]) * 1024 / MIB
+    except (OSError, TypeError):
         unit = 1 if sys.platform == "darwin" else 1024
-        process = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
-    return process, device
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / MIB
 
 
 class Stopwatch:

@@ -19,7 +19,7 @@ from rich.console import Console
 from torch.nn.functional import interpolate
 
 from phydict.datasets import find_cts, prepare_ct
-from phydict.evaluation import read_csv, rich_table, volume_metrics, write_csv
+from phydict.evaluation import mean_table, read_csv, volume_metrics, write_csv
 from phydict.prior import load_super_resolution
 
 FILE = Path(__file__).with_suffix(".csv")
@@ -60,4 +60,4 @@ if __name__ == "__main__":
             new = compared(stage, count, cts)
             others = [row for row in read_csv(FILE) if (row["stage"], row["views"]) != (Path(stage).stem, count)]
             write_csv(FILE, others + new)
-            Console(width=160).print(rich_table(new))
+            Console(width=160).print(mean_table(new).console())

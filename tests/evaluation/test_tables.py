@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import math
 import os
+import random
 import re
 
 import pytest
 import torch
 from rich.console import Console
 
+from phydict.evaluation import Table, mean_table, read_csv, summarise, write_csv
 from phydict.evaluation.metrics import MEASURES
-from phydict.evaluation.tables import markdown, read_csv, rich_table, summarise, write_csv
-from phydict.grid import Grid
+from phydict.evaluation.tables import ranks
+from phydict.units import HUWindow
 
 ROWS = [
     {"case": "007", "method": "fdk", "ssim": 0.5, "psnr": 20.0, "mae_hu": 80.0, "seconds": 1.0},
@@ -20,6 +22,7 @@ ROWS = [
     {"case": "007", "method": "gibbs", "ssim": 0.8, "psnr": 27.0, "mae_hu": 30.0, "seconds": 90.0},
     {"case": "008", "method": "gibbs", "ssim": 0.9, "psnr": 29.0, "mae_hu": 20.0, "seconds": 70.0},
 ]
+STATED = [row | {"grid": "64x64x64", "views": 8} for row in ROWS]
 
 
 def test_csv_round_trip_keeps_every_digit_and_kind(tmp_path):
@@ -76,25 +79,52 @@ def test_a_process_killed_while_writing_leaves_the_old_file(tmp_path, monkeypatc
     assert read_csv(path) == ROWS[:1]
 
 
-def cells(table: str) -> dict[str, dict[str, str]]:
-    """{row name: {column name without its arrow: cell}} of a Markdown table."""
-    lines = [[c.strip() for c in line.strip("| ").split(" | ")] for line in table.splitlines() if line.startswith("|")]
+def cells(rows: list[dict]) -> dict[str, dict[str, str]]:
+    """{row name: {column name without its arrow: cell}} of the Markdown table of some rows."""
+    lines = [[c.strip() for c in line.strip("| ").split(" | ")]
+             for line in mean_table(rows).markdown().splitlines() if line.startswith("|")]
     names = [re.sub(" [↑↓]$", "", name) for name in lines[0]]
     return {line[0]: dict(zip(names, line)) for line in lines[2:]}
 
 
 def test_bold_marks_the_best_in_the_right_direction():
-    table = cells(markdown(ROWS))
-    assert table["gibbs"]["SSIM"] == "**0.850 ± 0.071**" and table["fdk"]["SSIM"] == "0.600 ± 0.141"
+    table = cells(ROWS)
+    assert table["gibbs"]["SSIM"] == "**0.850 ± 0.071**" and table["fdk"]["SSIM"] == "<u>0.600 ± 0.141</u>"
     assert table["gibbs"]["PSNR (dB)"] == "**28.00 ± 1.41**"
     assert table["gibbs"]["MAE (HU)"] == "**25.0 ± 7.1**" and "**" not in table["fdk"]["MAE (HU)"]
     assert table["fdk"]["time (s)"] == "**1.00 ± 0.00**" and "**" not in table["gibbs"]["time (s)"]
 
 
+def test_ranks_follow_the_direction_and_the_printed_values():
+    draw = random.Random(0)
+    for _ in range(200):
+        values = [draw.choice([draw.random(), 0.5, math.nan]) for _ in range(draw.randint(0, 6))]
+        known = sorted(v for v in values if not math.isnan(v))
+        places = ranks(values, False)
+        assert places == ranks([-v for v in values], True)
+        assert [v for v, place in zip(values, places) if place == 1] == (
+            known[:known.count(known[0])] if len(known) > 1 else [])
+        seconds = {v for v, place in zip(values, places) if place == 2}
+        assert seconds == ({known[1]} if len(known) > 1 and known[1] > known[0] else set())
+        assert ranks(values, None) == [0] * len(values)
+
+
+def test_the_best_is_bold_and_the_second_underlined_by_what_is_printed():
+    table = Table("T_1", ["method", "PSNR", "MAE"], [MEASURES["psnr"], MEASURES["mae_hu"]],
+                  [("a_b", True, [20.001, 9.0]), ("b", True, [30.0, 5.0]), ("c", False, [40.0, 1.0]),
+                   ("d", True, [20.0, None])], ["100 %"])
+    lines = table.markdown().splitlines()
+    assert lines[4:8] == ["| a_b | <u>20.00</u> | <u>9.0</u> |", "| b | **30.00** | **5.0** |", "| c | 40.00 | 1.0 |",
+                          "| d | <u>20.00</u> | – |"]
+    tex = table.latex()
+    assert "a\\_b & \\underline{20.00} & \\underline{9.0} \\\\" in tex and "b & \\textbf{30.00} & \\textbf{5.0}" in tex
+    assert "T\\_1. 100 \\%" in tex and "d & \\underline{20.00} & --" in tex
+
+
 @pytest.mark.parametrize("name", MEASURES)
 def test_every_known_metric_has_its_direction(name):
     good_when_low = {"mae_hu", "mae_hu_lung", "misfit", "seconds"}
-    table = cells(markdown([{"case": "a", "method": "low", name: 1.0}, {"case": "a", "method": "high", name: 2.0}]))
+    table = cells([{"case": "a", "method": "low", name: 1.0}, {"case": "a", "method": "high", name: 2.0}])
     best = "low" if name in good_when_low else "high"
     assert [row for row, values in table.items() if "**" in list(values.values())[1]] == [best]
 
@@ -102,30 +132,31 @@ def test_every_known_metric_has_its_direction(name):
 def test_ties_share_the_place_and_failures_never_win():
     rows = [{"case": "a", "method": m, "psnr": p} for m, p in
             [("x", 20.001), ("y", 20.002), ("failed", math.nan), ("worse", 10.0)]]
-    table = cells(markdown(rows))
+    table = cells(rows)
     assert [m for m in table if "**" in table[m]["PSNR (dB)"]] == ["x", "y"]
     assert table["failed"]["PSNR (dB)"] == "nan"
 
 
 def test_the_caption_states_range_grid_views_and_cases():
-    text = markdown(ROWS, grid=Grid.cube(64), views=8).splitlines()[-1]
-    for part in ("n = 2 cases", "[-1000, 1000]", "2000 HU", "64 x 64 x 64 voxels of 6 x 6 x 6 mm", "Views: 8"):
+    (text,) = mean_table(STATED).notes
+    for part in ("n = 2 cases", "[-1000, 1000]", "2000 HU", "Grid: 64x64x64.", "Views: 8."):
         assert part in text
-    assert "Views: not stated" in markdown(ROWS)
-    assert "Views: 4, 8" in markdown([{**row, "views": v} for row in ROWS for v in (4, 8)], by="views")
+    assert "Views: not stated" in mean_table(ROWS).notes[0]
+    assert "Views: 4, 8" in mean_table([{**row, "views": v} for row in ROWS for v in (4, 8)], by="views").notes[0]
+    assert "[-900, 700], data range 1600 HU" in mean_table(ROWS, window=HUWindow(-900, 700)).notes[0]
 
 
 def test_the_caption_tells_when_methods_had_different_cases():
-    assert "n = 1 to 2 cases (not the same cases in every line)" in markdown(ROWS[:3])
-    assert "not the same" not in markdown(ROWS)
+    assert "n = 1 to 2 cases (not the same cases in every line)" in mean_table(ROWS[:3]).notes[0]
+    assert "not the same" not in mean_table(ROWS).notes[0]
 
 
 def test_warnings_are_counted_in_the_line_and_name_their_cases_in_the_caption():
     rows = [row | ({"warning": "no lungs"} if row["case"] == "008" and row["method"] == "fdk" else {}) for row in ROWS]
-    table = cells(markdown(rows))
+    table = cells(rows)
     assert (table["fdk"]["warned"], table["gibbs"]["warned"]) == ("1", "0")
-    assert "Doubtful, by what the rows' warning says: 008." in markdown(rows)
-    assert "Doubtful" not in markdown(ROWS) and "warned" not in markdown(ROWS)
+    assert mean_table(rows).notes[1:] == ["Doubtful cases, by the column warning: fdk: 008."]
+    assert "Doubtful" not in mean_table(ROWS).markdown() and "warned" not in mean_table(ROWS).markdown()
 
 
 def test_seeds_of_a_case_are_averaged_before_cases():
@@ -136,22 +167,23 @@ def test_seeds_of_a_case_are_averaged_before_cases():
 
 
 def test_a_metric_that_a_method_lacks_is_a_dash():
-    table = cells(markdown([*ROWS, {"case": "007", "method": "tv", "psnr": 1.0}]))
+    table = cells([*ROWS, {"case": "007", "method": "tv", "psnr": 1.0}])
     assert table["tv"]["SSIM"] == "–" and table["tv"]["PSNR (dB)"] == "1.00"
 
 
-def test_the_console_table_says_the_same():
+def test_the_tables_for_console_and_latex_say_the_same():
     console = Console(width=200, record=True, file=open(os.devnull, "w"))
-    console.print(rich_table(ROWS, grid=Grid.cube(64), views=8))
+    console.print(mean_table(STATED).console())
     text = console.export_text()
     for part in ("0.850 ± 0.071", "25.0 ± 7.1", "MAE (HU) ↓", "[-1000, 1000]", "Views: 8"):
         assert part in text
+    assert "\\textbf{0.850 $\\pm$ 0.071}" in mean_table(STATED).latex()
 
 
 def test_bad_requests_are_named():
     with pytest.raises(ValueError, match="no rows"):
-        markdown([])
+        mean_table([])
     with pytest.raises(ValueError, match="'prior'"):
-        markdown(ROWS, by="prior")
+        mean_table(ROWS, by="prior")
     with pytest.raises(ValueError, match="dice"):
-        markdown(ROWS, metrics=["dice"])
+        mean_table(ROWS, metrics=["dice"])

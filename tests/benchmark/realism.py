@@ -17,6 +17,7 @@ without their findings, since no report belongs to the CTs.
                              largest standardised weights, positive where phantoms have more
 """
 
+import itertools
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -32,7 +33,6 @@ from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM
 from phydict.evaluation import write_csv
 from phydict.grid import Grid
 from phydict.units import HUWindow
-import itertools
 
 GRID, WINDOW = Grid.cube(64), HUWindow()
 MM, ML = 6.0, 0.216

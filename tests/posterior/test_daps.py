@@ -1,12 +1,13 @@
 """DAPS on a Gaussian prior: exact with the exact spread, and what its published approximations do."""
 
+import itertools
+
 import pytest
 import torch
 from laws import random_like
 
 from phydict.posterior import DAPS, ExactDraw, Langevin
 from posterior.dense import SHAPE, condition, denoiser, measurement, moments
-import itertools
 
 V, NOISE = 0.04, 0.3
 EXACT = {"likelihood": ExactDraw(20, 1e-12), "noise": NOISE}

@@ -1,5 +1,7 @@
 """DDS on a Gaussian prior meets exact data and keeps the prior where they are silent; its ADMM ends at TV's optimum."""
 
+import itertools
+
 import pytest
 import torch
 from laws import random_like
@@ -7,7 +9,6 @@ from laws import random_like
 from phydict.posterior import ADMMTV, DDS
 from phydict.posterior.normalised import NormalisedMeasurement
 from posterior.dense import SHAPE, DenseMeasurement, condition, denoiser, measurement, moments, propagate
-import itertools
 
 V = 0.04
 X = random_like((1, *SHAPE), seed=10)

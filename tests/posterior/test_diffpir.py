@@ -1,12 +1,13 @@
 """DiffPIR on a Gaussian prior: what its mean and its spread are, and what it does with exact data."""
 
+import itertools
+
 import pytest
 import torch
 from laws import random_like
 
 from phydict.posterior import DiffPIR
 from posterior.dense import FINE, SHAPE, N, condition, denoiser, measurement, moments, propagate
-import itertools
 
 V, NOISE = 0.04, 0.3
 X = random_like((1, *SHAPE), seed=10)

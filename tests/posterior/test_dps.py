@@ -1,5 +1,7 @@
 """DPS on a Gaussian prior: its push is the misfit's gradient through the denoiser, and without it the prior is left."""
 
+import itertools
+
 import pytest
 import torch
 from laws import random_like
@@ -9,7 +11,6 @@ from phydict.grid import Grid
 from phydict.posterior import DPS, Posterior
 from phydict.xray import ConeBeam, Projector
 from posterior.dense import FINE, SHAPE, N, denoiser, measurement, moments
-import itertools
 
 V = 0.04
 X = random_like((1, *SHAPE), seed=10)

@@ -1,5 +1,7 @@
 """The likelihood steps: one solves its normal equations, the other descends the paper's objective."""
 
+import itertools
+
 import numpy as np
 import pytest
 import torch
@@ -13,7 +15,6 @@ from phydict.posterior import GradientSteps, Measurement, ProximalCG, Reward
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 from posterior.dense import SHAPE, DenseMeasurement, N, measurement
-import itertools
 
 X0 = 0.3 * random_like((1, *SHAPE), seed=20)
 

@@ -1,5 +1,7 @@
 """Grids of noise levels stay inside the schedule, and walks along them sample what they should."""
 
+import itertools
+
 import pytest
 import torch
 from laws import random_like
@@ -7,7 +9,6 @@ from laws import random_like
 from phydict.diffusion import CosineSchedule, ddim, noise_in, renoise
 from phydict.posterior.samplers.noise_levels import denoise_along, polynomial_levels, stochastic_ddim_step, times_of
 from posterior.dense import FINE, SHAPE, N, denoiser, moments
-import itertools
 
 SCHEDULE, V = CosineSchedule(), 0.04
 

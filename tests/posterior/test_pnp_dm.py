@@ -1,12 +1,13 @@
 """PnP-DM on a Gaussian prior: its states have the posterior of data blurred by the coupling, and its means the mean."""
 
+import itertools
+
 import pytest
 import torch
 from laws import random_like
 
 from phydict.posterior import ExactDraw, Langevin, PnPDM
 from posterior.dense import SHAPE, N, condition, denoiser, measurement, moments
-import itertools
 
 V, NOISE = 0.04, 0.3
 EXACT = {"likelihood": ExactDraw(20, 1e-12), "noise": NOISE}

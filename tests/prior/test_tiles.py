@@ -1,12 +1,13 @@
 """Tiles: their weights sum to one, and what is local comes out as on the whole volume, without seams."""
 
+import itertools
+
 import pytest
 import torch
 from laws import random_like
 from torch.nn.functional import avg_pool3d
 
 from phydict.prior.tiles import Tiles
-import itertools
 
 CASES = [(Tiles(8, 4), 8), (Tiles(8, 4), 9), (Tiles(8, 4), 31), (Tiles(12, 4, 2), 38), (Tiles(24, 8, 4), 64),
          (Tiles(16, 8, 8), 40), (Tiles(16, 8), 7)]

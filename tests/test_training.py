@@ -34,8 +34,8 @@ CONFIG = Path(__file__).parents[1] / "configs" / "prior" / "phantom.yaml"
 TINY = ["--model.network.class_path=phydict.prior.VolumeUNet", "--model.network.init_args.channels=[8,8]",
         "--model.network.init_args.attention=[false,true]", "--model.network.init_args.head_channels=8",
         "--model.voxels=16", "--model.text_pretrain_steps=2", "--model.warmup=2", "--model.preview_steps=2",
-        "--data.phantoms=4", "--data.validation_phantoms=1", "--data.epoch_size=8", "--data.batch_size=2", "--trainer.accelerator=cpu",
-        "--trainer.devices=1", "--precision=float32", "--trainer.max_steps=-1", "--trainer.log_every_n_steps=1",
+        "--data.phantoms=4", "--data.validation_phantoms=1", "--data.epoch_size=8", "--data.batch_size=2",
+        "--trainer.accelerator=cpu", "--trainer.devices=1", "--precision=float32", "--trainer.max_steps=-1", "--trainer.log_every_n_steps=1",
         "--trainer.check_val_every_n_epoch=1", "--trainer.enable_progress_bar=false",
         "--trainer.enable_model_summary=false"]
 

@@ -141,7 +141,8 @@ class SplitGibbs(Sampler):
         return self._guided_pass(denoiser, measurement, x, times, generator, on_step)
 
     def _guided_pass(self, denoiser: Denoiser, measurement: Measurement, x: Tensor,
-                     times: Iterable[tuple[float, float]], generator: Generators, on_step: Callable[[], None]) -> Tensor:
+                     times: Iterable[tuple[float, float]], generator: Generators,
+                     on_step: Callable[[], None]) -> Tensor:
         """The estimate after the noise levels of `times`, at each of which it meets the X-rays."""
         schedule = denoiser.schedule
         previous = None

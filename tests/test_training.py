@@ -35,8 +35,8 @@ TINY = ["--model.network.class_path=phydict.prior.VolumeUNet", "--model.network.
         "--model.network.init_args.attention=[false,true]", "--model.network.init_args.head_channels=8",
         "--model.voxels=16", "--model.text_pretrain_steps=2", "--model.warmup=2", "--model.preview_steps=2",
         "--data.phantoms=4", "--data.validation_phantoms=1", "--data.epoch_size=8", "--data.batch_size=2",
-        "--trainer.accelerator=cpu", "--trainer.devices=1", "--precision=float32", "--trainer.max_steps=-1", "--trainer.log_every_n_steps=1",
-        "--trainer.check_val_every_n_epoch=1", "--trainer.enable_progress_bar=false",
+        "--trainer.accelerator=cpu", "--trainer.devices=1", "--precision=float32", "--trainer.max_steps=-1",
+        "--trainer.log_every_n_steps=1", "--trainer.check_val_every_n_epoch=1", "--trainer.enable_progress_bar=false",
         "--trainer.enable_model_summary=false"]
 
 
@@ -106,6 +106,20 @@ def test_a_log_file_tells_steps_in_whole_lines_and_nothing_of_lightnings(tmp_pat
         assert any(line.startswith(last) and "samples_per_s" in line for line in said), said
         known = ("step ", "training ", "report ", "preparing ", "text map ", "Seed")
         assert all(line.startswith(known) for line in said)
+
+
+def test_each_epoch_has_draws_of_its_own_whatever_the_configuration_says(tmp_path, cache, monkeypatch, capsys):
+    seen, step = [], PriorTraining.training_step
+    monkeypatch.setattr(PriorTraining, "training_step", lambda task, batch, index: (
+        seen.append(batch["volume"].sum().item()), step(task, batch, index))[1])
+    plain = tmp_path / "plain.yaml"
+    plain.write_text("".join(line for line in CONFIG.read_text().splitlines(True) if "reload" not in line))
+    args = [f"--config={plain}" if arg.startswith("--config") else arg for arg in arguments(
+        tmp_path / "run", cache, "--trainer.max_epochs=2", "--trainer.limit_val_batches=0")]
+    main(args)
+    assert len(seen) == 8 and len(set(seen)) == 8
+    assert "reload_dataloaders_every_n_epochs must be 1, but 0" in refusal(
+        capsys, [*args[:-1], f"--out={tmp_path / 'other'}", "--trainer.reload_dataloaders_every_n_epochs=0"])
 
 
 def test_a_killed_run_goes_on_as_if_it_had_not_been(tmp_path, straight, cache):

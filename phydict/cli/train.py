@@ -155,7 +155,8 @@ def main(args: list[str] | None = None) -> None:
             given = with_configurations(given, ("prior",))
             PriorCLI(*STAGES[stage_of(given)], args=given, seed_everything_default=0,
                      save_config_kwargs={"overwrite": True},
-                     trainer_defaults={"enable_progress_bar": False, "enable_model_summary": False},
+                     trainer_defaults={"enable_progress_bar": False, "enable_model_summary": False,
+                                       "reload_dataloaders_every_n_epochs": 1},
                      parser_kwargs={"exit_on_error": False, "allow_abbrev": False, "description": (
                          "Train a prior of chest CT. Two more commands: `export --checkpoint <last.ckpt> --out "
                          "<prior.safetensors>` writes what a training learnt as a prior for reconstruction, and "

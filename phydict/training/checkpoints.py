@@ -56,8 +56,8 @@ class WholeCheckpoints(TorchCheckpointIO):
         except (OSError, RuntimeError) as error:
             if isinstance(error, RuntimeError):  # torch's words for a write that was cut short
                 error = OSError(errno.ENOSPC, "perhaps the disk is full")
-            raise not_written(f"the checkpoint {path}", error, "give another --out, and resume from the last one, if there "
-                              "is one, with --ckpt_path") from error
+            raise not_written(f"the checkpoint {path}", error, "give another --out, and resume from the last one, if "
+                              "there is one, with --ckpt_path") from error
 
 
 class BestCheckpoint(ModelCheckpoint):

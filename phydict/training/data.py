@@ -124,6 +124,10 @@ class PriorData(lightning.LightningDataModule):
         return change.reshape(1, cells, 2, cells, 2, cells, 2).mean((2, 4, 6)).astype(np.float32)
 
     def train_dataloader(self) -> DataLoader:
+        every = self.trainer.reload_dataloaders_every_n_epochs
+        if every != 1:
+            raise ValueError("each epoch has draws of its own, so that trainer.reload_dataloaders_every_n_epochs must be "
+                             f"1, but {every} was given: leave it out, or set it to 1 on a Trainer of your own")
         least = self.batch_size * self.trainer.world_size
         if self.epoch_size < least:
             raise ValueError(f"data.epoch_size is {self.epoch_size}, less than one batch on every device ({least}): "

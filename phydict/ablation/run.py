@@ -11,7 +11,6 @@ from pathlib import Path
 import torch
 
 from phydict.ablation.spec import Specification, Trial, key, prior_of
-from phydict.ablation.timing import TimedPrior, TimedProjector, WarmUp
 from phydict.evaluation import read_csv, write_csv
 from phydict.inference.data import case_scores
 from phydict.methods import fit_to_grid, reconstructor
@@ -19,7 +18,7 @@ from phydict.posterior import Sampler
 from phydict.reconstruction import Reconstruction
 from phydict.runtime.console import noted, sentence
 from phydict.runtime.precision import instruction_set
-from phydict.runtime.profiling import Stopwatch, peak_memory, reset_peak_memory
+from phydict.runtime.profiling import profiled, reset_peak_memory
 from phydict.runtime.progress import CaseProgress
 from phydict.runtime.seeds import case_seed
 
@@ -168,35 +167,35 @@ class Runner:
             self.warm.add(state)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # what there is to say is said again by the run that counts
-                _attempt(lambda: self._reconstruct(trial, scene, Stopwatch(), WarmUp(on_step)))
+                _attempt(lambda: self._reconstruct(trial, scene, WarmUp(on_step)))
         warned = list(scene.warnings)
         with noted(warned, f"{scene.case}, {trial.label}"):
             measured = _attempt(lambda: self._measured(trial, scene, on_step))
         return measured | {"warning": "; ".join(warned) or None}
 
     def _measured(self, trial: Trial, scene: MeasuredCase, on_step: Callable[[], None]) -> dict:
-        watch, known = Stopwatch(), reset_peak_memory(self.device)
-        result = self._reconstruct(trial, scene, watch, on_step)
-        peak, finite = peak_memory(self.device) if known else None, bool(result.volume.isfinite().all())
+        known = reset_peak_memory(self.device)
+        with profiled() as profile:
+            result = self._reconstruct(trial, scene, on_step)
+        finite = bool(result.volume.isfinite().all())
         scores = case_scores(result.volume, result.misfit, scene.truth, scene.window) if finite else {}
         return scores | {
             "status": "ok" if finite else "diverged",
             "error": None if finite else "the volume holds NaN or infinite voxels", "misfit": result.misfit,
             "seconds": sum(result.seconds.values()),
-            **{f"seconds_{stage}": value for stage, value in (result.seconds | watch.seconds).items()},
-            "network_calls": result.network_calls, "projector_calls": result.projector_calls, "peak_memory_mb": peak,
+            **{f"seconds_{stage}": value for stage, value in (result.seconds | profile.seconds("network", "projector")).items()},
+            "network_calls": result.network_calls, "projector_calls": result.projector_calls, "peak_memory_mb": profile.peak_memory(self.device) if known else None,
             "device": self.device.type, "threads": torch.get_num_threads(), "precision": result.precision,
             "instruction_set": instruction_set(self.device)}
 
-    def _reconstruct(self, trial: Trial, scene: MeasuredCase, watch: Stopwatch,
-                     on_step: Callable[[], None]) -> Reconstruction:
+    def _reconstruct(self, trial: Trial, scene: MeasuredCase, on_step: Callable[[], None]) -> Reconstruction:
         seed = case_seed(trial.seed, scene.case)
         torch.manual_seed(seed)
-        prior = TimedPrior(_on(trial.prior, self.device), watch) if isinstance(trial.method, Sampler) else None
+        prior = _on(trial.prior, self.device) if isinstance(trial.method, Sampler) else None
         ready = reconstructor(trial.method, prior, trial.guidance, trial.name, samples=trial.samples)
         xrays, projector = fit_to_grid(ready, scene.grid, scene.xrays.clone(), scene.beam)
         return ready.with_mu_water(scene.mu_water).reconstruct(
-            xrays, TimedProjector(projector, watch), scene.report(trial), False, seed, on_step)
+            xrays, projector, scene.report(trial), False, seed, on_step)
 
 
 @cache
@@ -215,3 +214,19 @@ def _attempt(work: Callable[[], object]) -> object | dict:
         if os.environ.get("PHYDICT_TRACEBACK"):
             raise
         return {"status": "failed", "error": f"{type(error).__name__}: {sentence(error)}"}
+
+
+class WarmUp:
+    """An on_step that ends a reconstruction, by raising Warm, after its second step."""
+
+    class Warm(Exception):
+        """The reconstruction has seen all of its code."""
+
+    def __init__(self, on_step: Callable[[], None] = lambda: None):
+        self.steps, self.on_step = 0, on_step
+
+    def __call__(self) -> None:
+        self.steps += 1
+        self.on_step()
+        if self.steps == 2:
+            raise self.Warm

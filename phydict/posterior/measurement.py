@@ -9,7 +9,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from phydict.runtime.profiling import stage
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import Projector
 from phydict.xray.calibration import match_views, subtract_scatter
@@ -48,22 +47,19 @@ class Measurement:
     def project(self, x: Tensor) -> Tensor:
         """P(x): line integrals (B, K, V, U) of the CT x."""
         self.calls += len(x)
-        with stage("projector"):
-            projected = self.slope * self.projector(x) + self.background
+        projected = self.slope * self.projector(x) + self.background
         self.last_projection = projected.detach()
         return projected
 
     def linear(self, d: Tensor) -> Tensor:
         """The linear part of P, for differences d of CTs."""
         self.calls += len(d)
-        with stage("projector"):
-            return self.slope * self.projector(d)
+        return self.slope * self.projector(d)
 
     def adjoint(self, r: Tensor) -> Tensor:
         """The exact adjoint of `linear`: (B, K, V, U) -> (B, 1, X, Y, Z)."""
         self.calls += len(r)
-        with stage("projector"):
-            return self.slope * self.projector.T(r)
+        return self.slope * self.projector.T(r)
 
     def norm(self) -> float:
         """The largest singular value of `linear`."""

@@ -68,6 +68,16 @@ class Profile:
             use = self.uses[name]
             use.peak_mib, use.device_mib = max(use.peak_mib, process), max(use.device_mib, device)
 
+    def seconds(self, *stages: str) -> dict[str, float]:
+        """Seconds of each of the innermost `stages` that ran, whatever they ran in."""
+        found = {name: [use.seconds for full, use in self.uses.items() if full.split(" / ")[-1] == name]
+                 for name in stages}
+        return {name: sum(seconds) for name, seconds in found.items() if seconds}
+
+    def peak_memory(self, device: torch.device) -> float:
+        """The peak in MiB of all stages: of the tensors on a CUDA device, of the process on others."""
+        return max(use.device_mib if device.type == "cuda" else use.peak_mib for use in self.uses.values())
+
     def table(self) -> str:
         """One line per stage."""
         on_device = any(use.device_mib for use in self.uses.values())

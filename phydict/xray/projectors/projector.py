@@ -10,6 +10,7 @@ import torch
 
 from phydict.grid import Grid
 from phydict.linalg.power_iteration import operator_norm
+from phydict.runtime.profiling import stage
 from phydict.runtime.warning import warn
 from phydict.xray.binning import binning
 from phydict.xray.geometry import VECTOR_KEYS, ConeBeam
@@ -144,7 +145,8 @@ class _Linear(torch.autograd.Function):
     @staticmethod
     def forward(ctx, x, operator, transposed):
         ctx.operator, ctx.transposed = operator, transposed
-        return operator.adjoint(x) if transposed else operator.forward(x)
+        with stage("projector"):
+            return operator.adjoint(x) if transposed else operator.forward(x)
 
     @staticmethod
     def backward(ctx, gradient):

@@ -1,16 +1,21 @@
 # make demo   environment, then a reconstruction of the embedded example by three methods
-# make test   environment, then the test suite
+# make test   environment, then the test suite, a process per core up to four
+# make lint   environment, then ruff and mypy
 PYTHON ?= python3
 VENV := .venv
 RUN := $(VENV)/bin/python
 
-.PHONY: demo test environment clean
+.PHONY: demo test lint environment clean
 
 demo: environment
 	$(RUN) data/example/demo.py
 
 test: environment
-	$(RUN) -m pytest
+	$(RUN) -m pytest -n auto --maxprocesses 4 --dist loadfile
+
+lint: environment
+	$(RUN) -m ruff check
+	$(RUN) -m mypy
 
 environment: $(VENV)/.ready
 

@@ -37,8 +37,7 @@ def differences_adjoint(p: Tensor, scales: Sequence[float] = UNIT) -> Tensor:
 
 def total_variation(x: Tensor, scales: Sequence[float] = UNIT, eps: float = 0.0) -> Tensor:
     """The sum over voxels of sqrt(|forward differences|^2 + eps^2)."""
-    return (eps**2 + sum((scale * pad(x.diff(dim=axis), [0, 0] * (4 - axis) + [0, 1])).square()
-                         for axis, scale in zip((2, 3, 4), scales))).sqrt().sum()
+    return (eps**2 + differences(x, scales).square().sum(0)).sqrt().sum()
 
 
 def tv_proximal(v: Tensor, weight: float, scales: Sequence[float], clip: Callable[[Tensor], Tensor], iterations: int,
@@ -78,5 +77,5 @@ class TVQuadraticMajorizer:
     def diagonal(self) -> Tensor:
         """The diagonal of the quadratic's matrix: what `gradient` makes of a voxel there itself."""
         inner = [self.weights.narrow(axis, 0, self.weights.shape[axis] - 1) for axis in (2, 3, 4)]
-        return sum(pad(w, [0, 0] * (4 - axis) + [0, 1]) + pad(w, [0, 0] * (4 - axis) + [1, 0])
-                   for axis, w in zip((2, 3, 4), inner))
+        return torch.stack([pad(w, [0, 0] * (4 - axis) + [0, 1]) + pad(w, [0, 0] * (4 - axis) + [1, 0])
+                            for axis, w in zip((2, 3, 4), inner)]).sum(0)

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch.utils.data import ConcatDataset, DataLoader, Dataset, DistributedSampler
 
+from phydict.command_line import check_writable
 from phydict.datasets import Augmentation, CTCases, Thorax, augment, find_cts, phantom_case, report, split_by_patient
 from phydict.datasets.cache import read_arrays, write_arrays
 from phydict.datasets.phantom import change_by_findings
@@ -110,7 +111,7 @@ class PriorData(lightning.LightningDataModule):
         super().__init__()
         check_seed(seed)
         for name, value, least in (("epoch_size", epoch_size, 1), ("batch_size", batch_size, 1),
-                                   ("workers", workers, 0)):
+                                   ("workers", workers, 0), ("validation_phantoms", validation_phantoms, 0)):
             if not least <= value <= MOST_DRAWS:
                 raise ValueError(f"data.{name} lies between {least} and {MOST_DRAWS:,}, but {value:,} was given")
         if not cts and not phantoms:
@@ -120,6 +121,7 @@ class PriorData(lightning.LightningDataModule):
                              f"{phantoms} and {ct_fraction} were given")
         if cts and Path(cache).resolve().is_relative_to(Path(cts).resolve()):
             raise ValueError(f"data.cache {cache} lies inside data.cts {cts}: give a folder elsewhere")
+        check_writable(Path(cache), "data.cache")
         window = HUWindow(*window)
         self.grid, self.window = Grid.cube(voxels, side), window
         self.phantoms = CachedPhantoms(0, phantoms, self.grid, window, Path(cache))

@@ -40,6 +40,7 @@ from phydict.prior import (
     DEFAULT_PRIOR, MedSynCheckpoint, file_read, fingerprint, load_prior, load_super_resolution)
 from phydict.profiling import profiled, stage
 from phydict.progress import CaseProgress
+from phydict.reading import reading
 from phydict.reconstruction_data import ReconstructionData, case_scores
 from phydict.reconstructor import Reconstruction, Reconstructor, case_seed, check_seed, describe, save_nifti
 from phydict.units import HUWindow
@@ -285,12 +286,22 @@ class InferenceCLI(LightningCLI):
     @property
     def dry_run(self) -> bool:
         """Whether the geometry is drawn and nothing reconstructed."""
-        return bool(self._get(self.config, "dry_run", False))
+        return self._flag("dry_run")
 
     @property
     def profile(self) -> bool:
         """Whether each case's stages are timed and their memory measured."""
-        return bool(self._get(self.config, "profile", False))
+        return self._flag("profile")
+
+    def _flag(self, name: str) -> bool:
+        value = self._get(self.config, name, False)
+        if not isinstance(value, bool):
+            raise ValueError(f"{name} is true or false, but {value!r} was given")
+        return value
+
+    def instantiate_trainer(self, **kwargs) -> lightning.Trainer:
+        with reading("the settings of trainer", "correct them"):
+            return super().instantiate_trainer(**kwargs)
 
     def predict(self, model: ReconstructionTask, datamodule: ReconstructionData) -> None:
         """Reconstruct X-rays, or draw their geometry."""

@@ -20,7 +20,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from phydict.atomic import alone_in, whole_file
 from phydict.command_line import (
-    check_command, check_configured, check_writable, one_sentence_errors, quiet, read_configurations,
+    check_apart, check_command, check_configured, check_writable, one_sentence_errors, quiet, read_configurations,
     with_configurations)
 from phydict.datamodule import PriorData
 from phydict.precision import PRECISIONS, resolve_precision, trainer_precision
@@ -29,7 +29,7 @@ from phydict.prior.checkpoint import build_prior, build_super_resolution, build_
 from phydict.prior.finite import check_finite
 from phydict.prior.pretrained import inspect_prior, read_torch
 from phydict.prior_training import PriorTraining
-from phydict.reading import not_written
+from phydict.reading import not_written, reading
 from phydict.stage_training import CHECKPOINT, StageTraining
 from phydict.super_resolution_data import SuperResolutionData
 from phydict.super_resolution_training import SuperResolutionTraining
@@ -191,12 +191,14 @@ class PriorCLI(LightningCLI):
             kwargs["precision"] = trainer_precision(self._get(self.config, "precision"), device)
         elif "bf16" in str(trainer.precision):
             resolve_precision("bfloat16", device)  # warns where that is slow
-        return super().instantiate_trainer(logger=logger, plugins=plugins, **kwargs)
+        with reading("the settings of trainer", "correct them"):
+            return super().instantiate_trainer(logger=logger, plugins=plugins, **kwargs)
 
     def fit(self, model: StageTraining, datamodule: PriorData, ckpt_path: str | None = None,
             weights_only: bool | None = None) -> None:
         """Train, alone in the folder of the run."""
         out = Path(self.config.fit.out)
+        check_apart(out, "--out", [Path(cts)] if (cts := self.config.fit.data.cts) else [])
         with alone_in(out, "--out") if self.trainer.is_global_zero else nullcontext():
             self._begin(out, ckpt_path)
             self.trainer.fit(model, datamodule=datamodule, ckpt_path=ckpt_path, weights_only=weights_only)

@@ -13,11 +13,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from rich.markup import escape
 from rich.table import Table
 
 from phydict.atomic import whole_file
 from phydict.evaluation.metrics import MEASURES, RANGE, SIGMA, TAPS, Measure
 from phydict.grid import Grid
+from phydict.reading import Unreadable, reading
 from phydict.units import HUWindow
 
 TEXT_COLUMNS = ("case", "method")
@@ -44,18 +46,19 @@ def read_csv(path: str | Path) -> list[dict]:
     """Rows of a CSV by `write_csv`, numbers as int or float; empty fields are left out; no file gives no rows.
 
     Text that only resembles a number ("007") stays text, and so do the columns case and method.
-    Raises ValueError on a row whose number of fields is not the header's, as in a file cut off by another program.
+    Raises ValueError naming the file where it is no table, or a row's number of fields is not the header's, as in a
+    file cut off by another program.
     """
     path = Path(path)
     if not path.exists():
         return []
-    with open(path, newline="", encoding="utf-8") as file:
+    with reading(f"the table {path}", "repair or remove it"), open(path, newline="", encoding="utf-8") as file:
         reader = csv.reader(file)
         columns = next(reader, [])
         rows = []
         for fields in reader:
             if len(fields) != len(columns):
-                raise ValueError(f"line {reader.line_num} of {path} has {len(fields)} fields, but its header has "
+                raise Unreadable(f"line {reader.line_num} of {path} has {len(fields)} fields, but its header has "
                                  f"{len(columns)}; the file was cut off or edited, remove or repair that line")
             rows.append({name: field if name in TEXT_COLUMNS else _from_text(field)
                          for name, field in zip(columns, fields) if field != ""})
@@ -144,7 +147,7 @@ def rich_table(rows: Iterable[Mapping], by: str = "method", metrics: Sequence[st
     """The table of `markdown` as a rich Table for the console; same arguments."""
     rows = list(rows)
     header, lines = _cells(rows, by, metrics)
-    table = Table(caption=caption(rows, by, window, grid, views))
+    table = Table(caption=escape(caption(rows, by, window, grid, views)))
     for name in header:
         table.add_column(name, justify="left" if name == by else "right")
     for line in lines:

@@ -24,8 +24,8 @@ PHANTOM_VERSION = 2
 HELD_OUT_PHANTOM = 1_000_000
 """Phantoms with this seed and above are never trained on."""
 
-MOST_DRAWS = 10_000_000
-"""Draws of an epoch are listed before it begins."""
+MOST_DRAWS, MOST_WORKERS = 10_000_000, 1000
+"""Draws of an epoch are listed before it begins, and loader processes are all started then."""
 
 KEYS = ("volume", "masks", "has_masks", "report")
 """The parts of a Case that training needs."""
@@ -110,10 +110,11 @@ class PriorData(lightning.LightningDataModule):
                  window: tuple[float, float] = (-1000.0, 1000.0)):
         super().__init__()
         check_seed(seed)
-        for name, value, least in (("epoch_size", epoch_size, 1), ("batch_size", batch_size, 1),
-                                   ("workers", workers, 0), ("validation_phantoms", validation_phantoms, 0)):
-            if not least <= value <= MOST_DRAWS:
-                raise ValueError(f"data.{name} lies between {least} and {MOST_DRAWS:,}, but {value:,} was given")
+        for name, value, least, most in (
+                ("epoch_size", epoch_size, 1, MOST_DRAWS), ("batch_size", batch_size, 1, MOST_DRAWS),
+                ("workers", workers, 0, MOST_WORKERS), ("validation_phantoms", validation_phantoms, 0, MOST_DRAWS)):
+            if not least <= value <= most:
+                raise ValueError(f"data.{name} lies between {least} and {most:,}, but {value:,} was given")
         if not cts and not phantoms:
             raise ValueError("there is nothing to train on: give data.cts, or data.phantoms above 0")
         if phantoms < 0 or not 0 <= ct_fraction <= 1:

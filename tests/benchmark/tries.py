@@ -1538,7 +1538,8 @@ def preparations():
             p.test(p.given / "prepared")
         return work
 
-    record = {"id": "a", "space": "patient", "extent": [200, 200, 200], "window": [-1000, 1000], "report": "", "row": {}}
+    record = {"id": "a", "space": "patient", "extent": [200, 200, 200], "window": [-1000, 1000], "report": "",
+    "row": {}}
     yield "a case as it should be", None, "", prepared(json.dumps(record | {"extent": [384, 384, 384]}))
     yield "a case too small", no, "a ", prepared(json.dumps(record))
     yield "a case 10^5 deep", no, "case.json", prepared("[" * 10**5)
@@ -1658,7 +1659,8 @@ def python_api():
             phydict.hu_to_mu, ("a",), {})):
         loose = any(word in name for word in ("None", "text", "number", "tuple", "complex", "beyond", "mapping"))
         yield name, None if loose else no, "TypeError" if loose else "", partial(
-            lambda p, function, args, named: p.call(function, *args, **named), function=function, args=args, named=named)
+            lambda p, function, args, named: p.call(function, *args, **named), function=function, args=args,
+            named=named)
 
     def saved(p, change):
         case = p.case()

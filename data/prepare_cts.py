@@ -45,7 +45,7 @@ def prepare(cts: str, out: str, voxels: int = 256, side: float = 384.0, space: s
 def main(args: list[str] | None = None) -> None:
     """Command line; a bad input ends in one sentence and exit code 2."""
     with cli_errors(), quiet():
-        auto_cli(prepare, args=args, as_positional=True)
+        auto_cli(prepare, args=args, as_positional=True, exit_on_error=False, allow_abbrev=False)
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from phydict.posterior import (
 from phydict.prior import DEFAULT_PRIOR, Cascade, Prior, SuperResolution, load_prior, load_super_resolution
 from phydict.reconstruction import Reconstruction, Reconstructor
 from phydict.runtime.precision import check_precision
+from phydict.runtime.reading import reason
 from phydict.runtime.seeds import check_seed
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector, binned, binning
@@ -131,6 +132,8 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: Prior | str | Path | None 
     """
     if not isinstance(beam, ConeBeam):
         raise ValueError(f"the geometry must be a ConeBeam, but {beam!r} was given; ConeBeam.load reads one")
+    if not isinstance(grid, Grid):
+        raise ValueError(f"the grid must be a Grid, but {grid!r} was given; Grid.cube makes one")
     if not isinstance(report, str | None):
         raise ValueError(f"the report must be text, but {report!r} was given")
     check_seed(seed)
@@ -138,5 +141,18 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: Prior | str | Path | None 
                           samples=samples, precision=precision)
     ready = ready if mu_water is None else ready.with_mu_water(mu_water)
     grid = ready.grid if isinstance(ready, Posterior | CascadePosterior) else grid
-    xrays, projector = fit_to_grid(ready, grid, torch.as_tensor(xrays), beam)
+    xrays, projector = fit_to_grid(ready, grid, _real(xrays), beam)
     return ready.reconstruct(xrays, projector, format_report(report), display, seed, on_step)
+
+
+def _real(xrays) -> Tensor:
+    """X-rays as a dense tensor of numbers. Raises ValueError where they are none."""
+    try:
+        values = torch.as_tensor(xrays)
+    except Exception as error:  # NumPy and torch each have their own for what is no array of numbers
+        raise ValueError(f"the X-rays must be an array of numbers, but {type(xrays).__name__} was given "
+                         f"({reason(error)})") from error
+    if values.layout != torch.strided or values.is_meta or values.is_complex() or values.dtype == torch.bool:
+        raise ValueError(f"the X-rays must be a dense array of real numbers, but {values.dtype} on {values.device}, "
+                         f"{values.layout}, was given")
+    return values if values.is_floating_point() else values.float()

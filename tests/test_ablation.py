@@ -393,3 +393,43 @@ def test_every_plot_that_the_rows_allow_is_drawn(tmp_path):
     files = plots.write_plots(tmp_path, entries(rows))
     assert sorted(file.name for file in files) == sorted(p.name for p in tmp_path.iterdir())
     assert {file.stem for file in files} == {"pareto_K_1", "pareto_K_8", "stages_K_1", "stages_K_8", "views", "delta"}
+
+
+def test_results_are_never_written_among_the_cts(tmp_path, capsys):
+    cts = tmp_path / "cts"
+    cts.mkdir()
+    nibabel.save(nibabel.Nifti1Image(np.zeros((20, 20, 20), np.float32), np.diag([10.0, 10, 10, 1])), cts / "a.nii.gz")
+    for out in (cts, cts / "out"):
+        file = write(tmp_path, axes={"method": ["trace"]}, cts=str(cts), out=str(out), phantoms=None)
+        assert "give another out" in refusal(capsys, ["ablate", "-c", str(file), "--device", "cpu"])
+    assert [path.name for path in cts.iterdir()] == ["a.nii.gz"]
+
+
+def test_a_device_that_is_not_there_is_refused(tmp_path, capsys):
+    file = write(tmp_path, axes={"method": ["trace"]})
+    assert "--device warp cannot be used" in refusal(capsys, ["ablate", "-c", str(file), "--device", "warp"])
+
+
+def test_a_table_with_words_for_numbers_is_refused_by_row_and_column(tmp_path, capsys):
+    (row, *_) = ablate(tmp_path, axes={"method": ["trace"]})
+    table = tmp_path / "out" / "results.csv"
+    table.write_text(table.read_text().replace(repr(row["psnr"]), "1e999"))
+    said = refusal(capsys, ["ablate", "-c", str(tmp_path / "spec.yaml"), "--device", "cpu"])
+    assert f"psnr of row {row['key']} is '1e999'" in said and "results.csv" in said
+
+
+def test_dollars_in_the_name_of_a_method_are_no_formula_of_its_plots(tmp_path):
+    names = ["a$\\frac$", "$x|[/b]"]
+    rows = ablate(tmp_path, methods={name: {"of": "sirt", "method.iterations": 2} for name in names})
+    assert {row["method"] for row in rows} == set(names) and list((tmp_path / "out").glob("*.png"))
+
+
+@pytest.mark.parametrize("content, words", [
+    ({"methods": {"mine": {"of": "trace", "methodnull.x": 1}}}, "methodnull.x means nothing"),
+    ({"products": [{"axes": {"method": ["trace"], "seed": list(range(500))}}] * 5}, "2,500 combinations"),
+    ({"axes": {"method": ["trace"], "views": ["9" * 500]}}, "an orbit needs at least one view")], ids=["part",
+    "products", "long"])
+def test_what_a_specification_cannot_mean_is_one_short_sentence(tmp_path, content, words):
+    with pytest.raises(ValueError, match=words) as caught:
+        read_specification(write(tmp_path, **content))
+    assert len(str(caught.value)) < 400

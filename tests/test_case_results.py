@@ -186,3 +186,24 @@ def test_a_table_of_someone_elses_is_never_replaced(tmp_path, name):
     (tmp_path / name).write_text("patient,result\n")
     with pytest.raises(ValueError, match=f"{name} is no table of this command, and is not replaced"):
         begun(tmp_path)
+
+
+SCORED = record() | {"method": "sirt", "views": 3, "grid": {"shape": [4, 4, 4]}, "scores": {"psnr": 20.0},
+                     "seconds": {"all": 1.0}, "network_calls": 0, "projector_calls": 2, "files": ["volume.nii.gz"]}
+
+
+@pytest.mark.parametrize("damage", [
+    *({name: ...} for name in ("method", "views", "grid", "seconds", "network_calls")), {"scores": "good"},
+    {"scores": {"psnr": [1]}}, {"seconds": 3}, {"method": ["sirt"]}, {"grid": []}, "[" * 100_000, "[]", "9" * 5000],
+    ids=repr)
+def test_a_damaged_record_is_refused_by_name_before_anything_is_done(old, damage):
+    whole = json.dumps({k: v for k, v in (SCORED | damage).items() if v is not ...}) if isinstance(damage,
+    dict) else damage
+    (old / RECORD).write_text(whole)
+    with pytest.raises(ValueError, match=f"{old} is in the place of a case, but its {RECORD} is missing or damaged"):
+        begun(old.parent)
+
+
+def test_a_whole_record_gives_its_row(old):
+    (old / RECORD).write_text(json.dumps(SCORED))
+    assert begun(old.parent).summarise(["anna"])[0]["psnr"] == 20.0

@@ -2,14 +2,19 @@
 
 import errno
 import os
+import subprocess
+import sys
 import warnings
+from pathlib import Path
 
 import pytest
 
 from phydict.cli.infer import main as infer
 from phydict.cli.train import main as train
-from phydict.runtime.console import cli_errors, noted, quiet, with_configurations
+from phydict.runtime.console import check_writable, cli_errors, noted, quiet, with_configurations
 from phydict.runtime.shipped import shipped
+
+ROOT = Path(__file__).parents[1]
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
@@ -74,3 +79,44 @@ def test_a_cases_warnings_are_noted_and_shown_with_its_name_however_often_others
     assert found == {"anna": ["too dark"], "bert": ["too dark"]}
     said = capsys.readouterr().err.splitlines()
     assert [line for line in said if "dark" in line] == ["warning: anna: too dark", "warning: bert: too dark"]
+
+
+BOMB = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
+    f"{name}: &{name} [{', '.join([f'*{before}'] * 10)}]\n" for before, name in zip("abcdefgh", "bcdefghi"))
+"""Nine lines of YAML that stand for a thousand million values."""
+
+
+@pytest.mark.parametrize("name", ["inline", "with:colon.yaml"])
+def test_anchors_that_repeat_each_other_are_refused_wherever_they_stand(empty, name):
+    (empty / "with:colon.yaml").write_text(BOMB)
+    done = subprocess.run([sys.executable, "-c", "import sys; from phydict.cli.infer import main; main(sys.argv[1:])",
+                           "predict", "-c", BOMB if name == "inline" else name, "--data.xrays", "x"],
+                          capture_output=True, text=True, timeout=120, env=os.environ | {"PYTHONPATH": str(ROOT)})
+    assert done.returncode == 2 and done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("content, words", [
+    ("model: {method: {class_path: [a]}}", "`model.method.class_path` is the name of a class"),
+    ("model: {method: {class_path: phydict.baselines.SIRT, init_args: [1]}}", "`model.method.init_args` is a mapping"),
+    ("trainer: {callbacks: [{class_path: 3}]}", "`trainer.callbacks.class_path` is the name of a class"),
+    ("dry_run: often", "dry_run is true or false"), ('model: {name: "a\\0b"}', "give another model.out"),
+    ("trainer: {devices: many}", "the settings of trainer")])
+def test_a_setting_of_the_wrong_kind_is_one_sentence_that_names_it(empty, capsys, content, words):
+    (empty / "mine.yaml").write_text(content)
+    with pytest.raises(SystemExit) as stopped:
+        infer(["predict", "-c", "sirt", "-c", "mine.yaml", "--data.xrays", str(shipped("data/example/xrays"))])
+    said = capsys.readouterr().err
+    assert stopped.value.code == 2 and said.count("\n") == 1 and words in said
+
+
+@pytest.mark.parametrize("out", ["x" * 300, "/".join(["x" * 100] * 60), "broken/link"])
+def test_an_output_that_cannot_be_is_refused_with_its_option(empty, out):
+    (empty / "broken").symlink_to("nowhere")
+    with pytest.raises(ValueError, match="give another model.out$"):
+        check_writable(Path(out), "model.out")
+
+
+def test_the_help_of_a_class_needs_no_configuration(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        infer(["predict", "--model.method.help=phydict.baselines.SIRT"])
+    assert not stopped.value.code and "--model.method.iterations" in capsys.readouterr().out

@@ -196,3 +196,25 @@ def test_a_warning_points_at_the_line_that_called(method):
     with pytest.warns(UserWarning, match="line integral") as found:
         reconstruct(100 * ball(beam, 90.0), beam, tiny_prior(), method, grid=Grid.cube(16))
     assert {warning.filename for warning in found} == {__file__}
+
+
+@pytest.mark.parametrize("spoil", [
+    lambda y: y.to(torch.complex64), lambda y: y > 1, lambda y: y.to("meta"), lambda y: y.to_sparse(), lambda y: None,
+    lambda y: "xrays", lambda y: [[1], [1, 2]]], ids=["complex", "bool", "meta", "sparse", "None", "text", "ragged"])
+def test_xrays_that_are_no_array_of_numbers_are_refused(spoil):
+    beam = ConeBeam.orbit(6, 1020, 740, (56, 56), 8.0)
+    with pytest.raises(ValueError, match="the X-rays must be a"):
+        reconstruct(spoil(ball(beam, 90.0)), beam, method=SIRT(2))
+
+
+def test_xrays_of_unsigned_integers_are_what_their_numbers_say():
+    beam = ConeBeam.orbit(6, 1020, 740, (56, 56), 8.0)
+    counts = (100 * ball(beam, 90.0).numpy()).astype(np.uint16)
+    pair = [reconstruct(xrays, beam, method=SIRT(2)).volume for xrays in (counts, counts.astype(np.float32))]
+    assert torch.equal(*pair)
+
+
+@pytest.mark.parametrize("guidance", [-1.0, float("nan"), 1e7, 1e308])
+def test_a_guidance_that_overflows_is_refused(guidance):
+    with pytest.raises(ValueError, match="the guidance scale lies between 0 and 1e.06"):
+        reconstructor("prior_only", tiny_prior(), guidance)

@@ -600,3 +600,28 @@ def test_a_phantoms_sketch_is_the_change_its_findings_make_where_they_are(cache)
         if sides in ({"left"}, {"right"}):
             low, high = change[0, :4].abs().sum(), change[0, 4:].abs().sum()
             assert (high > low) == (sides == {"right"}), (seed, findings)
+
+
+@pytest.mark.parametrize("weight", [torch.eye(3).to_sparse(), torch.zeros(3, device="meta")], ids=["sparse", "meta"])
+def test_weights_without_plain_numbers_are_refused_by_name(tmp_path, capsys, weight):
+    torch.save({"phydict": {"stage": "base"}, "state_dict": {"prior.x": weight}}, tmp_path / "c.ckpt")
+    said = refusal(capsys, ["export", "--checkpoint", str(tmp_path / "c.ckpt"), "--out",
+    str(tmp_path / "p.safetensors")])
+    assert "c.ckpt" in said and "prior.x holds no plain numbers" in said and not (tmp_path / "p.safetensors").exists()
+
+
+def test_a_training_is_never_written_among_its_cts(tmp_path, capsys, cache):
+    cts = tmp_path / "cts"
+    cts.mkdir()
+    nibabel.save(nibabel.Nifti1Image(np.zeros((20, 20, 20), np.float32), np.diag([10.0, 10, 10, 1])), cts / "a.nii.gz")
+    for out in (cts, cts / "out"):
+        said = refusal(capsys, arguments(out, cache, f"--data.cts={cts}"))
+        assert said.endswith("give another --out") and [path.name for path in cts.iterdir()] == ["a.nii.gz"]
+
+
+@pytest.mark.parametrize("option", ["--data.validation_phantoms=-1", "--data.cache=/dev/null",
+                                    "--model.learning_rate=-1", "--model.warmup=-3", "--data.workers=1000000",
+                                    "--model.network.init_args.channels=[]", "--model.network.init_args.block=0"])
+def test_data_that_cannot_be_are_refused_by_their_option(tmp_path, capsys, cache, option):
+    said = refusal(capsys, arguments(tmp_path, cache, option))
+    assert option.partition("=")[0].rpartition(".")[2] in said

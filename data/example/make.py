@@ -20,6 +20,6 @@ if __name__ == "__main__":
     beam = ConeBeam.orbit(8, 1020.0, 740.0, shape=(224, 224), pixel=(2.5, 2.5))
     projector = Projector(Grid.cube(128), beam, full_detector=True)
     xrays = Ideal(noise=0.005)(projector, window.to_mu(case["volume"])[None], SEED)[0]
-    save_xrays(here / "xrays", xrays, beam, case["report"], png=True)
+    save_xrays(here / "xrays", xrays, beam, case["report"], png=True, overwrite=True)
     coarse = torch.nn.functional.avg_pool3d(case["volume"][None], 2)[0, 0]
     save_nifti(here / "truth.nii.gz", window.to_hu(coarse).round(), Grid.cube(64))

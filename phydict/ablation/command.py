@@ -13,9 +13,10 @@ from phydict.ablation.run import RESULTS, run
 from phydict.ablation.spec import read_specification
 from phydict.ablation.summary import entries
 from phydict.ablation.tables import all_tables, write_tables
-from phydict.runtime.console import check_configured, check_writable, cli_errors, quiet
+from phydict.runtime.console import check_apart, check_configured, check_writable, cli_errors, quiet
 from phydict.runtime.files import alone_in
 from phydict.runtime.progress import CaseProgress
+from phydict.runtime.reading import reason
 
 
 def main(args: list[str] | None = None) -> None:
@@ -24,8 +25,14 @@ def main(args: list[str] | None = None) -> None:
         check_configured(sys.argv[1:] if args is None else args, (), "configs/ablate/pareto.yaml")
         given = _parser().parse_args(args).as_dict()
         device = given.pop("device") or ("cuda" if torch.cuda.is_available() else "cpu")
+        try:
+            torch.empty(0, device=device)
+        except Exception as error:  # torch has a kind for each reason
+            raise ValueError(f"--device {device} cannot be used ({reason(error)[:100]}): give cpu, or leave it "
+                             "out") from error
         specification = read_specification(given.pop("config"), **given)
         check_writable(specification.out, "out")
+        check_apart(specification.out, "out", [Path(cts)] if (cts := specification.cases.cts) else [])
         with alone_in(specification.out, "out"), CaseProgress() as progress:
             rows = run(specification, torch.device(device), progress)
         print(f"{len(rows)} rows in {specification.out / RESULTS}")

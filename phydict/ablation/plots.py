@@ -12,6 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from phydict.ablation.summary import SHOWN_MEASURES, Entry, best_settings, conditions, deltas, format_settings
+from phydict.evaluation.gallery import literal
 from phydict.runtime.files import atomic_write
 
 COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f", "#bcbd22", "#17becf",
@@ -70,15 +71,15 @@ def _pareto(axes: Sequence[Axes], group: Sequence[Entry], where: str, style: dic
     for ax, name in zip(axes, ("psnr", "ssim")):
         for method in dict.fromkeys(entry.method for entry in group):
             own = sorted((e.means["seconds"], e.means[name]) for e in group if e.method == method)
-            ax.plot(*zip(*own), **style[method], linewidth=0.8, markersize=6, label=method)
+            ax.plot(*zip(*own), **style[method], linewidth=0.8, markersize=6, label=literal(method))
         points = [(e.means["seconds"], e.means[name]) for e in group]
         best = [points[i] for i in front(points)]
         ax.plot(*zip(*best), color="black", linestyle="--", linewidth=1, zorder=0, label="front")
         for i in front(points):
-            ax.annotate(group[i].label, points[i], xytext=(4, 4), textcoords="offset points", fontsize=7)
+            ax.annotate(literal(group[i].label), points[i], xytext=(4, 4), textcoords="offset points", fontsize=7)
         ax.set_xscale("log")
         _dress(ax, "seconds per case", SHOWN_MEASURES[name].heading)
-        ax.set_title(where, fontsize=9)
+        ax.set_title(literal(where), fontsize=9)
     axes[-1].legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
 
 
@@ -89,7 +90,7 @@ def _views(axes: Sequence[Axes], group: Sequence[Entry], style: dict) -> None:
             own = sorted((e.condition["views"], e.means[name]) for e in group
                          if e.complete and e.name == label)
             if own:
-                ax.plot(*zip(*own), **style[method], markersize=5, label=label)
+                ax.plot(*zip(*own), **style[method], markersize=5, label=literal(label))
         views = sorted({e.condition["views"] for e in group})
         ax.set_xscale("log", base=2)
         ax.set_xticks(views, map(str, views))
@@ -103,7 +104,7 @@ def _deltas(axes: Sequence[Axes], curves: Sequence[tuple[str, list[Entry]]]) -> 
         for i, (label, group) in enumerate(curves):
             own = [(e.settings["delta"], e.means[name]) for e in group if e.complete]
             if own:
-                ax.plot(*zip(*own), color=COLOURS[i % len(COLOURS)], marker="o", markersize=5, label=label)
+                ax.plot(*zip(*own), color=COLOURS[i % len(COLOURS)], marker="o", markersize=5, label=literal(label))
         _dress(ax, "delta of Extra Compute (0: none)", SHOWN_MEASURES[name].heading)
     axes[-1].set_yscale("log")
     axes[-1].legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
@@ -112,7 +113,7 @@ def _deltas(axes: Sequence[Axes], curves: Sequence[tuple[str, list[Entry]]]) -> 
 def _stages(ax: Axes, group: Sequence[Entry], where: str) -> None:
     """Stacked shares of the seconds, a bar for each method at its best setting, with the seconds in all."""
     own = sorted(best_settings(group), key=lambda entry: entry.means["seconds"])
-    labels, left = [entry.label for entry in own], [0.0] * len(own)
+    labels, left = [literal(entry.label) for entry in own], [0.0] * len(own)
     for stage, label in STAGES.items():
         shares = []
         for entry in own:
@@ -126,7 +127,7 @@ def _stages(ax: Axes, group: Sequence[Entry], where: str) -> None:
     ax.set_xlim(0, 115)
     ax.set_axisbelow(True)
     _dress(ax, "share of the time (%)", "")
-    ax.set_title(where, fontsize=9)
+    ax.set_title(literal(where), fontsize=9)
     ax.legend(fontsize=7, loc="lower center", bbox_to_anchor=(0.5, 1.06), ncols=3)
 
 

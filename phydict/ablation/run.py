@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import reprlib
 import warnings
 from collections.abc import Callable, Mapping
 from functools import cache
@@ -36,6 +37,10 @@ MEASURED = ("status", "error", "warning", "ssim", "psnr", "mae_hu", "ssim_lung",
 CUDA device, else of the process."""
 
 
+WORDS = ("status", "error", "warning", "device", "precision", "instruction_set")
+"""Those of MEASURED that are no numbers."""
+
+
 class Results:
     """The table of results in a folder, of which this process alone writes while it is open.
 
@@ -57,6 +62,11 @@ class Results:
         if found and not found.keys() & planned.keys():
             raise ValueError(f"{self.file} is the table of another comparison, whose {len(found)} rows are all of "
                              "other settings or data: give another out, or remove it")
+        for name, row in found.items():
+            wrong = next((k for k in MEASURED if k not in WORDS and isinstance(row.get(k), str)), None)
+            if wrong:
+                raise ValueError(f"{self.file}: {wrong} of row {name} is {reprlib.repr(row[wrong])}, which is no "
+                                 "number: remove that row, and it is run again")
         self.others = [row for name, row in found.items() if name not in planned]
         self.done = {name: self._row(name, row) for name, row in found.items()
                      if name in planned and row.get("status") in FINISHED}

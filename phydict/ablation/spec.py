@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import math
+import reprlib
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 from itertools import product
 from pathlib import Path
 from types import NoneType
@@ -30,8 +31,8 @@ from phydict.xray import Ideal, Polychromatic, Simulator
 SIDE = 560.0
 """mm along each side of the simulated detector unless the size of its pixels is given."""
 
-MOST_TRIALS = 10_000
-"""Combinations of the values of a product's axes."""
+MOST_TRIALS = 2000
+"""Combinations of the values of axes, of all products together."""
 
 SIMULATORS: dict[str, Simulator] = {"ideal": Ideal(), "polychromatic": Polychromatic()}
 
@@ -181,7 +182,7 @@ def _specification(content, given: Mapping) -> Specification:
     for entry in products:
         _check_keys(entry, ("base", "axes"), "a product")
         own, axes = (_dotted(_mapping(entry.get(name), name)) for name in ("base", "axes"))
-        mine, meant = _trials(common | own, axes, methods, cases)
+        mine, meant = _trials(common | own, axes, methods, cases, len(found))
         _check_used([*own, *axes], meant, mine)
         used, found = used | meant, found + mine
         for trial in mine:
@@ -190,9 +191,10 @@ def _specification(content, given: Mapping) -> Specification:
     return Specification(Path(content["out"]), cases, list(trials.values()))
 
 
-def _trials(base: Mapping, axes: Mapping, methods: Mapping, cases: Cases) -> tuple[list[Trial], set[str]]:
+def _trials(base: Mapping, axes: Mapping, methods: Mapping, cases: Cases,
+            before: int) -> tuple[list[Trial], set[str]]:
     """The trials of one product, those that come out the same still among them, and the settings that mean anything
-    to one of them."""
+    to one of them; of other products there are `before` trials."""
     for name in base | axes:
         if name not in SETTINGS and not name.startswith(("method.", "simulator.")):
             raise ValueError(f"there is no setting {name!r}: use one of {', '.join(SETTINGS)}, method.<field> or "
@@ -204,7 +206,7 @@ def _trials(base: Mapping, axes: Mapping, methods: Mapping, cases: Cases) -> tup
     for name, values in axes.items():
         if not isinstance(values, list) or not values:
             raise ValueError(f"the axis {name} is a list of at least one value, but {values!r} was given")
-    if (count := math.prod(map(len, axes.values()))) > MOST_TRIALS:
+    if (count := before + math.prod(map(len, axes.values()))) > MOST_TRIALS:
         raise ValueError(f"the axes stand for {count:,} combinations, but at most {MOST_TRIALS:,} are run: shorten "
                          "them")
     found, used = [], set()
@@ -245,7 +247,7 @@ def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
     changes: dict[str, dict] = {"method": {}, "simulator": {}}
     for name, value in settings.items():
         part, _, path = name.partition(".")
-        if path and has_field(own[part], path.split(".")):
+        if path and part in own and has_field(own[part], path.split(".")):
             changes[part][path] = value
     try:
         method, simulator = (changed(own[part], changes[part], part) for part in own)
@@ -313,6 +315,10 @@ def changed(settings, changes: Mapping[str, object], name: str):
 
 def parsed(hint, value, name: str):
     """`value`, as YAML gives it, as the type `hint`. Raises ValueError naming the setting where it is none."""
+    return (_parsed_once if isinstance(value, str | int | float) else _parsed)(hint, value, name)
+
+
+def _parsed(hint, value, name: str):
     parser = ArgumentParser(exit_on_error=False)
     parser.add_argument("--value", type=hint)
     try:
@@ -321,12 +327,16 @@ def parsed(hint, value, name: str):
         return parser.instantiate_classes(parser.parse_object({"value": value})).value
     except (ArgumentError, TypeError, ValueError) as error:
         wanted = getattr(hint, "__name__", str(hint))
-        raise ValueError(f"{name} takes a value of type {wanted}, but {value!r} was given") from error
+        raise ValueError(f"{name} takes a value of type {wanted}, but {reprlib.repr(value)} was given") from error
 
 
 def plain(value):
     """A setting as one field of a table, where an empty field means that it is the method's own."""
     return json.dumps(describe(value)) if is_dataclass(value) else "none" if value is None else value
+
+
+_parsed_once = lru_cache(10_000, typed=True)(_parsed)
+"""A product has each of its values in many trials."""
 
 
 @cache
@@ -367,17 +377,17 @@ def _mapping(value, name: str) -> Mapping:
     if value is None:
         return {}
     if not isinstance(value, dict):
-        raise ValueError(f"{name} is a mapping of names to values, but {value!r} was given")
+        raise ValueError(f"{name} is a mapping of names to values, but {reprlib.repr(value)} was given")
     return value
 
 
 def _check_path(value, name: str) -> None:
     if not isinstance(value, str | None):
-        raise ValueError(f"{name} is the name of a file or folder, but {value!r} was given")
+        raise ValueError(f"{name} is the name of a file or folder, but {reprlib.repr(value)} was given")
 
 
 def _check_keys(value, keys: Sequence[str], what: str) -> None:
     if not isinstance(value, dict):
-        raise ValueError(f"{what} is a mapping with the keys {', '.join(keys)}, but {value!r} was given")
+        raise ValueError(f"{what} is a mapping with the keys {', '.join(keys)}, but {reprlib.repr(value)} was given")
     if unknown := [name for name in value if name not in keys]:
         raise ValueError(f"{what} has no key {unknown[0]!r}: use {', '.join(keys)}")

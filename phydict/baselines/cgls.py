@@ -46,10 +46,10 @@ class CGLS(Baseline):
         density = clip(empty(A, y), self.window)
         for _ in range(self.restarts):
             steps = iter(range(self.iterations))
-            downhill = A.T(y - A(density))
-            inactive = ~((density <= low) & (downhill < 0) | (density >= high) & (downhill > 0))
+            negative_gradient = A.T(y - A(density))
+            inactive = ~((density <= low) & (negative_gradient < 0) | (density >= high) & (negative_gradient > 0))
             density = clip(density + conjugate_gradients(
-                lambda d, inactive=inactive: inactive * A.T(A.linear(d)), inactive * downhill, self.iterations,
+                lambda d, inactive=inactive: inactive * A.T(A.linear(d)), inactive * negative_gradient, self.iterations,
                 on_step=lambda: (next(steps), on_step())), self.window)
             for _ in steps:  # that were not needed
                 on_step()

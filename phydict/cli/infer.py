@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import lightning
 from lightning.pytorch.cli import LightningCLI
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
@@ -16,6 +17,7 @@ from phydict.inference.task import ReconstructionTask
 from phydict.runtime.console import (
     check_apart, check_command, check_configured, cli_errors, noted, quiet, read_configurations, sentence,
     with_configurations)
+from phydict.runtime.reading import reading
 
 COMMANDS = {"predict": "X-rays -> volumes", "test": "CTs -> X-rays -> volumes and scores",
             "ablate": "methods compared on the same X-rays"}
@@ -41,12 +43,22 @@ class InferenceCLI(LightningCLI):
     @property
     def dry_run(self) -> bool:
         """Whether the geometry is drawn and nothing reconstructed."""
-        return bool(self._get(self.config, "dry_run", False))
+        return self._flag("dry_run")
 
     @property
     def profile(self) -> bool:
         """Whether each case's stages are timed and their memory measured."""
-        return bool(self._get(self.config, "profile", False))
+        return self._flag("profile")
+
+    def _flag(self, name: str) -> bool:
+        value = self._get(self.config, name, False)
+        if not isinstance(value, bool):
+            raise ValueError(f"{name} is true or false, but {value!r} was given")
+        return value
+
+    def instantiate_trainer(self, **kwargs) -> lightning.Trainer:
+        with reading("the settings of trainer", "correct them"):
+            return super().instantiate_trainer(**kwargs)
 
     def predict(self, model: ReconstructionTask, datamodule: ReconstructionData) -> None:
         """Reconstruct X-rays, or draw their geometry."""

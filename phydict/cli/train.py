@@ -18,9 +18,11 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from phydict.cli.export import export_prior, print_prior
 from phydict.runtime.console import (
-    check_command, check_configured, check_writable, cli_errors, quiet, read_configurations, with_configurations)
+    check_apart, check_command, check_configured, check_writable, cli_errors, quiet, read_configurations,
+    with_configurations)
 from phydict.runtime.files import alone_in, atomic_write
 from phydict.runtime.precision import PRECISIONS, resolve_precision, trainer_precision
+from phydict.runtime.reading import reading
 from phydict.training.base import PriorTraining
 from phydict.training.checkpoints import BEST, HELD_OUT, RESUMED, BestCheckpoint, WholeCheckpoints, read_checkpoint
 from phydict.training.crops import SuperResolutionData
@@ -93,12 +95,14 @@ class PriorCLI(LightningCLI):
             kwargs["precision"] = trainer_precision(self._get(self.config, "precision"), device)
         elif "bf16" in str(trainer.precision):
             resolve_precision("bfloat16", device)  # warns where that is slow
-        return super().instantiate_trainer(logger=logger, plugins=plugins, **kwargs)
+        with reading("the settings of trainer", "correct them"):
+            return super().instantiate_trainer(logger=logger, plugins=plugins, **kwargs)
 
     def fit(self, model: StageTraining, datamodule: PriorData, ckpt_path: str | None = None,
             weights_only: bool | None = None) -> None:
         """Train, alone in the folder of the run."""
         out = Path(self.config.fit.out)
+        check_apart(out, "--out", [Path(cts)] if (cts := self.config.fit.data.cts) else [])
         with alone_in(out, "--out") if self.trainer.is_global_zero else nullcontext():
             self._begin(out, ckpt_path)
             self.trainer.fit(model, datamodule=datamodule, ckpt_path=ckpt_path, weights_only=weights_only)

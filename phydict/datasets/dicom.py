@@ -47,17 +47,29 @@ class DicomTags:
     sign: int | None
 
 
+def open_dicom(path: Path, **settings) -> pydicom.Dataset:
+    """`pydicom.dcmread` of a file that is not deflated as a whole: a small one of those may take any memory. For use
+    inside `reading`: raises ValueError for those, and whatever a damaged one leads pydicom to."""
+    with path.open("rb") as stream:
+        if stream.read(132)[128:] == b"DICM" and pydicom.filereader.read_file_meta_info(path).get(
+                "TransferSyntaxUID") == pydicom.uid.DeflatedExplicitVRLittleEndian:
+            raise ValueError("it is deflated as a whole, which is not read")
+    return pydicom.dcmread(path, **settings)
+
+
 def read_dicom(path: Path) -> list[tuple[np.ndarray, DicomTags]]:
     """The frames of a DICOM file: pixels (V, U) float64 after the modality transform, and their tags.
 
     Raises ValueError naming the file where it cannot be read or decoded, or is not grey.
     """
     with reading(f"the DICOM file {path}", "export it again, uncompressed"):
-        dataset = pydicom.dcmread(path)
+        dataset = open_dicom(path)
         if dataset.get("SamplesPerPixel", 1) != 1:
             raise ValueError(f"it has {dataset.SamplesPerPixel} colours per pixel; export it as grey")
         if "PixelData" not in dataset:
             raise ValueError("it holds no image")
+        if lacking := [keyword for keyword in ("Rows", "Columns") if dataset.get(keyword) is None]:
+            raise ValueError(f"it lacks {' and '.join(lacking)}")
         check_memory(8 * int(dataset.Rows) * int(dataset.Columns) * int(dataset.get("NumberOfFrames") or 1),
                      "what its tags promise", "give a smaller one")
         stored = dataset.pixel_array

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from phydict.runtime.files import atomic_write
+from phydict.runtime.reading import Unreadable, reading
 
 TEXT_COLUMNS = ("case", "method")
 """Columns that are text even where they look like numbers."""
@@ -32,18 +33,19 @@ def read_csv(path: str | Path) -> list[dict]:
     """Rows of a CSV by `write_csv`, numbers as int or float; empty fields are left out; no file gives no rows.
 
     Text that only resembles a number ("007") stays text, and so do the columns case and method.
-    Raises ValueError on a row whose number of fields is not the header's, as in a file cut off by another program.
+    Raises ValueError naming the file where it is no table, or a row's number of fields is not the header's, as in a
+    file cut off by another program.
     """
     path = Path(path)
     if not path.exists():
         return []
-    with open(path, newline="", encoding="utf-8") as file:
+    with reading(f"the table {path}", "repair or remove it"), open(path, newline="", encoding="utf-8") as file:
         reader = csv.reader(file)
         columns = next(reader, [])
         rows = []
         for fields in reader:
             if len(fields) != len(columns):
-                raise ValueError(f"line {reader.line_num} of {path} has {len(fields)} fields, but its header has "
+                raise Unreadable(f"line {reader.line_num} of {path} has {len(fields)} fields, but its header has "
                                  f"{len(columns)}; the file was cut off or edited, remove or repair that line")
             rows.append({name: field if name in TEXT_COLUMNS else _from_text(field)
                          for name, field in zip(columns, fields) if field != ""})

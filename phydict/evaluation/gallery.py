@@ -124,8 +124,13 @@ def _page(width: float, upper: float, lower: float, title: str):
     FigureCanvasAgg(figure)
     heights = [strip, upper] + ([lower] if lower else [])
     parts = figure.subfigures(len(heights), 1, height_ratios=heights, hspace=0)
-    parts[0].suptitle(title, fontsize=13, y=0.6, va="center")
+    parts[0].suptitle(literal(title), fontsize=13, y=0.6, va="center")
     return figure, parts[1], parts[2] if lower else None
+
+
+def literal(text: str) -> str:
+    """A text that Matplotlib shows as it is, whatever dollars are in it."""
+    return text.replace("$", "\\$")
 
 
 def _margins(height: float, heading: float) -> dict[str, float]:

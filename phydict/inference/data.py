@@ -20,7 +20,7 @@ from phydict.grid import Grid
 from phydict.reconstruction import describe
 from phydict.runtime.console import noted
 from phydict.runtime.files import file_crc32
-from phydict.runtime.reading import read_ids
+from phydict.runtime.reading import name_of, read_ids
 from phydict.runtime.shipped import own_or_shipped
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Ideal, Projector, Simulator
@@ -104,7 +104,12 @@ class ReconstructionData(lightning.LightningDataModule):
         """Id -> folder of X-rays. Raises ValueError without data.xrays."""
         if not self.xrays:
             raise ValueError("predict needs data.xrays: a folder of X-ray images with geometry.yaml")
-        return {Path(os.path.abspath(folder)).name: folder for folder in find_xrays(self.xrays)}
+        folders = find_xrays(self.xrays)
+        cases = {name_of(os.path.abspath(folder)): folder for folder in folders}
+        if len(cases) < len(folders):
+            raise ValueError(f"two folders of {self.xrays} would both become one case, since their names differ in "
+                             "what is no UTF-8 alone: rename one of them")
+        return cases
 
     def inputs(self, stage: str) -> list[Path]:
         """The files and folders that a stage (predict, test) reads its cases from."""
@@ -147,7 +152,7 @@ class ReconstructionData(lightning.LightningDataModule):
         crc = 0
         files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
         for file in [*files, own_or_shipped(self.geometry)] if self.geometry else files:
-            named = zlib.crc32(file.name.encode(), crc)
+            named = zlib.crc32(os.fsencode(file.name), crc)
             crc = file_crc32(file, named) if file.is_file() else named
         return f"files crc32 {crc:08x}"
 

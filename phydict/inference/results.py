@@ -91,13 +91,7 @@ class CaseResults:
         for case in cases:
             record = self._there(case).record
             if record["scores"]:
-                rows.append({"case": case, "method": record["method"], "views": record["views"],
-                             "grid": "x".join(map(str, record["grid"]["shape"]))} | record["scores"] | {
-                                 "seconds": sum(record["seconds"].values()), "network_calls": record["network_calls"],
-                                 "projector_calls": record["projector_calls"],
-                                 "precision": record.get("precision"),
-                                 "instruction_set": record.get("instruction_set"),
-                                 "warning": "; ".join(record.get("warnings", [])) or None})
+                rows.append(_row(case, record))
         if rows:
             write_csv(self.folder / TABLE, rows)
             with atomic_write(self.folder / "results.md") as part:
@@ -112,8 +106,10 @@ class CaseResults:
         try:
             stat = (folder / RECORD).stat()
             record = json.loads((folder / RECORD).read_text())
-            record["settings"], record["source"], record["scores"], set(record.get("files", UNLISTED))
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            record["settings"], record["source"], set(record.get("files", UNLISTED))
+            if record["scores"]:
+                _row(case, record)
+        except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
             raise ValueError(f"{folder} is in the place of a case, but its {RECORD} is missing or damaged, and it is "
                              "not replaced: move it away, or give another model.out") from error
         return Finished(record, (stat.st_ino, stat.st_mtime_ns))
@@ -158,3 +154,16 @@ class CaseResults:
         if not own:
             raise ValueError(f"{table if table.is_file() else page} is no table of this command, and is not replaced: "
                              "move it away, or give another model.out")
+
+
+def _row(case: str, record: dict) -> dict:
+    """The row of scores of a record; of whatever kind the error where it lacks what a record holds."""
+    if not isinstance(record["method"], str) or not isinstance(record["views"], int):
+        raise TypeError
+    scores = {name: None if score is None else float(score) for name, score in (record["scores"] or {}).items()}
+    return {"case": case, "method": record["method"], "views": record["views"],
+            "grid": "x".join(map(str, record["grid"]["shape"]))} | scores | {
+                "seconds": float(sum(record["seconds"].values())),
+                "network_calls": int(record["network_calls"]), "projector_calls": int(record["projector_calls"]),
+                "precision": record.get("precision"), "instruction_set": record.get("instruction_set"),
+                "warning": "; ".join(record.get("warnings", [])) or None}

@@ -25,6 +25,9 @@ from phydict.runtime.reading import check_memory
 from phydict.units import MU_WATER
 from phydict.xray import Projector
 
+MOST_GUIDANCE = 1e6
+"""No scale of guidance is as large: it would overflow."""
+
 
 class CountingDenoiser:
     """A denoiser that counts its calls, one for each state of a batch, and shows a guard what it estimates."""
@@ -135,9 +138,9 @@ class Posterior(Reconstructor):
 
 
 def check_guidance(guidance: float) -> None:
-    """Raises ValueError unless the scale of classifier-free guidance is at least 0 and finite."""
-    if not 0 <= guidance < math.inf:
-        raise ValueError(f"the guidance scale is at least 0 and finite, but {guidance} was given")
+    """Raises ValueError unless the scale of classifier-free guidance lies between 0 and MOST_GUIDANCE."""
+    if not 0 <= guidance <= MOST_GUIDANCE:
+        raise ValueError(f"the guidance scale lies between 0 and {MOST_GUIDANCE:g}, but {guidance} was given")
 
 
 def sample_seed(seed: int, i: int) -> int:

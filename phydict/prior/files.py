@@ -35,6 +35,9 @@ FORMAT = 1
 DEFAULT_PRIOR = shipped("data/prior/phydict_64.safetensors")
 """The prior that comes with the project."""
 
+MOST_HU, MOST_LAYERS = 1e6, 256
+"""No window reaches as far, and no network has more blocks on its way down, or layers."""
+
 STAGES = {"base": "a base prior", "super_resolution": "a super-resolution stage"}
 """What a file's header may call it, and what that is; a header that says nothing is of a base prior."""
 
@@ -242,8 +245,19 @@ def _built(made: Callable[[], nn.Module], weights: dict[str, Tensor], header: di
 
 
 def _check_sizes(name: str, settings: dict, weights: dict[str, Tensor]) -> None:
-    """Raises ValueError where a network's settings hold anything larger than its weights have of it."""
+    """Raises ValueError where a network's settings hold anything larger than its weights have of it, or more layers
+    than can be meant."""
+    if not isinstance(settings, dict):
+        raise ValueError(f"{name} is {reprlib.repr(settings)}, where a mapping of settings is needed")
     most = max([len(weights), *(n for w in weights.values() for n in w.shape)])
+    layers = len(settings["channels"]) if isinstance(settings.get("channels"), list) else 1
+    for key, value in settings.items():
+        if key in ("res_blocks", "layers") and type(value) is int:
+            layers *= value
+        elif isinstance(value, list) and (key == "res_blocks" or not value):
+            raise ValueError(f"{name}.{key} is {reprlib.repr(value)}")
+    if layers > MOST_LAYERS:
+        raise ValueError(f"{name} has {layers:,} layers, more than {MOST_LAYERS}")
     for key, value in settings.items():
         values = value if isinstance(value, list) else [value]
         if len(values) > most or not all(isinstance(n, int) and 0 <= n <= most for n in values):
@@ -258,8 +272,9 @@ def _number(header: dict, key: str) -> float:
 
 def _window(header: dict) -> HUWindow:
     ends = header["hu_window"]
-    if not isinstance(ends, list) or len(ends) != 2:
-        raise ValueError(f"hu_window is {reprlib.repr(ends)}, where two numbers are needed")
+    if not isinstance(ends, list) or len(ends) != 2 or not all(
+            type(end) in (int, float) and abs(end) < MOST_HU for end in ends):
+        raise ValueError(f"hu_window is {reprlib.repr(ends)}, where two numbers of HU are needed")
     return HUWindow(*ends)
 
 
@@ -307,4 +322,7 @@ def _load_text(path: Path, text: dict) -> TextEncoder:
     with safe_open(path, "pt") as file:
         weights = {k: file.get_tensor(k) for k in file.keys() if k.startswith("text.")}
     check_finite(weights, path)
-    return build_text(text, weights)
+    try:
+        return build_text(text, weights)
+    except ValueError as error:
+        raise ValueError(f"'{path}' contradicts itself: {error}") from error

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import torch
 from torch import Tensor
 
 
 def not_finite(weights: Mapping[str, Tensor]) -> str:
     """The first of the weights that is not finite, and how many values that concerns; empty where all are."""
     for name, weight in weights.items():
+        if weight.layout != torch.strided or weight.is_meta or weight.is_quantized:
+            return f"{name} holds no plain numbers"
+        if weight.is_floating_point() and weight.itemsize < 2:
+            weight = weight.float()  # torch does not ask those of 8 bits
         if not weight.isfinite().all():
             return f"{name} has {int((~weight.isfinite()).sum())} NaN or infinite values of {weight.numel()}"
     return ""

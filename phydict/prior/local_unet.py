@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from torch.nn.functional import layer_norm
 
 from phydict.prior.convolution import speed_up
+from phydict.prior.unet import check_sizes
 
 
 class PositionNorm(nn.Module):
@@ -37,6 +38,7 @@ class LocalUNet(nn.Module):
         from monai.networks.nets import DiffusionModelUNet
 
         super().__init__()
+        check_sizes(block=block, channels=channels, res_blocks=res_blocks)
         self.settings = {"in_channels": in_channels, "out_channels": out_channels, "block": block,
                          "channels": list(channels), "res_blocks": res_blocks}
         self.in_channels, self.out_channels, self.block = in_channels, out_channels, block

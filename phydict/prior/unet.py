@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from types import MethodType
 
@@ -40,6 +41,14 @@ class TextMap(nn.Module):
         return self.to_sketch(self(context))
 
 
+def check_sizes(**sizes: int | Sequence[int]) -> None:
+    """Raises ValueError, naming the setting, unless each of a network's sizes is one number above 0 or some."""
+    for name, size in sizes.items():
+        numbers = [size] if isinstance(size, int) else list(size)
+        if not numbers or min(numbers) < 1:
+            raise ValueError(f"a network's {name} must be above 0, but {size} was given")
+
+
 class VolumeUNet(nn.Module):
     """MONAI's DiffusionModelUNet run on blocks of `block`^3 voxels, conditioned on time and on a text context.
 
@@ -68,6 +77,7 @@ class VolumeUNet(nn.Module):
         from monai.networks.nets import DiffusionModelUNet
 
         super().__init__()
+        check_sizes(block=block, channels=channels, res_blocks=res_blocks, head_channels=head_channels)
         self.settings = {
             "state_channels": state_channels, "block": block, "channels": list(channels),
             "attention": list(attention), "res_blocks": res_blocks, "head_channels": head_channels,

@@ -15,8 +15,10 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from jsonargparse import set_loader
+
 from phydict.runtime.shipped import configuration
-from phydict.runtime.yaml_file import read_yaml
+from phydict.runtime.yaml_file import parse_yaml, read_yaml
 
 NOISE = (".*does not have many workers", ".*LeafSpec.*is deprecated", ".*is smaller than the logging interval",
          "Total length of `DataLoader` across ranks is zero", "Checkpoint directory .* exists and is not empty",
@@ -30,6 +32,17 @@ NOISE = (".*does not have many workers", ".*LeafSpec.*is deprecated", ".*is smal
 CONFIGURATION = ("-c", "--config")
 """The option that names a configuration file."""
 
+
+def _bounded(text: str) -> object:
+    """A value or a file of the command line's parser, read within `read_yaml`'s bounds; "a:" and "{a}" stay text."""
+    value = parse_yaml(text, "the value")
+    if isinstance(value, dict) and value and all(part is None for part in value.values()):
+        if text.strip() == f"{next(iter(value))}:" or (text.strip().startswith("{") and ":" not in text):
+            return text
+    return value
+
+
+set_loader("yaml", _bounded, (ValueError,))
 
 TRACEBACK = "PHYDICT_TRACEBACK"
 """The environment variable that, where it is set, lets every error show its trace."""
@@ -91,7 +104,8 @@ def check_command(args: Sequence[str], commands: Mapping[str, str], anywhere: Co
 def check_configured(args: Sequence[str], options: Collection[str], example: str) -> None:
     """Raises ValueError where `args` hold none of the options that say what to run, and do not ask for help."""
     options = ("-c", "--config", "-h", "--help", *options)
-    if not any(arg.partition("=")[0] in options or arg.startswith("-c") for arg in args):
+    given = [arg.partition("=")[0] for arg in args]
+    if not any(arg in options or arg.startswith("-c") or arg.endswith(".help") for arg in given):
         raise ValueError(f"no configuration file was given: add -c <file>, such as -c {example}")
 
 
@@ -99,11 +113,20 @@ def check_writable(path: Path, option: str, file: bool = False) -> None:
     """Raises ValueError, in one sentence, unless a folder (or a file) can be written at `path`, which need not exist
     yet; `option` is what the user should change."""
     there = path.absolute()
-    if file and there.is_dir():
-        raise ValueError(f"{path} is a folder, but a file is to be written: give another {option}")
-    there = there.parent if file else there
-    while not there.exists():
-        there = there.parent
+    try:
+        if "\0" in str(path):
+            raise ValueError
+        if file and there.is_dir():
+            raise IsADirectoryError(None, "is a folder, but a file is to be written")
+        there = there.parent if file else there
+        while not there.exists():
+            if there.is_symlink():
+                raise FileNotFoundError(None, f"leads nowhere, since {there} is a broken link")
+            there = there.parent
+    except (OSError, ValueError) as error:
+        said = error.strerror if isinstance(error, OSError) else "is no name of a file"
+        shown = path if len(str(path)) < 256 and str(path).isprintable() else reprlib.repr(str(path))
+        raise ValueError(f"{shown} {said}: give another {option}") from error
     try:
         with tempfile.TemporaryFile(dir=there):
             pass
@@ -140,7 +163,20 @@ def read_configurations(args: Sequence[str]) -> list[dict]:
             if not isinstance(settings.get(name, {}), dict):
                 raise ValueError(f"{file}: `{name}` is a mapping of settings, but {reprlib.repr(settings[name])} was "
                                  "given")
+        _check_classes(settings, str(file), "")
     return list(found.values())
+
+
+def _check_classes(settings: object, file: str, key: str) -> None:
+    """Raises ValueError where a class in nested settings is not named by text, or its arguments are no mapping."""
+    if isinstance(settings, dict):
+        for name, kind, wanted in (("class_path", str, "the name of a class"), ("init_args", dict, "a mapping")):
+            if name in settings and not isinstance(settings[name], kind):
+                raise ValueError(f"{file}: `{key}{name}` is {wanted}, but {reprlib.repr(settings[name])} was given")
+        for name, value in settings.items():
+            _check_classes(value, file, f"{key}{name}.")
+    for value in settings if isinstance(settings, list) else ():
+        _check_classes(value, file, key)
 
 
 def sentence(error: Exception) -> str:
@@ -152,6 +188,9 @@ def sentence(error: Exception) -> str:
         reasons = re.split(r"\n\s*- ", text.partition("Given value type")[0])[1:]
         reasons = [reason for reason in reasons if "does not correspond to a subclass" not in reason] or reasons
         text = text.partition("Does not validate")[0] + "; ".join(reasons)
+    text = re.sub(r"(- )?Expected a path but .*? either not accessible or invalid;?|"
+                  r"Does not validate against any of the Union subtypes Subtypes: .*? Errors:;?|"
+                  r"; Expected a <class 'NoneType'>", "", " ".join(text.split()))
     return " ".join(text.split())
 
 
@@ -166,6 +205,8 @@ def quiet() -> Iterator[None]:
             warnings.filterwarnings("ignore", message)
         for logger in loggers:
             logger.setLevel(logging.WARNING)
+        if hasattr(sys.stdout, "reconfigure"):
+            sys.stdout.reconfigure(errors="backslashreplace")  # paths need not be text that the console knows
         try:
             yield
         finally:

@@ -52,18 +52,22 @@ def reason(error: Exception) -> str:
     return said if said and plain else f"{type(error).__name__} {said}".strip()
 
 
-def read_text(path: str | Path) -> str:
-    """The text of a UTF-8 file. Raises ValueError naming it where it is another or longer than MOST_TEXT, and OSError
-    as `open` does."""
+def read_text(path: str | Path, most: int = MOST_TEXT) -> str:
+    """The text of a UTF-8 file. Raises ValueError naming it where it is another or longer than `most` bytes, and
+    OSError as `open` does."""
     path = Path(path)
     size = path.stat().st_size
-    if size > MOST_TEXT:
-        raise Unreadable(f"{path} has {size:,} bytes, but no more than {MOST_TEXT:,} of text are read; give another "
-                         "file")
+    if size > most:
+        raise Unreadable(f"{path} has {size:,} bytes, but no more than {most:,} of text are read; give another file")
     try:
         return path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         raise Unreadable(f"{path} is not UTF-8 text ({error}); save it as UTF-8") from error
+
+
+def name_of(path: str | Path) -> str:
+    """The last part of a path as text that can be written anywhere; what is no UTF-8 in it becomes a question mark."""
+    return Path(path).name.encode(errors="replace").decode()
 
 
 def read_ids(path: str | Path, option: str) -> list[str]:

@@ -38,17 +38,21 @@ def read_yaml(path: str | Path) -> object:
     deep or repeats itself too often, for keys that are given twice, numbers of hundreds of digits and values of other
     kinds; OSError as `open` does.
     """
-    reader = _Reader(Path(path), read_text(path))
+    return parse_yaml(read_text(path), path)
+
+
+def parse_yaml(text: str, name: object) -> object:
+    """What a text of YAML holds, as `read_yaml` reads that of a file; `name` is what to call it. Raises ValueError."""
     try:
-        return reader.document()
+        return _Reader(name, text).document()
     except yaml.YAMLError as error:
-        raise ValueError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from error
+        raise ValueError(f"{name} is not valid YAML: {' '.join(str(error).split())}") from error
 
 
 class _Reader:
     """Builds the values of a file event by event, so that nothing is built that is refused."""
 
-    def __init__(self, path: Path, text: str):
+    def __init__(self, path: object, text: str):
         self.path, self.loader = path, _Loader(text)
         self.anchors: dict[str, tuple[object, int]] = {}
         self.values = self.repeated = 0

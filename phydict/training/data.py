@@ -14,12 +14,13 @@ from phydict.datasets.cts.cache import read_arrays, write_arrays
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM, CachedPhantoms
 from phydict.datasets.phantoms.phantom import change_by_findings
 from phydict.grid import Grid
+from phydict.runtime.console import check_writable
 from phydict.runtime.seeds import check_seed
 from phydict.training.draws import MixedCases, _training_parts
 from phydict.units import HUWindow
 
-MOST_DRAWS = 10_000_000
-"""Draws of an epoch are listed before it begins."""
+MOST_DRAWS, MOST_WORKERS = 10_000_000, 1000
+"""Draws of an epoch are listed before it begins, and loader processes are all started then."""
 
 class PriorData(lightning.LightningDataModule):
     """Cases for training a prior.
@@ -56,10 +57,11 @@ class PriorData(lightning.LightningDataModule):
                  window: tuple[float, float] = (-1000.0, 1000.0)):
         super().__init__()
         check_seed(seed)
-        for name, value, least in (("epoch_size", epoch_size, 1), ("batch_size", batch_size, 1),
-                                   ("workers", workers, 0)):
-            if not least <= value <= MOST_DRAWS:
-                raise ValueError(f"data.{name} lies between {least} and {MOST_DRAWS:,}, but {value:,} was given")
+        for name, value, least, most in (
+                ("epoch_size", epoch_size, 1, MOST_DRAWS), ("batch_size", batch_size, 1, MOST_DRAWS),
+                ("workers", workers, 0, MOST_WORKERS), ("validation_phantoms", validation_phantoms, 0, MOST_DRAWS)):
+            if not least <= value <= most:
+                raise ValueError(f"data.{name} lies between {least} and {most:,}, but {value:,} was given")
         if not cts and not phantoms:
             raise ValueError("there is nothing to train on: give data.cts, or data.phantoms above 0")
         if phantoms < 0 or not 0 <= ct_fraction <= 1:
@@ -67,6 +69,7 @@ class PriorData(lightning.LightningDataModule):
                              f"{phantoms} and {ct_fraction} were given")
         if cts and Path(cache).resolve().is_relative_to(Path(cts).resolve()):
             raise ValueError(f"data.cache {cache} lies inside data.cts {cts}: give a folder elsewhere")
+        check_writable(Path(cache), "data.cache")
         window = HUWindow(*window)
         self.grid, self.window = Grid.cube(voxels, side), window
         self.phantoms = CachedPhantoms(0, phantoms, self.grid, window, Path(cache))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from pathlib import Path
@@ -36,6 +37,10 @@ class StageTraining(lightning.LightningModule, ABC):
                  warmup: int, decay_from: int, decay_steps: int, preview_steps: int, seed: int,
                  mask_weight: float = 0.0):
         super().__init__()
+        for name, value in (("learning_rate", learning_rate), ("weight_decay", weight_decay), ("warmup", warmup),
+                            ("decay_from", decay_from), ("decay_steps", decay_steps), ("preview_steps", preview_steps)):
+            if not 0 <= value < math.inf:
+                raise ValueError(f"model.{name} is a finite number, 0 or more, but {value} was given")
         self.prior, self.typical_std, self.preview_steps = prior, typical_std, preview_steps
         self.learning_rate, self.weight_decay = learning_rate, weight_decay
         self.warmup, self.decay_from, self.decay_steps = warmup, decay_from, decay_steps

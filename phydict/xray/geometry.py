@@ -20,8 +20,8 @@ ORBIT_KEYS = ("views", "source_to_detector", "source_to_isocentre", "shape", "pi
 ORBIT_OPTIONS = ("start_degrees", "arc_degrees", "start", "arc")
 MOST_RADIANS = 4 * math.pi
 """An angle in radians beyond two turns was meant in degrees."""
-MOST_MM = 1e9
-"""No length is this long: it would be that of a mistake, and overflow."""
+LEAST_MM, MOST_MM = 1e-6, 1e9
+"""No pixel's side is shorter, and no length as long: they would be those of a mistake, and underflow or overflow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +61,9 @@ class ConeBeam:
             value.setflags(write=False)
             object.__setattr__(self, name, value)
         width, height = np.linalg.norm(self.u, axis=1), np.linalg.norm(self.v, axis=1)
-        if min(width.min(), height.min()) <= 0:
-            raise ValueError("a beam's u and v must be non-zero steps in mm, but a zero step was given")
+        if min(width.min(), height.min()) < LEAST_MM:
+            raise ValueError(f"a beam's u and v, its pixels' sides, must be at least {LEAST_MM:g} mm long, but one of "
+                             f"{min(width.min(), height.min()):g} mm was given")
         slant = np.abs((self.u * self.v).sum(1)) / (width * height)
         if slant.max() > 1e-4:
             raise ValueError(f"view {slant.argmax()}: u must be perpendicular to v, but the cosine of their angle is "
@@ -86,7 +87,8 @@ class ConeBeam:
         """
         count, sizes = whole_sizes(views), whole_sizes(shape)
         if count is None or len(count) != 1:
-            raise ValueError(f"an orbit needs at least one view, a whole number, but views={views!r} was given")
+            raise ValueError(f"an orbit needs at least one view, a whole number, but views={reprlib.repr(views)} was "
+                             "given")
         if sizes is not None and len(sizes) == 2:
             _check_room(count[0], sizes)
         if not 0 < source_to_isocentre < source_to_detector < MOST_MM:

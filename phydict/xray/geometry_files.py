@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from phydict.runtime.reading import read_npy, read_text, reading
+from phydict.runtime.reading import read_npy, read_text, reading, reason
 from phydict.xray.geometry import ConeBeam
 from phydict.xray.rtk import check_beam, read_rtk, write_rtk
 
@@ -104,5 +104,5 @@ def _read_table(path: Path) -> np.ndarray:
     try:
         table = np.array(rows, float).reshape(len(rows), len(columns))
     except ValueError as error:
-        raise ValueError(f"{path}: {error}; give numbers in mm") from error
+        raise ValueError(f"{path}: {reason(error)[:100]}; give numbers in mm") from error
     return table[:, [columns.index(name) for name in COLUMNS]]

@@ -460,3 +460,10 @@ def test_augmentation_refuses_other_grids_and_cases_with_xrays(case):
         augment(case, 0)
     with pytest.raises(ValueError, match="deform it before projecting"):
         augment(case | {"xrays": torch.zeros(1, 2, 2)}, 0, GRID)
+
+
+def test_metadata_of_voxels_that_no_ct_has_are_refused(tmp_path, thorax):
+    file = save(tmp_path / "a.nii.gz", thorax)
+    for spacing in (1e30, 500.0, 1e-5):
+        with pytest.raises(ValueError, match="a.nii.gz has voxels .*; correct it in the metadata table"):
+            load_ct(file, Calibration(1, 0, (spacing,) * 3))

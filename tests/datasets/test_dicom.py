@@ -265,3 +265,15 @@ def test_dicom_and_other_images_are_not_mixed(tmp_path):
     folder = described(one(tmp_path, **angled(0.0)), beam=ConeBeam.orbit(2, 1020, 740, SHAPE, 70).to_dict())
     np.save(folder / "b.npy", counts()[0])
     fails(re.escape("DICOM files and others (b.npy)"), folder, intensity=LINES)
+
+
+def test_a_deflated_file_is_refused_before_it_grows(tmp_path):
+    file = one(tmp_path, **angled(0.0)) / "a.dcm"
+    file.write_bytes(file.read_bytes().replace(b"\x14\x001.2.840.10008.1.2.1\0", b"\x16\x001.2.840.10008.1.2.1.99"))
+    fails("a.dcm cannot be read .it is deflated as a whole, which is not read.; export it again, uncompressed",
+    tmp_path,
+          intensity=LINES)
+
+
+def test_a_file_without_its_size_says_so(tmp_path):
+    fails("a.dcm cannot be read .it lacks Rows.", one(tmp_path, Rows=None, **angled(0.0)), intensity=LINES)

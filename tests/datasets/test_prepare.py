@@ -523,3 +523,21 @@ def test_a_volume_with_two_rows_of_metadata_is_refused(tmp_path):
     (tmp_path / "m.csv").write_text("VolumeName,RescaleSlope,RescaleIntercept,XYSpacing,ZSpacing\n" + 2 * row)
     with pytest.raises(ValueError, match="a has two rows"):
         read_calibrations(tmp_path / "m.csv")
+
+
+@pytest.mark.parametrize("record", ["null", "3", "[]", '{"id": "a", "space": "patient", "extent": [1, 1, 1], '
+                                    '"window": [0, 1], "report": "", "row": [1]}'])
+def test_a_record_that_is_none_is_refused_by_name(tmp_path, thorax, record):
+    save(tmp_path / "a" / "ct.nii.gz", thorax)
+    (tmp_path / "a" / RECORD).write_text(record)
+    with pytest.raises(ValueError, match=f"{RECORD} cannot be read .it is damaged"):
+        find_cts(tmp_path)
+
+
+@pytest.mark.parametrize("option", ["--side=nan", "--window=[nan,nan]", "--voxels=many", "--work=2"])
+def test_an_option_that_cannot_be_is_one_sentence(tmp_path, capsys, option):
+    main = runpy.run_path(str(ROOT / "data" / "prepare_cts.py"))["main"]
+    with pytest.raises(SystemExit) as stopped:
+        main([str(tmp_path), str(tmp_path / "out"), option])
+    said = capsys.readouterr().err
+    assert stopped.value.code == 2 and said.startswith("error: ") and said.count("\n") == 1

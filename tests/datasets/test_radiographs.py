@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 
 import nibabel
@@ -62,10 +63,10 @@ def test_saved_png_is_read_back_to_half_a_step(tmp_path):
 def test_saving_again_leaves_no_old_report_and_refuses_to_mix_with_other_images(tmp_path):
     beam = ConeBeam.orbit(2, 1020, 740, SHAPE, 70)
     save_xrays(tmp_path, images(), beam, "old")
-    save_xrays(tmp_path, images(), beam)
+    save_xrays(tmp_path, images(), beam, overwrite=True)
     assert load_xrays(tmp_path)["report"] == ""
     with pytest.raises(FileExistsError, match="view_0.npy, view_1.npy"):
-        save_xrays(tmp_path, images(), beam, png=True)
+        save_xrays(tmp_path, images(), beam, png=True, overwrite=True)
 
 
 def test_saving_checks_the_xrays_against_the_beam(tmp_path):
@@ -360,3 +361,30 @@ def test_a_truncated_png_is_named(tmp_path):
 def test_a_stack_in_one_file_is_refused(tmp_path):
     fails(re.escape("has shape (2, 6, 5); give one 2D image per view"),
           write(tmp_path, [images()], orbit=ORBIT | {"views": 1}))
+
+
+@pytest.mark.parametrize("name", [b"view_1\xc2\xb23.npy", b"view_\xe9.npy", b"view\n1.npy", b"9" * 250 + b".npy"],
+                         ids=["a digit that is no number", "no UTF-8", "a line break", "250 digits"])
+def test_a_view_may_have_any_name(tmp_path, name):
+    write(tmp_path / "case", images())
+    (tmp_path / "case" / "view_1.npy").rename(tmp_path / "case" / os.fsdecode(name))
+    assert len(load_xrays(tmp_path / "case")["xrays"]) == 2
+
+
+def test_a_folder_whose_name_is_no_text_has_an_id_that_is(tmp_path):
+    case = load_xrays(write(tmp_path / os.fsdecode(b"caf\xe9"), images()))
+    assert case["id"].encode() == b"caf?"
+
+
+def test_a_report_of_a_library_is_refused(tmp_path):
+    write(tmp_path, images())
+    (tmp_path / "report.txt").write_text("Nodule. " * 100_000)
+    fails("report.txt has 800,000 bytes", tmp_path)
+
+
+@pytest.mark.parametrize("name", ["report.txt", "geometry.yaml", "view_0.npy"])
+def test_what_lies_in_a_folder_is_not_replaced_unless_asked_for(tmp_path, name):
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(FileExistsError, match=f"already holds {name}"):
+        save_xrays(tmp_path, images(), ConeBeam.orbit(2, 1020, 740, SHAPE, 70))
+    assert (tmp_path / name).read_text() == "mine" and len(list(tmp_path.iterdir())) == 1

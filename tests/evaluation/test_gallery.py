@@ -127,3 +127,8 @@ def test_bad_input_is_named(tmp_path):
         method_panel(tmp_path / "m.png", {"a": volume}, None, GRID, {"b": ""})
     with pytest.raises(ValueError, match="no volumes"):
         method_panel(tmp_path / "m.png", {}, volume, GRID)
+
+
+def test_dollars_in_a_title_are_no_formula(tmp_path):
+    panel(tmp_path / "p.png", air_with_block(HIGH, HIGH, MIDDLE), GRID, title="$\\frac$ and $x")
+    assert (tmp_path / "p.png").is_file()

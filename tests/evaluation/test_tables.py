@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import os
 import random
@@ -187,3 +188,18 @@ def test_bad_requests_are_named():
         mean_table(ROWS, by="prior")
     with pytest.raises(ValueError, match="dice"):
         mean_table(ROWS, metrics=["dice"])
+
+
+@pytest.mark.parametrize("content", [b"case,method\n" + b"x" * 200_000 + b",y\n", bytes(range(256)),
+"case\n".encode("utf-16")],
+                         ids=["long", "binary", "UTF-16"])
+def test_what_is_no_table_is_one_sentence_that_names_the_file(tmp_path, content):
+    (tmp_path / "t.csv").write_bytes(content)
+    with pytest.raises(ValueError, match=r"t\.csv cannot be read .*; repair or remove it$"):
+        read_csv(tmp_path / "t.csv")
+
+
+def test_brackets_in_a_case_are_no_markup_of_the_console():
+    console = Console(width=400, file=io.StringIO())
+    console.print(mean_table([{"case": "[/b]", "method": "a", "psnr": 3.0, "warning": "x"}]).console())
+    assert "[/b]" in console.file.getvalue()

@@ -176,3 +176,41 @@ def test_safetensors_without_a_prior_of_this_format_are_refused(tmp_path, metada
     save_file({"w": torch.zeros(2)}, tmp_path / "other.safetensors", metadata)
     with pytest.raises(ValueError, match="no phydict prior of format 1"):
         load_prior(tmp_path / "other.safetensors")
+
+
+def with_header(file, weights=None, **changes):
+    """The prior in `file` with parts of its header changed and further weights."""
+    with safe_open(file, "pt") as opened:
+        header = json.loads(opened.metadata()["phydict"])
+    save_file(load_file(file) | (weights or {}), file, {"phydict": json.dumps(header | changes)})
+    return file
+
+
+@pytest.mark.parametrize("network, words", [
+    ({"res_blocks": 100_000}, "network has 200,000 layers, more than 256"), ({"res_blocks": [100_000, 1]},
+    "res_blocks is"),
+    ({"channels": []}, "channels is"), ([], "network is"), ("x", "network is"), (3, "network is")])
+def test_a_header_of_more_layers_than_can_be_meant_is_refused_before_they_are_made(file, network, words):
+    whole = tiny_prior().network.settings | network if isinstance(network, dict) else network
+    with pytest.raises(ValueError, match=f"tiny.safetensors' contradicts itself: .*{words}"):
+        load_prior(with_header(file, {"long": torch.zeros(10**6, dtype=torch.bool), "none": torch.zeros(10**9, 0)},
+                               network=whole))
+
+
+@pytest.mark.parametrize("window", [[False, True], [-1000, 1e300], ["-1000", "600"], [-1000]])
+def test_a_window_is_two_numbers_of_hu(file, window):
+    with pytest.raises(ValueError, match="hu_window is .* where two numbers of HU are needed"):
+        load_prior(with_header(file, hu_window=window))
+
+
+def test_weights_of_eight_bits_are_no_trace(file):
+    load_prior(with_header(file, {"network.fold.bias": load_file(file)["network.fold.bias"].to(torch.float8_e4m3fn)}))
+
+
+@pytest.mark.parametrize("change", [{"vocabulary": ["a"] * 3}, {"vocabulary": []}, {"width": 7}])
+def test_a_text_encoder_that_contradicts_its_header_names_the_file(file, change):
+    with safe_open(file, "pt") as opened:
+        text = json.loads(opened.metadata()["phydict"])["text"]
+    prior = load_prior(with_header(file, text=text | change))
+    with pytest.raises(ValueError, match="tiny.safetensors' contradicts itself: the text encoder"):
+        prior.bind(REPORTS[0])

@@ -65,10 +65,11 @@ def test_distances_are_perpendicular_to_the_detector():
 
 
 @pytest.mark.parametrize("changes, sentence", [
+    ({"u": [[1e-160, 0, 0]] * 2, "v": [[0, 0, -1e-160]] * 2}, "at least 1e-06 mm long"),
     ({"sources": [[0, 0, 0]]}, "1 sources, but 2 rows in detectors"),
     ({"u": [[1, 0], [1, 0]]}, r"u must be \(views, 3\)"),
     ({"detectors": [[0, float("nan"), 0], [0, 1, 0]]}, "detectors must be finite"),
-    ({"v": [[0, 0, 0], [0, 0, 1]]}, "zero step"),
+    ({"v": [[0, 0, 0], [0, 0, 1]]}, "one of 0 mm"),
     ({"u": [[-4, 0, 1], [4, 0, 0]]}, "view 0: u must be perpendicular to v"),
     ({"sources": [[10, 280, 0], [0, 740, 0]]}, "view 0: the source lies in the plane"),
     ({"shape": [4]}, "two positive sizes"),

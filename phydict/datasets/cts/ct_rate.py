@@ -24,7 +24,7 @@ from phydict.datasets.cts.segmentations import is_segmentation
 from phydict.datasets.cts.transforms import Calibration, case_id, prepare_ct
 from phydict.datasets.natural_order import natural_order
 from phydict.grid import Grid
-from phydict.runtime.reading import read_ids
+from phydict.runtime.reading import name_of, read_ids
 from phydict.units import HUWindow
 
 NAME = re.compile(r"(?P<patient>(?:train|valid)_\d+)_(?P<scan>[a-z]+)_(?P<reconstruction>\d+)", re.IGNORECASE)
@@ -125,10 +125,10 @@ def _nifti_files(root: Path) -> list[Path]:
 
 def _id(path: Path, root: Path) -> str:
     if is_prepared(path):
-        return path.absolute().parent.name
+        return name_of(path.absolute().parent)
     name = case_id(path)
     inner = path.relative_to(root).parts if root.is_dir() else ()
-    return name if NAME.fullmatch(name) or len(inner) < 2 else f"{inner[0]}__{name}"
+    return name if NAME.fullmatch(name) or len(inner) < 2 else f"{name_of(inner[0])}__{name}"
 
 
 def _own_report(path: Path) -> str:

@@ -63,8 +63,9 @@ def _rows(path: str | Path, columns: tuple[str, ...]) -> list[dict[str, str]]:
     for file in files:
         for number, row in enumerate(_table(file, columns), 2):
             id = case_id(row["VolumeName"] or "")
-            if not id:
-                raise ValueError(f"row {number} of {file} has no VolumeName; fill it in or remove that row")
+            if not 0 < len(id) < 256:
+                raise ValueError(f"row {number} of {file} has no VolumeName that is one of a file; fill it in or "
+                                 "remove that row")
             if id in rows:
                 raise ValueError(f"{id} has two rows, the second in row {number} of {file}; keep one row per volume")
             rows[id] = row

@@ -16,7 +16,7 @@ import pydicom
 from pydicom.errors import InvalidDicomError
 
 from phydict.datasets.cts.transforms import LEAST_SLICES, to_ras
-from phydict.datasets.dicom import read_dicom
+from phydict.datasets.dicom import open_dicom, read_dicom
 from phydict.datasets.natural_order import natural_order
 from phydict.runtime.reading import reading
 
@@ -43,7 +43,7 @@ def find_series(root: Path) -> list[Series]:
         if path.name.lower().endswith((".nii", ".nii.gz")) or path.name.upper() == "DICOMDIR":
             continue
         try:
-            header = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=["SeriesInstanceUID", "SeriesNumber"])
+            header = open_dicom(path, stop_before_pixels=True, specific_tags=["SeriesInstanceUID", "SeriesNumber"])
             number = header.get("SeriesNumber")
             uid = str(header.get("SeriesInstanceUID") or path.parent)
         except InvalidDicomError:
@@ -93,7 +93,7 @@ def load_series(series: Series) -> tuple[np.ndarray, np.ndarray]:
 
 def _header(path: Path) -> pydicom.Dataset:
     with reading(f"the DICOM file {path}", "export it again"):
-        header = pydicom.dcmread(path, stop_before_pixels=True)
+        header = open_dicom(path, stop_before_pixels=True)
         for keyword in (*NEEDED, *SAME, "Modality", "ImageType", "NumberOfFrames"):
             header.get(keyword)  # which is decoded only now
         return header

@@ -80,6 +80,8 @@ def read_record(path: Path) -> dict:
     file = path.parent / RECORD
     with reading(file, "remove its folder and prepare that CT again"):
         record = json.loads(read_text(file))
+        if not isinstance(record, dict):
+            raise ValueError(f"it is damaged: it holds {reprlib.repr(record)}")
         for name, kind in (("id", str), ("space", str), ("extent", list), ("window", list), ("report", str),
                            ("row", dict)):
             if not isinstance(record[name], kind):

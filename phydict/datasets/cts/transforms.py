@@ -16,7 +16,7 @@ import torch
 from phydict.datasets.cts.anatomy import lung_box_centre, segment
 from phydict.datasets.nifti_file import open_nifti
 from phydict.grid import Grid
-from phydict.runtime.reading import reading
+from phydict.runtime.reading import name_of, reading
 from phydict.runtime.warning import warn
 from phydict.units import HUWindow
 
@@ -101,21 +101,27 @@ def _check_header(path: Path, header, calibration: Calibration | None) -> None:
         raise ValueError(f"{path} has {min(shape)} slices (its shape is {tuple(shape)}), but a chest CT has at least "
                          f"{LEAST_SLICES}; give the whole series")
     if calibration is not None:
-        return
+        return _check_affine(path, calibration.affine(), "correct it in the metadata table")
     codes = [int(header[name]) for name in ("sform_code", "qform_code") if name in header]
     if not any(codes):
         raise ValueError(f"{path} does not say how the patient lies (neither sform nor qform is set); convert it from "
                          "DICOM again, or read CT-RATE v1 files with data.fixed false and their metadata table")
     affine = header.get_best_affine()
     axes = affine[:3, :3]
-    if not np.isfinite(axes).all() or abs(np.linalg.det(axes)) < 1e-6:
-        raise ValueError(f"{path} has voxels without volume (affine {axes.tolist()}); convert it from DICOM again")
-    if not (np.abs(affine[:3]) < FURTHEST).all() or np.linalg.norm(axes, axis=0).max() > LARGEST_VOXEL:
-        raise ValueError(f"{path} has voxels of {np.linalg.norm(axes, axis=0).max():g} mm, or lies at "
-                         f"{affine[:3, 3].tolist()} mm, which no CT does; convert it from DICOM again")
+    _check_affine(path, affine, "convert it from DICOM again")
     if np.allclose(axes, np.eye(3)) and shape[0] >= 512:
         warn(f"{path} has the blank header of CT-RATE v1 (1 mm voxels, identity axes); "
              "read such files with data.fixed false and their metadata table")
+
+
+def _check_affine(path: Path, affine: np.ndarray, advice: str) -> None:
+    """Raises ValueError unless a 4x4 affine gives voxels a volume, no larger and no further away than a CT's."""
+    axes = affine[:3, :3]
+    if not np.isfinite(axes).all() or abs(np.linalg.det(axes)) < 1e-6:
+        raise ValueError(f"{path} has voxels without volume (affine {axes.tolist()}); {advice}")
+    if not (np.abs(affine[:3]) < FURTHEST).all() or np.linalg.norm(axes, axis=0).max() > LARGEST_VOXEL:
+        raise ValueError(f"{path} has voxels of {np.linalg.norm(axes, axis=0).max():g} mm, or lies at "
+                         f"{affine[:3, 3].tolist()} mm, which no CT does; {advice}")
 
 
 def check_hu(hu: np.ndarray, name: str) -> None:
@@ -206,7 +212,7 @@ def centred(grid: Grid, centre: np.ndarray) -> Grid:
 
 def case_id(path: str | Path) -> str:
     """A file's name without .nii or .nii.gz."""
-    name = Path(path).name
+    name = name_of(path)
     for ending in (".nii.gz", ".nii"):
         if name.lower().endswith(ending):
             return name[: -len(ending)]

@@ -7,6 +7,7 @@ DICOM with one or more frames, in the natural order of their names: view_2 comes
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,11 +22,13 @@ from phydict.datasets.natural_order import natural_order
 from phydict.datasets.radiographs.xray_description import GEOMETRY, Description, read_description
 from phydict.datasets.radiographs.xray_images import ENDINGS, image_files, is_dicom, read_image
 from phydict.datasets.reports import format_report
-from phydict.runtime.reading import read_text
+from phydict.runtime.reading import name_of, read_text
 from phydict.runtime.shipped import own_or_shipped
 from phydict.xray.geometry import ConeBeam
 
 REPORT = "report.txt"
+MOST_REPORT = 2**18
+"""Bytes of the longest report, some 40,000 words."""
 SATURATED = 0.99
 """The share of an image's pixels that may not be all as dense as its densest."""
 
@@ -92,17 +95,19 @@ def load_xrays(folder: str | Path, geometry: str | Path | None = None, intensity
         raise ValueError(f"{views.names[saturated.argmax()]} shows nothing: {SATURATED:.0%} of its pixels or more hold "
                          "its densest value, as in a missing or saturated image; export it again, or leave the view "
                          "out of the images and of the geometry")
-    return {"id": folder.absolute().name, "beam": beam, "report": _read_report(folder / REPORT),
+    return {"id": name_of(folder.absolute()), "beam": beam, "report": _read_report(folder / REPORT),
             "xrays": torch.from_numpy(described.orientation.apply(xrays).astype(np.float32)),
             "display": intensity.kind == "display"}
 
 
 def save_xrays(folder: str | Path, xrays: torch.Tensor | np.ndarray, beam: ConeBeam, report: str = "",
-               png: bool = False) -> None:
+               png: bool = False, overwrite: bool = False) -> None:
     """Write line integrals (K, V, U) as view_<k>.npy, or 16-bit PNG, with geometry.yaml and report.txt.
 
     `load_xrays` reads them back: NPY as float32 exactly, PNG to half a step of range / 65535.
-    Raises ValueError where the X-rays do not fit the beam, FileExistsError where other images lie in the folder.
+    overwrite: whether a case that lies there is replaced, its report included.
+    Raises ValueError where the X-rays do not fit the beam, FileExistsError where other images lie in the folder, or a
+    case that is not to be replaced.
     """
     xrays = np.asarray(xrays, np.float32)
     if xrays.shape != (beam.views, *beam.shape):
@@ -116,6 +121,9 @@ def save_xrays(folder: str | Path, xrays: torch.Tensor | np.ndarray, beam: ConeB
     others = [file.name for file in image_files(folder) if file.name not in names]
     if others:
         raise FileExistsError(f"{folder} already holds other images ({', '.join(others)}); give an empty folder")
+    there = [name for name in (*names, GEOMETRY, REPORT) if os.path.lexists(folder / name)]
+    if there and not overwrite:
+        raise FileExistsError(f"{folder} already holds {', '.join(there[:3])}; give another folder, or overwrite=True")
     low, high = float(xrays.min()), float(xrays.max())
     scale = max(high - low, 1e-6) / 65535
     for name, image in zip(names, xrays):
@@ -205,4 +213,4 @@ def _mean(paths: list[Path], shape: tuple[int, int]) -> np.ndarray:
 
 
 def _read_report(path: Path) -> str:
-    return format_report(read_text(path)) if path.is_file() else ""
+    return format_report(read_text(path, MOST_REPORT)) if path.is_file() else ""

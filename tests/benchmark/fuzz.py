@@ -1,0 +1,148 @@
+"""The fuzzers of tests/fuzzing.py for as long as there is time: by Hypothesis, and by atheris where it is installed.
+
+    python tests/benchmark/fuzz.py <hypothesis or atheris> <target> <seconds>
+
+runs one of them on one target and prints what it found; robustness.py runs all of them.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+from pathlib import Path
+
+TESTS = Path(__file__).parents[1]
+sys.path.insert(0, str(TESTS))
+MOST_KB = 3 * 2**20
+FINDINGS = Path(os.environ.get("FUZZ_FINDINGS", tempfile.gettempdir())) / "fuzz_findings"
+
+
+class Found:
+    """What a fuzzer found, each fault once, by its kind and place."""
+
+    def __init__(self, name: str):
+        self.name, self.runs, self.read, self.faults = name, 0, 0, {}
+
+    def run(self, target, content: bytes, folder: Path) -> None:
+        from fuzzing import check
+
+        self.runs += 1
+        signal.alarm(15)
+        try:
+            self.read += check(target, content, folder)
+        except BaseException as error:
+            if isinstance(error, KeyboardInterrupt | SystemExit) and not isinstance(error, TimeoutError):
+                raise
+            place = [f for f in traceback.extract_tb((
+            error.__cause__ or error).__traceback__) if "phydict" in f.filename]
+            key = type(error).__name__
+            if place:
+                key += f" {place[-1].filename.rpartition('phydict/')[2]}:{place[-1].lineno}"
+            key += " " + re.sub(r"[0-9]+", "#", str(error).rpartition("/")[2])[:60]
+            if key not in self.faults:
+                self.faults[key] = repr(error)[:500]
+                FINDINGS.mkdir(parents=True, exist_ok=True)
+                number = len(list(FINDINGS.iterdir()))
+                (FINDINGS / f"{number:03d}-{self.name.replace(' ', '_')}-{target.name}").write_bytes(content)
+                print(f"{self.name}: {key}\n    {self.faults[key]}", flush=True)
+        finally:
+            signal.alarm(0)
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        if peak > MOST_KB and "memory" not in self.faults:
+            self.faults["memory"] = f"{peak / 2**20:.1f} GiB"
+            FINDINGS.mkdir(parents=True, exist_ok=True)
+            (FINDINGS / f"memory-{self.name}-{target.name}").write_bytes(content)
+            print(f"{self.name}: memory {peak / 2**20:.1f} GiB", flush=True)
+
+    def tell(self) -> None:
+        print("RESULT " + json.dumps({"target": self.name, "runs": self.runs, "read": self.read,
+                                      "faults": list(self.faults)}), flush=True)
+
+
+def _late(*_):
+    raise TimeoutError("more than 15 s")
+
+
+def by_hypothesis(name: str, seconds: float) -> None:
+    from fuzzing import TARGETS, contents
+    from hypothesis import HealthCheck, Phase, given, seed, settings
+
+    signal.signal(signal.SIGALRM, _late)
+    found, end, turn = Found(name), time.monotonic() + seconds, 0
+    with tempfile.TemporaryDirectory() as folder:
+        while time.monotonic() < end:
+            @seed(turn)
+            @settings(max_examples=200, deadline=None, database=None, phases=[Phase.generate],
+                      suppress_health_check=list(HealthCheck))
+            @given(contents(name))
+            def once(content):
+                if time.monotonic() < end:
+                    found.run(TARGETS[name], content, Path(folder))
+
+            once()
+            turn += 1
+    found.tell()
+
+
+def by_atheris(name: str, seconds: float) -> None:
+    import atheris
+
+    with atheris.instrument_imports(include=["phydict", "yaml", "pydicom", "nibabel"]):
+        from fuzzing import TARGETS
+
+    target, found, end = TARGETS[name], Found(name), time.monotonic() + seconds
+    with tempfile.TemporaryDirectory() as folder:
+        corpus, work = Path(folder) / "corpus", Path(folder) / "work"
+        corpus.mkdir(), work.mkdir()
+        for n, sample in enumerate(target.samples()):
+            (corpus / f"{n}").write_bytes(sample)
+        words = Path(folder) / "words"
+        words.write_text("".join('"' + "".join(f"\\x{byte:02x}" for byte in piece) + '"\n' for piece in target.pieces
+                                 if len(piece) < 60))
+
+        def once(content: bytes) -> None:
+            signal.signal(signal.SIGALRM, _late)
+            if time.monotonic() > end:
+                found.tell()
+                os._exit(0)
+            found.run(target, content, work)
+
+        atheris.Setup([sys.argv[0], str(corpus), f"-dict={words}", "-max_len=200000", "-rss_limit_mb=6000",
+        "-timeout=60",
+                       "-verbosity=0", f"-artifact_prefix={folder}/"], once, enable_python_coverage=True)
+        atheris.Fuzz()
+
+
+def fuzz(seconds: float, engines: tuple[str, ...] = ("hypothesis", "atheris")) -> list[dict]:
+    """Runs every engine on every target, each in a process of its own, with equal shares of the time."""
+    from fuzzing import TARGETS
+
+    results = []
+    for engine in engines:
+        if engine == "atheris" and subprocess.run([sys.executable, "-c", "import atheris"],
+            capture_output=True).returncode:
+            print("atheris is not installed: its fuzzers are left out")
+            continue
+        for name in TARGETS:
+            share = seconds / len(engines) / len(TARGETS)
+            done = subprocess.run([sys.executable, __file__, engine, name, str(share)], capture_output=True, text=True,
+                                  timeout=10 * share + 300)
+            told = [line for line in done.stdout.splitlines() if line.startswith("RESULT ")]
+            print("\n".join(line for line in done.stdout.splitlines() if not line.startswith("RESULT ")))
+            if not told:
+                print(f"{engine}, {name}: it ended with {done.returncode}: {done.stderr[-1500:]}")
+            results += [{"engine": engine, "seconds": share} | json.loads(line[7:]) for line in told]
+            print(results[-1] if results else "", flush=True)
+    return results
+
+
+if __name__ == "__main__":
+    {"hypothesis": by_hypothesis, "atheris": by_atheris}[sys.argv[1]](sys.argv[2], float(sys.argv[3]))

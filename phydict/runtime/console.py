@@ -36,9 +36,9 @@ CONFIGURATION = ("-c", "--config")
 def _bounded(text: str) -> object:
     """A value or a file of the command line's parser, read within `read_yaml`'s bounds; "a:" and "{a}" stay text."""
     value = parse_yaml(text, "the value")
-    if isinstance(value, dict) and value and all(part is None for part in value.values()):
-        if text.strip() == f"{next(iter(value))}:" or (text.strip().startswith("{") and ":" not in text):
-            return text
+    bare, text_alone = text.strip(), isinstance(value, dict) and value and all(v is None for v in value.values())
+    if text_alone and (bare == f"{next(iter(value))}:" or (bare.startswith("{") and ":" not in bare)):
+        return text
     return value
 
 

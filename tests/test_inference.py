@@ -42,14 +42,13 @@ from phydict.xray import ConeBeam, Ideal, Polychromatic, Projector
 from phydict.xray.geometry_files import write_beam
 
 ROOT = Path(__file__).parents[1]
-CONFIGS = ROOT / "configs" / "reconstruct"
 BEAM = ConeBeam.orbit(3, 1020.0, 740.0, (24, 24), 24.0)
 ORBIT = ["--data.views=3", "--data.detector=[24,24]", "--data.pixel=[24,24]"]
 FILES = ["panel.png", "reconstruction.json", "volume.nii.gz"]
 
 
 def sirt(command: str, out: Path, *more: str) -> list[str]:
-    return [command, f"--config={CONFIGS / 'sirt.yaml'}", "--model.method.init_args.iterations=3",
+    return [command, "--model.method=sirt", "--model.method.init_args.iterations=3",
             f"--model.out={out}", "--trainer.accelerator=cpu", *more]
 
 
@@ -58,7 +57,7 @@ def phantoms(out: Path, count: int, *more: str) -> list[str]:
 
 
 def with_prior(command: str, out: Path, prior: Path, *more: str) -> list[str]:
-    return [command, f"--config={CONFIGS / 'prior_only.yaml'}", "--model.method.init_args.iterations=2",
+    return [command, "--model.method=prior_only", "--model.method.init_args.iterations=2",
             f"--model.prior={prior}", f"--model.out={out}", "--trainer.accelerator=cpu", *more]
 
 
@@ -587,7 +586,7 @@ def test_python_gives_the_volume_of_a_test_by_the_cases_seed(prior, cts, tmp_pat
 
 
 def test_the_default_method_reconstructs_with_a_prior(prior, measured, tmp_path):
-    main(["test", f"--config={CONFIGS / 'phydict_fast.yaml'}", "--model.method.init_args.iterations=3", *ORBIT,
+    main(["test", "--model.method.init_args.iterations=3", *ORBIT,
           f"--model.prior={prior}", f"--model.out={tmp_path}", "--data.cts=phantom", "--data.phantoms=1",
           "--data.with_report=false", "--trainer.accelerator=cpu"])
     said = record(tmp_path / "phydict_fast" / "phantom-1000000")
@@ -613,7 +612,7 @@ def test_other_xrays_into_a_finished_folder_are_refused(scored, capsys):
 
 
 def test_realistic_xrays_are_made_and_come_out_in_hu(scored, tmp_path):
-    realistic = f"--config={CONFIGS.parent / 'simulate' / 'polychromatic.yaml'}"
+    realistic = f"--config={ROOT / 'configs' / 'simulate' / 'polychromatic.yaml'}"
     main(phantoms(tmp_path, 1, realistic, "--data.simulator.kvp=70"))
     folder = "sirt/phantom-1000000"
     said, density = record(tmp_path / folder), volume(tmp_path / folder) + 1000
@@ -1034,11 +1033,12 @@ def test_a_prior_refuses_xrays_of_another_grid(prior):
 
 
 @pytest.mark.parametrize("args, words", [
-    ([], ["predict", "test", "ablate", "such as: predict -c"]), (["reconstruct"], ["'reconstruct'", "ablate"]),
-    (["--data.xrays", "somewhere"], ["predict", "test", "ablate"]), (["predict"], ["-c configs/reconstruct/"]),
-    (["test", "--data.cts", "phantom"], ["-c configs/reconstruct/"]), (["ablate"], ["-c configs/ablate/"]),
+    ([], ["predict", "test", "ablate", "such as: predict --data.xrays"]), (["reconstruct"], ["'reconstruct'", "ablate"]),
+    (["--data.xrays", "somewhere"], ["predict", "test", "ablate"]), (["predict"], ["needs data.xrays"]),
+    (["test"], ["needs data.cts"]), (["ablate"], ["-c configs/ablate/"]),
     (["ablate", "--phantoms", "3"], ["-c configs/ablate/"])], ids=lambda value: " ".join(value)[:20])
-def test_a_missing_command_or_configuration_says_what_to_give(args, words, capsys):
+def test_a_missing_command_or_input_says_what_to_give(args, words, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     said = refusal(capsys, args)
     assert all(word in said for word in words), said
 
@@ -1050,6 +1050,8 @@ def test_a_missing_command_or_configuration_says_what_to_give(args, words, capsy
     (["--model.method.init_args.iteration=3"], ["iteration"]),
     (["--data.source_to_isocentre=2000"], ["isocentre"]),
     (["--config=nowhere.yaml"], ["nowhere.yaml"]),
+    (["--model.method=srit"], ["no method 'srit'", "sirt", "phydict_fast", "phydict.posterior.DDS"]),
+    (["--config={model: {method: 3}}"], ["model.method"]),
     (["--model.precision=half"], ["precision is auto, float32 or bfloat16, but 'half' was given"]),
 ], ids=lambda value: value[0] if value[0].startswith("--") else "")
 def test_a_bad_argument_is_one_sentence(change, words, tmp_path, capsys):
@@ -1058,13 +1060,24 @@ def test_a_bad_argument_is_one_sentence(change, words, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
+def test_a_config_file_names_its_method_and_is_told_of_one_that_is_none(measured, tmp_path, capsys):
+    (tmp_path / "mine.yaml").write_text("model: {method: sirt, seed: 4}")
+    args = ["predict", "-c", str(tmp_path / "mine.yaml"), "--model.method.init_args.iterations=2",
+            f"--data.xrays={measured / 'anna'}", f"--model.out={tmp_path / 'out'}", "--trainer.accelerator=cpu"]
+    main(args)
+    settings = record(tmp_path / "out" / "sirt" / "anna")["settings"]
+    assert settings["method"]["class"] == "SIRT" and settings["method"]["iterations"] == 2 and settings["seed"] == 4
+    (tmp_path / "mine.yaml").write_text("model: {method: srit}")
+    assert "no method 'srit'" in refusal(capsys, args)
+
+
 def test_an_unknown_key_of_a_config_file_is_named(tmp_path, capsys):
     (tmp_path / "mine.yaml").write_text("model:\n  guidence: 2.0\n")
     assert "model.guidence" in refusal(capsys, phantoms(tmp_path / "out", 1, f"--config={tmp_path / 'mine.yaml'}"))
 
 
 def test_an_impossible_setting_is_named_without_the_parsers_noise(prior, tmp_path, capsys):
-    said = refusal(capsys, ["test", f"--config={CONFIGS / 'phydict_fast.yaml'}", f"--model.prior={prior}",
+    said = refusal(capsys, ["test", f"--model.prior={prior}",
                             "--model.method.init_args.iterations=0"])
     assert "at least one iteration, but 0" in said and "Union" not in said
 

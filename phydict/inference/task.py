@@ -45,7 +45,7 @@ class ReconstructionTask(lightning.LightningModule):
 
     Args:
         method: a Sampler, which is run with the prior, or a Reconstructor
-        name: what tables and folders call the method
+        name: what tables and folders call the method; none given: the name it was given by, or its class's
         prior: the prior's file, or a file or folder of MedSyn's, read where the method is a Sampler
         guidance: scale of classifier-free guidance when a report is given; 1: none
         super_resolution: file of a cascade's second stage, which refines what the prior gives; none given: none
@@ -65,7 +65,7 @@ class ReconstructionTask(lightning.LightningModule):
         side: side of the cube in mm, for methods without a prior
     """
 
-    def __init__(self, method: Sampler | Reconstructor, name: str,
+    def __init__(self, method: Sampler | Reconstructor, name: str | None = None,
                  prior: str | MedSynCheckpoint = str(DEFAULT_PRIOR), guidance: float = 1.0,
                  super_resolution: str | MedSynCheckpoint | None = None, sr_guided: bool = True,
                  sr_sampler: Sampler | None = None, sr_noise_augmentation: float | None = None, sr_memory: float = 4.0,
@@ -73,6 +73,7 @@ class ReconstructionTask(lightning.LightningModule):
                  side: float = 384.0, samples: int = 1, precision: str = "auto"):
         super().__init__()
         check_seed(seed)
+        name = type(method).__name__ if name is None else name
         if name in ("", "..") or name != Path(name).name:
             raise ValueError(f"model.name is the name of one folder inside model.out, but '{name}' was given")
         self.method_name, self.seed, self.pages = name, seed, Path(out) / "dry_run"

@@ -88,10 +88,9 @@ def check_command(args: Sequence[str], commands: Mapping[str, str], anywhere: Co
                          f"of {told}; such as: {example}")
 
 
-def check_configured(args: Sequence[str], options: Collection[str], example: str) -> None:
-    """Raises ValueError where `args` hold none of the options that say what to run, and do not ask for help."""
-    options = ("-c", "--config", "-h", "--help", *options)
-    if not any(arg.partition("=")[0] in options or arg.startswith("-c") for arg in args):
+def check_configured(args: Sequence[str], example: str) -> None:
+    """Raises ValueError where `args` name no configuration, and do not ask for help."""
+    if not any(arg.partition("=")[0] in (*CONFIGURATION, "-h", "--help") or arg.startswith("-c") for arg in args):
         raise ValueError(f"no configuration file was given: add -c <file>, such as -c {example}")
 
 
@@ -124,23 +123,24 @@ def check_apart(output: Path, option: str, inputs: Iterable[Path]) -> None:
 
 
 def read_configurations(args: Sequence[str]) -> list[dict]:
-    """What the configuration files hold that a command line names with -c or --config, in their order.
-
-    They are read as `read_yaml` reads, so that what it refuses never reaches the command line's own parser. Files that
-    are not there are left to that. Raises ValueError.
-    """
+    """What the configuration files hold that a command line names, in their order; files that are not there are left
+    to the command line's own parser. Raises ValueError as `read_configuration` does."""
     look = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     look.add_argument("--config", "-c", action="append", default=[])
     given, _ = look.parse_known_args(list(args))
-    found = {file: read_yaml(file) for file in given.config if os.path.isfile(file)}
-    for file, settings in found.items():
-        if not isinstance(settings, dict):
-            raise ValueError(f"{file} holds no settings: it is a mapping, such as `model: {{...}}`")
-        for name in ("model", "data", "trainer"):
-            if not isinstance(settings.get(name, {}), dict):
-                raise ValueError(f"{file}: `{name}` is a mapping of settings, but {reprlib.repr(settings[name])} was "
-                                 "given")
-    return list(found.values())
+    return [read_configuration(file) for file in given.config if os.path.isfile(file)]
+
+
+def read_configuration(file: str) -> dict:
+    """What a configuration file holds, read as `read_yaml` reads, so that what it refuses never reaches the command
+    line's own parser. Raises ValueError."""
+    settings = read_yaml(file)
+    if not isinstance(settings, dict):
+        raise ValueError(f"{file} holds no settings: it is a mapping, such as `model: {{...}}`")
+    for name in ("model", "data", "trainer"):
+        if not isinstance(settings.get(name, {}), dict):
+            raise ValueError(f"{file}: `{name}` is a mapping of settings, but {reprlib.repr(settings[name])} was given")
+    return settings
 
 
 def sentence(error: Exception) -> str:

@@ -34,8 +34,7 @@ def compared(stage: str, views: int, cts: str) -> list[dict]:
             "guided": [f"--model.super_resolution={stage}"]}
     with tempfile.TemporaryDirectory() as out:
         for name, arguments in runs.items():
-            subprocess.run([sys.executable, "infer.py", "test", "-c", "configs/reconstruct/phydict_fast.yaml",
-                            f"--data.cts={cts}", f"--data.views={views}", f"--model.out={out}", f"--model.name={name}",
+            subprocess.run([sys.executable, "infer.py", "test", f"--data.cts={cts}", f"--data.views={views}", f"--model.out={out}", f"--model.name={name}",
                             *arguments], cwd=ROOT, check=True)
             scores = {row["case"]: row for row in read_csv(Path(out) / name / "results.csv")}
             for ct in find_cts(cts):

@@ -217,6 +217,21 @@ def test_named_variants_change_a_method_under_the_axes(tmp_path):
     assert changed(one.method, {"likelihood.reward.lpips": 1.0, "iterations": 50}, "method") == METHODS["phydict_paper"]
 
 
+@pytest.mark.parametrize("content", [
+    {"axes": {"method": ["phydict_fast"], "method.init_args.likelihood.variation": [1]}},
+    {"base": {"method.likelihood.variation": 1}, "axes": {"method": ["phydict_fast"]}},
+    {"methods": {"mine": {"of": "phydict_fast", "method.likelihood.variation": 1}}},
+    {"axes": {"method": ["phydict_fast"], "method.likelihood": [{"init_args": {"variation": 1}}]}}])
+def test_an_old_setting_is_refused_with_its_new_name(tmp_path, content):
+    with pytest.raises(ValueError, match="likelihood.*variation is now tv_weight: rename it"):
+        read_specification(write(tmp_path, **content))
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "configs" / "ablate").glob("*.yaml")), ids=lambda file: file.stem)
+def test_every_shipped_comparison_is_one(file):
+    assert read_specification(file, phantoms=1).trials
+
+
 def test_settings_that_hold_each_other_are_changed_together():
     method = changed(METHODS["pnp_dm"], {"iterations": 8, "burn_in": 6}, "method")
     assert (method.iterations, method.burn_in) == (8, 6)

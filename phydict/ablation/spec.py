@@ -21,6 +21,7 @@ from phydict.methods import METHODS
 from phydict.posterior import Sampler
 from phydict.prior import DEFAULT_PRIOR, fingerprint, load_prior
 from phydict.reconstruction import Reconstructor, describe
+from phydict.runtime.renamed import check_setting
 from phydict.runtime.seeds import check_seed
 from phydict.runtime.shipped import configuration
 from phydict.runtime.yaml_file import read_yaml
@@ -347,7 +348,8 @@ def key(trial: Trial, case: str, source: str) -> str:
 
 
 def _dotted(settings: Mapping) -> dict:
-    """Settings, their names without the init_args of infer.py's configuration files."""
+    """Settings, their names without the init_args of infer.py's configuration files. Raises ValueError for old names."""
+    check_setting("", settings)
     return {".".join(part for part in str(name).split(".") if part != "init_args"): value
             for name, value in settings.items()}
 

@@ -15,6 +15,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from phydict.runtime.renamed import check_options, check_setting
 from phydict.runtime.shipped import configuration
 from phydict.runtime.yaml_file import read_yaml
 
@@ -81,11 +82,12 @@ def with_configurations(args: list[str], kinds: tuple[str, ...]) -> list[str]:
 
 def check_command(args: Sequence[str], commands: Mapping[str, str], anywhere: Collection[str], example: str) -> None:
     """Raises ValueError, in one sentence that names `commands`, name -> what it does, and an example, where no argument
-    is one of those that may stand `anywhere`, and none asks for help."""
+    is one of those that may stand `anywhere`, and none asks for help, or where an option has an old name."""
     if not any(arg in anywhere or arg in ("-h", "--help") or arg.startswith("--print_config") for arg in args):
         told = ", ".join(f"{name} ({what})" for name, what in commands.items())
         raise ValueError(f"the first word says what to do, but {repr(args[0]) if args else 'none'} was given: use one "
                          f"of {told}; such as: {example}")
+    check_options(args)
 
 
 def check_configured(args: Sequence[str], example: str) -> None:
@@ -140,6 +142,10 @@ def read_configuration(file: str) -> dict:
     for name in ("model", "data", "trainer"):
         if not isinstance(settings.get(name, {}), dict):
             raise ValueError(f"{file}: `{name}` is a mapping of settings, but {reprlib.repr(settings[name])} was given")
+    try:
+        check_setting("", settings)
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from error
     return settings
 
 

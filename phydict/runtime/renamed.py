@@ -1,0 +1,61 @@
+"""Settings and classes that once had another name or place: the old one is refused with the new one's."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+SAMPLER = {
+    "fresh_noise": "noise_fraction", "overshoot": "momentum", "randomised_noise": "sampling_noise",
+    "warm_start": "t_start", "last": "t_end", "refine_from": "ec_delta", "refine_iterations": "ec_steps",
+    "refine_guided": "ec_guided", "at_zero": "final_denoise", "renewed": "eta (of DDS) or zeta (of DiffPIR)"}
+LIKELIHOOD = {"variation": "tv_weight", "edge": "tv_eps", "refit": "refit_scatter",
+              "weighted": "weighted_least_squares"}
+FIELDS = {"method": SAMPLER, "sr_sampler": SAMPLER, "likelihood": LIKELIHOOD, "final_likelihood": LIKELIHOOD,
+          "augmentation": {"waves": "elastic_mm", "gain": "hu_scale", "offset": "hu_offset"}}
+"""Of the settings in each place, old name -> new name."""
+
+PLACES = {
+    "model.guide_fine": "model.sr_guided", "model.fine_sampler": "model.sr_sampler",
+    "model.fine_noise": "model.sr_noise_augmentation", "model.fine_memory": "model.sr_memory",
+    "model.montage_steps": "model.preview_steps", "model.text_steps": "model.text_pretrain_steps"}
+"""Old path of a setting -> new path."""
+
+MODULES = {
+    "phydict.datamodule": "phydict.training", "phydict.prior_training": "phydict.training",
+    "phydict.super_resolution_data": "phydict.training", "phydict.super_resolution_training": "phydict.training",
+    "phydict.reconstruction_data": "phydict.inference", "phydict.reconstructor": "phydict.reconstruction",
+    "phydict.training_progress": "phydict.training.progress", "phydict.throughput": "phydict.training.throughput",
+    "phydict.prior.medsyn": "phydict.prior.medsyn.prior", "phydict.prior.pretrained": "phydict.prior.medsyn.checkpoint"
+} | {f"phydict.posterior.{name}": "phydict.posterior" for name in (
+    "admm_tv", "daps", "dds", "diffpir", "dps", "langevin", "likelihood", "likelihood_draw", "pnp_dm", "prior_only",
+    "reward", "split_gibbs")}
+"""Old module of classes that a setting may be -> where they are now."""
+
+
+def check_setting(path: str, value: object = None) -> None:
+    """Raises ValueError, in one sentence with the new name, where `path` (a.b.init_args.c), a part of it or what `value`,
+    nested settings, holds is an old setting, or where a text is an old class."""
+    place, parts = [], path.split(".")
+    for n, name in enumerate(parts, 1):
+        if name == "init_args":
+            continue
+        new = FIELDS.get(place[-1], {}).get(name) if place else None
+        place.append(name)
+        if new := new or PLACES.get(".".join(place)):
+            raise ValueError(f"{'.'.join(parts[:n])} is now {new}: rename it")
+    if isinstance(value, Mapping):
+        for name, inner in value.items():
+            check_setting(f"{path}.{name}" if path else str(name), inner)
+    elif isinstance(value, list | tuple):
+        for inner in value:
+            check_setting(path, inner)
+    elif isinstance(value, str) and (module := MODULES.get(value.rpartition(".")[0])):
+        raise ValueError(f"{path} is {value}, which is now {module}.{value.rpartition('.')[2]}: rename it")
+
+
+def check_options(args: Sequence[str]) -> None:
+    """Raises ValueError, as `check_setting` does, for what a command line gives as `--path=value` or `--path value`."""
+    for arg, following in zip(args, [*args[1:], ""]):
+        option, equals, value = arg.partition("=")
+        if option.startswith("--"):
+            check_setting(option[2:], value if equals else following)

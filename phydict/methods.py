@@ -45,13 +45,13 @@ METHODS: dict[str, Sampler | Reconstructor] = {
     # Langevin steps; the last level is 0.02 instead of 0.1, since the exact draw leaves its whole spread in the volume;
     # prior_std is 0.5, the state's own.
     "daps": DAPS(levels=25, sigma_min=0.02, flow_steps=2, likelihood=ExactDraw(iterations=10), prior_std=0.5),
-    # PnP-DM (Wu et al. 2024), reduced for a CPU: 30 of 100 iterations, whose coupling therefore falls by 0.85 instead of
-    # 0.9, and 12 of 100 noise levels in the grid of the prior step; the result is the mean of the last six states.
+    # PnP-DM (Wu et al. 2024), reduced for a CPU: 30 of 100 iterations, whose coupling therefore falls by 0.85 instead
+    # of 0.9, and 12 of 100 noise levels in the grid of the prior step; the result is the mean of the last six states.
     "pnp_dm": PnPDM(iterations=30, decay=0.85, levels=12, likelihood=ExactDraw(iterations=10), burn_in=24, thinning=1),
     # DiffPIR (Zhu et al. 2023) with its published constants; conjugate gradients for its closed forms.
     "diffpir": DiffPIR(iterations=100),
-    # DDS (Chung, Lee & Ye 2024) with its published constants; its total variation, made for priors of slices, is off, and
-    # so is gamma, its weight for noisy data.
+    # DDS (Chung, Lee & Ye 2024) with its published constants; its total variation, made for priors of slices, is off,
+    # and so is gamma, its weight for noisy data.
     "dds": DDS(iterations=50),
     # DPS (Chung et al. 2023), reduced for a CPU: 100 of 1000 levels, so each is pushed ten times as far.
     "dps": DPS(iterations=100, scale=3.0),
@@ -62,8 +62,8 @@ METHODS: dict[str, Sampler | Reconstructor] = {
     "tv": FISTATV(),
     "diffvox": DiffVox(),
 }
-"""Settings by name, in Python as `method=`, on the command line as `--model.method`. configs/reconstruct writes out four of
-them as examples."""
+"""Settings by name, in Python as `method=`, on the command line as `--model.method`. configs/reconstruct writes out
+four of them as examples."""
 
 
 def reconstructor(method: str | Sampler | Reconstructor, prior: Prior | str | Path | None = None,

@@ -155,8 +155,9 @@ def test_all_methods_see_the_same_xrays_and_score_as_in_a_test_of_their_own(tmp_
     assert all(torch.equal(seen[0], other) for seen in calls.values() for other in seen)
     assert not torch.equal(*(seen[0] for seen in calls.values()))
     main(["test", "--model.method=sirt", "--data.cts=phantom",
-          "--data.phantoms=2", "--data.views=3", "--data.detector=[24,24]", f"--data.pixel=[{560 / 24},{560 / 24}]",
-          "--model.method.init_args.iterations=3", "--model.voxels=16", f"--model.out={tmp_path}",
+          "--data.phantoms=2", "--data.orbit.views=3", "--data.orbit.detector=[24,24]",
+          f"--data.orbit.pixel=[{560 / 24},{560 / 24}]",
+          "--model.method.init_args.iterations=3", "--model.cube.voxels=16", f"--model.out={tmp_path}",
           "--trainer.accelerator=cpu"])
     for own in read_csv(tmp_path / "sirt" / "results.csv"):
         (row,) = (row for row in rows if row["method"] == "sirt" and row["case"] == own["case"])

@@ -100,6 +100,13 @@ def test_lightning_is_imported_on_the_top_floor_alone(file):
     assert not found or part(file) in LIGHTNING
 
 
+@pytest.mark.parametrize("file", files(), ids=lambda f: str(f.relative_to(PACKAGE)))
+def test_a_constructor_takes_at_most_ten_arguments(file):
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.FunctionDef) and node.name == "__init__":
+            assert len(node.args.args) + len(node.args.kwonlyargs) - 1 <= 10, f"{file}:{node.lineno}"
+
+
 def test_every_part_has_a_floor_and_the_top_is_small():
     assert {part(f) for f in files()} == set(FLOORS)
     assert len(list(PACKAGE.glob("*.py"))) <= ROOT_FILES
@@ -174,7 +181,8 @@ PAPER, SETTINGS = f"--config={ROOT / 'configs' / 'reconstruct' / 'phydict_paper.
     ([PAPER, "--model.method", "phydict_fast"], "phydict_fast", METHODS["phydict_fast"]),
     (["--model.method=dds", PAPER], "phydict_paper", METHODS["phydict_paper"]),
     ([PAPER, "--model.name=mine", "--model.method=dds"], "mine", METHODS["dds"]),
-    (["--model.method=dds", f"{SETTINGS}.iterations=4", "-c", "polychromatic"], "dds", replace(METHODS["dds"], iterations=4)),
+    (["--model.method=dds", f"{SETTINGS}.iterations=4", "-c", "polychromatic"], "dds",
+     replace(METHODS["dds"], iterations=4)),
     (["--model.method=dds", "--model.name=mine"], "mine", METHODS["dds"]),
     (["--model.name=mine", "--model.method=dds"], "mine", METHODS["dds"]),
     ([f"{SETTINGS}.iterations=4"], "phydict_fast", replace(METHODS["phydict_fast"], iterations=4)),
@@ -195,7 +203,7 @@ def prior_training(tmp_path, monkeypatch):
     return lambda *configs: train.PriorCLI(
         *train.STAGES[train.stage_of([f"--config={config}" for config in configs])], run=False,
         save_config_callback=None,
-        args=[*(f"--config={config}" for config in configs), "--data.phantoms=2", "--data.validation_phantoms=1",
+        args=[*(f"--config={config}" for config in configs), "--data.phantoms=2", "--data.holdout.phantoms=1",
               "--trainer.accelerator=cpu", "--trainer.devices=1"])
 
 

@@ -21,7 +21,7 @@ from phydict.runtime.progress import CaseProgress
 def main(args: list[str] | None = None) -> None:
     """infer.py ablate -c <file>. A bad input ends in one sentence and exit code 2; a run that was stopped goes on."""
     with cli_errors(), quiet():
-        check_configured(sys.argv[1:] if args is None else args, "configs/ablate/pareto.yaml")
+        check_configured(sys.argv[1:] if args is None else args, (), "configs/ablate/pareto.yaml")
         given = _parser().parse_args(args).as_dict()
         device = given.pop("device") or ("cuda" if torch.cuda.is_available() else "cpu")
         specification = read_specification(given.pop("config"), **given)

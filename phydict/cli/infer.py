@@ -149,16 +149,16 @@ def _is_name(method: object) -> bool:
 def _named(name: str) -> dict:
     """What a named method is as model.name and model.method. Raises ValueError where there is none of that name."""
     if name not in METHODS:
-        raise ValueError(f"there is no method '{name}': give model.method one of {', '.join(METHODS)}, or a class such as "
-                         "phydict.posterior.DDS")
+        raise ValueError(f"there is no method '{name}': give model.method one of {', '.join(METHODS)}, or a class "
+                         "such as phydict.posterior.DDS")
     return {"name": name, "method": _written(METHODS[name])}
 
 
 def _written(settings: object) -> dict:
     """Nested settings as a configuration writes them."""
-    kind = type(settings)
+    kind, values = type(settings), {field.name: getattr(settings, field.name) for field in fields(settings)}
     return {"class_path": f"{kind.__module__}.{kind.__qualname__}", "init_args": {
-        f.name: _written(value) if is_dataclass(value := getattr(settings, f.name)) else value for f in fields(settings)}}
+        name: _written(value) if is_dataclass(value) else value for name, value in values.items()}}
 
 
 def main(args: list[str] | None = None) -> None:

@@ -90,9 +90,10 @@ def check_command(args: Sequence[str], commands: Mapping[str, str], anywhere: Co
     check_options(args)
 
 
-def check_configured(args: Sequence[str], example: str) -> None:
-    """Raises ValueError where `args` name no configuration, and do not ask for help."""
-    if not any(arg.partition("=")[0] in (*CONFIGURATION, "-h", "--help") or arg.startswith("-c") for arg in args):
+def check_configured(args: Sequence[str], options: Collection[str], example: str) -> None:
+    """Raises ValueError where `args` hold none of the options that say what to run, and do not ask for help."""
+    options = ("-c", "--config", "-h", "--help", *options)
+    if not any(arg.partition("=")[0] in options or arg.startswith("-c") for arg in args):
         raise ValueError(f"no configuration file was given: add -c <file>, such as -c {example}")
 
 

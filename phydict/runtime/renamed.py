@@ -10,15 +10,39 @@ SAMPLER = {
     "refine_guided": "ec_guided", "at_zero": "final_denoise", "renewed": "eta (of DDS) or zeta (of DiffPIR)"}
 LIKELIHOOD = {"variation": "tv_weight", "edge": "tv_eps", "refit": "refit_scatter",
               "weighted": "weighted_least_squares"}
-FIELDS = {"method": SAMPLER, "sr_sampler": SAMPLER, "likelihood": LIKELIHOOD, "final_likelihood": LIKELIHOOD,
+FIELDS = {"method": SAMPLER, "sampler": SAMPLER, "likelihood": LIKELIHOOD, "final_likelihood": LIKELIHOOD,
           "augmentation": {"waves": "elastic_mm", "gain": "hu_scale", "offset": "hu_offset"}}
 """Of the settings in each place, old name -> new name."""
 
+GROUPS = {
+    "model.cube": ("voxels", "side"), "model.sampling": ("guidance", "samples", "precision"),
+    "model.optimisation": ("learning_rate", "weight_decay", "warmup", "decay_from", "decay_steps", "sigma_data",
+                           "mask_weight"),
+    "model.validation": ("preview_steps",), "model.execution": ("gradient_checkpointing", "channels_last", "compile"),
+    "data.source": ("reports", "metadata", "fixed", "first_reconstruction", "exclude"),
+    "data.orbit": ("views", "source_to_detector", "source_to_isocentre", "detector", "pixel"),
+    "data.loading": ("epoch_size", "batch_size", "workers", "ct_fraction")}
+"""Groups of settings that once lay beside them, model.voxels as model.cube.voxels."""
+
 PLACES = {
-    "model.guide_fine": "model.sr_guided", "model.fine_sampler": "model.sr_sampler",
-    "model.fine_noise": "model.sr_noise_augmentation", "model.fine_memory": "model.sr_memory",
-    "model.montage_steps": "model.preview_steps", "model.text_steps": "model.text_pretrain_steps"}
+    "model.guide_fine": "model.super_resolution.guided", "model.sr_guided": "model.super_resolution.guided",
+    "model.fine_sampler": "model.super_resolution.sampler", "model.sr_sampler": "model.super_resolution.sampler",
+    "model.fine_noise": "model.super_resolution.noise_augmentation",
+    "model.sr_noise_augmentation": "model.super_resolution.noise_augmentation",
+    "model.fine_memory": "model.super_resolution.memory", "model.sr_memory": "model.super_resolution.memory",
+    "model.super_resolution.path": "model.super_resolution.file.path",
+    "model.montage_steps": "model.validation.preview_steps", "model.validation_views": "model.validation.views",
+    "model.text_length": "model.text.length", "model.text_padded_to": "model.text.padded_to",
+    "model.text_dropout": "model.text.dropout", "model.text_steps": "model.text.pretrain_steps",
+    "model.text_pretrain_steps": "model.text.pretrain_steps", "data.holdout_fraction": "data.holdout.fraction",
+    "data.validation_phantoms": "data.holdout.phantoms", "data.crop": "data.crops.size",
+    "data.validation_crops": "data.crops.validation",
+} | {f"{group.partition('.')[0]}.{name}": f"{group}.{name}" for group, names in GROUPS.items() for name in names}
 """Old path of a setting -> new path."""
+
+VALUES = {"model.super_resolution": "model.super_resolution.file", "model.text": "model.text.encoder",
+          "data.holdout": "data.holdout.ids"}
+"""What was one value and is now a group of settings -> which of them it is."""
 
 MODULES = {
     "phydict.datamodule": "phydict.training", "phydict.prior_training": "phydict.training",
@@ -33,8 +57,8 @@ MODULES = {
 
 
 def check_setting(path: str, value: object = None) -> None:
-    """Raises ValueError, in one sentence with the new name, where `path` (a.b.init_args.c), a part of it or what `value`,
-    nested settings, holds is an old setting, or where a text is an old class."""
+    """Raises ValueError, in one sentence with the new name, where `path` (a.b.init_args.c), a part of it or what
+    `value`, nested settings, holds is an old setting, or where a text is an old class."""
     place, parts = [], path.split(".")
     for n, name in enumerate(parts, 1):
         if name == "init_args":
@@ -43,6 +67,8 @@ def check_setting(path: str, value: object = None) -> None:
         place.append(name)
         if new := new or PLACES.get(".".join(place)):
             raise ValueError(f"{'.'.join(parts[:n])} is now {new}: rename it")
+    if path in VALUES and value is not None and not isinstance(value, Mapping) and not str(value).startswith("{"):
+        raise ValueError(f"{path} is now {VALUES[path]}: rename it")
     if isinstance(value, Mapping):
         for name, inner in value.items():
             check_setting(f"{path}.{name}" if path else str(name), inner)

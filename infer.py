@@ -1,4 +1,4 @@
-"""Reconstruct: python infer.py predict -c configs/reconstruct/phydict_fast.yaml --data.xrays <folder>"""
+"""Reconstruct: python infer.py predict --data.xrays <folder>"""
 
 from phydict.cli.infer import main
 

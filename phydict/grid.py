@@ -103,3 +103,20 @@ class Grid:
     def to_dict(self) -> dict:
         """Plain lists, from which `Grid(**d)` builds the same grid."""
         return {"shape": list(self.shape), "affine": self.affine.tolist()}
+
+
+@dataclass(frozen=True)
+class Cube:
+    """A cube around the isocentre.
+
+    Args:
+        voxels: along each side
+        side: mm
+    """
+
+    voxels: int = 64
+    side: float = 384.0
+
+    def grid(self) -> Grid:
+        """Its voxels. Raises ValueError for what cannot be."""
+        return Grid.cube(self.voxels, self.side)

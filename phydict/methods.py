@@ -29,20 +29,32 @@ RELEASED_STEPS = GradientSteps(learning_rate=0.01, prior_mean=True, reward=Rewar
 """The likelihood step of the authors' release."""
 
 METHODS: dict[str, Sampler | Reconstructor] = {
+    # The default: conjugate gradients onto the X-rays at ten noise levels, the last counting each pixel by its noise.
     "phydict_fast": SplitGibbs(
         iterations=10, t_start=0.97, t_end=0.15, noise_fraction=0.4, momentum=0.5, sampling_noise=1.0, scatter=True,
         likelihood=ProximalCG(iterations=7, restarts=1, tv_weight=10.0, tv_eps=0.003),
         final_likelihood=ProximalCG(iterations=10, restarts=5, refit_scatter=True, weighted_least_squares=True,
                                     tv_weight=10.0, tv_eps=0.003)),
+    # The paper's text: two gradient steps of 0.1 per timestep with LPIPS, then Extra Compute from delta = 0.8.
     "phydict_paper": SplitGibbs(iterations=50, likelihood=GradientSteps(reward=Reward(lpips=1.0)), ec_delta=0.8,
                                 ec_steps=40, full_detector=True),
+    # What the authors' release does; its guidance scale of 10 is a setting beside the method.
     "phydict_released": SplitGibbs(
         iterations=50, likelihood=RELEASED_STEPS, final_likelihood=RELEASED_STEPS, ec_delta=0.8,
         ec_steps=40, full_detector=True, clip=False, final_denoise=True),
+    # DAPS (Zhang et al. 2025), reduced for a CPU: 25 of 200 noise levels, 2 of 5 flow steps, and the exact draw for 100
+    # Langevin steps; the last level is 0.02 instead of 0.1, since the exact draw leaves its whole spread in the volume;
+    # prior_std is 0.5, the state's own.
     "daps": DAPS(levels=25, sigma_min=0.02, flow_steps=2, likelihood=ExactDraw(iterations=10), prior_std=0.5),
+    # PnP-DM (Wu et al. 2024), reduced for a CPU: 30 of 100 iterations, whose coupling therefore falls by 0.85 instead
+    # of 0.9, and 12 of 100 noise levels in the grid of the prior step; the result is the mean of the last six states.
     "pnp_dm": PnPDM(iterations=30, decay=0.85, levels=12, likelihood=ExactDraw(iterations=10), burn_in=24, thinning=1),
+    # DiffPIR (Zhu et al. 2023) with its published constants; conjugate gradients for its closed forms.
     "diffpir": DiffPIR(iterations=100),
+    # DDS (Chung, Lee & Ye 2024) with its published constants; its total variation, made for priors of slices, is off,
+    # and so is gamma, its weight for noisy data.
     "dds": DDS(iterations=50),
+    # DPS (Chung et al. 2023), reduced for a CPU: 100 of 1000 levels, so each is pushed ten times as far.
     "dps": DPS(iterations=100, scale=3.0),
     "prior_only": PriorOnly(iterations=50),
     "sirt": SIRT(),
@@ -51,7 +63,8 @@ METHODS: dict[str, Sampler | Reconstructor] = {
     "tv": FISTATV(),
     "diffvox": DiffVox(),
 }
-"""Settings by name; configs/reconstruct/<name>.yaml holds the same settings for the command line."""
+"""Settings by name, in Python as `method=`, on the command line as `--model.method`. configs/reconstruct writes out
+four of them as examples."""
 
 
 def reconstructor(method: str | Sampler | Reconstructor, prior: Prior | str | Path | None = None,

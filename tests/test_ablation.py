@@ -154,9 +154,10 @@ def test_all_methods_see_the_same_xrays_and_score_as_in_a_test_of_their_own(tmp_
     assert len(calls) == 2 and all(len(seen) >= 2 for seen in calls.values())
     assert all(torch.equal(seen[0], other) for seen in calls.values() for other in seen)
     assert not torch.equal(*(seen[0] for seen in calls.values()))
-    main(["test", f"--config={ROOT / 'configs' / 'reconstruct' / 'sirt.yaml'}", "--data.cts=phantom",
-          "--data.phantoms=2", "--data.views=3", "--data.detector=[24,24]", f"--data.pixel=[{560 / 24},{560 / 24}]",
-          "--model.method.init_args.iterations=3", "--model.voxels=16", f"--model.out={tmp_path}",
+    main(["test", "--model.method=sirt", "--data.cts=phantom",
+          "--data.phantoms=2", "--data.orbit.views=3", "--data.orbit.detector=[24,24]",
+          f"--data.orbit.pixel=[{560 / 24},{560 / 24}]",
+          "--model.method.init_args.iterations=3", "--model.cube.voxels=16", f"--model.out={tmp_path}",
           "--trainer.accelerator=cpu"])
     for own in read_csv(tmp_path / "sirt" / "results.csv"):
         (row,) = (row for row in rows if row["method"] == "sirt" and row["case"] == own["case"])
@@ -215,6 +216,21 @@ def test_named_variants_change_a_method_under_the_axes(tmp_path):
     assert (one.name, two.name) == ("mine", "mine") and (one.method.iterations, two.method.iterations) == (7, 9)
     assert one.method.likelihood.reward.lpips == 0
     assert changed(one.method, {"likelihood.reward.lpips": 1.0, "iterations": 50}, "method") == METHODS["phydict_paper"]
+
+
+@pytest.mark.parametrize("content", [
+    {"axes": {"method": ["phydict_fast"], "method.init_args.likelihood.variation": [1]}},
+    {"base": {"method.likelihood.variation": 1}, "axes": {"method": ["phydict_fast"]}},
+    {"methods": {"mine": {"of": "phydict_fast", "method.likelihood.variation": 1}}},
+    {"axes": {"method": ["phydict_fast"], "method.likelihood": [{"init_args": {"variation": 1}}]}}])
+def test_an_old_setting_is_refused_with_its_new_name(tmp_path, content):
+    with pytest.raises(ValueError, match="likelihood.*variation is now tv_weight: rename it"):
+        read_specification(write(tmp_path, **content))
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "configs" / "ablate").glob("*.yaml")), ids=lambda file: file.stem)
+def test_every_shipped_comparison_is_one(file):
+    assert read_specification(file, phantoms=1).trials
 
 
 def test_settings_that_hold_each_other_are_changed_together():

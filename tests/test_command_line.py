@@ -5,13 +5,16 @@ import os
 import subprocess
 import sys
 import warnings
+from importlib import import_module
 from pathlib import Path
 
 import pytest
+import yaml
 
 from phydict.cli.infer import main as infer
 from phydict.cli.train import main as train
 from phydict.runtime.console import check_writable, cli_errors, noted, quiet, with_configurations
+from phydict.runtime.renamed import MODULES
 from phydict.runtime.shipped import shipped
 
 ROOT = Path(__file__).parents[1]
@@ -60,6 +63,43 @@ def test_an_unknown_configuration_is_one_sentence_that_lists_what_there_is(empty
     said = capsys.readouterr().err
     assert stopped.value.code == 2 and said.count("\n") == 1 and f"no configuration {given}:" in said
     assert all(name in said for name in names)
+
+
+@pytest.mark.parametrize("main, command", [(infer, "predict"), (train, "fit")], ids=["infer", "train"])
+@pytest.mark.parametrize("path, new", [
+    ("model.method.init_args.warm_start", "t_start"), ("model.method.init_args.renewed", "eta"),
+    ("model.method.init_args.final_likelihood.init_args.variation", "tv_weight"),
+    ("model.fine_noise", "noise_augmentation"), ("model.text_steps", "pretrain_steps"),
+    ("data.augmentation.waves", "elastic_mm"), ("model.fine_sampler", "model.super_resolution.sampler"),
+    ("model.voxels", "model.cube.voxels"), ("model.text", "model.text.encoder"), ("data.views", "data.orbit.views"),
+    ("data.holdout", "data.holdout.ids"), ("model.super_resolution", "model.super_resolution.file")])
+def test_an_old_setting_is_refused_with_its_new_name(empty, capsys, main, command, path, new):
+    settings = 1
+    for name in reversed(path.split(".")):
+        settings = {name: settings}
+    (empty / "old.yaml").write_text(yaml.safe_dump(settings))
+    for args in ([f"--{path}=1"], [f"--{path}", "1"], ["-c", "old.yaml"]):
+        with pytest.raises(SystemExit) as stopped:
+            main([command, *args])
+        said = capsys.readouterr().err
+        assert stopped.value.code == 2 and said.count("\n") == 1
+        assert f"{path} is now " in said and f"{new}" in said and "rename it" in said
+
+
+@pytest.mark.parametrize("given", [
+    "phydict.posterior.split_gibbs.SplitGibbs", "phydict.posterior.likelihood.ProximalCG"])
+def test_a_class_that_was_moved_is_refused_with_its_new_place(empty, capsys, given):
+    (empty / "old.yaml").write_text(yaml.safe_dump({"model": {"method": {"class_path": given}}}))
+    for args in (["--model.method.class_path", given], ["-c", "old.yaml"]):
+        with pytest.raises(SystemExit) as stopped:
+            infer(["predict", *args])
+        said = capsys.readouterr().err
+        assert stopped.value.code == 2 and f"is now phydict.posterior.{given.rpartition('.')[2]}: rename" in said
+
+
+@pytest.mark.parametrize("module", MODULES.values())
+def test_a_module_that_classes_were_moved_to_is_there(module):
+    assert import_module(module)
 
 
 def test_a_configuration_of_another_command_is_none_of_its_names(empty, capsys):

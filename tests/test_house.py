@@ -5,6 +5,7 @@ import subprocess
 import sys
 import tomllib
 import warnings
+from dataclasses import replace
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from phydict.cli.infer import main as infer
 from phydict.grid import Grid
 from phydict.inference import ReconstructionData, ReconstructionTask
 from phydict.methods import METHODS
-from phydict.posterior import Posterior
+from phydict.posterior import DDS, Posterior
 from phydict.prior import save_prior
 from phydict.xray import ConeBeam, Ideal, Polychromatic
 
@@ -99,6 +100,13 @@ def test_lightning_is_imported_on_the_top_floor_alone(file):
     assert not found or part(file) in LIGHTNING
 
 
+@pytest.mark.parametrize("file", files(), ids=lambda f: str(f.relative_to(PACKAGE)))
+def test_a_constructor_takes_at_most_ten_arguments(file):
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.FunctionDef) and node.name == "__init__":
+            assert len(node.args.args) + len(node.args.kwonlyargs) - 1 <= 10, f"{file}:{node.lineno}"
+
+
 def test_every_part_has_a_floor_and_the_top_is_small():
     assert {part(f) for f in files()} == set(FLOORS)
     assert len(list(PACKAGE.glob("*.py"))) <= ROOT_FILES
@@ -131,36 +139,61 @@ def test_a_bare_import_brings_nothing_heavy_and_everything_works_afterwards():
 
 @pytest.fixture
 def inference(tmp_path, monkeypatch):
-    """Builds infer.py's command line from configurations, with a tiny prior and nothing run."""
+    """Builds infer.py's command line from arguments, with a tiny prior and nothing run."""
     monkeypatch.chdir(tmp_path)
     save_prior(tiny_prior(), "tiny.safetensors")
-    return lambda *configs: InferenceCLI(
+    return lambda *args: InferenceCLI(
         ReconstructionTask, ReconstructionData, run=False, save_config_callback=None,
         trainer_defaults={"logger": False, "accelerator": "cpu", "devices": 1, "enable_progress_bar": False,
                           "enable_checkpointing": False, "enable_model_summary": False},
-        args=[*(f"--config={config}" for config in configs), "--model.prior=tiny.safetensors", "--model.out=out"])
+        args=[*args, "--model.prior=tiny.safetensors", "--model.out=out"])
+
+
+def built(model: ReconstructionTask):
+    return model.reconstructor.sampler if isinstance(model.reconstructor, Posterior) else model.reconstructor
+
+
+@pytest.mark.parametrize("config", CONFIGS["reconstruct"], ids=lambda f: f.stem)
+def test_a_named_method_is_what_its_configuration_builds(inference, config):
+    model = inference(f"--config={config}").model
+    assert built(model) == METHODS[config.stem]
+    assert model.method_name == config.stem == model.reconstructor.name
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_a_named_method_is_what_its_configuration_builds(inference, name):
-    model = inference(ROOT / "configs" / "reconstruct" / f"{name}.yaml").model
-    built = model.reconstructor.sampler if isinstance(model.reconstructor, Posterior) else model.reconstructor
-    assert built == METHODS[name]
-    assert model.method_name == name == model.reconstructor.name
-
-
-def test_every_reconstruction_configuration_is_a_named_method():
-    assert {file.stem for file in CONFIGS["reconstruct"]} == set(METHODS)
-
-
-@pytest.mark.parametrize("preset", CONFIGS["reconstruct"], ids=lambda f: f.stem)
 @pytest.mark.parametrize("config", CONFIGS["simulate"], ids=lambda f: f.stem)
-def test_every_simulator_goes_with_every_method(inference, preset, config):
-    cli = inference(preset, config)
+def test_every_method_builds_by_its_name_and_goes_with_every_simulator(inference, name, config):
+    cli = inference(f"--model.method={name}", f"--config={config}")
+    assert built(cli.model) == METHODS[name]
     assert cli.datamodule.simulator == {"ideal": Ideal(), "polychromatic": Polychromatic()}[config.stem]
-    assert cli.model.method_name == preset.stem
+    assert cli.model.method_name == name
     ready = cli.model.reconstructor.with_mu_water(cli.datamodule.simulator.effective_mu_water)
-    assert ready.mu_water == cli.datamodule.simulator.effective_mu_water and ready.name == preset.stem
+    assert ready.mu_water == cli.datamodule.simulator.effective_mu_water and ready.name == name
+
+
+PAPER, SETTINGS = f"--config={ROOT / 'configs' / 'reconstruct' / 'phydict_paper.yaml'}", "--model.method.init_args"
+
+
+@pytest.mark.parametrize("args, name, method", [
+    ([], "phydict_fast", METHODS["phydict_fast"]),
+    (["-c", str(CONFIGS["simulate"][0])], "phydict_fast", METHODS["phydict_fast"]),
+    (["-c", "dds"], "dds", METHODS["dds"]), (["-c", "configs/reconstruct/dds.yaml"], "dds", METHODS["dds"]),
+    ([PAPER, "--model.method", "phydict_fast"], "phydict_fast", METHODS["phydict_fast"]),
+    (["--model.method=dds", PAPER], "phydict_paper", METHODS["phydict_paper"]),
+    ([PAPER, "--model.name=mine", "--model.method=dds"], "mine", METHODS["dds"]),
+    (["--model.method=dds", f"{SETTINGS}.iterations=4", "-c", "polychromatic"], "dds",
+     replace(METHODS["dds"], iterations=4)),
+    (["--model.method=dds", "--model.name=mine"], "mine", METHODS["dds"]),
+    (["--model.name=mine", "--model.method=dds"], "mine", METHODS["dds"]),
+    ([f"{SETTINGS}.iterations=4"], "phydict_fast", replace(METHODS["phydict_fast"], iterations=4)),
+    (["--model.method=dds", f"{SETTINGS}.iterations=4"], "dds", replace(METHODS["dds"], iterations=4)),
+    (["--model.method=phydict.posterior.DDS", f"{SETTINGS}.iterations=4"], "DDS", DDS(iterations=4)),
+    (["--model.method=DDS"], "DDS", DDS()),
+    (["-c", "{model: {method: phydict.posterior.DDS}}"], "DDS", DDS()),
+], ids=lambda value: " ".join(value).replace(str(ROOT), "") if isinstance(value, list) else "")
+def test_a_method_is_given_by_name_by_class_or_not_at_all(inference, args, name, method):
+    model = inference(*args).model
+    assert (model.method_name, built(model)) == (name, method)
 
 
 @pytest.fixture
@@ -170,7 +203,7 @@ def prior_training(tmp_path, monkeypatch):
     return lambda *configs: train.PriorCLI(
         *train.STAGES[train.stage_of([f"--config={config}" for config in configs])], run=False,
         save_config_callback=None,
-        args=[*(f"--config={config}" for config in configs), "--data.phantoms=2", "--data.validation_phantoms=1",
+        args=[*(f"--config={config}" for config in configs), "--data.phantoms=2", "--data.holdout.phantoms=1",
               "--trainer.accelerator=cpu", "--trainer.devices=1"])
 
 

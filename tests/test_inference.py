@@ -42,14 +42,13 @@ from phydict.xray import ConeBeam, Ideal, Polychromatic, Projector
 from phydict.xray.geometry_files import write_beam
 
 ROOT = Path(__file__).parents[1]
-CONFIGS = ROOT / "configs" / "reconstruct"
 BEAM = ConeBeam.orbit(3, 1020.0, 740.0, (24, 24), 24.0)
-ORBIT = ["--data.views=3", "--data.detector=[24,24]", "--data.pixel=[24,24]"]
+ORBIT = ["--data.orbit.views=3", "--data.orbit.detector=[24,24]", "--data.orbit.pixel=[24,24]"]
 FILES = ["panel.png", "reconstruction.json", "volume.nii.gz"]
 
 
 def sirt(command: str, out: Path, *more: str) -> list[str]:
-    return [command, f"--config={CONFIGS / 'sirt.yaml'}", "--model.method.init_args.iterations=3",
+    return [command, "--model.method=sirt", "--model.method.init_args.iterations=3",
             f"--model.out={out}", "--trainer.accelerator=cpu", *more]
 
 
@@ -58,7 +57,7 @@ def phantoms(out: Path, count: int, *more: str) -> list[str]:
 
 
 def with_prior(command: str, out: Path, prior: Path, *more: str) -> list[str]:
-    return [command, f"--config={CONFIGS / 'prior_only.yaml'}", "--model.method.init_args.iterations=2",
+    return [command, "--model.method=prior_only", "--model.method.init_args.iterations=2",
             f"--model.prior={prior}", f"--model.out={out}", "--trainer.accelerator=cpu", *more]
 
 
@@ -561,7 +560,7 @@ def test_a_case_depends_on_its_id_and_the_seed_alone(cts, tmp_path):
 
 
 def test_a_sample_of_the_prior_depends_on_the_seed_alone_and_is_that_of_python(prior, measured, tmp_path):
-    given = ["--data.with_report=false", "--model.precision=float32"]
+    given = ["--data.with_report=false", "--model.sampling.precision=float32"]
     main(with_prior("predict", tmp_path / "both", prior, f"--data.xrays={measured}", *given))
     main(with_prior("predict", tmp_path / "other", prior, f"--data.xrays={measured / 'bert'}", "--model.seed=5",
                     *given))
@@ -576,7 +575,7 @@ def test_a_sample_of_the_prior_depends_on_the_seed_alone_and_is_that_of_python(p
 
 def test_python_gives_the_volume_of_a_test_by_the_cases_seed(prior, cts, tmp_path):
     main(with_prior("test", tmp_path, prior, f"--data.cts={cts / 'a.nii.gz'}", *ORBIT, "--model.seed=3",
-                    "--model.precision=float32"))
+                    "--model.sampling.precision=float32"))
     seed = phydict.case_seed(3, "a")
     truth = HUWindow().to_mu(prepare_ct(cts / "a.nii.gz", Grid.cube(16))["volume"])
     views = Ideal()(Projector(Grid.cube(16), BEAM, full_detector=True), truth[None], seed)[0]
@@ -587,7 +586,7 @@ def test_python_gives_the_volume_of_a_test_by_the_cases_seed(prior, cts, tmp_pat
 
 
 def test_the_default_method_reconstructs_with_a_prior(prior, measured, tmp_path):
-    main(["test", f"--config={CONFIGS / 'phydict_fast.yaml'}", "--model.method.init_args.iterations=3", *ORBIT,
+    main(["test", "--model.method.init_args.iterations=3", *ORBIT,
           f"--model.prior={prior}", f"--model.out={tmp_path}", "--data.cts=phantom", "--data.phantoms=1",
           "--data.with_report=false", "--trainer.accelerator=cpu"])
     said = record(tmp_path / "phydict_fast" / "phantom-1000000")
@@ -598,7 +597,7 @@ def test_the_default_method_reconstructs_with_a_prior(prior, measured, tmp_path)
 
 def test_the_simulated_orbit_is_the_one_asked_for(scored, tmp_path, capsys):
     case = "phantom-1000000"
-    main(phantoms(tmp_path / "five", 1, "--data.views=5"))
+    main(phantoms(tmp_path / "five", 1, "--data.orbit.views=5"))
     assert len(record(tmp_path / "five" / "sirt" / case)["misfit_per_view"]) == 5
     main(phantoms(tmp_path / "same", 1, "--data.simulation_voxels=64"))
     np.testing.assert_array_equal(volume(tmp_path / "same" / "sirt" / case), volume(scored / case))
@@ -608,12 +607,12 @@ def test_the_simulated_orbit_is_the_one_asked_for(scored, tmp_path, capsys):
 
 
 def test_other_xrays_into_a_finished_folder_are_refused(scored, capsys):
-    for change in ("--data.views=4", "--data.simulation_voxels=128", "--data.simulator.noise=0.1"):
+    for change in ("--data.orbit.views=4", "--data.simulation_voxels=128", "--data.simulator.noise=0.1"):
         assert "other settings" in refusal(capsys, phantoms(scored.parent, 2, change))
 
 
 def test_realistic_xrays_are_made_and_come_out_in_hu(scored, tmp_path):
-    realistic = f"--config={CONFIGS.parent / 'simulate' / 'polychromatic.yaml'}"
+    realistic = f"--config={ROOT / 'configs' / 'simulate' / 'polychromatic.yaml'}"
     main(phantoms(tmp_path, 1, realistic, "--data.simulator.kvp=70"))
     folder = "sirt/phantom-1000000"
     said, density = record(tmp_path / folder), volume(tmp_path / folder) + 1000
@@ -950,7 +949,7 @@ def test_a_priors_header_that_cannot_be_is_one_sentence(header, words, prior, me
 
 
 @pytest.mark.parametrize("change, words", [
-    (["--model.voxels=0"], "a whole number of voxels"), (["--model.voxels=100000"], "GiB of memory"),
+    (["--model.cube.voxels=0"], "a whole number of voxels"), (["--model.cube.voxels=100000"], "GiB of memory"),
     (["--model.seed=-1"], "a seed is a whole number"), ([f"--model.seed={2**70}"], "a seed is a whole number"),
     (["--model.method.init_args.mu_water=0"], "mu_water"), (["--model.method.init_args.mu_water=-1"], "mu_water"),
     (["--model.ou={tmp}/out"], "model.ou"), (["--data.xray={tmp}"], "data.xray"), (["--data.xray", "3"], "data.xray"),
@@ -968,8 +967,9 @@ def test_an_option_that_cannot_be_meant_is_one_sentence(change, words, measured,
 
 
 @pytest.mark.parametrize("change, words", [
-    ("--model.samples=1000000000", "samples=1000000000 states of"), ("--model.guidance=nan", "model.guidance"),
-    ("--model.guidance=.nan", "the guidance scale is at least 0 and finite")])
+    ("--model.sampling.samples=1000000000", "samples=1000000000 states of"),
+    ("--model.sampling.guidance=nan", "model.sampling.guidance"),
+    ("--model.sampling.guidance=.nan", "the guidance scale is at least 0 and finite")])
 def test_an_option_of_a_prior_that_cannot_be_meant_is_one_sentence(change, words, prior, measured, tmp_path, capsys):
     said = refusal(capsys, with_prior("predict", tmp_path / "out", prior, f"--data.xrays={measured}", change))
     assert words in said and not (tmp_path / "out").exists()
@@ -988,7 +988,8 @@ def test_a_fault_of_the_projects_own_shows_its_trace_and_on_request_every_refusa
 @pytest.mark.parametrize("guided", [True, False])
 def test_a_second_stage_is_scored_on_the_fine_grid(guided, prior, fine, cts, tmp_path):
     main(with_prior("test", tmp_path, prior, f"--data.cts={cts / 'a.nii.gz'}", *ORBIT,
-                    f"--model.super_resolution={fine}", f"--model.sr_guided={guided}", "--model.sr_memory=1"))
+                    f"--model.super_resolution.file={fine}", f"--model.super_resolution.guided={guided}",
+                    "--model.super_resolution.memory=1"))
     folder = tmp_path / "prior_only" / "a"
     found, said = nibabel.load(folder / "volume.nii.gz"), record(folder)
     assert found.shape == (32, 32, 32) and found.header.get_zooms() == (12.0, 12.0, 12.0)
@@ -1005,8 +1006,8 @@ def test_medsyns_second_stage_is_refused_before_anything_is_done_where_it_takes_
     base = write(tmp_path / "base" / "model_1.safetensors", entries(text_unet()))
     second = write(tmp_path / "second" / "model.safetensors", entries(super_resolution_unet())).parent
     said = refusal(capsys, with_prior("predict", tmp_path / "out", base, f"--data.xrays={measured}",
-                                      f"--model.super_resolution={second}", "--model.sr_memory=1"))
-    assert "(256, 256, 256)" in said and "1 GiB are allowed" in said and "--model.sr_memory " in said
+                                      f"--model.super_resolution.file={second}", "--model.super_resolution.memory=1"))
+    assert "(256, 256, 256)" in said and "1 GiB are allowed" in said and "--model.super_resolution.memory " in said
     assert not (tmp_path / "out").exists()
 
 
@@ -1014,9 +1015,10 @@ def test_stages_in_each_others_place_are_one_sentence(prior, fine, measured, tmp
     data = f"--data.xrays={measured}"
     said = refusal(capsys, with_prior("predict", tmp_path / "out", fine, data))
     assert "fine.safetensors' is a super-resolution stage, but a base prior" in said
-    said = refusal(capsys, with_prior("predict", tmp_path / "out", prior, data, f"--model.super_resolution={prior}"))
+    said = refusal(capsys, with_prior("predict", tmp_path / "out", prior, data,
+                                      f"--model.super_resolution.file={prior}"))
     assert "is a base prior, but a super-resolution stage" in said
-    said = refusal(capsys, sirt("predict", tmp_path / "out", data, f"--model.super_resolution={fine}"))
+    said = refusal(capsys, sirt("predict", tmp_path / "out", data, f"--model.super_resolution.file={fine}"))
     assert "SIRT has none" in said
 
 
@@ -1034,28 +1036,43 @@ def test_a_prior_refuses_xrays_of_another_grid(prior):
 
 
 @pytest.mark.parametrize("args, words", [
-    ([], ["predict", "test", "ablate", "such as: predict -c"]), (["reconstruct"], ["'reconstruct'", "ablate"]),
-    (["--data.xrays", "somewhere"], ["predict", "test", "ablate"]), (["predict"], ["-c configs/reconstruct/"]),
-    (["test", "--data.cts", "phantom"], ["-c configs/reconstruct/"]), (["ablate"], ["-c configs/ablate/"]),
+    ([], ["predict", "test", "ablate", "such as: predict --data.xrays"]),
+    (["reconstruct"], ["'reconstruct'", "ablate"]),
+    (["--data.xrays", "somewhere"], ["predict", "test", "ablate"]), (["predict"], ["needs data.xrays"]),
+    (["test"], ["needs data.cts"]), (["ablate"], ["-c configs/ablate/"]),
     (["ablate", "--phantoms", "3"], ["-c configs/ablate/"])], ids=lambda value: " ".join(value)[:20])
-def test_a_missing_command_or_configuration_says_what_to_give(args, words, capsys):
+def test_a_missing_command_or_input_says_what_to_give(args, words, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     said = refusal(capsys, args)
     assert all(word in said for word in words), said
 
 
 @pytest.mark.parametrize("change, words", [
     (["--data.viewz=3"], ["data.viewz"]),
-    (["--data.views=0"], ["one view"]),
-    (["--data.views=some"], ["data.views", "some"]),
+    (["--data.orbit.views=0"], ["one view"]),
+    (["--data.orbit.views=some"], ["data.orbit.views", "some"]),
     (["--model.method.init_args.iteration=3"], ["iteration"]),
-    (["--data.source_to_isocentre=2000"], ["isocentre"]),
+    (["--data.orbit.source_to_isocentre=2000"], ["isocentre"]),
     (["--config=nowhere.yaml"], ["nowhere.yaml"]),
-    (["--model.precision=half"], ["precision is auto, float32 or bfloat16, but 'half' was given"]),
+    (["--model.method=srit"], ["no method 'srit'", "sirt", "phydict_fast", "phydict.posterior.DDS"]),
+    (["--config={model: {method: 3}}"], ["model.method"]),
+    (["--model.sampling.precision=half"], ["precision is auto, float32 or bfloat16, but 'half' was given"]),
 ], ids=lambda value: value[0] if value[0].startswith("--") else "")
 def test_a_bad_argument_is_one_sentence(change, words, tmp_path, capsys):
     said = refusal(capsys, phantoms(tmp_path / "out", 1, *change))
     assert all(word in said for word in words), said
     assert not (tmp_path / "out").exists()
+
+
+def test_a_config_file_names_its_method_and_is_told_of_one_that_is_none(measured, tmp_path, capsys):
+    (tmp_path / "mine.yaml").write_text("model: {method: sirt, seed: 4}")
+    args = ["predict", "-c", str(tmp_path / "mine.yaml"), "--model.method.init_args.iterations=2",
+            f"--data.xrays={measured / 'anna'}", f"--model.out={tmp_path / 'out'}", "--trainer.accelerator=cpu"]
+    main(args)
+    settings = record(tmp_path / "out" / "sirt" / "anna")["settings"]
+    assert settings["method"]["class"] == "SIRT" and settings["method"]["iterations"] == 2 and settings["seed"] == 4
+    (tmp_path / "mine.yaml").write_text("model: {method: srit}")
+    assert "no method 'srit'" in refusal(capsys, args)
 
 
 def test_an_unknown_key_of_a_config_file_is_named(tmp_path, capsys):
@@ -1064,7 +1081,7 @@ def test_an_unknown_key_of_a_config_file_is_named(tmp_path, capsys):
 
 
 def test_an_impossible_setting_is_named_without_the_parsers_noise(prior, tmp_path, capsys):
-    said = refusal(capsys, ["test", f"--config={CONFIGS / 'phydict_fast.yaml'}", f"--model.prior={prior}",
+    said = refusal(capsys, ["test", f"--model.prior={prior}",
                             "--model.method.init_args.iterations=0"])
     assert "at least one iteration, but 0" in said and "Union" not in said
 
@@ -1102,7 +1119,7 @@ def test_a_disk_that_fills_up_leaves_no_case_that_looks_finished(measured, tmp_p
 
 def test_several_samples_leave_a_deviation_map_in_the_volumes_place(measured, prior, tmp_path):
     args = with_prior("predict", tmp_path, prior, f"--data.xrays={measured / 'anna'}", "--model.name=several")
-    main([*args, "--model.samples=2"])
+    main([*args, "--model.sampling.samples=2"])
     folder = tmp_path / "several" / "anna"
     assert names(folder) == sorted([*FILES, "deviation.nii.gz"])
     image, ct = (nibabel.load(folder / name) for name in ("deviation.nii.gz", "volume.nii.gz"))
@@ -1114,7 +1131,7 @@ def test_several_samples_leave_a_deviation_map_in_the_volumes_place(measured, pr
 
 def test_samples_of_a_method_without_a_prior_are_refused(capsys, measured, tmp_path):
     assert "leave samples at 1" in refusal(capsys, sirt("predict", tmp_path, f"--data.xrays={measured}",
-                                                        "--model.samples=3"))
+                                                        "--model.sampling.samples=3"))
 
 
 def test_a_profile_shows_the_stages_of_every_case_and_changes_no_volume(measured, tmp_path, capsys):

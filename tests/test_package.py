@@ -119,7 +119,8 @@ def test_a_wheel_from_the_source_archive_works_in_an_empty_folder(tmp_path):
     assert 0 < float(run(python, "-c", SCRIPT).split()[-1]) < 0.2
     infer, train = environment / "bin" / "phydict-infer", environment / "bin" / "phydict-train"
     assert "predict" in run(infer, "--help") and "fit" in run(train, "--help")
-    run(infer, "predict", "-c", "sirt", "--model.method.init_args.iterations", 2, "--data.xrays", "data/example/xrays")
+    run(infer, "predict", "--model.method", "sirt", "--model.method.init_args.iterations", 2, "--data.xrays",
+        "data/example/xrays")
     assert (folder / "runs/reconstructions/sirt/xrays/volume.nii.gz").is_file()
     missing = subprocess.run([infer, "predict", "-c", "quick"], capture_output=True, text=True, cwd=folder, env=clean)
     assert missing.returncode == 2 and "phydict_fast" in missing.stderr

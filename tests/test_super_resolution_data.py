@@ -9,8 +9,9 @@ import pytest
 import torch
 
 from phydict.datasets import phantom_case
-from phydict.grid import Grid
+from phydict.grid import Cube, Grid
 from phydict.training.crops import CropDataset, PhantomVolumes, SuperResolutionData, mapped_volume
+from phydict.training.settings import Crops, HoldOut, Loading
 from phydict.units import HUWindow
 
 RAMP = (np.arange(16**3).reshape(16, 16, 16) / 16**3).astype(np.float16)
@@ -109,8 +110,9 @@ def test_held_out_cts_alone_validate_on_fixed_crops(tmp_path):
         image.set_sform(image.affine, code=1)
         (tmp_path / "cts").mkdir(exist_ok=True)
         nibabel.save(image, tmp_path / "cts" / f"patient{n}.nii.gz")
-    data = SuperResolutionData(8, 4, 3, phantoms=0, validation_phantoms=1, voxels=16, cts=str(tmp_path / "cts"),
-                               holdout=["patient1"], cache=str(tmp_path / "cache"), ct_fraction=1.0, epoch_size=10)
+    data = SuperResolutionData(Crops(8, 4, 3), str(tmp_path / "cts"), holdout=HoldOut(["patient1"], phantoms=1),
+                               phantoms=0, loading=Loading(epoch_size=10, ct_fraction=1.0),
+                               cache=str(tmp_path / "cache"), cube=Cube(16))
     assert [ct.id for ct in data.cts.cts] == ["patient0"] and len(data.validation) == 3 + 3
     bone = float(HUWindow().to_range(torch.tensor(340.0)))
     assert max(float(data.validation[i]["volume"].max()) for i in (3, 4, 5)) == pytest.approx(bone, abs=1e-3)
@@ -121,5 +123,5 @@ def test_held_out_cts_alone_validate_on_fixed_crops(tmp_path):
 
 @pytest.mark.parametrize("crop, factor", [(10, 4), (20, 4), (0, 4)])
 def test_a_crop_that_cannot_be_is_refused(crop, factor, tmp_path):
-    with pytest.raises(ValueError, match="data.crop is a multiple"):
-        SuperResolutionData(crop, factor, phantoms=1, voxels=16, cache=str(tmp_path))
+    with pytest.raises(ValueError, match="data.crops.size is a multiple"):
+        SuperResolutionData(Crops(crop, factor), phantoms=1, cube=Cube(16), cache=str(tmp_path))

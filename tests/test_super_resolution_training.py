@@ -11,16 +11,19 @@ import torch
 from prior.tiny import tiny_prior, tiny_super_resolution
 
 from phydict.cli.train import main, stage_of
+from phydict.grid import Cube
 from phydict.prior import LocalUNet, load_super_resolution, save_prior, save_super_resolution
 from phydict.training import SuperResolutionTraining
 from phydict.training.crops import SuperResolutionData
+from phydict.training.settings import Crops
 
 CONFIG = Path(__file__).parents[1] / "configs" / "prior" / "super_resolution.yaml"
 BASE_CONFIG = CONFIG.with_name("phantom.yaml")
 TINY = ["--model.network.class_path=phydict.prior.LocalUNet", "--model.network.init_args.block=2",
-        "--model.network.init_args.channels=[8,8]", "--model.voxels=32", "--model.factor=2", "--model.warmup=2",
-        "--model.preview_steps=2", "--data.phantoms=2", "--data.validation_phantoms=1", "--data.validation_crops=1",
-        "--data.crop=16", "--data.epoch_size=8", "--data.batch_size=2", "--trainer.accelerator=cpu",
+        "--model.network.init_args.channels=[8,8]", "--model.cube.voxels=32", "--model.factor=2",
+        "--model.optimisation.warmup=2", "--model.validation.preview_steps=2", "--data.phantoms=2",
+        "--data.holdout.phantoms=1", "--data.crops.validation=1", "--data.crops.size=16",
+        "--data.loading.epoch_size=8", "--data.loading.batch_size=2", "--trainer.accelerator=cpu",
         "--trainer.devices=1", "--trainer.precision=32", "--trainer.max_steps=-1", "--trainer.log_every_n_steps=1",
         "--trainer.check_val_every_n_epoch=1", "--trainer.enable_progress_bar=false",
         "--trainer.enable_model_summary=false"]
@@ -65,12 +68,12 @@ def checkpoint(folder: Path) -> dict:
 
 
 def test_the_loss_falls(tmp_path, cache):
-    main(arguments(tmp_path, cache, "--trainer.max_epochs=15", "--model.learning_rate=5e-3",
+    main(arguments(tmp_path, cache, "--trainer.max_epochs=15", "--model.optimisation.learning_rate=5e-3",
                    "--trainer.limit_val_batches=0"))
     network = checkpoint(tmp_path)["phydict"]["network"]
-    tasks = [SuperResolutionTraining(LocalUNet(**network), 32, 2) for _ in range(2)]
+    tasks = [SuperResolutionTraining(LocalUNet(**network), Cube(32), 2) for _ in range(2)]
     tasks[1].load_state_dict(checkpoint(tmp_path)["current_model_state"])
-    crops = SuperResolutionData(crop=16, factor=2, phantoms=2, voxels=32, cache=str(cache)).draws(epoch=0)
+    crops = SuperResolutionData(Crops(16, 2), phantoms=2, cube=Cube(32), cache=str(cache)).draws(epoch=0)
     batch = {"volume": torch.stack([crops[i]["volume"] for i in range(8)])}
     before, after = (np.mean([task.denoising_loss(batch, (k,)).item() for k in range(8)]) for task in tasks)
     assert after < 0.9 * before
@@ -101,11 +104,11 @@ def test_an_exported_checkpoint_is_a_stage_with_the_averaged_weights(tmp_path, s
 
 
 def test_what_is_learnt_is_the_detail_of_a_crop_given_its_block_means():
-    task = SuperResolutionTraining(tiny_super_resolution().network, 32, 2, most_noise=0.0)
+    task = SuperResolutionTraining(tiny_super_resolution().network, Cube(32), 2, most_noise=0.0)
     x0 = torch.rand(2, 1, 16, 16, 16)
     upsampled, level = task._condition({"volume": x0}, x0, _draws())
     assert torch.equal(upsampled, task.prior.upsample(torch.nn.functional.avg_pool3d(x0, 2))) and not level.any()
-    noisy = SuperResolutionTraining(tiny_super_resolution().network, 32, 2, most_noise=0.4)
+    noisy = SuperResolutionTraining(tiny_super_resolution().network, Cube(32), 2, most_noise=0.4)
     upsampled, level = noisy._condition({"volume": x0}, x0, _draws())
     coarse, draws = torch.nn.functional.avg_pool3d(x0, 2), _draws()
     torch.testing.assert_close(level, torch.cat([0.4 * torch.rand(1, generator=draw) for draw in draws]))
@@ -121,17 +124,18 @@ def _draws() -> list[torch.Generator]:
 def test_a_checkpoint_of_the_other_stage_is_one_sentence(straight, cache, tmp_path, capsys):
     args = ["fit", f"--config={BASE_CONFIG}", "--model.network.class_path=phydict.prior.VolumeUNet",
             "--model.network.init_args.channels=[8,8]", "--model.network.init_args.attention=[false,true]",
-            "--model.network.init_args.head_channels=8", "--model.voxels=16", "--model.text=none", "--data.phantoms=2",
-            "--data.validation_phantoms=0", "--trainer.accelerator=cpu", "--trainer.devices=1",
-            "--trainer.precision=32", f"--data.cache={cache}", f"--out={tmp_path / 'base'}"]
+            "--model.network.init_args.head_channels=8", "--model.cube.voxels=16",
+            "--model.text.encoder=none", "--data.phantoms=2", "--data.holdout.phantoms=0",
+            "--trainer.accelerator=cpu", "--trainer.devices=1", "--trainer.precision=32",
+            f"--data.cache={cache}", f"--out={tmp_path / 'base'}"]
     said = refusal(capsys, [*args, f"--ckpt_path={straight / 'last.ckpt'}"])
     assert "super-resolution stage" in said and "base prior is needed" in said
 
 
 @pytest.mark.parametrize("change, words", [
-    (["--data.crop=15"], ["data.crop", "15"]), (["--data.crop=18"], ["18", "divisible by 4"]),
-    (["--model.voxels=34"], ["34", "divisible"]), (["--model.most_noise=2"], ["most_noise"]),
-    (["--stage=fine"], ["fine"]), (["--model.text=none"], ["model.text"]),
+    (["--data.crops.size=15"], ["data.crops.size", "15"]), (["--data.crops.size=18"], ["18", "divisible by 4"]),
+    (["--model.cube.voxels=34"], ["34", "divisible"]), (["--model.most_noise=2"], ["most_noise"]),
+    (["--stage=fine"], ["fine"]), (["--model.text.encoder=none"], ["model.text.encoder"]),
     (["--model.initial={base}"], ["base prior"])],
     ids=lambda value: value[0].split("=")[0].strip("-") if value[0].startswith("-") else "")
 def test_bad_input_is_one_sentence(change, words, cache, tmp_path, capsys):
@@ -145,11 +149,11 @@ def test_bad_input_is_one_sentence(change, words, cache, tmp_path, capsys):
 def test_training_goes_on_from_a_stage_and_refuses_one_of_another_grid(tmp_path):
     path, first = tmp_path / "fine.safetensors", tiny_super_resolution()
     save_super_resolution(first, path, dtype=torch.float32)
-    task = SuperResolutionTraining(initial=str(path), voxels=32, factor=2, window=(-1000, 600))
+    task = SuperResolutionTraining(initial=str(path), cube=Cube(32), factor=2, window=(-1000, 600))
     assert all(torch.equal(weight, first.state_dict()[name]) for name, weight in task.prior.state_dict().items())
     assert all(weight.requires_grad for weight in task.prior.parameters())
     with pytest.raises(ValueError, match="another grid"):
-        SuperResolutionTraining(initial=str(path), voxels=64, factor=2, window=(-1000, 600))
+        SuperResolutionTraining(initial=str(path), cube=Cube(64), factor=2, window=(-1000, 600))
 
 
 def test_the_stage_is_the_command_lines_or_the_last_configurations(tmp_path):

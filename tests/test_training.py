@@ -22,21 +22,23 @@ from torch.utils.data import default_collate
 from phydict.cli.train import main
 from phydict.datasets import Thorax, phantom_case
 from phydict.datasets.phantoms.cached import CachedPhantoms
-from phydict.grid import Grid
+from phydict.grid import Cube, Grid
 from phydict.prior import VolumeUNet, load_prior, save_prior
 from phydict.runtime.files import alone_in
 from phydict.training import PriorTraining
 from phydict.training.base import reconstruction_scores
 from phydict.training.data import PriorData
+from phydict.training.settings import HoldOut, TextSettings
 from phydict.units import HUWindow
 
 CONFIG = Path(__file__).parents[1] / "configs" / "prior" / "phantom.yaml"
 TINY = ["--model.network.class_path=phydict.prior.VolumeUNet", "--model.network.init_args.channels=[8,8]",
         "--model.network.init_args.attention=[false,true]", "--model.network.init_args.head_channels=8",
-        "--model.voxels=16", "--model.text_pretrain_steps=2", "--model.warmup=2", "--model.preview_steps=2",
-        "--data.phantoms=4", "--data.validation_phantoms=1", "--data.epoch_size=8", "--data.batch_size=2",
-        "--trainer.accelerator=cpu", "--trainer.devices=1", "--precision=float32", "--trainer.max_steps=-1",
-        "--trainer.log_every_n_steps=1", "--trainer.check_val_every_n_epoch=1", "--trainer.enable_progress_bar=false",
+        "--model.cube.voxels=16", "--model.text.pretrain_steps=2", "--model.optimisation.warmup=2",
+        "--model.validation.preview_steps=2", "--data.phantoms=4", "--data.holdout.phantoms=1",
+        "--data.loading.epoch_size=8", "--data.loading.batch_size=2", "--trainer.accelerator=cpu",
+        "--trainer.devices=1", "--precision=float32", "--trainer.max_steps=-1", "--trainer.log_every_n_steps=1",
+        "--trainer.check_val_every_n_epoch=1", "--trainer.enable_progress_bar=false",
         "--trainer.enable_model_summary=false"]
 
 
@@ -88,7 +90,7 @@ def checkpoint(folder: Path) -> dict:
 
 
 def test_the_loss_falls(tmp_path, cache):
-    main(arguments(tmp_path, cache, "--trainer.max_epochs=8", "--model.learning_rate=5e-3",
+    main(arguments(tmp_path, cache, "--trainer.max_epochs=8", "--model.optimisation.learning_rate=5e-3",
                    "--trainer.limit_val_batches=0"))
     loss = [float(value) for _, value in sorted(losses(tmp_path).items())]
     assert len(loss) == 32
@@ -245,7 +247,7 @@ def test_the_checkpoint_that_reconstructs_best_is_kept(tmp_path, cache, monkeypa
 
 
 def test_without_validation_views_nothing_is_reconstructed_or_kept(tmp_path, cache):
-    main(arguments(tmp_path, cache, "--trainer.max_epochs=1", "--model.validation_views=0"))
+    main(arguments(tmp_path, cache, "--trainer.max_epochs=1", "--model.validation.views=0"))
     assert "val/psnr" not in next(tmp_path.glob("logs/**/metrics.csv")).read_text()
     assert not (tmp_path / "best.ckpt").exists() and (tmp_path / "last.ckpt").exists()
 
@@ -271,7 +273,8 @@ def cts(tmp_path_factory) -> Path:
 
 
 def test_held_out_cts_only_validate_and_draws_mix_cts_with_phantoms(cts, tmp_path):
-    data = PriorData(str(cts), holdout=["patient1"], phantoms=2, validation_phantoms=1, cache=str(tmp_path), voxels=16)
+    data = PriorData(str(cts), holdout=HoldOut(["patient1"], phantoms=1), phantoms=2, cache=str(tmp_path),
+                     cube=Cube(16))
     assert [ct.id for ct in data.cts.cts] == ["patient0"]
     assert [ct.id for ct in data.validation.datasets[1].cts] == ["patient1"]
     both = [{key: case[key] for key in ("volume", "masks", "has_masks")} for case in (data.phantoms[0], data.cts[0])]
@@ -282,14 +285,14 @@ def test_held_out_cts_only_validate_and_draws_mix_cts_with_phantoms(cts, tmp_pat
 @pytest.mark.parametrize("change, words", [
     (["--data.phantoms=0"], ["nothing to train on"]),
     (["--data.cts=/nowhere/at/all"], ["/nowhere/at/all"]),
-    (["--data.holdout=[nobody]", "--data.cts={cts}"], ["nobody", "patient0"]),
-    (["--data.holdout=[patient]", "--data.cts={cts}", "--data.phantoms=0"], ["nothing to train on"]),
+    (["--data.holdout.ids=[nobody]", "--data.cts={cts}"], ["nobody", "patient0"]),
+    (["--data.holdout.ids=[patient]", "--data.cts={cts}", "--data.phantoms=0"], ["nothing to train on"]),
     (["--data.cts={cts}", "--data.cache={cts}/cache"], ["inside"]),
-    (["--data.epoch_size=1"], ["epoch_size", "batch"]),
+    (["--data.loading.epoch_size=1"], ["epoch_size", "batch"]),
     (["--data.lungs=2"], ["data.lungs"]),
     (["--data.augmentation.shift=-5"], ["shift", "-5"]),
     (["--throughput.peak=0"], ["throughput.peak"]),
-    (["--model.voxels=15"], ["15", "divisible"]),
+    (["--model.cube.voxels=15"], ["15", "divisible"]),
     (["--ckpt_path=/nowhere/last.ckpt"], ["/nowhere/last.ckpt"]),
     (["--ckpt_path={cut}"], ["cut.ckpt", "truncated"]),
 ], ids=lambda value: value[0].split("=")[0].strip("-") if isinstance(value, list) and value[0][0] == "-" else "")
@@ -319,7 +322,7 @@ def test_a_training_that_goes_on_elsewhere_overwrites_no_other(straight, cache, 
 
 
 def test_of_two_trainings_at_once_in_one_folder_the_second_is_refused(cache, tmp_path, capsys, monkeypatch):
-    short = ["--trainer.limit_train_batches=1", "--trainer.limit_val_batches=0", "--model.text=none"]
+    short = ["--trainer.limit_train_batches=1", "--trainer.limit_val_batches=0", "--model.text.encoder=none"]
     step, met = PriorTraining.training_step, []
 
     def meanwhile(task, batch, index):
@@ -367,7 +370,7 @@ def test_a_missing_configuration_says_which_to_give(command, cache, tmp_path, ca
 def test_a_list_of_someone_elses_is_not_replaced(cts, cache, tmp_path, capsys):
     (tmp_path / "held_out.txt").write_text("mine\n")
     said = refusal(capsys, arguments(tmp_path, cache, "--trainer.max_epochs=1", f"--data.cts={cts}",
-                                     "--data.holdout=[patient1]"))
+                                     "--data.holdout.ids=[patient1]"))
     assert "held_out.txt is there already" in said and (tmp_path / "held_out.txt").read_text() == "mine\n"
 
 
@@ -385,7 +388,7 @@ def test_an_export_replaces_a_prior_when_asked_and_nothing_else_ever(straight, t
     assert load_prior(file).window.high == 1000
 
 
-@pytest.mark.parametrize("change, key", [(["--model.voxels=24"], "grid"), (["--model.text=none"], "text"),
+@pytest.mark.parametrize("change, key", [(["--model.cube.voxels=24"], "grid"), (["--model.text.encoder=none"], "text"),
                                          (["--model.window=[-1000,600]"], "hu_window")])
 def test_a_checkpoint_is_resumed_only_as_what_it_is(change, key, straight, cache, tmp_path, capsys):
     said = refusal(capsys, arguments(tmp_path, cache, "--trainer.max_epochs=3", f"--ckpt_path={straight / 'last.ckpt'}",
@@ -400,7 +403,7 @@ def test_validation_needs_trained_weights(cache, tmp_path, capsys):
 
 def test_the_held_out_cts_are_written_down(cts, cache, tmp_path):
     main(arguments(tmp_path, cache, "--trainer.max_epochs=1", "--trainer.limit_train_batches=1",
-                   "--trainer.limit_val_batches=0", f"--data.cts={cts}", "--data.holdout=[patient1]"))
+                   "--trainer.limit_val_batches=0", f"--data.cts={cts}", "--data.holdout.ids=[patient1]"))
     assert (tmp_path / "held_out.txt").read_text() == "patient1\n"
 
 
@@ -436,7 +439,7 @@ def test_a_loader_process_sends_the_message_too(cts, tmp_path, cache, capsys):
     (tmp_path / "cts").mkdir()
     (tmp_path / "cts" / "cut.nii.gz").write_bytes((cts / "patient0.nii.gz").read_bytes()[:200])
     said = refusal(capsys, arguments(tmp_path, cache, "--trainer.max_epochs=1", f"--data.cts={tmp_path / 'cts'}",
-                                     "--data.phantoms=0", "--data.workers=1", "--model.text=none"))
+                                     "--data.phantoms=0", "--data.loading.workers=1", "--model.text.encoder=none"))
     assert "cut.nii.gz" in said and "Traceback" not in said
 
 
@@ -476,7 +479,7 @@ def test_an_export_that_cannot_be_written_leaves_nothing(out, straight, tmp_path
 def two_processes(folder: Path, cache: Path, config: str, *more: str) -> subprocess.CompletedProcess:
     """One epoch by two processes on one sample each per step, with a configuration for several devices."""
     args = arguments(folder, cache, f"--config={CONFIG.with_name(config)}", "--trainer.max_epochs=1",
-                     "--data.batch_size=1", "--trainer.devices=2", *more)
+                     "--data.loading.batch_size=1", "--trainer.devices=2", *more)
     return subprocess.run([sys.executable, str(CONFIG.parents[2] / "train.py"), *args], capture_output=True, text=True,
                           env=os.environ | {"OMP_NUM_THREADS": "1"}, timeout=300)
 
@@ -509,7 +512,7 @@ def test_every_process_stops_where_one_of_them_has_a_loss_that_is_not_finite(tmp
         PriorTraining.denoising_loss = broken
         main()""")
     args = arguments(tmp_path / "run", cache, f"--config={CONFIG.with_name('ddp.yaml')}", "--trainer.devices=2",
-                     "--data.batch_size=1", "--trainer.max_epochs=1", "--model.text=none")
+                     "--data.loading.batch_size=1", "--trainer.max_epochs=1", "--model.text.encoder=none")
     done = subprocess.run([sys.executable, str(tmp_path / "train.py"), *args], capture_output=True, text=True,
                           env=os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(CONFIG.parents[2])}, timeout=300)
     assert done.returncode == 2 and "Traceback" not in done.stderr, done.stderr[-2000:]
@@ -540,7 +543,7 @@ def test_spread_weights_are_not_averaged(tmp_path, cache):
 
 
 @pytest.mark.parametrize("flags, tolerance", [
-    (["--model.gradient_checkpointing=true"], 1e-6), (["--model.channels_last=false"], 1e-4),
+    (["--model.execution.gradient_checkpointing=true"], 1e-6), (["--model.execution.channels_last=false"], 1e-4),
     (["--precision=bfloat16"], 0.03)], ids=["checkpointing", "layout", "bf16"])
 def test_flags_leave_the_loss_and_their_checkpoint_goes_on_without_them(flags, tolerance, straight, cache, tmp_path):
     main(arguments(tmp_path, cache, "--trainer.max_epochs=1", "--trainer.limit_val_batches=0", *flags))
@@ -554,8 +557,8 @@ def test_flags_leave_the_loss_and_their_checkpoint_goes_on_without_them(flags, t
 
 
 def test_a_batch_is_one_loss_however_many_processes_share_it(cache):
-    data = PriorData(phantoms=4, cache=str(cache), voxels=16)
-    task = PriorTraining(VolumeUNet(4, 2, (8, 8), (False, True), 1, 8), "none", voxels=16)
+    data = PriorData(phantoms=4, cache=str(cache), cube=Cube(16))
+    task = PriorTraining(VolumeUNet(4, 2, (8, 8), (False, True), 1, 8), TextSettings("none"), cube=Cube(16))
     torch.nn.init.normal_(task.prior.network.unfold.weight, std=0.1)
     batch = default_collate([data.phantoms[i] for i in range(4)])
     shares = [{key: value[rank::2] for key, value in batch.items()} for rank in range(2)]
@@ -566,11 +569,11 @@ def test_a_batch_is_one_loss_however_many_processes_share_it(cache):
 
 
 def test_a_dropped_report_is_none_at_all(cache):
-    data = PriorData(phantoms=4, cache=str(cache), voxels=16)
+    data = PriorData(phantoms=4, cache=str(cache), cube=Cube(16))
     batch = default_collate([data.phantoms[i] for i in range(4)])
     silent = batch | {"report": [""] * 4}
     for dropout, heard in ((0.0, True), (1.0, False)):
-        task = PriorTraining(tiny_prior().network, reports=data.reports, voxels=16, text_dropout=dropout)
+        task = PriorTraining(tiny_prior().network, TextSettings(reports=data.reports, dropout=dropout), cube=Cube(16))
         with torch.no_grad():
             assert (task.denoising_loss(batch) != task.denoising_loss(silent)) == heard
 
@@ -579,13 +582,13 @@ def test_training_goes_on_from_a_prior_and_refuses_one_of_another_grid(tmp_path)
     path = tmp_path / "prior.safetensors"
     first = tiny_prior()
     save_prior(first, path, dtype=torch.float32)
-    task = PriorTraining(initial=str(path), voxels=16, window=(-1000, 600), text="none")
+    task = PriorTraining(initial=str(path), cube=Cube(16), window=(-1000, 600), text=TextSettings("none"))
     x, t = torch.randn(1, 4, 16, 16, 16), torch.tensor([0.4])
     reports = ["Pleural effusion (right), 12 mm."]
     torch.testing.assert_close(task.prior(x, t, task.prior.context(reports)), first(x, t, first.context(reports)))
     assert all(w.requires_grad for w in task.prior.parameters())
     with pytest.raises(ValueError, match="another grid"):
-        PriorTraining(initial=str(path), voxels=32, window=(-1000, 600), text="none")
+        PriorTraining(initial=str(path), cube=Cube(32), window=(-1000, 600), text=TextSettings("none"))
 
 
 def test_a_phantoms_sketch_is_the_change_its_findings_make_where_they_are(cache):

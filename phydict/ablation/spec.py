@@ -16,12 +16,15 @@ from typing import get_args, get_type_hints
 
 from jsonargparse import ArgumentError, ArgumentParser
 
+from phydict.datasets import CTSource
 from phydict.grid import Grid
 from phydict.inference.data import ReconstructionData
+from phydict.inference.settings import Orbit
 from phydict.methods import METHODS
 from phydict.posterior import Sampler
 from phydict.prior import DEFAULT_PRIOR, fingerprint, load_prior
 from phydict.reconstruction import Reconstructor, describe
+from phydict.runtime.renamed import check_setting
 from phydict.runtime.seeds import check_seed
 from phydict.runtime.shipped import configuration
 from phydict.runtime.yaml_file import read_yaml
@@ -75,7 +78,7 @@ class Cases:
         """The simulated X-rays of these cases."""
         if self.phantoms is not None:
             return ReconstructionData(cts="phantom", phantoms=self.phantoms, **settings)
-        return ReconstructionData(cts=self.cts, only=self.only, reports=self.reports, **settings)
+        return ReconstructionData(cts=self.cts, only=self.only, source=CTSource(self.reports), **settings)
 
 
 @dataclass(frozen=True)
@@ -265,8 +268,9 @@ def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
                          f"{value['detector']} was given")
     pixel = SIDE / value["detector"] if value["pixel"] is None else value["pixel"]
     data = cases.data(
-        with_report=value["report"], views=value["views"], source_to_detector=value["source_to_detector"],
-        source_to_isocentre=value["source_to_isocentre"], detector=(value["detector"],) * 2, pixel=(pixel, pixel),
+        with_report=value["report"],
+        orbit=Orbit(value["views"], value["source_to_detector"], value["source_to_isocentre"], (value["detector"],) * 2,
+                    (pixel, pixel)),
         simulator=simulator, simulation_voxels=value["simulation_voxels"])
     with_prior = isinstance(method, Sampler)
     overrides = {f"{part}.{path}": plain(field_of({"method": method, "simulator": simulator}[part], path.split(".")))
@@ -357,7 +361,9 @@ def key(trial: Trial, case: str, source: str) -> str:
 
 
 def _dotted(settings: Mapping) -> dict:
-    """Settings, their names without the init_args of infer.py's configuration files."""
+    """Settings, their names without the init_args of infer.py's configuration files. Raises ValueError for old
+    names."""
+    check_setting("", settings)
     return {".".join(part for part in str(name).split(".") if part != "init_args"): value
             for name, value in settings.items()}
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import sys
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 
 import lightning
@@ -14,17 +16,24 @@ from phydict.datasets.radiographs.radiographs import load_xrays
 from phydict.inference.data import ReconstructionData
 from phydict.inference.dry_run import dry_run
 from phydict.inference.task import ReconstructionTask
+from phydict.methods import METHODS
 from phydict.runtime.console import (
-    check_apart, check_command, check_configured, cli_errors, noted, quiet, read_configurations, sentence,
-    with_configurations)
+    CONFIGURATION, check_apart, check_command, cli_errors, noted, quiet, read_configuration, sentence)
 from phydict.runtime.reading import reading
+from phydict.runtime.shipped import configuration
 
 COMMANDS = {"predict": "X-rays -> volumes", "test": "CTs -> X-rays -> volumes and scores",
             "ablate": "methods compared on the same X-rays"}
 
+DEFAULT_METHOD = "phydict_fast"
+"""The method where none is given."""
+
 
 class InferenceCLI(LightningCLI):
     """predict and test only; no logs, no checkpoints, gradients allowed inside the steps."""
+
+    def parse_arguments(self, parser, args: list[str]) -> None:
+        super().parse_arguments(parser, with_methods(args))
 
     @staticmethod
     def subcommands() -> dict[str, set[str]]:
@@ -96,18 +105,81 @@ class InferenceCLI(LightningCLI):
             self.trainer.test(model, datamodule=datamodule, verbose=False)
 
 
+def with_methods(args: list[str]) -> list[str]:
+    """Arguments with a method's name and settings in the place of its name, in `--model.method` and in configurations.
+
+    `--model.name` calls it otherwise, and more arguments change the settings. Without any method it is DEFAULT_METHOD.
+    Raises ValueError for names of no method and of no configuration.
+    """
+    given = [arg.partition("=")[0] for arg in args]
+    chosen = any(option in ("--model", "--model.method", "--model.method.class_path") for option in given)
+    out, rest = [], iter(args)
+    for arg in rest:
+        option, equals, value = arg.partition("=")
+        if option in CONFIGURATION:
+            value, gives_method = _configuration(value if equals else next(rest, ""))
+            arg, chosen = f"--config={value}", chosen or gives_method
+        elif option == "--model.method":
+            value = value if equals else next(rest, "")
+            arg = f"{option}={value}"
+            if _is_name(value):
+                named = _named(value)
+                if "--model.name" in given:
+                    del named["name"]
+                arg = "--config=" + json.dumps({"model": named})
+        out.append(arg)
+    if not chosen:
+        start = next((i for i, arg in enumerate(out, 1) if arg in COMMANDS), 0)
+        out.insert(start, "--config=" + json.dumps({"model": _named(DEFAULT_METHOD)}))
+    return out
+
+
+def _configuration(given: str) -> tuple[str, bool]:
+    """A configuration, its file or what it holds where it names a method, and whether it gives one at all."""
+    if ":" in given:  # YAML itself
+        return given, "method" in given
+    try:
+        file = str(configuration(given, ("reconstruct", "simulate")))
+    except ValueError:
+        if (name := given.removeprefix("configs/reconstruct/").removesuffix(".yaml")) not in METHODS:
+            raise
+        return json.dumps({"model": _named(name)}), True
+    settings = read_configuration(file)
+    model = settings.get("model", {})
+    if not _is_name(model.get("method")):
+        return file, "method" in model
+    named = _named(model["method"])
+    return json.dumps(settings | {"model": named | model | {"method": named["method"]}}), True
+
+
+def _is_name(method: object) -> bool:
+    """Whether a method is given by a name, instead of a class or its settings."""
+    return isinstance(method, str) and not method.startswith("{") and "." not in method and method not in {
+        type(known).__name__ for known in METHODS.values()}
+
+
+def _named(name: str) -> dict:
+    """What a named method is as model.name and model.method. Raises ValueError where there is none of that name."""
+    if name not in METHODS:
+        raise ValueError(f"there is no method '{name}': give model.method one of {', '.join(METHODS)}, or a class "
+                         "such as phydict.posterior.DDS")
+    return {"name": name, "method": _written(METHODS[name])}
+
+
+def _written(settings: object) -> dict:
+    """Nested settings as a configuration writes them."""
+    kind, values = type(settings), {field.name: getattr(settings, field.name) for field in fields(settings)}
+    return {"class_path": f"{kind.__module__}.{kind.__qualname__}", "init_args": {
+        name: _written(value) if is_dataclass(value) else value for name, value in values.items()}}
+
+
 def main(args: list[str] | None = None) -> None:
     """Command line of inference: predict, test, ablate. A bad input ends in one sentence and exit code 2."""
     args = sys.argv[1:] if args is None else args
     if args[:1] == ["ablate"]:
         return ablate(args[1:])
     with cli_errors(MisconfigurationException), quiet():
-        check_command(args, COMMANDS, InferenceCLI.subcommands(), "predict -c "
-                      "configs/reconstruct/phydict_fast.yaml --data.xrays data/example/xrays")
-        check_configured(args, ("--model", "--model.method", "--model.method.class_path"),
-                         "configs/reconstruct/phydict_fast.yaml")
-        args = with_configurations(args, ("reconstruct", "simulate"))
-        read_configurations(args)
+        check_command(args, COMMANDS, InferenceCLI.subcommands(), "predict --data.xrays data/example/xrays")
         cli = InferenceCLI(
             ReconstructionTask, ReconstructionData, args=args, seed_everything_default=0, save_config_callback=None,
             parser_kwargs={"exit_on_error": False, "allow_abbrev": False, "description": (

@@ -73,16 +73,16 @@ class PriorCLI(LightningCLI):
         parser.add_lightning_class_args(TrainingProgress, "progress")
         parser.link_arguments("out", "checkpoint.dirpath")
         parser.link_arguments("out", "trainer.default_root_dir")
-        for name in ("voxels", "side", "window"):
+        for name in ("cube.voxels", "cube.side", "window"):
             parser.link_arguments(f"model.{name}", f"data.{name}")
         if self.model_class is PriorTraining:
-            parser.link_arguments("data.reports", "model.reports", apply_on="instantiate")
+            parser.link_arguments("data.reports", "model.text.reports", apply_on="instantiate")
             parser.add_lightning_class_args(BestCheckpoint, "best")
             parser.set_defaults({"best.filename": Path(BEST).stem, "best.enable_version_counter": False,
                                  "best.monitor": "val/psnr", "best.mode": "max", "best.save_on_train_epoch_end": False})
             parser.link_arguments("out", "best.dirpath")
         else:
-            parser.link_arguments("model.factor", "data.factor")
+            parser.link_arguments("model.factor", "data.crops.factor")
 
     def instantiate_trainer(self, **kwargs) -> lightning.Trainer:
         asked = self._get(self.config_init, "trainer").plugins or []

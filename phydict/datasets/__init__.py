@@ -2,7 +2,7 @@
 
 from phydict.datasets.cts.anatomy import MASKS, segment
 from phydict.datasets.cts.augment import Augmentation, Deformation, augment
-from phydict.datasets.cts.ct_rate import CTCases, CTFile, find_cts, load_case, patient_of, split_by_patient
+from phydict.datasets.cts.ct_rate import CTCases, CTFile, CTSource, find_cts, load_case, patient_of, split_by_patient
 from phydict.datasets.cts.ct_rate_tables import read_calibrations, read_reports
 from phydict.datasets.cts.transforms import Calibration, load_ct, prepare_ct
 from phydict.datasets.intensity import Intensity
@@ -17,6 +17,7 @@ __all__ = [
            "Augmentation",
            "CTCases",
            "CTFile",
+           "CTSource",
            "Calibration",
            "Deformation",
            "Finding",

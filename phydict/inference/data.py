@@ -13,17 +13,18 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from phydict.datasets import CTFile, find_cts, find_xrays, load_case, load_xrays, phantom_case
+from phydict.datasets import CTFile, CTSource, find_xrays, load_case, load_xrays, phantom_case
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM, PHANTOM_VERSION
 from phydict.evaluation import volume_metrics
 from phydict.grid import Grid
+from phydict.inference.settings import Orbit
 from phydict.reconstruction import describe
 from phydict.runtime.console import noted
 from phydict.runtime.files import file_crc32
 from phydict.runtime.reading import name_of, read_ids
 from phydict.runtime.shipped import own_or_shipped
 from phydict.units import HUWindow
-from phydict.xray import ConeBeam, Ideal, Projector, Simulator
+from phydict.xray import Ideal, Projector, Simulator
 
 MOST_PHANTOMS = 100_000
 
@@ -54,31 +55,19 @@ class ReconstructionData(lightning.LightningDataModule):
         xrays: for predict, a folder of X-ray images with geometry.yaml, or a folder of such folders
         geometry: a geometry file used instead of theirs
         cts: for test, a NIfTI file or a folder of CTs, or the word phantom
-        reports: CT-RATE's table of reports, or the folder it is in; none given: looked for beside the CTs
-        metadata: CT-RATE's metadata table, needed where headers are not fixed
-        fixed: whether the NIfTI headers are right (CT-RATE's *_fixed folders and ordinary archives)
+        source: which CTs of a folder are taken, and what belongs to them
         only: a text file of the case ids to test, such as the held_out.txt of a training; none given: all
-        first_reconstruction: keep one volume per scan
-        exclude: a text file of case ids to leave out
         phantoms: how many phantoms where cts is the word phantom
         with_report: whether the cases' reports are used
-        views: simulated views, on a full circle from anterior
-        source_to_detector: mm
-        source_to_isocentre: mm
-        detector: rows and columns of simulated pixels
-        pixel: mm from row to row and from column to column
+        orbit: the simulated X-rays' geometry
         simulator: how X-rays are made of a CT (configs/simulate)
         simulation_voxels: voxels per side of the volume that X-rays are made of; none given: the reconstruction's own
             grid, which is an inverse crime; more lessens it
     """
 
     def __init__(self, xrays: str | None = None, geometry: str | None = None, cts: str | None = None,
-                 reports: str | None = None, metadata: str | None = None, fixed: bool = True, only: str | None = None,
-                 first_reconstruction: bool = False, exclude: str | None = None, phantoms: int = 4,
-                 with_report: bool = True, views: int = 8, source_to_detector: float = 1020.0,
-                 source_to_isocentre: float = 740.0, detector: tuple[int, int] = (448, 448),
-                 pixel: tuple[float, float] = (1.25, 1.25), simulator: Simulator = Ideal(),
-                 simulation_voxels: int | None = None):
+                 source: CTSource = CTSource(), only: str | None = None, phantoms: int = 4, with_report: bool = True,
+                 orbit: Orbit = Orbit(), simulator: Simulator = Ideal(), simulation_voxels: int | None = None):
         super().__init__()
         if not 1 <= phantoms <= MOST_PHANTOMS:
             raise ValueError(f"data.phantoms lies between 1 and {MOST_PHANTOMS:,}, but {phantoms:,} was given")
@@ -86,18 +75,14 @@ class ReconstructionData(lightning.LightningDataModule):
             raise ValueError(f"data.simulation_voxels must be at least 1, but {simulation_voxels} was given: leave it "
                              "out for the reconstruction's own")
         self.xrays, self.geometry, self.cts, self.phantoms, self.only = xrays, geometry, cts, phantoms, only
-        self.tables = {"reports": reports, "metadata": metadata, "fixed": fixed,
-                       "first_reconstruction": first_reconstruction, "exclude": exclude}
-        self.with_report, self.simulator, self.simulation_voxels = with_report, simulator, simulation_voxels
-        self.beam = ConeBeam.orbit(views, source_to_detector, source_to_isocentre, detector, pixel)
-        self.orbit = {"views": views, "source_to_detector": source_to_detector,
-                      "source_to_isocentre": source_to_isocentre, "detector": detector, "pixel": pixel}
+        self.source, self.with_report, self.simulator = source, with_report, simulator
+        self.simulation_voxels, self.orbit, self.beam = simulation_voxels, orbit, orbit.beam()
 
     def settings(self, stage: str) -> dict:
         """What, beside the cases themselves, decides the X-rays that a stage (predict, test) reconstructs from."""
         if stage == "predict":
             return {"with_report": self.with_report, "geometry": self.geometry}
-        return {"with_report": self.with_report, **self.orbit, "simulator": describe(self.simulator),
+        return {"with_report": self.with_report, **vars(self.orbit), "simulator": describe(self.simulator),
                 "simulation_voxels": self.simulation_voxels}
 
     def xray_cases(self) -> dict[str, Path]:
@@ -135,7 +120,7 @@ class ReconstructionData(lightning.LightningDataModule):
                         grid, lambda g: phantom_case(s, g, window)))
                     for seed in range(HELD_OUT_PHANTOM, HELD_OUT_PHANTOM + self.phantoms)]
         return [(ct.id, _ct_source(ct), lambda c=ct: self._with_fine(grid, lambda g: load_case(c, g, window)))
-                for ct in self._chosen(find_cts(self.cts, **self.tables))]
+                for ct in self._chosen(self.source.find(self.cts))]
 
     def _chosen(self, cts: list[CTFile]) -> list[CTFile]:
         if not self.only:

@@ -22,9 +22,10 @@ from rich.console import Console
 from torch import Tensor
 
 from phydict.evaluation import CaseMetrics, mean_table, panel
-from phydict.grid import Grid
+from phydict.grid import Cube, Grid
 from phydict.inference.data import case_scores
 from phydict.inference.results import CaseResults
+from phydict.inference.settings import CascadeSettings, Sampling
 from phydict.methods import fit_to_grid, reconstructor
 from phydict.posterior import CascadePosterior, Sampler
 from phydict.prior import DEFAULT_PRIOR, MedSynCheckpoint, file_read, fingerprint, load_prior, load_super_resolution
@@ -45,60 +46,48 @@ class ReconstructionTask(lightning.LightningModule):
 
     Args:
         method: a Sampler, which is run with the prior, or a Reconstructor
-        name: what tables and folders call the method
+        name: what tables and folders call the method; none given: the name it was given by, or its class's
         prior: the prior's file, or a file or folder of MedSyn's, read where the method is a Sampler
-        guidance: scale of classifier-free guidance when a report is given; 1: none
-        super_resolution: file of a cascade's second stage, which refines what the prior gives; none given: none
-        sr_guided: whether the X-rays guide the second stage too
-        sr_sampler: how they do; none given: the cascade's own
-        sr_noise_augmentation: level in [0, 1] of the noise that the prior's estimate is given before the second stage
-        sees it;
-            none given: the stage's own, 0.05, or 0 for MedSyn's
-        samples: how many are drawn; of several the volume is the mean, and deviation.nii.gz their standard deviation
-        sr_memory: GiB that the second stage's network may take; it works in tiles where the whole takes more, and
-            MedSyn's, which cannot, is refused
-        precision: of the networks: auto (bfloat16 where the device computes it), float32 or bfloat16
+        sampling: how the prior is sampled
+        super_resolution: a cascade's second stage, which refines what the prior gives
         out: output folder; cases go to <out>/<name>/<case>
         overwrite: do finished cases again; a new result takes the old one's place when it is complete
         seed: the only source of randomness; of each case in predict, as in Python, and by phydict.case_seed in test
-        voxels: voxels along each side of the cube, for methods without a prior
-        side: side of the cube in mm, for methods without a prior
+        cube: of voxels, for methods without a prior
     """
 
-    def __init__(self, method: Sampler | Reconstructor, name: str,
-                 prior: str | MedSynCheckpoint = str(DEFAULT_PRIOR), guidance: float = 1.0,
-                 super_resolution: str | MedSynCheckpoint | None = None, sr_guided: bool = True,
-                 sr_sampler: Sampler | None = None, sr_noise_augmentation: float | None = None, sr_memory: float = 4.0,
-                 out: str = "runs/reconstructions", overwrite: bool = False, seed: int = 0, voxels: int = 64,
-                 side: float = 384.0, samples: int = 1, precision: str = "auto"):
+    def __init__(self, method: Sampler | Reconstructor, name: str | None = None,
+                 prior: str | MedSynCheckpoint = str(DEFAULT_PRIOR), sampling: Sampling = Sampling(),
+                 super_resolution: CascadeSettings = CascadeSettings(), out: str = "runs/reconstructions",
+                 overwrite: bool = False, seed: int = 0, cube: Cube = Cube()):
         super().__init__()
         check_seed(seed)
+        name = type(method).__name__ if name is None else name
         if name in ("", "..") or name != Path(name).name:
             raise ValueError(f"model.name is the name of one folder inside model.out, but '{name}' was given")
         self.method_name, self.seed, self.pages = name, seed, Path(out) / "dry_run"
         self.results = CaseResults(Path(out) / name, overwrite)
         check_writable(self.results.folder, "model.out")
         self.settings = {"name": name, "seed": seed, "method": describe(method)}
-        self.grid, self.window = Grid.cube(voxels, side), HUWindow()
+        self.grid, self.window = cube.grid(), HUWindow()
         self.prior = load_prior(prior) if isinstance(method, Sampler) else None
         if self.prior is not None:
             self.grid, self.window = self.prior.grid, self.prior.window
-            self.settings |= _identity("prior", prior) | {"guidance": guidance}
-            if samples != 1:
-                self.settings["samples"] = samples
-            if precision != "auto":
-                self.settings["precision"] = precision
+            self.settings |= _identity("prior", prior) | {"guidance": sampling.guidance}
+            if sampling.samples != 1:
+                self.settings["samples"] = sampling.samples
+            if sampling.precision != "auto":
+                self.settings["precision"] = sampling.precision
         self.super_resolution = None
-        if super_resolution:
-            if not 0 < sr_memory < 2**20:
-                raise ValueError(f"model.sr_memory is an amount in GiB, above 0, but {sr_memory:g} was given")
-            self.super_resolution = load_super_resolution(super_resolution)
-            self.super_resolution.memory = int(sr_memory * 2**30)
+        if super_resolution.file:
+            self.super_resolution = load_super_resolution(super_resolution.file)
+            self.super_resolution.memory = int(super_resolution.memory * 2**30)
             self.grid = self.super_resolution.grid
-        self.reconstructor = reconstructor(method, self.prior, guidance, name, self.super_resolution, sr_guided, sr_sampler,
-                                           sr_noise_augmentation, samples, precision)
+        self.reconstructor = reconstructor(
+            method, self.prior, sampling.guidance, name, self.super_resolution, super_resolution.guided,
+            super_resolution.sampler, super_resolution.noise_augmentation, sampling.samples, sampling.precision)
         if isinstance(self.reconstructor, CascadePosterior):
-            self.settings |= _identity("super_resolution", super_resolution) | {
+            self.settings |= _identity("super_resolution", super_resolution.file) | {
                 "sr_noise_augmentation": self.reconstructor.level, "second": describe(self.reconstructor.second)}
         self.metrics = CaseMetrics([name])
         self.progress = CaseProgress()

@@ -24,14 +24,15 @@ class Cascade:
         base, fine = self.base, self.super_resolution
         if not np.allclose(base.grid.extent, fine.grid.extent) or not np.allclose(base.grid.centre, fine.grid.centre):
             raise ValueError(f"the base prior's cube has sides of {_mm(base)} mm and the super-resolution stage's of "
-                             f"{_mm(fine)} mm, or another centre: use stages trained with the same model.side")
+                             f"{_mm(fine)} mm, or another centre: use stages trained with the same model.cube.side")
         if base.window != fine.window:
             raise ValueError(f"the base prior's HU window is [{base.window.low:g}, {base.window.high:g}] and the "
                              f"super-resolution stage's [{fine.window.low:g}, {fine.window.high:g}]: use stages "
                              "trained with the same model.window")
         if tuple(fine.factor * n for n in base.grid.shape) != fine.grid.shape:
             raise ValueError(f"the super-resolution stage makes {fine.grid.shape} voxels from a factor {fine.factor} "
-                             f"less, but the base prior has {base.grid.shape}: use stages of matching model.voxels")
+                             f"less, but the base prior has {base.grid.shape}: use stages of "
+                             "matching model.cube.voxels")
         if base.state_channels < fine.coarse_channels:
             raise ValueError(f"the super-resolution stage needs {fine.coarse_channels} channels of the base prior, "
                              f"which has {base.state_channels}")

@@ -17,6 +17,7 @@ from pathlib import Path
 
 from jsonargparse import set_loader
 
+from phydict.runtime.renamed import check_options, check_setting
 from phydict.runtime.shipped import configuration
 from phydict.runtime.yaml_file import parse_yaml, read_yaml
 
@@ -94,11 +95,12 @@ def with_configurations(args: list[str], kinds: tuple[str, ...]) -> list[str]:
 
 def check_command(args: Sequence[str], commands: Mapping[str, str], anywhere: Collection[str], example: str) -> None:
     """Raises ValueError, in one sentence that names `commands`, name -> what it does, and an example, where no argument
-    is one of those that may stand `anywhere`, and none asks for help."""
+    is one of those that may stand `anywhere`, and none asks for help, or where an option has an old name."""
     if not any(arg in anywhere or arg in ("-h", "--help") or arg.startswith("--print_config") for arg in args):
         told = ", ".join(f"{name} ({what})" for name, what in commands.items())
         raise ValueError(f"the first word says what to do, but {repr(args[0]) if args else 'none'} was given: use one "
                          f"of {told}; such as: {example}")
+    check_options(args)
 
 
 def check_configured(args: Sequence[str], options: Collection[str], example: str) -> None:
@@ -147,24 +149,29 @@ def check_apart(output: Path, option: str, inputs: Iterable[Path]) -> None:
 
 
 def read_configurations(args: Sequence[str]) -> list[dict]:
-    """What the configuration files hold that a command line names with -c or --config, in their order.
-
-    They are read as `read_yaml` reads, so that what it refuses never reaches the command line's own parser. Files that
-    are not there are left to that. Raises ValueError.
-    """
+    """What the configuration files hold that a command line names, in their order; files that are not there are left
+    to the command line's own parser. Raises ValueError as `read_configuration` does."""
     look = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     look.add_argument("--config", "-c", action="append", default=[])
     given, _ = look.parse_known_args(list(args))
-    found = {file: read_yaml(file) for file in given.config if os.path.isfile(file)}
-    for file, settings in found.items():
-        if not isinstance(settings, dict):
-            raise ValueError(f"{file} holds no settings: it is a mapping, such as `model: {{...}}`")
-        for name in ("model", "data", "trainer"):
-            if not isinstance(settings.get(name, {}), dict):
-                raise ValueError(f"{file}: `{name}` is a mapping of settings, but {reprlib.repr(settings[name])} was "
-                                 "given")
-        _check_classes(settings, str(file), "")
-    return list(found.values())
+    return [read_configuration(file) for file in given.config if os.path.isfile(file)]
+
+
+def read_configuration(file: str) -> dict:
+    """What a configuration file holds, read as `read_yaml` reads, so that what it refuses never reaches the command
+    line's own parser. Raises ValueError."""
+    settings = read_yaml(file)
+    if not isinstance(settings, dict):
+        raise ValueError(f"{file} holds no settings: it is a mapping, such as `model: {{...}}`")
+    for name in ("model", "data", "trainer"):
+        if not isinstance(settings.get(name, {}), dict):
+            raise ValueError(f"{file}: `{name}` is a mapping of settings, but {reprlib.repr(settings[name])} was given")
+    _check_classes(settings, str(file), "")
+    try:
+        check_setting("", settings)
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from error
+    return settings
 
 
 def _check_classes(settings: object, file: str, key: str) -> None:

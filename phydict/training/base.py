@@ -12,12 +12,13 @@ from torch import Tensor
 
 from phydict.diffusion import Denoiser
 from phydict.evaluation import method_panel, volume_metrics
-from phydict.grid import Grid
+from phydict.grid import Cube
 from phydict.methods import reconstruct
 from phydict.prior import DetailNetwork, Prior, TextEncoder, VolumeUNet, describe, learn_vocabulary, load_prior
 from phydict.runtime.warning import warn
 from phydict.training.data import PriorData
 from phydict.training.reports import learn_findings, learn_sketch
+from phydict.training.settings import Execution, PriorOptimisation, PriorValidation, TextSettings
 from phydict.training.sharding import shard
 from phydict.training.stage import StageTraining
 from phydict.units import HUWindow
@@ -29,66 +30,42 @@ class PriorTraining(StageTraining):
 
     Args:
         network: the UNet; none given: the default VolumeUNet
-        text: "small" for a BERT that learns reports first (none where the data have no reports), a folder or hub id
-            for a frozen one, "none" for a prior without text
-        text_length: tokens of a report that a frozen text reads
-        text_padded_to: 2048, with text_length 192, for contexts as MedSyn's; none given: padding is hidden
-        reports: texts that the small BERT's vocabulary is learnt from (taken from the data)
+        text: what reads reports, and how it learns to
         detail: the network for what the UNet's blocks of voxels cannot hold; none given: the default DetailNetwork
-        voxels: voxels along each side of the cube
-        side: side of the cube in mm
+        cube: of voxels
         window: HU that the prior's range [-1, 1] stands for
-        sigma_data: standard deviation of the data in the prior's range
-        text_dropout: share of reports replaced by the null context, in [0, 1]
-        mask_weight: weight of the anatomy masks' error beside the CT's
-        learning_rate: of AdamW
-        weight_decay: of AdamW
-        warmup: steps over which the learning rate rises
-        decay_from: step at which a linear decay of the learning rate to zero begins
-        decay_steps: length of that decay in steps; 0: no decay
-        text_pretrain_steps: steps of each task by which a small BERT learns reports before denoising begins; 0: it
-        learns by
-            denoising
-        preview_steps: noise levels of the samples that validation paints; 0: none
-        validation_views: X-rays from which validation reconstructs each held-out case by phydict_fast, to tell which
-            weights are best; 0: none, as where weights are spread over devices
-        gradient_checkpointing: less memory for a second computation of each block's activations
-        channels_last: lay the network's channels side by side in memory
-        compile: run the network through torch.compile
+        optimisation: how the weights are learnt
+        validation: what validation shows and measures
+        execution: how the network is run
         initial: a prior's file to go on from, which then decides the networks and the text; one without a detail
             network is given this training's
         seed: of times, noise and text dropout
     """
 
-    def __init__(self, network: VolumeUNet | None = None, text: str = "small", text_length: int = 128,
-                 text_padded_to: int | None = None, reports: list[str] | None = None,
-                 detail: DetailNetwork | None = None, voxels: int = 64, side: float = 384.0,
-                 window: tuple[float, float] = (-1000.0, 1000.0), sigma_data: float = 0.5,
-                 text_dropout: float = 0.1, mask_weight: float = 0.1, learning_rate: float = 5e-4,
-                 weight_decay: float = 0.01, warmup: int = 100, decay_from: int = 0, decay_steps: int = 0,
-                 text_pretrain_steps: int = 600, preview_steps: int = 16, validation_views: int = 4,
-                 gradient_checkpointing: bool = False, channels_last: bool = True, compile: bool = False,
+    def __init__(self, network: VolumeUNet | None = None, text: TextSettings = TextSettings(),
+                 detail: DetailNetwork | None = None, cube: Cube = Cube(),
+                 window: tuple[float, float] = (-1000.0, 1000.0), optimisation: PriorOptimisation = PriorOptimisation(),
+                 validation: PriorValidation = PriorValidation(), execution: Execution = Execution(),
                  initial: str | None = None, seed: int = 0):
-        if validation_views < 0:
-            raise ValueError(f"model.validation_views must not be negative, but {validation_views} was given")
         network = network or VolumeUNet()
         encoder = None
-        if text == "small" and not reports:
+        if text.encoder == "small" and not text.reports:
             warn("the data have no reports: this prior will know no text")
-        elif text == "small":
-            encoder = TextEncoder.small(learn_vocabulary(reports), network.context_dim)
-        elif text != "none":
-            encoder = TextEncoder.pretrained(text, text_length, text_padded_to)
-        prior = Prior(network, Grid.cube(voxels, side), HUWindow(*window), encoder, sigma_data=sigma_data,
+        elif text.encoder == "small":
+            encoder = TextEncoder.small(learn_vocabulary(text.reports), network.context_dim)
+        elif text.encoder != "none":
+            encoder = TextEncoder.pretrained(text.encoder, text.length, text.padded_to)
+        prior = Prior(network, cube.grid(), HUWindow(*window), encoder, sigma_data=optimisation.sigma_data,
                       detail=detail or DetailNetwork(network.state_channels))
-        super().__init__(prior, sigma_data, learning_rate, weight_decay, warmup, decay_from, decay_steps, preview_steps,
-                         seed, mask_weight)
+        super().__init__(prior, optimisation.sigma_data, optimisation, validation.preview_steps, seed,
+                         optimisation.mask_weight)
         if initial:
             self._start_from(load_prior(initial), initial)
-        if self.prior.text is not None and reports:
-            self.prior.text.check(reports)
-        self.prior.network.run_with(gradient_checkpointing, channels_last, compile)
-        self.text_dropout, self.text_pretrain_steps, self.validation_views = text_dropout, text_pretrain_steps, validation_views
+        if self.prior.text is not None and text.reports:
+            self.prior.text.check(text.reports)
+        self.prior.network.run_with(execution.gradient_checkpointing, execution.channels_last, execution.compile)
+        self.text_dropout, self.text_pretrain_steps = text.dropout, text.pretrain_steps
+        self.validation_views = validation.views
 
     def _start_from(self, prior: Prior, path: str) -> None:
         if not isinstance(prior, Prior):
@@ -96,7 +73,7 @@ class PriorTraining(StageTraining):
                              "model.initial")
         if not prior.grid.same_as(self.prior.grid) or prior.window != self.prior.window:
             raise ValueError(f"the prior {path} has another grid or HU window than this training: "
-                             "set model.voxels, model.side and model.window to its own")
+                             "set model.cube and model.window to its own")
         if prior.load_text is not None:
             prior.text = prior.load_text()
             prior.text.trainable = prior.text.source is None

@@ -10,12 +10,14 @@ import torch
 from torch import Tensor
 from torch.utils.data import ConcatDataset, Dataset
 
-from phydict.datasets import CTCases, Deformation, phantom_case, prepare_ct
+from phydict.datasets import CTCases, CTSource, Deformation, phantom_case, prepare_ct
 from phydict.datasets.cts.cache import write_array
 from phydict.datasets.cts.transforms import AIR
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM, CachedPhantoms
+from phydict.grid import Cube
 from phydict.runtime.warning import warn
 from phydict.training.data import PriorData
+from phydict.training.settings import Crops, HoldOut, Loading
 from phydict.units import HUWindow
 
 
@@ -94,30 +96,39 @@ class SuperResolutionData(PriorData):
     Volumes are cached in half precision without compression, so that a crop is read without the rest: 34 MB for 256^3.
 
     Args:
-        crop: voxels along each side of a crop
-        factor: tied to model.factor
-        validation_crops: fixed crops of each held-out volume that validate
+        crops: the cubes
+        cts: a NIfTI file, or a folder of any depth in CT-RATE's layout or any other
+        source: which CTs of a folder are taken, and what belongs to them
+        holdout: what validates instead of training
+        phantoms: number of different phantoms
+        loading: how cases are drawn
+        cache: folder for prepared cases, never inside the CTs' folder
+        seed: of the draws and of the split into patients
+        cube: tied to model.cube
+        window: tied to model.window
     """
 
-    def __init__(self, crop: int = 96, factor: int = 4, validation_crops: int = 4, phantoms: int = 32,
-                 validation_phantoms: int = 2, voxels: int = 256, **kwargs):
-        super().__init__(phantoms=phantoms, validation_phantoms=validation_phantoms, voxels=voxels, **kwargs)
-        if not 0 < crop <= voxels or crop % factor:
-            raise ValueError(f"data.crop is a multiple of the factor {factor}, up to the {voxels} voxels of a volume, "
-                             f"but {crop} was given")
-        self.crop, self.factor = crop, factor
-        cache = self.cts.cache
+    def __init__(self, crops: Crops = Crops(), cts: str | None = None, source: CTSource = CTSource(),
+                 holdout: HoldOut = HoldOut(phantoms=2), phantoms: int = 32, loading: Loading = Loading(),
+                 cache: str = "runs/cache", seed: int = 0, cube: Cube = Cube(256),
+                 window: tuple[float, float] = (-1000.0, 1000.0)):
+        super().__init__(cts, source, holdout, phantoms, loading, cache, seed=seed, cube=cube, window=window)
+        if not 0 < crops.size <= cube.voxels or crops.size % crops.factor:
+            raise ValueError(f"data.crops.size is a multiple of the factor {crops.factor}, up to the {cube.voxels} "
+                             f"voxels of a volume, but {crops.size} was given")
+        self.crops, cache = crops, self.cts.cache
         held_out = self.validation.datasets[1].cts
         self.phantoms = PhantomVolumes(0, phantoms, self.grid, self.window, cache)
         self.cts = CTVolumes(self.cts.cts, cache, self.grid, self.window)
         self.validation = ConcatDataset([self._fixed([], [], 0)] + [
-            self._fixed([], PhantomVolumes(HELD_OUT_PHANTOM + i, 1, self.grid, self.window, cache), validation_crops)
-            for i in range(validation_phantoms)] + [
-            self._fixed(CTVolumes([ct], cache, self.grid, self.window), [], validation_crops) for ct in held_out])
+            self._fixed([], PhantomVolumes(HELD_OUT_PHANTOM + i, 1, self.grid, self.window, cache), crops.validation)
+            for i in range(holdout.phantoms)] + [
+            self._fixed(CTVolumes([ct], cache, self.grid, self.window), [], crops.validation) for ct in held_out])
 
     def _fixed(self, cts: Dataset | list, phantoms: Dataset | list, count: int) -> CropDataset:
-        return CropDataset(cts, phantoms, 1.0, self.window, self.crop, self.factor, count, 0, 0, augmented=False)
+        return CropDataset(cts, phantoms, 1.0, self.window, self.crops.size, self.crops.factor, count, 0, 0,
+                           augmented=False)
 
     def draws(self, epoch: int) -> Dataset:
-        return CropDataset(self.cts, self.phantoms, self.ct_fraction, self.window, self.crop, self.factor,
-                           self.epoch_size, epoch, self.seed)
+        return CropDataset(self.cts, self.phantoms, self.loading.ct_fraction, self.window, self.crops.size,
+                           self.crops.factor, self.loading.epoch_size, epoch, self.seed)

@@ -9,89 +9,68 @@ import numpy as np
 import torch
 from torch.utils.data import ConcatDataset, DataLoader, Dataset, DistributedSampler
 
-from phydict.datasets import Augmentation, CTCases, Thorax, find_cts, report, split_by_patient
+from phydict.datasets import Augmentation, CTCases, CTSource, Thorax, report, split_by_patient
 from phydict.datasets.cts.cache import read_arrays, write_arrays
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM, CachedPhantoms
 from phydict.datasets.phantoms.phantom import change_by_findings
-from phydict.grid import Grid
+from phydict.grid import Cube, Grid
 from phydict.runtime.console import check_writable
 from phydict.runtime.seeds import check_seed
 from phydict.training.draws import MixedCases, _training_parts
+from phydict.training.settings import HoldOut, Loading
 from phydict.units import HUWindow
 
-MOST_DRAWS, MOST_WORKERS = 10_000_000, 1000
-"""Draws of an epoch are listed before it begins, and loader processes are all started then."""
 
 class PriorData(lightning.LightningDataModule):
     """Cases for training a prior.
 
     Args:
         cts: a NIfTI file, or a folder of any depth in CT-RATE's layout or any other
-        reports: CT-RATE's table of reports, or the folder it is in; none given: looked for beside the CTs
-        metadata: CT-RATE's metadata table, needed where headers are not fixed
-        fixed: whether the NIfTI headers are right (CT-RATE's *_fixed folders and ordinary archives)
-        first_reconstruction: keep one volume per scan
-        exclude: a text file of case ids to leave out
-        holdout: CTs whose id contains one of these words validate instead of training
-        holdout_fraction: share of the patients that validate instead of training, in [0, 1]
+        source: which CTs of a folder are taken, and what belongs to them
+        holdout: what validates instead of training
         phantoms: number of different phantoms
-        ct_fraction: share of draws taken from the CTs, in [0, 1]
-        validation_phantoms: phantoms, never trained on, that validate
-        epoch_size: draws per epoch
-        batch_size: draws per step on each device
-        workers: loader processes per device
+        loading: how cases are drawn
         cache: folder for prepared cases, never inside the CTs' folder
         augmentation: strengths of the random changes of each draw
         seed: of the draws and of the split into patients
-        voxels: tied to model.voxels
-        side: tied to model.side
+        cube: tied to model.cube
         window: tied to model.window
     """
 
-    def __init__(self, cts: str | None = None, reports: str | None = None, metadata: str | None = None,
-                 fixed: bool = True, first_reconstruction: bool = False, exclude: str | None = None,
-                 holdout: list[str] | None = None, holdout_fraction: float = 0.0, phantoms: int = 2000,
-                 ct_fraction: float = 0.5, validation_phantoms: int = 6, epoch_size: int = 400, batch_size: int = 4,
-                 workers: int = 0, cache: str = "runs/cache", augmentation: Augmentation = Augmentation(),
-                 seed: int = 0, voxels: int = 64, side: float = 384.0,
+    def __init__(self, cts: str | None = None, source: CTSource = CTSource(), holdout: HoldOut = HoldOut(),
+                 phantoms: int = 2000, loading: Loading = Loading(), cache: str = "runs/cache",
+                 augmentation: Augmentation = Augmentation(), seed: int = 0, cube: Cube = Cube(),
                  window: tuple[float, float] = (-1000.0, 1000.0)):
         super().__init__()
         check_seed(seed)
-        for name, value, least, most in (
-                ("epoch_size", epoch_size, 1, MOST_DRAWS), ("batch_size", batch_size, 1, MOST_DRAWS),
-                ("workers", workers, 0, MOST_WORKERS), ("validation_phantoms", validation_phantoms, 0, MOST_DRAWS)):
-            if not least <= value <= most:
-                raise ValueError(f"data.{name} lies between {least} and {most:,}, but {value:,} was given")
         if not cts and not phantoms:
             raise ValueError("there is nothing to train on: give data.cts, or data.phantoms above 0")
-        if phantoms < 0 or not 0 <= ct_fraction <= 1:
-            raise ValueError("data.phantoms must not be negative and data.ct_fraction lies in [0, 1], but "
-                             f"{phantoms} and {ct_fraction} were given")
+        if phantoms < 0:
+            raise ValueError(f"data.phantoms must not be negative, but {phantoms} was given")
         if cts and Path(cache).resolve().is_relative_to(Path(cts).resolve()):
             raise ValueError(f"data.cache {cache} lies inside data.cts {cts}: give a folder elsewhere")
         check_writable(Path(cache), "data.cache")
         window = HUWindow(*window)
-        self.grid, self.window = Grid.cube(voxels, side), window
+        self.grid, self.window = cube.grid(), window
         self.phantoms = CachedPhantoms(0, phantoms, self.grid, window, Path(cache))
-        files = find_cts(cts, reports, metadata, fixed, first_reconstruction, exclude) if cts else []
-        for word in holdout or []:
+        files = source.find(cts) if cts else []
+        for word in holdout.ids or []:
             if not any(word in f.id for f in files):
-                raise ValueError(f"data.holdout names '{word}', but no CT has that in its id"
+                raise ValueError(f"data.holdout.ids names '{word}', but no CT has that in its id"
                                  + (f" (the first id is {files[0].id})" if files else "") + ": correct or remove it")
-        validating = set(split_by_patient([f.id for f in files], holdout_fraction, seed)[1])
-        held_out = [f for f in files if f.id in validating or any(word in f.id for word in holdout or [])]
+        validating = set(split_by_patient([f.id for f in files], holdout.fraction, seed)[1])
+        held_out = [f for f in files if f.id in validating or any(word in f.id for word in holdout.ids or [])]
         if len(held_out) == len(files) and not phantoms:
             raise ValueError("there is nothing to train on: data.holdout holds out every CT, and data.phantoms is 0")
         self.held_out = [f.id for f in held_out]
         validating = set(self.held_out)
         self.cts = CTCases([f for f in files if f.id not in validating], cache, self.grid, window)
         self.validation = ConcatDataset([
-            CachedPhantoms(HELD_OUT_PHANTOM, validation_phantoms, self.grid, window, Path(cache)),
+            CachedPhantoms(HELD_OUT_PHANTOM, holdout.phantoms, self.grid, window, Path(cache)),
             CTCases(held_out, cache, self.grid, window)])
         self.reports = [f.report for f in files if f.report]
         self.reports += [report(Thorax.draw(s)) for s in range(min(phantoms, 1000))]
-        self.ct_fraction, self.epoch_size, self.seed = ct_fraction, epoch_size, seed
-        self.batch_size, self.workers, self.augmentation = batch_size, workers, augmentation
+        self.loading, self.seed, self.augmentation = loading, seed, augmentation
 
     def labelled_reports(self, count: int = 6000) -> tuple[list[str], torch.Tensor]:
         """Reports of phantoms and which findings (kind, side, lobe) each has: labels (N, F). None without phantoms."""
@@ -129,24 +108,25 @@ class PriorData(lightning.LightningDataModule):
     def train_dataloader(self) -> DataLoader:
         every = self.trainer.reload_dataloaders_every_n_epochs
         if every != 1:
-            raise ValueError("each epoch has draws of its own, so that trainer.reload_dataloaders_every_n_epochs must be "
-                             f"1, but {every} was given: leave it out, or set it to 1 on a Trainer of your own")
-        least = self.batch_size * self.trainer.world_size
-        if self.epoch_size < least:
-            raise ValueError(f"data.epoch_size is {self.epoch_size}, less than one batch on every device ({least}): "
-                             "raise it, or lower data.batch_size")
+            raise ValueError("each epoch has draws of its own, so that trainer.reload_dataloaders_every_n_epochs must "
+                             f"be 1, but {every} was given: leave it out, or set it to 1 on a Trainer of your own")
+        least = self.loading.batch_size * self.trainer.world_size
+        if self.loading.epoch_size < least:
+            raise ValueError(f"data.loading.epoch_size is {self.loading.epoch_size}, less than one batch on every "
+                             f"device ({least}): raise it, or lower data.loading.batch_size")
         # Lightning's own sampler would shuffle: several processes take turns, so that each step sees what one would.
         draws = self.draws(self.trainer.current_epoch)
         turns = DistributedSampler(draws, self.trainer.world_size, self.trainer.global_rank, shuffle=False)
-        return DataLoader(draws, self.batch_size, sampler=turns, num_workers=self.workers, drop_last=True)
+        return DataLoader(draws, self.loading.batch_size, sampler=turns, num_workers=self.loading.workers,
+                          drop_last=True)
 
     def draws(self, epoch: int) -> Dataset:
         """What is trained on in an epoch."""
-        return MixedCases(self.cts, self.phantoms, self.ct_fraction, self.grid, self.window, self.epoch_size, epoch,
-                          self.seed, self.augmentation)
+        return MixedCases(self.cts, self.phantoms, self.loading.ct_fraction, self.grid, self.window,
+                          self.loading.epoch_size, epoch, self.seed, self.augmentation)
 
     def val_dataloader(self) -> DataLoader:
-        return DataLoader(self.validation, 1, collate_fn=_collate, num_workers=self.workers)
+        return DataLoader(self.validation, 1, collate_fn=_collate, num_workers=self.loading.workers)
 
 
 def _collate(cases: list[dict]) -> dict:

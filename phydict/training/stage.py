@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,6 +16,7 @@ from phydict.prior import Prior, SuperResolution
 from phydict.prior.files import check_stage
 from phydict.prior.finite import not_finite
 from phydict.training.data import PriorData
+from phydict.training.settings import Optimisation
 from phydict.units import HUWindow
 
 CHECKPOINT = "last.ckpt"
@@ -33,18 +33,13 @@ class StageTraining(lightning.LightningModule, ABC):
     what denoises a held-out case (`_denoiser`). Its network is `self.prior`.
     """
 
-    def __init__(self, prior: Prior | SuperResolution, typical_std: float, learning_rate: float, weight_decay: float,
-                 warmup: int, decay_from: int, decay_steps: int, preview_steps: int, seed: int,
-                 mask_weight: float = 0.0):
+    def __init__(self, prior: Prior | SuperResolution, typical_std: float, optimisation: Optimisation,
+                 preview_steps: int, seed: int, mask_weight: float = 0.0):
         super().__init__()
-        for name, value in (("learning_rate", learning_rate), ("weight_decay", weight_decay), ("warmup", warmup),
-                            ("decay_from", decay_from), ("decay_steps", decay_steps), ("preview_steps", preview_steps)):
-            if not 0 <= value < math.inf:
-                raise ValueError(f"model.{name} is a finite number, 0 or more, but {value} was given")
+        if not 0 <= preview_steps <= 10_000:
+            raise ValueError(f"model.preview_steps lies between 0 and 10,000, but {preview_steps} was given")
         self.prior, self.typical_std, self.preview_steps = prior, typical_std, preview_steps
-        self.learning_rate, self.weight_decay = learning_rate, weight_decay
-        self.warmup, self.decay_from, self.decay_steps = warmup, decay_from, decay_steps
-        self.seed, self.mask_weight, self.samples = seed, mask_weight, 0
+        self.optimisation, self.seed, self.mask_weight, self.samples = optimisation, seed, mask_weight, 0
 
     @abstractmethod
     def _clean_state(self, batch: dict) -> tuple[Tensor, Tensor]:
@@ -109,7 +104,7 @@ class StageTraining(lightning.LightningModule, ABC):
         """What to do where a training has come to nothing."""
         file = Path(self.trainer.default_root_dir) / CHECKPOINT
         last = file if file.is_file() else self.trainer.ckpt_path
-        anew = "start anew with a lower model.learning_rate"
+        anew = "start anew with a lower model.optimisation.learning_rate"
         if not last:
             return f"no checkpoint had been written, so {anew}"
         return f"the last good checkpoint is {last}, so go on from it with --ckpt_path, or {anew}"
@@ -137,14 +132,10 @@ class StageTraining(lightning.LightningModule, ABC):
         """Writes a picture of a held-out case and a sample."""
 
     def configure_optimizers(self) -> dict:
-        def factor(step: int) -> float:
-            rise = min(1.0, (step + 1) / self.warmup) if self.warmup else 1.0
-            past = step - self.decay_from
-            return rise * (max(0.0, 1 - past / self.decay_steps) if self.decay_steps and past > 0 else 1.0)
-
         weights = [w for w in self.parameters() if w.requires_grad]
-        optimizer = torch.optim.AdamW(weights, self.learning_rate, weight_decay=self.weight_decay)
-        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
+        optimizer = torch.optim.AdamW(weights, self.optimisation.learning_rate,
+                                      weight_decay=self.optimisation.weight_decay)
+        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, self.optimisation.factor)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def on_save_checkpoint(self, checkpoint: dict) -> None:

@@ -10,8 +10,9 @@ from torch.nn.functional import avg_pool3d
 
 from phydict.diffusion import Denoiser
 from phydict.evaluation import method_panel
-from phydict.grid import Grid
+from phydict.grid import Cube, Grid
 from phydict.prior import LocalUNet, SuperResolution, describe_super_resolution, load_super_resolution
+from phydict.training.settings import Optimisation, Previews
 from phydict.training.stage import StageTraining
 from phydict.units import HUWindow
 
@@ -21,38 +22,32 @@ class SuperResolutionTraining(StageTraining):
 
     Args:
         network: the UNet; none given: the default LocalUNet
-        voxels: voxels along each side of the fine cube
+        cube: of fine voxels
         factor: fine voxels along each side of a coarse one
-        side: side of the cube in mm
         window: HU that the prior's range [-1, 1] stands for
         detail_std: standard deviation, in the prior's range, of what the fine CT adds to the coarse one
         most_noise: highest level of the noise that the coarse volume is given, in [0, 1]
-        learning_rate: of AdamW
-        weight_decay: of AdamW
-        warmup: steps over which the learning rate rises
-        decay_from: step at which a linear decay of the learning rate to zero begins
-        decay_steps: length of that decay in steps; 0: no decay
-        preview_steps: noise levels of the samples that validation paints; 0: none
+        optimisation: how the weights are learnt
+        validation: what validation shows
         initial: a stage's file to go on from, which then decides the network
         seed: of times and noise
     """
 
-    def __init__(self, network: LocalUNet | None = None, voxels: int = 256, factor: int = 4, side: float = 384.0,
+    def __init__(self, network: LocalUNet | None = None, cube: Cube = Cube(256), factor: int = 4,
                  window: tuple[float, float] = (-1000.0, 1000.0), detail_std: float = 0.08, most_noise: float = 0.3,
-                 learning_rate: float = 5e-4, weight_decay: float = 0.01, warmup: int = 100, decay_from: int = 0,
-                 decay_steps: int = 0, preview_steps: int = 16, initial: str | None = None, seed: int = 0):
+                 optimisation: Optimisation = Optimisation(), validation: Previews = Previews(),
+                 initial: str | None = None, seed: int = 0):
         if not 0 <= most_noise <= 1:
             raise ValueError(f"model.most_noise lies in [0, 1], but {most_noise} was given")
-        fine = SuperResolution(network or LocalUNet(), Grid.cube(voxels, side), HUWindow(*window), factor,
+        fine = SuperResolution(network or LocalUNet(), cube.grid(), HUWindow(*window), factor,
                                detail_std=detail_std)
         if initial:
             first = load_super_resolution(initial)
             if not first.grid.same_as(fine.grid) or first.window != fine.window or first.factor != factor:
                 raise ValueError(f"the stage {initial} has another grid, HU window or factor than this training: set "
-                                 "model.voxels, model.side, model.window and model.factor to its own")
+                                 "model.cube, model.window and model.factor to its own")
             fine = first.train().requires_grad_(True)
-        super().__init__(fine, fine.detail_std, learning_rate, weight_decay, warmup, decay_from, decay_steps,
-                         preview_steps, seed)
+        super().__init__(fine, fine.detail_std, optimisation, validation.preview_steps, seed)
         self.most_noise = most_noise
 
     def configure_model(self) -> None:

@@ -30,13 +30,12 @@ def compared(stage: str, views: int, cts: str) -> list[dict]:
     """One row for each way to the fine grid and each CT."""
     fine, rows = load_super_resolution(stage), []
     runs = {"upsampled": [f"--data.simulation_voxels={fine.grid.shape[0]}"],
-            "unguided": [f"--model.super_resolution={stage}", "--model.sr_guided=false"],
-            "guided": [f"--model.super_resolution={stage}"]}
+            "unguided": [f"--model.super_resolution.file={stage}", "--model.super_resolution.guided=false"],
+            "guided": [f"--model.super_resolution.file={stage}"]}
     with tempfile.TemporaryDirectory() as out:
         for name, arguments in runs.items():
-            subprocess.run([sys.executable, "infer.py", "test", "-c", "configs/reconstruct/phydict_fast.yaml",
-                            f"--data.cts={cts}", f"--data.views={views}", f"--model.out={out}", f"--model.name={name}",
-                            *arguments], cwd=ROOT, check=True)
+            subprocess.run([sys.executable, "infer.py", "test", f"--data.cts={cts}", f"--data.orbit.views={views}",
+                            f"--model.out={out}", f"--model.name={name}", *arguments], cwd=ROOT, check=True)
             scores = {row["case"]: row for row in read_csv(Path(out) / name / "results.csv")}
             for ct in find_cts(cts):
                 case = Path(out) / name / ct.id

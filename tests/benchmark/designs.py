@@ -32,6 +32,7 @@ from phydict.runtime.console import quiet
 from phydict.runtime.precision import trainer_precision
 from phydict.training.base import PriorTraining, reconstruction_scores
 from phydict.training.data import PriorData
+from phydict.training.settings import HoldOut, Loading, PriorOptimisation, TextSettings
 from phydict.training.stage import CHECKPOINT, denoising_errors
 
 FILE = Path(__file__).with_suffix(".csv")
@@ -111,7 +112,7 @@ class Effort(lightning.Callback):
     def on_train_batch_start(self, trainer, module, batch, index) -> None:
         rate = min(1.0, (trainer.global_step + 1) / WARMUP) * min(1.0, max(0.0, 2 - 2 * self.spent / self.seconds))
         for group in trainer.optimizers[0].param_groups:
-            group["lr"] = rate * module.learning_rate
+            group["lr"] = rate * module.optimisation.learning_rate
         self.begun = time.process_time()
 
     def on_train_batch_end(self, trainer, module, outputs, batch, index) -> None:
@@ -128,7 +129,8 @@ class Effort(lightning.Callback):
 def learnt(design: Design, data: PriorData, seconds: float, folder: Path) -> tuple[Prior, int]:
     """The prior that a design becomes, and the samples that it saw."""
     torch.manual_seed(design.seed)
-    training = PriorTraining(VolumeUNet(**design.network), "none", learning_rate=1e-3, warmup=0, seed=design.seed)
+    training = PriorTraining(VolumeUNet(**design.network), TextSettings("none"),
+                             optimisation=PriorOptimisation(learning_rate=1e-3, warmup=0), seed=design.seed)
     training.typical_std = design.typical_std
     if not design.middle_attention:
         training.prior.network.unet.middle_block.attention = NoAttention()
@@ -182,12 +184,12 @@ if __name__ == "__main__":
     given = parser().parse_args()
     torch.set_num_threads(1)
     with quiet():
-        data = Draws(given.cts, holdout=[HELD_OUT_CT], phantoms=given.phantoms, ct_fraction=0.4, epoch_size=50,
-                     batch_size=2, validation_phantoms=2, cache=str(given.out / "cache"))
+        data = Draws(given.cts, holdout=HoldOut([HELD_OUT_CT], phantoms=2), phantoms=given.phantoms,
+                     loading=Loading(epoch_size=50, batch_size=2, ct_fraction=0.4), cache=str(given.out / "cache"))
         data.folder = given.out / "draws"
         cases = [data.validation[i] | {"id": name} for i, name in
                  enumerate(("held-out phantom 0", "held-out phantom 1", *data.held_out))]
-        today = PriorTraining(VolumeUNet(), "none").prior.eval()
+        today = PriorTraining(VolumeUNet(), TextSettings("none")).prior.eval()
         for name in given.designs:
             if any(row["design"] == name and row["budget_s"] == given.seconds for row in read_csv(FILE)):
                 continue

@@ -32,12 +32,13 @@ def trained(initial: str, cts: str, left_out: list[str], fraction: float, steps:
     """The file of a prior that went on from `initial` for `steps` steps of two draws."""
     last, file = out / CHECKPOINT, out / "prior.safetensors"
     if not file.exists():
-        settings = {"out": out, "model.initial": initial, "model.text_pretrain_steps": 0, "model.learning_rate": 1e-3,
-                    "model.warmup": 30, "model.decay_from": steps // 2, "model.decay_steps": steps - steps // 2,
-                    "data.cts": cts, "data.holdout": f"[{','.join(left_out)}]", "data.ct_fraction": fraction,
-                    "data.batch_size": 2, "data.epoch_size": 100, "trainer.max_steps": steps,
-                    "trainer.limit_val_batches": 0, "trainer.callbacks.decay": 0.98, "trainer.accelerator": "cpu",
-                    "trainer.devices": 1} | ({"ckpt_path": last} if last.exists() else {})
+        settings = {"out": out, "model.initial": initial, "model.text.pretrain_steps": 0,
+                    "model.optimisation.learning_rate": 1e-3, "model.optimisation.warmup": 30,
+                    "model.optimisation.decay_from": steps // 2, "model.optimisation.decay_steps": steps - steps // 2,
+                    "data.cts": cts, "data.holdout.ids": f"[{','.join(left_out)}]",
+                    "data.loading.ct_fraction": fraction, "data.loading.batch_size": 2, "data.loading.epoch_size": 100,
+                    "trainer.max_steps": steps, "trainer.limit_val_batches": 0, "trainer.callbacks.decay": 0.98,
+                    "trainer.accelerator": "cpu", "trainer.devices": 1} | ({"ckpt_path": last} if last.exists() else {})
         subprocess.run([sys.executable, "train.py", "fit", "-c", "configs/prior/phantom.yaml",
                         *(f"--{name}={value}" for name, value in settings.items())], cwd=ROOT, check=True)
         subprocess.run([sys.executable, "train.py", "export", f"--checkpoint={last}", f"--out={file}"], cwd=ROOT,

@@ -50,7 +50,7 @@ if __name__ == "__main__":
     rows = []
     with tempfile.TemporaryDirectory() as out:
         for preset, extra in presets().items():
-            subprocess.run([sys.executable, "infer.py", "test", "-c", f"configs/reconstruct/{preset}.yaml",
+            subprocess.run([sys.executable, "infer.py", "test", "--model.method", preset,
                             "--data.cts", sys.argv[1], "--model.out", out, *extra], cwd=ROOT, check=True)
             rows += read_csv(Path(out) / (WITHOUT_LPIPS[-1] if extra else preset) / "results.csv")
         picture(sys.argv[1], Path(out), rows)

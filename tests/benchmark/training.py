@@ -24,10 +24,12 @@ from torch.utils.data import DataLoader
 
 from phydict.datasets import phantom_case
 from phydict.evaluation import write_csv
+from phydict.grid import Cube
 from phydict.prior import VolumeUNet, load_prior
 from phydict.prior.files import DEFAULT_PRIOR
 from phydict.runtime.console import quiet
 from phydict.training import PriorTraining
+from phydict.training.settings import Execution, PriorValidation, TextSettings
 from phydict.training.throughput import matmul_peak, sample_flop
 
 BATCH, STEPS, WARM_UP = 2, 8, 1
@@ -96,8 +98,10 @@ def monai_steps(loader: DataLoader) -> Clock:
 def new_task(**flags) -> PriorTraining:
     torch.manual_seed(0)
     prior = load_prior(DEFAULT_PRIOR)
-    return PriorTraining(text="none", initial=str(DEFAULT_PRIOR), voxels=prior.grid.shape[0], side=prior.grid.extent[0],
-                         window=(prior.window.low, prior.window.high), preview_steps=0, **flags)
+    return PriorTraining(text=TextSettings("none"), initial=str(DEFAULT_PRIOR),
+                         window=(prior.window.low, prior.window.high),
+                         cube=Cube(prior.grid.shape[0], prior.grid.extent[0]), validation=PriorValidation(0),
+                         execution=Execution(**flags))
 
 
 def example_cases() -> list[dict]:

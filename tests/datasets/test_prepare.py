@@ -28,8 +28,9 @@ from phydict.datasets.cts.ct_series import find_series, load_series
 from phydict.datasets.cts.preparation import ATLAS_LUNGS_MM, ATLAS_MM, SUMMARY, Settings, atlas_lungs, prepare_folder
 from phydict.datasets.cts.prepared import RECORD, read_prepared
 from phydict.datasets.cts.transforms import AIR, load_ct, prepare_ct, to_grid
-from phydict.grid import Grid
+from phydict.grid import Cube, Grid
 from phydict.training.data import PriorData
+from phydict.training.settings import HoldOut
 from phydict.units import HUWindow
 
 ROOT = Path(__file__).parents[2]
@@ -203,8 +204,8 @@ def test_training_and_inference_read_prepared_cases_without_resampling(tmp_path,
     coarse = load_case(ct, Grid.cube(16), HUWindow(-1000, 3000))["volume"]
     fine = load_case(ct, Grid.cube(32), HUWindow(-1000, 3000))["volume"]
     torch.testing.assert_close(coarse, torch.nn.functional.avg_pool3d(fine, 2), atol=1e-5, rtol=0)
-    data = PriorData(cts=str(tmp_path / "out"), phantoms=0, cache=str(tmp_path / "cache"), voxels=32,
-                     validation_phantoms=1)
+    data = PriorData(cts=str(tmp_path / "out"), phantoms=0, cache=str(tmp_path / "cache"), cube=Cube(32),
+                     holdout=HoldOut(phantoms=1))
     assert len(data.cts) == 1 and data.cts[0]["volume"].shape == (1, 32, 32, 32) and data.reports == [ct.report]
 
 

@@ -291,7 +291,7 @@ def test_the_stated_memory_is_that_of_a_measured_call():
 def test_a_second_stage_that_needs_more_memory_than_it_may_take_says_how_much_it_needs():
     with torch.device("meta"):
         fine = MedSynSuperResolution(SuperResolutionUNet())
-    with pytest.raises(ValueError, match=r"256.* about 36 GiB in float32, but 4 GiB .*--model.sr_memory 36") as error:
+    with pytest.raises(ValueError, match=r"256.* about 36 GiB in float32, but 4 GiB .*resolution.memory 36") as error:
         fine.check_memory(torch.float32)
     assert "\n" not in str(error.value)
     with pytest.raises(ValueError, match="about 18.5 GiB in bfloat16"):

@@ -13,6 +13,7 @@ from safetensors import safe_open
 from phydict.cli.infer import InferenceCLI
 from phydict.grid import Grid
 from phydict.inference import ReconstructionData, ReconstructionTask
+from phydict.inference.settings import Orbit
 from phydict.prior import (
     MedSynCheckpoint, TextEncoder, file_read, fingerprint, inspect_prior, load_prior, load_super_resolution, save_prior)
 from phydict.prior.medsyn.prior import MedSynPrior
@@ -305,7 +306,7 @@ def test_the_command_line_takes_medsyns_folder_and_its_switches(switch, results,
 
 def test_the_xrays_of_a_ct_are_simulated_on_the_box_of_the_prior():
     """A prior's grid need not be a cube."""
-    data, grid = ReconstructionData(cts="phantom", views=2), Grid((8, 8, 4), 40.0)
+    data, grid = ReconstructionData(cts="phantom", orbit=Orbit(views=2)), Grid((8, 8, 4), 40.0)
     seen = []
     data.simulator = lambda projector, mu, seed: seen.append(projector.grid) or mu[0]
     case = {"volume": torch.zeros(1, 8, 8, 4), "fine": torch.zeros(1, 16, 16, 8)}

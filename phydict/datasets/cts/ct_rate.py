@@ -54,6 +54,29 @@ def scan_of(id: str) -> str:
     return f"{match['patient']}_{match['scan']}" if match else id
 
 
+@dataclass(frozen=True)
+class CTSource:
+    """Which CTs of a folder are taken, and what belongs to them.
+
+    Args:
+        reports: CT-RATE's table of reports, or the folder it is in; none given: looked for beside the CTs
+        metadata: CT-RATE's metadata table, needed where headers are not fixed
+        fixed: whether the NIfTI headers are right (CT-RATE's *_fixed folders and ordinary archives)
+        first_reconstruction: keep one volume per scan
+        exclude: a text file of case ids to leave out
+    """
+
+    reports: str | None = None
+    metadata: str | None = None
+    fixed: bool = True
+    first_reconstruction: bool = False
+    exclude: str | None = None
+
+    def find(self, cts: str | Path) -> list[CTFile]:
+        """The CTs of a file or folder, as `find_cts`."""
+        return find_cts(cts, **vars(self))
+
+
 def find_cts(root: str | Path, reports: str | Path | None = None, metadata: str | Path | None = None,
              fixed: bool = True, first_reconstruction: bool = False,
              exclude: str | Path | None = None) -> list[CTFile]:
@@ -78,7 +101,7 @@ def find_cts(root: str | Path, reports: str | Path | None = None, metadata: str 
         elif id in files:
             raise ValueError(f"{files[id]} and {path} would both become case {id}; rename one of them")
         files[id] = path
-    for line in read_ids(exclude, "data.exclude") if exclude else ():
+    for line in read_ids(exclude, "data.source.exclude") if exclude else ():
         files.pop(case_id(line), None)
     ids = sorted(files, key=natural_order)
     if first_reconstruction:
@@ -96,12 +119,12 @@ def find_cts(root: str | Path, reports: str | Path | None = None, metadata: str 
 def _calibrated(cts: list[CTFile], metadata: str | Path | None) -> list[CTFile]:
     if metadata is None:
         raise ValueError("headers that are not fixed need CT-RATE's metadata table, but none was given or found; "
-                             "give it as data.metadata")
+                             "give it as data.source.metadata")
     table = read_calibrations(metadata)
     missing = [ct.id for ct in cts if ct.id not in table]
     if missing:
         raise ValueError(f"{len(missing)} of {len(cts)} volumes are not in the metadata {metadata}, the first is "
-                         f"{missing[0]}; give the table of these volumes, or data.fixed true if they are right")
+                         f"{missing[0]}; give the table of these volumes, or data.source.fixed true if they are right")
     return [replace(ct, calibration=table[ct.id]) for ct in cts]
 
 

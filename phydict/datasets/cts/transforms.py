@@ -105,13 +105,13 @@ def _check_header(path: Path, header, calibration: Calibration | None) -> None:
     codes = [int(header[name]) for name in ("sform_code", "qform_code") if name in header]
     if not any(codes):
         raise ValueError(f"{path} does not say how the patient lies (neither sform nor qform is set); convert it from "
-                         "DICOM again, or read CT-RATE v1 files with data.fixed false and their metadata table")
+                         "DICOM again, or read CT-RATE v1 files with data.source.fixed false and their metadata table")
     affine = header.get_best_affine()
     axes = affine[:3, :3]
     _check_affine(path, affine, "convert it from DICOM again")
     if np.allclose(axes, np.eye(3)) and shape[0] >= 512:
         warn(f"{path} has the blank header of CT-RATE v1 (1 mm voxels, identity axes); "
-             "read such files with data.fixed false and their metadata table")
+             "read such files with data.source.fixed false and their metadata table")
 
 
 def _check_affine(path: Path, affine: np.ndarray, advice: str) -> None:

@@ -54,8 +54,8 @@ class MedSynSuperResolution(nn.Module):
             raise ValueError(f"MedSyn's super-resolution stage denoises its {self.grid.shape} voxels at once, not in "
                              f"tiles, which takes about {gib:g} GiB in {str(dtype).removeprefix('torch.')}, but "
                              f"{self.memory / 2**30:g} GiB are allowed: where there is so much memory, allow it with "
-                             f"--model.sr_memory {gib:g} (in Python, the stage's `memory` in bytes), else leave the "
-                             "super-resolution stage out")
+                             f"--model.super_resolution.memory {gib:g} (in Python, the stage's `memory` in bytes), "
+                             "else leave the super-resolution stage out")
 
     def bind(self, coarse: Tensor, noise: float = 0.0, precision: str = "auto",
              generator: torch.Generator | None = None) -> BoundSuperResolution:

@@ -1,0 +1,175 @@
+"""Settings of a training and of its data, in groups."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+MOST_DRAWS, MOST_WORKERS = 10_000_000, 1000
+"""Draws of an epoch are listed before it begins, and loader processes are all started then."""
+
+
+@dataclass(frozen=True)
+class TextSettings:
+    """What a prior reads reports with, and how it learns to.
+
+    Args:
+        encoder: "small" for a BERT that learns reports first (none where the data have no reports), a folder or hub id
+            for a frozen one, "none" for a prior without text
+        length: tokens of a report that a frozen encoder reads
+        padded_to: 2048, with a length of 192, for contexts as MedSyn's; none given: padding is hidden
+        reports: texts that the small BERT's vocabulary is learnt from (taken from the data)
+        dropout: share of reports replaced by the null context, in [0, 1]
+        pretrain_steps: steps of each task by which a small BERT learns reports before denoising begins; 0: it learns by
+            denoising
+    """
+
+    encoder: str = "small"
+    length: int = 128
+    padded_to: int | None = None
+    reports: list[str] | None = None
+    dropout: float = 0.1
+    pretrain_steps: int = 600
+
+
+@dataclass(frozen=True)
+class Optimisation:
+    """How weights are learnt.
+
+    Args:
+        learning_rate: of AdamW
+        weight_decay: of AdamW
+        warmup: steps over which the learning rate rises
+        decay_from: step at which a linear decay of the learning rate to zero begins
+        decay_steps: length of that decay in steps; 0: no decay
+    """
+
+    learning_rate: float = 5e-4
+    weight_decay: float = 0.01
+    warmup: int = 100
+    decay_from: int = 0
+    decay_steps: int = 0
+
+    def __post_init__(self):
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not 0 <= value < math.inf:
+                raise ValueError(f"model.optimisation.{field.name} is a finite number, 0 or more, but {value} was "
+                                 "given")
+
+    def factor(self, step: int) -> float:
+        """The share of the learning rate at a step."""
+        rise = min(1.0, (step + 1) / self.warmup) if self.warmup else 1.0
+        past = step - self.decay_from
+        return rise * (max(0.0, 1 - past / self.decay_steps) if self.decay_steps and past > 0 else 1.0)
+
+
+@dataclass(frozen=True)
+class PriorOptimisation(Optimisation):
+    """How a prior's weights are learnt.
+
+    Args:
+        sigma_data: standard deviation of the data in the prior's range
+        mask_weight: weight of the anatomy masks' error beside the CT's
+    """
+
+    sigma_data: float = 0.5
+    mask_weight: float = 0.1
+
+
+@dataclass(frozen=True)
+class Previews:
+    """What validation shows.
+
+    Args:
+        preview_steps: noise levels of the samples that validation paints; 0: none
+    """
+
+    preview_steps: int = 16
+
+
+@dataclass(frozen=True)
+class PriorValidation(Previews):
+    """What validation shows and measures of a prior.
+
+    Args:
+        views: X-rays from which validation reconstructs each held-out case by phydict_fast, to tell which weights are
+            best; 0: none, as where weights are spread over devices
+    """
+
+    views: int = 4
+
+    def __post_init__(self):
+        if self.views < 0:
+            raise ValueError(f"model.validation.views must not be negative, but {self.views} was given")
+
+
+@dataclass(frozen=True)
+class Execution:
+    """How a network is run, which changes no result but for rounding.
+
+    Args:
+        gradient_checkpointing: less memory for a second computation of each block's activations
+        channels_last: lay the network's channels side by side in memory
+        compile: run the network through torch.compile
+    """
+
+    gradient_checkpointing: bool = False
+    channels_last: bool = True
+    compile: bool = False
+
+
+@dataclass(frozen=True)
+class HoldOut:
+    """What validates instead of training.
+
+    Args:
+        ids: CTs whose id contains one of these words
+        fraction: share of the patients, in [0, 1]
+        phantoms: a number of phantoms that are never trained on
+    """
+
+    ids: list[str] | None = None
+    fraction: float = 0.0
+    phantoms: int = 6
+
+
+@dataclass(frozen=True)
+class Loading:
+    """How cases are drawn.
+
+    Args:
+        epoch_size: draws per epoch
+        batch_size: draws per step on each device
+        workers: loader processes per device
+        ct_fraction: share of draws taken from the CTs, in [0, 1]
+    """
+
+    epoch_size: int = 400
+    batch_size: int = 4
+    workers: int = 0
+    ct_fraction: float = 0.5
+
+    def __post_init__(self):
+        for name, least, most in (("epoch_size", 1, MOST_DRAWS), ("batch_size", 1, MOST_DRAWS),
+                                  ("workers", 0, MOST_WORKERS)):
+            value = getattr(self, name)
+            if not least <= value <= most:
+                raise ValueError(f"data.loading.{name} lies between {least} and {most:,}, but {value:,} was given")
+        if not 0 <= self.ct_fraction <= 1:
+            raise ValueError(f"data.loading.ct_fraction lies in [0, 1], but {self.ct_fraction} was given")
+
+
+@dataclass(frozen=True)
+class Crops:
+    """The cubes that a super-resolution stage learns from.
+
+    Args:
+        size: voxels along each side
+        factor: tied to model.factor
+        validation: fixed crops of each held-out volume that validate
+    """
+
+    size: int = 96
+    factor: int = 4
+    validation: int = 4

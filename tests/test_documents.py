@@ -44,8 +44,7 @@ def test_the_readme_is_short_and_names_every_method():
 
 def test_the_readmes_results_are_those_of_their_table():
     rows = read_csv(ROOT / "tests" / "benchmark" / "views" / "results.csv")
-    shown = re.findall(r"^\| (.+?) \| \**([\d. /]+\d)\** \| \**([\d. /]+\d)\** \| \**([\d. /]+\d)\** \| \**([\d. /]+\d)\** \|$",
-                       README, flags=re.MULTILINE)
+    shown = re.findall(r"^\| (.+?) " + r"\| \**([\d. /]+\d)\** " * 4 + r"\|$", README, flags=re.MULTILINE)
     assert {name for name, *_ in shown} == {row["method"] for row in rows}
     for name, *cells in shown:
         for views, cell in zip((1, 2, 4, 8), cells, strict=True):

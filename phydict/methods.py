@@ -107,8 +107,8 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: Prior | str | Pa
                          "super_resolution: leave one of the two out")
     if isinstance(super_resolution, str | Path):
         super_resolution = load_super_resolution(super_resolution)
-    ready = CascadePosterior(Cascade(prior, super_resolution), method, sr_guided, noise=sr_noise_augmentation, guidance=guidance,
-                             name=name, precision=precision)
+    ready = CascadePosterior(Cascade(prior, super_resolution), method, sr_guided, noise=sr_noise_augmentation,
+                             guidance=guidance, name=name, precision=precision)
     return replace(ready, sr_sampler=sr_sampler) if sr_sampler else ready
 
 

@@ -187,14 +187,16 @@ class Runner:
         known = reset_peak_memory(self.device)
         with profiled() as profile:
             result = self._reconstruct(trial, scene, on_step)
+        seconds = result.seconds | profile.seconds("network", "projector")
         finite = bool(result.volume.isfinite().all())
         scores = case_scores(result.volume, result.misfit, scene.truth, scene.window) if finite else {}
         return scores | {
             "status": "ok" if finite else "diverged",
             "error": None if finite else "the volume holds NaN or infinite voxels", "misfit": result.misfit,
             "seconds": sum(result.seconds.values()),
-            **{f"seconds_{stage}": value for stage, value in (result.seconds | profile.seconds("network", "projector")).items()},
-            "network_calls": result.network_calls, "projector_calls": result.projector_calls, "peak_memory_mb": profile.peak_memory(self.device) if known else None,
+            **{f"seconds_{stage}": value for stage, value in seconds.items()},
+            "network_calls": result.network_calls, "projector_calls": result.projector_calls,
+            "peak_memory_mb": profile.peak_memory(self.device) if known else None,
             "device": self.device.type, "threads": torch.get_num_threads(), "precision": result.precision,
             "instruction_set": instruction_set(self.device)}
 

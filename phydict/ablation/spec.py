@@ -275,7 +275,8 @@ def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
     with_prior = isinstance(method, Sampler)
     overrides = {f"{part}.{path}": plain(field_of({"method": method, "simulator": simulator}[part], path.split(".")))
                  for part, paths in changes.items() for path in paths}
-    columns = {name: value[name] for name in DEFAULT_COLUMNS if name in given or name not in PRIOR_SETTINGS or with_prior}
+    columns = {name: value[name] for name in DEFAULT_COLUMNS
+               if name in given or name not in PRIOR_SETTINGS or with_prior}
     columns |= {name: given[name] for name in SETTINGS if name in given and name not in columns} | overrides
     trial = Trial(columns, method, data, value["prior"] if with_prior else None, value["guidance"], value["samples"],
                   value["seed"], value["voxels"], value["side"])

@@ -1,0 +1,58 @@
+"""What the documents say is so: links lead somewhere, figures are those of the CSVs, names and versions are today's."""
+
+import re
+import statistics
+from pathlib import Path
+
+import pytest
+import yaml
+
+import phydict
+from phydict.evaluation import read_csv
+
+ROOT = Path(__file__).parents[1]
+DOCUMENTS = [ROOT / name for name in (
+    "README.md", "CHANGELOG.md", "CONTRIBUTING.md", "configs/README.md", "data/README.md", "data/prior/README.md",
+    "data/spectra/README.md", "tests/benchmark/README.md")]
+README = DOCUMENTS[0].read_text()
+
+
+def prose(file: Path) -> str:
+    """A document without its code."""
+    return re.sub(r"^```.*?^```", "", file.read_text(), flags=re.DOTALL | re.MULTILINE)
+
+
+def anchors(file: Path) -> set[str]:
+    """The names by which a document's headings are linked."""
+    return {re.sub(r"[^\w\- ]", "", heading).lower().replace(" ", "-")
+            for heading in re.findall(r"^#+ (.*)$", prose(file), flags=re.MULTILINE)}
+
+
+@pytest.mark.parametrize("file", DOCUMENTS, ids=lambda f: str(f.relative_to(ROOT)))
+def test_a_link_leads_to_a_file_and_a_heading_that_are_there(file):
+    for link in re.findall(r"\]\(([^)\s]+)\)", prose(file)):
+        place, _, anchor = link.partition("#")
+        target = (file.parent / place).resolve() if place else file
+        assert target.exists(), link
+        assert not anchor or anchor in anchors(target), link
+
+
+def test_the_readme_is_short_and_names_every_method():
+    assert README.count("\n") <= 150
+    assert all(f"`{name}`" in README for name in phydict.METHODS)
+
+
+def test_the_readmes_results_are_those_of_their_table():
+    rows = read_csv(ROOT / "tests" / "benchmark" / "views" / "results.csv")
+    shown = re.findall(r"^\| (.+?) " + r"\| \**([\d. /]+\d)\** " * 4 + r"\|$", README, flags=re.MULTILINE)
+    assert {name for name, *_ in shown} == {row["method"] for row in rows}
+    for name, *cells in shown:
+        for views, cell in zip((1, 2, 4, 8), cells, strict=True):
+            of = [row for row in rows if row["method"] == name and int(row["views"]) == views]
+            assert cell == f"{statistics.mean(float(row['psnr']) for row in of):.2f} / " \
+                           f"{statistics.mean(float(row['ssim']) for row in of):.3f}", (name, views)
+
+
+def test_the_citation_and_the_changelog_are_of_this_version():
+    assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == phydict.__version__
+    assert re.search(r"^## (.*)$", (ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)[1] == phydict.__version__

@@ -622,9 +622,11 @@ def test_a_training_is_never_written_among_its_cts(tmp_path, capsys, cache):
         assert said.endswith("give another --out") and [path.name for path in cts.iterdir()] == ["a.nii.gz"]
 
 
-@pytest.mark.parametrize("option", ["--data.validation_phantoms=-1", "--data.cache=/dev/null",
-                                    "--model.learning_rate=-1", "--model.warmup=-3", "--data.workers=1000000",
+@pytest.mark.parametrize("option", ["--data.holdout.phantoms=-1", "--data.cache=/dev/null",
+                                    "--model.optimisation.learning_rate=-1", "--model.optimisation.warmup=-3",
+                                    "--data.loading.workers=1000000", "--model.validation.preview_steps=-1",
+                                    "--model.validation.views=-1",
                                     "--model.network.init_args.channels=[]", "--model.network.init_args.block=0"])
 def test_data_that_cannot_be_are_refused_by_their_option(tmp_path, capsys, cache, option):
     said = refusal(capsys, arguments(tmp_path, cache, option))
-    assert option.partition("=")[0].rpartition(".")[2] in said
+    assert option.partition("=")[0].rpartition(".")[2] in said and "is now" not in said

@@ -87,6 +87,11 @@ class Previews:
 
     preview_steps: int = 16
 
+    def __post_init__(self):
+        if self.preview_steps < 0:
+            raise ValueError("model.validation.preview_steps must not be negative, but "
+                             f"{self.preview_steps} was given")
+
 
 @dataclass(frozen=True)
 class PriorValidation(Previews):
@@ -100,6 +105,7 @@ class PriorValidation(Previews):
     views: int = 4
 
     def __post_init__(self):
+        super().__post_init__()
         if self.views < 0:
             raise ValueError(f"model.validation.views must not be negative, but {self.views} was given")
 
@@ -132,6 +138,11 @@ class HoldOut:
     ids: list[str] | None = None
     fraction: float = 0.0
     phantoms: int = 6
+
+    def __post_init__(self):
+        if not 0 <= self.phantoms <= MOST_DRAWS:
+            raise ValueError(f"data.holdout.phantoms lies between 0 and {MOST_DRAWS:,}, but {self.phantoms:,} was "
+                             "given")
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,7 @@ BEAM = ConeBeam.orbit(**ORBIT)
 PICKLE = b"cos\nsystem\n(S'touch pwned'\ntR."
 """Runs a command where it is unpickled."""
 
-SIRT = ["-c", "sirt", "--model.method.init_args.iterations=2", "--model.voxels=16", "--trainer.accelerator=cpu"]
+SIRT = ["-c", "sirt", "--model.method.init_args.iterations=2", "--model.cube.voxels=16", "--trainer.accelerator=cpu"]
 
 
 @cache
@@ -171,8 +171,8 @@ class Place:
         self.predict(folder, "--dry_run", *more)
 
     def test(self, cts, *more, out=None) -> None:
-        self.infer("test", *SIRT, f"--data.cts={cts}", f"--model.out={out or self.out}", "--data.views=3",
-                   "--data.detector=[24,24]", "--data.pixel=[24,24]", *more)
+        self.infer("test", *SIRT, f"--data.cts={cts}", f"--model.out={out or self.out}", "--data.orbit.views=3",
+                   "--data.orbit.detector=[24,24]", "--data.orbit.pixel=[24,24]", *more)
 
     def sampled(self, prior, *more) -> None:
         """predict with a prior, two steps of it."""
@@ -182,7 +182,7 @@ class Place:
     def settings(self, content, command: str = "predict") -> None:
         """predict with a configuration file that holds `content`."""
         file = self.write("mine.yaml", content if isinstance(content, str | bytes) else yaml.safe_dump(content))
-        self.infer(command, "-c", "sirt", "-c", file, "--model.method.init_args.iterations=2", "--model.voxels=16",
+        self.infer(command, "-c", "sirt", "-c", file, "--model.method.init_args.iterations=2", "--model.cube.voxels=16",
                    f"--data.xrays={self.case()}", f"--model.out={self.out}", "--trainer.accelerator=cpu")
 
     def ablate(self, content, *more) -> None:
@@ -199,11 +199,12 @@ class Place:
 
     def fit(self, *more) -> None:
         self.train("fit", "-c", "phantom", f"--out={self.out}", f"--data.cache={self.root / 'cache'}",
-                   "--data.phantoms=2", "--data.validation_phantoms=1", "--data.epoch_size=2", "--data.batch_size=1",
-                   "--trainer.max_steps=1", "--trainer.accelerator=cpu", "--model.voxels=16",
+                   "--data.phantoms=2", "--data.holdout.phantoms=1", "--data.loading.epoch_size=2",
+                   "--data.loading.batch_size=1", "--trainer.max_steps=1", "--trainer.accelerator=cpu",
+                   "--model.cube.voxels=16",
                    "--model.network.class_path=phydict.prior.VolumeUNet",
                    "--model.network.init_args.channels=[8,8]", "--model.network.init_args.attention=[false,true]",
-                   "--model.network.init_args.head_channels=8", "--model.text_pretrain_steps=2", *more)
+                   "--model.network.init_args.head_channels=8", "--model.text.pretrain_steps=2", *more)
 
     def prepare(self, cts, *more, out=None) -> None:
         import runpy
@@ -274,27 +275,30 @@ def command_lines():
     yield "seed_everything in words", no, "seed", lambda p: p.predict(p.case(), "--seed_everything=often")
     yield "seed_everything below 0", None, "", lambda p: p.predict(p.case(), "--seed_everything=-5")
     yield "seed_everything too large", None, "", lambda p: p.predict(p.case(), "--seed_everything=99999999999999")
-    yield "voxels nan", no, "voxels", lambda p: p.predict(p.case(), "--model.voxels=nan")
-    yield "voxels -4", no, "", lambda p: p.predict(p.case(), "--model.voxels=-4")
-    yield "voxels 1", None, "", lambda p: p.predict(p.case(), "--model.voxels=1")
-    yield "voxels 3", None, "", lambda p: p.predict(p.case(), "--model.voxels=3")
-    yield "side of 1 mm", None, "", lambda p: p.predict(p.case(), "--model.side=1")
-    yield "side inf", no, "", lambda p: p.predict(p.case(), "--model.side=inf")
+    yield "voxels nan", no, "voxels", lambda p: p.predict(p.case(), "--model.cube.voxels=nan")
+    yield "voxels -4", no, "", lambda p: p.predict(p.case(), "--model.cube.voxels=-4")
+    yield "voxels 1", None, "", lambda p: p.predict(p.case(), "--model.cube.voxels=1")
+    yield "voxels 3", None, "", lambda p: p.predict(p.case(), "--model.cube.voxels=3")
+    yield "side of 1 mm", None, "", lambda p: p.predict(p.case(), "--model.cube.side=1")
+    yield "side inf", no, "", lambda p: p.predict(p.case(), "--model.cube.side=inf")
     yield "iterations 10^12 dry", True, "", lambda p: p.dry(p.case(),
         "--model.method.init_args.iterations=1000000000000")
     yield "mu_water nan", no, "mu_water", lambda p: p.predict(p.case(), "--model.method.init_args.mu_water=nan")
     yield "mu_water 1e-300", None, "", lambda p: p.predict(p.case(), "--model.method.init_args.mu_water=1e-300")
     yield "mu_water 1e300", None, "", lambda p: p.predict(p.case(), "--model.method.init_args.mu_water=1e300")
-    yield "samples of a method without prior", no, "samples", lambda p: p.predict(p.case(), "--model.samples=2")
-    yield "samples 0 with a prior", no, "samples", lambda p: p.sampled(p.prior(), "--model.samples=0")
-    yield "guidance inf with a prior", no, "guidance", lambda p: p.sampled(p.prior(), "--model.guidance=inf")
-    yield "guidance 1e308 with a prior", None, "", lambda p: p.sampled(p.prior(), "--model.guidance=1e308")
-    yield "precision float16", no, "precision", lambda p: p.sampled(p.prior(), "--model.precision=float16")
-    yield "precision float64 without prior", no, "precision", lambda p: p.predict(p.case(), "--model.precision=float64")
-    yield "sr_memory nan", no, "sr_memory", lambda p: p.sampled(
-        p.prior(), "--model.sr_memory=nan", f"--model.super_resolution={p.prior(name='f.safetensors')}")
+    yield "samples of a method without prior", no, "samples", lambda p: p.predict(
+        p.case(), "--model.sampling.samples=2")
+    yield "samples 0 with a prior", no, "samples", lambda p: p.sampled(p.prior(), "--model.sampling.samples=0")
+    yield "guidance inf with a prior", no, "guidance", lambda p: p.sampled(p.prior(), "--model.sampling.guidance=inf")
+    yield "guidance 1e308 with a prior", None, "", lambda p: p.sampled(p.prior(), "--model.sampling.guidance=1e308")
+    yield "precision float16", no, "precision", lambda p: p.sampled(p.prior(), "--model.sampling.precision=float16")
+    yield "precision float64 without prior", no, "precision", lambda p: p.predict(
+        p.case(), "--model.sampling.precision=float64")
+    yield "memory nan", no, "memory", lambda p: p.sampled(
+        p.prior(), "--model.super_resolution.memory=nan",
+        f"--model.super_resolution.file={p.prior(name='f.safetensors')}")
     yield "a base prior as second stage", no, "super-resolution", lambda p: p.sampled(
-        p.prior(), f"--model.super_resolution={p.prior(name='f.safetensors')}")
+        p.prior(), f"--model.super_resolution.file={p.prior(name='f.safetensors')}")
     yield "accelerator that is not there", no, "accelerator", lambda p: p.predict(p.case(), "--trainer.accelerator=tpx")
     yield "gpu where there is none", no, "", lambda p: p.predict(p.case(), "--trainer.accelerator=gpu")
     yield "devices 0", no, "devices", lambda p: p.predict(p.case(), "--trainer.devices=0")
@@ -318,11 +322,11 @@ def command_lines():
     yield "test without cts", no, "data.cts", lambda p: p.infer("test", *SIRT, f"--model.out={p.out}")
     yield "predict without xrays", no, "data.xrays", lambda p: p.infer("predict", *SIRT, f"--model.out={p.out}")
     yield "phantoms 0", no, "phantoms", lambda p: p.test("phantom", "--data.phantoms=0")
-    yield "views 0 of test", no, "view", lambda p: p.test("phantom", "--data.views=0")
-    yield "detector of one number", no, "detector", lambda p: p.test("phantom", "--data.detector=24")
-    yield "detector of three numbers", no, "detector", lambda p: p.test("phantom", "--data.detector=[24,24,24]")
-    yield "pixel 0", no, "pixel", lambda p: p.test("phantom", "--data.pixel=[0,0]")
-    yield "detector 10^6 squared", no, "GiB", lambda p: p.test("phantom", "--data.detector=[1000000,1000000]")
+    yield "views 0 of test", no, "view", lambda p: p.test("phantom", "--data.orbit.views=0")
+    yield "detector of one number", no, "detector", lambda p: p.test("phantom", "--data.orbit.detector=24")
+    yield "detector of three numbers", no, "detector", lambda p: p.test("phantom", "--data.orbit.detector=[24,24,24]")
+    yield "pixel 0", no, "pixel", lambda p: p.test("phantom", "--data.orbit.pixel=[0,0]")
+    yield "detector 10^6 squared", no, "GiB", lambda p: p.test("phantom", "--data.orbit.detector=[1000000,1000000]")
     yield "simulation_voxels 17", no, "simulation_voxels", lambda p: p.test("phantom", "--data.simulation_voxels=17")
     yield "simulation_voxels 160000", no, "GiB", lambda p: p.test("phantom", "--data.simulation_voxels=160000")
     yield "simulator noise nan", no, "noise", lambda p: p.test(
@@ -341,8 +345,8 @@ def command_lines():
     yield "only is binary", no, "ids", lambda p: p.test(p.ct().parent,
         f"--data.only={p.write('ids', bytes(range(256)))}")
     yield "everything is excluded", no, "excluded", lambda p: p.test(
-        p.ct().parent, f"--data.exclude={p.write('ids', 'ct.nii.gz')}")
-    yield "exclude is not there", no, "exclude", lambda p: p.test(p.ct().parent, "--data.exclude=nowhere.txt")
+        p.ct().parent, f"--data.source.exclude={p.write('ids', 'ct.nii.gz')}")
+    yield "exclude is not there", no, "exclude", lambda p: p.test(p.ct().parent, "--data.source.exclude=nowhere.txt")
     yield "help", True, "", lambda p: p.infer("--help")
     yield "help of predict", True, "", lambda p: p.infer("predict", "--help")
     yield "help of a method", True, "", lambda p: p.infer("predict", "--model.method.help=phydict.baselines.SIRT")
@@ -834,7 +838,8 @@ def reports():
         return lambda p: p.sampled(p.prior(), "--data.with_report=true") if content is None else (
             folder := p.case("other"), p.write(folder / "report.txt", content), p.infer(
                 "predict", "-c", "prior_only", "--model.method.init_args.iterations=2", f"--model.prior={p.prior()}",
-                f"--data.xrays={folder}", f"--model.out={p.out}", "--trainer.accelerator=cpu", "--model.guidance=2"))
+                f"--data.xrays={folder}", f"--model.out={p.out}", "--trainer.accelerator=cpu",
+                "--model.sampling.guidance=2"))
 
     yield "as it should be", True, "", report(None)
     yield "empty", True, "", report("")
@@ -1001,7 +1006,7 @@ def tables():
     head = "VolumeName,Findings_EN,Impressions_EN\n"
 
     def report(content, good=True, word=""):
-        return good, word, lambda p: p.test(p.ct(), f"--data.reports={p.write('r.csv', content)}")
+        return good, word, lambda p: p.test(p.ct(), f"--data.source.reports={p.write('r.csv', content)}")
 
     yield "as it should be", *report(head + "ct.nii.gz,Nodule.,Nodule.\n")
     yield "empty", *report("", no, "r.csv")
@@ -1016,15 +1021,15 @@ def tables():
     yield "other columns", *report("name,text\nct,a\n", no, "columns")
     yield "semicolons", *report(head.replace(",", ";"), no, "columns")
     yield "UTF-16", *report(head.encode("utf-16"), no, "UTF-8")
-    yield "a folder without tables", no, "CSV", lambda p: p.test(p.ct(), f"--data.reports={p.given}")
-    yield "a table that is not there", no, "none.csv", lambda p: p.test(p.ct(), "--data.reports=none.csv")
+    yield "a folder without tables", no, "CSV", lambda p: p.test(p.ct(), f"--data.source.reports={p.given}")
+    yield "a table that is not there", no, "none.csv", lambda p: p.test(p.ct(), "--data.source.reports=none.csv")
     yield "an Excel file", no, "r.csv", lambda p: p.test(p.ct(),
-        f"--data.reports={p.write('r.csv', b'PK' + bytes(range(128, 256)))}")
+        f"--data.source.reports={p.write('r.csv', b'PK' + bytes(range(128, 256)))}")
     meta = "VolumeName,RescaleSlope,RescaleIntercept,XYSpacing,ZSpacing\n"
 
     def calibrated(row, good=no, word="", columns=meta):
-        return good, word, lambda p: p.test(p.ct(), f"--data.metadata={p.write('m.csv', columns + row)}",
-            "--data.fixed=false")
+        return good, word, lambda p: p.test(p.ct(), f"--data.source.metadata={p.write('m.csv', columns + row)}",
+            "--data.source.fixed=false")
 
     yield "metadata as they should be", *calibrated('ct.nii.gz,1,0,"[10, 10]",10\n', True)
     yield "metadata missing", *calibrated("", no, "ct")
@@ -1156,10 +1161,10 @@ def priors():
     yield "inspect of the prior", True, "", lambda p: p.train("inspect-prior", p.prior())
     yield "a second stage of another size", no, "", lambda p: (save_super_resolution(
         tiny_super_resolution(48, 2), p.given / "f.safetensors"), p.sampled(p.prior(),
-        f"--model.super_resolution={p.given / 'f.safetensors'}"))
+        f"--model.super_resolution.file={p.given / 'f.safetensors'}"))
     yield "a second stage as it should be", True, "", lambda p: (save_super_resolution(
         tiny_super_resolution(32, 2), p.given / "f.safetensors"), p.sampled(p.prior(),
-        f"--model.super_resolution={p.given / 'f.safetensors'}"))
+        f"--model.super_resolution.file={p.given / 'f.safetensors'}"))
 
 
 def configurations():
@@ -1181,7 +1186,7 @@ def configurations():
             "seed"),
             ("seed a text", {"model": {"seed": "one"}}, no, "seed"), ("seed null", {"model": {"seed": None}}, no,
             "seed"),
-            ("seed 1e3", {"model": {"seed": 1e3}}, None, "seed"), ("name null", {"model": {"name": None}}, no, "name"),
+            ("seed 1e3", {"model": {"seed": 1e3}}, None, "seed"), ("name null", {"model": {"name": None}}, None, ""),
             ("name a list", {"model": {"name": ["a"]}}, no, "name"), ("name a number", {"model": {"name": 3}}, None,
             "name"),
             ("name of dots", {"model": {"name": "..."}}, None, ""), ("name of a space", {"model": {"name": " "}}, None,
@@ -1214,10 +1219,10 @@ def configurations():
             "init_args": {"likelihood": {"class_path": "phydict.baselines.SIRT"}}}}}, no, "likelihood"),
             ("prior a mapping", {"model": {"prior": {"path": 3}}}, None, ""), ("prior a list",
             {"model": {"prior": ["a"]}}, None, ""),
-            ("views a text", {"data": {"views": "8"}}, None, ""), ("detector a text", {"data": {"detector": "24,24"}},
+            ("views a text", {"data": {"orbit": {"views": "8"}}}, None, ""), ("detector a text", {"data": {"orbit": {"detector": "24,24"}}},
             no, "detector"),
-            ("detector nested", {"data": {"detector": [[24], [24]]}}, no, "detector"), ("pixel null",
-            {"data": {"pixel": None}}, no, "pixel"),
+            ("detector nested", {"data": {"orbit": {"detector": [[24], [24]]}}}, no, "detector"), ("pixel null",
+            {"data": {"orbit": {"pixel": None}}}, no, "pixel"),
             ("simulator a word", {"data": {"simulator": "ideal"}}, no, "simulator"), ("simulator null",
             {"data": {"simulator": None}}, None, ""),
             ("trainer.devices a mapping", {"trainer": {"devices": {"n": 1}}}, no, "devices"),
@@ -1242,7 +1247,7 @@ def configurations():
             ("an include", "model: !include /etc/passwd", no, "mine.yaml"), ("environment", "model: {name: ${HOME}}",
             None, ""),
             ("3 anchors", "a: &a {seed: 3}\nmodel: *a\n", None, ""), ("a date", "model: {name: 2020-01-01}", None, ""),
-            ("a float with 1000 digits", "model: {side: 1." + "0" * 1000 + "}", no, "side"), ("a key twice",
+            ("a float with 1000 digits", "model: {cube: {side: 1." + "0" * 1000 + "}}", no, "side"), ("a key twice",
             "model: {seed: 1, seed: 2}", no, "seed"),
             ("40 levels", "model: " + "{a: " * 40 + "1" + "}" * 40, no, "mine.yaml"), ("a colon in text",
             "model: {name: 'a: b'}", None, ""),
@@ -1443,27 +1448,29 @@ def trainings():
     """train.py."""
     no = False
     for option, good, word in (
-            ("--trainer.max_steps=0", None, ""), ("--trainer.max_steps=-5", None, ""), ("--data.batch_size=0", no,
-            "batch_size"), ("--data.batch_size=100", no, "batch_size"),
-            ("--data.epoch_size=-1", no, "epoch_size"), ("--data.workers=-1", no, "workers"),
-            ("--data.workers=1000000", no, "workers"), ("--data.phantoms=-2", no, "phantoms"),
-            ("--data.phantoms=0", no, "phantoms"), ("--data.ct_fraction=2", no, "ct_fraction"),
-            ("--data.ct_fraction=nan", no, "ct_fraction"), ("--data.holdout_fraction=7", no, "fraction"),
-            ("--data.seed=-1", no, "seed"), ("--model.learning_rate=nan", None, "learning_rate"),
-            ("--model.learning_rate=-1", no, "learning"), ("--model.learning_rate=1e30", None, ""),
-            ("--model.voxels=7", no, ""), ("--model.voxels=0", no, "voxels"), ("--model.voxels=100000", no, "GiB"),
-            ("--model.side=-1", no, "side"), ("--model.window=[600,-1000]", no, "window"),
-            ("--model.window=[0]", no, "window"), ("--model.warmup=-3", None, "warmup"), ("--model.decay_steps=-3",
-            None, "decay"), ("--model.network.init_args.channels=[]", no, ""),
+            ("--trainer.max_steps=0", None, ""), ("--trainer.max_steps=-5", None, ""),
+            ("--data.loading.batch_size=0", no, "batch_size"), ("--data.loading.batch_size=100", no, "batch_size"),
+            ("--data.loading.epoch_size=-1", no, "epoch_size"), ("--data.loading.workers=-1", no, "workers"),
+            ("--data.loading.workers=1000000", no, "workers"), ("--data.phantoms=-2", no, "phantoms"),
+            ("--data.phantoms=0", no, "phantoms"), ("--data.loading.ct_fraction=2", no, "ct_fraction"),
+            ("--data.loading.ct_fraction=nan", no, "ct_fraction"), ("--data.holdout.fraction=7", no, "fraction"),
+            ("--data.seed=-1", no, "seed"), ("--model.optimisation.learning_rate=nan", None, "learning_rate"),
+            ("--model.optimisation.learning_rate=-1", no, "learning"),
+            ("--model.optimisation.learning_rate=1e30", None, ""),
+            ("--model.cube.voxels=7", no, ""), ("--model.cube.voxels=0", no, "voxels"),
+            ("--model.cube.voxels=100000", no, "GiB"),
+            ("--model.cube.side=-1", no, "side"), ("--model.window=[600,-1000]", no, "window"),
+            ("--model.window=[0]", no, "window"), ("--model.optimisation.warmup=-3", None, "warmup"),
+            ("--model.optimisation.decay_steps=-3", None, "decay"), ("--model.network.init_args.channels=[]", no, ""),
             ("--model.network.init_args.channels=[7,7]", no, ""), ("--model.network.init_args.block=0", no, ""),
             ("--model.initial=nowhere.safetensors", no, "nowhere"),
             ("--ckpt_path=nowhere.ckpt", no, "nowhere"), ("--ckpt_path=hpc", None, ""), ("--precision=half", no,
             "precision"), ("--stage=third", no, "stage"), ("--data.cache=/dev/null", no, "cache"),
             ("--data.cache=", None, ""), ("--out=", None, ""), ("--data.cts=nowhere", no, "nowhere"),
-            ("--data.holdout=[x]", no, "holdout"), ("--data.validation_phantoms=-1", None, "validation_phantoms"),
-            ("--data.validation_phantoms=1000000000", no, "validation_phantoms"), ("--data.augmentation.shift=nan",
+            ("--data.holdout.ids=[x]", no, "holdout"), ("--data.holdout.phantoms=-1", None, "phantoms"),
+            ("--data.holdout.phantoms=1000000000", no, "phantoms"), ("--data.augmentation.shift=nan",
             None, ""), ("--data.augmentation.shift=-5", None, ""), ("--trainer.max_epochs=-3", None, ""),
-            ("--model.text=nowhere", no, "nowhere"), ("--model.text_length=0", no, ""),
+            ("--model.text.encoder=nowhere", no, "nowhere"), ("--model.text.length=0", no, ""),
             ("--trainer.gradient_clip_val=-1", None, ""), ("--checkpoint.every_n_epochs=-1", None, ""),
             ("--progress.interval=x", no, "interval"), ("--trainer.devices=99", no, "devices")):
         yield option, good, word, lambda p, option=option: p.fit(option)
@@ -1683,8 +1690,8 @@ def interruptions():
             p.case(f"case{k}")
         p.started()
         return [sys.executable, "-c", code, "predict", *SIRT[:2], "--model.method.init_args.iterations=400",
-                "--model.voxels=32", "--trainer.accelerator=cpu", f"--data.xrays={p.given}", f"--model.out={p.out}",
-                *more]
+                "--model.cube.voxels=32", "--trainer.accelerator=cpu", f"--data.xrays={p.given}",
+                f"--model.out={p.out}", *more]
 
     def start(args, **settings) -> subprocess.Popen:
         return subprocess.Popen(args, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,

@@ -27,8 +27,8 @@ from torch import Tensor
 from phydict.ablation import main as ablate
 from phydict.case_results import CaseResults
 from phydict.command_line import (
-    TRACEBACK, check_apart, check_command, check_configured, check_writable, noted, one_sentence_errors,
-    quiet, read_configurations, sentence, with_configurations)
+    TRACEBACK, check_apart, check_command, check_configured, check_processes, check_writable, noted,
+    one_sentence_errors, quiet, read_configurations, sentence, with_configurations)
 from phydict.datasets import load_xrays
 from phydict.dry_run import dry_run
 from phydict.evaluation import CaseMetrics, panel, rich_table
@@ -301,7 +301,9 @@ class InferenceCLI(LightningCLI):
 
     def instantiate_trainer(self, **kwargs) -> lightning.Trainer:
         with reading("the settings of trainer", "correct them"):
-            return super().instantiate_trainer(**kwargs)
+            made = super().instantiate_trainer(**kwargs)
+        check_processes(made.num_devices)
+        return made
 
     def predict(self, model: ReconstructionTask, datamodule: ReconstructionData) -> None:
         """Reconstruct X-rays, or draw their geometry."""

@@ -20,8 +20,8 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from phydict.atomic import alone_in, whole_file
 from phydict.command_line import (
-    check_apart, check_command, check_configured, check_writable, one_sentence_errors, quiet, read_configurations,
-    with_configurations)
+    check_apart, check_command, check_configured, check_processes, check_writable, one_sentence_errors, quiet,
+    read_configurations, with_configurations)
 from phydict.datamodule import PriorData
 from phydict.precision import PRECISIONS, resolve_precision, trainer_precision
 from phydict.prior import save_prior, save_super_resolution
@@ -192,7 +192,9 @@ class PriorCLI(LightningCLI):
         elif "bf16" in str(trainer.precision):
             resolve_precision("bfloat16", device)  # warns where that is slow
         with reading("the settings of trainer", "correct them"):
-            return super().instantiate_trainer(logger=logger, plugins=plugins, **kwargs)
+            made = super().instantiate_trainer(logger=logger, plugins=plugins, **kwargs)
+        check_processes(made.num_devices)
+        return made
 
     def fit(self, model: StageTraining, datamodule: PriorData, ckpt_path: str | None = None,
             weights_only: bool | None = None) -> None:

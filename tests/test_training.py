@@ -603,6 +603,7 @@ def test_a_training_is_never_written_among_its_cts(tmp_path, capsys, cache):
 
 @pytest.mark.parametrize("option", ["--data.validation_phantoms=-1", "--data.cache=/dev/null",
                                     "--model.learning_rate=-1", "--model.warmup=-3", "--data.workers=1000000",
+                                    "--trainer.devices=99",
                                     "--model.network.init_args.channels=[]", "--model.network.init_args.block=0"])
 def test_data_that_cannot_be_are_refused_by_their_option(tmp_path, capsys, cache, option):
     said = refusal(capsys, arguments(tmp_path, cache, option))

@@ -1463,7 +1463,7 @@ def trainings():
             ("--data.holdout=[x]", no, "holdout"), ("--data.validation_phantoms=-1", None, "validation_phantoms"),
             ("--data.validation_phantoms=1000000000", no, "validation_phantoms"), ("--data.augmentation.shift=nan",
             None, ""), ("--data.augmentation.shift=-5", None, ""), ("--trainer.max_epochs=-3", None, ""),
-            ("--model.text=nowhere", no, "nowhere"), ("--model.text_length=0", no, ""),
+            ("--model.text=nowhere", no, "nowhere"), ("--model.text_length=0", None, ""),
             ("--trainer.gradient_clip_val=-1", None, ""), ("--checkpoint.every_n_epochs=-1", None, ""),
             ("--progress.interval=x", no, "interval"), ("--trainer.devices=99", no, "devices")):
         yield option, good, word, lambda p, option=option: p.fit(option)

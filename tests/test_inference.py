@@ -969,7 +969,7 @@ def test_an_option_that_cannot_be_meant_is_one_sentence(change, words, measured,
 @pytest.mark.parametrize("change, words", [
     ("--model.sampling.samples=1000000000", "samples=1000000000 states of"),
     ("--model.sampling.guidance=nan", "model.sampling.guidance"),
-    ("--model.sampling.guidance=.nan", "the guidance scale is at least 0 and finite")])
+    ("--model.sampling.guidance=.nan", "the guidance scale lies between 0 and 1e")])
 def test_an_option_of_a_prior_that_cannot_be_meant_is_one_sentence(change, words, prior, measured, tmp_path, capsys):
     said = refusal(capsys, with_prior("predict", tmp_path / "out", prior, f"--data.xrays={measured}", change))
     assert words in said and not (tmp_path / "out").exists()

@@ -18,7 +18,7 @@ from phydict.inference.dry_run import dry_run
 from phydict.inference.task import ReconstructionTask
 from phydict.methods import METHODS
 from phydict.runtime.console import (
-    CONFIGURATION, check_apart, check_command, cli_errors, noted, quiet, read_configuration, sentence)
+    CONFIGURATION, check_apart, check_command, check_processes, cli_errors, noted, quiet, read_configuration, sentence)
 from phydict.runtime.reading import reading
 from phydict.runtime.shipped import configuration
 
@@ -67,7 +67,9 @@ class InferenceCLI(LightningCLI):
 
     def instantiate_trainer(self, **kwargs) -> lightning.Trainer:
         with reading("the settings of trainer", "correct them"):
-            return super().instantiate_trainer(**kwargs)
+            made = super().instantiate_trainer(**kwargs)
+        check_processes(made.num_devices)
+        return made
 
     def predict(self, model: ReconstructionTask, datamodule: ReconstructionData) -> None:
         """Reconstruct X-rays, or draw their geometry."""

@@ -18,8 +18,8 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from phydict.cli.export import export_prior, print_prior
 from phydict.runtime.console import (
-    check_apart, check_command, check_configured, check_writable, cli_errors, quiet, read_configurations,
-    with_configurations)
+    check_apart, check_command, check_configured, check_processes, check_writable, cli_errors, quiet,
+    read_configurations, with_configurations)
 from phydict.runtime.files import alone_in, atomic_write
 from phydict.runtime.precision import PRECISIONS, resolve_precision, trainer_precision
 from phydict.runtime.reading import reading
@@ -96,7 +96,9 @@ class PriorCLI(LightningCLI):
         elif "bf16" in str(trainer.precision):
             resolve_precision("bfloat16", device)  # warns where that is slow
         with reading("the settings of trainer", "correct them"):
-            return super().instantiate_trainer(logger=logger, plugins=plugins, **kwargs)
+            made = super().instantiate_trainer(logger=logger, plugins=plugins, **kwargs)
+        check_processes(made.num_devices)
+        return made
 
     def fit(self, model: StageTraining, datamodule: PriorData, ckpt_path: str | None = None,
             weights_only: bool | None = None) -> None:

@@ -310,6 +310,9 @@ def build_text(text: dict, weights: dict[str, Tensor]) -> TextEncoder:
     weights = {k.removeprefix("text."): w.float() for k, w in weights.items() if k.startswith("text.")}
     try:
         _check_sizes("text", {key: text[key] for key in ("length", "width", "layers")}, weights)
+        held = len(weights["bert.embeddings.word_embeddings.weight"])
+        if len(text["vocabulary"]) != held:
+            raise ValueError(f"it lists {len(text['vocabulary'])} words, but its weights have {held}")
         encoder = TextEncoder.small(text["vocabulary"], text["width"], text["layers"], text["length"])
         encoder.load_state_dict(weights)
     except Exception as error:  # of whatever kind: it is the header that leads to it

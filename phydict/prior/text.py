@@ -39,6 +39,8 @@ class TextEncoder(nn.Module):
     def __init__(self, tokenizer: BertTokenizer, bert: BertModel, length: int = 128, trainable: bool = False,
                  source: str | None = None, padded_to: int | None = None):
         super().__init__()
+        if length < 1:
+            raise ValueError(f"a text encoder reads at least 1 token of a report, but a length of {length} was given")
         if padded_to is not None and padded_to < length:
             raise ValueError(f"a report padded to {padded_to} tokens has no {length} of them to keep: give a padded_to "
                              "of at least the length")

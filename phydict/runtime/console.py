@@ -30,6 +30,9 @@ NOISE = (".*does not have many workers", ".*LeafSpec.*is deprecated", ".*is smal
          r"Found \d+ module\(s\) in eval mode at the start of training")
 """Warnings that tell a user of the command lines nothing to act on."""
 
+MOST_SAID = 800
+"""Characters of an error's message; the parser can list every class that there is."""
+
 CONFIGURATION = ("-c", "--config")
 """The option that names a configuration file."""
 
@@ -137,6 +140,14 @@ def check_writable(path: Path, option: str, file: bool = False) -> None:
         raise ValueError(f"{path} cannot be written because {there} {reason}: give another {option}") from error
 
 
+def check_processes(processes: int) -> None:
+    """Raises ValueError where a run asks for more processes than this machine can have at work, at least 8."""
+    cores = os.cpu_count() or 1
+    if processes > max(8, cores):
+        raise ValueError(f"trainer.devices asks for {processes:,} processes, but this machine has {cores} cores: give "
+                         "fewer")
+
+
 def check_apart(output: Path, option: str, inputs: Iterable[Path]) -> None:
     """Raises ValueError, in one sentence, where `output` is one of the inputs, lies inside one or holds one, wherever
     links lead; `option` is what the user should change."""
@@ -198,7 +209,8 @@ def sentence(error: Exception) -> str:
     text = re.sub(r"(- )?Expected a path but .*? either not accessible or invalid;?|"
                   r"Does not validate against any of the Union subtypes Subtypes: .*? Errors:;?|"
                   r"; Expected a <class 'NoneType'>", "", " ".join(text.split()))
-    return " ".join(text.split())
+    text = " ".join(text.split())
+    return text if len(text) <= MOST_SAID else f"{text[:MOST_SAID]} ..."
 
 
 @contextmanager

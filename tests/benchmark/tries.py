@@ -1470,7 +1470,7 @@ def trainings():
             ("--data.holdout.ids=[x]", no, "holdout"), ("--data.holdout.phantoms=-1", None, "phantoms"),
             ("--data.holdout.phantoms=1000000000", no, "phantoms"), ("--data.augmentation.shift=nan",
             None, ""), ("--data.augmentation.shift=-5", None, ""), ("--trainer.max_epochs=-3", None, ""),
-            ("--model.text.encoder=nowhere", no, "nowhere"), ("--model.text.length=0", no, ""),
+            ("--model.text.encoder=nowhere", no, "nowhere"), ("--model.text.length=0", None, ""),
             ("--trainer.gradient_clip_val=-1", None, ""), ("--checkpoint.every_n_epochs=-1", None, ""),
             ("--progress.interval=x", no, "interval"), ("--trainer.devices=99", no, "devices")):
         yield option, good, word, lambda p, option=option: p.fit(option)

@@ -322,7 +322,7 @@ def test_a_training_that_goes_on_elsewhere_overwrites_no_other(straight, cache, 
 
 
 def test_of_two_trainings_at_once_in_one_folder_the_second_is_refused(cache, tmp_path, capsys, monkeypatch):
-    short = ["--trainer.limit_train_batches=1", "--trainer.limit_val_batches=0", "--model.text.encoder=none"]
+    short = ["--data.loading.epoch_size=2", "--trainer.limit_val_batches=0", "--model.text.encoder=none"]
     step, met = PriorTraining.training_step, []
 
     def meanwhile(task, batch, index):
@@ -438,7 +438,7 @@ def test_an_unknown_key_of_a_config_file_is_named(tmp_path, cache, capsys):
 def test_a_loader_process_sends_the_message_too(cts, tmp_path, cache, capsys):
     (tmp_path / "cts").mkdir()
     (tmp_path / "cts" / "cut.nii.gz").write_bytes((cts / "patient0.nii.gz").read_bytes()[:200])
-    said = refusal(capsys, arguments(tmp_path, cache, "--trainer.max_epochs=1", f"--data.cts={tmp_path / 'cts'}",
+    said = refusal(capsys, arguments(tmp_path / "run", cache, "--trainer.max_epochs=1", f"--data.cts={tmp_path / 'cts'}",
                                      "--data.phantoms=0", "--data.loading.workers=1", "--model.text.encoder=none"))
     assert "cut.nii.gz" in said and "Traceback" not in said
 

@@ -150,7 +150,7 @@ def test_a_second_stage_without_enough_memory_is_refused_before_the_first_is_run
     steps, stage = [], medsyn_stage()
     stage.memory = 2**20
     method = CascadePosterior(Cascade(tiny_prior(False), stage), SAMPLER)
-    with pytest.raises(ValueError, match="sr_memory"):
+    with pytest.raises(ValueError, match="super_resolution.memory"):
         method.reconstruct(xrays, PROJECTOR, on_step=lambda: steps.append(1))
     assert not steps
 

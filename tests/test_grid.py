@@ -7,6 +7,8 @@ import pytest
 
 from phydict.grid import Grid
 
+pytestmark = pytest.mark.smoke
+
 TURNED = np.array([[0.0, -3.0, 0, 40], [2.0, 0, 0, -15], [0, 0, 5.0, 7], [0, 0, 0, 1]])
 LEFT_FIRST = np.array([[-3.0, 0, 0, 120], [0, -3.0, 0, 112], [0, 0, 5.0, -122], [0, 0, 0, 1]])
 GRIDS = [Grid.cube(8), Grid((4, 5, 6), (2.0, 3.0, 4.0)), Grid((4, 5, 6), affine=TURNED),

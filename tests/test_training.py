@@ -438,8 +438,9 @@ def test_an_unknown_key_of_a_config_file_is_named(tmp_path, cache, capsys):
 def test_a_loader_process_sends_the_message_too(cts, tmp_path, cache, capsys):
     (tmp_path / "cts").mkdir()
     (tmp_path / "cts" / "cut.nii.gz").write_bytes((cts / "patient0.nii.gz").read_bytes()[:200])
-    said = refusal(capsys, arguments(tmp_path / "run", cache, "--trainer.max_epochs=1", f"--data.cts={tmp_path / 'cts'}",
-                                     "--data.phantoms=0", "--data.loading.workers=1", "--model.text.encoder=none"))
+    said = refusal(capsys, arguments(tmp_path / "run", cache, "--trainer.max_epochs=1",
+                                     f"--data.cts={tmp_path / 'cts'}", "--data.phantoms=0",
+                                     "--data.loading.workers=1", "--model.text.encoder=none"))
     assert "cut.nii.gz" in said and "Traceback" not in said
 
 

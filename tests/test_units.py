@@ -6,6 +6,8 @@ import torch
 
 from phydict.units import MU_WATER, HUWindow, hu_to_mu, mu_to_hu
 
+pytestmark = pytest.mark.smoke
+
 WINDOWS = [HUWindow(), HUWindow(-1000, 600), HUWindow(-500, 1500)]
 
 

@@ -5,6 +5,8 @@ import torch
 
 from phydict.diffusion import CosineSchedule
 
+pytestmark = pytest.mark.smoke
+
 SCHEDULES = [CosineSchedule(), CosineSchedule(offset=0.02, floor=1e-3)]
 
 

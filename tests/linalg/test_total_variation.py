@@ -9,6 +9,8 @@ from laws import assert_adjoint, random_like
 from phydict.linalg.total_variation import (
     UNIT, TVQuadraticMajorizer, differences, differences_adjoint, total_variation, tv_proximal)
 
+pytestmark = pytest.mark.smoke
+
 X = random_like((2, 1, 3, 4, 5), seed=1)
 OTHER = random_like((2, 1, 3, 4, 5), seed=2)
 EDGE = 0.1

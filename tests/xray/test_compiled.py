@@ -25,7 +25,7 @@ CODE = """if True:
 def test_an_installation_that_cannot_be_written_caches_elsewhere_or_runs_without(tmp_path, home):
     site, cache = tmp_path / "site", tmp_path / "home" / ".cache"
     shutil.copytree(Path(phydict.__file__).parent, site / "phydict", ignore=shutil.ignore_patterns("__pycache__"))
-    (site / "phydict" / "xray" / "projectors" / "__pycache__").touch()  # a file in its place: not even root can write into it
+    (site / "phydict" / "xray" / "projectors" / "__pycache__").touch()  # a file: not even root writes into it
     (tmp_path / "home").mkdir() if home == "a folder" else (tmp_path / "home").touch()
     clean = {name: value for name, value in os.environ.items() if not name.startswith(("NUMBA_CACHE", "XDG_"))}
     done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, cwd=site, timeout=300,

@@ -467,3 +467,9 @@ def test_metadata_of_voxels_that_no_ct_has_are_refused(tmp_path, thorax):
     for spacing in (1e30, 500.0, 1e-5):
         with pytest.raises(ValueError, match="a.nii.gz has voxels .*; correct it in the metadata table"):
             load_ct(file, Calibration(1, 0, (spacing,) * 3))
+
+
+def test_voxels_without_their_place_are_no_ct(thorax):
+    for ct in ((thorax,), (thorax[0], AFFINE), (thorax, AFFINE, AFFINE)):
+        with pytest.raises(ValueError, match="a CT is a file, or HU"):
+            prepare_ct(ct, GRID)

@@ -228,6 +228,8 @@ def prepare_ct(ct: str | Path | tuple[np.ndarray, np.ndarray], grid: Grid = Grid
     "report", "affine" (4,4) float64: the voxels' place in the CT's own world, "centred_on": "lungs" or "volume"}.
     Without lungs the box is centred on the scan, with a warning. Raises what `load_ct` raises.
     """
+    if isinstance(ct, tuple) and [np.ndim(part) for part in ct] != [3, 2]:
+        raise ValueError("a CT is a file, or HU (X, Y, Z) and the 4x4 affine that says where they are")
     hu, affine = ct if isinstance(ct, tuple) else load_ct(ct, calibration)
     name = id or ("the CT" if isinstance(ct, tuple) else case_id(ct))
     check_hu(hu, name)

@@ -331,6 +331,7 @@ def test_parts_of_the_time_are_parts_of_it_and_calls_are_counted(tmp_path):
         assert row["prior"].endswith("tiny.safetensors") and row["grid"] == "16x16x16"
 
 
+@pytest.mark.filterwarnings("default")
 def test_a_doubtful_ct_marks_its_rows_and_the_tables(tmp_path, trace):
     image = nibabel.Nifti1Image(np.zeros((12, 12, 12), np.float32) + 24, np.diag([30.0, 30.0, 30.0, 1.0]))
     image.set_sform(image.affine, code=1)

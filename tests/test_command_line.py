@@ -108,6 +108,7 @@ def test_a_configuration_of_another_command_is_none_of_its_names(empty, capsys):
     assert stopped.value.code == 2 and "no configuration phydict_fast" in capsys.readouterr().err
 
 
+@pytest.mark.filterwarnings("default")
 def test_a_cases_warnings_are_noted_and_shown_with_its_name_however_often_others_gave_them(capsys):
     found = {"anna": [], "bert": []}
     with quiet():

@@ -236,6 +236,7 @@ def test_a_dry_run_goes_on_after_a_bad_case_and_names_it_at_the_end(measured, tm
     assert said[0].startswith("error: anna: ") and "1 of 2 cases cannot be reconstructed (anna)" in said[1]
 
 
+@pytest.mark.filterwarnings("default")
 def test_a_dry_run_warns_of_a_left_lateral_view_told_to_stand_at_90_degrees(tmp_path, capsys):
     lateral, told = (ConeBeam.orbit(1, 1020.0, 740.0, (48, 48), 12.0, start_degrees=angle) for angle in (270, 90))
     truth = HUWindow().to_mu(phantom_case(1, Grid.cube(64))["volume"])
@@ -508,6 +509,7 @@ DOUBTFUL = {
     "attenuation": lambda hu: (0.02 * (1 + hu / 1000)).astype(np.float32), "air": lambda hu: 0 * hu - 1000}
 
 
+@pytest.mark.filterwarnings("default")
 def test_a_doubtful_ct_marks_its_row_its_record_and_the_table(tmp_path, capsys):
     for name, change in DOUBTFUL.items():
         write_ct(tmp_path / "cts" / f"{name}.nii.gz", 0, change=change)
@@ -532,6 +534,7 @@ def test_a_good_case_has_no_mark(tmp_path):
     assert "warned" not in (tmp_path / "sirt" / "results.md").read_text()
 
 
+@pytest.mark.filterwarnings("default")
 def test_inverted_line_integrals_are_warned_of_and_marked(measured, tmp_path, capsys):
     case = load_xrays(measured / "anna")
     save_xrays(tmp_path / "case", case["xrays"].max() - case["xrays"], case["beam"])
@@ -1022,6 +1025,7 @@ def test_stages_in_each_others_place_are_one_sentence(prior, fine, measured, tmp
     assert "SIRT has none" in said
 
 
+@pytest.mark.filterwarnings("default")
 def test_a_prior_without_text_says_that_it_reads_no_report(prior, measured, tmp_path, capsys):
     main(with_prior("predict", tmp_path / "out", prior, f"--data.xrays={measured}"))
     said = capsys.readouterr().err
@@ -1117,6 +1121,7 @@ def test_a_disk_that_fills_up_leaves_no_case_that_looks_finished(measured, tmp_p
     assert names(tmp_path / "sirt") == ["anna", "bert"]
 
 
+@pytest.mark.filterwarnings("default")
 def test_several_samples_leave_a_deviation_map_in_the_volumes_place(measured, prior, tmp_path):
     args = with_prior("predict", tmp_path, prior, f"--data.xrays={measured / 'anna'}", "--model.name=several")
     main([*args, "--model.sampling.samples=2"])

@@ -66,6 +66,9 @@ METHODS: dict[str, Sampler | Reconstructor] = {
 """Settings by name, in Python as `method=`, on the command line as `--model.method`. configs/reconstruct writes out
 four of them as examples."""
 
+DEFAULT_METHOD = "phydict_fast"
+"""The method where none is given."""
+
 
 def reconstructor(method: str | Sampler | Reconstructor, prior: Prior | str | Path | None = None,
                   guidance: float = 1.0, name: str | None = None,
@@ -127,7 +130,7 @@ def fit_to_grid(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam)
 
 
 def reconstruct(xrays: Tensor, beam: ConeBeam, prior: Prior | str | Path | None = None,
-                method: str | Sampler | Reconstructor = "phydict_fast", report: str | None = None,
+                method: str | Sampler | Reconstructor = DEFAULT_METHOD, report: str | None = None,
                 display: bool = False, seed: int = 0, guidance: float = 1.0, mu_water: float | None = None,
                 grid: Grid = Grid.cube(64), on_step=lambda: None,
                 super_resolution: SuperResolution | str | Path | None = None,

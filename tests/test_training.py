@@ -26,7 +26,7 @@ from phydict.grid import Cube, Grid
 from phydict.prior import VolumeUNet, load_prior, save_prior
 from phydict.runtime.files import alone_in
 from phydict.training import PriorTraining
-from phydict.training.base import reconstruction_scores
+from phydict.training.prior import reconstruction_scores
 from phydict.training.data import PriorData
 from phydict.training.settings import HoldOut, TextSettings
 from phydict.units import HUWindow
@@ -235,7 +235,7 @@ def test_validation_logs_every_noise_level_and_paints_a_montage(straight):
 
 def test_the_checkpoint_that_reconstructs_best_is_kept(tmp_path, cache, monkeypatch):
     scores = iter((10.0, 30.0, 20.0))
-    monkeypatch.setattr("phydict.training.base.reconstruction_scores",
+    monkeypatch.setattr("phydict.training.prior.reconstruction_scores",
                         lambda *_: {"psnr": next(scores), "ssim": 0.5})
     main(arguments(tmp_path, cache, "--trainer.max_epochs=3"))
     best = torch.load(tmp_path / "best.ckpt", map_location="cpu", weights_only=True)

@@ -17,9 +17,9 @@ from phydict.inference.data import case_scores
 from phydict.methods import fit_to_grid, reconstructor
 from phydict.posterior import Sampler
 from phydict.reconstruction import Reconstruction
-from phydict.runtime.console import noted, sentence
+from phydict.runtime.console import TRACEBACK, noted, sentence
 from phydict.runtime.precision import instruction_set
-from phydict.runtime.profiling import profiled, reset_peak_memory
+from phydict.runtime.profiling import peak_memory, profiled, reset_peak_memory
 from phydict.runtime.progress import CaseProgress
 from phydict.runtime.seeds import case_seed
 
@@ -185,8 +185,9 @@ class Runner:
 
     def _measured(self, trial: Trial, scene: MeasuredCase, on_step: Callable[[], None]) -> dict:
         known = reset_peak_memory(self.device)
-        with profiled() as profile:
+        with profiled(memory=False) as profile:
             result = self._reconstruct(trial, scene, on_step)
+        peak = peak_memory(self.device) if known else None
         seconds = result.seconds | profile.seconds("network", "projector")
         finite = bool(result.volume.isfinite().all())
         scores = case_scores(result.volume, result.misfit, scene.truth, scene.window) if finite else {}
@@ -196,7 +197,7 @@ class Runner:
             "seconds": sum(result.seconds.values()),
             **{f"seconds_{stage}": value for stage, value in seconds.items()},
             "network_calls": result.network_calls, "projector_calls": result.projector_calls,
-            "peak_memory_mb": profile.peak_memory(self.device) if known else None,
+            "peak_memory_mb": peak,
             "device": self.device.type, "threads": torch.get_num_threads(), "precision": result.precision,
             "instruction_set": instruction_set(self.device)}
 
@@ -223,7 +224,7 @@ def _attempt(work: Callable[[], object]) -> object | dict:
     except ValueError as error:
         return {"status": "refused", "error": sentence(error)}
     except Exception as error:  # of whatever kind: one method's failure must not end the others' runs
-        if os.environ.get("PHYDICT_TRACEBACK"):
+        if os.environ.get(TRACEBACK):
             raise
         return {"status": "failed", "error": f"{type(error).__name__}: {sentence(error)}"}
 

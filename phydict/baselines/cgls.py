@@ -45,12 +45,9 @@ class CGLS(Baseline):
         low, high = bounds(self.window)
         density = clip(empty(A, y), self.window)
         for _ in range(self.restarts):
-            steps = iter(range(self.iterations))
             negative_gradient = A.T(y - A(density))
             inactive = ~((density <= low) & (negative_gradient < 0) | (density >= high) & (negative_gradient > 0))
             density = clip(density + conjugate_gradients(
                 lambda d, inactive=inactive: inactive * A.T(A.linear(d)), inactive * negative_gradient, self.iterations,
-                on_step=lambda: (next(steps), on_step())), self.window)
-            for _ in steps:  # that were not needed
-                on_step()
+                on_step=on_step), self.window)
         return density

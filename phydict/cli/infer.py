@@ -16,7 +16,7 @@ from phydict.datasets.radiographs.radiographs import load_xrays
 from phydict.inference.data import ReconstructionData
 from phydict.inference.dry_run import dry_run
 from phydict.inference.task import ReconstructionTask
-from phydict.methods import METHODS
+from phydict.methods import DEFAULT_METHOD, METHODS
 from phydict.runtime.console import (
     CONFIGURATION, check_apart, check_command, check_processes, cli_errors, noted, quiet, read_configuration, sentence)
 from phydict.runtime.reading import reading
@@ -24,9 +24,6 @@ from phydict.runtime.shipped import configuration
 
 COMMANDS = {"predict": "X-rays -> volumes", "test": "CTs -> X-rays -> volumes and scores",
             "ablate": "methods compared on the same X-rays"}
-
-DEFAULT_METHOD = "phydict_fast"
-"""The method where none is given."""
 
 
 class InferenceCLI(LightningCLI):

@@ -23,7 +23,7 @@ from phydict.runtime.console import (
 from phydict.runtime.files import alone_in, atomic_write
 from phydict.runtime.precision import PRECISIONS, resolve_precision, trainer_precision
 from phydict.runtime.reading import reading
-from phydict.training.base import PriorTraining
+from phydict.training.prior import PriorTraining
 from phydict.training.checkpoints import BEST, HELD_OUT, RESUMED, BestCheckpoint, WholeCheckpoints, read_checkpoint
 from phydict.training.crops import SuperResolutionData
 from phydict.training.data import PriorData

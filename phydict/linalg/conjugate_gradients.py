@@ -14,7 +14,7 @@ def conjugate_gradients(operator: Callable[[Tensor], Tensor], right: Tensor, ite
 
     iterations: at most; a case is left alone once its residual has shrunk by `tolerance`. Where the operator is
     singular and `right` in its range, this is the solution of least norm. preconditioner: diagonal of an approximate
-    inverse; where it is 0, d stays 0. on_step: called after each iteration.
+    inverse; where it is 0, d stays 0. on_step: called `iterations` times, as each is done or found needless.
     """
     over = tuple(range(1, right.ndim))
     residual, d = right, torch.zeros_like(right)
@@ -22,15 +22,14 @@ def conjugate_gradients(operator: Callable[[Tensor], Tensor], right: Tensor, ite
     energy = (residual * direction).sum(over, keepdim=True)
     stop = energy * tolerance**2
     for _ in range(iterations):
-        if not (energy > stop).any():
-            break
-        product = operator(direction)
-        curvature = (direction * product).sum(over, keepdim=True)
-        active = (energy > stop) & (curvature > 0)
-        step = torch.where(active, energy / curvature, 0)
-        d, residual = d + step * direction, residual - step * product
-        scaled = preconditioner * residual
-        previous, energy = energy, torch.where(active, (residual * scaled).sum(over, keepdim=True), energy)
-        direction = scaled + torch.where(active, energy / previous, 0) * direction
+        if (energy > stop).any():
+            product = operator(direction)
+            curvature = (direction * product).sum(over, keepdim=True)
+            active = (energy > stop) & (curvature > 0)
+            step = torch.where(active, energy / curvature, 0)
+            d, residual = d + step * direction, residual - step * product
+            scaled = preconditioner * residual
+            previous, energy = energy, torch.where(active, (residual * scaled).sum(over, keepdim=True), energy)
+            direction = scaled + torch.where(active, energy / previous, 0) * direction
         on_step()
     return d

@@ -17,6 +17,7 @@ from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM, CachedPhantoms
 from phydict.grid import Cube
 from phydict.runtime.warning import warn
 from phydict.training.data import PriorData
+from phydict.training.draws import Draws
 from phydict.training.settings import Crops, HoldOut, Loading
 from phydict.units import HUWindow
 
@@ -50,8 +51,8 @@ class CTVolumes(CTCases):
             ct.path, self.grid, self.window, id=ct.id, calibration=ct.calibration)["volume"][0])
 
 
-class CropDataset(Dataset):
-    """Random cubes of volumes: draw n of epoch e is the same on every machine.
+class CropDataset(Draws):
+    """Random cubes of volumes.
 
     A crop starts at a multiple of `align` voxels; mere air is drawn again, up to three times. augmented: mirrored left
     to right half the time, with a small change of HU (the super-resolution stage sees too little of the body for a
@@ -60,34 +61,26 @@ class CropDataset(Dataset):
 
     def __init__(self, cts: Dataset, phantoms: Dataset, ct_fraction: float, window: HUWindow, size: int, align: int,
                  length: int, epoch: int, seed: int, augmented: bool = True):
-        self.cts, self.phantoms, self.ct_fraction, self.window = cts, phantoms, ct_fraction, window
-        self.size, self.align, self.length, self.epoch, self.seed = size, align, length, epoch, seed
-        self.augmented = augmented
+        super().__init__(cts, phantoms, ct_fraction, length, epoch, seed)
+        self.window, self.size, self.align, self.augmented = window, size, align, augmented
 
-    def __len__(self) -> int:
-        return self.length
-
-    def __getitem__(self, i: int) -> dict:
-        draw = np.random.default_rng((self.seed, self.epoch, i))
-        from_ct = len(self.phantoms) == 0 or (len(self.cts) > 0 and draw.random() < self.ct_fraction)
-        source = self.cts if from_ct else self.phantoms
-        volume = source[int(draw.integers(len(source)))]
+    def item(self, drawn: np.ndarray, rng: np.random.Generator) -> dict:
         for _ in range(4):
-            crop = self._crop(volume, draw)
+            crop = self._crop(drawn, rng)
             if crop.std() > 0.05:
                 break
-        return {"volume": self._augment(crop, draw) if self.augmented else crop}
+        return {"volume": self._augment(crop, rng) if self.augmented else crop}
 
-    def _crop(self, volume: np.ndarray, draw: np.random.Generator) -> Tensor:
-        starts = [self.align * int(draw.integers((n - self.size) // self.align + 1)) for n in volume.shape]
+    def _crop(self, volume: np.ndarray, rng: np.random.Generator) -> Tensor:
+        starts = [self.align * int(rng.integers((n - self.size) // self.align + 1)) for n in volume.shape]
         cut = volume[tuple(slice(start, start + self.size) for start in starts)]
         return torch.from_numpy(cut.astype(np.float32))[None]
 
-    def _augment(self, crop: Tensor, draw: np.random.Generator) -> Tensor:
-        change = Deformation.draw(int(draw.integers(2**31)))
+    def _augment(self, crop: Tensor, rng: np.random.Generator) -> Tensor:
+        change = Deformation.draw(int(rng.integers(2**31)))
         air = (self.window.to_hu(crop) - AIR).clamp(min=0)
         crop = self.window.to_range(AIR + change.hu_scale * air + change.hu_offset * (air / 200).clamp(max=1))
-        return crop.flip(1) if draw.random() < 0.5 else crop
+        return crop.flip(1) if rng.random() < 0.5 else crop
 
 
 class SuperResolutionData(PriorData):

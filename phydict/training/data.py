@@ -16,7 +16,7 @@ from phydict.datasets.phantoms.phantom import change_by_findings
 from phydict.grid import Cube, Grid
 from phydict.runtime.console import check_writable
 from phydict.runtime.seeds import check_seed
-from phydict.training.draws import MixedCases, _training_parts
+from phydict.training.draws import MixedCases, training_parts
 from phydict.training.settings import HoldOut, Loading
 from phydict.units import HUWindow
 
@@ -130,4 +130,4 @@ class PriorData(lightning.LightningDataModule):
 
 
 def _collate(cases: list[dict]) -> dict:
-    return torch.utils.data.default_collate([_training_parts(case) for case in cases])
+    return torch.utils.data.default_collate([training_parts(case) for case in cases])

@@ -1,7 +1,8 @@
-"""Draws: one epoch of deformed cases."""
+"""One epoch of what is drawn from CTs and phantoms."""
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 
 import numpy as np
@@ -15,24 +16,39 @@ KEYS = ("volume", "masks", "has_masks", "report")
 """The parts of a Case that training needs."""
 
 
-class MixedCases(Dataset):
-    """One epoch of deformed draws from CTs and phantoms; draw n of epoch e is the same on every machine."""
+class Draws(Dataset):
+    """One epoch of items, each made of a CT or a phantom; item n of epoch e is the same on every machine."""
 
-    def __init__(self, cts: Sequence, phantoms: Sequence, ct_fraction: float, grid: Grid, window: HUWindow,
-                 length: int, epoch: int, seed: int, augmentation: Augmentation = Augmentation()):
-        self.cts, self.phantoms, self.ct_fraction, self.grid, self.window = cts, phantoms, ct_fraction, grid, window
-        self.length, self.epoch, self.seed, self.augmentation = length, epoch, seed, augmentation
+    def __init__(self, cts: Sequence, phantoms: Sequence, ct_fraction: float, length: int, epoch: int, seed: int):
+        self.cts, self.phantoms, self.ct_fraction = cts, phantoms, ct_fraction
+        self.length, self.epoch, self.seed = length, epoch, seed
 
     def __len__(self) -> int:
         return self.length
 
     def __getitem__(self, i: int) -> dict:
-        draw = np.random.default_rng((self.seed, self.epoch, i))
-        from_ct = len(self.phantoms) == 0 or (len(self.cts) > 0 and draw.random() < self.ct_fraction)
+        rng = np.random.default_rng((self.seed, self.epoch, i))
+        from_ct = len(self.phantoms) == 0 or (len(self.cts) > 0 and rng.random() < self.ct_fraction)
         source = self.cts if from_ct else self.phantoms
-        case = source[int(draw.integers(len(source)))]
-        return _training_parts(augment(case, int(draw.integers(2**31)), self.grid, self.window, self.augmentation))
+        return self.item(source[int(rng.integers(len(source)))], rng)
+
+    @abstractmethod
+    def item(self, drawn, rng: np.random.Generator) -> dict:
+        """What is learnt from of a CT or phantom that was drawn; `rng` decides all else."""
 
 
-def _training_parts(case: dict) -> dict:
+class MixedCases(Draws):
+    """Deformed cases."""
+
+    def __init__(self, cts: Sequence, phantoms: Sequence, ct_fraction: float, grid: Grid, window: HUWindow,
+                 length: int, epoch: int, seed: int, augmentation: Augmentation = Augmentation()):
+        super().__init__(cts, phantoms, ct_fraction, length, epoch, seed)
+        self.grid, self.window, self.augmentation = grid, window, augmentation
+
+    def item(self, drawn: dict, rng: np.random.Generator) -> dict:
+        return training_parts(augment(drawn, int(rng.integers(2**31)), self.grid, self.window, self.augmentation))
+
+
+def training_parts(case: dict) -> dict:
+    """A Case without what training does not need."""
     return {key: case[key] for key in KEYS if key in case}

@@ -88,8 +88,8 @@ class Previews:
     preview_steps: int = 16
 
     def __post_init__(self):
-        if self.preview_steps < 0:
-            raise ValueError("model.validation.preview_steps must not be negative, but "
+        if not 0 <= self.preview_steps <= 10_000:
+            raise ValueError("model.validation.preview_steps lies between 0 and 10,000, but "
                              f"{self.preview_steps} was given")
 
 

@@ -36,8 +36,6 @@ class StageTraining(lightning.LightningModule, ABC):
     def __init__(self, prior: Prior | SuperResolution, typical_std: float, optimisation: Optimisation,
                  preview_steps: int, seed: int, mask_weight: float = 0.0):
         super().__init__()
-        if not 0 <= preview_steps <= 10_000:
-            raise ValueError(f"model.preview_steps lies between 0 and 10,000, but {preview_steps} was given")
         self.prior, self.typical_std, self.preview_steps = prior, typical_std, preview_steps
         self.optimisation, self.seed, self.mask_weight, self.samples = optimisation, seed, mask_weight, 0
 

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 import phydict
-from phydict.datasets import load_xrays
+from phydict.datasets import body_mask, load_xrays
 from phydict.evaluation import mean_table, method_panel, panel, volume_metrics, write_csv
 
 METHODS = ("phydict_fast", "prior_only", "sirt")
@@ -20,6 +20,7 @@ if __name__ == "__main__":
     here, out = Path(__file__).parent, Path("runs/demo")
     case, prior = load_xrays(here / "xrays"), phydict.load_prior()
     truth = torch.from_numpy(nibabel.load(here / "truth.nii.gz").get_fdata(dtype="float32"))
+    body = torch.from_numpy(body_mask(truth.numpy(), prior.grid.spacing))[None, None]
     out.mkdir(parents=True, exist_ok=True)
     rows, volumes = [], {}
     with Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()) as bar:
@@ -27,7 +28,7 @@ if __name__ == "__main__":
             steps = bar.add_task(method, total=phydict.METHODS[method].steps())
             result = phydict.reconstruct(case["xrays"], case["beam"], prior, method, case["report"],
                                          on_step=lambda: bar.advance(steps))
-            scores = volume_metrics(result.volume[None, None], truth[None, None])
+            scores = volume_metrics(result.volume[None, None], truth[None, None], body=body)
             rows.append({"case": "example", "method": method, "views": len(case["xrays"]), "grid": "64x64x64"} | scores
                         | {"misfit": result.misfit, "seconds": sum(result.seconds.values())})
             volumes[method] = result.volume

@@ -29,10 +29,10 @@ RESULTS, TABLES = "results.csv", ("tables.md", "tables.tex")
 FINISHED = ("ok", "refused", "diverged")
 """What a row's status may be that is not tried again; "failed" is, since its reason may lie outside."""
 
-MEASURED = ("status", "error", "warning", "ssim", "psnr", "mae_hu", "ssim_lung", "psnr_lung", "mae_hu_lung", "misfit",
-            "seconds", "seconds_prepare", "seconds_sample", "seconds_score", "seconds_network", "seconds_projector",
-            "network_calls", "projector_calls", "peak_memory_mb", "device", "threads",
-            "precision", "instruction_set")
+MEASURED = ("status", "error", "warning", "ssim", "psnr", "mae_hu", "ssim_body", "psnr_body", "mae_hu_body",
+            "ssim_lung", "psnr_lung", "mae_hu_lung", "misfit", "seconds", "seconds_prepare", "seconds_sample",
+            "seconds_score", "seconds_network", "seconds_projector", "network_calls", "projector_calls",
+            "peak_memory_mb", "device", "threads", "precision", "instruction_set")
 """Columns that a run fills; the others are the trial's. peak_memory_mb, in MiB, is that of the tensors on a
 CUDA device, else of the process."""
 
@@ -190,7 +190,7 @@ class Runner:
         peak = peak_memory(self.device) if known else None
         seconds = result.seconds | profile.seconds("network", "projector")
         finite = bool(result.volume.isfinite().all())
-        scores = case_scores(result.volume, result.misfit, scene.truth, scene.window) if finite else {}
+        scores = case_scores(result.volume, result.misfit, scene.truth, scene.grid, scene.window) if finite else {}
         return scores | {
             "status": "ok" if finite else "diverged",
             "error": None if finite else "the volume holds NaN or infinite voxels", "misfit": result.misfit,

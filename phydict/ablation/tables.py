@@ -10,13 +10,13 @@ from phydict.ablation.summary import SHOWN_MEASURES, Entry, best_settings, condi
 from phydict.evaluation.tables import Table, caption, doubts, listed
 from phydict.runtime.files import atomic_write
 
-OF_METHODS = ("ssim", "psnr", "mae_hu", "misfit", "seconds", "network_calls")
+OF_METHODS = ("ssim", "psnr", "mae_hu", "ssim_body", "psnr_body", "mae_hu_body", "misfit", "seconds", "network_calls")
 """Columns of the table of methods."""
 
-OF_VIEWS = ("ssim", "psnr", "seconds")
+OF_VIEWS = ("ssim", "psnr", "ssim_body", "psnr_body", "seconds")
 """Measures that are tabled against the number of views."""
 
-OF_DELTA = ("ssim", "misfit", "psnr", "mae_hu", "seconds")
+OF_DELTA = ("ssim", "misfit", "psnr", "mae_hu", "ssim_body", "psnr_body", "mae_hu_body", "seconds")
 """Columns of the table of Extra Compute, the misfit beside SSIM: what looks better may fit the X-rays worse."""
 
 
@@ -60,6 +60,7 @@ def _delta_table(label: str, found: Sequence[Entry], notes: Sequence[str]) -> Ta
 
 def _entry_table(title: str, first: str, names: Sequence[str], lines: Sequence[tuple[str, Entry]],
                  notes: Sequence[str]) -> Table:
+    names = _measured(names, [entry for _, entry in lines])
     measures = [SHOWN_MEASURES[name] for name in names]
     return Table(title, [first, *(measure.heading for measure in measures)], measures,
                  [(label, entry.complete, [entry.means.get(name) for name in names]) for label, entry in lines],
@@ -74,7 +75,7 @@ def _views_tables(found: Sequence[Entry], notes: Sequence[str]) -> list[Table]:
         for entry in group:
             lines.setdefault(entry.name, {})[entry.condition["views"]] = entry
         views = sorted({k for line in lines.values() for k in line})
-        for name in OF_VIEWS:
+        for name in _measured(OF_VIEWS, group):
             measure = SHOWN_MEASURES[name]
             tables.append(Table(
                 format_settings(f"{measure.heading} against the number of views", rest),
@@ -83,6 +84,11 @@ def _views_tables(found: Sequence[Entry], notes: Sequence[str]) -> list[Table]:
                   [line[k].means.get(name) if k in line else None for k in views]) for label, line in lines.items()],
                 [*notes, *_reasons(group)]))
     return tables
+
+
+def _measured(names: Sequence[str], found: Sequence[Entry]) -> list[str]:
+    """The measures without those in the body where no entry has them, as in results of 0.2.0 and before."""
+    return [name for name in names if not name.endswith("_body") or any(name in entry.means for entry in found)]
 
 
 def _caption(rows: Sequence[dict]) -> str:

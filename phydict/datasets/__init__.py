@@ -1,6 +1,6 @@
 """Files to Cases: procedural thoraxes, chest CTs with reports, and measured X-rays."""
 
-from phydict.datasets.cts.anatomy import MASKS, segment
+from phydict.datasets.cts.anatomy import MASKS, body_mask, segment
 from phydict.datasets.cts.augment import Augmentation, Deformation, augment
 from phydict.datasets.cts.ct_rate import CTCases, CTFile, CTSource, find_cts, load_case, patient_of, split_by_patient
 from phydict.datasets.cts.ct_rate_tables import read_calibrations, read_reports
@@ -24,6 +24,7 @@ __all__ = [
            "Intensity",
            "Thorax",
            "augment",
+           "body_mask",
            "build",
            "find_cts",
            "find_xrays",

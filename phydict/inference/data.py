@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from phydict.datasets import CTFile, CTSource, find_xrays, load_case, load_xrays, phantom_case
+from phydict.datasets import CTFile, CTSource, body_mask, find_xrays, load_case, load_xrays, phantom_case
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM, PHANTOM_VERSION
 from phydict.evaluation import volume_metrics
 from phydict.grid import Grid
@@ -168,10 +168,15 @@ class ReconstructionData(lightning.LightningDataModule):
         return DataLoader(cases, None)
 
 
-def case_scores(volume: Tensor, misfit: float, case: dict, window: HUWindow) -> dict[str, float]:
-    """Scores of a reconstructed volume (X, Y, Z) in HU against the CT case that its X-rays were made of."""
+def case_scores(volume: Tensor, misfit: float, case: dict, grid: Grid, window: HUWindow) -> dict[str, float]:
+    """Scores of a reconstructed volume (X, Y, Z) in HU on `grid` against the CT case that its X-rays were made of: over
+    the whole volume, in the body, which leaves out couch and air (`body_mask` of the CT), and in the lungs if known."""
+    truth = window.to_hu(case["volume"])[None].cpu()
     lung = case["masks"][None, :1].cpu() if bool(case["has_masks"][0]) else None
-    return volume_metrics(volume[None, None], window.to_hu(case["volume"])[None].cpu(), lung) | {"misfit": misfit}
+    body = torch.from_numpy(body_mask(truth[0, 0].numpy(), grid.spacing))[None, None]
+    if lung is not None:  # a lung that the field of view cuts open is not filled in the body
+        body |= lung > 0.5
+    return volume_metrics(volume[None, None], truth, lung, body) | {"misfit": misfit}
 
 
 def _divided(grid: Grid, shape: tuple[int, int, int]) -> Grid:

@@ -130,7 +130,7 @@ class ReconstructionTask(lightning.LightningModule):
         if "affine" in case:  # back to its place in the CT it came from
             result = replace(result, grid=Grid(self.grid.shape, affine=case["affine"].numpy()))
         with stage("metrics"):
-            scores = case_scores(result.volume, result.misfit, case, self.window)
+            scores = case_scores(result.volume, result.misfit, case, self.grid, self.window)
         self.metrics.update(case["index"], self.method_name, scores, seconds=sum(result.seconds.values()))
         self._finish(case, result, scores, self.window.to_hu(case["volume"])[0].cpu())
 

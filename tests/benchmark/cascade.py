@@ -19,7 +19,8 @@ from rich.console import Console
 from torch.nn.functional import interpolate
 
 from phydict.datasets import find_cts, prepare_ct
-from phydict.evaluation import mean_table, read_csv, volume_metrics, write_csv
+from phydict.evaluation import mean_table, read_csv, write_csv
+from phydict.inference.data import case_scores
 from phydict.prior import load_super_resolution
 
 FILE = Path(__file__).with_suffix(".csv")
@@ -45,7 +46,7 @@ def compared(stage: str, views: int, cts: str) -> list[dict]:
                     truth = prepare_ct(ct.path, fine.grid, fine.window, id=ct.id)
                     volume = torch.from_numpy(nibabel.load(case / "volume.nii.gz").get_fdata().astype("float32"))
                     volume = interpolate(volume[None, None], fine.grid.shape, mode="trilinear")
-                    row |= volume_metrics(volume, fine.window.to_hu(truth["volume"])[None], truth["masks"][None, :1])
+                    row |= case_scores(volume[0, 0], row["misfit"], truth, fine.grid, fine.window)
                 rows.append({"stage": Path(stage).stem} | row)
     return rows
 

@@ -14,7 +14,7 @@ from statistics import mean
 import torch
 
 import phydict
-from phydict.datasets import Thorax, pathology_region, phantom_case, report, wrong_side
+from phydict.datasets import Thorax, body_mask, pathology_region, phantom_case, report, wrong_side
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM
 from phydict.evaluation import volume_metrics, write_csv
 from phydict.prior.files import DEFAULT_PRIOR
@@ -45,12 +45,13 @@ def compared(file: Path, count: int) -> list[dict]:
         case, thorax = phantom_case(seed, prior.grid, prior.window), Thorax.draw(seed)
         xrays = Ideal()(projector, prior.window.to_mu(case["volume"])[None], seed)[0]
         truth = prior.window.to_hu(case["volume"])[None]
+        body = torch.from_numpy(body_mask(truth[0, 0].numpy(), prior.grid.spacing))[None, None]
         for name, text in (("correct", report(thorax)), ("none", ""), ("wrong side", report(wrong_side(thorax)))):
             result = phydict.reconstruct(xrays, beam, prior, report=text, seed=seed)
             error = (result.volume - truth[0, 0]).abs()[region].mean()
             rows.append({"prior": file.stem, "case": f"phantom-{seed}", "finding": thorax.findings[0].kind,
                          "method": name, "views": 2, "region_mae_hu": float(error)}
-                        | volume_metrics(result.volume[None, None], truth))
+                        | volume_metrics(result.volume[None, None], truth, body=body))
     return rows
 
 

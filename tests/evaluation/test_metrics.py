@@ -37,10 +37,10 @@ def reference_ssim_map(x, y, data_range):
 
 def test_identical_volumes_are_perfect():
     truth, _ = smooth_case(0)
-    got = volume_metrics(truth, truth.clone(), torch.ones_like(truth))
-    assert got["ssim"] == pytest.approx(1, abs=1e-5) and got["ssim_lung"] == pytest.approx(1, abs=1e-5)
-    assert got["psnr"] == got["psnr_lung"] == math.inf
-    assert got["mae_hu"] == got["mae_hu_lung"] == 0
+    got = volume_metrics(truth, truth.clone(), torch.ones_like(truth), torch.ones_like(truth))
+    for where in ("", "_body", "_lung"):
+        assert got[f"ssim{where}"] == pytest.approx(1, abs=1e-5)
+        assert got[f"psnr{where}"] == math.inf and got[f"mae_hu{where}"] == 0
 
 
 def test_a_constant_offset_has_closed_form_psnr_and_mae_and_lowers_ssim():
@@ -82,23 +82,30 @@ def test_psnr_and_mae_agree_with_numpy_and_the_mask_is_a_weight():
     assert got["mae_hu_lung"] == pytest.approx(np.average(abs(error), weights=weight), rel=1e-5)
 
 
-def test_lung_metrics_ignore_errors_outside_the_lung():
+@pytest.mark.parametrize("where", ["lung", "body"])
+def test_metrics_in_a_mask_ignore_errors_outside_it(where):
     truth, noisy = smooth_case(5, (24, 16, 16))
-    lung = torch.zeros_like(truth)
-    lung[:, :, :8] = 1
+    mask = torch.zeros_like(truth)
+    mask[:, :, :8] = 1
     spoiled = noisy.clone()
     spoiled[:, :, 8:] = 0
-    near = (volume_metrics(noisy, truth, lung), volume_metrics(spoiled, truth, lung))
-    assert near[0]["psnr_lung"] == near[1]["psnr_lung"] and near[0]["mae_hu_lung"] == near[1]["mae_hu_lung"]
-    assert near[0]["psnr"] > near[1]["psnr"] + 1
+    near, same = (volume_metrics(volume, truth, **{where: mask}) for volume in (noisy, spoiled))
+    assert near[f"psnr_{where}"] == same[f"psnr_{where}"] and near[f"mae_hu_{where}"] == same[f"mae_hu_{where}"]
+    assert near["psnr"] > same["psnr"] + 1
     far = noisy.clone()
     far[:, :, 8 + 5:] = 0
-    assert volume_metrics(far, truth, lung)["ssim_lung"] == pytest.approx(near[0]["ssim_lung"], abs=1e-6)
+    moved = volume_metrics(far, truth, **{where: mask})
+    assert moved[f"ssim_{where}"] == pytest.approx(near[f"ssim_{where}"], abs=1e-6)
 
 
-def test_an_empty_lung_mask_counts_as_none():
+def test_masks_are_scored_apart_and_an_empty_one_counts_as_none():
     truth, noisy = smooth_case(6)
-    assert volume_metrics(noisy, truth, torch.zeros_like(truth)) == volume_metrics(noisy, truth)
+    lung = torch.rand(truth.shape, generator=torch.Generator().manual_seed(1))
+    plain, none = volume_metrics(noisy, truth), torch.zeros_like(truth)
+    assert volume_metrics(noisy, truth, none, none) == plain
+    both = volume_metrics(noisy, truth, lung, 1 - lung)
+    assert both == volume_metrics(noisy, truth, lung) | volume_metrics(noisy, truth, body=1 - lung)
+    assert both["psnr_lung"] != both["psnr_body"] and both["mae_hu"] == plain["mae_hu"]
 
 
 def test_scale_and_offset_of_the_range_change_no_score():
@@ -156,16 +163,17 @@ def test_nan_shows():
     assert all(math.isnan(v) for v in volume_metrics(noisy, truth).values())
 
 
-@pytest.mark.parametrize("hu, true_hu, lung, low, sentence", [
-    ((2, 1, 8, 8, 8), (2, 1, 8, 8, 8), None, -1000, "loop over the batch"),
-    ((1, 1, 8, 8, 8), (1, 1, 8, 8, 9), None, -1000, r"\(1, 1, 8, 8, 9\)"),
-    ((8, 8, 8), (8, 8, 8), None, -1000, r"\(1, 1, X, Y, Z\)"),
-    ((1, 1, 8, 8, 8), (1, 1, 8, 8, 8), (1, 3, 8, 8, 8), -1000, "lung mask"),
-    ((1, 1, 8, 8, 8), (1, 1, 8, 8, 8), None, 1000, "low < high"),
+@pytest.mark.parametrize("hu, true_hu, given, sentence", [
+    ((2, 1, 8, 8, 8), (2, 1, 8, 8, 8), {}, "loop over the batch"),
+    ((1, 1, 8, 8, 8), (1, 1, 8, 8, 9), {}, r"\(1, 1, 8, 8, 9\)"),
+    ((8, 8, 8), (8, 8, 8), {}, r"\(1, 1, X, Y, Z\)"),
+    ((1, 1, 8, 8, 8), (1, 1, 8, 8, 8), {"lung": torch.ones(1, 3, 8, 8, 8)}, "lung mask"),
+    ((1, 1, 8, 8, 8), (1, 1, 8, 8, 8), {"body": torch.ones(8, 8, 8)}, "body mask"),
+    ((1, 1, 8, 8, 8), (1, 1, 8, 8, 8), {"low": 1000}, "low < high"),
 ])
-def test_bad_input_is_named(hu, true_hu, lung, low, sentence):
+def test_bad_input_is_named(hu, true_hu, given, sentence):
     with pytest.raises(ValueError, match=sentence):
-        volume_metrics(torch.zeros(hu), torch.zeros(true_hu), None if lung is None else torch.ones(lung), low=low)
+        volume_metrics(torch.zeros(hu), torch.zeros(true_hu), **given)
 
 
 def test_statistics_are_means_of_case_values_and_not_pooled():

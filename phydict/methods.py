@@ -115,9 +115,10 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: Prior | str | Pa
     return replace(ready, sr_sampler=sr_sampler) if sr_sampler else ready
 
 
-def fit_to_grid(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam) -> tuple[Tensor, Projector]:
+def fit_to_grid(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam,
+                projector: str = "auto") -> tuple[Tensor, Projector]:
     """X-rays (K, V, U), binned unless the method wants the full detector, and the projector that goes with them on the
-    X-rays' device.
+    X-rays' device; `projector` is its kind, as Projector's `method`.
 
     Raises ValueError where X-rays, geometry and grid do not fit, and warns where the X-rays look inverted.
     """
@@ -126,7 +127,8 @@ def fit_to_grid(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam)
     beam.check(grid)
     beam.check_scale(grid)
     factor = 1 if ready.full_detector else binning(grid, beam)
-    return binned(xrays.float(), factor), Projector(grid, beam.binned(factor), device=xrays.device, full_detector=True)
+    return binned(xrays.float(), factor), Projector(grid, beam.binned(factor), projector, device=xrays.device,
+                                                    full_detector=True)
 
 
 def reconstruct(xrays: Tensor, beam: ConeBeam, prior: Prior | str | Path | None = None,
@@ -134,7 +136,8 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: Prior | str | Path | None 
                 display: bool = False, seed: int = 0, guidance: float = 1.0, mu_water: float | None = None,
                 grid: Grid = Grid.cube(64), on_step=lambda: None,
                 super_resolution: SuperResolution | str | Path | None = None,
-                sr_guided: bool = True, samples: int = 1, precision: str = "auto") -> Reconstruction:
+                sr_guided: bool = True, samples: int = 1, precision: str = "auto",
+                projector: str = "auto") -> Reconstruction:
     """A CT volume from X-rays (K, V, U) and their geometry.
 
     xrays: tensor or array of line integrals; with display=True, of display values with an unknown gain and offset per
@@ -144,6 +147,7 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: Prior | str | Path | None 
     super_resolution, sr_guided: the second stage of a cascade, as for `reconstructor`; the volume is then on its grid.
     samples: more than one gives their mean, and `deviation`, a map of how far they differ, as for `reconstructor`.
     precision: of the networks; "auto" is bfloat16 where the device computes it, float32 elsewhere.
+    projector: the kind of `Projector`, such as "siddon"; "auto" is the fastest that suits the geometry.
     A detector finer than the grid can use is binned. Raises ValueError when X-rays, geometry and prior do not fit.
     """
     if not isinstance(beam, ConeBeam):
@@ -157,8 +161,8 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: Prior | str | Path | None 
                           samples=samples, precision=precision)
     ready = ready if mu_water is None else ready.with_mu_water(mu_water)
     grid = ready.grid if isinstance(ready, Posterior | CascadePosterior) else grid
-    xrays, projector = fit_to_grid(ready, grid, _real(xrays), beam)
-    return ready.reconstruct(xrays, projector, format_report(report), display, seed, on_step)
+    xrays, A = fit_to_grid(ready, grid, _real(xrays), beam, projector)
+    return ready.reconstruct(xrays, A, format_report(report), display, seed, on_step)
 
 
 def _real(xrays) -> Tensor:

@@ -15,9 +15,10 @@ import yaml
 from prior.tiny import tiny_prior
 
 from phydict.ablation import plots, read_specification
-from phydict.ablation.spec import changed, refined_from
+from phydict.ablation.nested import changed
 from phydict.ablation.summary import entries
 from phydict.ablation.tables import all_tables
+from phydict.ablation.trials import refined_from
 from phydict.baselines.baseline import Baseline
 from phydict.cli.infer import main
 from phydict.evaluation import read_csv
@@ -231,6 +232,42 @@ def test_an_old_setting_is_refused_with_its_new_name(tmp_path, content):
 @pytest.mark.parametrize("file", sorted((ROOT / "configs" / "ablate").glob("*.yaml")), ids=lambda file: file.stem)
 def test_every_shipped_comparison_is_one(file):
     assert read_specification(file, phantoms=1).trials
+
+
+def test_a_method_by_the_path_of_its_class_is_run_with_its_settings(tmp_path):
+    path = f"{Trace.__module__}.{Trace.__qualname__}"
+    methods = {name: {"of": of, "method.iterations": count} for name, of, count in (
+        ("own", "phydict.baselines.SIRT", 3), ("shorter", "phydict.baselines.SIRT", 2), ("named", "sirt", 3))}
+    rows = ablate(tmp_path, phantoms=1, methods=methods, axes={"method": [*methods, path, "trace"]})
+    assert [(row["method"], row["status"]) for row in rows] == [(name, "ok") for name in (*methods, path, "trace")]
+    own, shorter, named, by_path, trace = (row["psnr"] for row in rows)
+    assert own == named != shorter and by_path == trace
+
+
+def test_a_projector_is_an_axis_on_the_same_xrays_and_the_automatic_one_keeps_its_rows(tmp_path, trace):
+    plain = ablate(tmp_path, phantoms=1, axes={"method": ["trace"]})
+    rows = ablate(tmp_path, phantoms=1, axes={"method": ["trace"], "projector": ["auto", "siddon", "joseph"]})
+    assert rows[0]["key"] == plain[0]["key"] and [row["projector"] for row in rows] == ["auto", "siddon", "joseph"]
+    assert len({row["misfit"] for row in rows}) == 3 and {row["status"] for row in rows} == {"ok"}
+    assert all(torch.equal(trace.given[0][0], xrays) for xrays, _, _ in trace.given)
+
+
+def test_set_takes_the_place_of_a_files_axis_base_and_product(tmp_path):
+    file = write(tmp_path, products=[{"base": {"seed": 3}, "axes": {"method": ["sirt", "tv"], "views": [2, 4]}},
+                                     {"axes": {"method": ["cgls"]}}])
+    trials = read_specification(file, ["method=[sirt,cgls]", "views=5", "seed=[1,2]", "voxels=24"]).trials
+    assert {(t.name, t.data.beam.views, t.seed, t.voxels) for t in trials} == {
+        (name, 5, seed, 24) for name in ("sirt", "cgls") for seed in (1, 2)}
+
+
+@pytest.mark.parametrize("changes, words", [
+    (["views"], "name=value"), (["=3"], "name=value"), (["views=[2"], "value of views is not valid YAML"),
+    (["view=3"], "no setting 'view'"), (["projector=lines"], "no projector 'lines'"), (["method.steps=2"], "nothing"),
+    (["method=[no_module.Sampler]"], "no_module.Sampler cannot be made .*importable"), (["method=[sart]"], "'sart'"),
+    (["method=[pathlib.Path]"], "pathlib.Path is no method"), (["views=[]"], "at least one value")])
+def test_a_set_that_cannot_be_meant_is_one_sentence(tmp_path, changes, words):
+    with pytest.raises(ValueError, match=words):
+        read_specification(write(tmp_path, axes={"method": ["sirt"]}), changes)
 
 
 def test_settings_that_hold_each_other_are_changed_together():

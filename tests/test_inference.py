@@ -1176,3 +1176,15 @@ def test_the_record_says_whether_the_misfit_rose(measured, tmp_path, monkeypatch
         monkeypatch.setattr(SIRT, "solve", change)
         main(sirt("predict", tmp_path / name, f"--data.xrays={measured / 'anna'}"))
         assert record(tmp_path / name / "sirt" / "anna")["diverged_at"] == expected
+
+
+def test_a_projector_is_chosen_and_recorded_and_another_result_is_not_taken_for_its(measured, tmp_path, capsys):
+    args = sirt("predict", tmp_path / "out", f"--data.xrays={measured / 'anna'}")
+    main([*args, "--model.projector=siddon"])
+    assert record(tmp_path / "out" / "sirt" / "anna")["settings"]["projector"] == "siddon"
+    other = volume(tmp_path / "out" / "sirt" / "anna").copy()
+    assert "other settings" in refusal(capsys, args)
+    main([*args, "--model.overwrite=true"])
+    assert "projector" not in record(tmp_path / "out" / "sirt" / "anna")["settings"]
+    assert not np.array_equal(volume(tmp_path / "out" / "sirt" / "anna"), other)
+    assert "model.projector is one of" in refusal(capsys, [*args, "--model.projector=lines"])

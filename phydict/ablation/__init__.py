@@ -2,6 +2,7 @@
 
 from phydict.ablation.command import main
 from phydict.ablation.run import run
-from phydict.ablation.spec import Specification, Trial, read_specification
+from phydict.ablation.spec import Specification, read_specification
+from phydict.ablation.trials import Trial
 
 __all__ = ["Specification", "Trial", "main", "read_specification", "run"]

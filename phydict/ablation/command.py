@@ -30,7 +30,7 @@ def main(args: list[str] | None = None) -> None:
         except Exception as error:  # torch has a kind for each reason
             raise ValueError(f"--device {device} cannot be used ({reason(error)[:100]}): give cpu, or leave it "
                              "out") from error
-        specification = read_specification(given.pop("config"), **given)
+        specification = read_specification(given.pop("config"), given.pop("set"), **given)
         check_writable(specification.out, "out")
         check_apart(specification.out, "out", [Path(cts)] if (cts := specification.cases.cts) else [])
         with alone_in(specification.out, "out"), CaseProgress() as progress:
@@ -52,6 +52,9 @@ def _parser() -> ArgumentParser:
     parser.add_argument("--phantoms", type=int, help="a number of phantoms, instead of the file's cases")
     parser.add_argument("--only", type=str, help="a text file of the case ids to take")
     parser.add_argument("--reports", type=str, help="CT-RATE's table of reports, or the folder it is in")
+    parser.add_argument("--set", nargs="+", metavar="NAME=VALUE",
+                        help="settings instead of the file's; a list is an axis: --set "
+                             "method=[sirt,my_module.MySampler] views=4 projector=siddon")
     parser.add_argument("--out", type=str, help="folder of the results, instead of the file's")
     parser.add_argument("--device", type=str, help="cpu or cuda; left out: cuda where there is one")
     return parser

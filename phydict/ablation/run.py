@@ -11,7 +11,8 @@ from pathlib import Path
 
 import torch
 
-from phydict.ablation.spec import Specification, Trial, key, prior_of
+from phydict.ablation.spec import Specification
+from phydict.ablation.trials import Trial, key, prior_of
 from phydict.evaluation import read_csv, write_csv
 from phydict.inference.data import case_scores
 from phydict.methods import fit_to_grid, reconstructor
@@ -44,7 +45,7 @@ WORDS = ("status", "error", "warning", "device", "precision", "instruction_set")
 class Results:
     """The table of results in a folder, of which this process alone writes while it is open.
 
-    A row is known by its key (spec.key): rows of other settings or other data that the file holds are kept at its end.
+    A row is known by its key (trials.key): rows of other settings or other data in the file are kept at its end.
     Raises ValueError where the file is damaged, is the table of another comparison, with no row in common, or is not
     there while what is made of it is, which then is someone else's.
     """
@@ -206,7 +207,7 @@ class Runner:
         torch.manual_seed(seed)
         prior = _on(trial.prior, self.device) if isinstance(trial.method, Sampler) else None
         ready = reconstructor(trial.method, prior, trial.guidance, trial.name, samples=trial.samples)
-        xrays, projector = fit_to_grid(ready, scene.grid, scene.xrays.clone(), scene.beam)
+        xrays, projector = fit_to_grid(ready, scene.grid, scene.xrays.clone(), scene.beam, trial.projector)
         return ready.with_mu_water(scene.mu_water).reconstruct(
             xrays, projector, scene.report(trial), False, seed, on_step)
 

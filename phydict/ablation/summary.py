@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from phydict.ablation.run import MEASURED
-from phydict.ablation.spec import PRIOR_SETTINGS
+from phydict.ablation.trials import PRIOR_SETTINGS
 from phydict.evaluation.metrics import MEASURES, Measure, over_cases
 
 SHOWN_MEASURES = MEASURES | {"network_calls": Measure("network calls", None, 0),

@@ -37,6 +37,7 @@ from phydict.runtime.progress import CaseProgress
 from phydict.runtime.seeds import case_seed, check_seed
 from phydict.runtime.warning import warn
 from phydict.units import HUWindow
+from phydict.xray.projectors.projector import METHODS as PROJECTORS
 
 
 class ReconstructionTask(lightning.LightningModule):
@@ -54,21 +55,27 @@ class ReconstructionTask(lightning.LightningModule):
         overwrite: do finished cases again; a new result takes the old one's place when it is complete
         seed: the only source of randomness; of each case in predict, as in Python, and by phydict.case_seed in test
         cube: of voxels, for methods without a prior
+        projector: auto (the fastest that suits the geometry), separable, siddon, eq4, joseph or matrix
     """
 
     def __init__(self, method: Sampler | Reconstructor, name: str | None = None,
                  prior: str | MedSynCheckpoint = str(DEFAULT_PRIOR), sampling: Sampling = Sampling(),
                  super_resolution: CascadeSettings = CascadeSettings(), out: str = "runs/reconstructions",
-                 overwrite: bool = False, seed: int = 0, cube: Cube = Cube()):
+                 overwrite: bool = False, seed: int = 0, cube: Cube = Cube(), projector: str = "auto"):
         super().__init__()
         check_seed(seed)
+        if projector not in PROJECTORS:
+            raise ValueError(f"model.projector is one of {', '.join(PROJECTORS)}, but {projector!r} was given")
         name = type(method).__name__ if name is None else name
         if name in ("", "..") or name != Path(name).name:
             raise ValueError(f"model.name is the name of one folder inside model.out, but '{name}' was given")
         self.method_name, self.seed, self.pages = name, seed, Path(out) / "dry_run"
+        self.projector = projector
         self.results = CaseResults(Path(out) / name, overwrite)
         check_writable(self.results.folder, "model.out")
         self.settings = {"name": name, "seed": seed, "method": describe(method)}
+        if projector != "auto":
+            self.settings["projector"] = projector
         self.grid, self.window = cube.grid(), HUWindow()
         self.prior = load_prior(prior) if isinstance(method, Sampler) else None
         if self.prior is not None:
@@ -186,7 +193,8 @@ class ReconstructionTask(lightning.LightningModule):
 
     def _reconstruct(self, case: dict, seed: int) -> Reconstruction:
         with stage("fit to grid"):
-            xrays, projector = fit_to_grid(self.reconstructor, self.grid, case["xrays"].to(self.device), case["beam"])
+            xrays, projector = fit_to_grid(self.reconstructor, self.grid, case["xrays"].to(self.device), case["beam"],
+                                           self.projector)
         ready = self.reconstructor.with_mu_water(case["mu_water"]) if "mu_water" in case else self.reconstructor
         return ready.reconstruct(xrays, projector, case["report"], case.get("display", False), seed,
                                  self.progress.advance)

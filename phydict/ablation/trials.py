@@ -1,0 +1,266 @@
+"""The trials of a comparison: one method each, with one set of settings, from which X-rays and onto which grid."""
+
+from __future__ import annotations
+
+import json
+import math
+import zlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import cache
+from importlib import import_module
+from itertools import product
+
+from phydict.ablation.cases import Cases
+from phydict.ablation.nested import changed, field_of, has_field, parsed, plain
+from phydict.grid import Grid
+from phydict.inference.data import ReconstructionData
+from phydict.inference.settings import Orbit
+from phydict.methods import METHODS
+from phydict.posterior import Sampler
+from phydict.prior import DEFAULT_PRIOR, fingerprint, load_prior
+from phydict.reconstruction import Reconstructor, describe
+from phydict.runtime.reading import reason
+from phydict.runtime.renamed import check_setting
+from phydict.runtime.seeds import check_seed
+from phydict.units import HUWindow
+from phydict.xray import Ideal, Polychromatic, Simulator
+from phydict.xray.projectors.projector import METHODS as PROJECTORS
+
+SIDE = 560.0
+"""mm along each side of the simulated detector unless the size of its pixels is given."""
+
+MOST_TRIALS = 2000
+"""Combinations of the values of axes, of all products together."""
+
+SIMULATORS: dict[str, Simulator] = {"ideal": Ideal(), "polychromatic": Polychromatic()}
+
+SETTINGS: dict[str, tuple[type, object]] = {
+    "method": (str, None), "seed": (int, 0),
+    "views": (int, 8), "detector": (int, 448), "pixel": (float | None, None), "simulator": (str, "ideal"),
+    "simulation_voxels": (int | None, None), "source_to_detector": (float, 1020.0),
+    "source_to_isocentre": (float, 740.0),
+    "report": (bool, True), "voxels": (int, 64), "side": (float, 384.0),
+    "prior": (str, str(DEFAULT_PRIOR)), "guidance": (float, 1.0), "samples": (int, 1),
+    "delta": (float | None, None), "projector": (str, "auto")}
+"""Type and default of what an axis may be; beside these, method.<field> and simulator.<field>."""
+
+PRIOR_SETTINGS = ("prior", "guidance", "samples", "delta", "report")
+"""Settings that mean nothing to a method without a prior."""
+
+DEFAULT_COLUMNS = ("method", "views", "simulator", "detector", "seed", "guidance", "samples")
+"""Settings that the table of results always has as columns; others where a specification gives them."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One method with one set of settings, to be run on every case.
+
+    columns: what the table of results says of it; method, prior (a file, None where the method needs none), guidance,
+    samples, seed: as in infer.py; data: the X-rays; like: for a method without a prior, the file of the prior whose
+    grid and HU window it takes; voxels, side: its grid where there is none; projector: the method's, as Projector's
+    `method`; X-rays are made by the automatic one.
+    """
+
+    columns: dict
+    method: Sampler | Reconstructor
+    data: ReconstructionData
+    prior: str | None
+    guidance: float
+    samples: int
+    seed: int
+    voxels: int
+    side: float
+    like: str | None = None
+    projector: str = "auto"
+
+    @property
+    def name(self) -> str:
+        return self.columns["method"]
+
+    @property
+    def label(self) -> str:
+        """The method and what was changed of it or of its X-rays; the number of views always."""
+        return ", ".join([self.name, *(f"{name} {value}" for name, value in self.columns.items() if name == "views" or
+                                       (name != "method" and ("." in name or value != SETTINGS[name][1])))])
+
+    def scene(self) -> tuple[Grid, HUWindow]:
+        """The grid of the volume and the HU window that the truth is clipped to."""
+        file = self.prior or self.like
+        if file is None:
+            return Grid.cube(self.voxels, self.side), HUWindow()
+        return prior_of(file).grid, prior_of(file).window
+
+    def identity(self) -> dict:
+        """All that decides the numbers of a trial beside the case, as plain JSON values."""
+        grid, window = self.scene()
+        mine = {"name": self.name, "method": describe(self.method), "seed": self.seed, "grid": grid.to_dict(),
+                "window": describe(window), "data": self.data.settings("test")}
+        if self.prior is not None:
+            mine |= {"prior_crc32": _crc(self.prior), "guidance": self.guidance, "samples": self.samples}
+        if self.projector != "auto":
+            mine["projector"] = self.projector
+        return json.loads(json.dumps(mine))
+
+    def acquisition(self) -> str:
+        """Equal for trials whose X-rays are the same."""
+        grid, window = self.scene()
+        settings = self.data.settings("test") | {"with_report": None, "seed": self.seed}
+        return json.dumps([settings, grid.to_dict(), describe(window)], sort_keys=True)
+
+
+def trials_of(base: Mapping, axes: Mapping, methods: Mapping, cases: Cases,
+            before: int) -> tuple[list[Trial], set[str]]:
+    """The trials of one product, those that come out the same still among them, and the settings that mean anything
+    to one of them; of other products there are `before` trials."""
+    for name in base | axes:
+        if name not in SETTINGS and not name.startswith(("method.", "simulator.")):
+            raise ValueError(f"there is no setting {name!r}: use one of {', '.join(SETTINGS)}, method.<field> or "
+                             "simulator.<field>")
+    if "method" not in base | axes:
+        if not methods:
+            raise ValueError("there is no method: give it as an axis or in the base")
+        axes = axes | {"method": list(methods)}
+    for name, values in axes.items():
+        if not isinstance(values, list) or not values:
+            raise ValueError(f"the axis {name} is a list of at least one value, but {values!r} was given")
+    if (count := before + math.prod(map(len, axes.values()))) > MOST_TRIALS:
+        raise ValueError(f"the axes stand for {count:,} combinations, but at most {MOST_TRIALS:,} are run: shorten "
+                         "them")
+    found, used = [], set()
+    for values in product(*axes.values()):
+        mine = dict(zip(axes, values))
+        name = mine.get("method", base.get("method"))
+        if not isinstance(name, str) or name not in methods:
+            method_of(name, methods)
+        changes = dotted(methods.get(name) or {})
+        of = changes.pop("of", name)
+        trial, meant = _trial(of, base | changes | mine | {"method": name}, cases)
+        check_used(changes, meant, [trial])
+        found.append(trial)
+        used |= meant
+    like = next((trial.prior for trial in found if trial.prior), None)
+    found = [trial if trial.prior else replace(trial, like=like) for trial in found]
+    scenes = [trial.scene() for trial in found]
+    asked = [Grid.cube(trial.voxels, trial.side) for trial in found if {"voxels", "side"} & trial.columns.keys()]
+    if any(window != scenes[0][1] for _, window in scenes) or not all(
+            grid.same_as(scenes[0][0]) for grid in [*asked, *(grid for grid, _ in scenes)]):
+        raise ValueError("the methods of a product are compared on one grid and HU window, but their priors, or voxels "
+                         "and side, give several: leave voxels and side out, or make products of their own")
+    return found, used
+
+
+def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
+    """The trial of some settings, and the names of those that mean anything to it."""
+    given = {name: parsed(SETTINGS[name][0], value, name) for name, value in settings.items() if name in SETTINGS}
+    for name, value in given.items():
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ValueError(f"{name} must be a finite number, but {value} was given")
+    check_seed(given.get("seed", 0))
+    if (projector := given.get("projector", "auto")) not in PROJECTORS:
+        raise ValueError(f"there is no projector {projector!r}: use one of {', '.join(PROJECTORS)}")
+    base = method_of(of)
+    simulator = SIMULATORS.get(given.get("simulator", "ideal"))
+    if simulator is None:
+        raise ValueError(f"there is no simulator {given['simulator']!r}: use one of {', '.join(SIMULATORS)}")
+    own = {"method": base, "simulator": simulator}
+    changes: dict[str, dict] = {"method": {}, "simulator": {}}
+    for name, value in settings.items():
+        part, _, path = name.partition(".")
+        if path and part in own and has_field(own[part], path.split(".")):
+            changes[part][path] = value
+    try:
+        method, simulator = (changed(own[part], changes[part], part) for part in own)
+    except ValueError as error:
+        raise ValueError(f"{settings['method']}: {error}") from error
+    if not isinstance(method, Sampler) or not has_field(method, ["ec_delta"]):
+        given.pop("delta", None)
+    if given.get("delta") is not None:
+        method = refined_from(method, given["delta"], "ec_steps" in changes["method"])
+    if not isinstance(method, Sampler):
+        given = {name: value for name, value in given.items() if name not in PRIOR_SETTINGS}
+    value = {name: default for name, (_, default) in SETTINGS.items()} | given
+    if value["detector"] < 1:
+        raise ValueError("detector is a number of pixels along each side, 1 or more, but "
+                         f"{value['detector']} was given")
+    pixel = SIDE / value["detector"] if value["pixel"] is None else value["pixel"]
+    data = cases.data(
+        with_report=value["report"],
+        orbit=Orbit(value["views"], value["source_to_detector"], value["source_to_isocentre"], (value["detector"],) * 2,
+                    (pixel, pixel)),
+        simulator=simulator, simulation_voxels=value["simulation_voxels"])
+    with_prior = isinstance(method, Sampler)
+    overrides = {f"{part}.{path}": plain(field_of({"method": method, "simulator": simulator}[part], path.split(".")))
+                 for part, paths in changes.items() for path in paths}
+    columns = {name: value[name] for name in DEFAULT_COLUMNS
+               if name in given or name not in PRIOR_SETTINGS or with_prior}
+    columns |= {name: given[name] for name in SETTINGS if name in given and name not in columns} | overrides
+    trial = Trial(columns, method, data, value["prior"] if with_prior else None, value["guidance"], value["samples"],
+                  value["seed"], value["voxels"], value["side"], projector=value["projector"])
+    meant = set(given) | set(overrides)
+    return trial, meant | ({"voxels", "side"} & set(settings))
+
+
+def method_of(name: object, known: Iterable[str] = ()) -> Sampler | Reconstructor:
+    """A named method, or one's own by the path of its class, such as my_module.MySampler, with its default settings.
+
+    Raises ValueError, naming `known` beside the methods, where there is none, and where it lacks defaults.
+    """
+    if isinstance(name, str) and name in METHODS:
+        return METHODS[name]
+    module, _, own = name.rpartition(".") if isinstance(name, str) else ("", "", "")
+    if not module:
+        raise ValueError(f"there is no method {name!r}: use one of {', '.join([*known, *METHODS])}, or the path of a "
+                         "class, such as my_module.MySampler")
+    try:
+        made = getattr(import_module(module), own)()
+    except Exception as error:  # of whatever kind: another's code runs
+        raise ValueError(f"the method {name} cannot be made ({reason(error)}): its module must be importable, and its "
+                         "settings need defaults") from error
+    if not isinstance(made, Sampler | Reconstructor) or not is_dataclass(made):
+        raise ValueError(f"{name} is no method: derive it from phydict.posterior.Sampler or "
+                         "phydict.reconstruction.Reconstructor, as a dataclass")
+    return made
+
+
+def refined_from(method: Sampler, delta: float, keep_iterations: bool = False) -> Sampler:
+    """A method with Extra Compute from `delta`, 0 for none, in steps of the length of the first pass' unless its
+    number of steps is to be kept."""
+    iterations = method.ec_steps if keep_iterations else max(1, round(delta * method.iterations))
+    return replace(method, ec_delta=delta, ec_steps=iterations if delta else method.ec_steps)
+
+
+@cache
+def prior_of(file: str):
+    """The prior in a file, read once."""
+    return load_prior(file)
+
+
+@cache
+def _crc(file: str) -> int:
+    return fingerprint(file)
+
+
+def key(trial: Trial, case: str, source: str) -> str:
+    """What a row of results is known by: equal for equal settings and equal data (id, what identifies it) alone."""
+    text = json.dumps([trial.identity(), case, source], sort_keys=True)
+    return f"k{zlib.crc32(text.encode()):08x}{zlib.adler32(text.encode()):08x}"
+
+
+def dotted(settings: Mapping) -> dict:
+    """Settings, their names without the init_args of infer.py's configuration files. Raises ValueError for old
+    names."""
+    check_setting("", settings)
+    return {".".join(part for part in str(name).split(".") if part != "init_args"): value
+            for name, value in settings.items()}
+
+
+def check_used(names: Iterable[str], used: set[str], trials: Sequence[Trial]) -> None:
+    """Raises ValueError for the first of `names` that is not among the settings that mean anything to the trials."""
+    for name in names:
+        if name not in used:
+            part = name.partition(".")[0]
+            owners = {type(trial.method) if part == "method" else type(trial.data.simulator): 0 for trial in trials}
+            known = ", ".join(dict.fromkeys(f.name for owner in owners for f in fields(owner)))
+            raise ValueError(f"the setting {name} means nothing to any method or simulator here"
+                             + (f", whose fields are {known}" if "." in name else ""))

@@ -11,6 +11,7 @@ from phydict.datasets.phantoms.phantom import build, pathology_region, phantom_c
 from phydict.datasets.phantoms.thorax import Thorax, report, without, wrong_side
 from phydict.datasets.radiographs.radiographs import find_xrays, load_xrays, save_xrays
 from phydict.datasets.reports import format_report, join_report
+from phydict.datasets.surroundings.surroundings import Surroundings, surround
 
 __all__ = [
            "MASKS",
@@ -22,6 +23,7 @@ __all__ = [
            "Deformation",
            "Finding",
            "Intensity",
+           "Surroundings",
            "Thorax",
            "augment",
            "body_mask",
@@ -43,6 +45,7 @@ __all__ = [
            "save_xrays",
            "segment",
            "split_by_patient",
+           "surround",
            "without",
            "wrong_side",
 ]

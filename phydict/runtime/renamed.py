@@ -11,7 +11,8 @@ SAMPLER = {
 LIKELIHOOD = {"variation": "tv_weight", "edge": "tv_eps", "refit": "refit_scatter",
               "weighted": "weighted_least_squares"}
 FIELDS = {"method": SAMPLER, "sampler": SAMPLER, "likelihood": LIKELIHOOD, "final_likelihood": LIKELIHOOD,
-          "augmentation": {"waves": "elastic_mm", "gain": "hu_scale", "offset": "hu_offset"}}
+          "augmentation": {"waves": "elastic_mm", "gain": "hu_scale", "offset": "hu_offset",
+                           "table": "surroundings.table", "field": "surroundings.field"}}
 """Of the settings in each place, old name -> new name."""
 
 GROUPS = {

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from phydict.datasets.cts.acquisition import LEAST_BLOOD, change_contrast, cut_field, without_table
+from phydict.datasets.cts.acquisition import LEAST_BLOOD, change_contrast, cut_ends, cut_field, without_table
 from phydict.datasets.cts.augment import Augmentation, augment
 from phydict.datasets.phantoms.phantom import build, phantom_case
 from phydict.datasets.phantoms.thorax import Thorax, without
+from phydict.datasets.surroundings.surroundings import Surroundings
 from phydict.grid import Grid
 from phydict.units import HUWindow
 
@@ -81,18 +82,31 @@ def test_a_field_of_view_is_a_circle_of_its_diameter():
     assert area == pytest.approx(np.pi * 150**2, rel=0.01)
 
 
-@pytest.mark.parametrize("name", ["table", "field"])
+def only(**shares: float) -> Augmentation:
+    return replace(Augmentation.none(), surroundings=replace(Surroundings.none(), **shares))
+
+
+@pytest.mark.parametrize("name", ["table", "field", "ends"])
 def test_augmentation_changes_the_scan_of_its_share_of_the_cases(name):
     case = phantom_case(1, GRID)
     plain = augment(case, 3, GRID, strength=Augmentation.none())["volume"]
-    never, always = (replace(Augmentation.none(), **{name: share}) for share in (0.0, 1.0))
-    assert augment(case, 3, GRID, strength=never)["volume"].equal(plain)
-    changed = augment(case, 3, GRID, strength=always)["volume"]
+    assert augment(case, 3, GRID, strength=only(**{name: 0.0}))["volume"].equal(plain)
+    changed = augment(case, 3, GRID, strength=only(**{name: 1.0}))["volume"]
     taken = changed < plain - 1e-6
-    assert taken.any() and not (changed > plain + 1e-6).any(), "both only take away"
-    half = replace(Augmentation.none(), **{name: 0.5})
-    taken = [not augment(case, seed, GRID, strength=half)["volume"].equal(plain) for seed in range(40)]
+    assert taken.any() and not (changed > plain + 1e-6).any(), "all only take away"
+    taken = [not augment(case, seed, GRID, strength=only(**{name: 0.5}))["volume"].equal(plain) for seed in range(40)]
     assert 0.2 < np.mean(taken) < 0.8
+
+
+def test_a_shorter_scan_is_air_beyond_its_ends_and_itself_between():
+    hu, masks = chest()
+    new, seen = cut_ends(hu, masks, GRID, -60.0, 84.0)
+    z = (torch.arange(48) - 23.5) * 8
+    beyond, within = (z < -64) | (z > 88), (z > -56) & (z < 80)
+    assert (new[..., beyond] == -1000).all() and not seen[..., beyond].any()
+    assert new[..., within].equal(hu[..., within]) and seen[..., within].equal(masks[..., within])
+    height = float((cut_ends(0 * hu, masks, GRID, -60.0, 84.0)[0] + 1000)[0, 0, 0].sum()) * 8 / 1000
+    assert height == pytest.approx(144, abs=1e-3)
 
 
 def test_augmentation_of_contrast_stays_within_its_strength():

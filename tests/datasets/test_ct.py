@@ -15,6 +15,7 @@ import pytest
 import torch
 
 from phydict.datasets.cts.augment import Augmentation, Deformation, augment
+from phydict.datasets.surroundings.surroundings import Surroundings
 from phydict.datasets.cts.ct_rate import CTCases, find_cts, patient_of, split_by_patient
 from phydict.datasets.cts.ct_rate_tables import read_reports
 from phydict.datasets.cts.transforms import AIR, Calibration, covering_grid, load_ct, prepare_ct, to_grid
@@ -381,9 +382,10 @@ def test_augmentation_moves_volume_and_masks_together(case):
 def test_augmentation_stays_small_and_never_mirrors(case):
     start = np.argwhere(case["volume"][0].numpy() > 0.4).mean(0)
     lung = float(case["masks"][0].sum())
+    whole = dataclasses.replace(Augmentation(), surroundings=dataclasses.replace(Surroundings(), ends=0.0, field=0.0))
     moves = []
     for seed in range(10):
-        new = augment(case, seed, GRID)
+        new = augment(case, seed, GRID, strength=whole)
         assert new["volume"].min() >= -1 and new["volume"].max() <= 1
         assert new["masks"].min() >= 0 and new["masks"].max() <= 1
         assert new["volume"][0, 0, 0, 0] == -1, "air stays air"
@@ -442,8 +444,8 @@ def test_only_a_report_without_side_may_be_mirrored_and_only_on_demand(case, rep
 
 @pytest.mark.parametrize("strength, words", [({"shift": -1.0}, "shift is -1"), ({"scale": 0.9}, "small changes"),
                                                  ({"mirror": 1.5}, "share of the cases"),
-                                                 ({"table": 1.5}, "table is a share"),
-                                                 ({"field": -0.1}, "field is -0.1")])
+                                                 ({"girth": 1.5}, "girth is a share"),
+                                                 ({"girth": float("nan")}, "girth is nan")])
 def test_augmentation_refuses_impossible_strengths(strength, words):
     with pytest.raises(ValueError, match=words):
         Augmentation(**strength)

@@ -1,4 +1,4 @@
-"""Changes of how a chest was scanned, on a prepared volume: contrast agent, table, field of view."""
+"""Changes of how a chest was scanned, on a prepared volume: contrast agent, table, field of view, height."""
 
 from __future__ import annotations
 
@@ -42,10 +42,13 @@ def change_contrast(hu: torch.Tensor, masks: torch.Tensor, amount: float) -> tor
     return changed + amount * masks[2:3] * (1 - between)
 
 
-def without_table(hu: torch.Tensor, grid: Grid) -> torch.Tensor:
-    """HU (1, X, Y, Z) with air for all that does not belong to the body: table, clothes, cables."""
-    body = torch.from_numpy(body_mask(hu[0].numpy(), grid.spacing)).float()
-    around = torch.nn.functional.max_pool3d(body[None, None], 2 * BODY_MARGIN + 1, 1, BODY_MARGIN)[0]
+def without_table(hu: torch.Tensor, grid: Grid, body: torch.Tensor | None = None) -> torch.Tensor:
+    """HU (1, X, Y, Z) with air for all that does not belong to the body: table, clothes, cables.
+
+    body: (X, Y, Z) bool, found in `hu` if left out.
+    """
+    body = torch.from_numpy(body_mask(hu[0].numpy(), grid.spacing)) if body is None else body
+    around = torch.nn.functional.max_pool3d(body[None, None].float(), 2 * BODY_MARGIN + 1, 1, BODY_MARGIN)[0]
     return torch.where(around > 0, hu, AIR) if body.any() else hu
 
 
@@ -58,4 +61,12 @@ def cut_field(hu: torch.Tensor, masks: torch.Tensor, grid: Grid, diameter: float
     x, y = ((torch.arange(n) - (n - 1) / 2) * s - c for n, s, c in zip(grid.shape, grid.spacing, centre))
     edge = (torch.hypot(x[:, None], y) - diameter / 2) / float(np.mean(grid.spacing[:2]))
     seen = (0.5 - edge).clamp(0, 1)[..., None]
+    return AIR + seen * (hu - AIR), masks * seen
+
+
+def cut_ends(hu: torch.Tensor, masks: torch.Tensor, grid: Grid, low: float,
+             high: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """HU and masks of a scan from z = `low` to `high`, mm from the grid's centre: air, and masks of 0, beyond."""
+    z = (torch.arange(grid.shape[2]) - (grid.shape[2] - 1) / 2) * grid.spacing[2]
+    seen = (0.5 + torch.minimum(z - low, high - z) / grid.spacing[2]).clamp(0, 1)
     return AIR + seen * (hu - AIR), masks * seen

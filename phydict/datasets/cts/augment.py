@@ -8,8 +8,11 @@ from dataclasses import dataclass, fields, replace
 
 import torch
 
-from phydict.datasets.cts.acquisition import change_contrast, cut_field, without_table
+from phydict.datasets.cts.acquisition import change_contrast, cut_ends, cut_field, without_table
+from phydict.datasets.cts.anatomy import body_mask
+from phydict.datasets.cts.girth import Girth
 from phydict.datasets.cts.transforms import AIR
+from phydict.datasets.surroundings.surroundings import Surroundings, surround
 from phydict.grid import Grid
 from phydict.units import HUWindow
 
@@ -17,7 +20,10 @@ NAMES_A_SIDE = re.compile(r"\b(left|right|middle lobe|lingula\w*|[LR](UL|ML|LL)?
 """What makes an English report one of a side."""
 
 FIELD_MM, FIELD_SHIFT_MM = (310.0, 400.0), 15.0
-"""Diameters of the scanner's field that `Augmentation.field` draws, and how far it lies off the grid's centre."""
+"""Diameters of the scanner's field that `Surroundings.field` draws, and how far it lies off the grid's centre."""
+
+LEAST_SCAN_MM = 120.0
+"""Height that `Surroundings.ends` leaves of a scan at least."""
 
 
 @dataclass(frozen=True)
@@ -25,9 +31,9 @@ class Augmentation:
     """How strong random changes of a patient are; 0 leaves that kind out. `Augmentation.none()` changes nothing.
 
     rotation: degrees about any axis. scale: share of the size, along each axis. shift: mm. elastic_mm: mm, amplitude of
-    the slowest bending. hu_scale: share of HU + 1000. hu_offset: HU, in tissue only. contrast: HU, in blood only.
-    table: share of the cases whose table and clothes are taken away. field: share of the cases cut by a scanner's
-    circular field of view of 310 to 400 mm.
+    the slowest bending. girth: share of the cases, in [0, 1], whose body becomes up to 300 to 600 mm wide and loses
+    its table. hu_scale: share of HU + 1000. hu_offset: HU, in tissue only. contrast: HU, in blood only. surroundings:
+    what lies around the body and how much of it the scan shows.
     mirror: share of the cases mirrored left to right among those whose report is empty or names no side (in English),
     in [0, 1]. It is 0 unless asked for, since a thorax is not symmetric: a mirrored one has its heart on the right.
     Nothing is ever turned upside down or back to front.
@@ -37,29 +43,30 @@ class Augmentation:
     scale: float = 0.1
     shift: float = 20.0
     elastic_mm: float = 2.5
+    girth: float = 0.25
     hu_scale: float = 0.03
     hu_offset: float = 20.0
     contrast: float = 60.0
-    table: float = 0.2
-    field: float = 0.15
     mirror: float = 0.0
+    surroundings: Surroundings = Surroundings()
 
     def __post_init__(self):
-        negative = [name for name, value in vars(self).items() if not value >= 0]
+        negative = [name for name, value in vars(self).items() if name != "surroundings" and not value >= 0]
         if negative:
             raise ValueError(f"augmentation strengths are not negative, but {negative[0]} is "
                              f"{vars(self)[negative[0]]}: give 0 for none")
         if self.scale > 0.5 or self.hu_scale > 0.5 or self.rotation > 45:
             raise ValueError("augmentation is for small changes: rotation up to 45 degrees, scale and gain up to 0.5, "
                              f"but {self.rotation}, {self.scale} and {self.hu_scale} were given")
-        over = [name for name in ("table", "field", "mirror") if getattr(self, name) > 1]
+        over = [name for name in ("girth", "mirror") if getattr(self, name) > 1]
         if over:
             raise ValueError(f"augmentation's {over[0]} is a share of the cases, in [0, 1], but "
                              f"{getattr(self, over[0])} was given")
 
     @classmethod
     def none(cls) -> Augmentation:
-        return cls(**{field.name: 0.0 for field in fields(cls)})
+        return cls(**{field.name: 0.0 for field in fields(cls) if field.name != "surroundings"},
+                   surroundings=Surroundings.none())
 
 
 @dataclass(frozen=True)
@@ -67,8 +74,8 @@ class Deformation:
     """A small random change of a patient: pose, size, shape and HU.
 
     rotation: (3,) radians about x, y, z. scale: (3,). shift: (3,) mm. elastic_mm: (3, 4, 4, 4) mm, amplitudes of
-    cosines of up to 1.5 periods over the grid. hu_scale: factor of HU + 1000. hu_offset: HU, in tissue only. mirrored:
-    left to right.
+    cosines of up to 1.5 periods over the grid. hu_scale: factor of HU + 1000. hu_offset: HU, in tissue only. girth:
+    how the wall of the chest grows before all else. mirrored: left to right.
     """
 
     rotation: torch.Tensor
@@ -77,6 +84,7 @@ class Deformation:
     elastic_mm: torch.Tensor
     hu_scale: float
     hu_offset: float
+    girth: Girth | None = None
     mirrored: bool = False
 
     @classmethod
@@ -105,7 +113,10 @@ class Deformation:
         elastic_mm = self.elastic_mm
         for basis in cosines:
             elastic_mm = torch.tensordot(elastic_mm, basis, dims=([1], [1]))
-        return (points @ turn.T) * self.scale + self.shift + elastic_mm.movedim(0, -1)
+        points = (points @ turn.T) * self.scale + self.shift + elastic_mm.movedim(0, -1)
+        if self.mirrored:
+            points = points * torch.tensor([-1.0, 1, 1])
+        return self.girth.source(points) if self.girth else points
 
     def apply(self, case: dict, grid: Grid, window: HUWindow) -> dict:
         """The deformed Case; volume and masks are sampled at the same points, air and zeros outside."""
@@ -113,7 +124,6 @@ class Deformation:
         points = (self.sample_points(grid) / half).flip(-1)[None]  # grid_sample wants z, y, x of the last axis first
         air = float(window.to_range(torch.tensor(AIR)))
         state = torch.cat([case["volume"] - air, case["masks"]])
-        state = state.flip(1) if self.mirrored else state
         state = torch.nn.functional.grid_sample(state[None], points, padding_mode="zeros", align_corners=False)[0]
         hu = window.to_hu(state[:1] + air)
         hu = AIR + self.hu_scale * (hu - AIR) + self.hu_offset * ((hu - AIR) / 200).clamp(0, 1)
@@ -137,18 +147,50 @@ def augment(case: dict, seed: int | torch.Generator, grid: Grid = Grid.cube(64),
     if strength.mirror and not NAMES_A_SIDE.search(case["report"]):
         mirrored = bool(torch.rand(1, generator=generator) < strength.mirror)
         deformation = replace(deformation, mirrored=mirrored)
-    return _rescanned(deformation.apply(case, grid, window), generator, grid, window, strength)
+    shares = strength.surroundings
+    if not (strength.girth or shares.table or shares.adds):
+        return _rescanned(deformation.apply(case, grid, window), generator, grid, window, strength)
+    chance, size = torch.rand(2, generator=generator), torch.rand(1, generator=generator)
+    seed = int(torch.randint(2**31, (1,), generator=generator))
+    hu = window.to_hu(case["volume"])
+    body = torch.from_numpy(body_mask(hu[0].numpy(), grid.spacing))
+    if chance[1] < strength.girth:
+        deformation = replace(deformation, girth=Girth.draw(float(size), body, case["masks"][0], grid))
+    if bare := bool(chance[0] < shares.table) or deformation.girth is not None:
+        hu = without_table(hu, grid, body)
+    state = case | {"volume": window.to_range(hu), "masks": torch.cat([case["masks"], body[None].float()])}
+    case = deformation.apply(state, grid, window)
+    *masks, body = case["masks"]
+    hu = window.to_hu(case["volume"])
+    hu = torch.from_numpy(surround(hu[0].numpy(), body.numpy() > 0.5, grid, seed, shares, couch=bare))[None]
+    case |= {"volume": window.to_range(hu), "masks": torch.stack(masks)}
+    return _rescanned(case, generator, grid, window, strength)
 
 
 def _rescanned(case: dict, generator: torch.Generator, grid: Grid, window: HUWindow, strength: Augmentation) -> dict:
-    """The Case with another contrast of the blood, without its table, or in a smaller field of view, by chance."""
-    chance, amount, diameter, *centre = torch.rand(6, generator=generator).split((2, 1, 1, 1, 1))
+    """The Case with another contrast of the blood, in a smaller field of view or in a shorter scan, by chance."""
+    chance, amount, diameter, centre, ends = torch.rand(8, generator=generator).split((2, 1, 1, 2, 2))
     hu, masks = window.to_hu(case["volume"]), case["masks"]
-    if chance[0] < strength.table:
-        hu = without_table(hu, grid)
     if strength.contrast:
         hu = change_contrast(hu, masks, strength.contrast * (2 * float(amount) - 1))
-    if chance[1] < strength.field:
+    if chance[0] < strength.surroundings.field:
         middle = tuple(FIELD_SHIFT_MM * (2 * float(place) - 1) for place in centre)
         hu, masks = cut_field(hu, masks, grid, FIELD_MM[0] + float(diameter) * (FIELD_MM[1] - FIELD_MM[0]), middle)
+    if chance[1] < strength.surroundings.ends:
+        hu, masks = cut_ends(hu, masks, grid, *_ends(hu, grid, ends))
     return case | {"volume": window.to_range(hu), "masks": masks}
+
+
+def _ends(hu: torch.Tensor, grid: Grid, chance: torch.Tensor) -> tuple[float, float]:
+    """Lowest and highest z in mm from the grid's centre of a scan that is cut below, above (or both) at any height."""
+    scanned = (hu[0] > AIR + 100).any(0).any(0).nonzero()
+    if not len(scanned):
+        return -math.inf, math.inf
+    low, high = ((float(scanned[i]) - (grid.shape[2] - 1) / 2 + d / 2) * grid.spacing[2] for i, d in ((0, -1), (-1, 1)))
+    room = max(high - low - LEAST_SCAN_MM, 0)
+    kind, share = float(chance[0]), float(chance[1])
+    if kind < 0.4:
+        return low + share * room, high
+    if kind < 0.8:
+        return low, high - share * room
+    return low + share * room / 2, high - (kind - 0.8) / 0.2 * room / 2

@@ -126,7 +126,8 @@ def test_augmentation_puts_surroundings_around_an_unchanged_body(seed):
     plain = augment(case, seed, GRID, strength=replace(Augmentation.none(), surroundings=bare))
     full = augment(case, seed, GRID, strength=replace(Augmentation.none(), surroundings=replace(
         ALL, table=1.0, field=0.0, ends=0.0)))
-    body = plain["volume"] > -0.3
+    body = -torch.nn.functional.max_pool3d(-plain["volume"][None], 3, 1, 1)[0] > -0.3
+    assert body.sum() > 5000
     assert full["volume"][body].equal(plain["volume"][body]) and full["masks"].equal(plain["masks"])
     assert ((full["volume"] - plain["volume"]) > 0.05).sum() > 500
 
@@ -139,12 +140,12 @@ def test_girth_moves_the_skin_by_its_growth_and_spares_what_is_inside():
     assert girth.source(torch.tensor([[0.0, 120.0, 0.0]]))[0, 1] > girth.source(torch.tensor([[0.0, -120.0, 0]]))[0, 1]
 
 
-def test_girth_of_a_case_keeps_its_lungs_and_changes_its_width():
+def test_girth_of_a_case_keeps_its_lungs_and_changes_its_size():
     case = phantom_case(4, GRID)
     plain = augment(case, 0, GRID, strength=Augmentation.none())
-    widths = []
+    sizes = []
     for seed in range(6):
         new = augment(case, seed, GRID, strength=replace(Augmentation.none(), girth=1.0))
         torch.testing.assert_close(new["masks"], plain["masks"], atol=0.02, rtol=0)
-        widths.append(int((new["volume"] > -0.3).any(3).any(2).sum()))
-    assert max(widths) - min(widths) >= 3
+        sizes.append(int((new["volume"] > -0.3).sum()))
+    assert max(sizes) > 1.05 * min(sizes)

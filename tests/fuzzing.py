@@ -6,7 +6,9 @@ tests/benchmark/robustness.py as many as there is time for, by Hypothesis and, w
 
 from __future__ import annotations
 
+import csv
 import gzip
+import io
 import json
 import re
 import struct
@@ -20,10 +22,13 @@ from pathlib import Path
 
 import nibabel
 import numpy as np
+import pydicom
+import torch
 import yaml
 from dicom_files import orbit_tags, write_dicom
 from hypothesis import strategies as st
 from PIL import Image
+from prior.medsyn_files import entries, text_unet, write
 from prior.tiny import tiny_prior
 from safetensors.torch import save_file
 
@@ -40,6 +45,9 @@ from phydict.evaluation import read_csv
 from phydict.inference.results import CaseResults
 from phydict.prior.files import describe
 from phydict.prior.inspection import inspect_prior
+from phydict.prior.tensors import read_torch
+from phydict.runtime.console import read_configuration
+from phydict.runtime.reading import read_ids
 from phydict.xray.geometry_files import read_beam, write_beam
 
 SECONDS = 10
@@ -130,6 +138,19 @@ def changed(content) -> st.SearchStrategy:
     return st.one_of(own, own, own, own, own, own, own, values())
 
 
+def tables(table: bytes) -> st.SearchStrategy[bytes]:
+    """A CSV table of one row with some of its fields changed."""
+    columns, fields = csv.reader(table.decode().splitlines())
+    text = st.one_of(st.text(max_size=9), st.sampled_from([piece.decode("utf-8", "replace") for piece in TEXTS]))
+
+    def written(row: tuple) -> bytes:
+        lines = io.StringIO()
+        csv.writer(lines).writerows([columns, row])
+        return lines.getvalue().encode(errors="replace")
+
+    return st.tuples(*(st.one_of(st.just(field), st.just(field), text) for field in fields)).map(written)
+
+
 def contents(name: str) -> st.SearchStrategy[bytes]:
     """What a target is given: edited samples, and for texts with a structure that structure changed."""
     target, structured = TARGETS[name], STRUCTURED.get(name)
@@ -203,8 +224,9 @@ def _pictures(ending: str) -> Callable[[], list[bytes]]:
                 path = Path(folder) / f"{n}{ending}"
                 image.save(path)
                 found.append(path.read_bytes())
-            if ending == ".tif":
-                Image.fromarray(pixels.astype(np.float32)).save(path, compression="tiff_lzw")
+            for kind, packed in (("f4", "tiff_lzw"), ("i4", "tiff_adobe_deflate"), ("u1", "packbits"))[
+                    :3 * (ending == ".tif")]:
+                Image.fromarray(pixels.astype(kind)).save(path, compression=packed)
                 found.append(path.read_bytes())
             return found
     return made
@@ -213,8 +235,11 @@ def _pictures(ending: str) -> Callable[[], list[bytes]]:
 def _npy_samples() -> list[bytes]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "v.npy"
-        np.save(path, np.zeros(SHAPE, np.float32))
-        return [path.read_bytes()]
+        found = []
+        for array in (np.zeros(SHAPE, np.float32), np.asfortranarray(np.ones(SHAPE, ">u2"))):
+            np.save(path, array)
+            found.append(path.read_bytes())
+        return found
 
 
 def _dicom_samples() -> list[bytes]:
@@ -223,26 +248,68 @@ def _dicom_samples() -> list[bytes]:
         run = write_dicom(Path(folder) / "run.dcm", stored, **orbit_tags(2, 1020.0, 740.0, (70.0, 80.0)),
                           RescaleSlope=1, RescaleIntercept=0, PixelIntensityRelationship="LOG",
                           PixelIntensityRelationshipSign=-1).read_bytes()
-        slice_ = write_dicom(Path(folder) / "slice.dcm", stored[0], "CT", RescaleSlope=1, RescaleIntercept=-1024,
-                             PixelSpacing=[1, 1], ImagePositionPatient=[0, 0, 0], SeriesInstanceUID="1.2.3",
-                             ImageOrientationPatient=[1, 0, 0, 0, 1, 0]).read_bytes()
-    return [run, slice_]
+        slice_ = _slice(Path(folder) / "slice.dcm", 0).read_bytes()
+        table = pydicom.Dataset()
+        table.LUTDescriptor, table.ModalityLUTType = [4096, 0, 16], "US"
+        table.add_new("LUTData", "OW", np.arange(0, 40960, 10, np.uint16).tobytes())
+        looked = write_dicom(Path(folder) / "lut.dcm", stored[0], "DX", **orbit_tags(1, 1020.0, 740.0, (70.0, 80.0)) | {
+            "ModalityLUTSequence": [table], "PatientOrientation": ["L", "F"], "ViewPosition": "PA",
+            "EstimatedRadiographicMagnificationFactor": 1.4}).read_bytes()
+        inner, outer = pydicom.Dataset(), pydicom.Dataset()
+        inner.PositionerPrimaryAngle, inner.PositionerSecondaryAngle = 30.0, 0.0
+        outer.PositionerPositionSequence = [inner]
+        grouped = write_dicom(Path(folder) / "groups.dcm", stored, "XA", **orbit_tags(2, 1020.0, 740.0, (
+            70.0, 80.0)) | {"PerFrameFunctionalGroupsSequence": [outer, outer], "SharedFunctionalGroupsSequence": [
+                outer]}).read_bytes()
+    return [run, slice_, looked, grouped]
 
 
 def _read_dicom(path: Path) -> None:
     pixels, tags = zip(*read_dicom(path))
     if tags:
-        tags_intensity(list(tags))
         tags_beam(list(tags), pixels[0].shape)
+        tags_intensity(list(tags))
+
+
+def _slice(path: Path, number: int) -> Path:
+    """A CT slice, 5 mm above the one of the number before."""
+    return write_dicom(path, np.full(SHAPE, 1000 + number, np.uint16), "CT", RescaleSlope=1, RescaleIntercept=-1024,
+                       PixelSpacing=[1, 1], ImagePositionPatient=[0, 0, 5 * number], SeriesInstanceUID="1.2.3",
+                       ImageOrientationPatient=[1, 0, 0, 0, 1, 0], ImageType=["ORIGINAL", "PRIMARY", "AXIAL"])
 
 
 def _read_series(path: Path) -> None:
+    others = [path.with_name(f"other{number}.dcm") for number in range(1, 9)]
+    for number, other in enumerate(others, 1):
+        if not other.exists():
+            _slice(other, number)
     try:
-        load_series(Series(path.parent, "1", (path,) * 9))
+        load_series(Series(path.parent, "1", (path, *others)))
     except ValueError as error:  # such a sentence begins with "its": preparation puts the folder before it
         if str(error).startswith(("its", "it ")) or "slices" in str(error):
             raise ValueError(f"{path}: {error}") from error
         raise
+
+
+def _settings() -> dict:
+    return {"model": {"method": {"class_path": "phydict.baselines.SIRT", "init_args": {"iterations": 3}}, "seed": 1},
+            "data": {"orbit": {"views": 2}, "xrays": "x"}, "trainer": {"devices": 1}}
+
+
+@cache
+def _medsyn_samples() -> list[bytes]:
+    with tempfile.TemporaryDirectory() as folder:
+        return [write(Path(folder) / "m.safetensors", entries(text_unet())).read_bytes()]
+
+
+def _torch_samples() -> list[bytes]:
+    found = []
+    for zipped in (True, False):
+        stream = io.BytesIO()
+        torch.save({"phydict": {"grid": {"shape": [1]}}, "state_dict": {"a": torch.zeros(3)}}, stream,
+                   _use_new_zipfile_serialization=zipped)
+        found.append(stream.getvalue())
+    return found
 
 
 def _spec() -> dict:
@@ -294,12 +361,18 @@ TARGETS = {
     "DICOM": Target("run.dcm", _read_dicom, _dicom_samples, [*NUMBERS, *(
         text for text in TEXTS if len(text) < 20), b"\xfe\xff\x00\xe0\xff\xff\xff\xff", b"SQ\0\0\xff\xff\xff\xff",
         b"UN", b"DS"]),
-    "DICOM CT": Target("slice.dcm", _read_series, lambda: _dicom_samples()[1:], [*NUMBERS, b"UN", b"SQ", b"\\"]),
+    "DICOM CT": Target("slice.dcm", _read_series, lambda: _dicom_samples()[1:2], [*NUMBERS, b"UN", b"SQ", b"\\"]),
     "PNG": Target("v.png", read_image, _pictures(".png"), [*NUMBERS, b"IDAT", b"PLTE", b"tRNS", b"acTL", b"fdAT"]),
     "TIFF": Target("v.tif", read_image, _pictures(".tif"), NUMBERS),
     "NPY": Target("v.npy", read_image, _npy_samples, [*NUMBERS, *TEXTS]),
     "reports table": Target("t.csv", read_reports, lambda: [TABLE], TEXTS),
     "metadata table": Target("t.csv", read_calibrations, lambda: [TABLE], TEXTS),
+    "configuration": Target("c.yaml", read_configuration, lambda: [yaml.safe_dump(_settings()).encode()], TEXTS),
+    "ids": Target("ids.txt", lambda path: read_ids(path, "data.only"), lambda: [b"a b\nc\n"], [*TEXTS, *NUMBERS]),
+    "MedSyn": Target("m.safetensors", load_prior, _medsyn_samples, [
+        *NUMBERS, b'"F32"', b'"I64"', b'"shape":[', b"downs.", b"init_conv", b"[]", b"[1]", b"0"]),
+    "torch file": Target("c.ckpt", read_torch, _torch_samples, [*NUMBERS, b"c__builtin__\neval\n", b"R", b"(", b".",
+                                                                b"PK", b"q\0", b"X"]),
     "results table": Target("r.csv", read_csv, lambda: [b"case,method,psnr\na,sirt,20.5\n"], TEXTS),
     "specification": Target("s.yaml", read_specification, lambda: [yaml.safe_dump(_spec()).encode()], TEXTS),
     "prepared case": Target("case.json", read_record, lambda: [json.dumps(_record()).encode()], TEXTS),
@@ -312,6 +385,8 @@ STRUCTURED = {
     "prior": lambda: changed(_tiny()[0]).map(_with_header),
     "inspect": lambda: changed(_tiny()[0]).map(_with_header),
     "specification": lambda: changed(_spec()).map(_yaml),
+    "configuration": lambda: changed(_settings()).map(_yaml),
+    "reports table": lambda: tables(TABLE), "metadata table": lambda: tables(TABLE),
     "prepared case": lambda: changed(_record()).map(lambda c: json.dumps(_named(c)).encode()),
     "finished case": lambda: changed(_result()).map(lambda c: json.dumps(_named(c)).encode())}
 

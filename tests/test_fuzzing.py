@@ -23,4 +23,4 @@ def test_any_bytes_are_read_or_refused_in_one_sentence(name):
 @pytest.mark.parametrize("name", TARGETS)
 def test_the_samples_of_the_fuzzers_are_read(name, tmp_path):
     read = [check(TARGETS[name], sample, tmp_path) for sample in TARGETS[name].samples()]
-    assert any(read) or name == "DICOM CT"
+    assert any(read)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from phydict.ablation.cases import Cases, check_path
 from phydict.ablation.trials import Trial, check_used, dotted, method_of, trials_of
+from phydict.runtime.reading import refusing
 from phydict.runtime.shipped import configuration
 from phydict.runtime.yaml_file import parse_yaml, read_yaml
 
@@ -41,10 +42,8 @@ def read_specification(file: str | Path, changes: Sequence[str] | None = None, *
         if not equals or not name:
             raise ValueError(f"a setting is changed as name=value, such as views=[2,8], but '{text}' was given")
         changed[name] = parse_yaml(value, f"the value of {name}")
-    try:
+    with refusing(file, "correct it"):
         return _specification(content, {k: v for k, v in given.items() if v is not None}, dotted(changed))
-    except ValueError as error:
-        raise ValueError(f"{file}: {error}") from error
 
 
 def _specification(content, given: Mapping, changed: Mapping) -> Specification:

@@ -19,7 +19,7 @@ from pydicom.multival import MultiValue
 from pydicom.pixels import apply_modality_lut
 
 from phydict.datasets.intensity import Intensity
-from phydict.runtime.reading import check_memory, reading
+from phydict.runtime.reading import MOST_SQUEEZED, check_held, check_memory, one_line, reading, refusing
 
 VIEW_POSITIONS = {"PA": 0.0, "LL": 90.0, "AP": 180.0, "RL": -90.0}
 
@@ -62,6 +62,11 @@ def read_dicom(path: Path) -> list[tuple[np.ndarray, DicomTags]]:
 
     Raises ValueError naming the file where it cannot be read or decoded, or is not grey.
     """
+    with refusing(path, "export it again, uncompressed"):
+        return _frames(path)
+
+
+def _frames(path: Path) -> list[tuple[np.ndarray, DicomTags]]:
     with reading(f"the DICOM file {path}", "export it again, uncompressed"):
         dataset = open_dicom(path)
         if dataset.get("SamplesPerPixel", 1) != 1:
@@ -70,8 +75,9 @@ def read_dicom(path: Path) -> list[tuple[np.ndarray, DicomTags]]:
             raise ValueError("it holds no image")
         if lacking := [keyword for keyword in ("Rows", "Columns") if dataset.get(keyword) is None]:
             raise ValueError(f"it lacks {' and '.join(lacking)}")
-        check_memory(8 * int(dataset.Rows) * int(dataset.Columns) * int(dataset.get("NumberOfFrames") or 1),
-                     "what its tags promise", "give a smaller one")
+        pixels = int(dataset.Rows) * int(dataset.Columns) * int(dataset.get("NumberOfFrames") or 1)
+        check_held(pixels, path, "pixels", 8 * MOST_SQUEEZED)
+        check_memory(8 * pixels, "what its tags promise", "give a smaller one")
         stored = dataset.pixel_array
     frames = stored[None] if stored.ndim == 2 else stored
     several = len(frames) > 1
@@ -136,7 +142,7 @@ def _rescaled(pixels: np.ndarray, dataset: pydicom.Dataset, frame: int, name: st
 
 
 def _tags(dataset: pydicom.Dataset, frame: int, name: str) -> DicomTags:
-    angiographic = _find(dataset, frame, "Modality", name) in ("XA", "RF")
+    angiographic = _code(dataset, frame, "Modality", name) in ("XA", "RF")
     to_isocentre = magnification = None
     if angiographic:
         to_isocentre = _number(dataset, frame, "DistanceSourceToIsocenter", name)
@@ -146,30 +152,39 @@ def _tags(dataset: pydicom.Dataset, frame: int, name: str) -> DicomTags:
         magnification = _number(dataset, frame, "EstimatedRadiographicMagnificationFactor", name)
     primary = _angle(dataset, frame, "PositionerPrimaryAngle", name)
     secondary = _angle(dataset, frame, "PositionerSecondaryAngle", name)
-    position = str(_find(dataset, frame, "ViewPosition", name))
+    position = _code(dataset, frame, "ViewPosition", name)
     if primary is None and position in VIEW_POSITIONS:
         primary = VIEW_POSITIONS[position]
         secondary = secondary or 0.0
     orientation = _find(dataset, frame, "PatientOrientation", name)
-    if isinstance(orientation, str):
-        orientation = orientation.split("\\")
+    if orientation is not None:
+        orientation = tuple(map(str, orientation)) if isinstance(orientation, MultiValue) else str(
+            orientation).split("\\")
     sign = _number(dataset, frame, "PixelIntensityRelationshipSign", name)
     if sign and (_number(dataset, frame, "RescaleSlope", name) or 1) < 0:
         sign = -sign  # the tag speaks of stored values
     return DicomTags(
         name, _number(dataset, frame, "DistanceSourceToDetector", name), to_isocentre, magnification,
-        _numbers(dataset, frame, "ImagerPixelSpacing", name, 2), primary, secondary,
-        None if orientation is None else tuple(str(o) for o in orientation), angiographic,
-        _find(dataset, frame, "PhotometricInterpretation", name) == "MONOCHROME1",
-        str(_find(dataset, frame, "PixelIntensityRelationship", name) or ""), None if sign is None else int(sign))
+        tag_numbers(dataset, frame, "ImagerPixelSpacing", name, 2), primary, secondary,
+        orientation, angiographic, _code(dataset, frame, "PhotometricInterpretation", name) == "MONOCHROME1",
+        _code(dataset, frame, "PixelIntensityRelationship", name), None if sign is None else int(sign))
 
 
-def _numbers(dataset: pydicom.Dataset, frame: int, keyword: str, name: str, count: int | None) -> tuple | None:
-    """The finite numbers of a tag, `count` of them if it is given; None where the tag is empty."""
+def _code(dataset: pydicom.Dataset, frame: int, keyword: str, name: str) -> str:
+    """A tag that holds one word, of which DICOM allows 16 characters; "" where it is empty."""
+    return one_line(str(_find(dataset, frame, keyword, name) or ""))[:16]
+
+
+def tag_numbers(dataset: pydicom.Dataset, frame: int, keyword: str, name: str,
+                count: int | None = None) -> tuple[float, ...] | None:
+    """The finite numbers of a tag, `count` of them if it is given; None where the tag is empty.
+
+    Raises ValueError naming the tag and the frame's `name`.
+    """
     value = _find(dataset, frame, keyword, name)
     if value is None:
         return None
-    wanted = "numbers" if count is None else "a number" if count == 1 else f"{count} numbers"
+    wanted = "numbers" if count is None else "a number" if count == 1 else f"{count} finite numbers"
     try:
         found = tuple(float(part) for part in (value if isinstance(value, MultiValue) else [value]))
     except (TypeError, ValueError, OverflowError):
@@ -180,14 +195,14 @@ def _numbers(dataset: pydicom.Dataset, frame: int, keyword: str, name: str, coun
 
 
 def _number(dataset: pydicom.Dataset, frame: int, keyword: str, name: str) -> float | None:
-    found = _numbers(dataset, frame, keyword, name, 1)
+    found = tag_numbers(dataset, frame, keyword, name, 1)
     return None if found is None else found[0]
 
 
 def _angle(dataset: pydicom.Dataset, frame: int, keyword: str, name: str) -> float | None:
     """A positioner angle with its increment: one value per frame counts from the first, a single one is the step."""
     angle = _number(dataset, frame, keyword, name)
-    steps = None if angle is None else _numbers(dataset, frame, f"{keyword}Increment", name, None)
+    steps = None if angle is None else tag_numbers(dataset, frame, f"{keyword}Increment", name)
     if steps is None:
         return angle
     if len(steps) == 1:

@@ -6,13 +6,10 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from phydict.runtime.reading import check_memory
+from phydict.runtime.reading import MOST_SQUEEZED, check_held, check_memory
 
 if TYPE_CHECKING:
     from nibabel.spatialimages import SpatialImage
-
-MOST_SQUEEZED = 1100
-"""Times by which gzip can shrink a file at most."""
 
 
 def open_nifti(path: Path) -> SpatialImage:
@@ -30,9 +27,7 @@ def open_nifti(path: Path) -> SpatialImage:
                          "needed")
     if min(shape, default=0) < 1:
         raise ValueError(f"its header gives it the shape {tuple(shape)}")
-    needed, size = math.prod(map(int, shape)) * kind.itemsize, path.stat().st_size
-    if needed > size * (MOST_SQUEEZED if path.name.lower().endswith(".gz") else 1):
-        raise ValueError(f"its header promises {needed:,} bytes of voxels, shape {tuple(shape)}, but the file has "
-                         f"{size:,}: it is truncated or damaged")
+    check_held(math.prod(map(int, shape)) * kind.itemsize, path, f"bytes of voxels, shape {tuple(shape)},",
+               MOST_SQUEEZED if path.name.lower().endswith(".gz") else 1)
     check_memory(math.prod(map(int, shape)) * (kind.itemsize + 8), f"its shape {tuple(shape)}", "give a smaller one")
     return image

@@ -109,7 +109,7 @@ class CaseResults:
             record["settings"], record["source"], set(record.get("files", UNLISTED))
             if record["scores"]:
                 _row(case, record)
-        except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        except Exception as error:  # whatever a damaged record leads to
             raise ValueError(f"{folder} is in the place of a case, but its {RECORD} is missing or damaged, and it is "
                              "not replaced: move it away, or give another model.out") from error
         return Finished(record, (stat.st_ino, stat.st_mtime_ns))

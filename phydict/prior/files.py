@@ -26,7 +26,7 @@ from phydict.prior.super_resolution import SuperResolution
 from phydict.prior.text import TextEncoder
 from phydict.prior.unet import VolumeUNet
 from phydict.runtime.files import atomic_write, file_crc32
-from phydict.runtime.reading import not_written, reason
+from phydict.runtime.reading import not_written, reason, refusing
 from phydict.runtime.shipped import own_or_shipped, shipped
 from phydict.units import HUWindow
 
@@ -34,6 +34,8 @@ FORMAT = 1
 
 DEFAULT_PRIOR = shipped("data/prior/phydict_64.safetensors")
 """The prior that comes with the project."""
+
+ADVICE = "copy it again, or export it from its training checkpoint"
 
 MOST_HU, MOST_LAYERS = 1e6, 256
 """No window reaches as far, and no network has more blocks on its way down, or layers."""
@@ -109,13 +111,14 @@ def load_prior(path: str | Path | MedSynCheckpoint = DEFAULT_PRIOR, device: str 
     path = _found(path)
     if isinstance(path, MedSynCheckpoint) or is_medsyn(path):
         return load_medsyn(path, device)
-    header, weights = _read(path, "base", device)
-    try:
-        prior = build_prior(header, weights)
-        if has_text(header):
-            prior.load_text = lambda: _load_text(path, header["text"])
-    except ValueError as error:
-        raise ValueError(f"'{path}' contradicts itself: {error}") from error
+    with refusing(path, ADVICE):
+        header, weights = _read(path, "base", device)
+        try:
+            prior = build_prior(header, weights)
+            if has_text(header):
+                prior.load_text = lambda: _load_text(path, header["text"])
+        except ValueError as error:
+            raise ValueError(f"'{path}' contradicts itself: {error}") from error
     return prior.to(device).eval().requires_grad_(False)
 
 
@@ -125,11 +128,12 @@ def load_super_resolution(path: str | Path | MedSynCheckpoint,
     path = _found(path)
     if isinstance(path, MedSynCheckpoint) or is_medsyn(path):
         return load_medsyn_super_resolution(path, device)
-    header, weights = _read(path, "super_resolution", device)
-    try:
-        fine = build_super_resolution(header, weights)
-    except ValueError as error:
-        raise ValueError(f"'{path}' contradicts itself: {error}") from error
+    with refusing(path, ADVICE):
+        header, weights = _read(path, "super_resolution", device)
+        try:
+            fine = build_super_resolution(header, weights)
+        except ValueError as error:
+            raise ValueError(f"'{path}' contradicts itself: {error}") from error
     return fine.to(device).eval().requires_grad_(False)
 
 
@@ -146,8 +150,7 @@ def _read(path: Path, stage: str, device: str) -> tuple[dict, dict[str, Tensor]]
             header = json.loads((file.metadata() or {}).get("phydict", "{}"))
             weights = {k: file.get_tensor(k) for k in file.keys() if not k.startswith("text.")}
     except Exception as error:  # whatever a damaged file leads its readers to
-        raise ValueError(f"'{path}' is truncated or not a safetensors file ({reason(error)}): copy it again, "
-                         "or export it from its training checkpoint") from error
+        raise ValueError(f"'{path}' is truncated or not a safetensors file ({reason(error)}): {ADVICE}") from error
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise ValueError(f"'{path}' carries no phydict prior of format {FORMAT}: give a file that save_prior wrote")
     check_stage(header, stage, f"'{path}'")
@@ -322,10 +325,11 @@ def build_text(text: dict, weights: dict[str, Tensor]) -> TextEncoder:
 
 
 def _load_text(path: Path, text: dict) -> TextEncoder:
-    with safe_open(path, "pt") as file:
-        weights = {k: file.get_tensor(k) for k in file.keys() if k.startswith("text.")}
-    check_finite(weights, path)
-    try:
-        return build_text(text, weights)
-    except ValueError as error:
-        raise ValueError(f"'{path}' contradicts itself: {error}") from error
+    with refusing(path, ADVICE):
+        with safe_open(path, "pt") as file:
+            weights = {k: file.get_tensor(k) for k in file.keys() if k.startswith("text.")}
+        check_finite(weights, path)
+        try:
+            return build_text(text, weights)
+        except ValueError as error:
+            raise ValueError(f"'{path}' contradicts itself: {error}") from error

@@ -12,7 +12,7 @@ from phydict.prior.finite import check_finite
 from phydict.prior.medsyn.checkpoint import FILES, STAGES, MedSynWeights, default_kind, files_in, listed, read_tensors
 from phydict.prior.medsyn.networks import TextUNet
 from phydict.prior.tensors import read_torch
-from phydict.runtime.reading import reason
+from phydict.runtime.reading import reason, refusing
 
 
 def inspect_prior(path: str | Path) -> dict[str, dict[str, str]]:
@@ -51,12 +51,13 @@ def _inspect_file(file: Path) -> dict[str, str]:
             report, used = _inspect_medsyn(found, entries), [name for name in entries if name not in found.ignored]
     except Exception as error:  # whatever a file that is none of these leads to
         return {"kind": "unknown: " + reason(error).removeprefix(f"'{file}' ")}
-    if file.suffix == ".safetensors":
+    with refusing(file, "copy it again"):
+        if file.suffix != ".safetensors":
+            check_finite({name: entries[name] for name in used}, file)
+            return report
         with safe_open(file, "pt") as opened:
             for name in used:
                 check_finite({name: opened.get_tensor(name)}, file)
-    else:
-        check_finite({name: entries[name] for name in used}, file)
     return report
 
 

@@ -17,6 +17,7 @@ from pathlib import Path
 
 from jsonargparse import set_loader
 
+from phydict.runtime.reading import one_line
 from phydict.runtime.renamed import check_options, check_setting
 from phydict.runtime.shipped import configuration
 from phydict.runtime.yaml_file import parse_yaml, read_yaml
@@ -29,9 +30,6 @@ NOISE = (".*does not have many workers", ".*LeafSpec.*is deprecated", ".*is smal
          "You're using the WeightAveraging callback with a model that overrides the configure_model",
          r"Found \d+ module\(s\) in eval mode at the start of training")
 """Warnings that tell a user of the command lines nothing to act on."""
-
-MOST_SAID = 800
-"""Characters of an error's message; the parser can list every class that there is."""
 
 CONFIGURATION = ("-c", "--config")
 """The option that names a configuration file."""
@@ -209,8 +207,7 @@ def sentence(error: Exception) -> str:
     text = re.sub(r"(- )?Expected a path but .*? either not accessible or invalid;?|"
                   r"Does not validate against any of the Union subtypes Subtypes: .*? Errors:;?|"
                   r"; Expected a <class 'NoneType'>", "", " ".join(text.split()))
-    text = " ".join(text.split())
-    return text if len(text) <= MOST_SAID else f"{text[:MOST_SAID]} ..."
+    return one_line(text)
 
 
 @contextmanager

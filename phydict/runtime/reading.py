@@ -15,6 +15,12 @@ import numpy as np
 MOST_TEXT = 2**24
 """Bytes of the longest text that is read whole: a geometry, settings, a report, a list of ids."""
 
+MOST_SQUEEZED = 1100
+"""Times by which a file shrinks at most when it is compressed: deflate, the best of those that are read, 1032."""
+
+MOST_SAID = 800
+"""Characters of a sentence about what cannot be read; it may quote a file."""
+
 
 class Unreadable(ValueError):
     """A file of a user's that cannot be read, in one sentence that names it."""
@@ -34,6 +40,28 @@ def reading(name: object, advice: str) -> Iterator[None]:
         raise Unreadable(f"{name} cannot be read ({reason(error)}); {advice}") from error
 
 
+@contextmanager
+def refusing(name: object, advice: str) -> Iterator[None]:
+    """As `reading`, around what has sentences of its own: a ValueError or OSError keeps its sentence, on one line that
+    names `name`, at its start unless it does already. Their other kinds, such as UnicodeDecodeError, are no sentences.
+    """
+    try:
+        yield
+    except Exception as error:
+        if type(error) not in (ValueError, Unreadable) and not isinstance(error, OSError):
+            raise Unreadable(f"{name} cannot be read ({reason(error)}); {advice}") from error
+        said = one_line(str(error) if str(name) in str(error) else f"{name}: {error}")
+        if said == str(error):
+            raise
+        raise Unreadable(said) from error
+
+
+def one_line(text: str) -> str:
+    """A text without line breaks, cut off after MOST_SAID characters."""
+    text = " ".join(text.split())
+    return text if len(text) <= MOST_SAID else f"{text[:MOST_SAID]} ..."
+
+
 def not_written(what: str, error: Exception, instead: str) -> OSError:
     """The error of `what` that could not be written: its reason, to free space where a disk is full, and `instead`."""
     full = getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT) or re.search(
@@ -48,6 +76,9 @@ def reason(error: Exception) -> str:
     said = " ".join(str(getattr(error, "strerror", None) or error).split())[:300]
     if isinstance(error, MemoryError):
         return f"it asks for more memory than there is: {said}" if said else "it asks for more memory than there is"
+    if isinstance(error, TypeError | AttributeError | IndexError):  # whose own words tell a user nothing
+        unknown = re.search(r"unexpected keyword argument ('\w+')", said)
+        return f"it has no setting {unknown[1]}" if unknown else "it holds something of another kind than expected"
     plain = isinstance(error, ValueError | OSError | EOFError | SyntaxError) or type(error).__module__ != "builtins"
     return said if said and plain else f"{type(error).__name__} {said}".strip()
 
@@ -88,6 +119,13 @@ def read_npy(path: str | Path) -> np.ndarray:
     if promised > held:
         raise ValueError(f"its header promises {promised:,} bytes, shape {shape}, but the file has {held:,}")
     return np.load(path, allow_pickle=False)
+
+
+def check_held(promised: int, path: Path, what: str, times: int = MOST_SQUEEZED) -> None:
+    """Raises ValueError where the header of a file promises more than so many times what the file has of bytes."""
+    if promised > times * (size := path.stat().st_size):
+        raise ValueError(f"its header promises {promised:,} {what} but the file has {size:,} bytes: it is truncated or "
+                         "damaged")
 
 
 def check_memory(needed: int, what: str, advice: str) -> None:

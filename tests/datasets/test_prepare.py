@@ -161,7 +161,7 @@ def position(paths, shift):
     (lambda p: position(p, lambda k: [0, 1.5 * k, 0]), "gantry was tilted by 14.0 degrees"),
     (lambda p: edit(p[9:10], PixelSpacing=[[5.0, 6.0]]), "PixelSpacing changes within the series"),
     (lacking, "slice005.dcm lacks RescaleIntercept"),
-    (lambda p: edit(p[9:10], PixelSpacing=[6.0]), "PixelSpacing of slice009.dcm must be 2 finite numbers"),
+    (lambda p: edit(p[9:10], PixelSpacing=[6.0]), "slice009.dcm: PixelSpacing must be 2 finite numbers"),
     (lambda p: p[7].write_bytes(p[7].read_bytes()[:1500]), "slice007.dcm cannot be read"),
     (lambda p: edit(p, ImageType=[["ORIGINAL", "PRIMARY", "LOCALIZER"]] * len(p)), "only localizer"),
     (lambda p: edit(p, NumberOfFrames=[2] * len(p)), "multi-frame")],
@@ -511,7 +511,7 @@ def test_the_recipe_prints_counts_and_fails_in_one_sentence(tmp_path, thorax, ca
     ("", "lacks the columns VolumeName, Findings_EN, Impressions_EN"),
     ("VolumeName,Findings_EN,Impressions_EN\na.nii.gz,x,\nb,x,\na.nii.gz,y,\n", "a has two rows, the second in row 4"),
     ("VolumeName,Findings_EN,Impressions_EN\n,x,y\n", "row 2 of .* has no VolumeName"),
-    ("VolumeName,Findings_EN,Impressions_EN\na,caf\xe9,\n", "cannot be read as a table .* save it as CSV in UTF-8")])
+    ("VolumeName,Findings_EN,Impressions_EN\na,caf\xe9,\n", "cannot be read .* save it as CSV in UTF-8")])
 def test_bad_report_tables_are_one_sentence(tmp_path, text, sentence):
     (tmp_path / "r.csv").write_bytes(text.encode("latin-1"))
     with pytest.raises(ValueError, match=sentence) as caught:

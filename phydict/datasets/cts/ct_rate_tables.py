@@ -9,6 +9,9 @@ from pathlib import Path
 
 from phydict.datasets.cts.transforms import Calibration, case_id
 from phydict.datasets.reports import join_report
+from phydict.runtime.reading import reading, refusing
+
+TABLE_ADVICE = "save it as CSV in UTF-8"
 
 
 def read_reports(path: str | Path) -> dict[str, str]:
@@ -17,8 +20,9 @@ def read_reports(path: str | Path) -> dict[str, str]:
     Columns VolumeName, Findings_EN, Impressions_EN; a report is laid out by `join_report`. Raises FileNotFoundError,
     and ValueError for missing columns and for volumes without a name or with two rows.
     """
-    rows = _rows(path, ("VolumeName", "Findings_EN", "Impressions_EN"))
-    return {case_id(row["VolumeName"]): join_report(row["Findings_EN"], row["Impressions_EN"]) for row in rows}
+    with refusing(path, TABLE_ADVICE):
+        rows = _rows(path, ("VolumeName", "Findings_EN", "Impressions_EN"))
+        return {case_id(row["VolumeName"]): join_report(row["Findings_EN"], row["Impressions_EN"]) for row in rows}
 
 
 def read_calibrations(path: str | Path) -> dict[str, Calibration]:
@@ -28,17 +32,20 @@ def read_calibrations(path: str | Path) -> dict[str, Calibration]:
     with two rows.
     """
     columns = ("VolumeName", "RescaleSlope", "RescaleIntercept", "XYSpacing", "ZSpacing")
-    calibrations = {}
-    for row in _rows(path, columns):
-        slope, intercept, z_mm = (_numbers(path, row, name, 1)[0] for name in ("RescaleSlope", "RescaleIntercept",
-                                                                               "ZSpacing"))
-        spacing = (*_numbers(path, row, "XYSpacing", 2), z_mm)
-        if min(spacing) <= 0:
-            raise ValueError(f"the metadata of {row['VolumeName']} in {path} give it voxels of {spacing} mm; correct "
-                             "XYSpacing and ZSpacing")
-        orientation = _numbers(path, row, "ImageOrientationPatient", 6) if row.get("ImageOrientationPatient") else ()
-        calibrations[case_id(row["VolumeName"])] = Calibration(slope, intercept, spacing, *filter(None, [orientation]))
-    return calibrations
+    with refusing(path, TABLE_ADVICE):
+        return {case_id(row["VolumeName"]): _calibration(path, row) for row in _rows(path, columns)}
+
+
+def _calibration(path: str | Path, row: dict[str, str]) -> Calibration:
+    """What a row of metadata says."""
+    slope, intercept, z_mm = (_numbers(path, row, name, 1)[0] for name in ("RescaleSlope", "RescaleIntercept",
+                                                                           "ZSpacing"))
+    spacing = (*_numbers(path, row, "XYSpacing", 2), z_mm)
+    if min(spacing) <= 0:
+        raise ValueError(f"the metadata of {row['VolumeName']} in {path} give it voxels of {spacing} mm; correct "
+                         "XYSpacing and ZSpacing")
+    orientation = _numbers(path, row, "ImageOrientationPatient", 6) if row.get("ImageOrientationPatient") else ()
+    return Calibration(slope, intercept, spacing, *filter(None, [orientation]))
 
 
 def _numbers(path: str | Path, row: dict[str, str], column: str, count: int) -> tuple[float, ...]:
@@ -73,12 +80,9 @@ def _rows(path: str | Path, columns: tuple[str, ...]) -> list[dict[str, str]]:
 
 
 def _table(file: Path, columns: tuple[str, ...]) -> list[dict[str, str]]:
-    try:
-        with file.open(newline="", encoding="utf-8-sig") as lines:
-            table = csv.DictReader(lines)
-            rows, found = list(table), table.fieldnames or ()
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"{file} cannot be read as a table ({error}); save it as CSV in UTF-8") from error
+    with reading(f"the table {file}", TABLE_ADVICE), file.open(newline="", encoding="utf-8-sig") as lines:
+        table = csv.DictReader(lines)
+        rows, found = list(table), table.fieldnames or ()
     missing = [name for name in columns if name not in found]
     if missing:
         raise ValueError(f"{file} lacks the columns {', '.join(missing)}; CT-RATE's tables have {', '.join(columns)}")

@@ -16,12 +16,12 @@ import pydicom
 from pydicom.errors import InvalidDicomError
 
 from phydict.datasets.cts.transforms import LEAST_SLICES, to_ras
-from phydict.datasets.dicom import open_dicom, read_dicom
+from phydict.datasets.dicom import open_dicom, read_dicom, tag_numbers
 from phydict.datasets.natural_order import natural_order
 from phydict.runtime.reading import reading
 
-NEEDED = {"ImagePositionPatient": 3, "ImageOrientationPatient": 6, "PixelSpacing": 2, "RescaleSlope": 1,
-          "RescaleIntercept": 1}
+NEEDED = {"Rows": 1, "Columns": 1, "ImagePositionPatient": 3, "ImageOrientationPatient": 6, "PixelSpacing": 2,
+          "RescaleSlope": 1, "RescaleIntercept": 1}
 """Tags of every slice, and how many numbers each holds."""
 SAME = ("Rows", "Columns", "PixelSpacing", "ImageOrientationPatient")
 SAME_PLACE_MM, SPACING_TOLERANCE, TILT_DEGREES = 0.01, 0.05, 0.5
@@ -66,27 +66,15 @@ def load_series(series: Series) -> tuple[np.ndarray, np.ndarray]:
     modalities = sorted({str(header.get("Modality", "unknown")) for header in headers.values()})
     if modalities != ["CT"]:
         raise ValueError(f"its modality is {', '.join(modalities)}, not CT; only CT series can be prepared")
-    slices = {path: header for path, header in headers.items() if "LOCALIZER" not in (header.get("ImageType") or ())}
-    if not slices:
+    headers = {path: header for path, header in headers.items() if "LOCALIZER" not in str(header.get("ImageType"))}
+    if not headers:
         raise ValueError("it holds only localizer (scout) images; give the series of slices")
-    if any(int(header.get("NumberOfFrames") or 1) > 1 for header in slices.values()):
+    if any(max(tag_numbers(header, 0, "NumberOfFrames", path.name) or (1,)) > 1 for path, header in headers.items()):
         raise ValueError("it is stored as multi-frame (enhanced) CT; convert it to NIfTI and prepare that")
-    if len(slices) < LEAST_SLICES:
-        raise ValueError(f"it has {len(slices)} slices, but a chest CT has at least {LEAST_SLICES}; "
+    if len(headers) < LEAST_SLICES:
+        raise ValueError(f"it has {len(headers)} slices, but a chest CT has at least {LEAST_SLICES}; "
                          "give the whole series")
-    for path, header in slices.items():
-        missing = [keyword for keyword in NEEDED if header.get(keyword) in (None, "")]
-        if missing:
-            raise ValueError(f"{path.name} lacks {', '.join(missing)}; export the series again")
-        for keyword, count in NEEDED.items():
-            value = header.get(keyword)
-            if np.size(value) != count or not np.isfinite(np.asarray(value, float)).all():
-                raise ValueError(f"{keyword} of {path.name} must be {count} finite number{'s' * (count > 1)}, but "
-                                 f"{value} was found; export the series again")
-        if min(header.PixelSpacing) <= 0:
-            raise ValueError(f"PixelSpacing of {path.name} must be positive, but {header.PixelSpacing} mm was found; "
-                             "export the series again")
-    paths, affine = _stack(slices)
+    paths, affine = _stack({path: _geometry(path, header) for path, header in headers.items()})
     volume = np.stack([read_dicom(path)[0][0].T.astype(np.float32) for path in paths], axis=2)
     return to_ras(volume, affine)
 
@@ -94,30 +82,41 @@ def load_series(series: Series) -> tuple[np.ndarray, np.ndarray]:
 def _header(path: Path) -> pydicom.Dataset:
     with reading(f"the DICOM file {path}", "export it again"):
         header = open_dicom(path, stop_before_pixels=True)
-        for keyword in (*NEEDED, *SAME, "Modality", "ImageType", "NumberOfFrames"):
+        for keyword in ("Modality", "ImageType"):
             header.get(keyword)  # which is decoded only now
         return header
 
 
-def _stack(slices: dict[Path, pydicom.Dataset]) -> tuple[list[Path], np.ndarray]:
+def _geometry(path: Path, header: pydicom.Dataset) -> dict[str, np.ndarray]:
+    """The numbers of the tags NEEDED of one slice. Raises ValueError."""
+    found = {keyword: tag_numbers(header, 0, keyword, path.name, count) for keyword, count in NEEDED.items()}
+    if missing := [keyword for keyword, numbers in found.items() if numbers is None]:
+        raise ValueError(f"{path.name} lacks {', '.join(missing)}; export the series again")
+    if min(found["PixelSpacing"]) <= 0:
+        raise ValueError(f"PixelSpacing of {path.name} must be positive, but {list(found['PixelSpacing'])} mm was "
+                         "found; export the series again")
+    return {keyword: np.array(numbers) for keyword, numbers in found.items()}
+
+
+def _stack(slices: dict[Path, dict[str, np.ndarray]]) -> tuple[list[Path], np.ndarray]:
     """The paths from slice to slice, and the affine (columns, rows, slices) -> RAS+ mm."""
     first_path, first = next(iter(slices.items()))
-    for path, header in slices.items():
+    for path, tags in slices.items():
         for keyword in SAME:
-            if not np.allclose(header.get(keyword), first.get(keyword), atol=1e-3):
-                raise ValueError(f"{keyword} changes within the series, from {first.get(keyword)} in {first_path.name} "
-                                 f"to {header.get(keyword)} in {path.name}; separate these slices")
-    across, down = np.asarray(first.ImageOrientationPatient, float).reshape(2, 3)
+            if not np.allclose(tags[keyword], first[keyword], atol=1e-3):
+                raise ValueError(f"{keyword} changes within the series, from {first[keyword].tolist()} in "
+                                 f"{first_path.name} to {tags[keyword].tolist()} in {path.name}; separate these slices")
+    across, down = first["ImageOrientationPatient"].reshape(2, 3)
     if abs(across @ down) > 1e-3 or not np.allclose([across @ across, down @ down], 1, atol=1e-2):
-        raise ValueError(f"ImageOrientationPatient {list(first.ImageOrientationPatient)} is not two directions at "
-                         "right angles; export the series again")
+        raise ValueError(f"ImageOrientationPatient {first['ImageOrientationPatient'].tolist()} is not two directions "
+                         "at right angles; export the series again")
     normal = np.cross(across, down)
-    positions = np.array([header.ImagePositionPatient for header in slices.values()], float)
+    positions = np.array([tags["ImagePositionPatient"] for tags in slices.values()])
     order = np.argsort(positions @ normal, kind="stable")
     paths, positions = [list(slices)[k] for k in order], positions[order]
     _check_spacing(paths, positions, normal)
     step = (positions[-1] - positions[0]) / (len(positions) - 1)
-    row_mm, column_mm = (float(spacing) for spacing in first.PixelSpacing)
+    row_mm, column_mm = first["PixelSpacing"]
     affine = np.eye(4)
     affine[:3] = np.diag([-1.0, -1.0, 1.0]) @ np.stack([across * column_mm, down * row_mm, step, positions[0]], axis=1)
     return paths, affine

@@ -127,14 +127,14 @@ def _tag(keyword: str) -> str:
 def _oriented(name: str, orientation, right: np.ndarray, down: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The unit steps of columns and rows that lie in the detector's plane and agree best with PatientOrientation."""
     letters = orientation.split("\\") if isinstance(orientation, str) else list(orientation)
-    steps, along = [], []
+    shown, steps, along = reprlib.repr(letters), [], []
     for word in letters:
         if not word or any(letter not in DIRECTIONS for letter in word):
-            raise ValueError(f"{name}: PatientOrientation {letters} must name directions by R, L, A, P, H, F")
+            raise ValueError(f"{name}: PatientOrientation {shown} must name directions by R, L, A, P, H, F")
         wanted = sum(np.array(DIRECTIONS[letter], float) for letter in word)
         steps.append(max((right, -right, down, -down), key=lambda step: step @ wanted))
         along.append(steps[-1] @ wanted / max(np.linalg.norm(wanted), 1e-12))
     if len(steps) != 2 or abs(steps[0] @ steps[1]) > 0.5 or min(along) < 0.3:
-        raise ValueError(f"{name}: PatientOrientation {letters} does not give two directions across this view; correct "
+        raise ValueError(f"{name}: PatientOrientation {shown} does not give two directions across this view; correct "
                          "it or the positioner angles under `beam: {dicom: ...}` in geometry.yaml")
     return steps[0], steps[1]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +11,7 @@ from PIL import Image
 
 from phydict.datasets.natural_order import natural_order
 from phydict.datasets.nifti_file import open_nifti
-from phydict.runtime.reading import read_npy, reading
+from phydict.runtime.reading import MOST_SQUEEZED, check_held, read_npy, reading, refusing
 
 DICOM = (".dcm", ".dicom", ".ima")
 ENDINGS = (".png", ".tif", ".tiff", ".npy", ".nii", ".nii.gz", *DICOM)
@@ -39,14 +41,22 @@ def read_image(path: Path) -> np.ndarray:
     Raises ValueError naming the file where it cannot be read, is not one grey image, or holds values that are not
     finite numbers.
     """
+    with refusing(path, "export it again"):
+        return _checked(_read_image(path), path)
+
+
+def _read_image(path: Path) -> np.ndarray:
     name = path.name.lower()
     with reading(f"the image {path}", "export it again"):
         if name.endswith(".npy"):
-            image = read_npy(path)
-        elif name.endswith((".nii", ".nii.gz")):
-            image = _read_nifti(path)
-        else:
-            image = _read_picture(path)
+            return read_npy(path)
+        if name.endswith((".nii", ".nii.gz")):
+            return _read_nifti(path)
+        return _read_picture(path)
+
+
+def _checked(image: np.ndarray, path: Path) -> np.ndarray:
+    """The image, one grey value per pixel. Raises ValueError."""
     if image.ndim == 3 and image.shape[0] == 1:
         image = image[0]
     if image.ndim != 2:
@@ -70,9 +80,13 @@ def _read_picture(path: Path) -> np.ndarray:
     header = path.read_bytes()[:26]
     if header[1:4] == b"PNG" and len(header) == 26 and header[24] == 16 and header[25] != 0:
         raise ValueError("16-bit colour would be cut to 8 bit; store it as 16-bit grey")
-    with Image.open(path) as image:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", Image.DecompressionBombWarning)
+        opened = Image.open(path)
+    with opened as image:
         if getattr(image, "n_frames", 1) > 1:
             raise ValueError(f"it holds {image.n_frames} pages; store one image per file")
+        check_held(math.prod(image.size), path, f"pixels, {image.height} x {image.width},", 8 * MOST_SQUEEZED)
         image.load()
         if image.mode in GREY:
             pixels = np.asarray(image)

@@ -158,8 +158,8 @@ def _tags(dataset: pydicom.Dataset, frame: int, name: str) -> DicomTags:
         secondary = secondary or 0.0
     orientation = _find(dataset, frame, "PatientOrientation", name)
     if orientation is not None:
-        orientation = tuple(map(str, orientation)) if isinstance(orientation, MultiValue) else str(
-            orientation).split("\\")
+        letters = orientation if isinstance(orientation, MultiValue) else str(orientation).split("\\")
+        orientation = tuple(map(str, letters))
     sign = _number(dataset, frame, "PixelIntensityRelationshipSign", name)
     if sign and (_number(dataset, frame, "RescaleSlope", name) or 1) < 0:
         sign = -sign  # the tag speaks of stored values

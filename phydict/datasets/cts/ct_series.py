@@ -69,7 +69,7 @@ def load_series(series: Series) -> tuple[np.ndarray, np.ndarray]:
     headers = {path: header for path, header in headers.items() if "LOCALIZER" not in str(header.get("ImageType"))}
     if not headers:
         raise ValueError("it holds only localizer (scout) images; give the series of slices")
-    if any(max(tag_numbers(header, 0, "NumberOfFrames", path.name) or (1,)) > 1 for path, header in headers.items()):
+    if any((tag_numbers(header, 0, "NumberOfFrames", path.name, 1) or (1,))[0] > 1 for path, header in headers.items()):
         raise ValueError("it is stored as multi-frame (enhanced) CT; convert it to NIfTI and prepare that")
     if len(headers) < LEAST_SLICES:
         raise ValueError(f"it has {len(headers)} slices, but a chest CT has at least {LEAST_SLICES}; "

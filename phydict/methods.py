@@ -13,8 +13,8 @@ from phydict.datasets import format_report
 from phydict.grid import Grid
 from phydict.posterior import (
     DAPS, DDS, DPS, CascadePosterior, DiffPIR, ExactDraw, GradientSteps, PnPDM, Posterior, PriorOnly, ProximalCG,
-    Reward, Sampler, SplitGibbs)
-from phydict.prior import DEFAULT_PRIOR, Cascade, Prior, SuperResolution, load_prior, load_super_resolution
+    Reward, Sampler, SplitGibbs, Unrolled)
+from phydict.prior import Cascade, Prior, Refiner, SuperResolution, load_prior, load_super_resolution
 from phydict.reconstruction import Reconstruction, Reconstructor
 from phydict.runtime.precision import check_precision
 from phydict.runtime.reading import reason
@@ -35,6 +35,8 @@ METHODS: dict[str, Sampler | Reconstructor] = {
         likelihood=ProximalCG(iterations=7, restarts=1, tv_weight=10.0, tv_eps=0.003),
         final_likelihood=ProximalCG(iterations=10, restarts=5, refit_scatter=True, weighted_least_squares=True,
                                     tv_weight=10.0, tv_eps=0.003)),
+    # A network trained on scenes of X-rays: three calls, each followed by conjugate gradients.
+    "phydict_learned": Unrolled(),
     # The paper's text: two gradient steps of 0.1 per timestep with LPIPS, then Extra Compute from delta = 0.8.
     "phydict_paper": SplitGibbs(iterations=50, likelihood=GradientSteps(reward=Reward(lpips=1.0)), ec_delta=0.8,
                                 ec_steps=40, full_detector=True),
@@ -70,15 +72,15 @@ DEFAULT_METHOD = "phydict_fast"
 """The method where none is given."""
 
 
-def reconstructor(method: str | Sampler | Reconstructor, prior: Prior | str | Path | None = None,
+def reconstructor(method: str | Sampler | Reconstructor, prior: Prior | Refiner | str | Path | None = None,
                   guidance: float = 1.0, name: str | None = None,
                   super_resolution: SuperResolution | str | Path | None = None, sr_guided: bool = True,
                   sr_sampler: Sampler | None = None, sr_noise_augmentation: float | None = None, samples: int = 1,
                   precision: str = "auto") -> Reconstructor:
     """A method ready to reconstruct: a name of METHODS, a sampler (which needs a prior), or a Reconstructor.
 
-    prior: a Prior or the file it is in; None for the shipped one. It is only loaded by methods that need it. name: what
-    the result calls the method (None: its own name).
+    prior: a Prior, for Unrolled a Refiner, or the file it is in; None for the shipped one. It is only loaded by methods
+    that need it. name: what the result calls the method (None: its own name).
     super_resolution: the second stage of a cascade, or its file; None reconstructs on the prior's own grid. sr_guided:
     whether the X-rays guide that stage too; sr_sampler: how (None: CascadePosterior's own); sr_noise_augmentation: its
     noise (None: the stage's own).
@@ -101,7 +103,7 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: Prior | str | Pa
     if not isinstance(method, Sampler):
         raise ValueError(f"a method is a name ({', '.join(METHODS)}), a Sampler or a Reconstructor, but {method!r} was "
                          "given")
-    prior = load_prior(prior or DEFAULT_PRIOR) if prior is None or isinstance(prior, str | Path) else prior
+    prior = load_prior(prior or method.default_prior) if prior is None or isinstance(prior, str | Path) else prior
     name = name or type(method).__name__
     if super_resolution is None:
         return Posterior(prior, method, guidance, name=name, precision=precision, samples=samples)
@@ -131,7 +133,7 @@ def fit_to_grid(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam,
                                                     full_detector=True)
 
 
-def reconstruct(xrays: Tensor, beam: ConeBeam, prior: Prior | str | Path | None = None,
+def reconstruct(xrays: Tensor, beam: ConeBeam, prior: Prior | Refiner | str | Path | None = None,
                 method: str | Sampler | Reconstructor = DEFAULT_METHOD, report: str | None = None,
                 display: bool = False, seed: int = 0, guidance: float = 1.0, mu_water: float | None = None,
                 grid: Grid = Grid.cube(64), on_step=lambda: None,

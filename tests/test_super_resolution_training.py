@@ -75,7 +75,7 @@ def test_the_loss_falls(tmp_path, cache):
     tasks[1].load_state_dict(checkpoint(tmp_path)["current_model_state"])
     crops = SuperResolutionData(Crops(16, 2), phantoms=2, cube=Cube(32), cache=str(cache)).draws(epoch=0)
     batch = {"volume": torch.stack([crops[i]["volume"] for i in range(8)])}
-    before, after = (np.mean([task.denoising_loss(batch, (k,)).item() for k in range(8)]) for task in tasks)
+    before, after = (np.mean([task.batch_loss(batch, (k,)).item() for k in range(8)]) for task in tasks)
     assert after < 0.9 * before
 
 

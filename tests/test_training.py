@@ -157,8 +157,8 @@ def test_a_killed_run_goes_on_as_if_it_had_not_been(tmp_path, straight, cache):
 
 @pytest.mark.parametrize("before", [False, True], ids=["at once", "after a checkpoint"])
 def test_a_loss_that_is_not_finite_stops_the_training(tmp_path, cache, capsys, monkeypatch, before):
-    loss, at = PriorTraining.denoising_loss, 5 if before else 1
-    monkeypatch.setattr(PriorTraining, "denoising_loss", lambda task, *given: loss(task, *given) * (
+    loss, at = PriorTraining.batch_loss, 5 if before else 1
+    monkeypatch.setattr(PriorTraining, "batch_loss", lambda task, *given: loss(task, *given) * (
         float("nan") if task.global_step == at else 1))
     said = refusal(capsys, arguments(tmp_path, cache, "--trainer.max_epochs=2", "--trainer.limit_val_batches=0"))
     assert f"the loss is nan after {at} steps" in said
@@ -507,10 +507,10 @@ def test_every_process_stops_where_one_of_them_has_a_loss_that_is_not_finite(tmp
     (tmp_path / "train.py").write_text("""if True:
         from phydict.training import PriorTraining
         from phydict.cli.train import main
-        loss = PriorTraining.denoising_loss
+        loss = PriorTraining.batch_loss
         def broken(task, batch, key, rank, processes):
             return loss(task, batch, key, rank, processes) * (float("nan") if rank == task.global_step == 1 else 1)
-        PriorTraining.denoising_loss = broken
+        PriorTraining.batch_loss = broken
         main()""")
     args = arguments(tmp_path / "run", cache, f"--config={CONFIG.with_name('ddp.yaml')}", "--trainer.devices=2",
                      "--data.loading.batch_size=1", "--trainer.max_epochs=1", "--model.text.encoder=none")
@@ -564,9 +564,9 @@ def test_a_batch_is_one_loss_however_many_processes_share_it(cache):
     batch = default_collate([data.phantoms[i] for i in range(4)])
     shares = [{key: value[rank::2] for key, value in batch.items()} for rank in range(2)]
     for key in ((0, 0), (0, 1)):
-        halves = [task.denoising_loss(share, key, rank, 2) for rank, share in enumerate(shares)]
-        torch.testing.assert_close(sum(halves) / 2, task.denoising_loss(batch, key))
-    assert task.denoising_loss(batch, (0, 0)) != task.denoising_loss(batch, (0, 1))
+        halves = [task.batch_loss(share, key, rank, 2) for rank, share in enumerate(shares)]
+        torch.testing.assert_close(sum(halves) / 2, task.batch_loss(batch, key))
+    assert task.batch_loss(batch, (0, 0)) != task.batch_loss(batch, (0, 1))
 
 
 def test_a_dropped_report_is_none_at_all(cache):
@@ -576,7 +576,7 @@ def test_a_dropped_report_is_none_at_all(cache):
     for dropout, heard in ((0.0, True), (1.0, False)):
         task = PriorTraining(tiny_prior().network, TextSettings(reports=data.reports, dropout=dropout), cube=Cube(16))
         with torch.no_grad():
-            assert (task.denoising_loss(batch) != task.denoising_loss(silent)) == heard
+            assert (task.batch_loss(batch) != task.batch_loss(silent)) == heard
 
 
 def test_training_goes_on_from_a_prior_and_refuses_one_of_another_grid(tmp_path):

@@ -162,8 +162,7 @@ class MeasuredCase:
     def report(self, trial: Trial) -> str:
         """The report, where the trial uses it and its prior reads text."""
         prior = prior_of(trial.prior) if trial.prior else None
-        reads = prior is not None and (prior.text is not None or prior.load_text is not None)
-        return self.truth["report"] if reads and trial.data.with_report else ""
+        return self.truth["report"] if prior is not None and prior.reads_text and trial.data.with_report else ""
 
 
 class Runner:

@@ -18,7 +18,7 @@ from phydict.inference.data import ReconstructionData
 from phydict.inference.settings import Orbit
 from phydict.methods import METHODS
 from phydict.posterior import Sampler
-from phydict.prior import DEFAULT_PRIOR, fingerprint, load_prior
+from phydict.prior import fingerprint, load_prior
 from phydict.reconstruction import Reconstructor, describe
 from phydict.runtime.reading import reason
 from phydict.runtime.renamed import check_setting
@@ -41,7 +41,7 @@ SETTINGS: dict[str, tuple[type, object]] = {
     "simulation_voxels": (int | None, None), "source_to_detector": (float, 1020.0),
     "source_to_isocentre": (float, 740.0),
     "report": (bool, True), "voxels": (int, 64), "side": (float, 384.0),
-    "prior": (str, str(DEFAULT_PRIOR)), "guidance": (float, 1.0), "samples": (int, 1),
+    "prior": (str | None, None), "guidance": (float, 1.0), "samples": (int, 1),
     "delta": (float | None, None), "projector": (str, "auto")}
 """Type and default of what an axis may be; beside these, method.<field> and simulator.<field>."""
 
@@ -195,8 +195,9 @@ def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
     columns = {name: value[name] for name in DEFAULT_COLUMNS
                if name in given or name not in PRIOR_SETTINGS or with_prior}
     columns |= {name: given[name] for name in SETTINGS if name in given and name not in columns} | overrides
-    trial = Trial(columns, method, data, value["prior"] if with_prior else None, value["guidance"], value["samples"],
-                  value["seed"], value["voxels"], value["side"], projector=value["projector"])
+    prior = value["prior"] or str(method.default_prior) if with_prior else None
+    trial = Trial(columns, method, data, prior, value["guidance"], value["samples"], value["seed"],
+                  value["voxels"], value["side"], projector=value["projector"])
     meant = set(given) | set(overrides)
     return trial, meant | ({"voxels", "side"} & set(settings))
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from phydict.prior.files import (
-    build_prior, build_super_resolution, build_text, has_text, is_saved_prior, save_prior, save_super_resolution)
+    build_prior, build_refiner, build_super_resolution, build_text, has_text, is_saved_prior, save_prior, save_refiner,
+    save_super_resolution)
 from phydict.prior.inspection import inspect_prior
 from phydict.runtime.console import check_writable
 from phydict.training.checkpoints import read_checkpoint
@@ -33,10 +34,15 @@ def export_prior(checkpoint: str, out: str, overwrite: bool = False) -> None:
     if header.get("stage") == "super_resolution":
         save_super_resolution(build_super_resolution(header, weights), out, training)
     else:
-        prior = build_prior(header, weights)
+        refiner = build_refiner(header, weights) if header.get("stage") == "refiner" else None
+        prior = refiner.prior if refiner else build_prior(header, weights)
         if has_text(header):
+            weights = {k.removeprefix("prior."): w for k, w in weights.items()}
             prior.text = build_text(header["text"], {k: w for k, w in weights.items() if k.startswith("text.")})
-        save_prior(prior, out, training)
+        if refiner:
+            save_refiner(refiner, out, training)
+        else:
+            save_prior(prior, out, training)
     print(f"prior in {out}")
 
 

@@ -28,6 +28,7 @@ from phydict.training.checkpoints import BEST, HELD_OUT, RESUMED, BestCheckpoint
 from phydict.training.crops import SuperResolutionData
 from phydict.training.data import PriorData
 from phydict.training.progress import TrainingProgress
+from phydict.training.refiner import RefinerTraining
 from phydict.training.stage import CHECKPOINT, StageTraining
 from phydict.training.super_resolution import SuperResolutionTraining
 from phydict.training.throughput import Throughput
@@ -35,7 +36,8 @@ from phydict.training.throughput import Throughput
 COMMANDS = {"fit": "train a prior", "validate": "measure one on held-out cases", "export": "checkpoint -> prior",
             "inspect-prior": "what a file is"}
 
-STAGES = {"base": (PriorTraining, PriorData), "super_resolution": (SuperResolutionTraining, SuperResolutionData)}
+STAGES = {"base": (PriorTraining, PriorData), "super_resolution": (SuperResolutionTraining, SuperResolutionData),
+          "refiner": (RefinerTraining, PriorData)}
 """What trains a stage, and on which data."""
 
 
@@ -77,12 +79,13 @@ class PriorCLI(LightningCLI):
             parser.link_arguments(f"model.{name}", f"data.{name}")
         if self.model_class is PriorTraining:
             parser.link_arguments("data.reports", "model.text.reports", apply_on="instantiate")
+        if self.model_class is SuperResolutionTraining:
+            parser.link_arguments("model.factor", "data.crops.factor")
+        else:
             parser.add_lightning_class_args(BestCheckpoint, "best")
             parser.set_defaults({"best.filename": Path(BEST).stem, "best.enable_version_counter": False,
                                  "best.monitor": "val/psnr", "best.mode": "max", "best.save_on_train_epoch_end": False})
             parser.link_arguments("out", "best.dirpath")
-        else:
-            parser.link_arguments("model.factor", "data.crops.factor")
 
     def instantiate_trainer(self, **kwargs) -> lightning.Trainer:
         asked = self._get(self.config_init, "trainer").plugins or []

@@ -28,7 +28,7 @@ from phydict.inference.results import CaseResults
 from phydict.inference.settings import CascadeSettings, Sampling
 from phydict.methods import fit_to_grid, reconstructor
 from phydict.posterior import CascadePosterior, Sampler
-from phydict.prior import DEFAULT_PRIOR, MedSynCheckpoint, file_read, fingerprint, load_prior, load_super_resolution
+from phydict.prior import MedSynCheckpoint, file_read, fingerprint, load_prior, load_super_resolution
 from phydict.reconstruction import Reconstruction, Reconstructor, describe, save_nifti
 from phydict.runtime.console import TRACEBACK, check_apart, check_writable, noted, sentence
 from phydict.runtime.precision import instruction_set
@@ -48,7 +48,8 @@ class ReconstructionTask(lightning.LightningModule):
     Args:
         method: a Sampler, which is run with the prior, or a Reconstructor
         name: what tables and folders call the method; none given: the name it was given by, or its class's
-        prior: the prior's file, or a file or folder of MedSyn's, read where the method is a Sampler
+        prior: the prior's file, or a file or folder of MedSyn's, read where the method is a Sampler; none given: the
+            method's own
         sampling: how the prior is sampled
         super_resolution: a cascade's second stage, which refines what the prior gives
         out: output folder; cases go to <out>/<name>/<case>
@@ -59,7 +60,7 @@ class ReconstructionTask(lightning.LightningModule):
     """
 
     def __init__(self, method: Sampler | Reconstructor, name: str | None = None,
-                 prior: str | MedSynCheckpoint = str(DEFAULT_PRIOR), sampling: Sampling = Sampling(),
+                 prior: str | MedSynCheckpoint | None = None, sampling: Sampling = Sampling(),
                  super_resolution: CascadeSettings = CascadeSettings(), out: str = "runs/reconstructions",
                  overwrite: bool = False, seed: int = 0, cube: Cube = Cube(), projector: str = "auto"):
         super().__init__()
@@ -77,6 +78,7 @@ class ReconstructionTask(lightning.LightningModule):
         if projector != "auto":
             self.settings["projector"] = projector
         self.grid, self.window = cube.grid(), HUWindow()
+        prior = prior or (str(method.default_prior) if isinstance(method, Sampler) else None)
         self.prior = load_prior(prior) if isinstance(method, Sampler) else None
         if self.prior is not None:
             self.grid, self.window = self.prior.grid, self.prior.window
@@ -103,7 +105,7 @@ class ReconstructionTask(lightning.LightningModule):
 
     @property
     def reads_no_text(self) -> bool:
-        return self.prior is not None and self.prior.text is None and self.prior.load_text is None
+        return self.prior is not None and not self.prior.reads_text
 
     def setup(self, stage: str) -> None:
         self.settings["data"] = self.trainer.datamodule.settings(stage)

@@ -16,6 +16,7 @@ from phydict.posterior.samplers.pnp_dm import PnPDM
 from phydict.posterior.samplers.prior_only import PriorOnly
 from phydict.posterior.samplers.sampler import Sampler, ddim_sample
 from phydict.posterior.samplers.split_gibbs import SplitGibbs
+from phydict.posterior.samplers.unrolled import Unrolled
 
 __all__ = [
            "ADMMTV",
@@ -37,5 +38,6 @@ __all__ = [
            "Reward",
            "Sampler",
            "SplitGibbs",
+           "Unrolled",
            "ddim_sample",
 ]

@@ -17,7 +17,7 @@ from phydict.guard import Guard
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.samplers.sampler import Sampler
 from phydict.posterior.samplers.split_gibbs import SplitGibbs
-from phydict.prior import Prior
+from phydict.prior import BoundRefiner, Prior, Refiner
 from phydict.reconstruction import Reconstruction, Reconstructor
 from phydict.runtime.precision import check_precision, precision_name
 from phydict.runtime.profiling import Stopwatch, stage
@@ -43,6 +43,21 @@ class CountingDenoiser:
         return x0
 
 
+class CountingRefiner:
+    """A refiner that counts its calls, as CountingDenoiser does a denoiser's."""
+
+    def __init__(self, refiner: BoundRefiner, guard: Guard):
+        self.schedule, self.mean, self._refiner = refiner.schedule, refiner.mean, refiner
+        self.guard, self.calls = guard, 0
+
+    def refine(self, x: Tensor, t: float, evidence: Tensor) -> Tensor:
+        self.calls += len(x)
+        with stage("network"):
+            x0 = self._refiner.refine(x, t, evidence)
+        self.guard.estimate = x0.detach()
+        return x0
+
+
 @dataclass(frozen=True)
 class Posterior(Reconstructor):
     """Reconstructs by sampling p(x | Y, report) under a prior.
@@ -55,7 +70,7 @@ class Posterior(Reconstructor):
     but for rounding, on batch.
     """
 
-    prior: Prior
+    prior: Prior | Refiner
     sampler: Sampler = field(default_factory=SplitGibbs)
     guidance: float = 1.0
     mu_water: float = MU_WATER
@@ -68,6 +83,13 @@ class Posterior(Reconstructor):
         super().__post_init__()
         check_precision(self.precision)
         check_guidance(self.guidance)
+        if isinstance(self.prior, Refiner) != self.sampler.needs_refiner:
+            needed, given = ("a refiner", "a prior") if self.sampler.needs_refiner else ("a prior", "a refiner")
+            raise ValueError(f"{type(self.sampler).__name__} needs {needed}, but the file is {given}: give {needed}'s "
+                             "file, or leave it out")
+        if self.samples != 1 and self.sampler.needs_refiner:
+            raise ValueError("an unrolled reconstruction is not random, so that samples of it do not differ, but "
+                             f"{self.samples} were asked for: leave samples at 1, or use phydict_fast")
         for name in ("samples", "batch"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is a number of reconstructions, 1 or more, but {getattr(self, name)} was "
@@ -108,7 +130,8 @@ class Posterior(Reconstructor):
         with watch.stage("prepare"):
             measurement = Measurement(projector, xrays, prior.window, display, self.mu_water)
             guard = Guard(measurement, on_step, sampler.steps())
-            denoiser = CountingDenoiser(prior.bind(report, self.guidance, self.precision), guard)
+            counting = CountingRefiner if sampler.needs_refiner else CountingDenoiser
+            denoiser = counting(prior.bind(report, self.guidance, self.precision), guard)
             state = torch.empty(1, prior.state_channels, *prior.grid.shape, device=xrays.device)
         with watch.stage("sample"):
             states = []

@@ -3,19 +3,21 @@
 from phydict.prior.cascade import Cascade
 from phydict.prior.detail import DetailNetwork
 from phydict.prior.files import (
-    DEFAULT_PRIOR, describe, describe_super_resolution, file_read, fingerprint, load_prior, load_super_resolution,
-    save_prior, save_super_resolution)
+    DEFAULT_PRIOR, DEFAULT_REFINER, describe, describe_refiner, describe_super_resolution, file_read, fingerprint,
+    load_prior, load_super_resolution, save_prior, save_refiner, save_super_resolution)
 from phydict.prior.inspection import inspect_prior
 from phydict.prior.local_unet import LocalUNet
 from phydict.prior.medsyn.checkpoint import MedSynCheckpoint
 from phydict.prior.medsyn.prior import MedSynPrior
 from phydict.prior.medsyn.super_resolution import MedSynSuperResolution
 from phydict.prior.prior import STATE, BoundPrior, Prior
+from phydict.prior.refiner import BoundRefiner, Refiner
 from phydict.prior.super_resolution import SuperResolution
 from phydict.prior.text import TextEncoder, learn_vocabulary
 from phydict.prior.unet import VolumeUNet
 
-__all__ = ["DEFAULT_PRIOR", "STATE", "BoundPrior", "Cascade", "DetailNetwork", "LocalUNet", "MedSynCheckpoint",
-           "MedSynPrior", "MedSynSuperResolution", "Prior", "SuperResolution", "TextEncoder", "VolumeUNet", "describe",
-           "describe_super_resolution", "file_read", "fingerprint", "inspect_prior", "learn_vocabulary", "load_prior",
-           "load_super_resolution", "save_prior", "save_super_resolution"]
+__all__ = ["DEFAULT_PRIOR", "DEFAULT_REFINER", "STATE", "BoundPrior", "BoundRefiner", "Cascade", "DetailNetwork",
+           "LocalUNet", "MedSynCheckpoint", "MedSynPrior", "MedSynSuperResolution", "Prior", "Refiner",
+           "SuperResolution", "TextEncoder", "VolumeUNet", "describe", "describe_refiner", "describe_super_resolution",
+           "file_read", "fingerprint", "inspect_prior", "learn_vocabulary", "load_prior", "load_super_resolution",
+           "save_prior", "save_refiner", "save_super_resolution"]

@@ -29,13 +29,17 @@ class DetailNetwork(nn.Module):
         nn.init.zeros_(self.leave.bias)
         self.to(memory_format=torch.channels_last_3d)
 
-    def forward(self, difference: Tensor, estimate: Tensor, t: Tensor) -> Tensor:
-        """Difference of state and estimate, and the estimate (B, C, X, Y, Z), at times t (B,) -> (B, C, X, Y, Z)."""
+    def forward(self, difference: Tensor, estimate: Tensor, t: Tensor, offset: Tensor | None = None) -> Tensor:
+        """Difference of state and estimate, and the estimate (B, C, X, Y, Z), at times t (B,) -> (B, C, X, Y, Z).
+
+        offset: (B, width, X, Y, Z), added to what the first convolution gives; None for none.
+        """
         phase = math.pi * t[:, None] * torch.arange(1, FREQUENCIES + 1, device=t.device).to(t)
         told = self.time(torch.cat([phase.sin(), phase.cos()], 1).to(difference.dtype))
         scales, shifts = told[..., None, None, None].unflatten(1, (len(self.middle) + 1, 2, -1)).unbind(2)
         h = torch.cat([difference, 2 * estimate], 1).contiguous(memory_format=torch.channels_last_3d)
-        h = silu(torch.addcmul(shifts[:, 0], self.enter(h), 1 + scales[:, 0]), inplace=True)
+        h = self.enter(h) if offset is None else self.enter(h) + offset
+        h = silu(torch.addcmul(shifts[:, 0], h, 1 + scales[:, 0]), inplace=True)
         for i, layer in enumerate(self.middle, 1):
             h = silu(torch.addcmul(shifts[:, i], layer(h), 1 + scales[:, i]), inplace=True).add_(h)
         return self.leave(h)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import reprlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
@@ -22,6 +22,7 @@ from phydict.prior.medsyn.checkpoint import (
 from phydict.prior.medsyn.prior import MedSynPrior
 from phydict.prior.medsyn.super_resolution import MedSynSuperResolution
 from phydict.prior.prior import STATE, Prior
+from phydict.prior.refiner import Refiner
 from phydict.prior.super_resolution import SuperResolution
 from phydict.prior.text import TextEncoder
 from phydict.prior.unet import VolumeUNet
@@ -37,10 +38,13 @@ DEFAULT_PRIOR = shipped("data/prior/phydict_64.safetensors")
 
 ADVICE = "copy it again, or export it from its training checkpoint"
 
+DEFAULT_REFINER = shipped("data/prior/refiner_64.safetensors")
+"""The refiner that comes with the project."""
+
 MOST_HU, MOST_LAYERS = 1e6, 256
 """No window reaches as far, and no network has more blocks on its way down, or layers."""
 
-STAGES = {"base": "a base prior", "super_resolution": "a super-resolution stage"}
+STAGES = {"base": "a base prior", "super_resolution": "a super-resolution stage", "refiner": "a refiner"}
 """What a file's header may call it, and what that is; a header that says nothing is of a base prior."""
 
 
@@ -63,6 +67,16 @@ def save_super_resolution(fine: SuperResolution, path: str | Path, training: dic
                           dtype: torch.dtype = torch.float16):
     """Writes `fine` to one .safetensors file, as `save_prior` does."""
     _write(Path(path), describe_super_resolution(fine) | {"training": training or {}}, fine.state_dict(), dtype)
+
+
+def save_refiner(refiner: Refiner, path: str | Path, training: dict | None = None, dtype: torch.dtype = torch.float16):
+    """Writes `refiner`, with the prior that it is made of, to one .safetensors file, as `save_prior` does."""
+    if refiner.prior.text is None and refiner.prior.load_text is not None:
+        refiner.prior.text = refiner.prior.load_text()
+    copied = refiner.prior.text is not None and not refiner.prior.text.source
+    weights = {k.replace("prior.text.", "text.", 1): w for k, w in refiner.state_dict().items()
+               if copied or not k.startswith("prior.text.")}
+    _write(Path(path), describe_refiner(refiner) | {"training": training or {}}, weights, dtype)
 
 
 def _write(path: Path, header: dict, weights: dict[str, Tensor], dtype: torch.dtype) -> None:
@@ -100,9 +114,15 @@ def describe_super_resolution(fine: SuperResolution) -> dict:
             "network": fine.network.settings}
 
 
-def load_prior(path: str | Path | MedSynCheckpoint = DEFAULT_PRIOR, device: str = "cpu") -> Prior | MedSynPrior:
-    """The prior in a .safetensors file written by `save_prior`, or in a file or folder of MedSyn's (`load_medsyn`),
-    ready to denoise (float32, evaluation mode).
+def describe_refiner(refiner: Refiner) -> dict:
+    """What a refiner is, as plain JSON values, for `build_refiner`: its prior, called by another stage."""
+    return describe(refiner.prior) | {"stage": "refiner"}
+
+
+def load_prior(path: str | Path | MedSynCheckpoint = DEFAULT_PRIOR,
+               device: str = "cpu") -> Prior | Refiner | MedSynPrior:
+    """The prior in a .safetensors file written by `save_prior`, the refiner in one written by `save_refiner`, or the
+    prior in a file or folder of MedSyn's (`load_medsyn`), ready to denoise (float32, evaluation mode).
 
     The default is the one that comes with the project. The text encoder stays on disk until the first report. Raises
     FileNotFoundError when there is no file, ValueError when it is truncated, is no prior, or holds weights that are not
@@ -112,14 +132,15 @@ def load_prior(path: str | Path | MedSynCheckpoint = DEFAULT_PRIOR, device: str 
     if isinstance(path, MedSynCheckpoint) or is_medsyn(path):
         return load_medsyn(path, device)
     with refusing(path, ADVICE):
-        header, weights = _read(path, "base", device)
+        header, weights = _read(path, ("base", "refiner"), device)
         try:
-            prior = build_prior(header, weights)
+            found = build_refiner(header, weights) if header.get("stage") == "refiner" else build_prior(header, weights)
             if has_text(header):
+                prior = found.prior if isinstance(found, Refiner) else found
                 prior.load_text = lambda: _load_text(path, header["text"])
         except ValueError as error:
             raise ValueError(f"'{path}' contradicts itself: {error}") from error
-    return prior.to(device).eval().requires_grad_(False)
+    return found.to(device).eval().requires_grad_(False)
 
 
 def load_super_resolution(path: str | Path | MedSynCheckpoint,
@@ -129,7 +150,7 @@ def load_super_resolution(path: str | Path | MedSynCheckpoint,
     if isinstance(path, MedSynCheckpoint) or is_medsyn(path):
         return load_medsyn_super_resolution(path, device)
     with refusing(path, ADVICE):
-        header, weights = _read(path, "super_resolution", device)
+        header, weights = _read(path, ("super_resolution",), device)
         try:
             fine = build_super_resolution(header, weights)
         except ValueError as error:
@@ -141,8 +162,8 @@ def _found(path: str | Path | MedSynCheckpoint) -> Path | MedSynCheckpoint:
     return path if isinstance(path, MedSynCheckpoint) else own_or_shipped(path)
 
 
-def _read(path: Path, stage: str, device: str) -> tuple[dict, dict[str, Tensor]]:
-    """Header and weights, but those of a text encoder, of a file that must be of one of STAGES."""
+def _read(path: Path, stages: Sequence[str], device: str) -> tuple[dict, dict[str, Tensor]]:
+    """Header and weights, but those of a text encoder, of a file that must be of one of `stages`."""
     if not path.is_file():
         raise FileNotFoundError(f"no prior at '{path}': give the .safetensors file that training wrote")
     try:
@@ -153,7 +174,7 @@ def _read(path: Path, stage: str, device: str) -> tuple[dict, dict[str, Tensor]]
         raise ValueError(f"'{path}' is truncated or not a safetensors file ({reason(error)}): {ADVICE}") from error
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise ValueError(f"'{path}' carries no phydict prior of format {FORMAT}: give a file that save_prior wrote")
-    check_stage(header, stage, f"'{path}'")
+    check_stage(header, stages, f"'{path}'")
     check_finite(weights, path)
     return header, weights
 
@@ -167,12 +188,12 @@ def is_saved_prior(path: str | Path) -> bool:
         return False
 
 
-def check_stage(header: dict, stage: str, name: str) -> None:
-    """Raises ValueError where the header of the file `name` is of another stage."""
+def check_stage(header: dict, stages: Sequence[str], name: str) -> None:
+    """Raises ValueError where the header of the file `name` is of none of `stages`."""
     found = header.get("stage", "base")
-    if found != stage:
+    if found not in stages:
         kind = STAGES.get(found) if isinstance(found, str) else None
-        raise ValueError(f"{name} is {kind or f'of stage {reprlib.repr(found)}'}, but {STAGES[stage]} is needed "
+        raise ValueError(f"{name} is {kind or f'of stage {reprlib.repr(found)}'}, but {STAGES[stages[0]]} is needed "
                          "here: give the file of that stage")
 
 
@@ -198,13 +219,24 @@ def build_prior(header: dict, weights: dict[str, Tensor]) -> Prior:
 
     Raises ValueError where header and weights do not fit together.
     """
-    def made() -> Prior:
-        return Prior(VolumeUNet(**header["network"]), Grid(**header["grid"]), _window(header),
-                     schedule=CosineSchedule(**header["schedule"]), sigma_data=_number(header, "sigma_data"),
-                     skip_std=_number(header, "skip_std"),
-                     detail=DetailNetwork(**header["detail"]) if "detail" in header else None)
-
     weights = {k: w.float() for k, w in weights.items() if not k.startswith("text.")}
+    return _built(lambda: _untrained(header), weights, header, ("network", "detail"))
+
+
+def _untrained(header: dict) -> Prior:
+    return Prior(VolumeUNet(**header["network"]), Grid(**header["grid"]), _window(header),
+                 schedule=CosineSchedule(**header["schedule"]), sigma_data=_number(header, "sigma_data"),
+                 skip_std=_number(header, "skip_std"),
+                 detail=DetailNetwork(**header["detail"]) if "detail" in header else None)
+
+
+def build_refiner(header: dict, weights: dict[str, Tensor]) -> Refiner:
+    """The refiner that `describe_refiner` described, with these weights, as `build_prior` builds a prior."""
+    def made() -> Refiner:
+        prior = _untrained(header)
+        return Refiner(prior, torch.zeros(prior.state_channels, *prior.grid.shape))
+
+    weights = {k: w.float() for k, w in weights.items() if not k.startswith(("text.", "prior.text."))}
     return _built(made, weights, header, ("network", "detail"))
 
 

@@ -79,18 +79,28 @@ class Prior(nn.Module):
         """Channels of the state: the CT, then masks."""
         return self.network.state_channels
 
-    def forward(self, x: Tensor, t: Tensor, context: Tensor) -> Tensor:
-        """Clean estimate of the state x (B, C, X, Y, Z) at times t (B,), in x's dtype."""
+    @property
+    def reads_text(self) -> bool:
+        """Whether a report can be given."""
+        return self.text is not None or self.load_text is not None
+
+    def forward(self, x: Tensor, t: Tensor, context: Tensor,
+                offsets: tuple[Tensor | None, Tensor | None] = (None, None)) -> Tensor:
+        """Clean estimate of the state x (B, C, X, Y, Z) at times t (B,), in x's dtype.
+
+        offsets: what is added at the entrance of the network and of the detail network (see Refiner).
+        """
         a, s = (w.to(x.dtype).view(-1, 1, 1, 1, 1) for w in self.schedule.scales(t.double()))
         share, out = self.preconditioning(t)
         inward = (s**2 + (a * self.sigma_data) ** 2).rsqrt()
-        answer = self.network(inward * x, t, context).to(x.dtype)
+        answer = self.network(inward * x, t, context, offsets[0]).to(x.dtype)
         found = share * x / a + out * answer
         if self.detail is None:
             return found
-        return self._with_detail(found, x, a, self.sigma_data * answer, t)
+        return self._with_detail(found, x, a, self.sigma_data * answer, t, offsets[1])
 
-    def _with_detail(self, found: Tensor, x: Tensor, a: Tensor, estimate: Tensor, t: Tensor) -> Tensor:
+    def _with_detail(self, found: Tensor, x: Tensor, a: Tensor, estimate: Tensor, t: Tensor,
+                     offset: Tensor | None) -> Tensor:
         """`found` and what the detail network adds. In training it is always run, so that every process does the
         same."""
         sigma = self.schedule.sigma(t.double()).to(x.dtype)
@@ -103,7 +113,8 @@ class Prior(nn.Module):
         size = (sigma**2 + self.skip_std**2).sqrt()
         inward, out = (w[asked].view(-1, 1, 1, 1, 1) for w in (1 / size, reached * sigma * self.skip_std / size))
         estimate = estimate[asked]
-        answer = self.detail(inward * (x[asked] / a[asked] - estimate), estimate, t[asked].to(x.dtype))
+        answer = self.detail(inward * (x[asked] / a[asked] - estimate), estimate, t[asked].to(x.dtype),
+                             None if offset is None else offset[asked])
         return found.index_add(0, asked, out * answer.to(out))
 
     def network_inputs(self, shape: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:

@@ -127,11 +127,20 @@ class VolumeUNet(nn.Module):
             self._compiled_call_impl = None
         return self
 
-    def forward(self, x: Tensor, t: Tensor, context: Tensor) -> Tensor:
-        """x (B, C, X, Y, Z), t (B,) in [0, 1], context (B, L, D) -> (B, C, X, Y, Z)."""
+    def blocked(self, x: Tensor) -> Tensor:
+        """Voxels (B, C, X, Y, Z) folded into channels, as `fold` takes them: (B, C n^3, X/n, Y/n, Z/n), n = block."""
         n = self.block
         h = rearrange(x, "b c (x i) (y j) (z k) -> b (c i j k) x y z", i=n, j=n, k=n)
-        h = self.fold(h.contiguous(memory_format=self.memory_format))
+        return h.contiguous(memory_format=self.memory_format)
+
+    def forward(self, x: Tensor, t: Tensor, context: Tensor, offset: Tensor | None = None) -> Tensor:
+        """x (B, C, X, Y, Z), t (B,) in [0, 1], context (B, L, D) -> (B, C, X, Y, Z).
+
+        offset: (B, channels[0], X/block, ...), added to what enters the UNet; None for none.
+        """
+        n = self.block
+        h = self.fold(self.blocked(x))
+        h = h if offset is None else h + offset
         h = h + interpolate(self.hint(self.text_map(context)), h.shape[2:], mode="trilinear")
         h = self.unfold(self.unet(h, 1000 * t, context=context))
         return rearrange(h, "b (c i j k) x y z -> b c (x i) (y j) (z k)", i=n, j=n, k=n)

@@ -13,19 +13,20 @@ from torch import Tensor
 from phydict.diffusion import Denoiser
 from phydict.evaluation import method_panel, volume_metrics
 from phydict.grid import Cube
-from phydict.methods import reconstruct
-from phydict.prior import DetailNetwork, Prior, TextEncoder, VolumeUNet, describe, learn_vocabulary, load_prior
+from phydict.methods import DEFAULT_METHOD, reconstruct
+from phydict.posterior import Sampler
+from phydict.prior import DetailNetwork, Prior, Refiner, TextEncoder, VolumeUNet, describe, learn_vocabulary, load_prior
 from phydict.runtime.warning import warn
+from phydict.training.denoising import DenoisingTraining
 from phydict.training.data import PriorData
 from phydict.training.reports import learn_findings, learn_sketch
 from phydict.training.settings import Execution, PriorOptimisation, PriorValidation, TextSettings
 from phydict.training.sharding import shard
-from phydict.training.stage import StageTraining
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Ideal, Projector
 
 
-class PriorTraining(StageTraining):
+class PriorTraining(DenoisingTraining):
     """Learns a Prior, first its text, then denoising.
 
     Args:
@@ -151,13 +152,14 @@ class PriorTraining(StageTraining):
         return x0, weight[..., None, None, None]
 
 
-def reconstruction_scores(prior: Prior, ct: Tensor, views: int, seed: int) -> dict[str, float]:
-    """SSIM, PSNR (dB) and MAE (HU) of phydict_fast's reconstruction, without a report, from ideal X-rays of a CT
+def reconstruction_scores(prior: Prior | Refiner, ct: Tensor, views: int, seed: int,
+                          method: str | Sampler = DEFAULT_METHOD) -> dict[str, float]:
+    """SSIM, PSNR (dB) and MAE (HU) of a method's reconstruction, without a report, from ideal X-rays of a CT
     (1, 1, X, Y, Z) in the prior's range, on an orbit that is the benchmarks' where the cube has 384 mm."""
     scale = prior.grid.shape[0] * prior.grid.spacing[0] / 384
     beam = ConeBeam.orbit(views, 1020 * scale, 740 * scale, (448, 448), 1.25 * scale)
     exact = Projector(prior.grid, beam, device=ct.device, full_detector=True)
-    found = reconstruct(Ideal()(exact, prior.window.to_mu(ct), seed)[0], beam, prior, seed=seed)
+    found = reconstruct(Ideal()(exact, prior.window.to_mu(ct), seed)[0], beam, prior, method, seed=seed)
     return volume_metrics(found.volume[None, None], prior.window.to_hu(ct))
 
 

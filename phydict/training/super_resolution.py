@@ -12,12 +12,12 @@ from phydict.diffusion import Denoiser
 from phydict.evaluation import method_panel
 from phydict.grid import Cube, Grid
 from phydict.prior import LocalUNet, SuperResolution, describe_super_resolution, load_super_resolution
+from phydict.training.denoising import DenoisingTraining
 from phydict.training.settings import Optimisation, Previews
-from phydict.training.stage import StageTraining
 from phydict.units import HUWindow
 
 
-class SuperResolutionTraining(StageTraining):
+class SuperResolutionTraining(DenoisingTraining):
     """Learns a SuperResolution from crops; a crop's block means are its coarse volume.
 
     Args:

@@ -33,7 +33,8 @@ from phydict.runtime.precision import trainer_precision
 from phydict.training.prior import PriorTraining, reconstruction_scores
 from phydict.training.data import PriorData
 from phydict.training.settings import HoldOut, Loading, PriorOptimisation, TextSettings
-from phydict.training.stage import CHECKPOINT, denoising_errors
+from phydict.training.denoising import denoising_errors
+from phydict.training.stage import CHECKPOINT
 
 FILE = Path(__file__).with_suffix(".csv")
 HELD_OUT_CT = "LIDC-IDRI-0004"

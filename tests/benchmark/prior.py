@@ -18,7 +18,7 @@ from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM
 from phydict.evaluation import write_csv
 from phydict.prior import Prior
 from phydict.prior.files import DEFAULT_PRIOR
-from phydict.training.stage import NOISE_LEVELS, denoising_errors
+from phydict.training.denoising import NOISE_LEVELS, denoising_errors
 
 
 def errors(name: str, prior: Prior, cts: list) -> list[dict]:

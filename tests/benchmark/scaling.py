@@ -13,7 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from phydict.evaluation import read_csv, write_csv
-from phydict.training.stage import NOISE_LEVELS
+from phydict.training.denoising import NOISE_LEVELS
 
 FILE = Path(__file__)
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from phydict.diffusion import Denoiser, ddim
 from phydict.diffusion.steps import Generators
+from phydict.prior import DEFAULT_PRIOR
 
 if TYPE_CHECKING:
     from phydict.posterior.measurement import Measurement
@@ -17,11 +18,14 @@ if TYPE_CHECKING:
 class Sampler(ABC):
     """Settings of a sampling method; `sample` turns noise into a clean state.
 
-    full_detector, citation: as for a Reconstructor. batches: whether the states of a batch do not influence each other,
+    full_detector, citation: as for a Reconstructor. default_prior: the file of its network where none is given;
+    needs_refiner: whether that is a Refiner. batches: whether the states of a batch do not influence each other,
     so that several samples may be drawn at once, with one generator for each.
     """
 
     full_detector = False
+    default_prior = DEFAULT_PRIOR
+    needs_refiner = False
     citation = ""
     batches = False
 

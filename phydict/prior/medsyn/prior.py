@@ -58,6 +58,11 @@ class MedSynPrior(nn.Module):
         self.network, self.text, self.load_text, self.grid = network, text, load_text, grid
 
     @property
+    def reads_text(self) -> bool:
+        """As for a Prior."""
+        return self.text is not None or self.load_text is not None
+
+    @property
     def null(self) -> Tensor:
         """The learned context (1, L, D) of no report."""
         return self.network.null_cond_emb

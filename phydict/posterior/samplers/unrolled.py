@@ -1,0 +1,77 @@
+"""A few calls of a refiner, a network that sees the X-rays, each followed by a likelihood step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from phydict.diffusion.steps import Generators
+from phydict.posterior.evidence import Evidence
+from phydict.posterior.likelihood.likelihood import LikelihoodStep, ProximalCG
+from phydict.posterior.measurement import Measurement
+from phydict.posterior.samplers.sampler import Sampler
+from phydict.prior import DEFAULT_REFINER, BoundRefiner
+
+
+@dataclass(frozen=True)
+class Unrolled(Sampler):
+    """z = start(mean); then for each time: x0 = refine(z, evidence), z = likelihood(x0). Deterministic.
+
+    times: labels in (0, 1) under which the refiner's network takes each z, as if it were a noisy state of that time;
+    x0_stds: standard deviation of the error of each x0, in the prior's range, that of the mean first; start,
+    likelihood, final_likelihood: the steps towards the X-rays, first, between the calls and last.
+    """
+
+    citation = ("Adler & Oktem, Learned Primal-Dual Reconstruction, IEEE Transactions on Medical Imaging 37(6), 2018, "
+                "doi:10.1109/TMI.2018.2799231")
+
+    times: tuple[float, ...] = (0.35, 0.25, 0.15)
+    x0_stds: tuple[float, ...] = (0.5, 0.3, 0.3, 0.3)
+    start: LikelihoodStep = ProximalCG(10, 3, tv_weight=10.0, tv_eps=0.003)
+    likelihood: LikelihoodStep = ProximalCG(10, 3, tv_weight=5.0, tv_eps=0.003)
+    final_likelihood: LikelihoodStep = ProximalCG(10, 4, weighted_least_squares=True, tv_weight=5.0, tv_eps=0.003)
+    default_prior = DEFAULT_REFINER
+    needs_refiner = True
+
+    def __post_init__(self):
+        if not self.times or not all(0 < t < 1 for t in self.times):
+            raise ValueError(f"times are one or more numbers between 0 and 1, but {self.times} was given")
+        if len(self.x0_stds) != len(self.times) + 1 or not all(std > 0 for std in self.x0_stds):
+            raise ValueError(f"x0_stds are {len(self.times) + 1} numbers above 0, one more than times, but "
+                             f"{self.x0_stds} was given")
+
+    def steps(self) -> int:
+        return len(self.times) + 1
+
+    def estimates(self, refiner: BoundRefiner, measurement: Measurement,
+                  on_step: Callable[[], None] = lambda: None) -> Iterator[Tensor]:
+        """What the refiner answers at each call, and at last the result. Gradients do not pass from call to call."""
+        before = refiner.mean.to(measurement.y)
+        evidence = Evidence(measurement)
+        measurement.match_gain_offset(before[:, :1])
+        z = start = self._meet(self.start, measurement, before, self.x0_stds[0])
+        on_step()
+        for n, t in enumerate(self.times):
+            channels = evidence(z[:, :1], before[:, :1], start[:, :1])
+            signal = float(refiner.schedule.scales(t)[0])
+            x0 = refiner.refine(signal * z, t, channels)
+            yield x0
+            before = x0.detach().clamp(-1, 1)
+            measurement.match_gain_offset(before[:, :1])
+            last = n + 1 == len(self.times)
+            z = self._meet(self.final_likelihood if last else self.likelihood, measurement, before,
+                           self.x0_stds[n + 1])
+            on_step()
+        yield z
+
+    @staticmethod
+    def _meet(step: LikelihoodStep, measurement: Measurement, x0: Tensor, x0_std: float) -> Tensor:
+        return torch.cat([step(measurement, x0[:, :1], x0_std).clamp(-1, 1), x0[:, 1:]], 1)
+
+    def sample(self, denoiser: BoundRefiner, measurement: Measurement, x: Tensor, generator: Generators,
+               on_step: Callable[[], None] = lambda: None) -> Tensor:
+        *_, z = self.estimates(denoiser, measurement, on_step)
+        return z

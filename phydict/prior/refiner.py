@@ -1,0 +1,113 @@
+"""A prior's denoiser that sees the X-rays: it takes what they say of each voxel beside the state."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from phydict.diffusion import CosineSchedule
+from phydict.grid import Grid
+from phydict.prior.prior import Prior
+from phydict.runtime.precision import network_precision
+from phydict.units import HUWindow
+
+EVIDENCE_CHANNELS = 5
+"""Channels of the evidence (see phydict.posterior.evidence)."""
+
+GATE_WIDTH = 16
+
+
+class Refiner(nn.Module):
+    """One call of an unrolled reconstruction: state and evidence in, clean state out.
+
+    x0 = p + g (x_t / a - p) with p = prior(x_t, t, context), where linear maps of the evidence (B, EVIDENCE_CHANNELS,
+    X, Y, Z) are added at the entrance of its network and of its detail network. The gate g, of evidence and time, says
+    of each voxel how much of the CT is kept as it is; masks are not gated. Maps and gate start at zero, so that an
+    untrained refiner is its prior. Unrolled networks: Adler & Oktem 2018, doi:10.1109/TMI.2018.2799231.
+
+    prior: whose weights are trained on; it needs a detail network. mean: the state (C, X, Y, Z) that an unrolled
+    reconstruction starts from.
+    """
+
+    ends_at_zero = False
+
+    def __init__(self, prior: Prior, mean: Tensor):
+        super().__init__()
+        if prior.detail is None:
+            raise ValueError("a refiner needs a prior with a detail network, but this one has none: give another prior")
+        self.prior = prior
+        block, width = prior.network.block, prior.network.settings["channels"][0]
+        self.entrance = nn.Conv3d(EVIDENCE_CHANNELS * block**3, width, 1)
+        self.detail_entrance = nn.Conv3d(EVIDENCE_CHANNELS, prior.detail.settings["width"], 3, padding=1)
+        self.gate = nn.Sequential(nn.Conv3d(EVIDENCE_CHANNELS + 1, GATE_WIDTH, 1), nn.SiLU(),
+                                  nn.Conv3d(GATE_WIDTH, 1, 1))
+        for layer in (self.entrance, self.detail_entrance, self.gate[-1]):
+            nn.init.zeros_(layer.weight)
+            nn.init.zeros_(layer.bias)
+        self.detail_entrance.to(memory_format=torch.channels_last_3d)
+        self.register_buffer("mean", mean)
+
+    @property
+    def grid(self) -> Grid:
+        return self.prior.grid
+
+    @property
+    def window(self) -> HUWindow:
+        return self.prior.window
+
+    @property
+    def schedule(self) -> CosineSchedule:
+        return self.prior.schedule
+
+    @property
+    def state_channels(self) -> int:
+        return self.prior.state_channels
+
+    @property
+    def reads_text(self) -> bool:
+        """As for a Prior."""
+        return self.prior.reads_text
+
+    def forward(self, x: Tensor, t: Tensor, context: Tensor, evidence: Tensor) -> Tensor:
+        """Clean estimate of the state x (B, C, X, Y, Z) at times t (B,), in x's dtype."""
+        evidence = evidence.to(x.dtype)
+        x0 = self.prior(x, t, context, (self.entrance(self.prior.network.blocked(evidence)),
+                                        self.detail_entrance(evidence)))
+        a, t = self.schedule.scales(t.double())[0].to(x.dtype), t.to(x.dtype)
+        kept = self.gate(torch.cat([evidence, t.view(-1, 1, 1, 1, 1).expand_as(evidence[:, :1])], 1)).to(x.dtype)
+        ct = x0[:, :1] + kept * (x[:, :1] / a.view(-1, 1, 1, 1, 1) - x0[:, :1])
+        return torch.cat([ct, x0[:, 1:]], 1)
+
+    @torch.no_grad()
+    def bind(self, report: str = "", guidance: float = 1.0, precision: str = "auto") -> BoundRefiner:
+        """The refiner of one report. guidance: 1, since the X-rays guide. Otherwise as for a Prior."""
+        if guidance != 1:
+            raise ValueError(f"a refiner is guided by the X-rays alone, but a guidance scale of {guidance} was given: "
+                             "leave it at 1, or use phydict_fast")
+        return BoundRefiner(self, self.prior.bind(report, 1.0, precision).context, precision)
+
+
+@dataclass(frozen=True)
+class BoundRefiner:
+    """A refiner with its context fixed."""
+
+    refiner: Refiner
+    context: Tensor
+    precision: str = "auto"
+
+    @property
+    def schedule(self) -> CosineSchedule:
+        return self.refiner.schedule
+
+    @property
+    def mean(self) -> Tensor:
+        """The state (1, C, X, Y, Z) to start from."""
+        return self.refiner.mean[None]
+
+    def refine(self, x: Tensor, t: float, evidence: Tensor) -> Tensor:
+        """The clean state of x (B, C, X, Y, Z) at time t, given the evidence (B, EVIDENCE_CHANNELS, X, Y, Z)."""
+        times = torch.full((len(x),), float(t), device=x.device)
+        with torch.set_grad_enabled(self.refiner.training), network_precision(self.precision, x):
+            return self.refiner(x, times, self.context.expand(len(x), -1, -1), evidence)

@@ -1,0 +1,103 @@
+"""Training a refiner on the states of its own unrolled reconstructions."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from phydict.grid import Cube
+from phydict.posterior import Unrolled
+from phydict.prior import DEFAULT_PRIOR, Prior, Refiner, describe_refiner, load_prior
+from phydict.training.prior import reconstruction_scores
+from phydict.training.scenes import Scenes
+from phydict.training.settings import Optimisation
+from phydict.training.stage import StageTraining
+from phydict.units import HUWindow
+
+MEAN_DRAWS = 4
+"""Noise draws over which the prior's estimate at time 1 is averaged."""
+
+
+class RefinerTraining(StageTraining):
+    """Learns a Refiner: at each call of its own reconstruction, the logarithm of the CT's mean squared error.
+
+    The logarithm weighs a dB alike at all numbers of views. What the calls start from, and the likelihood steps between
+    them, are those of `method`; no gradient passes through them.
+
+    Args:
+        method: the unrolled reconstruction whose calls are learnt
+        scenes: the X-rays that are drawn for it
+        cube: of voxels
+        window: HU that the prior's range [-1, 1] stands for
+        optimisation: how the weights are learnt
+        validation_views: numbers of views from which validation reconstructs each held-out case
+        body_weight: how many times more a voxel of the body counts than one of air, plus 1
+        mask_weight: weight of the anatomy masks' error beside the CT's
+        initial: a prior's file to begin with, or a refiner's to go on from
+        seed: of scenes and noise
+    """
+
+    def __init__(self, method: Unrolled = Unrolled(), scenes: Scenes = Scenes(), cube: Cube = Cube(),
+                 window: tuple[float, float] = (-1000.0, 1000.0), optimisation: Optimisation = Optimisation(),
+                 validation_views: list[int] | None = None, body_weight: float = 2.0, mask_weight: float = 0.1,
+                 initial: str = str(DEFAULT_PRIOR), seed: int = 0):
+        found = load_prior(initial)
+        if not isinstance(found, Prior | Refiner):
+            raise ValueError(f"a refiner begins with a prior of phydict's own, but {initial} is MedSyn's: give another "
+                             "model.initial")
+        if not found.grid.same_as(cube.grid()) or found.window != HUWindow(*window):
+            raise ValueError(f"the prior {initial} has another grid or HU window than this training: "
+                             "set model.cube and model.window to its own")
+        refiner = found if isinstance(found, Refiner) else Refiner(found, _mean(found))
+        super().__init__(refiner.train().requires_grad_(True), optimisation, seed)
+        if refiner.prior.load_text is not None:
+            refiner.prior.text = refiner.prior.load_text()
+        self.method, self.scenes, self.body_weight, self.mask_weight = method, scenes, body_weight, mask_weight
+        self.validation_views = validation_views or [2, 8]
+
+    def batch_loss(self, batch: dict, key: tuple[int, ...] = (0,), rank: int = 0, processes: int = 1) -> Tensor:
+        losses = []
+        for n in range(len(batch["volume"])):
+            rng = np.random.default_rng((*key, rank + n * processes))
+            case = {name: value[n:n + 1] for name, value in batch.items()}
+            losses.append(self._case_loss(case, rng))
+        return torch.stack(losses).mean()
+
+    def _case_loss(self, case: dict, rng: np.random.Generator) -> Tensor:
+        ct, masks = case["volume"], 2 * case["masks"] - 1
+        measurement = self.scenes.measure(ct, rng, self.prior.grid, self.prior.window)
+        weight = 1 + self.body_weight * (ct > -0.9)
+        weight = weight / weight.mean()
+        bound = self.prior.bind(case["report"][0] if self.prior.prior.text is not None else "")
+        calls = len(self.method.times)
+        losses = []
+        for x0, _ in zip(self.method.estimates(bound, measurement), range(calls)):
+            loss = ((weight * (x0[:, :1] - ct).square()).mean() + 2e-5).log()
+            if bool(case["has_masks"].any()) and self.prior.state_channels > 1:
+                loss = loss + self.mask_weight * ((x0[:, 1:] - masks).square().mean() + 1e-4).log()
+            losses.append(loss)
+        return torch.stack(losses).mean()
+
+    def validation_step(self, batch: dict, index: int) -> None:
+        scores = []
+        with torch.autocast(self.device.type, enabled=False):
+            for views in self.validation_views:
+                found = reconstruction_scores(self.prior, batch["volume"], views, index, self.method)
+                self.log(f"val/psnr_{views}", found["psnr"], sync_dist=True, batch_size=1)
+                scores.append(found)
+        for name in ("psnr", "ssim"):
+            mean = float(np.mean([found[name] for found in scores]))
+            self.log(f"val/{name}", mean, prog_bar=name == "psnr", sync_dist=True, batch_size=1)
+        self.log("samples", float(self.samples), rank_zero_only=True, batch_size=1)
+
+    def _describe(self) -> dict:
+        return describe_refiner(self.prior)
+
+
+@torch.no_grad()
+def _mean(prior: Prior) -> Tensor:
+    """The state (C, X, Y, Z) that a prior expects at time 1, where there is nothing but noise."""
+    noise = torch.randn(MEAN_DRAWS, prior.state_channels, *prior.grid.shape, generator=torch.Generator().manual_seed(0))
+    denoiser = prior.bind(precision="float32")
+    return torch.stack([denoiser.denoise(one[None], 1.0)[0].clamp(-1, 1) for one in noise]).mean(0)

@@ -1,0 +1,86 @@
+"""X-ray scenes to learn from: geometry, noise and model errors, drawn at random."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from phydict.grid import Grid
+from phydict.posterior import Measurement
+from phydict.units import HUWindow
+from phydict.xray import ConeBeam, Projector
+
+REACH = 1.48
+"""Least distance from the isocentre to source and detector, over half the grid's side: their planes miss the grid."""
+
+
+@dataclass(frozen=True)
+class Scenes:
+    """From which scenes a refiner learns. Lengths are those of a grid of 384 mm and scale with the grid.
+
+    Args:
+        most_views: views, drawn log-uniformly from 1 on
+        orbit: share of full orbits from angle 0, as the benchmarks use; half as many again start anywhere
+        arc: share of limited arcs, of 40 to 220 degrees; the rest has views at irregular angles
+        varied: share of scenes whose distances, pixels and detector place differ from the benchmarks'
+        noise: least and most standard deviation of the noise, as a share of the largest line integral
+        model_error: share of scenes with beam hardening and a scale that is off by up to 2 %
+    """
+
+    most_views: int = 32
+    orbit: float = 0.5
+    arc: float = 0.15
+    varied: float = 0.4
+    noise: tuple[float, float] = (5e-4, 0.02)
+    model_error: float = 0.3
+
+    def __post_init__(self):
+        if not 1 <= self.most_views <= 1000:
+            raise ValueError(f"model.scenes.most_views lies between 1 and 1000, but {self.most_views} was given")
+        for name in ("orbit", "arc", "varied", "model_error"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"model.scenes.{name} is a share in [0, 1], but {getattr(self, name)} was given")
+        if 1.5 * self.orbit + self.arc > 1:
+            raise ValueError("model.scenes has 1.5 orbit + arc of at most 1, but orbit "
+                             f"{self.orbit} and arc {self.arc} were given")
+        if not 0 < self.noise[0] <= self.noise[1] < 1:
+            raise ValueError(f"model.scenes.noise is two shares, 0 < least <= most < 1, but {self.noise} was given")
+
+    def beam(self, rng: np.random.Generator, grid: Grid) -> ConeBeam:
+        """A geometry whose detector has about the resolution of the grid."""
+        scale, side = grid.extent[0] / 384, grid.shape[0]
+        views = int(np.clip(round(self.most_views ** rng.random()), 1, self.most_views))
+        source, centre, pixel, pixels, shift = 1020.0, 740.0, 5.0 * 64 / side, 112 * side // 64, 0.0
+        if rng.random() < self.varied:
+            source = rng.uniform(950, 1400)
+            centre = np.clip(source * rng.uniform(0.55, 0.75), REACH * 192, source - REACH * 192)
+            pixel *= rng.uniform(0.8, 1.2)
+            pixels = int(rng.uniform(0.65, 1.15) * pixels)
+            shift = rng.uniform(-0.25, 0.25) * (rng.random() < 0.3)
+        kind, start = rng.random(), rng.uniform(0, 2 * math.pi)
+        geometry = source * scale, centre * scale, (pixels, pixels), pixel * scale
+        if kind < 1.5 * self.orbit:
+            beam = ConeBeam.orbit(views, *geometry, start=0.0 if kind < self.orbit else start)
+        elif kind < 1.5 * self.orbit + self.arc:
+            beam = ConeBeam.orbit(views, *geometry, start=start, arc=math.radians(rng.uniform(40, 220)))
+        else:
+            beam = ConeBeam.orbit(360, *geometry).select(np.sort(rng.choice(360, views, replace=False)))
+        if not shift:
+            return beam
+        return ConeBeam(beam.sources, beam.detectors + shift * pixels * beam.u, beam.u, beam.v, beam.shape)
+
+    def measure(self, ct: Tensor, rng: np.random.Generator, grid: Grid, window: HUWindow) -> Measurement:
+        """X-rays of a CT (1, 1, X, Y, Z) in the prior's range, as a measurement of a drawn scene."""
+        projector = Projector(grid, self.beam(rng, grid), full_detector=True)
+        y = projector(window.to_mu(ct))
+        if rng.random() < self.model_error:
+            hardened = rng.uniform(0, 0.02) * y * (0.7 * float(y.max()) - y) / 2
+            y = (1 + rng.uniform(-0.02, 0.02)) * (y + hardened)
+        low, high = np.log(self.noise)
+        noise = 0.005 if rng.random() < 0.4 else math.exp(rng.uniform(low, high))
+        y = y + noise * y.max() * torch.from_numpy(rng.standard_normal(tuple(y.shape))).to(y)
+        return Measurement(projector, y[0], window)

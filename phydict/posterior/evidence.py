@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from phydict.posterior.measurement import Measurement
+from phydict.xray import Projector
 
 RESIDUAL_SCALE, CHANGE_SCALE, COVERAGE_SCALE = 10.0, 2.0, 0.2
 """Factors that bring the channels to a size near 1."""
@@ -44,12 +46,12 @@ class Evidence:
                           CHANGE_SCALE * (start - z), self.noise], 1)
 
 
-def views_seen(projector, seen: Tensor) -> Tensor:
+def views_seen(projector: Projector, seen: Tensor) -> Tensor:
     """How many views see each voxel, of A' 1: a view that sees the grid's centre gives it the volume of a voxel over
     the area of a pixel there."""
     beam, grid = projector.beam, projector.grid
-    to_detector = torch.as_tensor(beam.detectors - beam.sources)
-    depth = ((torch.as_tensor(grid.centre - beam.sources) * to_detector).sum(1) / to_detector.square().sum(1))
-    area = torch.as_tensor(beam.u).norm(dim=1) * torch.as_tensor(beam.v).norm(dim=1) * depth.square()
-    each = float(torch.tensor(grid.spacing).prod() / area.mean())
+    to_detector = beam.detectors - beam.sources
+    depth = ((grid.centre - beam.sources) * to_detector).sum(1) / (to_detector**2).sum(1)
+    area = (beam.u**2).sum(1) ** 0.5 * (beam.v**2).sum(1) ** 0.5 * depth**2
+    each = float(np.prod(grid.spacing) / area.mean())
     return (seen / each).clamp(0, beam.views)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor, nn
 from phydict.diffusion import CosineSchedule
 from phydict.grid import Grid
 from phydict.prior.prior import Prior
+from phydict.prior.unet import VolumeUNet
 from phydict.runtime.precision import network_precision
 from phydict.units import HUWindow
 
@@ -64,6 +66,14 @@ class Refiner(nn.Module):
     @property
     def state_channels(self) -> int:
         return self.prior.state_channels
+
+    @property
+    def network(self) -> VolumeUNet:
+        return self.prior.network
+
+    def network_inputs(self, shape: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
+        """As for a Prior."""
+        return self.prior.network_inputs(shape)
 
     @property
     def reads_text(self) -> bool:

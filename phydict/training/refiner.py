@@ -54,7 +54,7 @@ class RefinerTraining(StageTraining):
         if refiner.prior.load_text is not None:
             refiner.prior.text = refiner.prior.load_text()
         self.method, self.scenes, self.body_weight, self.mask_weight = method, scenes, body_weight, mask_weight
-        self.validation_views = validation_views or [2, 8]
+        self.validation_views, self.calls = validation_views or [2, 8], len(method.times)
 
     def batch_loss(self, batch: dict, key: tuple[int, ...] = (0,), rank: int = 0, processes: int = 1) -> Tensor:
         losses = []
@@ -70,9 +70,8 @@ class RefinerTraining(StageTraining):
         weight = 1 + self.body_weight * (ct > -0.9)
         weight = weight / weight.mean()
         bound = self.prior.bind(case["report"][0] if self.prior.prior.text is not None else "")
-        calls = len(self.method.times)
         losses = []
-        for x0, _ in zip(self.method.estimates(bound, measurement), range(calls)):
+        for x0, _ in zip(self.method.estimates(bound, measurement), range(self.calls)):
             loss = ((weight * (x0[:, :1] - ct).square()).mean() + 2e-5).log()
             if bool(case["has_masks"].any()) and self.prior.state_channels > 1:
                 loss = loss + self.mask_weight * ((x0[:, 1:] - masks).square().mean() + 1e-4).log()

@@ -21,7 +21,12 @@ CHECKPOINT = "last.ckpt"
 
 
 class StageTraining(lightning.LightningModule, ABC):
-    """Learns one stage, its network `self.prior`, by the loss of a batch (`batch_loss`)."""
+    """Learns one stage, its network `self.prior`, by the loss of a batch (`batch_loss`).
+
+    calls: of the network, forward and backward, that a sample costs.
+    """
+
+    calls = 1
 
     def __init__(self, prior: Prior | SuperResolution | Refiner, optimisation: Optimisation, seed: int):
         super().__init__()

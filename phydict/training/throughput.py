@@ -39,7 +39,7 @@ class Throughput(lightning.Callback):
         self.began, self.flop = None, 0
 
     def _tell_costs(self, trainer, module, shape: tuple[int, ...]) -> None:
-        self.flop = sample_flop(module.prior, shape)
+        self.flop = module.calls * sample_flop(module.prior, shape)
         low = torch.bfloat16 if "bf16" in str(trainer.precision) else torch.float32
         precision, instructions = str(low).removeprefix("torch."), instruction_set(module.device)
         if self.peak is None:

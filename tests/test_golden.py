@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 
 import pytest
 import torch
-from prior.tiny import tiny_prior, tiny_super_resolution
+from prior.tiny import tiny_prior, tiny_refiner, tiny_super_resolution
 from test_training import arguments, losses
 
 from phydict.ablation.summary import entries
@@ -55,7 +55,8 @@ def method(name: str) -> Sampler:
 def on_the_tiny_grid(name: str, dtype: torch.dtype, scene: str = "plain") -> dict:
     """Figures of a method in 16^3 voxels, from line integrals (plain) or display values, with a report, of several
     samples, or in two stages, of which the second is computed in single precision alone."""
-    chosen, prior = method(name), tiny_prior(detail=True).to(dtype)
+    chosen = method(name)
+    prior = (tiny_refiner() if getattr(chosen, "needs_refiner", False) else tiny_prior(detail=True)).to(dtype)
     if scene == "cascade":
         chosen = CascadePosterior(Cascade(prior, tiny_super_resolution().to(dtype)), chosen, precision="float32")
     elif isinstance(chosen, Sampler):

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import torch
-from prior.tiny import tiny_prior, tiny_super_resolution
+from prior.tiny import tiny_for, tiny_prior, tiny_super_resolution
 
 from phydict.baselines import SIRT
 from phydict.diffusion import GaussianDenoiser
@@ -135,7 +135,7 @@ def test_bad_arguments_are_one_sentence(change, sentence):
 
 @pytest.mark.parametrize("name", METHODS)
 def test_every_method_names_its_publication(name):
-    ready = reconstructor(name, tiny_prior(False))
+    ready = reconstructor(name, tiny_for(name, text=False))
     year = [word for word in ready.citation.replace(",", " ").split() if word.isdigit() and 1900 < int(word) < 2030]
     assert year and ready.citation.split(",")[0]
 

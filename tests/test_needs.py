@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 from posterior.test_posterior import BEAM, views
-from prior.tiny import REPORTS, tiny_prior
+from prior.tiny import REPORTS, tiny_for, tiny_prior
 
 from phydict import METHODS, ConeBeam, Grid, reconstruct
 from phydict.methods import fit_to_grid, reconstructor
@@ -113,7 +113,8 @@ def reduced(method: Sampler) -> Sampler:
     return method
 
 
-@pytest.mark.parametrize("name", [name for name, method in METHODS.items() if isinstance(method, Sampler)])
+@pytest.mark.parametrize("name", [name for name, method in METHODS.items()
+                                  if isinstance(method, Sampler) and not method.needs_refiner])
 def test_gradients_are_recorded_inside_the_likelihood_step_alone(name, monkeypatch):
     sampler, prior, projected = reduced(METHODS[name]), Watched(tiny_prior()), []
     through = Projector.__call__
@@ -128,7 +129,7 @@ def test_gradients_are_recorded_inside_the_likelihood_step_alone(name, monkeypat
 def test_the_detector_is_binned_to_the_grid_unless_a_method_wants_every_pixel():
     beam = ConeBeam.orbit(2, 1020, 740, (448, 448), 1.25)
     for name, method in METHODS.items():
-        ready = reconstructor(method, tiny_prior())
+        ready = reconstructor(method, tiny_for(method))
         xrays, projector = fit_to_grid(ready, Grid.cube(16), torch.zeros(2, 448, 448), beam)
         full = isinstance(ready, Posterior) and ready.sampler.full_detector
         assert (xrays.shape[-1] == 448) == full == (projector.beam.shape == (448, 448)), name

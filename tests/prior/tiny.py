@@ -9,7 +9,11 @@ import torch
 from transformers import BertConfig, BertForMaskedLM
 
 from phydict.grid import Grid
-from phydict.prior import DetailNetwork, LocalUNet, Prior, SuperResolution, TextEncoder, VolumeUNet, learn_vocabulary
+from phydict.methods import METHODS
+from phydict.posterior import Sampler
+from phydict.prior import (
+    DetailNetwork, LocalUNet, Prior, Refiner, SuperResolution, TextEncoder, VolumeUNet, learn_vocabulary)
+from phydict.reconstruction import Reconstructor
 from phydict.units import HUWindow
 
 REPORTS = ["Small nodule in the left upper lobe.", "No focal consolidation; cardiomegaly.",
@@ -30,6 +34,23 @@ def tiny_prior(text: bool = True, voxels: int = 16, seed: int = 0, detail: bool 
         prior = Prior(network, Grid.cube(voxels), HUWindow(-1000, 600), encoder, detail=details)
         torch.nn.init.normal_(prior.null)
     return prior.eval().requires_grad_(False)
+
+
+def tiny_refiner(text: bool = True, voxels: int = 16, seed: int = 0, untrained: bool = False) -> Refiner:
+    """A refiner of `tiny_prior`, whose entrances and gate answer to the evidence unless it is to be untrained."""
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        refiner = Refiner(tiny_prior(text, voxels, seed, True), 0.3 * torch.randn(4, voxels, voxels, voxels))
+        for layer in (refiner.entrance, refiner.detail_entrance, refiner.gate[-1]):
+            if not untrained:
+                torch.nn.init.normal_(layer.weight, std=0.2)
+    return refiner.eval().requires_grad_(False)
+
+
+def tiny_for(method: str | Sampler | Reconstructor, **settings) -> Prior | Refiner:
+    """What a method needs: a `tiny_refiner`, else a `tiny_prior`."""
+    method = METHODS[method] if isinstance(method, str) else method
+    return tiny_refiner(**settings) if getattr(method, "needs_refiner", False) else tiny_prior(**settings)
 
 
 def tiny_super_resolution(voxels: int = 32, factor: int = 2, seed: int = 0, **settings) -> SuperResolution:

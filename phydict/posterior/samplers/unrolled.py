@@ -50,8 +50,8 @@ class Unrolled(Sampler):
                   on_step: Callable[[], None] = lambda: None) -> Iterator[Tensor]:
         """What the refiner answers at each call, and at last the result. Gradients do not pass from call to call."""
         before = refiner.mean.to(measurement.y)
-        evidence = Evidence(measurement)
         measurement.match_gain_offset(before[:, :1])
+        evidence = Evidence(measurement)
         z = start = self._meet(self.start, measurement, before, self.x0_stds[0])
         on_step()
         for n, t in enumerate(self.times):

@@ -1,0 +1,163 @@
+"""The unrolled reconstruction: its prior's own where nothing is learnt, and what its evidence says."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from prior.tiny import tiny_prior, tiny_refiner
+
+from phydict.diffusion import renoise
+from phydict.grid import Grid
+from phydict.methods import METHODS, reconstruct, reconstructor
+from phydict.posterior import Measurement, Posterior, PriorOnly, ProximalCG, SplitGibbs, Unrolled
+from phydict.posterior.evidence import CHANGE_SCALE, COVERAGE_SCALE, RESIDUAL_SCALE, Evidence
+from phydict.prior import Prior, Refiner, load_prior, save_prior, save_refiner
+from phydict.units import HUWindow
+from phydict.xray import ConeBeam, Projector
+
+GRID, WINDOW = Grid.cube(16), HUWindow(-1000, 600)
+ORBIT = ConeBeam.orbit(3, 1020, 740, (28, 28), 20.0)
+OTHERS = {
+    "one view": ConeBeam.orbit(1, 1020, 740, (28, 28), 20.0),
+    "33 views": ConeBeam.orbit(33, 1020, 740, (28, 28), 20.0),
+    "an arc of 60 degrees": ConeBeam.orbit(5, 1020, 740, (28, 28), 20.0, arc_degrees=60),
+    "a detector that cuts the body": ConeBeam.orbit(4, 1020, 740, (10, 12), 20.0),
+    "half a fan": ConeBeam(ORBIT.sources, ORBIT.detectors + 10 * ORBIT.u, ORBIT.u, ORBIT.v, ORBIT.shape)}
+
+
+def block() -> torch.Tensor:
+    """Soft tissue with a hollow, in air: (1, 1, 16, 16, 16) in the prior's range."""
+    hu = torch.full((1, 1, *GRID.shape), -1000.0)
+    hu[:, :, 3:13, 4:12, 2:14] = 40
+    hu[:, :, 5:8, 6:10, 5:11] = -800
+    return WINDOW.to_range(hu)
+
+
+def measured(beam: ConeBeam = ORBIT, dtype: torch.dtype = torch.float32, noise: float = 0.0) -> Measurement:
+    projector = Projector(GRID, beam, full_detector=True)
+    y = projector(WINDOW.to_mu(block().double()))
+    y = y + noise * y.max() * torch.randn(y.shape, generator=torch.Generator().manual_seed(0), dtype=y.dtype)
+    return Measurement(projector, y[0].to(dtype), WINDOW)
+
+
+def test_an_untrained_refiner_is_its_prior_to_the_last_digit():
+    refiner = tiny_refiner(untrained=True)
+    x, t = torch.randn(1, 4, *GRID.shape), torch.tensor([0.3])
+    context, evidence = refiner.prior.null, torch.randn(1, 5, *GRID.shape)
+    assert torch.equal(refiner(x, t, context, evidence), refiner.prior(x, t, context))
+    assert not torch.equal(tiny_refiner()(x, t, context, evidence), refiner.prior(x, t, context))
+
+
+@torch.no_grad()
+def test_an_untrained_refiner_reconstructs_as_split_gibbs_without_noise_does():
+    """From the state that the first likelihood step leaves, at the same times with the same steps."""
+    refiner, m = tiny_refiner(untrained=True), measured()
+    step = ProximalCG(4, 2, tv_weight=5.0)
+    method = Unrolled((0.4, 0.2), (0.5, 0.3, 0.3), step, step, step)
+    *_, result = method.estimates(refiner.bind(precision="float32"), m)
+
+    class Levels(SplitGibbs):
+        def times(self, denoiser):
+            return [(0.4, 0.2), (0.2, 0.0)]
+
+        def x0_std(self, denoiser, t):
+            return 0.3
+
+    mean = refiner.mean[None]
+    z = torch.cat([step(m, mean[:, :1], 0.5).clamp(-1, 1), mean[:, 1:]], 1)
+    sampler = Levels(iterations=2, likelihood=step, final_likelihood=step, noise_fraction=0.0)
+    x = renoise(refiner.schedule, z, 0.4, torch.zeros_like(z))
+    again = sampler.sample(refiner.prior.bind(precision="float32"), m, x, torch.Generator())
+    torch.testing.assert_close(result, again, atol=1e-5, rtol=0)
+
+
+def test_views_in_another_order_give_the_same_volume():
+    refiner, y, order = tiny_refiner(), measured(noise=0.01).y[0], [2, 0, 1]
+    both = [reconstruct(xrays, beam, refiner, "phydict_learned", precision="float32").volume
+            for xrays, beam in ((y, ORBIT), (y[order], ORBIT.select(order)))]
+    assert (both[0] - both[1]).abs().max() < 0.5
+
+
+@pytest.mark.parametrize("beam", OTHERS.values(), ids=OTHERS)
+def test_any_number_of_views_and_any_geometry_is_reconstructed_within_the_bounds(beam):
+    found = reconstruct(measured(beam).y[0], beam, tiny_refiner(), "phydict_learned", precision="float32")
+    assert found.volume.isfinite().all() and found.volume.min() >= -1000 and found.volume.max() <= 600
+    assert found.network_calls == 3
+    assert found.misfit < 0.05  # an untrained network's estimates are met by the likelihood steps all the same
+
+
+def test_the_result_does_not_depend_on_the_seed():
+    y = measured().y[0]
+    volumes = [reconstruct(y, ORBIT, tiny_refiner(), "phydict_learned", seed=seed).volume for seed in (0, 1)]
+    assert torch.equal(*volumes)
+
+
+def test_exact_x_rays_of_the_estimate_leave_no_residual_and_the_back_projection_lowers_one():
+    m = measured(dtype=torch.float64)
+    evidence, truth = Evidence(m), block().double()
+    assert evidence(truth, truth, truth)[:, 0].abs().max() < 1e-9 * RESIDUAL_SCALE
+    z = truth + 0.1 * (truth > -0.5)
+    step = evidence(z, truth, truth)[:, :1] / RESIDUAL_SCALE
+    before, after = ((m.project(x) - m.y).norm() for x in (z, z + step))
+    assert after < 0.5 * before
+
+
+def test_the_coverage_counts_the_views_that_see_a_voxel():
+    narrow = ConeBeam.orbit(4, 1020, 740, (28, 6), 20.0)
+    for beam in (ORBIT, narrow):
+        coverage = 2 ** (Evidence(measured(beam)).coverage / COVERAGE_SCALE) - 1
+        assert float(coverage[0, 0, 6:10, 6:10, 6:10].mean()) == pytest.approx(beam.views, rel=0.1)
+    assert coverage[0, 0, 0, 0, 8] < 1  # a corner that the narrow detector misses
+
+
+def test_the_evidence_tells_changes_of_the_estimate_and_the_noise():
+    evidence, zeros = Evidence(measured(noise=0.01)), torch.zeros(1, 1, *GRID.shape)
+    channels = evidence(zeros + 0.3, zeros + 0.1, zeros)
+    torch.testing.assert_close(channels[:, 2:4], CHANGE_SCALE * torch.stack([zeros[:, 0] + 0.2, zeros[:, 0] - 0.3], 1))
+    assert 10 ** (float(channels[0, 4].mean()) - 2) == pytest.approx(0.01, rel=0.3)
+
+
+def test_a_refiners_file_gives_it_back(tmp_path):
+    refiner = tiny_refiner()
+    save_refiner(refiner, tmp_path / "refiner.safetensors", dtype=torch.float32)
+    again = load_prior(tmp_path / "refiner.safetensors")
+    assert isinstance(again, Refiner) and isinstance(again.prior, Prior)
+    x, t, evidence = torch.randn(1, 4, *GRID.shape), torch.tensor([0.3]), torch.randn(1, 5, *GRID.shape)
+    for report in ("", "Small nodule in the left upper lobe."):
+        contexts = [r.bind(report).context for r in (refiner, again)]
+        assert torch.equal(refiner(x, t, contexts[0], evidence), again(x, t, contexts[1], evidence))
+
+
+def test_a_report_reaches_the_refiner():
+    y = measured().y[0]
+    volumes = [reconstruct(y, ORBIT, tiny_refiner(), "phydict_learned", report=report, precision="float32").volume
+               for report in (None, "Small nodule in the left upper lobe.")]
+    assert not torch.equal(*volumes)
+
+
+def test_display_values_are_reconstructed_whatever_their_gain():
+    y = measured().y[0]
+    volumes = [reconstruct(gain * y + 0.1, ORBIT, tiny_refiner(), "phydict_learned", display=True,
+                           precision="float32").volume for gain in (0.5, 2.0)]
+    assert (volumes[0] - volumes[1]).abs().mean() < 2
+
+
+def test_what_does_not_fit_is_refused_in_a_sentence(tmp_path):
+    y = measured().y[0]
+    with pytest.raises(ValueError, match="Unrolled needs a refiner, but the file is a prior"):
+        reconstruct(y, ORBIT, tiny_prior(), "phydict_learned")
+    with pytest.raises(ValueError, match="PriorOnly needs a prior, but the file is a refiner"):
+        Posterior(tiny_refiner(), PriorOnly())
+    with pytest.raises(ValueError, match="leave samples at 1"):
+        reconstruct(y, ORBIT, tiny_refiner(), "phydict_learned", samples=2)
+    with pytest.raises(ValueError, match="guided by the X-rays alone"):
+        reconstruct(y, ORBIT, tiny_refiner(), "phydict_learned", guidance=2.0)
+    with pytest.raises(ValueError, match="needs a prior with a detail network"):
+        Refiner(tiny_prior(), torch.zeros(4, *GRID.shape))
+    for change, words in (({"times": ()}, "one or more"), ({"times": (0.0,), "x0_stds": (1, 1)}, "between 0 and 1"),
+                          ({"x0_stds": (0.1,)}, "4 numbers above 0"), ({"x0_stds": (0, 1, 1, 1)}, "above 0")):
+        with pytest.raises(ValueError, match=words):
+            replace(METHODS["phydict_learned"], **change)
+    save_prior(tiny_prior(), tmp_path / "prior.safetensors")
+    with pytest.raises(ValueError, match="needs a refiner"):
+        reconstructor("phydict_learned", tmp_path / "prior.safetensors")

@@ -119,5 +119,5 @@ class BoundRefiner:
     def refine(self, x: Tensor, t: float, evidence: Tensor) -> Tensor:
         """The clean state of x (B, C, X, Y, Z) at time t, given the evidence (B, EVIDENCE_CHANNELS, X, Y, Z)."""
         times = torch.full((len(x),), float(t), device=x.device)
-        with torch.set_grad_enabled(self.refiner.training), network_precision(self.precision, x):
+        with torch.no_grad(), network_precision(self.precision, x):
             return self.refiner(x, times, self.context.expand(len(x), -1, -1), evidence)

@@ -2,21 +2,47 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from torch import Tensor
 
+from phydict.diffusion import CosineSchedule
 from phydict.grid import Cube
 from phydict.posterior import Unrolled
 from phydict.prior import DEFAULT_PRIOR, Prior, Refiner, describe_refiner, load_prior
 from phydict.training.prior import reconstruction_scores
 from phydict.training.scenes import Scenes
-from phydict.training.settings import Optimisation
+from phydict.training.settings import Optimisation, RefinerValidation
 from phydict.training.stage import StageTraining
 from phydict.units import HUWindow
 
 MEAN_DRAWS = 4
 """Noise draws over which the prior's estimate at time 1 is averaged."""
+
+
+TEXT_DROPOUT = 0.3
+"""Share of the draws whose report is kept from the network."""
+
+
+@dataclass(frozen=True)
+class _Learning:
+    """A refiner of one report whose calls are recorded for gradients."""
+
+    refiner: Refiner
+    context: Tensor
+
+    @property
+    def schedule(self) -> CosineSchedule:
+        return self.refiner.schedule
+
+    @property
+    def mean(self) -> Tensor:
+        return self.refiner.mean[None]
+
+    def refine(self, x: Tensor, t: float, evidence: Tensor) -> Tensor:
+        return self.refiner(x, torch.full((len(x),), float(t), device=x.device), self.context, evidence)
 
 
 class RefinerTraining(StageTraining):
@@ -31,7 +57,7 @@ class RefinerTraining(StageTraining):
         cube: of voxels
         window: HU that the prior's range [-1, 1] stands for
         optimisation: how the weights are learnt
-        validation_views: numbers of views from which validation reconstructs each held-out case
+        validation: what validation measures
         body_weight: how many times more a voxel of the body counts than one of air, plus 1
         mask_weight: weight of the anatomy masks' error beside the CT's
         initial: a prior's file to begin with, or a refiner's to go on from
@@ -40,8 +66,8 @@ class RefinerTraining(StageTraining):
 
     def __init__(self, method: Unrolled = Unrolled(), scenes: Scenes = Scenes(), cube: Cube = Cube(),
                  window: tuple[float, float] = (-1000.0, 1000.0), optimisation: Optimisation = Optimisation(),
-                 validation_views: list[int] | None = None, body_weight: float = 2.0, mask_weight: float = 0.1,
-                 initial: str = str(DEFAULT_PRIOR), seed: int = 0):
+                 validation: RefinerValidation = RefinerValidation(), body_weight: float = 2.0,
+                 mask_weight: float = 0.1, initial: str = str(DEFAULT_PRIOR), seed: int = 0):
         found = load_prior(initial)
         if not isinstance(found, Prior | Refiner):
             raise ValueError(f"a refiner begins with a prior of phydict's own, but {initial} is MedSyn's: give another "
@@ -54,7 +80,7 @@ class RefinerTraining(StageTraining):
         if refiner.prior.load_text is not None:
             refiner.prior.text = refiner.prior.load_text()
         self.method, self.scenes, self.body_weight, self.mask_weight = method, scenes, body_weight, mask_weight
-        self.validation_views, self.calls = validation_views or [2, 8], len(method.times)
+        self.validation_views, self.calls = validation.views, len(method.times)
 
     def batch_loss(self, batch: dict, key: tuple[int, ...] = (0,), rank: int = 0, processes: int = 1) -> Tensor:
         losses = []
@@ -69,9 +95,10 @@ class RefinerTraining(StageTraining):
         measurement = self.scenes.measure(ct, rng, self.prior.grid, self.prior.window)
         weight = 1 + self.body_weight * (ct > -0.9)
         weight = weight / weight.mean()
-        bound = self.prior.bind(case["report"][0] if self.prior.prior.text is not None else "")
+        told = self.prior.prior.text is not None and rng.random() >= TEXT_DROPOUT
+        learning = _Learning(self.prior, self.prior.prior.context([case["report"][0] if told else ""]))
         losses = []
-        for x0, _ in zip(self.method.estimates(bound, measurement), range(self.calls)):
+        for x0, _ in zip(self.method.estimates(learning, measurement), range(self.calls)):
             loss = ((weight * (x0[:, :1] - ct).square()).mean() + 2e-5).log()
             if bool(case["has_masks"].any()) and self.prior.state_channels > 1:
                 loss = loss + self.mask_weight * ((x0[:, 1:] - masks).square().mean() + 1e-4).log()

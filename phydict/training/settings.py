@@ -111,6 +111,23 @@ class PriorValidation(Previews):
 
 
 @dataclass(frozen=True)
+class RefinerValidation:
+    """What validation measures of a refiner.
+
+    Args:
+        views: numbers of X-rays from which validation reconstructs each held-out case; their mean tells which weights
+            are best
+    """
+
+    views: tuple[int, ...] = (2, 8)
+
+    def __post_init__(self):
+        if not self.views or not all(1 <= count <= 1000 for count in self.views):
+            raise ValueError("model.validation.views are one or more numbers between 1 and 1000, but "
+                             f"{self.views} was given")
+
+
+@dataclass(frozen=True)
 class Execution:
     """How a network is run, which changes no result but for rounding.
 

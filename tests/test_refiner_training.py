@@ -1,0 +1,97 @@
+"""Training a refiner: scenes that can be reconstructed, a resumed run that is the uninterrupted one, and its file."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from prior.tiny import tiny_prior
+from test_training import cache, checkpoint, losses, refusal  # noqa: F401
+from torch.utils.data import default_collate
+
+from phydict.cli.train import main
+from phydict.datasets import phantom_case
+from phydict.grid import Cube, Grid
+from phydict.methods import reconstruct
+from phydict.prior import Refiner, load_prior, save_prior
+from phydict.training.refiner import RefinerTraining
+from phydict.training.scenes import Scenes
+from phydict.units import HUWindow
+from phydict.xray import ConeBeam, Projector
+
+CONFIG = Path(__file__).parents[1] / "configs" / "prior" / "refiner.yaml"
+
+
+@pytest.fixture(scope="module")
+def prior_file(tmp_path_factory) -> str:
+    file = tmp_path_factory.mktemp("prior") / "tiny.safetensors"
+    save_prior(tiny_prior(detail=True), file, dtype=torch.float32)
+    return str(file)
+
+
+def arguments(folder: Path, cache: Path, initial: str, *more: str) -> list[str]:  # noqa: F811
+    return ["fit", f"--config={CONFIG}", "--model.cube.voxels=16", "--model.window=[-1000,600]", "--data.phantoms=3",
+            "--data.holdout.phantoms=1", "--data.loading.epoch_size=2", "--model.scenes.most_views=4",
+            f"--model.initial={initial}", "--model.validation.views=[2]", "--trainer.accelerator=cpu",
+            "--trainer.log_every_n_steps=1", "--precision=float32", "--trainer.max_steps=-1",
+            f"--data.cache={cache}", f"--out={folder}", *more]
+
+
+def test_a_resumed_run_is_the_uninterrupted_one_and_is_exported_as_a_refiner(tmp_path, cache, prior_file):  # noqa: F811
+    straight, halved = tmp_path / "straight", tmp_path / "halved"
+    main(arguments(straight, cache, prior_file, "--trainer.max_epochs=2"))
+    main(arguments(halved, cache, prior_file, "--trainer.max_epochs=1"))
+    main(arguments(halved, cache, prior_file, "--trainer.max_epochs=2", f"--ckpt_path={halved / 'last.ckpt'}"))
+    assert set(losses(straight)) == {0, 1, 2, 3} and {2, 3} <= set(losses(halved))
+    one, other = (checkpoint(folder)["state_dict"] for folder in (straight, halved))
+    assert one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
+    main(["export", "--checkpoint", str(straight / "last.ckpt"), "--out", str(tmp_path / "refiner.safetensors")])
+    refiner = load_prior(tmp_path / "refiner.safetensors")
+    assert isinstance(refiner, Refiner) and refiner.entrance.weight.any() and refiner.gate[-1].weight.any()
+    beam = ConeBeam.orbit(3, 1020, 740, (28, 28), 20.0)
+    y = Projector(Grid.cube(16), beam, full_detector=True)(torch.full((1, 1, 16, 16, 16), 0.01))[0]
+    found = reconstruct(y, beam, refiner, "phydict_learned", report="Small nodule.")
+    assert found.volume.isfinite().all()
+
+
+def test_steps_on_one_batch_lower_its_loss(prior_file):
+    task = RefinerTraining(cube=Cube(16), window=(-1000, 600), initial=prior_file)
+    batch = default_collate([phantom_case(3, Grid.cube(16), HUWindow(-1000, 600))])
+    optimizer = torch.optim.Adam([w for w in task.parameters() if w.requires_grad], 3e-3)
+    found = []
+    for _ in range(10):
+        found.append(task.batch_loss(batch, (1,)))
+        optimizer.zero_grad()
+        found[-1].backward()
+        optimizer.step()
+    assert found[-1] < found[0] - 0.3
+
+
+def test_every_drawn_scene_can_be_reconstructed_on_its_grid():
+    seen = set()
+    for grid in (Grid.cube(64), Grid.cube(32, 192)):
+        for seed in range(150):
+            beam = Scenes().beam(np.random.default_rng(seed), grid)
+            beam.check(grid)
+            beam.check_scale(grid)
+            seen.add(beam.views)
+    assert min(seen) == 1 and max(seen) > 24
+
+
+def test_scenes_scale_with_the_grid():
+    one, half = (Scenes().beam(np.random.default_rng(4), Grid.cube(64, side)) for side in (384, 192))
+    np.testing.assert_allclose(one.sources, 2 * half.sources)
+    np.testing.assert_allclose(one.u, 2 * half.u)
+
+
+@pytest.mark.parametrize("settings, words", [
+    ({"most_views": 0}, "between 1 and 1000"), ({"arc": 1.2}, "arc is a share"), ({"orbit": 0.8}, "at most 1"),
+    ({"noise": (0.1, 0.01)}, "least <= most")])
+def test_scenes_that_cannot_be_drawn_are_refused(settings, words):
+    with pytest.raises(ValueError, match=words):
+        Scenes(**settings)
+
+
+def test_a_prior_of_another_grid_is_refused(tmp_path, cache, prior_file, capsys):  # noqa: F811
+    args = arguments(tmp_path, cache, prior_file, "--model.cube.voxels=32")
+    assert "another grid or HU window" in refusal(capsys, args)

@@ -1,12 +1,15 @@
 """Golden figures: what every method, twenty steps of training and every committed table gave, and still has to give.
 
-    python tests/test_golden.py     # writes golden.json anew: after a change of results that is meant, and told of
+    python tests/test_golden.py [methods ...]
+
+writes golden.json anew, or the figures of some methods in it: after a change of results that is meant, and told of.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import sys
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -150,9 +153,12 @@ def test_committed_results_give_their_committed_tables_byte_for_byte(results):
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    written = {f"{name}, {scene}": on_the_tiny_grid(
-        name, torch.float32 if scene == "cascade" else torch.float64, scene) for name, scene in scenes()}
-    written |= {f"{name}, example": on_the_example(name) for name in ON_THE_EXAMPLE}
-    with TemporaryDirectory() as folder:
-        written["losses"] = training(Path(folder))
+    written = json.loads(GOLDEN.read_text()) if sys.argv[1:] else {}
+    of = sys.argv[1:] or METHODS
+    written |= {f"{name}, {scene}": on_the_tiny_grid(
+        name, torch.float32 if scene == "cascade" else torch.float64, scene) for name, scene in scenes() if name in of}
+    written |= {f"{name}, example": on_the_example(name) for name in ON_THE_EXAMPLE if name in of}
+    if not sys.argv[1:]:
+        with TemporaryDirectory() as folder:
+            written["losses"] = training(Path(folder))
     GOLDEN.write_text(json.dumps(written, indent=1) + "\n")

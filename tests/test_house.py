@@ -15,7 +15,7 @@ from lightning.pytorch.callbacks import WeightAveraging
 from lightning.pytorch.strategies import DDPStrategy, ModelParallelStrategy
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
-from prior.tiny import tiny_prior
+from prior.tiny import tiny_prior, tiny_refiner
 
 from phydict.cli import train
 from phydict.cli.infer import InferenceCLI
@@ -24,7 +24,7 @@ from phydict.grid import Grid
 from phydict.inference import ReconstructionData, ReconstructionTask
 from phydict.methods import METHODS
 from phydict.posterior import DDS, Posterior
-from phydict.prior import save_prior
+from phydict.prior import save_prior, save_refiner
 from phydict.xray import ConeBeam, Ideal, Polychromatic
 
 ROOT = Path(__file__).parents[1]
@@ -142,11 +142,12 @@ def inference(tmp_path, monkeypatch):
     """Builds infer.py's command line from arguments, with a tiny prior and nothing run."""
     monkeypatch.chdir(tmp_path)
     save_prior(tiny_prior(), "tiny.safetensors")
+    save_refiner(tiny_refiner(), "refiner.safetensors")
     return lambda *args: InferenceCLI(
         ReconstructionTask, ReconstructionData, run=False, save_config_callback=None,
         trainer_defaults={"logger": False, "accelerator": "cpu", "devices": 1, "enable_progress_bar": False,
                           "enable_checkpointing": False, "enable_model_summary": False},
-        args=[*args, "--model.prior=tiny.safetensors", "--model.out=out"])
+        args=["--model.prior=tiny.safetensors", *args, "--model.out=out"])
 
 
 def built(model: ReconstructionTask):
@@ -163,7 +164,8 @@ def test_a_named_method_is_what_its_configuration_builds(inference, config):
 @pytest.mark.parametrize("name", METHODS)
 @pytest.mark.parametrize("config", CONFIGS["simulate"], ids=lambda f: f.stem)
 def test_every_method_builds_by_its_name_and_goes_with_every_simulator(inference, name, config):
-    cli = inference(f"--model.method={name}", f"--config={config}")
+    cli = inference(f"--model.method={name}", f"--config={config}",
+                    *["--model.prior=refiner.safetensors"] * (name == "phydict_learned"))
     assert built(cli.model) == METHODS[name]
     assert cli.datamodule.simulator == {"ideal": Ideal(), "polychromatic": Polychromatic()}[config.stem]
     assert cli.model.method_name == name

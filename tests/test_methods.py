@@ -121,7 +121,7 @@ def test_priors_samplers_and_projectors_of_ones_own_fit_in():
 @pytest.mark.parametrize("change, sentence", [
     ({"beam": "geometry.yaml"}, "ConeBeam.load"), ({"report": 5}, "report must be text"),
     ({"method": 123}, "a Sampler or"), ({"method": SIRT}, "a Sampler or"),
-    ({"method": "fbp"}, "phydict_fast, phydict_paper"),
+    ({"method": "fbp"}, "phydict_fast, phydict_learned"),
     ({"xrays": np.full((8, 448, 448), np.nan)}, "NaN"), ({"xrays": np.zeros((7, 448, 448))}, "8 views"),
     ({"seed": -1}, "a seed is a whole number"), ({"seed": 2**70}, "a seed is a whole number"),
     ({"mu_water": -0.02}, "mu_water"), ({"mu_water": 0}, "mu_water"), ({"mu_water": float("nan")}, "mu_water"),

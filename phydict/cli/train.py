@@ -50,7 +50,7 @@ def stage_of(args: list[str]) -> str:
     stages += [settings["stage"] for settings in reversed(read_configurations(args)) if "stage" in settings]
     stage = stages[0] if stages else "base"
     if not isinstance(stage, str) or stage not in STAGES:
-        raise ValueError(f"the stages that can be trained are {' and '.join(STAGES)}, but {reprlib.repr(stage)} was "
+        raise ValueError(f"the stages that can be trained are {', '.join(STAGES)}, but {reprlib.repr(stage)} was "
                          "given")
     return stage
 

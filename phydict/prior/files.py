@@ -36,10 +36,10 @@ FORMAT = 1
 DEFAULT_PRIOR = shipped("data/prior/phydict_64.safetensors")
 """The prior that comes with the project."""
 
-ADVICE = "copy it again, or export it from its training checkpoint"
-
 DEFAULT_REFINER = shipped("data/prior/refiner_64.safetensors")
 """The refiner that comes with the project."""
+
+ADVICE = "copy it again, or export it from its training checkpoint"
 
 MOST_HU, MOST_LAYERS = 1e6, 256
 """No window reaches as far, and no network has more blocks on its way down, or layers."""
@@ -134,7 +134,8 @@ def load_prior(path: str | Path | MedSynCheckpoint = DEFAULT_PRIOR,
     with refusing(path, ADVICE):
         header, weights = _read(path, ("base", "refiner"), device)
         try:
-            found = build_refiner(header, weights) if header.get("stage") == "refiner" else build_prior(header, weights)
+            build = build_refiner if header.get("stage") == "refiner" else build_prior
+            found = build(header, weights)
             if has_text(header):
                 prior = found.prior if isinstance(found, Refiner) else found
                 prior.load_text = lambda: _load_text(path, header["text"])

@@ -46,10 +46,11 @@ class _Learning:
 
 
 class RefinerTraining(StageTraining):
-    """Learns a Refiner: at each call of its own reconstruction, the logarithm of the CT's mean squared error.
+    """Learns a Refiner: at each call of its own reconstruction, the logarithms of the CT's mean squared and mean
+    absolute error.
 
-    The logarithm weighs a dB alike at all numbers of views. What the calls start from, and the likelihood steps between
-    them, are those of `method`; no gradient passes through them.
+    The logarithms weigh a dB alike at all numbers of views; the absolute error keeps air empty. What the calls start
+    from, and the likelihood steps between them, are those of `method`; no gradient passes through them.
 
     Args:
         method: the unrolled reconstruction whose calls are learnt
@@ -99,7 +100,8 @@ class RefinerTraining(StageTraining):
         learning = _Learning(self.prior, self.prior.prior.context([case["report"][0] if told else ""]))
         losses = []
         for x0, _ in zip(self.method.estimates(learning, measurement), range(self.calls)):
-            loss = ((weight * (x0[:, :1] - ct).square()).mean() + 2e-5).log()
+            error = x0[:, :1] - ct
+            loss = ((weight * error.square()).mean() + 2e-5).log() / 2 + ((weight * error.abs()).mean() + 1e-3).log()
             if bool(case["has_masks"].any()) and self.prior.state_channels > 1:
                 loss = loss + self.mask_weight * ((x0[:, 1:] - masks).square().mean() + 1e-4).log()
             losses.append(loss)

@@ -264,7 +264,8 @@ def test_set_takes_the_place_of_a_files_axis_base_and_product(tmp_path):
     (["views"], "name=value"), (["=3"], "name=value"), (["views=[2"], "value of views is not valid YAML"),
     (["view=3"], "no setting 'view'"), (["projector=lines"], "no projector 'lines'"), (["method.steps=2"], "nothing"),
     (["method=[no_module.Sampler]"], "no_module.Sampler cannot be made .*importable"), (["method=[sart]"], "'sart'"),
-    (["method=[pathlib.Path]"], "pathlib.Path is no method"), (["views=[]"], "at least one value")])
+    (["method=[pathlib.Path]"], "pathlib.Path is no method"), (["method=[sys.exit]"], "sys.exit is no method"),
+    (["views=[]"], "at least one value")])
 def test_a_set_that_cannot_be_meant_is_one_sentence(tmp_path, changes, words):
     with pytest.raises(ValueError, match=words):
         read_specification(write(tmp_path, axes={"method": ["sirt"]}), changes)

@@ -63,6 +63,15 @@ def test_an_older_record_without_a_list_is_read_and_its_case_replaced_if_nothing
     assert held(old)["volume.nii.gz"] == "new"
 
 
+def test_a_folder_that_has_the_name_of_a_file_is_not_replaced_with_what_is_in_it(old):
+    (old / "panel.png").unlink()
+    (old / "panel.png").mkdir()
+    (old / "panel.png" / "mine.txt").write_text("mine")
+    with pytest.raises(ValueError, match="holds panel.png, which phydict did not write, and is not replaced"):
+        begun(old.parent, overwrite=True)
+    assert (old / "panel.png" / "mine.txt").read_text() == "mine"
+
+
 def notes_beside(old: Path) -> None:
     (old / "notes.txt").write_text("mine")
 

@@ -214,14 +214,14 @@ def method_of(name: object, known: Iterable[str] = ()) -> Sampler | Reconstructo
         raise ValueError(f"there is no method {name!r}: use one of {', '.join([*known, *METHODS])}, or the path of a "
                          "class, such as my_module.MySampler")
     try:
-        made = getattr(import_module(module), own)()
-    except Exception as error:  # of whatever kind: another's code runs
+        kind = getattr(import_module(module), own)
+        if isinstance(kind, type) and issubclass(kind, Sampler | Reconstructor) and is_dataclass(kind):
+            return kind()
+    except (Exception, SystemExit) as error:  # of whatever kind: another's code runs
         raise ValueError(f"the method {name} cannot be made ({reason(error)}): its module must be importable, and its "
                          "settings need defaults") from error
-    if not isinstance(made, Sampler | Reconstructor) or not is_dataclass(made):
-        raise ValueError(f"{name} is no method: derive it from phydict.posterior.Sampler or "
-                         "phydict.reconstruction.Reconstructor, as a dataclass")
-    return made
+    raise ValueError(f"{name} is no method: derive it from phydict.posterior.Sampler or "
+                     "phydict.reconstruction.Reconstructor, as a dataclass")
 
 
 def refined_from(method: Sampler, delta: float, keep_iterations: bool = False) -> Sampler:

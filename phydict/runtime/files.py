@@ -90,7 +90,7 @@ def alone_in(folder: Path, option: str) -> Iterator[None]:
 def check_replaceable(folder: Path, written: Collection[str], option: str) -> None:
     """Raises ValueError where `folder` is a link or holds more than the files `written`, so that it must stay; `option`
     is what the user may change instead."""
-    strange = {file.name for file in folder.iterdir()} - set(written)
+    strange = {file.name for file in folder.iterdir() if file.name not in written or not file.is_file()}
     if folder.is_symlink() or strange:
         what = f"holds {', '.join(sorted(strange)[:3])}, which phydict did not write" if strange else "is a link"
         raise ValueError(f"{folder} {what}, and is not replaced: move that away, or give another {option}")

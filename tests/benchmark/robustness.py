@@ -90,7 +90,8 @@ def judge(one: Try, place) -> str:
     """What is wrong with what becomes of a try; empty where nothing is."""
     out, err, code, broken = io.StringIO(), io.StringIO(), 0, ""
     place.begin()
-    seconds = 30 * SECONDS if one.group == "interruptions" else SECONDS  # several processes, which must first start
+    several = one.group in ("interruptions", "surroundings")  # processes, which must first start
+    seconds = 30 * SECONDS if several else SECONDS
     began, peak = time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     here = os.getcwd()

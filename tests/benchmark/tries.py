@@ -237,9 +237,11 @@ def npy(header: str, data: bytes = b"") -> bytes:
 
 def tries() -> Iterator[Try]:
     """All tries, in groups."""
+    from stranger_tries import GROUPS  # which takes its places from here
+
     for group in (command_lines, geometries, geometry_files, images, dicoms, nifti_images, reports, cts, series, tables,
                   priors, configurations, outputs, ablations, trainings, preparations, names, python_api,
-                  interruptions):
+                  interruptions, *GROUPS):
         for name, good, words, work in group():
             words = (words,) if isinstance(words, str) else tuple(words)
             yield Try(group.__name__.replace("_", " "), name, good, words, work)
@@ -314,7 +316,7 @@ def command_lines():
     yield "a method without module", no, "method", lambda p: p.predict(p.case(), "--model.method=Nothing")
     yield "a method that is a prior", no, "", lambda p: p.predict(p.case(), "--model.method=phydict.prior.Prior")
     yield "a method that is abstract", no, "", lambda p: p.predict(p.case(), "--model.method=phydict.posterior.Sampler")
-    yield "a method by its short name", no, "", lambda p: p.predict(p.case(), "--model.method=sirt")
+    yield "a method by its name", True, "", lambda p: p.predict(p.case(), "--model.method=sirt")
     yield "an init_arg too many", no, "speed", lambda p: p.predict(p.case(), "--model.method.init_args.speed=9")
     yield "overwrite maybe", no, "overwrite", lambda p: p.predict(p.case(), "--model.overwrite=maybe")
     yield "dry_run with a value", None, "", lambda p: p.predict(p.case(), "--dry_run=7")

@@ -239,6 +239,12 @@ def test_weights_that_are_not_finite_are_refused_by_name(name, source, tmp_path)
             read(tmp_path / name)
 
 
+def test_a_network_of_more_levels_than_can_be_meant_is_refused_before_it_is_made(source, tmp_path):
+    deep = entries(source) | {f"denoise_fn.downs.{level}.x": torch.zeros(1) for level in range(40)}
+    with pytest.raises(ValueError, match="model.safetensors' is not MedSyn's: it has 40 levels, more than 16"):
+        load_prior(write(tmp_path / "model.safetensors", deep))
+
+
 def test_each_stage_refuses_the_other(source, tmp_path):
     with pytest.raises(ValueError, match="is MedSyn's 64.3 stage .*, but the 256.3 super-resolution .*results_SR_"):
         load_super_resolution(write(tmp_path / "one.bin", entries(source)))

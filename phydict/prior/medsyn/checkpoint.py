@@ -21,7 +21,7 @@ from phydict.prior.medsyn.prior import MedSynPrior
 from phydict.prior.medsyn.super_resolution import MedSynSuperResolution
 from phydict.prior.tensors import read_torch
 from phydict.prior.text import TextEncoder
-from phydict.runtime.reading import reason
+from phydict.runtime.reading import reason, refusing
 
 FILES = {"ema": ("model_1.safetensors", "pytorch_model_1.bin"), "online": ("model.safetensors", "pytorch_model.bin")}
 """Names of accelerate's files by what they hold, where a folder comes straight from MedSyn's training."""
@@ -38,6 +38,9 @@ UNUSED = re.compile(r"betas|.*alphas_cumprod.*|posterior_.*|ddim_.*|lpips\..*")
 
 TIED = re.compile(r"mid_spatial_attn\d\.fn\.fn\.fn\.(to_qkv|to_out)\.weight")
 """Names of stage 1's one self-attention, of which safetensors files keep only some."""
+
+MOST_LEVELS = 16
+"""No network of MedSyn's goes down as often."""
 
 
 @dataclass(frozen=True)
@@ -187,7 +190,10 @@ def _settings(weights: dict[str, Tensor], stage: int) -> dict:
     width = size("init_conv.weight", 0, 160) if stage == 1 else size("init_conv0.weight", 0, 56)
     if width < GROUPS:
         raise ValueError(f"is not MedSyn's: its first convolution has {width} channels, but it needs {GROUPS} at least")
-    levels = next(i for i in count(1) if not any(name.startswith(f"downs.{i}.") for name in weights))
+    there = {name.split(".")[1] for name in weights if name.startswith("downs.")}
+    levels = next(i for i in count(1) if str(i) not in there)
+    if levels > MOST_LEVELS:
+        raise ValueError(f"is not MedSyn's: it has {levels} levels, more than {MOST_LEVELS}")
     deep = [size(f"downs.{i}.0.block1.proj.weight", 0, width * 2**i) for i in range(levels)]
     attention = "mid_spatial_attn1" if stage == 1 else "mid_spatial_attn"
     inner = size(f"{attention}.fn.fn.fn.to_out.weight", 1, 256 if stage == 1 else 128)
@@ -236,16 +242,17 @@ def as_checkpoint(given: MedSynCheckpoint | str | Path) -> MedSynCheckpoint:
 
 def _network(checkpoint: MedSynCheckpoint, stage: int) -> SliceUNet:
     file = checkpoint.file
-    entries = read_tensors(file)
-    try:
-        found = MedSynWeights.sort(entries, checkpoint.upsample_first)
-        if found.stage != stage:
-            raise ValueError(f"is MedSyn's {STAGES[found.stage]}, but the {STAGES[stage]} is needed here: give that "
-                             f"one ({FOLDERS[stage]} in MedSyn's archive)")
-        network = found.loaded()
-    except ValueError as error:
-        raise ValueError(f"'{file}' {error}") from error
-    check_finite(found.weights, file)
+    with refusing(file, "copy it again"):
+        entries = read_tensors(file)
+        try:
+            found = MedSynWeights.sort(entries, checkpoint.upsample_first)
+            if found.stage != stage:
+                raise ValueError(f"is MedSyn's {STAGES[found.stage]}, but the {STAGES[stage]} is needed here: give "
+                                 f"that one ({FOLDERS[stage]} in MedSyn's archive)")
+            network = found.loaded()
+        except ValueError as error:
+            raise ValueError(f"'{file}' {error}") from error
+        check_finite(found.weights, file)
     return network
 
 

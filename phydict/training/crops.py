@@ -47,7 +47,7 @@ class CTVolumes(CTCases):
 
     def __getitem__(self, index: int) -> np.ndarray:
         ct = self.cts[index]
-        return mapped_volume(self.cache / f"{ct.id}-{self._key(ct)}.npy", lambda: prepare_ct(
+        return mapped_volume(self.cache / f"{ct.id}-{self.key(ct)}.npy", lambda: prepare_ct(
             ct.path, self.grid, self.window, id=ct.id, calibration=ct.calibration)["volume"][0])
 
 
@@ -105,6 +105,9 @@ class SuperResolutionData(PriorData):
                  holdout: HoldOut = HoldOut(phantoms=2), phantoms: int = 32, loading: Loading = Loading(),
                  cache: str = "runs/cache", seed: int = 0, cube: Cube = Cube(256),
                  window: tuple[float, float] = (-1000.0, 1000.0)):
+        if loading.population.share:
+            raise ValueError(f"a super-resolution stage learns from CTs and phantoms alone, but "
+                             f"data.loading.population.share is {loading.population.share}: set it to 0")
         super().__init__(cts, source, holdout, phantoms, loading, cache, seed=seed, cube=cube, window=window)
         if not 0 < crops.size <= cube.voxels or crops.size % crops.factor:
             raise ValueError(f"data.crops.size is a multiple of the factor {crops.factor}, up to the {cube.voxels} "

@@ -13,6 +13,7 @@ from phydict.datasets import Augmentation, CTCases, CTSource, Thorax, report, sp
 from phydict.datasets.cts.cache import read_arrays, write_arrays
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM, CachedPhantoms
 from phydict.datasets.phantoms.phantom import change_by_findings
+from phydict.datasets.population import DrawnPatients
 from phydict.grid import Cube, Grid
 from phydict.runtime.console import check_writable
 from phydict.runtime.seeds import check_seed
@@ -65,12 +66,18 @@ class PriorData(lightning.LightningDataModule):
         self.held_out = [f.id for f in held_out]
         validating = set(self.held_out)
         self.cts = CTCases([f for f in files if f.id not in validating], cache, self.grid, window)
+        self.population = DrawnPatients(self.cts, loading.population) if loading.population.share else None
         self.validation = ConcatDataset([
             CachedPhantoms(HELD_OUT_PHANTOM, holdout.phantoms, self.grid, window, Path(cache)),
             CTCases(held_out, cache, self.grid, window)])
         self.reports = [f.report for f in files if f.report]
         self.reports += [report(Thorax.draw(s)) for s in range(min(phantoms, 1000))]
+        self.reports += self.population.reports(1000) if self.population else []
         self.loading, self.seed, self.augmentation = loading, seed, augmentation
+
+    def prepare_data(self) -> None:
+        if self.population and self.trainer.state.fn == "fit":
+            self.population.prepare()
 
     def labelled_reports(self, count: int = 6000) -> tuple[list[str], torch.Tensor]:
         """Reports of phantoms and which findings (kind, side, lobe) each has: labels (N, F). None without phantoms."""
@@ -122,8 +129,10 @@ class PriorData(lightning.LightningDataModule):
 
     def draws(self, epoch: int) -> Dataset:
         """What is trained on in an epoch."""
+        if self.population:
+            self.population.prepare()  # here, before loader processes are forked
         return MixedCases(self.cts, self.phantoms, self.loading.ct_fraction, self.grid, self.window,
-                          self.loading.epoch_size, epoch, self.seed, self.augmentation)
+                          self.loading.epoch_size, epoch, self.seed, self.augmentation, self.population)
 
     def val_dataloader(self) -> DataLoader:
         return DataLoader(self.validation, 1, collate_fn=_collate, num_workers=self.loading.workers)

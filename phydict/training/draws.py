@@ -9,6 +9,7 @@ import numpy as np
 from torch.utils.data import Dataset
 
 from phydict.datasets.cts.augment import Augmentation, augment
+from phydict.datasets.population import DrawnPatients
 from phydict.grid import Grid
 from phydict.units import HUWindow
 
@@ -28,9 +29,13 @@ class Draws(Dataset):
 
     def __getitem__(self, i: int) -> dict:
         rng = np.random.default_rng((self.seed, self.epoch, i))
-        from_ct = len(self.phantoms) == 0 or (len(self.cts) > 0 and rng.random() < self.ct_fraction)
-        source = self.cts if from_ct else self.phantoms
+        source = self.source(rng)
         return self.item(source[int(rng.integers(len(source)))], rng)
+
+    def source(self, rng: np.random.Generator) -> Sequence:
+        """What the next item is drawn from."""
+        from_ct = len(self.phantoms) == 0 or (len(self.cts) > 0 and rng.random() < self.ct_fraction)
+        return self.cts if from_ct else self.phantoms
 
     @abstractmethod
     def item(self, drawn, rng: np.random.Generator) -> dict:
@@ -38,12 +43,19 @@ class Draws(Dataset):
 
 
 class MixedCases(Draws):
-    """Deformed cases."""
+    """Deformed cases; with a population, its share of the draws from CTs is taken from there."""
 
     def __init__(self, cts: Sequence, phantoms: Sequence, ct_fraction: float, grid: Grid, window: HUWindow,
-                 length: int, epoch: int, seed: int, augmentation: Augmentation = Augmentation()):
+                 length: int, epoch: int, seed: int, augmentation: Augmentation = Augmentation(),
+                 population: DrawnPatients | None = None):
         super().__init__(cts, phantoms, ct_fraction, length, epoch, seed)
-        self.grid, self.window, self.augmentation = grid, window, augmentation
+        self.grid, self.window, self.augmentation, self.population = grid, window, augmentation, population
+
+    def source(self, rng: np.random.Generator) -> Sequence:
+        source = super().source(rng)
+        if source is not self.cts or self.population is None or rng.random() >= self.population.settings.share:
+            return source
+        return self.population
 
     def item(self, drawn: dict, rng: np.random.Generator) -> dict:
         return training_parts(augment(drawn, int(rng.integers(2**31)), self.grid, self.window, self.augmentation))

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 
+from phydict.datasets.population import PopulationSettings
+
 MOST_DRAWS, MOST_WORKERS = 10_000_000, 1000
 """Draws of an epoch are listed before it begins, and loader processes are all started then."""
 
@@ -171,12 +173,14 @@ class Loading:
         batch_size: draws per step on each device
         workers: loader processes per device
         ct_fraction: share of draws taken from the CTs, in [0, 1]
+        population: new patients drawn from the CTs, which a share of these draws is taken from
     """
 
     epoch_size: int = 400
     batch_size: int = 4
     workers: int = 0
     ct_fraction: float = 0.5
+    population: PopulationSettings = PopulationSettings()
 
     def __post_init__(self):
         for name, least, most in (("epoch_size", 1, MOST_DRAWS), ("batch_size", 1, MOST_DRAWS),

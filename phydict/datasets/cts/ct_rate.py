@@ -25,6 +25,7 @@ from phydict.datasets.cts.transforms import Calibration, case_id, prepare_ct
 from phydict.datasets.natural_order import natural_order
 from phydict.grid import Grid
 from phydict.runtime.reading import name_of, read_ids
+from phydict.runtime.warning import warn
 from phydict.units import HUWindow
 
 NAME = re.compile(r"(?P<patient>(?:train|valid)_\d+)_(?P<scan>[a-z]+)_(?P<reconstruction>\d+)", re.IGNORECASE)
@@ -90,7 +91,8 @@ def find_cts(root: str | Path, reports: str | Path | None = None, metadata: str 
     Segmentations beside CTs are passed over. Of cases prepared by data/prepare_cts.py the volume alone is taken, with
     their own ids, and with their own reports where no table has one.
     Ids are file names without ending; outside CT-RATE's names, a file in a subfolder gets `<first subfolder>__<name>`.
-    Raises FileNotFoundError where there is no NIfTI, ValueError for ids found twice and v1 volumes without metadata.
+    Raises FileNotFoundError where there is no NIfTI, ValueError for ids found twice, v1 volumes without metadata, and a
+    given table of reports without any of the CTs; one that was found by itself is warned of.
     """
     root = Path(root)
     files = {}
@@ -108,10 +110,17 @@ def find_cts(root: str | Path, reports: str | Path | None = None, metadata: str 
         ids = [id for n, id in enumerate(ids) if n == 0 or scan_of(ids[n - 1]) != scan_of(id)]
     if not ids:
         raise FileNotFoundError(f"every CT in {root} is excluded by {exclude}; give another list or folder")
+    told = reports is not None
     reports = reports or _beside(root, "radiology_text_reports")
     texts = read_reports(reports) if reports else {}
     by_scan = {scan_of(id): text for id, text in texts.items()}
     found = {id: texts.get(id, by_scan.get(scan_of(id))) for id in ids}
+    if texts and all(text is None for text in found.values()):
+        missed = (f"none of the {len(texts)} reports in {reports} is of one of the {len(ids)} CTs in {root} (the first "
+                  f"report is of {next(iter(texts))}, the first CT is {ids[0]})")
+        if told:
+            raise ValueError(f"{missed}: give the table of these CTs, or leave out data.source.reports")
+        warn(missed)
     cts = [CTFile(files[id], id, _own_report(files[id]) if text is None else text) for id, text in found.items()]
     return cts if fixed else _calibrated(cts, metadata or _beside(root, "metadata"))
 
@@ -210,7 +219,7 @@ class CTCases(Dataset):
 
     def __getitem__(self, index: int) -> dict:
         ct = self.cts[index]
-        file = self.cache and self.cache / f"{ct.id}-{self._key(ct)}.npz"
+        file = self.cache and self.cache / f"{ct.id}-{self.key(ct)}.npz"
         packed = file and read_arrays(file)
         if packed is None:
             packed = _pack(load_case(ct, self.grid, self.window))
@@ -218,7 +227,8 @@ class CTCases(Dataset):
                 write_arrays(file, packed)
         return _unpack(packed) | {"id": ct.id, "report": ct.report}
 
-    def _key(self, ct: CTFile) -> str:
+    def key(self, ct: CTFile) -> str:
+        """Of a CT as it is prepared here: another file, grid, window or calibration has another."""
         stat = ct.path.stat()
         parts = [CACHE_VERSION, str(ct.path.resolve()), stat.st_mtime_ns, stat.st_size, self.grid.to_dict(),
                  asdict(self.window), asdict(ct.calibration) if ct.calibration else None]

@@ -1,0 +1,142 @@
+"""A population of a user's CTs as a dataset: registered once, each draw made once, all of it in the cache."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass
+
+import numpy as np
+import torch
+from torch.utils.data import Dataset
+
+from phydict.datasets.cts.cache import read_arrays, write_arrays
+from phydict.datasets.cts.ct_rate import CTCases, patient_of
+from phydict.datasets.phantoms.findings import write_report
+from phydict.datasets.population.anatomy import Variation, findings_of
+from phydict.datasets.population.population import Population
+from phydict.datasets.population.registration import Registered, features, medoid, register
+from phydict.runtime.progress import CaseProgress
+from phydict.runtime.warning import warn
+
+POPULATION_VERSION = 1
+"""Raised whenever a registration or a draw of the same seed comes out differently; older files are not read then."""
+
+MOST_DRAWS = 10_000_000
+
+
+@dataclass(frozen=True)
+class PopulationSettings:
+    """New patients drawn from the CTs, to train on beside these.
+
+    Args:
+        share: share of the CT draws that are taken from the population, in [0, 1]
+        draws: number of different new patients
+        patients: most patients that are registered, 10 s each; of more, so many are picked
+        variation: how far new patients go from those that are there
+    """
+
+    share: float = 0.0
+    draws: int = 1000
+    patients: int = 50
+    variation: Variation = Variation()
+
+    def __post_init__(self):
+        if not 0 <= self.share <= 1:
+            raise ValueError(f"data.loading.population.share lies in [0, 1], but {self.share} was given")
+        for name, least in (("draws", 1), ("patients", 2)):
+            if not least <= getattr(self, name) <= MOST_DRAWS:
+                raise ValueError(f"data.loading.population.{name} lies between {least} and {MOST_DRAWS:,}, but "
+                                 f"{getattr(self, name):,} was given")
+
+
+class DrawnPatients(Dataset):
+    """New patients of consecutive seeds, each drawn when first asked for and then kept as a file in the CTs' cache.
+
+    cts: the CTs, one scan of each patient is registered when first needed. Those that cannot be are named in a warning
+    and left out. Raises ValueError where fewer than two CTs are given, or could be registered.
+    """
+
+    def __init__(self, cts: CTCases, settings: PopulationSettings = PopulationSettings()):
+        self.settings, self.count = settings, settings.draws
+        firsts = {patient_of(ct.id): i for i, ct in reversed(list(enumerate(cts.cts)))}
+        picked = sorted(firsts.values())
+        if len(picked) > settings.patients:
+            picked = sorted(np.random.default_rng(0).permutation(picked)[:settings.patients].tolist())
+        if len(picked) < 2:
+            raise ValueError(f"a population is drawn from the CTs of at least 2 patients, but there "
+                             f"{'is 1' if picked else 'are 0'} to train on"
+                             + (f" ({cts.cts[picked[0]].id})" if picked else "") + ": give more CTs, or set "
+                             "data.loading.population.share to 0")
+        self.cts = CTCases([cts.cts[i] for i in picked], cts.cache, cts.grid, cts.window)
+        self.folder = cts.cache and cts.cache / f"population{POPULATION_VERSION}"
+        self.population: Population | None = None
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, seed: int) -> dict:
+        self.prepare()
+        file = self.drawn and self.drawn / f"{seed:07d}.npz"
+        packed = file and read_arrays(file)
+        if packed is None:
+            case = self.population.case(self.population.draw(seed, self.settings.variation), seed)
+            packed = {"volume": case["volume"].numpy().astype(np.float16),
+                      "masks": (255 * case["masks"].numpy()).round().astype(np.uint8),
+                      "has_masks": case["has_masks"].numpy(), "report": np.array(case["report"])}
+            if file:
+                write_arrays(file, packed)
+        return {"id": f"population-{seed:06d}", "volume": torch.from_numpy(packed["volume"].astype(np.float32)),
+                "masks": torch.from_numpy(packed["masks"].astype(np.float32) / 255),
+                "has_masks": torch.from_numpy(packed["has_masks"]), "report": str(packed["report"])}
+
+    def reports(self, most: int) -> list[str]:
+        """Reports such as draws have, for learning their words; nothing is registered for them."""
+        found = [(seed, findings_of(seed, self.settings.variation.findings)) for seed in range(min(most, self.count))]
+        return [write_report(findings, seed % 2 == 0, seed) for seed, findings in found if findings]
+
+    def prepare(self) -> None:
+        """Registers the CTs, or reads how they were; for use before several processes draw."""
+        if self.population is not None:
+            return
+        cases = [self.cts[i] for i in range(len(self.cts))]
+        faults = {i: "no lungs were found in it" for i, case in enumerate(cases) if not case["has_masks"][0]}
+        usable = [i for i in range(len(cases)) if i not in faults]
+        seen = {i: features(cases[i], self.cts.grid, self.cts.window) for i in usable}
+        template = usable[medoid(list(seen.values()))] if usable else -1
+        found = self._registered(seen, template)
+        faults |= {i: one.fault for i, one in found.items() if one.fault}
+        for i, fault in sorted(faults.items()):
+            warn(f"the CT {cases[i]['id']} does not register ({fault}): it is left out of the population")
+        kept = [i for i in found if i not in faults]
+        if len(kept) < 2:
+            raise ValueError(f"a population is drawn from at least 2 CTs, but {len(kept)} of {len(cases)} could be "
+                             "registered: give other CTs, or set data.loading.population.share to 0")
+        self.drawn = self.folder and self.folder / self._key([self.cts.key(self.cts.cts[i]) for i in kept],
+                                                             asdict(self.settings.variation))
+        self.overlaps = [found[i].overlap for i in kept if i != template]
+        self.population = Population([cases[i] for i in kept], torch.stack([found[i].velocity for i in kept]),
+                                     kept.index(template), self.cts.grid, self.cts.window)
+
+    def _registered(self, seen: dict[int, torch.Tensor], template: int) -> dict[int, Registered]:
+        keys = {i: self.cts.key(self.cts.cts[i]) for i in seen}
+        files = {i: self.folder and self.folder / f"{self.cts.cts[i].id}-{self._key(keys[i], keys[template])}.npz"
+                 for i in seen}
+        stored = {i: files[i] and read_arrays(files[i]) for i in seen}
+        found = {i: Registered(torch.from_numpy(one["velocity"]), float(one["overlap"]), float(one["least"]))
+                 for i, one in stored.items() if one is not None}
+        left = [i for i in seen if i not in found]
+        with CaseProgress() as progress:
+            if left:
+                progress.begin("CTs", len(left), verb="register")
+            for i in left:
+                progress.case(self.cts.cts[i].id)
+                found[i] = register(seen[template], seen[i]) if i != template else Registered.template(seen[i])
+                if files[i]:
+                    write_arrays(files[i], {name: np.asarray(value) for name, value in vars(found[i]).items()})
+                progress.finished(f"lungs overlap by {found[i].overlap:.2f}")
+        return dict(sorted(found.items()))
+
+    @staticmethod
+    def _key(*parts) -> str:
+        return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]

@@ -1,4 +1,4 @@
-"""Laws of populations: patients come back, shapes are taken over, nothing tears, findings are where their report says."""
+"""Laws of populations: patients come back, shapes are taken over, nothing tears, findings are where reports say."""
 
 from __future__ import annotations
 
@@ -21,7 +21,11 @@ from phydict.datasets.population.findings import put_findings
 from phydict.datasets.population.organs import expansion
 from phydict.datasets.population.registration import overlap
 from phydict.datasets.population.velocity import flow, jacobian, places, resize, sample
-from phydict.grid import Grid
+from phydict.grid import Cube, Grid
+from phydict.training.crops import SuperResolutionData
+from phydict.training.data import PriorData
+from phydict.training.draws import MixedCases
+from phydict.training.settings import HoldOut, Loading
 from phydict.units import HUWindow
 
 GRID, WINDOW, ROOT = Grid.cube(32), HUWindow(), Path(__file__).parents[2]
@@ -239,6 +243,34 @@ def test_two_processes_share_a_cache(folder, tmp_path):
     assert not list(tmp_path.rglob("*.part.*")) and len(list(third.drawn.iterdir())) == 3
 
 
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_a_share_of_the_draws_from_cts_comes_from_the_population(drawn, share):
+    settled = DrawnPatients(drawn.cts, replace(drawn.settings, share=share))
+    cts, phantoms = [None] * 3, [None] * 2
+    draws = MixedCases(cts, phantoms, 0.6, GRID, WINDOW, 400, 0, 0, population=settled)
+    picked = [draws.source(np.random.default_rng(i)) for i in range(400)]
+    counts = [sum(source is of for source in picked) / 400 for of in (phantoms, cts, settled)]
+    assert counts == pytest.approx([0.4, 0.6 * (1 - share), 0.6 * share], abs=0.08)
+    plain = MixedCases(cts, phantoms, 0.6, GRID, WINDOW, 400, 0, 0)
+    assert all((plain.source(np.random.default_rng(i)) is phantoms) == (picked[i] is phantoms) for i in range(400))
+
+
+def test_training_draws_from_the_population_what_it_draws_from_the_folder(folder, tmp_path):
+    settings = PopulationSettings(1.0, draws=2, variation=Variation(findings=1.0))
+    data = PriorData(str(folder), holdout=HoldOut(["patient2"], phantoms=0), phantoms=0, cache=str(tmp_path),
+                     loading=Loading(epoch_size=2, population=settings), cube=Cube(16))
+    item = data.draws(0)[0]
+    assert {case["id"] for case in data.population.population.cases} == {"patient0", "patient1"}
+    assert item["volume"].shape == (1, 16, 16, 16) and item["report"].startswith("Findings:")
+    assert data.reports and all(isinstance(report, str) for report in data.reports)
+
+
+def test_a_super_resolution_stage_refuses_a_population(folder, tmp_path):
+    with pytest.raises(ValueError, match=r"population\.share is 0\.5: set it to 0"):
+        SuperResolutionData(cts=str(folder), cache=str(tmp_path), cube=Cube(96),
+                            loading=Loading(population=PopulationSettings(0.5)))
+
+
 def water(folder: Path) -> None:
     """Adds a CT without lungs."""
     hu = np.full((20, 20, 20), -1000.0)
@@ -269,7 +301,8 @@ def test_fewer_than_two_patients_are_refused(folder, tmp_path):
 
 
 @pytest.mark.parametrize("settings, words", [
-    (lambda: PopulationSettings(1.5), "share lies in"), (lambda: PopulationSettings(0.5, draws=0), "draws lies between"),
+    (lambda: PopulationSettings(1.5), "share lies in"),
+    (lambda: PopulationSettings(0.5, draws=0), "draws lies between"),
     (lambda: PopulationSettings(0.5, patients=1), "patients lies between"),
     (lambda: Variation(lungs=2.0), "variation.lungs lies in"), (lambda: Variation(modes=-1.0), "variation.modes")])
 def test_settings_that_cannot_be_are_refused_by_their_name(settings, words):

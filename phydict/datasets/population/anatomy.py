@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -87,8 +87,8 @@ class Anatomy:
         kept = 1 - share
         own = np.eye(len(self.weights))[self.patient]
         weights = own + kept * (np.array(self.weights) - own)
-        return Anatomy(self.patient, tuple(weights.tolist()), kept * self.lungs, kept * self.heart, kept * self.liver,
-                       self.findings)
+        return replace(self, weights=tuple(weights.tolist()), lungs=kept * self.lungs, heart=kept * self.heart,
+                       liver=kept * self.liver)
 
 
 def findings_of(seed: int, share: float) -> tuple[Finding, ...]:

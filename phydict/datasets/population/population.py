@@ -8,6 +8,7 @@ CT is carried into it by going back to the template and on to the patient: I_k(e
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 
 import torch
@@ -63,7 +64,7 @@ class Population:
         """A random anatomy, near enough to its patient for a map without tears; the same for the same seed."""
         anatomy = Anatomy.draw(seed, self.modes, variation)
         if self.cases[anatomy.patient]["report"]:
-            anatomy = Anatomy(**vars(anatomy) | {"findings": ()})
+            anatomy = replace(anatomy, findings=())
         for _ in range(8):
             if float(jacobian(self.sources(anatomy)).min()) > LEAST_JACOBIAN:
                 return anatomy
@@ -80,7 +81,7 @@ class Population:
         A patient's own report is kept. A report is written where findings were put in; else it is empty.
         """
         case = self.cases[anatomy.patient]
-        if anatomy != Anatomy.of(anatomy.patient, len(self.cases)):
+        if replace(anatomy, findings=()) != Anatomy.of(anatomy.patient, len(self.cases)):
             case = carry(case, self.sources(anatomy), self.grid, self.window, anatomy.lungs)
         if not anatomy.findings:
             return case

@@ -145,7 +145,7 @@ def test_inflated_lungs_have_more_volume_and_the_same_mass(population, factor):
         return float(lung.sum()), float((lung * (WINDOW.to_hu(case["volume"][0]) + 1000)).sum())
 
     (volume, mass), (new_volume, new_mass) = volume_and_mass(case), volume_and_mass(inflated)
-    assert abs(np.log(new_volume / volume) - factor) < 0.05 and abs(np.log(new_mass / mass)) < 0.1
+    assert abs(np.log(new_volume / volume) - factor) < 0.06 and abs(np.log(new_mass / mass)) < 0.1
 
 
 def test_a_table_stays_straight_and_follows_the_back(population):

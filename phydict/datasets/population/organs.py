@@ -43,11 +43,13 @@ def organs(hu: Tensor, masks: Tensor, grid: Grid) -> dict[str, Tensor]:
 
 
 def expansion(organ: Tensor, extent, pull: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Tensor:
-    """The velocity (3, X, Y, Z), in half-widths of the box, with divergence 1 in an organ (X, Y, Z) and 0 around it.
+    """The velocity (3, X, Y, Z), in half-widths of the box, with a mean divergence of 1 in an organ, and 0 around it.
 
     It is the flow of a fluid that wells up in the organ: v = D grad p, div(D grad p) = organ, D = diag(pull), solved by
-    Fourier transform in a box twice as wide. exp(s v) multiplies the organ's volume by about e^s. extent: (3,) mm.
+    Fourier transform in a box twice as wide. exp(s v) multiplies the organ's volume by about e^s.
+    organ: shares (X, Y, Z). extent: (3,) mm.
     """
+    organ = organ * organ.sum() / organ.square().sum().clamp(min=1e-6)
     extent = torch.as_tensor(extent, dtype=torch.float32)
     double = [2 * n for n in organ.shape]
     frequencies = torch.meshgrid(*[torch.fft.fftfreq(n, float(length) / half) for n, half, length in zip(

@@ -12,11 +12,13 @@ from phydict.datasets.cts.acquisition import LEAST_BLOOD, change_contrast, cut_e
 from phydict.datasets.cts.augment import Augmentation, augment
 from phydict.datasets.phantoms.phantom import build, phantom_case
 from phydict.datasets.phantoms.thorax import Thorax, without
+from phydict.datasets.surroundings.couches import Couch
 from phydict.datasets.surroundings.surroundings import Surroundings
 from phydict.grid import Grid
 from phydict.units import HUWindow
 
 GRID = Grid.cube(48)
+COUCH = Couch.draw(np.random.default_rng(2))
 
 
 def chest(seed: int = 5, **changes) -> tuple[torch.Tensor, torch.Tensor]:
@@ -60,8 +62,8 @@ def test_without_lungs_there_is_no_blood():
 
 @pytest.mark.parametrize("seed", [5, 6])
 def test_the_table_goes_and_the_body_stays(seed):
-    with_table, _ = chest(seed, table=(22.0, 40.0))
-    bare, _ = chest(seed, table=None)
+    with_table, _ = chest(seed, couch=COUCH)
+    bare, _ = chest(seed, couch=None)
     assert (with_table - bare).abs().max() > 200
     new = without_table(with_table, GRID)
     body = bare > -300
@@ -88,7 +90,7 @@ def only(**shares: float) -> Augmentation:
 
 @pytest.mark.parametrize("name", ["table", "field", "ends"])
 def test_augmentation_changes_the_scan_of_its_share_of_the_cases(name):
-    case = phantom_case(1, GRID)
+    case = phantom_case(1, GRID) | {"report": ""}
     plain = augment(case, 3, GRID, strength=Augmentation.none())["volume"]
     assert augment(case, 3, GRID, strength=only(**{name: 0.0}))["volume"].equal(plain)
     changed = augment(case, 3, GRID, strength=only(**{name: 1.0}))["volume"]
@@ -96,6 +98,12 @@ def test_augmentation_changes_the_scan_of_its_share_of_the_cases(name):
     assert taken.any() and not (changed > plain + 1e-6).any(), "all only take away"
     taken = [not augment(case, seed, GRID, strength=only(**{name: 0.5}))["volume"].equal(plain) for seed in range(40)]
     assert 0.2 < np.mean(taken) < 0.8
+
+
+def test_a_case_with_a_report_keeps_its_ends():
+    case = phantom_case(1, GRID)
+    plain, shorter = (augment(case, 3, GRID, strength=only(ends=share))["volume"] for share in (0.0, 1.0))
+    assert case["report"] and shorter.equal(plain)
 
 
 def test_a_shorter_scan_is_air_beyond_its_ends_and_itself_between():

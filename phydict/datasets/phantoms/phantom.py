@@ -36,7 +36,7 @@ def build(thorax: Thorax, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     """
     canvas = Canvas(thorax, grid)
     texture = Texture(thorax.seed, 0, 16.0)(*canvas.axes)
-    _trunk(canvas, texture)
+    body = _trunk(canvas, texture)
     cavity = np.maximum(*(canvas.soft(thorax.lung(side, *canvas.axes)) for side in SIDES))
     tissue = lung_tissue(canvas, texture)
     vessel = vessels(canvas, tissue)
@@ -52,24 +52,25 @@ def build(thorax: Thorax, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     airway = airways(canvas, pleural)
     lung = lung * (1 - airway)
     masks = np.stack([lung, airway, np.minimum(vessel, lung)])
+    _couch(canvas, body)
     _scanner(canvas, masks)
     return canvas.hu, np.clip(masks, 0, 1).astype(np.float32)
 
 
-def _trunk(canvas: Canvas, texture: np.ndarray) -> None:
-    """Skin, fat, muscle, breasts, arms and neck, and the fat that fills the rib cage."""
+def _trunk(canvas: Canvas, texture: np.ndarray) -> np.ndarray:
+    """Skin, fat, muscle, breasts, arms and neck, and the fat that fills the rib cage; returns the body's share."""
     t, (x, y, z) = canvas.thorax, canvas.axes
     muscle = t.muscle(x, y, z)
     neck_y = y + 0.28 * t.depth
     muscle = -smooth_max(-muscle, -np.maximum(superellipse(x, neck_y, 56, 56, 2.2), (0.3 * t.height - z)), 30.0)
-    end = arm_end(t)
-    start = np.array([t.width + t.wall + 6, -18, 0.5 * t.height - 25])
-    line = end - start
-    along = np.clip(((np.abs(x) - start[0]) * line[0] + (y - start[1]) * line[1] + (z - start[2]) * line[2])
-                    / (line @ line), 0, 1)
-    arm = np.sqrt((np.abs(x) - start[0] - along * line[0]) ** 2 + (y - start[1] - along * line[1]) ** 2
-                  + (z - start[2] - along * line[2]) ** 2) - t.arm_width
-    muscle = -smooth_max(-muscle, -arm, 25.0)
+    for s in SIDES.values():
+        start = np.array([s * (t.width + t.wall + 6), -18, 0.5 * t.height - 25])
+        line = arm_end(t, s) - start
+        along = np.clip(((x - start[0]) * line[0] + (y - start[1]) * line[1] + (z - start[2]) * line[2])
+                        / (line @ line), 0, 1)
+        arm = np.sqrt((x - start[0] - along * line[0]) ** 2 + (y - start[1] - along * line[1]) ** 2
+                      + (z - start[2] - along * line[2]) ** 2) - t.arm_width
+        muscle = -smooth_max(-muscle, -arm, 25.0)
     front = np.clip(y / t.depth, -1, 1)
     skin = muscle - t.fat * (0.85 + 0.25 * np.clip(-t.level(z) + 0.6, -0.6, 0.6) - 0.15 * front) - 2
     skin = smooth_max(skin, -canvas.straight_y - t.back_plane, 16.0)
@@ -89,6 +90,7 @@ def _trunk(canvas: Canvas, texture: np.ndarray) -> None:
     roof = z - 0.5 * t.height
     inside = canvas.soft(smooth_max(cage - 2, roof, 10.0))
     canvas.paint(inside, -85 + 45 * np.clip(texture, -1, 2.2))
+    return canvas.soft(skin)
 
 
 def _abdomen(canvas: Canvas, texture: np.ndarray) -> None:
@@ -192,19 +194,22 @@ def _skeleton(canvas: Canvas, texture: np.ndarray) -> None:
         canvas.paint(canvas.soft(np.hypot(x, y + 0.8 * t.spine + 9) - 8 + 0 * z), 28.0, box)
 
 
-def _scanner(canvas: Canvas, masks: np.ndarray) -> None:
-    """Table, noise, and air outside the field of view and the scanned range."""
+def _couch(canvas: Canvas, body: np.ndarray) -> None:
+    """What the patient lies on, outside the body; its cross-section is drawn finely, averaged over a voxel, sampled."""
     t = canvas.thorax
-    if t.table is not None:
-        mattress, thickness = t.table
-        x, y, z = canvas.axes[0], canvas.straight_y, canvas.axes[2]
-        surface = y + t.back_plane - 7e-4 * x * x
-        width, free = canvas.soft(np.abs(x) - 215), np.clip((-900 - canvas.hu) / 100, 0, 1)
-        top, bottom = surface + mattress, surface + mattress + thickness
-        canvas.paint(free * width * (canvas.soft(surface) - canvas.soft(top)), -920.0)
-        canvas.paint(free * width * (canvas.soft(top) - canvas.soft(bottom)), -940.0)
-        for shell in (top, bottom):
-            canvas.paint(width * canvas.sheet(shell, 3.0) + 0 * z, 0.0)
+    if t.couch is None:
+        return
+    step = canvas.edge / 5
+    across, up = np.arange(-350, 350, step), np.arange(-320, 200, step)
+    section = scipy.ndimage.uniform_filter(t.couch.section(across, up), 5)
+    places = np.stack(np.broadcast_arrays(canvas.axes[0] - across[0], canvas.straight_y + t.back_plane - up[0])) / step
+    density = scipy.ndimage.map_coordinates(section, places, order=1).astype(np.float32)
+    canvas.hu += 1000 * (1 - body) * np.clip(-canvas.hu / 1000, 0, 1) * density
+
+
+def _scanner(canvas: Canvas, masks: np.ndarray) -> None:
+    """Noise, and air outside the field of view and the scanned range."""
+    t = canvas.thorax
     if t.noise:
         grain = np.random.default_rng([t.seed, 9]).standard_normal(canvas.grid.shape, np.float32)
         averaged = min(1.0, NOISE_MM / canvas.edge)

@@ -79,14 +79,17 @@ def _shoulder(thorax: Thorax, side: float) -> list[Tubes]:
     parts.append(Tubes.chain(ridge * mirror, 6, 0.7, hu=0.8 * thorax.cortex, core_hu=thorax.bone, core=0.3))
     parts.append(Tubes.of((joint - [0, 0, 20]) * mirror, (joint + [0, 0, 20]) * mirror, 21, hu=0.7 * thorax.cortex,
                           core_hu=thorax.bone, core=0.75))
-    parts.append(Tubes.of((joint + [0, 0, 12]) * mirror, arm_end(thorax) * mirror, 12, hu=1.1 * thorax.cortex,
+    parts.append(Tubes.of((joint + [0, 0, 12]) * mirror, arm_end(thorax, side), 12, hu=1.1 * thorax.cortex,
                           core_hu=40, core=0.4))
     return parts
 
 
-def arm_end(thorax: Thorax) -> np.ndarray:
-    """A point of the raised right arm's axis, far above the shoulder."""
-    return np.array([thorax.width + thorax.wall + 4, 6, 0.5 * thorax.height + 200])
+def arm_end(thorax: Thorax, side: float) -> np.ndarray:
+    """A point of an arm's axis far above the shoulder, or far below it where the arm is not raised."""
+    outer = thorax.width + thorax.wall
+    if thorax.arms[0 if side > 0 else 1]:
+        return np.array([side * (outer + 4), 6, 0.5 * thorax.height + 200])
+    return np.array([side * (outer + 2 * thorax.fat + thorax.arm_width + 25), -18, -0.5 * thorax.height - 120])
 
 
 def _arches(thorax: Thorax) -> list[Tubes]:

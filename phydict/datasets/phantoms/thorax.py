@@ -14,6 +14,7 @@ import numpy as np
 import scipy
 
 from phydict.datasets.phantoms.findings import Finding, draw_findings, write_report
+from phydict.datasets.surroundings.couches import Couch
 
 
 class Curve:
@@ -37,6 +38,11 @@ MEDIASTINUM_LEVEL = Curve([-1, 0.0, 0.4, 0.6, 0.8, 1.0, 1.5], [0.8, 0.8, 0.85, 1
 MEDIASTINUM_DEPTH = Curve([-2, -0.9, -0.45, -0.1, 0.35, 0.7, 1.0, 2], [21, 21, 27, 31, 27, 14, 7, 7])
 SHOULDER = Curve([-0.8, 0.0, 0.5, 0.75, 0.9, 1.2], [-2.0, 0.0, 6.0, 10.0, 13.0, 13.0])
 SIDES = {"right": 1.0, "left": -1.0}
+ARMS = ((False, False), (False, False), (False, True), (True, False))
+"""Raised arms (right, left) of those who do not raise both."""
+
+LEAST_SCAN = 120.0
+"""mm that a short scan shows at least."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +58,8 @@ class Thorax:
     noise: standard deviation in HU of voxels of 1.5 mm.
     marbling: how much fat lies between the muscles, muscle_hu: HU of muscle without it.
     scan: (low, high) world z in mm of the scanned range, field: diameter in mm of the reconstructed field of view,
-    both -1000 HU outside. table: mm of (mattress under the back, table under it), None without a table.
+    both -1000 HU outside. couch: what the patient lies on, None for nothing. arms: whether the (right, left) arm is
+    raised; else it lies beside the body.
     """
 
     seed: int
@@ -85,7 +92,8 @@ class Thorax:
     cava: float
     liver_hu: float
     gas: float
-    table: tuple[float, float] | None
+    couch: Couch | None
+    arms: tuple[bool, bool]
     round_field: bool
     field: float
     scan: tuple[float, float]
@@ -107,9 +115,15 @@ class Thorax:
         apex, base = offset[2] + height / 2, offset[2] - height / 2
         whole = rng.random() < 0.08
         scan = (-400.0, 400.0) if whole else (base - uniform(8, 95), apex + uniform(5, 38))
+        findings, pose = draw_findings(np.random.default_rng([seed, 2])), np.random.default_rng([seed, 11])
+        if not findings and pose.random() < 0.35:
+            ends = base + np.sort(pose.uniform(0, 1, 2)) * (height - LEAST_SCAN)
+            low, high = [(float(ends[0]), scan[1]), (scan[0], float(ends[1]) + LEAST_SCAN)][int(pose.integers(2))]
+            scan = (low, high)
+        stout = pose.uniform(44, 120) if pose.random() < 0.08 else None
         return cls(
             seed=seed, offset=offset, width=size * uniform(126, 146), depth=size * uniform(88, 105), height=height,
-            wall=uniform(9, 17), back=uniform(6, 13), fat=float(np.clip(rng.gamma(5.0, 4.2), 6, 44)),
+            wall=uniform(9, 17), back=uniform(6, 13), fat=stout or float(np.clip(rng.gamma(5.0, 4.2), 6, 44)),
             marbling=uniform(0.4, 1.2), muscle_hu=uniform(42, 68) + (8 if contrast else 0),
             dome=uniform(42, 66), dome_step=uniform(4, 20), heart=uniform(0.42, 0.49), heart_turn=uniform(0.45, 0.8),
             breast=uniform(0.6, 1.3) if rng.random() < 0.4 else 0.0, arm_width=uniform(36, 46),
@@ -118,9 +132,10 @@ class Thorax:
             parenchyma=uniform(-905, -812), gravity=uniform(15, 45), bone=uniform(120, 230), contrast=contrast,
             blood=tuple(float(v) for v in blood), cava=float(blood[0] * (uniform(1.0, 3.0) if contrast else 1.0)),
             liver_hu=uniform(45, 65) + (45 if contrast else 0), gas=uniform(0.0, 1.0),
-            table=(uniform(3, 22), uniform(15, 90)) if rng.random() < 0.9 else None,
+            couch=Couch.draw(pose) if pose.random() < 0.9 else None,
+            arms=ARMS[int(pose.integers(len(ARMS)))] if pose.random() < 0.2 else (True, True),
             round_field=bool(rng.random() < 0.85), field=uniform(320, 470), scan=scan, noise=uniform(8, 32),
-            findings=draw_findings(np.random.default_rng([seed, 2])))
+            findings=findings)
 
     @classmethod
     def standard(cls) -> Thorax:
@@ -130,7 +145,7 @@ class Thorax:
             marbling=0.7, muscle_hu=55.0, dome=54.0, dome_step=12.0, heart=0.455, heart_turn=0.62, breast=0.0,
             arm_width=41.0, spine=17.2, vertebra=23.0, rib_slope=1.2, kyphosis=18.0, aorta=13.8, trachea=8.0,
             parenchyma=-848.0, gravity=30.0, bone=175.0, contrast=False, blood=(42.0, 42.0), cava=42.0, liver_hu=55.0,
-            gas=0.5, table=None, round_field=False, field=800.0, scan=(-400.0, 400.0), noise=0.0)
+            gas=0.5, couch=None, arms=(True, True), round_field=False, field=800.0, scan=(-400.0, 400.0), noise=0.0)
 
     def level(self, z):
         """0 at the deepest recess of the lungs, 1 at the apices."""

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from phydict.datasets.surroundings.layers import between, fine
 from phydict.datasets.surroundings.scene import Scene
 
 KINDS = {
@@ -69,39 +70,40 @@ class Couch:
 
     def add_to(self, scene: Scene) -> None:
         """Put it below the body's back."""
-        scene.add(self.section(scene)[..., None])
+        scene.add(self.section(scene.axes[0] - scene.middle[0], scene.axes[1] - scene.back)[..., None])
 
-    def section(self, scene: Scene) -> np.ndarray:
-        """Density (X, Y) relative to water, averaged over each voxel."""
-        across = np.abs(scene.fine_x - scene.middle[0] - self.shift)
-        surface = scene.back - self.gap + self.curve * across**2
+    def section(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Density (X, Y) relative to water, averaged over each voxel, of voxels with centres `x` (X,) from the body's
+        middle and `y` (Y,) from its back, in mm."""
+        across = np.abs(fine(x) - self.shift)
+        surface = self.curve * across**2 - self.gap
         top = surface - self.pad
         bottom = np.minimum(top - self.thickness, top) if not self.keel else np.minimum(
             top[across.argmin()] - self.thickness + 0.7 * np.maximum(across - self.keel / 2, 0), top - 2 * self.shell)
-        section = _density(self.pad_hu) * self._layer(scene, across < self.width / 2 - 10, top, surface)
-        section += self._box(scene, across, self.width, top, bottom)
+        section = _density(self.pad_hu) * _layer(across < self.width / 2 - 10, top, surface, y)
+        section += self._box(across, self.width, top, bottom, y)
         if self.under:
             distance, thickness = self.under
             lower = np.full(across.shape, bottom.min() - distance)
-            section += self._box(scene, across, 0.9 * self.width, lower, lower - thickness)
+            section += self._box(across, 0.9 * self.width, lower, lower - thickness, y)
         if self.rest:
             start, slope, length = self.rest
             board = surface + slope * (across - start)
             beside = (across > start) & (across < start + length / np.hypot(1, slope))
-            section += _density(self.pad_hu) * self._layer(scene, beside, board - 12 * np.hypot(1, slope), board)
-            section += _density(self.shell_hu) * self._layer(scene, beside, board, board + 1.5 * np.hypot(1, slope))
+            section += _density(self.pad_hu) * _layer(beside, board - 12 * np.hypot(1, slope), board, y)
+            section += _density(self.shell_hu) * _layer(beside, board, board + 1.5 * np.hypot(1, slope), y)
         return section
 
-    def _box(self, scene: Scene, across: np.ndarray, width: float, top: np.ndarray, bottom: np.ndarray) -> np.ndarray:
+    def _box(self, across: np.ndarray, width: float, top: np.ndarray, bottom: np.ndarray, y: np.ndarray) -> np.ndarray:
         """A hollow shell with its core."""
         inner = across < width / 2 - self.shell
-        walls = self._layer(scene, across < width / 2, bottom, top)
-        core = self._layer(scene, inner, bottom + self.shell, top - self.shell)
+        walls = _layer(across < width / 2, bottom, top, y)
+        core = _layer(inner, bottom + self.shell, top - self.shell, y)
         return _density(self.shell_hu) * (walls - core) + _density(self.core_hu) * core
 
-    @staticmethod
-    def _layer(scene: Scene, where: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        return scene.between(low, np.where(where, high, low))
+
+def _layer(where: np.ndarray, low: np.ndarray, high: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return between(low, np.where(where, high, low), y)
 
 
 def _density(hu: float) -> float:

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from phydict.datasets.surroundings.scene import FINE, Scene
+from phydict.datasets.surroundings.layers import FINE, between, fine
+from phydict.datasets.surroundings.scene import Scene
 
 KINDS = {"sheet": ((0.4, 1.5), (-600, -100)), "clothes": ((1.0, 4.0), (-850, -500)), "blanket": ((4, 20), (-960, -860))}
 """Kind -> mm of thickness and HU."""
@@ -37,15 +38,15 @@ class Cover:
 
     def add_to(self, scene: Scene) -> None:
         """Lay it on the body."""
-        z = scene.axes[2][scene.slices]
+        x, z = fine(scene.axes[0]), scene.axes[2][scene.slices]
         height = self._draped(scene)[:, scene.slices]
         tall, across, along, phase = self.folds
-        wave = np.sin(2 * np.pi * (scene.fine_x[:, None] / across + z / along) + phase)
+        wave = np.sin(2 * np.pi * (x[:, None] / across + z / along) + phase)
         height = np.maximum(height + self.lift + tall * np.maximum(wave, 0) ** 2, scene.back)
-        slope = np.gradient(height, scene.fine_x, axis=0)
+        slope = np.gradient(height, x, axis=0)
         thick = self.thickness * np.sqrt(1 + slope**2)
         ends = np.clip((scene.low + self.end * (scene.high - scene.low) - z) / scene.grid.spacing[2] + 0.5, 0, 1)
-        share = scene.between(height, height + thick)
+        share = between(height, height + thick, scene.axes[1])
         scene.add((1 + self.hu / 1000) * share * ends, (slice(None), slice(None), scene.slices))
 
     def _draped(self, scene: Scene) -> np.ndarray:

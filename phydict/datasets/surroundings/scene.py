@@ -12,9 +12,6 @@ from phydict.grid import Grid
 OCCUPIED = -320.0
 """HU above which a voxel outside the body counts as solid."""
 
-FINE = 4
-"""Samples across a voxel in x, where a shape is given by its extent in y."""
-
 CONTACT = 0.02
 """Share of the skin's columns that reach further back than where the body is taken to rest on the couch."""
 
@@ -75,21 +72,6 @@ class Scene:
     def soft(self, distance) -> np.ndarray:
         """Share of each voxel inside a body with signed `distance` mm."""
         return np.clip(0.5 - np.asarray(distance) / self.edge, 0, 1)
-
-    @property
-    def fine_x(self) -> np.ndarray:
-        """x in mm (FINE X,) of evenly spread places, FINE in each voxel."""
-        places = (np.arange(FINE) + 0.5) / FINE - 0.5
-        return (self.axes[0][:, None] + places * self.grid.spacing[0]).ravel()
-
-    def between(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Share (X, Y, ...) of each voxel between the heights y `low` and `high` (FINE X, ...) in mm, exact in y."""
-        step = self.grid.spacing[1]
-        rows = self.axes[1].reshape(-1, *[1] * (low.ndim - 1))
-        share = np.minimum(high[:, None], rows + step / 2)
-        share -= np.maximum(low[:, None], rows - step / 2)
-        np.maximum(share, 0, out=share)
-        return share.reshape(-1, FINE, *share.shape[1:]).mean(1) / step
 
     def add(self, density: np.ndarray, box: tuple[slice, ...] = (slice(None),) * 3) -> None:
         """Add matter of `density` (water is 1), averaged over each voxel of `box`, to the share of it that is free."""

@@ -18,7 +18,8 @@ def lung_tissue(canvas: Canvas, texture: np.ndarray) -> np.ndarray:
     """HU of aerated lung everywhere: gravity gradient, grain, fissures, emphysema with its bullae."""
     t, (x, y, z) = canvas.thorax, canvas.axes
     fine = Texture(t.seed, 1, 7.0)(x, y, z)
-    tissue = t.parenchyma - t.gravity * (y / t.depth) + 18 * fine + 16 * texture
+    dense = np.clip(fine + texture - 1, 0, 3) ** 2
+    tissue = t.parenchyma - t.gravity * (y / t.depth) + 18 * fine + 16 * texture + 14 * dense
     for finding in t.findings:
         if finding.kind == "pneumothorax":
             tissue = tissue + (SIDES[finding.side] * x > 0) * finding.size * 160

@@ -72,7 +72,8 @@ def _trunk(canvas: Canvas, texture: np.ndarray) -> np.ndarray:
                       + (z - start[2] - along * line[2]) ** 2) - t.arm_width
         muscle = -smooth_max(-muscle, -arm, 25.0)
     front = np.clip(y / t.depth, -1, 1)
-    skin = muscle - t.fat * (0.85 + 0.25 * np.clip(-t.level(z) + 0.6, -0.6, 0.6) - 0.15 * front) - 2
+    lumps = 0.15 * min(t.fat, 25) * np.clip(Texture(t.seed, 12, 60.0)(x, y, z), -2, 2)
+    skin = muscle - t.fat * (0.85 + 0.25 * np.clip(-t.level(z) + 0.6, -0.6, 0.6) - 0.15 * front) - lumps - 2
     skin = smooth_max(skin, -canvas.straight_y - t.back_plane, 16.0)
     if t.breast:
         bulge = np.array([62, 34, 55]) * t.breast
@@ -187,7 +188,7 @@ def _skeleton(canvas: Canvas, texture: np.ndarray) -> None:
         inside = canvas.soft(np.maximum(body, -disc))
         canvas.paint(inside, t.bone + 30 * texture[box], box)
         rim = (canvas.sheet(body + 1, 2.2) * canvas.soft(-disc) + canvas.sheet(disc - 1, 2.0) * canvas.soft(body))
-        canvas.paint(np.minimum(rim, 1) * 0.8, 0.5 * t.cortex, box)
+        canvas.paint(np.minimum(rim, 1) * 0.7, 0.45 * t.cortex, box)
     share, value = canvas.fill(bones(t))
     canvas.paint(share, value)
     if 0 not in canvas.hu[box].shape:
@@ -213,7 +214,7 @@ def _scanner(canvas: Canvas, masks: np.ndarray) -> None:
     if t.noise:
         grain = np.random.default_rng([t.seed, 9]).standard_normal(canvas.grid.shape, np.float32)
         averaged = min(1.0, NOISE_MM / canvas.edge)
-        canvas.hu += np.float32(1.9 * t.noise * averaged) * scipy.ndimage.gaussian_filter(grain, 0.6)
+        canvas.hu += np.float32(2.4 * t.noise * averaged) * scipy.ndimage.gaussian_filter(grain, (0.6, 0.6, 0.9))
         slow = Texture(t.seed, 10, 13.0)(*canvas.axes)
         canvas.hu += np.float32(0.3 * t.noise) * slow * np.clip((canvas.hu - AIR) / 1000, 0, 1)
         unresolved = t.noise * np.sqrt(max(1 - averaged**2, 1e-6))

@@ -120,16 +120,16 @@ class Thorax:
             ends = base + np.sort(pose.uniform(0, 1, 2)) * (height - LEAST_SCAN)
             low, high = [(float(ends[0]), scan[1]), (scan[0], float(ends[1]) + LEAST_SCAN)][int(pose.integers(2))]
             scan = (low, high)
-        stout = pose.uniform(44, 120) if pose.random() < 0.08 else None
+        stout = pose.uniform(44, 120) if pose.random() < 0.06 else None
         return cls(
             seed=seed, offset=offset, width=size * uniform(126, 146), depth=size * uniform(88, 105), height=height,
             wall=uniform(9, 17), back=uniform(6, 13), fat=stout or float(np.clip(rng.gamma(5.0, 4.2), 6, 44)),
-            marbling=uniform(0.4, 1.2), muscle_hu=uniform(42, 68) + (8 if contrast else 0),
+            marbling=uniform(0.45, 1.25), muscle_hu=uniform(36, 62) + (8 if contrast else 0),
             dome=uniform(42, 66), dome_step=uniform(4, 20), heart=uniform(0.42, 0.49), heart_turn=uniform(0.45, 0.8),
             breast=uniform(0.6, 1.3) if rng.random() < 0.4 else 0.0, arm_width=uniform(36, 46),
-            spine=uniform(15.5, 19.0), vertebra=size * uniform(21, 25), rib_slope=uniform(0.95, 1.45),
-            kyphosis=uniform(8, 28), aorta=uniform(11.5, 16.0), trachea=uniform(6.5, 8.8),
-            parenchyma=uniform(-905, -812), gravity=uniform(15, 45), bone=uniform(120, 230), contrast=contrast,
+            spine=uniform(16.5, 20.0), vertebra=size * uniform(21, 25), rib_slope=uniform(0.95, 1.45),
+            kyphosis=uniform(8, 28), aorta=uniform(11.5, 16.0), trachea=uniform(5.8, 8.2),
+            parenchyma=uniform(-905, -812), gravity=uniform(15, 45), bone=uniform(150, 280), contrast=contrast,
             blood=tuple(float(v) for v in blood), cava=float(blood[0] * (uniform(1.0, 3.0) if contrast else 1.0)),
             liver_hu=uniform(45, 65) + (45 if contrast else 0), gas=uniform(0.0, 1.0),
             couch=Couch.draw(pose) if pose.random() < 0.9 else None,
@@ -164,7 +164,7 @@ class Thorax:
     @property
     def cortex(self) -> float:
         """HU of compact bone."""
-        return 470 + 3.4 * self.bone
+        return 430 + 3.2 * self.bone
 
     @property
     def back_plane(self) -> float:

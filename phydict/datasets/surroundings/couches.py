@@ -14,16 +14,16 @@ from phydict.datasets.surroundings.layers import between, fine
 from phydict.datasets.surroundings.scene import Scene
 
 KINDS = {
-    "flat narrow": ((370, 440), (15, 50), (0.0, 1e-4), (-970, -890), 0.0),
-    "flat wide": ((450, 560), (20, 60), (0.0, 1e-4), (-970, -890), 0.0),
-    "curved": ((390, 480), (20, 60), (4e-4, 1.4e-3), (-970, -890), 0.1),
-    "foam": ((400, 520), (60, 120), (0.0, 8e-4), (-970, -925), 0.0),
-    "PET": ((420, 530), (8, 25), (0.0, 4e-4), (-970, -850), 1.0),
-    "radiotherapy": ((500, 540), (45, 60), (0.0, 0.0), (-975, -910), 0.0)}
+    "flat narrow": ((370, 440), (15, 50), (0.0, 1e-4), (-955, -880), 0.0),
+    "flat wide": ((450, 560), (20, 60), (0.0, 1e-4), (-955, -880), 0.0),
+    "curved": ((390, 480), (20, 60), (4e-4, 1.4e-3), (-955, -880), 0.1),
+    "foam": ((400, 520), (60, 120), (0.0, 8e-4), (-955, -920), 0.0),
+    "PET": ((420, 530), (8, 25), (0.0, 4e-4), (-955, -850), 1.0),
+    "radiotherapy": ((500, 540), (45, 60), (0.0, 0.0), (-955, -900), 0.0)}
 """Kind -> mm of width and of thickness, curvature of its surface in 1/mm, HU of its core, share with a second shell."""
 
 SHELL_MM, SHELL_HU = (0.8, 2.8), (-200.0, 300.0)
-PAD_MM, PAD_HU = (4.0, 40.0), (-960.0, -860.0)
+PAD_MM, PAD_HU = (4.0, 40.0), (-950.0, -850.0)
 SHIFT_MM = 30.0
 
 

@@ -30,8 +30,8 @@ class Grid:
     """
 
     shape: tuple[int, int, int]
-    spacing: tuple[float, float, float] | None = None
-    affine: np.ndarray | None = None
+    spacing: tuple[float, float, float] = None  # type: ignore[assignment]  # either is made of the other
+    affine: np.ndarray = None  # type: ignore[assignment]
 
     def __post_init__(self):
         shape = whole_sizes(self.shape)

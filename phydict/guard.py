@@ -47,7 +47,8 @@ class Guard:
 
     def reset(self) -> None:
         """Steps are counted from 1 again: further samples are drawn."""
-        self.step, self.misfits, self.operator.last_projection = 0, {}, None
+        self.step, self.operator.last_projection = 0, None
+        self.misfits: dict[int, float] = {}
 
     def __call__(self) -> None:
         """A step is done. Raises FloatingPointError where what was estimated or projected in it is not finite."""

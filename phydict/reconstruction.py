@@ -84,7 +84,7 @@ class Reconstructor(ABC):
 
     def with_mu_water(self, mu_water: float) -> Reconstructor:
         """The same method for X-rays in which water attenuates `mu_water` in 1/mm."""
-        return replace(self, mu_water=mu_water)
+        return replace(self, mu_water=mu_water)  # type: ignore[type-var]
 
     @abstractmethod
     def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,

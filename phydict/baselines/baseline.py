@@ -24,11 +24,12 @@ class CountingProjector:
 
     def __init__(self, projector: Projector):
         self.grid, self.beam, self._projector, self.calls = projector.grid, projector.beam, projector, 0
-        self.y = self.last_projection = None
+        self.y: Tensor = None  # type: ignore[assignment]  # known once they are matched
+        self.last_projection: Tensor | None = None
 
     def __call__(self, density: Tensor) -> Tensor:
-        self.last_projection = self.linear(density)
-        return self.last_projection
+        self.last_projection = found = self.linear(density)
+        return found
 
     def linear(self, d: Tensor) -> Tensor:
         """The same of directions and test volumes, which are no estimates."""

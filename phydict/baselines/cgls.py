@@ -48,6 +48,7 @@ class CGLS(Baseline):
             negative_gradient = A.T(y - A(density))
             inactive = ~((density <= low) & (negative_gradient < 0) | (density >= high) & (negative_gradient > 0))
             density = clip(density + conjugate_gradients(
-                lambda d, inactive=inactive: inactive * A.T(A.linear(d)), inactive * negative_gradient, self.iterations,
+                lambda d, inactive=inactive: inactive * A.T(A.linear(d)),  # type: ignore[misc]
+                inactive * negative_gradient, self.iterations,
                 on_step=on_step), self.window)
         return density

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import nibabel as nib
 import numpy as np
@@ -123,7 +124,7 @@ def _page(width: float, upper: float, lower: float, title: str):
     figure = Figure(figsize=(width, strip + upper + lower), dpi=110, facecolor="white")
     FigureCanvasAgg(figure)
     heights = [strip, upper] + ([lower] if lower else [])
-    parts = figure.subfigures(len(heights), 1, height_ratios=heights, hspace=0)
+    parts: Any = figure.subfigures(len(heights), 1, height_ratios=heights, hspace=0)
     parts[0].suptitle(literal(title), fontsize=13, y=0.6, va="center")
     return figure, parts[1], parts[2] if lower else None
 
@@ -142,8 +143,7 @@ def _show_plane(ax: Axes, volume, grid: Grid, name: str, heading: str) -> None:
     ax.imshow(np.ma.masked_invalid(image), GREY, aspect=aspect, vmin=DISPLAY[0], vmax=DISPLAY[1],
               interpolation="nearest")
     _finish(ax, heading)
-    left, right, top, bottom = PLANES[name][1]
-    for x, y, letter in ((0.03, 0.5, left), (0.97, 0.5, right), (0.5, 0.96, top), (0.5, 0.04, bottom)):
+    for (x, y), letter in zip(((0.03, 0.5), (0.97, 0.5), (0.5, 0.96), (0.5, 0.04)), PLANES[name][1]):
         _write(ax, x, y, letter, "center")
     if broken := int((~np.isfinite(image)).sum()):
         _write(ax, 0.02, 0.04, f"{broken} not finite", "left")

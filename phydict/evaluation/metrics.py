@@ -192,6 +192,7 @@ class CaseMetrics(Metric):
         # Flat float64 rows [case, method, values, present]. torchmetrics gathers an empty process as a flat tensor of
         # the metric's dtype, so the state has to be both.
         self.set_dtype(torch.float64)
+        self.values: list[Tensor]
         self.add_state("values", default=[], dist_reduce_fx="cat")
 
     def update(self, case: int, method: str, values: Mapping[str, float], seconds: float | None = None) -> None:
@@ -228,7 +229,7 @@ class CaseMetrics(Metric):
     def _cases(self) -> dict[tuple[int, str], dict[str, float]]:
         n = len(self.names)
         table = dim_zero_cat(self.values).reshape(-1, 2 + 2 * n).tolist() if len(self.values) else []
-        cases = {}
+        cases: dict[tuple[int, str], dict[str, float]] = {}
         for case, method, *row in sorted(table, key=lambda row: row[:2]):
             values = {name: value for name, value, present in zip(self.names, row[:n], row[n:]) if present}
             cases.setdefault((int(case), self.methods[int(method)]), values)

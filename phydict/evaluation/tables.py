@@ -59,8 +59,8 @@ class Table:
         columns = [[printed(label) for label, _, _ in self.lines]]
         for c, measure in enumerate(self.measures):
             values = [values[c] for _, _, values in self.lines]
-            places = ranks([round(float(values[c]), measure.decimals) if ranked and values[c] is not None else math.nan
-                            for _, ranked, values in self.lines], measure.higher_is_better)
+            places = ranks([round(float(value), measure.decimals) if ranked and value is not None else math.nan
+                            for (_, ranked, _), value in zip(self.lines, values)], measure.higher_is_better)
             columns.append([marks[place].format(printed("–" if value is None else f"{value:.{measure.decimals}f}"))
                             for value, place in zip(values, places)])
         return [list(line) for line in zip(*columns)]
@@ -88,7 +88,8 @@ def mean_table(rows: Iterable[Mapping], by: str = "method", metrics: Sequence[st
     groups = summarise(rows, by, metrics)
     names = [name for name in metrics or MEASURES if any(name in group for group in groups.values())]
     measures = [MEASURES.get(name, Measure(name, None, 3)) for name in names]
-    lines = [(label, True, [group.get(name) for name in names]) for label, group in groups.items()]
+    lines: list[tuple[str, bool, list[float | Summary | None]]] = [
+        (label, True, [group.get(name) for name in names]) for label, group in groups.items()]
     if warned := warned_cases(rows, by):
         measures.append(Measure("warned", None, 0))
         lines = [(label, ranked, [*values, len(warned.get(label, ()))]) for label, ranked, values in lines]

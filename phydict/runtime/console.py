@@ -38,8 +38,9 @@ CONFIGURATION = ("-c", "--config")
 def _bounded(text: str) -> object:
     """A value or a file of the command line's parser, read within `read_yaml`'s bounds; "a:" and "{a}" stay text."""
     value = parse_yaml(text, "the value")
-    bare, text_alone = text.strip(), isinstance(value, dict) and value and all(v is None for v in value.values())
-    if text_alone and (bare == f"{next(iter(value))}:" or (bare.startswith("{") and ":" not in bare)):
+    bare = text.strip()
+    if isinstance(value, dict) and value and all(v is None for v in value.values()) and (
+            bare == f"{next(iter(value))}:" or (bare.startswith("{") and ":" not in bare)):
         return text
     return value
 
@@ -59,11 +60,11 @@ def cli_errors(*also: type[Exception], to_go_on: str = "run the same command aga
         yield
     except (KeyboardInterrupt, SystemExit) as stop:  # Lightning exits with 1 on SIGINT and without a code on SIGTERM
         interrupted = isinstance(stop, KeyboardInterrupt) or isinstance(stop.__context__, KeyboardInterrupt)
-        if not interrupted and stop.code is not None:
+        if not interrupted and isinstance(stop, SystemExit) and stop.code is not None:
             raise
         print(f"stopped by a signal; to go on, {to_go_on}", file=sys.stderr)
         raise SystemExit(130 if interrupted else 143) from None
-    except (ValueError, OSError, FloatingPointError, ArgumentError, *also) as error:
+    except (ValueError, OSError, FloatingPointError, ArgumentError, *also) as error:  # type: ignore[misc]
         if os.environ.get(TRACEBACK):
             raise
         full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
@@ -216,7 +217,7 @@ def quiet() -> Iterator[None]:
     loggers = [logging.getLogger(name) for name in ("lightning.pytorch", "lightning.fabric")]
     levels = [logger.level for logger in loggers]
     with warnings.catch_warnings():
-        warnings.showwarning = _show
+        warnings.showwarning = _show  # type: ignore[assignment]
         for message in NOISE:
             warnings.filterwarnings("ignore", message)
         for logger in loggers:
@@ -242,7 +243,7 @@ def noted(found: list[str], name: str) -> Iterator[None]:
                 found.append(text)
             show(message if name in text else f"{name}: {text}", category, *where)
 
-        warnings.showwarning = keep
+        warnings.showwarning = keep  # type: ignore[assignment]
         yield
 
 

@@ -60,7 +60,8 @@ MODULES = {
 def check_setting(path: str, value: object = None) -> None:
     """Raises ValueError, in one sentence with the new name, where `path` (a.b.init_args.c), a part of it or what
     `value`, nested settings, holds is an old setting, or where a text is an old class."""
-    place, parts = [], path.split(".")
+    place: list[str] = []
+    parts = path.split(".")
     for n, name in enumerate(parts, 1):
         if name == "init_args":
             continue

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import NoReturn
 
 import yaml
 
@@ -20,7 +21,7 @@ TAG = "tag:yaml.org,2002:"
 PLAIN = tuple(TAG + name for name in ("null", "bool", "int", "float", "str"))
 
 
-class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
+class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
     """YAML's parser and its words for numbers and the like."""
 
 
@@ -69,7 +70,7 @@ class _Reader:
             self.refuse("", "it holds several documents; keep one")
         return value
 
-    def refuse(self, key: str, what: str) -> None:
+    def refuse(self, key: str, what: str) -> NoReturn:
         raise ValueError(f"{self.path}: `{key}` {what}" if key else f"{self.path}: {what}")
 
     def value(self, key: str, depth: int) -> object:
@@ -96,9 +97,9 @@ class _Reader:
         return value
 
     def alias(self, event: yaml.AliasEvent, key: str) -> object:
-        if event.anchor not in self.anchors:
+        if (known := self.anchors.get(event.anchor or "")) is None:
             self.refuse(key, f"refers to *{event.anchor}, which nothing before it defines; write its value")
-        value, size = self.anchors[event.anchor]
+        value, size = known
         self.values += size
         self.repeated += size
         if self.repeated > MOST_REPEATED:
@@ -121,13 +122,14 @@ class _Reader:
             self.refuse(key, f"cannot be read ({reason(error)}); give a plain value")
 
     def sequence(self, key: str, depth: int) -> list:
-        found = []
+        found: list[object] = []
         while not self.loader.check_event(yaml.SequenceEndEvent):
             found.append(self.value(f"{key}[{len(found)}]", depth + 1))
         return found
 
     def mapping(self, key: str, depth: int) -> dict:
-        merged, found = {}, {}
+        merged: dict = {}
+        found: dict = {}
         while not self.loader.check_event(yaml.MappingEndEvent):
             event = self.loader.peek_event()
             merge = isinstance(event, yaml.ScalarEvent) and event.value == "<<" and event.implicit[0]

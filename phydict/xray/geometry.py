@@ -6,6 +6,7 @@ import math
 import reprlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -233,11 +234,12 @@ class ConeBeam:
             raise ValueError(f"{path}: {error}") from error
 
     @classmethod
-    def from_dict(cls, content: dict) -> ConeBeam:
+    def from_dict(cls, content: object) -> ConeBeam:
         """The beam of a mapping in one of the two forms that `load` reads. Raises ValueError naming the key."""
         if not isinstance(content, dict) or "orbit" not in content:
-            _check_keys(content, VECTOR_KEYS, ())
-            return cls(**{key: _numbers(key, value) for key, value in content.items()})
+            content = _check_keys(content, VECTOR_KEYS, ())
+            numbers: dict[str, Any] = {key: _numbers(key, value) for key, value in content.items()}
+            return cls(**numbers)
         _check_keys(content, ("orbit",), ())
         orbit = content["orbit"]
         _check_keys(orbit, ORBIT_KEYS, ORBIT_OPTIONS)
@@ -288,7 +290,8 @@ def _numbers(key: str, value) -> float | np.ndarray:
     return found if found.ndim else found.item()
 
 
-def _check_keys(content, required: tuple[str, ...], optional: tuple[str, ...]) -> None:
+def _check_keys(content: object, required: tuple[str, ...], optional: tuple[str, ...]) -> dict:
+    """The mapping with these keys that `content` is. Raises ValueError, naming the key, where it is none."""
     if not isinstance(content, dict):
         raise ValueError(f"a mapping with the keys {', '.join(required)} was expected, but "
                          f"{reprlib.repr(content)} was found")
@@ -299,3 +302,4 @@ def _check_keys(content, required: tuple[str, ...], optional: tuple[str, ...]) -
     for key in required:
         if key not in content:
             raise ValueError(f"missing key {key!r}; the keys are {allowed}")
+    return content

@@ -50,7 +50,8 @@ def read_beam(path: str | Path, shape: tuple[int, int] | None = None,
         raise ValueError(f"{path} holds numbers of shape {vectors.shape}, but 12 per view were expected: source, "
                          "detector centre, u and v")
     try:
-        return ConeBeam(*np.split(vectors, 4, axis=1), shape)
+        sources, detectors, u, v = np.split(vectors, 4, axis=1)
+        return ConeBeam(sources, detectors, u, v, shape)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 

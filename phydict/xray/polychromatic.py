@@ -115,12 +115,12 @@ class Polychromatic(Simulator):
             if density.any():
                 path.copy_(projector(density[None])[0])
         signal, quantum = self.primary(paths)
-        _, photon = self.primary(paths.new_zeros(3))
+        photon = float(self.primary(paths.new_zeros(3))[1])
         if self.scatter > 0:
             signal = signal + scatter_of(signal, projector.beam, self.scatter, self.scatter_width)
         floor = torch.finfo(signal.dtype).tiny
         if self.air_photons is not None:
-            quantum, photon = quantum.double() / self.air_photons, float(photon) / self.air_photons
+            quantum, photon = quantum.double() / self.air_photons, photon / self.air_photons
             signal = quantum * poisson(signal / quantum, generator) + self.readout * photon * normal(signal, generator)
             floor = photon / 2
         signal = signal.clamp(min=floor)

@@ -48,7 +48,7 @@ def read_rtk(path: str | Path, shape: tuple[int, int], pixel: float | tuple[floa
                          "3 was expected; write it again with a current RTK")
     height, width = pixel_sizes(pixel)
     stated = {name: 0.0 for name in PARAMETERS if name not in NEEDED}
-    poses = []
+    poses: list[tuple[np.ndarray, ...]] = []
     for element in root:
         if element.tag != "Projection":
             stated |= _numbers(path, [element])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 from numba import njit
 
@@ -18,7 +19,7 @@ def compiled(fastmath: bool | set[str] = False, parallel: bool = False) -> Calla
     The machine code is kept for other processes in NUMBA_CACHE_DIR, beside the source or in the user's cache folder,
     the first of them that can be written to; where none can, every process compiles anew.
     """
-    threads = LOOPS_ALONE if parallel else False
+    threads: Any = LOOPS_ALONE if parallel else False
 
     def decorate(function: Callable) -> Callable:
         try:

@@ -18,8 +18,8 @@ def csr_tensor(matrix, like: torch.Tensor) -> torch.Tensor:
     matrix = matrix.tocsr()
     matrix.sort_indices()
     kind = index_type(matrix.nnz, matrix.shape[1])
-    index = [torch.as_tensor(part.astype(kind, copy=False)) for part in (matrix.indptr, matrix.indices)]
+    rows, columns = (torch.as_tensor(part.astype(kind, copy=False)) for part in (matrix.indptr, matrix.indices))
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Sparse CSR tensor support is in beta state")
-        return torch.sparse_csr_tensor(*index, torch.as_tensor(matrix.data).to(like.dtype), matrix.shape,
+        return torch.sparse_csr_tensor(rows, columns, torch.as_tensor(matrix.data).to(like.dtype), matrix.shape,
                                        device=like.device, check_invariants=False)

@@ -13,7 +13,7 @@ may differ from run to run; on the CPU every result has one writer.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -44,21 +44,23 @@ class Sweep(NamedTuple):
 
     def to(self, like: torch.Tensor) -> Sweep:
         """On the device of `like`, numbers in its precision."""
-        return Sweep(self.axis, self.pixels.to(like.device), *[
-            None if part is None else part.to(like) for part in self[2:]])
+        return self._of(self.pixels.to(like.device), *[None if part is None else part.to(like) for part in self[2:]])
 
     @property
     def nbytes(self) -> int:
         return sum(part.nbytes for part in self[1:] if part is not None)
 
     def part(self, rays: slice) -> Sweep:
-        return Sweep(self.axis, *[None if part is None else part[rays] for part in self[1:]])
+        return self._of(*[None if part is None else part[rays] for part in self[1:]])
+
+    def _of(self, *parts: Any) -> Sweep:
+        return Sweep(self.axis, *parts)
 
     def positions(self, planes: slice, size: int) -> torch.Tensor:
         """Where the rays meet the planes (P, 1, R, 2) of `size`, as grid_sample wants it."""
         index = torch.arange(planes.start, planes.stop).to(self.middle)[:, None]
         at = self.middle + (index - (size - 1) / 2)[..., None] * self.slope
-        if self.first is not None:
+        if self.first is not None and self.last is not None:
             at = at.masked_fill(((index < self.first) | (index > self.last))[..., None], 3.0)  # beyond the grid
         return at[:, None]
 

@@ -116,7 +116,7 @@ def _array(x: torch.Tensor) -> np.ndarray:
 def _set_threads() -> int:
     """The number of threads that torch uses, told to numba, whose first start sets OpenMP's, and so torch's, to all."""
     asked = torch.get_num_threads()
-    threads = min(asked, numba.config.NUMBA_NUM_THREADS)
+    threads = min(asked, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
     numba.set_num_threads(threads)
     if torch.get_num_threads() != asked:
         torch.set_num_threads(asked)

@@ -154,7 +154,7 @@ def _project_group(volume, image, first, filled, extent, start, columns, rows, p
                 f = volume.dtype.type(at - k)
                 here, row = uint64(k * LANES), uint64(v * LANES)
                 for lane in range(LANES):
-                    c = uint64(lane)
+                    c = uint64(lane)  # type: ignore[assignment]
                     value = lines[here + c]
                     sums[row + c] += value + f * (lines[here + c + uint64(LANES)] - value)
     for v in range(height):
@@ -191,7 +191,7 @@ def _backproject_slab(volume, image, low, high, everywhere, start, columns, rows
                     f = volume.dtype.type(at - k)
                     here, row = uint64(k * LANES), uint64(v * LANES)
                     for lane in range(LANES):
-                        c = uint64(lane)
+                        c = uint64(lane)  # type: ignore[assignment]
                         above = f * values[row + c]
                         lines[here + c] += values[row + c] - above
                         lines[here + c + uint64(LANES)] += above

@@ -13,7 +13,7 @@ def prepare(cts: str, out: str, voxels: int = 256, side: float = 384.0, space: s
             window: tuple[float, float] | None = None, segmenter: str = "threshold", atlas: str | None = None,
             workers: int = 1, reports: str | None = None, metadata: str | None = None, fixed: bool = True,
             first_reconstruction: bool = False, exclude: str | None = None) -> None:
-    """Prepares the CTs of a folder for training a prior; a stopped run goes on where it was.
+    """Prepares the CTs of a folder for training a prior; a stopped run resumes.
 
     Args:
         cts: a folder of DICOM series or NIfTI CTs, at any depth, or one NIfTI file

@@ -84,7 +84,7 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: Prior | Refiner 
     super_resolution: the second stage of a cascade, or its file; None reconstructs on the prior's own grid. sr_guided:
     whether the X-rays guide that stage too; sr_sampler: how (None: CascadePosterior's own); sr_noise_augmentation: its
     noise (None: the stage's own).
-    samples: how many to draw; of several, the result is the mean, with their standard deviation as a map of trust.
+    samples: how many to draw; of several, the result is the mean, with their standard deviation as a map.
     precision: of the networks, one of phydict.runtime.precision.PRECISIONS. Raises ValueError for what cannot be meant.
     """
     check_precision(precision)
@@ -108,7 +108,7 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: Prior | Refiner 
     if super_resolution is None:
         return Posterior(prior, method, guidance, name=name, precision=precision, samples=samples)
     if samples != 1:
-        raise ValueError(f"samples are drawn of a prior without a second stage, but {samples} were asked for with "
+        raise ValueError(f"samples are drawn of a prior without a second stage, but {samples} were given with "
                          "super_resolution: leave one of the two out")
     if isinstance(super_resolution, str | Path):
         super_resolution = load_super_resolution(super_resolution)

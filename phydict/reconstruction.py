@@ -19,7 +19,7 @@ from phydict.xray import Projector
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """A reconstructed CT volume and the figures that say how far to trust it.
+    """A reconstructed CT volume and the figures that say how well it fits.
 
     volume: HU (X, Y, Z) on `grid`; misfit: relative residual |A mu - y| / |y| over all views, and misfit_per_view;
     seconds: per stage; network_calls, projector_calls: denoiser evaluations and applications of A or A.T to all

@@ -1,4 +1,4 @@
-"""The command line of reconstruction: what it writes, that it goes on after a stop, and how it refuses bad input."""
+"""The command line of reconstruction: what it writes, that it resumes after a stop, and how it refuses bad input."""
 
 from __future__ import annotations
 

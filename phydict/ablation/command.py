@@ -20,7 +20,7 @@ from phydict.runtime.reading import reason
 
 
 def main(args: list[str] | None = None) -> None:
-    """infer.py ablate -c <file>. A bad input ends in one sentence and exit code 2; a run that was stopped goes on."""
+    """infer.py ablate -c <file>. A bad input ends in one sentence and exit code 2; a stopped run resumes."""
     with cli_errors(), quiet():
         check_configured(sys.argv[1:] if args is None else args, (), "configs/ablate/pareto.yaml")
         given = _parser().parse_args(args).as_dict()

@@ -142,9 +142,9 @@ def trials_of(base: Mapping, axes: Mapping, methods: Mapping, cases: Cases,
     like = next((trial.prior for trial in found if trial.prior), None)
     found = [trial if trial.prior else replace(trial, like=like) for trial in found]
     scenes = [trial.scene() for trial in found]
-    asked = [Grid.cube(trial.voxels, trial.side) for trial in found if {"voxels", "side"} & trial.columns.keys()]
+    requested = [Grid.cube(trial.voxels, trial.side) for trial in found if {"voxels", "side"} & trial.columns.keys()]
     if any(window != scenes[0][1] for _, window in scenes) or not all(
-            grid.same_as(scenes[0][0]) for grid in [*asked, *(grid for grid, _ in scenes)]):
+            grid.same_as(scenes[0][0]) for grid in [*requested, *(grid for grid, _ in scenes)]):
         raise ValueError("the methods of a product are compared on one grid and HU window, but their priors, or voxels "
                          "and side, give several: leave voxels and side out, or make products of their own")
     return found, used

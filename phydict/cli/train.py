@@ -88,8 +88,8 @@ class PriorCLI(LightningCLI):
             parser.link_arguments("out", "best.dirpath")
 
     def instantiate_trainer(self, **kwargs) -> lightning.Trainer:
-        asked = self._get(self.config_init, "trainer").plugins or []
-        plugins = [*(asked if isinstance(asked, list) else [asked]), WholeCheckpoints()]
+        given = self._get(self.config_init, "trainer").plugins or []
+        plugins = [*(given if isinstance(given, list) else [given]), WholeCheckpoints()]
         logger = CSVLogger(self._get(self.config, "out"), name="logs")
         trainer = self._get(self.config_init, "trainer")
         found = None if trainer.accelerator == "cpu" else torch.accelerator.current_accelerator()
@@ -118,7 +118,7 @@ class PriorCLI(LightningCLI):
             return
         for name in (CHECKPOINT, BEST):
             if (out / name).exists():
-                raise ValueError(f"{out} holds a training already: go on with --ckpt_path {out / name}, or give "
+                raise ValueError(f"{out} holds a training already: resume it with --ckpt_path {out / name}, or give "
                                  "another folder with --out")
         if resumed:
             return
@@ -153,7 +153,7 @@ class PriorCLI(LightningCLI):
 def main(args: list[str] | None = None) -> None:
     """Command line of training: fit, validate, export, inspect-prior. A bad input ends in one sentence and code 2."""
     given = sys.argv[1:] if args is None else args
-    with cli_errors(MisconfigurationException, to_go_on="add --ckpt_path and the run's last.ckpt"), quiet():
+    with cli_errors(MisconfigurationException, to_resume="add --ckpt_path and the run's last.ckpt"), quiet():
         if given[:1] == ["export"]:
             auto_cli(export_prior, args=given[1:], as_positional=False, exit_on_error=False, allow_abbrev=False)
         elif given[:1] == ["inspect-prior"]:
@@ -169,4 +169,4 @@ def main(args: list[str] | None = None) -> None:
                      parser_kwargs={"exit_on_error": False, "allow_abbrev": False, "description": (
                          "Train a prior of chest CT. Two more commands: `export --checkpoint <last.ckpt> --out "
                          "<prior.safetensors>` writes what a training learnt as a prior for reconstruction, and "
-                         "`inspect-prior <path>` tells what a file or folder is.")})
+                         "`inspect-prior <path>` says what a file or folder is.")})

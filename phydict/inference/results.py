@@ -22,7 +22,7 @@ TABLE = "results.csv"
 
 
 class Finished(NamedTuple):
-    """A finished case: its record, and which file that is, by which two results of the same are told apart."""
+    """A finished case: its record, and which file that is, by which two results of the same differ."""
 
     record: dict
     file: tuple[int, int]
@@ -63,7 +63,7 @@ class CaseResults:
         return [case for case, there in self._before.items() if self.overwrite or not there]
 
     def missing(self) -> list[str]:
-        """Of the cases that `unfinished` was asked for, those that are not finished as they should be by now."""
+        """Of the cases given to `unfinished`, those that are not finished as they should be by now."""
         with undisturbed(self.folder):
             now = {case: self._there(case) for case in self._sources}
         return [case for case, there in now.items()
@@ -115,7 +115,7 @@ class CaseResults:
         return Finished(record, (stat.st_ino, stat.st_mtime_ns))
 
     def _other(self, case: str, there: Finished) -> str:
-        """In what a finished case differs from what is asked for; empty where it does not."""
+        """In what a finished case differs from the request; empty where it does not."""
         same = {"settings": there.record["settings"] == self._settings,
                 "data": there.record["source"] == self._sources[case]}
         return " and ".join(what for what in same if not same[what])

@@ -2,7 +2,7 @@
 
 predict: X-ray folders -> volumes, or with --dry_run pages that show their geometry, and nothing else.
 test: CTs or phantoms -> simulated X-rays -> volumes -> scores.
-Each finished case is one folder of the output; a run that was stopped goes on where it was.
+Each finished case is one folder of the output; a stopped run resumes where it was.
 """
 
 from __future__ import annotations
@@ -243,7 +243,7 @@ class ReconstructionTask(lightning.LightningModule):
 
 
 def _identity(role: str, prior: str | MedSynCheckpoint) -> dict:
-    """What a record tells of a prior: its name, CRC-32 and, where it was chosen from a folder of MedSyn's, its file."""
+    """What a record holds of a prior: its name, CRC-32 and, where it was chosen from a folder of MedSyn's, its file."""
     file = file_read(prior)
     return {role: Path(prior).name if isinstance(prior, str) else describe(prior),
             f"{role}_crc32": fingerprint(prior)} | ({f"{role}_file": file} if file else {})

@@ -110,7 +110,7 @@ class CascadePosterior(Reconstructor):
             if base.scatter:
                 measurement.reset_scatter(True)
                 measurement.subtract_scatter(measurement.project(fine.upsample(state)[:, :1]))
-                measurement.scatter_enabled = False  # what the base stage tells of is kept
+                measurement.scatter_enabled = False  # the base stage's is kept
             guard = Guard(measurement, on_step, self.second.steps())
             denoiser = CountingDenoiser(fine.bind(state, self.level, self.precision, generator), guard)
             x = noise_like(torch.empty(1, fine.state_channels, *fine.grid.shape, device=xrays.device), generator)

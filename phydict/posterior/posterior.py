@@ -65,7 +65,7 @@ class Posterior(Reconstructor):
     sampler: how; guidance: classifier-free guidance scale used when a report is given; mu_water: 1/mm;
     precision: of the denoiser, see phydict.runtime.precision;
     samples: how many are drawn. One is the sampler's own result; of several, drawn by its `for_sampling` settings, the
-    volume is the mean, and their standard deviation says where not to trust it. batch: how many of them go through
+    volume is the mean, and their standard deviation shows where it is uncertain. batch: how many of them go through
     the denoiser at once, where the sampler allows it; fewer need less memory. Sample i depends neither on samples nor,
     but for rounding, on batch.
     """

@@ -12,7 +12,7 @@ FREQUENCIES = 8
 
 
 class DetailNetwork(nn.Module):
-    """A few convolutions over single voxels, scaled and shifted by what they are told of the time.
+    """A few convolutions over single voxels, scaled and shifted by an embedding of the time.
 
     state_channels: channels of the state. width: channels between the convolutions. layers: convolutions between the
     first and the last. Untrained it answers with zeros.
@@ -35,8 +35,8 @@ class DetailNetwork(nn.Module):
         offset: (B, width, X, Y, Z), added to what the first convolution gives; None for none.
         """
         phase = math.pi * t[:, None] * torch.arange(1, FREQUENCIES + 1, device=t.device).to(t)
-        told = self.time(torch.cat([phase.sin(), phase.cos()], 1).to(difference.dtype))
-        scales, shifts = told[..., None, None, None].unflatten(1, (len(self.middle) + 1, 2, -1)).unbind(2)
+        embedded = self.time(torch.cat([phase.sin(), phase.cos()], 1).to(difference.dtype))
+        scales, shifts = embedded[..., None, None, None].unflatten(1, (len(self.middle) + 1, 2, -1)).unbind(2)
         h = torch.cat([difference, 2 * estimate], 1).contiguous(memory_format=torch.channels_last_3d)
         h = self.enter(h) if offset is None else self.enter(h) + offset
         h = silu(torch.addcmul(shifts[:, 0], h, 1 + scales[:, 0]), inplace=True)

@@ -21,7 +21,7 @@ STATE = ("ct", "lung", "airway", "vessel")
 
 
 DETAIL_REACH = 8.0
-"""Noise, over the size of the detail, beyond which a detail network is not asked."""
+"""Noise, over the size of the detail, beyond which a detail network is not called."""
 
 
 class Prior(nn.Module):
@@ -105,17 +105,17 @@ class Prior(nn.Module):
         same."""
         sigma = self.schedule.sigma(t.double()).to(x.dtype)
         reached = sigma <= DETAIL_REACH * self.skip_std
-        asked = reached.nonzero().flatten()
-        if not len(asked):
+        active = reached.nonzero().flatten()
+        if not len(active):
             if not self.training:
                 return found
-            asked = asked.new_zeros(1)
+            active = active.new_zeros(1)
         size = (sigma**2 + self.skip_std**2).sqrt()
-        inward, out = (w[asked].view(-1, 1, 1, 1, 1) for w in (1 / size, reached * sigma * self.skip_std / size))
-        estimate = estimate[asked]
-        answer = self.detail(inward * (x[asked] / a[asked] - estimate), estimate, t[asked].to(x.dtype),
-                             None if offset is None else offset[asked])
-        return found.index_add(0, asked, out * answer.to(out))
+        inward, out = (w[active].view(-1, 1, 1, 1, 1) for w in (1 / size, reached * sigma * self.skip_std / size))
+        estimate = estimate[active]
+        answer = self.detail(inward * (x[active] / a[active] - estimate), estimate, t[active].to(x.dtype),
+                             None if offset is None else offset[active])
+        return found.index_add(0, active, out * answer.to(out))
 
     def network_inputs(self, shape: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
         """Zeros on the default device, laid out as what the network is given for one state of `shape` voxels."""

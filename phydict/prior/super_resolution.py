@@ -25,7 +25,7 @@ class SuperResolution(nn.Module):
     `skip_std` does the input itself take over, k = skip_std^2 / (sigma^2 + skip_std^2), as in Prior.
 
     In training the coarse state carries Gaussian noise of a random level (noise augmentation; Ho et al. 2022,
-    arXiv:2106.15282), which F is told: at a level above 0 it relies less on the coarse state's details.
+    arXiv:2106.15282), which F is given: at a level above 0 it relies less on the coarse state's details.
 
     network: F, with state_channels + coarse_channels inputs; grid, window: where and in which HU range the fine volumes
     live; factor: fine voxels along each side of a coarse one; coarse_channels: how many of the coarse state's
@@ -33,7 +33,7 @@ class SuperResolution(nn.Module):
     volumes, which decides whether it runs on the whole or in tiles; overlap: voxels that neighbouring tiles share at
     least. Tiles that share 48 changed the shipped stage's estimates and a sample, on 144^3 voxels of a held-out CT, by
     0.06 HU in the root mean square and 0.9 HU at most; bfloat16 changes estimates by 0.3 and 2.5 HU. default_noise: the
-    level of the noise that a cascade gives the coarse state unless told otherwise.
+    level of the noise that a cascade gives the coarse state by default.
     """
 
     default_noise = 0.05
@@ -65,8 +65,8 @@ class SuperResolution(nn.Module):
         share, out = self.preconditioning(t)
         coarse = upsampled[:, :self.state_channels]
         inward = (s**2 + (a * self.detail_std) ** 2).rsqrt()
-        told = torch.cat([inward * (x - a * coarse), 2 * upsampled], 1)
-        return share * x / a + (1 - share) * coarse + out * self.network(told, t, level).to(x.dtype)
+        conditioning = torch.cat([inward * (x - a * coarse), 2 * upsampled], 1)
+        return share * x / a + (1 - share) * coarse + out * self.network(conditioning, t, level).to(x.dtype)
 
     def network_inputs(self, shape: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
         """As for a Prior."""

@@ -21,8 +21,8 @@ def read_torch(file: str | Path) -> object:
             warnings.filterwarnings("ignore", "Detected pickle protocol")
             return torch.load(file, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(file))
     except UnpicklingError as error:
-        asked = re.search(r"GLOBAL (\S+)", str(error))
-        reason = f"asks for code ({asked[1]})" if asked else "is no file of weights (perhaps a pickle with code)"
+        code = re.search(r"GLOBAL (\S+)", str(error))
+        reason = f"asks for code ({code[1]})" if code else "is no file of weights (perhaps a pickle with code)"
         raise ValueError(f"'{file}' {reason} and was refused, since only weights are read: give a .safetensors file, "
                          "or tensors alone as torch.save writes them") from error
     except Exception as error:  # whatever a damaged file leads to

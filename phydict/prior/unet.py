@@ -33,8 +33,8 @@ class TextMap(nn.Module):
     def forward(self, context: Tensor) -> Tensor:
         """Context (B, L, D) -> map (B, channels, cells, cells, cells)."""
         positions = self.positions.expand(len(context), -1, -1)
-        heard = positions + self.attention(positions, context, context, need_weights=False)[0]
-        return self.answer(heard).transpose(1, 2).unflatten(2, (self.cells,) * 3)
+        attended = positions + self.attention(positions, context, context, need_weights=False)[0]
+        return self.answer(attended).transpose(1, 2).unflatten(2, (self.cells,) * 3)
 
     def sketch(self, context: Tensor) -> Tensor:
         """What the report implies, averaged over cells: (B, 1, cells, cells, cells); see `learn_sketch`."""
@@ -53,7 +53,7 @@ class VolumeUNet(nn.Module):
     """MONAI's DiffusionModelUNet run on blocks of `block`^3 voxels, conditioned on time and on a text context.
 
     The text enters by cross-attention twice: in the UNet's attention levels, and as a TextMap laid over its input,
-    which tells it early and in place what the report says.
+    which gives it the report's content early and in place.
 
     The stem folds each block into channels (a 1x1x1 convolution follows), the last layer unfolds it: the expensive
     top level then runs on (X/block)^3 positions, which is what makes a 64^3 denoiser affordable on a CPU.

@@ -52,9 +52,9 @@ TRACEBACK = "PHYDICT_TRACEBACK"
 
 
 @contextmanager
-def cli_errors(*also: type[Exception], to_go_on: str = "run the same command again") -> Iterator[None]:
+def cli_errors(*also: type[Exception], to_resume: str = "run the same command again") -> Iterator[None]:
     """Prints bad arguments, ValueError, OSError, FloatingPointError and `also` as one sentence and exits with code 2;
-    the environment variable PHYDICT_TRACEBACK=1 shows the trace instead. A run that a signal stopped says how to go on
+    the environment variable PHYDICT_TRACEBACK=1 shows the trace instead. A run that a signal stopped says how to resume
     and exits with code 130 (SIGINT) or 143 (SIGTERM)."""
     try:
         yield
@@ -62,13 +62,13 @@ def cli_errors(*also: type[Exception], to_go_on: str = "run the same command aga
         interrupted = isinstance(stop, KeyboardInterrupt) or isinstance(stop.__context__, KeyboardInterrupt)
         if not interrupted and isinstance(stop, SystemExit) and stop.code is not None:
             raise
-        print(f"stopped by a signal; to go on, {to_go_on}", file=sys.stderr)
+        print(f"stopped by a signal; to resume, {to_resume}", file=sys.stderr)
         raise SystemExit(130 if interrupted else 143) from None
     except (ValueError, OSError, FloatingPointError, ArgumentError, *also) as error:  # type: ignore[misc]
         if os.environ.get(TRACEBACK):
             raise
         full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
-        said = f"{sentence(error)}: free some space; to go on, {to_go_on}" if full else sentence(error)
+        said = f"{sentence(error)}: free some space; to resume, {to_resume}" if full else sentence(error)
         print(f"error: {said}", file=sys.stderr)
         raise SystemExit(2) from None
     except RuntimeError as error:
@@ -99,9 +99,9 @@ def check_command(args: Sequence[str], commands: Mapping[str, str], anywhere: Co
     """Raises ValueError, in one sentence that names `commands`, name -> what it does, and an example, where no argument
     is one of those that may stand `anywhere`, and none asks for help, or where an option has an old name."""
     if not any(arg in anywhere or arg in ("-h", "--help") or arg.startswith("--print_config") for arg in args):
-        told = ", ".join(f"{name} ({what})" for name, what in commands.items())
+        listed = ", ".join(f"{name} ({what})" for name, what in commands.items())
         raise ValueError(f"the first word says what to do, but {repr(args[0]) if args else 'none'} was given: use one "
-                         f"of {told}; such as: {example}")
+                         f"of {listed}; such as: {example}")
     check_options(args)
 
 

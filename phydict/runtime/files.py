@@ -34,7 +34,7 @@ def atomic_write(final: Path) -> Iterator[Path]:
 def atomic_directory(final: Path, wanted: Callable[[], bool] = lambda: True) -> Iterator[Path]:
     """A folder to fill; when the block ends well that folder takes `final`'s place, else it is removed.
 
-    wanted: asked when all is written and no other process is at it, so that what is in `final`'s place then can be
+    wanted: called when all is written and no other process is at it, so that what is in `final`'s place then can be
     looked at; where it is not true, or raises, that stays.
     """
     partial = _partial(final)

@@ -13,7 +13,7 @@ from phydict.runtime.warning import warn
 
 PRECISIONS = ("auto", "float32", "bfloat16")
 """What a user may ask for. "auto" is bfloat16 where the hardware computes it and float32 elsewhere; a float64 state
-stays float64 unless bfloat16 is asked for."""
+stays float64 unless bfloat16 is requested."""
 
 SLOWER = {"AVX2": 200, "AVX512": 2}
 """How many times slower than float32 a network is in bfloat16 on CPUs that lack its instructions, by what they have:
@@ -32,7 +32,7 @@ def computes_bfloat16(device: torch.device) -> bool:
         return torch.cuda.is_bf16_supported(including_emulation=False)
     if device.type != "cpu" or not torch.ops.mkldnn._is_mkldnn_bf16_supported():
         return False
-    # On x86 oneDNN says yes to any AVX-512, of which only some have the instructions; on others it tells by itself.
+    # On x86 oneDNN says yes to any AVX-512, of which only some have the instructions; on others its answer holds.
     return (torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
             or not torch.cpu._is_avx2_supported())
 
@@ -91,7 +91,7 @@ def instruction_set(device: torch.device) -> str:
 def _warn_slow(device: torch.device) -> None:
     factor = SLOWER.get(torch.backends.cpu.get_cpu_capability()) if device.type == "cpu" else None
     slower = f"about {factor} times slower there than float32" if factor else "slower there than float32"
-    warn(f"bfloat16 was asked for, but {instruction_set(device)} does not compute it: networks are {slower}; "
+    warn(f"bfloat16 was requested, but {instruction_set(device)} does not compute it: networks are {slower}; "
          "precision auto or float32 is faster", RuntimeWarning)
 
 

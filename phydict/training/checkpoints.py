@@ -22,7 +22,7 @@ BEST, HELD_OUT = "best.ckpt", "held_out.txt"
 saw."""
 
 RESUMED = ("epoch", "global_step", "loops", "optimizer_states", "lr_schedulers", "callbacks")
-"""What a checkpoint must hold beside the weights for its training to go on."""
+"""What a checkpoint must hold beside the weights for its training to resume."""
 
 
 def read_checkpoint(path: str | Path) -> dict:

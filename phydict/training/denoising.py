@@ -22,7 +22,7 @@ NOISE_LEVELS = (0.1, 0.3, 0.5, 0.7, 0.9)
 class DenoisingTraining(StageTraining):
     """Learns one stage by denoising: squared error of x0 at all noise levels, up to four times heavier at the low ones.
 
-    A stage says what a batch's clean state is (`_clean_state`), what its network is told beside it (`_condition`), and
+    A stage says what a batch's clean state is (`_clean_state`), what conditions its network (`_condition`), and
     what denoises a held-out case (`_denoiser`).
     """
 
@@ -37,7 +37,7 @@ class DenoisingTraining(StageTraining):
 
     @abstractmethod
     def _condition(self, batch: dict, x0: Tensor, generators: list[torch.Generator]) -> tuple[Tensor, ...]:
-        """What the network is told beside the noisy state and its time; one source of randomness per sample."""
+        """What conditions the network beside the noisy state and its time; one source of randomness per sample."""
 
     @abstractmethod
     def _denoiser(self, batch: dict, x0: Tensor) -> Denoiser:
@@ -51,9 +51,9 @@ class DenoisingTraining(StageTraining):
         u = torch.cat([torch.rand(1, generator=generator) for generator in generators])
         t = ((torch.tensor(places) + u) / (len(x0) * processes)).to(self.device)
         noise = torch.stack([torch.randn(x0.shape[1:], generator=g) for g in generators]).to(self.device)
-        told = self._condition(batch, x0, generators)
+        conditioning = self._condition(batch, x0, generators)
         a, s = (w.float().view(-1, 1, 1, 1, 1) for w in self.prior.schedule.scales(t.double()))
-        error = (self.prior(a * x0 + s * noise, t, *told) - x0).square()
+        error = (self.prior(a * x0 + s * noise, t, *conditioning) - x0).square()
         unit = self.prior.preconditioning(t)[1].clamp(min=self.typical_std / 2) ** -2
         return (unit * weight * error).mean() * x0.shape[1] / (1 + self.mask_weight * (x0.shape[1] - 1))
 

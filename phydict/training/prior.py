@@ -38,7 +38,7 @@ class PriorTraining(DenoisingTraining):
         optimisation: how the weights are learnt
         validation: what validation shows and measures
         execution: how the network is run
-        initial: a prior's file to go on from, which then decides the networks and the text; one without a detail
+        initial: a prior's file to start from, which then decides the networks and the text; one without a detail
             network is given this training's
         seed: of times, noise and text dropout
     """
@@ -70,7 +70,7 @@ class PriorTraining(DenoisingTraining):
 
     def _start_from(self, prior: Prior, path: str) -> None:
         if not isinstance(prior, Prior):
-            raise ValueError(f"training goes on from priors of phydict's own, but {path} is MedSyn's: leave out "
+            raise ValueError(f"training starts from priors of phydict's own, but {path} is MedSyn's: leave out "
                              "model.initial")
         if not prior.grid.same_as(self.prior.grid) or prior.window != self.prior.window:
             raise ValueError(f"the prior {path} has another grid or HU window than this training: "
@@ -90,7 +90,7 @@ class PriorTraining(DenoisingTraining):
         if any(isinstance(callback, WeightAveraging) for callback in self.trainer.callbacks):
             raise ValueError("spread weights cannot be averaged: train without EMAWeightAveraging "
                              "(trainer.callbacks: null), as configs/prior/fsdp.yaml does")
-        # A spread optimizer goes on only if it has moved each of its weights: those that denoising leaves alone rest.
+        # A sharded optimizer resumes only if it has moved each of its weights: those that denoising leaves alone rest.
         self.prior.network.text_map.to_sketch.requires_grad_(False)
         if self.prior.text is not None and self.text_pretrain_steps:
             self.prior.text.requires_grad_(False)

@@ -75,7 +75,7 @@ class StageTraining(lightning.LightningModule, ABC):
         anew = "start anew with a lower model.optimisation.learning_rate"
         if not last:
             return f"no checkpoint had been written, so {anew}"
-        return f"the last good checkpoint is {last}, so go on from it with --ckpt_path, or {anew}"
+        return f"the last good checkpoint is {last}, so resume from it with --ckpt_path, or {anew}"
 
     def configure_optimizers(self) -> dict:
         weights = [w for w in self.parameters() if w.requires_grad]

@@ -29,7 +29,7 @@ class SuperResolutionTraining(DenoisingTraining):
         most_noise: highest level of the noise that the coarse volume is given, in [0, 1]
         optimisation: how the weights are learnt
         validation: what validation shows
-        initial: a stage's file to go on from, which then decides the network
+        initial: a stage's file to start from, which then decides the network
         seed: of times and noise
     """
 

@@ -19,7 +19,7 @@ REPEATS = 5
 
 
 class Throughput(lightning.Callback):
-    """Logs samples/s and TFLOP/s of all processes together, and tells at the start what they are to be compared with.
+    """Logs samples/s and TFLOP/s of all processes together, and prints at the start what to compare them with.
 
     FLOP are those of the network's forward and backward pass, a multiplication and an addition counting two; what
     gradient checkpointing computes twice counts once.

@@ -27,7 +27,7 @@ ENDINGS = (".yaml", ".yml", ".xml", ".npy", ".csv", ".txt")
 
 def read_beam(path: str | Path, shape: tuple[int, int] | None = None,
               pixel: float | tuple[float, float] | None = None) -> ConeBeam:
-    """The beam of a geometry file of any of the module's kinds, told by its ending.
+    """The beam of a geometry file of any of the module's kinds, chosen by its ending.
 
     shape: (V, U) pixels, needed but for YAML. pixel: (row height, column width) in mm, needed for RTK's XML.
     Raises FileNotFoundError, and ValueError naming the file for other endings, missing shape or pixel and bad content.

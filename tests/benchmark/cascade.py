@@ -2,9 +2,9 @@
 
     python tests/benchmark/cascade.py <folder of CTs> <super-resolution stage>[=<views>,<views>...] ...
 
-From eight views where none are told. Runs `infer.py test` with the base prior alone, with the second stage unguided,
+From eight views where none are given. Runs `infer.py test` with the base prior alone, with the second stage unguided,
 and guided; the base prior's volumes are upsampled trilinearly and scored on the fine grid too. Writes cascade.csv
-beside this file, and leaves the rows of stages and views that were not asked for.
+beside this file, and leaves the rows of stages and views that were not given.
 """
 
 import json

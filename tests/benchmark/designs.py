@@ -5,7 +5,7 @@
 Each design learns from the same draws, noise and times, for the same CPU time of one thread, which other work on the
 machine does not change. The learning rate rises over 30 steps and falls to zero over the second half of the time;
 the weights are averaged. LIDC-IDRI-0004 and the phantoms from seed 1,000,000 on are held out. A training that was
-stopped goes on from its last checkpoint in --out; a design that designs.csv holds already is not run again.
+stopped resumes from its last checkpoint in --out; a design that designs.csv holds already is not run again.
 
 Writes designs.csv beside this file, one row per design and held-out case: denoising error (RMSE of the CT in HU) at
 each noise level, and SSIM, PSNR and MAE of phydict_fast's reconstruction from four ideal views; CPU seconds of one

@@ -69,7 +69,7 @@ class Case:
 
 
 class HardCases:
-    """The cases of one CT by name, made when they are asked for."""
+    """The cases of one CT by name, made when they are needed."""
 
     def __init__(self, ct: Path):
         self.ct, self.prior = ct, load_prior(DEFAULT_PRIOR)

@@ -2,9 +2,9 @@
 
     python tests/benchmark/mixing.py <folder of training CTs> <prior of phantoms alone> [--out runs/mixing]
 
-The CTs, one of each patient, are left out in turn, --leave at a time. Each turn goes on from the same prior, which has
+The CTs, one of each patient, are left out in turn, --leave at a time. Each turn starts from the same prior, which has
 seen no CT, with the same number of draws, of which a share is from the CTs that are not left out; without any one
-training serves all turns. One that was stopped goes on from its last checkpoint in --out, one whose rows mixing.csv
+training serves all turns. One that was stopped resumes from its last checkpoint in --out, one whose rows mixing.csv
 holds is not run again.
 
 Writes mixing.csv beside this file, one row per share of CTs, left-out CT and number of ideal views: denoising error

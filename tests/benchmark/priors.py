@@ -4,7 +4,7 @@ X-rays from 1 to 16 views.
     python tests/benchmark/priors.py <folder of CTs> <name>=<prior file> ... [--out folder]
 
 Polychromatic X-rays are made on 128^3 voxels and reconstructed on 64^3. From four views two more methods without a
-prior are measured. Writes what `infer.py ablate` does, by default into priors/ beside this file, and goes on where it
+prior are measured. Writes what `infer.py ablate` does, by default into priors/ beside this file, and resumes where it
 was stopped.
 """
 

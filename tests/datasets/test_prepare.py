@@ -1,4 +1,4 @@
-"""Preparing CTs: DICOM equals NIfTI, a stopped run goes on, bad CTs are rejected with reasons, nothing is half done."""
+"""Preparing CTs: DICOM equals NIfTI, a stopped run resumes, bad CTs are rejected with reasons, nothing is half done."""
 
 from __future__ import annotations
 
@@ -238,8 +238,8 @@ def test_a_coarser_case_is_the_same_whether_prepared_so_or_read_so(tmp_path, tho
 
 
 @pytest.mark.parametrize("grid, sentence", [
-    (Grid.cube(32, 400), "as a box of 384 x 384 x 384 mm, but 400 x 400 x 400 mm are asked for; .* --side 400"),
-    (Grid.cube(64), "with voxels of 12 mm, but 6 mm are asked for; .* --voxels 64")])
+    (Grid.cube(32, 400), "as a box of 384 x 384 x 384 mm, but 400 x 400 x 400 mm are needed; .* --side 400"),
+    (Grid.cube(64), "with voxels of 12 mm, but 6 mm are needed; .* --voxels 64")])
 def test_more_than_was_prepared_is_refused(tmp_path, thorax, grid, sentence):
     save(tmp_path / "in/a.nii.gz", thorax)
     prepare_folder(tmp_path / "in", tmp_path / "out", SMALL)

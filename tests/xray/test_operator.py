@@ -153,7 +153,7 @@ def test_auto_looks_at_pose_size_memory_and_device_and_says_what_it_took():
     assert Projector(GRIDS["turned"], TILTED, memory=1000).method == "siddon"
     elsewhere = Projector(GRIDS["turned"], TILTED, memory=1000, device="cuda")
     assert elsewhere.method == "joseph" and "cuda" in elsewhere.reason and "1,000" in elsewhere.reason
-    assert Projector(GRIDS["turned"], TILTED, "eq4").reason == "it was asked for"
+    assert Projector(GRIDS["turned"], TILTED, "eq4").reason == "it was requested"
 
 
 def test_impossible_choices_are_refused_with_a_reason():

@@ -1,4 +1,4 @@
-"""Simulated X-rays: the noise that was asked for, and the same noise for the same seed."""
+"""Simulated X-rays: the requested noise, and the same noise for the same seed."""
 
 import pytest
 import torch

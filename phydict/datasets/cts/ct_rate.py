@@ -200,7 +200,7 @@ def load_case(ct: CTFile, grid: Grid, window: HUWindow) -> dict:
 
 
 class CTCases(Dataset):
-    """Cases prepared from CT files, one by one when first asked for, then read from a cache folder.
+    """Cases prepared from CT files, one by one when first needed, then read from a cache folder.
 
     cts: what `find_cts` returns. cache: a folder for the prepared cases, made when missing; None keeps nothing. A case
     is prepared anew when its file, grid, window or calibration changes. Volumes are stored to half precision (0.5 HU),

@@ -131,7 +131,7 @@ class Source:
         return load_series(self.ct) if self.is_dicom else load_ct(self.ct.path, self.ct.calibration)
 
     def fingerprint(self) -> dict:
-        """What tells this input from another: its files' number and bytes, those of its segmentations included."""
+        """What identifies this input: its files' number and bytes, those of its segmentations included."""
         files = [*(self.ct.files if self.is_dicom else (self.ct.path,)),
                  *(file for files in segmentations_beside(self.beside).values() for file in files)]
         return {"files": len(files), "bytes": sum(file.stat().st_size for file in files)}

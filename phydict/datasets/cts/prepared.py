@@ -136,11 +136,11 @@ def _check_room(record: dict, stored: Grid, grid: Grid) -> None:
         raise ValueError(f"{name} was prepared in MedSyn's space, a box of {box} mm, but the prior's box is {wanted} "
                          f"mm with {grid.shape[0]} voxels; prepare that CT again with --space patient")
     if (grid.extent > stored.extent + 1e-3).any():
-        raise ValueError(f"{name} was prepared as a box of {box} mm, but {wanted} mm are asked for; "
+        raise ValueError(f"{name} was prepared as a box of {box} mm, but {wanted} mm are needed; "
                          f"prepare that CT again with --side {grid.extent.max():g}")
     if (np.asarray(grid.spacing) < np.asarray(stored.spacing) * (1 - 1e-6)).any():
         raise ValueError(f"{name} was prepared with voxels of {stored.spacing[0]:g} mm, but {grid.spacing[0]:g} mm are "
-                         f"asked for; prepare that CT again with --voxels {round(stored.extent[0] / grid.spacing[0])}")
+                         f"needed; prepare that CT again with --voxels {round(stored.extent[0] / grid.spacing[0])}")
 
 
 def _block_means(image: np.ndarray, factors: np.ndarray) -> np.ndarray:

@@ -28,7 +28,7 @@ class DPS(Sampler):
     Every step costs a backward pass through the network, in time (about twice the forward one) and in memory (its
     activations are kept). The denoiser must be differentiable where its input requires a gradient, as those of priors
     are; others are refused with a ValueError. It samples no posterior that could be stated: the push has the length
-    `scale` times the denoiser's slope whatever the noise of the data, which it is not told.
+    `scale` times the denoiser's slope whatever the noise of the data, which it does not use.
 
     iterations: noise levels, evenly spaced in time; scale: length of the push, in units of an operator of norm 1,
     published as 0.3 for super-resolution and blur at 1000 levels; fewer levels need longer ones.

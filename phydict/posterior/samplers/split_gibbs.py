@@ -50,7 +50,7 @@ class SplitGibbs(Sampler):
     clip: pull the denoiser's estimate into the prior's range before the likelihood step, not only after it;
     final_denoise: both passes end with one more call of the denoiser, at time 0 and without X-rays, as in the release;
     scatter: where the result misses the X-rays by more than SCATTER_THRESHOLD times their noise, sample once more,
-    subtracting the scatter that each estimate tells of, and keep what that gives if it misses less.
+    subtracting the scatter that each estimate implies, and keep what that gives if it misses less.
     """
 
     citation = ("Dai, Ghosh & Batmanghelich, PhyDiCT: Plug-and-Play CT Reconstruction from Sparse X-Rays via "

@@ -116,9 +116,9 @@ class CrossAttention(nn.Module):
         slices = x.shape[2]
         q = rearrange(self.to_q(x.flatten(2, 3)), "b (h d) y x -> b h (y x) d", h=self.heads)
         k, v = rearrange(self.to_kv(context), "b l (part h d) -> part b h l d", part=2, h=self.heads)
-        heard = rearrange(scaled_dot_product_attention(q, k.to(q.dtype), v.to(q.dtype)),
+        attended = rearrange(scaled_dot_product_attention(q, k.to(q.dtype), v.to(q.dtype)),
                           "b h (y x) d -> b (h d) y x", x=x.shape[4])
-        return self.to_out(heard).unflatten(2, (slices, -1))
+        return self.to_out(attended).unflatten(2, (slices, -1))
 
 
 class Normed(nn.Module):

@@ -7,7 +7,7 @@
 
 Both are UNets over (slice, row, column) that never downsample the slices. Their parameters bear the names of MedSyn's
 checkpoints, which are therefore read strictly (`phydict.prior.medsyn.checkpoint`). What names and shapes leave open
-follows the convention of the video diffusion UNets that they descend from (Ho et al. 2022, arXiv:2204.03458): attention
+follows the convention of the video diffusion UNets that they derive from (Ho et al. 2022, arXiv:2204.03458): attention
 is normalised first and added to its input, the time gives scale before shift, sines stand before cosines, a level's own
 features before the skipped ones. Going down, both resize before their block across slices, which is known of stage 1
 alone. None of this could be compared with MedSyn's trained weights, which are not public.

@@ -25,7 +25,7 @@ if TYPE_CHECKING:  # they bring a compiler, so that each is imported where it is
 METHODS = ("auto", "separable", "siddon", "eq4", "joseph", "matrix")
 
 MEMORY = 2**29
-"""Bytes that a projector may hold beside volume and X-rays, unless told otherwise."""
+"""Bytes that a projector may hold beside volume and X-rays by default."""
 
 CACHE_SIZE = 2
 """Operators, with all that they computed from their geometry, that are kept for the next projector of the same one."""
@@ -43,7 +43,7 @@ class Projector:
         "joseph": plane sweep with bilinear samples, any pose and device (phydict.xray.projectors.joseph);
         "matrix": what siddon computes, as a stored matrix, any pose and device (phydict.xray.projectors.system_matrix);
         "auto": separable for upright detectors; else the matrix if it fits, else siddon on the CPU and joseph on other
-            devices. `A.method` tells which one runs and `A.reason` why.
+            devices. `A.method` is the one that runs and `A.reason` says why.
     memory: bytes that the stored matrix, or the plane sweep's temporaries and rays, may take. The other methods hold
         little: the separable one, on other devices than the CPU, the sparse factors of every view (some 15 MB each at
         256^3 voxels, 448^2 pixels and float32), which the budget does not count.
@@ -103,7 +103,7 @@ def _engine(grid: Grid, beam: ConeBeam, method: str, memory: int, device: str) -
     key = (method, memory, device, grid.shape, grid.affine.tobytes(), beam.shape,
            *(getattr(beam, name).tobytes() for name in VECTOR_KEYS[:4]))
     if key not in _engines:
-        chosen, reason = _choose(grid, beam, memory, device) if method == "auto" else (method, "it was asked for")
+        chosen, reason = _choose(grid, beam, memory, device) if method == "auto" else (method, "it was requested")
         _engines[key] = _Engine(_operator(grid, beam, chosen, memory), chosen, reason)
     _engines.move_to_end(key)
     while len(_engines) > CACHE_SIZE:

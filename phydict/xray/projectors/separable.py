@@ -99,7 +99,7 @@ class Separable:
 
     @property
     def sparse(self) -> SparseFactors:
-        """The same operator as sparse products, made when first asked for."""
+        """The same operator as sparse products, made when first needed."""
         if self._sparse is None:
             self._sparse = SparseFactors(self.grid.shape, self.beam.shape, *self.rays)
         return self._sparse
@@ -114,10 +114,10 @@ def _array(x: torch.Tensor) -> np.ndarray:
 
 
 def _set_threads() -> int:
-    """The number of threads that torch uses, told to numba, whose first start sets OpenMP's, and so torch's, to all."""
-    asked = torch.get_num_threads()
-    threads = min(asked, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+    """The number of threads that torch uses, set for numba, whose start sets OpenMP's, and so torch's, to all."""
+    requested = torch.get_num_threads()
+    threads = min(requested, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
     numba.set_num_threads(threads)
-    if torch.get_num_threads() != asked:
-        torch.set_num_threads(asked)
+    if torch.get_num_threads() != requested:
+        torch.set_num_threads(requested)
     return threads

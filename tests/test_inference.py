@@ -224,6 +224,18 @@ def test_a_dry_run_sees_images_that_lie_upside_down(measured, tmp_path, capsys):
     assert all("with flip_rows changed" in line for line in lines), lines
 
 
+@pytest.mark.filterwarnings("default")
+def test_a_dry_run_warns_of_images_unlike_a_thorax_in_their_geometry(measured, tmp_path, capsys):
+    case = load_xrays(measured / "anna")
+    height, width = case["xrays"].shape[1:]
+    middle = case["xrays"][:, height // 4:height - height // 4, width // 4:width - width // 4]
+    large = torch.nn.functional.interpolate(middle[None], (height, width), mode="bilinear")[0]
+    for name, xrays in (("right", case["xrays"]), ("magnified", large)):
+        save_xrays(tmp_path / name, xrays, case["beam"])
+        main(sirt("predict", tmp_path / "out", f"--data.xrays={tmp_path / name}", "--dry_run"))
+        assert ("agrees little with a standard thorax" in capsys.readouterr().err) == (name == "magnified")
+
+
 def test_a_dry_run_goes_on_after_a_bad_case_and_names_it_at_the_end(measured, tmp_path, capsys):
     shutil.copytree(measured, tmp_path / "cases")
     (tmp_path / "cases" / "anna" / "view_1.npy").unlink()

@@ -46,7 +46,7 @@ def view_sides(beam: ConeBeam, grid: Grid) -> list[str]:
 def agreement(xray: np.ndarray, thorax: np.ndarray) -> str:
     """How well a view (V, U) correlates with the standard thorax's, and what clearly agrees better, if anything: a
     flip, or the image inverted."""
-    found = {name: _correlation(xray[::rows, ::columns], thorax) for name, (rows, columns) in FLIPS.items()}
+    found = {name: correlation(xray[::rows, ::columns], thorax) for name, (rows, columns) in FLIPS.items()}
     best = max(found, key=found.get)
     said = f"agreement {found['as it is']:.2f}"
     if max(0, found[best]) < -found["as it is"]:
@@ -120,6 +120,7 @@ def _draw(ax: Axes, beam: ConeBeam, grid: Grid, thorax_hu: np.ndarray, name: str
         ax.text(x, y, letter, transform=ax.transAxes, ha="center", va="center", fontsize=11, fontweight="bold")
 
 
-def _correlation(a: np.ndarray, b: np.ndarray) -> float:
+def correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """Pearson's, in [-1, 1], of two images of one shape; 0 where one is constant."""
     a, b = a - a.mean(), b - b.mean()
     return float((a * b).sum() / max(np.sqrt((a * a).sum() * (b * b).sum()), 1e-12))

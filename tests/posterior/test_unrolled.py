@@ -80,10 +80,10 @@ def test_views_in_another_order_give_the_same_volume():
 
 @pytest.mark.parametrize("beam", OTHERS.values(), ids=OTHERS)
 def test_any_number_of_views_and_any_geometry_is_reconstructed_within_the_bounds(beam):
-    found = reconstruct(measured(beam).y[0], beam, tiny_refiner(), "phydict_learned", precision="float32")
+    found = reconstruct(measured(beam, noise=0.02).y[0], beam, tiny_refiner(), "phydict_learned", precision="float32")
     assert found.volume.isfinite().all() and found.volume.min() >= -1000 and found.volume.max() <= 600
-    assert found.network_calls == 3
-    assert found.misfit < 0.05  # an untrained network's estimates are met by the likelihood steps all the same
+    assert found.network_calls in (3, 6)  # six where a misfit of so coarse a grid looks like scatter
+    assert found.misfit < 0.1  # an untrained network's estimates are met by the likelihood steps all the same
 
 
 def test_the_result_does_not_depend_on_the_seed():

@@ -21,12 +21,7 @@ from phydict.diffusion.steps import Generators, noise_like
 from phydict.posterior.likelihood.likelihood import LikelihoodStep, ProximalCG
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.samplers.sampler import Sampler, ddim_sample
-
-SCATTER_THRESHOLD = 2.5
-"""Times their noise that X-rays are missed by before scatter is looked for: on the CTs that it was chosen on, ideal
-ones are missed by 1.4 at most (those without noise by whatever the grid cannot hold), polychromatic ones by 1.4 to 3.5,
-those with scatter of 6 % by 2.7 to 17, fewer views by less."""
-
+from phydict.posterior.scatter import with_scatter
 
 @dataclass(frozen=True)
 class SplitGibbs(Sampler):
@@ -115,18 +110,8 @@ class SplitGibbs(Sampler):
                on_step: Callable[[], None] = lambda: None) -> Tensor:
         if not self.scatter:
             return self._descend(denoiser, measurement, x, generator, on_step)
-        measurement.reset_scatter(False)
-        z = self._descend(denoiser, measurement, x, generator, on_step)
-        if not measurement.can_estimate_scatter:
-            return z
-        residual = measurement.normalised_residual(z[:, :1])
-        if (residual > SCATTER_THRESHOLD).any():
-            measurement.reset_scatter(True)
-            again = self._descend(denoiser, measurement, x, generator)
-            better = (residual > SCATTER_THRESHOLD) & (measurement.normalised_residual(again[:, :1]) < residual)
-            measurement.reset_scatter(bool(better.any()))
-            z = torch.where(better, again, z)
-        return z
+        return with_scatter(measurement, lambda: self._descend(denoiser, measurement, x, generator, on_step),
+                            lambda: self._descend(denoiser, measurement, x, generator))
 
     def _descend(self, denoiser: Denoiser, measurement: Measurement, x: Tensor, generator: Generators,
                  on_step: Callable[[], None] = lambda: None) -> Tensor:

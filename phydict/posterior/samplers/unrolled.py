@@ -13,12 +13,14 @@ from phydict.posterior.evidence import Evidence
 from phydict.posterior.likelihood.likelihood import LikelihoodStep, ProximalCG
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.samplers.sampler import Sampler
+from phydict.posterior.scatter import with_scatter
 from phydict.prior import DEFAULT_REFINER, BoundRefiner
 
 
 @dataclass(frozen=True)
 class Unrolled(Sampler):
-    """z = start(mean); then for each time: x0 = refine(z, evidence), z = likelihood(x0). Deterministic.
+    """z = start(mean); then for each time: x0 = refine(z, evidence), z = likelihood(x0). Deterministic. Once
+    more with scatter subtracted, as SplitGibbs does.
 
     times: labels in (0, 1) under which the refiner's network takes each z, as if it were a noisy state of that time;
     x0_stds: standard deviation of the error of each x0, in the prior's range, that of the mean first; start,
@@ -32,7 +34,8 @@ class Unrolled(Sampler):
     x0_stds: tuple[float, ...] = (0.5, 0.3, 0.3, 0.3)
     start: LikelihoodStep = ProximalCG(10, 3, tv_weight=10.0, tv_eps=0.003)
     likelihood: LikelihoodStep = ProximalCG(10, 3, tv_weight=5.0, tv_eps=0.003)
-    final_likelihood: LikelihoodStep = ProximalCG(10, 4, weighted_least_squares=True, tv_weight=5.0, tv_eps=0.003)
+    final_likelihood: LikelihoodStep = ProximalCG(10, 4, refit_scatter=True, weighted_least_squares=True,
+                                                  tv_weight=5.0, tv_eps=0.003)
     default_prior = DEFAULT_REFINER
     needs_refiner = True
 
@@ -55,6 +58,8 @@ class Unrolled(Sampler):
         z = start = self._meet(self.start, measurement, before, self.x0_stds[0])
         on_step()
         for n, t in enumerate(self.times):
+            if measurement.scatter_enabled:
+                measurement.subtract_scatter(measurement.project(z[:, :1]))
             channels = evidence(z[:, :1], before[:, :1], start[:, :1])
             signal = float(refiner.schedule.scales(t)[0])
             x0 = refiner.refine(signal * z, t, channels)
@@ -73,5 +78,8 @@ class Unrolled(Sampler):
 
     def sample(self, denoiser: BoundRefiner, measurement: Measurement, x: Tensor, generator: Generators,
                on_step: Callable[[], None] = lambda: None) -> Tensor:
-        *_, z = self.estimates(denoiser, measurement, on_step)
-        return z
+        def result(on_step: Callable[[], None]) -> Tensor:
+            *_, z = self.estimates(denoiser, measurement, on_step)
+            return z
+
+        return with_scatter(measurement, lambda: result(on_step), lambda: result(lambda: None))

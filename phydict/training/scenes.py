@@ -59,7 +59,7 @@ class Scenes:
             source = rng.uniform(950, 1400)
             centre = np.clip(source * rng.uniform(0.55, 0.75), REACH * 192, source - REACH * 192)
             pixel *= rng.uniform(0.8, 1.2)
-            pixels = int(rng.uniform(0.65, 1.15) * pixels)
+            pixels = int(rng.uniform(0.4, 1.15) * pixels)
             shift = rng.uniform(-0.25, 0.25) * (rng.random() < 0.3)
         kind, start = rng.random(), rng.uniform(0, 2 * math.pi)
         geometry = source * scale, centre * scale, (pixels, pixels), pixel * scale

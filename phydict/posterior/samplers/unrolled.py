@@ -32,8 +32,8 @@ class Unrolled(Sampler):
 
     times: tuple[float, ...] = (0.35, 0.25, 0.15)
     x0_stds: tuple[float, ...] = (0.5, 0.3, 0.3, 0.3)
-    start: LikelihoodStep = ProximalCG(10, 3, tv_weight=10.0, tv_eps=0.003)
-    likelihood: LikelihoodStep = ProximalCG(10, 3, tv_weight=5.0, tv_eps=0.003)
+    start: LikelihoodStep = ProximalCG(10, 3, refit_scatter=True, tv_weight=10.0, tv_eps=0.003)
+    likelihood: LikelihoodStep = ProximalCG(10, 3, refit_scatter=True, tv_weight=5.0, tv_eps=0.003)
     final_likelihood: LikelihoodStep = ProximalCG(10, 4, refit_scatter=True, weighted_least_squares=True,
                                                   tv_weight=5.0, tv_eps=0.003)
     default_prior = DEFAULT_REFINER
@@ -53,24 +53,29 @@ class Unrolled(Sampler):
                   on_step: Callable[[], None] = lambda: None) -> Iterator[Tensor]:
         """What the refiner answers at each call, and at last the result. Gradients do not pass from call to call."""
         before = refiner.mean.to(measurement.y)
-        measurement.match_gain_offset(before[:, :1])
+        self._match(measurement, before)
         evidence = Evidence(measurement)
         z = start = self._meet(self.start, measurement, before, self.x0_stds[0])
         on_step()
         for n, t in enumerate(self.times):
-            if measurement.scatter_enabled:
-                measurement.subtract_scatter(measurement.project(z[:, :1]))
             channels = evidence(z[:, :1], before[:, :1], start[:, :1])
             signal = float(refiner.schedule.scales(t)[0])
             x0 = refiner.refine(signal * z, t, channels)
             yield x0
             before = x0.detach().clamp(-1, 1)
-            measurement.match_gain_offset(before[:, :1])
+            self._match(measurement, before)
             last = n + 1 == len(self.times)
             z = self._meet(self.final_likelihood if last else self.likelihood, measurement, before,
                            self.x0_stds[n + 1])
             on_step()
         yield z
+
+    @staticmethod
+    def _match(measurement: Measurement, x0: Tensor) -> None:
+        """Refits what is not of the volume, gains or scatter, to an estimate."""
+        measurement.match_gain_offset(x0[:, :1])
+        if measurement.scatter_enabled:
+            measurement.subtract_scatter(measurement.project(x0[:, :1]))
 
     @staticmethod
     def _meet(step: LikelihoodStep, measurement: Measurement, x0: Tensor, x0_std: float) -> Tensor:

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from prior.tiny import tiny_prior, tiny_refiner
+from prior.tiny import tiny_prior, tiny_refiner, tiny_super_resolution
 
 from phydict.diffusion import renoise
 from phydict.grid import Grid
@@ -140,6 +140,13 @@ def test_display_values_are_reconstructed_whatever_their_gain():
     volumes = [reconstruct(gain * y + 0.1, ORBIT, tiny_refiner(), "phydict_learned", display=True,
                            precision="float32").volume for gain in (0.5, 2.0)]
     assert (volumes[0] - volumes[1]).abs().mean() < 2
+
+
+def test_a_second_stage_refines_what_it_gives():
+    fine = tiny_super_resolution()
+    found = reconstruct(measured(noise=0.01).y[0], ORBIT, tiny_refiner(), "phydict_learned", super_resolution=fine,
+                        precision="float32")
+    assert found.grid.same_as(fine.grid) and found.volume.isfinite().all() and found.misfit < 0.1
 
 
 def test_what_does_not_fit_is_refused_in_a_sentence(tmp_path):

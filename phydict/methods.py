@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -153,7 +154,8 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: Prior | Refiner | str | Pa
     A detector finer than the grid can use is binned. Raises ValueError when X-rays, geometry and prior do not fit.
     """
     if not isinstance(beam, ConeBeam):
-        raise ValueError(f"the geometry must be a ConeBeam, but {beam!r} was given; ConeBeam.load reads one")
+        raise ValueError(f"the geometry must be a ConeBeam, but {' '.join(reprlib.repr(beam).split())} was given; "
+                         "ConeBeam.load reads one")
     if not isinstance(grid, Grid):
         raise ValueError(f"the grid must be a Grid, but {grid!r} was given; Grid.cube makes one")
     if not isinstance(report, str | None):

@@ -54,8 +54,14 @@ class Reconstruction:
 
 
 def save_nifti(path: str | Path, volume: np.ndarray, grid: Grid) -> None:
-    """Writes `volume` (X, Y, Z) on `grid` as NIfTI (.nii or .nii.gz), replacing the file only when complete."""
+    """Writes `volume` (X, Y, Z) on `grid` as NIfTI (.nii or .nii.gz), replacing the file only when complete.
+
+    Raises ValueError for another ending.
+    """
     import nibabel
+
+    if not str(path).endswith((".nii", ".nii.gz")):
+        raise ValueError(f"a volume is written as NIfTI, but '{path}' was given: end the name in .nii or .nii.gz")
 
     image = nibabel.Nifti1Image(np.asarray(volume, np.float32), grid.affine)
     image.header.set_xyzt_units("mm", "sec")

@@ -11,7 +11,8 @@ from torch import Tensor
 def not_finite(weights: Mapping[str, Tensor]) -> str:
     """The first of the weights that is not finite, and how many values that concerns; empty where all are."""
     for name, weight in weights.items():
-        if weight.layout != torch.strided or weight.is_meta or weight.is_quantized:
+        if weight.dtype == torch.float4_e2m1fn_x2 or weight.layout != torch.strided or weight.is_meta or (
+                weight.is_quantized):
             return f"{name} holds no plain numbers"
         if weight.is_floating_point() and weight.itemsize < 2:
             weight = weight.float()  # torch does not ask those of 8 bits

@@ -79,6 +79,8 @@ def reason(error: Exception) -> str:
     if isinstance(error, TypeError | AttributeError | IndexError):  # whose own words tell a user nothing
         unknown = re.search(r"unexpected keyword argument ('\w+')", said)
         return f"it has no setting {unknown[1]}" if unknown else "it holds something of another kind than expected"
+    if wrong := re.search(r"^invalid literal for .*?: (.*)|^could not convert string to float: (.*)", said):
+        return f"{wrong[1] or wrong[2]} stands where a number is needed"
     plain = isinstance(error, ValueError | OSError | EOFError | SyntaxError) or type(error).__module__ != "builtins"
     return said if said and plain else f"{type(error).__name__} {said}".strip()
 

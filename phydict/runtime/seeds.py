@@ -14,5 +14,5 @@ def case_seed(seed: int, case: str) -> int:
 
 def check_seed(seed: int) -> None:
     """Raises ValueError unless a seed is a whole number that random generators take."""
-    if not isinstance(seed, int) or not 0 <= seed < 2**63:
+    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**63:
         raise ValueError(f"a seed is a whole number from 0 to 2^63 - 1, but {seed} was given")

@@ -88,7 +88,8 @@ def check_beam(function: str, path, beam) -> None:
     """Raises ValueError unless a function that writes a beam was given a path and a beam, in that order."""
     if not isinstance(beam, ConeBeam):
         swapped = isinstance(path, ConeBeam)
-        order = f"the beam first; call {function}(path, beam)" if swapped else f"{beam!r} as the beam"
+        shown = " ".join(reprlib.repr(beam).split())
+        order = f"the beam first; call {function}(path, beam)" if swapped else f"{shown} as the beam"
         raise ValueError(f"{function} takes a path and then a ConeBeam, but was given {order}")
 
 

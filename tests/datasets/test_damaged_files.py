@@ -7,14 +7,19 @@ import warnings
 import numpy as np
 import pydicom
 import pytest
+import torch
 from dicom_files import orbit_tags, write_ct_series, write_dicom
 from PIL import Image
 
+from phydict import Grid, reconstruct
 from phydict.datasets import read_calibrations
 from phydict.datasets.cts.ct_series import find_series, load_series
 from phydict.datasets.dicom import read_dicom
 from phydict.datasets.radiographs.xray_images import read_image
+from phydict.prior.finite import not_finite
+from phydict.reconstruction import save_nifti
 from phydict.runtime.reading import MOST_SAID, Unreadable, reading, refusing
+from phydict.runtime.seeds import check_seed
 
 
 @pytest.mark.parametrize("tag, kind, value, sentence", [
@@ -98,6 +103,38 @@ def test_an_array_whose_header_confuses_numpy_is_refused_in_words_for_users(tmp_
     path.write_bytes(stream.getvalue().replace(b" 'shape'", b"b'shape'"))
     with pytest.raises(Unreadable, match=r"v.npy cannot be read .it holds something of another kind than expected"):
         read_image(path)
+
+
+def test_words_where_dicom_needs_a_number_are_named(tmp_path):
+    path = write_dicom(tmp_path / "a.dcm", np.zeros((4, 5), np.uint16))
+    dataset = pydicom.dcmread(path)
+    dataset.add(pydicom.DataElement("NumberOfFrames", "LO", "many"))
+    dataset.save_as(path)
+    with pytest.raises(ValueError, match="'many' stands where a number is needed"):
+        read_dicom(path)
+
+
+def test_weights_of_four_bits_are_no_plain_numbers():
+    four = torch.zeros(1, dtype=torch.uint8).view(torch.float4_e2m1fn_x2)
+    assert not_finite({"a": four}) == "a holds no plain numbers"
+
+
+@pytest.mark.parametrize("name", ["", "volume.txt"])
+def test_a_volume_is_written_as_nifti_alone(tmp_path, name):
+    with pytest.raises(ValueError, match=r"end the name in .nii or .nii.gz"):
+        save_nifti(tmp_path / name, np.zeros((2, 2, 2)), Grid.cube(2))
+
+
+def test_x_rays_in_the_place_of_the_beam_are_named_in_one_short_line():
+    with pytest.raises(ValueError, match="must be a ConeBeam") as caught:
+        reconstruct(torch.zeros(2, 40, 40), torch.zeros(2, 40, 40))
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 200
+
+
+def test_true_is_no_seed():
+    with pytest.raises(ValueError, match="a seed is a whole number"):
+        check_seed(True)
 
 
 def test_what_refuses_keeps_its_own_sentence_and_every_other_error_becomes_one():

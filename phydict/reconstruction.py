@@ -60,7 +60,7 @@ def save_nifti(path: str | Path, volume: np.ndarray, grid: Grid) -> None:
     """
     import nibabel
 
-    if not str(path).endswith((".nii", ".nii.gz")):
+    if not str(path).lower().endswith((".nii", ".nii.gz")):
         raise ValueError(f"a volume is written as NIfTI, but '{path}' was given: end the name in .nii or .nii.gz")
 
     image = nibabel.Nifti1Image(np.asarray(volume, np.float32), grid.affine)

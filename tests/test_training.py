@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import nibabel
@@ -16,12 +17,13 @@ import numpy as np
 import pytest
 import torch
 from prior.medsyn_files import entries, text_unet, write
-from prior.tiny import tiny_prior
+from prior.tiny import REPORTS, tiny_prior
 from torch.utils.data import default_collate
 
 from phydict.cli.train import main
-from phydict.datasets import Thorax, phantom_case
+from phydict.datasets import phantom_case
 from phydict.datasets.phantoms.cached import CachedPhantoms
+from phydict.datasets.phantoms.findings import KINDS
 from phydict.grid import Cube, Grid
 from phydict.prior import VolumeUNet, load_prior, save_prior
 from phydict.runtime.files import alone_in
@@ -587,23 +589,67 @@ def test_training_goes_on_from_a_prior_and_refuses_one_of_another_grid(tmp_path)
     x, t = torch.randn(1, 4, 16, 16, 16), torch.tensor([0.4])
     reports = ["Pleural effusion (right), 12 mm."]
     torch.testing.assert_close(task.prior(x, t, task.prior.context(reports)), first(x, t, first.context(reports)))
+    for name, weight in task.prior.named_parameters():
+        assert weight.requires_grad != name.startswith(("text.", "network.text_map.", "null")), name
+    task = PriorTraining(initial=str(path), cube=Cube(16), window=(-1000, 600), text=TextSettings(frozen=False))
     assert all(w.requires_grad for w in task.prior.parameters())
     with pytest.raises(ValueError, match="another grid"):
         PriorTraining(initial=str(path), cube=Cube(32), window=(-1000, 600), text=TextSettings("none"))
 
 
-def test_a_phantoms_sketch_is_the_change_its_findings_make_where_they_are(cache):
-    data = PriorData(phantoms=30, cache=str(cache))
-    reports, maps = data.finding_maps(8)
-    again = data.finding_maps(8)[1]  # from the cache
-    assert torch.equal(maps, again) and len(reports) == len(maps) == 30
-    for seed, change in enumerate(maps):
-        findings = Thorax.draw(seed).findings
-        assert bool(change.any()) == bool(findings) or not change.abs().max() > 0.01
-        sides = {finding.side for finding in findings}
-        if sides in ({"left"}, {"right"}):
-            low, high = change[0, :4].abs().sum(), change[0, 4:].abs().sum()
-            assert (high > low) == (sides == {"right"}), (seed, findings)
+def test_text_that_is_kept_is_taught_first_and_not_moved_by_denoising(cache):
+    data = PriorData(phantoms=4, cache=str(cache), cube=Cube(16))
+    for frozen in (True, False):
+        text = TextSettings(reports=data.reports, pretrain_steps=2, frozen=frozen)
+        task = PriorTraining(VolumeUNet(4, 2, (8, 8), (False, True), 1, 8), text, cube=Cube(16))
+        untaught = {name: weight.clone() for name, weight in task.prior.state_dict().items()}
+        task.learn_reports()
+        taught = {name: weight.clone() for name, weight in task.prior.state_dict().items()}
+        text_side = {name for name in taught if name.startswith(("text.", "network.text_map.", "null"))}
+        moved = {name for name in taught if not torch.equal(taught[name], untaught[name])}
+        assert moved and moved < text_side and "null" not in moved
+        task.prior.network.hint.weight.data.normal_()
+        task.prior.network.unfold.weight.data.normal_()
+        optimizer = task.configure_optimizers()["optimizer"]
+        task.batch_loss(default_collate([data.phantoms[i] for i in range(4)])).backward()
+        optimizer.step()
+        moved = {name for name, weight in task.prior.state_dict().items() if not torch.equal(taught[name], weight)}
+        assert bool(moved & text_side) != frozen and moved - text_side
+
+
+def test_a_prior_gets_a_new_text_side_and_is_the_same_without_a_report(tmp_path):
+    path = tmp_path / "prior.safetensors"
+    first = tiny_prior()
+    torch.nn.init.zeros_(first.network.hint.weight)
+    torch.nn.init.zeros_(first.network.hint.bias)
+    save_prior(first, path, dtype=torch.float32)
+    settings = {"initial": str(path), "cube": Cube(16), "window": (-1000, 600)}
+    text = TextSettings(reports=REPORTS, pretrain_steps=2)
+    kept, renewed = (PriorTraining(text=replace(text, renew=renew), **settings) for renew in (False, True))
+    assert kept.prior.text.vocabulary == first.text.vocabulary and not hasattr(kept.prior.network.text_map, "kinds")
+    assert renewed.prior.network.text_map.kinds == KINDS and "effusion" in renewed.prior.text.vocabulary
+    x, t = torch.randn(1, 4, 16, 16, 16), torch.tensor([0.4])
+    for task in (kept, renewed):
+        assert torch.equal(task.prior(x, t, task.prior.context([""])), first(x, t, first.context([""])))
+    before = {name: weight.clone() for name, weight in kept.prior.state_dict().items()}
+    for task in (kept, renewed):
+        task.learn_reports()  # a new one alone
+    assert all(torch.equal(weight, before[name]) for name, weight in kept.prior.state_dict().items())
+    export = tmp_path / "renewed.safetensors"
+    save_prior(renewed.prior, export, dtype=torch.float32)
+    again = load_prior(export)
+    assert torch.equal(again.network.text_map.scores(again.context(REPORTS[:1])),
+                       renewed.prior.network.text_map.scores(renewed.prior.context(REPORTS[:1])))
+    with pytest.raises(ValueError, match="model.initial"):
+        PriorTraining(text=replace(text, renew=True), cube=Cube(16))
+
+
+def test_a_small_encoder_knows_the_words_of_a_file_of_texts(tmp_path):
+    (tmp_path / "texts.txt").write_text("Hamartoma with popcorn calcification.\n")
+    for texts in (None, str(tmp_path / "texts.txt")):
+        task = PriorTraining(VolumeUNet(4, 2, (8, 8), (False, True), 1, 8),
+                             TextSettings(reports=["Clear lungs."], texts=texts), cube=Cube(16))
+        assert ("hamartoma" in task.prior.text.vocabulary) == (texts is not None)
 
 
 @pytest.mark.parametrize("weight", [torch.eye(3).to_sparse(), torch.zeros(3, device="meta")], ids=["sparse", "meta"])
@@ -624,6 +670,7 @@ def test_a_training_is_never_written_among_its_cts(tmp_path, capsys, cache):
 
 
 @pytest.mark.parametrize("option", ["--data.holdout.phantoms=-1", "--data.cache=/dev/null",
+                                    "--model.text.dropout=2", "--model.text.pretrain_steps=-1",
                                     "--model.optimisation.learning_rate=-1", "--model.optimisation.warmup=-3",
                                     "--data.loading.workers=1000000", "--model.validation.preview_steps=-1",
                                     "--model.validation.views=-1",

@@ -130,7 +130,7 @@ class PriorCLI(LightningCLI):
                                  "it away, or give another folder with --out")
             with atomic_write(file) as part:
                 part.write_text(held_out)
-        self.model.learn_reports(self.datamodule)
+        self.model.learn_reports()
 
     def before_validate(self) -> None:
         if not (self.config.validate.ckpt_path or self.config.validate.model.initial):

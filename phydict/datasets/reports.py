@@ -6,7 +6,11 @@ in the same layout, so that a prior meets at inference what it met in training.
 
 from __future__ import annotations
 
+import json
 import re
+from pathlib import Path
+
+from phydict.runtime.reading import reading
 
 ABSENT = {"", "nan", "none", "null", "n/a", "<na>", "not given", "not given.", "-", "."}
 """What stands for a section that nobody wrote, in lower case."""
@@ -54,3 +58,18 @@ def _parts(text: str | None, title: str) -> list[tuple[str, str]]:
 
 def _written(text: str | None) -> str:
     return "" if text is None or text != text else text  # NaN differs from itself
+
+
+def read_texts(path: str | Path) -> list[str]:
+    """The texts of a UTF-8 file: one a line, or of each line's JSON object what stands under "text" or "caption".
+
+    Raises ValueError, with what to do, where there is no such file or no text in it.
+    """
+    with reading(f"the texts in '{path}'", "give a UTF-8 file with one text, or one JSON object, a line"):
+        lines = [line for line in Path(path).read_text(encoding="utf-8").splitlines() if line.strip()]
+        found = [json.loads(line) if line.lstrip().startswith("{") else {"text": line} for line in lines]
+        texts = [text.get("text") or text.get("caption") for text in found]
+    if not texts or not all(isinstance(text, str) for text in texts):
+        raise ValueError(f"the file '{path}' holds no texts, or a line without one: give one text, or one JSON object "
+                         "with \"text\" or \"caption\", a line")
+    return texts

@@ -97,7 +97,8 @@ def describe(prior: Prior) -> dict:
         text = {"source": text.source, "length": text.length, "width": text.width,
                 "layers": text.bert.config.num_hidden_layers,
                 "vocabulary": None if text.source else text.vocabulary,
-                **({"padded_to": text.padded_to} if text.padded_to else {})}
+                **({"padded_to": text.padded_to} if text.padded_to else {}),
+                **({"sentences": text.sentences} if text.sentences else {})}
     return {"format": FORMAT, "stage": "base", "grid": prior.grid.to_dict(),
             "hu_window": [prior.window.low, prior.window.high], "state": STATE[:prior.network.state_channels],
             "sigma_data": prior.sigma_data, "skip_std": prior.skip_std, "schedule": vars(prior.schedule),
@@ -295,6 +296,8 @@ def _check_sizes(name: str, settings: dict, weights: dict[str, Tensor]) -> None:
     if layers > MOST_LAYERS:
         raise ValueError(f"{name} has {layers:,} layers, more than {MOST_LAYERS}")
     for key, value in settings.items():
+        if key == "kinds" and isinstance(value, list) and all(isinstance(kind, str) for kind in value):
+            value = len(value)
         values = value if isinstance(value, list) else [value]
         if len(values) > most or not all(isinstance(n, int) and 0 <= n <= most for n in values):
             raise ValueError(f"{name}.{key} is {reprlib.repr(value)}")
@@ -329,8 +332,9 @@ def has_text(header: dict) -> bool:
         raise ValueError(f"text is {reprlib.repr(text)}, where {', '.join(keys)} are needed, or null")
     for key in ("length", "width", "layers"):
         _whole(text, key)
-    if "padded_to" in text:
-        _whole(text, "padded_to")
+    for key in ("padded_to", "sentences"):
+        if key in text:
+            _whole(text, key)
     words = text["vocabulary"]
     if not isinstance(text["source"], str | None) or (text["source"] is None and not (
             isinstance(words, list) and all(isinstance(word, str) for word in words))):
@@ -349,7 +353,8 @@ def build_text(text: dict, weights: dict[str, Tensor]) -> TextEncoder:
         held = len(weights["bert.embeddings.word_embeddings.weight"])
         if len(text["vocabulary"]) != held:
             raise ValueError(f"it lists {len(text['vocabulary'])} words, but its weights have {held}")
-        encoder = TextEncoder.small(text["vocabulary"], text["width"], text["layers"], text["length"])
+        encoder = TextEncoder.small(text["vocabulary"], text["width"], text["layers"], text["length"],
+                                    text.get("sentences"))
         encoder.load_state_dict(weights)
     except Exception as error:  # of whatever kind: it is the header that leads to it
         raise ValueError(f"the text encoder is not the one that the header describes ({reason(error)})") from error

@@ -119,7 +119,7 @@ class Prior(nn.Module):
 
     def network_inputs(self, shape: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
         """Zeros on the default device, laid out as what the network is given for one state of `shape` voxels."""
-        length = self.text.length if self.text is not None else 1
+        length = self.text.states if self.text is not None else 1
         return (torch.zeros(1, self.state_channels, *shape), torch.zeros(1),
                 torch.zeros(1, length, self.network.context_dim))
 

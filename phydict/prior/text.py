@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
+from torch.nn.utils.rnn import pad_sequence
 
 from phydict.prior.bert_files import load_bert
+from phydict.prior.sentences import split_sentences
 from phydict.runtime.warning import warn
 
 if TYPE_CHECKING:
@@ -19,15 +21,21 @@ if TYPE_CHECKING:
 FOREIGN = 0.2
 """Share of a report's tokens that may be [UNK] before `TextEncoder.check` warns."""
 
+TOGETHER = 16
+"""Sentences that are read at once: those of a batch differ much in length, and padding costs time."""
+
 
 class TextEncoder(nn.Module):
-    """A BERT and its tokenizer: reports -> token embeddings (B, length, D).
+    """A BERT and its tokenizer: reports -> embeddings of their tokens (B, length, D) or sentences (B, sentences, D).
 
-    length: a report is cut or padded to this many tokens, so a context never depends on its batch.
+    length: a report (with sentences: a sentence) is cut or padded to this many tokens, so a context never depends on
+    its batch.
     trainable: whether the weights learn with the prior (the small default) or stay frozen (a pretrained BERT).
     source: folder or hub id it was loaded from; None for a BERT that belongs to its prior.
     padded_to: MedSyn's convention (see `pretrained`): the BERT reads up to this many tokens, of which the first
     `length` are kept; None: it reads no more than `length`.
+    sentences: how many of a report's sentences are read, each alone and into one state (that of [CLS]), so that "no"
+    reaches no further than its sentence; None: the report is read as a whole, into one state per token.
 
     A frozen encoder reads each report alone, without dropout and in the precision of its weights, and keeps the result
     in main memory until its weights change or `cache_bytes` are full: a report's context costs one reading.
@@ -37,7 +45,7 @@ class TextEncoder(nn.Module):
     cache_bytes = 2**30
 
     def __init__(self, tokenizer: BertTokenizer, bert: BertModel, length: int = 128, trainable: bool = False,
-                 source: str | None = None, padded_to: int | None = None):
+                 source: str | None = None, padded_to: int | None = None, sentences: int | None = None):
         super().__init__()
         if length < 1:
             raise ValueError(f"a text encoder reads at least 1 token of a report, but a length of {length} was given")
@@ -45,7 +53,7 @@ class TextEncoder(nn.Module):
             raise ValueError(f"a report padded to {padded_to} tokens has no {length} of them to keep: give a padded_to "
                              "of at least the length")
         self.tokenizer, self.bert, self.length, self.source = tokenizer, bert, length, source
-        self.trainable, self.padded_to = trainable, padded_to
+        self.trainable, self.padded_to, self.sentences = trainable, padded_to, sentences
         self.bert.requires_grad_(trainable)
         self._kept: dict[str, tuple[Tensor, Tensor]] = {}
         self._kept_of, self._kept_bytes = None, 0
@@ -55,6 +63,11 @@ class TextEncoder(nn.Module):
     def width(self) -> int:
         """D, the width of a token's embedding."""
         return self.bert.config.hidden_size
+
+    @property
+    def states(self) -> int:
+        """L, how many states a context has."""
+        return self.sentences or self.length
 
     @classmethod
     def pretrained(cls, source: str | Path, length: int = 128, padded_to: int | None = None) -> TextEncoder:
@@ -76,7 +89,8 @@ class TextEncoder(nn.Module):
                    padded_to=padded_to and min(padded_to, positions))
 
     @classmethod
-    def small(cls, vocabulary: list[str], width: int = 64, layers: int = 2, length: int = 128) -> TextEncoder:
+    def small(cls, vocabulary: list[str], width: int = 64, layers: int = 2, length: int = 128,
+              sentences: int | None = None) -> TextEncoder:
         """A new small BERT over a WordPiece vocabulary (see `learn_vocabulary`); it trains with its prior."""
         from transformers import BertConfig, BertModel, BertTokenizer
 
@@ -85,7 +99,7 @@ class TextEncoder(nn.Module):
             vocab_size=len(vocabulary), hidden_size=width, num_hidden_layers=layers, num_attention_heads=4,
             intermediate_size=4 * width, max_position_embeddings=length, hidden_dropout_prob=0.0,
             attention_probs_dropout_prob=0.0), add_pooling_layer=False)
-        return cls(tokenizer, bert, length, trainable=True)
+        return cls(tokenizer, bert, length, trainable=True, sentences=sentences)
 
     @property
     def vocabulary(self) -> list[str]:
@@ -94,16 +108,16 @@ class TextEncoder(nn.Module):
         return sorted(words, key=words.get)
 
     def forward(self, reports: list[str]) -> tuple[Tensor, Tensor]:
-        """Reports -> token embeddings (B, length, D) and their mask (B, length), True where cross-attention looks:
-        at tokens, and with padded_to at padding too."""
+        """Reports -> states (B, L, D) and their mask (B, L), True where cross-attention looks: at tokens or sentences,
+        and with padded_to at padding too."""
         if self.trainable:
             return self._read(reports)
         states, masks = zip(*map(self._read_once, reports))
         return torch.stack(states).to(self.bert.device), torch.stack(masks).to(self.bert.device)
 
     def check(self, reports: Iterable[str]) -> None:
-        """Warns of reports that are longer than the BERT reads (`padded_to`, else `length`) and of reports in words
-        that the vocabulary lacks.
+        """Warns of reports that are longer than is read (`sentences`, else `padded_to`, else `length`) and of reports
+        in words that the vocabulary lacks.
 
         Each report is looked at once: later calls speak of new reports alone.
         """
@@ -112,11 +126,13 @@ class TextEncoder(nn.Module):
             return
         self._checked.update(new)
         tokens = self.tokenizer(new, add_special_tokens=False, verbose=False)["input_ids"]
-        read = self.padded_to or self.length
-        excess = [len(own) + 2 - read for own in tokens if len(own) + 2 > read]
+        sizes, read, unit = [len(own) + 2 for own in tokens], self.padded_to or self.length, "tokens"
+        if self.sentences:
+            sizes, read, unit = [len(split_sentences(report)) for report in new], self.sentences, "sentences"
+        excess = [size - read for size in sizes if size > read]
         if excess:
-            warn(f"{len(excess)} of {len(new)} reports are longer than the {read} tokens that the text "
-                 f"encoder reads: up to {max(excess)} tokens at their end are left out")
+            warn(f"{len(excess)} of {len(new)} reports are longer than the {read} {unit} that the text "
+                 f"encoder reads: up to {max(excess)} {unit} at their end are left out")
         unknown = [sum(token == self.tokenizer.unk_token_id for token in own) / max(len(own), 1) for own in tokens]
         foreign = [share for share in unknown if share > FOREIGN]
         if foreign:
@@ -124,7 +140,32 @@ class TextEncoder(nn.Module):
                  f"to {max(foreign):.0%} of a report, and say little to it: give them in the language that "
                  "it learnt, or leave them out")
 
+    def read_sentences(self, sentences: list[str]) -> Tensor:
+        """Sentences -> the state of each (N, D). Those of like length are read together, padded to the longest."""
+        tokens = [torch.tensor(own) for own in
+                  self.tokenizer(sentences, truncation=True, max_length=self.length)["input_ids"]]
+        order = sorted(range(len(tokens)), key=lambda place: len(tokens[place]))
+        states = []
+        for first in range(0, len(order), TOGETHER):
+            own = [tokens[place] for place in order[first:first + TOGETHER]]
+            ids = pad_sequence(own, batch_first=True, padding_value=self.tokenizer.pad_token_id)
+            seen = torch.arange(ids.shape[1]) < torch.tensor([[len(sentence)] for sentence in own])
+            states.append(self.bert(input_ids=ids.to(self.bert.device), attention_mask=seen.to(
+                self.bert.device, torch.long)).last_hidden_state[:, 0])
+        return torch.cat(states)[torch.tensor(order, device=self.bert.device).argsort()]
+
     def _read(self, reports: list[str]) -> tuple[Tensor, Tensor]:
+        return self._read_by_sentence(reports) if self.sentences else self._read_as_a_whole(reports)
+
+    def _read_by_sentence(self, reports: list[str]) -> tuple[Tensor, Tensor]:
+        split = [split_sentences(report)[:self.sentences] for report in reports]
+        states = torch.zeros(len(reports), self.sentences, self.width, device=self.bert.device, dtype=self.bert.dtype)
+        mask = torch.tensor([[place < len(own) for place in range(self.sentences)] for own in split])
+        if mask.any():
+            states[mask] = self.read_sentences([sentence for own in split for sentence in own]).to(states)
+        return states, mask.to(states.device)
+
+    def _read_as_a_whole(self, reports: list[str]) -> tuple[Tensor, Tensor]:
         window = self.length
         if self.padded_to:
             tokens = self.tokenizer(reports, truncation=True, max_length=self.padded_to)["input_ids"]

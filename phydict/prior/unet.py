@@ -13,6 +13,7 @@ from torch.nn.functional import interpolate
 from torch.utils.checkpoint import checkpoint
 
 from phydict.prior.convolution import speed_up
+from phydict.prior.kind_map import KindMap
 
 
 class TextMap(nn.Module):
@@ -23,22 +24,18 @@ class TextMap(nn.Module):
 
     def __init__(self, context_dim: int, channels: int = 8, cells: int = 8, heads: int = 4):
         super().__init__()
-        self.cells = cells
+        self.cells, self.channels = cells, channels
         self.positions = nn.Parameter(0.02 * torch.randn(cells**3, context_dim))
         self.attention = nn.MultiheadAttention(context_dim, heads, batch_first=True)
         self.answer = nn.Sequential(nn.LayerNorm(context_dim), nn.Linear(context_dim, 2 * context_dim), nn.GELU(),
                                     nn.Linear(2 * context_dim, channels))
-        self.to_sketch = nn.Conv3d(channels, 1, 1)
+        self.to_sketch = nn.Conv3d(channels, 1, 1)  # of priors up to 0.2, which learnt the map by it
 
     def forward(self, context: Tensor) -> Tensor:
         """Context (B, L, D) -> map (B, channels, cells, cells, cells)."""
         positions = self.positions.expand(len(context), -1, -1)
         attended = positions + self.attention(positions, context, context, need_weights=False)[0]
         return self.answer(attended).transpose(1, 2).unflatten(2, (self.cells,) * 3)
-
-    def sketch(self, context: Tensor) -> Tensor:
-        """What the report implies, averaged over cells: (B, 1, cells, cells, cells); see `learn_sketch`."""
-        return self.to_sketch(self(context))
 
 
 def check_sizes(**sizes: int | Sequence[int]) -> None:
@@ -52,8 +49,8 @@ def check_sizes(**sizes: int | Sequence[int]) -> None:
 class VolumeUNet(nn.Module):
     """MONAI's DiffusionModelUNet run on blocks of `block`^3 voxels, conditioned on time and on a text context.
 
-    The text enters by cross-attention twice: in the UNet's attention levels, and as a TextMap laid over its input,
-    which gives it the report's content early and in place.
+    The text enters twice: by cross-attention in the UNet's attention levels, and as a map laid over its input, which
+    gives it the report's content early and in place: a KindMap where `kinds` are named, else a TextMap.
 
     The stem folds each block into channels (a 1x1x1 convolution follows), the last layer unfolds it: the expensive
     top level then runs on (X/block)^3 positions, which is what makes a 64^3 denoiser affordable on a CPU.
@@ -61,6 +58,7 @@ class VolumeUNet(nn.Module):
     state_channels: channels of the state (CT and masks).
     channels, attention: width of each level, and whether it attends to itself and to the text.
     context_dim: width D of the text context (B, L, D).
+    kinds: of findings, each with a map of its own.
     Spatial sizes must be divisible by block * 2^(levels - 1).
     """
 
@@ -73,6 +71,7 @@ class VolumeUNet(nn.Module):
         res_blocks: int = 1,
         head_channels: int = 32,
         context_dim: int = 64,
+        kinds: tuple[str, ...] = (),
     ):
         from monai.networks.nets import DiffusionModelUNet
 
@@ -85,8 +84,7 @@ class VolumeUNet(nn.Module):
         self.block, self.context_dim, self.state_channels = block, context_dim, state_channels
         self.divisor = block * 2 ** (len(channels) - 1)
         self.fold = nn.Conv3d(state_channels * block**3, channels[0], 1)
-        self.text_map = TextMap(context_dim)
-        self.hint = nn.Conv3d(8, channels[0], 1)
+        self.draw_kinds(kinds)
         self.unet = DiffusionModelUNet(
             spatial_dims=3, in_channels=channels[0], out_channels=channels[0], channels=tuple(channels),
             attention_levels=tuple(attention), num_res_blocks=res_blocks, norm_num_groups=8,
@@ -97,10 +95,18 @@ class VolumeUNet(nn.Module):
         nn.init.xavier_uniform_(self.unet.out[-1].conv.weight)
         nn.init.zeros_(self.unfold.weight)
         nn.init.zeros_(self.unfold.bias)
-        nn.init.zeros_(self.hint.weight)
-        nn.init.zeros_(self.hint.bias)
         speed_up(self)
         self.run_with()
+
+    def draw_kinds(self, kinds: Sequence[str]) -> None:
+        """A new, untaught map of what reports say, which changes nothing yet: a KindMap, or without kinds a TextMap."""
+        self.text_map = KindMap(self.context_dim, kinds) if kinds else TextMap(self.context_dim)
+        self.hint = nn.Conv3d(self.text_map.channels, self.settings["channels"][0], 1)
+        nn.init.zeros_(self.hint.weight)
+        nn.init.zeros_(self.hint.bias)
+        speed_up(self.hint)
+        if kinds:  # which older files do not name
+            self.settings["kinds"] = list(kinds)
 
     def blocks(self) -> list[nn.Module]:
         """The residual and attention blocks of the UNet, which hold nearly all of its weights and activations."""

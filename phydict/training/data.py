@@ -5,16 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import lightning
-import numpy as np
 import torch
 from torch.utils.data import ConcatDataset, DataLoader, Dataset, DistributedSampler
 
 from phydict.datasets import Augmentation, CTCases, CTSource, Thorax, report, split_by_patient
-from phydict.datasets.cts.cache import read_arrays, write_arrays
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM, CachedPhantoms
-from phydict.datasets.phantoms.phantom import change_by_findings
 from phydict.datasets.population import DrawnPatients
-from phydict.grid import Cube, Grid
+from phydict.grid import Cube
 from phydict.runtime.console import check_writable
 from phydict.runtime.seeds import check_seed
 from phydict.training.draws import MixedCases, training_parts
@@ -78,39 +75,6 @@ class PriorData(lightning.LightningDataModule):
     def prepare_data(self) -> None:
         if self.population and self.trainer.state.fn == "fit":
             self.population.prepare()
-
-    def labelled_reports(self, count: int = 6000) -> tuple[list[str], torch.Tensor]:
-        """Reports of phantoms and which findings (kind, side, lobe) each has: labels (N, F). None without phantoms."""
-        thoraxes = [Thorax.draw(seed) for seed in range(count if len(self.phantoms) else 0)]
-        findings = [{(f.kind, f.side, f.lobe) for f in thorax.findings} for thorax in thoraxes]
-        columns = sorted(set().union(*findings))
-        labels = torch.tensor([[float(column in own) for column in columns] for own in findings])
-        return [report(thorax) for thorax in thoraxes], labels
-
-    def finding_maps(self, cells: int, most: int = 1500) -> tuple[list[str], torch.Tensor]:
-        """What reports imply, for at most so many cases that have one: reports, and maps (N, 1, cells^3).
-
-        Of a phantom, the map is what its findings change, averaged over cells; where there are none, it is how a CT
-        departs from the mean of the CTs. Both are in the prior's range.
-        """
-        if len(self.phantoms):
-            count = min(most, len(self.phantoms))
-            reports = [report(Thorax.draw(seed)) for seed in range(count)]
-            file = self.phantoms.folder / f"effects-{cells}-{count}.npz"
-            stored = read_arrays(file)
-            if stored is None:
-                stored = {"effects": np.stack([self._effect(seed, cells) for seed in range(count)])}
-                write_arrays(file, stored)
-            return reports, torch.from_numpy(stored["effects"])
-        cases = [self.cts[i] for i, ct in enumerate(self.cts.cts) if ct.report][:most]
-        coarse = [torch.nn.functional.adaptive_avg_pool3d(case["volume"], cells) for case in cases]
-        coarse = torch.stack(coarse) if cases else torch.zeros(0, 1, cells, cells, cells)
-        return [case["report"] for case in cases], coarse - coarse.mean(0)
-
-    def _effect(self, seed: int, cells: int) -> np.ndarray:
-        thorax, grid = Thorax.draw(seed), Grid.cube(2 * cells, self.grid.extent[0])
-        change = change_by_findings(thorax, grid) / self.window.half_width
-        return change.reshape(1, cells, 2, cells, 2, cells, 2).mean((2, 4, 6)).astype(np.float32)
 
     def train_dataloader(self) -> DataLoader:
         every = self.trainer.reload_dataloaders_every_n_epochs

@@ -10,20 +10,28 @@ from lightning.pytorch.callbacks import WeightAveraging
 from lightning.pytorch.utilities import rank_zero_only
 from torch import Tensor
 
+from phydict.datasets.phantoms.findings import KINDS
+from phydict.datasets.phantoms.teaching import teaching_sentences
+from phydict.datasets.prose import written_words
+from phydict.datasets.reports import read_texts
 from phydict.diffusion import Denoiser
 from phydict.evaluation import method_panel, volume_metrics
 from phydict.grid import Cube
 from phydict.methods import DEFAULT_METHOD, reconstruct
 from phydict.posterior import Sampler
 from phydict.prior import DetailNetwork, Prior, Refiner, TextEncoder, VolumeUNet, describe, learn_vocabulary, load_prior
+from phydict.prior.unet import TextMap
 from phydict.runtime.warning import warn
 from phydict.training.denoising import DenoisingTraining
-from phydict.training.data import PriorData
-from phydict.training.reports import learn_findings, learn_sketch
+from phydict.training.reports import BATCH, learn_sentences
 from phydict.training.settings import Execution, PriorOptimisation, PriorValidation, TextSettings
 from phydict.training.sharding import shard
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Ideal, Projector
+
+SENTENCES, VOCABULARY_SIZE = 20_000, 5000
+SENTENCE_LENGTH, MOST_SENTENCES = 64, 64
+"""Tokens that a small encoder reads of a sentence, and sentences that it reads of a report."""
 
 
 class PriorTraining(DenoisingTraining):
@@ -48,40 +56,34 @@ class PriorTraining(DenoisingTraining):
                  window: tuple[float, float] = (-1000.0, 1000.0), optimisation: PriorOptimisation = PriorOptimisation(),
                  validation: PriorValidation = PriorValidation(), execution: Execution = Execution(),
                  initial: str | None = None, seed: int = 0):
+        if text.renew and not initial:
+            raise ValueError("model.text.renew gives a prior a new text side, but none was given to start from: give "
+                             "model.initial, or leave it out")
         network = network or VolumeUNet()
-        encoder = None
-        if text.encoder == "small" and not text.reports:
-            warn("the data have no reports: this prior will know no text")
-        elif text.encoder == "small":
-            encoder = TextEncoder.small(learn_vocabulary(text.reports), network.context_dim)
-        elif text.encoder != "none":
-            encoder = TextEncoder.pretrained(text.encoder, text.length, text.padded_to)
+        encoder = None if initial else _text_encoder(text, network)
         prior = Prior(network, cube.grid(), HUWindow(*window), encoder, sigma_data=optimisation.sigma_data,
                       detail=detail or DetailNetwork(network.state_channels))
+        if initial:
+            prior = _loaded(initial, prior)
+        if text.renew:
+            prior = _renewed(prior, _text_encoder(text, prior.network))
+        new_text = text.renew or not initial
         super().__init__(prior, optimisation.sigma_data, optimisation, validation.preview_steps, seed,
                          optimisation.mask_weight)
-        if initial:
-            self._start_from(load_prior(initial), initial)
         if self.prior.text is not None and text.reports:
             self.prior.text.check(text.reports)
         self.prior.network.run_with(execution.gradient_checkpointing, execution.channels_last, execution.compile)
-        self.text_dropout, self.text_pretrain_steps = text.dropout, text.pretrain_steps
+        own = self.prior.text is not None and self.prior.text.source is None
+        self.text_dropout, self.pretrain_steps = text.dropout, text.pretrain_steps if own and new_text else 0
         self.validation_views = validation.views
+        if own and text.frozen and (self.pretrain_steps or not new_text):
+            self._keep_text()
 
-    def _start_from(self, prior: Prior, path: str) -> None:
-        if not isinstance(prior, Prior):
-            raise ValueError(f"training starts from priors of phydict's own, but {path} is MedSyn's: leave out "
-                             "model.initial")
-        if not prior.grid.same_as(self.prior.grid) or prior.window != self.prior.window:
-            raise ValueError(f"the prior {path} has another grid or HU window than this training: "
-                             "set model.cube and model.window to its own")
-        if prior.load_text is not None:
-            prior.text = prior.load_text()
-            prior.text.trainable = prior.text.source is None
-        prior.detail = prior.detail or self.prior.detail
-        self.prior = prior.train().requires_grad_(True)
-        if prior.text is not None:
-            prior.text.requires_grad_(prior.text.trainable)
+    def _keep_text(self) -> None:
+        """What reads reports and draws what they say stays as it is."""
+        self.prior.text.trainable = False
+        for part in (self.prior.text, self.prior.network.text_map, self.prior.null):
+            part.requires_grad_(False)
 
     def configure_model(self) -> None:
         mesh = self.device_mesh  # only of a strategy that spreads the weights
@@ -91,9 +93,8 @@ class PriorTraining(DenoisingTraining):
             raise ValueError("spread weights cannot be averaged: train without EMAWeightAveraging "
                              "(trainer.callbacks: null), as configs/prior/fsdp.yaml does")
         # A sharded optimizer resumes only if it has moved each of its weights: those that denoising leaves alone rest.
-        self.prior.network.text_map.to_sketch.requires_grad_(False)
-        if self.prior.text is not None and self.text_pretrain_steps:
-            self.prior.text.requires_grad_(False)
+        if isinstance(self.prior.network.text_map, TextMap):
+            self.prior.network.text_map.to_sketch.requires_grad_(False)
         shard(self.prior, mesh["data_parallel"])
 
     def _condition(self, batch: dict, x0: Tensor, generators: list[torch.Generator]) -> tuple[Tensor, ...]:
@@ -121,28 +122,18 @@ class PriorTraining(DenoisingTraining):
         method_panel(file, {"prior sample": window.to_hu(sample[0, 0].cpu())}, window.to_hu(x0[0, 0].cpu()),
                      self.prior.grid, title=batch["report"][0][:80] or "no report")
 
-    def learn_reports(self, data: PriorData) -> None:
-        """Teaches a small report encoder and the text map, once, before the first denoising step.
+    def learn_reports(self) -> None:
+        """Teaches a new small report encoder and the map of kinds, once, before the first denoising step.
 
         It belongs before `fit`, since distributed training watches every backward pass from there on.
         """
-        text = self.prior.text
-        if text is None or not text.trainable or not self.text_pretrain_steps:
+        if not self.pretrain_steps:
             return
-        reports, labels = data.labelled_reports()
-        if reports:
-            losses = learn_findings(text, reports, labels, self.text_pretrain_steps, self.seed)
-            _tell(f"report encoder learns findings: loss {losses[0]:.3f} -> {losses[-1]:.3f}")
-        _tell("preparing what reports imply")
-        reports, maps = data.finding_maps(self.prior.network.text_map.cells)
-        if reports:
-            losses = learn_sketch(self.prior, reports, maps, self.text_pretrain_steps, self.seed)
-            _tell(f"text map learns what reports imply: squared error {losses[0]:.3f} -> {losses[-1]:.3f} of its "
-                  "variance")
-
-    def on_fit_start(self) -> None:
-        if self.prior.text is not None and self.text_pretrain_steps:
-            self.prior.text.trainable = False  # what it learnt stays, while the UNet learns to use it
+        sentences = teaching_sentences(min(SENTENCES, BATCH * self.pretrain_steps), self.seed)
+        words = [word for word in self.prior.text.vocabulary if word.isalpha() and len(word) > 1]
+        losses = learn_sentences(self.prior, sentences, self.pretrain_steps, self.seed, words)
+        _tell(f"report encoder and map of kinds learn {len(sentences)} sentences: loss {losses[0]:.3f} -> "
+              f"{losses[-1]:.3f}")
 
     def _clean_state(self, batch: dict) -> tuple[Tensor, Tensor]:
         channels = self.prior.network.state_channels
@@ -150,6 +141,48 @@ class PriorTraining(DenoisingTraining):
         known = self.mask_weight * batch["has_masks"].float()
         weight = torch.cat([torch.ones_like(known[:, :1]), known], 1)[:, :channels]
         return x0, weight[..., None, None, None]
+
+
+def _loaded(path: str, asked: Prior) -> Prior:
+    """The prior in a file, to be trained; one without a detail network is given that of `asked`."""
+    prior = load_prior(path)
+    if not isinstance(prior, Prior):
+        raise ValueError(f"training starts from priors of phydict's own, but {path} is MedSyn's: leave out "
+                         "model.initial")
+    if not prior.grid.same_as(asked.grid) or prior.window != asked.window:
+        raise ValueError(f"the prior {path} has another grid or HU window than this training: "
+                         "set model.cube and model.window to its own")
+    if prior.load_text is not None:
+        prior.text, prior.load_text = prior.load_text(), None
+        prior.text.trainable = prior.text.source is None
+    prior.detail = prior.detail or asked.detail
+    prior = prior.train().requires_grad_(True)
+    if prior.text is not None:
+        prior.text.requires_grad_(prior.text.trainable)
+    return prior
+
+
+def _renewed(prior: Prior, text: TextEncoder | None) -> Prior:
+    """A prior with other text; without a report it is the same but for the map that was laid over its input."""
+    renewed = Prior(prior.network, prior.grid, prior.window, text, prior.schedule, prior.sigma_data, prior.skip_std,
+                    detail=prior.detail)
+    renewed.null = prior.null
+    return renewed.train()
+
+
+def _text_encoder(text: TextSettings, network: VolumeUNet) -> TextEncoder | None:
+    """What `text` asks for to read reports; a small one also gives the network a map for each kind of finding."""
+    if text.encoder == "none":
+        return None
+    if text.encoder != "small":
+        return TextEncoder.pretrained(text.encoder, text.length, text.padded_to)
+    if not text.reports:
+        warn("the data have no reports: this prior will know no text")
+        return None
+    network.draw_kinds(KINDS)
+    texts = read_texts(text.texts) if text.texts else []
+    vocabulary = learn_vocabulary([*written_words(), *text.reports, *texts], VOCABULARY_SIZE)
+    return TextEncoder.small(vocabulary, network.context_dim, length=SENTENCE_LENGTH, sentences=MOST_SENTENCES)
 
 
 def reconstruction_scores(prior: Prior | Refiner, ct: Tensor, views: int, seed: int,

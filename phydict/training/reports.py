@@ -1,61 +1,109 @@
-"""Teaching a report encoder before denoising begins.
+"""Teaching the text side of a prior before denoising begins.
 
-Denoising alone teaches text slowly, since at most noise levels the state shows what the report says. Two short tasks
-come first: telling a report's findings, and sketching what they change in the CT. The sketch is of the change alone,
-since in a whole CT one finding is too small a part for its side to be learnt.
+Denoising alone teaches text slowly, since at most noise levels the state shows what the report says. So the sentences
+of written reports, whose findings are known, come first: the encoder and the map of kinds learn which kinds a sentence
+states, and where in the chest these lie. Sentences that deny findings, or are of something else, state none.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import re
+from collections.abc import Sequence
 
+import numpy as np
 import torch
-from torch import Tensor, nn
-from torch.nn.functional import binary_cross_entropy_with_logits
+from torch import Tensor
+from torch.nn.functional import binary_cross_entropy_with_logits, mse_loss
 
+from phydict.datasets.phantoms.findings import KINDS
+from phydict.datasets.phantoms.places import examples, extents
+from phydict.datasets.prose import naming_words, telling_words
 from phydict.prior.prior import Prior
-from phydict.prior.text import TextEncoder
 
-BATCH, LEARNING_RATE = 32, 2e-3
-
-
-def learn_findings(text: TextEncoder, reports: list[str], labels: Tensor, steps: int, seed: int = 0) -> list[float]:
-    """The encoder learns to tell findings: labels (N, F) in {0, 1} of N reports. Returns the loss of each step."""
-    head = nn.Linear(text.width, labels.shape[1]).to(text.bert.device)
-
-    def loss(picked: list[int]) -> Tensor:
-        states, mask = text([reports[i] for i in picked])
-        mean = (states * mask[..., None]).sum(1) / mask.sum(1, keepdim=True)
-        return binary_cross_entropy_with_logits(head(10 * mean), labels[picked].to(mean))
-
-    return _learn([*text.parameters(), *head.parameters()], loss, len(reports), steps, seed)
+BATCH, LEARNING_RATE = 64, 2e-3
+EXTENT_WEIGHT = 20.0
+STRANGE, NAMELESS = 0.35, 0.12
+"""Shares of the sentences that are given strange words, and that lose the names of their findings."""
 
 
-def learn_sketch(prior: Prior, reports: list[str], maps: Tensor, steps: int, seed: int = 0) -> list[float]:
-    """The text map learns maps (N, 1, cells^3) that N reports imply, in units of their root mean square.
+def learn_sentences(prior: Prior, sentences: Sequence[tuple[str, tuple[int, ...]]], steps: int, seed: int = 0,
+                    words: Sequence[str] = ()) -> list[float]:
+    """The report encoder and the map of kinds learn from sentences, each with the `examples` that it states.
 
-    Returns the loss of each step.
+    words: any words that reports may hold. Returns the loss of each step.
     """
-    text_map, maps = prior.network.text_map, maps / maps.square().mean().sqrt().clamp(min=1e-6)
-
-    def loss(picked: list[int]) -> Tensor:
-        with torch.no_grad():
-            context = prior.context([reports[i] for i in picked])
-        return (text_map.sketch(context) - maps[picked].to(context)).square().mean()
-
-    return _learn(text_map.parameters(), loss, len(reports), steps, seed)
-
-
-def _learn(parameters: Iterable[Tensor], loss: Callable[[list[int]], Tensor], cases: int, steps: int,
-           seed: int) -> list[float]:
-    optimizer = torch.optim.AdamW(parameters)
-    draw, losses = torch.Generator().manual_seed(seed), []
+    text, kind_map = prior.text, prior.network.text_map
+    weights = [*text.parameters(), *kind_map.parameters()]
+    resting = [weight for weight in weights if not weight.requires_grad]
+    for weight in weights:
+        weight.requires_grad_(True)
+    targets = Targets(kind_map.cells, prior.grid.extent[0], prior.null.device)
+    disguise = Disguise(words)
+    optimizer = torch.optim.AdamW(weights)
+    draw, losses = np.random.default_rng(seed), []
     for step in range(steps):
         for group in optimizer.param_groups:
-            group["lr"] = LEARNING_RATE * min(1, (step + 1) / 50, 3 * (1 - step / steps))
-        value = loss(torch.randint(cases, (BATCH,), generator=draw).tolist())
+            group["lr"] = LEARNING_RATE * min(1, (step + 1) / 50, 2 * (1 - step / steps))
+        picked = [disguise(*sentences[i], draw) for i in draw.integers(len(sentences), size=BATCH)]
+        states = text.read_sentences([sentence for sentence, _ in picked])
+        states = torch.cat([states, prior.null[0].detach().to(states)])  # which stands for no sentence
+        score, extent = kind_map.answers(states[None])
+        stated, filled = targets([findings for _, findings in picked] + [()])
+        loss = binary_cross_entropy_with_logits(score[0].float(), stated)
+        if stated.any():
+            loss = loss + EXTENT_WEIGHT * mse_loss(extent[0][stated > 0].float(), filled[stated > 0])
         optimizer.zero_grad()
-        value.backward()
+        loss.backward()
         optimizer.step()
-        losses.append(float(value.detach()))
+        losses.append(float(loss.detach()))
+    for weight in resting:
+        weight.requires_grad_(False)
     return losses
+
+
+class Targets:
+    """What sentences state, of the `examples` that they name: kinds (N, kinds) in {0, 1}, and the extent of each
+    (N, kinds, cells^3), that of the example that fills most in each cell."""
+
+    def __init__(self, cells: int, side: float, device: torch.device | str = "cpu"):
+        self.extents = torch.from_numpy(extents(cells, side).copy()).flatten(1).to(device)
+        self.kinds = [KINDS.index(finding.kind) for finding in examples()]
+
+    def __call__(self, stated: Sequence[tuple[int, ...]]) -> tuple[Tensor, Tensor]:
+        filled = self.extents.new_zeros(len(stated), len(KINDS), self.extents.shape[1])
+        kinds = filled.new_zeros(len(stated), len(KINDS))
+        for row, findings in enumerate(stated):
+            for finding in findings:
+                kind = self.kinds[finding]
+                kinds[row, kind] = 1
+                filled[row, kind] = torch.maximum(filled[row, kind], self.extents[finding])
+        return kinds, filled
+
+
+class Disguise:
+    """Sentences with words of elsewhere, so that a reader goes by the words that tell, and by no others.
+
+    words: that reports may hold. Some sentences get a few more of them, and in some they stand for words that tell
+    nothing, which changes no finding; in some they stand for the words that name findings, and no finding is left.
+    """
+
+    def __init__(self, words: Sequence[str]):
+        self.telling, self.naming = set(telling_words()), set(naming_words())
+        self.words = [word for word in words if word not in self.telling]
+
+    def __call__(self, sentence: str, findings: tuple[int, ...],
+                 draw: np.random.Generator) -> tuple[str, tuple[int, ...]]:
+        case = draw.random()
+        if not self.words or case > STRANGE + NAMELESS:
+            return sentence, findings
+        parts = re.findall(r"\w+|[^\w\s]", sentence)
+        if case < NAMELESS:
+            return " ".join(self._any(draw) if part.lower() in self.naming else part for part in parts), ()
+        parts = [self._any(draw) if part.isalpha() and part.lower() not in self.telling and draw.random() < 0.4
+                 else part for part in parts]
+        for _ in range(int(draw.integers(0, 4))):
+            parts.insert(int(draw.integers(len(parts) + 1)), self._any(draw))
+        return " ".join(parts), findings
+
+    def _any(self, draw: np.random.Generator) -> str:
+        return self.words[int(draw.integers(len(self.words)))]

@@ -21,17 +21,29 @@ class TextSettings:
         length: tokens of a report that a frozen encoder reads
         padded_to: 2048, with a length of 192, for contexts as MedSyn's; none given: padding is hidden
         reports: texts that the small BERT's vocabulary is learnt from (taken from the data)
+        texts: a file of more such texts, one a line or one JSON object a line with its text under "text" or "caption"
         dropout: share of reports replaced by the null context, in [0, 1]
-        pretrain_steps: steps of each task by which a small BERT learns reports before denoising begins; 0: it learns by
-            denoising
+        pretrain_steps: steps in which a new small BERT and the map of kinds learn written reports before denoising
+            begins; 0: they learn by denoising
+        frozen: a small BERT that has learnt reports, and the map of kinds, are left as they are by denoising
+        renew: a prior given as model.initial gets a new text side
     """
 
     encoder: str = "small"
     length: int = 128
     padded_to: int | None = None
     reports: list[str] | None = None
+    texts: str | None = None
     dropout: float = 0.1
-    pretrain_steps: int = 600
+    pretrain_steps: int = 1000
+    frozen: bool = True
+    renew: bool = False
+
+    def __post_init__(self):
+        if not 0 <= self.dropout <= 1:
+            raise ValueError(f"model.text.dropout lies in [0, 1], but {self.dropout} was given")
+        if self.pretrain_steps < 0:
+            raise ValueError(f"model.text.pretrain_steps must not be negative, but {self.pretrain_steps} was given")
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,6 @@ from torch import Tensor
 from phydict.prior import Prior, Refiner, SuperResolution
 from phydict.prior.files import check_stage
 from phydict.prior.finite import not_finite
-from phydict.training.data import PriorData
 from phydict.training.settings import Optimisation
 
 CHECKPOINT = "last.ckpt"
@@ -44,7 +43,7 @@ class StageTraining(lightning.LightningModule, ABC):
     def _describe(self) -> dict:
         """What the stage is, as plain JSON values."""
 
-    def learn_reports(self, data: PriorData) -> None:
+    def learn_reports(self) -> None:
         """Teaches the text part, where there is one, before the first denoising step."""
 
     def training_step(self, batch: dict, index: int) -> Tensor:

@@ -1,69 +1,92 @@
-"""Does the report matter? Held-out phantoms from two X-rays with the right report, none, and a wrong-side one.
+"""Does the report matter? Held-out phantoms from few X-rays with the right report, none, and a wrong-side one.
 
-    python tests/benchmark/text.py [prior.safetensors ...] [--phantoms number]
+    python tests/benchmark/text.py [prior.safetensors ...] [--phantoms 48] [--views 1 2 4] [--guidance 1]
 
 Without a prior, the shipped one. The error is the mean absolute HU error over the voxels that the phantom's findings
-changed. Writes text.csv beside this file. Only phantoms with a one-sided finding of at least 50 ml count: others have
-no wrong side.
+changed. Writes text.csv beside this file, and prints means and paired differences to the same case without a report,
+each with its standard error. Only phantoms with a one-sided finding of at least 50 ml count: others have no wrong side.
 """
 
 import argparse
 from pathlib import Path
-from statistics import mean
 
+import numpy as np
 import torch
 
 import phydict
 from phydict.datasets import Thorax, body_mask, pathology_region, phantom_case, report, wrong_side
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM
 from phydict.evaluation import volume_metrics, write_csv
-from phydict.prior.files import DEFAULT_PRIOR
+from phydict.prior import DEFAULT_PRIOR, Prior
 from phydict.xray import Ideal
 
-VOXEL_ML = 0.216
+REPORTS = ("right report", "none", "wrong side")
 
 
 def one_sided(count: int, grid: phydict.Grid) -> list[tuple[int, torch.Tensor]]:
     """The first `count` held-out seeds with a sizeable one-sided finding, and where it is."""
-    found, seed = [], HELD_OUT_PHANTOM + 1000
+    voxel_ml, found, seed = np.prod(grid.spacing) / 1000, [], HELD_OUT_PHANTOM + 1000
     while len(found) < count:
         thorax = Thorax.draw(seed)
         if len(thorax.findings) == 1 and thorax.findings[0].side in ("left", "right"):
             region = torch.from_numpy(pathology_region(thorax, grid))
-            if region.sum() * VOXEL_ML >= 50:
+            if region.sum() * voxel_ml >= 50:
                 found.append((seed, region))
         seed += 1
     return found
 
 
-def compared(file: Path, count: int) -> list[dict]:
-    """One row for each phantom and report, reconstructed with the prior in a file."""
-    prior, rows = phydict.load_prior(file), []
-    beam = phydict.ConeBeam.orbit(2, 1020.0, 740.0, shape=(112, 112), pixel=(5.0, 5.0))
+def compared(name: str, prior: Prior, cases: list[tuple[int, torch.Tensor]], views: int, guidance: float) -> list[dict]:
+    """One row for each phantom and report, reconstructed from a number of X-rays."""
+    rows = []
+    beam = phydict.ConeBeam.orbit(views, 1020.0, 740.0, shape=(112, 112), pixel=(5.0, 5.0))
     projector = phydict.Projector(prior.grid, beam)
-    for seed, region in one_sided(count, prior.grid):
+    for seed, region in cases:
         case, thorax = phantom_case(seed, prior.grid, prior.window), Thorax.draw(seed)
         xrays = Ideal()(projector, prior.window.to_mu(case["volume"])[None], seed)[0]
         truth = prior.window.to_hu(case["volume"])[None]
         body = torch.from_numpy(body_mask(truth[0, 0].numpy(), prior.grid.spacing))[None, None]
-        for name, text in (("correct", report(thorax)), ("none", ""), ("wrong side", report(wrong_side(thorax)))):
-            result = phydict.reconstruct(xrays, beam, prior, report=text, seed=seed)
+        for kind, text in zip(REPORTS, (report(thorax), "", report(wrong_side(thorax)))):
+            result = phydict.reconstruct(xrays, beam, prior, report=text, seed=seed, guidance=guidance)
             error = (result.volume - truth[0, 0]).abs()[region].mean()
-            rows.append({"prior": file.stem, "case": f"phantom-{seed}", "finding": thorax.findings[0].kind,
-                         "method": name, "views": 2, "region_mae_hu": float(error)}
+            rows.append({"prior": name, "case": f"phantom-{seed}", "finding": thorax.findings[0].kind, "method": kind,
+                         "views": views, "guidance": guidance, "region_mae_hu": float(error)}
                         | volume_metrics(result.volume[None, None], truth, body=body))
     return rows
+
+
+def mean_and_error(values: np.ndarray) -> str:
+    """A mean and its standard error."""
+    return f"{values.mean():8.2f} +- {values.std(ddof=1) / np.sqrt(len(values)):.2f}"
+
+
+def summary(rows: list[dict]) -> str:
+    """Of rows with one prior and number of views, each report's figures, and what they change in each case."""
+    column = {(kind, key): np.array([row[key] for row in rows if row["method"] == kind])
+              for kind in REPORTS for key in ("region_mae_hu", "psnr")}
+    lines = []
+    for kind in REPORTS:
+        error, psnr = column[kind, "region_mae_hu"], column[kind, "psnr"]
+        lines.append(f"K = {rows[0]['views']}, {kind:12s} region MAE {mean_and_error(error)} HU "
+                     f"({mean_and_error(error - column['none', 'region_mae_hu'])} to none), PSNR {psnr.mean():.2f} dB "
+                     f"({mean_and_error(psnr - column['none', 'psnr'])})")
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("priors", nargs="*", type=Path, default=[DEFAULT_PRIOR])
-    parser.add_argument("--phantoms", type=int, default=12)
+    parser.add_argument("--phantoms", type=int, default=48)
+    parser.add_argument("--views", type=int, nargs="+", default=[1, 2, 4])
+    parser.add_argument("--guidance", type=float, default=1.0)
+    parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".csv"))
     given = parser.parse_args()
-    rows = [row for file in given.priors for row in compared(file, given.phantoms)]
-    write_csv(Path(__file__).with_suffix(".csv"), rows)
+    rows = []
     for file in given.priors:
-        for name in ("correct", "none", "wrong side"):
-            own = [row for row in rows if (row["prior"], row["method"]) == (file.stem, name)]
-            print(f"{file.stem}, {name:12s} region MAE {mean(r['region_mae_hu'] for r in own):6.1f} HU   "
-                  f"PSNR {mean(r['psnr'] for r in own):.2f} dB")
+        prior = phydict.load_prior(file)
+        cases = one_sided(given.phantoms, prior.grid)
+        for views in given.views:
+            found = compared(file.stem, prior, cases, views, given.guidance)
+            print(f"{file.stem}:\n{summary(found)}", flush=True)
+            rows += found
+            write_csv(given.out, rows)

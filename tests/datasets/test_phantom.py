@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from phydict.datasets.phantoms.findings import FOCAL, KINDS, PLEURAL, Finding
+from phydict.datasets.phantoms.findings import KINDS, Finding
 from phydict.datasets.phantoms.phantom import build, pathology_region, phantom_case
-from phydict.datasets.phantoms.thorax import Thorax, report, without, wrong_side
+from phydict.datasets.phantoms.thorax import Thorax, without
 from phydict.grid import Grid
 
 COARSE = Grid.cube(32)
-WORDS = {"nodule": ("nodule",), "mass": ("mass",), "effusion": ("effusion",), "consolidation": ("consolidation",),
-         "emphysema": ("emphysema",), "cardiomegaly": ("cardiomegaly", "heart is enlarged", "heart size is increased"),
-         "pneumothorax": ("pneumothorax",)}
 EXAMPLES = [Finding("nodule", "left", "lower", 28, 5), Finding("mass", "right", "upper", 55, 6),
             Finding("effusion", "left", "", 0.25, 7), Finding("consolidation", "right", "lower", 0.6, 8),
-            Finding("consolidation", "right", "middle", 1.0, 8), Finding("pneumothorax", "right", "", 0.3, 9)]
+            Finding("consolidation", "right", "middle", 1.0, 8), Finding("opacity", "left", "upper", 0.6, 8),
+            Finding("atelectasis", "right", "lower", 0.2, 8), Finding("pneumothorax", "right", "", 0.3, 9)]
 
 
 def quiet(seed: int, *findings: Finding) -> Thorax:
@@ -31,13 +28,6 @@ def quiet(seed: int, *findings: Finding) -> Thorax:
 def world(grid: Grid) -> np.ndarray:
     index = np.stack(np.meshgrid(*(np.arange(n) for n in grid.shape), indexing="ij"), -1)
     return index @ grid.affine[:3, :3].T + grid.affine[:3, 3]
-
-
-def stated(text: str) -> list[str]:
-    """Sentences that assert something, in lower case."""
-    text = re.sub(r"(\d)\.(\d)", r"\1,\2", text.replace("Findings:", "").replace("Impression:", "").lower())
-    sentences = [s.strip() for s in text.split(".")]
-    return [s for s in sentences if s and not s.startswith("no ") and " no " not in s]
 
 
 def test_replays_bit_for_bit():
@@ -105,9 +95,10 @@ def test_a_finding_changes_its_own_side_only(finding):
         assert (change[region].mean() < 0) == (case.kind == "pneumothorax")
 
 
-@pytest.mark.parametrize("kind, sign", [("emphysema", -1), ("cardiomegaly", 1)])
-def test_findings_of_both_sides(kind, sign):
-    finding = Finding("emphysema", "both", "", 0.9, 3) if kind == "emphysema" else Finding(kind, "", "", 0.66)
+@pytest.mark.parametrize("finding, sign", [
+    (Finding("emphysema", "both", "", 0.9, 3), -1), (Finding("cardiomegaly", "", "", 0.66), 1),
+    (Finding("pericardial effusion", "", "", 20.0), 1)], ids=lambda value: getattr(value, "kind", ""))
+def test_findings_of_both_sides(finding, sign):
     thorax, grid = quiet(12, finding), Grid.cube(32)
     change = build(thorax, grid)[0] - build(without(thorax), grid)[0]
     x = world(grid)[..., 0] - thorax.offset[0]
@@ -119,6 +110,25 @@ def test_effusion_fills_its_fraction_of_the_cavity(size):
     thorax, grid = quiet(13, Finding("effusion", "right", "", size)), Grid.cube(48)
     lung = build(thorax, grid)[1][0][24:].sum() / build(without(thorax), grid)[1][0][24:].sum()
     assert 1 - lung == pytest.approx(size, abs=0.06)
+
+
+@pytest.mark.parametrize("finding", [Finding("opacity", "left", "lower", 0.6, 8),
+                                     Finding("consolidation", "left", "lower", 0.6, 8)], ids=lambda f: f.kind)
+def test_ground_glass_is_half_aerated_and_consolidation_is_not(finding):
+    thorax, grid = quiet(15, finding), Grid.cube(48)
+    hu = build(thorax, grid)[0][np.abs(pathology_region(thorax, grid, 200.0))]
+    assert -750 < np.median(hu) < -350 if finding.kind == "opacity" else np.median(hu) > -100
+
+
+def test_pericardial_fluid_of_the_stated_depth_surrounds_the_heart():
+    grid = Grid.cube(96)
+    for depth in (6.0, 20.0):
+        thorax = replace(Thorax.standard(), findings=(Finding("pericardial effusion", "", "", depth),))
+        fluid = np.abs(build(thorax, grid)[0] - 12) < 8
+        centre, axes, half = thorax.heart_ellipsoid(thorax.heart)
+        points = (world(grid) - centre) @ axes.T
+        shells = [(np.linalg.norm(points / (half + depth * share), axis=-1) < 1) for share in (0.0, 0.4, 0.8)]
+        assert fluid[shells[2] & ~shells[1]].mean() > 0.5
 
 
 @pytest.mark.parametrize("ratio", [0.55, 0.66])
@@ -143,37 +153,7 @@ def test_hundred_thoraces_are_finite_and_plausible():
     assert all(np.isfinite(build(t, Grid.cube(12))[0]).all() for t in draws)
     abnormal = [len(t.findings) for t in draws]
     assert 0.12 < abnormal.count(0) / 100 < 0.4 and max(abnormal) <= 3
-    assert {f.kind for t in draws for f in t.findings} == set(KINDS)
-
-
-@pytest.mark.parametrize("seed", range(50))
-def test_report_says_what_is_there_and_nothing_else(seed):
-    thorax = Thorax.draw(seed)
-    claims = stated(report(thorax))
-    for kind, words in WORDS.items():
-        about = [claim for claim in claims if any(word in claim for word in words)]
-        own = [f for f in thorax.findings if f.kind == kind]
-        assert len(about) == 2 * len(own), f"{kind}: once in each section per finding"
-        for finding in own:
-            side = finding.side if kind in PLEURAL + FOCAL else ""
-            matching = [claim for claim in about if side in claim and finding.lobe in claim]
-            assert len(matching) >= 2
-            if kind in ("nodule", "mass"):
-                assert sum(f"{finding.size:.0f} mm" in c for c in matching) >= 2
-            elif kind != "cardiomegaly":
-                assert sum(finding.grade in c for c in matching) >= 2
-            else:
-                assert any(f"{finding.size:.2f}".replace(".", ",") in c for c in matching)
-    text = report(thorax).lower()
-    for finding in thorax.findings:
-        assert f"no {finding.kind}" not in text and f"no pleural {finding.kind}" not in text
-
-
-@pytest.mark.parametrize("seed", range(30))
-def test_wrong_side_report_swaps_the_sides_alone(seed):
-    thorax = Thorax.draw(seed)
-    swapped = report(thorax).replace("right", "#").replace("left", "right").replace("#", "left")
-    assert report(wrong_side(thorax)) == swapped.replace("left middle", "left upper")
+    assert {f.kind for seed in range(400) for f in Thorax.draw(seed).findings} == set(KINDS)
 
 
 def test_bad_input_is_refused():

@@ -14,7 +14,7 @@ from phydict.datasets.phantoms.thorax import Thorax, report
 from phydict.grid import Grid
 from phydict.units import HUWindow
 
-PHANTOM_VERSION = 3
+PHANTOM_VERSION = 4
 """Raised whenever a phantom of the same seed comes out differently, so that cached ones are made anew."""
 
 HELD_OUT_PHANTOM = 1_000_000

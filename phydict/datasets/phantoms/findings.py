@@ -3,9 +3,11 @@
     Finding.size by kind
     nodule, mass                 diameter in mm (a mass is larger than 30 mm)
     effusion, pneumothorax       fraction of the lung cavity of that side that is filled
-    consolidation                fraction of the lobe that is opacified
+    consolidation, opacity       fraction of the lobe that is airless, or of ground glass
+    atelectasis                  fraction of the lobe that is collapsed, where it lies lowest
     emphysema                    severity in (0, 1], both lungs, strongest in the upper lobes
     cardiomegaly                 cardiothoracic ratio, at least 0.55
+    pericardial effusion         mm of fluid around the heart
 """
 
 from __future__ import annotations
@@ -14,22 +16,32 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from phydict.datasets.reports import join_report
+from phydict.datasets.prose import write_report
 
-KINDS = ("nodule", "mass", "effusion", "consolidation", "emphysema", "cardiomegaly", "pneumothorax")
+__all__ = ["FOCAL", "FREQUENCY", "GRADES", "KINDS", "LOBES", "PLEURAL", "Finding", "draw_findings", "write_report"]
+
+KINDS = ("nodule", "mass", "effusion", "consolidation", "opacity", "atelectasis", "emphysema", "cardiomegaly",
+         "pericardial effusion", "pneumothorax")
 PLEURAL = ("effusion", "pneumothorax")
-FOCAL = ("nodule", "mass", "consolidation")
+FOCAL = ("nodule", "mass", "consolidation", "opacity", "atelectasis")
 LOBES = {"right": ("upper", "middle", "lower"), "left": ("upper", "lower")}
-FREQUENCY = {"nodule": 0.15, "mass": 0.14, "effusion": 0.25, "consolidation": 0.23, "emphysema": 0.09,
-             "cardiomegaly": 0.18, "pneumothorax": 0.06}
+MIDLINE = {"emphysema": ("both",), "cardiomegaly": ("",), "pericardial effusion": ("",)}
+"""The sides of the kinds that take neither right nor left."""
+
+FREQUENCY = {"nodule": 0.13, "mass": 0.12, "effusion": 0.21, "consolidation": 0.19, "opacity": 0.09,
+             "atelectasis": 0.07, "emphysema": 0.08, "cardiomegaly": 0.14, "pericardial effusion": 0.05,
+             "pneumothorax": 0.06}
 """How often `draw_findings` proposes a kind for an abnormal case; refused proposals shift these slightly."""
 
 GRADES = {
     "effusion": {"small": (0.07, 0.12), "moderate": (0.18, 0.30), "large": (0.40, 0.65)},
     "pneumothorax": {"small": (0.08, 0.14), "moderate": (0.20, 0.32), "large": (0.40, 0.60)},
     "consolidation": {"focal": (0.20, 0.38), "extensive": (0.50, 0.75), "complete": (0.99, 1.0)},
+    "opacity": {"focal": (0.20, 0.38), "extensive": (0.50, 0.75), "complete": (0.99, 1.0)},
+    "atelectasis": {"mild": (0.06, 0.10), "moderate": (0.16, 0.24), "marked": (0.32, 0.42)},
     "emphysema": {"mild": (0.30, 0.45), "moderate": (0.55, 0.70), "severe": (0.85, 1.0)},
     "cardiomegaly": {"mild": (0.55, 0.57), "moderate": (0.59, 0.62), "marked": (0.64, 0.68)},
+    "pericardial effusion": {"small": (5.0, 8.0), "moderate": (11.0, 15.0), "large": (19.0, 26.0)},
 }
 """The word a report uses for a size, and the sizes drawn for it; the intervals are apart, so a word is never a toss."""
 
@@ -38,8 +50,8 @@ GRADES = {
 class Finding:
     """One abnormality.
 
-    kind: one of `KINDS`. side: "right" or "left"; "both" for emphysema, "" for cardiomegaly.
-    lobe: "upper", "middle" (right only) or "lower" for nodule, mass and consolidation; "" else.
+    kind: one of `KINDS`. side: "right" or "left"; "both" for emphysema, "" for the heart's.
+    lobe: "upper", "middle" (right only) or "lower" for the kinds of FOCAL; "" else.
     size: see the table at the head of this file. seed: places it inside its lobe.
     """
 
@@ -52,7 +64,7 @@ class Finding:
     def __post_init__(self):
         if self.kind not in KINDS:
             raise ValueError(f"'{self.kind}' is no kind of finding; choose one of {', '.join(KINDS)}")
-        sides = {"emphysema": ("both",), "cardiomegaly": ("",)}.get(self.kind, ("right", "left"))
+        sides = MIDLINE.get(self.kind, ("right", "left"))
         lobes = LOBES[self.side] if self.kind in FOCAL and self.side in LOBES else ("",)
         if self.side not in sides or self.lobe not in lobes:
             raise ValueError(f"{self.kind} was given side '{self.side}' and lobe '{self.lobe}'; "
@@ -88,7 +100,7 @@ def draw_findings(rng: np.random.Generator) -> tuple[Finding, ...]:
 
 def _draw_finding(rng: np.random.Generator) -> Finding:
     kind = str(rng.choice(list(FREQUENCY), p=np.array(list(FREQUENCY.values())) / sum(FREQUENCY.values())))
-    side = {"emphysema": "both", "cardiomegaly": ""}.get(kind, str(rng.choice(["right", "left"])))
+    side = str(rng.choice(MIDLINE.get(kind, ("right", "left"))))
     lobe = str(rng.choice(LOBES[side])) if kind in FOCAL else ""
     if kind == "nodule":
         size = float(rng.integers(7, 30))
@@ -108,75 +120,3 @@ def _clash(a: Finding, b: Finding) -> bool:
     if a.kind not in local or b.kind not in local or a.side != b.side:
         return False
     return a.kind in PLEURAL or b.kind in PLEURAL or a.lobe == b.lobe
-
-
-def _sentences(finding: Finding) -> tuple[list[str], list[str]]:
-    """The phrasings of one finding in the Findings and in the Impression section."""
-    side, lobe, mm, grade = finding.side, f"{finding.side} {finding.lobe} lobe", f"{finding.size:.0f} mm", finding.grade
-    if finding.kind == "nodule":
-        return ([f"A {mm} nodule in the {lobe}.", f"There is a {mm} solid nodule in the {lobe}.",
-                 f"A nodule measuring {mm} is observed in the {lobe} of the lung."],
-                [f"{mm} nodule in the {lobe}.", f"Nodule in the {lobe}, {mm}."])
-    if finding.kind == "mass":
-        return ([f"A {mm} mass in the {lobe}.", f"There is a soft tissue mass measuring {mm} in the {lobe}.",
-                 f"A mass lesion with a diameter of {mm} is observed in the {lobe}."],
-                [f"{mm} mass in the {lobe}.", f"Mass in the {lobe}, {mm}."])
-    if finding.kind == "effusion":
-        return ([f"There is a {grade} {side} pleural effusion.", f"A {grade} pleural effusion on the {side}.",
-                 f"{grade.capitalize()} pleural effusion is observed on the {side} side."],
-                [f"{grade.capitalize()} {side} pleural effusion."])
-    if finding.kind == "pneumothorax":
-        return ([f"There is a {grade} {side} pneumothorax.", f"A {grade} pneumothorax on the {side}.",
-                 f"Free air in the {side} pleural space, consistent with a {grade} pneumothorax."],
-                [f"{grade.capitalize()} {side} pneumothorax."])
-    if finding.kind == "consolidation":
-        return ([f"{grade.capitalize()} consolidation in the {lobe}.", f"There is {grade} consolidation in the {lobe}.",
-                 f"{grade.capitalize()} consolidation with air bronchograms is observed in the {lobe}."],
-                [f"{grade.capitalize()} consolidation in the {lobe}.", f"{grade.capitalize()} {lobe} consolidation."])
-    if finding.kind == "emphysema":
-        return ([f"{grade.capitalize()} emphysema in both lungs, most marked in the upper lobes.",
-                 f"There is {grade} upper lobe predominant emphysema in both lungs."],
-                [f"{grade.capitalize()} bilateral emphysema."])
-    return ([f"The heart is enlarged, cardiothoracic ratio {finding.size:.2f}.",
-             f"{grade.capitalize()} cardiomegaly with a cardiothoracic ratio of {finding.size:.2f}.",
-             f"Heart size is increased, cardiothoracic ratio {finding.size:.2f}."],
-            [f"{grade.capitalize()} cardiomegaly."])
-
-
-ABSENT = {
-    ("effusion",): ["No pleural effusion.", "No pleural effusion was observed."],
-    ("pneumothorax",): ["No pneumothorax.", "There is no pneumothorax."],
-    ("consolidation",): ["No consolidation.", "There is no consolidation in either lung."],
-    ("nodule", "mass"): ["No nodule or mass in either lung.", "There is no pulmonary nodule or mass."],
-    ("emphysema",): ["No emphysema."],
-    ("cardiomegaly",): ["Heart size is normal.", "The heart is of normal size."],
-}
-AIRWAY = ["Trachea and both main bronchi are open.", "Trachea and main bronchi are patent.", ""]
-NORMAL = ["No acute abnormality in the thorax.", "Chest CT within normal limits.", "Normal chest CT."]
-
-
-def write_report(findings: tuple[Finding, ...], contrast: bool, seed: int) -> str:
-    """"Findings: ... Impression: ..." stating every finding with side, lobe and size, and most absent kinds as absent.
-
-    The phrasing depends on `seed` alone, so that swapping sides changes nothing but the sides.
-    """
-    rng = np.random.default_rng([seed, 7])
-
-    def pick(options: list[str]) -> str:
-        return options[int(rng.random() * len(options))]
-
-    lines = [pick(AIRWAY)]
-    if rng.random() < 0.5:
-        lines.append("Contrast-enhanced examination." if contrast else "Examination without contrast.")
-    impression = []
-    for finding in findings:
-        long, short = _sentences(finding)
-        lines.append(pick(long))
-        impression.append(pick(short))
-    present = {finding.kind for finding in findings}
-    for kinds, options in ABSENT.items():
-        stated = rng.random() < 0.75
-        if stated and not present.intersection(kinds):
-            lines.append(pick(options))
-    text = " ".join(line for line in lines if line) or "The lungs are clear."
-    return join_report(text, " ".join(impression) or pick(NORMAL))

@@ -62,7 +62,7 @@ def vessels(canvas: Canvas, tissue: np.ndarray) -> np.ndarray:
 
 
 def focal_findings(canvas: Canvas, tissue: np.ndarray, texture: np.ndarray) -> None:
-    """Paint nodules, masses and consolidations into the lung tissue."""
+    """Paint nodules, masses, consolidations, ground glass and atelectases into the lung tissue."""
     t, (x, y, z) = canvas.thorax, canvas.axes
     for finding in t.findings:
         rng = np.random.default_rng([finding.seed, 5])
@@ -74,7 +74,12 @@ def focal_findings(canvas: Canvas, tissue: np.ndarray, texture: np.ndarray) -> N
             distance = np.sqrt((bx - centre[0]) ** 2 + (by - centre[1]) ** 2 + (bz - centre[2]) ** 2) - radius
             share = canvas.soft(distance + 0.07 * radius * np.clip(lumps, -2, 2)) * (SIDES[finding.side] * bx > 0)
             canvas.paint(share, 38 + (25 if t.contrast else 0) + 6 * texture[box], box, tissue)
-        if finding.kind == "consolidation":
+        if finding.kind == "atelectasis":
+            level = np.quantile(_lowness(*_lobe_points(t, finding).T), finding.size)
+            share = np.clip(0.5 - (_lowness(x, y, z) - level) / (canvas.edge + 4), 0, 1)
+            share = share * canvas.soft(t.lobe(finding.side, finding.lobe, x, y, z)) * (SIDES[finding.side] * x > 0)
+            canvas.paint(0.95 * share, 35 + (35 if t.contrast else 0), into=tissue)
+        if finding.kind in ("consolidation", "opacity"):
             ragged = Texture(finding.seed, 6, 22.0)
             centre = _focus(t, finding, rng, 15.0)
 
@@ -84,7 +89,14 @@ def focal_findings(canvas: Canvas, tissue: np.ndarray, texture: np.ndarray) -> N
             level = np.quantile(spread(*_lobe_points(t, finding).T), finding.size) if finding.size < 0.98 else 1e3
             share = np.clip(0.5 - (spread(x, y, z) - level) / (canvas.edge + 8), 0, 1) * (SIDES[finding.side] * x > 0)
             share = share * canvas.soft(t.lobe(finding.side, finding.lobe, x, y, z))
-            canvas.paint(share * np.clip(0.93 - 0.06 * texture, 0.75, 1), 32 + (30 if t.contrast else 0), into=tissue)
+            airless = np.clip(0.93 - 0.06 * texture, 0.75, 1)
+            airless = airless if finding.kind == "consolidation" else 0.38 * airless
+            canvas.paint(share * airless, 32 + (30 if t.contrast else 0), into=tissue)
+
+
+def _lowness(x, y, z):
+    """A height that rises forwards and upwards: dependent lung, which collapses first, lies low."""
+    return 0.6 * y + z + 0 * x
 
 
 def _lobe_points(t: Thorax, finding: Finding) -> np.ndarray:

@@ -142,6 +142,9 @@ def _mediastinum(canvas: Canvas) -> np.ndarray:
         if covers:
             organs[box] = np.maximum(organs[box], share)
 
+    for finding in t.findings:
+        if finding.kind == "pericardial effusion":
+            put(*canvas.blob(centre, half + finding.size, axes), 12.0)
     put(*canvas.blob(centre, half, axes), -60.0)
     put(*canvas.blob(centre, half - 2.0, axes), 48 + (45 if t.contrast else 0))
     chambers = [((-0.36, -0.10, -0.08), 0.42, left_blood), ((0.08, 0.40, -0.12), 0.38, right_blood),

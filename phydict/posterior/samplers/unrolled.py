@@ -30,12 +30,12 @@ class Unrolled(Sampler):
     citation = ("Adler & Oktem, Learned Primal-Dual Reconstruction, IEEE Transactions on Medical Imaging 37(6), 2018, "
                 "doi:10.1109/TMI.2018.2799231")
 
-    times: tuple[float, ...] = (0.35, 0.25, 0.15)
-    x0_stds: tuple[float, ...] = (0.5, 0.3, 0.3, 0.3)
+    times: tuple[float, ...] = (0.35, 0.25, 0.2, 0.15)
+    x0_stds: tuple[float, ...] = (0.5, 0.3, 0.3, 0.3, 0.3)
     start: LikelihoodStep = ProximalCG(10, 3, refit_scatter=True, tv_weight=10.0, tv_eps=0.003)
     likelihood: LikelihoodStep = ProximalCG(10, 3, refit_scatter=True, tv_weight=5.0, tv_eps=0.003)
     final_likelihood: LikelihoodStep = ProximalCG(10, 4, refit_scatter=True, weighted_least_squares=True,
-                                                  tv_weight=5.0, tv_eps=0.003)
+                                                  tv_weight=2.0, tv_eps=0.003)
     default_prior = DEFAULT_REFINER
     needs_refiner = True
 

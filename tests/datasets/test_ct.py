@@ -317,6 +317,18 @@ def test_report_tables_are_checked(tmp_path):
         read_reports(write_csv(tmp_path / "a.csv", ("VolumeName",)))
 
 
+def test_a_table_of_reports_of_other_cts_is_refused_and_one_found_by_itself_warned_of(tmp_path, thorax):
+    save(tmp_path / "cts" / "mine.nii.gz", thorax[:4, :4, :4])
+    table = write_csv(tmp_path / "others" / "train_reports.csv", REPORT_COLUMNS,
+                      ("train_1_a_1.nii.gz", "", "", "Nodule, 4 mm.", "Nodule."))
+    said = "none of the 1 reports in .* is of one of the 1 CTs in .*train_1_a_1, the first CT is mine"
+    with pytest.raises(ValueError, match=said):
+        find_cts(tmp_path / "cts", reports=table)
+    table.parent.rename(tmp_path / "radiology_text_reports")
+    with pytest.warns(UserWarning, match=said):
+        assert find_cts(tmp_path / "cts")[0].report == ""
+
+
 def test_a_patient_never_straddles_the_split():
     ids = [f"train_{p}_{s}_{r}" for p in range(20) for s in "ab" for r in (1, 2)] + ["x__1", "x__2", "LIDC-IDRI-0002"]
     for seed in range(20):

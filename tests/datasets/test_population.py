@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,10 +21,14 @@ from phydict.datasets.population.findings import put_findings
 from phydict.datasets.population.organs import expansion
 from phydict.datasets.population.registration import overlap
 from phydict.datasets.population.velocity import flow, jacobian, places, resize, sample
-from phydict.grid import Grid
+from phydict.grid import Cube, Grid
+from phydict.training.crops import SuperResolutionData
+from phydict.training.data import PriorData
+from phydict.training.draws import MixedCases
+from phydict.training.settings import HoldOut, Loading
 from phydict.units import HUWindow
 
-GRID, WINDOW = Grid.cube(32), HUWindow()
+GRID, WINDOW, ROOT = Grid.cube(32), HUWindow(), Path(__file__).parents[2]
 STRONG = Variation(mixing=1.0, modes=2.0, lungs=0.7, heart=0.7, liver=0.7, findings=0.0)
 
 
@@ -129,6 +135,19 @@ def test_an_organ_grows_by_the_factor_that_its_velocity_says(factor):
     assert far.sub(1).abs().max() < 0.03
 
 
+@pytest.mark.parametrize("factor", [0.25, -0.25])
+def test_inflated_lungs_have_more_volume_and_their_tissue_keeps_its_mass(population, factor):
+    own = Anatomy.of(0, 3)
+    case, inflated = population.cases[0], population.case(replace(own, lungs=factor))
+
+    def volume_and_density(case: dict) -> tuple[float, float]:
+        inside = (case["masks"][0] > 0.99) & (case["masks"][2] < 0.01)
+        return float(case["masks"][0].sum()), float(WINDOW.to_hu(case["volume"][0])[inside].median()) + 1000
+
+    (volume, density), (new_volume, new_density) = volume_and_density(case), volume_and_density(inflated)
+    assert abs(np.log(new_volume / volume) - factor) < 0.06 and abs(np.log(new_density / density) + factor) < 0.06
+
+
 def test_a_table_stays_straight_and_follows_the_back(population):
     case = population.cases[0]
     hu = torch.full((1, 32, 32, 32), -1000.0)
@@ -203,6 +222,53 @@ def test_a_cached_draw_is_the_draw_and_other_variations_are_other_files(drawn, m
     assert other.drawn != drawn.drawn
     patient = other.population.cases[other.population.draw(1, Variation.none()).patient]
     assert other[1]["volume"].sub(patient["volume"]).abs().max() < 1e-3
+
+
+def test_two_processes_share_a_cache(folder, tmp_path):
+    code = """if True:
+        import sys
+        from phydict.datasets import CTCases, find_cts
+        from phydict.datasets.population import DrawnPatients, PopulationSettings
+        from phydict.grid import Grid
+        cts = CTCases(find_cts(sys.argv[1]), sys.argv[2], Grid.cube(16))
+        drawn = DrawnPatients(cts, PopulationSettings(1.0, draws=3))
+        print([round(float(drawn[i]["volume"].double().sum()), 6) for i in range(3)])"""
+    runs = [subprocess.Popen([sys.executable, "-c", code, str(folder), str(tmp_path)], stdout=subprocess.PIPE,
+                             stderr=subprocess.PIPE, text=True, cwd=ROOT) for _ in range(2)]
+    said = [run.communicate(timeout=300) for run in runs]
+    assert all(run.returncode == 0 for run in runs), said
+    third = DrawnPatients(CTCases(find_cts(folder), tmp_path, Grid.cube(16)), PopulationSettings(1.0, draws=3))
+    sums = [round(float(third[i]["volume"].double().sum()), 6) for i in range(3)]
+    assert [out.strip() for out, _ in said] == [str(sums)] * 2
+    assert not list(tmp_path.rglob("*.part.*")) and len(list(third.drawn.iterdir())) == 3
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_a_share_of_the_draws_from_cts_comes_from_the_population(drawn, share):
+    settled = DrawnPatients(drawn.cts, replace(drawn.settings, share=share))
+    cts, phantoms = [None] * 3, [None] * 2
+    draws = MixedCases(cts, phantoms, 0.6, GRID, WINDOW, 400, 0, 0, population=settled)
+    picked = [draws.source(np.random.default_rng(i)) for i in range(400)]
+    counts = [sum(source is of for source in picked) / 400 for of in (phantoms, cts, settled)]
+    assert counts == pytest.approx([0.4, 0.6 * (1 - share), 0.6 * share], abs=0.08)
+    plain = MixedCases(cts, phantoms, 0.6, GRID, WINDOW, 400, 0, 0)
+    assert all((plain.source(np.random.default_rng(i)) is phantoms) == (picked[i] is phantoms) for i in range(400))
+
+
+def test_training_draws_from_the_population_what_it_draws_from_the_folder(folder, tmp_path):
+    settings = PopulationSettings(1.0, draws=2, variation=Variation(findings=1.0))
+    data = PriorData(str(folder), holdout=HoldOut(["patient2"], phantoms=0), phantoms=0, cache=str(tmp_path),
+                     loading=Loading(epoch_size=2, population=settings), cube=Cube(16))
+    item = data.draws(0)[0]
+    assert {case["id"] for case in data.population.population.cases} == {"patient0", "patient1"}
+    assert item["volume"].shape == (1, 16, 16, 16) and item["report"].startswith("Findings:")
+    assert data.reports and all(isinstance(report, str) for report in data.reports)
+
+
+def test_a_super_resolution_stage_refuses_a_population(folder, tmp_path):
+    with pytest.raises(ValueError, match=r"population\.share is 0\.5: set it to 0"):
+        SuperResolutionData(cts=str(folder), cache=str(tmp_path), cube=Cube(96),
+                            loading=Loading(population=PopulationSettings(0.5)))
 
 
 def water(folder: Path) -> None:

@@ -145,7 +145,7 @@ def test_inflated_lungs_have_more_volume_and_their_tissue_keeps_its_mass(populat
         return float(case["masks"][0].sum()), float(WINDOW.to_hu(case["volume"][0])[inside].median()) + 1000
 
     (volume, density), (new_volume, new_density) = volume_and_density(case), volume_and_density(inflated)
-    assert abs(np.log(new_volume / volume) - factor) < 0.06 and abs(np.log(new_density / density) + factor) < 0.06
+    assert abs(np.log(new_volume / volume) - factor) < 0.06 and abs(np.log(new_density / density) + factor) < 0.08
 
 
 def test_a_table_stays_straight_and_follows_the_back(population):
@@ -230,14 +230,14 @@ def test_two_processes_share_a_cache(folder, tmp_path):
         from phydict.datasets import CTCases, find_cts
         from phydict.datasets.population import DrawnPatients, PopulationSettings
         from phydict.grid import Grid
-        cts = CTCases(find_cts(sys.argv[1]), sys.argv[2], Grid.cube(16))
+        cts = CTCases(find_cts(sys.argv[1])[:2], sys.argv[2], Grid.cube(16))
         drawn = DrawnPatients(cts, PopulationSettings(1.0, draws=3))
         print([round(float(drawn[i]["volume"].double().sum()), 6) for i in range(3)])"""
     runs = [subprocess.Popen([sys.executable, "-c", code, str(folder), str(tmp_path)], stdout=subprocess.PIPE,
                              stderr=subprocess.PIPE, text=True, cwd=ROOT) for _ in range(2)]
     said = [run.communicate(timeout=300) for run in runs]
     assert all(run.returncode == 0 for run in runs), said
-    third = DrawnPatients(CTCases(find_cts(folder), tmp_path, Grid.cube(16)), PopulationSettings(1.0, draws=3))
+    third = DrawnPatients(CTCases(find_cts(folder)[:2], tmp_path, Grid.cube(16)), PopulationSettings(1.0, draws=3))
     sums = [round(float(third[i]["volume"].double().sum()), 6) for i in range(3)]
     assert [out.strip() for out, _ in said] == [str(sums)] * 2
     assert not list(tmp_path.rglob("*.part.*")) and len(list(third.drawn.iterdir())) == 3

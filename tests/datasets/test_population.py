@@ -25,17 +25,20 @@ from phydict.grid import Cube, Grid
 from phydict.training.crops import SuperResolutionData
 from phydict.training.data import PriorData
 from phydict.training.draws import MixedCases
+from phydict.datasets.surroundings.couches import Couch
 from phydict.training.settings import HoldOut, Loading
 from phydict.units import HUWindow
 
 GRID, WINDOW, ROOT = Grid.cube(32), HUWindow(), Path(__file__).parents[2]
+FLAT = Couch(width=420.0, thickness=40.0, gap=10.0, shift=0.0, curve=0.0, keel=0.0, pad=0.0, pad_hu=-900.0, shell=3.0,
+             shell_hu=0.0, core_hu=-950.0)
 STRONG = Variation(mixing=1.0, modes=2.0, lungs=0.7, heart=0.7, liver=0.7, findings=0.0)
 
 
 def thorax(seed: int, **changes) -> Thorax:
-    """A healthy thorax scanned as a whole, on a table."""
-    return replace(without(Thorax.draw(seed)), noise=4.0, scan=(-400.0, 400.0), field=470.0, table=(10.0, 40.0),
-                   **changes)
+    """A healthy thorax scanned as a whole, on a flat couch, with raised arms."""
+    return replace(without(Thorax.draw(seed)), noise=4.0, scan=(-400.0, 400.0), field=470.0, couch=FLAT,
+                   arms=(True, True), **changes)
 
 
 def write_ct(file: Path, hu: np.ndarray, mm: float) -> None:

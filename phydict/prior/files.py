@@ -102,7 +102,7 @@ def describe(prior: Prior) -> dict:
     return {"format": FORMAT, "stage": "base", "grid": prior.grid.to_dict(),
             "hu_window": [prior.window.low, prior.window.high], "state": STATE[:prior.network.state_channels],
             "sigma_data": prior.sigma_data, "skip_std": prior.skip_std, "schedule": vars(prior.schedule),
-            "network": prior.network.settings, "text": text,
+            "text": text, "network": prior.network.settings,
             **({"detail": prior.detail.settings} if prior.detail else {})}  # which older files do not name
 
 

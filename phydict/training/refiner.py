@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from torch import Tensor
 
-from phydict.diffusion import CosineSchedule
 from phydict.grid import Cube
 from phydict.posterior import Unrolled
-from phydict.prior import DEFAULT_PRIOR, Prior, Refiner, describe_refiner, load_prior
+from phydict.prior import DEFAULT_PRIOR, BoundRefiner, Prior, Refiner, describe_refiner, load_prior
 from phydict.training.prior import reconstruction_scores
 from phydict.training.scenes import Scenes
 from phydict.training.settings import Optimisation, RefinerValidation
@@ -26,20 +23,8 @@ TEXT_DROPOUT = 0.3
 """Share of the draws whose report is kept from the network."""
 
 
-@dataclass(frozen=True)
-class _Learning:
-    """A refiner of one report whose calls are recorded for gradients."""
-
-    refiner: Refiner
-    context: Tensor
-
-    @property
-    def schedule(self) -> CosineSchedule:
-        return self.refiner.schedule
-
-    @property
-    def mean(self) -> Tensor:
-        return self.refiner.mean[None]
+class _Learning(BoundRefiner):
+    """A refiner of one report whose calls are recorded for gradients, in the precision of the training."""
 
     def refine(self, x: Tensor, t: float, evidence: Tensor) -> Tensor:
         return self.refiner(x, torch.full((len(x),), float(t), device=x.device), self.context, evidence)

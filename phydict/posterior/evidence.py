@@ -8,6 +8,7 @@ from torch import Tensor
 
 from phydict.posterior.measurement import Measurement
 from phydict.xray import Projector
+from phydict.xray.binning import pixel_sides
 
 RESIDUAL_SCALE, CHANGE_SCALE, COVERAGE_SCALE = 10.0, 2.0, 0.2
 """Factors that bring the channels to a size near 1."""
@@ -49,9 +50,6 @@ class Evidence:
 def views_seen(projector: Projector, seen: Tensor) -> Tensor:
     """How many views see each voxel, of A' 1: a view that sees the grid's centre gives it the volume of a voxel over
     the area of a pixel there."""
-    beam, grid = projector.beam, projector.grid
-    to_detector = beam.detectors - beam.sources
-    depth = ((grid.centre - beam.sources) * to_detector).sum(1) / (to_detector**2).sum(1)
-    area = (beam.u**2).sum(1) ** 0.5 * (beam.v**2).sum(1) ** 0.5 * depth**2
-    each = float(np.prod(grid.spacing) / area.mean())
-    return (seen / each).clamp(0, beam.views)
+    width, height = pixel_sides(projector.grid, projector.beam)
+    each = float(np.prod(projector.grid.spacing) / (width * height).mean())
+    return (seen / each).clamp(0, projector.beam.views)

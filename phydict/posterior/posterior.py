@@ -32,30 +32,29 @@ MOST_GUIDANCE = 1e6
 class CountingDenoiser:
     """A denoiser that counts its calls, one for each state of a batch, and shows a guard what it estimates."""
 
-    def __init__(self, denoiser: Denoiser, guard: Guard):
+    def __init__(self, denoiser: Denoiser | BoundRefiner, guard: Guard):
         self.schedule, self._denoiser, self.guard, self.calls = denoiser.schedule, denoiser, guard, 0
 
     def denoise(self, x: Tensor, t: float) -> Tensor:
+        return self._count(x, lambda: self._denoiser.denoise(x, t))
+
+    def _count(self, x: Tensor, call: Callable[[], Tensor]) -> Tensor:
         self.calls += len(x)
         with stage("network"):
-            x0 = self._denoiser.denoise(x, t)
+            x0 = call()
         self.guard.estimate = x0.detach()
         return x0
 
 
-class CountingRefiner:
+class CountingRefiner(CountingDenoiser):
     """A refiner that counts its calls, as CountingDenoiser does a denoiser's."""
 
-    def __init__(self, refiner: BoundRefiner, guard: Guard):
-        self.schedule, self.mean, self._refiner = refiner.schedule, refiner.mean, refiner
-        self.guard, self.calls = guard, 0
+    @property
+    def mean(self) -> Tensor:
+        return self._denoiser.mean
 
     def refine(self, x: Tensor, t: float, evidence: Tensor) -> Tensor:
-        self.calls += len(x)
-        with stage("network"):
-            x0 = self._refiner.refine(x, t, evidence)
-        self.guard.estimate = x0.detach()
-        return x0
+        return self._count(x, lambda: self._denoiser.refine(x, t, evidence))
 
 
 @dataclass(frozen=True)

@@ -33,8 +33,6 @@ class Refiner(nn.Module):
     reconstruction starts from.
     """
 
-    ends_at_zero = False
-
     def __init__(self, prior: Prior, mean: Tensor):
         super().__init__()
         if prior.detail is None:

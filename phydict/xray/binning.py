@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -12,12 +13,17 @@ from phydict.xray.geometry import ConeBeam
 def binning(grid: Grid, beam: ConeBeam) -> int:
     """The largest whole factor by which the detector may be binned while its pixels, seen at the grid's centre, stay
     below 0.7 voxels; finer pixels cost time and carry nothing that the grid can hold."""
-    to_detector = beam.detectors - beam.sources
-    depth = ((grid.centre - beam.sources) * to_detector).sum(1) / (to_detector**2).sum(1)
-    pixel = max(float((abs(step**2).sum(1) ** 0.5 * depth).max()) for step in (beam.u, beam.v))
-    limit = 0.7 * min(grid.spacing) / pixel
+    limit = 0.7 * min(grid.spacing) / float(max(sides.max() for sides in pixel_sides(grid, beam)))
     factors = [f for f in range(1, max(int(limit), 1) + 1) if all(n % f == 0 for n in beam.shape)]
     return factors[-1]
+
+
+def pixel_sides(grid: Grid, beam: ConeBeam) -> tuple[np.ndarray, np.ndarray]:
+    """Width and height (K,) in mm of each view's pixels, seen at the grid's centre."""
+    to_detector = beam.detectors - beam.sources
+    depth = ((grid.centre - beam.sources) * to_detector).sum(1) / (to_detector**2).sum(1)
+    width, height = ((step**2).sum(1) ** 0.5 * depth for step in (beam.u, beam.v))
+    return width, height
 
 
 def binned(xrays: Tensor, factor: int) -> Tensor:

@@ -17,11 +17,12 @@ import sys
 import tempfile
 import time
 import traceback
+from collections.abc import Iterator
 from pathlib import Path
 
 TESTS = Path(__file__).parents[1]
 sys.path.insert(0, str(TESTS))
-MOST_KB = 3 * 2**20
+MOST_KB, MOST_SECONDS = 3 * 2**20, 15
 FINDINGS = Path(os.environ.get("FUZZ_FINDINGS", tempfile.gettempdir())) / "fuzz_findings"
 
 
@@ -35,7 +36,7 @@ class Found:
         from fuzzing import check
 
         self.runs += 1
-        signal.alarm(15)
+        signal.setitimer(signal.ITIMER_PROF, MOST_SECONDS)
         try:
             self.read += check(target, content, folder)
         except BaseException as error:
@@ -54,7 +55,7 @@ class Found:
                 (FINDINGS / f"{number:03d}-{self.name.replace(' ', '_')}-{target.name}").write_bytes(content)
                 print(f"{self.name}: {key}\n    {self.faults[key]}", flush=True)
         finally:
-            signal.alarm(0)
+            signal.setitimer(signal.ITIMER_PROF, 0)
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         if peak > MOST_KB and "memory" not in self.faults:
             self.faults["memory"] = f"{peak / 2**20:.1f} GiB"
@@ -68,14 +69,14 @@ class Found:
 
 
 def _late(*_):
-    raise TimeoutError("more than 15 s")
+    raise TimeoutError(f"more than {MOST_SECONDS} s of computing")
 
 
 def by_hypothesis(name: str, seconds: float) -> None:
     from fuzzing import TARGETS, contents
     from hypothesis import HealthCheck, Phase, given, seed, settings
 
-    signal.signal(signal.SIGALRM, _late)
+    signal.signal(signal.SIGPROF, _late)
     found, end, turn = Found(name), time.monotonic() + seconds, 0
     with tempfile.TemporaryDirectory() as folder:
         while time.monotonic() < end:
@@ -109,7 +110,7 @@ def by_atheris(name: str, seconds: float) -> None:
                                  if len(piece) < 60))
 
         def once(content: bytes) -> None:
-            signal.signal(signal.SIGALRM, _late)
+            signal.signal(signal.SIGPROF, _late)
             if time.monotonic() > end:
                 found.tell()
                 os._exit(0)
@@ -121,27 +122,22 @@ def by_atheris(name: str, seconds: float) -> None:
         atheris.Fuzz()
 
 
-def fuzz(seconds: float, engines: tuple[str, ...] = ("hypothesis", "atheris")) -> list[dict]:
-    """Runs every engine on every target, each in a process of its own, with equal shares of the time."""
-    from fuzzing import TARGETS
+def fuzz(seconds: float, engine: str, names: list[str]) -> Iterator[dict]:
+    """Runs an engine ("hypothesis" or "atheris") on targets, each in a process of its own, with equal shares of the time.
 
-    results = []
-    for engine in engines:
-        if engine == "atheris" and subprocess.run([sys.executable, "-c", "import atheris"],
-            capture_output=True).returncode:
-            print("atheris is not installed: its fuzzers are left out")
-            continue
-        for name in TARGETS:
-            share = seconds / len(engines) / len(TARGETS)
-            done = subprocess.run([sys.executable, __file__, engine, name, str(share)], capture_output=True, text=True,
-                                  timeout=10 * share + 300)
-            told = [line for line in done.stdout.splitlines() if line.startswith("RESULT ")]
-            print("\n".join(line for line in done.stdout.splitlines() if not line.startswith("RESULT ")))
-            if not told:
-                print(f"{engine}, {name}: it ended with {done.returncode}: {done.stderr[-1500:]}")
-            results += [{"engine": engine, "seconds": share} | json.loads(line[7:]) for line in told]
-            print(results[-1] if results else "", flush=True)
-    return results
+    Yields {"target", "seconds", "runs", "read", "faults"} after each; a process that ended by itself is a fault.
+    """
+    for name in names:
+        share = seconds / len(names)
+        done = subprocess.run([sys.executable, __file__, engine, name, str(share)], capture_output=True, text=True,
+                              timeout=10 * share + 300)
+        lines = [line for line in done.stdout.splitlines() if not line.startswith("RESULT ")]
+        told = [json.loads(line[7:]) for line in done.stdout.splitlines() if line.startswith("RESULT ")]
+        if not told:
+            lines.append(f"{engine}, {name}: it ended with {done.returncode}: {done.stderr[-1500:]}")
+            told = [{"target": name, "runs": 0, "read": 0, "faults": ["ended"]}]
+        print("\n".join(lines), flush=True)
+        yield {"seconds": share} | told[-1]
 
 
 if __name__ == "__main__":

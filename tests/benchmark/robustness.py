@@ -1,13 +1,14 @@
 """What becomes of input as strangers and attackers may give it: scripted tries, then fuzzers.
 
-    python tests/benchmark/robustness.py [minutes of fuzzing] [words in the names of tries]
+    python tests/benchmark/robustness.py tries [words in their names]
+    python tests/benchmark/robustness.py fuzz <minutes> <hypothesis or atheris> [readers of tests/fuzzing.py, all if none]
 
 Each try runs in this process through a main function or the Python API, in a folder of its own, for at most 10
 seconds of computing (a minute on the clock).
 It is a fault where an exception other than a refusal comes out, where a refusal is not one sentence that names what is
 wrong (the try says which words), where the exit code is wrong, where an input changed, and where something half-written
-is left. Tries that are fine print nothing. The fuzzers are those of tests/fuzzing.py, with equal shares of the time, by
-Hypothesis and, where it is installed, by atheris. Without words writes the counts to robustness.csv beside this file.
+is left. Tries that are fine print nothing. The fuzzers are those of tests/fuzzing.py, with equal shares of the time.
+The counts replace the rows of the same name in robustness.csv beside this file; tries picked by words are not counted.
 ROBUSTNESS_LOG names a file for what every try printed, FUZZ_FINDINGS a folder for the inputs of the fuzzers' faults.
 """
 
@@ -20,6 +21,7 @@ import os
 import re
 import resource
 import signal
+import subprocess
 import sys
 import tempfile
 import time
@@ -30,7 +32,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from phydict.evaluation import write_csv
+from phydict.evaluation import read_csv, write_csv
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -160,22 +162,34 @@ def run_tries(words: str = "") -> Counter:
     return counts
 
 
+def count(rows: list[dict]) -> None:
+    """Puts rows in the table of counts, in place of those of the same name."""
+    commit = subprocess.run(["git", "-C", str(OUT.parent), "rev-parse", "--short", "HEAD"], capture_output=True, text=True,
+                            check=True).stdout.strip()
+    names = {row["what"] for row in rows}
+    kept = [row for row in read_csv(OUT) if row["what"] not in names] if OUT.exists() else []
+    write_csv(OUT, [*kept, *(row | {"commit": commit} for row in rows)])
+
+
 def main() -> None:
-    minutes = float(sys.argv[1]) if len(sys.argv) > 1 else 0
-    counts = run_tries(sys.argv[2] if len(sys.argv) > 2 else "")
+    kind, *given = sys.argv[1:]
+    if kind == "fuzz":
+        from fuzz import fuzz
+        from fuzzing import TARGETS
+
+        minutes, engine, *names = given
+        for found in fuzz(60 * float(minutes), engine, names or list(TARGETS)):
+            count([{"what": f"{engine}: {found['target']}", "minutes": round(found["seconds"] / 60, 2),
+                    "inputs": found["runs"], "read": found["read"], "faults": len(found["faults"])}])
+        return
+    counts = run_tries(given[0] if given else "")
     rows = [{"what": f"tries: {group}", "inputs": sum(n for (other, _), n in counts.items() if other == group),
              "faults": sum(n for (other, kind), n in counts.items() if other == group and kind != "fine")}
             for group in dict.fromkeys(group for group, _ in counts)]
-    if minutes:
-        from fuzz import fuzz
-
-        rows += [{"what": f"{found['engine']}: {found['target']}", "minutes": round(found["seconds"] / 60, 2),
-                  "inputs": found["runs"], "read": found["read"], "faults": len(found["faults"])}
-                 for found in fuzz(60 * minutes)]
     for row in rows:
         print(", ".join(f"{name} {value}" for name, value in row.items()))
-    if len(sys.argv) < 3:
-        write_csv(OUT, rows)
+    if not given:
+        count(rows)
 
 
 if __name__ == "__main__":

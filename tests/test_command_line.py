@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 import subprocess
 import sys
 import warnings
@@ -149,6 +150,31 @@ def test_a_setting_of_the_wrong_kind_is_one_sentence_that_names_it(empty, capsys
         infer(["predict", "-c", "sirt", "-c", "mine.yaml", "--data.xrays", str(shipped("data/example/xrays"))])
     said = capsys.readouterr().err
     assert stopped.value.code == 2 and said.count("\n") == 1 and words in said
+
+
+@pytest.mark.parametrize("option, words", [
+    ("--model.sampling.guidance=nan", "model.sampling.guidance is a number, but nan was given"),
+    ("--model.seed=1.5", "model.seed is a whole number, but 1.5 was given"),
+    ("--model.overwrite=maybe", "model.overwrite is true or false, but maybe was given"),
+    ("--model.sampling={samples: x}", "model.sampling.samples is a whole number, but x was given"),
+    ("--model.cube=big", "model.cube is a mapping of settings, but big was given"),
+    ("--data.orbit.pixel=[1]", "data.orbit.pixel is a list of 2, but [1] was given"),
+    ("--data.simulator=os.system", "data.simulator is the path of a Simulator, but os.system was given"),
+    ("--model.method=os.system", "model.method is the path of a Sampler or the path of a Reconstructor, but os.system"),
+    ("--model.method=nowhere.X", "model.method is the path of a class, but nowhere.X cannot be imported"),
+    ("--model.method=phydict.posterior.Sampler", "phydict.posterior.Sampler is abstract: give one derived from it"),
+    ("--model.method.init_args=3", "model.method.init_args is a mapping of the settings of phydict.baselines.SIRT"),
+    ("--model.method.init_args.iterations=[]", "model.method.init_args.iterations is a whole number, but [] was given"),
+    ('--model.method={"class_path": "phydict.baselines.SIRT", "init_args": {"speed": 3}}', "SIRT has no setting speed"),
+    ("--trainer.callbacks=3", "trainer.callbacks is a list"), ("--dry_run=7", "--dry_run takes no value, but 7 was"),
+    ("--trainer.precision=12", "32-true, 64-true, bf16, but 12 was given"),
+    ("--trainer.speed=3", "there is no option --trainer.speed=3")])
+def test_an_option_of_the_wrong_kind_is_told_in_words_of_the_settings(empty, capsys, option, words):
+    with pytest.raises(SystemExit) as stopped:
+        infer(["predict", "-c", "sirt", "--data.xrays", str(shipped("data/example/xrays")), option])
+    said = capsys.readouterr().err
+    assert stopped.value.code == 2 and said.count("\n") == 1 and words in said
+    assert not re.search("Parser key|<class|Expected|has no attribute", said)
 
 
 @pytest.mark.parametrize("out", ["x" * 300, "/".join(["x" * 100] * 60), "broken/link"])

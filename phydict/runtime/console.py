@@ -17,6 +17,7 @@ from pathlib import Path
 
 from jsonargparse import set_loader
 
+from phydict.runtime.parser_message import plain
 from phydict.runtime.reading import one_line
 from phydict.runtime.renamed import check_options, check_setting
 from phydict.runtime.shipped import configuration
@@ -201,14 +202,7 @@ def sentence(error: Exception) -> str:
     text = str(error).strip()
     if text.startswith("Caught "):  # a loader process sends its whole trace; the last line holds the message
         text = text.splitlines()[-1].partition(": ")[2]
-    if "Does not validate against any of the Union" in text:
-        reasons = re.split(r"\n\s*- ", text.partition("Given value type")[0])[1:]
-        reasons = [reason for reason in reasons if "does not correspond to a subclass" not in reason] or reasons
-        text = text.partition("Does not validate")[0] + "; ".join(reasons)
-    text = re.sub(r"(- )?Expected a path but .*? either not accessible or invalid;?|"
-                  r"Does not validate against any of the Union subtypes Subtypes: .*? Errors:;?|"
-                  r"; Expected a <class 'NoneType'>", "", " ".join(text.split()))
-    return one_line(text)
+    return one_line(plain(text) or text)
 
 
 @contextmanager

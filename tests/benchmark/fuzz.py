@@ -123,7 +123,7 @@ def by_atheris(name: str, seconds: float) -> None:
 
 
 def fuzz(seconds: float, engine: str, names: list[str]) -> Iterator[dict]:
-    """Runs an engine ("hypothesis" or "atheris") on targets, each in a process of its own, with equal shares of the time.
+    """Runs an engine ("hypothesis" or "atheris") on targets in processes of their own, with equal shares of the time.
 
     Yields {"target", "seconds", "runs", "read", "faults"} after each; a process that ended by itself is a fault.
     """

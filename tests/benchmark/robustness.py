@@ -1,10 +1,10 @@
 """What becomes of input as strangers and attackers may give it: scripted tries, then fuzzers.
 
-    python tests/benchmark/robustness.py tries [words in their names]
-    python tests/benchmark/robustness.py fuzz <minutes> <hypothesis or atheris> [readers of tests/fuzzing.py, all if none]
+    python tests/benchmark/robustness.py tries [groups, or words in the names of tries]
+    python tests/benchmark/robustness.py fuzz <minutes> <hypothesis or atheris> [readers of tests/fuzzing.py, else all]
 
 Each try runs in this process through a main function or the Python API, in a folder of its own, for at most 10
-seconds of computing (a minute on the clock).
+seconds of computing (five minutes on the clock).
 It is a fault where an exception other than a refusal comes out, where a refusal is not one sentence that names what is
 wrong (the try says which words), where the exit code is wrong, where an input changed, and where something half-written
 is left. Tries that are fine print nothing. The fuzzers are those of tests/fuzzing.py, with equal shares of the time.
@@ -17,9 +17,11 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import io
+import itertools
 import os
 import re
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -27,8 +29,7 @@ import tempfile
 import time
 import traceback
 import warnings
-from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,7 +41,8 @@ OUT = Path(__file__).with_suffix(".csv")
 SECONDS, GIGABYTES = 10, 2
 RAW = re.compile(r"'NoneType'|has no attribute|object is not|invalid literal for|to unpack|list index|Error\(|"
                  r"unhashable|not supported between|unsupported operand|expected str,|an integer is required|"
-                 r"^error: '?\[?(Errno|\w+)'?$|embedded null|object cannot|does not match format|positional_argument")
+                 r"^error: '?\[?(Errno|\w+)'?$|embedded null|object cannot|does not match format|positional_argument|"
+                 r"Parser key|<class '|unrecognized arguments|Expected an? ")
 """Words of Python's own that tell a user nothing."""
 
 
@@ -65,9 +67,9 @@ def _ring(*_):
 
 @contextlib.contextmanager
 def limited(seconds: int = SECONDS):
-    """Raises Hang in the block after so many seconds of computing, or six times as many on the clock."""
+    """Raises Hang in the block after so many seconds of computing, or 30 times as many on the clock."""
     before = {number: signal.signal(number, _ring) for number in (signal.SIGALRM, signal.SIGPROF)}
-    signal.alarm(6 * seconds)
+    signal.alarm(30 * seconds)
     signal.setitimer(signal.ITIMER_PROF, seconds)
     try:
         yield
@@ -93,7 +95,7 @@ def judge(one: Try, place) -> str:
     out, err, code, broken = io.StringIO(), io.StringIO(), 0, ""
     place.begin()
     several = one.group in ("interruptions", "surroundings")  # processes, which must first start
-    seconds = 30 * SECONDS if several else SECONDS
+    seconds = 6 * SECONDS if several else SECONDS
     began, peak = time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     here = os.getcwd()
@@ -141,31 +143,40 @@ def judge(one: Try, place) -> str:
     return place.harm()
 
 
-def run_tries(words: str = "") -> Counter:
-    """(group, kind of fault or "fine") -> how often; prints what is wrong."""
+def run_tries(words: Sequence[str]) -> None:
+    """Runs groups and counts them, or tries with one of these words in their names; prints what is wrong."""
     from tries import Place, tries
 
-    counts, log = Counter(), []
+    chosen = list(enumerate(tries()))
+    known = {one.group for _, one in chosen}
+    whole = known.issuperset(words)
+    chosen = [(n, one) for n, one in chosen if not words or (
+        one.group in words if whole else any(word in f"{one.group}: {one.name}" for word in words))]
     with tempfile.TemporaryDirectory(prefix="tries") as root:
-        for n, one in enumerate(tries()):
-            if words not in f"{one.group}: {one.name}":
-                continue
-            place = Place(Path(root) / f"{n:03d}")
-            began = time.monotonic()
-            wrong = judge(one, place)
-            log.append(f"{n} {one.group}: {one.name} [{time.monotonic() - began:.1f} s]\n{place.said}\n")
-            counts[one.group, wrong.partition(":")[0] or "fine"] += 1
-            if wrong:
-                print(f"{n} {one.group}: {one.name}\n    {wrong}", flush=True)
+        for group, members in itertools.groupby(chosen, lambda each: each[1].group):
+            verdicts = [_run(one, Place(Path(root) / f"{n:04d}"), n) for n, one in members]
+            row = {"what": f"tries: {group}", "inputs": len(verdicts), "faults": sum(map(bool, verdicts))}
+            print(*row.values(), flush=True)
+            if whole:
+                count([row])
+
+
+def _run(one: Try, place, number: int) -> str:
+    began = time.monotonic()
+    wrong = judge(one, place)
+    if wrong:
+        print(f"{number} {one.group}: {one.name}\n    {wrong}", flush=True)
     if file := os.environ.get("ROBUSTNESS_LOG"):
-        Path(file).write_text("\n".join(log), errors="backslashreplace")
-    return counts
+        with open(file, "a", errors="backslashreplace") as log:
+            log.write(f"{number} {one.group}: {one.name} [{time.monotonic() - began:.1f} s]\n{place.said}\n\n")
+    shutil.rmtree(place.root, ignore_errors=True)
+    return wrong
 
 
 def count(rows: list[dict]) -> None:
     """Puts rows in the table of counts, in place of those of the same name."""
-    commit = subprocess.run(["git", "-C", str(OUT.parent), "rev-parse", "--short", "HEAD"], capture_output=True, text=True,
-                            check=True).stdout.strip()
+    commit = subprocess.run(["git", "-C", str(OUT.parent), "rev-parse", "--short", "HEAD"], capture_output=True,
+                            text=True, check=True).stdout.strip()
     names = {row["what"] for row in rows}
     kept = [row for row in read_csv(OUT) if row["what"] not in names] if OUT.exists() else []
     write_csv(OUT, [*kept, *(row | {"commit": commit} for row in rows)])
@@ -182,14 +193,7 @@ def main() -> None:
             count([{"what": f"{engine}: {found['target']}", "minutes": round(found["seconds"] / 60, 2),
                     "inputs": found["runs"], "read": found["read"], "faults": len(found["faults"])}])
         return
-    counts = run_tries(given[0] if given else "")
-    rows = [{"what": f"tries: {group}", "inputs": sum(n for (other, _), n in counts.items() if other == group),
-             "faults": sum(n for (other, kind), n in counts.items() if other == group and kind != "fine")}
-            for group in dict.fromkeys(group for group, _ in counts)]
-    for row in rows:
-        print(", ".join(f"{name} {value}" for name, value in row.items()))
-    if not given:
-        count(rows)
+    run_tries(given)
 
 
 if __name__ == "__main__":

@@ -42,7 +42,7 @@ def surroundings():
             p.started()
             run = subprocess.run(
                 [sys.executable, "-c", code, "predict", *SIRT, f"--data.xrays={folder}", f"--model.out={p.out}"],
-                env={**os.environ, "PYTHONPATH": str(ROOT), **variables}, capture_output=True, text=True, timeout=250)
+                env={**os.environ, "PYTHONPATH": str(ROOT), **variables}, capture_output=True, text=True, timeout=1500)
             sys.stderr.write(run.stderr)
             if run.returncode:
                 sys.exit(run.returncode)

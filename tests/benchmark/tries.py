@@ -1712,7 +1712,7 @@ def interruptions():
     def goes_on(p, args, before) -> None:
         """The same command again ends well, keeps what was finished, and leaves nothing behind."""
         done = start(args)
-        _out, err = done.communicate(timeout=200)
+        _out, err = done.communicate(timeout=1000)
         assert done.returncode == 0, err
         after = finished(p)
         assert all(after[name] == content for name, content in before.items()), "a finished case was changed"
@@ -1727,7 +1727,7 @@ def interruptions():
                 time.sleep(0.01)
             time.sleep(delay)
             run.send_signal(number)
-            _out, err = run.communicate(timeout=100)
+            _out, err = run.communicate(timeout=1000)
             assert "Traceback" not in err, err
             assert run.returncode in (0, -number, 130, 143), (run.returncode, err)
             goes_on(p, args, {k: v for k, v in finished(p).items()})
@@ -1754,7 +1754,7 @@ def interruptions():
     def small(p):
         args = command(p)
         run = start(args, preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000)))
-        _out, err = run.communicate(timeout=200)
+        _out, err = run.communicate(timeout=1000)
         assert run.returncode == 2 and "Traceback" not in err and "could not be written" in err, (run.returncode, err)
         assert not [f for f in (p.out / "sirt").iterdir() if f.name != ".lock"], "something half-written is left"
         goes_on(p, args, {})
@@ -1768,7 +1768,7 @@ def interruptions():
             return
         try:
             run = start(command(p))
-            _out, err = run.communicate(timeout=200)
+            _out, err = run.communicate(timeout=1000)
             assert run.returncode == 2 and "Traceback" not in err and "free some space" in err, (run.returncode, err)
             left = [f.name for f in (p.out / "sirt").iterdir()]
             assert not [name for name in left if name.startswith(".")], left
@@ -1781,7 +1781,7 @@ def interruptions():
         def work(p):
             args = command(p)
             runs = [start([*args, *(extra for extra in (more if k else ()))]) for k in range(2)]
-            told = [(run.communicate(timeout=300)[1], run.returncode) for run in runs]
+            told = [(run.communicate(timeout=1000)[1], run.returncode) for run in runs]
             assert all("Traceback" not in err for err, _ in told), told
             whole(p)
             if not more:
@@ -1805,20 +1805,20 @@ def interruptions():
             run = start(args, user=65534, group=65534, extra_groups=[])
         except PermissionError:  # where that user may not run Python either, or nobody else can be run as
             return
-        _out, err = run.communicate(timeout=200)
+        _out, err = run.communicate(timeout=1000)
         assert "Traceback" not in err and run.returncode == 2, (run.returncode, err)
 
     yield "as a user who may not write there", True, "", nobody
     yield "output closed", True, "", lambda p: (run := start([
-        "sh", "-c", 'exec "$0" "$@" >&-', *command(p)]), told := run.communicate(timeout=200), _must(
+        "sh", "-c", 'exec "$0" "$@" >&-', *command(p)]), told := run.communicate(timeout=1000), _must(
             run.returncode == 0 and "Traceback" not in told[1], told))
     yield "no UTF-8 console", True, "", lambda p: (p.case("käse"), run := subprocess.Popen(
         command(p), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | {
-            "PYTHONPATH": str(ROOT), "PYTHONIOENCODING": "ascii"}), told := run.communicate(timeout=200), _must(
+            "PYTHONPATH": str(ROOT), "PYTHONIOENCODING": "ascii"}), told := run.communicate(timeout=1000), _must(
                 run.returncode == 0 and "Traceback" not in told[1], told))
     yield "a folder that is gone", False, "", lambda p: (args := command(p), gone := p.root / "gone", gone.mkdir(),
         run := start(
-        ["sh", "-c", 'cd "$0" && rmdir "$0" && exec "$@"', str(gone), *args]), told := run.communicate(timeout=200),
+        ["sh", "-c", 'cd "$0" && rmdir "$0" && exec "$@"', str(gone), *args]), told := run.communicate(timeout=1000),
         _must(
             "Traceback" not in told[1] and run.returncode in (0, 2), (run.returncode, told)), sys.stderr.write(
                 "error: as it should be"), sys.exit(2))

@@ -1,0 +1,67 @@
+"""What the command line's parser says of a setting that it refuses, as a sentence for a user."""
+
+from __future__ import annotations
+
+import re
+
+KINDS = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "a text", "list": "a list",
+         "tuple": "a list", "dict": "a mapping of settings"}
+"""How sentences name the types of settings."""
+
+UNLOADED = re.compile(r"""Parser key "([^"]+)": Unable to load config (['"])(.*?)\2 - (Parser key .*)""")
+NESTED = re.compile(r"""Problem with given class_path '[^']*': Parser key "([^"]+)": (.*)""")
+PROBLEM = re.compile(r"Problem with given class_path '([^']*)': (.*?)(?= - | Given value type: |$)")
+GIVEN = re.compile(r"(?:Got|Given) value: (.*?)(?= Given value type: |$)|Expected a path but (.*?) either not ")
+
+
+def plain(message: str) -> str:
+    """A message of jsonargparse on one setting as one sentence: its name, what it holds and what was given. Empty where
+    it is another message."""
+    text = " ".join(message.split())
+    if flag := re.fullmatch(r"argument (--\S+): ignored explicit argument '(.*)'", text):
+        return f"{flag[1]} takes no value, but {_short(flag[2])} was given"
+    if unknown := re.fullmatch(r"unrecognized arguments: (.*)", text):
+        return f"there is no option {_short(unknown[1])}: --help lists what there is"
+    if unloaded := UNLOADED.match(text):
+        return (f"{unloaded[1]} is a mapping of settings, but {_short(unloaded[3])} was given"
+                if ": Unable to load config " in unloaded[4] else plain(unloaded[4]))
+    start = re.match(r'Parser key "([^"]+)": ', text)
+    if not start:
+        return ""
+    key = start[1]
+    if nested := NESTED.search(text):
+        return plain(f'Parser key "{key}.init_args.{nested[1]}": {nested[2]}')
+    if problem := PROBLEM.search(text):
+        return _of_class(key, problem[1], problem[2])
+    given = next((found[1] or found[2] for found in GIVEN.finditer(text)), "something else")
+    given = _short(re.sub(r"^NestedArg\(key='\w+', val=(.*)\)$", r"\1", given))
+    if "is abstract" in text:
+        return f"{key} is the path of a class that can be used, but {given} is abstract: give one derived from it"
+    wanted = _wanted(text)
+    return f"{key} is {wanted}, but {given} was given" if wanted else ""
+
+
+def _of_class(key: str, path: str, reason: str) -> str:
+    if option := re.fullmatch(r"Option '(.*)' is not accepted", reason):
+        return f"{key}: {path} has no setting {option[1]}"
+    if reason.endswith("has no attribute 'keys'"):
+        return f"{key}.init_args is a mapping of the settings of {path}, but something else was given"
+    reason = re.sub(r"module '([^']*)' has no attribute '([^']*)'", r"\1 has no \2", reason)
+    return f"{key} is the path of a class, but {path} cannot be imported ({reason})"
+
+
+def _wanted(text: str) -> str:
+    """What a setting holds, by all types that the parser tried."""
+    kinds = [KINDS[kind] for kind in re.findall(r"Expected an? <class '(\w+)'>", text) if kind in KINDS]
+    kinds += [f"a list of {size}" for size in re.findall(r"Expected a tuple with (\d+) elements", text)]
+    kinds += ["the path of a class"] * ("Expected a dot import path" in text)
+    kinds += [f"the path of a {name}" for name in re.findall(r"does not correspond to a subclass of (\w+)", text)]
+    names = [name.strip(" '") for listed in re.findall(r"Expected a typing\.Literal\[(.*?)\]", text)
+             for name in listed.split(",")]
+    kinds += [f"one of {', '.join(dict.fromkeys(names))}"] * bool(names)
+    return " or ".join(dict.fromkeys(kinds))
+
+
+def _short(text: str) -> str:
+    text = text.strip("'\"")
+    return text if len(text) <= 80 else f"{text[:40]}...{text[-30:]}"

@@ -11,6 +11,7 @@
     posterior        likelihood steps, reward, samplers                             prior x X-rays
     baselines        reconstruction without a prior                                 yardsticks
     evaluation       metrics, tables, picture panels                                scores
+    rivals           published networks from X-rays to CT, re-implemented           yardsticks
     methods          the named methods, and `reconstruct` in one call
     training         priors and super-resolution stages                             Lightning
     inference        X-rays -> volumes, CTs -> scores                               Lightning

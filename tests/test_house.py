@@ -35,16 +35,17 @@ FLOORS = {
     "xray": 2, "diffusion": 2,
     "prior": 3, "datasets": 3, "reconstruction": 3, "guard": 3,
     "posterior": 4, "baselines": 4, "evaluation": 4,
-    "methods": 5,
-    "training": 6, "inference": 6,
-    "ablation": 7,
-    "cli": 8}
+    "rivals": 5,
+    "methods": 6,
+    "training": 7, "inference": 7,
+    "ablation": 8,
+    "cli": 9}
 LIGHTNING = ("training", "inference", "ablation", "cli")
 ROOT_FILES = 8
 """How many modules the package's top may hold."""
 
 CONFIGS = {folder: sorted((ROOT / "configs" / folder).glob("*.yaml"))
-           for folder in ("prior", "reconstruct", "geometry", "simulate")}
+           for folder in ("prior", "rivals", "reconstruct", "geometry", "simulate")}
 
 SEVERAL_DEVICES = (ROOT / "configs" / "prior" / "ddp.yaml", ROOT / "configs" / "prior" / "fsdp.yaml")
 
@@ -209,8 +210,9 @@ def prior_training(tmp_path, monkeypatch):
               "--trainer.accelerator=cpu", "--trainer.devices=1"])
 
 
-@pytest.mark.parametrize("config", [f for f in CONFIGS["prior"] if f not in SEVERAL_DEVICES], ids=lambda f: f.stem)
-def test_every_prior_configuration_builds(prior_training, config):
+@pytest.mark.parametrize("config", [
+    f for f in CONFIGS["prior"] + CONFIGS["rivals"] if f not in SEVERAL_DEVICES], ids=lambda f: f.stem)
+def test_every_training_configuration_builds(prior_training, config):
     cli = prior_training(config)
     assert cli.model.prior.grid.same_as(cli.datamodule.grid) and cli.model.prior.window == cli.datamodule.window
     assert cli.trainer.max_steps == yaml.safe_load(config.read_text())["trainer"]["max_steps"]

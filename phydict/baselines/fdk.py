@@ -15,6 +15,7 @@ from phydict.baselines.baseline import Baseline, CountingProjector, clip, empty
 from phydict.baselines.orbit import Orbit
 from phydict.grid import Grid
 from phydict.units import MU_WATER, HUWindow
+from phydict.xray.places import detector_places
 
 
 @dataclass(frozen=True)
@@ -86,21 +87,6 @@ def ramp(n: int, hann: bool = False) -> Tensor:
 
 def _smeared(orbit: Orbit, k: int, filtered: Tensor, grid: Grid) -> Tensor:
     """View k's part in the volume (1, 1, X, Y, Z): its filtered pixels (V, U) along their rays, by distance."""
-    beam, axes = orbit.beam, [torch.arange(m) for m in grid.shape]
-    start = grid.affine[:3, 3] - beam.sources[k]
-
-    def along(direction: np.ndarray) -> Tensor:
-        """The voxels' coordinate (X, Y, Z) from the source along a direction."""
-        steps = direction @ grid.affine[:3, :3]
-        x, y, z = (s * axis.to(filtered) for s, axis in zip(steps, axes))
-        return x[:, None, None] + y[:, None] + z + direction @ start
-
-    depth = along(beam.normals[k]).clamp(min=1e-3 * orbit.radius)
-    places = []
-    for step, size in ((beam.u[k], beam.shape[1]), (beam.v[k], beam.shape[0])):
-        unit = step / (step @ step)  # from mm to pixels
-        pixel = along(unit) * (beam.distances[k] / depth) - unit @ (beam.detectors[k] - beam.sources[k])
-        places.append(2 * pixel / size)  # grid_sample's: -1 and 1 at the detector's edges
-    at = torch.stack(places, -1).flatten(0, 1)[None]
-    smeared = grid_sample(filtered[None, None], at, align_corners=False).view(depth.shape)
+    depth, places = detector_places(grid, orbit.beam, k, filtered)
+    smeared = grid_sample(filtered[None, None], places.flatten(0, 1)[None], align_corners=False).view(depth.shape)
     return ((orbit.radius / depth) ** 2 * smeared)[None, None]

@@ -8,12 +8,13 @@ from phydict.prior.files import (
     build_prior, build_refiner, build_super_resolution, build_text, has_text, is_saved_prior, save_prior, save_refiner,
     save_super_resolution)
 from phydict.prior.inspection import inspect_prior
+from phydict.rivals import NETWORKS, build_rival, save_rival
 from phydict.runtime.console import check_writable
 from phydict.training.checkpoints import read_checkpoint
 
 
 def export_prior(checkpoint: str, out: str, overwrite: bool = False) -> None:
-    """Write the averaged weights of a training checkpoint as a prior, or a super-resolution stage, for reconstruction.
+    """Write the averaged weights of a training checkpoint as a prior, a further stage or a rival, for reconstruction.
 
     Args:
         checkpoint: the .ckpt file that training wrote
@@ -33,6 +34,8 @@ def export_prior(checkpoint: str, out: str, overwrite: bool = False) -> None:
     training = header.get("training", {"steps": content.get("global_step")})
     if header.get("stage") == "super_resolution":
         save_super_resolution(build_super_resolution(header, weights), out, training)
+    elif header.get("stage") in NETWORKS:
+        save_rival(build_rival(header, weights), out, training)
     else:
         refiner = build_refiner(header, weights) if header.get("stage") == "refiner" else None
         prior = refiner.prior if refiner else build_prior(header, weights)

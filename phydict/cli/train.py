@@ -29,6 +29,7 @@ from phydict.training.crops import SuperResolutionData
 from phydict.training.data import PriorData
 from phydict.training.progress import TrainingProgress
 from phydict.training.refiner import RefinerTraining
+from phydict.training.rivals import LiftedTraining
 from phydict.training.stage import CHECKPOINT, StageTraining
 from phydict.training.super_resolution import SuperResolutionTraining
 from phydict.training.throughput import Throughput
@@ -37,7 +38,7 @@ COMMANDS = {"fit": "train a prior", "validate": "measure one on held-out cases",
             "inspect-prior": "what a file is"}
 
 STAGES = {"base": (PriorTraining, PriorData), "super_resolution": (SuperResolutionTraining, SuperResolutionData),
-          "refiner": (RefinerTraining, PriorData)}
+          "refiner": (RefinerTraining, PriorData), "lifted": (LiftedTraining, PriorData)}
 """What trains a stage, and on which data."""
 
 
@@ -64,7 +65,7 @@ class PriorCLI(LightningCLI):
 
     def add_arguments_to_parser(self, parser) -> None:
         parser.add_argument("--out", default="runs/prior", help="folder for checkpoint, logs and samples")
-        parser.add_argument("--stage", default="base", choices=list(STAGES), help="which stage of a cascade to train")
+        parser.add_argument("--stage", default="base", choices=list(STAGES), help="what to train")
         parser.add_argument("--precision", default="auto", choices=list(PRECISIONS),
                             help="of the network: bfloat16 where the device computes it and float32 elsewhere (auto), "
                                  "or one of the two; trainer.precision takes Lightning's own names instead")
@@ -161,7 +162,7 @@ def main(args: list[str] | None = None) -> None:
         else:
             check_command(given, COMMANDS, PriorCLI.subcommands(), "fit -c configs/prior/phantom.yaml")
             check_configured(given, ("--print_config",), "configs/prior/phantom.yaml")
-            given = with_configurations(given, ("prior",))
+            given = with_configurations(given, ("prior", "rivals"))
             PriorCLI(*STAGES[stage_of(given)], args=given, seed_everything_default=0,
                      save_config_kwargs={"overwrite": True},
                      trainer_defaults={"enable_progress_bar": False, "enable_model_summary": False,

@@ -44,7 +44,8 @@ ADVICE = "copy it again, or export it from its training checkpoint"
 MOST_HU, MOST_LAYERS = 1e6, 256
 """No window reaches as far, and no network has more blocks on its way down, or layers."""
 
-STAGES = {"base": "a base prior", "super_resolution": "a super-resolution stage", "refiner": "a refiner"}
+STAGES = {"base": "a base prior", "super_resolution": "a super-resolution stage", "refiner": "a refiner",
+          "lifted": "a rival"}
 """What a file's header may call it, and what that is; a header that says nothing is of a base prior."""
 
 
@@ -60,13 +61,13 @@ def save_prior(prior: Prior, path: str | Path, training: dict | None = None, dty
     weights = prior.state_dict()
     if prior.text is not None and prior.text.source:  # a pretrained BERT is named, not copied
         weights = {k: w for k, w in weights.items() if not k.startswith("text.")}
-    _write(Path(path), describe(prior) | {"training": training or {}}, weights, dtype)
+    write_stage(Path(path), describe(prior) | {"training": training or {}}, weights, dtype)
 
 
 def save_super_resolution(fine: SuperResolution, path: str | Path, training: dict | None = None,
                           dtype: torch.dtype = torch.float16):
     """Writes `fine` to one .safetensors file, as `save_prior` does."""
-    _write(Path(path), describe_super_resolution(fine) | {"training": training or {}}, fine.state_dict(), dtype)
+    write_stage(Path(path), describe_super_resolution(fine) | {"training": training or {}}, fine.state_dict(), dtype)
 
 
 def save_refiner(refiner: Refiner, path: str | Path, training: dict | None = None, dtype: torch.dtype = torch.float16):
@@ -76,10 +77,12 @@ def save_refiner(refiner: Refiner, path: str | Path, training: dict | None = Non
     copied = refiner.prior.text is not None and not refiner.prior.text.source
     weights = {k.replace("prior.text.", "text.", 1): w for k, w in refiner.state_dict().items()
                if copied or not k.startswith("prior.text.")}
-    _write(Path(path), describe_refiner(refiner) | {"training": training or {}}, weights, dtype)
+    write_stage(Path(path), describe_refiner(refiner) | {"training": training or {}}, weights, dtype)
 
 
-def _write(path: Path, header: dict, weights: dict[str, Tensor], dtype: torch.dtype) -> None:
+def write_stage(path: Path, header: dict, weights: dict[str, Tensor], dtype: torch.dtype) -> None:
+    """Writes header and weights to one .safetensors file, replacing it only when complete. Raises OSError where it
+    cannot, and ValueError where weights are not finite in `dtype`."""
     tensors = {k: w.detach().to("cpu", dtype).contiguous() for k, w in weights.items()}
     if broken := not_finite(tensors):
         raise ValueError(f"'{path}' was not written, since its weights are not finite in {dtype}: {broken}")
@@ -133,7 +136,7 @@ def load_prior(path: str | Path | MedSynCheckpoint = DEFAULT_PRIOR,
     if isinstance(path, MedSynCheckpoint) or is_medsyn(path):
         return load_medsyn(path, device)
     with refusing(path, ADVICE):
-        header, weights = _read(path, ("base", "refiner"), device)
+        header, weights = read_stage(path, ("base", "refiner"), device)
         try:
             build = build_refiner if header.get("stage") == "refiner" else build_prior
             found = build(header, weights)
@@ -152,7 +155,7 @@ def load_super_resolution(path: str | Path | MedSynCheckpoint,
     if isinstance(path, MedSynCheckpoint) or is_medsyn(path):
         return load_medsyn_super_resolution(path, device)
     with refusing(path, ADVICE):
-        header, weights = _read(path, ("super_resolution",), device)
+        header, weights = read_stage(path, ("super_resolution",), device)
         try:
             fine = build_super_resolution(header, weights)
         except ValueError as error:
@@ -164,7 +167,7 @@ def _found(path: str | Path | MedSynCheckpoint) -> Path | MedSynCheckpoint:
     return path if isinstance(path, MedSynCheckpoint) else own_or_shipped(path)
 
 
-def _read(path: Path, stages: Sequence[str], device: str) -> tuple[dict, dict[str, Tensor]]:
+def read_stage(path: Path, stages: Sequence[str], device: str) -> tuple[dict, dict[str, Tensor]]:
     """Header and weights, but those of a text encoder, of a file that must be of one of `stages`."""
     if not path.is_file():
         raise FileNotFoundError(f"no prior at '{path}': give the .safetensors file that training wrote")
@@ -222,11 +225,11 @@ def build_prior(header: dict, weights: dict[str, Tensor]) -> Prior:
     Raises ValueError where header and weights do not fit together.
     """
     weights = {k: w.float() for k, w in weights.items() if not k.startswith("text.")}
-    return _built(lambda: _untrained(header), weights, header, ("network", "detail"))
+    return built_network(lambda: _untrained(header), weights, header, ("network", "detail"))
 
 
 def _untrained(header: dict) -> Prior:
-    return Prior(VolumeUNet(**header["network"]), Grid(**header["grid"]), _window(header),
+    return Prior(VolumeUNet(**header["network"]), Grid(**header["grid"]), window_of(header),
                  schedule=CosineSchedule(**header["schedule"]), sigma_data=_number(header, "sigma_data"),
                  skip_std=_number(header, "skip_std"),
                  detail=DetailNetwork(**header["detail"]) if "detail" in header else None)
@@ -239,7 +242,7 @@ def build_refiner(header: dict, weights: dict[str, Tensor]) -> Refiner:
         return Refiner(prior, torch.zeros(prior.state_channels, *prior.grid.shape))
 
     weights = {k: w.float() for k, w in weights.items() if not k.startswith(("text.", "prior.text."))}
-    return _built(made, weights, header, ("network", "detail"))
+    return built_network(made, weights, header, ("network", "detail"))
 
 
 def build_super_resolution(header: dict, weights: dict[str, Tensor]) -> SuperResolution:
@@ -249,14 +252,14 @@ def build_super_resolution(header: dict, weights: dict[str, Tensor]) -> SuperRes
     """
     def made() -> SuperResolution:
         return SuperResolution(
-            LocalUNet(**header["network"]), Grid(**header["grid"]), _window(header),
+            LocalUNet(**header["network"]), Grid(**header["grid"]), window_of(header),
             _whole(header, "factor"), len(header["coarse_state"]), CosineSchedule(**header["schedule"]),
             _number(header, "detail_std"), _number(header, "skip_std"))
 
-    return _built(made, {k: w.float() for k, w in weights.items()}, header, ("network",))
+    return built_network(made, {k: w.float() for k, w in weights.items()}, header, ("network",))
 
 
-def _built(made: Callable[[], nn.Module], weights: dict[str, Tensor], header: dict,
+def built_network(made: Callable[[], nn.Module], weights: dict[str, Tensor], header: dict,
            networks: tuple[str, ...]) -> nn.Module:
     """What `made` makes of a header, with these weights. What does not fit them is refused before it takes memory.
 
@@ -309,7 +312,8 @@ def _number(header: dict, key: str) -> float:
     return header[key]
 
 
-def _window(header: dict) -> HUWindow:
+def window_of(header: dict) -> HUWindow:
+    """The HU window of a header. Raises ValueError where it holds none."""
     ends = header["hu_window"]
     if not isinstance(ends, list) or len(ends) != 2 or not all(
             type(end) in (int, float) and abs(end) < MOST_HU for end in ends):

@@ -21,6 +21,8 @@ from phydict.methods import DEFAULT_METHOD, reconstruct
 from phydict.posterior import Sampler
 from phydict.prior import DetailNetwork, Prior, Refiner, TextEncoder, VolumeUNet, describe, learn_vocabulary, load_prior
 from phydict.prior.unet import TextMap
+from phydict.reconstruction import Reconstructor
+from phydict.rivals import Rival
 from phydict.runtime.warning import warn
 from phydict.training.denoising import DenoisingTraining
 from phydict.training.reports import BATCH, learn_sentences
@@ -185,14 +187,15 @@ def _text_encoder(text: TextSettings, network: VolumeUNet) -> TextEncoder | None
     return TextEncoder.small(vocabulary, network.context_dim, length=SENTENCE_LENGTH, sentences=MOST_SENTENCES)
 
 
-def reconstruction_scores(prior: Prior | Refiner, ct: Tensor, views: int, seed: int,
-                          method: str | Sampler = DEFAULT_METHOD) -> dict[str, float]:
+def reconstruction_scores(prior: Prior | Refiner | Rival, ct: Tensor, views: int, seed: int,
+                          method: str | Sampler | Reconstructor = DEFAULT_METHOD) -> dict[str, float]:
     """SSIM, PSNR (dB) and MAE (HU) of a method's reconstruction, without a report, from ideal X-rays of a CT
     (1, 1, X, Y, Z) in the prior's range, on an orbit that is the benchmarks' where the cube has 384 mm."""
     scale = prior.grid.shape[0] * prior.grid.spacing[0] / 384
     beam = ConeBeam.orbit(views, 1020 * scale, 740 * scale, (448, 448), 1.25 * scale)
     exact = Projector(prior.grid, beam, device=ct.device, full_detector=True)
-    found = reconstruct(Ideal()(exact, prior.window.to_mu(ct), seed)[0], beam, prior, method, seed=seed)
+    found = reconstruct(Ideal()(exact, prior.window.to_mu(ct), seed)[0], beam, prior, method, seed=seed,
+                        grid=prior.grid)
     return volume_metrics(found.volume[None, None], prior.window.to_hu(ct))
 
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from torch import Tensor
 
 from phydict.grid import Cube
-from phydict.posterior import Unrolled
+from phydict.posterior import Sampler, Unrolled
 from phydict.prior import DEFAULT_PRIOR, BoundRefiner, Prior, Refiner, describe_refiner, load_prior
+from phydict.reconstruction import Reconstructor
 from phydict.training.prior import reconstruction_scores
 from phydict.training.scenes import Scenes
 from phydict.training.settings import Optimisation, RefinerValidation
@@ -79,33 +82,44 @@ class RefinerTraining(StageTraining):
     def _case_loss(self, case: dict, rng: np.random.Generator) -> Tensor:
         ct, masks = case["volume"], 2 * case["masks"] - 1
         measurement = self.scenes.measure(ct, rng, self.prior.grid, self.prior.window)
-        weight = 1 + self.body_weight * (ct > -0.9)
-        weight = weight / weight.mean()
         told = self.prior.prior.text is not None and rng.random() >= TEXT_DROPOUT
         learning = _Learning(self.prior, self.prior.prior.context([case["report"][0] if told else ""]))
         losses = []
         for x0, _ in zip(self.method.estimates(learning, measurement), range(self.calls)):
-            error = x0[:, :1] - ct
-            loss = ((weight * error.square()).mean() + 2e-5).log() / 2 + ((weight * error.abs()).mean() + 1e-3).log()
+            loss = log_error(x0[:, :1], ct, self.body_weight)
             if bool(case["has_masks"].any()) and self.prior.state_channels > 1:
                 loss = loss + self.mask_weight * ((x0[:, 1:] - masks).square().mean() + 1e-4).log()
             losses.append(loss)
         return torch.stack(losses).mean()
 
     def validation_step(self, batch: dict, index: int) -> None:
-        scores = []
-        with torch.autocast(self.device.type, enabled=False):
-            for views in self.validation_views:
-                found = reconstruction_scores(self.prior, batch["volume"], views, index, self.method)
-                self.log(f"val/psnr_{views}", found["psnr"], sync_dist=True, batch_size=1)
-                scores.append(found)
-        for name in ("psnr", "ssim"):
-            mean = float(np.mean([found[name] for found in scores]))
-            self.log(f"val/{name}", mean, prog_bar=name == "psnr", sync_dist=True, batch_size=1)
-        self.log("samples", float(self.samples), rank_zero_only=True, batch_size=1)
+        log_scores(self, batch, index, self.validation_views, self.method)
 
     def _describe(self) -> dict:
         return describe_refiner(self.prior)
+
+
+def log_error(x0: Tensor, ct: Tensor, body_weight: float) -> Tensor:
+    """The logarithms of the mean squared and of the mean absolute error of an estimate of a CT, both (B, 1, X, Y, Z) in
+    the prior's range, whose voxels of the body count 1 + body_weight times as much as those of air."""
+    weight, error = 1 + body_weight * (ct > -0.9), x0 - ct
+    weight = weight / weight.mean()
+    return ((weight * error.square()).mean() + 2e-5).log() / 2 + ((weight * error.abs()).mean() + 1e-3).log()
+
+
+def log_scores(module: StageTraining, batch: dict, index: int, views: Sequence[int],
+               method: Sampler | Reconstructor) -> None:
+    """Logs how well a training's network reconstructs a held-out case from each of these numbers of X-rays."""
+    scores = []
+    with torch.autocast(module.device.type, enabled=False):
+        for count in views:
+            found = reconstruction_scores(module.prior, batch["volume"], count, index, method)
+            module.log(f"val/psnr_{count}", found["psnr"], sync_dist=True, batch_size=1)
+            scores.append(found)
+    for name in ("psnr", "ssim"):
+        mean = float(np.mean([found[name] for found in scores]))
+        module.log(f"val/{name}", mean, prog_bar=name == "psnr", sync_dist=True, batch_size=1)
+    module.log("samples", float(module.samples), rank_zero_only=True, batch_size=1)
 
 
 @torch.no_grad()

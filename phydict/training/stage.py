@@ -13,6 +13,7 @@ from torch import Tensor
 from phydict.prior import Prior, Refiner, SuperResolution
 from phydict.prior.files import check_stage
 from phydict.prior.finite import not_finite
+from phydict.rivals import Rival
 from phydict.training.settings import Optimisation
 
 CHECKPOINT = "last.ckpt"
@@ -27,7 +28,7 @@ class StageTraining(lightning.LightningModule, ABC):
 
     calls = 1
 
-    def __init__(self, prior: Prior | SuperResolution | Refiner, optimisation: Optimisation, seed: int):
+    def __init__(self, prior: Prior | SuperResolution | Refiner | Rival, optimisation: Optimisation, seed: int):
         super().__init__()
         self.prior, self.optimisation, self.seed, self.samples = prior, optimisation, seed, 0
 

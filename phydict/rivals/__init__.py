@@ -1,0 +1,10 @@
+"""Trained rivals: published networks that map X-rays to a CT without a projector in the loop, re-implemented."""
+
+from phydict.rivals.files import NETWORKS, build_rival, load_rival, save_rival
+from phydict.rivals.lifted import LiftedNetwork
+from phydict.rivals.method import RivalAnswer, TrainedRival
+from phydict.rivals.network import RivalNetwork
+from phydict.rivals.rival import Rival
+
+__all__ = ["NETWORKS", "LiftedNetwork", "Rival", "RivalAnswer", "RivalNetwork", "TrainedRival", "build_rival",
+           "load_rival", "save_rival"]

@@ -1,0 +1,52 @@
+"""One file per rival: weights as safetensors, with the grid, the HU window and the geometry that they hold for."""
+
+from __future__ import annotations
+
+import reprlib
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from phydict.grid import Grid
+from phydict.prior.files import ADVICE, built_network, read_stage, window_of, write_stage
+from phydict.rivals.lifted import LiftedNetwork
+from phydict.rivals.network import RivalNetwork
+from phydict.rivals.rival import Rival
+from phydict.runtime.reading import refusing
+from phydict.xray import ConeBeam
+
+NETWORKS: dict[str, type[RivalNetwork]] = {network.stage: network for network in (LiftedNetwork,)}
+"""The networks by the name that a file's header calls them."""
+
+
+def save_rival(rival: Rival, path: str | Path, training: dict | None = None, dtype: torch.dtype = torch.float16):
+    """Writes `rival` to one .safetensors file, as `phydict.prior.save_prior` writes a prior."""
+    write_stage(Path(path), rival.describe() | {"training": training or {}}, rival.state_dict(), dtype)
+
+
+def load_rival(path: str | Path, device: str = "cpu") -> Rival:
+    """The rival in a file written by `save_rival`, in evaluation mode.
+
+    Raises FileNotFoundError when there is no file, ValueError when it is truncated, is no rival, or holds weights that
+    are not finite.
+    """
+    path = Path(path)
+    with refusing(path, ADVICE):
+        header, weights = read_stage(path, tuple(NETWORKS), device)
+        try:
+            found = build_rival(header, weights)
+        except ValueError as error:
+            raise ValueError(f"'{path}' contradicts itself: {error}") from error
+    return found.to(device).eval().requires_grad_(False)
+
+
+def build_rival(header: dict, weights: dict[str, Tensor]) -> Rival:
+    """The rival that `Rival.describe` described, with these weights. Raises ValueError where they do not fit."""
+    def made() -> Rival:
+        beam = None if header["beam"] is None else ConeBeam.from_dict(header["beam"])
+        return Rival(NETWORKS[header["stage"]](**header["network"]), Grid(**header["grid"]), window_of(header), beam)
+
+    if not isinstance(header.get("beam"), dict | None):
+        raise ValueError(f"beam is {reprlib.repr(header['beam'])}, where a geometry is needed, or null")
+    return built_network(made, {k: w.float() for k, w in weights.items()}, header, ("network",))

@@ -1,0 +1,104 @@
+"""Rivals as reconstruction methods: X-rays through a trained network, once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from phydict.baselines.baseline import Baseline, CountingProjector
+from phydict.reconstruction import Reconstruction, Reconstructor
+from phydict.rivals.files import load_rival
+from phydict.rivals.rival import Rival
+from phydict.runtime.files import file_crc32
+from phydict.runtime.precision import check_precision, network_precision, precision_name
+from phydict.units import MU_WATER
+from phydict.xray import Projector
+
+
+@dataclass(frozen=True)
+class RivalAnswer(Baseline):
+    """What a rival makes of X-rays. Display values are matched to a typical chest, as for other baselines.
+
+    seed: of a rival that is random; precision: of its network, see phydict.runtime.precision.
+    """
+
+    rival: Rival
+    seed: int = 0
+    precision: str = "auto"
+    mu_water: float = MU_WATER
+    name: str = "rival"
+
+    def steps(self) -> int:
+        return self.rival.network.steps()
+
+    def solve(self, A: CountingProjector, y: Tensor, on_step: Callable[[], None]) -> Tensor:
+        self.rival.check(A.grid, A.beam)
+        with network_precision(self.precision, y):
+            x = self.rival.reconstruct(y, A.beam, torch.Generator().manual_seed(self.seed), on_step)
+        return self.rival.window.to_mu(x, 1.0)
+
+    def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,
+                    seed: int = 0, on_step: Callable[[], None] = lambda: None) -> Reconstruction:
+        seeded = replace(self, seed=seed)
+        return replace(super(RivalAnswer, seeded).reconstruct(xrays, projector, report, display, seed, on_step),
+                       network_calls=self.steps(), precision=precision_name(self.precision, xrays))
+
+
+@dataclass(frozen=True)
+class TrainedRival(Reconstructor):
+    """A rival from its file, such as `train.py fit -c configs/rivals/lifted.yaml` and `train.py export` write it.
+
+    It reads no report. Another grid than its own is refused, and of a rival that is bound to one geometry any other.
+
+    Args:
+        file: the rival's .safetensors file
+        precision: of its network: auto, float32 or bfloat16
+    """
+
+    file: str | None = None
+    precision: str = "auto"
+    mu_water: float = MU_WATER
+    name: str = "rival"
+    weights_crc32: int = field(init=False, default=0)
+
+    def __post_init__(self):
+        super().__post_init__()
+        check_precision(self.precision)
+        if self.file is not None:
+            object.__setattr__(self, "weights_crc32", _checksum(self.file))
+
+    @property
+    def answer(self) -> RivalAnswer:
+        """The method with its weights read. Raises ValueError without a file."""
+        if self.file is None:
+            raise ValueError("a rival is trained weights, but no file was given: give --model.method.init_args.file, "
+                             "the .safetensors file that train.py export wrote")
+        return RivalAnswer(_loaded(self.file, self.weights_crc32), 0, self.precision, self.mu_water, self.name)
+
+    def steps(self) -> int:
+        return self.answer.steps()
+
+    def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,
+                    seed: int = 0, on_step: Callable[[], None] = lambda: None) -> Reconstruction:
+        answer = self.answer
+        answer.rival.to(xrays.device)
+        return answer.reconstruct(xrays, projector, report, display, seed, on_step)
+
+
+def _checksum(file: str) -> int:
+    try:
+        return file_crc32(Path(file))
+    except OSError as error:
+        raise ValueError(f"there is no rival's file {file}: give the .safetensors file that train.py export wrote"
+                         ) from error
+
+
+@lru_cache(4)
+def _loaded(file: str, checksum: int) -> Rival:
+    """The rival in a file, read once for each of its contents."""
+    return load_rival(file)

@@ -1,0 +1,83 @@
+"""A rival's network with all that it was trained for: grid, HU window and, where it is bound to one, geometry."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor, nn
+
+from phydict.grid import Grid
+from phydict.prior.files import FORMAT
+from phydict.rivals.network import RivalNetwork
+from phydict.units import HUWindow
+from phydict.xray import ConeBeam
+
+WATER_MM = 200.0
+"""mm of water that the networks take as 1."""
+
+SAME_MM = 0.5
+"""mm by which sources, detectors and pixels may differ from those of the training."""
+
+
+def benchmark_orbit(grid: Grid, views: int, arc_degrees: float = 360.0) -> ConeBeam:
+    """The benchmarks' orbit where the grid has 384 mm, in proportion for others, with a detector of about the grid's
+    resolution: on 64^3 voxels the one that `phydict.methods.fit_to_grid` bins the detector of 448^2 pixels to."""
+    scale, side = grid.extent[0] / 384, grid.shape[0]
+    pixels = 112 * side // 64
+    return ConeBeam.orbit(views, 1020 * scale, 740 * scale, (pixels, pixels), 5 * 64 / side * scale,
+                          arc_degrees=arc_degrees)
+
+
+class Rival(nn.Module):
+    """A network, and what it holds for.
+
+    beam: the geometry of a bound network, its detector binned as `phydict.methods.fit_to_grid` does; None for others.
+    Raises ValueError where the grid does not suit the network, or where one of beam and network is bound alone.
+    """
+
+    def __init__(self, network: RivalNetwork, grid: Grid, window: HUWindow, beam: ConeBeam | None = None):
+        super().__init__()
+        network.check(grid)
+        if network.bound != (beam is not None):
+            raise ValueError(f"{type(network).__name__} is {'' if network.bound else 'not '}bound to one geometry, "
+                             f"but {'none' if beam is None else 'one'} was given")
+        self.network, self.grid, self.window, self.beam = network, grid, window, beam
+
+    def describe(self) -> dict:
+        """What the rival is, as plain JSON values; `phydict.rivals.build_rival` builds it again."""
+        return {"format": FORMAT, "stage": self.network.stage, "grid": self.grid.to_dict(),
+                "hu_window": [self.window.low, self.window.high], "network": self.network.settings,
+                "beam": None if self.beam is None else self.beam.to_dict()}
+
+    def network_inputs(self, shape: Sequence[int]) -> tuple[Tensor, ...]:
+        """Arguments of the network for X-rays of a volume of `shape`, its grid's: eight views where any number do."""
+        return self.network.inputs(self.grid, self.beam or benchmark_orbit(self.grid, 8))
+
+    def check(self, grid: Grid, beam: ConeBeam) -> None:
+        """Raises ValueError unless X-rays of this beam can be reconstructed on this grid."""
+        if not self.grid.same_as(grid):
+            raise ValueError(
+                f"the rival was trained on {self.grid.shape} voxels of {self.grid.spacing} mm, but {grid.shape} of "
+                f"{grid.spacing} mm were given: give its own, by --model.cube.voxels and --model.cube.side")
+        if self.beam is None:
+            return
+        if self.beam.views != beam.views:
+            raise ValueError(f"the rival was trained for {self.beam.views} X-rays, but {beam.views} were given: give "
+                             "as many, or a rival's file for this number")
+        if not self.beam.same_as(beam, SAME_MM):
+            raise ValueError(f"the rival was trained for one geometry of its {beam.views} views, detectors of "
+                             f"{self.beam.shape[0]} x {self.beam.shape[1]} pixels, but another was given: give X-rays "
+                             "of its own, or use a method for any geometry")
+
+    def forward(self, water: Tensor, beam: ConeBeam) -> Tensor:
+        """Line integrals (B, K, V, U) in mm of water -> CT (B, 1, X, Y, Z) in [-1, 1], without clipping."""
+        y = water / WATER_MM
+        return self.network(y, *self.network.geometry(self.grid, beam, y))
+
+    def reconstruct(self, water: Tensor, beam: ConeBeam, generator: torch.Generator,
+                    on_step: Callable[[], None] = lambda: None) -> Tensor:
+        """As `forward`, within [-1, 1], by as many steps as the network takes."""
+        y = water / WATER_MM
+        found = self.network.reconstruct(y, self.network.geometry(self.grid, beam, y), generator, on_step)
+        return found.to(water).clamp(-1, 1)

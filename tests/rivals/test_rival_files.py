@@ -1,0 +1,87 @@
+"""Rivals as methods: their file gives them back, and what they were not trained for is refused in a sentence."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from prior.tiny import tiny_prior
+from rivals.tiny_rivals import GRID, WINDOW, body, tiny_lifted
+
+from phydict.grid import Grid
+from phydict.methods import reconstruct
+from phydict.prior import load_prior, save_prior
+from phydict.rivals import LiftedNetwork, Rival, RivalAnswer, TrainedRival, load_rival, save_rival
+from phydict.units import MU_WATER
+from phydict.xray import ConeBeam, Projector
+
+ORBIT = ConeBeam.orbit(3, 1020, 740, (28, 28), 20.0)
+
+
+def xrays(beam: ConeBeam = ORBIT) -> torch.Tensor:
+    return Projector(GRID, beam, full_detector=True)(WINDOW.to_mu(body()))[0]
+
+
+@pytest.fixture
+def file(tmp_path) -> str:
+    save_rival(tiny_lifted(), tmp_path / "rival.safetensors", dtype=torch.float32)
+    return str(tmp_path / "rival.safetensors")
+
+
+def test_a_rivals_file_gives_it_back(file):
+    found = reconstruct(xrays(), ORBIT, method=TrainedRival(file, "float32"), grid=GRID)
+    again = reconstruct(xrays(), ORBIT, method=RivalAnswer(tiny_lifted(), precision="float32"), grid=GRID)
+    assert torch.equal(found.volume, again.volume) and found.network_calls == 1 and found.precision == "float32"
+    assert -1000 <= found.volume.min() < found.volume.max() <= 600
+
+
+def test_hu_do_not_depend_on_what_water_attenuates(file):
+    method = TrainedRival(file, "float32")
+    doubled = reconstruct(2 * xrays(), ORBIT, method=replace(method, mu_water=2 * MU_WATER), grid=GRID)
+    torch.testing.assert_close(doubled.volume, reconstruct(xrays(), ORBIT, method=method, grid=GRID).volume, atol=0.05,
+                               rtol=0)
+
+
+def test_display_values_give_the_same_volume_for_any_gain_and_offset(file):
+    method = TrainedRival(file, "float32")
+    one, other = (reconstruct(gain * xrays() + 0.1, ORBIT, method=method, display=True, grid=GRID)
+                  for gain in (1.0, 3.0))
+    torch.testing.assert_close(one.volume, other.volume, atol=0.5, rtol=0)
+
+
+def test_other_weights_are_another_method(file, tmp_path):
+    save_rival(tiny_lifted(seed=1), tmp_path / "other.safetensors", dtype=torch.float32)
+    other = TrainedRival(str(tmp_path / "other.safetensors"))
+    assert TrainedRival(file).weights_crc32 != other.weights_crc32
+
+
+def test_a_file_is_read_anew_when_it_is_replaced(file):
+    before = reconstruct(xrays(), ORBIT, method=TrainedRival(file, "float32"), grid=GRID).volume
+    save_rival(tiny_lifted(seed=1), file, dtype=torch.float32)
+    after = reconstruct(xrays(), ORBIT, method=TrainedRival(file, "float32"), grid=GRID).volume
+    assert not torch.equal(before, after)
+
+
+def test_what_a_rival_is_not_for_is_refused(file, tmp_path):
+    with pytest.raises(ValueError, match=r"trained on \(16, 16, 16\) voxels"):
+        reconstruct(xrays(), ORBIT, method=TrainedRival(file), grid=Grid.cube(32))
+    with pytest.raises(ValueError, match="no file was given"):
+        reconstruct(xrays(), ORBIT, method=TrainedRival(), grid=GRID)
+    with pytest.raises(ValueError, match="there is no rival's file"):
+        TrainedRival(str(tmp_path / "nowhere.safetensors"))
+    with pytest.raises(ValueError, match="not bound to one geometry"):
+        Rival(LiftedNetwork(), Grid.cube(64), WINDOW, ORBIT)
+    with pytest.raises(ValueError, match="divisible by 8"):
+        Rival(LiftedNetwork(), Grid.cube(20), WINDOW)
+    with pytest.raises(ValueError, match="precision"):
+        TrainedRival(file, "half")
+
+
+def test_a_prior_is_no_rival_and_a_rival_no_prior(file, tmp_path):
+    save_prior(tiny_prior(), tmp_path / "prior.safetensors")
+    with pytest.raises(ValueError, match="is a base prior, but a rival is needed"):
+        load_rival(tmp_path / "prior.safetensors")
+    with pytest.raises(ValueError, match="is a rival, but a base prior is needed"):
+        load_prior(file)
+    (tmp_path / "cut.safetensors").write_bytes(open(file, "rb").read()[:-100])
+    with pytest.raises(ValueError, match="truncated"):
+        load_rival(tmp_path / "cut.safetensors")

@@ -1,0 +1,81 @@
+"""Training of rivals: the loss falls, a resumed run is the uninterrupted one, and its file can be compared."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from rivals.tiny_rivals import GRID, lively
+from test_training import cache, checkpoint, losses, refusal  # noqa: F401
+from torch.utils.data import default_collate
+
+from phydict.cli.infer import main as infer
+from phydict.cli.train import main
+from phydict.datasets import phantom_case
+from phydict.evaluation import read_csv
+from phydict.grid import Cube
+from phydict.rivals import LiftedNetwork, load_rival
+from phydict.training.rivals import LiftedTraining
+from phydict.units import HUWindow
+
+CONFIGS = Path(__file__).parents[2] / "configs" / "rivals"
+TINY = {"lifted": ["--model.network.class_path=phydict.rivals.LiftedNetwork",
+                   "--model.network.init_args.image_channels=[4,6]", "--model.network.init_args.fine=2",
+                   "--model.network.init_args.coarse=4", "--model.network.init_args.channels=[4,6,8]",
+                   "--model.scenes.most_views=4", "--model.validation.views=[2]"]}
+TASKS = {"lifted": lambda: LiftedTraining(lively(lambda: LiftedNetwork((4, 6), 2, 4, (4, 6, 8))),
+                                          cube=Cube(16), window=(-1000, 600))}
+
+
+def arguments(name: str, folder: Path, cache: Path, *more: str) -> list[str]:  # noqa: F811
+    return ["fit", f"--config={CONFIGS / name}.yaml", *TINY[name], "--model.cube.voxels=16",
+            "--model.window=[-1000,600]", "--data.phantoms=3", "--data.holdout.phantoms=1",
+            "--data.loading.epoch_size=2", "--trainer.accelerator=cpu", "--trainer.log_every_n_steps=1",
+            "--precision=float32", "--trainer.max_steps=-1", f"--data.cache={cache}", f"--out={folder}", *more]
+
+
+@pytest.mark.parametrize("name", TINY)
+def test_a_resumed_run_is_the_uninterrupted_one_and_its_file_is_compared(name, tmp_path, cache):  # noqa: F811
+    straight, halved = tmp_path / "straight", tmp_path / "halved"
+    main(arguments(name, straight, cache, "--trainer.max_epochs=2"))
+    main(arguments(name, halved, cache, "--trainer.max_epochs=1"))
+    main(arguments(name, halved, cache, "--trainer.max_epochs=2", f"--ckpt_path={halved / 'last.ckpt'}"))
+    assert set(losses(straight)) == {0, 1, 2, 3} and {2, 3} <= set(losses(halved))
+    one, other = (checkpoint(folder)["state_dict"] for folder in (straight, halved))
+    assert one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
+    file = tmp_path / "rival.safetensors"
+    main(["export", "--checkpoint", str(straight / "last.ckpt"), "--out", str(file)])
+    assert load_rival(file).network.stage == name
+    comparison = tmp_path / "comparison.yaml"
+    comparison.write_text(f"methods: {{{name}: {{of: phydict.rivals.TrainedRival, method.file: {file}}}}}\n"
+                          "base: {voxels: 16, views: 2, detector: 28}\n"
+                          f"axes: {{method: [{name}, cgls]}}\nphantoms: 1\nout: {tmp_path / 'table'}\n")
+    infer(["ablate", "-c", str(comparison)])
+    rows = read_csv(tmp_path / "table" / "results.csv")
+    assert [(row["method"], row["status"]) for row in rows] == [(name, "ok"), ("cgls", "ok")]
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_steps_on_one_batch_lower_its_loss(name):
+    task = TASKS[name]()
+    batch = default_collate([phantom_case(3, GRID, HUWindow(-1000, 600))])
+    optimizer = torch.optim.Adam(task.parameters(), 1e-2)
+    found = []
+    for _ in range(25):
+        found.append(task.batch_loss(batch, (1,)))
+        optimizer.zero_grad()
+        found[-1].backward()
+        optimizer.step()
+    assert found[-1] < found[0] - 0.3
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_the_loss_follows_from_its_key_alone(name):
+    task, batch = TASKS[name](), default_collate([phantom_case(3, GRID, HUWindow(-1000, 600))])
+    with torch.no_grad():
+        one, again, other = (float(task.batch_loss(batch, key)) for key in ((1,), (1,), (2,)))
+    assert one == again != other
+
+
+def test_training_that_cannot_be_is_refused(tmp_path, cache, capsys):  # noqa: F811
+    args = arguments("lifted", tmp_path, cache, "--model.cube.voxels=18")
+    assert "divisible by 4" in refusal(capsys, args)

@@ -1,0 +1,46 @@
+"""Rivals small enough for tests, whose networks answer to their X-rays although they are untrained."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+
+from phydict.grid import Grid
+from phydict.rivals import LiftedNetwork, Rival
+from phydict.rivals.network import RivalNetwork
+from phydict.units import HUWindow
+from phydict.xray import ConeBeam
+
+GRID, WINDOW = Grid.cube(16), HUWindow(-1000, 600)
+
+
+def lively(make: Callable[[], RivalNetwork], seed: int = 0) -> RivalNetwork:
+    """A new network with random weights where layers that start at zero would let nothing show."""
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        network = make()
+        for weight in network.parameters():
+            if weight.ndim > 1:
+                torch.nn.init.normal_(weight, std=0.1)
+    return network
+
+
+def tiny_lifted(grid: Grid = GRID, seed: int = 0) -> Rival:
+    network = lively(lambda: LiftedNetwork((4, 6), 2, 4, (4, 6, 8)), seed)
+    return Rival(network, grid, WINDOW).eval().requires_grad_(False)
+
+
+def body(grid: Grid = GRID) -> torch.Tensor:
+    """Soft tissue with a hollow, in air: (1, 1, X, Y, Z) in [-1, 1]."""
+    hu = torch.full((1, 1, *grid.shape), -1000.0)
+    hu[:, :, 3:13, 4:12, 2:14] = 40
+    hu[:, :, 5:8, 6:10, 5:11] = -800
+    return WINDOW.to_range(hu)
+
+
+def tilted(views: int, shape: tuple[int, int] = (31, 28)) -> ConeBeam:
+    """Views of an orbit whose detectors are turned in their plane and moved off the central ray."""
+    beam = ConeBeam.orbit(views, 1020, 740, shape, 20.0, arc_degrees=200)
+    u, v = beam.u + 0.3 * beam.v, beam.v - 0.3 * beam.u
+    return ConeBeam(beam.sources, beam.detectors + 2 * beam.u - beam.v, u, v, beam.shape)

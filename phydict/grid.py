@@ -110,8 +110,8 @@ class Cube:
     """A cube around the isocentre.
 
     Args:
-        voxels: along each side
-        side: mm
+        voxels: how many along each side
+        side: its length in mm
     """
 
     voxels: int = 64

@@ -29,7 +29,9 @@ def mu_to_hu(mu, mu_water: float = MU_WATER):
 class HUWindow:
     """The HU interval [low, high] that a prior maps to [-1, 1].
 
-    `low` must not lie below -1000 HU if every x in [-1, 1] is to have mu >= 0.
+    Args:
+        low: HU of x = -1, not below -1000 if every x in [-1, 1] is to have mu >= 0
+        high: HU of x = 1
     """
 
     low: float = -1000.0

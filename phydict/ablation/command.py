@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -13,8 +15,10 @@ from phydict.ablation.run import RESULTS, run
 from phydict.ablation.spec import read_specification
 from phydict.ablation.summary import entries
 from phydict.ablation.tables import all_tables, write_tables
+from phydict.methods import METHODS
 from phydict.runtime.console import check_apart, check_configured, check_writable, cli_errors, quiet
 from phydict.runtime.files import alone_in
+from phydict.runtime.help import HelpFormatter, show_settings
 from phydict.runtime.progress import CaseProgress
 from phydict.runtime.reading import reason
 
@@ -22,8 +26,9 @@ from phydict.runtime.reading import reason
 def main(args: list[str] | None = None) -> None:
     """infer.py ablate -c <file>. A bad input ends in one sentence and exit code 2; a stopped run resumes."""
     with cli_errors(), quiet():
-        check_configured(sys.argv[1:] if args is None else args, (), "configs/ablate/pareto.yaml")
-        given = _parser().parse_args(args).as_dict()
+        args = sys.argv[1:] if args is None else args
+        check_configured(args, (), "configs/ablate/pareto.yaml")
+        given = _parser(args).parse_args(args).as_dict()
         device = given.pop("device") or ("cuda" if torch.cuda.is_available() else "cpu")
         try:
             torch.empty(0, device=device)
@@ -41,11 +46,14 @@ def main(args: list[str] | None = None) -> None:
         print(f"tables and plots in {specification.out}: {', '.join(path.name for path in written)}")
 
 
-def _parser() -> ArgumentParser:
+def _parser(args: Sequence[str]) -> ArgumentParser:
+    """The options, and in their help the settings of each method that `args` name."""
     parser = ArgumentParser(
         prog=f"{Path(sys.argv[0]).name} ablate", exit_on_error=False, allow_abbrev=False,
+        formatter_class=HelpFormatter,
         description="Compare methods on the same X-rays: every combination of settings that a file names, one row of "
-                    "results each, then tables and plots.")
+                    "results each, then tables and plots. `ablate --set method=NAME --help` shows the settings of a "
+                    f"method, one of {', '.join(METHODS)}.")
     parser.add_argument("-c", "--config", required=True,
                         help="what to compare: a YAML file, or the name of a shipped one, such as pareto")
     parser.add_argument("--cts", type=str, help="a NIfTI file or a folder of CTs, instead of the file's cases")
@@ -57,4 +65,7 @@ def _parser() -> ArgumentParser:
                              "method=[sirt,my_module.MySampler] views=4 projector=siddon")
     parser.add_argument("--out", type=str, help="folder of the results, instead of the file's")
     parser.add_argument("--device", type=str, help="cpu or cuda; left out: cuda where there is one")
+    words = {word for arg in args for word in re.findall(r"\w+", arg)}
+    for name in reversed([name for name in METHODS if name in words]):
+        show_settings(parser, name, METHODS[name], "method")
     return parser

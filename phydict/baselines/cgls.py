@@ -18,9 +18,14 @@ class CGLS(Baseline):
     doi:10.6028/jres.049.044).
 
     What the views see best is corrected first, so few iterations regularise and many fit the noise.
-    iterations: per restart; window: HU bounds, whose low end of -1000 HU is non-negativity, or None for none. restarts:
-    each frees the voxels inside the bounds or pulled back into them, runs conjugate gradients on those alone and clips
-    (More & Toraldo 1991, doi:10.1137/0801008); without bounds one is the classical method.
+
+    Args:
+        iterations: of conjugate gradients per restart
+        restarts: each frees the voxels inside the bounds or pulled back into them, runs conjugate gradients on those
+            alone and clips (More & Toraldo 1991, doi:10.1137/0801008); without bounds one is the classical method
+        window: HU bounds, whose low end of -1000 HU is non-negativity, or None for none
+        mu_water: attenuation of water in 1/mm in the X-rays
+        name: what results call the method
     """
 
     citation = ("Hestenes & Stiefel, Methods of Conjugate Gradients for Solving Linear Systems, Journal of Research "

@@ -25,7 +25,13 @@ class DiffVox(Baseline):
     (arXiv:2411.19224): Adam at 0.01, raised to it and lowered again linearly (one cycle). They take batches of
     rays for 50 epochs; here every step sees all rays. Their smoothness is 15 mm, on finer voxels and more views.
 
-    window: HU bounds of the result, or None for none.
+    Args:
+        iterations: steps of Adam, each of all rays
+        smoothness: weight of |grad d|, mm of water
+        learning_rate: Adam's, at its highest
+        window: HU bounds of the result, or None for none
+        mu_water: attenuation of water in 1/mm in the X-rays
+        name: what results call the method
     """
 
     citation = ("Momeni et al., Voxel-Based Differentiable X-Ray Rendering Improves Self-Supervised 3D CBCT "

@@ -29,9 +29,13 @@ class FDK(Baseline):
     are `Orbit`'s, which says how they are on full circles, short scans and limited arcs. The ramp is Kak & Slaney's
     band-limited one (1988, ch. 3), between zeros; detector edges that cut the patient are not extrapolated.
 
-    hann: smooth the ramp with a Hann window down to zero at the pixels' Nyquist frequency; window: HU bounds of the
-    result, or None for none, which makes it linear in the X-rays. Few views give streaks. Raises ValueError for views
-    that are no such orbit.
+    Few views give streaks. Raises ValueError for views that are no such orbit.
+
+    Args:
+        hann: smooth the ramp with a Hann window down to zero at the pixels' Nyquist frequency
+        window: HU bounds of the result, or None for none, which makes it linear in the X-rays
+        mu_water: attenuation of water in 1/mm in the X-rays
+        name: what results call the method
     """
 
     citation = ("Feldkamp, Davis & Kress, Practical Cone-Beam Algorithm, Journal of the Optical Society of America "

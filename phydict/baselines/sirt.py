@@ -17,7 +17,10 @@ class SIRT(Baseline):
     """mu <- max(0, mu + C A.T R (y - A mu)), R and C the inverse row and column sums of A (Gregor & Benson 2008,
     doi:10.1109/TMI.2008.923696), from zero.
 
-    iterations: more fit the views better and, on noisy data, the noise too.
+    Args:
+        iterations: how many; more fit the views better and, on noisy data, the noise too
+        mu_water: attenuation of water in 1/mm in the X-rays
+        name: what results call the method
     """
 
     citation = ("Gregor & Benson, Computational Analysis and Improvement of SIRT, IEEE Transactions on Medical Imaging "

@@ -22,8 +22,13 @@ class FISTATV(Baseline):
     & Teboulle 2009, doi:10.1137/080716542 (FISTA, with the adaptive restart of O'Donoghue & Candes 2015,
     doi:10.1007/s10208-013-9150-3) and doi:10.1109/TIP.2009.2028250 (the proximal step, by its dual).
 
-    weight: more is smoother; inner: dual iterations per proximal step, each starting where the last one ended; window:
-    HU bounds, whose low end of -1000 HU is non-negativity, or None for none.
+    Args:
+        iterations: of FISTA
+        weight: of the total variation; more is smoother
+        inner: dual iterations per proximal step, each starting where the last one ended
+        window: HU bounds, whose low end of -1000 HU is non-negativity, or None for none
+        mu_water: attenuation of water in 1/mm in the X-rays
+        name: what results call the method
     """
 
     citation = ("Beck & Teboulle, Fast Gradient-Based Algorithms for Constrained Total Variation Image Denoising and "

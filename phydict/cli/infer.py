@@ -12,6 +12,7 @@ from lightning.pytorch.cli import LightningCLI
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from phydict.ablation import main as ablate
+from phydict.cli.help import describe_commands, method_help, predict_help
 from phydict.datasets.radiographs.radiographs import load_xrays
 from phydict.inference.data import ReconstructionData
 from phydict.inference.dry_run import dry_run
@@ -19,6 +20,7 @@ from phydict.inference.task import ReconstructionTask
 from phydict.methods import DEFAULT_METHOD, METHODS
 from phydict.runtime.console import (
     CONFIGURATION, check_apart, check_command, check_processes, cli_errors, noted, quiet, read_configuration, sentence)
+from phydict.runtime.help import HelpFormatter
 from phydict.runtime.reading import reading
 from phydict.runtime.shipped import configuration
 
@@ -29,8 +31,9 @@ COMMANDS = {"predict": "X-rays -> volumes", "test": "CTs -> X-rays -> volumes an
 class InferenceCLI(LightningCLI):
     """predict and test only; no logs, no checkpoints, gradients allowed inside the steps."""
 
-    def parse_arguments(self, parser, args: list[str]) -> None:
-        super().parse_arguments(parser, with_methods(args))
+    def setup_parser(self, *args) -> None:
+        super().setup_parser(*args)
+        describe_commands(self.parser, COMMANDS)
 
     @staticmethod
     def subcommands() -> dict[str, set[str]]:
@@ -44,7 +47,15 @@ class InferenceCLI(LightningCLI):
         if subcommand == "predict":
             parser.add_argument("--dry_run", action="store_true",
                                 help="draw the geometry of every case and reconstruct nothing")
+        predict_help(parser, subcommand, COMMANDS[subcommand])
         return parser
+
+    def parse_arguments(self, parser, args: list[str]) -> None:
+        args = with_methods(args)
+        if "-h" in args or "--help" in args:
+            for subparser in self._subcommand_parsers.values():
+                method_help(subparser, args)
+        super().parse_arguments(parser, args)
 
     @property
     def dry_run(self) -> bool:
@@ -181,7 +192,9 @@ def main(args: list[str] | None = None) -> None:
         check_command(args, COMMANDS, InferenceCLI.subcommands(), "predict --data.xrays data/example/xrays")
         cli = InferenceCLI(
             ReconstructionTask, ReconstructionData, args=args, seed_everything_default=0, save_config_callback=None,
-            parser_kwargs={"exit_on_error": False, "allow_abbrev": False, "description": (
+            auto_configure_optimizers=False,
+            parser_kwargs={"exit_on_error": False, "allow_abbrev": False, "formatter_class": HelpFormatter,
+                           "description": (
                 "Reconstruct chest CTs from X-rays. A third subcommand, ablate, compares methods: ablate --help.")},
             trainer_defaults={"inference_mode": False, "logger": False, "enable_progress_bar": False,
                               "enable_checkpointing": False, "enable_model_summary": False, "accelerator": "auto",

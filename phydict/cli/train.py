@@ -17,11 +17,13 @@ from lightning.pytorch.loggers import CSVLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from phydict.cli.export import export_prior, print_prior
+from phydict.cli.help import describe_commands, fit_help
 from phydict.runtime.console import (
     check_apart, check_command, check_configured, check_processes, check_writable, cli_errors, quiet,
     read_configurations, with_configurations)
 from phydict.runtime.files import alone_in, atomic_write
 from phydict.runtime.precision import PRECISIONS, resolve_precision, trainer_precision
+from phydict.runtime.help import HelpFormatter
 from phydict.runtime.reading import reading
 from phydict.training.prior import PriorTraining
 from phydict.training.checkpoints import BEST, HELD_OUT, RESUMED, BestCheckpoint, WholeCheckpoints, read_checkpoint
@@ -62,6 +64,15 @@ class PriorCLI(LightningCLI):
     @staticmethod
     def subcommands() -> dict[str, set[str]]:
         return {name: LightningCLI.subcommands()[name] for name in ("fit", "validate")}
+
+    def setup_parser(self, *args) -> None:
+        super().setup_parser(*args)
+        describe_commands(self.parser, COMMANDS)
+
+    def _prepare_subcommand_parser(self, klass: type, subcommand: str, **kwargs):
+        parser = super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
+        fit_help(parser, subcommand, COMMANDS[subcommand])
+        return parser
 
     def add_arguments_to_parser(self, parser) -> None:
         parser.add_argument("--out", default="runs/prior", help="folder for checkpoint, logs and samples")
@@ -164,10 +175,11 @@ def main(args: list[str] | None = None) -> None:
             check_configured(given, ("--print_config",), "configs/prior/phantom.yaml")
             given = with_configurations(given, ("prior", "rivals"))
             PriorCLI(*STAGES[stage_of(given)], args=given, seed_everything_default=0,
-                     save_config_kwargs={"overwrite": True},
+                     save_config_kwargs={"overwrite": True}, auto_configure_optimizers=False,
                      trainer_defaults={"enable_progress_bar": False, "enable_model_summary": False,
                                        "reload_dataloaders_every_n_epochs": 1},
-                     parser_kwargs={"exit_on_error": False, "allow_abbrev": False, "description": (
+                     parser_kwargs={"exit_on_error": False, "allow_abbrev": False, "formatter_class": HelpFormatter,
+                           "description": (
                          "Train a prior of chest CT. Two more commands: `export --checkpoint <last.ckpt> --out "
                          "<prior.safetensors>` writes what a training learnt as a prior for reconstruction, and "
                          "`inspect-prior <path>` says what a file or folder is.")})

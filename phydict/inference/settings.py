@@ -29,9 +29,9 @@ class CascadeSettings:
     """A second stage, which refines what the prior gives.
 
     Args:
-        file: the stage's; none given: no second stage
+        file: the second stage's file; none given: no second stage
         guided: whether the X-rays guide it too
-        sampler: how they do; none given: the cascade's own
+        sampler: the Sampler that guides it; none given: the cascade's own
         noise_augmentation: level in [0, 1] of the noise that the prior's estimate is given before the second stage sees
             it; none given: the stage's own, 0.05, or 0 for MedSyn's
         memory: GiB that its network may take; it works in tiles where the whole takes more, and MedSyn's, which cannot,
@@ -56,8 +56,8 @@ class Orbit:
 
     Args:
         views: how many
-        source_to_detector: mm
-        source_to_isocentre: mm
+        source_to_detector: distance in mm
+        source_to_isocentre: distance in mm
         detector: rows and columns of pixels
         pixel: mm from row to row and from column to column
     """

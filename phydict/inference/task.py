@@ -55,7 +55,7 @@ class ReconstructionTask(lightning.LightningModule):
         out: output folder; cases go to <out>/<name>/<case>
         overwrite: do finished cases again; a new result takes the old one's place when it is complete
         seed: the only source of randomness; of each case in predict, as in Python, and by phydict.case_seed in test
-        cube: of voxels, for methods without a prior
+        cube: the grid of voxels, for methods without a prior
         projector: auto (the fastest that suits the geometry), separable, siddon, eq4, joseph or matrix
     """
 

@@ -33,23 +33,25 @@ WATER_PATH = 200.0
 class Polychromatic(Simulator):
     """X-rays of a tube at 70, 80, 100 or 120 kVp, read by an energy-integrating detector.
 
-    kvp: the tube (Spectrum.tube); spectrum: used instead of it.
-    air_photons: photons per pixel that reach the detector without patient, None for no noise at all. At 120 kVp 27 uGy
-        of air kerma are a million on a pixel of 1.25 mm.
-    readout: standard deviation of electronic noise, in detected photons.
-    scintillator: mm of solid caesium iodide. A photon is absorbed with probability 1 - exp(-mu mm) and then gives
-        light in proportion to its energy; fluorescence does not escape. None: every photon is absorbed. 0.45 mm are
-        the solid part of the usual 0.6 mm of columns.
-    scatter: amplitude of scattered radiation, 0 for none (scatter_of). 0.3 gives about as much scatter as primary
-        behind a wide object of line integral 3; an antiscatter grid leaves about a fifth of that.
-    scatter_width: standard deviation in mm on the detector of the scatter kernel.
-    saturation: the largest signal that the detector can read, as a multiple of the signal without patient; None: no
-        limit. Signals below half a detected photon read as half a photon, so that no pixel is infinite.
-    metal: HU from which voxels are titanium (such as 3000), None for never. CTs clipped to a prior's HU window hold no
-        metal.
-    ct_energy: effective energy in keV of the CT that the volume is from; 70 suits 120 kVp.
-
     Not modelled: heel effect, bow-tie filters, focal spot, blur of the detector, motion.
+
+    Args:
+        kvp: the tube (Spectrum.tube)
+        spectrum: used instead of the tube's
+        air_photons: photons per pixel that reach the detector without patient, None for no noise at all. At 120 kVp 27
+            uGy of air kerma are a million on a pixel of 1.25 mm.
+        readout: standard deviation of electronic noise, in detected photons.
+        scintillator: mm of solid caesium iodide. A photon is absorbed with probability 1 - exp(-mu mm) and then gives
+            light in proportion to its energy; fluorescence does not escape. None: every photon is absorbed. 0.45 mm are
+            the solid part of the usual 0.6 mm of columns.
+        scatter: amplitude of scattered radiation, 0 for none (scatter_of). 0.3 gives about as much scatter as primary
+            behind a wide object of line integral 3; an antiscatter grid leaves about a fifth of that.
+        scatter_width: standard deviation in mm on the detector of the scatter kernel.
+        saturation: the largest signal that the detector can read, as a multiple of the signal without patient; None: no
+            limit. Signals below half a detected photon read as half a photon, so that no pixel is infinite.
+        metal: HU from which voxels are titanium (such as 3000), None for never. CTs clipped to a prior's HU window hold
+            no metal.
+        ct_energy: effective energy in keV of the CT that the volume is from; 70 suits 120 kVp.
     """
 
     kvp: int = 120

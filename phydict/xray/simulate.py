@@ -45,12 +45,13 @@ class Simulator(ABC):
 class Ideal(Simulator):
     """Monoenergetic X-rays without scatter: the projector's line integrals, with noise.
 
-    noise: standard deviation of added Gaussian noise, as a fraction of the case's largest line integral; 0 = none.
-    photons: photons per pixel that leave the source, None for no counting noise. A pixel with line integral p reads
-        -log(max(Poisson(photons exp(-p)), 0.5) / photons).
-
     Reconstructing with the projector that made the X-rays is an inverse crime: the model error of a real
     measurement is missing. To lessen it, simulate on a finer grid or with the other method, or use Polychromatic.
+
+    Args:
+        noise: standard deviation of added Gaussian noise, as a fraction of the case's largest line integral; 0 = none
+        photons: photons per pixel that leave the source, None for no counting noise; a pixel with line integral p reads
+            -log(max(Poisson(photons exp(-p)), 0.5) / photons)
     """
 
     noise: float = 0.005

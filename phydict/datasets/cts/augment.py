@@ -30,13 +30,20 @@ LEAST_SCAN_MM = 120.0
 class Augmentation:
     """How strong random changes of a patient are; 0 leaves that kind out. `Augmentation.none()` changes nothing.
 
-    rotation: degrees about any axis. scale: share of the size, along each axis. shift: mm. elastic_mm: mm, amplitude of
-    the slowest bending. girth: share of the cases, in [0, 1], whose body becomes up to 300 to 600 mm wide and loses
-    its table. hu_scale: share of HU + 1000. hu_offset: HU, in tissue only. contrast: HU, in blood only. surroundings:
-    what lies around the body and how much of it the scan shows.
-    mirror: share of the cases mirrored left to right among those whose report is empty or names no side (in English),
-    in [0, 1]. It is 0 unless asked for, since a thorax is not symmetric: a mirrored one has its heart on the right.
     Nothing is ever turned upside down or back to front.
+
+    Args:
+        rotation: degrees, at most, about any axis
+        scale: change of the size, at most, along each axis, as a share of it
+        shift: length in mm, at most
+        elastic_mm: mm, amplitude of the slowest bending
+        girth: share of the cases, in [0, 1], whose body becomes up to 300 to 600 mm wide and loses its table
+        hu_scale: change of HU + 1000, at most, as a share of it
+        hu_offset: change of HU, at most, in tissue only
+        contrast: change of HU, at most, in blood only
+        mirror: share of the cases mirrored left to right among those whose report is empty or names no side (in
+            English), in [0, 1]; 0 unless given, since a mirrored thorax has its heart on the right
+        surroundings: what lies around the body and how much of it the scan shows
     """
 
     rotation: float = 8.0

@@ -21,11 +21,16 @@ FIELD_MM = 560.0
 class Surroundings:
     """Shares of the cases, in [0, 1], whose surroundings or scan are changed; 0 leaves that kind out.
 
-    table: couch and clothes are taken away. couch: another couch is put in, of those without one. cover: a sheet,
-    clothes or a blanket lies on the body. leads: ECG leads, cables or tubes lie on the chest. arms: one or both arms
-    lie beside the body. field: a circular field of view of 310 to 400 mm cuts the body. ends: the scan ends at any
-    height, of those without a report, which may tell of what is cut off. Nothing inside the body changes but by `field`
-    and `ends`.
+    Nothing inside the body changes but by `field` and `ends`.
+
+    Args:
+        table: couch and clothes are taken away
+        couch: another couch is put in, of those without one
+        cover: a sheet, clothes or a blanket lies on the body
+        leads: ECG leads, cables or tubes lie on the chest
+        arms: one or both arms lie beside the body
+        field: a circular field of view of 310 to 400 mm cuts the body
+        ends: the scan ends at any height, of those without a report, which may tell of what is cut off
     """
 
     table: float = 0.7

@@ -15,8 +15,12 @@ from phydict.posterior.normalised import NormalisedMeasurement
 class ADMMTV:
     """Passes of ADMM towards argmin |P(x) - y|^2 / 2 + weight |D x|_1, D the differences along `axes`.
 
-    weight: the published lambda, 0.04 for few views and 0.4 for a limited arc, in units of an operator of norm 1;
-    rho: penalty; axes: of "xyz", published as "z" alone. Boyd et al. 2011, doi:10.1561/2200000016.
+    Boyd et al. 2011, doi:10.1561/2200000016.
+
+    Args:
+        weight: the published lambda, 0.04 for few views and 0.4 for a limited arc, in units of an operator of norm 1
+        rho: penalty of the split
+        axes: of "xyz", published as "z" alone
     """
 
     weight: float = 0.04

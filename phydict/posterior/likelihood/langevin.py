@@ -25,10 +25,14 @@ def langevin(score: Callable[[Tensor], Tensor], z: Tensor, step: float, iteratio
 class Langevin(LikelihoodDraw):
     """Langevin steps from the estimate, as published with DAPS and PnP-DM.
 
-    iterations; step: their size, for an operator of norm 1; last_share: the share of it that is left at the end of the
-    sampling, to which it shrinks linearly. A step is cut to 1 / (1 / noise^2 + 1 / x0_std^2), beyond which
-    the dynamics overshoot, and at twice which they diverge. Short of convergence z stays near the estimate; a
-    direction of precision p then has variance 1 / p / (1 - step p / 2) instead of 1 / p.
+    A step is cut to 1 / (1 / noise^2 + 1 / x0_std^2), beyond which the dynamics overshoot, and at twice which they
+    diverge. Short of convergence z stays near the estimate; a direction of precision p then has variance
+    1 / p / (1 - step p / 2) instead of 1 / p.
+
+    Args:
+        iterations: steps at each noise level
+        step: size of a step, for an operator of norm 1
+        last_share: the share of it that is left at the end of the sampling, to which it shrinks linearly
     """
 
     iterations: int = 100

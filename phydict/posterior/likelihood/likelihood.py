@@ -37,17 +37,22 @@ class ProximalCG(LikelihoodStep):
     few iterations regularise, since what the views see best is corrected first. TV(z) sums sqrt(slope^2 + tv_eps^2)
     over the voxels.
 
-    iterations: per restart, at most; restarts; noise: standard deviation of the line integrals' error (noise and
-    model); tolerance: a restart ends once its residual has shrunk by this factor;
-    refit_scatter: whether each restart refits the scatter of a measurement in which it is sought;
-    weighted_least_squares: whether the variance of each pixel's own noise is added to noise^2, so that pixels which few
-    photons reach count less (Thibault et al. 2007, doi:10.1118/1.2789499);
-    tv_weight: weight of the total variation TV, 0 for none; each restart replaces it by the quadratic that touches it
-    there (Vogel & Oman 1996, doi:10.1137/0917016), so the last step wants several, and conjugate gradients are
-    preconditioned by the diagonal of that quadratic, which differs by orders between flat parts and edges; edge:
-    differences between neighbours, in the prior's range, below which TV is smooth.
+    Each restart replaces TV by the quadratic that touches it there (Vogel & Oman 1996, doi:10.1137/0917016), so the
+    last step wants several, and conjugate gradients are preconditioned by the diagonal of that quadratic, which differs
+    by orders between flat parts and edges.
     Hestenes & Stiefel 1952, doi:10.6028/jres.049.044; with bounds, More & Toraldo 1991, doi:10.1137/0801008; as data
     consistency in diffusion sampling, Chung et al. 2024, arXiv:2303.05754.
+
+    Args:
+        iterations: of conjugate gradients per restart, at most
+        restarts: how often conjugate gradients begin again
+        noise: standard deviation of the line integrals' error (noise and model)
+        tolerance: a restart ends once its residual has shrunk by this factor
+        refit_scatter: whether each restart refits the scatter of a measurement in which it is sought
+        weighted_least_squares: whether the variance of each pixel's own noise is added to noise^2, so that pixels which
+            few photons reach count less (Thibault et al. 2007, doi:10.1118/1.2789499)
+        tv_weight: weight of the total variation TV, 0 for none
+        tv_eps: differences between neighbours, in the prior's range, below which TV is smooth
     """
 
     iterations: int = 5
@@ -94,9 +99,16 @@ class GradientSteps(LikelihoodStep):
     """The paper's step: a few Adam steps on J(Y, z) + |z - x0|^2 / rho, started at x0.
 
     The text gives two gradient steps of 0.1 and rho = 1; Adam is what the authors' release uses, with a fresh state
-    at every time. x0_std is not used. adam: else plain gradient descent, which diverges unless
-    learning_rate (1 / rho + |A|^2 / K) < 1, with |A| the operator's norm and K the number of views.
-    prior_mean: the mean over voxels of |z - x0|^2 instead of the sum, as in the release.
+    at every time. x0_std is not used.
+
+    Args:
+        steps: how many
+        learning_rate: length of a step
+        rho: the larger, the less the prior's estimate weighs
+        reward: what the X-rays are compared by
+        adam: Adam; else plain gradient descent, which diverges unless learning_rate (1 / rho + |A|^2 / K) < 1, with |A|
+            the operator's norm and K the number of views
+        prior_mean: the mean over voxels of |z - x0|^2 instead of the sum, as in the release
     """
 
     steps: int = 2

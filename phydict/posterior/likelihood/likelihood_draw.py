@@ -27,10 +27,13 @@ class LikelihoodDraw(ABC):
 class ExactDraw(LikelihoodDraw):
     """The draw itself, since it is Gaussian: data and estimate are perturbed by their noise, then fitted.
 
-    iterations, tolerance: of the conjugate gradients, which start at the perturbed estimate: what the X-rays do not
-    see has its full spread at once, and few iterations suffice for the rest. Exact with as many iterations as the
-    operator has singular values. Perturb and optimise: Papandreou & Yuille 2010; cut short, Gilavert et
-    al. 2015, arXiv:1409.0606.
+    Conjugate gradients start at the perturbed estimate: what the X-rays do not see has its full spread at once, and few
+    iterations suffice for the rest. Perturb and optimise: Papandreou & Yuille 2010; cut short, Gilavert et al. 2015,
+    arXiv:1409.0606.
+
+    Args:
+        iterations: of conjugate gradients; exact with as many as the operator has singular values
+        tolerance: factor by which the residual shrinks, after which they end
     """
 
     iterations: int = 30

@@ -26,14 +26,21 @@ from phydict.xray import Projector
 class Reward:
     """-J(Y, x) per case: squared error per view plus `lpips` times the perceptual distance.
 
-    lpips: weight of LPIPS; at 0 it is not loaded. backbone: alex, vgg or squeeze. random_backbone: use LPIPS with an
-    untrained backbone, which needs no download; its figures mean nothing beside those of the trained one.
-    dropout: leave LPIPS' dropout active, as it is in training; it then draws anew at each call.
-    squared: weight of the squared error; pixel_mean: its mean over a view's pixels instead of the sum; view_sum: the
-    sum over views instead of the mean. standardise: both views of a pair less their mean and divided by their standard
-    deviation, each by itself; LPIPS is then given those. raw_range: project the prior's range itself, zero outside the
-    volume, instead of attenuation. renderer: a method of Projector instead of the measurement's; upsampling: project
-    the volume on a grid so many times finer, interpolated linearly, or by `nearest`, where each voxel is repeated.
+    Args:
+        lpips: weight of LPIPS; at 0 it is not loaded
+        backbone: of LPIPS: alex, vgg or squeeze
+        random_backbone: use LPIPS with an untrained backbone, which needs no download; its figures mean nothing beside
+            those of the trained one
+        dropout: leave LPIPS' dropout active, as it is in training; it then draws anew at each call
+        squared: weight of the squared error
+        pixel_mean: the squared error's mean over a view's pixels instead of the sum
+        view_sum: the sum over views instead of the mean
+        standardise: both views of a pair less their mean and divided by their standard deviation, each by itself; LPIPS
+            is then given those
+        raw_range: project the prior's range itself, zero outside the volume, instead of attenuation
+        renderer: a kind of Projector instead of the measurement's
+        upsampling: project the volume on a grid so many times finer
+        nearest: repeat each voxel on that grid instead of interpolating linearly
     """
 
     lpips: float = 0.0

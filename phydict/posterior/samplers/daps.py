@@ -29,16 +29,21 @@ from phydict.posterior.samplers.sampler import Sampler
 class DAPS(Sampler):
     """Zhang et al. 2025, decoupled annealing posterior sampling.
 
-    levels, sigma_max, sigma_min: the noise levels, polynomially spaced and clipped to the schedule's; flow_steps,
-    flow_end: denoiser calls of the probability flow from each level, and the noise level of the last; one call is the
-    denoiser's estimate. likelihood: Langevin as published, or ExactDraw; noise: standard deviation of the line
-    integrals' error, which, divided by the operator's norm, is the published tau;
-    prior_std: None for the published spread, sigma; with the standard deviation v of the state, the spread is that of
-    x_0 given x_t under independent components, sigma v / sqrt(sigma^2 + v^2).
-
-    On a Gaussian prior with components of variance v^2, one flow step, the exact draw and this spread sample the
+    On a Gaussian prior with components of variance v^2, one flow step, the exact draw and prior_std v sample the
     posterior exactly, with any levels. With the published spread and a full flow, low noise levels see the prior with
     half its weight: where the data are silent, the variance tends to 2 v^2.
+
+    Args:
+        levels: how many noise levels, polynomially spaced and clipped to the schedule's
+        sigma_max: highest noise level
+        sigma_min: lowest noise level
+        flow_steps: denoiser calls of the probability flow from each level; one is the denoiser's estimate
+        flow_end: noise level of the last of these calls
+        likelihood: Langevin as published, or ExactDraw
+        noise: standard deviation of the line integrals' error, which, divided by the operator's norm, is the published
+            tau
+        prior_std: None for the published spread, sigma; with the standard deviation v of the state, the spread is that
+            of x_0 given x_t under independent components, sigma v / sqrt(sigma^2 + v^2)
     """
 
     citation = ("Zhang et al., Improving Diffusion Inverse Problem Solving with Decoupled Noise Annealing, CVPR 2025, "

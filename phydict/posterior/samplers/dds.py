@@ -30,9 +30,12 @@ class DDS(Sampler):
     Gaussian prior with components of equal variance, its mean is the posterior's for noiseless data; its covariance is
     (1 + sqrt(1 - eta^2)) / 2 times that posterior's.
 
-    iterations: noise levels, evenly spaced in time; eta: the published eta, amplitude of the noise that is new at
-    each level; cg_iterations: per level; gamma: weight of |P(z) - y|^2 against |z - x0|^2, as published for noisy
-    data (None: no proximal term); tv: total variation, as in the published 3D solver; it replaces the proximal term.
+    Args:
+        iterations: noise levels, evenly spaced in time
+        eta: the published eta, amplitude of the noise that is new at each level
+        cg_iterations: of conjugate gradients at each level
+        gamma: weight of |P(z) - y|^2 against |z - x0|^2, as published for noisy data (None: no proximal term)
+        tv: total variation, as in the published 3D solver; it replaces the proximal term
     """
 
     citation = ("Chung, Lee & Ye, Decomposed Diffusion Sampler for Accelerating Large-Scale Inverse Problems, ICLR "

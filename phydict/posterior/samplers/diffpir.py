@@ -27,10 +27,14 @@ class DiffPIR(Sampler):
     """Zhu et al. 2023. For many steps on a Gaussian prior its mean is the posterior's, under data of variance
     trust noise^2; its covariance is (1 + sqrt(1 - zeta)) / 2 times the posterior's.
 
-    iterations: noise levels; spacing: their times are (1 - i / iterations)^spacing, dense near pure noise as
-    published (there called quadratic), even at 1; trust: the published lambda, weight of the prior's estimate;
-    zeta: the published zeta, share of the noise's variance that is new at each level; noise: standard deviation of
-    the line integrals' error; cg_iterations: of conjugate gradients, in place of the published closed forms.
+    Args:
+        iterations: noise levels
+        spacing: their times are (1 - i / iterations)^spacing, dense near pure noise as published (there called
+            quadratic), even at 1
+        trust: the published lambda, weight of the prior's estimate
+        zeta: the published zeta, share of the noise's variance that is new at each level
+        noise: standard deviation of the line integrals' error
+        cg_iterations: of conjugate gradients at each level, in place of the published closed forms
     """
 
     citation = ("Zhu et al., Denoising Diffusion Models for Plug-and-Play Image Restoration, CVPR Workshops (NTIRE) "

@@ -30,8 +30,10 @@ class DPS(Sampler):
     are; others are refused with a ValueError. It samples no posterior that could be stated: the push has the length
     `scale` times the denoiser's slope whatever the noise of the data, which it does not use.
 
-    iterations: noise levels, evenly spaced in time; scale: length of the push, in units of an operator of norm 1,
-    published as 0.3 for super-resolution and blur at 1000 levels; fewer levels need longer ones.
+    Args:
+        iterations: noise levels, evenly spaced in time
+        scale: length of the push, in units of an operator of norm 1, published as 0.3 for super-resolution and blur at
+            1000 levels; fewer levels need longer ones
     """
 
     citation = ("Chung et al., Diffusion Posterior Sampling for General Noisy Inverse Problems, ICLR 2023, "

@@ -26,15 +26,23 @@ from phydict.posterior.samplers.sampler import Sampler
 class PnPDM(Sampler):
     """Wu et al. 2024, plug-and-play diffusion models.
 
-    iterations: of the Gibbs sampler; rho_max, decay, rho_min: coupling of the two, rho_max decay^k but not below
-    rho_min; levels, sigma_max, sigma_min: the polynomial grid of noise levels, of which each prior step takes rho and
-    those below it; stochastic: whether the prior step draws, as the Gibbs sampler asks, or follows the probability
-    flow, which is published too; likelihood: ExactDraw, published for linear operators, or Langevin, for others;
-    noise: standard deviation of the line integrals' error; burn_in, thinning: the result is the mean of every
-    `thinning`-th state after the first burn_in ones: the posterior mean. For one draw: burn_in iterations - 1 and
-    thinning 1.
-
     With many levels its states tend to p(x | y) for data whose noise has the covariance noise^2 I + rho_min^2 A A'.
+
+    Args:
+        iterations: of the Gibbs sampler
+        rho_max: coupling of the two states in iteration k, rho_max decay^k but not below rho_min
+        decay: see rho_max
+        rho_min: see rho_max
+        levels: of the polynomial grid of noise levels, of which each prior step takes rho and those below it
+        sigma_max: highest level of that grid
+        sigma_min: lowest level of that grid
+        stochastic: whether the prior step draws, as the Gibbs sampler asks, or follows the probability flow, which is
+            published too
+        likelihood: ExactDraw, published for linear operators, or Langevin, for others
+        noise: standard deviation of the line integrals' error
+        burn_in: iterations left out of the result, which is the mean of the states after them: the posterior mean; for
+            one draw, iterations - 1
+        thinning: every how many iterations a state is taken into that mean; for one draw, 1
     """
 
     citation = ("Wu et al., Principled Probabilistic Imaging using Diffusion Models as Plug-and-Play Priors, NeurIPS "

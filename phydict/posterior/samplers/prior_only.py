@@ -17,8 +17,10 @@ from phydict.posterior.samplers.sampler import Sampler, ddim_sample
 class PriorOnly(Sampler):
     """A sample of the prior that ignores the X-rays: deterministic DDIM with `iterations` noise levels.
 
-    final_denoise: denoise once more at time 0; None: where the prior's own inference does, which its `ends_at_zero`
-    says.
+    Args:
+        iterations: noise levels, evenly spaced in time
+        final_denoise: denoise once more at time 0; None: where the prior's own inference does, which its `ends_at_zero`
+            says
     """
 
     citation = "Song, Meng & Ermon, Denoising Diffusion Implicit Models, ICLR 2021, arXiv:2010.02502"

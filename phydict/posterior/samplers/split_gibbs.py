@@ -28,24 +28,30 @@ class SplitGibbs(Sampler):
     """Samples p(x | Y, report) with one denoiser call and one likelihood step per noise level, twice where
     scatter is sought.
 
-    iterations: noise levels; likelihood: the step towards the X-rays; final_likelihood: the one at the last level,
-    None to return the denoiser's estimate there, as the paper does;
-    t_start: below 1, the first estimate, the prior's mean moved onto the X-rays, is taken at once to this time;
-    t_end: the last level's time (None: levels evenly spaced down to 0);
-    noise_fraction: None for the paper's DDIM moves; else each level starts from the estimate with new noise of this
-    share of the level's own: 1 decouples the levels, 0 adds none and descends to a point estimate;
-    momentum: with noise_fraction, each level starts beyond the estimate, by this share of how far it has moved since
-    the level before, so that fewer levels reach as far (heavy ball; Polyak 1964, doi:10.1016/0041-5553(64)90137-5);
-    sampling_noise: the noise_fraction that takes its place, without momentum, where several samples are to show how far
-    they differ; None: the same;
-    prior_std: standard deviation of the state, which sets the spread of x0 at each time;
-    ec_delta: EC's delta in [0, 1), 0 for none; ec_steps: its noise levels; ec_guided: meet the X-rays
-    at each of them too, as in the first pass, instead of following the prior alone, as the paper does;
-    full_detector: meet the X-rays pixel by pixel instead of binned to what the grid can hold;
-    clip: pull the denoiser's estimate into the prior's range before the likelihood step, not only after it;
-    final_denoise: both passes end with one more call of the denoiser, at time 0 and without X-rays, as in the release;
-    scatter: where the result misses the X-rays by more than SCATTER_THRESHOLD times their noise, sample once more,
-    subtracting the scatter that each estimate implies, and keep what that gives if it misses less.
+    Args:
+        iterations: noise levels
+        likelihood: the step towards the X-rays
+        final_likelihood: the one at the last level, None to return the denoiser's estimate there, as the paper does
+        t_start: below 1, the first estimate, the prior's mean moved onto the X-rays, is taken at once to this time
+        t_end: the last level's time (None: levels evenly spaced down to 0)
+        noise_fraction: None for the paper's DDIM moves; else each level starts from the estimate with new noise of this
+            share of the level's own: 1 decouples the levels, 0 adds none and descends to a point estimate
+        momentum: with noise_fraction, each level starts beyond the estimate, by this share of how far it has moved
+            since the level before, so that fewer levels reach as far (heavy ball; Polyak 1964,
+            doi:10.1016/0041-5553(64)90137-5)
+        sampling_noise: the noise_fraction that takes its place, without momentum, where several samples are to show how
+            far they differ; None: the same
+        prior_std: standard deviation of the state, which sets the spread of x0 at each time
+        ec_delta: EC's delta in [0, 1), 0 for none
+        ec_steps: EC's noise levels
+        ec_guided: meet the X-rays at each of EC's levels too, as in the first pass, instead of following the prior
+            alone, as the paper does
+        full_detector: meet the X-rays pixel by pixel instead of binned to what the grid can hold
+        clip: pull the denoiser's estimate into the prior's range before the likelihood step, not only after it
+        final_denoise: both passes end with one more call of the denoiser, at time 0 and without X-rays, as in the
+            release
+        scatter: where the result misses the X-rays by more than SCATTER_THRESHOLD times their noise, sample once more,
+            subtracting the scatter that each estimate implies, and keep what that gives if it misses less
     """
 
     citation = ("Dai, Ghosh & Batmanghelich, PhyDiCT: Plug-and-Play CT Reconstruction from Sparse X-Rays via "

@@ -25,12 +25,16 @@ class Unrolled(Sampler):
     """z = start(mean); then for each time: x0 = refine(z, evidence), z = likelihood(x0). Deterministic. Once
     more with scatter subtracted, as SplitGibbs does.
 
-    times: labels in (0, 1) under which the refiner's network takes each z, as if it were a noisy state of that time;
-    x0_stds: standard deviation of the error of each x0, in the prior's range, that of the mean first; start,
-    likelihood, final_likelihood: the steps towards the X-rays, first, between the calls and last. Where a ProximalCG at
-    the end misses the X-rays by more than their noise, as it does a tube's spectrum, the excess is model error, which
-    counts as noise (Morozov 1966): the step is repeated with its total variation weighted by the squared normalised
-    residual.
+    Where a ProximalCG at the end misses the X-rays by more than their noise, as it does a tube's spectrum, the excess
+    is model error, which counts as noise (Morozov 1966): the step is repeated with its total variation weighted by the
+    squared normalised residual.
+
+    Args:
+        times: labels in (0, 1) under which the refiner's network takes each z, as if it were a noisy state of that time
+        x0_stds: standard deviation of the error of each x0, in the prior's range, that of the mean first
+        start: the first step towards the X-rays
+        likelihood: the steps towards the X-rays between the calls
+        final_likelihood: the last step towards the X-rays
     """
 
     citation = ("Adler & Oktem, Learned Primal-Dual Reconstruction, IEEE Transactions on Medical Imaging 37(6), 2018, "

@@ -252,6 +252,23 @@ def test_a_projector_is_an_axis_on_the_same_xrays_and_the_automatic_one_keeps_it
     assert all(torch.equal(trace.given[0][0], xrays) for xrays, _, _ in trace.given)
 
 
+def test_a_geometry_file_is_an_axis_with_views_of_its_own(tmp_path, trace):
+    orbit = {"views": 2, "source_to_detector": 1020, "source_to_isocentre": 740, "shape": [24, 24], "pixel": 24}
+    for name, change in {"tilted": {"tilt_degrees": 5}, "four": {"views": 4}}.items():
+        (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump({"orbit": orbit | change}))
+    files = [str(tmp_path / f"{name}.yaml") for name in ("tilted", "four")]
+    rows = ablate(tmp_path, base={"method": "trace", "voxels": 16}, axes={"geometry": files})
+    assert [(Path(row["geometry"]).stem, row["views"]) for row in rows] == [("tilted", 2)] * 2 + [("four", 4)] * 2
+    assert {len(xrays) for xrays, *_ in trace.given} == {2, 4}
+    assert "by geometry" in (tmp_path / "out" / "tables.md").read_text()
+    assert [file.name for file in (tmp_path / "out").glob("*.png")] == ["geometry.png"]
+
+
+def test_an_orbits_setting_means_nothing_beside_a_geometry_file(tmp_path):
+    with pytest.raises(ValueError, match="the setting views means nothing"):
+        read_specification(write(tmp_path, base={"method": "sirt", "voxels": 16, "geometry": "arc_90", "views": 3}))
+
+
 def test_set_takes_the_place_of_a_files_axis_base_and_product(tmp_path):
     file = write(tmp_path, products=[{"base": {"seed": 3}, "axes": {"method": ["sirt", "tv"], "views": [2, 4]}},
                                      {"axes": {"method": ["cgls"]}}])

@@ -281,7 +281,7 @@ def test_a_finished_case_is_kept_until_asked_otherwise(measured, tmp_path, capsy
     assert stamp(folder) == before and "1 of 1 cases are finished already" in capsys.readouterr().err
     main([*args, "--profile"])
     assert "not profiled: --model.overwrite true" in capsys.readouterr().err
-    for change in ("--model.seed=1", "--model.method.init_args.iterations=4", "--data.geometry=other.yaml"):
+    for change in ("--model.seed=1", "--model.method.init_args.iterations=4", "--data.geometry=arc_90"):
         said = refusal(capsys, [*args, change])
         assert "other settings" in said and "overwrite" in said
     assert stamp(folder) == before
@@ -624,6 +624,15 @@ def test_the_simulated_orbit_is_the_one_asked_for(scored, tmp_path, capsys):
     main(phantoms(tmp_path / "finer", 1, "--data.simulation_voxels=128"))
     assert not np.array_equal(volume(tmp_path / "finer" / "sirt" / case), volume(scored / case))
     assert "multiple" in refusal(capsys, phantoms(tmp_path / "coarser", 1, "--data.simulation_voxels=96"))
+
+
+def test_simulated_xrays_are_taken_where_a_geometry_file_says(scored, tmp_path, capsys):
+    other = ["test", "--data.cts=phantom", "--data.phantoms=1", f"--model.out={tmp_path}", "--model.method=sirt",
+             "--data.geometry=biplanar"]
+    main(other)
+    assert len(record(tmp_path / "sirt" / "phantom-1000000")["misfit_per_view"]) == 2
+    assert "leave one out" in refusal(capsys, [*other, "--data.orbit.views=4"])
+    assert "biplanar" in refusal(capsys, [*other[:-1], "--data.geometry=nowhere"])
 
 
 def test_other_xrays_into_a_finished_folder_are_refused(scored, capsys):

@@ -1,17 +1,26 @@
-"""Plots of an ablation: seconds against error, error against views, Extra Compute's delta, where the time goes."""
+"""Plots of an ablation: seconds against error, error against views and by geometry, Extra Compute's delta, where the time goes."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from phydict.ablation.summary import SHOWN_MEASURES, Entry, best_settings, conditions, deltas, format_settings
+from phydict.ablation.summary import (
+    SHOWN_MEASURES,
+    Entry,
+    best_settings,
+    compared_geometries,
+    compared_views,
+    conditions,
+    deltas,
+    format_settings,
+)
 from phydict.evaluation.gallery import literal
 from phydict.runtime.files import atomic_write
 
@@ -27,12 +36,15 @@ def write_plots(folder: Path, found: Sequence[Entry]) -> list[Path]:
     for condition, group in conditions(found):
         own = [entry for entry in group if entry.complete]
         where = format_settings(condition)
-        if len(own) > 1:
+        if len(own) > 1 and "geometry" not in condition:
             written.append(_draw(folder, f"pareto {where}", 2, lambda axes: _pareto(axes, own, where, style)))
             written.append(_draw(folder, f"stages {where}", 1, lambda axes: _stages(axes[0], own, where)))
-    for rest, group in conditions(found, without="views"):
-        if len({entry.condition.get("views") for entry in group}) > 1:
-            written.append(_draw(folder, f"views {format_settings(rest)}", 2, lambda axes: _views(axes, group, style)))
+    for rest, places in compared_views(found):
+        group = [entry for place in places.values() for entry in place]
+        written.append(_draw(folder, f"views {format_settings(rest)}", 2, lambda axes: _views(axes, group, style)))
+    for rest, places in compared_geometries(found):
+        written.append(_draw(folder, f"geometry {format_settings(rest)}", 2,
+                             lambda axes: _geometries(axes, places, style)))
     curves = [(label, group) for label, group in deltas(found) if len(group) > 1]
     if curves:
         written.append(_draw(folder, "delta", 2, lambda axes: _deltas(axes, curves)))
@@ -95,6 +107,22 @@ def _views(axes: Sequence[Axes], group: Sequence[Entry], style: dict) -> None:
         ax.set_xscale("log", base=2)
         ax.set_xticks(views, map(str, views))
         _dress(ax, "views", SHOWN_MEASURES[name].heading)
+    axes[-1].legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
+
+
+def _geometries(axes: Sequence[Axes], places: Mapping[str, Sequence[Entry]], style: dict) -> None:
+    """Where each method stands, a line of the plot for each geometry."""
+    names = [Path(name).stem for name in places]
+    for ax, measure in zip(axes, ("psnr", "ssim")):
+        labels = {entry.name: entry.method for group in places.values() for entry in group}
+        for label, method in labels.items():
+            own = [(entry.means[measure], i) for i, group in enumerate(places.values()) for entry in group
+                   if entry.complete and entry.name == label]
+            if own:
+                ax.plot(*zip(*own), **style[method], linestyle="", markersize=6, label=literal(label))
+        ax.set_yticks(range(len(names)), list(map(literal, names)))
+        ax.invert_yaxis()
+        _dress(ax, SHOWN_MEASURES[measure].heading, "")
     axes[-1].legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
 
 

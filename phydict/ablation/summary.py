@@ -86,12 +86,34 @@ def entries(rows: Iterable[Mapping]) -> list[Entry]:
     return [_entry(group, own[group[0]["method"]], varying) for group in groups.values()]
 
 
-def conditions(found: Sequence[Entry], without: str | None = None) -> list[tuple[dict, list[Entry]]]:
-    """The entries under each condition, or under what is left of it `without` one of its parts."""
+def conditions(found: Sequence[Entry], without: Sequence[str] = ()) -> list[tuple[dict, list[Entry]]]:
+    """The entries under each condition, or under what is left of it `without` some of its parts."""
     groups: dict[tuple, list] = {}
     for entry in found:
-        groups.setdefault(tuple((k, v) for k, v in entry.condition.items() if k != without), []).append(entry)
+        groups.setdefault(tuple((k, v) for k, v in entry.condition.items() if k not in without), []).append(entry)
     return [(dict(condition), group) for condition, group in groups.items()]
+
+
+def compared_views(found: Sequence[Entry]) -> list[tuple[dict, dict[int, list[Entry]]]]:
+    """Number of views -> entries, under each other condition that has several."""
+    return _along(found, "views", ("views",))
+
+
+def compared_geometries(found: Sequence[Entry]) -> list[tuple[dict, dict[str, list[Entry]]]]:
+    """Geometry file -> entries, under each other condition that has several; a file fixes the views."""
+    return _along(found, "geometry", ("geometry", "views"))
+
+
+def _along(found: Sequence[Entry], axis: str, without: Sequence[str]) -> list[tuple[dict, dict]]:
+    compared = []
+    for rest, group in conditions(found, without):
+        places: dict = {}
+        for entry in group:
+            if entry.condition.get(axis) is not None:
+                places.setdefault(entry.condition[axis], []).append(entry)
+        if len(places) > 1:
+            compared.append((rest, places))
+    return compared
 
 
 def best_settings(found: Sequence[Entry], measure: str = "psnr") -> list[Entry]:

@@ -1,12 +1,21 @@
-"""The tables of an ablation: methods under each condition, against the number of views, and Extra Compute's delta."""
+"""The tables of an ablation: methods under each condition, against the views, by geometry, and Extra Compute's delta."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from phydict.ablation.run import TABLES
-from phydict.ablation.summary import SHOWN_MEASURES, Entry, best_settings, conditions, deltas, format_settings
+from phydict.ablation.summary import (
+    SHOWN_MEASURES,
+    Entry,
+    best_settings,
+    compared_geometries,
+    compared_views,
+    conditions,
+    deltas,
+    format_settings,
+)
 from phydict.evaluation.tables import Table, caption, doubts, listed
 from phydict.runtime.files import atomic_write
 
@@ -14,7 +23,7 @@ OF_METHODS = ("ssim", "psnr", "mae_hu", "ssim_body", "psnr_body", "mae_hu_body",
 """Columns of the table of methods."""
 
 OF_VIEWS = ("ssim", "psnr", "ssim_body", "psnr_body", "seconds")
-"""Measures that are tabled against the number of views."""
+"""Measures that are tabled against the number of views and by geometry."""
 
 OF_DELTA = ("ssim", "misfit", "psnr", "mae_hu", "ssim_body", "psnr_body", "mae_hu_body", "seconds")
 """Columns of the table of Extra Compute, the misfit beside SSIM: what looks better may fit the X-rays worse."""
@@ -31,8 +40,11 @@ def all_tables(found: Sequence[Entry], rows: Sequence[dict]) -> list[Table]:
                                         [*notes, "The settings were chosen by these cases' own PSNR."]))
             title += ": all settings"
         tables.append(_method_table(title, group, notes))
-    if any("views" in entry.condition for entry in found):
-        tables += _views_tables(found, notes)
+    for rest, places in compared_views(found):
+        columns = {f"K = {k}": places[k] for k in sorted(places)}
+        tables += _axis_tables("against the number of views", rest, columns, notes)
+    for rest, places in compared_geometries(found):
+        tables += _axis_tables("by geometry", rest, places, notes)
     return tables + [_delta_table(label, group, notes) for label, group in deltas(found)]
 
 
@@ -67,22 +79,21 @@ def _entry_table(title: str, first: str, names: Sequence[str], lines: Sequence[t
                  [*notes, *_reasons([entry for _, entry in lines])])
 
 
-def _views_tables(found: Sequence[Entry], notes: Sequence[str]) -> list[Table]:
-    """Method x number of views, a table for each measure and each other condition: the form of the paper's Table 3."""
-    tables = []
-    for rest, group in conditions(found, without="views"):
-        lines: dict[str, dict[int, Entry]] = {}
-        for entry in group:
-            lines.setdefault(entry.name, {})[entry.condition["views"]] = entry
-        views = sorted({k for line in lines.values() for k in line})
-        for name in _measured(OF_VIEWS, group):
-            measure = SHOWN_MEASURES[name]
-            tables.append(Table(
-                format_settings(f"{measure.heading} against the number of views", rest),
-                ["method", *(f"K = {k}" for k in views)], [measure] * len(views),
-                [(label, all(entry.complete or not entry.cases for entry in line.values()),
-                  [line[k].means.get(name) if k in line else None for k in views]) for label, line in lines.items()],
-                [*notes, *_reasons(group)]))
+def _axis_tables(title: str, rest: dict, columns: Mapping[str, Sequence[Entry]], notes: Sequence[str]) -> list[Table]:
+    """Method x what is compared, a table for each measure: the form of the paper's Table 3."""
+    tables, group = [], [entry for entries in columns.values() for entry in entries]
+    lines: dict[str, dict[str, Entry]] = {}
+    for column, entries in columns.items():
+        for entry in entries:
+            lines.setdefault(entry.name, {})[column] = entry
+    for name in _measured(OF_VIEWS, group):
+        measure = SHOWN_MEASURES[name]
+        tables.append(Table(
+            format_settings(f"{measure.heading} {title}", rest),
+            ["method", *columns], [measure] * len(columns),
+            [(label, all(entry.complete or not entry.cases for entry in line.values()),
+              [line[k].means.get(name) if k in line else None for k in columns]) for label, line in lines.items()],
+            [*notes, *_reasons(group)]))
     return tables
 
 

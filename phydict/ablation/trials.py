@@ -39,7 +39,7 @@ SETTINGS: dict[str, tuple[type, object]] = {
     "method": (str, None), "seed": (int, 0),
     "views": (int, 8), "detector": (int, 448), "pixel": (float | None, None), "simulator": (str, "ideal"),
     "simulation_voxels": (int | None, None), "source_to_detector": (float, 1020.0),
-    "source_to_isocentre": (float, 740.0),
+    "source_to_isocentre": (float, 740.0), "geometry": (str | None, None),
     "report": (bool, True), "voxels": (int, 64), "side": (float, 384.0),
     "prior": (str | None, None), "guidance": (float, 1.0), "samples": (int, 1),
     "delta": (float | None, None), "projector": (str, "auto")}
@@ -47,6 +47,9 @@ SETTINGS: dict[str, tuple[type, object]] = {
 
 PRIOR_SETTINGS = ("prior", "guidance", "samples", "delta", "report")
 """Settings that mean nothing to a method without a prior."""
+
+ORBIT_SETTINGS = ("views", "detector", "pixel", "source_to_detector", "source_to_isocentre")
+"""Settings that mean nothing where a geometry file is given."""
 
 DEFAULT_COLUMNS = ("method", "views", "simulator", "detector", "seed", "guidance", "samples")
 """Settings that the table of results always has as columns; others where a specification gives them."""
@@ -179,13 +182,15 @@ def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
         method = refined_from(method, given["delta"], "ec_steps" in changes["method"])
     if not isinstance(method, Sampler):
         given = {name: value for name, value in given.items() if name not in PRIOR_SETTINGS}
+    if given.get("geometry") is not None:
+        given = {name: value for name, value in given.items() if name not in ORBIT_SETTINGS}
     value = {name: default for name, (_, default) in SETTINGS.items()} | given
     if value["detector"] < 1:
         raise ValueError("detector is a number of pixels along each side, 1 or more, but "
                          f"{value['detector']} was given")
     pixel = SIDE / value["detector"] if value["pixel"] is None else value["pixel"]
     data = cases.data(
-        with_report=value["report"],
+        with_report=value["report"], geometry=value["geometry"],
         orbit=Orbit(value["views"], value["source_to_detector"], value["source_to_isocentre"], (value["detector"],) * 2,
                     (pixel, pixel)),
         simulator=simulator, simulation_voxels=value["simulation_voxels"])
@@ -194,6 +199,8 @@ def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
                  for part, paths in changes.items() for path in paths}
     columns = {name: value[name] for name in DEFAULT_COLUMNS
                if name in given or name not in PRIOR_SETTINGS or with_prior}
+    if value["geometry"] is not None:
+        columns |= {"views": data.beam.views, "detector": data.beam.shape[0]}
     columns |= {name: given[name] for name in SETTINGS if name in given and name not in columns} | overrides
     prior = value["prior"] or str(method.default_prior) if with_prior else None
     trial = Trial(columns, method, data, prior, value["guidance"], value["samples"], value["seed"],

@@ -22,9 +22,10 @@ from phydict.reconstruction import describe
 from phydict.runtime.console import noted
 from phydict.runtime.files import file_crc32
 from phydict.runtime.reading import name_of, read_ids
-from phydict.runtime.shipped import own_or_shipped
+from phydict.runtime.shipped import configuration
 from phydict.units import HUWindow
 from phydict.xray import Ideal, Projector, Simulator
+from phydict.xray.geometry_files import read_beam
 
 MOST_PHANTOMS = 100_000
 
@@ -53,13 +54,14 @@ class ReconstructionData(lightning.LightningDataModule):
 
     Args:
         xrays: for predict, a folder of X-ray images with geometry.yaml, or a folder of such folders
-        geometry: a geometry file used instead of theirs
+        geometry: a geometry file, or the name of one of configs/geometry: used instead of the folders' own, and for
+            simulated X-rays in place of orbit
         cts: for test, a NIfTI file or a folder of CTs, or the word phantom
         source: which CTs of a folder are taken, and what belongs to them
         only: a text file of the case ids to test, such as the held_out.txt of a training; none given: all
         phantoms: how many phantoms where cts is the word phantom
         with_report: whether the cases' reports are used
-        orbit: the simulated X-rays' geometry
+        orbit: the simulated X-rays' geometry where no file gives it
         simulator: how X-rays are made of a CT (configs/simulate)
         simulation_voxels: voxels per side of the volume that X-rays are made of; none given: the reconstruction's own
             grid, which is an inverse crime; more lessens it
@@ -76,13 +78,21 @@ class ReconstructionData(lightning.LightningDataModule):
                              "out for the reconstruction's own")
         self.xrays, self.geometry, self.cts, self.phantoms, self.only = xrays, geometry, cts, phantoms, only
         self.source, self.with_report, self.simulator = source, with_report, simulator
-        self.simulation_voxels, self.orbit, self.beam = simulation_voxels, orbit, orbit.beam()
+        if cts and geometry and orbit != Orbit():
+            raise ValueError(f"the simulated X-rays' geometry is that of data.geometry ({geometry}), but data.orbit was "
+                             "given as well: leave one out")
+        self.simulation_voxels, self.orbit = simulation_voxels, orbit
+        self.geometry_file = configuration(geometry, ("geometry",)) if geometry else None
+        self.beam = read_beam(self.geometry_file) if cts and self.geometry_file else orbit.beam()
 
     def settings(self, stage: str) -> dict:
         """What, beside the cases themselves, decides the X-rays that a stage (predict, test) reconstructs from."""
         if stage == "predict":
             return {"with_report": self.with_report, "geometry": self.geometry}
-        return {"with_report": self.with_report, **vars(self.orbit), "simulator": describe(self.simulator),
+        beam = vars(self.orbit)
+        if self.geometry_file:
+            beam = {"geometry": f"{self.geometry_file.name}, crc32 {file_crc32(self.geometry_file):08x}"}
+        return {"with_report": self.with_report, **beam, "simulator": describe(self.simulator),
                 "simulation_voxels": self.simulation_voxels}
 
     def xray_cases(self) -> dict[str, Path]:
@@ -104,7 +114,7 @@ class ReconstructionData(lightning.LightningDataModule):
         return [Path(self.cts)] if self.cts and self.cts != "phantom" else []
 
     def predict_dataloader(self) -> DataLoader:
-        return self._loader([(name, self._xrays_source(folder), lambda f=folder: load_xrays(f, self.geometry))
+        return self._loader([(name, self._xrays_source(folder), lambda f=folder: load_xrays(f, self.geometry_file))
                              for name, folder in self.xray_cases().items()])
 
     def test_dataloader(self) -> DataLoader:
@@ -136,7 +146,7 @@ class ReconstructionData(lightning.LightningDataModule):
         """What identifies a folder's X-rays: a checksum of its files and of the geometry used instead of its own."""
         crc = 0
         files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
-        for file in [*files, own_or_shipped(self.geometry)] if self.geometry else files:
+        for file in [*files, self.geometry_file] if self.geometry_file else files:
             named = zlib.crc32(os.fsencode(file.name), crc)
             crc = file_crc32(file, named) if file.is_file() else named
         return f"files crc32 {crc:08x}"

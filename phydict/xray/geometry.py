@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import reprlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,10 +16,17 @@ from phydict.grid import Grid, whole_sizes
 from phydict.runtime.reading import check_memory
 from phydict.runtime.warning import warn
 from phydict.runtime.yaml_file import read_yaml
+from phydict.xray.orbits import on_circle, on_line, turned
 
 VECTOR_KEYS = ("sources", "detectors", "u", "v", "shape")
 ORBIT_KEYS = ("views", "source_to_detector", "source_to_isocentre", "shape", "pixel")
 ORBIT_OPTIONS = ("start_degrees", "arc_degrees", "start", "arc")
+FORMS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "orbit": (ORBIT_KEYS, ORBIT_OPTIONS), "angles": (("angles_degrees", *ORBIT_KEYS[1:]), ()),
+    "sweep": ((*ORBIT_KEYS, "sweep_degrees"), ())}
+"""Required and optional keys of the mappings that a YAML file may hold in place of vectors."""
+PLACE_OPTIONS = ("detector_shift", "tilt_degrees")
+LISTS = ("shape", "pixel", "angles_degrees", "detector_shift")
 MOST_RADIANS = 4 * math.pi
 """An angle in radians beyond two turns was meant in degrees."""
 LEAST_MM, MOST_MM = 1e-6, 1e9
@@ -92,18 +100,54 @@ class ConeBeam:
                              "given")
         if sizes is not None and len(sizes) == 2:
             _check_room(count[0], sizes)
-        if not 0 < source_to_isocentre < source_to_detector < MOST_MM:
-            raise ValueError(f"the isocentre must lie between source and detector, but source_to_isocentre="
-                             f"{source_to_isocentre} mm and source_to_detector={source_to_detector} mm were given; "
-                             "correct them, both from the source and in mm")
-        height, width = pixel_sizes(pixel)
+        _check_isocentre(source_to_detector, source_to_isocentre)
         first, turn = _radians("start", start, start_degrees, 0.0), _radians("arc", arc, arc_degrees, 2 * math.pi)
-        angle = first + turn * np.arange(int(views)) / int(views)
-        cos, sin = np.round(np.cos(angle), 15), np.round(np.sin(angle), 15)  # exact zeros at right angles
-        zero = np.zeros_like(angle)
-        towards = np.stack([sin, cos, zero], 1)
-        return cls(-source_to_isocentre * towards, (source_to_detector - source_to_isocentre) * towards,
-                   width * np.stack([-cos, sin, zero], 1), height * np.stack([zero, zero, zero - 1], 1), shape)
+        angles = first + turn * np.arange(int(views)) / int(views)
+        return cls(*on_circle(angles, source_to_detector, source_to_isocentre, pixel_sizes(pixel)), shape)
+
+    @classmethod
+    def at_angles(cls, angles_degrees: Sequence[float], source_to_detector: float, source_to_isocentre: float,
+                  shape: tuple[int, int], pixel: float | tuple[float, float]) -> ConeBeam:
+        """Views of an orbit at any angles, in degrees, and in any order."""
+        angles = _numbers("angles_degrees", angles_degrees)
+        if np.ndim(angles) != 1 or not len(angles):
+            raise ValueError("angles_degrees is a list of an angle for each view, but "
+                             f"{reprlib.repr(angles_degrees)} was given")
+        _check_isocentre(source_to_detector, source_to_isocentre)
+        poses = on_circle(np.radians(angles), source_to_detector, source_to_isocentre, pixel_sizes(pixel))
+        return cls(*poses, shape)
+
+    @classmethod
+    def sweep(cls, views: int, source_to_detector: float, source_to_isocentre: float, shape: tuple[int, int],
+              pixel: float | tuple[float, float], sweep_degrees: float) -> ConeBeam:
+        """Tomosynthesis: a resting PA detector, and a source that moves along a line from inferior to superior.
+
+        sweep_degrees: the angle between the first and the last source, seen from the isocentre, in (0, 160]; the steps
+        between them are of equal length. Else as `orbit`.
+        """
+        count = whole_sizes(views)
+        if count is None or len(count) != 1 or count[0] < 2:
+            raise ValueError(f"a sweep needs two views or more, but views={reprlib.repr(views)} was given")
+        if not 0 < sweep_degrees <= 160:
+            raise ValueError(f"sweep_degrees lies in (0, 160], but {sweep_degrees} was given")
+        _check_isocentre(source_to_detector, source_to_isocentre)
+        reach = math.tan(math.radians(sweep_degrees) / 2)
+        tangents = np.linspace(-reach, reach, count[0])
+        return cls(*on_line(tangents, source_to_detector, source_to_isocentre, pixel_sizes(pixel)), shape)
+
+    def shifted(self, rows: float = 0.0, columns: float = 0.0) -> ConeBeam:
+        """The beam with its detectors moved in their planes, by mm in the direction from row to row and from column to
+        column, as for a half-fan acquisition."""
+        height, width = np.linalg.norm(self.v, axis=1), np.linalg.norm(self.u, axis=1)
+        move = rows * self.v / height[:, None] + columns * self.u / width[:, None]
+        return ConeBeam(self.sources, self.detectors + move, self.u, self.v, self.shape)
+
+    def tilted(self, degrees: float) -> ConeBeam:
+        """The beam with each view turned about the line through the isocentre that its rows run along, so that the
+        source rises by `degrees`: the angulation of a C-arm."""
+        if not abs(degrees) < 90:
+            raise ValueError(f"tilt_degrees lies between -90 and 90, but {degrees} was given")
+        return ConeBeam(*turned((self.sources, self.detectors, self.u, self.v), math.radians(degrees)), self.shape)
 
     @property
     def views(self) -> int:
@@ -216,11 +260,13 @@ class ConeBeam:
 
     @classmethod
     def load(cls, path: str | Path) -> ConeBeam:
-        """Read a beam from YAML: the vector form that `save` writes, or one mapping `orbit:`, at the top level
-        or under `beam:` as in geometry.yaml.
+        """Read a beam from YAML: the vector form that `save` writes, or one mapping `orbit:`, at the top
+        level or under `beam:` as in geometry.yaml.
 
         orbit: {views, source_to_detector, source_to_isocentre, shape: [rows, columns], pixel: [row mm, column mm]}
-        and optionally start_degrees (0) and arc_degrees (360), or start and arc in radians.
+        and optionally start_degrees (0) and arc_degrees (360), or start and arc in radians; angles_degrees: [...] in
+        place of views, start and arc; or one mapping `sweep:` with sweep_degrees beside the orbit's five keys. Both
+        take detector_shift (mm from column to column, or [from row to row, from column to column]) and tilt_degrees.
         Raises FileNotFoundError, and ValueError naming the file for unknown or missing keys and impossible geometry.
         """
         path = Path(path)
@@ -236,17 +282,29 @@ class ConeBeam:
     @classmethod
     def from_dict(cls, content: object) -> ConeBeam:
         """The beam of a mapping in one of the two forms that `load` reads. Raises ValueError naming the key."""
-        if not isinstance(content, dict) or "orbit" not in content:
+        form = next((name for name in ("orbit", "sweep") if isinstance(content, dict) and name in content), None)
+        if form is None:
             content = _check_keys(content, VECTOR_KEYS, ())
             numbers: dict[str, Any] = {key: _numbers(key, value) for key, value in content.items()}
             return cls(**numbers)
-        _check_keys(content, ("orbit",), ())
-        orbit = content["orbit"]
-        _check_keys(orbit, ORBIT_KEYS, ORBIT_OPTIONS)
-        for key, value in orbit.items():
-            if np.ndim(_numbers(key, value)) and key not in ("shape", "pixel"):
+        _check_keys(content, (form,), ())
+        given = content[form]
+        if form == "orbit" and isinstance(given, dict) and "angles_degrees" in given:
+            form = "angles"
+        required, optional = FORMS[form]
+        given = dict(_check_keys(given, required, optional + PLACE_OPTIONS))
+        for key, value in given.items():
+            if np.ndim(_numbers(key, value)) and key not in LISTS:
                 raise ValueError(f"{key} is one number, but {reprlib.repr(value)} was given")
-        return cls.orbit(**orbit)
+        shift, tilt = given.pop("detector_shift", 0.0), given.pop("tilt_degrees", 0.0)
+        if np.shape(shift) not in ((), (2,)):
+            raise ValueError("detector_shift is mm from column to column, or [from row to row, from column to column], "
+                             f"but {reprlib.repr(shift)} was given")
+        make = {"orbit": cls.orbit, "angles": cls.at_angles, "sweep": cls.sweep}[form]
+        beam = make(**given)
+        if np.any(shift):
+            beam = beam.shifted(*((0.0, shift) if np.ndim(shift) == 0 else shift))
+        return beam.tilted(tilt) if tilt else beam
 
 
 def _radians(name: str, radians: float | None, degrees: float | None, otherwise: float) -> float:
@@ -269,6 +327,13 @@ def pixel_sizes(pixel) -> tuple[float, float]:
     if not (0 < height < MOST_MM and 0 < width < MOST_MM):
         raise ValueError(f"pixel must be (row height, column width) > 0 in mm, but {reprlib.repr(pixel)} was given")
     return height, width
+
+
+def _check_isocentre(source_to_detector: float, source_to_isocentre: float) -> None:
+    if not 0 < source_to_isocentre < source_to_detector < MOST_MM:
+        raise ValueError(f"the isocentre must lie between source and detector, but source_to_isocentre="
+                         f"{source_to_isocentre} mm and source_to_detector={source_to_detector} mm were given; "
+                         "correct them, both from the source and in mm")
 
 
 def _check_room(views: int, shape: tuple[int, int]) -> None:

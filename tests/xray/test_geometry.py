@@ -50,6 +50,44 @@ def test_degrees_given_as_radians_are_refused_with_the_name_of_degrees(angle):
         orbit(4, **{angle: 90})
 
 
+def pixel_of(beam, point):
+    """Row and column (K, 2) in pixels from the detectors' centres at which a world point is seen."""
+    ray = np.asarray(point, float) - beam.sources
+    hit = beam.sources + ray * (beam.distances / (ray * beam.normals).sum(1))[:, None] - beam.detectors
+    return np.stack([(hit * step).sum(1) / (step ** 2).sum(1) for step in (beam.v, beam.u)], 1)
+
+
+def test_views_at_given_angles_are_those_of_an_orbit():
+    beam = ConeBeam.at_angles([270, 0, 90], 1020, 740, (112, 96), (5.0, 4.0))
+    assert beam.same_as(orbit().select([3, 0, 1]))
+
+
+def test_a_shifted_detector_sees_the_isocentre_as_far_the_other_way():
+    np.testing.assert_allclose(pixel_of(orbit().shifted(rows=10.0, columns=60.0), [0, 0, 0]),
+                               np.tile([-10 / 5, -60 / 4], (4, 1)), atol=1e-12)
+
+
+@pytest.mark.parametrize("degrees", [15.0, -40.0])
+def test_a_tilted_view_looks_at_the_isocentre_from_as_far_and_from_above(degrees):
+    beam = orbit().tilted(degrees)
+    np.testing.assert_allclose(beam.sources[:, 2], 740 * np.sin(np.radians(degrees)), atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(beam.sources, axis=1), 740)
+    np.testing.assert_allclose(beam.distances, 1020)
+    np.testing.assert_allclose(pixel_of(beam, [0, 0, 0]), 0, atol=1e-9)
+    assert orbit().tilted(degrees).tilted(-degrees).same_as(orbit())
+
+
+def test_a_sweep_moves_the_source_evenly_along_the_patient_before_a_resting_detector():
+    beam = ConeBeam.sweep(5, 1020, 740, (112, 96), (5.0, 4.0), 40)
+    assert beam.select([2]).same_as(orbit().select([0]))
+    angles = np.degrees(np.arctan2(beam.sources[:, 2], -beam.sources[:, 1]))
+    np.testing.assert_allclose(angles[[0, -1]], [-20, 20])
+    np.testing.assert_allclose(np.ptp(np.diff(beam.sources[:, 2])), 0, atol=1e-9)
+    np.testing.assert_allclose(np.ptp(beam.detectors, axis=0), 0)
+    rows = pixel_of(beam, [0, 100, 0])[:, 0]  # what lies before the detector moves down as the source rises
+    assert (np.diff(rows) > 0).all()
+
+
 def test_binned_pixels_are_the_means_of_their_blocks():
     beam = orbit()
     blocks = beam.pixels().reshape(4, 28, 4, 24, 4, 3).mean((2, 4))
@@ -146,7 +184,25 @@ def test_yaml_orbit_is_read_in_degrees(tmp_path):
     assert ConeBeam.load(path).same_as(orbit(start=np.pi / 2, arc=np.pi))
 
 
+def test_yaml_holds_angles_sweeps_shifts_and_tilts(tmp_path):
+    path, place = tmp_path / "beam.yaml", "  detector_shift: 30\n  tilt_degrees: 10\n"
+    path.write_text(ORBIT + place)
+    assert ConeBeam.load(path).same_as(orbit().shifted(columns=30).tilted(10))
+    path.write_text(ORBIT.replace("views: 4", "angles_degrees: [3, 50]") + "  detector_shift: [5, -30]\n")
+    assert ConeBeam.load(path).same_as(ConeBeam.at_angles([3, 50], 1020, 740, (112, 96), (5, 4)).shifted(5, -30))
+    path.write_text(ORBIT.replace("orbit", "sweep") + "  sweep_degrees: 40\n")
+    assert ConeBeam.load(path).same_as(ConeBeam.sweep(4, 1020, 740, (112, 96), (5, 4), 40))
+
+
 @pytest.mark.parametrize("text, sentence", [
+    (ORBIT + "  angles_degrees: [1, 2]\n", "unknown key 'views'; the keys are angles_degrees"),
+    (ORBIT.replace("views: 4", "angles_degrees: []"), "an angle for each view"),
+    (ORBIT.replace("views: 4", "angles_degrees: 3"), "an angle for each view"),
+    (ORBIT + "  detector_shift: [1, 2, 3]\n", "detector_shift is mm"),
+    (ORBIT + "  tilt_degrees: 90\n", "between -90 and 90"),
+    (ORBIT.replace("orbit", "sweep"), "missing key 'sweep_degrees'"),
+    (ORBIT.replace("orbit", "sweep") + "  sweep_degrees: 170\n", r"in \(0, 160\]"),
+    (ORBIT.replace("orbit", "sweep").replace("views: 4", "views: 1") + "  sweep_degrees: 17\n", "two views or more"),
     (ORBIT + "  angle: 3\n", "unknown key 'angle'; .* start_degrees, arc_degrees"),
     (ORBIT + "  start: 90\n", "give start_degrees"),
     (ORBIT.replace("  views: 4\n", ""), "missing key 'views'"),

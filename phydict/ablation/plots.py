@@ -1,4 +1,4 @@
-"""Plots of an ablation: seconds against error, error against views and by geometry, Extra Compute's delta, where the time goes."""
+"""Plots of an ablation: seconds against error, error against views, by geometry, Extra Compute, shares of the time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The tables of an ablation: methods under each condition, against the views, by geometry, and Extra Compute's delta."""
+"""The tables of an ablation: methods under each condition, against the views, by geometry, and Extra Compute."""
 
 from __future__ import annotations
 

@@ -79,7 +79,7 @@ class ReconstructionData(lightning.LightningDataModule):
         self.xrays, self.geometry, self.cts, self.phantoms, self.only = xrays, geometry, cts, phantoms, only
         self.source, self.with_report, self.simulator = source, with_report, simulator
         if cts and geometry and orbit != Orbit():
-            raise ValueError(f"the simulated X-rays' geometry is that of data.geometry ({geometry}), but data.orbit was "
+            raise ValueError(f"the simulated X-rays are those of data.geometry ({geometry}), but data.orbit was "
                              "given as well: leave one out")
         self.simulation_voxels, self.orbit = simulation_voxels, orbit
         self.geometry_file = configuration(geometry, ("geometry",)) if geometry else None

@@ -35,12 +35,15 @@ from phydict.training.rivals import LiftedTraining
 from phydict.training.stage import CHECKPOINT, StageTraining
 from phydict.training.super_resolution import SuperResolutionTraining
 from phydict.training.throughput import Throughput
+from phydict.training.x2ct import X2CTTraining
+from phydict.training.xray2ctpa import XrayToCTPATraining
 
 COMMANDS = {"fit": "train a prior", "validate": "measure one on held-out cases", "export": "checkpoint -> prior",
             "inspect-prior": "what a file is"}
 
 STAGES = {"base": (PriorTraining, PriorData), "super_resolution": (SuperResolutionTraining, SuperResolutionData),
-          "refiner": (RefinerTraining, PriorData), "lifted": (LiftedTraining, PriorData)}
+          "refiner": (RefinerTraining, PriorData), "lifted": (LiftedTraining, PriorData),
+          "x2ct": (X2CTTraining, PriorData), "xray2ctpa": (XrayToCTPATraining, PriorData)}
 """What trains a stage, and on which data."""
 
 

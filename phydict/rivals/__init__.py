@@ -5,6 +5,8 @@ from phydict.rivals.lifted import LiftedNetwork
 from phydict.rivals.method import RivalAnswer, TrainedRival
 from phydict.rivals.network import RivalNetwork
 from phydict.rivals.rival import Rival
+from phydict.rivals.x2ct import PatchDiscriminator, X2CTNetwork
+from phydict.rivals.xray2ctpa import XrayToCTPANetwork
 
-__all__ = ["NETWORKS", "LiftedNetwork", "Rival", "RivalAnswer", "RivalNetwork", "TrainedRival", "build_rival",
-           "load_rival", "save_rival"]
+__all__ = ["NETWORKS", "LiftedNetwork", "PatchDiscriminator", "Rival", "RivalAnswer", "RivalNetwork", "TrainedRival",
+           "X2CTNetwork", "XrayToCTPANetwork", "build_rival", "load_rival", "save_rival"]

@@ -13,10 +13,13 @@ from phydict.prior.files import ADVICE, built_network, read_stage, window_of, wr
 from phydict.rivals.lifted import LiftedNetwork
 from phydict.rivals.network import RivalNetwork
 from phydict.rivals.rival import Rival
+from phydict.rivals.x2ct import X2CTNetwork
+from phydict.rivals.xray2ctpa import XrayToCTPANetwork
 from phydict.runtime.reading import refusing
 from phydict.xray import ConeBeam
 
-NETWORKS: dict[str, type[RivalNetwork]] = {network.stage: network for network in (LiftedNetwork,)}
+NETWORKS: dict[str, type[RivalNetwork]] = {
+    network.stage: network for network in (LiftedNetwork, X2CTNetwork, XrayToCTPANetwork)}
 """The networks by the name that a file's header calls them."""
 
 

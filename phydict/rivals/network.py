@@ -40,7 +40,8 @@ class RivalNetwork(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, y: Tensor, *geometry: Tensor) -> Tensor:
-        """X-rays y (B, K, V, U) -> CT (B, 1, X, Y, Z) in [-1, 1], without clipping."""
+        """X-rays y (B, K, V, U) -> CT (B, 1, X, Y, Z) in [-1, 1], without clipping; of a diffusion, what a step of its
+        training calls, with the arguments of `inputs`."""
 
     def steps(self) -> int:
         """How often `reconstruct` calls on_step."""
@@ -54,6 +55,6 @@ class RivalNetwork(nn.Module, ABC):
         return found
 
     def inputs(self, grid: Grid, beam: ConeBeam) -> tuple[Tensor, ...]:
-        """Arguments of `forward` for zero X-rays of one case."""
+        """Arguments of `forward` for one case, all zeros but for what they tell of the geometry."""
         y = torch.zeros(1, beam.views, *beam.shape)
         return y, *self.geometry(grid, beam, y)

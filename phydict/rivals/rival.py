@@ -11,28 +11,27 @@ from phydict.grid import Grid
 from phydict.prior.files import FORMAT
 from phydict.rivals.network import RivalNetwork
 from phydict.units import HUWindow
-from phydict.xray import ConeBeam
+from phydict.xray import ConeBeam, binning
 
 WATER_MM = 200.0
 """mm of water that the networks take as 1."""
 
-SAME_MM = 0.5
-"""mm by which sources, detectors and pixels may differ from those of the training."""
+SAME_MM = 0.01
+"""mm by which sources, detectors' centres and pixels' sides may differ from those of the training."""
 
 
 def benchmark_orbit(grid: Grid, views: int, arc_degrees: float = 360.0) -> ConeBeam:
-    """The benchmarks' orbit where the grid has 384 mm, in proportion for others, with a detector of about the grid's
-    resolution: on 64^3 voxels the one that `phydict.methods.fit_to_grid` bins the detector of 448^2 pixels to."""
-    scale, side = grid.extent[0] / 384, grid.shape[0]
-    pixels = 112 * side // 64
-    return ConeBeam.orbit(views, 1020 * scale, 740 * scale, (pixels, pixels), 5 * 64 / side * scale,
-                          arc_degrees=arc_degrees)
+    """The benchmarks' orbit where the grid has 384 mm, in proportion for others, its detector of 448^2 pixels binned to
+    what the grid can hold."""
+    scale = grid.extent[0] / 384
+    beam = ConeBeam.orbit(views, 1020 * scale, 740 * scale, (448, 448), 1.25 * scale, arc_degrees=arc_degrees)
+    return beam.binned(binning(grid, beam))
 
 
 class Rival(nn.Module):
     """A network, and what it holds for.
 
-    beam: the geometry of a bound network, its detector binned as `phydict.methods.fit_to_grid` does; None for others.
+    beam: the geometry of a bound network, its detector binned to what the grid can hold; None for others.
     Raises ValueError where the grid does not suit the network, or where one of beam and network is bound alone.
     """
 

@@ -188,11 +188,13 @@ def _text_encoder(text: TextSettings, network: VolumeUNet) -> TextEncoder | None
 
 
 def reconstruction_scores(prior: Prior | Refiner | Rival, ct: Tensor, views: int, seed: int,
-                          method: str | Sampler | Reconstructor = DEFAULT_METHOD) -> dict[str, float]:
+                          method: str | Sampler | Reconstructor = DEFAULT_METHOD,
+                          beam: ConeBeam | None = None) -> dict[str, float]:
     """SSIM, PSNR (dB) and MAE (HU) of a method's reconstruction, without a report, from ideal X-rays of a CT
-    (1, 1, X, Y, Z) in the prior's range, on an orbit that is the benchmarks' where the cube has 384 mm."""
-    scale = prior.grid.shape[0] * prior.grid.spacing[0] / 384
-    beam = ConeBeam.orbit(views, 1020 * scale, 740 * scale, (448, 448), 1.25 * scale)
+    (1, 1, X, Y, Z) in the prior's range, on `beam` or an orbit that is the benchmarks' where the cube has 384 mm."""
+    if beam is None:
+        scale = prior.grid.shape[0] * prior.grid.spacing[0] / 384
+        beam = ConeBeam.orbit(views, 1020 * scale, 740 * scale, (448, 448), 1.25 * scale)
     exact = Projector(prior.grid, beam, device=ct.device, full_detector=True)
     found = reconstruct(Ideal()(exact, prior.window.to_mu(ct), seed)[0], beam, prior, method, seed=seed,
                         grid=prior.grid)

@@ -17,6 +17,7 @@ from phydict.training.scenes import Scenes
 from phydict.training.settings import Optimisation, RefinerValidation
 from phydict.training.stage import StageTraining
 from phydict.units import HUWindow
+from phydict.xray import ConeBeam
 
 MEAN_DRAWS = 4
 """Noise draws over which the prior's estimate at time 1 is averaged."""
@@ -108,12 +109,13 @@ def log_error(x0: Tensor, ct: Tensor, body_weight: float) -> Tensor:
 
 
 def log_scores(module: StageTraining, batch: dict, index: int, views: Sequence[int],
-               method: Sampler | Reconstructor) -> None:
-    """Logs how well a training's network reconstructs a held-out case from each of these numbers of X-rays."""
+               method: Sampler | Reconstructor, beam: ConeBeam | None = None) -> None:
+    """Logs how well a training's network reconstructs a held-out case from each of these numbers of X-rays, or from
+    those of `beam`."""
     scores = []
     with torch.autocast(module.device.type, enabled=False):
         for count in views:
-            found = reconstruction_scores(module.prior, batch["volume"], count, index, method)
+            found = reconstruction_scores(module.prior, batch["volume"], count, index, method, beam)
             module.log(f"val/psnr_{count}", found["psnr"], sync_dist=True, batch_size=1)
             scores.append(found)
     for name in ("psnr", "ssim"):

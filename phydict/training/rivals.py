@@ -51,7 +51,7 @@ class RivalTraining(StageTraining):
         return torch.stack(losses).mean()
 
     def validation_step(self, batch: dict, index: int) -> None:
-        log_scores(self, batch, index, self.validation_views, RivalAnswer(self.prior))
+        log_scores(self, batch, index, self.validation_views, RivalAnswer(self.prior), self.prior.beam)
 
     def _describe(self) -> dict:
         return self.prior.describe()

@@ -7,6 +7,8 @@ import torch
 from prior.tiny import tiny_prior
 from rivals.tiny_rivals import GRID, WINDOW, body, tiny_lifted
 
+from phydict.cli.infer import main as infer
+from phydict.evaluation import read_csv
 from phydict.grid import Grid
 from phydict.methods import reconstruct
 from phydict.prior import load_prior, save_prior
@@ -32,6 +34,18 @@ def test_a_rivals_file_gives_it_back(file):
     again = reconstruct(xrays(), ORBIT, method=RivalAnswer(tiny_lifted(), precision="float32"), grid=GRID)
     assert torch.equal(found.volume, again.volume) and found.network_calls == 1 and found.precision == "float32"
     assert -1000 <= found.volume.min() < found.volume.max() <= 600
+
+
+def test_the_command_line_takes_a_rivals_file(file, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    args = ["test", "--data.cts=phantom", "--data.phantoms=1", "--data.orbit.views=2", "--model.out=out",
+            "--model.method=phydict.rivals.TrainedRival", f"--model.method.init_args.file={file}",
+            "--model.name=lifted"]
+    infer([*args, "--model.cube.voxels=16"])
+    assert len(read_csv(tmp_path / "out" / "lifted" / "results.csv")) == 1
+    with pytest.raises(SystemExit):
+        infer([*args, "--model.cube.voxels=32", "--model.overwrite=true"])
+    assert "trained on (16, 16, 16) voxels" in capsys.readouterr().err
 
 
 def test_hu_do_not_depend_on_what_water_attenuates(file):

@@ -13,17 +13,33 @@ from phydict.cli.train import main
 from phydict.datasets import phantom_case
 from phydict.evaluation import read_csv
 from phydict.grid import Cube
-from phydict.rivals import LiftedNetwork, load_rival
-from phydict.training.rivals import LiftedTraining
+from phydict.rivals import LiftedNetwork, X2CTNetwork, XrayToCTPANetwork, load_rival
+from phydict.training.rivals import LiftedTraining, OrbitScenes
+from phydict.training.x2ct import Adversary, X2CTTraining
+from phydict.training.xray2ctpa import XrayToCTPATraining
 from phydict.units import HUWindow
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "rivals"
 TINY = {"lifted": ["--model.network.class_path=phydict.rivals.LiftedNetwork",
                    "--model.network.init_args.image_channels=[4,6]", "--model.network.init_args.fine=2",
                    "--model.network.init_args.coarse=4", "--model.network.init_args.channels=[4,6,8]",
-                   "--model.scenes.most_views=4", "--model.validation.views=[2]"]}
+                   "--model.scenes.most_views=4", "--model.validation.views=[2]"],
+        "x2ct": ["--model.network.class_path=phydict.rivals.X2CTNetwork", "--model.network.init_args.stem=8",
+                 "--model.network.init_args.growth=4", "--model.network.init_args.blocks=[2,2]",
+                 "--model.network.init_args.channels=[4,8,8]", "--model.scenes.views=2",
+                 "--model.adversary.width=4"],
+        "xray2ctpa": ["--model.network.class_path=phydict.rivals.XrayToCTPANetwork",
+                      "--model.network.init_args.image_channels=[4,4]", "--model.network.init_args.embedding=8",
+                      "--model.network.init_args.slice_channels=[4,8]", "--model.network.init_args.channels=[4,8]",
+                      "--model.network.init_args.ddim_steps=4", "--model.scenes.views=2",
+                      "--model.latent.autoencoder_steps=3", "--trainer.check_val_every_n_epoch=1"]}
 TASKS = {"lifted": lambda: LiftedTraining(lively(lambda: LiftedNetwork((4, 6), 2, 4, (4, 6, 8))),
-                                          cube=Cube(16), window=(-1000, 600))}
+                                          cube=Cube(16), window=(-1000, 600)),
+         "x2ct": lambda: X2CTTraining(lively(lambda: X2CTNetwork(8, 4, (2, 2), (4, 8, 8))), OrbitScenes(views=2),
+                                      Cube(16), (-1000, 600), adversary=Adversary(width=4)),
+         "xray2ctpa": lambda: XrayToCTPATraining(
+             lively(lambda: XrayToCTPANetwork((4, 4), 8, (4, 8), (4, 8), 4)), OrbitScenes(views=2), Cube(16),
+             (-1000, 600))}
 
 
 def arguments(name: str, folder: Path, cache: Path, *more: str) -> list[str]:  # noqa: F811
@@ -74,6 +90,14 @@ def test_the_loss_follows_from_its_key_alone(name):
     with torch.no_grad():
         one, again, other = (float(task.batch_loss(batch, key)) for key in ((1,), (1,), (2,)))
     assert one == again != other
+
+
+def test_validation_takes_the_x_rays_that_a_bound_rival_holds_for(monkeypatch):
+    task, found = X2CTTraining(X2CTNetwork(8, 4, (2, 2), (4, 8, 8)), OrbitScenes(views=2, arc_degrees=180.0), Cube(16),
+                               (-1000, 600)).eval(), {}
+    monkeypatch.setattr(task, "log", lambda name, value, **how: found.update({name: value}))
+    task.validation_step(default_collate([phantom_case(3, GRID, HUWindow(-1000, 600))]), 0)
+    assert found["val/psnr"] == found["val/psnr_2"] > 5
 
 
 def test_training_that_cannot_be_is_refused(tmp_path, cache, capsys):  # noqa: F811

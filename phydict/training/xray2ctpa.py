@@ -1,0 +1,124 @@
+"""Training of X-ray2CTPA: its autoencoder first, then the diffusion of its latents."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from safetensors.torch import load_file
+from torch import Tensor, nn
+from torch.nn.functional import l1_loss
+
+from phydict.diffusion.steps import noise_like
+from phydict.grid import Cube
+from phydict.rivals import Rival, XrayToCTPANetwork
+from phydict.rivals.rival import WATER_MM, benchmark_orbit
+from phydict.runtime.reading import refusing
+from phydict.training.rivals import OrbitScenes, RivalTraining
+from phydict.training.settings import Optimisation
+from phydict.units import HUWindow
+from phydict.xray import ConeBeam
+
+FORGOTTEN = 0.01
+"""By which share a new case moves the size of the latents."""
+
+
+@dataclass(frozen=True)
+class LatentSettings:
+    """The parts around the diffusion.
+
+    Args:
+        autoencoder_steps: of the training, the first, in which the autoencoder learns and nothing else
+        slices: of a case, that each of them takes
+        kl_weight: of the latents' divergence from a normal distribution beside the mean absolute error
+        autoencoder: a .safetensors file of weights of MONAI's AutoencoderKL of the network's slice_channels, to begin
+            with; with autoencoder_steps 0 they are kept
+        encoder: a .safetensors file of weights of the network's XrayEmbedding, to begin with
+    """
+
+    autoencoder_steps: int = 4000
+    slices: int = 8
+    kl_weight: float = 1e-6
+    autoencoder: str | None = None
+    encoder: str | None = None
+
+    def __post_init__(self):
+        if self.autoencoder_steps < 0 or self.slices < 1 or not 0 <= self.kl_weight < 1:
+            raise ValueError("model.latent has autoencoder_steps of 0 or more, slices of 1 or more and a kl_weight in "
+                             f"[0, 1), but {self.autoencoder_steps}, {self.slices} and {self.kl_weight} were given")
+
+
+class XrayToCTPATraining(RivalTraining):
+    """Learns an XrayToCTPANetwork: mean absolute error of slices, then of the noise in their latents.
+
+    Args:
+        network: the network; none given: the default XrayToCTPANetwork
+        scenes: the X-rays, of one geometry
+        cube: of voxels
+        window: HU that the range [-1, 1] stands for
+        optimisation: how the weights are learnt
+        latent: the autoencoder's training, and weights of one's own
+        initial: a rival's file to go on from
+        seed: of noise, slices and times
+    """
+
+    def __init__(self, network: XrayToCTPANetwork | None = None, scenes: OrbitScenes = OrbitScenes(),
+                 cube: Cube = Cube(), window: tuple[float, float] = (-1000.0, 1000.0),
+                 optimisation: Optimisation = Optimisation(1e-4), latent: LatentSettings = LatentSettings(),
+                 initial: str | None = None, seed: int = 0):
+        network, grid = network or XrayToCTPANetwork(), cube.grid()
+        for part in ("autoencoder", "encoder"):
+            if file := getattr(latent, part):
+                _load_own(getattr(network, part), file, f"model.latent.{part}")
+        made = Rival(network, grid, HUWindow(*window), benchmark_orbit(grid, scenes.views, scenes.arc_degrees))
+        super().__init__(made, scenes, (scenes.views,), optimisation, initial, seed)
+        self.latent = latent
+
+    @property
+    def learns_slices(self) -> bool:
+        """Whether the autoencoder is being learnt, before the diffusion."""
+        return self.global_step < self.latent.autoencoder_steps
+
+    def case_loss(self, ct: Tensor, water: Tensor, beam: ConeBeam, generator: torch.Generator) -> Tensor:
+        if self.learns_slices:
+            return self._slices_loss(ct, generator)
+        network, y = self.prior.network, water / WATER_MM
+        with torch.no_grad():
+            latent = network.latent(ct).float()
+            if not network.largest:  # the autoencoder came with weights of its own
+                network.largest.copy_(latent.abs().max())
+            x0 = (latent / network.largest).clamp(-1, 1)
+        noise, t = noise_like(x0, generator), torch.rand(1, generator=generator).to(x0)
+        signal, sigma = (scale.view(-1, 1, 1, 1, 1) for scale in network.schedule.scales(t))
+        directions, _ = network.geometry(self.prior.grid, beam, y)
+        return l1_loss(network(signal * x0 + sigma * noise, t, y, directions).float(), noise)
+
+    def _slices_loss(self, ct: Tensor, generator: torch.Generator) -> Tensor:
+        network = self.prior.network
+        chosen = torch.randperm(ct.shape[-1], generator=generator)[:self.latent.slices]
+        slices = ct[0, :, :, :, chosen.to(ct.device)].permute(3, 0, 1, 2)
+        mean, std = (part.float() for part in network.autoencoder.encode(slices))
+        with torch.no_grad():
+            share = FORGOTTEN if network.largest else 1.0
+            network.largest.lerp_(mean.abs().max(), share)
+        divergence = (mean.square() + std.square() - 1 - 2 * std.clamp(min=1e-12).log()).mean() / 2
+        again = network.autoencoder.decode(mean + std * noise_like(mean, generator))
+        return l1_loss(again.float(), slices) + self.latent.kl_weight * divergence
+
+    def validation_step(self, batch: dict, index: int) -> None:
+        if not self.learns_slices:
+            super().validation_step(batch, index)
+
+
+def _load_own(part: nn.Module, file: str, option: str) -> None:
+    """Gives a part of a network the weights of a user's file. Raises ValueError where they are not its own."""
+    if not Path(file).is_file():
+        raise ValueError(f"there is no file {file}: give another {option}, a .safetensors file of weights")
+    with refusing(file, f"give another {option}"):
+        try:
+            part.load_state_dict(load_file(file))
+        except RuntimeError as error:
+            raise ValueError(f"{file} does not hold the weights of this {type(part).__name__} "
+                             f"({str(error).splitlines()[-1].strip()}): give another {option}, or the network's "
+                             "settings that it was trained with") from error

@@ -1,0 +1,99 @@
+"""X2CT-GAN for K views: views' frames in the grid's, the published case among them, one geometry, separate losses."""
+
+import numpy as np
+import pytest
+import torch
+from rivals.tiny_rivals import GRID, body, lively, tiny_x2ct
+from torch.nn.functional import mse_loss
+
+from phydict.grid import Cube, Grid
+from phydict.methods import reconstruct
+from phydict.rivals import Rival, RivalAnswer, X2CTNetwork, load_rival, save_rival
+from phydict.rivals.planes import on_planes, plane_places, turned, turns
+from phydict.rivals.rival import benchmark_orbit
+from phydict.training.rivals import OrbitScenes
+from phydict.training.x2ct import Adversary, X2CTTraining
+from phydict.units import MU_WATER
+from phydict.xray import ConeBeam, Projector
+
+
+def test_views_at_right_angles_are_turned_by_permuting_axes():
+    """At 0 degrees depth runs anterior, columns to the left, rows down; at 90 degrees depth runs right, columns
+    anterior."""
+    volumes = torch.randn(1, 2, 3, *GRID.shape, generator=torch.Generator().manual_seed(0))
+    beam = benchmark_orbit(GRID, 2, 180.0)
+    first, second = turned(volumes, turns(GRID, beam, volumes))[0]
+    torch.testing.assert_close(first, volumes[0, 0].permute(0, 3, 1, 2).flip(1, 3), atol=1e-5, rtol=0)
+    torch.testing.assert_close(second, volumes[0, 1].permute(0, 1, 3, 2).flip(3), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("voxel", [(8, 7, 8), (6, 9, 7), (9, 8, 10)])
+def test_a_point_near_the_isocentre_is_lifted_to_its_place(voxel):
+    volume = torch.zeros(1, 1, *GRID.shape)
+    volume[(0, 0, *voxel)] = 1
+    beam = benchmark_orbit(GRID, 5)
+    y = Projector(GRID, beam, "siddon", full_detector=True)(volume)
+    network = X2CTNetwork(8, 4, (2, 2), (4, 8, 8))
+    mean = network.lifted(y, *network.geometry(GRID, beam, y)).mean(1)
+    assert np.unravel_index(int(mean.argmax()), GRID.shape) == voxel
+
+
+def test_an_image_on_the_plane_of_the_isocentre_keeps_places_in_mm():
+    """A detector whose pixels are voxels magnified is its own image."""
+    magnified = GRID.spacing[0] * 1020 / 740
+    beam = ConeBeam.orbit(3, 1020, 740, (16, 16), magnified)
+    y = torch.randn(2, 3, 16, 16, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(on_planes(y, plane_places(GRID, beam, y)), y, atol=1e-4, rtol=0)
+
+
+def test_views_in_another_order_give_the_same_ct():
+    rival, order = tiny_x2ct(views=3), [2, 0, 1]
+    y = 100 + 30 * torch.randn(1, 3, *rival.beam.shape, generator=torch.Generator().manual_seed(0))
+    one, other = rival(y, rival.beam), rival(y[:, order], rival.beam.select(order))
+    torch.testing.assert_close(one, other, atol=1e-4, rtol=0)
+    assert one.std() > 1e-3
+
+
+def test_another_number_of_views_geometry_or_grid_is_refused(tmp_path):
+    save_rival(tiny_x2ct(), tmp_path / "x2ct.safetensors")
+    method = RivalAnswer(load_rival(tmp_path / "x2ct.safetensors"))
+    for beam, said in ((benchmark_orbit(GRID, 3), "trained for 2 X-rays, but 3 were given"),
+                       (benchmark_orbit(GRID, 2, 180.0), "one geometry of its 2 views"),
+                       (ConeBeam.orbit(2, 1020, 740, (20, 28), 20.0), "28 x 28 pixels, but another")):
+        y = Projector(GRID, beam, full_detector=True)(body() + 1)[0] * MU_WATER
+        with pytest.raises(ValueError, match=said):
+            reconstruct(y, beam, method=method, grid=GRID)
+    with pytest.raises(ValueError, match="cube of 16 voxels a side"):
+        tiny_x2ct(Grid.cube(32))
+    with pytest.raises(ValueError, match="bound to one geometry, but none"):
+        Rival(X2CTNetwork(8, 4, (2, 2), (4, 8, 8)), GRID, tiny_x2ct().window)
+    with pytest.raises(ValueError, match="one more of channels"):
+        X2CTNetwork(blocks=(2, 2))
+    with pytest.raises(ValueError, match="adversary.width"):
+        Adversary(width=0)
+    with pytest.raises(ValueError, match="differ in 'beam'"):
+        X2CTTraining(X2CTNetwork(8, 4, (2, 2), (4, 8, 8)), OrbitScenes(views=3), Cube(16), (-1000, 600),
+                     initial=str(tmp_path / "x2ct.safetensors"))
+
+
+def test_the_discriminator_learns_from_its_own_loss_alone_and_the_generator_from_the_others():
+    """One backward pass of the sum gives the gradients of two passes, one for each network."""
+    task = X2CTTraining(lively(lambda: X2CTNetwork(8, 4, (2, 2), (4, 8, 8))), OrbitScenes(views=2), Cube(16),
+                        (-1000, 600), adversary=Adversary(width=4)).eval().double()
+    ct, beam, adversary = body().double(), task.prior.beam, task.discriminator
+    water = Projector(GRID, beam, full_detector=True)(ct + 1)
+    task.case_loss(ct, water, beam, torch.Generator().manual_seed(0)).backward()
+    found = {name: weight.grad.clone() for name, weight in task.named_parameters()}
+    task.zero_grad()
+    made, real = (task.prior(water, beam) + 1) / 2, (ct + 1) / 2
+    lifted = task.prior.network.lifted(water / 200, *task.prior.network.geometry(GRID, beam, water))
+    one, zero = adversary(real, lifted), adversary(made.detach(), lifted)
+    ((one - 1).square().mean() / 2 + zero.square().mean() / 2).backward()
+    expected = {name: weight.grad.clone() for name, weight in adversary.named_parameters()}
+    adversary.requires_grad_(False)
+    projected = sum((made.mean(axis) - real.mean(axis)).abs().mean() for axis in (2, 3, 4)) / 3
+    (0.1 * (adversary(made, lifted) - 1).square().mean() + 10 * mse_loss(made, real) + 10 * projected).backward()
+    for name, gradient in found.items():
+        part, _, inner = name.partition(".")
+        other = expected[inner] if part == "discriminator" else task.get_parameter(name).grad
+        torch.testing.assert_close(gradient, other)

@@ -1,0 +1,93 @@
+"""X-ray2CTPA for K views: sampling ends where its noise says, views in any order, one seed one volume."""
+
+import pytest
+import torch
+from rivals.tiny_rivals import GRID, body, lively, tiny_xray2ctpa
+from safetensors.torch import save_file
+
+from phydict.grid import Cube, Grid
+from phydict.methods import reconstruct
+from phydict.rivals import RivalAnswer, XrayToCTPANetwork
+from phydict.rivals.rival import WATER_MM, benchmark_orbit
+from phydict.training.rivals import OrbitScenes
+from phydict.training.xray2ctpa import LatentSettings, XrayToCTPATraining
+from phydict.units import MU_WATER
+from phydict.xray import Projector
+
+BEAM = benchmark_orbit(GRID, 2)
+
+
+def water(beam=BEAM) -> torch.Tensor:
+    return Projector(GRID, beam, full_detector=True)(body() + 1) * 0.8
+
+
+def task(**latent) -> XrayToCTPATraining:
+    return XrayToCTPATraining(lively(lambda: XrayToCTPANetwork((4, 4), 8, (4, 8), (4, 8), 4)), OrbitScenes(views=2),
+                              Cube(16), (-1000, 600), latent=LatentSettings(**latent))
+
+
+@torch.no_grad()
+def test_sampling_ends_at_the_latent_whose_noise_is_found(monkeypatch):
+    network, y = tiny_xray2ctpa().network, water() / WATER_MM
+    geometry = network.geometry(GRID, BEAM, y)
+    wanted = torch.rand(1, *geometry[1].shape, generator=torch.Generator().manual_seed(0)) - 0.5
+
+    def knows(x, t, condition):
+        signal, sigma = network.schedule.scales(t)
+        return (x - signal * wanted) / sigma
+
+    monkeypatch.setattr(network, "denoiser", torch.nn.Identity())
+    monkeypatch.setattr(network.denoiser, "forward", knows)
+    found = network.reconstruct(y, geometry, torch.Generator().manual_seed(1))
+    torch.testing.assert_close(found, network.decoded(wanted), atol=1e-4, rtol=0)
+
+
+def test_the_seed_decides_the_volume_and_the_xrays_condition_it():
+    method, y = RivalAnswer(tiny_xray2ctpa(), precision="float32"), water()[0] * MU_WATER
+    one, again, other = (reconstruct(y, BEAM, method=method, grid=GRID, seed=seed).volume for seed in (1, 1, 2))
+    assert torch.equal(one, again) and not torch.allclose(one, other, atol=1)
+    assert not torch.allclose(one, reconstruct(y.flip(2), BEAM, method=method, grid=GRID, seed=1).volume, atol=1e-2)
+
+
+@torch.no_grad()
+def test_views_in_another_order_give_the_same_ct():
+    rival = tiny_xray2ctpa()
+    one, other = (rival.reconstruct(y, beam, torch.Generator().manual_seed(0)) for y, beam in (
+        (water(), BEAM), (water()[:, [1, 0]], BEAM.select([1, 0]))))
+    torch.testing.assert_close(one, other, atol=1e-4, rtol=0)
+
+
+def test_each_part_learns_in_its_own_time():
+    first, then = task(autoencoder_steps=1), task(autoencoder_steps=0)
+    for training, learnt in ((first, "autoencoder"), (then, "denoiser"), (then, "encoder")):
+        training.zero_grad()
+        training.case_loss(body(), water(), BEAM, torch.Generator().manual_seed(0)).backward()
+        moved = {name.split(".")[2] for name, weight in training.named_parameters() if weight.grad is not None}
+        assert learnt in moved and ("autoencoder" in moved) == (training is first)
+    assert first.prior.network.largest > 0 and then.prior.network.largest > 0
+
+
+def test_ones_own_weights_are_taken_and_others_are_refused(tmp_path):
+    own, file = task(), str(tmp_path / "own.safetensors")
+    save_file(own.prior.network.autoencoder.state_dict(), file)
+    other = XrayToCTPANetwork((4, 4), 8, (4, 8), (4, 8), 4)
+    settings = {"scenes": OrbitScenes(views=2), "cube": Cube(16), "window": (-1000, 600)}
+    taken = XrayToCTPATraining(other, latent=LatentSettings(0, autoencoder=file), **settings)
+    for name, weight in own.prior.network.autoencoder.state_dict().items():
+        assert torch.equal(weight, taken.prior.network.autoencoder.state_dict()[name])
+    with pytest.raises(ValueError, match="does not hold the weights of this XrayEmbedding"):
+        XrayToCTPATraining(other, latent=LatentSettings(encoder=file), **settings)
+    with pytest.raises(ValueError, match=r"nowhere\.safetensors"):
+        XrayToCTPATraining(other, latent=LatentSettings(encoder=str(tmp_path / "nowhere.safetensors")), **settings)
+
+
+def test_what_it_is_not_for_is_refused():
+    method, beam = RivalAnswer(tiny_xray2ctpa()), benchmark_orbit(GRID, 3)
+    with pytest.raises(ValueError, match="trained for 2 X-rays, but 3 were given"):
+        reconstruct(water(beam)[0] * MU_WATER, beam, method=method, grid=GRID)
+    with pytest.raises(ValueError, match="divisible by 4"):
+        tiny_xray2ctpa(Grid.cube(18))
+    with pytest.raises(ValueError, match="multiples of 4"):
+        XrayToCTPANetwork(channels=(6, 8))
+    with pytest.raises(ValueError, match=r"model\.latent"):
+        LatentSettings(slices=0)

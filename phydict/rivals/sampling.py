@@ -15,12 +15,12 @@ HIDDEN = -1e4
 """What the maximum over views starts from, below any feature."""
 
 
-def halved(grid: Grid, times: int = 1) -> Grid:
-    """The box in blocks of 2^times voxels a side, each where its block's centre is."""
-    factor, affine = 2**times, grid.affine.copy()
-    affine[:3, 3] += grid.affine[:3, :3] @ np.full(3, (factor - 1) / 2)
-    affine[:3, :3] *= factor
-    x, y, z = (n // factor for n in grid.shape)
+def halved(grid: Grid) -> Grid:
+    """The box in blocks of two voxels a side, each where its block's centre is."""
+    affine = grid.affine.copy()
+    affine[:3, 3] += grid.affine[:3, :3] @ np.full(3, 0.5)
+    affine[:3, :3] *= 2
+    x, y, z = (n // 2 for n in grid.shape)
     return Grid((x, y, z), affine=affine)
 
 

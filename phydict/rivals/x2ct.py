@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
@@ -153,31 +151,6 @@ class X2CTNetwork(RivalNetwork):
             view = self.branch[n](view, self.b[n](maps[n]))
             main = self.main[n](main, turned(view.unflatten(0, cases), theta).mean(1))
         return 2 * self.leave(main).relu() - 1
-
-
-class PatchDiscriminator(nn.Module):
-    """Whether each patch of a CT looks real beside the X-rays lifted into it (Isola et al. 2017, arXiv:1611.07004).
-
-    views: channels of X-rays; width: channels of the first layer, doubled by each of `layers`.
-    """
-
-    def __init__(self, views: int, width: int = 16, layers: int = 2):
-        super().__init__()
-        widths = [1 + views, *(width * 2**n for n in range(layers + 1))]
-        self.layers = nn.ModuleList(nn.Conv3d(a, b, 4, 2 if n < layers else 1, 1 if n < layers else 2)
-                                    for n, (a, b) in enumerate(pairwise(widths)))
-        self.leave = nn.Conv3d(widths[-1], 1, 4, 1, 1)
-        for layer in (*self.layers, self.leave):
-            nn.init.normal_(layer.weight, std=0.02)
-        speed_up(self)
-
-    def forward(self, ct: Tensor, lifted: Tensor) -> Tensor:
-        """CT (B, 1, X, Y, Z) and lifted X-rays (B, K, X, Y, Z) -> one score for each patch."""
-        h = torch.cat([ct, lifted.to(ct)], 1)
-        for n, layer in enumerate(self.layers):
-            h = layer(h)
-            h = nn.functional.leaky_relu(h if n == 0 else nn.functional.instance_norm(h), 0.2)
-        return self.leave(h)
 
 
 def _normal(h: Tensor) -> Tensor:

@@ -11,7 +11,8 @@ KINDS = {"int": "a whole number", "float": "a number", "bool": "true or false", 
 UNLOADED = re.compile(r"""Parser key "([^"]+)": Unable to load config (['"])(.*?)\2 - (Parser key .*)""")
 NESTED = re.compile(r"""Problem with given class_path '[^']*': Parser key "([^"]+)": (.*)""")
 PROBLEM = re.compile(r"Problem with given class_path '([^']*)': (.*?)(?= - | Given value type: |$)")
-GIVEN = re.compile(r"(?:Got|Given) value: (.*?)(?= Given value type: |$)|Expected a path but (.*?) either not ")
+GIVEN = re.compile(r"(?:Got|Given) value: (.*?)(?= Given value type: | Subclass types expect |$)|"
+                   r"Expected a path but (.*?) either not ")
 
 
 def plain(message: str) -> str:
@@ -38,7 +39,7 @@ def plain(message: str) -> str:
     if "is abstract" in text:
         return f"{key} is the path of a class that can be used, but {given} is abstract: give one derived from it"
     wanted = _wanted(text)
-    return f"{key} is {wanted}, but {given} was given" if wanted else ""
+    return f"{key} is {wanted}, but {given} was given" if wanted else f"{key}: {text[len(start[0]):]}"
 
 
 def _of_class(key: str, path: str, reason: str) -> str:
@@ -55,7 +56,7 @@ def _wanted(text: str) -> str:
     kinds = [KINDS[kind] for kind in re.findall(r"Expected an? <class '(\w+)'>", text) if kind in KINDS]
     kinds += [f"a list of {size}" for size in re.findall(r"Expected a tuple with (\d+) elements", text)]
     kinds += ["the path of a class"] * ("Expected a dot import path" in text)
-    kinds += [f"the path of a {name}" for name in re.findall(r"does not correspond to a subclass of (\w+)", text)]
+    kinds += [f"the path of a {name}" for name in re.findall(r"(?:to a|valid) subclass of (\w+)", text)]
     names = [name.strip(" '") for listed in re.findall(r"Expected a typing\.Literal\[(.*?)\]", text)
              for name in listed.split(",")]
     kinds += [f"one of {', '.join(dict.fromkeys(names))}"] * bool(names)

@@ -76,6 +76,8 @@ def reason(error: Exception) -> str:
     said = " ".join(str(getattr(error, "strerror", None) or error).split())[:300]
     if isinstance(error, MemoryError):
         return f"it asks for more memory than there is: {said}" if said else "it asks for more memory than there is"
+    if isinstance(error, TypeError) and said.startswith("`"):  # Lightning's words on a setting of its own
+        return said.rstrip(".")
     if isinstance(error, TypeError | AttributeError | IndexError):  # whose own words tell a user nothing
         unknown = re.search(r"unexpected keyword argument ('\w+')", said)
         return f"it has no setting {unknown[1]}" if unknown else "it holds something of another kind than expected"

@@ -74,18 +74,20 @@ TEXTS = [text.encode() for text in (
 
 @dataclass(frozen=True)
 class Target:
-    """A reader of files called `name`; samples: contents to start from; pieces: what is put into them."""
+    """A reader of files called `name`; samples: contents to start from; pieces: what is put into them; whole: the file
+    of a content, where that is a part of it."""
 
     name: str
     read: Callable[[Path], object]
     samples: Callable[[], list[bytes]]
     pieces: list[bytes]
+    whole: Callable[[bytes], bytes] = bytes
 
 
 def check(target: Target, content: bytes, folder: Path) -> bool:
     """Whether a file of this content is read; False where it is refused as it should be. Raises whatever else comes."""
     path = folder / target.name
-    path.write_bytes(content)
+    path.write_bytes(target.whole(content))
     began, read = time.process_time(), True
     try:
         with warnings.catch_warnings():
@@ -198,15 +200,23 @@ def _prior_samples() -> list[bytes]:
 
 def _with_header(header: object) -> bytes:
     """A prior's file whose header is another."""
-    raw = _prior_samples_once()[0]
-    length = struct.unpack("<Q", raw[:8])[0]
-    outer = json.loads(raw[8:8 + length])
+    outer = json.loads(_split_prior()[0])
     outer["__metadata__"]["phydict"] = json.dumps(header)
-    text = json.dumps(outer).encode()
-    return struct.pack("<Q", len(text)) + text + raw[8 + length:]
+    return _headed(json.dumps(outer).encode())
 
 
 _prior_samples_once = cache(_prior_samples)
+
+
+def _split_prior() -> tuple[bytes, bytes]:
+    """The header and the weights of a prior's file."""
+    raw = _prior_samples_once()[0]
+    end = 8 + struct.unpack("<Q", raw[:8])[0]
+    return raw[8:end], raw[end:]
+
+
+def _headed(header: bytes) -> bytes:
+    return struct.pack("<Q", len(header)) + header + _split_prior()[1]
 
 
 def _nifti(shape: tuple[int, ...], kind: str, spacing: float) -> bytes:
@@ -353,6 +363,8 @@ TARGETS = {
     "beam table": Target("g.csv", lambda path: read_beam(path, SHAPE), _beam_samples(".csv"), TEXTS),
     "beam array": Target("g.npy", lambda path: read_beam(path, SHAPE), _beam_samples(".npy"), [*TEXTS, *NUMBERS]),
     "prior": Target("p.safetensors", load_prior, _prior_samples_once, [*TEXTS, *NUMBERS]),
+    "prior's header": Target("p.safetensors", load_prior, lambda: [_split_prior()[0]], [*TEXTS, b"F16", b"I64", b'"'],
+                             _headed),
     "inspect": Target("p.safetensors", lambda path: inspect_prior(path), _prior_samples_once, [*TEXTS, *NUMBERS]),
     "NIfTI image": Target("v.nii", read_image, lambda: [_nifti(SHAPE[::-1], "f4", 1.0)], NUMBERS),
     "NIfTI CT": Target("ct.nii", load_ct, lambda: [_nifti((9, 8, 10), "i2", 30.0)], NUMBERS),

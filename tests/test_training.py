@@ -678,7 +678,7 @@ def test_a_training_is_never_written_among_its_cts(tmp_path, capsys, cache):
                                     "--model.optimisation.learning_rate=-1", "--model.optimisation.warmup=-3",
                                     "--data.loading.workers=1000000", "--model.validation.preview_steps=-1",
                                     "--model.validation.views=-1",
-                                    "--trainer.devices=99",
+                                    "--model.optimisation.learning_rate=1e38", "--trainer.devices=99",
                                     "--model.network.init_args.channels=[]", "--model.network.init_args.block=0"])
 def test_data_that_cannot_be_are_refused_by_their_option(tmp_path, capsys, cache, option):
     said = refusal(capsys, arguments(tmp_path, cache, option))

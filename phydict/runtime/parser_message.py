@@ -11,6 +11,10 @@ KINDS = {"int": "a whole number", "float": "a number", "bool": "true or false", 
 UNLOADED = re.compile(r"""Parser key "([^"]+)": Unable to load config (['"])(.*?)\2 - (Parser key .*)""")
 NESTED = re.compile(r"""Problem with given class_path '[^']*': Parser key "([^"]+)": (.*)""")
 PROBLEM = re.compile(r"Problem with given class_path '([^']*)': (.*?)(?= - | Given value type: |$)")
+UNION = "Does not validate against any of the Union subtypes"
+PARSERS = re.compile(r"Import path|Expected an? |Problem with given|Not a valid|Does not validate|Parser key|Unable to")
+"""The parser's own words on one of several types, unlike those of a class that refuses its settings."""
+
 GIVEN = re.compile(r"(?:Got|Given) value: (.*?)(?= Given value type: | Subclass types expect |$)|"
                    r"Expected a path but (.*?) either not ")
 
@@ -26,6 +30,9 @@ def plain(message: str) -> str:
     if unloaded := UNLOADED.match(text):
         return (f"{unloaded[1]} is a mapping of settings, but {_short(unloaded[3])} was given"
                 if ": Unable to load config " in unloaded[4] else plain(unloaded[4]))
+    reasons = re.split(r"\n\s*- ", message.partition("Given value type")[0])[1:] if UNION in text else []
+    if ours := [reason for reason in reasons if not PARSERS.match(reason)]:
+        return "; ".join(" ".join(reason.split()) for reason in ours)
     start = re.match(r'Parser key "([^"]+)": ', text)
     if not start:
         return ""
@@ -47,8 +54,10 @@ def _of_class(key: str, path: str, reason: str) -> str:
         return f"{key}: {path} has no setting {option[1]}"
     if reason.endswith("has no attribute 'keys'"):
         return f"{key}.init_args is a mapping of the settings of {path}, but something else was given"
-    reason = re.sub(r"module '([^']*)' has no attribute '([^']*)'", r"\1 has no \2", reason)
-    return f"{key} is the path of a class, but {path} cannot be imported ({reason})"
+    reason = re.sub(r"^module '([^']*)' has no attribute '([^']*)'", r"\1 has no \2", reason)
+    if " has no " in reason or reason.startswith("No module named"):
+        return f"{key} is the path of a class, but {path} cannot be imported ({reason})"
+    return f"{key}: {reason}"
 
 
 def _wanted(text: str) -> str:

@@ -34,6 +34,6 @@ def configuration(given: str | Path, kinds: tuple[str, ...]) -> Path:
         return own_or_shipped(given)
     files = {file.stem: file for kind in kinds for file in sorted(shipped(f"configs/{kind}").glob("*.yaml"))}
     if str(given).removesuffix(".yaml") not in files:
-        raise ValueError(f"there is no configuration {given}: give a YAML file, or the name of one that comes with the "
-                         f"project ({', '.join(files)})")
+        raise ValueError(f"there is no configuration {given or repr('')}: give a YAML file, or the name of one that "
+                         f"comes with the project ({', '.join(files)})")
     return files[str(given).removesuffix(".yaml")]

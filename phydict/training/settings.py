@@ -10,6 +10,9 @@ from phydict.datasets.population import PopulationSettings
 MOST_DRAWS, MOST_WORKERS = 10_000_000, 1000
 """Draws of an epoch are listed before it begins, and loader processes are all started then."""
 
+MOST_LEARNING_RATE = 1e30
+"""Steps of a larger one do not fit into float32."""
+
 
 @dataclass(frozen=True)
 class TextSettings:
@@ -70,6 +73,9 @@ class Optimisation:
             if not 0 <= value < math.inf:
                 raise ValueError(f"model.optimisation.{field.name} is a finite number, 0 or more, but {value} was "
                                  "given")
+        if self.learning_rate > MOST_LEARNING_RATE:
+            raise ValueError(f"model.optimisation.learning_rate is at most {MOST_LEARNING_RATE:g}, but "
+                             f"{self.learning_rate:g} was given")
 
     def factor(self, step: int) -> float:
         """The share of the learning rate at a step."""

@@ -116,9 +116,10 @@ def by_atheris(name: str, seconds: float) -> None:
                 os._exit(0)
             found.run(target, content, work)
 
-        atheris.Setup([sys.argv[0], str(corpus), f"-dict={words}", "-max_len=200000", "-rss_limit_mb=6000",
-        "-timeout=60",
-                       "-verbosity=0", f"-artifact_prefix={folder}/"], once, enable_python_coverage=True)
+        longest = max(200_000, 2 * max(map(len, target.samples())))
+        atheris.Setup([sys.argv[0], str(corpus), f"-dict={words}", f"-max_len={longest}", "-rss_limit_mb=6000",
+                       "-timeout=600", "-verbosity=0", f"-artifact_prefix={folder}/"], once,
+                      enable_python_coverage=True)
         atheris.Fuzz()
 
 

@@ -152,6 +152,8 @@ def run_tries(words: Sequence[str]) -> None:
     whole = known.issuperset(words)
     chosen = [(n, one) for n, one in chosen if not words or (
         one.group in words if whole else any(word in f"{one.group}: {one.name}" for word in words))]
+    if words and whole:
+        chosen.sort(key=lambda each: words.index(each[1].group))
     with tempfile.TemporaryDirectory(prefix="tries") as root:
         for group, members in itertools.groupby(chosen, lambda each: each[1].group):
             verdicts = [_run(one, Place(Path(root) / f"{n:04d}"), n) for n, one in members]

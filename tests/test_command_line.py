@@ -191,3 +191,9 @@ def test_the_help_of_a_class_needs_no_configuration(capsys):
     with pytest.raises(SystemExit) as stopped:
         infer(["predict", "--model.method.help=phydict.baselines.SIRT"])
     assert not stopped.value.code and "--model.method.iterations" in capsys.readouterr().out
+
+
+def test_a_picture_engine_that_is_not_there_does_not_matter():
+    run = subprocess.run([sys.executable, "-c", "import phydict.cli, matplotlib; print(matplotlib.get_backend())"],
+                         cwd=ROOT, env=os.environ | {"MPLBACKEND": "nonsense"}, capture_output=True, text=True)
+    assert run.returncode == 0 and run.stdout.lower().strip() == "agg", run.stderr

@@ -15,7 +15,8 @@ from phydict.grid import Grid
 from phydict.posterior import (
     DAPS, DDS, DPS, CascadePosterior, DiffPIR, ExactDraw, GradientSteps, PnPDM, Posterior, PriorOnly, ProximalCG,
     Reward, Sampler, SplitGibbs, Unrolled)
-from phydict.prior import Cascade, Prior, Refiner, SuperResolution, load_prior, load_super_resolution
+from phydict.prior import (
+    Cascade, PriorContract, Refiner, SuperResolution, check_prior, find_prior, load_super_resolution)
 from phydict.reconstruction import Reconstruction, Reconstructor
 from phydict.runtime.precision import check_precision
 from phydict.runtime.reading import reason
@@ -73,15 +74,16 @@ DEFAULT_METHOD = "phydict_fast"
 """The method where none is given."""
 
 
-def reconstructor(method: str | Sampler | Reconstructor, prior: Prior | Refiner | str | Path | None = None,
+def reconstructor(method: str | Sampler | Reconstructor, prior: PriorContract | Refiner | str | Path | None = None,
                   guidance: float = 1.0, name: str | None = None,
                   super_resolution: SuperResolution | str | Path | None = None, sr_guided: bool = True,
                   sr_sampler: Sampler | None = None, sr_noise_augmentation: float | None = None, samples: int = 1,
                   precision: str = "auto") -> Reconstructor:
     """A method ready to reconstruct: a name of METHODS, a sampler (which needs a prior), or a Reconstructor.
 
-    prior: a Prior, for Unrolled a Refiner, or the file it is in; None for the shipped one. It is only loaded by methods
-    that need it. name: what the result calls the method (None: its own name).
+    prior: what keeps PriorContract, as Prior does, for Unrolled a Refiner, or its file, or the path of its class; None
+    for the shipped one. It is only loaded by methods that need it. name: what the result calls the method (None: its
+    own name).
     super_resolution: the second stage of a cascade, or its file; None reconstructs on the prior's own grid. sr_guided:
     whether the X-rays guide that stage too; sr_sampler: how (None: CascadePosterior's own); sr_noise_augmentation: its
     noise (None: the stage's own).
@@ -104,7 +106,8 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: Prior | Refiner 
     if not isinstance(method, Sampler):
         raise ValueError(f"a method is a name ({', '.join(METHODS)}), a Sampler or a Reconstructor, but {method!r} was "
                          "given")
-    prior = load_prior(prior or method.default_prior) if prior is None or isinstance(prior, str | Path) else prior
+    prior = find_prior(prior or method.default_prior) if prior is None or isinstance(prior, str | Path) else prior
+    check_prior(prior)
     name = name or type(method).__name__
     if super_resolution is None:
         return Posterior(prior, method, guidance, name=name, precision=precision, samples=samples)
@@ -134,7 +137,7 @@ def fit_to_grid(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam,
                                                     full_detector=True)
 
 
-def reconstruct(xrays: Tensor, beam: ConeBeam, prior: Prior | Refiner | str | Path | None = None,
+def reconstruct(xrays: Tensor, beam: ConeBeam, prior: PriorContract | Refiner | str | Path | None = None,
                 method: str | Sampler | Reconstructor = DEFAULT_METHOD, report: str | None = None,
                 display: bool = False, seed: int = 0, guidance: float = 1.0, mu_water: float | None = None,
                 grid: Grid = Grid.cube(64), on_step=lambda: None,
@@ -145,7 +148,7 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: Prior | Refiner | str | Pa
 
     xrays: tensor or array of line integrals; with display=True, of display values with an unknown gain and offset per
     view. grid: for methods without a prior; others work on their prior's.
-    prior: a Prior, a file, or None for the shipped one; report: radiology text, if any, which `format_report` lays out.
+    prior: as for `reconstructor`; report: radiology text, if any, which `format_report` lays out.
     mu_water: attenuation in 1/mm that water has in the X-rays (None: the method's own, near 65 keV).
     super_resolution, sr_guided: the second stage of a cascade, as for `reconstructor`; the volume is then on its grid.
     samples: more than one gives their mean, and `deviation`, a map of how far they differ, as for `reconstructor`.

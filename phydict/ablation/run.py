@@ -212,8 +212,9 @@ class Runner:
 
 
 @cache
-def _on(prior: str, device: torch.device):
-    return prior_of(prior).to(device)
+def _on(file: str, device: torch.device):
+    prior = prior_of(file)
+    return prior.to(device) if isinstance(prior, torch.nn.Module) else prior
 
 
 def _attempt(work: Callable[[], object]) -> object | dict:

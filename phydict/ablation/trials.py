@@ -18,7 +18,7 @@ from phydict.inference.data import ReconstructionData
 from phydict.inference.settings import Orbit
 from phydict.methods import METHODS
 from phydict.posterior import Sampler
-from phydict.prior import fingerprint, load_prior
+from phydict.prior import PriorContract, find_prior, fingerprint
 from phydict.reconstruction import Reconstructor, describe
 from phydict.runtime.reading import reason
 from phydict.runtime.renamed import check_setting
@@ -100,7 +100,10 @@ class Trial:
         mine = {"name": self.name, "method": describe(self.method), "seed": self.seed, "grid": grid.to_dict(),
                 "window": describe(window), "data": self.data.settings("test")}
         if self.prior is not None:
-            mine |= {"prior_crc32": _crc(self.prior), "guidance": self.guidance, "samples": self.samples}
+            prior = prior_of(self.prior)
+            mine |= {"prior": prior.identity()} if isinstance(prior, PriorContract) else {
+                "prior_crc32": _crc(self.prior)}
+            mine |= {"guidance": self.guidance, "samples": self.samples}
         if self.projector != "auto":
             mine["projector"] = self.projector
         return json.loads(json.dumps(mine))
@@ -240,8 +243,8 @@ def refined_from(method: Sampler, delta: float, keep_iterations: bool = False) -
 
 @cache
 def prior_of(file: str):
-    """The prior in a file, read once."""
-    return load_prior(file)
+    """The prior in a file, or of a class, read once."""
+    return find_prior(file)
 
 
 @cache

@@ -28,7 +28,8 @@ from phydict.inference.results import CaseResults
 from phydict.inference.settings import CascadeSettings, Sampling
 from phydict.methods import fit_to_grid, reconstructor
 from phydict.posterior import CascadePosterior, Sampler
-from phydict.prior import MedSynCheckpoint, file_read, fingerprint, load_prior, load_super_resolution
+from phydict.prior import (
+    MedSynCheckpoint, PriorContract, file_read, find_prior, fingerprint, load_super_resolution)
 from phydict.reconstruction import Reconstruction, Reconstructor, describe, save_nifti
 from phydict.runtime.console import TRACEBACK, check_apart, check_writable, noted, sentence
 from phydict.runtime.precision import instruction_set
@@ -48,8 +49,8 @@ class ReconstructionTask(lightning.LightningModule):
     Args:
         method: a Sampler, which is run with the prior, or a Reconstructor
         name: what tables and folders call the method; none given: the name it was given by, or its class's
-        prior: the prior's file, or a file or folder of MedSyn's, read where the method is a Sampler; none given: the
-            method's own
+        prior: the prior's file, a file or folder of MedSyn's, or the path of a PriorContract's class, read where the
+            method is a Sampler; none given: the method's own
         sampling: how the prior is sampled
         super_resolution: a cascade's second stage, which refines what the prior gives
         out: output folder; cases go to <out>/<name>/<case>
@@ -60,7 +61,7 @@ class ReconstructionTask(lightning.LightningModule):
     """
 
     def __init__(self, method: Sampler | Reconstructor, name: str | None = None,
-                 prior: str | MedSynCheckpoint | None = None, sampling: Sampling = Sampling(),
+                 prior: PriorContract | str | MedSynCheckpoint | None = None, sampling: Sampling = Sampling(),
                  super_resolution: CascadeSettings = CascadeSettings(), out: str = "runs/reconstructions",
                  overwrite: bool = False, seed: int = 0, cube: Cube = Cube(), projector: str = "auto"):
         super().__init__()
@@ -79,10 +80,12 @@ class ReconstructionTask(lightning.LightningModule):
             self.settings["projector"] = projector
         self.grid, self.window = cube.grid(), HUWindow()
         prior = prior or (str(method.default_prior) if isinstance(method, Sampler) else None)
-        self.prior = load_prior(prior) if isinstance(method, Sampler) else None
+        self.prior = find_prior(prior) if isinstance(method, Sampler) else None
         if self.prior is not None:
             self.grid, self.window = self.prior.grid, self.prior.window
-            self.settings |= _identity("prior", prior) | {"guidance": sampling.guidance}
+            own = isinstance(self.prior, PriorContract)
+            self.settings |= {"prior": self.prior.identity()} if own else _identity("prior", prior)
+            self.settings |= {"guidance": sampling.guidance}
             if sampling.samples != 1:
                 self.settings["samples"] = sampling.samples
             if sampling.precision != "auto":

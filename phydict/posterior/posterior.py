@@ -17,7 +17,7 @@ from phydict.guard import Guard
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.samplers.sampler import Sampler
 from phydict.posterior.samplers.split_gibbs import SplitGibbs
-from phydict.prior import BoundRefiner, Prior, Refiner
+from phydict.prior import BoundRefiner, PriorContract, Refiner
 from phydict.reconstruction import Reconstruction, Reconstructor
 from phydict.runtime.precision import check_precision, precision_name
 from phydict.runtime.profiling import Stopwatch, stage
@@ -42,6 +42,9 @@ class CountingDenoiser:
         self.calls += len(x)
         with stage("network"):
             x0 = call()
+        if x0.shape != x.shape:
+            raise ValueError(f"a denoiser answers with states like those it is given, {tuple(x.shape)}, but "
+                             f"{tuple(x0.shape)} came: correct the prior's denoise, or its grid and state_channels")
         self.guard.estimate = x0.detach()
         return x0
 
@@ -69,7 +72,7 @@ class Posterior(Reconstructor):
     but for rounding, on batch.
     """
 
-    prior: Prior | Refiner
+    prior: PriorContract | Refiner
     sampler: Sampler = field(default_factory=SplitGibbs)
     guidance: float = 1.0
     mu_water: float = MU_WATER

@@ -1,6 +1,7 @@
 """The diffusion prior of CT: networks, report encoder, cascade, and their files with grid and HU window."""
 
 from phydict.prior.cascade import Cascade
+from phydict.prior.contract import PriorContract, check_prior, find_prior
 from phydict.prior.detail import DetailNetwork
 from phydict.prior.files import (
     DEFAULT_PRIOR, DEFAULT_REFINER, describe, describe_refiner, describe_super_resolution, file_read, fingerprint,
@@ -17,7 +18,7 @@ from phydict.prior.text import TextEncoder, learn_vocabulary
 from phydict.prior.unet import VolumeUNet
 
 __all__ = ["DEFAULT_PRIOR", "DEFAULT_REFINER", "STATE", "BoundPrior", "BoundRefiner", "Cascade", "DetailNetwork",
-           "LocalUNet", "MedSynCheckpoint", "MedSynPrior", "MedSynSuperResolution", "Prior", "Refiner",
-           "SuperResolution", "TextEncoder", "VolumeUNet", "describe", "describe_refiner", "describe_super_resolution",
-           "file_read", "fingerprint", "inspect_prior", "learn_vocabulary", "load_prior", "load_super_resolution",
-           "save_prior", "save_refiner", "save_super_resolution"]
+           "LocalUNet", "MedSynCheckpoint", "MedSynPrior", "MedSynSuperResolution", "Prior", "PriorContract", "Refiner",
+           "SuperResolution", "TextEncoder", "VolumeUNet", "check_prior", "describe", "describe_refiner",
+           "describe_super_resolution", "file_read", "find_prior", "fingerprint", "inspect_prior", "learn_vocabulary",
+           "load_prior", "load_super_resolution", "save_prior", "save_refiner", "save_super_resolution"]

@@ -1,0 +1,75 @@
+"""What a method asks of a prior: whatever keeps this contract takes the place of a trained one."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from importlib import import_module
+from pathlib import Path
+
+from phydict.diffusion import Denoiser
+from phydict.grid import Grid
+from phydict.prior.files import load_prior
+from phydict.prior.medsyn.checkpoint import MedSynCheckpoint
+from phydict.runtime.reading import reason
+from phydict.units import HUWindow
+
+
+class PriorContract(ABC):
+    """A prior of one's own: derive from it, in an importable module, and give its object to `phydict.reconstruct`, or
+    the path of its class, such as my_module.MyPrior, to `--model.prior`.
+
+    grid, window: where the volumes live, and the HU that x = -1 and 1 stand for; state_channels: channels of the state,
+    the CT first, then soft masks in [-1, 1]; reads_text: whether `bind` takes a report; ends_at_zero: whether its own
+    sampling ends with a call at time 0 (see PriorOnly). A torch.nn.Module is moved to the device of the X-rays; others
+    answer on the device of x.
+    """
+
+    grid: Grid
+    window: HUWindow
+    state_channels: int = 1
+    reads_text: bool = False
+    ends_at_zero: bool = False
+
+    @abstractmethod
+    def bind(self, report: str, guidance: float, precision: str) -> Denoiser:
+        """The denoiser of states (B, state_channels, *grid.shape) for one report, "" for none: `denoise(x, t)`, the
+        estimate of the clean state, and `schedule`, such as CosineSchedule().
+
+        guidance: scale of classifier-free guidance; precision: see phydict.runtime.precision.
+        """
+
+    def identity(self) -> dict:
+        """What decides its answers, as plain JSON values: its class and those of its attributes that are plain. A prior
+        with weights adds their checksum, so that results of others are not taken for its own."""
+        plain = {name: value for name, value in vars(self).items() if isinstance(value, str | int | float | None)}
+        return {"class": f"{type(self).__module__}.{type(self).__qualname__}"} | plain
+
+
+def check_prior(prior: object) -> None:
+    """Raises ValueError unless an object keeps the contract; it need not derive from PriorContract."""
+    kinds = {"grid": Grid, "window": HUWindow, "state_channels": int}
+    bad = [name for name, kind in kinds.items() if not isinstance(getattr(prior, name, None), kind)]
+    bad += [] if callable(getattr(prior, "bind", None)) else ["bind"]
+    if bad:
+        raise ValueError("a prior has a grid (Grid), a window (HUWindow), state_channels (int) and a method bind, but "
+                         f"{type(prior).__name__} lacks {', '.join(bad)}: see phydict.prior.PriorContract")
+
+
+def find_prior(given: str | Path | MedSynCheckpoint | PriorContract):
+    """The prior that is given: an object that keeps the contract, what `load_prior` reads, or one with its defaults by
+    the path of its class.
+
+    Raises as `load_prior`, and ValueError where the class cannot be imported or made, or keeps no contract.
+    """
+    if isinstance(given, PriorContract):
+        return given
+    module, _, name = str(given).rpartition(".")
+    if isinstance(given, MedSynCheckpoint | Path) or not (module and name[:1].isupper()) or Path(given).exists():
+        return load_prior(given)
+    try:
+        prior = getattr(import_module(module), name)()
+    except (Exception, SystemExit) as error:  # of whatever kind: another's code runs
+        raise ValueError(f"the prior {given} cannot be made ({reason(error)}): its module must be importable, and its "
+                         "settings need defaults") from error
+    check_prior(prior)
+    return prior

@@ -1,0 +1,116 @@
+"""A prior of one's own takes the place of a trained one, in Python and on the command line."""
+
+import json
+import re
+
+import pytest
+import torch
+import yaml
+
+import phydict
+from phydict.cli.infer import main as infer
+from phydict.methods import reconstructor
+from phydict.prior import find_prior
+
+MODULE = '''
+from dataclasses import dataclass
+
+import torch
+
+from phydict.diffusion import CosineSchedule
+from phydict.grid import Grid
+from phydict.prior import PriorContract
+from phydict.units import HUWindow
+
+
+@dataclass(frozen=True)
+class Mean:
+    """Answers with blurred states, drawn towards `hu`."""
+
+    x0: float
+    schedule: CosineSchedule = CosineSchedule()
+
+    def denoise(self, x, t):
+        signal, noise = (float(w) for w in self.schedule.scales(t))
+        smooth = torch.nn.functional.avg_pool3d(x, 3, 1, 1, count_include_pad=False) / signal
+        return torch.lerp(smooth, torch.full_like(x, self.x0), noise**2)
+
+
+class OwnPrior(PriorContract):
+    grid, window = Grid.cube(16), HUWindow()
+
+    def __init__(self, hu: float = -500.0):
+        self.hu = hu
+
+    def bind(self, report, guidance, precision):
+        return Mean(float(self.window.to_range(torch.tensor(self.hu))))
+
+
+class Shapeless(OwnPrior):
+    def bind(self, report, guidance, precision):
+        denoiser = super().bind(report, guidance, precision)
+        object.__setattr__(denoiser, "denoise", lambda x, t: x[..., :1])
+        return denoiser
+
+
+class Unbound:
+    grid, window, state_channels = Grid.cube(16), HUWindow(), 1
+'''
+
+
+@pytest.fixture
+def module(tmp_path, monkeypatch):
+    """The name of a module with priors of one's own."""
+    name = f"own_{re.sub('[^a-z0-9]', '_', tmp_path.name)}"
+    (tmp_path / f"{name}.py").write_text(MODULE)
+    monkeypatch.syspath_prepend(tmp_path)
+    return name
+
+
+@pytest.fixture
+def xrays():
+    return phydict.load_xrays("data/example/xrays")
+
+
+def test_in_python_it_is_an_object_or_the_path_of_its_class(module, xrays):
+    prior = find_prior(f"{module}.OwnPrior")
+    given = xrays["xrays"], xrays["beam"]
+    found = phydict.reconstruct(*given, prior, display=xrays["display"])
+    by_path = phydict.reconstruct(*given, f"{module}.OwnPrior", display=xrays["display"])
+    assert torch.equal(found.volume, by_path.volume) and found.grid.same_as(prior.grid)
+    alone = phydict.reconstruct(*given, prior, "prior_only", display=xrays["display"])
+    assert found.misfit < 0.5 * alone.misfit and alone.volume.mean() == pytest.approx(-500, abs=50)
+
+
+def test_on_the_command_line_it_is_a_class_with_its_settings(module, tmp_path):
+    settings = {"model": {"prior": {"class_path": f"{module}.OwnPrior", "init_args": {"hu": -300.0}}}}
+    (tmp_path / "own.yaml").write_text(yaml.safe_dump(settings))
+    common = ["predict", "--data.xrays", "data/example/xrays", "--model.method", "prior_only",
+              "--data.with_report", "false", "--model.out"]
+    infer([*common, str(tmp_path / "a"), "--model.prior", f"{module}.OwnPrior"])
+    infer([*common, str(tmp_path / "b"), "-c", str(tmp_path / "own.yaml")])
+    levels = []
+    for name, hu in (("a", -500.0), ("b", -300.0)):
+        record = json.loads(next((tmp_path / name).rglob("reconstruction.json")).read_text())
+        assert record["settings"]["prior"] == {"class": f"{module}.OwnPrior", "hu": hu}
+        levels.append(record["misfit"])
+    assert levels[0] != levels[1]
+
+
+def test_an_ablation_compares_with_it(module, tmp_path):
+    (tmp_path / "ablate.yaml").write_text(yaml.safe_dump({
+        "out": str(tmp_path / "out"), "phantoms": 1,
+        "axes": {"prior": [f"{module}.OwnPrior"], "method": ["prior_only"], "views": [2], "detector": [32]}}))
+    infer(["ablate", "-c", str(tmp_path / "ablate.yaml"), "--device", "cpu"])
+    assert f"{module}.OwnPrior" in (tmp_path / "out" / "results.csv").read_text()
+
+
+def test_what_keeps_no_contract_is_refused_in_one_sentence(module, xrays, tmp_path):
+    for path, words in (("Unbound", "Unbound lacks bind: see phydict.prior.PriorContract"),
+                        ("Absent", "cannot be made .*module must be importable")):
+        with pytest.raises(ValueError, match=words):
+            find_prior(f"{module}.{path}")
+    with pytest.raises(ValueError, match="dict lacks grid, window, state_channels, bind"):
+        reconstructor("phydict_fast", {})
+    with pytest.raises(ValueError, match=r"states like those it is given, \(1, 1, 16, 16, 16\)"):
+        phydict.reconstruct(xrays["xrays"], xrays["beam"], f"{module}.Shapeless", display=xrays["display"])

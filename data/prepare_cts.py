@@ -5,7 +5,8 @@ from pathlib import Path
 
 from jsonargparse import auto_cli
 
-from phydict.datasets.cts.preparation import SUMMARY, Settings, atlas_lungs, prepare_folder
+from phydict.datasets.cts.preparation import SUMMARY, prepare_folder
+from phydict.datasets.cts.spaces import Settings, atlas_lungs
 from phydict.runtime.console import check_writable, cli_errors, quiet
 
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from phydict.prior.files import (
-    build_prior, build_refiner, build_super_resolution, build_text, has_text, is_saved_prior, save_prior, save_refiner,
-    save_super_resolution)
+    build_prior, build_refiner, build_super_resolution, save_prior, save_refiner, save_super_resolution)
 from phydict.prior.inspection import inspect_prior
+from phydict.prior.stage_file import is_saved_prior
+from phydict.prior.text_file import build_text, has_text
 from phydict.rivals import NETWORKS, build_rival, save_rival
 from phydict.runtime.console import check_writable
 from phydict.training.checkpoints import read_checkpoint

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-import json
-import reprlib
-from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
-from torch import Tensor, nn
+from torch import Tensor
 
 from phydict.diffusion import CosineSchedule
 from phydict.grid import Grid
 from phydict.prior.detail import DetailNetwork
-from phydict.prior.finite import check_finite, not_finite
 from phydict.prior.local_unet import LocalUNet
 from phydict.prior.medsyn.checkpoint import (
     FILES, MedSynCheckpoint, as_checkpoint, is_medsyn, load_medsyn, load_medsyn_super_resolution)
@@ -23,30 +17,20 @@ from phydict.prior.medsyn.prior import MedSynPrior
 from phydict.prior.medsyn.super_resolution import MedSynSuperResolution
 from phydict.prior.prior import STATE, Prior
 from phydict.prior.refiner import Refiner
+from phydict.prior.stage_file import (
+    ADVICE, FORMAT, built_network, number_of, read_stage, whole_of, window_of, write_stage)
 from phydict.prior.super_resolution import SuperResolution
-from phydict.prior.text import TextEncoder
+from phydict.prior.text_file import has_text, load_text
 from phydict.prior.unet import VolumeUNet
-from phydict.runtime.files import atomic_write, file_crc32
-from phydict.runtime.reading import not_written, reason, refusing
+from phydict.runtime.files import file_crc32
+from phydict.runtime.reading import refusing
 from phydict.runtime.shipped import own_or_shipped, shipped
-from phydict.units import HUWindow
-
-FORMAT = 1
 
 DEFAULT_PRIOR = shipped("data/prior/phydict_64.safetensors")
 """The prior that comes with the project."""
 
 DEFAULT_REFINER = shipped("data/prior/refiner_64.safetensors")
 """The refiner that comes with the project."""
-
-ADVICE = "copy it again, or export it from its training checkpoint"
-
-MOST_HU, MOST_LAYERS = 1e6, 256
-"""No window reaches as far, and no network has more blocks on its way down, or layers."""
-
-STAGES = {"base": "a base prior", "super_resolution": "a super-resolution stage", "refiner": "a refiner",
-          "lifted": "a rival", "x2ct": "a rival", "xray2ctpa": "a rival"}
-"""What a file's header may call it, and what that is; a header that says nothing is of a base prior."""
 
 
 def save_prior(prior: Prior, path: str | Path, training: dict | None = None, dtype: torch.dtype = torch.float16):
@@ -78,19 +62,6 @@ def save_refiner(refiner: Refiner, path: str | Path, training: dict | None = Non
     weights = {k.replace("prior.text.", "text.", 1): w for k, w in refiner.state_dict().items()
                if copied or not k.startswith("prior.text.")}
     write_stage(Path(path), describe_refiner(refiner) | {"training": training or {}}, weights, dtype)
-
-
-def write_stage(path: Path, header: dict, weights: dict[str, Tensor], dtype: torch.dtype) -> None:
-    """Writes header and weights to one .safetensors file, replacing it only when complete. Raises OSError where it
-    cannot, and ValueError where weights are not finite in `dtype`."""
-    tensors = {k: w.detach().to("cpu", dtype).contiguous() for k, w in weights.items()}
-    if broken := not_finite(tensors):
-        raise ValueError(f"'{path}' was not written, since its weights are not finite in {dtype}: {broken}")
-    try:
-        with atomic_write(path) as part:
-            save_file(tensors, part, {"phydict": json.dumps(header)})
-    except (SafetensorError, OSError) as error:
-        raise not_written(f"'{path}'", error, "give another place") from error
 
 
 def describe(prior: Prior) -> dict:
@@ -142,7 +113,7 @@ def load_prior(path: str | Path | MedSynCheckpoint = DEFAULT_PRIOR,
             found = build(header, weights)
             if has_text(header):
                 prior = found.prior if isinstance(found, Refiner) else found
-                prior.load_text = lambda: _load_text(path, header["text"])
+                prior.load_text = lambda: load_text(path, header["text"])
         except ValueError as error:
             raise ValueError(f"'{path}' contradicts itself: {error}") from error
     return found.to(device).eval().requires_grad_(False)
@@ -165,41 +136,6 @@ def load_super_resolution(path: str | Path | MedSynCheckpoint,
 
 def _found(path: str | Path | MedSynCheckpoint) -> Path | MedSynCheckpoint:
     return path if isinstance(path, MedSynCheckpoint) else own_or_shipped(path)
-
-
-def read_stage(path: Path, stages: Sequence[str], device: str) -> tuple[dict, dict[str, Tensor]]:
-    """Header and weights, but those of a text encoder, of a file that must be of one of `stages`."""
-    if not path.is_file():
-        raise FileNotFoundError(f"no prior at '{path}': give the .safetensors file that training wrote")
-    try:
-        with safe_open(path, "pt", device=device) as file:
-            header = json.loads((file.metadata() or {}).get("phydict", "{}"))
-            weights = {k: file.get_tensor(k) for k in file.keys() if not k.startswith("text.")}
-    except Exception as error:  # whatever a damaged file leads its readers to
-        raise ValueError(f"'{path}' is truncated or not a safetensors file ({reason(error)}): {ADVICE}") from error
-    if not isinstance(header, dict) or header.get("format") != FORMAT:
-        raise ValueError(f"'{path}' carries no phydict prior of format {FORMAT}: give a file that save_prior wrote")
-    check_stage(header, stages, f"'{path}'")
-    check_finite(weights, path)
-    return header, weights
-
-
-def is_saved_prior(path: str | Path) -> bool:
-    """Whether `save_prior` or `save_super_resolution` wrote a file."""
-    try:
-        with safe_open(path, "pt") as file:
-            return "phydict" in (file.metadata() or {})
-    except (SafetensorError, OSError):
-        return False
-
-
-def check_stage(header: dict, stages: Sequence[str], name: str) -> None:
-    """Raises ValueError where the header of the file `name` is of none of `stages`."""
-    found = header.get("stage", "base")
-    if found not in stages:
-        kind = STAGES.get(found) if isinstance(found, str) else None
-        raise ValueError(f"{name} is {kind or f'of stage {reprlib.repr(found)}'}, but {STAGES[stages[0]]} is needed "
-                         "here: give the file of that stage")
 
 
 def fingerprint(path: str | Path | MedSynCheckpoint) -> int:
@@ -230,8 +166,8 @@ def build_prior(header: dict, weights: dict[str, Tensor]) -> Prior:
 
 def _untrained(header: dict) -> Prior:
     return Prior(VolumeUNet(**header["network"]), Grid(**header["grid"]), window_of(header),
-                 schedule=CosineSchedule(**header["schedule"]), sigma_data=_number(header, "sigma_data"),
-                 skip_std=_number(header, "skip_std"),
+                 schedule=CosineSchedule(**header["schedule"]), sigma_data=number_of(header, "sigma_data"),
+                 skip_std=number_of(header, "skip_std"),
                  detail=DetailNetwork(**header["detail"]) if "detail" in header else None)
 
 
@@ -253,125 +189,7 @@ def build_super_resolution(header: dict, weights: dict[str, Tensor]) -> SuperRes
     def made() -> SuperResolution:
         return SuperResolution(
             LocalUNet(**header["network"]), Grid(**header["grid"]), window_of(header),
-            _whole(header, "factor"), len(header["coarse_state"]), CosineSchedule(**header["schedule"]),
-            _number(header, "detail_std"), _number(header, "skip_std"))
+            whole_of(header, "factor"), len(header["coarse_state"]), CosineSchedule(**header["schedule"]),
+            number_of(header, "detail_std"), number_of(header, "skip_std"))
 
     return built_network(made, {k: w.float() for k, w in weights.items()}, header, ("network",))
-
-
-def built_network(made: Callable[[], nn.Module], weights: dict[str, Tensor], header: dict,
-           networks: tuple[str, ...]) -> nn.Module:
-    """What `made` makes of a header, with these weights. What does not fit them is refused before it takes memory.
-
-    networks: the header's keys whose values are settings of networks.
-    """
-    try:
-        for name in networks:
-            if name in header:
-                _check_sizes(name, header[name], weights)
-        with torch.device("meta"):
-            shapes = {k: w.shape for k, w in made().state_dict().items()}
-        unlike = [k for k in shapes.keys() | weights.keys() if k not in shapes or k not in weights
-                  or shapes[k] != weights[k].shape]
-        if unlike:
-            raise ValueError(f"{len(unlike)} of them are missing, unexpected or of another shape, such as "
-                             f"{min(unlike)}")
-        stage = made()
-        stage.load_state_dict(weights)
-    except Exception as error:  # of whatever kind: it is the header that leads to it
-        lacks = f"the header lacks {error}" if isinstance(error, KeyError) else reason(error)
-        raise ValueError(f"the weights are not those of the network that the header describes ({lacks})") from error
-    return stage
-
-
-def _check_sizes(name: str, settings: dict, weights: dict[str, Tensor]) -> None:
-    """Raises ValueError where a network's settings hold anything larger than its weights have of it, or more layers
-    than can be meant."""
-    if not isinstance(settings, dict):
-        raise ValueError(f"{name} is {reprlib.repr(settings)}, where a mapping of settings is needed")
-    most = max([len(weights), *(n for w in weights.values() for n in w.shape)])
-    layers = len(settings["channels"]) if isinstance(settings.get("channels"), list) else 1
-    for key, value in settings.items():
-        if key in ("res_blocks", "layers") and type(value) is int:
-            layers *= value
-        elif isinstance(value, list) and (key == "res_blocks" or not value):
-            raise ValueError(f"{name}.{key} is {reprlib.repr(value)}")
-    if layers > MOST_LAYERS:
-        raise ValueError(f"{name} has {layers:,} layers, more than {MOST_LAYERS}")
-    for key, value in settings.items():
-        if key == "kinds" and isinstance(value, list) and all(isinstance(kind, str) for kind in value):
-            value = len(value)
-        values = value if isinstance(value, list) else [value]
-        if len(values) > most or not all(isinstance(n, int) and 0 <= n <= most for n in values):
-            raise ValueError(f"{name}.{key} is {reprlib.repr(value)}")
-
-
-def _number(header: dict, key: str) -> float:
-    if isinstance(header[key], bool) or not isinstance(header[key], int | float) or not 0 < header[key] < 1e6:
-        raise ValueError(f"{key} is {reprlib.repr(header[key])}, where a positive number is needed")
-    return header[key]
-
-
-def window_of(header: dict) -> HUWindow:
-    """The HU window of a header. Raises ValueError where it holds none."""
-    ends = header["hu_window"]
-    if not isinstance(ends, list) or len(ends) != 2 or not all(
-            type(end) in (int, float) and abs(end) < MOST_HU for end in ends):
-        raise ValueError(f"hu_window is {reprlib.repr(ends)}, where two numbers of HU are needed")
-    return HUWindow(*ends)
-
-
-def _whole(header: dict, key: str) -> int:
-    if type(header[key]) is not int or not 0 < header[key] < 2**16:
-        raise ValueError(f"{key} is {reprlib.repr(header[key])}, where a positive whole number is needed")
-    return header[key]
-
-
-def has_text(header: dict) -> bool:
-    """Whether a header describes a text encoder. Raises ValueError where "text" is not what `describe` writes."""
-    text, keys = header.get("text", "missing"), ("source", "length", "width", "layers", "vocabulary")
-    if text is None:
-        return False
-    if not isinstance(text, dict) or any(key not in text for key in keys):
-        raise ValueError(f"text is {reprlib.repr(text)}, where {', '.join(keys)} are needed, or null")
-    for key in ("length", "width", "layers"):
-        _whole(text, key)
-    for key in ("padded_to", "sentences"):
-        if key in text:
-            _whole(text, key)
-    words = text["vocabulary"]
-    if not isinstance(text["source"], str | None) or (text["source"] is None and not (
-            isinstance(words, list) and all(isinstance(word, str) for word in words))):
-        raise ValueError(f"text.source is {reprlib.repr(text['source'])} and text.vocabulary {reprlib.repr(words)}, "
-                         "where one of them names a text encoder or lists words")
-    return True
-
-
-def build_text(text: dict, weights: dict[str, Tensor]) -> TextEncoder:
-    """The text encoder of a header's "text", frozen; `weights` ("text.") are used unless it is a pretrained one."""
-    if text["source"]:
-        return TextEncoder.pretrained(text["source"], text["length"], text.get("padded_to"))
-    weights = {k.removeprefix("text."): w.float() for k, w in weights.items() if k.startswith("text.")}
-    try:
-        _check_sizes("text", {key: text[key] for key in ("length", "width", "layers")}, weights)
-        held = len(weights["bert.embeddings.word_embeddings.weight"])
-        if len(text["vocabulary"]) != held:
-            raise ValueError(f"it lists {len(text['vocabulary'])} words, but its weights have {held}")
-        encoder = TextEncoder.small(text["vocabulary"], text["width"], text["layers"], text["length"],
-                                    text.get("sentences"))
-        encoder.load_state_dict(weights)
-    except Exception as error:  # of whatever kind: it is the header that leads to it
-        raise ValueError(f"the text encoder is not the one that the header describes ({reason(error)})") from error
-    encoder.trainable = False
-    return encoder.eval().requires_grad_(False)
-
-
-def _load_text(path: Path, text: dict) -> TextEncoder:
-    with refusing(path, ADVICE):
-        with safe_open(path, "pt") as file:
-            weights = {k: file.get_tensor(k) for k in file.keys() if k.startswith("text.")}
-        check_finite(weights, path)
-        try:
-            return build_text(text, weights)
-        except ValueError as error:
-            raise ValueError(f"'{path}' contradicts itself: {error}") from error

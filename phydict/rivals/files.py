@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from phydict.grid import Grid
-from phydict.prior.files import ADVICE, built_network, read_stage, window_of, write_stage
+from phydict.prior.stage_file import ADVICE, built_network, read_stage, window_of, write_stage
 from phydict.rivals.lifted import LiftedNetwork
 from phydict.rivals.network import RivalNetwork
 from phydict.rivals.rival import Rival

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from phydict.grid import Grid
-from phydict.prior.files import FORMAT
+from phydict.prior.stage_file import FORMAT
 from phydict.rivals.network import RivalNetwork
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, binning

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from phydict.prior import Prior, Refiner, SuperResolution
-from phydict.prior.files import check_stage
 from phydict.prior.finite import not_finite
+from phydict.prior.stage_file import check_stage
 from phydict.rivals import Rival
 from phydict.training.settings import Optimisation
 
@@ -90,10 +90,10 @@ class StageTraining(lightning.LightningModule, ABC):
         checkpoint["phydict"] = self._describe() | {"training": seen}
 
     def on_load_checkpoint(self, checkpoint: dict) -> None:
-        theirs, ours = {"stage": "base"} | checkpoint["phydict"], self._describe()
-        check_stage(theirs, (ours["stage"],), "the checkpoint")
-        for key, own in ours.items():
-            if theirs[key] != own:
+        resumed, current = {"stage": "base"} | checkpoint["phydict"], self._describe()
+        check_stage(resumed, (current["stage"],), "the checkpoint")
+        for key, own in current.items():
+            if resumed[key] != own:
                 raise ValueError(f"the checkpoint's prior and this training's differ in '{key}': give the settings and "
                                  "data that the checkpoint was trained with, or start anew with model.initial")
         self.samples = checkpoint["phydict"].get("training", {}).get("samples", 0)

@@ -25,8 +25,9 @@ from phydict.datasets.cts import cache, preparation
 from phydict.datasets.cts.ct_rate import CTCases, find_cts, load_case, patient_of
 from phydict.datasets.cts.ct_rate_tables import read_calibrations, read_reports
 from phydict.datasets.cts.ct_series import find_series, load_series
-from phydict.datasets.cts.preparation import ATLAS_LUNGS_MM, ATLAS_MM, SUMMARY, Settings, atlas_lungs, prepare_folder
+from phydict.datasets.cts.preparation import SUMMARY, prepare_folder
 from phydict.datasets.cts.prepared import RECORD, read_prepared
+from phydict.datasets.cts.spaces import ATLAS_LUNGS_MM, ATLAS_MM, Settings, atlas_lungs
 from phydict.datasets.cts.transforms import AIR, load_ct, prepare_ct, to_grid
 from phydict.grid import Cube, Grid
 from phydict.training.data import PriorData

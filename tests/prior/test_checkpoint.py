@@ -10,7 +10,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from phydict.prior import TextEncoder, describe, inspect_prior, load_prior, save_prior
-from phydict.prior.files import build_text
+from phydict.prior.text_file import build_text
 from prior.tiny import REPORTS, tiny_prior, write_cxr_bert
 
 X = random_like((1, 4, 16, 16, 16), torch.float32, seed=1)

@@ -1,9 +1,4 @@
-"""From folders of CTs, DICOM or NIfTI, to prepared cases: in parallel, resumable, with a summary of what was rejected.
-
-The space `medsyn` approximates MedSyn's (10.1109/TMI.2024.3415032), which registers each patient's lungs to those of an
-atlas by an affine map: here the box around the lungs is scaled along each axis and moved onto the atlas' box. Rotation
-and shear of the registration are left out, and voxels are averages where MedSyn interpolates.
-"""
+"""From folders of CTs, DICOM or NIfTI, to prepared cases: in parallel, resumable, with a table of what was rejected."""
 
 from __future__ import annotations
 
@@ -14,23 +9,21 @@ import os
 import signal
 import threading
 import warnings
-from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
 from phydict.datasets.cts.anatomy import MASKS, body_mask, lung_box_centre, lung_box_size, segment
-from phydict.datasets.cts.ct_rate import CTFile, find_cts
-from phydict.datasets.cts.ct_series import Series, find_series, load_series
 from phydict.datasets.cts.prepared import RECORD, VOLUME, read_record, write_prepared
 from phydict.datasets.cts.segmentations import lungs_by_lungmask, read_segmentation, segmentations_beside
-from phydict.datasets.cts.transforms import (
-    AIR, SEGMENTATION_MM, case_id, centred, check_hu, covering_grid, load_ct, to_grid)
+from phydict.datasets.cts.sources import Source, find_sources
+from phydict.datasets.cts.spaces import Settings
+from phydict.datasets.cts.transforms import SEGMENTATION_MM, check_hu, covering_grid, to_grid
 from phydict.grid import Grid
 from phydict.runtime.files import atomic_directory, atomic_write, check_replaceable, remove_leftovers
 from phydict.runtime.progress import CaseProgress
@@ -40,142 +33,6 @@ SUMMARY = "summary.csv"
 COLUMNS = ("id", "status", "reason", "remark", "source", "kind", "slices", "spacing_x_mm", "spacing_y_mm",
            "spacing_z_mm", "extent_z_mm", "lungs_by", "lung_ml", "lungs_inside", "lung_width_mm", "lung_depth_mm",
            "lung_height_mm", "masks", "window_low", "window_high")
-SPACES, SEGMENTERS = ("patient", "medsyn"), ("threshold", "lungmask")
-ATLAS_MM = (316.0, 316.0, 292.0)
-"""MedSyn's atlas volume, right-left, posterior-anterior and inferior-superior."""
-ATLAS_LUNGS_MM = (275.0, 193.0, 256.0)
-"""The box around the atlas' lungs, an assumption, because the atlas may not be shipped: the mean over seven uncut CTs
-of LIDC-IDRI, placed in the middle of the atlas volume. `atlas_lungs` measures a copy of the atlas instead."""
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What a prepared case is to be.
-
-    voxels: per side of the box. side: mm of the cube in the space `patient`. window: HU, recorded and not applied.
-    space: patient or medsyn. segmenter: of CTs without a segmentation beside them, threshold or lungmask.
-    atlas_lungs_mm, atlas_offset_mm: of MedSyn's atlas, the box around the lungs, and where its middle lies from the
-    volume's middle.
-    """
-
-    voxels: int = 256
-    side: float = 384.0
-    window: tuple[float, float] = (-1000.0, 1000.0)
-    space: str = "patient"
-    segmenter: str = "threshold"
-    atlas_lungs_mm: tuple[float, float, float] = ATLAS_LUNGS_MM
-    atlas_offset_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    def __post_init__(self):
-        if self.voxels < 8 or self.side <= 0:
-            raise ValueError(f"a case needs at least 8 voxels and a side above 0 mm, but {self.voxels} voxels and "
-                             f"{self.side} mm were given")
-        if not self.window[0] < self.window[1]:
-            raise ValueError(f"an HU window needs low < high, but {list(self.window)} was given")
-        for name, value, values in (("space", self.space, SPACES), ("segmenter", self.segmenter, SEGMENTERS)):
-            if value not in values:
-                raise ValueError(f"{name} is {' or '.join(values)}, but {value!r} was given")
-
-    @property
-    def extent(self) -> tuple[float, float, float]:
-        """Edge lengths in mm of the box, in the space's own millimetres."""
-        return (self.side,) * 3 if self.space == "patient" else ATLAS_MM
-
-    @property
-    def outside(self) -> float:
-        """HU where there is no scan, and the least that is kept."""
-        return min(AIR, self.window[0]) if self.space == "medsyn" else AIR
-
-    def grid(self, lung_centre: np.ndarray, lung_mm: np.ndarray) -> Grid:
-        """The voxels in the patient's world, for lungs in a box of `lung_mm` (3,) around `lung_centre` (3,)."""
-        shape, extent = (self.voxels,) * 3, np.asarray(self.extent)
-        if self.space == "patient":
-            return centred(Grid(shape, extent / shape), lung_centre)
-        shrink = lung_mm / self.atlas_lungs_mm
-        return centred(Grid(shape, extent * shrink / shape), lung_centre - shrink * self.atlas_offset_mm)
-
-
-def atlas_lungs(mask: Path) -> dict:
-    """Settings' atlas_lungs_mm and atlas_offset_mm by a copy of MedSyn's atlas lung mask (NIfTI).
-
-    Raises ValueError where it cannot be read, is empty or is not of the atlas' size.
-    """
-    lungs, affine = load_ct(mask)
-    volume = Grid(lungs.shape, affine=affine)
-    if not (lungs > 0.5).any() or not np.allclose(volume.extent, ATLAS_MM, atol=2):
-        raise ValueError(f"{mask} is not MedSyn's atlas: a lung mask of {' x '.join(f'{n:g}' for n in ATLAS_MM)} mm "
-                         f"was expected, but its box has {' x '.join(f'{n:g}' for n in volume.extent)} mm")
-    offset = lung_box_centre(lungs, affine) - volume.centre
-    return {"atlas_lungs_mm": tuple(lung_box_size(lungs, volume.spacing).tolist()),
-            "atlas_offset_mm": tuple(offset.tolist())}
-
-
-@dataclass(frozen=True)
-class Source:
-    """A CT to prepare. beside: its path without ending, beside which segmentations lie."""
-
-    id: str
-    ct: CTFile | Series
-    beside: Path
-
-    @property
-    def is_dicom(self) -> bool:
-        return isinstance(self.ct, Series)
-
-    @property
-    def place(self) -> Path:
-        return self.ct.folder if self.is_dicom else self.ct.path
-
-    def load(self) -> tuple[np.ndarray, np.ndarray]:
-        """HU (X, Y, Z) in RAS+ and the affine. Raises ValueError and OSError."""
-        return load_series(self.ct) if self.is_dicom else load_ct(self.ct.path, self.ct.calibration)
-
-    def fingerprint(self) -> dict:
-        """What identifies this input: its files' number and bytes, those of its segmentations included."""
-        files = [*(self.ct.files if self.is_dicom else (self.ct.path,)),
-                 *(file for files in segmentations_beside(self.beside).values() for file in files)]
-        return {"files": len(files), "bytes": sum(file.stat().st_size for file in files)}
-
-
-def find_sources(root: Path, **tables) -> list[Source]:
-    """Every DICOM series and NIfTI CT below `root`; tables: as for `find_cts`.
-
-    A series is named as a NIfTI file in its folder's place would be, `<first subfolder>__<folder>`; where that is not
-    enough, by all its folders, then with its SeriesNumber, then with a count.
-    Raises FileNotFoundError where there is none, and what `find_cts` raises.
-    """
-    series = find_series(root) if root.is_dir() else []
-    try:
-        cts = find_cts(root, **tables)
-    except FileNotFoundError:
-        if not series:
-            raise FileNotFoundError(f"there is no CT in {root}; give a NIfTI file, or a folder that holds NIfTI files "
-                                    "or DICOM series") from None
-        cts = []
-    sources = [Source(ct.id, ct, ct.path.with_name(case_id(ct.path))) for ct in cts]
-    return sources + _named(series, root, {ct.id for ct in cts})
-
-
-def _named(series: list[Series], root: Path, taken: set[str]) -> list[Source]:
-    def forms(s: Series) -> tuple[str, ...]:
-        parts = s.folder.relative_to(root).parts or (s.folder.absolute().name,)
-        short, full = "__".join(dict.fromkeys((parts[0], parts[-1]))), "__".join(parts)
-        return short, full, "__".join(part for part in (full, s.number) if part)
-
-    counts = [Counter(names) for names in zip(*(forms(s) for s in series))]
-    folders = Counter(s.folder for s in series)
-    sources = []
-    for s in series:
-        names = forms(s)
-        id = next((name for name, count in zip(names, counts) if count[name] == 1 and name not in taken), names[-1])
-        n = 1
-        while id in taken:
-            n += 1
-            id = f"{names[-1]}__{n}"
-        taken.add(id)
-        name = s.folder.absolute().name + (f"__{s.number}" if folders[s.folder] > 1 else "")
-        sources.append(Source(id, s, s.folder.absolute().with_name(name)))
-    return sources
 
 
 def prepare_folder(cts: str | Path, out: str | Path, settings: Settings = Settings(), workers: int = 1,

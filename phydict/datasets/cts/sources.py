@@ -1,0 +1,82 @@
+"""The CTs of a folder that can be prepared, NIfTI files and DICOM series, each with a name of its own."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from phydict.datasets.cts.ct_rate import CTFile, find_cts
+from phydict.datasets.cts.ct_series import Series, find_series, load_series
+from phydict.datasets.cts.segmentations import segmentations_beside
+from phydict.datasets.cts.transforms import case_id, load_ct
+
+
+@dataclass(frozen=True)
+class Source:
+    """A CT to prepare. beside: its path without ending, beside which segmentations lie."""
+
+    id: str
+    ct: CTFile | Series
+    beside: Path
+
+    @property
+    def is_dicom(self) -> bool:
+        return isinstance(self.ct, Series)
+
+    @property
+    def place(self) -> Path:
+        return self.ct.folder if self.is_dicom else self.ct.path
+
+    def load(self) -> tuple[np.ndarray, np.ndarray]:
+        """HU (X, Y, Z) in RAS+ and the affine. Raises ValueError and OSError."""
+        return load_series(self.ct) if self.is_dicom else load_ct(self.ct.path, self.ct.calibration)
+
+    def fingerprint(self) -> dict:
+        """What identifies this input: its files' number and bytes, those of its segmentations included."""
+        files = [*(self.ct.files if self.is_dicom else (self.ct.path,)),
+                 *(file for files in segmentations_beside(self.beside).values() for file in files)]
+        return {"files": len(files), "bytes": sum(file.stat().st_size for file in files)}
+
+
+def find_sources(root: Path, **tables) -> list[Source]:
+    """Every DICOM series and NIfTI CT below `root`; tables: as for `find_cts`.
+
+    A series is named as a NIfTI file in its folder's place would be, `<first subfolder>__<folder>`; where that is not
+    enough, by all its folders, then with its SeriesNumber, then with a count.
+    Raises FileNotFoundError where there is none, and what `find_cts` raises.
+    """
+    series = find_series(root) if root.is_dir() else []
+    try:
+        cts = find_cts(root, **tables)
+    except FileNotFoundError:
+        if not series:
+            raise FileNotFoundError(f"there is no CT in {root}; give a NIfTI file, or a folder that holds NIfTI files "
+                                    "or DICOM series") from None
+        cts = []
+    sources = [Source(ct.id, ct, ct.path.with_name(case_id(ct.path))) for ct in cts]
+    return sources + _named(series, root, {ct.id for ct in cts})
+
+
+def _named(series: list[Series], root: Path, taken: set[str]) -> list[Source]:
+    def forms(s: Series) -> tuple[str, ...]:
+        parts = s.folder.relative_to(root).parts or (s.folder.absolute().name,)
+        short, full = "__".join(dict.fromkeys((parts[0], parts[-1]))), "__".join(parts)
+        return short, full, "__".join(part for part in (full, s.number) if part)
+
+    counts = [Counter(names) for names in zip(*(forms(s) for s in series))]
+    folders = Counter(s.folder for s in series)
+    sources = []
+    for s in series:
+        names = forms(s)
+        id = next((name for name, count in zip(names, counts) if count[name] == 1 and name not in taken), names[-1])
+        n = 1
+        while id in taken:
+            n += 1
+            id = f"{names[-1]}__{n}"
+        taken.add(id)
+        name = s.folder.absolute().name + (f"__{s.number}" if folders[s.folder] > 1 else "")
+        sources.append(Source(id, s, s.folder.absolute().with_name(name)))
+    return sources

@@ -32,14 +32,14 @@ def changed(settings, changes: Mapping[str, object], name: str):
 
     Raises ValueError naming the setting where a value is none that its field can have.
     """
-    mine = {}
+    new_values = {}
     for first in dict.fromkeys(path.partition(".")[0] for path in changes):
         value, hint = getattr(settings, first), get_type_hints(type(settings))[first]
         if first in changes:
             value = parsed(hint, changes[first], f"{name}.{first}")
         deeper = {path.partition(".")[2]: v for path, v in changes.items() if path.startswith(first + ".")}
-        mine[first] = changed(value, deeper, f"{name}.{first}") if deeper else value
-    return replace(settings, **mine) if mine else settings
+        new_values[first] = changed(value, deeper, f"{name}.{first}") if deeper else value
+    return replace(settings, **new_values) if new_values else settings
 
 
 def parsed(hint, value, name: str):

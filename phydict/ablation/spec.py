@@ -77,10 +77,10 @@ def _specification(content, given: Mapping, changed: Mapping) -> Specification:
         own, axes = ({setting: value for setting, value in dotted(_mapping(entry.get(name), name)).items()
                       if setting not in changed} for name in ("base", "axes"))
         axes |= lists
-        mine, meant = trials_of(common | own, axes, methods, cases, len(found))
-        check_used([*own, *axes], meant, mine)
-        used, found = used | meant, found + mine
-        for trial in mine:
+        product, meant = trials_of(common | own, axes, methods, cases, len(found))
+        check_used([*own, *axes], meant, product)
+        used, found = used | meant, found + product
+        for trial in product:
             trials.setdefault(json.dumps(trial.identity(), sort_keys=True), trial)
     check_used(common, used, found)
     return Specification(Path(content["out"]), cases, list(trials.values()))

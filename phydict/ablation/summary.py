@@ -75,9 +75,9 @@ def entries(rows: Iterable[Mapping]) -> list[Entry]:
     """
     rows = list(rows)
     names = [name for name in dict.fromkeys(k for row in rows for k in row) if name not in NON_SETTING_COLUMNS]
-    mine = [name for name in names if name in ("method", *PRIOR_SETTINGS) or name.startswith("method.")]
-    varying = _varying(rows, [name for name in names if name not in mine])
-    own = {method: _varying([row for row in rows if row["method"] == method], [n for n in mine if n != "method"])
+    common = [name for name in names if name in ("method", *PRIOR_SETTINGS) or name.startswith("method.")]
+    varying = _varying(rows, [name for name in names if name not in common])
+    own = {method: _varying([row for row in rows if row["method"] == method], [n for n in common if n != "method"])
            for method in dict.fromkeys(row["method"] for row in rows)}
     groups: dict[tuple, list] = {}
     for row in rows:

@@ -97,16 +97,16 @@ class Trial:
     def identity(self) -> dict:
         """All that decides the numbers of a trial beside the case, as plain JSON values."""
         grid, window = self.scene()
-        mine = {"name": self.name, "method": describe(self.method), "seed": self.seed, "grid": grid.to_dict(),
+        identity = {"name": self.name, "method": describe(self.method), "seed": self.seed, "grid": grid.to_dict(),
                 "window": describe(window), "data": self.data.settings("test")}
         if self.prior is not None:
             prior = prior_of(self.prior)
-            mine |= {"prior": prior.identity()} if isinstance(prior, PriorContract) else {
+            identity |= {"prior": prior.identity()} if isinstance(prior, PriorContract) else {
                 "prior_crc32": _crc(self.prior)}
-            mine |= {"guidance": self.guidance, "samples": self.samples}
+            identity |= {"guidance": self.guidance, "samples": self.samples}
         if self.projector != "auto":
-            mine["projector"] = self.projector
-        return json.loads(json.dumps(mine))
+            identity["projector"] = self.projector
+        return json.loads(json.dumps(identity))
 
     def acquisition(self) -> str:
         """Equal for trials whose X-rays are the same."""
@@ -135,13 +135,13 @@ def trials_of(base: Mapping, axes: Mapping, methods: Mapping, cases: Cases,
                          "them")
     found, used = [], set()
     for values in product(*axes.values()):
-        mine = dict(zip(axes, values))
-        name = mine.get("method", base.get("method"))
+        combination = dict(zip(axes, values))
+        name = combination.get("method", base.get("method"))
         if not isinstance(name, str) or name not in methods:
             method_of(name, methods)
         changes = dotted(methods.get(name) or {})
         of = changes.pop("of", name)
-        trial, meant = _trial(of, base | changes | mine | {"method": name}, cases)
+        trial, meant = _trial(of, base | changes | combination | {"method": name}, cases)
         check_used(changes, meant, [trial])
         found.append(trial)
         used |= meant

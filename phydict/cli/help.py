@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from jsonargparse import ArgumentParser
 
@@ -75,7 +76,7 @@ def _method_in(args: Sequence[str]) -> tuple[str, object] | None:
         if option in ("--model.method", "--model.method.class_path"):
             return _method(parse_yaml(value, option), None)
         if option in CONFIGURATION:
-            settings = parse_yaml(value, option) if ":" in value else read_configuration(value)
+            settings: Any = parse_yaml(value, option) if ":" in value else read_configuration(value)
             model = settings.get("model") or {}
             if "method" in model:
                 return _method(model["method"], model.get("name"))

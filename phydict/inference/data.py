@@ -21,6 +21,7 @@ from phydict.inference.settings import Orbit
 from phydict.reconstruction import describe
 from phydict.runtime.console import noted
 from phydict.runtime.files import file_crc32
+from phydict.runtime.ranges import check_between
 from phydict.runtime.reading import name_of, read_ids
 from phydict.runtime.shipped import configuration
 from phydict.units import HUWindow
@@ -71,8 +72,7 @@ class ReconstructionData(lightning.LightningDataModule):
                  source: CTSource = CTSource(), only: str | None = None, phantoms: int = 4, with_report: bool = True,
                  orbit: Orbit = Orbit(), simulator: Simulator = Ideal(), simulation_voxels: int | None = None):
         super().__init__()
-        if not 1 <= phantoms <= MOST_PHANTOMS:
-            raise ValueError(f"data.phantoms lies between 1 and {MOST_PHANTOMS:,}, but {phantoms:,} was given")
+        check_between("data.phantoms", phantoms, 1, MOST_PHANTOMS)
         if simulation_voxels is not None and simulation_voxels < 1:
             raise ValueError(f"data.simulation_voxels must be at least 1, but {simulation_voxels} was given: leave it "
                              "out for the reconstruction's own")

@@ -48,12 +48,12 @@ def agreement(xray: np.ndarray, thorax: np.ndarray) -> str:
     flip, or the image inverted."""
     found = {name: correlation(xray[::rows, ::columns], thorax) for name, (rows, columns) in FLIPS.items()}
     best = max(found, key=found.get)
-    said = f"agreement {found['as it is']:.2f}"
+    label = f"agreement {found['as it is']:.2f}"
     if max(0, found[best]) < -found["as it is"]:
-        return f"{said}, better ({-found['as it is']:.2f}) inverted"
+        return f"{label}, better ({-found['as it is']:.2f}) inverted"
     if found[best] <= found["as it is"] + CLEAR:
-        return said
-    return f"{said}, better ({found[best]:.2f}) with {best} changed"
+        return label
+    return f"{label}, better ({found[best]:.2f}) with {best} changed"
 
 
 def geometry_page(path: str | Path, beam: ConeBeam, grid: Grid, xrays: np.ndarray, thorax: np.ndarray,

@@ -109,7 +109,7 @@ class CascadePosterior(Reconstructor):
             measurement = Measurement(projector, xrays, fine.window, display, self.mu_water)
             if base.scatter:
                 measurement.reset_scatter(True)
-                measurement.subtract_scatter(measurement.project(fine.upsample(state)[:, :1]))
+                measurement.refit(fine.upsample(state)[:, :1])
                 measurement.scatter_enabled = False  # the base stage's is kept
             guard = Guard(measurement, on_step, self.second.steps())
             denoiser = CountingDenoiser(fine.bind(state, self.level, self.precision, generator), guard)

@@ -42,7 +42,8 @@ class Measurement:
         self.background = self.offset * projector(torch.ones(1, 1, *projector.grid.shape).to(xrays))
         self.y = xrays[None]
         self.scatter_enabled = False
-        self.calls, self.last_projection = 1, None
+        self.calls = 1
+        self.last_projection: Tensor | None = None
 
     def project(self, x: Tensor) -> Tensor:
         """P(x): line integrals (B, K, V, U) of the CT x."""
@@ -82,6 +83,12 @@ class Measurement:
         """Where the views are display values: refit their gain and offset to the projections of the CT x."""
         if self.display is not None:
             self.y = match_views(self.display, self.project(x))
+
+    def refit(self, x: Tensor) -> None:
+        """Refit what y holds beside the volume to the CT x: gains and offsets of display values, or scatter."""
+        self.match_gain_offset(x)
+        if self.scatter_enabled:
+            self.subtract_scatter(self.project(x))
 
     @property
     def can_estimate_scatter(self) -> bool:

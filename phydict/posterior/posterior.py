@@ -21,11 +21,12 @@ from phydict.prior import BoundRefiner, PriorContract, Refiner
 from phydict.reconstruction import Reconstruction, Reconstructor
 from phydict.runtime.precision import check_precision, precision_name
 from phydict.runtime.profiling import Stopwatch, stage
+from phydict.runtime.ranges import check_between
 from phydict.runtime.reading import check_memory
 from phydict.units import MU_WATER
 from phydict.xray import Projector
 
-MOST_GUIDANCE = 1e6
+MOST_GUIDANCE = 1_000_000
 """No scale of guidance is as large: it would overflow."""
 
 
@@ -91,7 +92,7 @@ class Posterior(Reconstructor):
                              "file, or leave it out")
         if self.samples != 1 and self.sampler.needs_refiner:
             raise ValueError("an unrolled reconstruction is not random, so that samples of it do not differ, but "
-                             f"{self.samples} were asked for: leave samples at 1, or use phydict_fast")
+                             f"{self.samples} were given: leave samples at 1, or use phydict_fast")
         for name in ("samples", "batch"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is a number of reconstructions, 1 or more, but {getattr(self, name)} was "
@@ -164,8 +165,7 @@ class Posterior(Reconstructor):
 
 def check_guidance(guidance: float) -> None:
     """Raises ValueError unless the scale of classifier-free guidance lies between 0 and MOST_GUIDANCE."""
-    if not 0 <= guidance <= MOST_GUIDANCE:
-        raise ValueError(f"the guidance scale lies between 0 and {MOST_GUIDANCE:g}, but {guidance} was given")
+    check_between("the guidance scale", guidance, 0, MOST_GUIDANCE)
 
 
 def sample_seed(seed: int, i: int) -> int:

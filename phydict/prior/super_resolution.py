@@ -14,6 +14,7 @@ from phydict.grid import Grid
 from phydict.prior.local_unet import LocalUNet
 from phydict.prior.tiles import Tiles
 from phydict.runtime.precision import network_precision
+from phydict.runtime.ranges import check_between
 from phydict.units import HUWindow
 
 
@@ -98,8 +99,7 @@ class SuperResolution(nn.Module):
         precision: see phydict.runtime.precision. generator: what the noise, added here, is drawn from; None: `coarse`
         carries it already. Raises ValueError for a level outside [0, 1] or too few channels.
         """
-        if not 0 <= noise <= 1:
-            raise ValueError(f"the noise level of the coarse state lies in [0, 1], but {noise} was given")
+        check_between("the noise level of the coarse state", noise)
         if coarse.shape[1] < self.coarse_channels:
             raise ValueError(f"this super-resolution stage needs {self.coarse_channels} coarse channels, but "
                              f"{coarse.shape[1]} were given")

@@ -77,13 +77,13 @@ class TextEncoder(nn.Module):
         length=192, padded_to=2048: the last hidden states of the first 192 positions of a report that was cut or padded
         to 2048 tokens, states of padding included, which cross-attention sees. The BERT itself masks padding, so that
         padding beyond the first `length` changes nothing and is left out.
-        Where the BERT has fewer positions than asked for, both are lowered to these, and a warning says so.
+        Where the BERT has fewer positions than requested, both are lowered to these, and a warning says so.
         Raises FileNotFoundError, with what to do, when it is neither on disk nor reachable.
         """
         tokenizer, bert = load_bert(source)
-        positions, asked = bert.config.max_position_embeddings, padded_to or length
-        if asked > positions:
-            warn(f"the text encoder at '{source}' knows {positions} of the {asked} positions asked for: "
+        positions, requested = bert.config.max_position_embeddings, padded_to or length
+        if requested > positions:
+            warn(f"the text encoder at '{source}' knows {positions} of the {requested} positions requested: "
                  f"reports are cut to {positions} tokens")
         return cls(tokenizer, bert, min(length, positions), source=str(source),
                    padded_to=padded_to and min(padded_to, positions))

@@ -69,8 +69,8 @@ def cli_errors(*also: type[Exception], to_resume: str = "run the same command ag
         if os.environ.get(TRACEBACK):
             raise
         full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
-        said = f"{sentence(error)}: free some space; to resume, {to_resume}" if full else sentence(error)
-        print(f"error: {said}", file=sys.stderr)
+        advice = f": free some space; to resume, {to_resume}" if full else ""
+        print(f"error: {sentence(error)}{advice}", file=sys.stderr)
         raise SystemExit(2) from None
     except RuntimeError as error:
         if os.environ.get(TRACEBACK) or not re.search("Connection (closed|reset) by peer", str(error)):
@@ -129,9 +129,9 @@ def check_writable(path: Path, option: str, file: bool = False) -> None:
                 raise FileNotFoundError(None, f"leads nowhere, since {there} is a broken link")
             there = there.parent
     except (OSError, ValueError) as error:
-        said = error.strerror if isinstance(error, OSError) else "is no name of a file"
+        wrong = error.strerror if isinstance(error, OSError) else "is no name of a file"
         shown = path if len(str(path)) < 256 and str(path).isprintable() else reprlib.repr(str(path))
-        raise ValueError(f"{shown} {said}: give another {option}") from error
+        raise ValueError(f"{shown} {wrong}: give another {option}") from error
     try:
         with tempfile.TemporaryFile(dir=there):
             pass

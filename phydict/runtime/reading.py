@@ -50,10 +50,10 @@ def refusing(name: object, advice: str) -> Iterator[None]:
     except Exception as error:
         if type(error) not in (ValueError, Unreadable) and not isinstance(error, OSError):
             raise Unreadable(f"{name} cannot be read ({reason(error)}); {advice}") from error
-        said = one_line(str(error) if str(name) in str(error) else f"{name}: {error}")
-        if said == str(error):
+        message = one_line(str(error) if str(name) in str(error) else f"{name}: {error}")
+        if message == str(error):
             raise
-        raise Unreadable(said) from error
+        raise Unreadable(message) from error
 
 
 def one_line(text: str) -> str:
@@ -73,18 +73,18 @@ def reason(error: Exception) -> str:
     """An error in a few words, its kind among them where that is not for users."""
     if isinstance(error, RecursionError):
         return "it is nested too deeply"
-    said = " ".join(str(getattr(error, "strerror", None) or error).split())[:300]
+    message = " ".join(str(getattr(error, "strerror", None) or error).split())[:300]
     if isinstance(error, MemoryError):
-        return f"it asks for more memory than there is: {said}" if said else "it asks for more memory than there is"
-    if isinstance(error, TypeError) and said.startswith("`"):  # Lightning's words on a setting of its own
-        return said.rstrip(".")
+        return "it asks for more memory than there is" + (f": {message}" if message else "")
+    if isinstance(error, TypeError) and message.startswith("`"):  # Lightning's words on a setting of its own
+        return message.rstrip(".")
     if isinstance(error, TypeError | AttributeError | IndexError):  # whose own words tell a user nothing
-        unknown = re.search(r"unexpected keyword argument ('\w+')", said)
+        unknown = re.search(r"unexpected keyword argument ('\w+')", message)
         return f"it has no setting {unknown[1]}" if unknown else "it holds something of another kind than expected"
-    if wrong := re.search(r"^invalid literal for .*?: (.*)|^could not convert string to float: (.*)", said):
+    if wrong := re.search(r"^invalid literal for .*?: (.*)|^could not convert string to float: (.*)", message):
         return f"{wrong[1] or wrong[2]} stands where a number is needed"
     plain = isinstance(error, ValueError | OSError | EOFError | SyntaxError) or type(error).__module__ != "builtins"
-    return said if said and plain else f"{type(error).__name__} {said}".strip()
+    return message if message and plain else f"{type(error).__name__} {message}".strip()
 
 
 def read_text(path: str | Path, most: int = MOST_TEXT) -> str:

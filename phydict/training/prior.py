@@ -145,19 +145,19 @@ class PriorTraining(DenoisingTraining):
         return x0, weight[..., None, None, None]
 
 
-def _loaded(path: str, asked: Prior) -> Prior:
-    """The prior in a file, to be trained; one without a detail network is given that of `asked`."""
+def _loaded(path: str, requested: Prior) -> Prior:
+    """The prior in a file, to be trained; one without a detail network is given that of `requested`."""
     prior = load_prior(path)
     if not isinstance(prior, Prior):
         raise ValueError(f"training starts from priors of phydict's own, but {path} is MedSyn's: leave out "
                          "model.initial")
-    if not prior.grid.same_as(asked.grid) or prior.window != asked.window:
+    if not prior.grid.same_as(requested.grid) or prior.window != requested.window:
         raise ValueError(f"the prior {path} has another grid or HU window than this training: "
                          "set model.cube and model.window to its own")
     if prior.load_text is not None:
         prior.text, prior.load_text = prior.load_text(), None
         prior.text.trainable = prior.text.source is None
-    prior.detail = prior.detail or asked.detail
+    prior.detail = prior.detail or requested.detail
     prior = prior.train().requires_grad_(True)
     if prior.text is not None:
         prior.text.requires_grad_(prior.text.trainable)

@@ -22,7 +22,7 @@ class TrainingProgress(lightning.Callback):
         self.interval, self.bar = interval, None
 
     def on_train_start(self, trainer, module) -> None:
-        console, self.spoke, self.said = Console(stderr=True), time.monotonic(), -1
+        console, self.spoke, self.last_shown = Console(stderr=True), time.monotonic(), -1
         self.live = console.is_terminal and trainer.is_global_zero
         self.bar = Progress(TextColumn("training"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
                             TimeRemainingColumn(), TextColumn("{task.description}"), console=console,
@@ -52,9 +52,9 @@ class TrainingProgress(lightning.Callback):
     def _line(self, trainer) -> None:
         """A line about the present step, once."""
         self.spoke = time.monotonic()
-        if self.said == trainer.global_step or self.live or not trainer.is_global_zero:
+        if self.last_shown == trainer.global_step or self.live or not trainer.is_global_zero:
             return
-        self.said = trainer.global_step
+        self.last_shown = trainer.global_step
         of = f" of {self.total}" if self.total else ""
         print(f"step {trainer.global_step}{of}: {_logged(trainer)}", file=sys.stderr, flush=True)
 

@@ -83,8 +83,8 @@ class RefinerTraining(StageTraining):
     def _case_loss(self, case: dict, rng: np.random.Generator) -> Tensor:
         ct, masks = case["volume"], 2 * case["masks"] - 1
         measurement = self.scenes.measure(ct, rng, self.prior.grid, self.prior.window)
-        told = self.prior.prior.text is not None and rng.random() >= TEXT_DROPOUT
-        learning = _Learning(self.prior, self.prior.prior.context([case["report"][0] if told else ""]))
+        with_report = self.prior.prior.text is not None and rng.random() >= TEXT_DROPOUT
+        learning = _Learning(self.prior, self.prior.prior.context([case["report"][0] if with_report else ""]))
         losses = []
         for x0, _ in zip(self.method.estimates(learning, measurement), range(self.calls)):
             loss = log_error(x0[:, :1], ct, self.body_weight)

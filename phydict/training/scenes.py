@@ -11,6 +11,7 @@ from torch import Tensor
 
 from phydict.grid import Grid
 from phydict.posterior import Measurement
+from phydict.runtime.ranges import check_between
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 
@@ -39,11 +40,9 @@ class Scenes:
     model_error: float = 0.3
 
     def __post_init__(self):
-        if not 1 <= self.most_views <= 1000:
-            raise ValueError(f"model.scenes.most_views lies between 1 and 1000, but {self.most_views} was given")
+        check_between("model.scenes.most_views", self.most_views, 1, 1000)
         for name in ("orbit", "arc", "varied", "model_error"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"model.scenes.{name} is a share in [0, 1], but {getattr(self, name)} was given")
+            check_between(f"model.scenes.{name}", getattr(self, name))
         if 1.5 * self.orbit + self.arc > 1:
             raise ValueError("model.scenes has 1.5 orbit + arc of at most 1, but orbit "
                              f"{self.orbit} and arc {self.arc} were given")

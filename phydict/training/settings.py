@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, fields
 
 from phydict.datasets.population import PopulationSettings
+from phydict.runtime.ranges import check_between
 
 MOST_DRAWS, MOST_WORKERS = 10_000_000, 1000
 """Draws of an epoch are listed before it begins, and loader processes are all started then."""
@@ -43,8 +44,7 @@ class TextSettings:
     renew: bool = False
 
     def __post_init__(self):
-        if not 0 <= self.dropout <= 1:
-            raise ValueError(f"model.text.dropout lies in [0, 1], but {self.dropout} was given")
+        check_between("model.text.dropout", self.dropout)
         if self.pretrain_steps < 0:
             raise ValueError(f"model.text.pretrain_steps must not be negative, but {self.pretrain_steps} was given")
 
@@ -108,9 +108,7 @@ class Previews:
     preview_steps: int = 16
 
     def __post_init__(self):
-        if not 0 <= self.preview_steps <= 10_000:
-            raise ValueError("model.validation.preview_steps lies between 0 and 10,000, but "
-                             f"{self.preview_steps} was given")
+        check_between("model.validation.preview_steps", self.preview_steps, 0, 10_000)
 
 
 @dataclass(frozen=True)
@@ -177,9 +175,7 @@ class HoldOut:
     phantoms: int = 6
 
     def __post_init__(self):
-        if not 0 <= self.phantoms <= MOST_DRAWS:
-            raise ValueError(f"data.holdout.phantoms lies between 0 and {MOST_DRAWS:,}, but {self.phantoms:,} was "
-                             "given")
+        check_between("data.holdout.phantoms", self.phantoms, 0, MOST_DRAWS)
 
 
 @dataclass(frozen=True)
@@ -202,12 +198,8 @@ class Loading:
 
     def __post_init__(self):
         for name, least, most in (("epoch_size", 1, MOST_DRAWS), ("batch_size", 1, MOST_DRAWS),
-                                  ("workers", 0, MOST_WORKERS)):
-            value = getattr(self, name)
-            if not least <= value <= most:
-                raise ValueError(f"data.loading.{name} lies between {least} and {most:,}, but {value:,} was given")
-        if not 0 <= self.ct_fraction <= 1:
-            raise ValueError(f"data.loading.ct_fraction lies in [0, 1], but {self.ct_fraction} was given")
+                                  ("workers", 0, MOST_WORKERS), ("ct_fraction", 0, 1)):
+            check_between(f"data.loading.{name}", getattr(self, name), least, most)
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from phydict.diffusion import Denoiser
 from phydict.evaluation import method_panel
 from phydict.grid import Cube, Grid
 from phydict.prior import LocalUNet, SuperResolution, describe_super_resolution, load_super_resolution
+from phydict.runtime.ranges import check_between
 from phydict.training.denoising import DenoisingTraining
 from phydict.training.settings import Optimisation, Previews
 from phydict.units import HUWindow
@@ -37,8 +38,7 @@ class SuperResolutionTraining(DenoisingTraining):
                  window: tuple[float, float] = (-1000.0, 1000.0), detail_std: float = 0.08, most_noise: float = 0.3,
                  optimisation: Optimisation = Optimisation(), validation: Previews = Previews(),
                  initial: str | None = None, seed: int = 0):
-        if not 0 <= most_noise <= 1:
-            raise ValueError(f"model.most_noise lies in [0, 1], but {most_noise} was given")
+        check_between("model.most_noise", most_noise)
         fine = SuperResolution(network or LocalUNet(), cube.grid(), HUWindow(*window), factor,
                                detail_std=detail_std)
         if initial:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import reprlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -110,7 +110,7 @@ class ConeBeam:
                   shape: tuple[int, int], pixel: float | tuple[float, float]) -> ConeBeam:
         """Views of an orbit at any angles, in degrees, and in any order."""
         angles = _numbers("angles_degrees", angles_degrees)
-        if np.ndim(angles) != 1 or not len(angles):
+        if np.ndim(angles) != 1 or not np.size(angles):
             raise ValueError("angles_degrees is a list of an angle for each view, but "
                              f"{reprlib.repr(angles_degrees)} was given")
         _check_isocentre(source_to_detector, source_to_isocentre)
@@ -227,12 +227,12 @@ class ConeBeam:
             if factor < 3:
                 continue
             comparison = "larger" if ratio.min() > 1 else "smaller"
-            said = (f"view {k}: the volume's shadow is {factor:.1f} times {comparison} than the detector of "
+            message = (f"view {k}: the volume's shadow is {factor:.1f} times {comparison} than the detector of "
                     f"{sides[k][0]:.4g} x {sides[k][1]:.4g} mm; check that the pixel size and all distances are in mm, "
                     "not in cm or m, and that the pixel size is that of these images")
             if factor >= 6:
-                raise ValueError(said)
-            warn(said)
+                raise ValueError(message)
+            warn(message)
             return
 
     def _shadow(self, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
@@ -287,8 +287,7 @@ class ConeBeam:
             content = _check_keys(content, VECTOR_KEYS, ())
             numbers: dict[str, Any] = {key: _numbers(key, value) for key, value in content.items()}
             return cls(**numbers)
-        _check_keys(content, (form,), ())
-        given = content[form]
+        given: Any = _check_keys(content, (form,), ())[form]
         if form == "orbit" and isinstance(given, dict) and "angles_degrees" in given:
             form = "angles"
         required, optional = FORMS[form]
@@ -300,8 +299,8 @@ class ConeBeam:
         if np.shape(shift) not in ((), (2,)):
             raise ValueError("detector_shift is mm from column to column, or [from row to row, from column to column], "
                              f"but {reprlib.repr(shift)} was given")
-        make = {"orbit": cls.orbit, "angles": cls.at_angles, "sweep": cls.sweep}[form]
-        beam = make(**given)
+        make: dict[str, Callable[..., ConeBeam]] = {"orbit": cls.orbit, "angles": cls.at_angles, "sweep": cls.sweep}
+        beam = make[form](**given)
         if np.any(shift):
             beam = beam.shifted(*((0.0, shift) if np.ndim(shift) == 0 else shift))
         return beam.tilted(tilt) if tilt else beam

@@ -14,6 +14,7 @@ from phydict.datasets.cts.girth import Girth
 from phydict.datasets.cts.transforms import AIR
 from phydict.datasets.surroundings.surroundings import Surroundings, surround
 from phydict.grid import Grid
+from phydict.runtime.ranges import check_between
 from phydict.units import HUWindow
 
 NAMES_A_SIDE = re.compile(r"\b(left|right|middle lobe|lingula\w*|[LR](UL|ML|LL)?)\b", re.IGNORECASE)
@@ -65,10 +66,8 @@ class Augmentation:
         if self.scale > 0.5 or self.hu_scale > 0.5 or self.rotation > 45:
             raise ValueError("augmentation is for small changes: rotation up to 45 degrees, scale and gain up to 0.5, "
                              f"but {self.rotation}, {self.scale} and {self.hu_scale} were given")
-        over = [name for name in ("girth", "mirror") if getattr(self, name) > 1]
-        if over:
-            raise ValueError(f"augmentation's {over[0]} is a share of the cases, in [0, 1], but "
-                             f"{getattr(self, over[0])} was given")
+        for name in ("girth", "mirror"):
+            check_between(f"data.augmentation.{name}", getattr(self, name))
 
     @classmethod
     def none(cls) -> Augmentation:

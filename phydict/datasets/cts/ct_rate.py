@@ -110,17 +110,17 @@ def find_cts(root: str | Path, reports: str | Path | None = None, metadata: str 
         ids = [id for n, id in enumerate(ids) if n == 0 or scan_of(ids[n - 1]) != scan_of(id)]
     if not ids:
         raise FileNotFoundError(f"every CT in {root} is excluded by {exclude}; give another list or folder")
-    told = reports is not None
+    table_given = reports is not None
     reports = reports or _beside(root, "radiology_text_reports")
     texts = read_reports(reports) if reports else {}
     by_scan = {scan_of(id): text for id, text in texts.items()}
     found = {id: texts.get(id, by_scan.get(scan_of(id))) for id in ids}
     if texts and all(text is None for text in found.values()):
-        missed = (f"none of the {len(texts)} reports in {reports} is of one of the {len(ids)} CTs in {root} (the first "
-                  f"report is of {next(iter(texts))}, the first CT is {ids[0]})")
-        if told:
-            raise ValueError(f"{missed}: give the table of these CTs, or leave out data.source.reports")
-        warn(missed)
+        message = (f"none of the {len(texts)} reports in {reports} is of one of the {len(ids)} CTs in {root} (the "
+                   f"first report is of {next(iter(texts))}, the first CT is {ids[0]})")
+        if table_given:
+            raise ValueError(f"{message}: give the table of these CTs, or leave out data.source.reports")
+        warn(message)
     cts = [CTFile(files[id], id, _own_report(files[id]) if text is None else text) for id, text in found.items()]
     return cts if fixed else _calibrated(cts, metadata or _beside(root, "metadata"))
 

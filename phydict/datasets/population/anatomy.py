@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from phydict.datasets.phantoms.findings import FOCAL, PLEURAL, Finding, draw_findings
+from phydict.runtime.ranges import check_between
 
 PAINTED = FOCAL + PLEURAL
 """Kinds of findings that are put into CTs; the others would change organs that no mask shows."""
@@ -40,9 +41,7 @@ class Variation:
     def __post_init__(self):
         for name, most in (("mixing", 1.0), ("modes", 2.0), ("lungs", 0.7), ("heart", 0.7), ("liver", 0.7),
                            ("findings", 1.0)):
-            if not 0 <= getattr(self, name) <= most:
-                raise ValueError(f"data.loading.population.variation.{name} lies in [0, {most:g}], but "
-                                 f"{getattr(self, name)} was given")
+            check_between(f"data.loading.population.variation.{name}", getattr(self, name), 0, most)
 
     @classmethod
     def none(cls) -> Variation:

@@ -17,6 +17,7 @@ from phydict.datasets.population.anatomy import Variation, findings_of
 from phydict.datasets.population.population import Population
 from phydict.datasets.population.registration import Registered, features, medoid, register
 from phydict.runtime.progress import CaseProgress
+from phydict.runtime.ranges import check_between
 from phydict.runtime.warning import warn
 
 POPULATION_VERSION = 1
@@ -42,12 +43,8 @@ class PopulationSettings:
     variation: Variation = Variation()
 
     def __post_init__(self):
-        if not 0 <= self.share <= 1:
-            raise ValueError(f"data.loading.population.share lies in [0, 1], but {self.share} was given")
-        for name, least in (("draws", 1), ("patients", 2)):
-            if not least <= getattr(self, name) <= MOST_DRAWS:
-                raise ValueError(f"data.loading.population.{name} lies between {least} and {MOST_DRAWS:,}, but "
-                                 f"{getattr(self, name):,} was given")
+        for name, least, most in (("share", 0, 1), ("draws", 1, MOST_DRAWS), ("patients", 2, MOST_DRAWS)):
+            check_between(f"data.loading.population.{name}", getattr(self, name), least, most)
 
 
 class DrawnPatients(Dataset):

@@ -12,6 +12,7 @@ from phydict.datasets.surroundings.covers import Cover
 from phydict.datasets.surroundings.leads import Lead
 from phydict.datasets.surroundings.scene import Scene
 from phydict.grid import Grid
+from phydict.runtime.ranges import check_between
 
 FIELD_MM = 560.0
 """Largest diameter of the scanner's field that is drawn for what lies around a body."""
@@ -43,9 +44,7 @@ class Surroundings:
 
     def __post_init__(self):
         for name, share in vars(self).items():
-            if not 0 <= share <= 1:
-                raise ValueError(f"surroundings' {name} is a share of the cases, in [0, 1], but {share} was given; "
-                                 "give 0 for none and 1 for all")
+            check_between(f"data.augmentation.surroundings.{name}", share)
 
     @classmethod
     def none(cls) -> Surroundings:

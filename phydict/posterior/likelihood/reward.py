@@ -78,7 +78,7 @@ class Reward:
         projector, n = measurement.projector, self.upsampling
         field = x if self.raw_range else measurement.slope * x + measurement.offset
         if n > 1:
-            field = interpolate(field, scale_factor=n, **({} if self.nearest else {"mode": "trilinear"}))
+            field = interpolate(field, scale_factor=n, mode="nearest" if self.nearest else "trilinear")
         if self.renderer or n > 1:
             projector = Projector(finer(projector.grid, n), projector.beam, self.renderer or "auto", device=x.device,
                                   full_detector=True)
@@ -91,7 +91,8 @@ class Reward:
         images = projected, measured.expand_as(projected)
         if not self.standardise:
             low, high = measured.amin((-2, -1), keepdim=True), measured.amax((-2, -1), keepdim=True)
-            images = [(v - low) * (2 / (high - low).clamp(min=1e-6)) - 1 for v in images]
+            scale = 2 / (high - low).clamp(min=1e-6)
+            images = (images[0] - low) * scale - 1, (images[1] - low) * scale - 1
         network = load_lpips(self.backbone, self.random_backbone).to(projected.device).train(self.dropout)
         with torch.random.fork_rng(enabled=self.dropout):
             if self.dropout:
@@ -112,7 +113,8 @@ def finer(grid: Grid, n: int) -> Grid:
     affine = grid.affine.copy()
     affine[:3, :3] /= n
     affine[:3, 3] -= affine[:3, :3].sum(1) * (n - 1) / 2
-    return Grid(tuple(n * size for size in grid.shape), affine=affine)
+    x, y, z = grid.shape
+    return Grid((n * x, n * y, n * z), affine=affine)
 
 
 def _standardised(views: Tensor) -> Tensor:

@@ -22,6 +22,7 @@ from phydict.posterior.likelihood.likelihood import LikelihoodStep, ProximalCG
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.samplers.sampler import Sampler, ddim_sample
 from phydict.posterior.scatter import with_scatter
+from phydict.runtime.ranges import check_between
 
 @dataclass(frozen=True)
 class SplitGibbs(Sampler):
@@ -88,9 +89,8 @@ class SplitGibbs(Sampler):
             raise ValueError("momentum is a share in [0, 1], and above 0 only where noise_fraction is given, but "
                              f"{self.momentum} was given, with a noise_fraction of {self.noise_fraction}")
         for name in ("noise_fraction", "sampling_noise"):
-            share = getattr(self, name)
-            if share is not None and not 0 <= share <= 1:
-                raise ValueError(f"{name} is a share in [0, 1] or left out, but {share} was given")
+            if getattr(self, name) is not None:
+                check_between(name, getattr(self, name))
         if not 0 <= self.ec_delta < 1:
             raise ValueError(f"ec_delta (the paper's delta) lies in [0, 1), but {self.ec_delta} was given")
         if self.ec_delta and self.ec_steps < 1:
@@ -141,9 +141,7 @@ class SplitGibbs(Sampler):
             x0 = denoiser.denoise(x, t)
             if self.clip:
                 x0 = x0.clamp(-1, 1)
-            measurement.match_gain_offset(x0[:, :1])
-            if measurement.scatter_enabled and t < 1:
-                measurement.subtract_scatter(measurement.project(x0[:, :1]))
+            (measurement.refit if t < 1 else measurement.match_gain_offset)(x0[:, :1])
             z, step = x0.clamp(-1, 1), self.likelihood if s > 0 else self.final_likelihood
             if step:
                 ct = step(measurement, x0[:, :1], self.x0_std(denoiser, t)).clamp(-1, 1)

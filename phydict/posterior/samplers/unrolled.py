@@ -63,7 +63,7 @@ class Unrolled(Sampler):
                   on_step: Callable[[], None] = lambda: None) -> Iterator[Tensor]:
         """What the refiner answers at each call, and at last the result. Gradients do not pass from call to call."""
         before = refiner.mean.to(measurement.y)
-        self._match(measurement, before)
+        measurement.refit(before[:, :1])
         evidence = Evidence(measurement)
         z = start = self._meet(self.start, measurement, before, self.x0_stds[0])
         on_step()
@@ -73,7 +73,7 @@ class Unrolled(Sampler):
             x0 = refiner.refine(signal * z, t, channels)
             yield x0
             before = x0.detach().clamp(-1, 1)
-            self._match(measurement, before)
+            measurement.refit(before[:, :1])
             last = n + 1 == len(self.times)
             step = self.final_likelihood if last else self.likelihood
             z = self._meet(step, measurement, before, self.x0_stds[n + 1])
@@ -84,13 +84,6 @@ class Unrolled(Sampler):
                     z = self._meet(smoother, measurement, before, self.x0_stds[n + 1])
             on_step()
         yield z
-
-    @staticmethod
-    def _match(measurement: Measurement, x0: Tensor) -> None:
-        """Refits what is not of the volume, gains or scatter, to an estimate."""
-        measurement.match_gain_offset(x0[:, :1])
-        if measurement.scatter_enabled:
-            measurement.subtract_scatter(measurement.project(x0[:, :1]))
 
     @staticmethod
     def _meet(step: LikelihoodStep, measurement: Measurement, x0: Tensor, x0_std: float) -> Tensor:

@@ -14,6 +14,7 @@ from phydict.grid import Grid
 from phydict.prior.medsyn.networks import FACTOR, STATE_CHANNELS, SuperResolutionUNet, from_slices, to_slices
 from phydict.prior.medsyn.prior import WINDOW, _check_divisible, atlas_grid
 from phydict.runtime.precision import network_precision
+from phydict.runtime.ranges import check_between
 
 
 class MedSynSuperResolution(nn.Module):
@@ -68,8 +69,7 @@ class MedSynSuperResolution(nn.Module):
         if coarse.ndim != 5 or coarse.shape[1] != self.coarse_channels:
             raise ValueError(f"a coarse state is (B, {self.coarse_channels}, X, Y, Z), but {tuple(coarse.shape)} was "
                              "given: give the whole state of MedSyn's first stage, masks included")
-        if not 0 <= noise <= 1:
-            raise ValueError(f"the coarse state's share of noise lies in [0, 1], but {noise} was given")
+        check_between("the noise level of the coarse state", noise)
         upsampled = self.upsample(coarse)
         if noise and generator is not None:
             upsampled = torch.lerp(upsampled, torch.randn(upsampled.shape, generator=generator).to(upsampled), noise)

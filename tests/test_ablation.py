@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from command_lines import refusal
 from prior.tiny import tiny_prior
 
 from phydict.ablation import plots, read_specification
@@ -87,15 +88,6 @@ def ablate(folder: Path, **content) -> list[dict]:
 def lasting(rows: list[dict]) -> list[dict]:
     """Rows without what the clock decides."""
     return [{k: v for k, v in row.items() if not any(word in k for word in TIMES)} for row in rows]
-
-
-def refusal(capsys, args: list[str]) -> str:
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as stopped:
-        main(args)
-    assert stopped.value.code == 2
-    (line,) = (line for line in capsys.readouterr().err.splitlines() if line.startswith("error: "))
-    return line
 
 
 def test_a_stopped_run_loses_no_row_and_ends_as_if_it_had_not_been_stopped(tmp_path, monkeypatch, trace):
@@ -328,7 +320,7 @@ def test_delta_keeps_the_length_of_a_step():
     ({"axes": {"method": ["phydict_fast"], "method.iterations": [1]}}, ["phydict_fast: ", "2 iterations"]),
     ({"axes": [1]}, ["axes", "mapping"])], ids=lambda value: str(value)[:60] if isinstance(value, dict) else "")
 def test_a_specification_that_cannot_be_meant_is_one_sentence(tmp_path, capsys, content, words):
-    said = refusal(capsys, ["ablate", "-c", str(write(tmp_path, **content))])
+    said = refusal(capsys, main, ["ablate", "-c", str(write(tmp_path, **content))])
     assert "spec.yaml" in said and all(word in said for word in words), said
     assert not (tmp_path / "out").exists()
 
@@ -337,7 +329,7 @@ def test_the_table_of_another_comparison_is_left_alone(tmp_path, capsys, trace):
     ablate(tmp_path, phantoms=1, base=TINY, axes={"method": ["trace"]})
     before = {file: file.read_bytes() for file in (tmp_path / "out").iterdir()}
     other = write(tmp_path, phantoms=1, base=TINY | {"seed": 7}, axes={"method": ["trace"]})
-    assert "another out" in refusal(capsys, ["ablate", "-c", str(other)])
+    assert "another out" in refusal(capsys, main, ["ablate", "-c", str(other)])
     assert {file: file.read_bytes() for file in (tmp_path / "out").iterdir()} == before
 
 
@@ -345,21 +337,21 @@ def test_the_table_of_another_comparison_is_left_alone(tmp_path, capsys, trace):
 def test_what_other_programs_wrote_is_left_alone(tmp_path, capsys, trace, name):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / name).write_text("mine")
-    said = refusal(capsys, ["ablate", "-c", str(write(tmp_path, axes={"method": ["trace"]})), "--device", "cpu"])
+    said = refusal(capsys, main, ["ablate", "-c", str(write(tmp_path, axes={"method": ["trace"]})), "--device", "cpu"])
     assert f"holds {name}, but no results.csv of this command" in said and not trace.given
     assert (tmp_path / "out" / name).read_text() == "mine"
 
 
 def test_arguments_and_files_that_cannot_be_meant_are_one_sentence(tmp_path, capsys):
-    assert "nowhere.yaml" in refusal(capsys, ["ablate", "-c", str(tmp_path / "nowhere.yaml")])
+    assert "nowhere.yaml" in refusal(capsys, main, ["ablate", "-c", str(tmp_path / "nowhere.yaml")])
     file = write(tmp_path, axes={"method": ["trace"]})
-    assert "nowhere" in refusal(capsys, ["ablate", "-c", str(file), "--cts", str(tmp_path / "nowhere")])
+    assert "nowhere" in refusal(capsys, main, ["ablate", "-c", str(file), "--cts", str(tmp_path / "nowhere")])
     (tmp_path / "bad.yaml").write_text("axes: [")
-    assert "bad.yaml is not valid YAML" in refusal(capsys, ["ablate", "-c", str(tmp_path / "bad.yaml")])
+    assert "bad.yaml is not valid YAML" in refusal(capsys, main, ["ablate", "-c", str(tmp_path / "bad.yaml")])
     with alone_in(tmp_path / "out", "out"):
-        assert "another run" in refusal(capsys, ["ablate", "-c", str(file)])
+        assert "another run" in refusal(capsys, main, ["ablate", "-c", str(file)])
     (tmp_path / "out" / "results.csv").write_text("case,method\na,b\n")
-    assert "another out" in refusal(capsys, ["ablate", "-c", str(file)])
+    assert "another out" in refusal(capsys, main, ["ablate", "-c", str(file)])
 
 
 @pytest.mark.parametrize("config", sorted((ROOT / "configs" / "ablate").glob("*.yaml")), ids=lambda file: file.stem)
@@ -473,20 +465,20 @@ def test_results_are_never_written_among_the_cts(tmp_path, capsys):
     nibabel.save(nibabel.Nifti1Image(np.zeros((20, 20, 20), np.float32), np.diag([10.0, 10, 10, 1])), cts / "a.nii.gz")
     for out in (cts, cts / "out"):
         file = write(tmp_path, axes={"method": ["trace"]}, cts=str(cts), out=str(out), phantoms=None)
-        assert "give another out" in refusal(capsys, ["ablate", "-c", str(file), "--device", "cpu"])
+        assert "give another out" in refusal(capsys, main, ["ablate", "-c", str(file), "--device", "cpu"])
     assert [path.name for path in cts.iterdir()] == ["a.nii.gz"]
 
 
 def test_a_device_that_is_not_there_is_refused(tmp_path, capsys):
     file = write(tmp_path, axes={"method": ["trace"]})
-    assert "--device warp cannot be used" in refusal(capsys, ["ablate", "-c", str(file), "--device", "warp"])
+    assert "--device warp cannot be used" in refusal(capsys, main, ["ablate", "-c", str(file), "--device", "warp"])
 
 
 def test_a_table_with_words_for_numbers_is_refused_by_row_and_column(tmp_path, capsys):
     (row, *_) = ablate(tmp_path, axes={"method": ["trace"]})
     table = tmp_path / "out" / "results.csv"
     table.write_text(table.read_text().replace(repr(row["psnr"]), "1e999"))
-    said = refusal(capsys, ["ablate", "-c", str(tmp_path / "spec.yaml"), "--device", "cpu"])
+    said = refusal(capsys, main, ["ablate", "-c", str(tmp_path / "spec.yaml"), "--device", "cpu"])
     assert f"psnr of row {row['key']} is '1e999'" in said and "results.csv" in said
 
 

@@ -16,8 +16,8 @@ from tempfile import TemporaryDirectory
 
 import pytest
 import torch
+from command_lines import arguments, losses
 from prior.tiny import tiny_prior, tiny_refiner, tiny_super_resolution
-from test_training import arguments, losses
 
 from phydict.ablation.summary import entries
 from phydict.ablation.tables import all_tables

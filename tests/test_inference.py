@@ -21,6 +21,7 @@ import pydicom
 import pytest
 import torch
 import yaml
+from command_lines import refusal
 from dicom_files import orbit_tags, write_dicom
 from PIL import Image
 from prior.medsyn_files import entries, super_resolution_unet, text_unet, write
@@ -75,19 +76,6 @@ def stamp(folder: Path) -> dict[str, int]:
 
 def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
-
-
-def refusal(capsys, args: list[str]) -> str:
-    """The one sentence on stderr with which the command line refuses `args`."""
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as stopped:
-        main(args)
-    assert stopped.value.code == 2
-    said = capsys.readouterr().err
-    assert "Traceback" not in said and "usage:" not in said
-    lines = [line for line in said.splitlines() if line.startswith("error: ")]
-    assert lines == said.splitlines()[-1:], said
-    return lines[0]
 
 
 def write_ct(path: Path, seed: int, code: int = 1, change=lambda hu: hu) -> Path:
@@ -263,7 +251,7 @@ def test_a_dry_run_warns_of_a_left_lateral_view_told_to_stand_at_90_degrees(tmp_
 
 
 def test_a_dry_run_belongs_to_predict(tmp_path, capsys):
-    assert "dry_run" in refusal(capsys, phantoms(tmp_path / "out", 1, "--dry_run"))
+    assert "dry_run" in refusal(capsys, main, phantoms(tmp_path / "out", 1, "--dry_run"))
 
 
 def test_one_folder_of_xrays_is_a_case(measured, tmp_path, monkeypatch):
@@ -282,7 +270,7 @@ def test_a_finished_case_is_kept_until_asked_otherwise(measured, tmp_path, capsy
     main([*args, "--profile"])
     assert "not profiled: --model.overwrite true" in capsys.readouterr().err
     for change in ("--model.seed=1", "--model.method.init_args.iterations=4", "--data.geometry=arc_90"):
-        said = refusal(capsys, [*args, change])
+        said = refusal(capsys, main, [*args, change])
         assert "other settings" in said and "overwrite" in said
     assert stamp(folder) == before
     main([*args, "--model.overwrite=true", "--model.seed=1"])
@@ -327,7 +315,7 @@ def test_a_folder_that_is_no_case_is_never_replaced(measured, tmp_path, capsys, 
     notes = tmp_path / "sirt" / "anna" / "notes.txt"
     notes.parent.mkdir(parents=True)
     notes.write_text("mine")
-    said = refusal(capsys, sirt("predict", tmp_path, f"--data.xrays={measured / 'anna'}",
+    said = refusal(capsys, main, sirt("predict", tmp_path, f"--data.xrays={measured / 'anna'}",
                                 f"--model.overwrite={overwrite}"))
     assert str(notes.parent) in said and "model.out" in said and "overwrite" not in said
     assert names(tmp_path / "sirt") == ["anna"] and notes.read_text() == "mine"
@@ -347,27 +335,27 @@ def test_an_output_that_is_holds_or_lies_inside_the_input_is_refused(measured, t
     before = contents(tmp_path)
     args = sirt("predict", tmp_path / place, f"--data.xrays={tmp_path / 'cases'}", "--model.overwrite=true",
                 f"--model.name={name.format(parent=tmp_path.name)}")
-    said = refusal(capsys, args)
+    said = refusal(capsys, main, args)
     assert how in said and "give another model.out" in said and contents(tmp_path) == before
 
 
 def test_results_are_never_written_among_the_cts(cts, tmp_path, capsys):
     before = contents(cts)
-    said = refusal(capsys, sirt("test", cts, f"--data.cts={cts}", *ORBIT))
+    said = refusal(capsys, main, sirt("test", cts, f"--data.cts={cts}", *ORBIT))
     assert "lies inside the input" in said and contents(cts) == before
 
 
 def test_a_dry_run_writes_no_page_among_the_xrays(measured, tmp_path, capsys):
     shutil.copytree(measured, tmp_path / "dry_run")
     before = contents(tmp_path)
-    said = refusal(capsys, sirt("predict", tmp_path, f"--data.xrays={tmp_path / 'dry_run'}", "--dry_run"))
+    said = refusal(capsys, main, sirt("predict", tmp_path, f"--data.xrays={tmp_path / 'dry_run'}", "--dry_run"))
     assert "is the input" in said and contents(tmp_path) == before
 
 
 @pytest.mark.parametrize("name", ["../other", "/{out}/other", "a/b", "..", ".", ""])
 def test_a_name_is_that_of_one_folder_inside_the_output(measured, tmp_path, capsys, name):
     name = name.format(out=str(tmp_path).strip("/"))
-    said = refusal(capsys, sirt("predict", tmp_path / "out", f"--data.xrays={measured}", f"--model.name={name}"))
+    said = refusal(capsys, main, sirt("predict", tmp_path / "out", f"--data.xrays={measured}", f"--model.name={name}"))
     assert f"one folder inside model.out, but '{name}' was given" in said and names(tmp_path) == []
 
 
@@ -407,7 +395,7 @@ def test_a_run_that_another_one_overtakes_keeps_its_result(measured, tmp_path, c
     if code is None:
         main(args)
     else:
-        assert "another process has finished" in refusal(capsys, args)
+        assert "another process has finished" in refusal(capsys, main, args)
     assert stamp(folder) == overtaken[1] and record(folder)["settings"]["seed"] == seed
 
 
@@ -432,7 +420,7 @@ def test_a_damaged_record_is_named(measured, tmp_path, capsys):
     file = tmp_path / "sirt" / "anna" / "reconstruction.json"
     for content in (file.read_text()[:50], "{}"):
         file.write_text(content)
-        said = refusal(capsys, args)
+        said = refusal(capsys, main, args)
         assert str(file.parent) in said and "damaged" in said
 
 
@@ -450,7 +438,7 @@ def test_a_finished_case_is_never_taken_for_that_of_other_data(measured, cts, tm
     for file in sorted((tmp_path / "case").iterdir()):
         whole = file.read_bytes()
         file.write_bytes(whole + b"\n")
-        assert "other data" in refusal(capsys, xrays), file
+        assert "other data" in refusal(capsys, main, xrays), file
         file.write_bytes(whole)
     main(xrays)
     for name in ("a", "b"):
@@ -459,7 +447,7 @@ def test_a_finished_case_is_never_taken_for_that_of_other_data(measured, cts, tm
             main(ct)
             shutil.copyfile(cts / "a.nii.gz", tmp_path / "ct.nii.gz")  # later, but the same
             main(ct)
-    assert "other data" in refusal(capsys, ct)
+    assert "other data" in refusal(capsys, main, ct)
 
 
 def test_one_bad_case_spoils_no_other(measured, tmp_path, capsys):
@@ -484,7 +472,8 @@ def test_a_table_holds_the_cases_of_its_run_alone(cts, tmp_path):
 
 def test_a_list_of_cases_must_fit_the_folder(cts, tmp_path, capsys):
     (tmp_path / "only.txt").write_text("b\nnobody\n")
-    said = refusal(capsys, sirt("test", tmp_path, f"--data.cts={cts}", *ORBIT, f"--data.only={tmp_path / 'only.txt'}"))
+    args = sirt("test", tmp_path, f"--data.cts={cts}", *ORBIT, f"--data.only={tmp_path / 'only.txt'}")
+    said = refusal(capsys, main, args)
     assert "nobody" in said and "data.only" in said
 
 
@@ -623,7 +612,7 @@ def test_the_simulated_orbit_is_the_one_asked_for(scored, tmp_path, capsys):
     np.testing.assert_array_equal(volume(tmp_path / "same" / "sirt" / case), volume(scored / case))
     main(phantoms(tmp_path / "finer", 1, "--data.simulation_voxels=128"))
     assert not np.array_equal(volume(tmp_path / "finer" / "sirt" / case), volume(scored / case))
-    assert "multiple" in refusal(capsys, phantoms(tmp_path / "coarser", 1, "--data.simulation_voxels=96"))
+    assert "multiple" in refusal(capsys, main, phantoms(tmp_path / "coarser", 1, "--data.simulation_voxels=96"))
 
 
 def test_simulated_xrays_are_taken_where_a_geometry_file_says(scored, tmp_path, capsys):
@@ -637,7 +626,7 @@ def test_simulated_xrays_are_taken_where_a_geometry_file_says(scored, tmp_path, 
 
 def test_other_xrays_into_a_finished_folder_are_refused(scored, capsys):
     for change in ("--data.orbit.views=4", "--data.simulation_voxels=128", "--data.simulator.noise=0.1"):
-        assert "other settings" in refusal(capsys, phantoms(scored.parent, 2, change))
+        assert "other settings" in refusal(capsys, main, phantoms(scored.parent, 2, change))
 
 
 def test_realistic_xrays_are_made_and_come_out_in_hu(scored, tmp_path):
@@ -809,7 +798,7 @@ BAD_PRIORS = {
 def test_bad_xrays_are_one_sentence(case, tmp_path, capsys):
     make, words = BAD_XRAYS[case]
     (tmp_path / "in").mkdir()
-    said = refusal(capsys, sirt("predict", tmp_path / "out", f"--data.xrays={make(tmp_path / 'in')}"))
+    said = refusal(capsys, main, sirt("predict", tmp_path / "out", f"--data.xrays={make(tmp_path / 'in')}"))
     assert all(word in said for word in words), said
     assert not (tmp_path / "out").exists()
 
@@ -818,7 +807,7 @@ def test_bad_xrays_are_one_sentence(case, tmp_path, capsys):
 def test_a_bad_ct_is_one_sentence(case, tmp_path, capsys):
     make, words = BAD_CTS[case]
     (tmp_path / "in").mkdir()
-    said = refusal(capsys, sirt("test", tmp_path / "out", f"--data.cts={make(tmp_path / 'in')}", *ORBIT))
+    said = refusal(capsys, main, sirt("test", tmp_path / "out", f"--data.cts={make(tmp_path / 'in')}", *ORBIT))
     assert all(word in said for word in words), said
     assert not (tmp_path / "out").exists()
 
@@ -828,7 +817,7 @@ def test_a_bad_prior_is_one_sentence(case, prior, measured, tmp_path, capsys):
     make, words = BAD_PRIORS[case]
     (tmp_path / "in").mkdir()
     file = make(tmp_path / "in", prior)
-    said = refusal(capsys, with_prior("predict", tmp_path / "out", file, f"--data.xrays={measured}"))
+    said = refusal(capsys, main, with_prior("predict", tmp_path / "out", file, f"--data.xrays={measured}"))
     assert all(word in said for word in words), said
     assert not (tmp_path / "out").exists()
 
@@ -973,7 +962,7 @@ def headed(good: Path, target: Path, header: object) -> Path:
 ], ids=["list", "null", "deep", "stage", "text", "number", "channels", "grid"])
 def test_a_priors_header_that_cannot_be_is_one_sentence(header, words, prior, measured, tmp_path, capsys):
     file = headed(prior, tmp_path / "p.safetensors", header)
-    said = refusal(capsys, with_prior("predict", tmp_path / "out", file, f"--data.xrays={measured}"))
+    said = refusal(capsys, main, with_prior("predict", tmp_path / "out", file, f"--data.xrays={measured}"))
     assert "p.safetensors" in said and words in said and not (tmp_path / "out").exists()
 
 
@@ -991,16 +980,16 @@ def test_an_option_that_cannot_be_meant_is_one_sentence(change, words, measured,
                        ("laughs", "a: &a [1, 2, 3, 4, 5, 6, 7, 8, 9]\n" + LAUGHS), ("latin", "# \xe9")):
         (tmp_path / f"{name}.yaml").write_text(text, encoding="latin-1")
     change = [text.format(tmp=tmp_path) for text in change]
-    said = refusal(capsys, sirt("predict", tmp_path / "out", f"--data.xrays={measured}", *change))
+    said = refusal(capsys, main, sirt("predict", tmp_path / "out", f"--data.xrays={measured}", *change))
     assert words in said and not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("change, words", [
     ("--model.sampling.samples=1000000000", "samples=1000000000 states of"),
     ("--model.sampling.guidance=nan", "model.sampling.guidance"),
-    ("--model.sampling.guidance=.nan", "the guidance scale lies between 0 and 1e")])
+    ("--model.sampling.guidance=.nan", "the guidance scale lies between 0 and 1,000,000")])
 def test_an_option_of_a_prior_that_cannot_be_meant_is_one_sentence(change, words, prior, measured, tmp_path, capsys):
-    said = refusal(capsys, with_prior("predict", tmp_path / "out", prior, f"--data.xrays={measured}", change))
+    said = refusal(capsys, main, with_prior("predict", tmp_path / "out", prior, f"--data.xrays={measured}", change))
     assert words in said and not (tmp_path / "out").exists()
 
 
@@ -1034,7 +1023,7 @@ def test_medsyns_second_stage_is_refused_before_anything_is_done_where_it_takes_
         measured, tmp_path, capsys):
     base = write(tmp_path / "base" / "model_1.safetensors", entries(text_unet()))
     second = write(tmp_path / "second" / "model.safetensors", entries(super_resolution_unet())).parent
-    said = refusal(capsys, with_prior("predict", tmp_path / "out", base, f"--data.xrays={measured}",
+    said = refusal(capsys, main, with_prior("predict", tmp_path / "out", base, f"--data.xrays={measured}",
                                       f"--model.super_resolution.file={second}", "--model.super_resolution.memory=1"))
     assert "(256, 256, 256)" in said and "1 GiB are allowed" in said and "--model.super_resolution.memory " in said
     assert not (tmp_path / "out").exists()
@@ -1042,12 +1031,12 @@ def test_medsyns_second_stage_is_refused_before_anything_is_done_where_it_takes_
 
 def test_stages_in_each_others_place_are_one_sentence(prior, fine, measured, tmp_path, capsys):
     data = f"--data.xrays={measured}"
-    said = refusal(capsys, with_prior("predict", tmp_path / "out", fine, data))
+    said = refusal(capsys, main, with_prior("predict", tmp_path / "out", fine, data))
     assert "fine.safetensors' is a super-resolution stage, but a base prior" in said
-    said = refusal(capsys, with_prior("predict", tmp_path / "out", prior, data,
+    said = refusal(capsys, main, with_prior("predict", tmp_path / "out", prior, data,
                                       f"--model.super_resolution.file={prior}"))
     assert "is a base prior, but a super-resolution stage" in said
-    said = refusal(capsys, sirt("predict", tmp_path / "out", data, f"--model.super_resolution.file={fine}"))
+    said = refusal(capsys, main, sirt("predict", tmp_path / "out", data, f"--model.super_resolution.file={fine}"))
     assert "SIRT has none" in said
 
 
@@ -1073,7 +1062,7 @@ def test_a_prior_refuses_xrays_of_another_grid(prior):
     (["ablate", "--phantoms", "3"], ["-c configs/ablate/"])], ids=lambda value: " ".join(value)[:20])
 def test_a_missing_command_or_input_says_what_to_give(args, words, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    said = refusal(capsys, args)
+    said = refusal(capsys, main, args)
     assert all(word in said for word in words), said
 
 
@@ -1089,7 +1078,7 @@ def test_a_missing_command_or_input_says_what_to_give(args, words, capsys, tmp_p
     (["--model.sampling.precision=half"], ["precision is auto, float32 or bfloat16, but 'half' was given"]),
 ], ids=lambda value: value[0] if value[0].startswith("--") else "")
 def test_a_bad_argument_is_one_sentence(change, words, tmp_path, capsys):
-    said = refusal(capsys, phantoms(tmp_path / "out", 1, *change))
+    said = refusal(capsys, main, phantoms(tmp_path / "out", 1, *change))
     assert all(word in said for word in words), said
     assert not (tmp_path / "out").exists()
 
@@ -1102,16 +1091,17 @@ def test_a_config_file_names_its_method_and_is_told_of_one_that_is_none(measured
     settings = record(tmp_path / "out" / "sirt" / "anna")["settings"]
     assert settings["method"]["class"] == "SIRT" and settings["method"]["iterations"] == 2 and settings["seed"] == 4
     (tmp_path / "mine.yaml").write_text("model: {method: srit}")
-    assert "no method 'srit'" in refusal(capsys, args)
+    assert "no method 'srit'" in refusal(capsys, main, args)
 
 
 def test_an_unknown_key_of_a_config_file_is_named(tmp_path, capsys):
     (tmp_path / "mine.yaml").write_text("model:\n  guidence: 2.0\n")
-    assert "model.guidence" in refusal(capsys, phantoms(tmp_path / "out", 1, f"--config={tmp_path / 'mine.yaml'}"))
+    args = phantoms(tmp_path / "out", 1, f"--config={tmp_path / 'mine.yaml'}")
+    assert "model.guidence" in refusal(capsys, main, args)
 
 
 def test_an_impossible_setting_is_named_without_the_parsers_noise(prior, tmp_path, capsys):
-    said = refusal(capsys, ["test", f"--model.prior={prior}",
+    said = refusal(capsys, main, ["test", f"--model.prior={prior}",
                             "--model.method.init_args.iterations=0"])
     assert "at least one iteration, but 0" in said and "Union" not in said
 
@@ -1119,7 +1109,7 @@ def test_an_impossible_setting_is_named_without_the_parsers_noise(prior, tmp_pat
 def test_an_output_folder_that_cannot_be_is_one_sentence(measured, tmp_path, capsys):
     (tmp_path / "file").write_text("mine")
     for out in (tmp_path / "file", tmp_path / "file" / "deeper", Path("/proc/phydict")):
-        said = refusal(capsys, sirt("predict", out, f"--data.xrays={measured}"))
+        said = refusal(capsys, main, sirt("predict", out, f"--data.xrays={measured}"))
         assert str(out) in said and "model.out" in said
     assert (tmp_path / "file").read_text() == "mine"
 
@@ -1129,7 +1119,7 @@ def test_a_read_only_disk_is_one_sentence(measured, tmp_path, capsys, monkeypatc
         raise OSError(30, "Read-only file system")
 
     monkeypatch.setattr("phydict.runtime.console.tempfile.TemporaryFile", refuse)
-    said = refusal(capsys, sirt("predict", tmp_path / "out", f"--data.xrays={measured}"))
+    said = refusal(capsys, main, sirt("predict", tmp_path / "out", f"--data.xrays={measured}"))
     assert "Read-only file system" in said and not (tmp_path / "out").exists()
 
 
@@ -1138,7 +1128,7 @@ def test_a_disk_that_fills_up_leaves_no_case_that_looks_finished(measured, tmp_p
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, hard))  # no file may grow beyond 50 kB
     try:
-        said = refusal(capsys, args)
+        said = refusal(capsys, main, args)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert "anna" in said and "could not be written" in said and "free some space" not in said  # the disk is not full
@@ -1161,7 +1151,7 @@ def test_several_samples_leave_a_deviation_map_in_the_volumes_place(measured, pr
 
 
 def test_samples_of_a_method_without_a_prior_are_refused(capsys, measured, tmp_path):
-    assert "leave samples at 1" in refusal(capsys, sirt("predict", tmp_path, f"--data.xrays={measured}",
+    assert "leave samples at 1" in refusal(capsys, main, sirt("predict", tmp_path, f"--data.xrays={measured}",
                                                         "--model.sampling.samples=3"))
 
 
@@ -1182,7 +1172,7 @@ def test_a_profile_shows_the_stages_of_every_case_and_changes_no_volume(measured
 def test_a_run_that_is_not_finite_ends_in_one_sentence_and_leaves_no_case(measured, tmp_path, capsys, monkeypatch):
     solve = SIRT.solve
     monkeypatch.setattr(SIRT, "solve", lambda self, *given: solve(self, *given) * float("nan"))
-    said = refusal(capsys, sirt("predict", tmp_path, f"--data.xrays={measured / 'anna'}"))
+    said = refusal(capsys, main, sirt("predict", tmp_path, f"--data.xrays={measured / 'anna'}"))
     assert "not finite from step 3 of 3 on" in said and not (tmp_path / "sirt" / "anna").exists()
 
 
@@ -1206,8 +1196,8 @@ def test_a_projector_is_chosen_and_recorded_and_another_result_is_not_taken_for_
     main([*args, "--model.projector=siddon"])
     assert record(tmp_path / "out" / "sirt" / "anna")["settings"]["projector"] == "siddon"
     other = volume(tmp_path / "out" / "sirt" / "anna").copy()
-    assert "other settings" in refusal(capsys, args)
+    assert "other settings" in refusal(capsys, main, args)
     main([*args, "--model.overwrite=true"])
     assert "projector" not in record(tmp_path / "out" / "sirt" / "anna")["settings"]
     assert not np.array_equal(volume(tmp_path / "out" / "sirt" / "anna"), other)
-    assert "model.projector is one of" in refusal(capsys, [*args, "--model.projector=lines"])
+    assert "model.projector is one of" in refusal(capsys, main, [*args, "--model.projector=lines"])

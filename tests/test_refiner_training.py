@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from command_lines import checkpoint, losses, refusal
 from prior.tiny import tiny_prior
-from test_training import cache, checkpoint, losses, refusal  # noqa: F401
 from torch.utils.data import default_collate
 
 from phydict.cli.train import main
@@ -29,7 +29,7 @@ def prior_file(tmp_path_factory) -> str:
     return str(file)
 
 
-def arguments(folder: Path, cache: Path, initial: str, *more: str) -> list[str]:  # noqa: F811
+def arguments(folder: Path, cache: Path, initial: str, *more: str) -> list[str]:
     return ["fit", f"--config={CONFIG}", "--model.cube.voxels=16", "--model.window=[-1000,600]", "--data.phantoms=3",
             "--data.holdout.phantoms=1", "--data.loading.epoch_size=2", "--model.scenes.most_views=4",
             f"--model.initial={initial}", "--model.validation.views=[2]", "--trainer.accelerator=cpu",
@@ -37,7 +37,7 @@ def arguments(folder: Path, cache: Path, initial: str, *more: str) -> list[str]:
             f"--data.cache={cache}", f"--out={folder}", *more]
 
 
-def test_a_resumed_run_is_the_uninterrupted_one_and_is_exported_as_a_refiner(tmp_path, cache, prior_file):  # noqa: F811
+def test_a_resumed_run_is_the_uninterrupted_one_and_is_exported_as_a_refiner(tmp_path, cache, prior_file):
     straight, halved = tmp_path / "straight", tmp_path / "halved"
     main(arguments(straight, cache, prior_file, "--trainer.max_epochs=2"))
     main(arguments(halved, cache, prior_file, "--trainer.max_epochs=1"))
@@ -84,13 +84,13 @@ def test_scenes_scale_with_the_grid():
 
 
 @pytest.mark.parametrize("settings, words", [
-    ({"most_views": 0}, "between 1 and 1000"), ({"arc": 1.2}, "arc is a share"), ({"orbit": 0.8}, "at most 1"),
+    ({"most_views": 0}, "between 1 and 1000"), ({"arc": 1.2}, "arc lies between"), ({"orbit": 0.8}, "at most 1"),
     ({"noise": (0.1, 0.01)}, "least <= most")])
 def test_scenes_that_cannot_be_drawn_are_refused(settings, words):
     with pytest.raises(ValueError, match=words):
         Scenes(**settings)
 
 
-def test_a_prior_of_another_grid_is_refused(tmp_path, cache, prior_file, capsys):  # noqa: F811
+def test_a_prior_of_another_grid_is_refused(tmp_path, cache, prior_file, capsys):
     args = arguments(tmp_path, cache, prior_file, "--model.cube.voxels=32")
-    assert "another grid or HU window" in refusal(capsys, args)
+    assert "another grid or HU window" in refusal(capsys, main, args)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from command_lines import SHORT, checkpoint, losses, refusal
 from prior.tiny import tiny_prior, tiny_super_resolution
 
 from phydict.cli.train import main, stage_of
@@ -22,16 +22,8 @@ BASE_CONFIG = CONFIG.with_name("phantom.yaml")
 TINY = ["--model.network.class_path=phydict.prior.LocalUNet", "--model.network.init_args.block=2",
         "--model.network.init_args.channels=[8,8]", "--model.cube.voxels=32", "--model.factor=2",
         "--model.optimisation.warmup=2", "--model.validation.preview_steps=2", "--data.phantoms=2",
-        "--data.holdout.phantoms=1", "--data.crops.validation=1", "--data.crops.size=16",
-        "--data.loading.epoch_size=8", "--data.loading.batch_size=2", "--trainer.accelerator=cpu",
-        "--trainer.devices=1", "--trainer.precision=32", "--trainer.max_steps=-1", "--trainer.log_every_n_steps=1",
-        "--trainer.check_val_every_n_epoch=1", "--trainer.enable_progress_bar=false",
-        "--trainer.enable_model_summary=false"]
-
-
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory) -> Path:
-    return tmp_path_factory.mktemp("cache")
+        "--data.holdout.phantoms=1", "--data.crops.validation=1", "--data.crops.size=16", "--trainer.precision=32",
+        *SHORT]
 
 
 def arguments(folder: Path, cache: Path, *more: str) -> list[str]:
@@ -44,27 +36,6 @@ def straight(tmp_path_factory, cache) -> Path:
     folder = tmp_path_factory.mktemp("straight")
     main(arguments(folder, cache, "--trainer.max_epochs=2"))
     return folder
-
-
-def rows(folder: Path, key: str) -> list[float]:
-    log = max(folder.glob("logs/**/metrics.csv"), key=lambda path: path.stat().st_mtime_ns)
-    with log.open() as file:
-        return [float(row[key]) for row in csv.DictReader(file) if row[key]]
-
-
-def refusal(capsys, args: list[str]) -> str:
-    """The one sentence on stderr with which the command line refuses `args`."""
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as stopped:
-        main(args)
-    assert stopped.value.code == 2
-    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
-    assert len(said) == 1
-    return said[0]
-
-
-def checkpoint(folder: Path) -> dict:
-    return torch.load(folder / "last.ckpt", map_location="cpu", weights_only=True)
 
 
 def test_the_loss_falls(tmp_path, cache):
@@ -85,7 +56,7 @@ def test_a_resumed_run_is_the_uninterrupted_one(tmp_path, cache, straight):
     main(arguments(tmp_path, cache, "--trainer.max_epochs=2", f"--ckpt_path={tmp_path / 'last.ckpt'}"))
     ours, theirs = checkpoint(tmp_path)["state_dict"], checkpoint(straight)["state_dict"]
     assert all(torch.equal(ours[name], weight) for name, weight in theirs.items())
-    assert rows(tmp_path, "loss") == rows(straight, "loss")[4:]
+    assert list(losses(tmp_path).values()) == list(losses(straight).values())[4:]
 
 
 def test_validation_logs_every_noise_level_beside_what_upsampling_lacks(straight):
@@ -128,7 +99,7 @@ def test_a_checkpoint_of_the_other_stage_is_one_sentence(straight, cache, tmp_pa
             "--model.text.encoder=none", "--data.phantoms=2", "--data.holdout.phantoms=0",
             "--trainer.accelerator=cpu", "--trainer.devices=1", "--trainer.precision=32",
             f"--data.cache={cache}", f"--out={tmp_path / 'base'}"]
-    said = refusal(capsys, [*args, f"--ckpt_path={straight / 'last.ckpt'}"])
+    said = refusal(capsys, main, [*args, f"--ckpt_path={straight / 'last.ckpt'}"])
     assert "super-resolution stage" in said and "base prior is needed" in said
 
 
@@ -141,7 +112,7 @@ def test_a_checkpoint_of_the_other_stage_is_one_sentence(straight, cache, tmp_pa
 def test_bad_input_is_one_sentence(change, words, cache, tmp_path, capsys):
     save_prior(tiny_prior(False), tmp_path / "base.safetensors")
     change = [text.format(base=tmp_path / "base.safetensors") for text in change]
-    said = refusal(capsys, arguments(tmp_path / "run", cache, "--trainer.max_epochs=1", *change))
+    said = refusal(capsys, main, arguments(tmp_path / "run", cache, "--trainer.max_epochs=1", *change))
     assert all(word in said for word in words), said
     assert not list((tmp_path / "run").glob("*.ckpt"))
 

@@ -4,8 +4,8 @@ import csv
 
 import pytest
 import torch
+from command_lines import arguments
 from prior.tiny import tiny_prior
-from test_training import arguments, cache  # noqa: F401
 
 from phydict.cli.train import main
 from phydict.grid import Grid
@@ -38,7 +38,7 @@ def test_flop_are_counted_without_touching_the_prior():
     assert all(torch.equal(weight, before[name]) for name, weight in prior.state_dict().items())
 
 
-def test_rates_follow_from_one_another(cache, tmp_path, capsys):  # noqa: F811
+def test_rates_follow_from_one_another(cache, tmp_path, capsys):
     main(arguments(tmp_path, cache, "--trainer.max_epochs=1", "--trainer.limit_val_batches=0", "--throughput.peak=0.5"))
     said = capsys.readouterr().err
     assert f"weights in float32 on {instruction_set(torch.device('cpu'))}: a sample costs" in said

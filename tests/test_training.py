@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import os
 import resource
 import signal
@@ -16,6 +15,7 @@ import nibabel
 import numpy as np
 import pytest
 import torch
+from command_lines import CONFIG, TINY, arguments, checkpoint, losses, refusal
 from prior.medsyn_files import entries, text_unet, write
 from prior.tiny import REPORTS, tiny_prior
 from torch.utils.data import default_collate
@@ -33,27 +33,6 @@ from phydict.training.data import PriorData
 from phydict.training.settings import HoldOut, TextSettings
 from phydict.units import HUWindow
 
-CONFIG = Path(__file__).parents[1] / "configs" / "prior" / "phantom.yaml"
-TINY = ["--model.network.class_path=phydict.prior.VolumeUNet", "--model.network.init_args.channels=[8,8]",
-        "--model.network.init_args.attention=[false,true]", "--model.network.init_args.head_channels=8",
-        "--model.cube.voxels=16", "--model.text.pretrain_steps=2", "--model.optimisation.warmup=2",
-        "--model.validation.preview_steps=2", "--data.phantoms=4", "--data.holdout.phantoms=1",
-        "--data.loading.epoch_size=8", "--data.loading.batch_size=2", "--trainer.accelerator=cpu",
-        "--trainer.devices=1", "--precision=float32", "--trainer.max_steps=-1", "--trainer.log_every_n_steps=1",
-        "--trainer.check_val_every_n_epoch=1", "--trainer.enable_progress_bar=false",
-        "--trainer.enable_model_summary=false"]
-
-
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory) -> Path:
-    return tmp_path_factory.mktemp("cache")
-
-
-def arguments(folder: Path, cache: Path, *more: str) -> list[str]:
-    """`fit` of a tiny network on four phantoms, everything written below `folder`."""
-    return ["fit", f"--config={CONFIG}", *TINY, f"--data.cache={cache}", f"--out={folder}", *more]
-
-
 @pytest.fixture(scope="module")
 def straight(tmp_path_factory, cache) -> Path:
     """The folder of an uninterrupted run of two epochs."""
@@ -67,28 +46,6 @@ class Code:
 
     def __reduce__(self):
         return os.system, ("exit 1",)
-
-
-def losses(folder: Path, column: str = "loss") -> dict[int, str]:
-    """Step -> loss as logged, from the last log that the run in `folder` wrote."""
-    log = max(folder.glob("logs/**/metrics.csv"), key=lambda path: path.stat().st_mtime_ns)
-    with log.open() as file:
-        return {int(row["step"]): row[column] for row in csv.DictReader(file) if row[column]}
-
-
-def refusal(capsys, args: list[str]) -> str:
-    """The one sentence on stderr with which the command line refuses `args`."""
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as stopped:
-        main(args)
-    assert stopped.value.code == 2
-    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
-    assert len(said) == 1
-    return said[0]
-
-
-def checkpoint(folder: Path) -> dict:
-    return torch.load(folder / "last.ckpt", map_location="cpu", weights_only=True)
 
 
 def test_the_loss_falls(tmp_path, cache):
@@ -162,7 +119,7 @@ def test_a_loss_that_is_not_finite_stops_the_training(tmp_path, cache, capsys, m
     loss, at = PriorTraining.batch_loss, 5 if before else 1
     monkeypatch.setattr(PriorTraining, "batch_loss", lambda task, *given: loss(task, *given) * (
         float("nan") if task.global_step == at else 1))
-    said = refusal(capsys, arguments(tmp_path, cache, "--trainer.max_epochs=2", "--trainer.limit_val_batches=0"))
+    said = refusal(capsys, main, arguments(tmp_path, cache, "--trainer.max_epochs=2", "--trainer.limit_val_batches=0"))
     assert f"the loss is nan after {at} steps" in said
     assert (f"the last good checkpoint is {tmp_path / 'last.ckpt'}" if before else "no checkpoint") in said
     assert not before or checkpoint(tmp_path)["global_step"] == 4
@@ -176,7 +133,7 @@ def test_weights_that_are_not_finite_never_replace_a_checkpoint(tmp_path, cache,
 
     monkeypatch.setattr(PriorTraining, "on_train_batch_end", spoil)
     more = [] if validated else ["--trainer.limit_val_batches=0"]
-    said = refusal(capsys, arguments(tmp_path, cache, "--trainer.max_epochs=3", *more))
+    said = refusal(capsys, main, arguments(tmp_path, cache, "--trainer.max_epochs=3", *more))
     assert "the weights are not finite after 8 steps (prior.null has 1 NaN" in said and "last.ckpt" in said
     assert checkpoint(tmp_path)["global_step"] == 4
     assert not validated or torch.load(tmp_path / "best.ckpt", weights_only=True)["global_step"] == 4
@@ -195,7 +152,7 @@ def test_weights_that_are_not_finite_are_refused_by_name(spoilt, cache, tmp_path
     for args in (["export", f"--checkpoint={spoilt}", f"--out={tmp_path / 'prior.safetensors'}"],
                  ["inspect-prior", str(spoilt)],
                  arguments(tmp_path / "run", cache, f"--ckpt_path={spoilt}")):
-        said = refusal(capsys, args)
+        said = refusal(capsys, main, args)
         assert "spoilt.ckpt" in said and "not finite (prior.null has 1 NaN or infinite values of 64)" in said
     assert [path.name for path in tmp_path.iterdir()] == ["spoilt.ckpt"]
 
@@ -206,7 +163,7 @@ def test_a_checkpoint_that_the_disk_cannot_hold_leaves_the_last_one(tmp_path, ca
     last, limits = (tmp_path / "last.ckpt").read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (len(last) // 2, limits[1]))  # no file may grow beyond half of it
     try:
-        said = refusal(capsys, arguments(tmp_path, cache, "--trainer.max_epochs=2", *short,
+        said = refusal(capsys, main, arguments(tmp_path, cache, "--trainer.max_epochs=2", *short,
                                          f"--ckpt_path={tmp_path / 'last.ckpt'}"))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
@@ -306,14 +263,14 @@ def test_bad_input_is_one_sentence(change, words, cts, straight, cache, tmp_path
     whole = (straight / "last.ckpt").read_bytes()
     (tmp_path / "cut.ckpt").write_bytes(whole[:len(whole) // 2])
     change = [text.format(cts=cts, cut=tmp_path / "cut.ckpt") for text in change]
-    said = refusal(capsys, arguments(tmp_path / "run", cache, "--trainer.max_epochs=1", *change))
+    said = refusal(capsys, main, arguments(tmp_path / "run", cache, "--trainer.max_epochs=1", *change))
     assert all(word in said for word in words), said
     assert not list((tmp_path / "run").glob("*.ckpt"))
 
 
 def test_a_second_training_never_overwrites_a_first(straight, cache, capsys):
     before = (straight / "last.ckpt").read_bytes()
-    said = refusal(capsys, arguments(straight, cache, "--trainer.max_epochs=1"))
+    said = refusal(capsys, main, arguments(straight, cache, "--trainer.max_epochs=1"))
     assert str(straight) in said and "--ckpt_path" in said and "--out" in said
     assert (straight / "last.ckpt").read_bytes() == before
 
@@ -322,7 +279,7 @@ def test_a_second_training_never_overwrites_a_first(straight, cache, capsys):
 def test_a_training_that_goes_on_elsewhere_overwrites_no_other(straight, cache, tmp_path, capsys, name):
     (tmp_path / name).write_bytes(b"another's")
     for more in ([], [f"--ckpt_path={straight / 'last.ckpt'}"]):
-        said = refusal(capsys, arguments(tmp_path, cache, "--trainer.max_epochs=3", *more))
+        said = refusal(capsys, main, arguments(tmp_path, cache, "--trainer.max_epochs=3", *more))
         assert f"--ckpt_path {tmp_path / name}" in said and "--out" in said
     assert (tmp_path / name).read_bytes() == b"another's"
 
@@ -335,7 +292,7 @@ def test_of_two_trainings_at_once_in_one_folder_the_second_is_refused(cache, tmp
         if len(met) <= task.current_epoch:
             met.append(sorted(tmp_path.rglob("*")))
             more = [f"--ckpt_path={tmp_path / 'last.ckpt'}"] if task.current_epoch else []
-            said = refusal(capsys, arguments(tmp_path, cache, "--trainer.max_epochs=3", *short, *more))
+            said = refusal(capsys, main, arguments(tmp_path, cache, "--trainer.max_epochs=3", *short, *more))
             assert f"another run writes to {tmp_path}: wait for its end, or give another --out" in said
             assert sorted(tmp_path.rglob("*")) == met[-1]
         return step(task, batch, index)
@@ -375,7 +332,7 @@ def test_a_missing_configuration_says_which_to_give(command, cache, tmp_path, ca
 
 def test_a_list_of_someone_elses_is_not_replaced(cts, cache, tmp_path, capsys):
     (tmp_path / "held_out.txt").write_text("mine\n")
-    said = refusal(capsys, arguments(tmp_path, cache, "--trainer.max_epochs=1", f"--data.cts={cts}",
+    said = refusal(capsys, main, arguments(tmp_path, cache, "--trainer.max_epochs=1", f"--data.cts={cts}",
                                      "--data.holdout.ids=[patient1]"))
     assert "held_out.txt is there already" in said and (tmp_path / "held_out.txt").read_text() == "mine\n"
 
@@ -385,11 +342,11 @@ def test_an_export_replaces_a_prior_when_asked_and_nothing_else_ever(straight, t
     args = ["export", f"--checkpoint={straight / 'last.ckpt'}", f"--out={file}"]
     file.write_bytes(b"mine")
     for more in ([], ["--overwrite=true"]):
-        assert "is no prior of phydict's, and is not replaced" in refusal(capsys, [*args, *more])
+        assert "is no prior of phydict's, and is not replaced" in refusal(capsys, main, [*args, *more])
     assert file.read_bytes() == b"mine"
     save_prior(tiny_prior(), file)
     before = file.read_bytes()
-    assert "add --overwrite true" in refusal(capsys, args) and file.read_bytes() == before
+    assert "add --overwrite true" in refusal(capsys, main, args) and file.read_bytes() == before
     main([*args, "--overwrite=true"])
     assert load_prior(file).window.high == 1000
 
@@ -397,14 +354,14 @@ def test_an_export_replaces_a_prior_when_asked_and_nothing_else_ever(straight, t
 @pytest.mark.parametrize("change, key", [(["--model.cube.voxels=24"], "grid"), (["--model.text.encoder=none"], "text"),
                                          (["--model.window=[-1000,600]"], "hu_window")])
 def test_a_checkpoint_is_resumed_only_as_what_it_is(change, key, straight, cache, tmp_path, capsys):
-    said = refusal(capsys, arguments(tmp_path, cache, "--trainer.max_epochs=3", f"--ckpt_path={straight / 'last.ckpt'}",
-                                     *change))
+    resumed = ["--trainer.max_epochs=3", f"--ckpt_path={straight / 'last.ckpt'}"]
+    said = refusal(capsys, main, arguments(tmp_path, cache, *resumed, *change))
     assert f"'{key}'" in said and not (tmp_path / "last.ckpt").exists()
 
 
 def test_validation_needs_trained_weights(cache, tmp_path, capsys):
     args = [arg for arg in arguments(tmp_path, cache)[1:] if "max_steps" not in arg]
-    assert "--ckpt_path" in refusal(capsys, ["validate", *args])
+    assert "--ckpt_path" in refusal(capsys, main, ["validate", *args])
 
 
 def test_the_held_out_cts_are_written_down(cts, cache, tmp_path):
@@ -438,13 +395,13 @@ def test_a_damaged_phantom_in_the_cache_is_made_again(tmp_path):
 def test_an_unknown_key_of_a_config_file_is_named(tmp_path, cache, capsys):
     config = tmp_path / "mine.yaml"
     config.write_text("model:\n  learning_rats: 1.0\n")
-    assert "model.learning_rats" in refusal(capsys, arguments(tmp_path, cache, f"--config={config}"))
+    assert "model.learning_rats" in refusal(capsys, main, arguments(tmp_path, cache, f"--config={config}"))
 
 
 def test_a_loader_process_sends_the_message_too(cts, tmp_path, cache, capsys):
     (tmp_path / "cts").mkdir()
     (tmp_path / "cts" / "cut.nii.gz").write_bytes((cts / "patient0.nii.gz").read_bytes()[:200])
-    said = refusal(capsys, arguments(tmp_path / "run", cache, "--trainer.max_epochs=1",
+    said = refusal(capsys, main, arguments(tmp_path / "run", cache, "--trainer.max_epochs=1",
                                      f"--data.cts={tmp_path / 'cts'}", "--data.phantoms=0",
                                      "--data.loading.workers=1", "--model.text.encoder=none"))
     assert "cut.nii.gz" in said and "Traceback" not in said
@@ -459,7 +416,7 @@ def test_a_loader_process_sends_the_message_too(cts, tmp_path, cache, capsys):
 def test_what_cannot_be_exported_is_one_sentence(spoil, words, straight, tmp_path, capsys):
     file, out = tmp_path / "spoilt.ckpt", tmp_path / "out.safetensors"
     spoil(file, (straight / "last.ckpt").read_bytes())
-    said = refusal(capsys, ["export", f"--checkpoint={file}", f"--out={out}"])
+    said = refusal(capsys, main, ["export", f"--checkpoint={file}", f"--out={out}"])
     assert all(word in said for word in [*words, "spoilt.ckpt"]), said
     assert not out.exists()
 
@@ -471,14 +428,14 @@ def test_inspecting_tells_what_training_and_medsyn_left(straight, tmp_path, caps
     write(tmp_path / "5_ckpt" / "model.safetensors", entries(text_unet()))
     main(["inspect-prior", str(tmp_path)])
     assert "kind: MedSyn's 64^3 stage" in capsys.readouterr().out
-    assert "nowhere" in refusal(capsys, ["inspect-prior", str(tmp_path / "nowhere")])
+    assert "nowhere" in refusal(capsys, main, ["inspect-prior", str(tmp_path / "nowhere")])
 
 
 @pytest.mark.parametrize("out", ["folder.safetensors", "file/prior.safetensors"])
 def test_an_export_that_cannot_be_written_leaves_nothing(out, straight, tmp_path, capsys):
     (tmp_path / "folder.safetensors").mkdir()
     (tmp_path / "file").write_text("")
-    said = refusal(capsys, ["export", f"--checkpoint={straight / 'last.ckpt'}", f"--out={tmp_path / out}"])
+    said = refusal(capsys, main, ["export", f"--checkpoint={straight / 'last.ckpt'}", f"--out={tmp_path / out}"])
     assert out in said and "--out" in said
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["file", "folder.safetensors"]
 
@@ -659,7 +616,7 @@ def test_a_small_encoder_knows_the_words_of_a_file_of_texts(tmp_path):
 @pytest.mark.parametrize("weight", [torch.eye(3).to_sparse(), torch.zeros(3, device="meta")], ids=["sparse", "meta"])
 def test_weights_without_plain_numbers_are_refused_by_name(tmp_path, capsys, weight):
     torch.save({"phydict": {"stage": "base"}, "state_dict": {"prior.x": weight}}, tmp_path / "c.ckpt")
-    said = refusal(capsys, ["export", "--checkpoint", str(tmp_path / "c.ckpt"), "--out",
+    said = refusal(capsys, main, ["export", "--checkpoint", str(tmp_path / "c.ckpt"), "--out",
     str(tmp_path / "p.safetensors")])
     assert "c.ckpt" in said and "prior.x holds no plain numbers" in said and not (tmp_path / "p.safetensors").exists()
 
@@ -669,7 +626,7 @@ def test_a_training_is_never_written_among_its_cts(tmp_path, capsys, cache):
     cts.mkdir()
     nibabel.save(nibabel.Nifti1Image(np.zeros((20, 20, 20), np.float32), np.diag([10.0, 10, 10, 1])), cts / "a.nii.gz")
     for out in (cts, cts / "out"):
-        said = refusal(capsys, arguments(out, cache, f"--data.cts={cts}"))
+        said = refusal(capsys, main, arguments(out, cache, f"--data.cts={cts}"))
         assert said.endswith("give another --out") and [path.name for path in cts.iterdir()] == ["a.nii.gz"]
 
 
@@ -681,5 +638,5 @@ def test_a_training_is_never_written_among_its_cts(tmp_path, capsys, cache):
                                     "--model.optimisation.learning_rate=1e38", "--trainer.devices=99",
                                     "--model.network.init_args.channels=[]", "--model.network.init_args.block=0"])
 def test_data_that_cannot_be_are_refused_by_their_option(tmp_path, capsys, cache, option):
-    said = refusal(capsys, arguments(tmp_path, cache, option))
+    said = refusal(capsys, main, arguments(tmp_path, cache, option))
     assert option.partition("=")[0].rpartition(".")[2] in said and "is now" not in said

@@ -455,8 +455,8 @@ def test_only_a_report_without_side_may_be_mirrored_and_only_on_demand(case, rep
 
 
 @pytest.mark.parametrize("strength, words", [({"shift": -1.0}, "shift is -1"), ({"scale": 0.9}, "small changes"),
-                                                 ({"mirror": 1.5}, "share of the cases"),
-                                                 ({"girth": 1.5}, "girth is a share"),
+                                                 ({"mirror": 1.5}, "mirror lies between 0 and 1"),
+                                                 ({"girth": 1.5}, "girth lies between 0 and 1"),
                                                  ({"girth": float("nan")}, "girth is nan")])
 def test_augmentation_refuses_impossible_strengths(strength, words):
     with pytest.raises(ValueError, match=words):

@@ -117,7 +117,7 @@ def test_a_cover_lies_on_the_body_and_leads_too():
 
 def test_bad_shares_and_a_scene_without_a_body_are_refused():
     for name, share in (("couch", 1.5), ("leads", -0.1), ("ends", float("nan"))):
-        with pytest.raises(ValueError, match=f"surroundings' {name} is a share of the cases"):
+        with pytest.raises(ValueError, match=f"surroundings.{name} lies between 0 and 1,"):
             Surroundings(**{name: share})
     hu, body, grid = chest()
     with pytest.raises(ValueError, match="a scene needs a body"):

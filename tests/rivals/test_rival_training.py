@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from command_lines import checkpoint, losses, refusal
 from rivals.tiny_rivals import GRID, lively
-from test_training import cache, checkpoint, losses, refusal  # noqa: F401
 from torch.utils.data import default_collate
 
 from phydict.cli.infer import main as infer
@@ -42,7 +42,7 @@ TASKS = {"lifted": lambda: LiftedTraining(lively(lambda: LiftedNetwork((4, 6), 2
              (-1000, 600))}
 
 
-def arguments(name: str, folder: Path, cache: Path, *more: str) -> list[str]:  # noqa: F811
+def arguments(name: str, folder: Path, cache: Path, *more: str) -> list[str]:
     return ["fit", f"--config={CONFIGS / name}.yaml", *TINY[name], "--model.cube.voxels=16",
             "--model.window=[-1000,600]", "--data.phantoms=3", "--data.holdout.phantoms=1",
             "--data.loading.epoch_size=2", "--trainer.accelerator=cpu", "--trainer.log_every_n_steps=1",
@@ -50,7 +50,7 @@ def arguments(name: str, folder: Path, cache: Path, *more: str) -> list[str]:  #
 
 
 @pytest.mark.parametrize("name", TINY)
-def test_a_resumed_run_is_the_uninterrupted_one_and_its_file_is_compared(name, tmp_path, cache):  # noqa: F811
+def test_a_resumed_run_is_the_uninterrupted_one_and_its_file_is_compared(name, tmp_path, cache):
     straight, halved = tmp_path / "straight", tmp_path / "halved"
     main(arguments(name, straight, cache, "--trainer.max_epochs=2"))
     main(arguments(name, halved, cache, "--trainer.max_epochs=1"))
@@ -100,6 +100,6 @@ def test_validation_takes_the_x_rays_that_a_bound_rival_holds_for(monkeypatch):
     assert found["val/psnr"] == found["val/psnr_2"] > 5
 
 
-def test_training_that_cannot_be_is_refused(tmp_path, cache, capsys):  # noqa: F811
+def test_training_that_cannot_be_is_refused(tmp_path, cache, capsys):
     args = arguments("lifted", tmp_path, cache, "--model.cube.voxels=18")
-    assert "divisible by 4" in refusal(capsys, args)
+    assert "divisible by 4" in refusal(capsys, main, args)

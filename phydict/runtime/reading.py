@@ -69,7 +69,7 @@ def not_written(what: str, error: Exception, instead: str) -> OSError:
     return OSError(f"{what} could not be written ({reason(error)}): {'free some space, or ' if full else ''}{instead}")
 
 
-def reason(error: Exception) -> str:
+def reason(error: BaseException) -> str:
     """An error in a few words, its kind among them where that is not for users."""
     if isinstance(error, RecursionError):
         return "it is nested too deeply"

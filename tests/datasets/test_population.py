@@ -304,10 +304,10 @@ def test_fewer_than_two_patients_are_refused(folder, tmp_path):
 
 
 @pytest.mark.parametrize("settings, words", [
-    (lambda: PopulationSettings(1.5), "share lies in"),
+    (lambda: PopulationSettings(1.5), "share lies between"),
     (lambda: PopulationSettings(0.5, draws=0), "draws lies between"),
     (lambda: PopulationSettings(0.5, patients=1), "patients lies between"),
-    (lambda: Variation(lungs=2.0), "variation.lungs lies in"), (lambda: Variation(modes=-1.0), "variation.modes")])
+    (lambda: Variation(lungs=2.0), "variation.lungs lies between"), (lambda: Variation(modes=-1.0), "variation.modes")])
 def test_settings_that_cannot_be_are_refused_by_their_name(settings, words):
     with pytest.raises(ValueError, match=words):
         settings()

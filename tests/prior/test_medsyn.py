@@ -313,7 +313,7 @@ def test_the_second_stage_samples_on_the_fine_voxels_of_a_part():
     (lambda: MedSynPrior(text_unet(), grid=GRID).bind("a report"), "no text encoder, but a report was given"),
     (lambda: MedSynPrior(text_unet(tokens=9), Words(), grid=GRID).bind("a report"), "9 tokens of 16 .* gave .6, 16."),
     (lambda: MedSynSuperResolution(super_resolution_unet()).bind(X[:, :1]), "whole state"),
-    (lambda: MedSynSuperResolution(super_resolution_unet()).bind(X, noise=1.5), "share of noise"),
+    (lambda: MedSynSuperResolution(super_resolution_unet()).bind(X, noise=1.5), "noise level of the coarse state"),
     (lambda: MedSynSuperResolution(super_resolution_unet()).bind(X).denoise(X, 0.5), "the same region")])
 def test_what_does_not_fit_is_refused(wrong, words):
     with pytest.raises(ValueError, match=words):

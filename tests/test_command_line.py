@@ -193,7 +193,8 @@ def test_the_help_of_a_class_needs_no_configuration(capsys):
     assert not stopped.value.code and "--model.method.iterations" in capsys.readouterr().out
 
 
-def test_a_picture_engine_that_is_not_there_does_not_matter():
-    run = subprocess.run([sys.executable, "-c", "import phydict.cli, matplotlib; print(matplotlib.get_backend())"],
-                         cwd=ROOT, env=os.environ | {"MPLBACKEND": "nonsense"}, capture_output=True, text=True)
+def test_neither_picture_engine_nor_cache_that_cannot_be_keeps_a_command_from_starting():
+    run = subprocess.run([sys.executable, "-c", "import phydict.cli, matplotlib, torch._dynamo.package; "
+                          "print(matplotlib.get_backend())"], cwd=ROOT, capture_output=True, text=True,
+                         env=os.environ | {"MPLBACKEND": "nonsense", "TORCHINDUCTOR_CACHE_DIR": "/dev/null/x"})
     assert run.returncode == 0 and run.stdout.lower().strip() == "agg", run.stderr

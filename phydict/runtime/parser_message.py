@@ -15,7 +15,7 @@ UNION = "Does not validate against any of the Union subtypes"
 PARSERS = re.compile(r"Import path|Expected an? |Problem with given|Not a valid|Does not validate|Parser key|Unable to")
 """The parser's own words on one of several types, unlike those of a class that refuses its settings."""
 
-GIVEN = re.compile(r"(?:Got|Given) value: (.*?)(?= Given value type: | Subclass types expect |$)|"
+GIVEN = re.compile(r"(?:Got|Given) value: (.*?)(?= Given value type: | Subclass types expect | - [A-Z]\w+ |$)|"
                    r"Expected a path but (.*?) either not ")
 
 
@@ -30,12 +30,10 @@ def plain(message: str) -> str:
     if unloaded := UNLOADED.match(text):
         return (f"{unloaded[1]} is a mapping of settings, but {_short(unloaded[3])} was given"
                 if ": Unable to load config " in unloaded[4] else plain(unloaded[4]))
-    reasons = re.split(r"\n\s*- ", message.partition("Given value type")[0])[1:] if UNION in text else []
-    if ours := [reason for reason in reasons if not PARSERS.match(reason)]:
-        return "; ".join(" ".join(reason.split()) for reason in ours)
     start = re.match(r'Parser key "([^"]+)": ', text)
     if not start:
-        return ""
+        reasons = re.split(r"\n\s*- ", message.partition("Given value type")[0])[1:] if UNION in text else []
+        return "; ".join(" ".join(reason.split()) for reason in reasons if not PARSERS.match(reason))
     key = start[1]
     if nested := NESTED.search(text):
         return plain(f'Parser key "{key}.init_args.{nested[1]}": {nested[2]}')
@@ -64,7 +62,7 @@ def _wanted(text: str) -> str:
     """What a setting holds, by all types that the parser tried."""
     kinds = [KINDS[kind] for kind in re.findall(r"Expected an? <class '(\w+)'>", text) if kind in KINDS]
     kinds += [f"a list of {size}" for size in re.findall(r"Expected a tuple with (\d+) elements", text)]
-    kinds += ["the path of a class"] * ("Expected a dot import path" in text)
+    kinds += ["the path of a class"] * bool(re.search("dot import path|import path format", text))
     kinds += [f"the path of a {name}" for name in re.findall(r"(?:to a|valid) subclass of (\w+)", text)]
     names = [name.strip(" '") for listed in re.findall(r"Expected a typing\.Literal\[(.*?)\]", text)
              for name in listed.split(",")]

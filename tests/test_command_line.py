@@ -161,6 +161,7 @@ def test_a_setting_of_the_wrong_kind_is_one_sentence_that_names_it(empty, capsys
     ("--data.orbit.pixel=[1]", "data.orbit.pixel is a list of 2, but [1] was given"),
     ("--data.simulator=os.system", "data.simulator is the path of a Simulator, but os.system was given"),
     ("--model.method.init_args.mu_water=-1", "error: mu_water, the attenuation of water in 1/mm, is above 0"),
+    ("--model.method={class_path: phydict.baselines.SIRT, init_args: {7: 1}}", "model.method: Key must be a string"),
     ("--model.method=a..b", "model.method is the path of a class, but a..b was given"),
     ("--trainer.plugins=os.system", "trainer.plugins is "),
     ("--data.simulator=null", "data.simulator is the path of a Simulator, but null was given"),

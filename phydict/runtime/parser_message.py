@@ -31,9 +31,10 @@ def plain(message: str) -> str:
         return (f"{unloaded[1]} is a mapping of settings, but {_short(unloaded[3])} was given"
                 if ": Unable to load config " in unloaded[4] else plain(unloaded[4]))
     start = re.match(r'Parser key "([^"]+)": ', text)
+    reasons = re.split(r"\n\s*- ", message.partition("Given value type")[0])[1:] if UNION in text else []
+    ours = "; ".join(dict.fromkeys(" ".join(reason.split()) for reason in reasons if not PARSERS.match(reason)))
     if not start:
-        reasons = re.split(r"\n\s*- ", message.partition("Given value type")[0])[1:] if UNION in text else []
-        return "; ".join(" ".join(reason.split()) for reason in reasons if not PARSERS.match(reason))
+        return ours
     key = start[1]
     if nested := NESTED.search(text):
         return plain(f'Parser key "{key}.init_args.{nested[1]}": {nested[2]}')
@@ -44,7 +45,7 @@ def plain(message: str) -> str:
     if "is abstract" in text:
         return f"{key} is the path of a class that can be used, but {given} is abstract: give one derived from it"
     wanted = _wanted(text)
-    return f"{key} is {wanted}, but {given} was given" if wanted else f"{key}: {text[len(start[0]):]}"
+    return f"{key} is {wanted}, but {given} was given" if wanted else f"{key}: {ours or text[len(start[0]):]}"
 
 
 def _of_class(key: str, path: str, reason: str) -> str:

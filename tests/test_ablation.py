@@ -415,10 +415,14 @@ def test_a_case_counts_once_whatever_its_seeds_and_a_missing_case_takes_a_method
             row("b", "y", None), row("a", "z", 5.0), row("b", "z", 5.0)]
     x, y, z = entries(rows)
     assert x.means["psnr"] == 25.0 and x.complete and not y.complete and y.label == "y (1 of 2 cases)"
-    (table,) = all_tables([x, y, z], rows)
+    table, differences = all_tables([x, y, z], rows)
     text = table.markdown()
-    assert "| x | **0.625** | **25.00** |" in text and "| y (1 of 2 cases) | 0.975 | 39.00 |" in text
-    assert "y: refused: no." in text and "| z | <u>0.125</u> |" in text
+    assert "| x | **0.625 [0.375, 0.875]** | **25.00 [15.00, 35.00]** |" in text
+    assert "| y (1 of 2 cases) | 0.975 | 39.00 |" in text
+    assert "y: refused: no." in text and "| z | <u>0.125 [0.125, 0.125]</u> |" in text
+    assert differences.title == "Methods, K = 8, ideal: less x, case by case"
+    assert "| y (1 of 2 cases) | 0.600 | 24.00 |" in differences.markdown()
+    assert "| z | -0.500 [-0.750, -0.250] | -20.00 [-30.00, -10.00] |" in differences.markdown()
 
 
 def test_each_condition_has_its_table_and_the_best_setting_stands_for_a_method():

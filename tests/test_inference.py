@@ -569,7 +569,7 @@ def test_a_case_depends_on_its_id_and_the_seed_alone(cts, tmp_path):
 
 
 def test_a_sample_of_the_prior_depends_on_the_seed_alone_and_is_that_of_python(prior, measured, tmp_path):
-    given = ["--data.with_report=false", "--model.sampling.precision=float32"]
+    given = ["--model.sampling.with_report=false", "--model.sampling.precision=float32"]
     main(with_prior("predict", tmp_path / "both", prior, f"--data.xrays={measured}", *given))
     main(with_prior("predict", tmp_path / "other", prior, f"--data.xrays={measured / 'bert'}", "--model.seed=5",
                     *given))
@@ -597,7 +597,7 @@ def test_python_gives_the_volume_of_a_test_by_the_cases_seed(prior, cts, tmp_pat
 def test_the_default_method_reconstructs_with_a_prior(prior, measured, tmp_path):
     main(["test", "--model.method.init_args.iterations=3", *ORBIT,
           f"--model.prior={prior}", f"--model.out={tmp_path}", "--data.cts=phantom", "--data.phantoms=1",
-          "--data.with_report=false", "--trainer.accelerator=cpu"])
+          "--model.sampling.with_report=false", "--trainer.accelerator=cpu"])
     said = record(tmp_path / "phydict_fast" / "phantom-1000000")
     assert said["network_calls"] == 3 and said["grid"]["shape"] == [16, 16, 16] and said["report"] == ""
     assert said["settings"]["prior"] == "tiny.safetensors" and said["settings"]["prior_crc32"]

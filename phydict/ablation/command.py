@@ -10,11 +10,13 @@ from pathlib import Path
 import torch
 from jsonargparse import ArgumentParser
 
+from phydict.ablation.fid import fid_tables
 from phydict.ablation.plots import write_plots
 from phydict.ablation.run import RESULTS, run
 from phydict.ablation.spec import read_specification
 from phydict.ablation.summary import entries
 from phydict.ablation.tables import all_tables, write_tables
+from phydict.inference.scoring import METRICS, Scoring
 from phydict.methods import METHODS
 from phydict.runtime.console import check_apart, check_configured, check_writable, cli_errors, quiet
 from phydict.runtime.files import alone_in
@@ -38,11 +40,13 @@ def main(args: list[str] | None = None) -> None:
         specification = read_specification(given.pop("config"), given.pop("set"), **given)
         check_writable(specification.out, "out")
         check_apart(specification.out, "out", [Path(cts)] if (cts := specification.cases.cts) else [])
+        scoring = Scoring(specification.metrics, specification.fid, specification.clip)
         with alone_in(specification.out, "out"), CaseProgress() as progress:
-            rows = run(specification, torch.device(device), progress)
+            rows = run(specification, torch.device(device), progress, scoring)
         print(f"{len(rows)} rows in {specification.out / RESULTS}")
         found = entries(rows)
-        written = write_tables(specification.out, all_tables(found, rows)) + write_plots(specification.out, found)
+        tables = all_tables(found, rows, scoring.empty) + fid_tables(specification.out, found, scoring)
+        written = write_tables(specification.out, tables) + write_plots(specification.out, found)
         print(f"tables and plots in {specification.out}: {', '.join(path.name for path in written)}")
 
 
@@ -63,6 +67,8 @@ def _parser(args: Sequence[str]) -> ArgumentParser:
     parser.add_argument("--set", nargs="+", metavar="NAME=VALUE",
                         help="settings instead of the file's; a list is an axis: --set "
                              "method=[sirt,my_module.MySampler] views=4 projector=siddon")
+    parser.add_argument("--metrics", type=list[str],
+                        help=f"what is measured, instead of the file's: a list of {', '.join(METRICS)}")
     parser.add_argument("--out", type=str, help="folder of the results, instead of the file's")
     parser.add_argument("--device", type=str, help="cpu or cuda; left out: cuda where there is one")
     words = {word for arg in args for word in re.findall(r"\w+", arg)}

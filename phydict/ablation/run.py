@@ -14,7 +14,10 @@ import torch
 from phydict.ablation.spec import Specification
 from phydict.ablation.trials import Trial, key, prior_of
 from phydict.evaluation import read_csv, write_csv
-from phydict.inference.data import case_scores
+from phydict.evaluation.fid import save_features
+from phydict.evaluation.metrics import MEASURES
+from phydict.inference.protocols import resampled
+from phydict.inference.scoring import Scoring
 from phydict.methods import fit_to_grid, reconstructor
 from phydict.posterior import Sampler
 from phydict.reconstruction import Reconstruction
@@ -30,10 +33,9 @@ RESULTS, TABLES = "results.csv", ("tables.md", "tables.tex")
 FINISHED = ("ok", "refused", "diverged")
 """What a row's status may be that is not tried again; "failed" is, since its reason may lie outside."""
 
-MEASURED = ("status", "error", "warning", "ssim", "psnr", "mae_hu", "ssim_body", "psnr_body", "mae_hu_body",
-            "ssim_lung", "psnr_lung", "mae_hu_lung", "misfit", "seconds", "seconds_prepare", "seconds_sample",
-            "seconds_score", "seconds_network", "seconds_projector", "network_calls", "projector_calls",
-            "peak_memory_mb", "device", "threads", "precision", "instruction_set")
+MEASURED = ("status", "error", "warning", *MEASURES, "seconds_prepare", "seconds_sample", "seconds_score",
+            "seconds_network", "seconds_projector", "network_calls", "projector_calls", "peak_memory_mb", "device",
+            "threads", "precision", "instruction_set")
 """Columns that a run fills; the others are the trial's. peak_memory_mb, in MiB, is that of the tensors on a
 CUDA device, else of the process."""
 
@@ -85,32 +87,41 @@ class Results:
         self.done[name] = self._row(name, measured)
         self.write()
 
+    def forget(self, lacking: Callable[[str], bool]) -> None:
+        """Take rows for not done whose volume was scored, but which lack something, by their keys."""
+        self.done = {name: row for name, row in self.done.items() if row["status"] != "ok" or not lacking(name)}
+
     def write(self) -> None:
         """The table with the columns in one order, whatever order its rows came in."""
         order = dict.fromkeys(k for row in self.planned.values() for k in row) | dict.fromkeys((*MEASURED, "key"))
         write_csv(self.file, [{k: row.get(k) for k in order} | row for row in self.rows + self.others])
 
 
-def run(specification: Specification, device: torch.device, progress: CaseProgress) -> list[dict]:
-    """The rows of a specification: those that its table holds already, and those that are run now.
+def run(specification: Specification, device: torch.device, progress: CaseProgress,
+        scoring: Scoring | None = None) -> list[dict]:
+    """The rows of a specification: those that its table holds already, and those that are run now, with the metrics of
+    `scoring`.
 
     Case by case; the X-rays of a case are simulated once for all trials that share an acquisition.
     """
+    scoring = scoring or Scoring()
     found, planned = {}, {}  # cases of an acquisition; key -> columns
     cases: dict[str, list] = {}  # id -> trials, their rows' keys, and the functions that make the case
     for trial in specification.trials:
         if (acquisition := trial.acquisition()) not in found:
             found[acquisition] = trial.data.test_cases(*trial.scene())
         for case, source, make in found[acquisition]:
-            name = key(trial, case, source)
+            name = key(trial, case, source, scoring.settings())
             planned[name] = {"case": case} | trial.columns | {"grid": "x".join(map(str, trial.scene()[0].shape))}
             cases.setdefault(case, []).append((trial, name, make))
     results = Results(specification.out, planned)
+    if scoring.network:
+        results.forget(lambda name: not features_file(specification.out, name).is_file())
     left = sum(name not in results.done for name in planned)
     print(f"{len(planned) - left} of {len(planned)} rows are there already, {left} are to be run")
     if results.others:
         print(f"{len(results.others)} rows of other settings or data are kept in {results.file} and left out of tables")
-    bench = Runner(device)
+    bench = Runner(device, scoring, specification.out)
     progress.begin("ablate", left, verb="run")
     for case, work in cases.items():
         groups: dict[str, list] = {}
@@ -123,7 +134,8 @@ def run(specification: Specification, device: torch.device, progress: CaseProgre
             scene = _attempt(lambda: MeasuredCase(case, first, made.case(case, first, make), device))
             for trial, name, _ in group:
                 progress.case(f"{case}: {trial.label}")
-                measured = scene if isinstance(scene, dict) else bench.measure(trial, scene, progress.advance)
+                measured = scene if isinstance(scene, dict) else bench.measure(trial, scene, progress.advance,
+                                                                                              name)
                 results.add(name, measured)
                 progress.finished(f"{measured['seconds']:.2f} s, {measured['psnr']:.2f} dB"
                                   if measured["status"] == "ok" else f"{measured['status']}: {measured['error']}")
@@ -162,17 +174,19 @@ class MeasuredCase:
     def report(self, trial: Trial) -> str:
         """The report, where the trial uses it and its prior reads text."""
         prior = prior_of(trial.prior) if trial.prior else None
-        return self.truth["report"] if prior is not None and prior.reads_text and trial.data.with_report else ""
+        return self.truth["report"] if prior is not None and prior.reads_text and trial.with_report else ""
 
 
 class Runner:
-    """Runs trials and measures them; what only a first call costs is spent before the clock runs."""
+    """Runs trials and measures them; what only a first call costs is spent before the clock runs.
 
-    def __init__(self, device: torch.device):
-        self.device, self.warm = device, set()
+    out: where the features of slices are kept, where the Frechet distance is measured."""
 
-    def measure(self, trial: Trial, scene: MeasuredCase, on_step: Callable[[], None]) -> dict:
-        """The measured columns of one trial on one case."""
+    def __init__(self, device: torch.device, scoring: Scoring, out: Path):
+        self.device, self.scoring, self.out, self.warm = device, scoring, out, set()
+
+    def measure(self, trial: Trial, scene: MeasuredCase, on_step: Callable[[], None], key: str) -> dict:
+        """The measured columns of one trial on one case, the row of `key`."""
         if (state := str(trial.identity() | {"seed": None})) not in self.warm:
             self.warm.add(state)
             with warnings.catch_warnings():
@@ -180,17 +194,23 @@ class Runner:
                 _attempt(lambda: self._reconstruct(trial, scene, WarmUp(on_step)))
         warned = list(scene.warnings)
         with noted(warned, f"{scene.case}, {trial.label}"):
-            measured = _attempt(lambda: self._measured(trial, scene, on_step))
+            measured = _attempt(lambda: self._measured(trial, scene, on_step, key))
         return measured | {"warning": "; ".join(warned) or None}
 
-    def _measured(self, trial: Trial, scene: MeasuredCase, on_step: Callable[[], None]) -> dict:
+    def _measured(self, trial: Trial, scene: MeasuredCase, on_step: Callable[[], None], key: str) -> dict:
         known = reset_peak_memory(self.device)
         with profiled(memory=False) as profile:
             result = self._reconstruct(trial, scene, on_step)
         peak = peak_memory(self.device) if known else None
         seconds = result.seconds | profile.seconds("network", "projector")
         finite = bool(result.volume.isfinite().all())
-        scores = case_scores(result.volume, result.misfit, scene.truth, scene.grid, scene.window) if finite else {}
+        scores = {}
+        if finite:
+            volume = resampled(result.volume, trial.own()[0], scene.grid)
+            scores = self.scoring.scores(volume, result.misfit, scene.truth, scene.grid, scene.window, self.device,
+                                         trial.data.protocol)
+            if features := self.scoring.features(volume, scene.truth, scene.window, self.device):
+                save_features(features_file(self.out, key), features)
         return scores | {
             "status": "ok" if finite else "diverged",
             "error": None if finite else "the volume holds NaN or infinite voxels", "misfit": result.misfit,
@@ -206,9 +226,14 @@ class Runner:
         torch.manual_seed(seed)
         prior = _on(trial.prior, self.device) if isinstance(trial.method, Sampler) else None
         ready = reconstructor(trial.method, prior, trial.guidance, trial.name, samples=trial.samples)
-        xrays, projector = fit_to_grid(ready, scene.grid, scene.xrays.clone(), scene.beam, trial.projector)
+        xrays, projector = fit_to_grid(ready, trial.own()[0], scene.xrays.clone(), scene.beam, trial.projector)
         return ready.with_mu_water(scene.mu_water).reconstruct(
             xrays, projector, scene.report(trial), False, seed, on_step)
+
+
+def features_file(out: Path, key: str) -> Path:
+    """Where the features of the slices of a row's volume are kept."""
+    return out / "features" / f"{key}.safetensors"
 
 
 @cache

@@ -9,7 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from phydict.ablation.cases import Cases, check_path
+from phydict.ablation.nested import changed as changed_settings
+from phydict.ablation.nested import has_field, parsed
 from phydict.ablation.trials import Trial, check_used, dotted, method_of, trials_of
+from phydict.inference.scoring import CLIPSettings, FIDSettings
 from phydict.runtime.reading import refusing
 from phydict.runtime.shipped import configuration
 from phydict.runtime.yaml_file import parse_yaml, read_yaml
@@ -22,16 +25,20 @@ class Specification:
     out: Path
     cases: Cases
     trials: list[Trial]
+    metrics: tuple[str, ...] = ("volume",)
+    fid: FIDSettings = FIDSettings()
+    clip: CLIPSettings = CLIPSettings()
 
 
 def read_specification(file: str | Path, changes: Sequence[str] | None = None, **given) -> Specification:
-    """The specification in a YAML file, or in a shipped one by its name; `given` (out, cts, phantoms, only, reports),
-    where not None, takes the place of what the file says, and so do `changes`: settings as "name=value", of which a
-    list of values is an axis.
+    """The specification in a YAML file, or in a shipped one by its name; `given` (out, cts, phantoms, only, reports,
+    metrics), where not None, takes the place of what the file says, and so do `changes`: settings as "name=value", of
+    which a list of values is an axis.
 
-    Its keys: out; cts or phantoms, only, reports; methods: names for changed methods, each a mapping of settings and
-    `of`, the method that is changed, by its name or the path of its class; base: settings of all trials; axes: setting
-    -> list of values, of which every combination is a trial; or products: a list of such bases and axes. A setting that
+    Its keys: out; cts or phantoms, only, reports; metrics, fid, clip: what is measured, as in infer.py test; methods:
+    names for changed methods, each a mapping of settings and `of`, the method that is changed, by its name or the path
+    of its class; base: settings of all trials; axes: setting -> list of values, of which every combination is a trial;
+    or products: a list of such bases and axes. A setting that
     means nothing to a method is left out for it, and what then is the same is run once. Raises ValueError, in one
     sentence, on what cannot be meant.
     """
@@ -47,7 +54,8 @@ def read_specification(file: str | Path, changes: Sequence[str] | None = None, *
 
 
 def _specification(content, given: Mapping, changed: Mapping) -> Specification:
-    keys = ("out", "cts", "phantoms", "only", "reports", "methods", "base", "axes", "products")
+    keys = ("out", "cts", "phantoms", "only", "reports", "metrics", "fid", "clip", "methods", "base", "axes",
+            "products")
     _check_keys(content, keys, "a specification")
     if "products" in content and "axes" in content:
         raise ValueError("give axes, or products, each with axes of its own, but not both")
@@ -83,7 +91,18 @@ def _specification(content, given: Mapping, changed: Mapping) -> Specification:
         for trial in product:
             trials.setdefault(json.dumps(trial.identity(), sort_keys=True), trial)
     check_used(common, used, found)
-    return Specification(Path(content["out"]), cases, list(trials.values()))
+    metrics = parsed(list[str], content.get("metrics", ["volume"]), "metrics")
+    fid, clip = (_settings(kind(), content.get(name), name) for kind, name in ((FIDSettings, "fid"),
+                                                                              (CLIPSettings, "clip")))
+    return Specification(Path(content["out"]), cases, list(trials.values()), tuple(metrics), fid, clip)
+
+
+def _settings(default, value, name: str):
+    """A group of settings, `default` with what a mapping changes."""
+    for key in _mapping(value, name):
+        if not has_field(default, [key]):
+            raise ValueError(f"{name} has no setting {key!r}: use {', '.join(vars(default))}")
+    return changed_settings(default, _mapping(value, name), name)
 
 
 def _mapping(value, name: str) -> Mapping:

@@ -5,15 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
 
 from phydict.ablation.run import MEASURED
 from phydict.ablation.trials import PRIOR_SETTINGS
-from phydict.evaluation.metrics import MEASURES, Measure, over_cases
+from phydict.evaluation.bootstrap import Estimate, estimate
+from phydict.evaluation.metrics import MEASURES, Measure, case_values
 
 SHOWN_MEASURES = MEASURES | {"network_calls": Measure("network calls", None, 0),
                              "projector_calls": Measure("projector calls", None, 0),
                              "peak_memory_mb": Measure("peak memory (MiB)", False, 0)}
 """How the columns of results are printed."""
+
+SCORES = MEASURES.keys() - {"seconds"}
+"""The measures of how good a volume is, whose means have intervals."""
 
 NON_SETTING_COLUMNS = (*MEASURED, "case", "key", "seed", "grid")
 
@@ -22,18 +29,29 @@ NON_SETTING_COLUMNS = (*MEASURED, "case", "key", "seed", "grid")
 class Entry:
     """The mean over cases of one method's settings under one condition.
 
-    settings: those that differ among the method's entries, beside its name; means: measure -> mean over cases, the
-    seeds of a case averaged first; cases, of: how many cases it has and how many it was to have; error: why one is
-    missing.
+    settings: those that differ among the method's entries, beside its name; values: measure -> {case: value}, the
+    seeds of a case averaged, of those measures that all its cases have; cases, of: how many cases it has and how many
+    it was to have; error: why one is missing; rows: the case and the key of each row that counts.
     """
 
     method: str
     settings: dict
     condition: dict
-    means: dict[str, float]
+    values: dict[str, dict[str, float]]
     cases: int
     of: int
     error: str | None = None
+    rows: tuple[tuple[str, str], ...] = ()
+
+    @cached_property
+    def means(self) -> dict[str, float]:
+        """Measure -> mean over cases."""
+        return {name: float(np.mean(list(values.values()))) for name, values in self.values.items()}
+
+    def estimate(self, name: str) -> float | Estimate | None:
+        """The mean of a measure, of a score of several patients with its interval; None where it was not measured."""
+        found = estimate(self.values[name]) if name in SCORES & self.values.keys() else None
+        return self.means.get(name) if found is None or math.isnan(found.low) else found
 
     @property
     def complete(self) -> bool:
@@ -141,11 +159,11 @@ def _entry(rows: Sequence[Mapping], own: Sequence[str], varying: Sequence[str]) 
     first, good = rows[0], [row for row in rows if row["status"] == "ok"]
     cases = len({row["case"] for row in good})
     stages = {name for row in good for name in row if name.startswith("seconds_")}
-    means = {name: found.mean for name, found in over_cases(good, SHOWN_MEASURES.keys() | stages).items()
-             if found.cases == cases}
+    values = {name: found for name in [*SHOWN_MEASURES, *stages] if len(found := case_values(good, name)) == cases > 0}
     error = next((f"{row['status']}: {row['error']}" for row in rows if row["status"] != "ok"), None)
     return Entry(first["method"], {n: first[n] for n in own if n in first},
-                 {n: first[n] for n in varying if n in first}, means, cases, len({row["case"] for row in rows}), error)
+                 {n: first[n] for n in varying if n in first}, values, cases, len({row["case"] for row in rows}), error,
+                 tuple((row["case"], str(row.get("key"))) for row in good))
 
 
 def _varying(rows: Sequence[Mapping], names: Sequence[str]) -> list[str]:

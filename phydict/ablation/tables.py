@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 from phydict.ablation.run import TABLES
 from phydict.ablation.summary import (
@@ -16,22 +17,34 @@ from phydict.ablation.summary import (
     deltas,
     format_settings,
 )
-from phydict.evaluation.tables import Table, caption, doubts, listed
+from phydict.evaluation.bootstrap import difference
+from phydict.evaluation.metrics import MEASURES, RANGE
+from phydict.evaluation.tables import INTERVAL, Table, caption, doubts, empty_notes, interval_note, listed
+from phydict.inference.protocols import protocol_of
 from phydict.runtime.files import atomic_write
 
-OF_METHODS = ("ssim", "psnr", "mae_hu", "ssim_body", "psnr_body", "mae_hu_body", "misfit", "seconds", "network_calls")
+FURTHER = tuple(name for name in MEASURES if name not in (
+    "ssim", "psnr", "mae_hu", "ssim_lung", "psnr_lung", "mae_hu_lung", "misfit", "seconds"))
+"""Measures that have a column only where they were taken."""
+
+OF_METHODS = ("ssim", "psnr", "mae_hu", *FURTHER, "misfit", "seconds", "network_calls")
 """Columns of the table of methods."""
 
-OF_VIEWS = ("ssim", "psnr", "ssim_body", "psnr_body", "seconds")
+OF_VIEWS = ("ssim", "psnr", *FURTHER, "seconds")
 """Measures that are tabled against the number of views and by geometry."""
 
-OF_DELTA = ("ssim", "misfit", "psnr", "mae_hu", "ssim_body", "psnr_body", "mae_hu_body", "seconds")
+OF_DIFFERENCES = ("ssim", "psnr", "mae_hu", *FURTHER, "misfit")
+"""Measures whose differences between methods are tabled."""
+
+OF_DELTA = ("ssim", "misfit", "psnr", "mae_hu", *FURTHER, "seconds")
 """Columns of the table of Extra Compute, the misfit beside SSIM: what looks better may fit the X-rays worse."""
 
 
-def all_tables(found: Sequence[Entry], rows: Sequence[dict]) -> list[Table]:
-    """Every table that the entries of some rows allow."""
-    notes, tables = [_caption(rows), *doubts(rows)], []
+def all_tables(found: Sequence[Entry], rows: Sequence[dict],
+               empty: Mapping[str, str] = MappingProxyType({})) -> list[Table]:
+    """Every table that the entries of some rows allow; empty: scores that may stay empty -> why they then do."""
+    measured = {name for entry in found for name in entry.values}
+    notes, tables = [_caption(rows), *empty_notes(empty, measured), *doubts(rows)], []
     for condition, group in conditions(found):
         title = format_settings("Methods", condition or {name: rows[0][name] for name in ("views", "simulator")})
         best = best_settings(group)
@@ -40,6 +53,7 @@ def all_tables(found: Sequence[Entry], rows: Sequence[dict]) -> list[Table]:
                                         [*notes, "The settings were chosen by these cases' own PSNR."]))
             title += ": all settings"
         tables.append(_method_table(title, group, notes))
+        tables += _difference_tables(title.removesuffix(": all settings"), best, notes[1:])
     for rest, places in compared_views(found):
         columns = {f"K = {k}": places[k] for k in sorted(places)}
         tables += _axis_tables("against the number of views", rest, columns, notes)
@@ -64,6 +78,21 @@ def _method_table(title: str, found: Sequence[Entry], notes: Sequence[str]) -> T
     return _entry_table(title, "method", OF_METHODS, [(entry.label, entry) for entry in found], notes)
 
 
+def _difference_tables(title: str, found: Sequence[Entry], notes: Sequence[str]) -> list[Table]:
+    """What each method has more than the first one on the same cases; none without a second one."""
+    first, *others = [entry for entry in found if entry.cases] or [None]
+    names = _measured(OF_DIFFERENCES, found)
+    lines: list[tuple[str, bool, list]] = []
+    for entry in others:
+        values = [difference(entry.values.get(name, {}), first.values.get(name, {})) for name in names]
+        lines.append((entry.label, False, values))
+    if not interval_note(lines):
+        return []
+    measures = [SHOWN_MEASURES[name] for name in names]
+    return [Table(f"{title}: less {first.name}, case by case", ["method", *(m.heading for m in measures)], measures,
+                  lines, [INTERVAL, *notes])]
+
+
 def _delta_table(label: str, found: Sequence[Entry], notes: Sequence[str]) -> Table:
     """Extra Compute's delta x measures: the form of the paper's Table 2, with the misfit beside SSIM."""
     return _entry_table(f"Extra Compute's delta: {label}", "delta", OF_DELTA,
@@ -74,9 +103,9 @@ def _entry_table(title: str, first: str, names: Sequence[str], lines: Sequence[t
                  notes: Sequence[str]) -> Table:
     names = _measured(names, [entry for _, entry in lines])
     measures = [SHOWN_MEASURES[name] for name in names]
-    return Table(title, [first, *(measure.heading for measure in measures)], measures,
-                 [(label, entry.complete, [entry.means.get(name) for name in names]) for label, entry in lines],
-                 [*notes, *_reasons([entry for _, entry in lines])])
+    printed = [(label, entry.complete, [entry.estimate(name) for name in names]) for label, entry in lines]
+    return Table(title, [first, *(measure.heading for measure in measures)], measures, printed,
+                 [*notes, *interval_note(printed), *_reasons([entry for _, entry in lines])])
 
 
 def _axis_tables(title: str, rest: dict, columns: Mapping[str, Sequence[Entry]], notes: Sequence[str]) -> list[Table]:
@@ -88,18 +117,17 @@ def _axis_tables(title: str, rest: dict, columns: Mapping[str, Sequence[Entry]],
             lines.setdefault(entry.name, {})[column] = entry
     for name in _measured(OF_VIEWS, group):
         measure = SHOWN_MEASURES[name]
+        printed = [(label, all(entry.complete or not entry.cases for entry in line.values()),
+                    [line[k].estimate(name) if k in line else None for k in columns]) for label, line in lines.items()]
         tables.append(Table(
-            format_settings(f"{measure.heading} {title}", rest),
-            ["method", *columns], [measure] * len(columns),
-            [(label, all(entry.complete or not entry.cases for entry in line.values()),
-              [line[k].means.get(name) if k in line else None for k in columns]) for label, line in lines.items()],
-            [*notes, *_reasons(group)]))
+            format_settings(f"{measure.heading} {title}", rest), ["method", *columns], [measure] * len(columns),
+            printed, [*notes, *interval_note(printed), *_reasons(group)]))
     return tables
 
 
 def _measured(names: Sequence[str], found: Sequence[Entry]) -> list[str]:
-    """The measures without those in the body where no entry has them, as in results of 0.2.0 and before."""
-    return [name for name in names if not name.endswith("_body") or any(name in entry.means for entry in found)]
+    """The measures without those of FURTHER that no entry has."""
+    return [name for name in names if name not in FURTHER or any(name in entry.values for entry in found)]
 
 
 def _caption(rows: Sequence[dict]) -> str:
@@ -107,7 +135,9 @@ def _caption(rows: Sequence[dict]) -> str:
     count = len({row["case"] for row in rows})
     over = f"Mean over {count} {'case' if count == 1 else 'cases'}"
     how = " on ".join(filter(None, (listed(rows, name) for name in ("precision", "instruction_set"))))
-    return caption(over, rows, {"Grid": "grid", "Seeds": "seed"}) + (
+    protocols = {row.get("protocol") for row in rows}
+    window = protocol_of(*protocols).window if len(protocols) == 1 and None not in protocols else RANGE
+    return caption(over, rows, {"Grid": "grid", "Seeds": "seed"}, window) + (
         f" Seconds: one reconstruction after a warm-up, {listed(rows, 'device') or 'none'}, threads "
         f"{listed(rows, 'threads') or 'none'}{how and f', {how}'}; loading and scoring excluded.")
 

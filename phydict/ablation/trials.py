@@ -10,6 +10,7 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cache
 from importlib import import_module
 from itertools import product
+from types import MappingProxyType
 
 from phydict.ablation.cases import Cases
 from phydict.ablation.nested import changed, field_of, has_field, parsed, plain
@@ -41,7 +42,7 @@ SETTINGS: dict[str, tuple[type, object]] = {
     "simulation_voxels": (int | None, None), "source_to_detector": (float, 1020.0),
     "source_to_isocentre": (float, 740.0), "geometry": (str | None, None),
     "report": (bool, True), "voxels": (int, 64), "side": (float, 384.0),
-    "prior": (str | None, None), "guidance": (float, 1.0), "samples": (int, 1),
+    "protocol": (str | None, None), "prior": (str | None, None), "guidance": (float, 1.0), "samples": (int, 1),
     "delta": (float | None, None), "projector": (str, "auto")}
 """Type and default of what an axis may be; beside these, method.<field> and simulator.<field>."""
 
@@ -76,6 +77,7 @@ class Trial:
     side: float
     like: str | None = None
     projector: str = "auto"
+    with_report: bool = True
 
     @property
     def name(self) -> str:
@@ -88,8 +90,14 @@ class Trial:
                                        (name != "method" and ("." in name or value != SETTINGS[name][1])))])
 
     def scene(self) -> tuple[Grid, HUWindow]:
-        """The grid of the volume and the HU window that the truth is clipped to."""
+        """The grid of the truth, which is also scored on, and the HU window that the truth is clipped to."""
+        return self.data.scene(*self.own())
+
+    def own(self) -> tuple[Grid, HUWindow]:
+        """The method's own grid and HU window."""
         file = self.prior or self.like
+        if self.prior is None and self.data.protocol and self.data.protocol.grid:
+            return self.data.protocol.grid, HUWindow()
         if file is None:
             return Grid.cube(self.voxels, self.side), HUWindow()
         return prior_of(file).grid, prior_of(file).window
@@ -98,7 +106,7 @@ class Trial:
         """All that decides the numbers of a trial beside the case, as plain JSON values."""
         grid, window = self.scene()
         identity = {"name": self.name, "method": describe(self.method), "seed": self.seed, "grid": grid.to_dict(),
-                "window": describe(window), "data": self.data.settings("test")}
+                "window": describe(window), "data": {"with_report": self.with_report} | self.data.settings("test")}
         if self.prior is not None:
             prior = prior_of(self.prior)
             identity |= {"prior": prior.identity()} if isinstance(prior, PriorContract) else {
@@ -111,7 +119,7 @@ class Trial:
     def acquisition(self) -> str:
         """Equal for trials whose X-rays are the same."""
         grid, window = self.scene()
-        settings = self.data.settings("test") | {"with_report": None, "seed": self.seed}
+        settings = self.data.settings("test") | {"seed": self.seed}
         return json.dumps([settings, grid.to_dict(), describe(window)], sort_keys=True)
 
 
@@ -193,10 +201,13 @@ def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
                          f"{value['detector']} was given")
     pixel = SIDE / value["detector"] if value["pixel"] is None else value["pixel"]
     data = cases.data(
-        with_report=value["report"], geometry=value["geometry"],
-        orbit=Orbit(value["views"], value["source_to_detector"], value["source_to_isocentre"], (value["detector"],) * 2,
-                    (pixel, pixel)),
-        simulator=simulator, simulation_voxels=value["simulation_voxels"])
+        orbit=_orbit(given) if value["protocol"] or value["geometry"] else Orbit(
+            value["views"], value["source_to_detector"], value["source_to_isocentre"], (value["detector"],) * 2,
+            (pixel, pixel)),
+        simulator=simulator, simulation_voxels=value["simulation_voxels"], geometry=value["geometry"],
+        protocol=value["protocol"])
+    if value["protocol"]:
+        value |= {"views": data.orbit.views, "detector": data.orbit.detector[0]}
     with_prior = isinstance(method, Sampler)
     overrides = {f"{part}.{path}": plain(field_of({"method": method, "simulator": simulator}[part], path.split(".")))
                  for part, paths in changes.items() for path in paths}
@@ -207,9 +218,15 @@ def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
     columns |= {name: given[name] for name in SETTINGS if name in given and name not in columns} | overrides
     prior = value["prior"] or str(method.default_prior) if with_prior else None
     trial = Trial(columns, method, data, prior, value["guidance"], value["samples"], value["seed"],
-                  value["voxels"], value["side"], projector=value["projector"])
+                  value["voxels"], value["side"], projector=value["projector"], with_report=value["report"])
     meant = set(given) | set(overrides)
     return trial, meant | ({"voxels", "side"} & set(settings))
+
+
+def _orbit(given: Mapping) -> Orbit:
+    """The part of a protocol's orbit that is given beside it."""
+    sizes = {name: (given[name],) * 2 for name in ("detector", "pixel") if given.get(name) is not None}
+    return Orbit(given.get("views"), given.get("source_to_detector"), given.get("source_to_isocentre"), **sizes)
 
 
 def method_of(name: object, known: Iterable[str] = ()) -> Sampler | Reconstructor:
@@ -252,9 +269,10 @@ def _crc(file: str) -> int:
     return fingerprint(file)
 
 
-def key(trial: Trial, case: str, source: str) -> str:
-    """What a row of results is known by: equal for equal settings and equal data (id, what identifies it) alone."""
-    text = json.dumps([trial.identity(), case, source], sort_keys=True)
+def key(trial: Trial, case: str, source: str, measured: Mapping = MappingProxyType({})) -> str:
+    """What a row of results is known by: equal for equal settings and equal data (id, what identifies it) alone, and
+    for equal further metrics."""
+    text = json.dumps([trial.identity() | dict(measured), case, source], sort_keys=True)
     return f"k{zlib.crc32(text.encode()):08x}{zlib.adler32(text.encode()):08x}"
 
 

@@ -16,6 +16,7 @@ from phydict.cli.help import describe_commands, method_help, predict_help
 from phydict.datasets.radiographs.radiographs import load_xrays
 from phydict.inference.data import ReconstructionData
 from phydict.inference.dry_run import dry_run
+from phydict.inference.scoring import METRICS, CLIPSettings, FIDSettings, Scoring
 from phydict.inference.task import ReconstructionTask
 from phydict.methods import DEFAULT_METHOD, METHODS
 from phydict.runtime.console import (
@@ -47,6 +48,11 @@ class InferenceCLI(LightningCLI):
         if subcommand == "predict":
             parser.add_argument("--dry_run", action="store_true",
                                 help="draw the geometry of every case and reconstruct nothing")
+        if subcommand == "test":
+            parser.add_argument("--metrics", type=list[str], default=["volume"],
+                                help=f"what is measured, of {', '.join(METRICS)}; volume always is")
+            parser.add_class_arguments(FIDSettings, "fid")
+            parser.add_class_arguments(CLIPSettings, "clip")
         predict_help(parser, subcommand, COMMANDS[subcommand])
         return parser
 
@@ -111,6 +117,8 @@ class InferenceCLI(LightningCLI):
     def test(self, model: ReconstructionTask, datamodule: ReconstructionData) -> None:
         """Simulate the X-rays of CTs, reconstruct and score them."""
         model.profile = self.profile
+        model.measure(Scoring(self._get(self.config, "metrics"), self._get(self.config_init, "fid"),
+                              self._get(self.config_init, "clip")))
         with model.progress:
             self.trainer.test(model, datamodule=datamodule, verbose=False)
 

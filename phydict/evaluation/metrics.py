@@ -27,6 +27,7 @@ from torchmetrics import Metric
 from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 from torchmetrics.utilities.data import dim_zero_cat
 
+from phydict.evaluation.bootstrap import bounds, estimate
 from phydict.units import HUWindow
 
 RANGE = HUWindow(-1000.0, 1000.0)
@@ -59,6 +60,16 @@ MEASURES = {
     "ssim_lung": Measure("SSIM lung", True, 3),
     "psnr_lung": Measure("PSNR lung (dB)", True, 2),
     "mae_hu_lung": Measure("MAE lung (HU)", False, 1),
+    "psnr_slices": Measure("PSNR of slices (dB)", True, 2),
+    "ssim_slices": Measure("SSIM of slices", True, 3),
+    "ssim_uniform": Measure("SSIM 7^3", True, 3),
+    "lpips_alex": Measure("LPIPS alex", False, 4),
+    "lpips_squeeze": Measure("LPIPS squeeze", False, 4),
+    "dice_lung": Measure("Dice lungs", True, 3),
+    "hd95_lung": Measure("HD95 lungs (mm)", False, 1),
+    "cldice_vessel": Measure("clDice vessels", True, 3),
+    "clip_t2i": Measure("CLIP T2I (%)", True, 2),
+    "clip_i2i": Measure("CLIP I2I (%)", True, 2),
     "misfit": Measure("misfit", False, 4),
     "seconds": Measure("time (s)", False, 2),
 }
@@ -119,36 +130,43 @@ def volume_metrics(hu: Tensor, true_hu: Tensor, lung: Tensor | None = None, body
 
 
 class Summary(NamedTuple):
-    """Mean and sample standard deviation over `cases` cases (std NaN for one case); prints as mean ± std."""
+    """Mean and sample standard deviation over `cases` cases (std NaN for one case), and the ends of the mean's 95 %
+    interval by the bootstrap over patients (NaN for one); prints as mean ± std [low, high]."""
 
     mean: float
     std: float
     cases: int
+    low: float = math.nan
+    high: float = math.nan
 
     def __float__(self) -> float:
         return self.mean
 
     def __format__(self, spec: str) -> str:
-        return format(self.mean, spec) + ("" if math.isnan(self.std) else f" ± {format(self.std, spec)}")
+        spread = "" if math.isnan(self.std) else f" ± {format(self.std, spec)}"
+        return format(self.mean, spec) + spread + bounds(self.low, self.high, spec)
+
+
+def case_values(rows: Iterable[Mapping], name: str) -> dict[str, float]:
+    """{case: value} of a metric, rows of one case (several seeds) averaged; rows without the key "case" count as a case
+    each."""
+    cases: dict[str, list[float]] = {}
+    for n, row in enumerate(rows):
+        if row.get(name) is not None:
+            cases.setdefault(str(row.get("case", f"row {n}")), []).append(float(row[name]))
+    return {case: float(np.mean(repeats)) for case, repeats in cases.items()}
 
 
 def over_cases(rows: Sequence[Mapping], metrics: Iterable[str]) -> dict[str, Summary]:
-    """{metric: Summary} of those metrics that some row has.
-
-    Rows of one case (several seeds) are averaged first, so that each case counts once; rows without the key "case"
-    count as a case each.
-    """
+    """{metric: Summary} of those metrics that some row has, each case counting once (`case_values`)."""
     result = {}
     for name in metrics:
-        cases: dict[str, list[float]] = {}
-        for n, row in enumerate(rows):
-            if row.get(name) is not None:
-                cases.setdefault(row.get("case", f"row {n}"), []).append(float(row[name]))
-        if cases:
+        if cases := case_values(rows, name):
             with np.errstate(invalid="ignore"):
-                values = np.array([np.mean(repeats) for repeats in cases.values()])
+                values = np.array(list(cases.values()))
                 std = float(values.std(ddof=1)) if len(values) > 1 else math.nan
-            result[name] = Summary(float(values.mean()), std, len(values))
+                mean, low, high = estimate(cases)
+            result[name] = Summary(mean, std, len(values), low, high)
     return result
 
 

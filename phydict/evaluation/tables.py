@@ -9,12 +9,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 from rich.markup import escape
 from rich.table import Table as ConsoleTable
 
+from phydict.evaluation.bootstrap import Estimate
+from phydict.evaluation.fid import NAMES, Features, fid
 from phydict.evaluation.metrics import MEASURES, RANGE, SIGMA, TAPS, Measure, Summary, summarise
+from phydict.evaluation.planes import PLANES
 from phydict.units import HUWindow
+
+Value = float | Summary | Estimate
+"""What a table prints: a number, or a mean with its interval."""
+
+INTERVAL = "In brackets: 95 % interval of the mean, bootstrap over patients."
 
 
 @dataclass(frozen=True)
@@ -25,7 +34,7 @@ class Table:
     title: str
     header: list[str]
     measures: list[Measure]
-    lines: list[tuple[str, bool, list[float | Summary | None]]]
+    lines: list[tuple[str, bool, list[Value | None]]]
     notes: list[str]
 
     def markdown(self) -> str:
@@ -77,18 +86,20 @@ def ranks(values: Sequence[float], higher_is_better: bool | None) -> list[int]:
 
 
 def mean_table(rows: Iterable[Mapping], by: str = "method", metrics: Sequence[str] | None = None,
-               window: HUWindow = RANGE) -> Table:
+               window: HUWindow = RANGE, empty: Mapping[str, str] = MappingProxyType({})) -> Table:
     """Mean ± standard deviation over cases, a line per group; where rows have warnings, a last column counts their
     cases.
 
-    by, metrics: as in `summarise`. window: the HU range of `volume_metrics`. The caption takes grid and views from the
+    by, metrics: as in `summarise`. window: the HU range of `volume_metrics`. empty: metric -> why it has no value, if
+    it has none; it then has a column all the same, and a note. The caption takes grid and views from the
     rows' columns of these names.
     """
     rows = list(rows)
     groups = summarise(rows, by, metrics)
-    names = [name for name in metrics or MEASURES if any(name in group for group in groups.values())]
+    measured = [name for name in metrics or MEASURES if any(name in group for group in groups.values())]
+    names = [name for name in metrics or MEASURES if name in measured or name in empty]
     measures = [MEASURES.get(name, Measure(name, None, 3)) for name in names]
-    lines: list[tuple[str, bool, list[float | Summary | None]]] = [
+    lines: list[tuple[str, bool, list[Value | None]]] = [
         (label, True, [group.get(name) for name in names]) for label, group in groups.items()]
     if warned := warned_cases(rows, by):
         measures.append(Measure("warned", None, 0))
@@ -99,7 +110,28 @@ def mean_table(rows: Iterable[Mapping], by: str = "method", metrics: Sequence[st
     unequal = " (not the same cases in every line)" if len(cases) > 1 else ""
     over = f"Mean ± standard deviation over n = {' to '.join(map(str, counts))} cases{unequal}"
     return Table(f"Scores by {by}", [by, *(measure.heading for measure in measures)], measures, lines,
-                 [caption(over, rows, {"Grid": "grid", "Views": "views"}, window), *doubts(rows, by)])
+                 [caption(over, rows, {"Grid": "grid", "Views": "views"}, window), *interval_note(lines),
+                  *empty_notes(empty, measured), *doubts(rows, by)])
+
+
+def fid_table(found: Mapping[str, Mapping[str, Features]], backbone: str, replicates: int,
+              title: str = "Frechet distance of slices (FID)") -> Table:
+    """The Frechet distances of some methods, label -> the features of its cases, a line each, and what they rest on."""
+    lines: list[tuple[str, bool, list[Value | None]]] = []
+    for label, cases in found.items():
+        distances = fid(cases, replicates)
+        lines.append((label, all(cases.keys() == other.keys() for other in found.values()),
+                      [distances[name] for name in NAMES]))
+    counts = dict.fromkeys(f"{len(cases)} cases with " + ", ".join(
+        f"{plane.upper()} {sum(one[plane].shape[1] for one in cases.values())}" for plane in PLANES) + " slices"
+        for cases in found.values())
+    note = (f"Backbone {backbone}, a scale of its own: {'; '.join(counts)}, all of each volume, against the truth's of "
+            f"the same cases. HU clipped to [{RANGE.low:g}, {RANGE.high:g}], each volume's least and largest value "
+            "mapped to 0 and 1, so that a wrong HU scale is not seen. FID: mean of the planes.")
+    measures = [Measure(f"FID-{name[4:].upper()}" if "_" in name else "FID", False, 3) for name in NAMES]
+    intervals = f"In brackets: 95 % interval, {replicates} draws of patients; repeated slices make it too high."
+    return Table(title, ["method", *(measure.heading for measure in measures)], measures, lines,
+                 [note, *([intervals] if interval_note(lines) else [])])
 
 
 def caption(statistic: str, rows: Sequence[Mapping], columns: Mapping[str, str], window: HUWindow = RANGE) -> str:
@@ -109,6 +141,18 @@ def caption(statistic: str, rows: Sequence[Mapping], columns: Mapping[str, str],
     return (f"{statistic}; best in bold, second underlined. HU clipped to [{window.low:g}, {window.high:g}], data "
             f"range {2 * window.half_width:g} HU; SSIM 3-D on HU from the range's low end, Gaussian of {TAPS} taps, "
             f"sigma {SIGMA:g} voxels.{stated}")
+
+
+def interval_note(lines: Iterable[tuple[str, bool, Sequence[Value | None]]]) -> list[str]:
+    """The note on intervals, where some value of a table's lines has one."""
+    values = [value for _, _, line in lines for value in line]
+    shown = any(isinstance(value, Summary | Estimate) and not math.isnan(value.low + value.high) for value in values)
+    return [INTERVAL] if shown else []
+
+
+def empty_notes(empty: Mapping[str, str], measured: Iterable[str]) -> list[str]:
+    """Why columns are empty: metric -> reason, of those that were not measured."""
+    return [f"{MEASURES[name].label}: empty, since {reason}." for name, reason in empty.items() if name not in measured]
 
 
 def listed(rows: Sequence[Mapping], column: str) -> str:

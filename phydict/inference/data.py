@@ -15,8 +15,9 @@ from torch.utils.data import DataLoader, Dataset
 
 from phydict.datasets import CTFile, CTSource, body_mask, find_xrays, load_case, load_xrays, phantom_case
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM, PHANTOM_VERSION
-from phydict.evaluation import volume_metrics
+from phydict.evaluation import RANGE, volume_metrics
 from phydict.grid import Grid
+from phydict.inference.protocols import protocol_of
 from phydict.inference.settings import Orbit
 from phydict.reconstruction import describe
 from phydict.runtime.console import noted
@@ -61,44 +62,59 @@ class ReconstructionData(lightning.LightningDataModule):
         source: which CTs of a folder are taken, and what belongs to them
         only: a text file of the case ids to test, such as the held_out.txt of a training; none given: all
         phantoms: how many phantoms where cts is the word phantom
-        with_report: whether the cases' reports are used
         orbit: the simulated X-rays' geometry where no file gives it
         simulator: how X-rays are made of a CT (configs/simulate)
         simulation_voxels: voxels per side of the volume that X-rays are made of; none given: the reconstruction's own
             grid, which is an inverse crime; more lessens it
+        protocol: a published evaluation that fixes the geometry, grid, HU range and noise of test: phydict, x2ct,
+            luna16 or sparc
     """
 
     def __init__(self, xrays: str | None = None, geometry: str | None = None, cts: str | None = None,
-                 source: CTSource = CTSource(), only: str | None = None, phantoms: int = 4, with_report: bool = True,
-                 orbit: Orbit = Orbit(), simulator: Simulator = Ideal(), simulation_voxels: int | None = None):
+                 source: CTSource = CTSource(), only: str | None = None, phantoms: int = 4,
+                 orbit: Orbit = Orbit(), simulator: Simulator = Ideal(), simulation_voxels: int | None = None,
+                 protocol: str | None = None):
         super().__init__()
         check_between("data.phantoms", phantoms, 1, MOST_PHANTOMS)
         if simulation_voxels is not None and simulation_voxels < 1:
             raise ValueError(f"data.simulation_voxels must be at least 1, but {simulation_voxels} was given: leave it "
                              "out for the reconstruction's own")
         self.xrays, self.geometry, self.cts, self.phantoms, self.only = xrays, geometry, cts, phantoms, only
-        self.source, self.with_report, self.simulator = source, with_report, simulator
+        self.source, self.simulation_voxels = source, simulation_voxels
         if cts and geometry and orbit != Orbit():
             raise ValueError(f"the simulated X-rays are those of data.geometry ({geometry}), but data.orbit was "
                              "given as well: leave one out")
-        self.simulation_voxels, self.orbit = simulation_voxels, orbit
+        self.protocol = None if protocol is None else protocol_of(protocol)
+        if self.protocol and geometry is not None:
+            raise ValueError(f"data.protocol {protocol} fixes the geometry of simulated X-rays, but data.geometry "
+                             f"{geometry} was given: leave one of the two out")
+        self.orbit = self.protocol.fixed_orbit(orbit) if self.protocol else orbit.filled()
+        self.simulator = self.protocol.fixed_simulator(simulator) if self.protocol else simulator
         self.geometry_file = configuration(geometry, ("geometry",)) if geometry else None
-        self.beam = read_beam(self.geometry_file) if cts and self.geometry_file else orbit.beam()
+        self.beam = read_beam(self.geometry_file) if cts and self.geometry_file else self.orbit.beam()
 
     def settings(self, stage: str) -> dict:
         """What, beside the cases themselves, decides the X-rays that a stage (predict, test) reconstructs from."""
         if stage == "predict":
-            return {"with_report": self.with_report, "geometry": self.geometry}
-        beam = vars(self.orbit)
+            return {"geometry": self.geometry}
+        beam = self.orbit.settings()
         if self.geometry_file:
             beam = {"geometry": f"{self.geometry_file.name}, crc32 {file_crc32(self.geometry_file):08x}"}
-        return {"with_report": self.with_report, **beam, "simulator": describe(self.simulator),
-                "simulation_voxels": self.simulation_voxels}
+        return beam | {"simulator": describe(self.simulator), "simulation_voxels": self.simulation_voxels} | (
+            {"protocol": self.protocol.name} if self.protocol else {})
+
+    def scene(self, grid: Grid, window: HUWindow) -> tuple[Grid, HUWindow]:
+        """The voxels and the HU range of the CTs that X-rays are made of, where a method has these of its own."""
+        protocol = self.protocol
+        return (protocol.grid or grid, protocol.hu or window) if protocol else (grid, window)
 
     def xray_cases(self) -> dict[str, Path]:
         """Id -> folder of X-rays. Raises ValueError without data.xrays."""
         if not self.xrays:
             raise ValueError("predict needs data.xrays: a folder of X-ray images with geometry.yaml")
+        if self.protocol:
+            raise ValueError(f"data.protocol {self.protocol.name} is a way to simulate X-rays and to score, but "
+                             "predict takes measured ones: leave it out, or use test")
         folders = find_xrays(self.xrays)
         cases = {name_of(os.path.abspath(folder)): folder for folder in folders}
         if len(cases) < len(folders):
@@ -119,7 +135,7 @@ class ReconstructionData(lightning.LightningDataModule):
 
     def test_dataloader(self) -> DataLoader:
         task = self.trainer.lightning_module
-        return self._loader(self.test_cases(task.grid, task.window))
+        return self._loader(self.test_cases(*self.scene(task.grid, task.window)))
 
     def test_cases(self, grid: Grid, window: HUWindow) -> list[tuple[str, str, Callable[[], dict]]]:
         """The CTs or phantoms of test: id, what identifies its data, and the function that makes it on `grid`."""
@@ -129,7 +145,8 @@ class ReconstructionData(lightning.LightningDataModule):
             return [(f"phantom-{seed:06d}", f"phantom version {PHANTOM_VERSION}", lambda s=seed: self._with_fine(
                         grid, lambda g: phantom_case(s, g, window)))
                     for seed in range(HELD_OUT_PHANTOM, HELD_OUT_PHANTOM + self.phantoms)]
-        return [(ct.id, _ct_source(ct), lambda c=ct: self._with_fine(grid, lambda g: load_case(c, g, window)))
+        return [(ct.id, _ct_source(ct), lambda c=ct: {"file": c.path} | self._with_fine(
+                    grid, lambda g: load_case(c, g, window)))
                 for ct in self._chosen(self.source.find(self.cts))]
 
     def _chosen(self, cts: list[CTFile]) -> list[CTFile]:
@@ -178,15 +195,17 @@ class ReconstructionData(lightning.LightningDataModule):
         return DataLoader(cases, None)
 
 
-def case_scores(volume: Tensor, misfit: float, case: dict, grid: Grid, window: HUWindow) -> dict[str, float]:
-    """Scores of a reconstructed volume (X, Y, Z) in HU on `grid` against the CT case that its X-rays were made of: over
-    the whole volume, in the body, which leaves out couch and air (`body_mask` of the CT), and in the lungs if known."""
+def case_scores(volume: Tensor, misfit: float, case: dict, grid: Grid, window: HUWindow,
+                scored: HUWindow = RANGE) -> dict[str, float]:
+    """Scores of a reconstructed volume (X, Y, Z) in HU on `grid` against the CT case that its X-rays were made of, in
+    the HU range `scored`: over the whole volume, in the body, which leaves out couch and air (`body_mask` of the CT),
+    and in the lungs if known."""
     truth = window.to_hu(case["volume"])[None].cpu()
     lung = case["masks"][None, :1].cpu() if bool(case["has_masks"][0]) else None
     body = torch.from_numpy(body_mask(truth[0, 0].numpy(), grid.spacing))[None, None]
     if lung is not None:  # a lung that the field of view cuts open is not filled in the body
         body |= lung > 0.5
-    return volume_metrics(volume[None, None], truth, lung, body) | {"misfit": misfit}
+    return volume_metrics(volume[None, None], truth, lung, body, scored.low, scored.high) | {"misfit": misfit}
 
 
 def _divided(grid: Grid, shape: tuple[int, int, int]) -> Grid:

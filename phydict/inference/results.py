@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
-from phydict.evaluation import mean_table, write_csv
+from phydict.evaluation import RANGE, Table, mean_table, write_csv
+from phydict.inference.protocols import Protocol
 from phydict.runtime.files import atomic_directory, atomic_write, check_replaceable, remove_leftovers, undisturbed
 from phydict.runtime.reading import not_written
 
@@ -18,7 +21,8 @@ RECORD = "reconstruction.json"
 UNLISTED = ("volume.nii.gz", "deviation.nii.gz", "panel.png")
 """The files, beside the record, of cases whose record does not list them, as older ones do not."""
 
-TABLE = "results.csv"
+TABLE, FEATURES = "results.csv", "slice_features.safetensors"
+"""The table of scores, and of a case the features of its slices, where the Frechet distance is measured."""
 
 
 class Finished(NamedTuple):
@@ -85,18 +89,24 @@ class CaseResults:
         except OSError as error:
             raise not_written(f"the case {final}", error, "give another model.out") from error
 
-    def summarise(self, cases: Iterable[str]) -> list[dict]:
-        """One row of scores per finished case that was scored; written as results.csv and results.md."""
+    def summarise(self, cases: Iterable[str], further: Sequence[Table] = (),
+                  protocol: Protocol | None = None, empty: Mapping[str, str] = MappingProxyType({})) -> list[Table]:
+        """The tables of the finished cases that were scored, and further ones behind them; written as results.csv, with
+        one row per case, and results.md. None where no case was scored. protocol: what the scores were taken by;
+        empty: scores that may stay empty -> why."""
         rows = []
         for case in cases:
             record = self._there(case).record
             if record["scores"]:
                 rows.append(_row(case, record))
-        if rows:
-            write_csv(self.folder / TABLE, rows)
-            with atomic_write(self.folder / "results.md") as part:
-                part.write_text(mean_table(rows).markdown())
-        return rows
+        if not rows:
+            return []
+        table = mean_table(rows, window=protocol.window if protocol else RANGE, empty=empty)
+        tables = [replace(table, notes=[*table.notes, *([protocol.note] if protocol else [])]), *further]
+        write_csv(self.folder / TABLE, rows)
+        with atomic_write(self.folder / "results.md") as part:
+            part.write_text("\n".join(table.markdown() for table in tables))
+        return tables
 
     def _there(self, case: str) -> Finished | None:
         """The finished case in its place, None where nothing is. Raises ValueError for anything else."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from phydict.posterior import Sampler
 from phydict.prior import MedSynCheckpoint
@@ -17,11 +17,13 @@ class Sampling:
         guidance: scale of classifier-free guidance when a report is given; 1: none
         samples: how many are drawn; of several the volume is the mean, and deviation.nii.gz their standard deviation
         precision: of the networks: auto (bfloat16 where the device computes it), float32 or bfloat16
+        with_report: whether the cases' reports are used
     """
 
     guidance: float = 1.0
     samples: int = 1
     precision: str = "auto"
+    with_report: bool = True
 
 
 @dataclass(frozen=True)
@@ -52,22 +54,38 @@ class CascadeSettings:
 
 @dataclass(frozen=True)
 class Orbit:
-    """The simulated X-rays' geometry: views on a full circle from anterior.
+    """The simulated X-rays' geometry: views on a circle from anterior; what is not given is PAPER's, or a protocol's.
 
     Args:
-        views: how many
-        source_to_detector: distance in mm
-        source_to_isocentre: distance in mm
-        detector: rows and columns of pixels
-        pixel: mm from row to row and from column to column
+        views: how many; 8 if left out
+        source_to_detector: distance in mm; 1020 if left out
+        source_to_isocentre: distance in mm; 740 if left out
+        detector: rows and columns of pixels; 448 and 448 if left out
+        pixel: mm from row to row and from column to column; 1.25 and 1.25 if left out
+        arc: degrees over which the views are spread evenly; 360 if left out
     """
 
-    views: int = 8
-    source_to_detector: float = 1020.0
-    source_to_isocentre: float = 740.0
-    detector: tuple[int, int] = (448, 448)
-    pixel: tuple[float, float] = (1.25, 1.25)
+    views: int | None = None
+    source_to_detector: float | None = None
+    source_to_isocentre: float | None = None
+    detector: tuple[int, int] | None = None
+    pixel: tuple[float, float] | None = None
+    arc: float | None = None
+
+    def filled(self, by: Orbit | None = None) -> Orbit:
+        """The same with what is left out taken from another one, PAPER if none is given."""
+        return replace(by or PAPER, **{name: value for name, value in vars(self).items() if value is not None})
+
+    def settings(self) -> dict:
+        """What decides the geometry; an arc of 360 degrees is left out."""
+        mine = vars(self.filled())
+        return {name: value for name, value in mine.items() if name != "arc" or value != PAPER.arc}
 
     def beam(self) -> ConeBeam:
         """As per-view vectors. Raises ValueError for what cannot be."""
-        return ConeBeam.orbit(*vars(self).values())
+        *rest, arc = vars(self.filled()).values()
+        return ConeBeam.orbit(*rest) if arc == PAPER.arc else ConeBeam.orbit(*rest, arc_degrees=arc)
+
+
+PAPER = Orbit(8, 1020.0, 740.0, (448, 448), (1.25, 1.25), 360.0)
+"""The paper's orbit, and the default."""

@@ -21,10 +21,13 @@ from lightning.pytorch.utilities.exceptions import SIGTERMException
 from rich.console import Console
 from torch import Tensor
 
-from phydict.evaluation import CaseMetrics, mean_table, panel
-from phydict.grid import Cube, Grid
-from phydict.inference.data import case_scores
-from phydict.inference.results import CaseResults
+from phydict.evaluation import CaseMetrics, Table, panel
+from phydict.evaluation.fid import Features, PlaneFID, load_features, save_features
+from phydict.evaluation.tables import fid_table
+from phydict.grid import Cube
+from phydict.inference.protocols import placed, resampled
+from phydict.inference.results import FEATURES, CaseResults
+from phydict.inference.scoring import Scoring
 from phydict.inference.settings import CascadeSettings, Sampling
 from phydict.methods import fit_to_grid, reconstructor
 from phydict.posterior import CascadePosterior, Sampler
@@ -101,17 +104,28 @@ class ReconstructionTask(lightning.LightningModule):
         if isinstance(self.reconstructor, CascadePosterior):
             self.settings |= _identity("super_resolution", super_resolution.file) | {
                 "sr_noise_augmentation": self.reconstructor.level, "second": describe(self.reconstructor.second)}
-        self.metrics = CaseMetrics([name])
+        self.metrics, self.scoring, self.slices = CaseMetrics([name]), Scoring(), None
+        self.with_report = sampling.with_report
         self.progress = CaseProgress()
         self.cases: list[str] = []
         self.profile = self.said_no_text = False
+
+    def measure(self, scoring: Scoring) -> None:
+        """Take these metrics in test."""
+        self.scoring = scoring
+        self.slices = PlaneFID(scoring.network.dimensions) if scoring.network else None
 
     @property
     def reads_no_text(self) -> bool:
         return self.prior is not None and not self.prior.reads_text
 
     def setup(self, stage: str) -> None:
-        self.settings["data"] = self.trainer.datamodule.settings(stage)
+        data = self.trainer.datamodule
+        self.settings["data"] = {"with_report": self.with_report} | data.settings(stage)
+        if stage == "test":
+            self.settings |= self.scoring.settings()
+            if data.protocol and data.protocol.grid and self.prior is None:
+                self.grid = data.protocol.fixed_grid(self.grid)
         check_apart(self.results.folder, "model.out", self.trainer.datamodule.inputs(stage))
 
     def unfinished(self, sources: dict[str, str]) -> list[str]:
@@ -134,17 +148,23 @@ class ReconstructionTask(lightning.LightningModule):
         self._finish(case, self._reconstruct(case, self.seed))
 
     def _test(self, case: dict) -> None:
-        case["beam"], seed = self.trainer.datamodule.beam, case_seed(self.seed, case["id"])
+        data = self.trainer.datamodule
+        case["beam"], seed = data.beam, case_seed(self.seed, case["id"])
+        grid, window = data.scene(self.grid, self.window)
         with stage("simulate"):
-            case["xrays"] = self.trainer.datamodule.simulate(case, seed, self.grid, self.window, self.device)
-        case["mu_water"] = self.trainer.datamodule.simulator.effective_mu_water
+            case["xrays"] = data.simulate(case, seed, grid, window, self.device)
+        case["mu_water"] = data.simulator.effective_mu_water
         result = self._reconstruct(case, seed)
+        volume, truth = resampled(result.volume, self.grid, grid), window.to_hu(case["volume"])[0].cpu()
         if "affine" in case:  # back to its place in the CT it came from
-            result = replace(result, grid=Grid(self.grid.shape, affine=case["affine"].numpy()))
+            result = replace(result, grid=placed(self.grid, grid, case["affine"].numpy()))
         with stage("metrics"):
-            scores = case_scores(result.volume, result.misfit, case, self.grid, self.window)
+            scores = self.scoring.scores(volume, result.misfit, case, grid, window, self.device, data.protocol)
+            features = self.scoring.features(volume, case, window, self.device)
         self.metrics.update(case["index"], self.method_name, scores, seconds=sum(result.seconds.values()))
-        self._finish(case, result, scores, self.window.to_hu(case["volume"])[0].cpu())
+        if self.slices is not None and features:
+            self.slices.update(case["index"], features)
+        self._finish(case, result, scores, resampled(truth, grid, self.grid), features)
 
     def _attempt(self, case: dict, work: Callable[[dict], None]) -> None:
         """Bad input ends the run, or, where there are more cases, this one alone; a signal ends it between cases."""
@@ -154,7 +174,7 @@ class ReconstructionTask(lightning.LightningModule):
         try:
             if "error" in case:
                 raise ValueError(case["error"]) from case["error"]
-            case["report"] = self._report(case)
+            case["ct_report"], case["report"] = case["report"], self._report(case)
             with noted(case["warnings"], case["id"]), profiled() if self.profile else nullcontext() as profile:
                 work(case)
             if profile:
@@ -169,6 +189,8 @@ class ReconstructionTask(lightning.LightningModule):
 
     def on_test_epoch_end(self) -> None:
         self.log_dict(self.metrics.compute())
+        if self.slices is not None:
+            self.log_dict({f"{self.method_name}/{name}": value for name, value in self.slices.compute().items()})
 
     def on_predict_start(self) -> None:
         self._start(self.trainer.num_predict_batches[0])
@@ -189,7 +211,7 @@ class ReconstructionTask(lightning.LightningModule):
 
     def _report(self, case: dict) -> str:
         """The report of a case where it is used; says once that a prior without text uses none."""
-        if not case["report"] or not self.trainer.datamodule.with_report:
+        if not case["report"] or not self.with_report:
             return ""
         if self.reads_no_text and not self.said_no_text:
             warn("the prior was trained without text: reports are not used")
@@ -205,8 +227,10 @@ class ReconstructionTask(lightning.LightningModule):
                                  self.progress.advance)
 
     def _finish(self, case: dict, result: Reconstruction, scores: dict | None = None,
-                truth: Tensor | None = None) -> None:
+                truth: Tensor | None = None, features: Features | None = None) -> None:
         def write_files(folder: Path) -> None:
+            if features:
+                save_features(folder / FEATURES, features)
             result.save_nifti(folder / "volume.nii.gz")
             if result.deviation is not None:
                 save_nifti(folder / "deviation.nii.gz", result.deviation.numpy(), result.grid)
@@ -234,15 +258,26 @@ class ReconstructionTask(lightning.LightningModule):
     def summarise(self) -> None:
         """Prints and writes the scores of this run's cases. Raises ValueError, naming them, where some have failed."""
         missing = self.results.missing()
-        rows = self.results.summarise(case for case in self.cases if case not in missing)
-        if rows:
-            console = Console()
-            console.width = max(console.width, 80 if console.is_terminal else 120)
-            console.print(mean_table(rows).console())
+        finished = [case for case in self.cases if case not in missing]
+        tables = self.results.summarise(finished, self._further_tables(finished), self.trainer.datamodule.protocol,
+                                        self.scoring.empty)
+        console = Console()
+        console.width = max(console.width, 80 if console.is_terminal else 120)
+        for table in tables:
+            console.print(table.console())
         print(f"results in {self.results.folder}")
         if missing:
             raise ValueError(f"{len(missing)} of {len(self.cases)} cases were not reconstructed "
                              f"({', '.join(missing)}): see the messages above, and run the same command again")
+
+
+    def _further_tables(self, cases: list[str]) -> list[Table]:
+        """The table of Frechet distances over finished cases, where they are measured."""
+        backbone = self.scoring.fid.backbone
+        if self.slices is None or not cases:
+            return []
+        features = {case: load_features(self.results.folder / case / FEATURES, backbone) for case in cases}
+        return [fid_table({self.method_name: features}, backbone, self.scoring.fid.replicates)]
 
 
 def _identity(role: str, prior: str | MedSynCheckpoint) -> dict:

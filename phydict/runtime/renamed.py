@@ -31,6 +31,7 @@ PLACES = {
     "model.fine_noise": "model.super_resolution.noise_augmentation",
     "model.sr_noise_augmentation": "model.super_resolution.noise_augmentation",
     "model.fine_memory": "model.super_resolution.memory", "model.sr_memory": "model.super_resolution.memory",
+    "data.with_report": "model.sampling.with_report",
     "model.super_resolution.path": "model.super_resolution.file.path",
     "model.montage_steps": "model.validation.preview_steps", "model.validation_views": "model.validation.views",
     "model.text_length": "model.text.length", "model.text_padded_to": "model.text.padded_to",

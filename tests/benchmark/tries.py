@@ -837,7 +837,7 @@ def nifti_images():
 def reports():
     """report.txt."""
     def report(content):
-        return lambda p: p.sampled(p.prior(), "--data.with_report=true") if content is None else (
+        return lambda p: p.sampled(p.prior(), "--model.sampling.with_report=true") if content is None else (
             folder := p.case("other"), p.write(folder / "report.txt", content), p.infer(
                 "predict", "-c", "prior_only", "--model.method.init_args.iterations=2", f"--model.prior={p.prior()}",
                 f"--data.xrays={folder}", f"--model.out={p.out}", "--trainer.accelerator=cpu",

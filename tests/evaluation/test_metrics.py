@@ -9,7 +9,9 @@ import pytest
 import torch
 from scipy.ndimage import correlate1d
 
+from phydict.evaluation.fid import PlaneFID
 from phydict.evaluation.metrics import CaseMetrics, ssim_window, volume_metrics
+from phydict.evaluation.planes import PLANES
 
 
 def smooth_case(seed: int, shape=(20, 18, 16)):
@@ -242,6 +244,9 @@ def test_unknown_methods_and_names_are_refused():
 VALUES = {(case, method): 20 + 3.7 * case + 0.1 * len(method) for case in range(5) for method in ("fdk", "gibbs")}
 
 
+FEATURES = {case: {plane: torch.randn(2, 4 + case, 3, generator=torch.Generator().manual_seed(case))
+                   for plane in PLANES} for case in range(5)}
+
 SHARES = {"repeated case": ([0, 2, 4], [1, 3, 0]), "idle process": ([0, 1, 2, 3, 4], [])}
 
 
@@ -253,7 +258,10 @@ def of_process(rank: int, store: str, out: str) -> None:
         for case in shares[rank]:
             for method in ("fdk", "gibbs"):
                 metric.update(case, method, {"psnr": VALUES[case, method]}, seconds=case)
-        result[name] = metric.compute(), len(metric.values)
+        slices = PlaneFID(3)
+        for case in shares[rank]:
+            slices.update(case, FEATURES[case])
+        result[name] = metric.compute() | slices.compute(), len(metric.values)
     torch.save(result, f"{out}.{rank}")
     torch.distributed.destroy_process_group()
 
@@ -263,7 +271,10 @@ def test_two_processes_equal_one(tmp_path):
     alone = CaseMetrics(["fdk", "gibbs"])
     for (case, method), psnr in VALUES.items():
         alone.update(case, method, {"psnr": psnr}, seconds=case)
-    wanted = {name: float(value) for name, value in alone.compute().items()}
+    slices = PlaneFID(3)
+    for case, features in FEATURES.items():
+        slices.update(case, features)
+    wanted = {name: float(value) for name, value in (alone.compute() | slices.compute()).items()}
     for rank in range(2):
         for name, (got, kept) in torch.load(tmp_path / f"out.{rank}").items():
             assert {k: float(v) for k, v in got.items()} == wanted

@@ -90,10 +90,11 @@ def cells(rows: list[dict]) -> dict[str, dict[str, str]]:
 
 def test_bold_marks_the_best_in_the_right_direction():
     table = cells(ROWS)
-    assert table["gibbs"]["SSIM"] == "**0.850 ± 0.071**" and table["fdk"]["SSIM"] == "<u>0.600 ± 0.141</u>"
-    assert table["gibbs"]["PSNR (dB)"] == "**28.00 ± 1.41**"
-    assert table["gibbs"]["MAE (HU)"] == "**25.0 ± 7.1**" and "**" not in table["fdk"]["MAE (HU)"]
-    assert table["fdk"]["time (s)"] == "**1.00 ± 0.00**" and "**" not in table["gibbs"]["time (s)"]
+    assert table["gibbs"]["SSIM"] == "**0.850 ± 0.071 [0.800, 0.900]**"
+    assert table["fdk"]["SSIM"] == "<u>0.600 ± 0.141 [0.500, 0.700]</u>"
+    assert table["gibbs"]["PSNR (dB)"] == "**28.00 ± 1.41 [27.00, 29.00]**"
+    assert table["gibbs"]["MAE (HU)"] == "**25.0 ± 7.1 [20.0, 30.0]**" and "**" not in table["fdk"]["MAE (HU)"]
+    assert table["fdk"]["time (s)"] == "**1.00 ± 0.00 [1.00, 1.00]**" and "**" not in table["gibbs"]["time (s)"]
 
 
 def test_ranks_follow_the_direction_and_the_printed_values():
@@ -124,7 +125,8 @@ def test_the_best_is_bold_and_the_second_underlined_by_what_is_printed():
 
 @pytest.mark.parametrize("name", MEASURES)
 def test_every_known_metric_has_its_direction(name):
-    good_when_low = {"mae_hu", "mae_hu_body", "mae_hu_lung", "misfit", "seconds"}
+    good_when_low = {"mae_hu", "mae_hu_body", "mae_hu_lung", "lpips_alex", "lpips_squeeze", "hd95_lung", "misfit",
+                     "seconds"}
     table = cells([{"case": "a", "method": "low", name: 1.0}, {"case": "a", "method": "high", name: 2.0}])
     best = "low" if name in good_when_low else "high"
     assert [row for row, values in table.items() if "**" in list(values.values())[1]] == [best]
@@ -139,7 +141,8 @@ def test_ties_share_the_place_and_failures_never_win():
 
 
 def test_the_caption_states_range_grid_views_and_cases():
-    (text,) = mean_table(STATED).notes
+    text, interval = mean_table(STATED).notes
+    assert "bootstrap over patients" in interval and len(mean_table(STATED[::2]).notes) == 1
     for part in ("n = 2 cases", "[-1000, 1000]", "2000 HU", "Grid: 64x64x64.", "Views: 8."):
         assert part in text
     assert "Views: not stated" in mean_table(ROWS).notes[0]
@@ -156,7 +159,7 @@ def test_warnings_are_counted_in_the_line_and_name_their_cases_in_the_caption():
     rows = [row | ({"warning": "no lungs"} if row["case"] == "008" and row["method"] == "fdk" else {}) for row in ROWS]
     table = cells(rows)
     assert (table["fdk"]["warned"], table["gibbs"]["warned"]) == ("1", "0")
-    assert mean_table(rows).notes[1:] == ["Doubtful cases, by the column warning: fdk: 008."]
+    assert mean_table(rows).notes[2:] == ["Doubtful cases, by the column warning: fdk: 008."]
     assert "Doubtful" not in mean_table(ROWS).markdown() and "warned" not in mean_table(ROWS).markdown()
 
 
@@ -178,7 +181,7 @@ def test_the_tables_for_console_and_latex_say_the_same():
     text = console.export_text()
     for part in ("0.850 ± 0.071", "25.0 ± 7.1", "MAE (HU) ↓", "[-1000, 1000]", "Views: 8"):
         assert part in text
-    assert "\\textbf{0.850 $\\pm$ 0.071}" in mean_table(STATED).latex()
+    assert "\\textbf{0.850 $\\pm$ 0.071 [0.800, 0.900]}" in mean_table(STATED).latex()
 
 
 def test_bad_requests_are_named():

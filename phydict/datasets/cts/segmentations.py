@@ -17,7 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from phydict.datasets.cts.transforms import load_ct
+from phydict.datasets.cts.transforms import case_id, load_ct, to_grid
+from phydict.grid import Grid
 
 LUNGMASK, TOTALSEGMENTATOR = "_lungmask", "_totalsegmentator"
 LOBES = ("lung_upper_lobe_left", "lung_lower_lobe_left", "lung_upper_lobe_right", "lung_middle_lobe_right",
@@ -62,6 +63,22 @@ def read_segmentation(files: tuple[Path, ...], shape, affine: np.ndarray) -> np.
                              "another place); segment this CT again, or remove that file")
         union |= labels > 0.5
     return union
+
+
+def organs_beside(ct: Path, grid: Grid) -> dict[str, np.ndarray]:
+    """Masks (X, Y, Z) bool of what is segmented beside a NIfTI CT, lung and vessel, on `grid` in the CT's own world.
+
+    Raises ValueError where a file cannot be read or some of the lungs' lobes are missing.
+    """
+    found = {}
+    for name, files in segmentations_beside(ct.with_name(case_id(ct))).items():
+        if name in ("lung", "vessel"):
+            union = np.zeros(grid.shape, np.float32)
+            for file in files:
+                labels, place = load_ct(file)
+                union += to_grid((labels > 0.5).astype(np.float32), place, grid, 0.0)
+            found[name] = union > 0.5
+    return found
 
 
 def lungs_by_lungmask(hu: np.ndarray) -> np.ndarray:

@@ -9,16 +9,15 @@ The authors' release differs in almost every term: each difference is a switch.
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
-from functools import lru_cache
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import interpolate
 
 from phydict.grid import Grid
 from phydict.posterior.measurement import Measurement
+from phydict.runtime.lpips_networks import load_lpips, lpips_distances
 from phydict.xray import Projector
 
 
@@ -97,14 +96,8 @@ class Reward:
         with torch.random.fork_rng(enabled=self.dropout):
             if self.dropout:
                 torch.manual_seed(seed)
-            try:
-                found = network(*(v.flatten(0, 1)[:, None].expand(-1, 3, -1, -1) for v in images))
-            except RuntimeError as error:
-                if not re.search("Output size is too small|Kernel size can't be greater", str(error)):
-                    raise
-                raise ValueError(f"views of {projected.shape[2]} x {projected.shape[3]} pixels are too small for "
-                                 f"LPIPS' {self.backbone}: give a finer detector, or set the reward's lpips weight to 0"
-                                 ) from error
+            found = lpips_distances(network, *(v.flatten(0, 1) for v in images),
+                                    "give a finer detector, or set the reward's lpips weight to 0")
         return found.view(projected.shape[:2])
 
 
@@ -120,27 +113,3 @@ def finer(grid: Grid, n: int) -> Grid:
 def _standardised(views: Tensor) -> Tensor:
     deviation, mean = torch.std_mean(views, (-2, -1), keepdim=True)
     return (views - mean) / deviation.clamp(min=1e-6)
-
-
-@lru_cache(maxsize=2)
-def load_lpips(backbone: str, random_backbone: bool) -> nn.Module:
-    """LPIPS (Zhang et al. 2018, arXiv:1801.03924), frozen and in evaluation mode.
-
-    Raises FileNotFoundError naming the file and the switch when the trained backbone is not there and cannot be
-    downloaded.
-    """
-    files = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth", "squeeze": "squeezenet1_1-b8a52dc0.pth"}
-    if backbone not in files:
-        raise ValueError(f"LPIPS backbones are {', '.join(files)}, but '{backbone}' was given")
-    import lpips
-
-    try:
-        with torch.random.fork_rng():  # an untrained backbone is the same in every process
-            torch.manual_seed(0)
-            network = lpips.LPIPS(net=backbone, pnet_rand=random_backbone, verbose=False)
-    except OSError as error:
-        raise FileNotFoundError(
-            f"LPIPS needs the trained backbone {files[backbone]} in {torch.hub.get_dir()}/checkpoints and could not "
-            "download it: put the file there, set the reward's lpips weight to 0, or set random_backbone: true"
-        ) from error
-    return network.eval().requires_grad_(False)

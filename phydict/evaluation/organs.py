@@ -1,0 +1,97 @@
+"""How well organs agree: lungs and their vessels in a reconstruction and in the truth.
+
+Both volumes are segmented by `datasets.segment` (thresholds), on voxels of FINEST_MM or less, into which coarser ones
+are divided linearly. Where other segmentations of the truth are given, they take the place of the truth's own; the
+reconstruction is segmented by thresholds all the same, so that even a perfect one then scores below 1.
+
+    Dice    2 |A and B| / (|A| + |B|), of the lungs
+    HD95    the 95th percentile of the distances in mm between the lungs' surfaces (MONAI)
+    clDice  harmonic mean of the shares of each vessel tree's skeleton that lie in the other tree
+            (Shit et al. 2021, arXiv:2003.07311; skeleton by MONAI's soft_skel)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from phydict.datasets.cts.anatomy import segment
+from phydict.grid import Grid
+
+FINEST_MM, SKELETON_STEPS = 3.0, 10
+
+
+def fine_grid(grid: Grid) -> Grid:
+    """The voxels of FINEST_MM or less, whole parts of the grid's, on which organs are compared."""
+    parts = max(1, math.ceil(max(grid.spacing) / FINEST_MM - 1e-6))
+    affine = grid.affine.copy()
+    affine[:3, :3] /= parts
+    affine[:3, 3] -= affine[:3, :3].sum(1) * (parts - 1) / 2
+    return Grid(tuple(parts * n for n in grid.shape), affine=affine)
+
+
+def organ_scores(hu: Tensor, true_hu: Tensor, grid: Grid, given: Mapping[str, np.ndarray] | None = None
+                 ) -> dict[str, float]:
+    """{"dice_lung", "hd95_lung", "cldice_vessel"} of volumes (X, Y, Z) in HU on `grid`.
+
+    given: masks (lung, vessel) of the truth on `fine_grid(grid)`, bool, by another segmenter. What is not found in the
+    truth has no score; lungs that are not found in the reconstruction have Dice 0 and an infinite HD95.
+    """
+    fine = fine_grid(grid)
+    found, known = _organs(hu, fine)
+    truth, has = _organs(true_hu, fine) if not {"lung", "vessel"} <= (given or {}).keys() else ({}, {})
+    truth, has = truth | dict(given or {}), has | {name: bool(mask.any()) for name, mask in (given or {}).items()}
+    scores = {}
+    if has.get("lung"):
+        scores["dice_lung"] = dice(found["lung"], truth["lung"]) if known["lung"] else 0.0
+        scores["hd95_lung"] = hd95(found["lung"], truth["lung"], fine.spacing) if known["lung"] else math.inf
+    if has.get("vessel"):
+        scores["cldice_vessel"] = cl_dice(found["vessel"], truth["vessel"]) if known["vessel"] else 0.0
+    return scores
+
+
+def dice(a: np.ndarray, b: np.ndarray) -> float:
+    """Dice of two masks, of which one at least is not empty."""
+    return float(2 * (a & b).sum() / (a.sum() + b.sum()))
+
+
+def hd95(a: np.ndarray, b: np.ndarray, spacing) -> float:
+    """The 95th percentile of the surfaces' distances in mm of masks (X, Y, Z)."""
+    from monai.metrics import compute_hausdorff_distance
+
+    box = tuple(slice(max(0, int(i.min()) - 1), int(i.max()) + 2) for i in np.nonzero(a | b))
+    masks = (torch.from_numpy(mask[box][None, None].astype(np.float32)) for mask in (a, b))
+    return float(compute_hausdorff_distance(*masks, include_background=True, percentile=95,
+                                            spacing=[float(mm) for mm in spacing]))
+
+
+def cl_dice(a: np.ndarray, b: np.ndarray) -> float:
+    """clDice of two trees of vessels, masks (X, Y, Z); 0 where one of them is empty."""
+    if not (a.any() and b.any()):
+        return 0.0
+    shares = []
+    for own, other in ((a, b), (b, a)):
+        lines = skeleton(own)
+        shares.append(float(lines[other].sum() / lines.sum()))
+    precision, sensitivity = shares
+    return 2 * precision * sensitivity / (precision + sensitivity) if precision + sensitivity else 0.0
+
+
+def skeleton(mask: np.ndarray) -> np.ndarray:
+    """The morphological skeleton of a mask (X, Y, Z) that is not empty."""
+    from monai.losses.cldice import soft_skel
+
+    return soft_skel(torch.from_numpy(mask[None, None].astype(np.float32)), SKELETON_STEPS)[0, 0].numpy()
+
+
+def _organs(hu: Tensor, fine: Grid) -> tuple[dict[str, np.ndarray], dict[str, bool]]:
+    """Lung and vessels of HU (X, Y, Z) on the finer grid, and which of them were found."""
+    volume = interpolate(hu[None, None].float().cpu(), fine.shape, mode="trilinear")[0, 0]
+    masks, known = segment(volume.numpy(), fine.spacing)
+    return ({"lung": masks[0] > 0, "vessel": masks[2] > 0},
+            {"lung": bool(known[0]), "vessel": bool(known[2] and masks[2].any())})

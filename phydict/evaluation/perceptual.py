@@ -1,0 +1,42 @@
+"""LPIPS of a reconstructed volume: its slices in three planes against the truth's."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from phydict.evaluation.metrics import RANGE
+from phydict.evaluation.planes import PLANES, slices
+from phydict.runtime.lpips_networks import load_lpips, lpips_distances
+
+BACKBONES = ("alex", "squeeze")
+OTHERWISE = "leave lpips out of the metrics"
+BATCH = 32
+
+
+def load_networks() -> None:
+    """Reads the backbones. Raises FileNotFoundError, in one sentence, where one is not there."""
+    for backbone in BACKBONES:
+        load_lpips(backbone, False, OTHERWISE)
+
+
+@torch.no_grad()
+def lpips_scores(hu: Tensor, true_hu: Tensor, device: torch.device | str = "cpu") -> dict[str, float]:
+    """{"lpips_alex", "lpips_squeeze"}: means over a plane's slices, then over the planes, of volumes (X, Y, Z).
+
+    Both are clipped to `RANGE` and mapped to [-1, 1]. Computed in float32 on `device`. Raises ValueError where slices
+    are too small for a backbone.
+    """
+    x, y = (RANGE.to_range(volume.float()).to(device) for volume in (hu, true_hu))
+    found = {}
+    for backbone in BACKBONES:
+        network = load_lpips(backbone, False, OTHERWISE).to(device)
+        means = []
+        with torch.autocast(torch.device(device).type, enabled=False):
+            for plane in PLANES:
+                pairs = zip(slices(x, plane).split(BATCH), slices(y, plane).split(BATCH))
+                distances = torch.cat([lpips_distances(network, a, b, f"give more voxels, or {OTHERWISE}")
+                                       for a, b in pairs])
+                means.append(distances.double().mean())
+        found[f"lpips_{backbone}"] = float(torch.stack(means).mean())
+    return found

@@ -1,0 +1,135 @@
+"""What a test or a comparison measures of every case, beside misfit and time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from phydict.datasets.cts.segmentations import organs_beside
+from phydict.evaluation import RANGE
+from phydict.evaluation.backbones import SliceFeatures
+from phydict.evaluation.ct_clip import clip_scores, load_ct_clip
+from phydict.evaluation.fid import Features, case_features
+from phydict.evaluation.organs import fine_grid, organ_scores
+from phydict.evaluation.perceptual import load_networks, lpips_scores
+from phydict.evaluation.published import PUBLISHED
+from phydict.grid import Grid
+from phydict.inference.data import case_scores
+from phydict.inference.protocols import Protocol
+from phydict.units import HUWindow
+
+METRICS = ("volume", "lpips", "fid", "organs", "clip")
+
+
+@dataclass(frozen=True)
+class FIDSettings:
+    """The Frechet distance of slices.
+
+    Args:
+        backbone: squeezenet, radimagenet or inception; each has a scale of its own
+        weights: the file of its weights; squeezenet takes LPIPS' own
+        replicates: draws of patients for the 95 % intervals; 0: no intervals
+    """
+
+    backbone: str = "squeezenet"
+    weights: str | None = None
+    replicates: int = 200
+
+    def __post_init__(self):
+        if self.replicates < 0:
+            raise ValueError(f"fid.replicates is a number of draws, 0 for no intervals, but "
+                             f"{self.replicates} was given")
+
+
+@dataclass(frozen=True)
+class CLIPSettings:
+    """CT-CLIP's scores.
+
+    Args:
+        weights: its checkpoint, CT-CLIP_v2.pt; none given: the scores stay empty
+        text: a folder with CXR-BERT's config.json, weights and vocabulary, or its hub id; none given: no score of
+            reports
+    """
+
+    weights: str | None = None
+    text: str | None = None
+
+    def __post_init__(self):
+        if self.text and not self.weights:
+            raise ValueError(f"clip.text {self.text} means nothing without CT-CLIP's checkpoint: give clip.weights")
+
+
+class Scoring:
+    """The metrics of a run, with the networks that they need.
+
+    metrics: names among METRICS; volume (SSIM, PSNR, MAE) is always measured. Raises ValueError for an unknown name,
+    and ValueError or FileNotFoundError, in one sentence, where a metric's weights are missing.
+    """
+
+    def __init__(self, metrics: Sequence[str] = ("volume",), fid: FIDSettings = FIDSettings(),
+                 clip: CLIPSettings = CLIPSettings()):
+        if isinstance(metrics, str) or (unknown := [name for name in metrics if name not in METRICS]):
+            raise ValueError(f"metrics is a list of some of {', '.join(METRICS)}, but "
+                             f"{metrics if isinstance(metrics, str) else unknown[0]} was given")
+        self.metrics, self.fid = tuple(name for name in METRICS if name in metrics), fid
+        for name, given, default in (("fid", fid, FIDSettings()), ("clip", clip, CLIPSettings())):
+            if given != default and name not in self.metrics:
+                raise ValueError(f"settings of {name} mean nothing without that metric: add {name} to the metrics")
+        if "lpips" in self.metrics:
+            load_networks()
+        self.network = SliceFeatures(fid.backbone, fid.weights) if "fid" in self.metrics else None
+        self.clip = load_ct_clip(clip.weights, clip.text) if clip.weights else None
+
+    def settings(self) -> dict:
+        """What decides the scores beyond those that are always taken; empty where there is nothing."""
+        further = [name for name in self.metrics if name != "volume"]
+        return ({"metrics": further} if further else {}) | (
+            {"fid_backbone": self.fid.backbone} if self.network else {}) | (
+            {"clip_text": self.clip.text_transformer is not None} if self.clip else {})
+
+    @property
+    def empty(self) -> dict[str, str]:
+        """Scores that may stay empty -> why they then do."""
+        if "clip" not in self.metrics:
+            return {}
+        if self.clip is None:
+            return dict.fromkeys(("clip_t2i", "clip_i2i"), "CT-CLIP's checkpoint was not given (clip.weights)")
+        return {"clip_t2i": "CXR-BERT was not given (clip.text)" if self.clip.text_transformer is None else
+                "no case has a report"}
+
+    def scores(self, volume: Tensor, misfit: float, case: dict, grid: Grid, window: HUWindow,
+               device: torch.device, protocol: Protocol | None = None) -> dict[str, float]:
+        """Metric -> value of a reconstructed volume (X, Y, Z) in HU on `grid`, of a CT case as `case_scores` takes it;
+        in the HU range of a protocol, and with its own scores."""
+        scored = protocol.window if protocol else RANGE
+        scores = case_scores(volume, misfit, case, grid, window, scored)
+        truth = window.to_hu(case["volume"])[0].cpu()
+        if protocol:
+            scores |= {name: PUBLISHED[name](volume, truth, scored) for name in protocol.scores}
+        if "lpips" in self.metrics:
+            scores |= lpips_scores(volume, truth, device)
+        if "organs" in self.metrics:
+            scores |= organ_scores(volume, truth, grid, segmented(case, grid))
+        if self.clip:
+            scores |= clip_scores(self.clip.to(device), volume, truth, grid, case.get("ct_report", case["report"]))
+        return scores
+
+    def features(self, volume: Tensor, case: dict, window: HUWindow, device: torch.device) -> Features | None:
+        """The features of the slices of volume and truth, where FID is measured; the truth's are kept in the case."""
+        if self.network is None:
+            return None
+        truth = case.get("features") or window.to_hu(case["volume"])[0].to(device)
+        case["features"] = case_features(self.network.to(device), volume.to(device), truth)
+        return case["features"]
+
+
+def segmented(case: dict, grid: Grid) -> dict:
+    """Organs that are segmented beside a case's CT, on the finer voxels on which organs are compared; often none."""
+    file: Path | None = case.get("file")
+    if file is None or "affine" not in case:
+        return {}
+    return organs_beside(file, fine_grid(Grid(grid.shape, affine=case["affine"].numpy())))

@@ -1,0 +1,146 @@
+"""The Frechet distance of slices: closed forms, MONAI's figure, invariances, planes, and what its backbones refuse."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from monai.metrics import FIDMetric
+from torch.nn.functional import conv2d, interpolate
+
+from phydict.evaluation import backbones
+from phydict.evaluation.backbones import SliceFeatures
+from phydict.evaluation.fid import PlaneFID, case_features, fid, frechet_distance, load_features, save_features
+from phydict.evaluation.planes import PLANES, slices
+
+
+def normal(count: int, dimensions: int, seed: int = 0) -> torch.Tensor:
+    return torch.randn(count, dimensions, generator=torch.Generator().manual_seed(seed))
+
+
+def patterns(hu: torch.Tensor, plane: str) -> torch.Tensor:
+    """Eight figures of each slice: the mean answers of fixed random filters."""
+    filters = torch.randn(8, 1, 3, 3, generator=torch.Generator().manual_seed(1))
+    return conv2d(slices(hu, plane)[:, None] / 1000, filters).relu().mean((2, 3))
+
+
+def volume(seed: int) -> torch.Tensor:
+    coarse = torch.randn(1, 1, 8, 8, 8, generator=torch.Generator().manual_seed(seed))
+    return 400 * interpolate(coarse, (24, 20, 16), mode="trilinear")[0, 0].clamp(-2, 2)
+
+
+def blurred(hu: torch.Tensor, times: int) -> torch.Tensor:
+    for _ in range(times):
+        hu = torch.nn.functional.avg_pool3d(hu[None, None], 3, 1, 1, count_include_pad=False)[0, 0]
+    return hu
+
+
+def of_volumes(change) -> dict:
+    return {f"p{seed}": case_features(patterns, change(volume(seed)), volume(seed)) for seed in range(4)}
+
+
+@pytest.mark.parametrize("count", [200, 5])
+def test_a_set_is_at_no_distance_of_itself_and_a_shift_and_a_scale_have_closed_forms(count):
+    x = normal(count, 12)
+    spread = x.var(0).sum()
+    assert frechet_distance(x, x) == pytest.approx(0, abs=1e-6)
+    assert frechet_distance(x + 3, x) == pytest.approx(9 * 12, rel=1e-5)
+    scaled = (x - x.mean(0)) * 2 + x.mean(0)
+    assert frechet_distance(scaled, x) == pytest.approx(float(spread), rel=1e-5)
+
+
+@pytest.mark.parametrize("counts, dimensions", [((300, 200), 16), ((9, 7), 16)])
+def test_it_agrees_with_monai_also_for_fewer_slices_than_features(counts, dimensions):
+    a, b = normal(counts[0], dimensions, 1), 1.5 * normal(counts[1], dimensions, 2) + 0.3
+    assert frechet_distance(a, b) == pytest.approx(float(FIDMetric()(a, b)), rel=1e-4)
+
+
+def test_a_slice_that_counts_twice_is_one_that_is_there_twice():
+    a, b, repeats = normal(30, 6, 1), normal(30, 6, 2) + 1, torch.arange(30) % 3
+    wanted = frechet_distance(*(x.repeat_interleave(repeats, 0) for x in (a, b)))
+    assert frechet_distance(a, b, repeats) == pytest.approx(wanted, rel=1e-6)
+
+
+def test_a_volume_that_is_not_finite_shows():
+    spoiled = of_volumes(lambda hu: hu.clone().fill_(math.nan))
+    found = fid(spoiled, replicates=5)["fid"]
+    assert math.isnan(found.mean) and math.isnan(found.low)
+
+
+def test_it_is_nothing_for_the_truth_and_grows_with_blur():
+    found = [fid(of_volumes(lambda hu, n=n: blurred(hu, n)))["fid"].mean for n in (0, 1, 3, 9)]
+    assert found[0] == pytest.approx(0, abs=1e-6) and found == sorted(found) and found[1] > 1e-3
+
+
+def test_the_mean_is_that_of_the_planes_and_the_interval_is_the_patients():
+    found = fid(of_volumes(lambda hu: blurred(hu, 2)), replicates=50)
+    assert found["fid"].mean == pytest.approx(sum(found[f"fid_{plane}"].mean for plane in PLANES) / 3)
+    assert all(one.low < one.high for one in found.values())
+    alone = fid({"p0": of_volumes(lambda hu: blurred(hu, 2))["p0"]}, replicates=50)
+    assert math.isnan(alone["fid"].low)
+    with pytest.raises(ValueError, match="no cases"):
+        fid({})
+
+
+@pytest.mark.parametrize("plane", PLANES)
+def test_a_volume_that_is_the_same_along_an_axis_has_equal_slices_in_that_axis_plane_alone(plane):
+    shape = [6, 5, 4]
+    shape[PLANES[plane]] = 1
+    hu = torch.randn(shape, generator=torch.Generator().manual_seed(0)).expand(6, 5, 4)
+    equal = {name: bool((slices(hu, name) == slices(hu, name)[:1]).all()) for name in PLANES}
+    assert equal == {name: name == plane for name in PLANES}
+    assert {name: len(slices(hu, name)) for name in PLANES} == {"xy": 4, "yz": 6, "zx": 5}
+
+
+def test_a_repeated_case_counts_once_and_compute_is_fid():
+    metric, cases = PlaneFID(8), of_volumes(lambda hu: blurred(hu, 1))
+    for index in (0, 1, 2, 3, 1):
+        metric.update(index, cases[f"p{index}"])
+    got, wanted = metric.compute(), fid(cases)
+    for name, value in wanted.items():
+        assert float(got[name]) == pytest.approx(value.mean, rel=1e-4)
+    assert (got["fid_cases"], got["slices_xy"], got["slices_yz"]) == (4, 64, 96)
+
+
+def test_features_come_back_from_their_file_and_others_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setitem(backbones.DIMENSIONS, "squeezenet", 8)
+    features = of_volumes(lambda hu: hu)["p0"]
+    save_features(tmp_path / "f.safetensors", features)
+    assert all(torch.equal(features[plane], found) for plane, found in
+               load_features(tmp_path / "f.safetensors", "squeezenet").items())
+    with pytest.raises(ValueError, match="not hold features of the FID backbone radimagenet"):
+        load_features(tmp_path / "f.safetensors", "radimagenet")
+    (tmp_path / "f.safetensors").write_bytes(b"none")
+    with pytest.raises(ValueError, match="missing or damaged"):
+        load_features(tmp_path / "f.safetensors", "squeezenet")
+
+
+@pytest.fixture(scope="module")
+def radimagenet(tmp_path_factory):
+    """A file with random weights of RadImageNet's ResNet50."""
+    file = tmp_path_factory.mktemp("weights") / "RadImageNet-ResNet50_notop.pth"
+    torch.manual_seed(0)
+    torch.save(backbones._radimagenet().state_dict(), file)
+    return file
+
+
+def test_a_backbone_is_read_from_its_file_and_is_blind_to_a_scale_and_an_offset_of_hu(radimagenet):
+    network = SliceFeatures("radimagenet", radimagenet)
+    hu = volume(0)[:, :, :3].repeat_interleave(2, 0).repeat_interleave(2, 1)
+    plain = network(hu, "xy")
+    assert plain.shape == (3, 2048) and plain.abs().max() > 0
+    assert torch.allclose(network(0.5 * hu + 100, "xy"), plain, rtol=1e-2, atol=1e-4)
+    assert not torch.allclose(network(hu.flip(1), "xy"), plain, rtol=1e-2, atol=1e-4)
+    assert not network.training and not any(weight.requires_grad for weight in network.parameters())
+
+
+def test_a_backbone_without_its_weights_or_with_anothers_is_refused(radimagenet, tmp_path):
+    torch.save({"conv1.weight": torch.zeros(3)}, tmp_path / "other.pth")
+    for name, weights, sentence in (
+            ("radimagenet", None, "RadImageNet-ResNet50_notop.pth"), ("inception", None, "inception_v3_google"),
+            ("radimagenet", tmp_path / "none.pth", "there is no file"), ("vgg", None, "fid.backbone is one of"),
+            ("radimagenet", tmp_path / "other.pth", "conv1.weight is missing"),
+            ("squeezenet", radimagenet, "leave it out")):
+        with pytest.raises((ValueError, FileNotFoundError), match=sentence):
+            SliceFeatures(name, weights)

@@ -1,0 +1,49 @@
+"""LPIPS of a volume's slices, by untrained backbones, which the figures of a test do not need."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from phydict.evaluation import perceptual
+from phydict.evaluation.perceptual import load_networks, lpips_scores
+from phydict.runtime import lpips_networks
+from phydict.runtime.lpips_networks import load_lpips
+
+
+@pytest.fixture
+def untrained(monkeypatch):
+    monkeypatch.setattr(perceptual, "load_lpips", lambda backbone, *_: load_lpips(backbone, True))
+
+
+def noise(seed: int) -> torch.Tensor:
+    return 300 * torch.randn(34, 34, 34, generator=torch.Generator().manual_seed(seed))
+
+
+def test_a_volume_is_at_no_distance_of_itself_and_noise_moves_it_away(untrained):
+    truth = noise(0)
+    same, near, far = (lpips_scores(truth + amount * noise(1), truth) for amount in (0, 0.3, 1.5))
+    for name in ("lpips_alex", "lpips_squeeze"):
+        assert same[name] == pytest.approx(0, abs=1e-6) and 1e-6 < near[name] < far[name]
+
+
+def test_what_lies_beyond_the_range_is_not_seen(untrained):
+    truth = noise(0)
+    truth[:, :, 20:] = 1000
+    far = torch.where(truth == 1000, 3000.0, truth)
+    assert lpips_scores(far, truth) == pytest.approx({"lpips_alex": 0, "lpips_squeeze": 0}, abs=1e-6)
+
+
+def test_slices_that_are_too_small_and_a_missing_backbone_are_refused(untrained, monkeypatch, tmp_path):
+    with pytest.raises(ValueError, match="12 x 12 pixels are too small .* more voxels, or leave lpips out"):
+        lpips_scores(torch.zeros(12, 12, 12), torch.zeros(12, 12, 12))
+    monkeypatch.undo()
+
+    def offline(*_, **__):
+        raise OSError("no network")
+
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    monkeypatch.setattr(torch.hub, "download_url_to_file", offline)
+    lpips_networks.load_lpips.cache_clear()
+    with pytest.raises(FileNotFoundError, match="alexnet-owt-7be5be79.pth .* leave lpips out of the metrics"):
+        load_networks()

@@ -1,0 +1,104 @@
+"""The metrics of test and ablate: columns, tables, resumed runs, and what is refused before any work."""
+
+from __future__ import annotations
+
+import nibabel
+import numpy as np
+import pytest
+import yaml
+from test_inference import phantoms, record, refusal
+
+from phydict.cli.infer import main
+from phydict.datasets.cts.segmentations import organs_beside
+from phydict.evaluation import backbones, perceptual, read_csv
+from phydict.evaluation.organs import dice
+from phydict.grid import Grid
+from phydict.inference.scoring import FIDSettings, Scoring
+from phydict.runtime.lpips_networks import load_lpips
+
+METRICS = "--metrics=[lpips,fid,organs]"
+COLUMNS = ("lpips_alex", "lpips_squeeze", "dice_lung", "hd95_lung", "cldice_vessel")
+
+
+@pytest.fixture
+def untrained(monkeypatch):
+    for module in (perceptual, backbones):
+        monkeypatch.setattr(module, "load_lpips", lambda backbone, *_: load_lpips(backbone, True))
+
+
+def cases(folder, *more) -> list[str]:
+    return phantoms(folder, 2, "--model.cube.voxels=34", METRICS, *more)
+
+
+def test_test_measures_them_all_and_a_repeated_command_tables_the_same(tmp_path, untrained):
+    main(cases(tmp_path, "--fid.replicates=20"))
+    folder = tmp_path / "sirt"
+    page, rows = (folder / "results.md").read_text(), read_csv(folder / "results.csv")
+    assert all(not np.isnan(row[name]) for row in rows for name in COLUMNS)
+    assert "Backbone squeezenet" in page and "2 cases with XY 68, YZ 68, ZX 68 slices" in page and "FID-YZ ↓" in page
+    assert record(folder / "phantom-1000000")["settings"]["metrics"] == ["lpips", "fid", "organs"]
+    (folder / "results.md").unlink()
+    (folder / "results.csv").unlink()
+    main(cases(tmp_path, "--fid.replicates=20"))
+    assert (folder / "results.md").read_text() == page and read_csv(folder / "results.csv") == rows
+
+
+def test_other_metrics_do_not_pass_for_those_of_a_finished_case(tmp_path, capsys, untrained):
+    main(phantoms(tmp_path, 1, "--model.cube.voxels=34"))
+    assert "other settings" in refusal(capsys, phantoms(tmp_path, 1, "--model.cube.voxels=34", "--metrics=[lpips]"))
+
+
+def test_ablate_has_a_line_of_fid_for_each_method_and_resumes(tmp_path, untrained, capsys):
+    file = tmp_path / "spec.yaml"
+    file.write_text(yaml.safe_dump({
+        "out": str(tmp_path / "out"), "phantoms": 2, "metrics": ["fid", "lpips"], "fid": {"replicates": 0},
+        "base": {"voxels": 34, "detector": 24, "views": 3, "method.iterations": 2},
+        "axes": {"method": ["sirt", "tv"]}}))
+    args = ["ablate", "-c", str(file), "--device", "cpu"]
+    main(args)
+    page = (tmp_path / "out" / "tables.md").read_text()
+    fid = page[page.index("Frechet"):]
+    assert "| sirt |" in fid and "| tv |" in fid and "LPIPS alex" in page[:page.index("Frechet")]
+    next((tmp_path / "out" / "features").iterdir()).unlink()
+    capsys.readouterr()
+    main(args)
+    assert "3 of 4 rows are there already" in capsys.readouterr().out
+    assert (tmp_path / "out" / "tables.md").read_text()[page.index("Frechet"):] == fid
+
+
+@pytest.mark.parametrize("given, sentence", [
+    (["--metrics=[psnr]"], "metrics is a list of some of volume, lpips, fid"),
+    (["--metrics=[fid]", "--fid.backbone=radimagenet"], "needs its weights: give fid.weights"),
+    (["--metrics=[fid]", "--fid.backbone=vgg"], "fid.backbone is one of"),
+    (["--fid.backbone=radimagenet"], "add fid to the metrics"),
+    (["--fid.replicates=-1"], "fid.replicates"),
+])
+def test_what_cannot_be_measured_is_refused_before_any_work(tmp_path, capsys, given, sentence):
+    assert sentence in refusal(capsys, phantoms(tmp_path, 1, *given))
+    assert not (tmp_path / "sirt" / "phantom-1000000").exists()
+
+
+def test_a_specification_with_unknown_metrics_is_refused(tmp_path, capsys):
+    for content, sentence in (({"metrics": ["psnr"]}, "some of volume"), ({"fid": {"net": 1}}, "no setting 'net'"),
+                              ({"metrics": 3}, "metrics takes")):
+        file = tmp_path / "spec.yaml"
+        file.write_text(yaml.safe_dump({"out": str(tmp_path / "out"), "phantoms": 1, "axes": {"method": ["sirt"]}}
+                                       | content))
+        assert sentence in refusal(capsys, ["ablate", "-c", str(file), "--device", "cpu"])
+
+
+def test_lungs_that_are_segmented_beside_a_ct_are_those_of_the_truth(tmp_path):
+    grid, ct = Grid.cube(24, 240.0), tmp_path / "anna.nii.gz"
+    lung = np.zeros(grid.shape, np.float32)
+    lung[4:20, 6:18, 5:15] = 1
+    nibabel.save(nibabel.Nifti1Image(lung, grid.affine), tmp_path / "anna_lungmask.nii.gz")
+    found = organs_beside(ct, Grid.cube(48, 240.0))
+    assert found.keys() == {"lung"}
+    assert dice(found["lung"], lung.repeat(2, 0).repeat(2, 1).repeat(2, 2) > 0) > 0.999  # but for its corners
+    assert organs_beside(tmp_path / "bert.nii.gz", grid) == {}
+
+
+def test_settings_name_what_decides_the_scores_and_nothing_by_default(untrained):
+    assert Scoring().settings() == {} == Scoring(["volume"]).settings()
+    assert Scoring(["fid", "volume"], FIDSettings(replicates=5)).settings() == {
+        "metrics": ["fid"], "fid_backbone": "squeezenet"}

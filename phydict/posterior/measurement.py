@@ -15,9 +15,6 @@ from phydict.xray.calibration import match_views, subtract_scatter
 from phydict.xray.checks import check_line_integrals, check_xrays
 from phydict.xray.noise_level import noise_level
 
-MIN_SCATTER_FRACTION = 0.03
-"""The mean share of scatter in the signal from which it is believed: on the CTs that it was chosen on, X-rays without
-scatter look like 0.027 at most."""
 MAX_LINE_INTEGRAL = 30.0
 """Line integrals above which no photon comes through, so that they hold no scatter either."""
 
@@ -101,16 +98,11 @@ class Measurement:
         self.y, self.scatter_enabled = self.measured, enabled and self.can_estimate_scatter
 
     def subtract_scatter(self, reprojection: Tensor) -> None:
-        """Where scatter is sought, subtract what the projections P(x) tell of, if it is MIN_SCATTER_FRACTION of the
-        signal on average or more."""
+        """Where scatter is sought, subtract what the projections P(x) tell of."""
         if self.scatter_enabled:
-            corrected = subtract_scatter(self.measured, reprojection)
-            self.y = torch.where(self._share(corrected) < MIN_SCATTER_FRACTION, self.measured, corrected)
+            self.y = subtract_scatter(self.measured, reprojection)
 
     @property
     def scatter(self) -> float:
         """The mean share of the signal that is now subtracted as scatter."""
-        return float(self._share(self.y).mean()) if self.scatter_enabled else 0.0
-
-    def _share(self, corrected: Tensor) -> Tensor:
-        return 1 - torch.exp(self.measured - corrected).mean((1, 2, 3), keepdim=True)
+        return float(1 - torch.exp(self.measured - self.y).mean()) if self.scatter_enabled else 0.0

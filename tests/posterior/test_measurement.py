@@ -6,6 +6,7 @@ from laws import assert_adjoint, assert_linear, random_like
 
 from phydict.grid import Grid
 from phydict.posterior import Measurement
+from phydict.posterior.scatter import with_scatter
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 
@@ -89,21 +90,28 @@ def chest_views():
     return clean, lambda y, **more: Measurement(Projector(GRID, beam), y, HUWindow(), **more)
 
 
-def test_scatter_is_subtracted_where_it_is_sought_and_there_is_enough_of_it_and_what_was_measured_can_be_had_back():
+@pytest.mark.parametrize("scatter", [0.0, 0.002, 0.03])
+def test_scatter_is_subtracted_where_it_is_sought_and_what_was_measured_can_be_had_back(scatter):
     clean, measurement = chest_views()
-    for scatter, seen in ((0.0, False), (0.002, False), (0.03, True)):
-        measured = -torch.log(torch.exp(-clean) + scatter)
-        m = measurement(measured)
-        m.subtract_scatter(clean[None])  # not sought
-        assert torch.equal(m.y[0], measured)
-        m.reset_scatter(True)
+    measured = -torch.log(torch.exp(-clean) + scatter)
+    m = measurement(measured)
+    m.subtract_scatter(clean[None])  # not sought
+    assert torch.equal(m.y[0], measured)
+    m.reset_scatter(True)
+    for _ in range(2):  # always from what was measured
         m.subtract_scatter(clean[None])
-        torch.testing.assert_close(m.y[0], clean if seen else measured, atol=1e-3, rtol=0)
-        assert seen or torch.equal(m.y[0], measured)
-        m.subtract_scatter(clean[None])  # always from what was measured
-        torch.testing.assert_close(m.y[0], clean if seen else measured, atol=1e-3, rtol=0)
-        m.reset_scatter(False)
-        assert torch.equal(m.y[0], measured)
+        torch.testing.assert_close(m.y[0], clean, atol=1e-3, rtol=0)
+    assert m.scatter == pytest.approx(float((scatter * torch.exp(measured)).mean()), abs=1e-3)
+    m.reset_scatter(False)
+    assert torch.equal(m.y[0], measured) and m.scatter == 0
+
+
+@pytest.mark.parametrize("missed, believed", [((9.0, 5.0), True), ((9.0, 6.0), False), ((2.0, 0.5), False)])
+def test_scatter_is_believed_where_xrays_are_missed_and_it_explains_much_of_that(missed, believed):
+    m = chest_views()[1](chest_views()[0])
+    m.normalised_residual = lambda z: torch.as_tensor(missed)[z.long()]  # the results 0 and 1 miss by these
+    result = with_scatter(m, lambda: torch.zeros(1, 1, 1, 1, 1), lambda: torch.ones(1, 1, 1, 1, 1))
+    assert bool(result) == believed == m.scatter_enabled
 
 
 def test_display_values_have_no_scatter_to_subtract():

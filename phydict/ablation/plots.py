@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from matplotlib.axes import Axes
@@ -39,12 +39,11 @@ def write_plots(folder: Path, found: Sequence[Entry]) -> list[Path]:
         if len(own) > 1 and "geometry" not in condition:
             written.append(_draw(folder, f"pareto {where}", 2, lambda axes: _pareto(axes, own, where, style)))
             written.append(_draw(folder, f"stages {where}", 1, lambda axes: _stages(axes[0], own, where)))
-    for rest, places in compared_views(found):
-        group = [entry for place in places.values() for entry in place]
+    for rest, group in compared_views(found):
         written.append(_draw(folder, f"views {format_settings(rest)}", 2, lambda axes: _views(axes, group, style)))
-    for rest, places in compared_geometries(found):
+    for rest, group in compared_geometries(found):
         written.append(_draw(folder, f"geometry {format_settings(rest)}", 2,
-                             lambda axes: _geometries(axes, places, style)))
+                             lambda axes: _geometries(axes, group, style)))
     curves = [(label, group) for label, group in deltas(found) if len(group) > 1]
     if curves:
         written.append(_draw(folder, "delta", 2, lambda axes: _deltas(axes, curves)))
@@ -110,19 +109,19 @@ def _views(axes: Sequence[Axes], group: Sequence[Entry], style: dict) -> None:
     axes[-1].legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
 
 
-def _geometries(axes: Sequence[Axes], places: Mapping[str, Sequence[Entry]], style: dict) -> None:
+def _geometries(axes: Sequence[Axes], group: Sequence[Entry], style: dict) -> None:
     """Where each method stands, a line of the plot for each geometry."""
-    names = [Path(name).stem for name in places]
-    for ax, measure in zip(axes, ("psnr", "ssim")):
-        labels = {entry.name: entry.method for group in places.values() for entry in group}
+    places = list(dict.fromkeys(entry.condition["geometry"] for entry in group))
+    for ax, name in zip(axes, ("psnr", "ssim")):
+        labels = {entry.name: entry.method for entry in group}
         for label, method in labels.items():
-            own = [(entry.means[measure], i) for i, group in enumerate(places.values()) for entry in group
+            own = [(entry.means[name], places.index(entry.condition["geometry"])) for entry in group
                    if entry.complete and entry.name == label]
             if own:
                 ax.plot(*zip(*own), **style[method], linestyle="", markersize=6, label=literal(label))
-        ax.set_yticks(range(len(names)), list(map(literal, names)))
+        ax.set_yticks(range(len(places)), [literal(Path(place).stem) for place in places])
         ax.invert_yaxis()
-        _dress(ax, SHOWN_MEASURES[measure].heading, "")
+        _dress(ax, SHOWN_MEASURES[name].heading, "")
     axes[-1].legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
 
 

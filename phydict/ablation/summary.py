@@ -112,26 +112,19 @@ def conditions(found: Sequence[Entry], without: Sequence[str] = ()) -> list[tupl
     return [(dict(condition), group) for condition, group in groups.items()]
 
 
-def compared_views(found: Sequence[Entry]) -> list[tuple[dict, dict[int, list[Entry]]]]:
-    """Number of views -> entries, under each other condition that has several."""
+def compared_views(found: Sequence[Entry]) -> list[tuple[dict, list[Entry]]]:
+    """The entries under each other condition that has several numbers of views."""
     return _along(found, "views", ("views",))
 
 
-def compared_geometries(found: Sequence[Entry]) -> list[tuple[dict, dict[str, list[Entry]]]]:
-    """Geometry file -> entries, under each other condition that has several; a file fixes the views."""
+def compared_geometries(found: Sequence[Entry]) -> list[tuple[dict, list[Entry]]]:
+    """The entries under each other condition that has several geometry files, which fix the views."""
     return _along(found, "geometry", ("geometry", "views"))
 
 
-def _along(found: Sequence[Entry], axis: str, without: Sequence[str]) -> list[tuple[dict, dict]]:
-    compared = []
-    for rest, group in conditions(found, without):
-        places: dict = {}
-        for entry in group:
-            if entry.condition.get(axis) is not None:
-                places.setdefault(entry.condition[axis], []).append(entry)
-        if len(places) > 1:
-            compared.append((rest, places))
-    return compared
+def _along(found: Sequence[Entry], axis: str, without: Sequence[str]) -> list[tuple[dict, list[Entry]]]:
+    groups = conditions([entry for entry in found if entry.condition.get(axis) is not None], without)
+    return [(rest, group) for rest, group in groups if len({entry.condition[axis] for entry in group}) > 1]
 
 
 def best_settings(found: Sequence[Entry], measure: str = "psnr") -> list[Entry]:

@@ -54,11 +54,12 @@ def all_tables(found: Sequence[Entry], rows: Sequence[dict],
             title += ": all settings"
         tables.append(_method_table(title, group, notes))
         tables += _difference_tables(title.removesuffix(": all settings"), best, notes[1:])
-    for rest, places in compared_views(found):
-        columns = {f"K = {k}": places[k] for k in sorted(places)}
-        tables += _axis_tables("against the number of views", rest, columns, notes)
-    for rest, places in compared_geometries(found):
-        tables += _axis_tables("by geometry", rest, places, notes)
+    for rest, group in compared_views(found):
+        columns = {k: f"K = {k}" for k in sorted({entry.condition["views"] for entry in group})}
+        tables += _axis_tables("against the number of views", rest, group, columns, "views", notes)
+    for rest, group in compared_geometries(found):
+        columns = {file: Path(file).stem for file in dict.fromkeys(entry.condition["geometry"] for entry in group)}
+        tables += _axis_tables("by geometry", rest, group, columns, "geometry", notes)
     return tables + [_delta_table(label, group, notes) for label, group in deltas(found)]
 
 
@@ -108,20 +109,21 @@ def _entry_table(title: str, first: str, names: Sequence[str], lines: Sequence[t
                  [*notes, *interval_note(printed), *_reasons([entry for _, entry in lines])])
 
 
-def _axis_tables(title: str, rest: dict, columns: Mapping[str, Sequence[Entry]], notes: Sequence[str]) -> list[Table]:
-    """Method x what is compared, a table for each measure: the form of the paper's Table 3."""
-    tables, group = [], [entry for entries in columns.values() for entry in entries]
-    lines: dict[str, dict[str, Entry]] = {}
-    for column, entries in columns.items():
-        for entry in entries:
-            lines.setdefault(entry.name, {})[column] = entry
+def _axis_tables(title: str, rest: dict, group: Sequence[Entry], columns: Mapping[object, str], axis: str,
+                 notes: Sequence[str]) -> list[Table]:
+    """Method x values of an axis, a table for each measure: the form of the paper's Table 3. columns: value ->
+    heading."""
+    tables: list[Table] = []
+    lines: dict[str, dict[object, Entry]] = {}
+    for entry in group:
+        lines.setdefault(entry.name, {})[entry.condition[axis]] = entry
     for name in _measured(OF_VIEWS, group):
         measure = SHOWN_MEASURES[name]
         printed = [(label, all(entry.complete or not entry.cases for entry in line.values()),
                     [line[k].estimate(name) if k in line else None for k in columns]) for label, line in lines.items()]
         tables.append(Table(
-            format_settings(f"{measure.heading} {title}", rest), ["method", *columns], [measure] * len(columns),
-            printed, [*notes, *interval_note(printed), *_reasons(group)]))
+            format_settings(f"{measure.heading} {title}", rest), ["method", *columns.values()],
+            [measure] * len(columns), printed, [*notes, *interval_note(printed), *_reasons(group)]))
     return tables
 
 

@@ -49,7 +49,7 @@ class SliceFeatures(nn.Module):
                 f"the FID backbone squeezenet takes LPIPS' weights from {torch.hub.get_dir()}/checkpoints, but "
                 f"fid.weights {weights} was given: leave it out")
         self.name, self.dimensions = name, DIMENSIONS[name]
-        if name == "squeezenet":
+        if weights is None:
             self.network = load_lpips("squeeze", False, "leave fid out of the metrics").get_submodule("net")
         else:
             self.network = _radimagenet() if name == "radimagenet" else _inception()

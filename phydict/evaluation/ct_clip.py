@@ -45,6 +45,8 @@ class Towers:
 class Norm(nn.Module):
     """Layer norm with a learned scale and a fixed shift."""
 
+    beta: Tensor
+
     def __init__(self, width: int):
         super().__init__()
         self.gamma = nn.Parameter(torch.ones(width))

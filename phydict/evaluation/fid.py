@@ -11,7 +11,7 @@ large, and so do the bootstrap's repeated ones: its interval may lie above the n
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -100,7 +100,8 @@ def fid(cases: Mapping[str, Features], replicates: int = 0) -> dict[str, Estimat
 
 
 def _planes(stacks: Features, repeats: Mapping[str, Tensor | None] | None = None) -> dict[str, float]:
-    found = {f"fid_{plane}": frechet_distance(*stacks[plane], (repeats or {}).get(plane)) for plane in PLANES}
+    found = {f"fid_{plane}": frechet_distance(stacks[plane][0], stacks[plane][1], (repeats or {}).get(plane))
+             for plane in PLANES}
     return found | {"fid": sum(found.values()) / len(PLANES)}
 
 
@@ -133,7 +134,7 @@ class PlaneFID(Metric):
         """The distances, and the numbers of cases and of slices in each plane, as a flat dict of scalars."""
         cases: dict[str, Features] = {}
         for plane in PLANES:
-            state: Sequence[Tensor] | Tensor = getattr(self, plane)
+            state: list[Tensor] | Tensor = getattr(self, plane)
             if not len(state):
                 return {}
             rows = dim_zero_cat(state).reshape(-1, 2 + 2 * self.dimensions).cpu()

@@ -32,7 +32,8 @@ def fine_grid(grid: Grid) -> Grid:
     affine = grid.affine.copy()
     affine[:3, :3] /= parts
     affine[:3, 3] -= affine[:3, :3].sum(1) * (parts - 1) / 2
-    return Grid(tuple(parts * n for n in grid.shape), affine=affine)
+    x, y, z = grid.shape
+    return Grid((parts * x, parts * y, parts * z), affine=affine)
 
 
 def organ_scores(hu: Tensor, true_hu: Tensor, grid: Grid, given: Mapping[str, np.ndarray] | None = None
@@ -65,8 +66,8 @@ def hd95(a: np.ndarray, b: np.ndarray, spacing) -> float:
     from monai.metrics import compute_hausdorff_distance
 
     box = tuple(slice(max(0, int(i.min()) - 1), int(i.max()) + 2) for i in np.nonzero(a | b))
-    masks = (torch.from_numpy(mask[box][None, None].astype(np.float32)) for mask in (a, b))
-    return float(compute_hausdorff_distance(*masks, include_background=True, percentile=95,
+    one, other = (torch.from_numpy(mask[box][None, None].astype(np.float32)) for mask in (a, b))
+    return float(compute_hausdorff_distance(one, other, include_background=True, percentile=95,
                                             spacing=[float(mm) for mm in spacing]))
 
 

@@ -83,8 +83,9 @@ class Orbit:
 
     def beam(self) -> ConeBeam:
         """As per-view vectors. Raises ValueError for what cannot be."""
-        *rest, arc = vars(self.filled()).values()
-        return ConeBeam.orbit(*rest) if arc == PAPER.arc else ConeBeam.orbit(*rest, arc_degrees=arc)
+        views, source_to_detector, source_to_isocentre, detector, pixel, arc = vars(self.filled()).values()
+        return ConeBeam.orbit(views, source_to_detector, source_to_isocentre, detector, pixel,
+                              arc_degrees=None if arc == PAPER.arc else arc)
 
 
 PAPER = Orbit(8, 1020.0, 740.0, (448, 448), (1.25, 1.25), 360.0)

@@ -620,8 +620,8 @@ def test_simulated_xrays_are_taken_where_a_geometry_file_says(scored, tmp_path, 
              "--data.geometry=biplanar"]
     main(other)
     assert len(record(tmp_path / "sirt" / "phantom-1000000")["misfit_per_view"]) == 2
-    assert "leave one out" in refusal(capsys, [*other, "--data.orbit.views=4"])
-    assert "biplanar" in refusal(capsys, [*other[:-1], "--data.geometry=nowhere"])
+    assert "leave one out" in refusal(capsys, main, [*other, "--data.orbit.views=4"])
+    assert "biplanar" in refusal(capsys, main, [*other[:-1], "--data.geometry=nowhere"])
 
 
 def test_other_xrays_into_a_finished_folder_are_refused(scored, capsys):

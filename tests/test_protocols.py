@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from test_inference import record, refusal, sirt
+from command_lines import refusal
+from test_inference import record, sirt
 
 from phydict.cli.infer import main
 from phydict.evaluation import read_csv
@@ -69,8 +70,8 @@ def test_what_clashes_with_a_protocol_is_refused(given, sentence):
 
 def test_another_grid_and_measured_xrays_are_refused_by_the_command_line(tmp_path, capsys):
     args = sirt("test", tmp_path, "--data.cts=phantom", "--data.phantoms=1", "--data.protocol=x2ct")
-    assert "fixes 128 voxels over 320 mm" in refusal(capsys, [*args, "--model.cube.voxels=32"])
-    assert "predict takes measured ones" in refusal(capsys, sirt("predict", tmp_path, "--data.xrays=none",
+    assert "fixes 128 voxels over 320 mm" in refusal(capsys, main, [*args, "--model.cube.voxels=32"])
+    assert "predict takes measured ones" in refusal(capsys, main, sirt("predict", tmp_path, "--data.xrays=none",
                                                                  "--data.protocol=x2ct"))
 
 
@@ -140,4 +141,5 @@ def test_a_protocol_against_another_number_of_views_is_refused_by_ablate(tmp_pat
     file = tmp_path / "spec.yaml"
     file.write_text(yaml.safe_dump({"out": str(tmp_path / "out"), "phantoms": 1, "axes": {
         "method": ["sirt"], "protocol": ["small"], "views": [8]}}))
-    assert "small has 2, 3 views, but 8 were given" in refusal(capsys, ["ablate", "-c", str(file), "--device", "cpu"])
+    said = refusal(capsys, main, ["ablate", "-c", str(file), "--device", "cpu"])
+    assert "small has 2, 3 views, but 8 were given" in said

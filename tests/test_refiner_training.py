@@ -84,7 +84,7 @@ def test_scenes_scale_with_the_grid():
 
 
 @pytest.mark.parametrize("settings, words", [
-    ({"most_views": 0}, "between 1 and 1000"), ({"arc": 1.2}, "arc lies between"), ({"orbit": 0.8}, "at most 1"),
+    ({"most_views": 0}, "between 1 and 1,000"), ({"arc": 1.2}, "arc lies between"), ({"orbit": 0.8}, "at most 1"),
     ({"noise": (0.1, 0.01)}, "least <= most")])
 def test_scenes_that_cannot_be_drawn_are_refused(settings, words):
     with pytest.raises(ValueError, match=words):

@@ -6,7 +6,8 @@ import nibabel
 import numpy as np
 import pytest
 import yaml
-from test_inference import phantoms, record, refusal
+from command_lines import refusal
+from test_inference import phantoms, record
 
 from phydict.cli.infer import main
 from phydict.datasets.cts.segmentations import organs_beside
@@ -45,7 +46,8 @@ def test_test_measures_them_all_and_a_repeated_command_tables_the_same(tmp_path,
 
 def test_other_metrics_do_not_pass_for_those_of_a_finished_case(tmp_path, capsys, untrained):
     main(phantoms(tmp_path, 1, "--model.cube.voxels=34"))
-    assert "other settings" in refusal(capsys, phantoms(tmp_path, 1, "--model.cube.voxels=34", "--metrics=[lpips]"))
+    other = phantoms(tmp_path, 1, "--model.cube.voxels=34", "--metrics=[lpips]")
+    assert "other settings" in refusal(capsys, main, other)
 
 
 def test_ablate_has_a_line_of_fid_for_each_method_and_resumes(tmp_path, untrained, capsys):
@@ -74,7 +76,7 @@ def test_ablate_has_a_line_of_fid_for_each_method_and_resumes(tmp_path, untraine
     (["--fid.replicates=-1"], "fid.replicates"),
 ])
 def test_what_cannot_be_measured_is_refused_before_any_work(tmp_path, capsys, given, sentence):
-    assert sentence in refusal(capsys, phantoms(tmp_path, 1, *given))
+    assert sentence in refusal(capsys, main, phantoms(tmp_path, 1, *given))
     assert not (tmp_path / "sirt" / "phantom-1000000").exists()
 
 
@@ -84,7 +86,7 @@ def test_a_specification_with_unknown_metrics_is_refused(tmp_path, capsys):
         file = tmp_path / "spec.yaml"
         file.write_text(yaml.safe_dump({"out": str(tmp_path / "out"), "phantoms": 1, "axes": {"method": ["sirt"]}}
                                        | content))
-        assert sentence in refusal(capsys, ["ablate", "-c", str(file), "--device", "cpu"])
+        assert sentence in refusal(capsys, main, ["ablate", "-c", str(file), "--device", "cpu"])
 
 
 def test_lungs_that_are_segmented_beside_a_ct_are_those_of_the_truth(tmp_path):

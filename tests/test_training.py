@@ -80,7 +80,7 @@ def test_each_epoch_has_draws_of_its_own_whatever_the_configuration_says(tmp_pat
     main(args)
     assert len(seen) == 8 and len(set(seen)) == 8
     assert "reload_dataloaders_every_n_epochs must be 1, but 0" in refusal(
-        capsys, [*args[:-1], f"--out={tmp_path / 'other'}", "--trainer.reload_dataloaders_every_n_epochs=0"])
+        capsys, main, [*args[:-1], f"--out={tmp_path / 'other'}", "--trainer.reload_dataloaders_every_n_epochs=0"])
 
 
 def test_a_killed_run_goes_on_as_if_it_had_not_been(tmp_path, straight, cache):
@@ -326,7 +326,7 @@ def test_a_killed_run_leaves_its_folder_free_even_while_its_loaders_live_on(tmp_
 def test_a_missing_configuration_says_which_to_give(command, cache, tmp_path, capsys):
     args = [command, *TINY, "--trainer.max_epochs=1", f"--data.cache={cache}", f"--out={tmp_path / 'run'}"]
     assert "no configuration file was given: add -c <file>, such as -c configs/prior/phantom.yaml" in refusal(
-        capsys, args)
+        capsys, main, args)
     assert not (tmp_path / "run").exists()
 
 

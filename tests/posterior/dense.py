@@ -17,8 +17,6 @@ FINE = CosineSchedule(offset=1e-3, floor=1e-6)
 class DenseMeasurement:
     """y = A x + background, on states (B, 1, 1, 2, 3); stands in for phydict.posterior.Measurement."""
 
-    scatter_enabled = False
-
     def __init__(self, matrix: Tensor, y: Tensor, background: float = 0.0):
         self.matrix, self.y, self.background, self.calls = matrix, y[None], background, 0
 
@@ -36,8 +34,10 @@ class DenseMeasurement:
     def norm(self) -> float:
         return float(torch.linalg.matrix_norm(self.matrix, 2))
 
-    def match_gain_offset(self, x: Tensor) -> None:
-        pass
+    def refit(self, x: Tensor) -> None:
+        """y holds nothing beside the state."""
+
+    match_gain_offset = refit
 
 
 def measurement(rows: int = 4, background: float = 0.05) -> DenseMeasurement:

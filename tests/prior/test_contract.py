@@ -86,7 +86,7 @@ def test_on_the_command_line_it_is_a_class_with_its_settings(module, tmp_path):
     settings = {"model": {"prior": {"class_path": f"{module}.OwnPrior", "init_args": {"hu": -300.0}}}}
     (tmp_path / "own.yaml").write_text(yaml.safe_dump(settings))
     common = ["predict", "--data.xrays", "data/example/xrays", "--model.method", "prior_only",
-              "--data.with_report", "false", "--model.out"]
+              "--model.sampling.with_report", "false", "--model.out"]
     infer([*common, str(tmp_path / "a"), "--model.prior", f"{module}.OwnPrior"])
     infer([*common, str(tmp_path / "b"), "-c", str(tmp_path / "own.yaml")])
     levels = []

@@ -155,7 +155,7 @@ def test_noise_drawn_for_the_coarse_volume_is_added_to_it():
 
 @pytest.mark.parametrize("noise", [-0.1, 1.1])
 def test_a_noise_level_outside_its_range_is_refused(noise):
-    with pytest.raises(ValueError, match=r"in \[0, 1\]"):
+    with pytest.raises(ValueError, match=r"between 0 and 1"):
         tiny_super_resolution().bind(COARSE, noise)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from rich.markup import escape
@@ -23,7 +23,9 @@ from phydict.units import HUWindow
 Value = float | Summary | Estimate
 """What a table prints: a number, or a mean with its interval."""
 
-INTERVAL = "In brackets: 95 % interval of the mean, bootstrap over patients."
+IN_BRACKETS = "In brackets: 95 % interval"
+"""How the notes on intervals begin."""
+INTERVAL = f"{IN_BRACKETS} of the mean, bootstrap over patients."
 
 
 @dataclass(frozen=True)
@@ -54,11 +56,14 @@ class Table:
                           f"\\caption{{{notes}}}", "\\end{table}", ""])
 
     def console(self) -> ConsoleTable:
-        """For rich's console: best in bold, second underlined."""
-        table = ConsoleTable(title=escape(self.title), caption=escape("\n".join(self.notes)))
+        """For rich's console, without intervals, for which its lines are too short: best in bold, second underlined."""
+        notes = [note for note in self.notes if not note.startswith(IN_BRACKETS)]
+        table = ConsoleTable(title=escape(self.title), caption=escape("\n".join(notes)))
         for i, name in enumerate(self.header):
             table.add_column(escape(name), justify="right" if i else "left")
-        for line in self._marked(("{}", "[bold]{}[/bold]", "[underline]{}[/underline]"), escape):
+        plain = replace(self, lines=[(label, ranked, [_without_interval(value) for value in values])
+                                     for label, ranked, values in self.lines])
+        for line in plain._marked(("{}", "[bold]{}[/bold]", "[underline]{}[/underline]"), escape):
             table.add_row(*line)
         return table
 
@@ -73,6 +78,10 @@ class Table:
             columns.append([marks[place].format(printed("–" if value is None else f"{value:.{measure.decimals}f}"))
                             for value, place in zip(values, places)])
         return [list(line) for line in zip(*columns)]
+
+
+def _without_interval(value: Value | None) -> Value | None:
+    return value._replace(low=math.nan, high=math.nan) if isinstance(value, Summary | Estimate) else value
 
 
 def ranks(values: Sequence[float], higher_is_better: bool | None) -> list[int]:
@@ -129,7 +138,7 @@ def fid_table(found: Mapping[str, Mapping[str, Features]], backbone: str, replic
             f"the same cases. HU clipped to [{RANGE.low:g}, {RANGE.high:g}], each volume's least and largest value "
             "mapped to 0 and 1, so that a wrong HU scale is not seen. FID: mean of the planes.")
     measures = [Measure(f"FID-{name[4:].upper()}" if "_" in name else "FID", False, 3) for name in NAMES]
-    intervals = f"In brackets: 95 % interval, {replicates} draws of patients; repeated slices make it too high."
+    intervals = f"{IN_BRACKETS}, {replicates} draws of patients; repeated slices make it too high."
     return Table(title, ["method", *(measure.heading for measure in measures)], measures, lines,
                  [note, *([intervals] if interval_note(lines) else [])])
 

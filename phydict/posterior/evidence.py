@@ -26,10 +26,9 @@ class Evidence:
 
     def __init__(self, measurement: Measurement):
         projector = measurement.projector
-        ones = torch.ones(1, 1, *projector.grid.shape).to(measurement.y)
-        rays = projector(ones)
+        rays = measurement.background / measurement.offset
         seen = projector.T(torch.ones_like(measurement.y))
-        measurement.calls += 2
+        measurement.calls += 1
         self.measurement = measurement
         self.rows = torch.where(rays > 1e-3 * rays.max(), 1 / rays.clamp(min=1e-12), 0)
         self.columns = torch.where(seen > 1e-3 * seen.max(), 1 / seen.clamp(min=1e-12), 0)

@@ -104,7 +104,8 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: PriorContract | 
                              f"samples at 1 instead of {samples}, or use a method with a prior")
         return replace(method, name=name) if name else method
     if not isinstance(method, Sampler):
-        raise ValueError(f"a method is a name ({', '.join(METHODS)}), a Sampler or a Reconstructor, but {method!r} was "
+        given = f"the class {method.__name__}, not an object of it," if isinstance(method, type) else repr(method)
+        raise ValueError(f"a method is a name ({', '.join(METHODS)}), a Sampler or a Reconstructor, but {given} was "
                          "given")
     prior = find_prior(prior or method.default_prior) if prior is None or isinstance(prior, str | Path) else prior
     check_prior(prior)

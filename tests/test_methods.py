@@ -73,6 +73,11 @@ def test_an_unknown_method_names_the_known_ones():
     assert "\n" not in str(error.value)
 
 
+def test_a_class_in_place_of_a_method_is_told_apart_from_its_object():
+    with pytest.raises(ValueError, match="but the class SIRT, not an object of it, was given"):
+        reconstructor(SIRT)
+
+
 def test_sirt_needs_no_prior_and_a_sampler_says_which_one_is_missing(tmp_path):
     assert reconstructor("sirt", tmp_path / "nowhere.safetensors") == METHODS["sirt"]
     assert reconstructor("sirt", name="mine").name == "mine"

@@ -62,6 +62,11 @@ class InferenceCLI(LightningCLI):
             for subparser in self._subcommand_parsers.values():
                 method_help(subparser, args)
         super().parse_arguments(parser, args)
+        given = [value for name, value in zip(args, [*args[1:], ""]) if name == "--model.prior"]
+        given += [arg.partition("=")[2] for arg in args if arg.startswith("--model.prior=")]
+        chosen = self.config.get(str(self.config.get("subcommand")), self.config).get("model.prior")
+        if given and Path(given[-1]).is_file() and chosen is None:  # its content was read, as a null
+            raise ValueError(f"the prior {given[-1]} is empty: give the .safetensors file that training wrote")
 
     @property
     def dry_run(self) -> bool:

@@ -6,6 +6,7 @@ import re
 import pytest
 import torch
 import yaml
+from command_lines import refusal
 
 import phydict
 from phydict.cli.infer import main as infer
@@ -114,3 +115,12 @@ def test_what_keeps_no_contract_is_refused_in_one_sentence(module, xrays, tmp_pa
         reconstructor("phydict_fast", {})
     with pytest.raises(ValueError, match=r"states like those it is given, \(1, 1, 16, 16, 16\)"):
         phydict.reconstruct(xrays["xrays"], xrays["beam"], f"{module}.Shapeless", display=xrays["display"])
+
+
+def test_an_empty_file_is_not_taken_for_no_prior(tmp_path, capsys):
+    (tmp_path / "pytorch_model.bin").write_bytes(b"")
+    for given in (["--model.prior", str(tmp_path / "pytorch_model.bin")],
+                  [f"--model.prior={tmp_path / 'pytorch_model.bin'}"]):
+        assert "is empty" in refusal(capsys, infer, ["predict", "--data.xrays", "data/example/xrays", "--model.out",
+                                                     str(tmp_path / "out"), *given])
+    assert not (tmp_path / "out").exists()

@@ -1224,7 +1224,7 @@ def configurations():
             ("views a text", {"data": {"orbit": {"views": "8"}}}, None, ""),
             ("detector a text", {"data": {"orbit": {"detector": "24,24"}}}, no, "detector"),
             ("detector nested", {"data": {"orbit": {"detector": [[24], [24]]}}}, no, "detector"), ("pixel null",
-            {"data": {"orbit": {"pixel": None}}}, no, "pixel"),
+            {"data": {"orbit": {"pixel": None}}}, None, ""),
             ("simulator a word", {"data": {"simulator": "ideal"}}, no, "simulator"), ("simulator null",
             {"data": {"simulator": None}}, None, ""),
             ("trainer.devices a mapping", {"trainer": {"devices": {"n": 1}}}, no, "devices"),

@@ -322,6 +322,17 @@ def test_a_killed_run_leaves_its_folder_free_even_while_its_loaders_live_on(tmp_
         os.kill(loader, signal.SIGKILL)  # was alive until now
 
 
+def test_a_gpu_that_is_not_there_is_not_asked_for_its_precision(cache, tmp_path, monkeypatch):
+    def accelerator(check_available=False):  # what a CUDA build of PyTorch answers on a machine without a GPU
+        return None if check_available else torch.device("cuda")
+
+    monkeypatch.setattr(torch.accelerator, "current_accelerator", accelerator)
+    args = [arg for arg in arguments(tmp_path, cache, "--trainer.max_steps=1", "--trainer.limit_val_batches=0")
+            if "accelerator" not in arg and "--precision" not in arg]
+    main(args)
+    assert (tmp_path / "last.ckpt").exists()
+
+
 @pytest.mark.parametrize("command", ["fit", "validate"])
 def test_a_missing_configuration_says_which_to_give(command, cache, tmp_path, capsys):
     args = [command, *TINY, "--trainer.max_epochs=1", f"--data.cache={cache}", f"--out={tmp_path / 'run'}"]

@@ -43,6 +43,19 @@ def refusal(capsys, main: Callable[[list[str]], None], args: list[str]) -> str:
     return lines[0]
 
 
+def resumed_as_uninterrupted(main: Callable[[list[str]], None], fit: Callable[..., list[str]], folder: Path) -> Path:
+    """The checkpoint of two epochs of two steps, after checking that one that stops and resumes between them has the
+    same weights; fit: the arguments of a training into a folder, with more behind."""
+    straight, halved = folder / "straight", folder / "halved"
+    main(fit(straight, "--trainer.max_epochs=2"))
+    main(fit(halved, "--trainer.max_epochs=1"))
+    main(fit(halved, "--trainer.max_epochs=2", f"--ckpt_path={halved / 'last.ckpt'}"))
+    assert set(losses(straight)) == {0, 1, 2, 3} and {2, 3} <= set(losses(halved))
+    one, other = (checkpoint(run)["state_dict"] for run in (straight, halved))
+    assert one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
+    return straight / "last.ckpt"
+
+
 def losses(folder: Path, column: str = "loss") -> dict[int, str]:
     """Step -> loss as logged, from the last log that the run in `folder` wrote."""
     log = max(folder.glob("logs/**/metrics.csv"), key=lambda path: path.stat().st_mtime_ns)

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from command_lines import checkpoint, losses, refusal
+from command_lines import refusal, resumed_as_uninterrupted
 from prior.tiny import tiny_prior
 from torch.utils.data import default_collate
 
@@ -38,14 +38,8 @@ def arguments(folder: Path, cache: Path, initial: str, *more: str) -> list[str]:
 
 
 def test_a_resumed_run_is_the_uninterrupted_one_and_is_exported_as_a_refiner(tmp_path, cache, prior_file):
-    straight, halved = tmp_path / "straight", tmp_path / "halved"
-    main(arguments(straight, cache, prior_file, "--trainer.max_epochs=2"))
-    main(arguments(halved, cache, prior_file, "--trainer.max_epochs=1"))
-    main(arguments(halved, cache, prior_file, "--trainer.max_epochs=2", f"--ckpt_path={halved / 'last.ckpt'}"))
-    assert set(losses(straight)) == {0, 1, 2, 3} and {2, 3} <= set(losses(halved))
-    one, other = (checkpoint(folder)["state_dict"] for folder in (straight, halved))
-    assert one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
-    main(["export", "--checkpoint", str(straight / "last.ckpt"), "--out", str(tmp_path / "refiner.safetensors")])
+    last = resumed_as_uninterrupted(main, lambda run, *more: arguments(run, cache, prior_file, *more), tmp_path)
+    main(["export", "--checkpoint", str(last), "--out", str(tmp_path / "refiner.safetensors")])
     refiner = load_prior(tmp_path / "refiner.safetensors")
     assert isinstance(refiner, Refiner) and refiner.entrance.weight.any() and refiner.gate[-1].weight.any()
     beam = ConeBeam.orbit(3, 1020, 740, (28, 28), 20.0)

@@ -134,8 +134,7 @@ def run(specification: Specification, device: torch.device, progress: CaseProgre
             scene = _attempt(lambda: MeasuredCase(case, first, made.case(case, first, make), device))
             for trial, name, _ in group:
                 progress.case(f"{case}: {trial.label}")
-                measured = scene if isinstance(scene, dict) else bench.measure(trial, scene, progress.advance,
-                                                                                              name)
+                measured = scene if isinstance(scene, dict) else bench.measure(trial, scene, progress.advance, name)
                 results.add(name, measured)
                 progress.finished(f"{measured['seconds']:.2f} s, {measured['psnr']:.2f} dB"
                                   if measured["status"] == "ok" else f"{measured['status']}: {measured['error']}")

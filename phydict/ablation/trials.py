@@ -106,7 +106,7 @@ class Trial:
         """All that decides the numbers of a trial beside the case, as plain JSON values."""
         grid, window = self.scene()
         identity = {"name": self.name, "method": describe(self.method), "seed": self.seed, "grid": grid.to_dict(),
-                "window": describe(window), "data": {"with_report": self.with_report} | self.data.settings("test")}
+                    "window": describe(window), "data": {"with_report": self.with_report} | self.data.settings("test")}
         if self.prior is not None:
             prior = prior_of(self.prior)
             identity |= {"prior": prior.identity()} if isinstance(prior, PriorContract) else {
@@ -206,15 +206,13 @@ def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
             (pixel, pixel)),
         simulator=simulator, simulation_voxels=value["simulation_voxels"], geometry=value["geometry"],
         protocol=value["protocol"])
-    if value["protocol"]:
-        value |= {"views": data.orbit.views, "detector": data.orbit.detector[0]}
+    if value["protocol"] or value["geometry"]:
+        value |= {"views": data.beam.views, "detector": data.beam.shape[0]}
     with_prior = isinstance(method, Sampler)
     overrides = {f"{part}.{path}": plain(field_of({"method": method, "simulator": simulator}[part], path.split(".")))
                  for part, paths in changes.items() for path in paths}
     columns = {name: value[name] for name in DEFAULT_COLUMNS
                if name in given or name not in PRIOR_SETTINGS or with_prior}
-    if value["geometry"] is not None:
-        columns |= {"views": data.beam.views, "detector": data.beam.shape[0]}
     columns |= {name: given[name] for name in SETTINGS if name in given and name not in columns} | overrides
     prior = value["prior"] or str(method.default_prior) if with_prior else None
     trial = Trial(columns, method, data, prior, value["guidance"], value["samples"], value["seed"],

@@ -182,7 +182,7 @@ def main(args: list[str] | None = None) -> None:
                      trainer_defaults={"enable_progress_bar": False, "enable_model_summary": False,
                                        "reload_dataloaders_every_n_epochs": 1},
                      parser_kwargs={"exit_on_error": False, "allow_abbrev": False, "formatter_class": HelpFormatter,
-                           "description": (
+                                    "description": (
                          "Train a prior of chest CT. Two more commands: `export --checkpoint <last.ckpt> --out "
                          "<prior.safetensors>` writes what a training learnt as a prior for reconstruction, and "
                          "`inspect-prior <path>` says what a file or folder is.")})

@@ -91,17 +91,19 @@ class ReconstructionData(lightning.LightningDataModule):
         self.orbit = self.protocol.fixed_orbit(orbit) if self.protocol else orbit.filled()
         self.simulator = self.protocol.fixed_simulator(simulator) if self.protocol else simulator
         self.geometry_file = configuration(geometry, ("geometry",)) if geometry else None
-        self.beam = read_beam(self.geometry_file) if cts and self.geometry_file else self.orbit.beam()
+        self.beam, self._beam_settings = self.orbit.beam(), self.orbit.settings()
+        if cts and self.geometry_file:
+            self.beam = read_beam(self.geometry_file)
+            crc = file_crc32(self.geometry_file)
+            self._beam_settings = {"geometry": f"{self.geometry_file.name}, crc32 {crc:08x}"}
 
     def settings(self, stage: str) -> dict:
         """What, beside the cases themselves, decides the X-rays that a stage (predict, test) reconstructs from."""
         if stage == "predict":
             return {"geometry": self.geometry}
-        beam = self.orbit.settings()
-        if self.geometry_file:
-            beam = {"geometry": f"{self.geometry_file.name}, crc32 {file_crc32(self.geometry_file):08x}"}
-        return beam | {"simulator": describe(self.simulator), "simulation_voxels": self.simulation_voxels} | (
-            {"protocol": self.protocol.name} if self.protocol else {})
+        return self._beam_settings | {
+            "simulator": describe(self.simulator), "simulation_voxels": self.simulation_voxels} | (
+                {"protocol": self.protocol.name} if self.protocol else {})
 
     def scene(self, grid: Grid, window: HUWindow) -> tuple[Grid, HUWindow]:
         """The voxels and the HU range of the CTs that X-rays are made of, where a method has these of its own."""

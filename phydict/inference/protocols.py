@@ -7,7 +7,7 @@ where the publications crop the middle of the scan.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -83,7 +83,7 @@ class Protocol:
 
 
 PROTOCOLS = {protocol.name: protocol for protocol in (
-    Protocol("phydict", (8,), Orbit(None, *list(vars(PAPER).values())[1:]), None, None, Ideal().noise, (),
+    Protocol("phydict", (8,), replace(PAPER, views=None), None, None, Ideal().noise, (),
              "Dai, Ghosh and Batmanghelich, MICCAI 2026"),
     Protocol("x2ct", (2,), Orbit(None, 949.0, 541.0, (320, 320), (1.5625, 1.5625), 180.0), (128, 320.0),
              HUWindow(-1000.0, 1500.0), 0.0, ("psnr_slices", "ssim_slices"),

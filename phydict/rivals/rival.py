@@ -12,6 +12,7 @@ from phydict.prior.stage_file import FORMAT
 from phydict.rivals.network import RivalNetwork
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, binning
+from phydict.xray.binning import benchmark_orbit
 
 WATER_MM = 200.0
 """mm of water that the networks take as 1."""
@@ -20,11 +21,9 @@ SAME_MM = 0.01
 """mm by which sources, detectors' centres and pixels' sides may differ from those of the training."""
 
 
-def benchmark_orbit(grid: Grid, views: int, arc_degrees: float = 360.0) -> ConeBeam:
-    """The benchmarks' orbit where the grid has 384 mm, in proportion for others, its detector of 448^2 pixels binned to
-    what the grid can hold."""
-    scale = grid.extent[0] / 384
-    beam = ConeBeam.orbit(views, 1020 * scale, 740 * scale, (448, 448), 1.25 * scale, arc_degrees=arc_degrees)
+def bound_orbit(grid: Grid, views: int, arc_degrees: float = 360.0) -> ConeBeam:
+    """The benchmarks' orbit with its detector binned to what the grid can hold."""
+    beam = benchmark_orbit(grid, views, arc_degrees)
     return beam.binned(binning(grid, beam))
 
 
@@ -51,7 +50,7 @@ class Rival(nn.Module):
 
     def network_inputs(self, shape: Sequence[int]) -> tuple[Tensor, ...]:
         """Arguments of the network for X-rays of a volume of `shape`, its grid's: eight views where any number do."""
-        return self.network.inputs(self.grid, self.beam or benchmark_orbit(self.grid, 8))
+        return self.network.inputs(self.grid, self.beam or bound_orbit(self.grid, 8))
 
     def check(self, grid: Grid, beam: ConeBeam) -> None:
         """Raises ValueError unless X-rays of this beam can be reconstructed on this grid."""

@@ -30,6 +30,7 @@ from phydict.training.settings import Execution, PriorOptimisation, PriorValidat
 from phydict.training.sharding import shard
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Ideal, Projector
+from phydict.xray.binning import benchmark_orbit
 
 SENTENCES, VOCABULARY_SIZE = 20_000, 5000
 SENTENCE_LENGTH, MOST_SENTENCES = 64, 64
@@ -191,10 +192,8 @@ def reconstruction_scores(prior: Prior | Refiner | Rival, ct: Tensor, views: int
                           method: str | Sampler | Reconstructor = DEFAULT_METHOD,
                           beam: ConeBeam | None = None) -> dict[str, float]:
     """SSIM, PSNR (dB) and MAE (HU) of a method's reconstruction, without a report, from ideal X-rays of a CT
-    (1, 1, X, Y, Z) in the prior's range, on `beam` or an orbit that is the benchmarks' where the cube has 384 mm."""
-    if beam is None:
-        scale = prior.grid.shape[0] * prior.grid.spacing[0] / 384
-        beam = ConeBeam.orbit(views, 1020 * scale, 740 * scale, (448, 448), 1.25 * scale)
+    (1, 1, X, Y, Z) in the prior's range, on `beam` or `benchmark_orbit`."""
+    beam = beam or benchmark_orbit(prior.grid, views)
     exact = Projector(prior.grid, beam, device=ct.device, full_detector=True)
     found = reconstruct(Ideal()(exact, prior.window.to_mu(ct), seed)[0], beam, prior, method, seed=seed,
                         grid=prior.grid)

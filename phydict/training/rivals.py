@@ -11,7 +11,7 @@ from torch import Tensor
 
 from phydict.grid import Cube, Grid
 from phydict.rivals import LiftedNetwork, Rival, RivalAnswer, load_rival
-from phydict.rivals.rival import benchmark_orbit
+from phydict.rivals.rival import bound_orbit
 from phydict.training.refiner import log_error, log_scores
 from phydict.training.scenes import Scenes
 from phydict.training.settings import Optimisation, RefinerValidation
@@ -97,4 +97,4 @@ class OrbitScenes(Scenes):
     arc_degrees: float = 360.0
 
     def beam(self, rng: np.random.Generator, grid: Grid) -> ConeBeam:
-        return benchmark_orbit(grid, self.views, self.arc_degrees)
+        return bound_orbit(grid, self.views, self.arc_degrees)

@@ -68,9 +68,7 @@ class Scenes:
             beam = ConeBeam.orbit(views, *geometry, start=start, arc=math.radians(rng.uniform(40, 220)))
         else:
             beam = ConeBeam.orbit(360, *geometry).select(np.sort(rng.choice(360, views, replace=False)))
-        if not shift:
-            return beam
-        return ConeBeam(beam.sources, beam.detectors + shift * pixels * beam.u, beam.u, beam.v, beam.shape)
+        return beam.shifted(columns=shift * pixels * pixel * scale) if shift else beam
 
     def measure(self, ct: Tensor, rng: np.random.Generator, grid: Grid, window: HUWindow) -> Measurement:
         """X-rays of a CT (1, 1, X, Y, Z) in the prior's range, as a measurement of a drawn scene."""

@@ -12,7 +12,7 @@ from torch.nn.functional import l1_loss, mse_loss
 
 from phydict.grid import Cube
 from phydict.rivals import PatchDiscriminator, Rival, X2CTNetwork
-from phydict.rivals.rival import WATER_MM, benchmark_orbit
+from phydict.rivals.rival import WATER_MM, bound_orbit
 from phydict.training.rivals import OrbitScenes, RivalTraining
 from phydict.training.settings import Optimisation
 from phydict.units import HUWindow
@@ -69,7 +69,7 @@ class X2CTTraining(RivalTraining):
                  optimisation: Optimisation = Optimisation(2e-4, 0.0, 0), adversary: Adversary = Adversary(),
                  initial: str | None = None, seed: int = 0):
         grid = cube.grid()
-        beam = benchmark_orbit(grid, scenes.views, scenes.arc_degrees)
+        beam = bound_orbit(grid, scenes.views, scenes.arc_degrees)
         made = Rival(network or X2CTNetwork(), grid, HUWindow(*window), beam)
         super().__init__(made, scenes, (scenes.views,), optimisation, initial, seed)
         self.discriminator = PatchDiscriminator(scenes.views, adversary.width, adversary.layers)

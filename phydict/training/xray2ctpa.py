@@ -13,7 +13,7 @@ from torch.nn.functional import l1_loss
 from phydict.diffusion.steps import noise_like
 from phydict.grid import Cube
 from phydict.rivals import Rival, XrayToCTPANetwork
-from phydict.rivals.rival import WATER_MM, benchmark_orbit
+from phydict.rivals.rival import WATER_MM, bound_orbit
 from phydict.runtime.reading import refusing
 from phydict.training.rivals import OrbitScenes, RivalTraining
 from phydict.training.settings import Optimisation
@@ -71,7 +71,7 @@ class XrayToCTPATraining(RivalTraining):
         for part in ("autoencoder", "encoder"):
             if file := getattr(latent, part):
                 _load_own(getattr(network, part), file, f"model.latent.{part}")
-        made = Rival(network, grid, HUWindow(*window), benchmark_orbit(grid, scenes.views, scenes.arc_degrees))
+        made = Rival(network, grid, HUWindow(*window), bound_orbit(grid, scenes.views, scenes.arc_degrees))
         super().__init__(made, scenes, (scenes.views,), optimisation, initial, seed)
         self.latent = latent
 

@@ -1,4 +1,4 @@
-"""Detectors finer than a grid can use, and the binning that makes them fit."""
+"""The benchmarks' orbit, detectors finer than a grid can use, and the binning that makes them fit."""
 
 from __future__ import annotations
 
@@ -8,6 +8,12 @@ from torch import Tensor
 
 from phydict.grid import Grid
 from phydict.xray.geometry import ConeBeam
+
+
+def benchmark_orbit(grid: Grid, views: int, arc_degrees: float = 360.0) -> ConeBeam:
+    """The benchmarks' orbit where the grid has 384 mm, in proportion for others, view k at arc k / views."""
+    scale = grid.extent[0] / 384
+    return ConeBeam.orbit(views, 1020 * scale, 740 * scale, (448, 448), 1.25 * scale, arc_degrees=arc_degrees)
 
 
 def binning(grid: Grid, beam: ConeBeam) -> int:

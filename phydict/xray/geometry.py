@@ -228,8 +228,8 @@ class ConeBeam:
                 continue
             comparison = "larger" if ratio.min() > 1 else "smaller"
             message = (f"view {k}: the volume's shadow is {factor:.1f} times {comparison} than the detector of "
-                    f"{sides[k][0]:.4g} x {sides[k][1]:.4g} mm; check that the pixel size and all distances are in mm, "
-                    "not in cm or m, and that the pixel size is that of these images")
+                       f"{sides[k][0]:.4g} x {sides[k][1]:.4g} mm; check that the pixel size and all distances are in "
+                       "mm, not in cm or m, and that the pixel size is that of these images")
             if factor >= 6:
                 raise ValueError(message)
             warn(message)
@@ -281,7 +281,7 @@ class ConeBeam:
 
     @classmethod
     def from_dict(cls, content: object) -> ConeBeam:
-        """The beam of a mapping in one of the two forms that `load` reads. Raises ValueError naming the key."""
+        """The beam of a mapping in one of the forms that `load` reads. Raises ValueError naming the key."""
         form = next((name for name in ("orbit", "sweep") if isinstance(content, dict) and name in content), None)
         if form is None:
             content = _check_keys(content, VECTOR_KEYS, ())

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from command_lines import checkpoint, losses, refusal
+from command_lines import refusal, resumed_as_uninterrupted
 from rivals.tiny_rivals import GRID, lively
 from torch.utils.data import default_collate
 
@@ -51,15 +51,9 @@ def arguments(name: str, folder: Path, cache: Path, *more: str) -> list[str]:
 
 @pytest.mark.parametrize("name", TINY)
 def test_a_resumed_run_is_the_uninterrupted_one_and_its_file_is_compared(name, tmp_path, cache):
-    straight, halved = tmp_path / "straight", tmp_path / "halved"
-    main(arguments(name, straight, cache, "--trainer.max_epochs=2"))
-    main(arguments(name, halved, cache, "--trainer.max_epochs=1"))
-    main(arguments(name, halved, cache, "--trainer.max_epochs=2", f"--ckpt_path={halved / 'last.ckpt'}"))
-    assert set(losses(straight)) == {0, 1, 2, 3} and {2, 3} <= set(losses(halved))
-    one, other = (checkpoint(folder)["state_dict"] for folder in (straight, halved))
-    assert one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
+    last = resumed_as_uninterrupted(main, lambda run, *more: arguments(name, run, cache, *more), tmp_path)
     file = tmp_path / "rival.safetensors"
-    main(["export", "--checkpoint", str(straight / "last.ckpt"), "--out", str(file)])
+    main(["export", "--checkpoint", str(last), "--out", str(file)])
     assert load_rival(file).network.stage == name
     comparison = tmp_path / "comparison.yaml"
     comparison.write_text(f"methods: {{{name}: {{of: phydict.rivals.TrainedRival, method.file: {file}}}}}\n"

@@ -10,7 +10,7 @@ from phydict.grid import Cube, Grid
 from phydict.methods import reconstruct
 from phydict.rivals import Rival, RivalAnswer, X2CTNetwork, load_rival, save_rival
 from phydict.rivals.planes import on_planes, plane_places, turned, turns
-from phydict.rivals.rival import benchmark_orbit
+from phydict.rivals.rival import bound_orbit
 from phydict.training.rivals import OrbitScenes
 from phydict.training.x2ct import Adversary, X2CTTraining
 from phydict.units import MU_WATER
@@ -21,7 +21,7 @@ def test_views_at_right_angles_are_turned_by_permuting_axes():
     """At 0 degrees depth runs anterior, columns to the left, rows down; at 90 degrees depth runs right, columns
     anterior."""
     volumes = torch.randn(1, 2, 3, *GRID.shape, generator=torch.Generator().manual_seed(0))
-    beam = benchmark_orbit(GRID, 2, 180.0)
+    beam = bound_orbit(GRID, 2, 180.0)
     first, second = turned(volumes, turns(GRID, beam, volumes))[0]
     torch.testing.assert_close(first, volumes[0, 0].permute(0, 3, 1, 2).flip(1, 3), atol=1e-5, rtol=0)
     torch.testing.assert_close(second, volumes[0, 1].permute(0, 1, 3, 2).flip(3), atol=1e-5, rtol=0)
@@ -31,7 +31,7 @@ def test_views_at_right_angles_are_turned_by_permuting_axes():
 def test_a_point_near_the_isocentre_is_lifted_to_its_place(voxel):
     volume = torch.zeros(1, 1, *GRID.shape)
     volume[(0, 0, *voxel)] = 1
-    beam = benchmark_orbit(GRID, 5)
+    beam = bound_orbit(GRID, 5)
     y = Projector(GRID, beam, "siddon", full_detector=True)(volume)
     network = X2CTNetwork(8, 4, (2, 2), (4, 8, 8))
     mean = network.lifted(y, *network.geometry(GRID, beam, y)).mean(1)
@@ -57,8 +57,8 @@ def test_views_in_another_order_give_the_same_ct():
 def test_another_number_of_views_geometry_or_grid_is_refused(tmp_path):
     save_rival(tiny_x2ct(), tmp_path / "x2ct.safetensors")
     method = RivalAnswer(load_rival(tmp_path / "x2ct.safetensors"))
-    for beam, said in ((benchmark_orbit(GRID, 3), "trained for 2 X-rays, but 3 were given"),
-                       (benchmark_orbit(GRID, 2, 180.0), "one geometry of its 2 views"),
+    for beam, said in ((bound_orbit(GRID, 3), "trained for 2 X-rays, but 3 were given"),
+                       (bound_orbit(GRID, 2, 180.0), "one geometry of its 2 views"),
                        (ConeBeam.orbit(2, 1020, 740, (20, 28), 20.0), "28 x 28 pixels, but another")):
         y = Projector(GRID, beam, full_detector=True)(body() + 1)[0] * MU_WATER
         with pytest.raises(ValueError, match=said):

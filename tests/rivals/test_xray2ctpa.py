@@ -8,13 +8,13 @@ from safetensors.torch import save_file
 from phydict.grid import Cube, Grid
 from phydict.methods import reconstruct
 from phydict.rivals import RivalAnswer, XrayToCTPANetwork
-from phydict.rivals.rival import WATER_MM, benchmark_orbit
+from phydict.rivals.rival import WATER_MM, bound_orbit
 from phydict.training.rivals import OrbitScenes
 from phydict.training.xray2ctpa import LatentSettings, XrayToCTPATraining
 from phydict.units import MU_WATER
 from phydict.xray import Projector
 
-BEAM = benchmark_orbit(GRID, 2)
+BEAM = bound_orbit(GRID, 2)
 
 
 def water(beam=BEAM) -> torch.Tensor:
@@ -82,7 +82,7 @@ def test_ones_own_weights_are_taken_and_others_are_refused(tmp_path):
 
 
 def test_what_it_is_not_for_is_refused():
-    method, beam = RivalAnswer(tiny_xray2ctpa()), benchmark_orbit(GRID, 3)
+    method, beam = RivalAnswer(tiny_xray2ctpa()), bound_orbit(GRID, 3)
     with pytest.raises(ValueError, match="trained for 2 X-rays, but 3 were given"):
         reconstruct(water(beam)[0] * MU_WATER, beam, method=method, grid=GRID)
     with pytest.raises(ValueError, match="divisible by 4"):

@@ -9,7 +9,7 @@ import torch
 from phydict.grid import Grid
 from phydict.rivals import LiftedNetwork, Rival, X2CTNetwork, XrayToCTPANetwork
 from phydict.rivals.network import RivalNetwork
-from phydict.rivals.rival import benchmark_orbit
+from phydict.rivals.rival import bound_orbit
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam
 
@@ -34,13 +34,13 @@ def tiny_lifted(grid: Grid = GRID, seed: int = 0) -> Rival:
 
 def tiny_x2ct(grid: Grid = GRID, views: int = 2) -> Rival:
     network = lively(lambda: X2CTNetwork(8, 4, (2, 2), (4, 8, 8)))
-    return Rival(network, grid, WINDOW, benchmark_orbit(grid, views)).eval().requires_grad_(False)
+    return Rival(network, grid, WINDOW, bound_orbit(grid, views)).eval().requires_grad_(False)
 
 
 def tiny_xray2ctpa(grid: Grid = GRID, views: int = 2) -> Rival:
     network = lively(lambda: XrayToCTPANetwork((4, 4), 8, (4, 8), (4, 8), 4))
     network.largest.fill_(1.0)
-    return Rival(network, grid, WINDOW, benchmark_orbit(grid, views)).eval().requires_grad_(False)
+    return Rival(network, grid, WINDOW, bound_orbit(grid, views)).eval().requires_grad_(False)
 
 
 def body(grid: Grid = GRID) -> torch.Tensor:

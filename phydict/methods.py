@@ -16,7 +16,8 @@ from phydict.posterior import (
     DAPS, DDS, DPS, CascadePosterior, DiffPIR, ExactDraw, GradientSteps, PnPDM, Posterior, PriorOnly, ProximalCG,
     Reward, Sampler, SplitGibbs, Unrolled)
 from phydict.prior import (
-    Cascade, PriorContract, Refiner, SuperResolution, check_prior, find_prior, load_super_resolution)
+    Cascade, MedSynCheckpoint, PriorContract, Refiner, SuperResolution, check_prior, find_prior, is_refiner,
+    load_super_resolution)
 from phydict.reconstruction import Reconstruction, Reconstructor
 from phydict.runtime.precision import check_precision
 from phydict.runtime.reading import reason
@@ -31,13 +32,13 @@ RELEASED_STEPS = GradientSteps(learning_rate=0.01, prior_mean=True, reward=Rewar
 """The likelihood step of the authors' release."""
 
 METHODS: dict[str, Sampler | Reconstructor] = {
-    # The default: conjugate gradients onto the X-rays at ten noise levels, the last counting each pixel by its noise.
+    # Conjugate gradients onto the X-rays at ten noise levels, the last counting each pixel by its noise.
     "phydict_fast": SplitGibbs(
         iterations=10, t_start=0.97, t_end=0.15, noise_fraction=0.4, momentum=0.5, sampling_noise=1.0, scatter=True,
         likelihood=ProximalCG(iterations=7, restarts=1, tv_weight=10.0, tv_eps=0.003),
         final_likelihood=ProximalCG(iterations=10, restarts=5, refit_scatter=True, weighted_least_squares=True,
                                     tv_weight=10.0, tv_eps=0.003)),
-    # A network trained on scenes of X-rays: four calls, each followed by conjugate gradients.
+    # The default: a network trained on scenes of X-rays, four calls, each followed by conjugate gradients.
     "phydict_learned": Unrolled(),
     # The paper's text: two gradient steps of 0.1 per timestep with LPIPS, then Extra Compute from delta = 0.8.
     "phydict_paper": SplitGibbs(iterations=50, likelihood=GradientSteps(reward=Reward(lpips=1.0)), ec_delta=0.8,
@@ -70,8 +71,16 @@ METHODS: dict[str, Sampler | Reconstructor] = {
 """Settings by name, in Python as `method=`, on the command line as `--model.method`. configs/reconstruct writes out
 four of them as examples."""
 
-DEFAULT_METHOD = "phydict_fast"
-"""The method where none is given."""
+DEFAULT_METHOD, SAMPLING_METHOD = "phydict_learned", "phydict_fast"
+"""The method where none is given, and the one where what is given needs a prior that is sampled."""
+
+
+def default_method(prior: PriorContract | Refiner | MedSynCheckpoint | str | Path | None = None, samples: int = 1,
+                   guidance: float = 1.0) -> str:
+    """The method where none is given: DEFAULT_METHOD, or SAMPLING_METHOD with a prior that is no refiner, with several
+    samples, or with guidance."""
+    sampled = samples != 1 or guidance != 1 or not (prior is None or is_refiner(prior))
+    return SAMPLING_METHOD if sampled else DEFAULT_METHOD
 
 
 def reconstructor(method: str | Sampler | Reconstructor, prior: PriorContract | Refiner | str | Path | None = None,
@@ -139,7 +148,7 @@ def fit_to_grid(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam,
 
 
 def reconstruct(xrays: Tensor, beam: ConeBeam, prior: PriorContract | Refiner | str | Path | None = None,
-                method: str | Sampler | Reconstructor = DEFAULT_METHOD, report: str | None = None,
+                method: str | Sampler | Reconstructor | None = None, report: str | None = None,
                 display: bool = False, seed: int = 0, guidance: float = 1.0, mu_water: float | None = None,
                 grid: Grid = Grid.cube(64), on_step=lambda: None,
                 super_resolution: SuperResolution | str | Path | None = None,
@@ -149,7 +158,8 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: PriorContract | Refiner | 
 
     xrays: tensor or array of line integrals; with display=True, of display values with an unknown gain and offset per
     view. grid: for methods without a prior; others work on their prior's.
-    prior: as for `reconstructor`; report: radiology text, if any, which `format_report` lays out.
+    method: as for `reconstructor`; None for `default_method`'s. prior: as for `reconstructor`; report: radiology text,
+    if any, which `format_report` lays out.
     mu_water: attenuation in 1/mm that water has in the X-rays (None: the method's own, near 65 keV).
     super_resolution, sr_guided: the second stage of a cascade, as for `reconstructor`; the volume is then on its grid.
     samples: more than one gives their mean, and `deviation`, a map of how far they differ, as for `reconstructor`.
@@ -165,6 +175,7 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: PriorContract | Refiner | 
     if not isinstance(report, str | None):
         raise ValueError(f"the report must be text, but {report!r} was given")
     check_seed(seed)
+    method = default_method(prior, samples, guidance) if method is None else method
     ready = reconstructor(method, prior, guidance, super_resolution=super_resolution, sr_guided=sr_guided,
                           samples=samples, precision=precision)
     ready = ready if mu_water is None else ready.with_mu_water(mu_water)

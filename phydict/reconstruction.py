@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +26,8 @@ class Reconstruction:
     views; xrays, reprojection: line integrals (K, V, U), measured (calibrated where they were display values) and
     of the volume; masks: soft anatomy masks (M, X, Y, Z) in [0, 1] where the method gives them; deviation: HU
     (X, Y, Z), the standard deviation of the samples of which the volume is the mean, where there are several;
+    intervals: level -> HU (X, Y, Z), half the width of the interval around the volume that is to hold that share of
+    voxels, where the method knows it;
     diverged_at: the step, counted from 1, from which on the misfit had risen until the end, None where it had not;
     precision: what the networks computed in, or, without any, the X-rays' type;
     scatter: the mean share of the pixels' signal that was subtracted as scatter, and is no longer in xrays.
@@ -44,6 +46,7 @@ class Reconstruction:
     projector_calls: int = 0
     masks: Tensor | None = None
     deviation: Tensor | None = None
+    intervals: dict[float, Tensor] = field(default_factory=dict)
     diverged_at: int | None = None
     scatter: float = 0.0
     precision: str = "float32"

@@ -190,6 +190,14 @@ def test_an_output_that_cannot_be_is_refused_with_its_option(empty, out):
         check_writable(Path(out), "model.out")
 
 
+def test_settings_without_a_method_are_refused_with_the_methods_names(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        infer(["predict", "--model.method.init_args.iterations=4"])
+    said = capsys.readouterr().err
+    assert stopped.value.code == 2 and said.count("\n") == 1
+    assert "--model.method.init_args.iterations is a setting of a method, but none was given" in said and "tv" in said
+
+
 def test_the_help_of_a_class_needs_no_configuration(capsys):
     with pytest.raises(SystemExit) as stopped:
         infer(["predict", "--model.method.help=phydict.baselines.SIRT"])

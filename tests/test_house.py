@@ -179,6 +179,10 @@ PAPER, SETTINGS = f"--config={ROOT / 'configs' / 'reconstruct' / 'phydict_paper.
 
 @pytest.mark.parametrize("args, name, method", [
     ([], "phydict_fast", METHODS["phydict_fast"]),
+    (["--model.prior=refiner.safetensors"], "phydict_learned", METHODS["phydict_learned"]),
+    (["--model.name=mine"], "mine", METHODS["phydict_fast"]),
+    (["-c", "{model: {prior: refiner.safetensors}}", "--model.prior=tiny.safetensors"], "phydict_fast",
+     METHODS["phydict_fast"]),
     (["-c", str(CONFIGS["simulate"][0])], "phydict_fast", METHODS["phydict_fast"]),
     (["-c", "dds"], "dds", METHODS["dds"]), (["-c", "configs/reconstruct/dds.yaml"], "dds", METHODS["dds"]),
     ([PAPER, "--model.method", "phydict_fast"], "phydict_fast", METHODS["phydict_fast"]),
@@ -188,7 +192,6 @@ PAPER, SETTINGS = f"--config={ROOT / 'configs' / 'reconstruct' / 'phydict_paper.
      replace(METHODS["dds"], iterations=4)),
     (["--model.method=dds", "--model.name=mine"], "mine", METHODS["dds"]),
     (["--model.name=mine", "--model.method=dds"], "mine", METHODS["dds"]),
-    ([f"{SETTINGS}.iterations=4"], "phydict_fast", replace(METHODS["phydict_fast"], iterations=4)),
     (["--model.method=dds", f"{SETTINGS}.iterations=4"], "dds", replace(METHODS["dds"], iterations=4)),
     (["--model.method=phydict.posterior.DDS", f"{SETTINGS}.iterations=4"], "DDS", DDS(iterations=4)),
     (["--model.method=DDS"], "DDS", DDS()),

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import torch
-from prior.tiny import tiny_for, tiny_prior, tiny_super_resolution
+from prior.tiny import tiny_for, tiny_prior, tiny_refiner, tiny_super_resolution
 
 from phydict.baselines import SIRT
 from phydict.diffusion import GaussianDenoiser
 from phydict.grid import Grid
-from phydict.methods import METHODS, reconstruct, reconstructor
+from phydict.methods import METHODS, default_method, reconstruct, reconstructor
 from phydict.posterior import CascadePosterior, Posterior, PriorOnly, ProximalCG, Sampler, SplitGibbs
-from phydict.prior import save_prior, save_super_resolution
+from phydict.prior import MedSynCheckpoint, save_prior, save_refiner, save_super_resolution
 from phydict.units import MU_WATER, HUWindow, hu_to_mu
 from phydict.xray import ConeBeam, Projector, binned, binning
 
@@ -153,6 +153,20 @@ def test_a_method_may_be_a_name_a_sampler_or_a_reconstructor(tmp_path):
     assert (named.name, made.name) == ("phydict_fast", "SplitGibbs")
     assert reconstructor("prior_only", tmp_path / "tiny.safetensors").prior.grid.same_as(prior.grid)
     assert reconstructor(made) is made
+
+
+def test_the_default_is_the_learned_method_unless_a_prior_must_be_sampled(tmp_path):
+    save_prior(tiny_prior(), tmp_path / "prior.safetensors")
+    save_refiner(tiny_refiner(), tmp_path / "refiner.safetensors")
+    for given in (None, tiny_refiner(), tmp_path / "refiner.safetensors", str(tmp_path / "refiner.safetensors")):
+        assert default_method(given) == "phydict_learned"
+        assert default_method(given, samples=2) == default_method(given, guidance=3.0) == "phydict_fast"
+    for given in (tiny_prior(), tmp_path / "prior.safetensors", tmp_path / "nowhere.safetensors", "my_module.MyPrior",
+                  MedSynCheckpoint(str(tmp_path))):
+        assert default_method(given) == "phydict_fast"
+    beam = ConeBeam.orbit(2, 1020, 740, (28, 28), 20.0)
+    methods = [reconstruct(ball(beam, 90.0), beam, prior).method for prior in (tiny_prior(), tiny_refiner())]
+    assert methods == ["phydict_fast", "phydict_learned"]
 
 
 def test_one_call_takes_the_priors_grid_and_fits_the_views():

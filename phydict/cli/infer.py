@@ -18,7 +18,7 @@ from phydict.inference.data import ReconstructionData
 from phydict.inference.dry_run import dry_run
 from phydict.inference.scoring import METRICS, CLIPSettings, FIDSettings, Scoring
 from phydict.inference.task import ReconstructionTask
-from phydict.methods import DEFAULT_METHOD, METHODS
+from phydict.methods import METHODS
 from phydict.runtime.console import (
     CONFIGURATION, check_apart, check_command, check_processes, cli_errors, noted, quiet, read_configuration, sentence)
 from phydict.runtime.help import HelpFormatter
@@ -131,8 +131,8 @@ class InferenceCLI(LightningCLI):
 def with_methods(args: list[str]) -> list[str]:
     """Arguments with a method's name and settings in the place of its name, in `--model.method` and in configurations.
 
-    `--model.name` calls it otherwise, and more arguments change the settings. Without any method it is DEFAULT_METHOD.
-    Raises ValueError for names of no method and of no configuration.
+    `--model.name` calls it otherwise, and more arguments change the settings. Raises ValueError for names of no method
+    and of no configuration, and for settings without a method.
     """
     given = [arg.partition("=")[0] for arg in args]
     chosen = any(option in ("--model", "--model.method", "--model.method.class_path") for option in given)
@@ -151,9 +151,11 @@ def with_methods(args: list[str]) -> list[str]:
                     del named["name"]
                 arg = "--config=" + json.dumps({"model": named})
         out.append(arg)
-    if not chosen:
-        start = next((i for i, arg in enumerate(out, 1) if arg in COMMANDS), 0)
-        out.insert(start, "--config=" + json.dumps({"model": _named(DEFAULT_METHOD)}))
+    alone = [] if chosen else [option for option in given if option.startswith("--model.method.")
+                               and option != "--model.method.help"]
+    if alone:
+        raise ValueError(f"{alone[0]} is a setting of a method, but none was given: add --model.method with one of "
+                         f"{', '.join(METHODS)}")
     return out
 
 

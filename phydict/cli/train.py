@@ -35,6 +35,7 @@ from phydict.training.rivals import LiftedTraining
 from phydict.training.stage import CHECKPOINT, StageTraining
 from phydict.training.super_resolution import SuperResolutionTraining
 from phydict.training.throughput import Throughput
+from phydict.training.uncertainty import UncertaintyTraining
 from phydict.training.x2ct import X2CTTraining
 from phydict.training.xray2ctpa import XrayToCTPATraining
 
@@ -42,8 +43,9 @@ COMMANDS = {"fit": "train a prior", "validate": "measure one on held-out cases",
             "inspect-prior": "what a file is"}
 
 STAGES = {"base": (PriorTraining, PriorData), "super_resolution": (SuperResolutionTraining, SuperResolutionData),
-          "refiner": (RefinerTraining, PriorData), "lifted": (LiftedTraining, PriorData),
-          "x2ct": (X2CTTraining, PriorData), "xray2ctpa": (XrayToCTPATraining, PriorData)}
+          "refiner": (RefinerTraining, PriorData), "uncertainty": (UncertaintyTraining, PriorData),
+          "lifted": (LiftedTraining, PriorData), "x2ct": (X2CTTraining, PriorData),
+          "xray2ctpa": (XrayToCTPATraining, PriorData)}
 """What trains a stage, and on which data."""
 
 

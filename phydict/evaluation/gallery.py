@@ -61,10 +61,10 @@ def plane(volume, grid: Grid, name: str) -> tuple[np.ndarray, float]:
 
 
 def panel(path: str | Path, reconstruction_hu, grid: Grid, xrays=None, reprojection=None, truth_hu=None,
-          title: str = "", deviation_hu=None) -> None:
+          title: str = "", deviation_hu=None, deviation_label: str = "standard deviation") -> None:
     """Write one PNG page of a case: three planes, beside the truth and the difference, and its X-rays below.
 
-    deviation_hu: (X, Y, Z), the standard deviation of several samples, shown beside them from black to yellow.
+    deviation_hu: (X, Y, Z), how uncertain each voxel is, shown beside them from black to yellow under its label.
 
     reconstruction_hu, truth_hu: (X, Y, Z) in HU. xrays, reprojection: (K, V, U) line integrals, measured and of the
     reconstruction; up to 8 views, evenly picked, all in one scale. The misfit ||A x - y|| / ||y|| of each view stands
@@ -85,7 +85,7 @@ def panel(path: str | Path, reconstruction_hu, grid: Grid, xrays=None, reproject
             ax = upper.add_subplot(cells[n, column] if beside else cells[0, n])
             _show_plane(ax, volume, grid, name, f"{label}, {name}")
         if deviation_hu is not None:
-            _show_deviation(upper.add_subplot(cells[n, columns - 1]), deviation_hu, grid, name)
+            _show_deviation(upper.add_subplot(cells[n, columns - 1]), deviation_hu, grid, name, deviation_label)
         if truth_hu is not None:
             difference = _array(reconstruction_hu, 3, "a volume") - _array(truth_hu, 3, "a volume")
             _show_difference(upper.add_subplot(cells[n, 2]), difference, grid, name)
@@ -154,10 +154,10 @@ def _write(ax: Axes, x: float, y: float, text: str, align: str) -> None:
     ax.text(x, y, text, transform=ax.transAxes, color="gold", fontsize=8, ha=align, va="center", path_effects=outline)
 
 
-def _show_deviation(ax: Axes, deviation, grid: Grid, name: str) -> None:
+def _show_deviation(ax: Axes, deviation, grid: Grid, name: str, label: str) -> None:
     image, aspect = plane(deviation, grid, name)
     ax.imshow(np.ma.masked_invalid(image), SPREAD, aspect=aspect, vmin=0, vmax=DIFFERENCE, interpolation="nearest")
-    _finish(ax, f"standard deviation, up to {DIFFERENCE:g} HU")
+    _finish(ax, f"{label}, up to {DIFFERENCE:g} HU")
 
 
 def _show_difference(ax: Axes, difference: np.ndarray, grid: Grid, name: str) -> None:

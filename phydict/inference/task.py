@@ -29,7 +29,7 @@ from phydict.inference.protocols import placed, resampled
 from phydict.inference.results import FEATURES, CaseResults
 from phydict.inference.scoring import Scoring
 from phydict.inference.settings import CascadeSettings, Sampling
-from phydict.methods import fit_to_grid, reconstructor
+from phydict.methods import METHODS, default_method, fit_to_grid, reconstructor
 from phydict.posterior import CascadePosterior, Sampler
 from phydict.prior import (
     MedSynCheckpoint, PriorContract, file_read, find_prior, fingerprint, load_super_resolution)
@@ -43,6 +43,12 @@ from phydict.runtime.warning import warn
 from phydict.units import HUWindow
 from phydict.xray.projectors.projector import METHODS as PROJECTORS
 
+SHOWN_LEVEL = 0.9
+"""The level of the intervals that are written and shown."""
+
+TISSUE = -500.0
+"""HU above which a voxel is no air."""
+
 
 class ReconstructionTask(lightning.LightningModule):
     """Reconstructs every case with one method and writes it; in test, scores it against the CT it came from.
@@ -50,7 +56,8 @@ class ReconstructionTask(lightning.LightningModule):
     In test the method takes its attenuation of water from the simulator, so that the HU scale fits the spectrum.
 
     Args:
-        method: a Sampler, which is run with the prior, or a Reconstructor
+        method: a Sampler, which is run with the prior, or a Reconstructor; none given: phydict_learned, or
+            phydict_fast with a prior that is no refiner, with several samples or with guidance
         name: what tables and folders call the method; none given: the name it was given by, or its class's
         prior: the prior's file, a file or folder of MedSyn's, or the path of a PriorContract's class, read where the
             method is a Sampler; none given: the method's own
@@ -63,7 +70,7 @@ class ReconstructionTask(lightning.LightningModule):
         projector: auto (the fastest that suits the geometry), separable, siddon, eq4, joseph or matrix
     """
 
-    def __init__(self, method: Sampler | Reconstructor, name: str | None = None,
+    def __init__(self, method: Sampler | Reconstructor | None = None, name: str | None = None,
                  prior: PriorContract | str | MedSynCheckpoint | None = None, sampling: Sampling = Sampling(),
                  super_resolution: CascadeSettings = CascadeSettings(), out: str = "runs/reconstructions",
                  overwrite: bool = False, seed: int = 0, cube: Cube = Cube(), projector: str = "auto"):
@@ -71,6 +78,9 @@ class ReconstructionTask(lightning.LightningModule):
         check_seed(seed)
         if projector not in PROJECTORS:
             raise ValueError(f"model.projector is one of {', '.join(PROJECTORS)}, but {projector!r} was given")
+        if method is None:
+            chosen = default_method(prior, sampling.samples, sampling.guidance)
+            method, name = METHODS[chosen], name or chosen
         name = type(method).__name__ if name is None else name
         if name in ("", "..") or name != Path(name).name:
             raise ValueError(f"model.name is the name of one folder inside model.out, but '{name}' was given")
@@ -234,18 +244,32 @@ class ReconstructionTask(lightning.LightningModule):
             result.save_nifti(folder / "volume.nii.gz")
             if result.deviation is not None:
                 save_nifti(folder / "deviation.nii.gz", result.deviation.numpy(), result.grid)
+            uncertain, label = result.deviation, "standard deviation"
+            if result.intervals:
+                uncertain, label = result.intervals[SHOWN_LEVEL], f"half of the {SHOWN_LEVEL:.0%} interval"
+                save_nifti(folder / f"interval_{SHOWN_LEVEL * 100:.0f}.nii.gz", uncertain.numpy(), result.grid)
             panel(folder / "panel.png", result.volume, result.grid, result.xrays, result.reprojection, truth,
-                  title=f"{case['id']}: {self.method_name}", deviation_hu=result.deviation)
+                  title=f"{case['id']}: {self.method_name}", deviation_hu=uncertain, deviation_label=label)
 
         with stage("write"):
             self.results.write(case["id"], self._record(case, result, scores), write_files)
         self.progress.finished(f"{sum(result.seconds.values()):.1f} s, misfit {result.misfit:.4f}")
+
+    @staticmethod
+    def _body_interval(result: Reconstruction) -> float | None:
+        """Half the interval's width in HU, mean over tissue and lungs; None where the method knows none."""
+        if not result.intervals:
+            return None
+        lung = result.masks[0] > 0.5 if len(result.masks) else False
+        inside = (result.volume > TISSUE) | lung
+        return float(result.intervals[SHOWN_LEVEL][inside].mean()) if inside.any() else None
 
     def _record(self, case: dict, result: Reconstruction, scores: dict | None) -> dict:
         """All that is known of a finished case, as plain JSON values; process_peak_memory_mb is in MiB."""
         return {"case": case["id"], "method": self.method_name,
                 "citation": self.reconstructor.citation, "scores": scores, "misfit": result.misfit,
                 "misfit_per_view": result.misfit_per_view, "diverged_at": result.diverged_at, "scatter": result.scatter,
+                "interval_90_hu": self._body_interval(result),
                 "seconds": result.seconds, "network_calls": result.network_calls,
                 "projector_calls": result.projector_calls,
                 "process_peak_memory_mb": peak_memory(CPU),

@@ -7,11 +7,9 @@ import torch
 from torch import Tensor
 
 from phydict.posterior.measurement import Measurement
+from phydict.prior.evidence_channels import CHANGE_SCALE, COVERAGE_SCALE, RESIDUAL_SCALE
 from phydict.xray import Projector
 from phydict.xray.binning import pixel_sides
-
-RESIDUAL_SCALE, CHANGE_SCALE, COVERAGE_SCALE = 10.0, 2.0, 0.2
-"""Factors that bring the channels to a size near 1."""
 
 
 class Evidence:

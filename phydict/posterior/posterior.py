@@ -18,11 +18,13 @@ from phydict.posterior.measurement import Measurement
 from phydict.posterior.samplers.sampler import Sampler
 from phydict.posterior.samplers.split_gibbs import SplitGibbs
 from phydict.prior import BoundRefiner, PriorContract, Refiner
+from phydict.prior.uncertainty import LEVELS
 from phydict.reconstruction import Reconstruction, Reconstructor
 from phydict.runtime.precision import check_precision, precision_name
 from phydict.runtime.profiling import Stopwatch, stage
 from phydict.runtime.ranges import check_between
 from phydict.runtime.reading import check_memory
+from phydict.runtime.warning import warn
 from phydict.units import MU_WATER
 from phydict.xray import Projector
 
@@ -51,7 +53,10 @@ class CountingDenoiser:
 
 
 class CountingRefiner(CountingDenoiser):
-    """A refiner that counts its calls, as CountingDenoiser does a denoiser's."""
+    """A refiner that counts its calls, as CountingDenoiser does a denoiser's, and keeps the half-widths of the last
+    state's intervals."""
+
+    half_widths: Tensor | None = None
 
     @property
     def mean(self) -> Tensor:
@@ -59,6 +64,11 @@ class CountingRefiner(CountingDenoiser):
 
     def refine(self, x: Tensor, t: float, evidence: Tensor) -> Tensor:
         return self._count(x, lambda: self._denoiser.refine(x, t, evidence))
+
+    def conclude(self, z: Tensor, evidence: Callable[[], Tensor]) -> None:
+        if self._denoiser.refiner.uncertainty is not None:
+            with stage("network"):
+                self.half_widths = self._denoiser.half_widths(z, evidence())
 
 
 @dataclass(frozen=True)
@@ -154,13 +164,27 @@ class Posterior(Reconstructor):
             measurement.subtract_scatter(reprojection)
             found = guard.score(states if self.samples == 1 else None, reprojection, measurement.y)
             deviation = (prior.window.half_width * states[:, 0].std(0)).cpu() if self.samples > 1 else None
+            intervals = self._intervals(denoiser, measurement, ct)
         return Reconstruction(
             volume=prior.window.to_hu(ct[0, 0]).cpu(), grid=prior.grid, method=self.name, seed=seed,
             **found, seconds=watch.seconds,
             network_calls=denoiser.calls * (2 if report and self.guidance != 1 else 1),
             projector_calls=measurement.calls, masks=((state[1:] + 1) / 2).cpu(), deviation=deviation,
-            scatter=measurement.scatter,
+            intervals=intervals, scatter=measurement.scatter,
             precision=precision_name(self.precision, xrays))
+
+
+    def _intervals(self, denoiser: CountingDenoiser, measurement: Measurement, ct: Tensor) -> dict[float, Tensor]:
+        """Level -> half-widths in HU (X, Y, Z), none where the network does not know them; wider, with a warning, where
+        the X-rays are missed by more than in any scene that they were calibrated on."""
+        if not isinstance(denoiser, CountingRefiner) or denoiser.half_widths is None:
+            return {}
+        residual, most = float(measurement.normalised_residual(ct)), float(self.prior.uncertainty.most_residual)
+        if residual > most:
+            warn(f"the X-rays are missed by {residual:.3g} times their noise, more than in any scene that the "
+                 f"intervals were calibrated on ({most:.3g}): they are widened, and may still be too narrow")
+        widths = max(1.0, residual / most) * self.prior.window.half_width * denoiser.half_widths[0].cpu()
+        return dict(zip(LEVELS, widths))
 
 
 def check_guidance(guidance: float) -> None:

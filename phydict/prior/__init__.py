@@ -5,7 +5,7 @@ from phydict.prior.contract import PriorContract, check_prior, find_prior
 from phydict.prior.detail import DetailNetwork
 from phydict.prior.files import (
     DEFAULT_PRIOR, DEFAULT_REFINER, describe, describe_refiner, describe_super_resolution, file_read, fingerprint,
-    load_prior, load_super_resolution, save_prior, save_refiner, save_super_resolution)
+    is_refiner, load_prior, load_super_resolution, save_prior, save_refiner, save_super_resolution)
 from phydict.prior.inspection import inspect_prior
 from phydict.prior.local_unet import LocalUNet
 from phydict.prior.medsyn.checkpoint import MedSynCheckpoint
@@ -20,5 +20,6 @@ from phydict.prior.unet import VolumeUNet
 __all__ = ["DEFAULT_PRIOR", "DEFAULT_REFINER", "STATE", "BoundPrior", "BoundRefiner", "Cascade", "DetailNetwork",
            "LocalUNet", "MedSynCheckpoint", "MedSynPrior", "MedSynSuperResolution", "Prior", "PriorContract", "Refiner",
            "SuperResolution", "TextEncoder", "VolumeUNet", "check_prior", "describe", "describe_refiner",
-           "describe_super_resolution", "file_read", "find_prior", "fingerprint", "inspect_prior", "learn_vocabulary",
-           "load_prior", "load_super_resolution", "save_prior", "save_refiner", "save_super_resolution"]
+           "describe_super_resolution", "file_read", "find_prior", "fingerprint", "inspect_prior", "is_refiner",
+           "learn_vocabulary", "load_prior", "load_super_resolution", "save_prior", "save_refiner",
+           "save_super_resolution"]

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import torch
+from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from phydict.diffusion import CosineSchedule
@@ -21,6 +23,7 @@ from phydict.prior.stage_file import (
     ADVICE, FORMAT, built_network, number_of, read_stage, whole_of, window_of, write_stage)
 from phydict.prior.super_resolution import SuperResolution
 from phydict.prior.text_file import has_text, load_text
+from phydict.prior.uncertainty import Uncertainty
 from phydict.prior.unet import VolumeUNet
 from phydict.runtime.files import file_crc32
 from phydict.runtime.reading import refusing
@@ -91,7 +94,8 @@ def describe_super_resolution(fine: SuperResolution) -> dict:
 
 def describe_refiner(refiner: Refiner) -> dict:
     """What a refiner is, as plain JSON values, for `build_refiner`: its prior, called by another stage."""
-    return describe(refiner.prior) | {"stage": "refiner"}
+    return describe(refiner.prior) | {"stage": "refiner"} | (
+        {"uncertainty": refiner.uncertainty.settings} if refiner.uncertainty else {})
 
 
 def load_prior(path: str | Path | MedSynCheckpoint = DEFAULT_PRIOR,
@@ -132,6 +136,17 @@ def load_super_resolution(path: str | Path | MedSynCheckpoint,
         except ValueError as error:
             raise ValueError(f"'{path}' contradicts itself: {error}") from error
     return fine.to(device).eval().requires_grad_(False)
+
+
+def is_refiner(given: object) -> bool:
+    """Whether what may be given as a prior is a Refiner, or a file that `save_refiner` wrote."""
+    if not isinstance(given, str | Path):
+        return isinstance(given, Refiner)
+    try:
+        with safe_open(own_or_shipped(given), "pt") as file:
+            return json.loads((file.metadata() or {}).get("phydict", "{}")).get("stage") == "refiner"
+    except (SafetensorError, OSError, ValueError, AttributeError):  # whoever reads it says what it lacks
+        return False
 
 
 def _found(path: str | Path | MedSynCheckpoint) -> Path | MedSynCheckpoint:
@@ -175,10 +190,11 @@ def build_refiner(header: dict, weights: dict[str, Tensor]) -> Refiner:
     """The refiner that `describe_refiner` described, with these weights, as `build_prior` builds a prior."""
     def made() -> Refiner:
         prior = _untrained(header)
-        return Refiner(prior, torch.zeros(prior.state_channels, *prior.grid.shape))
+        uncertainty = Uncertainty(**header["uncertainty"]) if "uncertainty" in header else None
+        return Refiner(prior, torch.zeros(prior.state_channels, *prior.grid.shape), uncertainty)
 
     weights = {k: w.float() for k, w in weights.items() if not k.startswith(("text.", "prior.text."))}
-    return built_network(made, weights, header, ("network", "detail"))
+    return built_network(made, weights, header, ("network", "detail", "uncertainty"))
 
 
 def build_super_resolution(header: dict, weights: dict[str, Tensor]) -> SuperResolution:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -10,13 +10,12 @@ from torch import Tensor, nn
 
 from phydict.diffusion import CosineSchedule
 from phydict.grid import Grid
+from phydict.prior.evidence_channels import EVIDENCE_CHANNELS
 from phydict.prior.prior import Prior
+from phydict.prior.uncertainty import Uncertainty
 from phydict.prior.unet import VolumeUNet
 from phydict.runtime.precision import network_precision
 from phydict.units import HUWindow
-
-EVIDENCE_CHANNELS = 5
-"""Channels of the evidence (see phydict.posterior.evidence)."""
 
 GATE_WIDTH = 16
 
@@ -30,14 +29,14 @@ class Refiner(nn.Module):
     untrained refiner is its prior. Unrolled networks: Adler & Oktem 2018, doi:10.1109/TMI.2018.2799231.
 
     prior: whose weights are trained on; it needs a detail network. mean: the state (C, X, Y, Z) that an unrolled
-    reconstruction starts from.
+    reconstruction starts from. uncertainty: what says how far the last state may be off, None for a refiner without.
     """
 
-    def __init__(self, prior: Prior, mean: Tensor):
+    def __init__(self, prior: Prior, mean: Tensor, uncertainty: Uncertainty | None = None):
         super().__init__()
         if prior.detail is None:
             raise ValueError("a refiner needs a prior with a detail network, but this one has none: give another prior")
-        self.prior = prior
+        self.prior, self.uncertainty = prior, uncertainty
         block, width = prior.network.block, prior.network.settings["channels"][0]
         self.entrance = nn.Conv3d(EVIDENCE_CHANNELS * block**3, width, 1)
         self.detail_entrance = nn.Conv3d(EVIDENCE_CHANNELS, prior.detail.settings["width"], 3, padding=1)
@@ -119,3 +118,14 @@ class BoundRefiner:
         times = torch.full((len(x),), float(t), device=x.device)
         with torch.no_grad(), network_precision(self.precision, x):
             return self.refiner(x, times, self.context.expand(len(x), -1, -1), evidence)
+
+    def conclude(self, z: Tensor, evidence: Callable[[], Tensor]) -> None:
+        """Is called with the last state and what computes the evidence there."""
+
+    def half_widths(self, z: Tensor, evidence: Tensor) -> Tensor | None:
+        """Half-widths (B, len(LEVELS), X, Y, Z), in the prior's range, of the intervals around the CT of the last state
+        z, given the evidence there; None for a refiner without uncertainty."""
+        if self.refiner.uncertainty is None:
+            return None
+        with torch.no_grad(), network_precision(self.precision, z):
+            return self.refiner.uncertainty.half_widths(z, evidence)

@@ -17,7 +17,7 @@ from phydict.datasets.reports import read_texts
 from phydict.diffusion import Denoiser
 from phydict.evaluation import method_panel, volume_metrics
 from phydict.grid import Cube
-from phydict.methods import DEFAULT_METHOD, reconstruct
+from phydict.methods import reconstruct
 from phydict.posterior import Sampler
 from phydict.prior import DetailNetwork, Prior, Refiner, TextEncoder, VolumeUNet, describe, learn_vocabulary, load_prior
 from phydict.prior.unet import TextMap
@@ -189,7 +189,7 @@ def _text_encoder(text: TextSettings, network: VolumeUNet) -> TextEncoder | None
 
 
 def reconstruction_scores(prior: Prior | Refiner | Rival, ct: Tensor, views: int, seed: int,
-                          method: str | Sampler | Reconstructor = DEFAULT_METHOD,
+                          method: str | Sampler | Reconstructor | None = None,
                           beam: ConeBeam | None = None) -> dict[str, float]:
     """SSIM, PSNR (dB) and MAE (HU) of a method's reconstruction, without a report, from ideal X-rays of a CT
     (1, 1, X, Y, Z) in the prior's range, on `beam` or `benchmark_orbit`."""

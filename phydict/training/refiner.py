@@ -66,6 +66,7 @@ class RefinerTraining(StageTraining):
             raise ValueError(f"the prior {initial} has another grid or HU window than this training: "
                              "set model.cube and model.window to its own")
         refiner = found if isinstance(found, Refiner) else Refiner(found, _mean(found))
+        refiner.uncertainty = None  # of what it was
         super().__init__(refiner.train().requires_grad_(True), optimisation, seed)
         if refiner.prior.load_text is not None:
             refiner.prior.text = refiner.prior.load_text()

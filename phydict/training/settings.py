@@ -146,6 +146,20 @@ class RefinerValidation:
 
 
 @dataclass(frozen=True)
+class CalibrationScenes:
+    """What calibrates the uncertainty of a refiner.
+
+    Args:
+        scenes: reconstructions of each held-out case, from X-rays that are drawn as training's are
+    """
+
+    scenes: int = 12
+
+    def __post_init__(self):
+        check_between("model.validation.scenes", self.scenes, 1, 10_000)
+
+
+@dataclass(frozen=True)
 class Execution:
     """How a network is run, which changes no result but for rounding.
 

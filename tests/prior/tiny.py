@@ -13,6 +13,7 @@ from phydict.methods import METHODS
 from phydict.posterior import Sampler
 from phydict.prior import (
     DetailNetwork, LocalUNet, Prior, Refiner, SuperResolution, TextEncoder, VolumeUNet, learn_vocabulary)
+from phydict.prior.uncertainty import Uncertainty
 from phydict.reconstruction import Reconstructor
 from phydict.units import HUWindow
 
@@ -36,7 +37,8 @@ def tiny_prior(text: bool = True, voxels: int = 16, seed: int = 0, detail: bool 
     return prior.eval().requires_grad_(False)
 
 
-def tiny_refiner(text: bool = True, voxels: int = 16, seed: int = 0, untrained: bool = False) -> Refiner:
+def tiny_refiner(text: bool = True, voxels: int = 16, seed: int = 0, untrained: bool = False,
+                 uncertain: bool = False) -> Refiner:
     """A refiner of `tiny_prior`, whose entrances and gate answer to the evidence unless it is to be untrained."""
     with torch.random.fork_rng():
         torch.manual_seed(seed)
@@ -44,6 +46,7 @@ def tiny_refiner(text: bool = True, voxels: int = 16, seed: int = 0, untrained: 
         for layer in (refiner.entrance, refiner.detail_entrance, refiner.gate[-1]):
             if not untrained:
                 torch.nn.init.normal_(layer.weight, std=0.2)
+        refiner.uncertainty = Uncertainty(4, (4, 8)) if uncertain else None
     return refiner.eval().requires_grad_(False)
 
 

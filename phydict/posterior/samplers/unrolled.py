@@ -59,9 +59,13 @@ class Unrolled(Sampler):
     def steps(self) -> int:
         return len(self.times) + 1
 
-    def estimates(self, refiner: BoundRefiner, measurement: Measurement,
-                  on_step: Callable[[], None] = lambda: None) -> Iterator[Tensor]:
-        """What the refiner answers at each call, and at last the result. Gradients do not pass from call to call."""
+    def estimates(self, refiner: BoundRefiner, measurement: Measurement, on_step: Callable[[], None] = lambda: None,
+                  on_result: Callable[[Tensor, Callable[[], Tensor]], None] = lambda z, evidence: None
+                  ) -> Iterator[Tensor]:
+        """What the refiner answers at each call, and at last the result. Gradients do not pass from call to call.
+
+        on_result: is given the result, and what computes the evidence there.
+        """
         before = refiner.mean.to(measurement.y)
         measurement.refit(before[:, :1])
         evidence = Evidence(measurement)
@@ -83,6 +87,7 @@ class Unrolled(Sampler):
                     smoother = replace(step, tv_weight=step.tv_weight * min(excess, MOST_SMOOTHING))
                     z = self._meet(smoother, measurement, before, self.x0_stds[n + 1])
             on_step()
+        on_result(z, lambda: evidence(z[:, :1], before[:, :1], start[:, :1]))
         yield z
 
     @staticmethod
@@ -91,8 +96,14 @@ class Unrolled(Sampler):
 
     def sample(self, denoiser: BoundRefiner, measurement: Measurement, x: Tensor, generator: Generators,
                on_step: Callable[[], None] = lambda: None) -> Tensor:
+        results = []
+
         def result(on_step: Callable[[], None]) -> Tensor:
-            *_, z = self.estimates(denoiser, measurement, on_step)
+            *_, z = self.estimates(denoiser, measurement, on_step, lambda *found: results.append(found))
             return z
 
-        return with_scatter(measurement, lambda: result(on_step), lambda: result(lambda: None))
+        z = with_scatter(measurement, lambda: result(on_step), lambda: result(lambda: None))
+        for found, evidence in results:
+            if torch.equal(found, z):
+                denoiser.conclude(z, evidence)
+        return z

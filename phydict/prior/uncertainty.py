@@ -1,0 +1,96 @@
+"""How far a refiner's reconstruction may be off, voxel by voxel."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from phydict.prior.evidence_channels import COVERAGE_SCALE, EVIDENCE_CHANNELS
+
+LEVELS = (0.5, 0.8, 0.9, 0.95)
+"""The shares of voxels that intervals are to hold."""
+
+TISSUES = ("lung", "body", "air")
+"""What a voxel may be: by the lung's mask, else by its HU on the two sides of AIR_BELOW."""
+
+AIR_BELOW = -0.6
+"""In the prior's range."""
+
+COVERAGES = 6
+"""Bins of log2(1 + n), rounded, n the number of views that see a voxel: 0, 1, 2 to 4, 5 to 10, 11 to 21 and more."""
+
+LOG_SCALE = (-7.0, 2.0)
+"""Least and most log b."""
+
+UNBOUNDED = 1e4
+"""The most residual of a network that was not calibrated."""
+
+INPUTS = 3
+"""Beside state and evidence: the steepness of the CT and the sizes of two channels of the evidence, the changes."""
+
+
+class Uncertainty(nn.Module):
+    """The scale b of the error e of each voxel's CT, and from it the half-widths of intervals.
+
+    A UNet of the state z (B, C, X, Y, Z) and the evidence there (B, EVIDENCE_CHANNELS, X, Y, Z) answers with log b; it
+    learns to by the likelihood of a Laplace distribution, |e| / b + log b. An interval of level p is z -+ q b, where q
+    is the p-quantile of |e| / b over voxels of the same tissue and coverage of patients that were not learnt from
+    (split conformal prediction: Angelopoulos & Bates 2023, doi:10.1561/2200000101); before calibration it is the
+    distribution's own, -log(1 - p).
+
+    state_channels: C; channels: width of each level of the UNet.
+    """
+
+    def __init__(self, state_channels: int = 4, channels: tuple[int, ...] = (16, 32, 64)):
+        from monai.networks.nets import UNet
+
+        super().__init__()
+        self.settings = {"state_channels": state_channels, "channels": list(channels)}
+        self.unet = UNet(3, state_channels + EVIDENCE_CHANNELS + INPUTS, 1, tuple(channels),
+                         (2,) * (len(channels) - 1), num_res_units=2, norm=None, act="swish")
+        own = -torch.log1p(-torch.tensor(LEVELS))
+        self.register_buffer("quantiles", own.expand(len(TISSUES), COVERAGES, -1).clone())
+        self.register_buffer("most_residual", torch.tensor(UNBOUNDED))
+
+    def forward(self, z: Tensor, evidence: Tensor) -> Tensor:
+        """log b (B, 1, X, Y, Z), b in the prior's range."""
+        steepness = sum(torch.gradient(z[:, :1], dim=d)[0].abs() for d in (2, 3, 4))
+        sizes = evidence[:, 2:4].abs()
+        return self.unet(torch.cat([z, evidence, 2 * steepness, sizes], 1)).float().sub(3.5).clamp(*LOG_SCALE)
+
+    def half_widths(self, z: Tensor, evidence: Tensor) -> Tensor:
+        """Half-widths (B, len(LEVELS), X, Y, Z), in the prior's range, of the intervals around the CT of z."""
+        factors = self.quantiles[tissue_of(z), coverage_of(evidence)]
+        return factors.movedim(-1, 1) * self(z, evidence).exp()
+
+    @torch.no_grad()
+    def calibrate(self, ratios: Tensor, tissues: Tensor, coverages: Tensor, residuals: Tensor) -> None:
+        """Sets the quantiles to those of held-out patients.
+
+        ratios: |e| / b of voxels (N,); tissues, coverages: what `tissue_of` and `coverage_of` say of them (N,);
+        residuals: by how many times their noise the reconstructions missed their X-rays. A tissue or coverage of few
+        voxels takes the quantiles of all.
+        """
+        levels = torch.tensor(LEVELS, dtype=ratios.dtype)
+        for t in range(len(TISSUES)):
+            of_tissue = ratios[tissues == t]
+            shared = of_tissue.quantile(levels) if len(of_tissue) >= FEWEST else ratios.quantile(levels)
+            for n in range(COVERAGES):
+                own = ratios[(tissues == t) & (coverages == n)]
+                self.quantiles[t, n] = own.quantile(levels) if len(own) >= FEWEST else shared
+        self.most_residual.copy_(residuals.max())
+
+
+FEWEST = 2000
+"""Voxels from which a tissue and a coverage have quantiles of their own."""
+
+
+def tissue_of(z: Tensor) -> Tensor:
+    """The index in TISSUES (B, X, Y, Z) of the voxels of a state (B, C, X, Y, Z)."""
+    outside = (z[:, 0] < AIR_BELOW).long() + 1
+    return torch.where(z[:, 1] > 0, 0, outside) if z.shape[1] > 1 else outside
+
+
+def coverage_of(evidence: Tensor) -> Tensor:
+    """The bin of coverage (B, X, Y, Z) of the voxels of an evidence."""
+    return (evidence[:, 1] / COVERAGE_SCALE).round().long().clamp(0, COVERAGES - 1)

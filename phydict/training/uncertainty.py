@@ -1,0 +1,108 @@
+"""Training what says how far a refiner's reconstruction may be off."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+from torchmetrics.functional import spearman_corrcoef
+
+from phydict.grid import Cube
+from phydict.posterior import Measurement, Unrolled
+from phydict.prior import DEFAULT_REFINER, Refiner, describe_refiner, load_prior
+from phydict.prior.uncertainty import AIR_BELOW, Uncertainty, coverage_of, tissue_of
+from phydict.training.scenes import Scenes
+from phydict.training.settings import CalibrationScenes, Optimisation
+from phydict.training.stage import StageTraining
+from phydict.units import HUWindow
+
+VOXELS = 20_000
+"""Voxels of a reconstruction that calibrate."""
+
+
+class UncertaintyTraining(StageTraining):
+    """Learns the Uncertainty of a refiner, whose own weights stay as they are; each validation calibrates it.
+
+    Training teaches the scale of each voxel's error; validation sets the quantiles of error over scale that make
+    intervals of it, from patients who are not trained on.
+
+    Args:
+        network: what is learnt; none given: the initial refiner's, or the default Uncertainty
+        method: the unrolled reconstruction whose errors are learnt
+        scenes: the X-rays that are drawn for it
+        cube: of voxels
+        window: HU that the prior's range [-1, 1] stands for
+        optimisation: how the weights are learnt
+        validation: the scenes of each held-out case
+        body_weight: how many times more a voxel of the body counts than one of air, plus 1
+        initial: the refiner's file
+        seed: of scenes and noise
+    """
+
+    def __init__(self, network: Uncertainty | None = None, method: Unrolled = Unrolled(), scenes: Scenes = Scenes(),
+                 cube: Cube = Cube(), window: tuple[float, float] = (-1000.0, 1000.0),
+                 optimisation: Optimisation = Optimisation(), validation: CalibrationScenes = CalibrationScenes(),
+                 body_weight: float = 9.0, initial: str = str(DEFAULT_REFINER), seed: int = 0):
+        refiner = load_prior(initial)
+        if not isinstance(refiner, Refiner):
+            raise ValueError(f"uncertainty is learnt of a refiner, but {initial} is none: give a refiner's file as "
+                             "model.initial")
+        if not refiner.grid.same_as(cube.grid()) or refiner.window != HUWindow(*window):
+            raise ValueError(f"the refiner {initial} has another grid or HU window than this training: "
+                             "set model.cube and model.window to its own")
+        refiner.uncertainty = network or refiner.uncertainty or Uncertainty(refiner.state_channels)
+        super().__init__(refiner, optimisation, seed)
+        if refiner.prior.load_text is not None:  # to be written with the rest
+            refiner.prior.text = refiner.prior.load_text().requires_grad_(False)
+        refiner.uncertainty.requires_grad_(True)
+        self.method, self.scenes, self.validation, self.body_weight = method, scenes, validation, body_weight
+        self.held_out: list[tuple[Tensor, ...]] = []
+
+    def batch_loss(self, batch: dict, key: tuple[int, ...] = (0,), rank: int = 0, processes: int = 1) -> Tensor:
+        losses = []
+        for n, ct in enumerate(batch["volume"]):
+            rng = np.random.default_rng((*key, rank + n * processes))
+            z, evidence, _ = self._reconstruct(ct[None], rng)
+            log_scale = self.prior.uncertainty(z, evidence)
+            error = (z[:, :1] - ct).abs()
+            weight = 1 + self.body_weight * ((ct[None] > AIR_BELOW) | (tissue_of(z)[:, None] == 0))
+            losses.append((weight * (log_scale + error / log_scale.exp())).sum() / weight.sum())
+        return torch.stack(losses).mean()
+
+    @torch.no_grad()
+    def _reconstruct(self, ct: Tensor, rng: np.random.Generator) -> tuple[Tensor, Tensor, Measurement]:
+        """The last state of a reconstruction, the evidence there, and its measurement."""
+        with torch.autocast(self.device.type, enabled=False):
+            measurement = self.scenes.measure(ct, rng, self.prior.grid, self.prior.window)
+            ends = []
+            for _ in self.method.estimates(self.prior.bind(), measurement, on_result=lambda *end: ends.append(end)):
+                pass
+            [(z, evidence)] = ends
+            return z, evidence(), measurement
+
+    def on_validation_start(self) -> None:
+        super().on_validation_start()
+        self.held_out = []
+
+    def validation_step(self, batch: dict, index: int) -> None:
+        ct = batch["volume"]
+        for scene in range(self.validation.scenes):
+            rng = np.random.default_rng((self.seed, index, scene))
+            z, evidence, measurement = self._reconstruct(ct, rng)
+            error, log_scale = (z[:, :1] - ct).abs(), self.prior.uncertainty(z, evidence)
+            body = (ct > AIR_BELOW) | (tissue_of(z)[:, None] == 0)
+            self.log("val/rank", spearman_corrcoef(log_scale[body], error[body]), batch_size=1, sync_dist=True,
+                     prog_bar=True)
+            chosen = torch.from_numpy(rng.integers(error.numel(), size=VOXELS)).to(ct.device)
+            self.held_out.append((
+                (error / log_scale.exp()).flatten()[chosen], tissue_of(z).flatten()[chosen],
+                coverage_of(evidence).flatten()[chosen], measurement.normalised_residual(z[:, :1]).flatten()))
+        self.log("samples", float(self.samples), rank_zero_only=True, batch_size=1)
+
+    def on_validation_epoch_end(self) -> None:
+        if self.held_out:
+            found = [torch.cat(parts) for parts in zip(*self.held_out)]
+            self.prior.uncertainty.calibrate(*[self.all_gather(part).flatten() for part in found])
+
+    def _describe(self) -> dict:
+        return describe_refiner(self.prior)

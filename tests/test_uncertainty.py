@@ -1,0 +1,146 @@
+"""How far a refiner's reconstruction may be off: intervals that hold their share, their training and their files."""
+
+import json
+from pathlib import Path
+
+import nibabel
+import pytest
+import torch
+from command_lines import refusal, resumed_as_uninterrupted
+from prior.tiny import tiny_prior, tiny_refiner
+
+from phydict.cli.infer import main as infer
+from phydict.cli.train import main
+from phydict.grid import Cube, Grid
+from phydict.methods import reconstruct
+from phydict.prior import load_prior, save_prior, save_refiner
+from phydict.prior.uncertainty import COVERAGES, LEVELS, TISSUES, Uncertainty, coverage_of, tissue_of
+from phydict.training.refiner import RefinerTraining
+from phydict.xray import ConeBeam, Projector
+
+CONFIG = Path(__file__).parents[1] / "configs" / "prior" / "uncertainty.yaml"
+GRID, BEAM = Grid.cube(16), ConeBeam.orbit(3, 1020, 740, (28, 28), 20.0)
+
+
+def views() -> torch.Tensor:
+    return Projector(GRID, BEAM, full_detector=True)(torch.full((1, 1, *GRID.shape), 0.01))[0]
+
+
+def arguments(folder: Path, cache: Path, initial: str, *more: str) -> list[str]:
+    return ["fit", f"--config={CONFIG}", "--model.cube.voxels=16", "--model.window=[-1000,600]", "--data.phantoms=3",
+            "--data.holdout.phantoms=1", "--data.loading.epoch_size=2", "--model.scenes.most_views=4",
+            f"--model.initial={initial}", "--model.validation.scenes=2", "--trainer.accelerator=cpu",
+            "--trainer.log_every_n_steps=1", "--precision=float32", "--trainer.max_steps=-1",
+            f"--data.cache={cache}", f"--out={folder}", *more]
+
+
+@pytest.fixture(scope="module")
+def refiner_file(tmp_path_factory) -> str:
+    file = tmp_path_factory.mktemp("refiner") / "tiny.safetensors"
+    save_refiner(tiny_refiner(uncertain=True), file, dtype=torch.float32)
+    return str(file)
+
+
+def test_calibrated_intervals_hold_their_share_in_each_tissue_and_coverage():
+    """Of errors whose scale the network misjudges by a factor of its own for each of them."""
+    network, draw = Uncertainty(4, (4, 8)), torch.Generator().manual_seed(0)
+    tissues = torch.arange(len(TISSUES)).repeat_interleave(COVERAGES)
+    coverages = torch.arange(COVERAGES).repeat(len(TISSUES))
+    factors = torch.logspace(-1, 1, len(tissues))
+
+    def ratios() -> torch.Tensor:
+        return factors * torch.randn(20_000, len(tissues), generator=draw).abs()
+
+    given = ratios()
+    network.calibrate(given.flatten(), tissues.expand_as(given).flatten(), coverages.expand_as(given).flatten(),
+                      torch.tensor([1.0, 3.0]))
+    held = (ratios()[..., None] <= network.quantiles[tissues, coverages]).float().mean(0)
+    torch.testing.assert_close(held, torch.tensor(LEVELS).expand_as(held), atol=0.015, rtol=0)
+    assert network.most_residual == 3
+
+
+def test_few_voxels_take_the_quantiles_of_their_tissue_and_a_tissue_of_few_those_of_all():
+    network = Uncertainty(4, (4, 8))
+    ratios = torch.cat([torch.linspace(0, 1, 9000), torch.full((50,), 7.0), torch.full((60,), 9.0)])
+    tissues = torch.cat([torch.zeros(9050), torch.ones(60)]).long()
+    coverages = torch.cat([torch.zeros(9000), torch.ones(50), torch.ones(60)]).long()
+    network.calibrate(ratios, tissues, coverages, torch.ones(1))
+    assert torch.equal(network.quantiles[0, 1], ratios[:9050].quantile(torch.tensor(LEVELS)))
+    assert torch.equal(network.quantiles[1, 1], ratios.quantile(torch.tensor(LEVELS)))
+    assert torch.equal(network.quantiles[2], network.quantiles[1])
+
+
+def test_an_uncalibrated_network_gives_the_intervals_of_its_own_distribution():
+    network, z, evidence = Uncertainty(4, (4, 8)), torch.randn(1, 4, 8, 8, 8), torch.rand(1, 5, 8, 8, 8)
+    with torch.no_grad():
+        widths, scale = network.half_widths(z, evidence), network(z, evidence).exp()
+    for n, level in enumerate(LEVELS):
+        torch.testing.assert_close(1 - torch.exp(-widths[:, n:n + 1] / scale), torch.full_like(scale, level))
+
+
+def test_voxels_are_sorted_by_mask_and_hu_and_by_the_views_that_see_them():
+    z = torch.full((1, 4, 1, 1, 3), -0.99)
+    z[0, 1, 0, 0, 0], z[0, 0, 0, 0, 1] = 0.8, 0.1
+    assert tissue_of(z).flatten().tolist() == [0, 1, 2]
+    assert tissue_of(z[:, :1]).flatten().tolist() == [2, 1, 2]
+    evidence = torch.zeros(1, 5, 1, 1, 6)
+    evidence[0, 1] = 0.2 * torch.log2(1 + torch.tensor([0.0, 1, 2, 8, 32, 200]))
+    assert coverage_of(evidence).flatten().tolist() == [0, 1, 2, 3, 5, 5]
+
+
+def test_a_reconstruction_has_nested_intervals_where_its_refiner_knows_them(tmp_path):
+    refiner = tiny_refiner(uncertain=True)
+    found = reconstruct(views(), BEAM, refiner)
+    assert list(found.intervals) == list(LEVELS)
+    widths = torch.stack(list(found.intervals.values()))
+    assert (widths.diff(dim=0) > 0).all() and widths.shape[1:] == GRID.shape and (widths > 0).all()
+    save_refiner(refiner, tmp_path / "tiny.safetensors", dtype=torch.float32)
+    again = reconstruct(views(), BEAM, tmp_path / "tiny.safetensors")
+    assert torch.equal(torch.stack(list(again.intervals.values())), widths)
+    plain = reconstruct(views(), BEAM, tiny_refiner())
+    assert plain.intervals == {} and torch.equal(plain.volume, found.volume)
+
+
+def test_x_rays_missed_by_more_than_in_calibration_widen_the_intervals_with_a_warning():
+    refiner = tiny_refiner(uncertain=True)
+    usual = reconstruct(views(), BEAM, refiner).intervals
+    refiner.uncertainty.most_residual.fill_(1e-3)
+    with pytest.warns(UserWarning, match="more than in any scene that the intervals were calibrated on") as said:
+        wider = reconstruct(views(), BEAM, refiner).intervals
+    factor = float(str(said[0].message).split("missed by ")[1].split(" times")[0]) / 1e-3
+    torch.testing.assert_close(wider[0.9], factor * usual[0.9], rtol=0.01, atol=0)
+
+
+def test_predict_writes_the_interval_beside_the_volume(tmp_path, refiner_file, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "xrays"
+    folder.mkdir()
+    BEAM.save(folder / "geometry.yaml")
+    for n, view in enumerate(views()):
+        nibabel.save(nibabel.Nifti1Image(view.numpy(), torch.eye(4).numpy()), folder / f"view_{n}.nii.gz")
+    infer(["predict", f"--data.xrays={folder}", f"--model.prior={refiner_file}", "--model.out=out",
+           "--trainer.accelerator=cpu"])
+    [case] = Path("out/phydict_learned").glob("*/")
+    record = json.loads((case / "reconstruction.json").read_text())
+    interval, volume = (nibabel.load(case / name) for name in ("interval_90.nii.gz", "volume.nii.gz"))
+    assert (interval.affine == volume.affine).all() and (interval.get_fdata() > 0).all()
+    assert 0 < record["interval_90_hu"] <= interval.get_fdata().max()
+
+
+def test_a_resumed_run_is_the_uninterrupted_one_and_leaves_the_refiner_as_it_was(tmp_path, cache, refiner_file):
+    last = resumed_as_uninterrupted(main, lambda run, *more: arguments(run, cache, refiner_file, *more), tmp_path)
+    main(["export", "--checkpoint", str(last), "--out", str(tmp_path / "refiner.safetensors")])
+    trained, before = load_prior(tmp_path / "refiner.safetensors").state_dict(), load_prior(refiner_file).state_dict()
+    moved = {name for name in before if not torch.equal(before[name].half(), trained[name].half())}
+    assert moved and all(name.startswith("uncertainty.") for name in moved) and "uncertainty.quantiles" in moved
+
+
+def test_a_prior_in_place_of_a_refiner_is_refused(tmp_path, cache, capsys):
+    save_prior(tiny_prior(detail=True), tmp_path / "prior.safetensors")
+    said = refusal(capsys, main, arguments(tmp_path / "run", cache, str(tmp_path / "prior.safetensors")))
+    assert "uncertainty is learnt of a refiner" in said and "model.initial" in said
+
+
+def test_a_refiner_that_is_trained_on_loses_what_was_known_of_its_errors(refiner_file):
+    assert load_prior(refiner_file).uncertainty is not None
+    assert RefinerTraining(cube=Cube(16), window=(-1000, 600), initial=refiner_file).prior.uncertainty is None

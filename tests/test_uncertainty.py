@@ -90,27 +90,33 @@ def test_voxels_are_sorted_by_mask_and_hu_and_by_the_views_that_see_them():
 
 def test_a_reconstruction_has_nested_intervals_where_its_refiner_knows_them(tmp_path):
     refiner = tiny_refiner(uncertain=True)
-    found = reconstruct(views(), BEAM, refiner)
+    found = reconstruct(views(), BEAM, refiner, display=True)
     assert list(found.intervals) == list(LEVELS)
     widths = torch.stack(list(found.intervals.values()))
     assert (widths.diff(dim=0) > 0).all() and widths.shape[1:] == GRID.shape and (widths > 0).all()
     save_refiner(refiner, tmp_path / "tiny.safetensors", dtype=torch.float32)
-    again = reconstruct(views(), BEAM, tmp_path / "tiny.safetensors")
+    again = reconstruct(views(), BEAM, tmp_path / "tiny.safetensors", display=True)
     assert torch.equal(torch.stack(list(again.intervals.values())), widths)
-    plain = reconstruct(views(), BEAM, tiny_refiner())
+    plain = reconstruct(views(), BEAM, tiny_refiner(), display=True)
     assert plain.intervals == {} and torch.equal(plain.volume, found.volume)
 
 
 def test_x_rays_missed_by_more_than_in_calibration_widen_the_intervals_with_a_warning():
     refiner = tiny_refiner(uncertain=True)
-    usual = reconstruct(views(), BEAM, refiner).intervals
+    usual = reconstruct(views(), BEAM, refiner, display=True).intervals
     refiner.uncertainty.most_residual.fill_(1e-3)
     with pytest.warns(UserWarning, match="more than in any scene that the intervals were calibrated on") as said:
-        wider = reconstruct(views(), BEAM, refiner).intervals
-    factor = float(str(said[0].message).split("missed by ")[1].split(" times")[0]) / 1e-3
-    torch.testing.assert_close(wider[0.9], factor * usual[0.9], rtol=0.01, atol=0)
+        wider = reconstruct(views(), BEAM, refiner, display=True).intervals
+    residual = float(str(said[0].message).split("missed by ")[1].split(" times")[0])
+    torch.testing.assert_close(wider[0.9], (residual / 1e-3) ** 0.25 * usual[0.9], rtol=0.01, atol=0)
 
 
+def test_subtracted_scatter_is_said_to_lie_outside_of_the_calibration():
+    with pytest.warns(UserWarning, match="scatter was subtracted, which the intervals were not calibrated on"):
+        assert reconstruct(views(), BEAM, tiny_refiner(uncertain=True)).scatter > 0
+
+
+@pytest.mark.filterwarnings("default:scatter was subtracted")
 def test_predict_writes_the_interval_beside_the_volume(tmp_path, refiner_file, monkeypatch):
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "xrays"
@@ -124,6 +130,7 @@ def test_predict_writes_the_interval_beside_the_volume(tmp_path, refiner_file, m
     record = json.loads((case / "reconstruction.json").read_text())
     interval, volume = (nibabel.load(case / name) for name in ("interval_90.nii.gz", "volume.nii.gz"))
     assert (interval.affine == volume.affine).all() and (interval.get_fdata() > 0).all()
+    assert any("scatter was subtracted" in said for said in record["warnings"])
     assert 0 < record["interval_90_hu"] <= interval.get_fdata().max()
 
 

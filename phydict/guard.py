@@ -89,11 +89,11 @@ class Guard:
         result, and as they were measured. Raises and warns as `finish` and `check_fit` do.
         """
         reprojection, xrays = reprojection[0].cpu(), xrays[0].cpu()
-        found = misfits(reprojection, xrays)
+        fit = misfits(reprojection, xrays)
         if volumes is not None:
-            self.finish(volumes, found["misfit"])
-        self.check_fit(**found)
-        return found | {"xrays": xrays, "reprojection": reprojection, "diverged_at": self.diverged_at}
+            self.finish(volumes, fit["misfit"])
+        self.check_fit(**fit)
+        return fit | {"xrays": xrays, "reprojection": reprojection, "diverged_at": self.diverged_at}
 
     def check_fit(self, misfit: float, misfit_per_view: Sequence[float]) -> None:
         """Warns where a method that looked at the X-rays and did not diverge fits one view, or all, badly."""

@@ -17,7 +17,7 @@ from prior.tiny import tiny_prior
 
 from phydict.ablation import plots, read_specification
 from phydict.ablation.nested import changed
-from phydict.ablation.summary import entries
+from phydict.ablation.summary import summarise
 from phydict.ablation.tables import all_tables
 from phydict.ablation.trials import refined_from
 from phydict.baselines.baseline import Baseline
@@ -413,7 +413,7 @@ def row(case: str, method: str, psnr: float | None, **more) -> dict:
 def test_a_case_counts_once_whatever_its_seeds_and_a_missing_case_takes_a_method_out():
     rows = [row("a", "x", 10.0), row("a", "x", 20.0, seed=1), row("b", "x", 35.0), row("a", "y", 39.0),
             row("b", "y", None), row("a", "z", 5.0), row("b", "z", 5.0)]
-    x, y, z = entries(rows)
+    x, y, z = summarise(rows)
     assert x.means["psnr"] == 25.0 and x.complete and not y.complete and y.label == "y (1 of 2 cases)"
     table, differences = all_tables([x, y, z], rows)
     text = table.markdown()
@@ -428,7 +428,7 @@ def test_a_case_counts_once_whatever_its_seeds_and_a_missing_case_takes_a_method
 def test_each_condition_has_its_table_and_the_best_setting_stands_for_a_method():
     rows = [row("a", "x", 20.0 + n + views / 10, views=views, **{"method.iterations": n}) for views in (2, 8)
             for n in (1, 3, 2)] + [row("a", "y", 21.0, views=views) for views in (2, 8)]
-    tables = {table.title: table for table in all_tables(entries(rows), rows)}
+    tables = {table.title: table for table in all_tables(summarise(rows), rows)}
     best = tables["Methods, K = 8: each at its setting of highest mean PSNR"]
     assert [label for label, _, _ in best.lines] == ["x, iterations 3", "y"]
     assert len(tables["Methods, K = 2: all settings"].lines) == 4
@@ -438,7 +438,7 @@ def test_each_condition_has_its_table_and_the_best_setting_stands_for_a_method()
 
 def test_the_table_of_delta_has_the_misfit_beside_ssim():
     rows = [row("a", "x", 20.0 + d, delta=d) for d in (0.0, 0.8, 0.1)]
-    table = next(t for t in all_tables(entries(rows), rows) if "delta" in t.header)
+    table = next(t for t in all_tables(summarise(rows), rows) if "delta" in t.header)
     assert table.header[1:3] == ["SSIM ↑", "misfit ↓"]
     assert [label for label, _, _ in table.lines] == ["0", "0.1", "0.8"]
     assert [values[:2] for _, _, values in table.lines] == [[(20 + d) / 40, 1 / (20 + d)] for d in (0.0, 0.1, 0.8)]
@@ -458,7 +458,7 @@ def test_the_front_holds_what_nothing_beats():
 def test_every_plot_that_the_rows_allow_is_drawn(tmp_path):
     rows = [row("a", method, 20.0 + n, views=views, seconds_network=0.5, **more) for views in (1, 8)
             for n, (method, more) in enumerate([("x", {"delta": 0.0}), ("x", {"delta": 0.8}), ("y", {})])]
-    files = plots.write_plots(tmp_path, entries(rows))
+    files = plots.write_plots(tmp_path, summarise(rows))
     assert sorted(file.name for file in files) == sorted(p.name for p in tmp_path.iterdir())
     assert {file.stem for file in files} == {"pareto_K_1", "pareto_K_8", "stages_K_1", "stages_K_8", "views", "delta"}
 

@@ -19,7 +19,7 @@ import torch
 from command_lines import arguments, losses
 from prior.tiny import tiny_prior, tiny_refiner, tiny_super_resolution
 
-from phydict.ablation.summary import entries
+from phydict.ablation.summary import summarise
 from phydict.ablation.tables import all_tables
 from phydict.cli.train import main
 from phydict.evaluation import read_csv
@@ -147,7 +147,7 @@ def test_training_gives_its_golden_losses(golden, tmp_path):
 @pytest.mark.parametrize("results", sorted(HERE.glob("benchmark/*/results.csv")), ids=lambda file: file.parent.name)
 def test_committed_results_give_their_committed_tables_byte_for_byte(results):
     rows = read_csv(results)
-    tables = "\n".join(table.markdown() for table in all_tables(entries(rows), rows))
+    tables = "\n".join(table.markdown() for table in all_tables(summarise(rows), rows))
     assert tables == (results.parent / "tables.md").read_text()
 
 

@@ -14,7 +14,7 @@ from phydict.ablation.fid import fid_tables
 from phydict.ablation.plots import write_plots
 from phydict.ablation.run import RESULTS, run
 from phydict.ablation.spec import read_specification
-from phydict.ablation.summary import entries
+from phydict.ablation.summary import summarise
 from phydict.ablation.tables import all_tables, write_tables
 from phydict.inference.scoring import METRICS, Scoring
 from phydict.methods import METHODS
@@ -44,9 +44,9 @@ def main(args: list[str] | None = None) -> None:
         with alone_in(specification.out, "out"), CaseProgress() as progress:
             rows = run(specification, torch.device(device), progress, scoring)
         print(f"{len(rows)} rows in {specification.out / RESULTS}")
-        found = entries(rows)
-        tables = all_tables(found, rows, scoring.empty) + fid_tables(specification.out, found, scoring)
-        written = write_tables(specification.out, tables) + write_plots(specification.out, found)
+        entries = summarise(rows)
+        tables = all_tables(entries, rows, scoring.empty) + fid_tables(specification.out, entries, scoring)
+        written = write_tables(specification.out, tables) + write_plots(specification.out, entries)
         print(f"tables and plots in {specification.out}: {', '.join(path.name for path in written)}")
 
 

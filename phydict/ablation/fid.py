@@ -13,7 +13,7 @@ from phydict.evaluation.tables import Table, fid_table
 from phydict.inference.scoring import Scoring
 
 
-def fid_tables(out: Path, found: Sequence[Entry], scoring: Scoring) -> list[Table]:
+def fid_tables(out: Path, entries: Sequence[Entry], scoring: Scoring) -> list[Table]:
     """A table for each condition, with a line per entry; none where the distance is not measured.
 
     Of several seeds of a case each counts as a case of the same patient.
@@ -21,7 +21,7 @@ def fid_tables(out: Path, found: Sequence[Entry], scoring: Scoring) -> list[Tabl
     if scoring.network is None:
         return []
     tables, backbone = [], scoring.fid.backbone
-    for condition, group in conditions(found):
+    for condition, group in conditions(entries):
         features = {entry.label: {name: load_features(features_file(out, key), backbone)
                                   for name, key in _named(entry.rows)} for entry in group if entry.rows}
         if features:

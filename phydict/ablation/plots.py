@@ -22,30 +22,30 @@ MARKERS = "osD^v<>pP*Xhd8"
 STAGES = {"seconds_network": "network", "seconds_projector": "projector", "rest": "the rest"}
 
 
-def write_plots(folder: Path, found: Sequence[Entry]) -> list[Path]:
+def write_plots(folder: Path, entries: Sequence[Entry]) -> list[Path]:
     """Every plot that the entries allow, as PNG in a folder; returns the files."""
-    written, style = [], styles(found)
-    for condition, group in conditions(found):
-        own = [entry for entry in group if entry.complete]
+    written, style = [], styles(entries)
+    for condition, group in conditions(entries):
+        complete = [entry for entry in group if entry.complete]
         where = format_settings(condition)
-        if len(own) > 1 and "geometry" not in condition:
-            written.append(_draw(folder, f"pareto {where}", 2, lambda axes: _pareto(axes, own, where, style)))
-            written.append(_draw(folder, f"stages {where}", 1, lambda axes: _stages(axes[0], own, where)))
-    for rest, group in compared_views(found):
+        if len(complete) > 1 and "geometry" not in condition:
+            written.append(_draw(folder, f"pareto {where}", 2, lambda axes: _pareto(axes, complete, where, style)))
+            written.append(_draw(folder, f"stages {where}", 1, lambda axes: _stages(axes[0], complete, where)))
+    for rest, group in compared_views(entries):
         written.append(_draw(folder, f"views {format_settings(rest)}", 2, lambda axes: _views(axes, group, style)))
-    for rest, group in compared_geometries(found):
+    for rest, group in compared_geometries(entries):
         written.append(_draw(folder, f"geometry {format_settings(rest)}", 2,
                              lambda axes: _geometries(axes, group, style)))
-    curves = [(label, group) for label, group in deltas(found) if len(group) > 1]
+    curves = [(label, group) for label, group in deltas(entries) if len(group) > 1]
     if curves:
         written.append(_draw(folder, "delta", 2, lambda axes: _deltas(axes, curves)))
     return written
 
 
-def styles(found: Sequence[Entry]) -> dict[str, dict]:
+def styles(entries: Sequence[Entry]) -> dict[str, dict]:
     """A colour and a marker for each method, the same in every plot."""
     return {method: {"color": COLOURS[i % len(COLOURS)], "marker": MARKERS[i % len(MARKERS)]}
-            for i, method in enumerate(dict.fromkeys(entry.method for entry in found))}
+            for i, method in enumerate(dict.fromkeys(entry.method for entry in entries))}
 
 
 def front(points: Sequence[tuple[float, float]]) -> list[int]:
@@ -73,8 +73,8 @@ def _pareto(axes: Sequence[Axes], group: Sequence[Entry], where: str, style: dic
     """Seconds against PSNR and SSIM; the settings of a method are joined, and the front is dashed."""
     for ax, name in zip(axes, ("psnr", "ssim")):
         for method in dict.fromkeys(entry.method for entry in group):
-            own = sorted((e.means["seconds"], e.means[name]) for e in group if e.method == method)
-            ax.plot(*zip(*own), **style[method], linewidth=0.8, markersize=6, label=literal(method))
+            points = sorted((e.means["seconds"], e.means[name]) for e in group if e.method == method)
+            ax.plot(*zip(*points), **style[method], linewidth=0.8, markersize=6, label=literal(method))
         points = [(e.means["seconds"], e.means[name]) for e in group]
         best = [points[i] for i in front(points)]
         ax.plot(*zip(*best), color="black", linestyle="--", linewidth=1, zorder=0, label="front")
@@ -90,10 +90,10 @@ def _views(axes: Sequence[Axes], group: Sequence[Entry], style: dict) -> None:
     for ax, name in zip(axes, ("psnr", "ssim")):
         labels = {e.name: e.method for e in group}
         for label, method in labels.items():
-            own = sorted((e.condition["views"], e.means[name]) for e in group
+            points = sorted((e.condition["views"], e.means[name]) for e in group
                          if e.complete and e.name == label)
-            if own:
-                ax.plot(*zip(*own), **style[method], markersize=5, label=literal(label))
+            if points:
+                ax.plot(*zip(*points), **style[method], markersize=5, label=literal(label))
         views = sorted({e.condition["views"] for e in group})
         ax.set_xscale("log", base=2)
         ax.set_xticks(views, map(str, views))
@@ -107,10 +107,10 @@ def _geometries(axes: Sequence[Axes], group: Sequence[Entry], style: dict) -> No
     for ax, name in zip(axes, ("psnr", "ssim")):
         labels = {entry.name: entry.method for entry in group}
         for label, method in labels.items():
-            own = [(entry.means[name], places.index(entry.condition["geometry"])) for entry in group
+            points = [(entry.means[name], places.index(entry.condition["geometry"])) for entry in group
                    if entry.complete and entry.name == label]
-            if own:
-                ax.plot(*zip(*own), **style[method], linestyle="", markersize=6, label=literal(label))
+            if points:
+                ax.plot(*zip(*points), **style[method], linestyle="", markersize=6, label=literal(label))
         ax.set_yticks(range(len(places)), [literal(Path(place).stem) for place in places])
         ax.invert_yaxis()
         _dress(ax, SHOWN_MEASURES[name].heading, "")
@@ -121,9 +121,9 @@ def _deltas(axes: Sequence[Axes], curves: Sequence[tuple[str, list[Entry]]]) -> 
     """SSIM and, beside it, the misfit of the X-rays."""
     for ax, name in zip(axes, ("ssim", "misfit")):
         for i, (label, group) in enumerate(curves):
-            own = [(e.settings["delta"], e.means[name]) for e in group if e.complete]
-            if own:
-                ax.plot(*zip(*own), color=COLOURS[i % len(COLOURS)], marker="o", markersize=5, label=literal(label))
+            points = [(e.settings["delta"], e.means[name]) for e in group if e.complete]
+            if points:
+                ax.plot(*zip(*points), color=COLOURS[i % len(COLOURS)], marker="o", markersize=5, label=literal(label))
         _dress(ax, "delta of Extra Compute (0: none)", SHOWN_MEASURES[name].heading)
     axes[-1].set_yscale("log")
     axes[-1].legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
@@ -131,17 +131,17 @@ def _deltas(axes: Sequence[Axes], curves: Sequence[tuple[str, list[Entry]]]) -> 
 
 def _stages(ax: Axes, group: Sequence[Entry], where: str) -> None:
     """Stacked shares of the seconds, a bar for each method at its best setting, with the seconds in all."""
-    own = sorted(best_settings(group), key=lambda entry: entry.means["seconds"])
-    labels, left = [literal(entry.label) for entry in own], [0.0] * len(own)
+    best = sorted(best_settings(group), key=lambda entry: entry.means["seconds"])
+    labels, left = [literal(entry.label) for entry in best], [0.0] * len(best)
     for stage, label in STAGES.items():
         shares = []
-        for entry in own:
+        for entry in best:
             known = {name: entry.means.get(name, 0.0) for name in STAGES if name != "rest"}
             known["rest"] = max(0.0, entry.means["seconds"] - sum(known.values()))
             shares.append(100 * known[stage] / entry.means["seconds"])
         ax.barh(labels, shares, left=left, label=label)
         left = [a + b for a, b in zip(left, shares)]
-    for i, entry in enumerate(own):
+    for i, entry in enumerate(best):
         ax.annotate(f"{entry.means['seconds']:.3g} s", (100, i), xytext=(4, -3), textcoords="offset points", fontsize=7)
     ax.set_xlim(0, 115)
     ax.set_axisbelow(True)

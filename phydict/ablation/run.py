@@ -58,20 +58,20 @@ class Results:
         if others and not self.file.exists():
             raise ValueError(f"{folder} holds {others[0]}, but no {RESULTS} of this command, and is not written to: "
                              "give another out, or move that away")
-        found = {row.get("key"): row for row in read_csv(self.file)}
-        if None in found:
+        stored = {row.get("key"): row for row in read_csv(self.file)}
+        if None in stored:
             raise ValueError(f"{self.file} has rows without a key, so that it is no table of this command: give "
                              "another out")
-        if found and not found.keys() & planned.keys():
-            raise ValueError(f"{self.file} is the table of another comparison, whose {len(found)} rows are all of "
+        if stored and not stored.keys() & planned.keys():
+            raise ValueError(f"{self.file} is the table of another comparison, whose {len(stored)} rows are all of "
                              "other settings or data: give another out, or remove it")
-        for name, row in found.items():
+        for name, row in stored.items():
             wrong = next((k for k in MEASURED if k not in WORDS and isinstance(row.get(k), str)), None)
             if wrong:
                 raise ValueError(f"{self.file}: {wrong} of row {name} is {reprlib.repr(row[wrong])}, which is no "
                                  "number: remove that row, and it is run again")
-        self.others = [row for name, row in found.items() if name not in planned]
-        self.done = {name: self._row(name, row) for name, row in found.items()
+        self.others = [row for name, row in stored.items() if name not in planned]
+        self.done = {name: self._row(name, row) for name, row in stored.items()
                      if name in planned and row.get("status") in FINISHED}
 
     def _row(self, name: str, measured: Mapping) -> dict:
@@ -105,12 +105,12 @@ def run(specification: Specification, device: torch.device, progress: CaseProgre
     Case by case; the X-rays of a case are simulated once for all trials that share an acquisition.
     """
     scoring = scoring or Scoring()
-    found, planned = {}, {}  # cases of an acquisition; key -> columns
+    acquired, planned = {}, {}  # cases of an acquisition; key -> columns
     cases: dict[str, list] = {}  # id -> trials, their rows' keys, and the functions that make the case
     for trial in specification.trials:
-        if (acquisition := trial.acquisition()) not in found:
-            found[acquisition] = trial.data.test_cases(*trial.scene())
-        for case, source, make in found[acquisition]:
+        if (acquisition := trial.acquisition()) not in acquired:
+            acquired[acquisition] = trial.data.test_cases(*trial.scene())
+        for case, source, make in acquired[acquisition]:
             name = key(trial, case, source, scoring.settings())
             planned[name] = {"case": case} | trial.columns | {"grid": "x".join(map(str, trial.scene()[0].shape))}
             cases.setdefault(case, []).append((trial, name, make))
@@ -189,7 +189,7 @@ class Runner:
         if (state := str(trial.identity() | {"seed": None})) not in self.warm:
             self.warm.add(state)
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # what there is to say is said again by the run that counts
+                warnings.simplefilter("ignore")  # the measured run repeats them
                 _attempt(lambda: self._reconstruct(trial, scene, WarmUp(on_step)))
         warned = list(scene.warnings)
         with noted(warned, f"{scene.case}, {trial.label}"):
@@ -205,7 +205,7 @@ class Runner:
         finite = bool(result.volume.isfinite().all())
         scores = {}
         if finite:
-            volume = resampled(result.volume, trial.own()[0], scene.grid)
+            volume = resampled(result.volume, trial.domain()[0], scene.grid)
             scores = self.scoring.scores(volume, result.misfit, scene.truth, scene.grid, scene.window, self.device,
                                          trial.data.protocol)
             if features := self.scoring.features(volume, scene.truth, scene.window, self.device):
@@ -225,7 +225,7 @@ class Runner:
         torch.manual_seed(seed)
         prior = _on(trial.prior, self.device) if isinstance(trial.method, Sampler) else None
         ready = reconstructor(trial.method, prior, trial.guidance, trial.name, samples=trial.samples)
-        xrays, projector = fit_to_grid(ready, trial.own()[0], scene.xrays.clone(), scene.beam, trial.projector)
+        xrays, projector = fit_to_grid(ready, trial.domain()[0], scene.xrays.clone(), scene.beam, trial.projector)
         return ready.with_mu_water(scene.mu_water).reconstruct(
             xrays, projector, scene.report(trial), False, seed, on_step)
 

@@ -79,18 +79,18 @@ def _specification(content, given: Mapping, changed: Mapping) -> Specification:
     common = dotted(_mapping(content.get("base"), "base")) | {
         name: value for name, value in changed.items() if not isinstance(value, list)}
     lists = {name: value for name, value in changed.items() if isinstance(value, list)}
-    trials, used, found = {}, set(), []
+    trials, used, planned = {}, set(), []
     for entry in products:
         _check_keys(entry, ("base", "axes"), "a product")
-        own, axes = ({setting: value for setting, value in dotted(_mapping(entry.get(name), name)).items()
+        base, axes = ({setting: value for setting, value in dotted(_mapping(entry.get(name), name)).items()
                       if setting not in changed} for name in ("base", "axes"))
         axes |= lists
-        product, meant = trials_of(common | own, axes, methods, cases, len(found))
-        check_used([*own, *axes], meant, product)
-        used, found = used | meant, found + product
+        product, meant = trials_of(common | base, axes, methods, cases, len(planned))
+        check_used([*base, *axes], meant, product)
+        used, planned = used | meant, planned + product
         for trial in product:
             trials.setdefault(json.dumps(trial.identity(), sort_keys=True), trial)
-    check_used(common, used, found)
+    check_used(common, used, planned)
     metrics = parsed(list[str], content.get("metrics", ["volume"]), "metrics")
     fid, clip = (_settings(kind(), content.get(name), name) for kind, name in ((FIDSettings, "fid"),
                                                                               (CLIPSettings, "clip")))

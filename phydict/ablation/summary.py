@@ -50,8 +50,8 @@ class Entry:
 
     def estimate(self, name: str) -> float | Estimate | None:
         """The mean of a measure, of a score of several patients with its interval; None where it was not measured."""
-        found = estimate(self.values[name]) if name in SCORES & self.values.keys() else None
-        return self.means.get(name) if found is None or math.isnan(found.low) else found
+        interval = estimate(self.values[name]) if name in SCORES & self.values.keys() else None
+        return self.means.get(name) if interval is None or math.isnan(interval.low) else interval
 
     @property
     def complete(self) -> bool:
@@ -86,7 +86,7 @@ def _format_setting(name: str, value: object) -> str:
     return f"K = {value}" if name == "views" else f"{name.split('.', 1)[-1].replace('_', ' ')} {value}"
 
 
-def entries(rows: Iterable[Mapping]) -> list[Entry]:
+def summarise(rows: Iterable[Mapping]) -> list[Entry]:
     """One entry per method, settings and condition, in the order of the rows.
 
     The condition of an entry is what differs among the rows' X-rays.
@@ -95,42 +95,42 @@ def entries(rows: Iterable[Mapping]) -> list[Entry]:
     names = [name for name in dict.fromkeys(k for row in rows for k in row) if name not in NON_SETTING_COLUMNS]
     common = [name for name in names if name in ("method", *PRIOR_SETTINGS) or name.startswith("method.")]
     varying = _varying(rows, [name for name in names if name not in common])
-    own = {method: _varying([row for row in rows if row["method"] == method], [n for n in common if n != "method"])
+    changed = {method: _varying([row for row in rows if row["method"] == method], [n for n in common if n != "method"])
            for method in dict.fromkeys(row["method"] for row in rows)}
     groups: dict[tuple, list] = {}
     for row in rows:
-        place = (row["method"], *(row.get(name) for name in (*own[row["method"]], *varying)))
+        place = (row["method"], *(row.get(name) for name in (*changed[row["method"]], *varying)))
         groups.setdefault(place, []).append(row)
-    return [_entry(group, own[group[0]["method"]], varying) for group in groups.values()]
+    return [_entry(group, changed[group[0]["method"]], varying) for group in groups.values()]
 
 
-def conditions(found: Sequence[Entry], without: Sequence[str] = ()) -> list[tuple[dict, list[Entry]]]:
+def conditions(entries: Sequence[Entry], without: Sequence[str] = ()) -> list[tuple[dict, list[Entry]]]:
     """The entries under each condition, or under what is left of it `without` some of its parts."""
     groups: dict[tuple, list] = {}
-    for entry in found:
+    for entry in entries:
         groups.setdefault(tuple((k, v) for k, v in entry.condition.items() if k not in without), []).append(entry)
     return [(dict(condition), group) for condition, group in groups.items()]
 
 
-def compared_views(found: Sequence[Entry]) -> list[tuple[dict, list[Entry]]]:
+def compared_views(entries: Sequence[Entry]) -> list[tuple[dict, list[Entry]]]:
     """The entries under each other condition that has several numbers of views."""
-    return _along(found, "views", ("views",))
+    return _along(entries, "views", ("views",))
 
 
-def compared_geometries(found: Sequence[Entry]) -> list[tuple[dict, list[Entry]]]:
+def compared_geometries(entries: Sequence[Entry]) -> list[tuple[dict, list[Entry]]]:
     """The entries under each other condition that has several geometry files, which fix the views."""
-    return _along(found, "geometry", ("geometry", "views"))
+    return _along(entries, "geometry", ("geometry", "views"))
 
 
-def _along(found: Sequence[Entry], axis: str, without: Sequence[str]) -> list[tuple[dict, list[Entry]]]:
-    groups = conditions([entry for entry in found if entry.condition.get(axis) is not None], without)
+def _along(entries: Sequence[Entry], axis: str, without: Sequence[str]) -> list[tuple[dict, list[Entry]]]:
+    groups = conditions([entry for entry in entries if entry.condition.get(axis) is not None], without)
     return [(rest, group) for rest, group in groups if len({entry.condition[axis] for entry in group}) > 1]
 
 
-def best_settings(found: Sequence[Entry], measure: str = "psnr") -> list[Entry]:
+def best_settings(entries: Sequence[Entry], measure: str = "psnr") -> list[Entry]:
     """Of each method the entry with the highest mean of `measure`, complete ones first."""
     best: dict[str, Entry] = {}
-    for entry in found:
+    for entry in entries:
         rank = (entry.complete, entry.means.get(measure, -math.inf))
         other = best.get(entry.method)
         if other is None or rank > (other.complete, other.means.get(measure, -math.inf)):
@@ -138,23 +138,24 @@ def best_settings(found: Sequence[Entry], measure: str = "psnr") -> list[Entry]:
     return list(best.values())
 
 
-def deltas(found: Sequence[Entry]) -> list[tuple[str, list[Entry]]]:
+def deltas(entries: Sequence[Entry]) -> list[tuple[str, list[Entry]]]:
     """What has a curve over Extra Compute's delta: a label, and its entries from delta 0 up."""
     groups: dict[str, list] = {}
-    for entry in found:
+    for entry in entries:
         if "delta" in entry.settings:
             others = {name: value for name, value in entry.settings.items() if name != "delta"}
             groups.setdefault(format_settings(entry.method, others, entry.condition), []).append(entry)
     return [(label, sorted(group, key=lambda entry: entry.settings["delta"])) for label, group in groups.items()]
 
 
-def _entry(rows: Sequence[Mapping], own: Sequence[str], varying: Sequence[str]) -> Entry:
+def _entry(rows: Sequence[Mapping], changed: Sequence[str], varying: Sequence[str]) -> Entry:
     first, good = rows[0], [row for row in rows if row["status"] == "ok"]
     cases = len({row["case"] for row in good})
     stages = {name for row in good for name in row if name.startswith("seconds_")}
-    values = {name: found for name in [*SHOWN_MEASURES, *stages] if len(found := case_values(good, name)) == cases > 0}
+    values = {name: scores for name in [*SHOWN_MEASURES, *stages]
+              if len(scores := case_values(good, name)) == cases > 0}
     error = next((f"{row['status']}: {row['error']}" for row in rows if row["status"] != "ok"), None)
-    return Entry(first["method"], {n: first[n] for n in own if n in first},
+    return Entry(first["method"], {n: first[n] for n in changed if n in first},
                  {n: first[n] for n in varying if n in first}, values, cases, len({row["case"] for row in rows}), error,
                  tuple((row["case"], str(row.get("key"))) for row in good))
 

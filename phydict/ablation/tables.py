@@ -32,12 +32,12 @@ OF_DELTA = ("ssim", "misfit", "psnr", "mae_hu", *FURTHER, "seconds")
 """Columns of the table of Extra Compute, the misfit beside SSIM: what looks better may fit the X-rays worse."""
 
 
-def all_tables(found: Sequence[Entry], rows: Sequence[dict],
+def all_tables(entries: Sequence[Entry], rows: Sequence[dict],
                empty: Mapping[str, str] = MappingProxyType({})) -> list[Table]:
     """Every table that the entries of some rows allow; empty: scores that may stay empty -> why they then do."""
-    measured = {name for entry in found for name in entry.values}
+    measured = {name for entry in entries for name in entry.values}
     notes, tables = [_caption(rows), *empty_notes(empty, measured), *doubts(rows)], []
-    for condition, group in conditions(found):
+    for condition, group in conditions(entries):
         title = format_settings("Methods", condition or {name: rows[0][name] for name in ("views", "simulator")})
         best = best_settings(group)
         if len(best) < len(group):
@@ -46,13 +46,13 @@ def all_tables(found: Sequence[Entry], rows: Sequence[dict],
             title += ": all settings"
         tables.append(_method_table(title, group, notes))
         tables += _difference_tables(title.removesuffix(": all settings"), best, notes[1:])
-    for rest, group in compared_views(found):
+    for rest, group in compared_views(entries):
         columns = {k: f"K = {k}" for k in sorted({entry.condition["views"] for entry in group})}
         tables += _axis_tables("against the number of views", rest, group, columns, "views", notes)
-    for rest, group in compared_geometries(found):
+    for rest, group in compared_geometries(entries):
         columns = {file: Path(file).stem for file in dict.fromkeys(entry.condition["geometry"] for entry in group)}
         tables += _axis_tables("by geometry", rest, group, columns, "geometry", notes)
-    return tables + [_delta_table(label, group, notes) for label, group in deltas(found)]
+    return tables + [_delta_table(label, group, notes) for label, group in deltas(entries)]
 
 
 def write_tables(folder: Path, tables: Sequence[Table]) -> list[Path]:
@@ -66,15 +66,15 @@ def write_tables(folder: Path, tables: Sequence[Table]) -> list[Path]:
     return list(files)
 
 
-def _method_table(title: str, found: Sequence[Entry], notes: Sequence[str]) -> Table:
+def _method_table(title: str, entries: Sequence[Entry], notes: Sequence[str]) -> Table:
     """Method x measures, under one condition."""
-    return _entry_table(title, "method", OF_METHODS, [(entry.label, entry) for entry in found], notes)
+    return _entry_table(title, "method", OF_METHODS, [(entry.label, entry) for entry in entries], notes)
 
 
-def _difference_tables(title: str, found: Sequence[Entry], notes: Sequence[str]) -> list[Table]:
+def _difference_tables(title: str, entries: Sequence[Entry], notes: Sequence[str]) -> list[Table]:
     """What each method has more than the first one on the same cases; none without a second one."""
-    first, *others = [entry for entry in found if entry.cases] or [None]
-    names = _measured(OF_DIFFERENCES, found)
+    first, *others = [entry for entry in entries if entry.cases] or [None]
+    names = _measured(OF_DIFFERENCES, entries)
     lines: list[tuple[str, bool, list]] = []
     for entry in others:
         values = [difference(entry.values.get(name, {}), first.values.get(name, {})) for name in names]
@@ -86,10 +86,10 @@ def _difference_tables(title: str, found: Sequence[Entry], notes: Sequence[str])
                   lines, [INTERVAL, *notes])]
 
 
-def _delta_table(label: str, found: Sequence[Entry], notes: Sequence[str]) -> Table:
+def _delta_table(label: str, entries: Sequence[Entry], notes: Sequence[str]) -> Table:
     """Extra Compute's delta x measures: the form of the paper's Table 2, with the misfit beside SSIM."""
     return _entry_table(f"Extra Compute's delta: {label}", "delta", OF_DELTA,
-                        [(f"{entry.settings['delta']:g}{entry.lacking}", entry) for entry in found], notes)
+                        [(f"{entry.settings['delta']:g}{entry.lacking}", entry) for entry in entries], notes)
 
 
 def _entry_table(title: str, first: str, names: Sequence[str], lines: Sequence[tuple[str, Entry]],
@@ -119,9 +119,9 @@ def _axis_tables(title: str, rest: dict, group: Sequence[Entry], columns: Mappin
     return tables
 
 
-def _measured(names: Sequence[str], found: Sequence[Entry]) -> list[str]:
+def _measured(names: Sequence[str], entries: Sequence[Entry]) -> list[str]:
     """The measures without those of FURTHER that no entry has."""
-    return [name for name in names if name not in FURTHER or any(name in entry.values for entry in found)]
+    return [name for name in names if name not in FURTHER or any(name in entry.values for entry in entries)]
 
 
 def _caption(rows: Sequence[dict]) -> str:
@@ -136,6 +136,6 @@ def _caption(rows: Sequence[dict]) -> str:
         f"{listed(rows, 'threads') or 'none'}{how and f', {how}'}; loading and scoring excluded.")
 
 
-def _reasons(found: Sequence[Entry]) -> list[str]:
+def _reasons(entries: Sequence[Entry]) -> list[str]:
     """Why entries lack cases, each reason once."""
-    return list(dict.fromkeys(f"{entry.method}: {entry.error}" for entry in found if entry.error))
+    return list(dict.fromkeys(f"{entry.method}: {entry.error}" for entry in entries if entry.error))

@@ -28,8 +28,8 @@ class CountingProjector:
         self.last_projection: Tensor | None = None
 
     def __call__(self, density: Tensor) -> Tensor:
-        self.last_projection = found = self.linear(density)
-        return found
+        self.last_projection = projected = self.linear(density)
+        return projected
 
     def linear(self, d: Tensor) -> Tensor:
         """The same of directions and test volumes, which are no estimates."""
@@ -70,10 +70,10 @@ class Baseline(Reconstructor):
             A.y, guard = y, Guard(A, on_step, self.steps())
             density = self.solve(A, y, guard)
         with watch.stage("score"):
-            found = guard.score(density, self.mu_water * A(density), self.mu_water * y)
+            fit = guard.score(density, self.mu_water * A(density), self.mu_water * y)
         return Reconstruction(
             volume=mu_to_hu(density[0, 0], 1.0).cpu(), grid=A.grid, method=self.name, seed=seed,
-            **found, seconds=watch.seconds, projector_calls=A.calls)
+            **fit, seconds=watch.seconds, projector_calls=A.calls)
 
 
 def empty(A: CountingProjector, y: Tensor) -> Tensor:

@@ -79,10 +79,10 @@ class Orbit:
             return np.full(tangents.shape, 0.5)
         start = self.angles[order[0]] - step / 2
         fan = self.turns[:, None] * np.arctan(tangents)
-        own, other = (self._inside(angle - start, arc) for angle in (
+        weight, opposite = (self._inside(angle - start, arc) for angle in (
             self.angles[:, None], self.angles[:, None] + math.pi + 2 * fan))
-        own = own.clip(1e-6)  # a view at the very end of the arc
-        return own / (own + other)
+        weight = weight.clip(1e-6)  # a view at the very end of the arc
+        return weight / (weight + opposite)
 
     @staticmethod
     def _inside(way: np.ndarray, arc: float) -> np.ndarray:

@@ -109,8 +109,8 @@ class PriorCLI(LightningCLI):
         plugins = [*(given if isinstance(given, list) else [given]), WholeCheckpoints()]
         logger = CSVLogger(self._get(self.config, "out"), name="logs")
         trainer = self._get(self.config_init, "trainer")
-        found = None if trainer.accelerator == "cpu" else torch.accelerator.current_accelerator(check_available=True)
-        device = found or torch.device("cpu")
+        gpu = None if trainer.accelerator == "cpu" else torch.accelerator.current_accelerator(check_available=True)
+        device = gpu or torch.device("cpu")
         if trainer.precision is None:
             kwargs["precision"] = trainer_precision(self._get(self.config, "precision"), device)
         elif "bf16" in str(trainer.precision):

@@ -186,17 +186,17 @@ def tag_numbers(dataset: pydicom.Dataset, frame: int, keyword: str, name: str,
         return None
     wanted = "numbers" if count is None else "a number" if count == 1 else f"{count} finite numbers"
     try:
-        found = tuple(float(part) for part in (value if isinstance(value, MultiValue) else [value]))
+        numbers = tuple(float(part) for part in (value if isinstance(value, MultiValue) else [value]))
     except (TypeError, ValueError, OverflowError):
-        found = (math.nan,)
-    if len(found) != (count or len(found)) or not all(map(math.isfinite, found)):
+        numbers = (math.nan,)
+    if len(numbers) != (count or len(numbers)) or not all(map(math.isfinite, numbers)):
         raise ValueError(f"{name}: {keyword} must be {wanted}, but {reprlib.repr(value)} was found")
-    return found
+    return numbers
 
 
 def _number(dataset: pydicom.Dataset, frame: int, keyword: str, name: str) -> float | None:
-    found = tag_numbers(dataset, frame, keyword, name, 1)
-    return None if found is None else found[0]
+    numbers = tag_numbers(dataset, frame, keyword, name, 1)
+    return None if numbers is None else numbers[0]
 
 
 def _angle(dataset: pydicom.Dataset, frame: int, keyword: str, name: str) -> float | None:

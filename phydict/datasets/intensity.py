@@ -15,10 +15,10 @@ from numbers import Real
 import numpy as np
 
 KINDS = ("line_integrals", "counts", "display")
-MOST = 100.0
+LARGEST_LINE_INTEGRAL = 100.0
 """No line integral of a patient is larger: it is 2 m of bone."""
 
-LARGEST = 1e30
+LARGEST_PIXEL = 1e30
 """No pixel value, scale or offset is as large: it would overflow."""
 
 ABOVE_AIR = 1.5
@@ -73,7 +73,7 @@ class Intensity:
         value = getattr(self, name)
         if value is None:
             return
-        if isinstance(value, bool) or not isinstance(value, Real) or not abs(value) < LARGEST:
+        if isinstance(value, bool) or not isinstance(value, Real) or not abs(value) < LARGEST_PIXEL:
             raise ValueError(f"intensity needs a number for {name}, but {reprlib.repr(value)} was given; give a "
                              "finite one without quotes")
         object.__setattr__(self, name, float(value))
@@ -93,7 +93,7 @@ class Intensity:
         """
         if self.kind == "line_integrals":
             y = self.scale * pixels + self.offset
-            if np.nanmax(y) > MOST or np.nanmedian(y) < 0:
+            if np.nanmax(y) > LARGEST_LINE_INTEGRAL or np.nanmedian(y) < 0:
                 raise ValueError(f"the line integrals have a median of {np.nanmedian(y):.3g} and reach "
                                  f"{np.nanmax(y):.3g}, but behind a patient they lie between 0 and about 10; correct "
                                  "`scale` and `offset`, or state another intensity kind")

@@ -133,10 +133,10 @@ class PositionBias(nn.Module):
         device = next(self.parameters()).device
         place = torch.cartesian_prod(torch.arange(rows, device=device), torch.arange(columns, device=device)).float()
         apart = place[:, None] - place[None]
-        found = apart.sign() * (apart.abs() + 1).log()
+        bias = apart.sign() * (apart.abs() + 1).log()
         for layer in self.net:
-            found = layer(found)
-        return found.movedim(-1, 0)
+            bias = layer(bias)
+        return bias.movedim(-1, 0)
 
 
 class Codebook(nn.Module):
@@ -229,17 +229,17 @@ def load_ct_clip(file: str | Path, text: str | Path | None = None, towers: Tower
     tokenizer, bert = load_bert(text) if text else (None, None)
     model = CTCLIP(towers, bert, tokenizer)
     weights = read_torch(file)
-    found = {name: value for name, value in weights.items() if isinstance(value, Tensor)} if isinstance(
+    tensors = {name: value for name, value in weights.items() if isinstance(value, Tensor)} if isinstance(
         weights, dict) else {}
     wanted = model.state_dict()
     wrong = next((name for name, value in wanted.items()
-                  if name not in found or found[name].shape != value.shape), None)
+                  if name not in tensors or tensors[name].shape != value.shape), None)
     if wrong:
         raise ValueError(f"{file} is not CT-CLIP's checkpoint ({wrong} is missing or of another shape): give "
                          "CT-CLIP_v2.pt")
-    mine = {name: found[name] for name in wanted}
-    check_finite(mine, file)
-    model.load_state_dict(mine)
+    tensors = {name: tensors[name] for name in wanted}
+    check_finite(tensors, file)
+    model.load_state_dict(tensors)
     return model.eval().requires_grad_(False)
 
 

@@ -43,19 +43,19 @@ def case_features(network: SliceFeatures, hu: Tensor, truth: Features | Tensor) 
 def save_features(file: Path, features: Features) -> None:
     """Writes the features of a case as safetensors."""
     with atomic_write(file) as part:
-        save_file({plane: found.contiguous() for plane, found in features.items()}, part)
+        save_file({plane: values.contiguous() for plane, values in features.items()}, part)
 
 
 def load_features(file: Path, backbone: str) -> Features:
     """What `save_features` wrote. Raises ValueError, naming the file, where it is something else."""
     try:
-        found = load_file(file)
-        shapes = {plane: tuple(found[plane].shape) for plane in PLANES}
+        features = load_file(file)
+        shapes = {plane: tuple(features[plane].shape) for plane in PLANES}
     except Exception as error:  # whatever a missing or damaged file leads to
         raise ValueError(f"the features of slices {file} are missing or damaged: do the case again") from error
     if any(len(shape) != 3 or shape[::2] != (2, DIMENSIONS[backbone]) for shape in shapes.values()):
         raise ValueError(f"{file} does not hold features of the FID backbone {backbone}: do the case again")
-    return found
+    return features
 
 
 def frechet_distance(a: Tensor, b: Tensor, repeats: Tensor | None = None) -> float:
@@ -90,19 +90,19 @@ def fid(cases: Mapping[str, Features], replicates: int = 0) -> dict[str, Estimat
     stacks = {plane: torch.cat([features[plane] for features in cases.values()], 1) for plane in PLANES}
     owners = {plane: torch.tensor([names.index(patient_of(case)) for case, features in cases.items()
                                    for _ in range(features[plane].shape[1])]) for plane in PLANES}
-    found = _planes(stacks)
+    distances = _planes(stacks)
     if replicates < 1 or len(names) < 2:
-        return {name: Estimate(value) for name, value in found.items()}
+        return {name: Estimate(value) for name, value in distances.items()}
     drawn = [_planes(stacks, {plane: torch.from_numpy(counts)[owners[plane]] for plane in PLANES})
              for counts in draws(len(names), replicates)]
     return {name: Estimate(value, *percentiles(np.array([one[name] for one in drawn])))
-            for name, value in found.items()}
+            for name, value in distances.items()}
 
 
 def _planes(stacks: Features, repeats: Mapping[str, Tensor | None] | None = None) -> dict[str, float]:
-    found = {f"fid_{plane}": frechet_distance(stacks[plane][0], stacks[plane][1], (repeats or {}).get(plane))
+    distances = {f"fid_{plane}": frechet_distance(stacks[plane][0], stacks[plane][1], (repeats or {}).get(plane))
              for plane in PLANES}
-    return found | {"fid": sum(found.values()) / len(PLANES)}
+    return distances | {"fid": sum(distances.values()) / len(PLANES)}
 
 
 class PlaneFID(Metric):
@@ -125,8 +125,8 @@ class PlaneFID(Metric):
 
     def update(self, case: int, features: Features) -> None:
         """Add one case, by its index in the dataset, the same in every process."""
-        for plane, found in features.items():
-            fake, real = found.float().to(self.device)
+        for plane, values in features.items():
+            fake, real = values.float().to(self.device)
             place = torch.stack([torch.full((len(fake),), float(case)), torch.arange(float(len(fake)))], 1)
             getattr(self, plane).append(torch.cat([place.to(self.device), fake, real], 1).flatten())
 
@@ -139,10 +139,10 @@ class PlaneFID(Metric):
                 return {}
             rows = dim_zero_cat(state).reshape(-1, 2 + 2 * self.dimensions).cpu()
             for case in rows[:, 0].unique().tolist():
-                own = rows[rows[:, 0] == case]
-                own = own[: int(own[:, 1].max()) + 1, 2:]
-                cases.setdefault(str(case), {})[plane] = own.view(-1, 2, self.dimensions).movedim(1, 0)
-        found = {name: torch.tensor(float(value)) for name, value in fid(cases).items()}
+                slices = rows[rows[:, 0] == case]
+                slices = slices[: int(slices[:, 1].max()) + 1, 2:]
+                cases.setdefault(str(case), {})[plane] = slices.view(-1, 2, self.dimensions).movedim(1, 0)
+        distances = {name: torch.tensor(float(value)) for name, value in fid(cases).items()}
         counts = {f"slices_{plane}": sum(case[plane].shape[1] for case in cases.values()) for plane in PLANES}
         counts["fid_cases"] = len(cases)
-        return found | {name: torch.tensor(float(count)) for name, count in counts.items()}
+        return distances | {name: torch.tensor(float(count)) for name, count in counts.items()}

@@ -239,9 +239,9 @@ class CaseMetrics(Metric):
             rows = [values for (_, name), values in cases.items() if name == method]
             if rows:
                 result[f"{method}/cases"] = torch.tensor(float(len(rows)))
-            for name, found in over_cases(rows, self.names).items():
-                result[f"{method}/{name}"] = torch.tensor(found.mean, dtype=torch.float64)
-                result[f"{method}/{name}_std"] = torch.tensor(found.std, dtype=torch.float64)
+            for name, summary in over_cases(rows, self.names).items():
+                result[f"{method}/{name}"] = torch.tensor(summary.mean, dtype=torch.float64)
+                result[f"{method}/{name}_std"] = torch.tensor(summary.std, dtype=torch.float64)
         return result
 
     def _cases(self) -> dict[tuple[int, str], dict[str, float]]:

@@ -44,15 +44,15 @@ def organ_scores(hu: Tensor, true_hu: Tensor, grid: Grid, given: Mapping[str, np
     truth has no score; lungs that are not found in the reconstruction have Dice 0 and an infinite HD95.
     """
     fine = fine_grid(grid)
-    found, known = _organs(hu, fine)
+    organs, known = _organs(hu, fine)
     truth, has = _organs(true_hu, fine) if not {"lung", "vessel"} <= (given or {}).keys() else ({}, {})
     truth, has = truth | dict(given or {}), has | {name: bool(mask.any()) for name, mask in (given or {}).items()}
     scores = {}
     if has.get("lung"):
-        scores["dice_lung"] = dice(found["lung"], truth["lung"]) if known["lung"] else 0.0
-        scores["hd95_lung"] = hd95(found["lung"], truth["lung"], fine.spacing) if known["lung"] else math.inf
+        scores["dice_lung"] = dice(organs["lung"], truth["lung"]) if known["lung"] else 0.0
+        scores["hd95_lung"] = hd95(organs["lung"], truth["lung"], fine.spacing) if known["lung"] else math.inf
     if has.get("vessel"):
-        scores["cldice_vessel"] = cl_dice(found["vessel"], truth["vessel"]) if known["vessel"] else 0.0
+        scores["cldice_vessel"] = cl_dice(organs["vessel"], truth["vessel"]) if known["vessel"] else 0.0
     return scores
 
 
@@ -76,8 +76,8 @@ def cl_dice(a: np.ndarray, b: np.ndarray) -> float:
     if not (a.any() and b.any()):
         return 0.0
     shares = []
-    for own, other in ((a, b), (b, a)):
-        lines = skeleton(own)
+    for mask, other in ((a, b), (b, a)):
+        lines = skeleton(mask)
         shares.append(float(lines[other].sum() / lines.sum()))
     precision, sensitivity = shares
     return 2 * precision * sensitivity / (precision + sensitivity) if precision + sensitivity else 0.0

@@ -28,7 +28,7 @@ def lpips_scores(hu: Tensor, true_hu: Tensor, device: torch.device | str = "cpu"
     are too small for a backbone.
     """
     x, y = (RANGE.to_range(volume.float()).to(device) for volume in (hu, true_hu))
-    found = {}
+    scores = {}
     for backbone in BACKBONES:
         network = load_lpips(backbone, False, OTHERWISE).to(device)
         means = []
@@ -38,5 +38,5 @@ def lpips_scores(hu: Tensor, true_hu: Tensor, device: torch.device | str = "cpu"
                 distances = torch.cat([lpips_distances(network, a, b, f"give more voxels, or {OTHERWISE}")
                                        for a, b in pairs])
                 means.append(distances.double().mean())
-        found[f"lpips_{backbone}"] = float(torch.stack(means).mean())
-    return found
+        scores[f"lpips_{backbone}"] = float(torch.stack(means).mean())
+    return scores

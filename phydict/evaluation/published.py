@@ -66,6 +66,6 @@ def _ssim(x: np.ndarray, y: np.ndarray, axes: Sequence[int]) -> float:
     sample = count / (count - 1)
     xx, yy, xy = (sample * (mean(a * b) - p * q) for a, b, p, q in ((x, x, m, m), (y, y, n, n), (x, y, m, n)))
     c1, c2 = 0.01**2, 0.03**2
-    found = (2 * m * n + c1) * (2 * xy + c2) / ((m**2 + n**2 + c1) * (xx + yy + c2))
+    ssim = (2 * m * n + c1) * (2 * xy + c2) / ((m**2 + n**2 + c1) * (xx + yy + c2))
     rim = WINDOW // 2
-    return float(found[tuple(slice(rim, -rim) if axis in axes else slice(None) for axis in range(x.ndim))].mean())
+    return float(ssim[tuple(slice(rim, -rim) if axis in axes else slice(None) for axis in range(x.ndim))].mean())

@@ -123,17 +123,17 @@ def mean_table(rows: Iterable[Mapping], by: str = "method", metrics: Sequence[st
                   *empty_notes(empty, measured), *doubts(rows, by)])
 
 
-def fid_table(found: Mapping[str, Mapping[str, Features]], backbone: str, replicates: int,
+def fid_table(methods: Mapping[str, Mapping[str, Features]], backbone: str, replicates: int,
               title: str = "Frechet distance of slices (FID)") -> Table:
     """The Frechet distances of some methods, label -> the features of its cases, a line each, and what they rest on."""
     lines: list[tuple[str, bool, list[Value | None]]] = []
-    for label, cases in found.items():
+    for label, cases in methods.items():
         distances = fid(cases, replicates)
-        lines.append((label, all(cases.keys() == other.keys() for other in found.values()),
+        lines.append((label, all(cases.keys() == other.keys() for other in methods.values()),
                       [distances[name] for name in NAMES]))
     counts = dict.fromkeys(f"{len(cases)} cases with " + ", ".join(
         f"{plane.upper()} {sum(one[plane].shape[1] for one in cases.values())}" for plane in PLANES) + " slices"
-        for cases in found.values())
+        for cases in methods.values())
     note = (f"Backbone {backbone}, a scale of its own: {'; '.join(counts)}, all of each volume, against the truth's of "
             f"the same cases. HU clipped to [{RANGE.low:g}, {RANGE.high:g}], each volume's least and largest value "
             "mapped to 0 and 1, so that a wrong HU scale is not seen. FID: mean of the planes.")

@@ -46,14 +46,14 @@ def view_sides(beam: ConeBeam, grid: Grid) -> list[str]:
 def agreement(xray: np.ndarray, thorax: np.ndarray) -> str:
     """How well a view (V, U) correlates with the standard thorax's, and what clearly agrees better, if anything: a
     flip, or the image inverted."""
-    found = {name: correlation(xray[::rows, ::columns], thorax) for name, (rows, columns) in FLIPS.items()}
-    best = max(found, key=found.get)
-    label = f"agreement {found['as it is']:.2f}"
-    if max(0, found[best]) < -found["as it is"]:
-        return f"{label}, better ({-found['as it is']:.2f}) inverted"
-    if found[best] <= found["as it is"] + CLEAR:
+    scores = {name: correlation(xray[::rows, ::columns], thorax) for name, (rows, columns) in FLIPS.items()}
+    best = max(scores, key=scores.get)
+    label = f"agreement {scores['as it is']:.2f}"
+    if max(0, scores[best]) < -scores["as it is"]:
+        return f"{label}, better ({-scores['as it is']:.2f}) inverted"
+    if scores[best] <= scores["as it is"] + CLEAR:
         return label
-    return f"{label}, better ({found[best]:.2f}) with {best} changed"
+    return f"{label}, better ({scores[best]:.2f}) with {best} changed"
 
 
 def geometry_page(path: str | Path, beam: ConeBeam, grid: Grid, xrays: np.ndarray, thorax: np.ndarray,

@@ -78,8 +78,8 @@ class Orbit:
 
     def settings(self) -> dict:
         """What decides the geometry; an arc of 360 degrees is left out."""
-        mine = vars(self.filled())
-        return {name: value for name, value in mine.items() if name != "arc" or value != PAPER.arc}
+        settings = vars(self.filled())
+        return {name: value for name, value in settings.items() if name != "arc" or value != PAPER.arc}
 
     def beam(self) -> ConeBeam:
         """As per-view vectors. Raises ValueError for what cannot be."""

@@ -119,12 +119,12 @@ class CascadePosterior(Reconstructor):
         with watch.stage("score"):
             ct = state[:, :1]
             measurement.match_gain_offset(ct)
-            found = guard.score(state, measurement.project(ct), measurement.y)
+            fit = guard.score(state, measurement.project(ct), measurement.y)
             masks = interpolate(base.masks[None], fine.grid.shape, mode="trilinear")[0]
             masks[:fine.state_channels - 1] = ((state[0, 1:] + 1) / 2).cpu()
         return Reconstruction(
             volume=fine.window.to_hu(ct[0, 0]).cpu(), grid=fine.grid, method=self.name, seed=seed,
-            **found | {"diverged_at": base.diverged_at or guard.diverged_at}, seconds=watch.seconds,
+            **fit | {"diverged_at": base.diverged_at or guard.diverged_at}, seconds=watch.seconds,
             network_calls=base.network_calls + denoiser.calls,
             projector_calls=base.projector_calls + measurement.calls, masks=masks,
             scatter=base.scatter, precision=base.precision)

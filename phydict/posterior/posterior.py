@@ -170,12 +170,12 @@ class Posterior(Reconstructor):
             measurement.match_gain_offset(ct)
             reprojection = measurement.project(ct)
             measurement.subtract_scatter(reprojection)
-            found = guard.score(states if self.samples == 1 else None, reprojection, measurement.y)
+            fit = guard.score(states if self.samples == 1 else None, reprojection, measurement.y)
             deviation = (prior.window.half_width * states[:, 0].std(0)).cpu() if self.samples > 1 else None
             intervals = self._intervals(denoiser, measurement, ct)
         return Reconstruction(
             volume=prior.window.to_hu(ct[0, 0]).cpu(), grid=prior.grid, method=self.name, seed=seed,
-            **found, seconds=watch.seconds,
+            **fit, seconds=watch.seconds,
             network_calls=denoiser.calls * (2 if report and self.guidance != 1 else 1),
             projector_calls=measurement.calls, masks=((state[1:] + 1) / 2).cpu(), deviation=deviation,
             intervals=intervals, scatter=measurement.scatter,

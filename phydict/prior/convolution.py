@@ -44,9 +44,9 @@ class _OneDNN(torch.autograd.Function):
         x, weight = ctx.saved_tensors
         wanted = [*ctx.needs_input_grad[:2], ctx.needs_input_grad[2] and ctx.bias_shape is not None]
         # Only inputs in oneDNN's own layout keep torch from its slow road here.
-        found = torch.ops.aten.convolution_backward(
+        parts = torch.ops.aten.convolution_backward(
             gradient.to_mkldnn(), x.to_mkldnn(), weight, ctx.bias_shape, *ctx.settings, False, [0] * 3, 1, wanted)
-        return *(part.to_dense() if part is not None and part.is_mkldnn else part for part in found), None, None, None
+        return *(part.to_dense() if part is not None and part.is_mkldnn else part for part in parts), None, None, None
 
 
 def speed_up(network: nn.Module) -> None:

@@ -114,13 +114,13 @@ def load_prior(path: str | Path | MedSynCheckpoint = DEFAULT_PRIOR,
         header, weights = read_stage(path, ("base", "refiner"), device)
         try:
             build = build_refiner if header.get("stage") == "refiner" else build_prior
-            found = build(header, weights)
+            loaded = build(header, weights)
             if has_text(header):
-                prior = found.prior if isinstance(found, Refiner) else found
+                prior = loaded.prior if isinstance(loaded, Refiner) else loaded
                 prior.load_text = lambda: load_text(path, header["text"])
         except ValueError as error:
             raise ValueError(f"'{path}' contradicts itself: {error}") from error
-    return found.to(device).eval().requires_grad_(False)
+    return loaded.to(device).eval().requires_grad_(False)
 
 
 def load_super_resolution(path: str | Path | MedSynCheckpoint,

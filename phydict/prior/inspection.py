@@ -28,10 +28,10 @@ def inspect_prior(path: str | Path) -> dict[str, dict[str, str]]:
         return {str(path): _inspect_file(path)}
     held = files_in(path)
     chosen = default_kind(held)
-    found = {str(file): {"by its name": kind + (", read by default" if kind == chosen else "")} | _inspect_file(file)
+    kinds = {str(file): {"by its name": kind + (", read by default" if kind == chosen else "")} | _inspect_file(file)
              for kind, file in held.items()}
     names = [name for both in FILES.values() for name in both]
-    return found or {str(path): {"kind": f"unknown: the folder holds no {' or '.join(names)}, nor <N>_ckpt folders"}}
+    return kinds or {str(path): {"kind": f"unknown: the folder holds no {' or '.join(names)}, nor <N>_ckpt folders"}}
 
 
 def _inspect_file(file: Path) -> dict[str, str]:
@@ -47,8 +47,8 @@ def _inspect_file(file: Path) -> dict[str, str]:
         if header:
             report, used = _inspect_phydict(header, entries, file.suffix == ".safetensors"), [*entries]
         else:
-            found = MedSynWeights.sort(entries)
-            report, used = _inspect_medsyn(found, entries), [name for name in entries if name not in found.ignored]
+            medsyn = MedSynWeights.sort(entries)
+            report, used = _inspect_medsyn(medsyn, entries), [name for name in entries if name not in medsyn.ignored]
     except Exception as error:  # whatever a file that is none of these leads to
         return {"kind": "unknown: " + reason(error).removeprefix(f"'{file}' ")}
     with refusing(file, "copy it again"):
@@ -72,14 +72,14 @@ def _inspect_phydict(header: dict, entries: dict[str, Tensor], finished: bool) -
             "training": json.dumps(header.get("training", {}))}
 
 
-def _inspect_medsyn(found: MedSynWeights, entries: dict[str, Tensor]) -> dict[str, str]:
-    parameters = sum(weight.numel() for weight in found.network.parameters())
-    report = {"kind": f"MedSyn's {STAGES[found.stage]}", "width": " ".join(map(str, found.network.widths)),
+def _inspect_medsyn(medsyn: MedSynWeights, entries: dict[str, Tensor]) -> dict[str, str]:
+    parameters = sum(weight.numel() for weight in medsyn.network.parameters())
+    report = {"kind": f"MedSyn's {STAGES[medsyn.stage]}", "width": " ".join(map(str, medsyn.network.widths)),
               "parameters": f"{parameters:,}", "entries": str(len(entries)),
               "prefix": next(iter(entries)).partition("denoise_fn.")[0] + "denoise_fn."
               if any("denoise_fn." in name for name in entries) else "none"}
-    if found.stage == 1:
-        report["names of the shared self-attention"] = f"{found.tied} of {2 * TextUNet.REPEATS}"
-    if found.ignored:
-        report["ignored"] = f"{len(found.ignored)} ({listed(found.ignored)})"
-    return report | {"fits": f"no: {found.misfits}" if found.misfits else "yes"}
+    if medsyn.stage == 1:
+        report["names of the shared self-attention"] = f"{medsyn.tied} of {2 * TextUNet.REPEATS}"
+    if medsyn.ignored:
+        report["ignored"] = f"{len(medsyn.ignored)} ({listed(medsyn.ignored)})"
+    return report | {"fits": f"no: {medsyn.misfits}" if medsyn.misfits else "yes"}

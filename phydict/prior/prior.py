@@ -94,28 +94,28 @@ class Prior(nn.Module):
         share, out = self.preconditioning(t)
         inward = (s**2 + (a * self.sigma_data) ** 2).rsqrt()
         answer = self.network(inward * x, t, context, offsets[0]).to(x.dtype)
-        found = share * x / a + out * answer
+        x0 = share * x / a + out * answer
         if self.detail is None:
-            return found
-        return self._with_detail(found, x, a, self.sigma_data * answer, t, offsets[1])
+            return x0
+        return self._with_detail(x0, x, a, self.sigma_data * answer, t, offsets[1])
 
-    def _with_detail(self, found: Tensor, x: Tensor, a: Tensor, estimate: Tensor, t: Tensor,
+    def _with_detail(self, x0: Tensor, x: Tensor, a: Tensor, estimate: Tensor, t: Tensor,
                      offset: Tensor | None) -> Tensor:
-        """`found` and what the detail network adds. In training it is always run, so that every process does the
+        """`x0` and what the detail network adds. In training it is always run, so that every process does the
         same."""
         sigma = self.schedule.sigma(t.double()).to(x.dtype)
         reached = sigma <= DETAIL_REACH * self.skip_std
         active = reached.nonzero().flatten()
         if not len(active):
             if not self.training:
-                return found
+                return x0
             active = active.new_zeros(1)
         size = (sigma**2 + self.skip_std**2).sqrt()
         inward, out = (w[active].view(-1, 1, 1, 1, 1) for w in (1 / size, reached * sigma * self.skip_std / size))
         estimate = estimate[active]
         answer = self.detail(inward * (x[active] / a[active] - estimate), estimate, t[active].to(x.dtype),
                              None if offset is None else offset[active])
-        return found.index_add(0, active, out * answer.to(out))
+        return x0.index_add(0, active, out * answer.to(out))
 
     def network_inputs(self, shape: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
         """Zeros on the default device, laid out as what the network is given for one state of `shape` voxels."""

@@ -70,10 +70,10 @@ def is_saved_prior(path: str | Path) -> bool:
 
 def check_stage(header: dict, stages: Sequence[str], name: str) -> None:
     """Raises ValueError where the header of the file `name` is of none of `stages`."""
-    found = header.get("stage", "base")
-    if found not in stages:
-        kind = STAGES.get(found) if isinstance(found, str) else None
-        raise ValueError(f"{name} is {kind or f'of stage {reprlib.repr(found)}'}, but {STAGES[stages[0]]} is needed "
+    stage = header.get("stage", "base")
+    if stage not in stages:
+        kind = STAGES.get(stage) if isinstance(stage, str) else None
+        raise ValueError(f"{name} is {kind or f'of stage {reprlib.repr(stage)}'}, but {STAGES[stages[0]]} is needed "
                          "here: give the file of that stage")
 
 

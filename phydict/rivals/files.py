@@ -38,10 +38,10 @@ def load_rival(path: str | Path, device: str = "cpu") -> Rival:
     with refusing(path, ADVICE):
         header, weights = read_stage(path, tuple(NETWORKS), device)
         try:
-            found = build_rival(header, weights)
+            rival = build_rival(header, weights)
         except ValueError as error:
             raise ValueError(f"'{path}' contradicts itself: {error}") from error
-    return found.to(device).eval().requires_grad_(False)
+    return rival.to(device).eval().requires_grad_(False)
 
 
 def build_rival(header: dict, weights: dict[str, Tensor]) -> Rival:

@@ -50,9 +50,9 @@ class RivalNetwork(nn.Module, ABC):
     def reconstruct(self, y: Tensor, geometry: Geometry, generator: torch.Generator,
                     on_step: Callable[[], None] = lambda: None) -> Tensor:
         """The CT of y, as `forward`; the generator is the only source of randomness."""
-        found = self(y, *geometry)
+        ct = self(y, *geometry)
         on_step()
-        return found
+        return ct
 
     def inputs(self, grid: Grid, beam: ConeBeam) -> tuple[Tensor, ...]:
         """Arguments of `forward` for one case, all zeros but for what they tell of the geometry."""

@@ -22,14 +22,14 @@ def plane_places(grid: Grid, beam: ConeBeam, like: Tensor) -> Tensor:
     """Where on the detectors the points (row, column) of each view's plane through the grid's centre are seen:
     (K, N, N, 2), as `detector_places` gives them; points a voxel apart, parallel to the detector, for a cubic grid."""
     n, step = grid.shape[0], grid.spacing[0]
-    found = []
+    places = []
     for k in range(beam.views):
         column, row, depth = step * view_axes(beam, k)
         affine = np.eye(4)
         affine[:3, :3] = np.stack([row, column, depth], 1)
         affine[:3, 3] = grid.centre - (n - 1) / 2 * (row + column)
-        found.append(detector_places(Grid((n, n, 1), affine=affine), beam, k, like)[1][:, :, 0])
-    return torch.stack(found)
+        places.append(detector_places(Grid((n, n, 1), affine=affine), beam, k, like)[1][:, :, 0])
+    return torch.stack(places)
 
 
 def turns(grid: Grid, beam: ConeBeam, like: Tensor) -> Tensor:

@@ -77,5 +77,5 @@ class Rival(nn.Module):
                     on_step: Callable[[], None] = lambda: None) -> Tensor:
         """As `forward`, within [-1, 1], by as many steps as the network takes."""
         y = water / WATER_MM
-        found = self.network.reconstruct(y, self.network.geometry(self.grid, beam, y), generator, on_step)
-        return found.to(water).clamp(-1, 1)
+        ct = self.network.reconstruct(y, self.network.geometry(self.grid, beam, y), generator, on_step)
+        return ct.to(water).clamp(-1, 1)

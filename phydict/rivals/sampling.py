@@ -45,10 +45,10 @@ def pooled(features: Tensor, places: Tensor, pixels: tuple[int, int], scale: int
     share, views = torch.tensor([columns, rows]).to(places), seen(places)
     shape = len(features), features.shape[2], *places.shape[1:4]
     total, largest = places.new_zeros(shape), places.new_full(shape, HIDDEN)
-    for k, (own, there) in enumerate(zip(places, views)):
-        at = ((own + 1) * share - 1).flatten(0, 1)[None].expand(len(features), -1, -1, -1)
+    for k, (place, there) in enumerate(zip(places, views)):
+        at = ((place + 1) * share - 1).flatten(0, 1)[None].expand(len(features), -1, -1, -1)
         read = grid_sample(features[:, k].to(places), at, padding_mode="border", align_corners=False)
-        read = read.unflatten(2, own.shape[:2])
+        read = read.unflatten(2, place.shape[:2])
         total = total + there * read
         largest = torch.where(there > 0, read, HIDDEN).maximum(largest)
     count = views.sum(0)

@@ -66,8 +66,8 @@ class SliceUNet(nn.Module):
     def __init__(self, channels: int, condition: int, widths: tuple[int, ...]):
         super().__init__()
         known = condition + 2 * widths[0]
-        self.wave, told = widths[0], 2 * widths[0]
-        self.time = nn.Sequential(nn.Linear(self.wave, told), nn.SiLU(), nn.Linear(told, told))
+        self.wave, width = widths[0], 2 * widths[0]
+        self.time = nn.Sequential(nn.Linear(self.wave, width), nn.SiLU(), nn.Linear(width, width))
         self.enter = nn.Conv3d(channels, widths[0], (3, 3, 1), padding=(1, 1, 0))
         self.blocks = nn.ModuleList(SliceBlock(w, w, known) for w in widths)
         self.attention = nn.ModuleList(StackAttention(w) for w in widths)

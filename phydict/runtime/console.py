@@ -226,15 +226,15 @@ def quiet() -> Iterator[None]:
 
 
 @contextmanager
-def noted(found: list[str], name: str) -> Iterator[None]:
-    """Adds to `found`, each once, what the UserWarnings given inside say, and shows them with the name of the case."""
+def noted(texts: list[str], name: str) -> Iterator[None]:
+    """Adds to `texts`, each once, what the UserWarnings given inside say, and shows them with the name of the case."""
     with warnings.catch_warnings():
         show = warnings.showwarning
 
         def keep(message: Warning | str, category: type[Warning], *where) -> None:
             text = " ".join(str(message).split())
-            if category is UserWarning and text not in found:
-                found.append(text)
+            if category is UserWarning and text not in texts:
+                texts.append(text)
             show(message if name in text else f"{name}: {text}", category, *where)
 
         warnings.showwarning = keep  # type: ignore[assignment]

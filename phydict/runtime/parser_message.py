@@ -40,7 +40,7 @@ def plain(message: str) -> str:
         return plain(f'Parser key "{key}.init_args.{nested[1]}": {nested[2]}')
     if problem := PROBLEM.search(text):
         return _of_class(key, problem[1], problem[2])
-    given = next((found[1] or found[2] for found in GIVEN.finditer(text)), "something else")
+    given = next((value[1] or value[2] for value in GIVEN.finditer(text)), "something else")
     given = _short(re.sub(r"^NestedArg\(key='\w+', val=(.*)\)$", r"\1", given))
     if "is abstract" in text:
         return f"{key} is the path of a class that can be used, but {given} is abstract: give one derived from it"

@@ -76,9 +76,9 @@ class Profile:
 
     def seconds(self, *stages: str) -> dict[str, float]:
         """Seconds of each of the innermost `stages` that ran, whatever they ran in."""
-        found = {name: [use.seconds for full, use in self.uses.items() if full.split(" / ")[-1] == name]
+        by_stage = {name: [use.seconds for full, use in self.uses.items() if full.split(" / ")[-1] == name]
                  for name in stages}
-        return {name: sum(seconds) for name, seconds in found.items() if seconds}
+        return {name: sum(seconds) for name, seconds in by_stage.items() if seconds}
 
     def table(self) -> str:
         """One line per stage."""
@@ -134,13 +134,13 @@ def peak_memory(device: torch.device) -> float:
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device) / MIB
     try:
-        found = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
+        peak = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
     except OSError:
-        found = None
-    if found is None:
+        peak = None
+    if peak is None:
         unit = 1 if sys.platform == "darwin" else 1024
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / MIB
-    return int(found[1]) * 1024 / MIB
+    return int(peak[1]) * 1024 / MIB
 
 
 class Stopwatch:

@@ -26,8 +26,8 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
 
 
 _Loader.yaml_implicit_resolvers = {
-    letter: [(tag, pattern) for tag, pattern in found if tag != TAG + "timestamp"]
-    for letter, found in _Loader.yaml_implicit_resolvers.items()}
+    letter: [(tag, pattern) for tag, pattern in resolvers if tag != TAG + "timestamp"]
+    for letter, resolvers in _Loader.yaml_implicit_resolvers.items()}
 _Loader.add_implicit_resolver(TAG + "float", re.compile(r"[-+]?[0-9][0-9_]*(\.[0-9_]*)?[eE][-+]?[0-9]+$"),
                               list("-+0123456789"))
 
@@ -122,14 +122,14 @@ class _Reader:
             self.refuse(key, f"cannot be read ({reason(error)}); give a plain value")
 
     def sequence(self, key: str, depth: int) -> list:
-        found: list[object] = []
+        items: list[object] = []
         while not self.loader.check_event(yaml.SequenceEndEvent):
-            found.append(self.value(f"{key}[{len(found)}]", depth + 1))
-        return found
+            items.append(self.value(f"{key}[{len(items)}]", depth + 1))
+        return items
 
     def mapping(self, key: str, depth: int) -> dict:
         merged: dict = {}
-        found: dict = {}
+        mapping: dict = {}
         while not self.loader.check_event(yaml.MappingEndEvent):
             event = self.loader.peek_event()
             merge = isinstance(event, yaml.ScalarEvent) and event.value == "<<" and event.implicit[0]
@@ -137,14 +137,14 @@ class _Reader:
             if isinstance(name, list | dict):
                 self.refuse(key, "has a list or a mapping as a key; give a name")
             inner = f"{key}.{name}" if key else f"{name}"
-            if name in found:
+            if name in mapping:
                 self.refuse(inner, "is given twice; keep one of them")
             value = self.value(inner, depth + 1)
             if not merge:
-                found[name] = value
+                mapping[name] = value
                 continue
             for part in value if isinstance(value, list) else [value]:
                 if not isinstance(part, dict):
                     self.refuse(inner, "merges what is no mapping; give a mapping")
                 merged = part | merged
-        return merged | found
+        return merged | mapping

@@ -76,10 +76,10 @@ class PriorTraining(DenoisingTraining):
         if self.prior.text is not None and text.reports:
             self.prior.text.check(text.reports)
         self.prior.network.run_with(execution.gradient_checkpointing, execution.channels_last, execution.compile)
-        own = self.prior.text is not None and self.prior.text.source is None
-        self.text_dropout, self.pretrain_steps = text.dropout, text.pretrain_steps if own and new_text else 0
+        own_text = self.prior.text is not None and self.prior.text.source is None
+        self.text_dropout, self.pretrain_steps = text.dropout, text.pretrain_steps if own_text and new_text else 0
         self.validation_views = validation.views
-        if own and text.frozen and (self.pretrain_steps or not new_text):
+        if own_text and text.frozen and (self.pretrain_steps or not new_text):
             self._keep_text()
 
     def _keep_text(self) -> None:
@@ -195,9 +195,9 @@ def reconstruction_scores(prior: Prior | Refiner | Rival, ct: Tensor, views: int
     (1, 1, X, Y, Z) in the prior's range, on `beam` or `benchmark_orbit`."""
     beam = beam or benchmark_orbit(prior.grid, views)
     exact = Projector(prior.grid, beam, device=ct.device, full_detector=True)
-    found = reconstruct(Ideal()(exact, prior.window.to_mu(ct), seed)[0], beam, prior, method, seed=seed,
+    result = reconstruct(Ideal()(exact, prior.window.to_mu(ct), seed)[0], beam, prior, method, seed=seed,
                         grid=prior.grid)
-    return volume_metrics(found.volume[None, None], prior.window.to_hu(ct))
+    return volume_metrics(result.volume[None, None], prior.window.to_hu(ct))
 
 
 @rank_zero_only

@@ -92,8 +92,8 @@ class StageTraining(lightning.LightningModule, ABC):
     def on_load_checkpoint(self, checkpoint: dict) -> None:
         resumed, current = {"stage": "base"} | checkpoint["phydict"], self._describe()
         check_stage(resumed, (current["stage"],), "the checkpoint")
-        for key, own in current.items():
-            if resumed[key] != own:
+        for key, value in current.items():
+            if resumed[key] != value:
                 raise ValueError(f"the checkpoint's prior and this training's differ in '{key}': give the settings and "
                                  "data that the checkpoint was trained with, or start anew with model.initial")
         self.samples = checkpoint["phydict"].get("training", {}).get("samples", 0)

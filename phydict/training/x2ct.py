@@ -76,10 +76,10 @@ class X2CTTraining(RivalTraining):
         self.adversary = adversary
 
     def configure_optimizers(self) -> dict:
-        found = super().configure_optimizers()
-        for group in found["optimizer"].param_groups:
+        optimizers = super().configure_optimizers()
+        for group in optimizers["optimizer"].param_groups:
             group["betas"] = BETAS
-        return found
+        return optimizers
 
     def case_loss(self, ct: Tensor, water: Tensor, beam: ConeBeam, generator: torch.Generator) -> Tensor:
         y, network = water / WATER_MM, self.prior.network

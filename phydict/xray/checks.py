@@ -8,8 +8,9 @@ from torch import Tensor
 from phydict.runtime.warning import warn
 from phydict.xray.geometry import ConeBeam
 
-CHEST = 1.0, 20.0
+LINE_INTEGRAL_RANGE = 1.0, 20.0
 """Between these lies the largest line integral of a chest: 50 mm and 1 m of water."""
+
 
 def check_xrays(xrays: Tensor, beam: ConeBeam) -> None:
     """Raises ValueError unless the X-rays (K, V, U) are finite, as many and as large as the beam's views, and none of
@@ -46,7 +47,8 @@ def check_air(xrays: Tensor) -> None:
 def check_line_integrals(xrays: Tensor) -> None:
     """Warns of line integrals that no chest has."""
     largest = float(xrays.max())
-    if not CHEST[0] < largest < CHEST[1]:
-        warn(f"the largest line integral is {largest:.3g}, but those of a chest lie between {CHEST[0]:g} and "
-             f"{CHEST[1]:g}: check that the X-rays are line integrals of attenuation in 1/mm along mm, or "
-             "give display: true where they are display values")
+    low, high = LINE_INTEGRAL_RANGE
+    if not low < largest < high:
+        warn(f"the largest line integral is {largest:.3g}, but those of a chest lie between {low:g} and {high:g}: "
+             "check that the X-rays are line integrals of attenuation in 1/mm along mm, or give "
+             "display: true where they are display values")

@@ -343,15 +343,15 @@ def _check_room(views: int, shape: tuple[int, int]) -> None:
 def _numbers(key: str, value) -> float | np.ndarray:
     """A number, or a regular list of numbers as an array, all finite. Raises ValueError naming the key."""
     try:
-        found = np.asarray(value)
+        numbers = np.asarray(value)
     except ValueError:  # lists of different lengths
-        found = np.asarray(None)
-    if found.dtype.kind not in "iuf":
+        numbers = np.asarray(None)
+    if numbers.dtype.kind not in "iuf":
         raise ValueError(f"{key} is a number or a list of numbers without units and quotes, but {reprlib.repr(value)} "
                          "was given")
-    if not np.isfinite(found).all():
+    if not np.isfinite(numbers).all():
         raise ValueError(f"{key} must be finite, but {reprlib.repr(value)} was given")
-    return found if found.ndim else found.item()
+    return numbers if numbers.ndim else numbers.item()
 
 
 def _check_keys(content: object, required: tuple[str, ...], optional: tuple[str, ...]) -> dict:

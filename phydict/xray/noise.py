@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import torch
 
-FEW = 64.0
+EXACT_BELOW = 64.0
 """Counts expected per pixel from which the quantile is approximated."""
 
 
@@ -20,14 +20,14 @@ def normal(like: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
 def poisson(rate: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
     """Poisson counts (float64) of the expected counts `rate` >= 0, on its device, from a generator on the CPU.
 
-    Below FEW the exact quantile, by summing probabilities; above, its expansion rate + sqrt(rate) z + (z^2 - 1) / 6
-    (Fisher and Cornish 1960, Technometrics 2:209), rounded.
+    Below EXACT_BELOW the exact quantile, by summing probabilities; above, its expansion
+    rate + sqrt(rate) z + (z^2 - 1) / 6 (Fisher and Cornish 1960, Technometrics 2:209), rounded.
     """
     uniform = torch.rand(rate.shape, generator=generator, dtype=torch.float64).clamp(1e-16, 1 - 1e-16).to(rate.device)
     rate = rate.double()
     z = torch.special.ndtri(uniform)
     counts = (rate + rate.sqrt() * z + (z.square() - 1) / 6).round().clamp(min=0)
-    few = rate < FEW
+    few = rate < EXACT_BELOW
     counts[few] = _quantile(rate[few], uniform[few])
     return counts
 
@@ -36,7 +36,7 @@ def _quantile(rate: torch.Tensor, uniform: torch.Tensor) -> torch.Tensor:
     """The smallest count whose cumulative probability is not below `uniform`."""
     probability = torch.exp(-rate)
     below, counts = probability.clone(), torch.zeros_like(rate)
-    for n in range(1, int(FEW + 12 * FEW**0.5)):
+    for n in range(1, int(EXACT_BELOW + 12 * EXACT_BELOW**0.5)):
         counts += below < uniform
         probability = probability * rate / n
         below = below + probability

@@ -24,9 +24,9 @@ def noise_level(xrays: Tensor) -> Tensor:
     if min(xrays.shape[-2:]) < 3:
         return torch.zeros_like(xrays)
     rough = (xrays.diff(n=2, dim=-1).diff(n=2, dim=-2).abs() / (6 * MEDIAN)).flatten(1)
-    found = torch.zeros_like(rough)
+    levels = torch.zeros_like(rough)
     for group in avg_pool2d(xrays, 3, 1).flatten(1).argsort(1).tensor_split(BINS, 1):
         if group.shape[1]:
             level = rough.gather(1, group).median(1, keepdim=True).values
-            found.scatter_(1, group, level.expand_as(group))
-    return pad(found.view(xrays.shape[0], 1, xrays.shape[1] - 2, -1), (1, 1, 1, 1), "replicate")[:, 0]
+            levels.scatter_(1, group, level.expand_as(group))
+    return pad(levels.view(xrays.shape[0], 1, xrays.shape[1] - 2, -1), (1, 1, 1, 1), "replicate")[:, 0]

@@ -3,14 +3,14 @@
 import pytest
 import torch
 
-from phydict.xray.noise import FEW, poisson
+from phydict.xray.noise import EXACT_BELOW, poisson
 
 
 def draw(rate: torch.Tensor, seed: int = 0) -> torch.Tensor:
     return poisson(rate, torch.Generator().manual_seed(seed))
 
 
-@pytest.mark.parametrize("rate", [0.02, 0.7, 5.0, FEW - 1, FEW + 1, 1e3, 1e7])
+@pytest.mark.parametrize("rate", [0.02, 0.7, 5.0, EXACT_BELOW - 1, EXACT_BELOW + 1, 1e3, 1e7])
 def test_mean_variance_and_skewness_are_poissons(rate):
     n = 200_000
     counts = draw(torch.full((n,), rate, dtype=torch.float64))
@@ -22,7 +22,7 @@ def test_mean_variance_and_skewness_are_poissons(rate):
     assert skewness == pytest.approx(rate**-0.5, rel=0.1, abs=0.03)
 
 
-@pytest.mark.parametrize("rate", [0.5, 20.0, FEW - 1e-6, FEW])
+@pytest.mark.parametrize("rate", [0.5, 20.0, EXACT_BELOW - 1e-6, EXACT_BELOW])
 def test_frequencies_are_poissons_probabilities(rate):
     n = 400_000
     counts = draw(torch.full((n,), rate, dtype=torch.float64))
@@ -45,7 +45,7 @@ def test_no_light_counts_nothing_and_light_in_one_pixel_moves_no_other():
 
 
 def test_more_light_never_counts_less():
-    rates = torch.linspace(0, 3 * FEW, 2000, dtype=torch.float64)
+    rates = torch.linspace(0, 3 * EXACT_BELOW, 2000, dtype=torch.float64)
     for seed in range(3):
         uniform = torch.stack([draw(r.view(1), seed)[0] for r in rates[::20]])
         assert (uniform.diff() >= -1).all()

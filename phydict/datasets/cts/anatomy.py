@@ -46,8 +46,8 @@ def segment(hu: np.ndarray, spacing) -> tuple[np.ndarray, np.ndarray]:
     hu, lungs = hu[box], lungs[box]
     airway = _airway(interior[box], lungs, hu, spacing)
     filled, vessel = _fill(lungs, airway, hu, spacing)
-    for mask, found in zip(masks, (filled, airway, vessel)):
-        mask[box] = found
+    for mask, part in zip(masks, (filled, airway, vessel)):
+        mask[box] = part
     known[:] = True, airway.any(), True
     return masks, known
 

@@ -114,14 +114,14 @@ def find_cts(root: str | Path, reports: str | Path | None = None, metadata: str 
     reports = reports or _beside(root, "radiology_text_reports")
     texts = read_reports(reports) if reports else {}
     by_scan = {scan_of(id): text for id, text in texts.items()}
-    found = {id: texts.get(id, by_scan.get(scan_of(id))) for id in ids}
-    if texts and all(text is None for text in found.values()):
+    reports_of = {id: texts.get(id, by_scan.get(scan_of(id))) for id in ids}
+    if texts and all(text is None for text in reports_of.values()):
         message = (f"none of the {len(texts)} reports in {reports} is of one of the {len(ids)} CTs in {root} (the "
                    f"first report is of {next(iter(texts))}, the first CT is {ids[0]})")
         if table_given:
             raise ValueError(f"{message}: give the table of these CTs, or leave out data.source.reports")
         warn(message)
-    cts = [CTFile(files[id], id, _own_report(files[id]) if text is None else text) for id, text in found.items()]
+    cts = [CTFile(files[id], id, _own_report(files[id]) if text is None else text) for id, text in reports_of.items()]
     return cts if fixed else _calibrated(cts, metadata or _beside(root, "metadata"))
 
 
@@ -146,13 +146,13 @@ def _nifti_files(root: Path) -> list[Path]:
         raise FileNotFoundError(f"there is no folder or file {root}; give the folder that holds the CTs")
     every = [p for p in root.rglob("*") if p.is_file()
              and not any(part.startswith(".") for part in p.relative_to(root).parts)]
-    found = sorted(p for p in every if p.name.lower().endswith((".nii", ".nii.gz")) and not is_segmentation(p)
+    files = sorted(p for p in every if p.name.lower().endswith((".nii", ".nii.gz")) and not is_segmentation(p)
                    and (p.name == VOLUME or not is_prepared(p)))
-    if not found:
+    if not files:
         held = f"its {len(every)} files are of other kinds" if every else "it is empty"
         raise FileNotFoundError(f"there is no .nii or .nii.gz file in {root} ({held}); give a folder of NIfTI CTs, or "
                                 "prepare DICOM series with data/prepare_cts.py first")
-    return found
+    return files
 
 
 def _id(path: Path, root: Path) -> str:

@@ -52,13 +52,13 @@ def _numbers(path: str | Path, row: dict[str, str], column: str, count: int) -> 
     """The finite numbers in one field: "1.5", or "[0.7, 0.7]" where there are several."""
     written = str(row[column])
     try:
-        found = tuple(map(float, written.strip(" []").split(",")))
+        numbers = tuple(map(float, written.strip(" []").split(",")))
     except ValueError:
-        found = ()
-    if len(found) != count or not all(map(math.isfinite, found)):
+        numbers = ()
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
         raise ValueError(f"the metadata of {row['VolumeName']} in {path} cannot be read: {column} must be {count} "
                          f"finite number{'s' * (count > 1)}, but {reprlib.repr(written)} was found")
-    return found
+    return numbers
 
 
 def _rows(path: str | Path, columns: tuple[str, ...]) -> list[dict[str, str]]:
@@ -82,8 +82,8 @@ def _rows(path: str | Path, columns: tuple[str, ...]) -> list[dict[str, str]]:
 def _table(file: Path, columns: tuple[str, ...]) -> list[dict[str, str]]:
     with reading(f"the table {file}", TABLE_ADVICE), file.open(newline="", encoding="utf-8-sig") as lines:
         table = csv.DictReader(lines)
-        rows, found = list(table), table.fieldnames or ()
-    missing = [name for name in columns if name not in found]
+        rows, header = list(table), table.fieldnames or ()
+    missing = [name for name in columns if name not in header]
     if missing:
         raise ValueError(f"{file} lacks the columns {', '.join(missing)}; CT-RATE's tables have {', '.join(columns)}")
     return rows

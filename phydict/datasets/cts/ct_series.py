@@ -52,8 +52,8 @@ def find_series(root: Path) -> list[Series]:
             groups[str(path)].append((path, ""))
             continue
         groups[uid].append((path, "" if number is None else str(number)))
-    found = [Series(group[0][0].parent, group[0][1], tuple(path for path, _ in group)) for group in groups.values()]
-    return sorted(found, key=lambda series: natural_order(f"{series.folder}/{series.number}"))
+    every = [Series(group[0][0].parent, group[0][1], tuple(path for path, _ in group)) for group in groups.values()]
+    return sorted(every, key=lambda series: natural_order(f"{series.folder}/{series.number}"))
 
 
 def load_series(series: Series) -> tuple[np.ndarray, np.ndarray]:
@@ -89,13 +89,13 @@ def _header(path: Path) -> pydicom.Dataset:
 
 def _geometry(path: Path, header: pydicom.Dataset) -> dict[str, np.ndarray]:
     """The numbers of the tags NEEDED of one slice. Raises ValueError."""
-    found = {keyword: tag_numbers(header, 0, keyword, path.name, count) for keyword, count in NEEDED.items()}
-    if missing := [keyword for keyword, numbers in found.items() if numbers is None]:
+    tags = {keyword: tag_numbers(header, 0, keyword, path.name, count) for keyword, count in NEEDED.items()}
+    if missing := [keyword for keyword, numbers in tags.items() if numbers is None]:
         raise ValueError(f"{path.name} lacks {', '.join(missing)}; export the series again")
-    if min(found["PixelSpacing"]) <= 0:
-        raise ValueError(f"PixelSpacing of {path.name} must be positive, but {list(found['PixelSpacing'])} mm was "
+    if min(tags["PixelSpacing"]) <= 0:
+        raise ValueError(f"PixelSpacing of {path.name} must be positive, but {list(tags['PixelSpacing'])} mm was "
                          "found; export the series again")
-    return {keyword: np.array(numbers) for keyword, numbers in found.items()}
+    return {keyword: np.array(numbers) for keyword, numbers in tags.items()}
 
 
 def _stack(slices: dict[Path, dict[str, np.ndarray]]) -> tuple[list[Path], np.ndarray]:

@@ -11,8 +11,8 @@ from phydict.grid import Grid
 WIDTH_MM = (300.0, 600.0)
 """Widths of the bodies drawn."""
 
-BAND, LEAST, MOST = 0.7, -0.6, 1.2
-"""Inner share of the wall that grows; its least and most growth. The skin moves without stretching."""
+BAND, GROWTH = 0.7, (-0.6, 1.2)
+"""Inner share of the wall that grows; the range of its growth. The skin moves without stretching."""
 
 RIBS_MM = 12.0
 """What lies outside the box around the lungs and keeps its size: ribs and sternum."""
@@ -51,11 +51,11 @@ class Girth:
         half = tuple((high - low + s) / 2 + RIBS_MM for (low, high), s in zip(ends, grid.spacing))
         columns = body.any(2).any(1).nonzero()[:, 0]
         width = (int(columns[-1] - columns[0]) + 1) * grid.spacing[0]
-        wanted = WIDTH_MM[0] + chance * (WIDTH_MM[1] - WIDTH_MM[0])
+        target = WIDTH_MM[0] + chance * (WIDTH_MM[1] - WIDTH_MM[0])
         if body[0].any() or body[-1].any():
-            wanted = max(wanted, width)
+            target = max(target, width)
         band = BAND * max(width / 2 - half[0], 2 * grid.spacing[0])
-        growth = min(max((wanted - width) / 2, LEAST * band), MOST * band)
+        growth = min(max((target - width) / 2, GROWTH[0] * band), GROWTH[1] * band)
         return cls(tuple(sum(pair) / 2 for pair in ends), half, band / half[0], growth / half[0])
 
     def source(self, points: torch.Tensor) -> torch.Tensor:

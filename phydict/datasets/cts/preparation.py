@@ -158,8 +158,8 @@ def _place(hu: np.ndarray, affine: np.ndarray, beside: dict[str, tuple[Path, ...
     hu = hu.clip(settings.outside)
     work = covering_grid(hu.shape, affine, SEGMENTATION_MM)
     coarse = to_grid(hu, affine, work, settings.outside)
-    found, known = segment(coarse, work.spacing)
-    masks = {name: (mask, work.affine) for name, mask, here in zip(MASKS, found, known) if here}
+    segmented, known = segment(coarse, work.spacing)
+    masks = {name: (mask, work.affine) for name, mask, here in zip(MASKS, segmented, known) if here}
     masks["body"] = body_mask(coarse, work.spacing), work.affine
     facts["lungs_by"] = "file" if "lung" in beside else settings.segmenter
     if facts["lungs_by"] == "lungmask":

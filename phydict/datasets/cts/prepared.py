@@ -103,9 +103,9 @@ def read_prepared(path: Path, grid: Grid, window: HUWindow) -> dict:
     if remark := record["row"].get("remark"):
         warn(f"{record['id']} was prepared with the remark: {remark}")
     hu, affine = load_ct(path)
-    found = [path.parent / f"{name}.nii.gz" for name in MASKS]
-    known = np.array([file.is_file() for file in found])
-    masks = [load_ct(file)[0] if here else None for file, here in zip(found, known)]
+    files = [path.parent / f"{name}.nii.gz" for name in MASKS]
+    known = np.array([file.is_file() for file in files])
+    masks = [load_ct(file)[0] if here else None for file, here in zip(files, known)]
     factors = np.array(hu.shape) // grid.shape
     if np.allclose(record["extent"], grid.extent, atol=1e-3) and (factors * grid.shape == hu.shape).all():
         placed = affine @ np.diag([*factors, 1.0])

@@ -43,11 +43,11 @@ def segmentations_beside(ct: Path) -> dict[str, tuple[Path, ...]]:
     if not lungmask and 0 < len(lobes) < len(LOBES):
         raise ValueError(f"{folder} holds {len(lobes)} of the {len(LOBES)} lobes of the lungs; segment all of them "
                          "(roi_subset), or remove these")
-    found = {"lung": lungmask or lobes}
+    beside = {"lung": lungmask or lobes}
     for name, files in (("airway", ("lung_trachea_bronchia", "trachea")), ("vessel", ("lung_vessels",)),
                         ("body", ("body",))):
-        found[name] = tuple(path for path in (folder / f"{file}.nii.gz" for file in files) if path.is_file())[:1]
-    return {name: files for name, files in found.items() if files}
+        beside[name] = tuple(path for path in (folder / f"{file}.nii.gz" for file in files) if path.is_file())[:1]
+    return {name: files for name, files in beside.items() if files}
 
 
 def read_segmentation(files: tuple[Path, ...], shape, affine: np.ndarray) -> np.ndarray:
@@ -70,15 +70,15 @@ def organs_beside(ct: Path, grid: Grid) -> dict[str, np.ndarray]:
 
     Raises ValueError where a file cannot be read or some of the lungs' lobes are missing.
     """
-    found = {}
+    masks = {}
     for name, files in segmentations_beside(ct.with_name(case_id(ct))).items():
         if name in ("lung", "vessel"):
             union = np.zeros(grid.shape, np.float32)
             for file in files:
                 labels, place = load_ct(file)
                 union += to_grid((labels > 0.5).astype(np.float32), place, grid, 0.0)
-            found[name] = union > 0.5
-    return found
+            masks[name] = union > 0.5
+    return masks
 
 
 def lungs_by_lungmask(hu: np.ndarray) -> np.ndarray:

@@ -132,8 +132,8 @@ def check_hu(hu: np.ndarray, name: str) -> None:
     counts, edges = np.histogram(low, bins=35, range=(AIR, -300))
     mode = edges[counts.argmax()] + 10
     if not low.size or mode > -900:
-        found = f"the most frequent value below -300 is {mode:.0f}" if low.size else "no value lies below -300"
-        warn(f"{name} does not look like HU: {found}, but air should lie near -1000; check slope, intercept "
+        air = f"the most frequent value below -300 is {mode:.0f}" if low.size else "no value lies below -300"
+        warn(f"{name} does not look like HU: {air}, but air should lie near -1000; check slope, intercept "
              "and whether `fixed` is right")
     elif tissue < 0.01:
         warn(f"{name} does not look like HU: only {100 * tissue:.1f} % of it lies above -200; it may have "

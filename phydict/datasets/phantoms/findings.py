@@ -88,14 +88,14 @@ class Finding:
 def draw_findings(rng: np.random.Generator) -> tuple[Finding, ...]:
     """No finding in a quarter of the draws, else one to three that do not hide each other."""
     wanted = int(rng.choice(4, p=[0.25, 0.42, 0.22, 0.11]))
-    found: list[Finding] = []
+    findings: list[Finding] = []
     for _ in range(20):
-        if len(found) == wanted:
+        if len(findings) == wanted:
             break
         proposal = _draw_finding(rng)
-        if not any(_clash(proposal, other) for other in found):
-            found.append(proposal)
-    return tuple(found)
+        if not any(_clash(proposal, other) for other in findings):
+            findings.append(proposal)
+    return tuple(findings)
 
 
 def _draw_finding(rng: np.random.Generator) -> Finding:

@@ -120,12 +120,12 @@ def pleural_space(canvas: Canvas, tissue: np.ndarray) -> np.ndarray:
     t, taken = canvas.thorax, np.zeros_like(tissue)
     for finding in t.findings:
         if finding.kind in PLEURAL:
-            own = SIDES[finding.side] * canvas.axes[0] > 0
+            side = SIDES[finding.side] * canvas.axes[0] > 0
             depth = _pleural_depth(t, finding, *canvas.axes)
             if finding.kind == "effusion":
                 rim = 4 + 18 * finding.size
-                canvas.paint(own * np.clip(0.5 - (depth - rim) / (canvas.edge + 8), 0, 1) * 0.85, -40.0, into=tissue)
-            share = own * canvas.soft(depth)
+                canvas.paint(side * np.clip(0.5 - (depth - rim) / (canvas.edge + 8), 0, 1) * 0.85, -40.0, into=tissue)
+            share = side * canvas.soft(depth)
             canvas.paint(share, 10.0 if finding.kind == "effusion" else AIR, into=tissue)
             taken = np.maximum(taken, share)
     return taken

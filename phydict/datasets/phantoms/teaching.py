@@ -59,17 +59,17 @@ def _statement(pen: Pen) -> tuple[str, tuple[Finding, ...]]:
 
 def _findings(pen: Pen, kind: str) -> tuple[Finding, ...]:
     """Findings of one kind and size in one place, in the same lobe of both sides, in one lung or everywhere."""
-    own = [finding for finding in examples() if finding.kind == kind]
-    sizes = list(dict.fromkeys(finding.size for finding in own))
+    alike = [finding for finding in examples() if finding.kind == kind]
+    sizes = list(dict.fromkeys(finding.size for finding in alike))
     size = sizes[int(pen.rng.random() * len(sizes))]
-    own = [finding for finding in own if finding.size == size]
-    where, chosen = pen.rng.random(), own[int(pen.rng.random() * len(own))]
+    alike = [finding for finding in alike if finding.size == size]
+    where, chosen = pen.rng.random(), alike[int(pen.rng.random() * len(alike))]
     if kind in MIDLINE or where < 0.5:
         return (chosen,)
     if kind not in FOCAL:
-        return tuple(own) if where < 0.8 else (chosen,)
+        return tuple(alike) if where < 0.8 else (chosen,)
     if where < 0.65 and chosen.lobe in LOBES["left"]:
-        return tuple(finding for finding in own if finding.lobe == chosen.lobe)
+        return tuple(finding for finding in alike if finding.lobe == chosen.lobe)
     if where < 0.75:
-        return tuple(finding for finding in own if finding.side == chosen.side)
-    return tuple(own)
+        return tuple(finding for finding in alike if finding.side == chosen.side)
+    return tuple(alike)

@@ -83,11 +83,11 @@ class Anatomy:
 
     def towards_patient(self, share: float) -> Anatomy:
         """This anatomy, `share` of the way nearer to the shape of its own patient; its findings stay."""
-        kept = 1 - share
-        own = np.eye(len(self.weights))[self.patient]
-        weights = own + kept * (np.array(self.weights) - own)
-        return replace(self, weights=tuple(weights.tolist()), lungs=kept * self.lungs, heart=kept * self.heart,
-                       liver=kept * self.liver)
+        varied = 1 - share
+        patient = np.eye(len(self.weights))[self.patient]
+        weights = patient + varied * (np.array(self.weights) - patient)
+        return replace(self, weights=tuple(weights.tolist()), lungs=varied * self.lungs, heart=varied * self.heart,
+                       liver=varied * self.liver)
 
 
 def findings_of(seed: int, share: float) -> tuple[Finding, ...]:

@@ -21,16 +21,16 @@ LEAST_SEEN = 0.9
 """Share of a slice's middle that must come from slices that were scanned, or the scan ends before it."""
 
 
-def sources(shape: Tensor, own: Tensor, voxels) -> Tensor:
-    """Where a new anatomy takes its values in the patient's CT: exp(own) after exp(-shape), (3, *voxels).
+def sources(shape: Tensor, patient: Tensor, voxels) -> Tensor:
+    """Where a new anatomy takes its values in the patient's CT: exp(patient) after exp(-shape), (3, *voxels).
 
-    shape, own: velocities (3, x, y, z) of the new shape and of the patient, from the template. The result is in
+    shape, patient: velocities (3, x, y, z) of the new shape and of the patient, from the template. The result is in
     half-widths of the box.
     """
     fine = [min(2 * n, m) for n, m in zip(shape.shape[1:], voxels)]
     start = places(fine)
     back = start + flow(-resize(shape, fine))
-    moved = back + sample(flow(resize(own, fine)), back) - start
+    moved = back + sample(flow(resize(patient, fine)), back) - start
     return places(voxels) + resize(moved, voxels)
 
 

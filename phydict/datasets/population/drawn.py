@@ -89,8 +89,8 @@ class DrawnPatients(Dataset):
 
     def reports(self, most: int) -> list[str]:
         """Reports such as draws have, for learning their words; nothing is registered for them."""
-        found = [(seed, findings_of(seed, self.settings.variation.findings)) for seed in range(min(most, self.count))]
-        return [write_report(findings, seed % 2 == 0, seed) for seed, findings in found if findings]
+        drawn = [(seed, findings_of(seed, self.settings.variation.findings)) for seed in range(min(most, self.count))]
+        return [write_report(findings, seed % 2 == 0, seed) for seed, findings in drawn if findings]
 
     def prepare(self) -> None:
         """Registers the CTs, or reads how they were; for use before several processes draw."""
@@ -99,40 +99,41 @@ class DrawnPatients(Dataset):
         cases = [self.cts[i] for i in range(len(self.cts))]
         faults = {i: "no lungs were found in it" for i, case in enumerate(cases) if not case["has_masks"][0]}
         usable = [i for i in range(len(cases)) if i not in faults]
-        seen = {i: features(cases[i], self.cts.grid, self.cts.window) for i in usable}
-        template = usable[medoid(list(seen.values()))] if usable else -1
-        found = self._registered(seen, template)
-        faults |= {i: one.fault for i, one in found.items() if one.fault}
+        images = {i: features(cases[i], self.cts.grid, self.cts.window) for i in usable}
+        template = usable[medoid(list(images.values()))] if usable else -1
+        registered = self._registered(images, template)
+        faults |= {i: one.fault for i, one in registered.items() if one.fault}
         for i, fault in sorted(faults.items()):
             warn(f"the CT {cases[i]['id']} does not register ({fault}): it is left out of the population")
-        kept = [i for i in found if i not in faults]
-        if len(kept) < 2:
-            raise ValueError(f"a population is drawn from at least 2 CTs, but {len(kept)} of {len(cases)} could be "
+        left = [i for i in registered if i not in faults]
+        if len(left) < 2:
+            raise ValueError(f"a population is drawn from at least 2 CTs, but {len(left)} of {len(cases)} could be "
                              "registered: give other CTs, or set data.loading.population.share to 0")
-        self.drawn = self.folder and self.folder / self._key([self.cts.key(self.cts.cts[i]) for i in kept],
+        self.drawn = self.folder and self.folder / self._key([self.cts.key(self.cts.cts[i]) for i in left],
                                                              asdict(self.settings.variation))
-        self.overlaps = [found[i].overlap for i in kept if i != template]
-        self.population = Population([cases[i] for i in kept], torch.stack([found[i].velocity for i in kept]),
-                                     kept.index(template), self.cts.grid, self.cts.window)
+        self.overlaps = [registered[i].overlap for i in left if i != template]
+        self.population = Population([cases[i] for i in left], torch.stack([registered[i].velocity for i in left]),
+                                     left.index(template), self.cts.grid, self.cts.window)
 
-    def _registered(self, seen: dict[int, torch.Tensor], template: int) -> dict[int, Registered]:
-        keys = {i: self.cts.key(self.cts.cts[i]) for i in seen}
+    def _registered(self, images: dict[int, torch.Tensor], template: int) -> dict[int, Registered]:
+        keys = {i: self.cts.key(self.cts.cts[i]) for i in images}
         files = {i: self.folder and self.folder / f"{self.cts.cts[i].id}-{self._key(keys[i], keys[template])}.npz"
-                 for i in seen}
-        stored = {i: files[i] and read_arrays(files[i]) for i in seen}
-        found = {i: Registered(torch.from_numpy(one["velocity"]), float(one["overlap"]), float(one["least"]))
+                 for i in images}
+        stored = {i: files[i] and read_arrays(files[i]) for i in images}
+        registered = {i: Registered(torch.from_numpy(one["velocity"]), float(one["overlap"]), float(one["least"]))
                  for i, one in stored.items() if one is not None}
-        left = [i for i in seen if i not in found]
+        left = [i for i in images if i not in registered]
         with CaseProgress() as progress:
             if left:
                 progress.begin("CTs", len(left), verb="register")
             for i in left:
                 progress.case(self.cts.cts[i].id)
-                found[i] = register(seen[template], seen[i]) if i != template else Registered.template(seen[i])
+                image = images[i]
+                registered[i] = register(images[template], image) if i != template else Registered.template(image)
                 if files[i]:
-                    write_arrays(files[i], {name: np.asarray(value) for name, value in vars(found[i]).items()})
-                progress.finished(f"lungs overlap by {found[i].overlap:.2f}")
-        return dict(sorted(found.items()))
+                    write_arrays(files[i], {name: np.asarray(value) for name, value in vars(registered[i]).items()})
+                progress.finished(f"lungs overlap by {registered[i].overlap:.2f}")
+        return dict(sorted(registered.items()))
 
     @staticmethod
     def _key(*parts) -> str:

@@ -37,8 +37,8 @@ class CTThorax(Thorax):
         x = grid.affine[0, 3] + np.arange(grid.shape[0])[:, None, None] * grid.spacing[0] - offset[0]
         depths = {}
         for side, sign in SIDES.items():
-            own = inside & (sign * x > 0)
-            outer, inner = (scipy.ndimage.distance_transform_edt(m, grid.spacing) for m in (~own, own))
+            lung = inside & (sign * x > 0)
+            outer, inner = (scipy.ndimage.distance_transform_edt(m, grid.spacing) for m in (~lung, lung))
             depths[side] = (outer - inner - np.sign(outer - inner) * min(grid.spacing) / 2).astype(np.float32)
         standard = replace(Thorax.standard(), seed=seed, offset=tuple(offset), width=width / 2, depth=depth / 2,
                            height=height, kyphosis=0.0, contrast=contrast, findings=findings)

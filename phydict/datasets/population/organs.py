@@ -22,9 +22,9 @@ PULL = {"lungs": (0.6, 0.8, 1.6), "heart": (1.0, 1.0, 1.0), "liver": (0.8, 0.8, 
 def organs(hu: Tensor, masks: Tensor, grid: Grid) -> dict[str, Tensor]:
     """Shares (X, Y, Z) of each of ORGANS by HU (X, Y, Z) and masks (3, X, Y, Z); of zeros without lungs."""
     lung = masks[0] > 0.5
-    found = {"lungs": masks[0], "heart": torch.zeros_like(hu), "liver": torch.zeros_like(hu)}
+    shares = {"lungs": masks[0], "heart": torch.zeros_like(hu), "liver": torch.zeros_like(hu)}
     if not lung.any():
-        return found
+        return shares
     rows, heights = (lung.any(2).any(0).nonzero()[:, 0], lung.any(0).any(0).nonzero()[:, 0])
     front = int(rows[0] + SPINE_SHARE * (rows[-1] - rows[0]))
     low, high = int(heights[0]), int(heights[-1])
@@ -39,7 +39,7 @@ def organs(hu: Tensor, masks: Tensor, grid: Grid) -> dict[str, Tensor]:
     liver[..., (low + high) // 2:] = False
     middle = int(lung.any(2).any(1).nonzero()[:, 0].float().mean())
     liver[:max(0, middle - round(20 / grid.spacing[0]))] = False
-    return found | {"heart": heart.to(hu), "liver": liver.to(hu)}
+    return shares | {"heart": heart.to(hu), "liver": liver.to(hu)}
 
 
 def expansion(organ: Tensor, extent, pull: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Tensor:

@@ -30,12 +30,12 @@ def _lists(module: ModuleType) -> list:
 
 
 def _words(values: Iterable) -> set[str]:
-    found: set[str] = set()
+    words: set[str] = set()
     for value in values:
         if isinstance(value, str):
-            found |= set(re.findall(r"[a-z]{2,}", re.sub(r"\{[^}]*\}", " ", value).lower()))
+            words |= set(re.findall(r"[a-z]{2,}", re.sub(r"\{[^}]*\}", " ", value).lower()))
         elif isinstance(value, dict):
-            found |= _words(value.values())
+            words |= _words(value.values())
         elif isinstance(value, list | tuple):
-            found |= _words(value)
-    return found
+            words |= _words(value)
+    return words

@@ -43,11 +43,11 @@ def find_xrays(path: str | Path) -> list[Path]:
         raise FileNotFoundError(f"there is no folder {path}; give a folder of X-rays, or a folder of such folders")
     if _is_case(path):
         return [path]
-    found = sorted((p for p in path.iterdir() if p.is_dir() and _is_case(p)), key=lambda p: natural_order(p.name))
-    if not found:
+    cases = sorted((p for p in path.iterdir() if p.is_dir() and _is_case(p)), key=lambda p: natural_order(p.name))
+    if not cases:
         raise FileNotFoundError(f"neither {path} nor its subfolders hold {GEOMETRY} or X-ray images "
                                 f"({', '.join(ENDINGS)}); give a folder of X-ray images")
-    return found
+    return cases
 
 
 def load_xrays(folder: str | Path, geometry: str | Path | None = None, intensity: Intensity | None = None) -> dict:

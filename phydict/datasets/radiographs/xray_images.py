@@ -20,9 +20,9 @@ GREY = ("L", "I;16", "I;16B", "I;16L", "I", "F")
 
 def image_files(folder: Path) -> list[Path]:
     """The X-ray images of a folder in the natural order of their names; DICOM files need no ending."""
-    found = (p for p in folder.iterdir() if p.is_file() and not p.name.startswith(".")
+    images = (p for p in folder.iterdir() if p.is_file() and not p.name.startswith(".")
              and (p.name.lower().endswith(ENDINGS) or is_dicom(p)))
-    return sorted(found, key=lambda p: natural_order(p.name))
+    return sorted(images, key=lambda p: natural_order(p.name))
 
 
 def is_dicom(path: Path) -> bool:

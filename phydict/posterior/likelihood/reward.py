@@ -96,9 +96,9 @@ class Reward:
         with torch.random.fork_rng(enabled=self.dropout):
             if self.dropout:
                 torch.manual_seed(seed)
-            found = lpips_distances(network, images[0].flatten(0, 1), images[1].flatten(0, 1),
+            distances = lpips_distances(network, images[0].flatten(0, 1), images[1].flatten(0, 1),
                                     "give a finer detector, or set the reward's lpips weight to 0")
-        return found.view(projected.shape[:2])
+        return distances.view(projected.shape[:2])
 
 
 def finer(grid: Grid, n: int) -> Grid:

@@ -207,12 +207,13 @@ def _tie(weights: dict[str, Tensor]) -> int:
     """Gives each name of the shared self-attention its tensor; returns how many names there were."""
     there = [name for name in weights if TIED.fullmatch(name)]
     for part in ("to_qkv", "to_out"):
-        own = [name for name in there if f".{part}." in name]
-        if not own:
+        names = [name for name in there if f".{part}." in name]
+        if not names:
             continue
-        first = weights[own[0]]
-        if not first.is_meta and any(not torch.equal(weights[name], first) for name in own):
-            raise ValueError(f"is not MedSyn's: its self-attentions should share one {part}, but {listed(own)} differ")
+        first = weights[names[0]]
+        if not first.is_meta and any(not torch.equal(weights[name], first) for name in names):
+            raise ValueError(f"is not MedSyn's: its self-attentions should share one {part}, but "
+                             f"{listed(names)} differ")
         weights.update({f"mid_spatial_attn{n}.fn.fn.fn.{part}.weight": first for n in range(1, TextUNet.REPEATS + 1)})
     return len(there)
 
@@ -245,14 +246,14 @@ def _network(checkpoint: MedSynCheckpoint, stage: int) -> SliceUNet:
     with refusing(file, "copy it again"):
         entries = read_tensors(file)
         try:
-            found = MedSynWeights.sort(entries, checkpoint.upsample_first)
-            if found.stage != stage:
-                raise ValueError(f"is MedSyn's {STAGES[found.stage]}, but the {STAGES[stage]} is needed here: give "
+            medsyn = MedSynWeights.sort(entries, checkpoint.upsample_first)
+            if medsyn.stage != stage:
+                raise ValueError(f"is MedSyn's {STAGES[medsyn.stage]}, but the {STAGES[stage]} is needed here: give "
                                  f"that one ({FOLDERS[stage]} in MedSyn's archive)")
-            network = found.loaded()
+            network = medsyn.loaded()
         except ValueError as error:
             raise ValueError(f"'{file}' {error}") from error
-        check_finite(found.weights, file)
+        check_finite(medsyn.weights, file)
     return network
 
 

@@ -163,7 +163,7 @@ class PriorCLI(LightningCLI):
         if checkpoint and checkpoint not in ("last", "best"):
             lacks = [part for part in RESUMED if part not in read_checkpoint(checkpoint)]
             if lacks:
-                raise ValueError(f"{checkpoint} lacks {', '.join(lacks)}, and cannot be gone on from: give the "
+                raise ValueError(f"{checkpoint} lacks {', '.join(lacks)}, and cannot be resumed: give the "
                                  "last.ckpt of a training")
 
 

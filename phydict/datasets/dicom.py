@@ -108,7 +108,7 @@ def shown(intensity: Intensity, tags: list[DicomTags]) -> Intensity:
     """
     for frame in tags:
         if intensity.kind == "counts" and (frame.relationship == "LOG" or frame.sign == -1):
-            raise ValueError(f"{frame.name} is said to hold counts, but its PixelIntensityRelationship is "
+            raise ValueError(f"{frame.name} is declared as counts, but its PixelIntensityRelationship is "
                              f"{frame.relationship or 'unknown'}, sign {frame.sign}: correct `intensity:`")
     if intensity.kind != "display" or not tags[0].inverted:
         return intensity

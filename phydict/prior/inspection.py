@@ -18,7 +18,7 @@ from phydict.runtime.reading import reason, refusing
 def inspect_prior(path: str | Path) -> dict[str, dict[str, str]]:
     """What a file or folder is, as file -> {property: value}; nothing is run, and tensors are not kept.
 
-    Told apart: priors and training checkpoints of phydict, MedSyn's two stages, and others, with the reason why they
+    Kinds: priors and training checkpoints of phydict, MedSyn's two stages, and others, with the reason why they
     are none of these. Raises FileNotFoundError where nothing is there, and ValueError where weights are not finite.
     """
     path = Path(path)

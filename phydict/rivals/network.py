@@ -12,7 +12,7 @@ from phydict.grid import Grid
 from phydict.xray import ConeBeam
 
 Geometry = tuple[Tensor, ...]
-"""What a network is told of grid and beam."""
+"""Grid and beam, as inputs of a network."""
 
 
 class RivalNetwork(nn.Module, ABC):

@@ -24,7 +24,7 @@ class RivalTraining(StageTraining):
     """Learns a rival from CTs and X-rays of drawn scenes.
 
     made: the rival to train; scenes: its X-rays; views: numbers of X-rays from which validation reconstructs; initial:
-    a rival's file to go on from; seed: of scenes, noise and whatever else is drawn.
+    a rival's file to continue from; seed: of scenes, noise and whatever else is drawn.
     """
 
     def __init__(self, made: Rival, scenes: Scenes, views: tuple[int, ...], optimisation: Optimisation,
@@ -68,7 +68,7 @@ class LiftedTraining(RivalTraining):
         optimisation: how the weights are learnt
         validation: what validation measures
         body_weight: how many times more a voxel of the body counts than one of air, plus 1
-        initial: a rival's file to go on from
+        initial: a rival's file to continue from
         seed: of scenes and noise
     """
 

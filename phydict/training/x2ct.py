@@ -60,7 +60,7 @@ class X2CTTraining(RivalTraining):
         window: HU that the range [-1, 1] stands for, whose volumes the losses see in [0, 1]
         optimisation: how the weights are learnt, by Adam with betas of 0.5 and 0.99
         adversary: the losses and the discriminator
-        initial: a rival's file to go on from, with a new discriminator
+        initial: a rival's file to continue from, with a new discriminator
         seed: of noise and dropout
     """
 

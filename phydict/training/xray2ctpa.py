@@ -59,7 +59,7 @@ class XrayToCTPATraining(RivalTraining):
         window: HU that the range [-1, 1] stands for
         optimisation: how the weights are learnt
         latent: the autoencoder's training, and weights of one's own
-        initial: a rival's file to go on from
+        initial: a rival's file to continue from
         seed: of noise, slices and times
     """
 

@@ -196,7 +196,7 @@ def test_linear_images_become_line_integrals_by_their_air(tmp_path):
 
 def test_values_of_unknown_meaning_are_refused(tmp_path):
     fails("PixelIntensityRelationship unknown.*`intensity:`", one(tmp_path / "a", **angled(0.0)))
-    fails("said to hold counts, but its PixelIntensityRelationship is LOG, sign -1", one(
+    fails("declared as counts, but its PixelIntensityRelationship is LOG, sign -1", one(
         tmp_path / "b", **angled(0.0), PixelIntensityRelationship="LOG", PixelIntensityRelationshipSign=-1),
         intensity=Intensity("counts", air=60000))
 

@@ -86,7 +86,7 @@ def find_cts(root: str | Path, reports: str | Path | None = None, metadata: str 
     reports, metadata: CT-RATE's CSV tables or folders of them; left out, radiology_text_reports/ (and, for
     fixed=False, metadata/) is looked for in `root` and the three folders above it. No reports at all is fine.
     fixed: trust the headers; False reads CT-RATE v1 by its metadata. Where the folder holds both versions of a volume,
-    the one `fixed` asks for is kept. first_reconstruction: keep one volume per scan. exclude: a text file of volume
+    the one of `fixed` is read. first_reconstruction: keep one volume per scan. exclude: a text file of volume
     names to leave out (CT-RATE's no_chest_*.txt).
     Segmentations beside CTs are passed over. Of cases prepared by data/prepare_cts.py the volume alone is taken, with
     their own ids, and with their own reports where no table has one.

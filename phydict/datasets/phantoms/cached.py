@@ -22,7 +22,7 @@ HELD_OUT_PHANTOM = 1_000_000
 
 
 class CachedPhantoms(Dataset):
-    """Phantom cases of consecutive seeds, each built when first asked for and then kept as a file in `cache`."""
+    """Phantom cases of consecutive seeds, each built at its first use and stored as a file in `cache`."""
 
     def __init__(self, first_seed: int, count: int, grid: Grid, window: HUWindow, cache: Path):
         self.first_seed, self.count, self.grid, self.window = first_seed, count, grid, window

@@ -48,7 +48,7 @@ class PopulationSettings:
 
 
 class DrawnPatients(Dataset):
-    """New patients of consecutive seeds, each drawn when first asked for and then kept as a file in the CTs' cache.
+    """New patients of consecutive seeds, each drawn at its first use and stored as a file in the CTs' cache.
 
     cts: the CTs, one scan of each patient is registered when first needed. Those that cannot be are named in a warning
     and left out. Raises ValueError where fewer than two CTs are given, or could be registered.

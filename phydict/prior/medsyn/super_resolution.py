@@ -62,8 +62,8 @@ class MedSynSuperResolution(nn.Module):
              generator: torch.Generator | None = None) -> BoundSuperResolution:
         """The denoiser of the fine states of a coarse one (B, 4, X/4, Y/4, Z/4), which may be a part of the grid's.
 
-        noise: share in [0, 1] of normal noise in the coarse state (MedSyn trained with up to 0.4); the network is not
-        told. generator: what the noise is drawn from, to be (1 - noise) coarse + noise n on the fine voxels, as in
+        noise: share in [0, 1] of normal noise in the coarse state (MedSyn trained with up to 0.4), no input of the
+        network. generator: what the noise is drawn from, to be (1 - noise) coarse + noise n on the fine voxels, as in
         MedSyn's training; None: `coarse` carries it already.
         """
         if coarse.ndim != 5 or coarse.shape[1] != self.coarse_channels:

@@ -66,7 +66,8 @@ def _parser(args: Sequence[str]) -> ArgumentParser:
     parser.add_argument("--reports", type=str, help="CT-RATE's table of reports, or the folder it is in")
     parser.add_argument("--set", nargs="+", metavar="NAME=VALUE",
                         help="settings instead of the file's; a list is an axis: --set "
-                             "method=[sirt,my_module.MySampler] views=4 projector=siddon")
+                             "method=[sirt,my_module.MySampler] views=4 projector=siddon; of one of the file's changed "
+                             "methods as --set X2CT.method.file=x2ct.safetensors")
     parser.add_argument("--metrics", type=list[str],
                         help=f"what is measured, instead of the file's: a list of {', '.join(METRICS)}")
     parser.add_argument("--out", type=str, help="folder of the results, instead of the file's")

@@ -33,7 +33,7 @@ class Specification:
 def read_specification(file: str | Path, changes: Sequence[str] | None = None, **given) -> Specification:
     """The specification in a YAML file, or in a shipped one by its name; `given` (out, cts, phantoms, only, reports,
     metrics), where not None, takes the place of what the file says, and so do `changes`: settings as "name=value", of
-    which a list of values is an axis.
+    which a list of values is an axis, or as "method.setting=value" of one of the file's changed methods.
 
     Its keys: out; cts or phantoms, only, reports; metrics, fid, clip: what is measured, as in infer.py test; methods:
     names for changed methods, each a mapping of settings and `of`, the method that is changed, by its name or the path
@@ -53,7 +53,7 @@ def read_specification(file: str | Path, changes: Sequence[str] | None = None, *
         return _specification(content, {k: v for k, v in given.items() if v is not None}, dotted(changed))
 
 
-def _specification(content, given: Mapping, changed: Mapping) -> Specification:
+def _specification(content, given: Mapping, changed: dict) -> Specification:
     keys = ("out", "cts", "phantoms", "only", "reports", "metrics", "fid", "clip", "methods", "base", "axes",
             "products")
     _check_keys(content, keys, "a specification")
@@ -62,7 +62,10 @@ def _specification(content, given: Mapping, changed: Mapping) -> Specification:
     if "cts" in given or "phantoms" in given:
         content = {k: v for k, v in content.items() if k not in ("cts", "phantoms", "only", "reports")}
     content = content | given
-    methods = _mapping(content.get("methods"), "methods")
+    methods = dict(_mapping(content.get("methods"), "methods"))
+    for name in [name for name in changed if name.partition(".")[0] in methods]:
+        method, _, setting = name.partition(".")
+        methods[method] = {**_mapping(methods[method], f"methods.{method}"), setting: changed.pop(name)}
     for name, changes in methods.items():
         of = _mapping(changes, f"methods.{name}").get("of", name)
         try:

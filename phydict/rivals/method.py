@@ -76,8 +76,9 @@ class TrainedRival(Reconstructor):
     def answer(self) -> RivalAnswer:
         """The method with its weights read. Raises ValueError without a file."""
         if self.file is None:
-            raise ValueError("a rival is trained weights, but no file was given: give --model.method.init_args.file, "
-                             "the .safetensors file that train.py export wrote")
+            raise ValueError("a rival is trained weights, but no file was given: train one by `train.py fit -c "
+                             "configs/rivals/<lifted, x2ct or xray2ctpa>.yaml` and `train.py export`, then give its "
+                             "file as --model.method.init_args.file, or to ablate as --set <name>.method.file=<file>")
         return RivalAnswer(_loaded(self.file, self.weights_crc32), 0, self.precision, self.mu_water, self.name)
 
     def steps(self) -> int:

@@ -62,7 +62,10 @@ def front(points: Sequence[tuple[float, float]]) -> list[int]:
 def _draw(folder: Path, name: str, panels: int, draw: Callable[[Sequence[Axes]], None]) -> Path:
     figure = Figure(figsize=(5.5 * panels + 2.5, 4.8), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
-    draw(figure.subplots(1, panels, squeeze=False)[0])
+    axes = figure.subplots(1, panels, squeeze=False)[0]
+    draw(axes)
+    if not axes[-1].get_legend():
+        axes[-1].legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
     path = folder / (re.sub(r"[^\w.]+", "_", name.strip()) + ".png")
     with atomic_write(path) as part:
         figure.savefig(part, format="png")
@@ -83,22 +86,18 @@ def _pareto(axes: Sequence[Axes], group: Sequence[Entry], where: str, style: dic
         ax.set_xscale("log")
         _dress(ax, "seconds per case", SHOWN_MEASURES[name].heading)
         ax.set_title(literal(where), fontsize=9)
-    axes[-1].legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
 
 
 def _views(axes: Sequence[Axes], group: Sequence[Entry], style: dict) -> None:
     for ax, name in zip(axes, ("psnr", "ssim")):
         labels = {e.name: e.method for e in group}
         for label, method in labels.items():
-            points = sorted((e.condition["views"], e.means[name]) for e in group
-                         if e.complete and e.name == label)
-            if points:
-                ax.plot(*zip(*points), **style[method], markersize=5, label=literal(label))
+            points = sorted((e.condition["views"], e.means[name]) for e in group if e.complete and e.name == label)
+            ax.plot(*zip(*points), **style[method], markersize=5, label=literal(label))
         views = sorted({e.condition["views"] for e in group})
         ax.set_xscale("log", base=2)
         ax.set_xticks(views, map(str, views))
         _dress(ax, "views", SHOWN_MEASURES[name].heading)
-    axes[-1].legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
 
 
 def _geometries(axes: Sequence[Axes], group: Sequence[Entry], style: dict) -> None:
@@ -108,13 +107,11 @@ def _geometries(axes: Sequence[Axes], group: Sequence[Entry], style: dict) -> No
         labels = {entry.name: entry.method for entry in group}
         for label, method in labels.items():
             points = [(entry.means[name], places.index(entry.condition["geometry"])) for entry in group
-                   if entry.complete and entry.name == label]
-            if points:
-                ax.plot(*zip(*points), **style[method], linestyle="", markersize=6, label=literal(label))
+                      if entry.complete and entry.name == label]
+            ax.plot(*zip(*points), **style[method], linestyle="", markersize=6, label=literal(label))
         ax.set_yticks(range(len(places)), [literal(Path(place).stem) for place in places])
         ax.invert_yaxis()
         _dress(ax, SHOWN_MEASURES[name].heading, "")
-    axes[-1].legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
 
 
 def _deltas(axes: Sequence[Axes], curves: Sequence[tuple[str, list[Entry]]]) -> None:
@@ -122,11 +119,9 @@ def _deltas(axes: Sequence[Axes], curves: Sequence[tuple[str, list[Entry]]]) -> 
     for ax, name in zip(axes, ("ssim", "misfit")):
         for i, (label, group) in enumerate(curves):
             points = [(e.settings["delta"], e.means[name]) for e in group if e.complete]
-            if points:
-                ax.plot(*zip(*points), color=COLOURS[i % len(COLOURS)], marker="o", markersize=5, label=literal(label))
+            ax.plot(*zip(*points), color=COLOURS[i % len(COLOURS)], marker="o", markersize=5, label=literal(label))
         _dress(ax, "delta of Extra Compute (0: none)", SHOWN_MEASURES[name].heading)
     axes[-1].set_yscale("log")
-    axes[-1].legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
 
 
 def _stages(ax: Axes, group: Sequence[Entry], where: str) -> None:

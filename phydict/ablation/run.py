@@ -105,12 +105,12 @@ def run(specification: Specification, device: torch.device, progress: CaseProgre
     Case by case; the X-rays of a case are simulated once for all trials that share an acquisition.
     """
     scoring = scoring or Scoring()
-    acquired, planned = {}, {}  # cases of an acquisition; key -> columns
+    found, planned = {}, {}  # cases of an acquisition; key -> columns
     cases: dict[str, list] = {}  # id -> trials, their rows' keys, and the functions that make the case
     for trial in specification.trials:
-        if (acquisition := trial.acquisition()) not in acquired:
-            acquired[acquisition] = trial.data.test_cases(*trial.scene())
-        for case, source, make in acquired[acquisition]:
+        if (acquisition := trial.acquisition()) not in found:
+            found[acquisition] = trial.data.test_cases(*trial.scene())
+        for case, source, make in found[acquisition]:
             name = key(trial, case, source, scoring.settings())
             planned[name] = {"case": case} | trial.columns | {"grid": "x".join(map(str, trial.scene()[0].shape))}
             cases.setdefault(case, []).append((trial, name, make))
@@ -205,7 +205,7 @@ class Runner:
         finite = bool(result.volume.isfinite().all())
         scores = {}
         if finite:
-            volume = resampled(result.volume, trial.domain()[0], scene.grid)
+            volume = resampled(result.volume, trial.own()[0], scene.grid)
             scores = self.scoring.scores(volume, result.misfit, scene.truth, scene.grid, scene.window, self.device,
                                          trial.data.protocol)
             if features := self.scoring.features(volume, scene.truth, scene.window, self.device):
@@ -225,7 +225,7 @@ class Runner:
         torch.manual_seed(seed)
         prior = _on(trial.prior, self.device) if isinstance(trial.method, Sampler) else None
         ready = reconstructor(trial.method, prior, trial.guidance, trial.name, samples=trial.samples)
-        xrays, projector = fit_to_grid(ready, trial.domain()[0], scene.xrays.clone(), scene.beam, trial.projector)
+        xrays, projector = fit_to_grid(ready, trial.own()[0], scene.xrays.clone(), scene.beam, trial.projector)
         return ready.with_mu_water(scene.mu_water).reconstruct(
             xrays, projector, scene.report(trial), False, seed, on_step)
 

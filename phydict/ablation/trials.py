@@ -91,9 +91,9 @@ class Trial:
 
     def scene(self) -> tuple[Grid, HUWindow]:
         """The grid of the truth, which is also scored on, and the HU window that the truth is clipped to."""
-        return self.data.scene(*self.domain())
+        return self.data.scene(*self.own())
 
-    def domain(self) -> tuple[Grid, HUWindow]:
+    def own(self) -> tuple[Grid, HUWindow]:
         """The method's own grid and HU window."""
         file = self.prior or self.like
         if self.prior is None and self.data.protocol and self.data.protocol.grid:
@@ -141,7 +141,7 @@ def trials_of(base: Mapping, axes: Mapping, methods: Mapping, cases: Cases,
     if (count := before + math.prod(map(len, axes.values()))) > MOST_TRIALS:
         raise ValueError(f"the axes stand for {count:,} combinations, but at most {MOST_TRIALS:,} are run: shorten "
                          "them")
-    trials, used = [], set()
+    found, used = [], set()
     for values in product(*axes.values()):
         combination = dict(zip(axes, values))
         name = combination.get("method", base.get("method"))
@@ -151,17 +151,17 @@ def trials_of(base: Mapping, axes: Mapping, methods: Mapping, cases: Cases,
         of = changes.pop("of", name)
         trial, meant = _trial(of, base | changes | combination | {"method": name}, cases)
         check_used(changes, meant, [trial])
-        trials.append(trial)
+        found.append(trial)
         used |= meant
-    like = next((trial.prior for trial in trials if trial.prior), None)
-    trials = [trial if trial.prior else replace(trial, like=like) for trial in trials]
-    scenes = [trial.scene() for trial in trials]
-    requested = [Grid.cube(trial.voxels, trial.side) for trial in trials if {"voxels", "side"} & trial.columns.keys()]
+    like = next((trial.prior for trial in found if trial.prior), None)
+    found = [trial if trial.prior else replace(trial, like=like) for trial in found]
+    scenes = [trial.scene() for trial in found]
+    requested = [Grid.cube(trial.voxels, trial.side) for trial in found if {"voxels", "side"} & trial.columns.keys()]
     if any(window != scenes[0][1] for _, window in scenes) or not all(
             grid.same_as(scenes[0][0]) for grid in [*requested, *(grid for grid, _ in scenes)]):
         raise ValueError("the methods of a product are compared on one grid and HU window, but their priors, or voxels "
                          "and side, give several: leave voxels and side out, or make products of their own")
-    return trials, used
+    return found, used
 
 
 def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
@@ -177,14 +177,14 @@ def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
     simulator = SIMULATORS.get(given.get("simulator", "ideal"))
     if simulator is None:
         raise ValueError(f"there is no simulator {given['simulator']!r}: use one of {', '.join(SIMULATORS)}")
-    parts = {"method": base, "simulator": simulator}
+    own = {"method": base, "simulator": simulator}
     changes: dict[str, dict] = {"method": {}, "simulator": {}}
     for name, value in settings.items():
         part, _, path = name.partition(".")
-        if path and part in parts and has_field(parts[part], path.split(".")):
+        if path and part in own and has_field(own[part], path.split(".")):
             changes[part][path] = value
     try:
-        method, simulator = (changed(parts[part], changes[part], part) for part in parts)
+        method, simulator = (changed(own[part], changes[part], part) for part in own)
     except ValueError as error:
         raise ValueError(f"{settings['method']}: {error}") from error
     if not isinstance(method, Sampler) or not has_field(method, ["ec_delta"]):
@@ -234,12 +234,12 @@ def method_of(name: object, known: Iterable[str] = ()) -> Sampler | Reconstructo
     """
     if isinstance(name, str) and name in METHODS:
         return METHODS[name]
-    module, _, class_name = name.rpartition(".") if isinstance(name, str) else ("", "", "")
+    module, _, own = name.rpartition(".") if isinstance(name, str) else ("", "", "")
     if not module:
         raise ValueError(f"there is no method {name!r}: use one of {', '.join([*known, *METHODS])}, or the path of a "
                          "class, such as my_module.MySampler")
     try:
-        kind = getattr(import_module(module), class_name)
+        kind = getattr(import_module(module), own)
         if isinstance(kind, type) and issubclass(kind, Sampler | Reconstructor) and is_dataclass(kind):
             return kind()
     except (Exception, SystemExit) as error:  # of whatever kind: another's code runs

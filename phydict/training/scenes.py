@@ -11,7 +11,7 @@ from torch import Tensor
 
 from phydict.grid import Grid
 from phydict.posterior import Measurement
-from phydict.runtime.ranges import check_between
+from phydict.runtime.ranges import check_fields
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 
@@ -40,9 +40,8 @@ class Scenes:
     model_error: float = 0.3
 
     def __post_init__(self):
-        check_between("model.scenes.most_views", self.most_views, 1, 1000)
-        for name in ("orbit", "arc", "varied", "model_error"):
-            check_between(f"model.scenes.{name}", getattr(self, name))
+        check_fields(self, "model.scenes", most_views=(1, 1000), orbit=(0, 1), arc=(0, 1), varied=(0, 1),
+                     model_error=(0, 1))
         if 1.5 * self.orbit + self.arc > 1:
             raise ValueError("model.scenes has 1.5 orbit + arc of at most 1, but orbit "
                              f"{self.orbit} and arc {self.arc} were given")

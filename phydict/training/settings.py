@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 from phydict.datasets.population import PopulationSettings
-from phydict.runtime.ranges import check_between
+from phydict.runtime.ranges import check_between, check_fields
 
 MOST_DRAWS, MOST_WORKERS = 10_000_000, 1000
 """Draws of an epoch are listed before it begins, and loader processes are all started then."""
@@ -45,8 +45,7 @@ class TextSettings:
 
     def __post_init__(self):
         check_between("model.text.dropout", self.dropout)
-        if self.pretrain_steps < 0:
-            raise ValueError(f"model.text.pretrain_steps must not be negative, but {self.pretrain_steps} was given")
+        check_between("model.text.pretrain_steps", self.pretrain_steps, 0, math.inf)
 
 
 @dataclass(frozen=True)
@@ -68,14 +67,8 @@ class Optimisation:
     decay_steps: int = 0
 
     def __post_init__(self):
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if not 0 <= value < math.inf:
-                raise ValueError(f"model.optimisation.{field.name} is a finite number, 0 or more, but {value} was "
-                                 "given")
-        if self.learning_rate > MOST_LEARNING_RATE:
-            raise ValueError(f"model.optimisation.learning_rate is at most {MOST_LEARNING_RATE:g}, but "
-                             f"{self.learning_rate:g} was given")
+        ranges = dict.fromkeys(vars(self), (0, math.inf)) | {"learning_rate": (0, MOST_LEARNING_RATE)}
+        check_fields(self, "model.optimisation", **ranges)
 
     def factor(self, step: int) -> float:
         """The share of the learning rate at a step."""
@@ -124,8 +117,7 @@ class PriorValidation(Previews):
 
     def __post_init__(self):
         super().__post_init__()
-        if self.views < 0:
-            raise ValueError(f"model.validation.views must not be negative, but {self.views} was given")
+        check_between("model.validation.views", self.views, 0, math.inf)
 
 
 @dataclass(frozen=True)
@@ -211,9 +203,8 @@ class Loading:
     population: PopulationSettings = PopulationSettings()
 
     def __post_init__(self):
-        for name, least, most in (("epoch_size", 1, MOST_DRAWS), ("batch_size", 1, MOST_DRAWS),
-                                  ("workers", 0, MOST_WORKERS), ("ct_fraction", 0, 1)):
-            check_between(f"data.loading.{name}", getattr(self, name), least, most)
+        check_fields(self, "data.loading", epoch_size=(1, MOST_DRAWS), batch_size=(1, MOST_DRAWS),
+                     workers=(0, MOST_WORKERS), ct_fraction=(0, 1))
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -13,6 +13,7 @@ from torch.nn.functional import l1_loss, mse_loss
 from phydict.grid import Cube
 from phydict.rivals import PatchDiscriminator, Rival, X2CTNetwork
 from phydict.rivals.rival import WATER_MM, bound_orbit
+from phydict.runtime.ranges import check_fields
 from phydict.training.rivals import OrbitScenes, RivalTraining
 from phydict.training.settings import Optimisation
 from phydict.units import HUWindow
@@ -41,11 +42,8 @@ class Adversary:
     layers: int = 2
 
     def __post_init__(self):
-        for field in fields(self):
-            least = 1 if field.type == "int" else 0
-            if not least <= getattr(self, field.name) < math.inf:
-                raise ValueError(f"model.adversary.{field.name} is a finite number, {least} or more, but "
-                                 f"{getattr(self, field.name)} was given")
+        check_fields(self, "model.adversary", adversarial=(0, math.inf), reconstruction=(0, math.inf),
+                     projection=(0, math.inf), width=(1, math.inf), layers=(1, math.inf))
 
 
 class X2CTTraining(RivalTraining):

@@ -14,7 +14,7 @@ from phydict.datasets.cts.girth import Girth
 from phydict.datasets.cts.transforms import AIR
 from phydict.datasets.surroundings.surroundings import Surroundings, surround
 from phydict.grid import Grid
-from phydict.runtime.ranges import check_between
+from phydict.runtime.ranges import check_fields
 from phydict.units import HUWindow
 
 NAMES_A_SIDE = re.compile(r"\b(left|right|middle lobe|lingula\w*|[LR](UL|ML|LL)?)\b", re.IGNORECASE)
@@ -66,8 +66,7 @@ class Augmentation:
         if self.scale > 0.5 or self.hu_scale > 0.5 or self.rotation > 45:
             raise ValueError("augmentation is for small changes: rotation up to 45 degrees, scale and gain up to 0.5, "
                              f"but {self.rotation}, {self.scale} and {self.hu_scale} were given")
-        for name in ("girth", "mirror"):
-            check_between(f"data.augmentation.{name}", getattr(self, name))
+        check_fields(self, "data.augmentation", girth=(0, 1), mirror=(0, 1))
 
     @classmethod
     def none(cls) -> Augmentation:

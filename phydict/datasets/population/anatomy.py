@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from phydict.datasets.phantoms.findings import FOCAL, PLEURAL, Finding, draw_findings
-from phydict.runtime.ranges import check_between
+from phydict.runtime.ranges import check_fields
 
 PAINTED = FOCAL + PLEURAL
 """Kinds of findings that are put into CTs; the others would change organs that no mask shows."""
@@ -39,9 +39,8 @@ class Variation:
     findings: float = 0.5
 
     def __post_init__(self):
-        for name, most in (("mixing", 1.0), ("modes", 2.0), ("lungs", 0.7), ("heart", 0.7), ("liver", 0.7),
-                           ("findings", 1.0)):
-            check_between(f"data.loading.population.variation.{name}", getattr(self, name), 0, most)
+        check_fields(self, "data.loading.population.variation", mixing=(0, 1.0), modes=(0, 2.0), lungs=(0, 0.7),
+                     heart=(0, 0.7), liver=(0, 0.7), findings=(0, 1.0))
 
     @classmethod
     def none(cls) -> Variation:

@@ -17,7 +17,7 @@ from phydict.datasets.population.anatomy import Variation, findings_of
 from phydict.datasets.population.population import Population
 from phydict.datasets.population.registration import Registered, features, medoid, register
 from phydict.runtime.progress import CaseProgress
-from phydict.runtime.ranges import check_between
+from phydict.runtime.ranges import check_fields
 from phydict.runtime.warning import warn
 
 POPULATION_VERSION = 1
@@ -43,8 +43,7 @@ class PopulationSettings:
     variation: Variation = Variation()
 
     def __post_init__(self):
-        for name, least, most in (("share", 0, 1), ("draws", 1, MOST_DRAWS), ("patients", 2, MOST_DRAWS)):
-            check_between(f"data.loading.population.{name}", getattr(self, name), least, most)
+        check_fields(self, "data.loading.population", share=(0, 1), draws=(1, MOST_DRAWS), patients=(2, MOST_DRAWS))
 
 
 class DrawnPatients(Dataset):

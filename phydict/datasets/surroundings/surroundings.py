@@ -12,7 +12,7 @@ from phydict.datasets.surroundings.covers import Cover
 from phydict.datasets.surroundings.leads import Lead
 from phydict.datasets.surroundings.scene import Scene
 from phydict.grid import Grid
-from phydict.runtime.ranges import check_between
+from phydict.runtime.ranges import check_fields
 
 FIELD_MM = 560.0
 """Largest diameter of the scanner's field that is drawn for what lies around a body."""
@@ -43,8 +43,7 @@ class Surroundings:
     ends: float = 0.2
 
     def __post_init__(self):
-        for name, share in vars(self).items():
-            check_between(f"data.augmentation.surroundings.{name}", share)
+        check_fields(self, "data.augmentation.surroundings", **dict.fromkeys(vars(self), (0, 1)))
 
     @classmethod
     def none(cls) -> Surroundings:

@@ -38,5 +38,5 @@ if __name__ == "__main__":
     captions = {row["method"]: f"{row['psnr']:.1f} dB, SSIM {row['ssim']:.2f}" for row in rows}
     method_panel(out / "comparison.png", volumes, truth, prior.grid, captions)
     write_csv(out / "results.csv", rows)
-    Console().print(mean_table(rows).console())
+    Console().print(mean_table(rows))
     print(f"picture: {out / 'comparison.png'}\nvolumes, X-ray fits and results.csv: {out}")

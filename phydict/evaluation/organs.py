@@ -13,6 +13,7 @@ reconstruction is segmented by thresholds all the same, so that even a perfect o
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping
 
 import numpy as np
@@ -67,8 +68,10 @@ def hd95(a: np.ndarray, b: np.ndarray, spacing) -> float:
 
     box = tuple(slice(max(0, int(i.min()) - 1), int(i.max()) + 2) for i in np.nonzero(a | b))
     one, other = (torch.from_numpy(mask[box][None, None].astype(np.float32)) for mask in (a, b))
-    return float(compute_hausdorff_distance(one, other, include_background=True, percentile=95,
-                                            spacing=[float(mm) for mm in spacing]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # MONAI's, of an argument that it gives itself
+        return float(compute_hausdorff_distance(one, other, include_background=True, percentile=95,
+                                                spacing=[float(mm) for mm in spacing]))
 
 
 def cl_dice(a: np.ndarray, b: np.ndarray) -> float:

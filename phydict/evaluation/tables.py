@@ -11,7 +11,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
+from rich.console import Console, ConsoleOptions, RenderResult
 from rich.markup import escape
+from rich.measure import Measurement
 from rich.table import Table as ConsoleTable
 
 from phydict.evaluation.bootstrap import Estimate
@@ -55,15 +57,24 @@ class Table:
                           "\\toprule", header, "\\midrule", *body, "\\bottomrule", "\\end{tabular}",
                           f"\\caption{{{notes}}}", "\\end{table}", ""])
 
-    def console(self) -> ConsoleTable:
-        """For rich's console, without intervals, for which its lines are too short: best in bold, second underlined."""
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """For rich's console, without intervals, for which its lines are too short: best in bold, second underlined.
+        Where measures do not fit beside each other, they stand below each other."""
+        table, wide = self._console(), options.update(width=10_000)
+        fits = Measurement.get(console, wide, table).maximum <= options.max_width
+        yield table if fits else self._console(turned=True)
+
+    def _console(self, turned: bool = False) -> ConsoleTable:
         notes = [note for note in self.notes if not note.startswith(IN_BRACKETS)]
         table = ConsoleTable(title=escape(self.title), caption=escape("\n".join(notes)))
-        for i, name in enumerate(self.header):
-            table.add_column(escape(name), justify="right" if i else "left")
         plain = replace(self, lines=[(label, ranked, [_without_interval(value) for value in values])
                                      for label, ranked, values in self.lines])
-        for line in plain._marked(("{}", "[bold]{}[/bold]", "[underline]{}[/underline]"), escape):
+        lines = [[escape(name) for name in self.header],
+                 *plain._marked(("{}", "[bold]{}[/bold]", "[underline]{}[/underline]"), escape)]
+        header, *lines = [list(line) for line in zip(*lines)] if turned else lines
+        for i, name in enumerate(header):
+            table.add_column(name, justify="right" if i else "left")
+        for line in lines:
             table.add_row(*line)
         return table
 

@@ -288,7 +288,7 @@ class ReconstructionTask(lightning.LightningModule):
         console = Console()
         console.width = max(console.width, 80 if console.is_terminal else 120)
         for table in tables:
-            console.print(table.console())
+            console.print(table)
         print(f"results in {self.results.folder}")
         if missing:
             raise ValueError(f"{len(missing)} of {len(self.cases)} cases were not reconstructed "

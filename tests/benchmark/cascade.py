@@ -60,4 +60,4 @@ if __name__ == "__main__":
             new = compared(stage, count, cts)
             others = [row for row in read_csv(FILE) if (row["stage"], row["views"]) != (Path(stage).stem, count)]
             write_csv(FILE, others + new)
-            Console(width=160).print(mean_table(new).console())
+            Console(width=160).print(mean_table(new))

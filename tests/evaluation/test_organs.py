@@ -38,6 +38,11 @@ def test_shifted_boxes_have_closed_forms():
     assert dice(box(), ~box()) == 0
 
 
+@pytest.mark.filterwarnings("error")
+def test_the_scores_of_organs_warn_of_nothing_that_a_user_could_change():
+    hd95(box(), box(1), (1, 1, 1))
+
+
 def test_a_lost_branch_halves_the_sensitivity_of_cldice_alone():
     tree = np.zeros((20, 20, 30), bool)
     tree[3:6, 3:6] = tree[13:16, 13:16] = True

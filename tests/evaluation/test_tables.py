@@ -177,7 +177,7 @@ def test_a_metric_that_a_method_lacks_is_a_dash():
 
 def test_the_tables_for_console_and_latex_say_the_same():
     console = Console(width=200, record=True, file=open(os.devnull, "w"))
-    console.print(mean_table(STATED).console())
+    console.print(mean_table(STATED))
     text = console.export_text()
     for part in ("0.850 ± 0.071 ", "25.0 ± 7.1", "MAE (HU) ↓", "[-1000, 1000]", "Views: 8"):
         assert part in text
@@ -203,7 +203,19 @@ def test_what_is_no_table_is_one_sentence_that_names_the_file(tmp_path, content)
         read_csv(tmp_path / "t.csv")
 
 
+@pytest.mark.parametrize("width", [80, 120, 400])
+def test_the_console_shows_every_value_whole_however_many_measures_there_are(width):
+    rows = [{"case": str(n), "method": "phydict_fast", **{name: 10.0 * i + n for i, name in enumerate(MEASURES)}}
+            for n in range(3)]
+    console = Console(width=width, file=io.StringIO())
+    console.print(table := mean_table(rows))
+    shown = console.file.getvalue()
+    assert "…" not in shown and all(name in shown for name in table.header)
+    assert all(f"{float(value):.{measure.decimals}f}" in shown
+               for value, measure in zip(table.lines[0][2], table.measures))
+
+
 def test_brackets_in_a_case_are_no_markup_of_the_console():
     console = Console(width=400, file=io.StringIO())
-    console.print(mean_table([{"case": "[/b]", "method": "a", "psnr": 3.0, "warning": "x"}]).console())
+    console.print(mean_table([{"case": "[/b]", "method": "a", "psnr": 3.0, "warning": "x"}]))
     assert "[/b]" in console.file.getvalue()

@@ -120,6 +120,7 @@ def test_nothing_is_run_again_and_tables_and_plots_come_back(tmp_path, trace):
     made = {path.name: path.read_bytes() for path in out.iterdir() if path.suffix in (".md", ".tex", ".csv")}
     pictures = [path for path in out.iterdir() if path.suffix == ".png"]
     assert {p.name.split("_")[0] for p in pictures} >= {"pareto", "stages"} and "tables.tex" in made
+    assert all(path.name in (out / "index.html").read_text() for path in pictures)
     for path in pictures:
         path.unlink()
     assert ablate(tmp_path, **content) == rows and len(trace.given) == calls

@@ -45,7 +45,7 @@ from phydict.xray.geometry_files import write_beam
 ROOT = Path(__file__).parents[1]
 BEAM = ConeBeam.orbit(3, 1020.0, 740.0, (24, 24), 24.0)
 ORBIT = ["--data.orbit.views=3", "--data.orbit.detector=[24,24]", "--data.orbit.pixel=[24,24]"]
-FILES = ["panel.png", "reconstruction.json", "volume.nii.gz"]
+FILES = ["panel.png", "reconstruction.json", "thumbnail.png", "view.js", "volume.nii.gz"]
 
 
 def sirt(command: str, out: Path, *more: str) -> list[str]:
@@ -168,7 +168,8 @@ def test_predict_writes_what_the_library_reconstructs(measured, tmp_path, capsys
     with Image.open(folder / "panel.png") as page:
         assert min(page.size) > 300
     out, err = capsys.readouterr()
-    assert out == f"results in {tmp_path / 'sirt'}\n"
+    assert out == f"results in {tmp_path / 'sirt'}\npage: {tmp_path / 'index.html'}\n"
+    assert "anna" in (tmp_path / "index.html").read_text()
     assert [line.split(":")[0] for line in err.splitlines() if not line.startswith("Seed")] == ["sirt", "anna", "bert"]
 
 
@@ -306,6 +307,7 @@ def test_a_stopped_run_goes_on_where_it_was(measured, tmp_path, monkeypatch, sto
     before = stamp(tmp_path / "sirt" / "anna")
     main(args)
     assert stamp(tmp_path / "sirt" / "anna") == before and len(calls) == 3
+    assert all(f'"folder": "sirt/{case}"' in (tmp_path / "index.html").read_text() for case in ("anna", "bert"))
     assert names(tmp_path / "sirt" / "bert") == FILES
 
 
@@ -655,7 +657,7 @@ def test_two_processes_split_the_cases_and_agree_with_one(scored, tmp_path):
     assert [name for name in names(tmp_path / "sirt") if name.startswith(".")] == []
     for case in ("phantom-1000000", "phantom-1000001"):
         np.testing.assert_array_equal(volume(tmp_path / "sirt" / case), volume(scored / case))
-    assert run.stdout.count("results in") == 1 and run.stdout.count("n = 3 cases") == 1
+    assert [run.stdout.count(once) for once in ("results in", "n = 3 cases", "page: ")] == [1, 1, 1]
 
 
 @pytest.mark.slow

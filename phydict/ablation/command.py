@@ -11,6 +11,7 @@ import torch
 from jsonargparse import ArgumentParser
 
 from phydict.ablation.fid import fid_tables
+from phydict.ablation.page import comparison_page
 from phydict.ablation.plots import write_plots
 from phydict.ablation.run import RESULTS, run
 from phydict.ablation.spec import read_specification
@@ -18,6 +19,7 @@ from phydict.ablation.summary import summarise
 from phydict.ablation.tables import all_tables, write_tables
 from phydict.inference.scoring import METRICS, Scoring
 from phydict.methods import METHODS
+from phydict.page import check_own_page
 from phydict.runtime.console import check_apart, check_configured, check_writable, cli_errors, quiet
 from phydict.runtime.files import alone_in
 from phydict.runtime.help import HelpFormatter, show_settings
@@ -39,6 +41,7 @@ def main(args: list[str] | None = None) -> None:
                              "out") from error
         specification = read_specification(given.pop("config"), given.pop("set"), **given)
         check_writable(specification.out, "out")
+        check_own_page(specification.out, "out")
         check_apart(specification.out, "out", [Path(cts)] if (cts := specification.cases.cts) else [])
         scoring = Scoring(specification.metrics, specification.fid, specification.clip)
         with alone_in(specification.out, "out"), CaseProgress() as progress:
@@ -48,6 +51,7 @@ def main(args: list[str] | None = None) -> None:
         tables = all_tables(entries, rows, scoring.empty) + fid_tables(specification.out, entries, scoring)
         written = write_tables(specification.out, tables) + write_plots(specification.out, entries)
         print(f"tables and plots in {specification.out}: {', '.join(path.name for path in written)}")
+        print(f"page: {comparison_page(specification.out, rows, found, tables)}")
 
 
 def _parser(args: Sequence[str]) -> ArgumentParser:

@@ -13,6 +13,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from phydict.ablation import main as ablate
 from phydict.cli.help import describe_commands, method_help, predict_help
+from phydict.cli.page import main as page
 from phydict.datasets.radiographs.radiographs import load_xrays
 from phydict.inference.data import ReconstructionData
 from phydict.inference.dry_run import dry_run
@@ -26,7 +27,7 @@ from phydict.runtime.reading import reading
 from phydict.runtime.shipped import configuration
 
 COMMANDS = {"predict": "X-rays -> volumes", "test": "CTs -> X-rays -> volumes and scores",
-            "ablate": "methods compared on the same X-rays"}
+            "ablate": "methods compared on the same X-rays", "page": "results -> a page for the browser"}
 
 
 class InferenceCLI(LightningCLI):
@@ -199,10 +200,12 @@ def _written(settings: object) -> dict:
 
 
 def main(args: list[str] | None = None) -> None:
-    """Command line of inference: predict, test, ablate. A bad input ends in one sentence and exit code 2."""
+    """Command line of inference: predict, test, ablate, page. A bad input ends in one sentence and exit code 2."""
     args = sys.argv[1:] if args is None else args
     if args[:1] == ["ablate"]:
         return ablate(args[1:])
+    if args[:1] == ["page"]:
+        return page(args[1:])
     with cli_errors(MisconfigurationException), quiet():
         check_command(args, COMMANDS, InferenceCLI.subcommands(), "predict --data.xrays data/example/xrays")
         cli = InferenceCLI(
@@ -210,7 +213,8 @@ def main(args: list[str] | None = None) -> None:
             auto_configure_optimizers=False,
             parser_kwargs={"exit_on_error": False, "allow_abbrev": False, "formatter_class": HelpFormatter,
                            "description": (
-                "Reconstruct chest CTs from X-rays. A third subcommand, ablate, compares methods: ablate --help.")},
+                "Reconstruct chest CTs from X-rays. Two more subcommands: ablate compares methods, page makes the "
+                "page of results anew (ablate --help, page --help).")},
             trainer_defaults={"inference_mode": False, "logger": False, "enable_progress_bar": False,
                               "enable_checkpointing": False, "enable_model_summary": False, "accelerator": "auto",
                               "devices": 1})

@@ -78,17 +78,22 @@ class Table:
             table.add_row(*line)
         return table
 
-    def _marked(self, marks: Sequence[str], printed: Callable[[str], str]) -> list[list[str]]:
-        """The lines as text, each value in the mark of its place: 1 for the best, 2 for the second, else 0. Values that
+    def cells(self) -> list[list[tuple[str, int]]]:
+        """The values of each line as text, each with its place: 1 for the best, 2 for the second, else 0. Values that
         are printed alike share a place."""
-        columns = [[printed(label) for label, _, _ in self.lines]]
+        columns = []
         for c, measure in enumerate(self.measures):
             values = [values[c] for _, _, values in self.lines]
             places = ranks([round(float(value), measure.decimals) if ranked and value is not None else math.nan
                             for (_, ranked, _), value in zip(self.lines, values)], measure.higher_is_better)
-            columns.append([marks[place].format(printed("–" if value is None else f"{value:.{measure.decimals}f}"))
+            columns.append([("–" if value is None else f"{value:.{measure.decimals}f}", place)
                             for value, place in zip(values, places)])
-        return [list(line) for line in zip(*columns)]
+        return [[column[n] for column in columns] for n in range(len(self.lines))]
+
+    def _marked(self, marks: Sequence[str], printed: Callable[[str], str]) -> list[list[str]]:
+        """The lines as text, each value in the mark of its place."""
+        return [[printed(label), *(marks[place].format(printed(text)) for text, place in cells)]
+                for (label, _, _), cells in zip(self.lines, self.cells())]
 
 
 def _without_interval(value: Value | None) -> Value | None:

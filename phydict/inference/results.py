@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from phydict.evaluation import RANGE, Table, mean_table, write_csv
 from phydict.inference.protocols import Protocol
+from phydict.page import CASE_FILES
 from phydict.runtime.files import atomic_directory, atomic_write, check_replaceable, remove_leftovers, undisturbed
 from phydict.runtime.reading import not_written
 
@@ -98,7 +99,7 @@ class CaseResults:
         for case in cases:
             record = self._there(case).record
             if record["scores"]:
-                rows.append(_row(case, record))
+                rows.append(score_row(case, record))
         if not rows:
             return []
         table = mean_table(rows, window=protocol.window if protocol else RANGE, empty=empty)
@@ -118,7 +119,7 @@ class CaseResults:
             record = json.loads((folder / RECORD).read_text())
             record["settings"], record["source"], set(record.get("files", UNLISTED))
             if record["scores"]:
-                _row(case, record)
+                score_row(case, record)
         except Exception as error:  # whatever a damaged record leads to
             raise ValueError(f"{folder} is in the place of a case, but its {RECORD} is missing or damaged, and it is "
                              "not replaced: move it away, or give another model.out") from error
@@ -137,7 +138,7 @@ class CaseResults:
 
     def _check_own(self, case: str, there: Finished) -> None:
         """Raises ValueError where a finished case's folder is not this project's alone, so that it must stay."""
-        check_replaceable(self.folder / case, {RECORD, *there.record.get("files", UNLISTED)}, "model.out")
+        check_replaceable(self.folder / case, {RECORD, *CASE_FILES, *there.record.get("files", UNLISTED)}, "model.out")
 
     def _is_free(self, case: str) -> bool:
         """Whether a result takes its place: not where another process has put the same there. Raises ValueError where
@@ -166,7 +167,7 @@ class CaseResults:
                              "move it away, or give another model.out")
 
 
-def _row(case: str, record: dict) -> dict:
+def score_row(case: str, record: dict) -> dict:
     """The row of scores of a record; of whatever kind the error where it lacks what a record holds."""
     if not isinstance(record["method"], str) or not isinstance(record["views"], int):
         raise TypeError

@@ -25,11 +25,13 @@ from phydict.evaluation import CaseMetrics, Table, panel
 from phydict.evaluation.fid import Features, PlaneFID, load_features, save_features
 from phydict.evaluation.tables import fid_table
 from phydict.grid import Cube
+from phydict.inference.page import results_page
 from phydict.inference.protocols import placed, resampled
 from phydict.inference.results import FEATURES, CaseResults
 from phydict.inference.scoring import Scoring
 from phydict.inference.settings import CascadeSettings, Sampling
 from phydict.methods import METHODS, default_method, fit_to_grid, reconstructor
+from phydict.page import check_own_page, write_case_files
 from phydict.posterior import CascadePosterior, Sampler
 from phydict.prior import (
     MedSynCheckpoint, PriorContract, file_read, find_prior, fingerprint, load_super_resolution)
@@ -137,6 +139,7 @@ class ReconstructionTask(lightning.LightningModule):
             if data.protocol and data.protocol.grid and self.prior is None:
                 self.grid = data.protocol.fixed_grid(self.grid)
         check_apart(self.results.folder, "model.out", self.trainer.datamodule.inputs(stage))
+        check_own_page(self.results.folder.parent, "model.out")
 
     def unfinished(self, sources: dict[str, str]) -> list[str]:
         """Of this run's cases, id -> what identifies their data, those that remain to be done."""
@@ -250,6 +253,9 @@ class ReconstructionTask(lightning.LightningModule):
                 save_nifti(folder / f"interval_{SHOWN_LEVEL * 100:.0f}.nii.gz", uncertain.numpy(), result.grid)
             panel(folder / "panel.png", result.volume, result.grid, result.xrays, result.reprojection, truth,
                   title=f"{case['id']}: {self.method_name}", deviation_hu=uncertain, deviation_label=label)
+            volumes = {"reconstruction": result.volume, "truth": truth, label: uncertain}
+            write_case_files(folder, result.grid, {k: v for k, v in volumes.items() if v is not None}, result.xrays,
+                             result.reprojection)
 
         with stage("write"):
             self.results.write(case["id"], self._record(case, result, scores), write_files)
@@ -290,6 +296,8 @@ class ReconstructionTask(lightning.LightningModule):
         for table in tables:
             console.print(table)
         print(f"results in {self.results.folder}")
+        if finished:
+            print(f"page: {results_page(self.results.folder.parent)}")
         if missing:
             raise ValueError(f"{len(missing)} of {len(self.cases)} cases were not reconstructed "
                              f"({', '.join(missing)}): see the messages above, and run the same command again")

@@ -32,6 +32,7 @@ from phydict import ConeBeam, Grid, HUWindow
 from phydict.cli.infer import main as infer
 from phydict.cli.train import main as train
 from phydict.datasets import find_cts, load_ct, load_xrays, phantom_case, prepare_ct, save_xrays
+from phydict.page import CASE_FILES
 from phydict.prior import load_super_resolution, save_prior, save_super_resolution
 from phydict.prior.files import describe
 from phydict.xray import Ideal, Polychromatic
@@ -1706,7 +1707,7 @@ def interruptions():
     def whole(p, cases=3) -> None:
         for k in range(cases):
             names = {f.name for f in (p.out / "sirt" / f"case{k}").iterdir()}
-            assert names == {"volume.nii.gz", "panel.png", "reconstruction.json"}, names
+            assert names == {"volume.nii.gz", "panel.png", "reconstruction.json", *CASE_FILES}, names
             load_ct(p.out / "sirt" / f"case{k}" / "volume.nii.gz")
 
     def goes_on(p, args, before) -> None:

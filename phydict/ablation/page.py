@@ -1,0 +1,52 @@
+"""The page of a comparison: its tables and plots, and every row that counts in them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from phydict.ablation.run import RESULTS
+from phydict.ablation.summary import Entry, entries, format_settings
+from phydict.ablation.tables import all_tables
+from phydict.evaluation import read_csv
+from phydict.evaluation.metrics import MEASURES
+from phydict.evaluation.tables import Table
+from phydict.page import Case, Contents, check_own_page, write_page
+
+
+def is_comparison(folder: Path) -> bool:
+    """Whether a folder holds a table of ablate's."""
+    return any("key" in row for row in read_csv(folder / RESULTS))
+
+
+def page_anew(folder: Path) -> Path:
+    """Writes the page of a folder's table; returns its path. Tables of Frechet distances, which ablate
+    makes of features, are in tables.md alone."""
+    rows = read_csv(folder / RESULTS)
+    found = entries(rows)
+    return comparison_page(folder, rows, found, all_tables(found, rows))
+
+
+def comparison_page(folder: Path, rows: Sequence[Mapping], found: Sequence[Entry], tables: Sequence[Table]) -> Path:
+    """Writes the page of rows, their entries and tables, with the plots in the folder; returns its path. Raises
+    ValueError where a page of someone else's is in its place."""
+    check_own_page(folder, "out")
+    by_key = {row["key"]: row for row in rows}
+    cases = [_case(entry, by_key[key]) for entry in found for _, key in entry.rows]
+    points = [{"name": format_settings(entry.label, entry.condition), "series": entry.method,
+               "seconds": entry.means["seconds"], "error": entry.means.get("mae_hu")}
+              for entry in found if "seconds" in entry.means]
+    kept = sorted(path.name for path in folder.iterdir() if path.suffix in (".csv", ".md", ".tex"))
+    return write_page(folder, Contents(f"Comparison in {folder.resolve().name}", tables, cases, points,
+                                       plots=sorted(path.name for path in folder.glob("*.png")), links=kept))
+
+
+def _case(entry: Entry, row: Mapping) -> Case:
+    """A row as a case, known by its method, settings and seed."""
+    scores = {name: row[name] for name in MEASURES if row.get(name) is not None}
+    record = {name: value for name, value in row.items() if name not in scores and value is not None}
+    group = format_settings(str(row["case"]), entry.condition)
+    return Case("", (), record | {
+        "method": format_settings(entry.name, entry.condition, {"seed": row.get("seed", 0)}),
+        "scores": scores, "misfit": row.get("misfit"), "seconds": {"all": row["seconds"]} if "seconds" in row else {},
+        "warnings": [row["warning"]] if row.get("warning") else []}, group)

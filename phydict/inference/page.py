@@ -1,0 +1,78 @@
+"""The page of finished cases: made of what lies on disk, so that it can be made anew at any time."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import nibabel as nib
+import numpy as np
+
+from phydict.evaluation import RANGE, mean_table
+from phydict.evaluation.tables import Table
+from phydict.grid import Grid
+from phydict.inference.protocols import protocol_of
+from phydict.inference.results import RECORD, TABLE, score_row
+from phydict.page import CASE_FILES, Case, Contents, check_own_page, write_case_files, write_page
+from phydict.runtime.warning import warn
+
+
+def results_page(folder: Path) -> Path:
+    """Writes the page of a folder's finished cases, one method's or several methods' in a folder each; returns its
+    path. What the page needs of a case and older results lack is made of their NIfTI files.
+
+    Raises ValueError where there is no finished case, or where a page of someone else's is in its place.
+    """
+    check_own_page(folder, "folder")
+    cases = [case for path in _case_folders(folder) if (case := _case(folder, path))]
+    if not cases:
+        raise ValueError(f"{folder} holds no results: give the folder that predict, test or ablate wrote to, which "
+                         f"holds <case>/{RECORD}, <method>/<case>/{RECORD} or ablate's {TABLE}")
+    scored = [case.record for case in cases if case.record["scores"]]
+    error = "mae_hu" if any("mae_hu" in record["scores"] for record in scored) else "misfit"
+    points = [{"name": f"{case.record['case']}, {case.record['method']}", "series": case.record["method"],
+               "seconds": sum(case.record["seconds"].values()),
+               "error": case.record["misfit"] if error == "misfit" else (case.record["scores"] or {}).get(error)}
+              for case in cases]
+    tables = sorted({path.relative_to(folder).as_posix() for depth in ("", "*/") for name in (TABLE, "results.md")
+                     for path in folder.glob(depth + name)})
+    return write_page(folder, Contents(f"Results in {folder.resolve().name}", _mean_tables(scored), cases, points,
+                                       error, links=tables))
+
+
+def _case_folders(folder: Path) -> list[Path]:
+    """The folders of finished cases, those that are just being written left out."""
+    found = {path.parent for depth in ("*", "*/*") for path in folder.glob(f"{depth}/{RECORD}")}
+    return sorted(path for path in found if not any(part[:1] == "." for part in path.relative_to(folder).parts))
+
+
+def _case(folder: Path, path: Path) -> Case | None:
+    """A finished case, None, with a warning, where its files are damaged."""
+    try:
+        record = json.loads((path / RECORD).read_text())
+        score_row(record["case"], record | {"scores": record["scores"] or {}})
+        float(record["misfit"]), list(record["misfit_per_view"])
+        if not all((path / name).is_file() for name in CASE_FILES):
+            _make_case_files(path)
+    except Exception as error:  # whatever a damaged record or volume leads to
+        warn(f"{path} is left out of the page, since its files are damaged ({type(error).__name__}: {error})")
+        return None
+    return Case(path.relative_to(folder).as_posix(), sorted(os.listdir(path)), record)
+
+
+def _make_case_files(path: Path) -> None:
+    image = nib.load(path / "volume.nii.gz")
+    volumes = {"reconstruction": np.asarray(image.dataobj)}
+    if (path / "deviation.nii.gz").is_file():
+        volumes["deviation"] = np.asarray(nib.load(path / "deviation.nii.gz").dataobj)
+    write_case_files(path, Grid(image.shape, affine=image.affine), volumes)
+
+
+def _mean_tables(scored: list[dict]) -> list[Table]:
+    """The means over scored cases by method, where there are any."""
+    if not scored:
+        return []
+    names = {record["settings"].get("data", {}).get("protocol") for record in scored}
+    window = protocol_of(*names).window if len(names) == 1 and None not in names else RANGE
+    return [mean_table([score_row(record["case"], record) for record in scored], window=window)]

@@ -1,0 +1,10 @@
+"""The page of results: an index.html that a browser opens from disk, without a server and without network.
+
+It holds tables, plots and what is known of each case; the volumes and the X-rays of a case lie beside its NIfTI files
+and are loaded when it is opened.
+"""
+
+from phydict.page.case_files import CASE_FILES, write_case_files
+from phydict.page.document import PAGE, Case, Contents, check_own_page, write_page
+
+__all__ = ["CASE_FILES", "PAGE", "Case", "Contents", "check_own_page", "write_case_files", "write_page"]

@@ -1,0 +1,97 @@
+"""What the page shows of a case and the browser cannot read itself: its volumes and X-rays as text, and a thumbnail."""
+
+from __future__ import annotations
+
+import base64
+import json
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+
+import nibabel as nib
+import numpy as np
+from PIL import Image
+from torch import Tensor
+
+from phydict.evaluation.gallery import DISPLAY, plane
+from phydict.grid import Grid
+from phydict.runtime.files import atomic_write
+
+VIEW, THUMBNAIL = "view.js", "thumbnail.png"
+CASE_FILES = (VIEW, THUMBNAIL)
+"""The files of a case that only the page needs."""
+
+EMPTY = -2**15
+"""The int16 of a voxel that is not finite."""
+
+XRAY_SIDE = 256
+"""Pixels along an X-ray's longer side, above which it is shown binned."""
+
+THUMBNAIL_SIDE = 96
+
+
+def write_case_files(folder: Path, grid: Grid, volumes: Mapping[str, Tensor | np.ndarray],
+                     xrays: Tensor | None = None, reprojection: Tensor | None = None) -> None:
+    """Writes what the page shows of a case into its folder.
+
+    volumes: name -> HU (X, Y, Z) on `grid`, the reconstruction first; kept as int16 in RAS+, rounded. xrays,
+    reprojection: line integrals (K, V, U), kept as uint16 over the range of both; None where they are not known.
+    """
+    turn = nib.io_orientation(grid.affine)
+    affine = grid.affine @ nib.orientations.inv_ornt_aff(turn, grid.shape)
+    with atomic_write(folder / VIEW) as part, part.open("w", encoding="ascii") as file:
+        file.write("phydictView({")
+        for name, volume in volumes.items():
+            turned = nib.apply_orientation(_int16(volume), turn)
+            file.write(f'{json.dumps(name)}: "{packed(turned.ravel(order="F"))}",\n')
+        if xrays is not None and reprojection is not None:
+            file.write(f'"X-rays": {json.dumps(_xrays(np.asarray(xrays), np.asarray(reprojection)))},\n')
+        file.write(f'"shape": {list(turned.shape)}, "affine": {affine[:3].tolist()}, '
+                   f'"inverse": {np.linalg.inv(affine)[:3].tolist()}}});\n')
+    _write_thumbnail(folder / THUMBNAIL, next(iter(volumes.values())), grid)
+
+
+def packed(array: np.ndarray) -> str:
+    """An array's little-endian bytes, compressed by gzip, in base64."""
+    squeeze = zlib.compressobj(1, wbits=31)
+    little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
+    return base64.b64encode(squeeze.compress(little) + squeeze.flush()).decode()
+
+
+def _int16(volume: Tensor | np.ndarray) -> np.ndarray:
+    hu = np.asarray(volume)
+    out = np.empty(hu.shape, np.int16)
+    for x, values in enumerate(hu):  # slice by slice, so that a large volume needs no second copy in float
+        whole = np.where(np.isfinite(values), np.rint(values).clip(EMPTY + 1, -EMPTY - 1), EMPTY)
+        out[x] = whole
+    return out
+
+
+def _xrays(measured: np.ndarray, rendered: np.ndarray) -> dict:
+    factor = -(-max(measured.shape[1:]) // XRAY_SIDE)
+    images = [_binned(values, factor) for values in (measured, rendered)]
+    finite = np.concatenate([image[np.isfinite(image)] for image in images])
+    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
+    step = (high - low or 1.0) / (2**16 - 1)
+    codes = [packed(np.rint((np.nan_to_num(image, nan=low, posinf=high, neginf=low) - low) / step).astype(np.uint16))
+             for image in images]
+    return {"shape": images[0].shape, "low": low, "step": step, "measured": codes[0], "rendered": codes[1]}
+
+
+def _binned(images: np.ndarray, factor: int) -> np.ndarray:
+    """Means of blocks of pixels (K, V, U); incomplete blocks at the far edges are left out."""
+    views, rows, columns = images.shape[0], images.shape[1] // factor, images.shape[2] // factor
+    cut = images[:, :rows * factor, :columns * factor].astype(np.float32)
+    return cut.reshape(views, rows, factor, columns, factor).mean((2, 4))
+
+
+def _write_thumbnail(path: Path, volume: Tensor | np.ndarray, grid: Grid) -> None:
+    """The middle coronal plane in the gallery's window as a small PNG."""
+    image, aspect = plane(volume, grid, "coronal")
+    low, high = DISPLAY
+    grey = np.nan_to_num((image - low) / (high - low)).clip(0, 1) * 255
+    height, width = image.shape[0] * aspect, image.shape[1]
+    scale = THUMBNAIL_SIDE / max(height, width)
+    size = (max(round(width * scale), 1), max(round(height * scale), 1))
+    with atomic_write(path) as part:
+        Image.fromarray(grey.astype(np.uint8)).resize(size, Image.Resampling.BILINEAR).save(part, format="png")

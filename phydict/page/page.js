@@ -1,0 +1,199 @@
+"use strict";
+const content = JSON.parse(byId("content").textContent);
+const keyOf = case_ => `${case_.record.method}/${case_.record.case}`;
+const places = new Map(content.cases.map(case_ => [keyOf(case_), case_]));
+const loaded = new Map();  // key -> {volumes, xrays}, the last ones opened
+let viewer = null, opened = "";
+
+/* The rows of a table in the order of a column: numbers by size, text by its letters, what is missing last. */
+function inOrder(rows, column, down) {
+  const key = row => row[column].value ?? row[column].text;
+  const absent = row => row[column].value === null && !row[column].label;
+  return [...rows].sort((one, other) => absent(one) - absent(other) || (down ? -1 : 1) * (
+    typeof key(one) === "number" && typeof key(other) === "number" ? key(one) - key(other)
+      : String(key(one)).localeCompare(String(key(other)), undefined, {numeric: true})));
+}
+
+function table(title, header, rows, notes = []) {
+  const body = element("tbody"), fill = shown => body.replaceChildren(...shown.map(row => row.made ??= line(row)));
+  const heads = header.map((name, column) => {
+    const head = element("th", {scope: "col", "aria-sort": "none", class: rows[0]?.[column]?.label ? "text" : null},
+      element("button", {type: "button", onclick: () => {
+        const down = head.getAttribute("aria-sort") === "ascending";
+        for (const other of heads) other.setAttribute("aria-sort", "none");
+        head.setAttribute("aria-sort", down ? "descending" : "ascending");
+        fill(inOrder(rows, column, down));
+      }}, name));
+    return head;
+  });
+  fill(rows);
+  return element("div", {},
+    element("div", {class: "scroll"}, element("table", {}, element("caption", {}, title),
+      element("thead", {}, element("tr", {}, ...heads)), body)),
+    ...notes.map(note => element("p", {class: "notes"}, note)));
+}
+
+function line(cells) {
+  return element("tr", {"data-key": cells.key}, ...cells.map(cell => element("td", {
+    class: ["", "best", "second"][cell.place ?? 0] + (cell.label ? " text" : "")}, cell.node ?? cell.text)));
+}
+
+function caseRow(case_) {
+  const {record, scores} = case_, key = keyOf(case_), open = () => { location.hash = encodeURIComponent(key); };
+  const picture = case_.files.find(file => file.name === "thumbnail.png");
+  const row = [
+    {text: record.case, value: null, label: true,
+     node: element("button", {class: "name", type: "button", onclick: open}, record.case)},
+    {text: "", value: null, label: true, node: picture ? element("img", {
+      loading: "lazy", alt: "", src: `${case_.folder}/${picture.url}`, onclick: open}) : ""},
+    {text: record.method, value: null, label: true},
+    {text: String(record.views ?? "–"), value: record.views ?? null}];
+  for (const {name, decimals} of content.measures) {
+    const value = scores[name] ?? null;
+    row.push({text: value === null ? "–" : value.toFixed(decimals), value, place: case_.places[name]});
+  }
+  const warnings = (record.warnings ?? []).length;
+  row.push({text: String(warnings), value: warnings});
+  row.key = key;
+  return row;
+}
+
+/* Seconds against error, a dot each, coloured by its series; null where there is nothing to see. */
+function plot(points, error) {
+  const known = points.filter(point => point.seconds > 0 && point.error !== null);
+  if (known.length < 2) return null;
+  const svg = (tag, attributes, ...children) => {
+    const made = document.createElementNS("http://www.w3.org/2000/svg", tag);
+    for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
+    made.append(...children);
+    return made;
+  };
+  const range = values => [Math.min(...values), Math.max(...values)];
+  const [first, last] = range(known.map(point => Math.log10(point.seconds)));
+  const [low, high] = range(known.map(point => point.error));
+  const x = seconds => 60 + 340 * share(Math.log10(seconds), first, last === first ? first + 1 : last);
+  const y = value => 250 - 220 * share(value, low, high === low ? low + 1 : high);
+  const series = [...new Set(known.map(point => point.series))];
+  const colour = name => `hsl(${Math.round(360 * series.indexOf(name) / series.length)} 65% 50%)`;
+  const words = (text, at) => svg("text", at, text), number = value => Number(value.toPrecision(3)).toString();
+  return element("figure", {}, element("figcaption", {}, `Seconds per case against ${error}; lower left is better`),
+    svg("svg", {viewBox: "0 0 620 300", role: "img", "aria-label": `Seconds per case against ${error}`},
+      svg("line", {x1: 50, y1: 260, x2: 410, y2: 260}), svg("line", {x1: 50, y1: 20, x2: 50, y2: 260}),
+      words(number(10 ** first) + " s", {x: 60, y: 278, "text-anchor": "middle"}),
+      words(number(10 ** last) + " s", {x: 400, y: 278, "text-anchor": "middle"}),
+      words(number(high), {x: 45, y: 34, "text-anchor": "end"}),
+      words(number(low), {x: 45, y: 254, "text-anchor": "end"}),
+      ...known.map(point => svg("circle", {cx: x(point.seconds), cy: y(point.error), r: 4, fill: colour(point.series)},
+        svg("title", {}, `${point.name}: ${number(point.seconds)} s, ${number(point.error)}`))),
+      ...series.slice(0, 18).map((name, n) => svg("g", {}, words(name, {x: 436, y: 34 + 15 * n}),
+        svg("circle", {cx: 426, cy: 30 + 15 * n, r: 4, fill: colour(name)})))));
+}
+
+function showRun() {
+  const {title, version, tables, cases, measures, points, error, plots, links} = content, run = byId("run");
+  byId("title").textContent = title;
+  byId("made").textContent = `Made by phydict ${version}.`;
+  run.append(...tables.map(made => table(made.title, made.header, made.rows.map(row => {
+    row[0].label = true;
+    return row;
+  }), made.notes)), plot(points, error) ?? "");
+  if (cases.length) {
+    const header = ["case", "", "method", "views", ...measures.map(measure => measure.label), "warnings"];
+    const rows = cases.map(caseRow), own = table("Cases", header, rows, [
+      "Best of each case in bold, second underlined. A name opens the case."]);
+    const filter = element("input", {type: "search", oninput: () => {
+      for (const row of own.querySelectorAll("tbody tr")) row.hidden = !row.dataset.key.includes(filter.value);
+    }});
+    run.append(element("p", {}, element("label", {}, "show cases and methods with ", filter)), own);
+  }
+  run.append(
+    ...plots.map(({name, url}) => element("p", {},
+      element("img", {class: "plot", loading: "lazy", alt: name, src: url}))),
+    element("ul", {}, ...links.map(({name, url}) => element("li", {}, element("a", {href: url}, name)))));
+}
+
+/* A case's volumes and X-rays; the last few opened are kept. */
+async function load(case_) {
+  const key = keyOf(case_);
+  if (!loaded.has(key)) {
+    const script = element("script", {src: `${case_.folder}/view.js`});
+    const data = await new Promise((resolve, reject) => {
+      script.onload = () => script.data ? resolve(script.data) : reject(new Error("it is damaged"));
+      script.onerror = () => reject(new Error("it is missing"));
+      document.head.append(script);
+    }).finally(() => script.remove());
+    const volumes = {}, xrays = data["X-rays"] ?? null;
+    for (const name of ["reconstruction", "truth", "deviation"])
+      if (data[name]) volumes[name] = new Volume(name, await unpack(data[name], Int16Array), data);
+    for (const name of xrays ? ["measured", "rendered"] : []) xrays[name] = await unpack(xrays[name], Uint16Array);
+    loaded.set(key, {volumes, xrays});
+    if (loaded.size > 4) loaded.delete(loaded.keys().next().value);
+  }
+  return loaded.get(key);
+}
+window.phydictView = data => { document.currentScript.data = data; };
+
+async function showCase(key) {
+  const case_ = places.get(key);
+  byId("case").hidden = !case_;
+  opened = key;
+  for (const row of document.querySelectorAll("tr[data-key]"))
+    row.setAttribute("aria-current", row.dataset.key === key);
+  if (!case_) return;
+  const {record, scores, folder, files} = case_;
+  byId("case-name").textContent = `${record.case}: ${record.method}`;
+  byId("case-scores").textContent = content.measures.filter(({name}) => (scores[name] ?? null) !== null)
+    .map(({name, label, decimals}) => `${label} ${scores[name].toFixed(decimals)}`).join(", ");
+  byId("warnings").replaceChildren(...(record.warnings ?? []).map(text => element("li", {}, text)));
+  byId("report").textContent = record.report || "none was used";
+  byId("files").replaceChildren(...files.filter(({name}) => name !== "view.js").map(({name, url}) => element("li", {},
+    element("a", {href: `${folder}/${url}`}, name))));
+  const {settings, versions, grid, report, warnings, scores: _, files: __, ...facts} = record;
+  byId("facts").replaceChildren(...Object.entries({...facts, voxels: grid?.shape?.join(" x ")}).flatMap(
+    ([name, value]) => [element("dt", {}, name.replaceAll("_", " ")),
+                        element("dd", {}, typeof value === "object" ? JSON.stringify(value) : String(value))]));
+  byId("settings").textContent = JSON.stringify(
+    {settings: content.shared[settings], versions: content.shared[versions]}, null, 1);
+  byId("viewer").hidden = true;
+  byId("state").textContent = folder ? "loading the volume" : "";
+  try {
+    if (!folder) return;
+    const {volumes, xrays} = await load(case_);
+    if (opened !== key) return;
+    byId("viewer").hidden = false;
+    viewer ??= new Viewer();
+    viewer.show(volumes, xrays, record.misfit_per_view ?? []);
+    await offerOthers(case_, volumes);
+    byId("state").textContent = "";
+  } catch (error) {
+    byId("state").textContent = `The volume is not shown: ${folder}/view.js cannot be used, since ${error.message}. ` +
+      "Make the page anew: infer.py page <folder>.";
+  } finally {
+    byId("case-name").focus({preventScroll: true});
+    byId("case").scrollIntoView();
+  }
+}
+
+/* Fills the choice of what stands beside a case's volume: its truth, and the same case by other methods. */
+async function offerOthers(case_, volumes) {
+  const same = content.cases.filter(other => other !== case_ && other.record.case === case_.record.case);
+  const choices = [["nothing", null], ...volumes.truth ? [["truth", volumes.truth]] : [],
+                   ...same.map(other => [other.record.method, other])];
+  byId("other").replaceChildren(...choices.map(([name], n) => element("option", {value: n}, name)));
+  byId("other").value = volumes.truth ? 1 : 0;
+  const choose = async () => {
+    const [name, chosen] = choices[byId("other").value];
+    const other = chosen?.record ? Object.assign(Object.create(Volume.prototype),
+      (await load(chosen)).volumes.reconstruction, {name}) : chosen;
+    const shown = viewer.compare(other);
+    byId("state").textContent = shown ? "" : `The volume of ${name} lies askew to this one and is not shown beside it.`;
+  };
+  byId("other").onchange = choose;
+  await choose();
+}
+
+showRun();
+const follow = () => showCase(decodeURIComponent(location.hash.slice(1)));
+window.addEventListener("hashchange", follow);
+if (!location.hash && content.cases.length === 1) location.hash = encodeURIComponent(keyOf(content.cases[0]));
+else follow();

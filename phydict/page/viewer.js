@@ -1,0 +1,231 @@
+"use strict";
+// level and width in HU
+const WINDOWS = {all: [-300, 1400], lung: [-600, 1500], "soft tissue": [40, 400], bone: [400, 1800]};
+const PLANES = {axial: {across: 2, x: 0, y: 1, edges: "RLAP"}, coronal: {across: 1, x: 0, y: 2, edges: "RLSI"},
+                sagittal: {across: 0, x: 1, y: 2, edges: "APSI"}};
+const SPREAD = 500;  // HU of difference in full colour, and of deviation in the strongest
+const WIDE = 360;  // pixels across a canvas
+const byId = id => document.getElementById(id);
+
+function element(tag, attributes = {}, ...children) {
+  const made = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) {
+    if (name.startsWith("on")) made.addEventListener(name.slice(2), value);
+    else if (value !== null && value !== undefined) made.setAttribute(name, value);
+  }
+  made.append(...children.map(child => child ?? ""));
+  return made;
+}
+
+const share = (value, low, high) => Math.min(Math.max((value - low) / (high - low), 0), 1);
+const signed = part => part > 0 ? [255, 255 * (1 - part), 255 * (1 - part)] : [255 * (1 + part), 255 * (1 + part), 255];
+
+/* Draws values through a colour (value, position -> [r, g, b]) onto a canvas; ratio: its height over its width. */
+function paint(canvas, values, wide, high, ratio, colour) {
+  const image = new ImageData(wide, high), raw = new OffscreenCanvas(wide, high);
+  for (let n = 0; n < values.length; n++) {
+    const [r, g, b] = colour(values[n], n), at = 4 * n;
+    image.data[at] = r; image.data[at + 1] = g; image.data[at + 2] = b; image.data[at + 3] = 255;
+  }
+  raw.getContext("2d").putImageData(image, 0, 0);
+  canvas.width = WIDE;
+  canvas.height = Math.max(Math.round(WIDE * ratio), 1);
+  const context = canvas.getContext("2d");
+  context.imageSmoothingEnabled = false;
+  context.drawImage(raw, 0, 0, canvas.width, canvas.height);
+  return context;
+}
+
+class Viewer {
+  constructor() {
+    this.window = [...WINDOWS.all];
+    this.angle = 0;
+    this.mean = false;
+    this.rows = [0, 1].map(row => ({canvases: Object.fromEntries(Object.keys(PLANES).map(name =>
+      [name, this.canvas(name, row)])), turning: this.turning(row)}));
+    for (const row of this.rows) for (const canvas of [...Object.values(row.canvases), row.turning])
+      byId("planes").append(canvas.parentNode);
+    for (const [name, window] of Object.entries(WINDOWS))
+      byId("windows").append(element("button", {type: "button", onclick: () => this.setWindow(...window)}, name), " ");
+    for (const id of ["level", "width"])
+      byId(id).addEventListener("input", () => this.setWindow(+byId("level").value, Math.max(+byId("width").value, 1)));
+    byId("way").addEventListener("change", () => this.draw());
+    byId("overlay").addEventListener("change", () => this.draw());
+    byId("wipe").addEventListener("input", () => this.drawXrays());
+    this.setWindow(...this.window);
+  }
+
+  canvas(name, row) {
+    const canvas = element("canvas", {tabindex: 0, role: "slider", "data-plane": name, "data-row": row,
+                                      "aria-label": `${name} plane${row ? ", beside it" : ""}`, "aria-valuemin": 1});
+    const {across, x, y} = PLANES[name];
+    const pick = event => {
+      const box = canvas.getBoundingClientRect(), [wide, high] = [this.volume.shape[x], this.volume.shape[y]];
+      const i = wide - 1 - Math.floor((event.clientX - box.left) / box.width * wide);
+      this.move({[x]: i, [y]: high - 1 - Math.floor((event.clientY - box.top) / box.height * high)});
+    };
+    canvas.addEventListener("pointerdown", event => { canvas.setPointerCapture(event.pointerId); pick(event); });
+    canvas.addEventListener("pointermove", event => { if (event.buttons) pick(event); });
+    canvas.addEventListener("wheel", event => {
+      event.preventDefault();
+      this.move({[across]: this.at[across] - Math.sign(event.deltaY)});
+    }, {passive: false});
+    canvas.addEventListener("keydown", event => {
+      const [axis, step] = {ArrowLeft: [x, 1], ArrowRight: [x, -1], ArrowUp: [y, 1], ArrowDown: [y, -1],
+                            PageUp: [across, 1], PageDown: [across, -1]}[event.key] ?? [];
+      if (step) {
+        event.preventDefault();
+        this.move({[axis]: this.at[axis] + step});
+      }
+    });
+    element("figure", {}, canvas, element("figcaption"));
+    return canvas;
+  }
+
+  turning(row) {
+    const canvas = element("canvas", {role: "img", "aria-label": "Projection of the volume, turned by the slider"});
+    const turn = element("input", {
+      type: "range", min: -180, max: 180, value: 0, "aria-label": "Angle of the projection",
+      oninput: () => { this.angle = +turn.value; this.drawTurning(); }});
+    const kind = element("button", {type: "button", "aria-pressed": "false", onclick: () => {
+      this.mean = !this.mean;
+      kind.setAttribute("aria-pressed", this.mean);
+      this.drawTurning();
+    }}, "mean");
+    canvas.addEventListener("pointermove", event => {
+      if (!event.buttons) return;
+      this.angle = (this.angle + event.movementX + 540) % 360 - 180;
+      this.drawTurning();
+    });
+    element("figure", {}, canvas, element("figcaption", {}, ...row ? [] : ["turn ", turn, " ", kind]));
+    return canvas;
+  }
+
+  /* Shows a case's volumes and X-rays; misfits: of each view. */
+  show(volumes, xrays, misfits) {
+    [this.volume, this.deviation, this.xrays] = [volumes.reconstruction, volumes.deviation ?? null, xrays];
+    this.at = this.volume.shape.map(size => Math.floor(size / 2));
+    this.own = this.volume.indices(this.volume);
+    this.other = null;
+    byId("overlay-label").hidden = !this.deviation;
+    byId("xrays").hidden = !xrays;
+    this.view = 0;
+    const most = Math.max(...misfits.map(value => value ?? 0), 1e-9);
+    byId("bars").replaceChildren(...misfits.map((value, view) => element("button", {
+      type: "button", "aria-label": `view ${view + 1}: misfit ${value?.toPrecision(3) ?? "unknown"}`,
+      onclick: () => { this.view = view; this.drawXrays(); }},
+      element("span", {style: `height: ${100 * (value ?? 0) / most}%`}))));
+    this.misfits = misfits;
+    this.draw();
+    this.drawXrays();
+  }
+
+  /* Takes another volume for the second row, null for none; returns whether it can be shown there. */
+  compare(other) {
+    const indices = other?.indices(this.volume) ?? null;
+    this.other = indices && {volume: other, indices};
+    this.draw();
+    return !other || Boolean(indices);
+  }
+
+  setWindow(level, width) {
+    this.window = [level, width];
+    for (const [n, id] of ["level", "width"].entries())
+      if (+byId(id).value !== this.window[n]) byId(id).value = this.window[n];
+    for (const button of byId("windows").children)
+      button.setAttribute("aria-pressed", String(WINDOWS[button.textContent]) === String(this.window));
+    if (this.volume) this.drawPlanes();
+  }
+
+  move(changes) {
+    for (const [axis, index] of Object.entries(changes))
+      this.at[axis] = Math.min(Math.max(index, 0), this.volume.shape[axis] - 1);
+    this.drawPlanes();
+  }
+
+  draw() {
+    this.drawPlanes();
+    this.drawTurning();
+  }
+
+  drawPlanes() {
+    const {volume, at, other} = this, difference = byId("way").value === "difference";
+    const low = this.window[0] - this.window[1] / 2, high = low + this.window[1];
+    const grey = hu => hu === EMPTY ? [255, 0, 255] : Array(3).fill(255 * share(hu, low, high));
+    for (const [name, plane] of Object.entries(PLANES)) {
+      const {across, x, y, edges} = plane, [wide, tall] = [volume.shape[x], volume.shape[y]];
+      const ratio = tall * volume.spacing[y] / (wide * volume.spacing[x]);
+      const hu = volume.plane(plane, at[across], this.own);
+      const spread = byId("overlay").checked && this.deviation?.plane(plane, at[across], this.own);
+      const beside = other?.volume.plane(plane, at[across], other.indices);
+      const colours = [spread ? (value, n) => {
+        const part = 0.8 * share(spread[n], 0, SPREAD), [base] = grey(value);
+        return [255, 160, 0].map(full => base + part * (full - base));
+      } : grey, difference ? (value, n) => value === EMPTY || hu[n] === EMPTY ? [128, 128, 128]
+        : signed(Math.min(Math.max((hu[n] - value) / SPREAD, -1), 1)) : grey];
+      for (const [row, values] of [hu, beside].entries()) {
+        const canvas = this.rows[row].canvases[name], figure = canvas.parentNode;
+        figure.hidden = !values;
+        if (!values) continue;
+        const context = paint(canvas, values, wide, tall, ratio, colours[row]);
+        this.drawCrosshair(context, (wide - at[x] - 0.5) / wide, (tall - at[y] - 0.5) / tall, edges);
+        const mm = world(volume.affine, at)[across].toFixed(1);
+        const place = `slice ${at[across] + 1} of ${volume.shape[across]}`;
+        canvas.setAttribute("aria-valuenow", at[across] + 1);
+        canvas.setAttribute("aria-valuemax", volume.shape[across]);
+        canvas.setAttribute("aria-valuetext", `${place}, ${mm} mm`);
+        const what = !row ? volume.name : (difference ? `less ` : "") + other.volume.name;
+        figure.lastChild.textContent = `${what}, ${name}, ${place}`;
+      }
+    }
+    this.readOut();
+  }
+
+  drawCrosshair(context, x, y, edges) {
+    const {width, height} = context.canvas;
+    context.fillStyle = "rgba(90, 200, 255, 0.75)";
+    context.fillRect(Math.floor(x * width), 0, 1, height);
+    context.fillRect(0, Math.floor(y * height), width, 1);
+    context.fillStyle = "gold";
+    context.font = "13px sans-serif";
+    context.textAlign = "center";
+    const places = [[8, height / 2], [width - 8, height / 2], [width / 2, 14], [width / 2, height - 5]];
+    for (const [n, place] of places.entries()) context.fillText(edges[n], ...place);
+  }
+
+  readOut() {
+    const {volume, at, other} = this, said = [[volume.name, volume.at(at)]];
+    if (other) said.push([other.volume.name, other.volume.at(at.map((index, axis) => other.indices[axis][index]))]);
+    if (this.deviation) said.push(["standard deviation", this.deviation.at(at)]);
+    byId("readout").textContent = `(${world(volume.affine, at).map(mm => mm.toFixed(1)).join(", ")}) mm RAS+: ` +
+      said.map(([name, hu]) => `${name} ${hu === EMPTY ? "no value" : hu + " HU"}`).join(", ");
+  }
+
+  drawTurning() {
+    const volumes = [this.volume, this.other && byId("way").value === "beside" ? this.other.volume : null];
+    for (const [row, volume] of volumes.entries()) {
+      const canvas = this.rows[row].turning;
+      canvas.parentNode.hidden = !volume;
+      if (!volume) continue;
+      const {values, wide, high, ratio} = volume.projection(this.angle, this.mean);
+      const low = this.mean ? -1024 : -200, top = values.reduce((a, b) => Math.max(a, b), low + 1);
+      paint(canvas, values, wide, high, ratio, hu => Array(3).fill(255 * share(hu, low, top)));
+    }
+  }
+
+  drawXrays() {
+    for (const [n, bar] of [...byId("bars").children].entries()) bar.setAttribute("aria-pressed", n === this.view);
+    byId("view-name").textContent = `view ${this.view + 1} of ${this.misfits.length}, misfit ` +
+      `${this.misfits[this.view]?.toPrecision(3) ?? "unknown"}`;
+    if (!this.xrays) return;
+    const {shape: [, tall, wide], low, step, measured, rendered} = this.xrays, size = wide * tall;
+    const [y, p] = [measured, rendered].map(all => all.subarray(this.view * size, (this.view + 1) * size));
+    const edge = wide * byId("wipe").value / 100, residual = Float32Array.from(p, (code, n) => step * (code - y[n]));
+    const top = 65535 * step || 1, most = residual.reduce((a, b) => Math.max(a, Math.abs(b)), step);
+    paint(byId("xray"), y, wide, tall, tall / wide,
+          (code, n) => Array(3).fill(255 * step * (n % wide < edge ? code : p[n]) / top));
+    paint(byId("residual"), residual, wide, tall, tall / wide, value => signed(value / most));
+    byId("residual-scale").textContent = `residual, ±${most.toPrecision(2)} in line integrals from ` +
+      `${low.toPrecision(2)} to ${(low + top).toPrecision(2)}; red: re-projected too high`;
+  }
+}

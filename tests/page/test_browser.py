@@ -1,0 +1,213 @@
+"""The page of results in a real browser, from disk; skipped where no Chromium or no playwright is found."""
+
+import re
+import shutil
+from itertools import product
+
+import nibabel
+import numpy as np
+import pytest
+from page.made import finish
+
+from phydict.grid import Grid
+from phydict.inference.page import results_page
+
+BROWSER = next(filter(None, map(shutil.which, (
+    "chromium-headless-shell", "chromium", "chromium-browser", "google-chrome"))), None)
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+pytestmark = pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
+
+HOSTILE = "<script>alert('1')<∕script>\"é😀 #?%41&amp;"
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with playwright.sync_playwright() as driver:
+        made = driver.chromium.launch(executable_path=BROWSER, args=["--no-sandbox"], timeout=300_000)
+        yield made
+        made.close()
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    """The folder of two methods' results on two cases, one of a hostile name."""
+    out = tmp_path_factory.mktemp("out")
+    of = [("anna", "sirt", 9.0), ("anna", "tv", 21.0), (HOSTILE, "sirt", 100.0)]
+    for seed, (case, method, psnr) in enumerate(of):
+        finish(out, case, method, seed=seed, report=HOSTILE, warnings=[HOSTILE], scores={"psnr": psnr})
+    fine = Grid((12, 18, 14), affine=[[-2, 0, 0, 12], [0, 1.5, 0, -8], [0, 0, 2.5, -21], [0, 0, 0, 1]])
+    finish(out, "anna", "fine", grid=fine, seed=7, scores=None)
+    results_page(out)
+    return out
+
+
+@pytest.fixture
+def shown(browser, results):
+    """Opens the page, of a case where a hash names it; at the end nothing was said on its console."""
+    said, pages = [], []
+
+    def show(place: str = "", folder=results, scheme: str = "light"):
+        page = browser.new_page(color_scheme=scheme)
+        pages.append(page)
+        page.set_default_timeout(60_000)
+        page.on("console", lambda message: message.type == "error" and said.append(message.text))
+        page.on("pageerror", lambda error: said.append(str(error)))
+        page.on("dialog", lambda dialog: said.append(dialog.message) or dialog.dismiss())
+        page.on("request", lambda request: request.url.startswith("file:") or said.append(request.url))
+        page.goto((folder / "index.html").as_uri() + place)
+        if place:
+            page.wait_for_selector("#viewer:not([hidden])")
+            page.wait_for_function("document.getElementById('state').textContent === ''")
+        return page
+
+    yield show
+    for page in pages:
+        page.close()
+    assert said == []
+
+
+def readout(page) -> tuple[np.ndarray, dict[str, int]]:
+    """The crosshair's place in mm and the HU there of each volume."""
+    place, values = page.inner_text("#readout").split(" mm RAS+: ")
+    return np.array(eval(place)), {name: int(hu) for name, hu in re.findall(r"([a-z][a-z ]*?) (-?\d+) HU", values)}
+
+
+def look(page, selector: str) -> str:
+    """A canvas's picture, as text."""
+    return page.eval_on_selector(selector, "canvas => canvas.toDataURL()")
+
+
+def test_the_hu_under_the_crosshair_is_the_files_wherever_it_is_moved(shown, results):
+    page = shown("#sirt%2Fanna")
+    image = nibabel.load(results / "sirt" / "anna" / "volume.nii.gz")
+    seen = set()
+    for act in (lambda: None, lambda: page.click("[data-plane=axial][data-row='0']", position={"x": 20, "y": 30}),
+                lambda: page.keyboard.press("ArrowLeft"), lambda: page.keyboard.press("PageUp"),
+                lambda: page.click("[data-plane=sagittal][data-row='0']", position={"x": 60, "y": 10})):
+        act()
+        mm, hu = readout(page)
+        index = np.rint(np.linalg.inv(image.affine) @ [*mm, 1]).astype(int)[:3]
+        assert hu["reconstruction"] == round(float(image.dataobj[tuple(index)]))
+        seen.add(tuple(mm))
+    assert len(seen) == 5
+
+
+def test_a_click_points_to_what_the_radiological_display_shows_there(shown):
+    page = shown("#sirt%2Fanna")
+    box = page.locator("[data-plane=axial][data-row='0']").bounding_box()
+    page.click("[data-plane=axial][data-row='0']", position={"x": 2, "y": 2})
+    (right, front, _), _ = readout(page)
+    page.click("[data-plane=axial][data-row='0']", position={"x": box["width"] - 2, "y": box["height"] - 2})
+    (left, back, _), _ = readout(page)
+    assert right == left + 4 * 8 and front == back + 3 * 5  # RAS+: x grows to the right, y to the front
+
+
+def test_wheel_and_keys_change_the_slice_that_a_screen_reader_is_told(shown):
+    page = shown("#sirt%2Fanna")
+    canvas = page.locator("[data-plane=coronal][data-row='0']")
+    before = look(page, "[data-plane=coronal][data-row='0']"), int(canvas.get_attribute("aria-valuenow"))
+    canvas.hover()
+    page.mouse.wheel(0, -100)
+    page.wait_for_function("n => document.querySelector('[data-plane=coronal]').ariaValueNow == n + 1", arg=before[1])
+    assert look(page, "[data-plane=coronal][data-row='0']") != before[0]
+    canvas.focus()
+    page.keyboard.press("PageDown")
+    assert int(canvas.get_attribute("aria-valuenow")) == before[1]
+    assert look(page, "[data-plane=coronal][data-row='0']") == before[0]
+    assert re.fullmatch(r"slice \d of 6, -?\d+\.\d mm", canvas.get_attribute("aria-valuetext"))
+
+
+def test_windows_overlay_and_difference_change_what_is_shown(shown):
+    page, plane = shown("#sirt%2Fanna"), "[data-plane=axial][data-row='0']"
+    looks = []
+    for name in ("lung", "soft tissue", "bone"):
+        page.click(f"button:text-is('{name}')")
+        assert page.get_attribute(f"button:text-is('{name}')", "aria-pressed") == "true"
+        looks.append(look(page, plane))
+    page.fill("#level", "-100")
+    looks.append(look(page, plane))
+    page.check("#overlay")
+    looks.append(look(page, plane))
+    assert len(set(looks)) == len(looks)
+    beside = look(page, "[data-plane=axial][data-row='1']")
+    page.select_option("#way", "difference")
+    assert look(page, "[data-plane=axial][data-row='1']") != beside
+
+
+def test_truth_and_other_methods_stand_beside_a_volume_at_the_same_place(shown, results):
+    page = shown("#sirt%2Fanna")
+    assert set(readout(page)[1]) == {"reconstruction", "truth", "standard deviation"}
+    for method in ("tv", "fine"):  # the second on other voxels
+        page.select_option("#other", label=method)
+        page.wait_for_function("name => document.getElementById('readout').textContent.includes(name)", arg=method)
+        mm, hu = readout(page)
+        image = nibabel.load(results / method / "anna" / "volume.nii.gz")
+        index = np.linalg.inv(image.affine) @ [*mm, 1]
+        nearest = [np.floor(index[:3] + 0.5 + nudge).astype(int) for nudge in product((-1e-6, 1e-6), repeat=3)]
+        assert hu[method] in [round(float(image.dataobj[tuple(at)])) for at in nearest]
+
+
+def test_xrays_follow_the_bars_and_the_slider(shown):
+    page = shown("#sirt%2Fanna")
+    assert [bar.get_attribute("aria-label") for bar in page.locator("#bars button").all()] == [
+        "view 1: misfit 0.100", "view 2: misfit 0.200", "view 3: misfit 0.0500"]
+    first = look(page, "#xray")
+    page.locator("#bars button").nth(1).click()
+    assert page.inner_text("#view-name") == "view 2 of 3, misfit 0.200" and look(page, "#xray") != first
+    second = look(page, "#xray")
+    page.fill("#wipe", "100")
+    assert look(page, "#xray") != second
+    ends = [page.eval_on_selector("#residual", "(c, x) => [...c.getContext('2d').getImageData(x, 9, 1, 1).data]", x)
+            for x in (0, 359)]
+    assert ends == [[0, 0, 255, 255], [255, 0, 0, 255]]  # from -1 to 1 across
+
+
+def test_a_click_on_a_column_sorts_by_number_and_puts_what_is_missing_last(shown):
+    page = shown()
+
+    def column() -> list[str]:
+        return page.eval_on_selector_all("tr[data-key]", "rows => rows.map(row => row.cells[4].textContent)")
+
+    head = page.locator("table:has(tr[data-key]) th", has_text="PSNR")
+    wanted = ["9.00", "21.00", "100.00"]
+    for direction, values in (("ascending", wanted), ("descending", wanted[::-1])):
+        head.locator("button").click()
+        assert column() == [*values, "–"] and head.get_attribute("aria-sort") == direction
+
+
+def test_a_hostile_name_is_text_and_its_case_opens(shown):
+    page = shown()
+    page.click(f"button.name >> text={HOSTILE}")
+    page.wait_for_selector("#viewer:not([hidden])")
+    assert page.inner_text("#case-name") == f"{HOSTILE}: sirt"
+    assert page.inner_text("#report") == HOSTILE == page.inner_text("#warnings li")
+    assert page.locator("script").count() == 2  # the data and the page's own
+    sources = page.eval_on_selector_all("#files a", "links => links.map(link => link.href)")
+    assert len([name for name in sources if name.endswith("volume.nii.gz")]) == 1
+
+
+def test_a_missing_volume_is_said_in_a_sentence(shown, tmp_path):
+    folder = finish(tmp_path, "anna", "sirt")
+    results_page(tmp_path)
+    (folder / "view.js").write_text("phydictView(null);")
+    page = shown(folder=tmp_path)  # its only case opens by itself
+    page.wait_for_function("document.getElementById('state').textContent.includes('cannot be used, since it is dama')")
+
+
+def test_light_and_dark_follow_the_system(shown):
+    backs = [shown(scheme=scheme).eval_on_selector("body", "body => getComputedStyle(body).backgroundColor")
+             for scheme in ("light", "dark")]
+    assert backs == ["rgb(255, 255, 255)", "rgb(20, 23, 27)"]
+
+
+def test_two_hundred_cases_are_one_small_page(shown, tmp_path):
+    folder = finish(tmp_path, "0", "sirt")
+    for case in range(1, 200):
+        shutil.copytree(folder, tmp_path / "sirt" / str(case))
+        made = (folder / "reconstruction.json").read_text().replace('"case": "0"', f'"case": "{case}"')
+        (tmp_path / "sirt" / str(case) / "reconstruction.json").write_text(made)
+    assert results_page(tmp_path).stat().st_size < 6e6
+    page = shown(folder=tmp_path)
+    assert page.locator("tr[data-key]").count() == 200
+    page.fill("[type=search]", "/17")
+    assert page.locator("tr[data-key]:visible").count() == 11  # 17 and 170 to 179

@@ -1,0 +1,152 @@
+"""The page of results: what it holds is what lies on disk, and other people's text stays text."""
+
+import base64
+import gzip
+import json
+import re
+
+import nibabel
+import numpy as np
+import pytest
+import torch
+from page.made import TURNED, finish, random_hu
+
+from phydict.cli.infer import main
+from phydict.evaluation import Table, write_csv
+from phydict.evaluation.metrics import MEASURES
+from phydict.inference.page import results_page
+from phydict.inference.results import RECORD, CaseResults
+from phydict.page import CASE_FILES, PAGE, Contents, write_case_files, write_page
+from phydict.page.case_files import EMPTY
+
+HOSTILE = "</script><script>alert(1)</script> \"'&# %é😀<!--CONTENT-->"
+
+
+def view(folder) -> dict:
+    """What the script of a case hands to the page."""
+    return json.loads((folder / "view.js").read_text().removeprefix("phydictView(").rstrip().removesuffix(");"))
+
+
+def unpacked(text: str, kind: str) -> np.ndarray:
+    return np.frombuffer(gzip.decompress(base64.b64decode(text)), kind)
+
+
+def content(page) -> dict:
+    """What the document holds for its script."""
+    text = page.read_text()
+    return json.loads(re.search(r'id="content">(.*)</script>\n<script>', text).group(1))
+
+
+def test_the_pages_volume_is_the_niftis_rounded_and_turned_to_ras(tmp_path):
+    folder = finish(tmp_path, "anna", "sirt")
+    image = nibabel.as_closest_canonical(nibabel.load(folder / "volume.nii.gz"))
+    held = view(folder)
+    volume = unpacked(held["reconstruction"], "<i2").reshape(held["shape"], order="F")
+    assert (volume == np.rint(np.asarray(image.dataobj))).all()
+    assert np.allclose(np.array(held["affine"]), image.affine[:3], atol=1e-5)
+    assert np.allclose(np.vstack([held["inverse"], [0, 0, 0, 1]]), np.linalg.inv(image.affine), atol=1e-5)
+
+
+def test_voxels_that_are_not_finite_and_beyond_int16_are_marked_and_clipped(tmp_path):
+    hu = random_hu(0)
+    hu[0, 0, 0], hu[1, 0, 0], hu[2, 0, 0] = torch.nan, torch.inf, 1e6
+    write_case_files(tmp_path, TURNED, {"reconstruction": hu})
+    volume = unpacked(view(tmp_path)["reconstruction"], "<i2").reshape(view(tmp_path)["shape"], order="F")
+    assert (volume == EMPTY).sum() == 2 and (volume == 32767).sum() == 1
+
+
+@pytest.mark.parametrize("shape, shown", [((2, 40, 30), (2, 40, 30)), ((1, 600, 301), (1, 200, 100))])
+def test_the_pages_xrays_are_the_measured_ones_to_half_a_step(tmp_path, shape, shown):
+    y = torch.from_numpy(np.random.default_rng(0).uniform(-1, 8, shape))
+    write_case_files(tmp_path, TURNED, {"reconstruction": random_hu(0)}, y, y + 1)
+    held = view(tmp_path)["X-rays"]
+    codes = unpacked(held["measured"], "<u2").reshape(held["shape"])
+    factor = shape[1] // shown[1]
+    wanted = y.numpy()[:, :, :shown[2] * factor].reshape(shape[0], shown[1], factor, shown[2], factor).mean((2, 4))
+    assert codes.shape == shown and abs(held["low"] + codes * held["step"] - wanted).max() <= 0.51 * held["step"]
+    assert abs(unpacked(held["rendered"], "<u2").astype(float) - codes.ravel() - 1 / held["step"]).max() <= 1
+
+
+def test_hostile_text_is_data_and_nothing_else(tmp_path):
+    name = HOSTILE.replace("/", "∕")
+    finish(tmp_path, name, "sirt", report=HOSTILE, warnings=[HOSTILE], scores=None)
+    page = results_page(tmp_path)
+    [case] = content(page)["cases"]
+    assert case["record"]["report"] == HOSTILE == case["record"]["warnings"][0] and case["record"]["case"] == name
+    before = page.read_text().count("<script")
+    write_page(tmp_path, Contents(HOSTILE, [Table(HOSTILE, [HOSTILE], [], [(HOSTILE, True, [])], [HOSTILE])]))
+    assert page.read_text().count("<script") == before and content(page)["title"] == HOSTILE
+
+
+def test_the_best_of_each_case_is_marked_among_the_methods(tmp_path):
+    for case, better in (("anna", "sirt"), ("bert", "tv")):
+        for method in ("sirt", "tv"):
+            finish(tmp_path, case, method, scores={"psnr": 20.0 + (method == better)})
+    places = {(c["record"]["case"], c["record"]["method"]): c["places"]["psnr"]
+              for c in content(results_page(tmp_path))["cases"]}
+    assert places == {("anna", "sirt"): 1, ("anna", "tv"): 2, ("bert", "sirt"): 2, ("bert", "tv"): 1}
+
+
+def test_what_is_not_a_number_leaves_the_page_readable(tmp_path):
+    finish(tmp_path, "anna", "sirt", misfit=float("nan"), scores={"psnr": float("inf")})
+    [case] = content(results_page(tmp_path))["cases"]
+    assert case["record"]["misfit"] is None and case["scores"]["psnr"] is None
+
+
+def test_the_page_is_made_anew_of_what_older_runs_left(tmp_path, capsys):
+    folder = finish(tmp_path, "anna", "sirt", with_page=False)
+    main(["page", str(tmp_path)])
+    assert str(tmp_path / PAGE) in capsys.readouterr().out and all((folder / name).is_file() for name in CASE_FILES)
+    image = nibabel.as_closest_canonical(nibabel.load(folder / "volume.nii.gz"))
+    assert (unpacked(view(folder)["reconstruction"], "<i2") == np.rint(image.get_fdata()).ravel(order="F")).all()
+    results = CaseResults(folder.parent, overwrite=True)  # the case is still this project's alone
+    assert results.unfinished({"anna": "crc32 1"}, {"seed": 0}) == ["anna"]
+
+
+def test_the_page_of_one_method_is_that_of_its_folder(tmp_path):
+    finish(tmp_path, "anna", "sirt"), finish(tmp_path, "anna", "tv")
+    assert [case["folder"] for case in content(results_page(tmp_path / "sirt"))["cases"]] == ["anna"]
+    assert [case["folder"] for case in content(results_page(tmp_path))["cases"]] == ["sirt/anna", "tv/anna"]
+
+
+def test_a_damaged_case_is_left_out_with_a_word(tmp_path):
+    finish(tmp_path, "anna", "sirt")
+    (finish(tmp_path, "bert", "sirt") / RECORD).write_text("{")
+    (finish(tmp_path, "carl", "sirt", with_page=False) / "volume.nii.gz").write_bytes(b"no volume")
+    with pytest.warns(UserWarning, match="is left out of the page, since its files are damaged") as said:
+        page = results_page(tmp_path)
+    assert [case["record"]["case"] for case in content(page)["cases"]] == ["anna"] and len(said) == 2
+
+
+def test_a_folder_without_results_is_refused_in_one_sentence(tmp_path, capsys):
+    for given in (tmp_path, tmp_path / "none", tmp_path / RECORD):
+        with pytest.raises(SystemExit) as stopped:
+            main(["page", str(given)])
+        said = capsys.readouterr().err
+        assert stopped.value.code == 2 and said.startswith("error: ") and said.count("\n") == 1
+        assert "predict, test or ablate wrote to" in said
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_page_of_someone_elses_stays(tmp_path):
+    finish(tmp_path, "anna", "sirt")
+    (tmp_path / PAGE).write_text("<html>mine</html>")
+    with pytest.raises(ValueError, match="is no page of results by phydict, and is not replaced"):
+        results_page(tmp_path)
+    assert (tmp_path / PAGE).read_text() == "<html>mine</html>"
+
+
+def test_a_comparisons_page_has_the_rows_that_count_its_tables_and_its_plots(tmp_path, capsys):
+    rows = [{"case": case, "method": method, "views": views, "seed": 0, "simulator": "ideal", "status": "ok",
+             "psnr": 20.0 + views, "ssim": 0.5, "mae_hu": 50.0, "misfit": 0.1, "seconds": 2.0, "network_calls": 0,
+             "key": f"{case}{method}{views}"}
+            for case in ("anna", "bert") for method in ("sirt", "tv") for views in (2, 8)]
+    rows[0] |= {"status": "refused", "error": "why", "psnr": None}
+    write_csv(tmp_path / "results.csv", rows)
+    (tmp_path / "pareto.png").touch()
+    main(["page", str(tmp_path)])
+    held = content(tmp_path / PAGE)
+    assert len({(case["record"]["method"], case["record"]["case"]) for case in held["cases"]}) == len(rows) - 1
+    assert held["plots"] == [{"name": "pareto.png", "url": "pareto.png"}] and len(held["points"]) == 4
+    assert held["tables"] and held["error"] == MEASURES["mae_hu"].label
+    assert any("sirt: why" in note for table in held["tables"] for note in table["notes"])

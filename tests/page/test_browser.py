@@ -82,7 +82,7 @@ def test_the_hu_under_the_crosshair_is_the_files_wherever_it_is_moved(shown, res
     image = nibabel.load(results / "sirt" / "anna" / "volume.nii.gz")
     seen = set()
     for act in (lambda: None, lambda: page.click("[data-plane=axial][data-row='0']", position={"x": 20, "y": 30}),
-                lambda: page.keyboard.press("ArrowLeft"), lambda: page.keyboard.press("PageUp"),
+                lambda: page.keyboard.press("ArrowRight"), lambda: page.keyboard.press("PageUp"),
                 lambda: page.click("[data-plane=sagittal][data-row='0']", position={"x": 60, "y": 10})):
         act()
         mm, hu = readout(page)

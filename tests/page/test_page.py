@@ -149,4 +149,4 @@ def test_a_comparisons_page_has_the_rows_that_count_its_tables_and_its_plots(tmp
     assert len({(case["record"]["method"], case["record"]["case"]) for case in held["cases"]}) == len(rows) - 1
     assert held["plots"] == [{"name": "pareto.png", "url": "pareto.png"}] and len(held["points"]) == 4
     assert held["tables"] and held["error"] == MEASURES["mae_hu"].label
-    assert any("sirt: why" in note for table in held["tables"] for note in table["notes"])
+    assert any("why" in note for table in held["tables"] for note in table["notes"])

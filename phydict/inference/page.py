@@ -64,8 +64,9 @@ def _case(folder: Path, path: Path) -> Case | None:
 def _make_case_files(path: Path) -> None:
     image = nib.load(path / "volume.nii.gz")
     volumes = {"reconstruction": np.asarray(image.dataobj)}
-    if (path / "deviation.nii.gz").is_file():
-        volumes["deviation"] = np.asarray(nib.load(path / "deviation.nii.gz").dataobj)
+    for name, label in (("interval_90", "half of the 90% interval"), ("deviation", "standard deviation")):
+        if len(volumes) == 1 and (path / f"{name}.nii.gz").is_file():
+            volumes[label] = np.asarray(nib.load(path / f"{name}.nii.gz").dataobj)
     write_case_files(path, Grid(image.shape, affine=image.affine), volumes)
 
 

@@ -34,16 +34,18 @@ def write_case_files(folder: Path, grid: Grid, volumes: Mapping[str, Tensor | np
                      xrays: Tensor | None = None, reprojection: Tensor | None = None) -> None:
     """Writes what the page shows of a case into its folder.
 
-    volumes: name -> HU (X, Y, Z) on `grid`, the reconstruction first; kept as int16 in RAS+, rounded. xrays,
-    reprojection: line integrals (K, V, U), kept as uint16 over the range of both; None where they are not known.
+    volumes: name -> HU (X, Y, Z) on `grid`, "reconstruction" first, then "truth" where it is known and how uncertain a
+    voxel is, by any other name; kept as int16 in RAS+, rounded. xrays, reprojection: line integrals (K, V, U), kept as
+    uint16 over the range of both; None where they are not known.
     """
     turn = nib.io_orientation(grid.affine)
     affine = grid.affine @ nib.orientations.inv_ornt_aff(turn, grid.shape)
     with atomic_write(folder / VIEW) as part, part.open("w", encoding="ascii") as file:
-        file.write("phydictView({")
-        for name, volume in volumes.items():
+        file.write('phydictView({"volumes": {')
+        for n, (name, volume) in enumerate(volumes.items()):
             turned = nib.apply_orientation(_int16(volume), turn)
-            file.write(f'{json.dumps(name)}: "{packed(turned.ravel(order="F"))}",\n')
+            file.write(f'{", " * (n > 0)}{json.dumps(name)}: "{packed(turned.ravel(order="F"))}"')
+        file.write("},\n")
         if xrays is not None and reprojection is not None:
             file.write(f'"X-rays": {json.dumps(_xrays(np.asarray(xrays), np.asarray(reprojection)))},\n')
         file.write(f'"shape": {list(turned.shape)}, "affine": {affine[:3].tolist()}, '
@@ -55,7 +57,7 @@ def packed(array: np.ndarray) -> str:
     """An array's little-endian bytes, compressed by gzip, in base64."""
     squeeze = zlib.compressobj(1, wbits=31)
     little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
-    return base64.b64encode(squeeze.compress(little) + squeeze.flush()).decode()
+    return base64.b64encode(squeeze.compress(little.data) + squeeze.flush()).decode()
 
 
 def _int16(volume: Tensor | np.ndarray) -> np.ndarray:

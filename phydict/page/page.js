@@ -123,8 +123,8 @@ async function load(case_) {
       document.head.append(script);
     }).finally(() => script.remove());
     const volumes = {}, xrays = data["X-rays"] ?? null;
-    for (const name of ["reconstruction", "truth", "deviation"])
-      if (data[name]) volumes[name] = new Volume(name, await unpack(data[name], Int16Array), data);
+    for (const [name, text] of Object.entries(data.volumes))
+      volumes[name] = new Volume(name, await unpack(text, Int16Array), data);
     for (const name of xrays ? ["measured", "rendered"] : []) xrays[name] = await unpack(xrays[name], Uint16Array);
     loaded.set(key, {volumes, xrays});
     if (loaded.size > 4) loaded.delete(loaded.keys().next().value);

@@ -3,7 +3,7 @@
 const WINDOWS = {all: [-300, 1400], lung: [-600, 1500], "soft tissue": [40, 400], bone: [400, 1800]};
 const PLANES = {axial: {across: 2, x: 0, y: 1, edges: "RLAP"}, coronal: {across: 1, x: 0, y: 2, edges: "RLSI"},
                 sagittal: {across: 0, x: 1, y: 2, edges: "APSI"}};
-const SPREAD = 500;  // HU of difference in full colour, and of deviation in the strongest
+const SPREAD = 500;  // HU of difference in full colour, and of uncertainty in the strongest
 const WIDE = 360;  // pixels across a canvas
 const byId = id => document.getElementById(id);
 
@@ -103,11 +103,13 @@ class Viewer {
 
   /* Shows a case's volumes and X-rays; misfits: of each view. */
   show(volumes, xrays, misfits) {
-    [this.volume, this.deviation, this.xrays] = [volumes.reconstruction, volumes.deviation ?? null, xrays];
+    const {reconstruction, truth, ...further} = volumes;
+    [this.volume, this.uncertainty, this.xrays] = [reconstruction, Object.values(further)[0] ?? null, xrays];
     this.at = this.volume.shape.map(size => Math.floor(size / 2));
     this.own = this.volume.indices(this.volume);
     this.other = null;
-    byId("overlay-label").hidden = !this.deviation;
+    byId("overlay-label").hidden = !this.uncertainty;
+    byId("overlay-name").textContent = `${this.uncertainty?.name} as overlay`;
     byId("xrays").hidden = !xrays;
     this.view = 0;
     const most = Math.max(...misfits.map(value => value ?? 0), 1e-9);
@@ -156,7 +158,7 @@ class Viewer {
       const {across, x, y, edges} = plane, [wide, tall] = [volume.shape[x], volume.shape[y]];
       const ratio = tall * volume.spacing[y] / (wide * volume.spacing[x]);
       const hu = volume.plane(plane, at[across], this.own);
-      const spread = byId("overlay").checked && this.deviation?.plane(plane, at[across], this.own);
+      const spread = byId("overlay").checked && this.uncertainty?.plane(plane, at[across], this.own);
       const beside = other?.volume.plane(plane, at[across], other.indices);
       const colours = [spread ? (value, n) => {
         const part = 0.8 * share(spread[n], 0, SPREAD), [base] = grey(value);
@@ -196,7 +198,7 @@ class Viewer {
   readOut() {
     const {volume, at, other} = this, said = [[volume.name, volume.at(at)]];
     if (other) said.push([other.volume.name, other.volume.at(at.map((index, axis) => other.indices[axis][index]))]);
-    if (this.deviation) said.push(["standard deviation", this.deviation.at(at)]);
+    if (this.uncertainty) said.push([this.uncertainty.name, this.uncertainty.at(at)]);
     byId("readout").textContent = `(${world(volume.affine, at).map(mm => mm.toFixed(1)).join(", ")}) mm RAS+: ` +
       said.map(([name, hu]) => `${name} ${hu === EMPTY ? "no value" : hu + " HU"}`).join(", ");
   }

@@ -36,7 +36,7 @@ def finish(out: Path, case: str, method: str, with_page: bool = True, grid: Grid
     xrays = torch.from_numpy(np.random.default_rng(seed).uniform(0, 5, (3, 8, 10)))
     save_nifti(folder / "volume.nii.gz", volume.numpy(), grid)
     if with_page:
-        volumes = {"reconstruction": volume, "truth": truth, "deviation": volume.abs() / 4}
+        volumes = {"reconstruction": volume, "truth": truth, "standard deviation": volume.abs() / 4}
         write_case_files(folder, grid, volumes, xrays, xrays + torch.linspace(-1, 1, 10))
     made = record(case, method, **{"grid": grid.to_dict()} | changes)
     (folder / RECORD).write_text(json.dumps(made | {"files": [file.name for file in folder.iterdir()]}))

@@ -31,6 +31,12 @@ def unpacked(text: str, kind: str) -> np.ndarray:
     return np.frombuffer(gzip.decompress(base64.b64decode(text)), kind)
 
 
+def volume_in(folder) -> np.ndarray:
+    """The reconstruction as the page has it."""
+    held = view(folder)
+    return unpacked(held["volumes"]["reconstruction"], "<i2").reshape(held["shape"], order="F")
+
+
 def content(page) -> dict:
     """What the document holds for its script."""
     text = page.read_text()
@@ -41,8 +47,7 @@ def test_the_pages_volume_is_the_niftis_rounded_and_turned_to_ras(tmp_path):
     folder = finish(tmp_path, "anna", "sirt")
     image = nibabel.as_closest_canonical(nibabel.load(folder / "volume.nii.gz"))
     held = view(folder)
-    volume = unpacked(held["reconstruction"], "<i2").reshape(held["shape"], order="F")
-    assert (volume == np.rint(np.asarray(image.dataobj))).all()
+    assert (volume_in(folder) == np.rint(np.asarray(image.dataobj))).all()
     assert np.allclose(np.array(held["affine"]), image.affine[:3], atol=1e-5)
     assert np.allclose(np.vstack([held["inverse"], [0, 0, 0, 1]]), np.linalg.inv(image.affine), atol=1e-5)
 
@@ -51,7 +56,7 @@ def test_voxels_that_are_not_finite_and_beyond_int16_are_marked_and_clipped(tmp_
     hu = random_hu(0)
     hu[0, 0, 0], hu[1, 0, 0], hu[2, 0, 0] = torch.nan, torch.inf, 1e6
     write_case_files(tmp_path, TURNED, {"reconstruction": hu})
-    volume = unpacked(view(tmp_path)["reconstruction"], "<i2").reshape(view(tmp_path)["shape"], order="F")
+    volume = volume_in(tmp_path)
     assert (volume == EMPTY).sum() == 2 and (volume == 32767).sum() == 1
 
 
@@ -98,7 +103,7 @@ def test_the_page_is_made_anew_of_what_older_runs_left(tmp_path, capsys):
     main(["page", str(tmp_path)])
     assert str(tmp_path / PAGE) in capsys.readouterr().out and all((folder / name).is_file() for name in CASE_FILES)
     image = nibabel.as_closest_canonical(nibabel.load(folder / "volume.nii.gz"))
-    assert (unpacked(view(folder)["reconstruction"], "<i2") == np.rint(image.get_fdata()).ravel(order="F")).all()
+    assert (volume_in(folder) == np.rint(image.get_fdata())).all()
     results = CaseResults(folder.parent, overwrite=True)  # the case is still this project's alone
     assert results.unfinished({"anna": "crc32 1"}, {"seed": 0}) == ["anna"]
 

@@ -51,7 +51,7 @@ def main(args: list[str] | None = None) -> None:
         tables = all_tables(entries, rows, scoring.empty) + fid_tables(specification.out, entries, scoring)
         written = write_tables(specification.out, tables) + write_plots(specification.out, entries)
         print(f"tables and plots in {specification.out}: {', '.join(path.name for path in written)}")
-        print(f"page: {comparison_page(specification.out, rows, found, tables)}")
+        print(f"page: {comparison_page(specification.out, rows, entries, tables)}")
 
 
 def _parser(args: Sequence[str]) -> ArgumentParser:

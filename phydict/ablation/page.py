@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from phydict.ablation.run import RESULTS
-from phydict.ablation.summary import Entry, entries, format_settings
+from phydict.ablation.summary import Entry, format_settings, summarise
 from phydict.ablation.tables import all_tables
 from phydict.evaluation import read_csv
 from phydict.evaluation.metrics import MEASURES
@@ -23,19 +23,19 @@ def page_anew(folder: Path) -> Path:
     """Writes the page of a folder's table; returns its path. Tables of Frechet distances, which ablate
     makes of features, are in tables.md alone."""
     rows = read_csv(folder / RESULTS)
-    found = entries(rows)
-    return comparison_page(folder, rows, found, all_tables(found, rows))
+    entries = summarise(rows)
+    return comparison_page(folder, rows, entries, all_tables(entries, rows))
 
 
-def comparison_page(folder: Path, rows: Sequence[Mapping], found: Sequence[Entry], tables: Sequence[Table]) -> Path:
+def comparison_page(folder: Path, rows: Sequence[Mapping], entries: Sequence[Entry], tables: Sequence[Table]) -> Path:
     """Writes the page of rows, their entries and tables, with the plots in the folder; returns its path. Raises
     ValueError where a page of someone else's is in its place."""
     check_own_page(folder, "out")
     by_key = {row["key"]: row for row in rows}
-    cases = [_case(entry, by_key[key]) for entry in found for _, key in entry.rows]
+    cases = [_case(entry, by_key[key]) for entry in entries for _, key in entry.rows]
     points = [{"name": format_settings(entry.label, entry.condition), "series": entry.method,
                "seconds": entry.means["seconds"], "error": entry.means.get("mae_hu")}
-              for entry in found if "seconds" in entry.means]
+              for entry in entries if "seconds" in entry.means]
     kept = sorted(path.name for path in folder.iterdir() if path.suffix in (".csv", ".md", ".tex"))
     return write_page(folder, Contents(f"Comparison in {folder.resolve().name}", tables, cases, points,
                                        plots=sorted(path.name for path in folder.glob("*.png")), links=kept))

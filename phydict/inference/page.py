@@ -43,8 +43,8 @@ def results_page(folder: Path) -> Path:
 
 def _case_folders(folder: Path) -> list[Path]:
     """The folders of finished cases, those that are just being written left out."""
-    found = {path.parent for depth in ("*", "*/*") for path in folder.glob(f"{depth}/{RECORD}")}
-    return sorted(path for path in found if not any(part[:1] == "." for part in path.relative_to(folder).parts))
+    folders = {path.parent for depth in ("*", "*/*") for path in folder.glob(f"{depth}/{RECORD}")}
+    return sorted(path for path in folders if not any(part[:1] == "." for part in path.relative_to(folder).parts))
 
 
 def _case(folder: Path, path: Path) -> Case | None:

@@ -122,7 +122,7 @@ def run(specification: Specification, device: torch.device, progress: CaseProgre
     if results.others:
         print(f"{len(results.others)} rows of other settings or data are kept in {results.file} and left out of tables")
     bench = Runner(device, scoring, specification.out)
-    progress.begin("ablate", left, verb="run")
+    progress.begin("ablate", left, verb="run", out=specification.out)
     for case, work in cases.items():
         groups: dict[str, list] = {}
         made = CaseCache()

@@ -46,6 +46,8 @@ class InferenceCLI(LightningCLI):
         parser = super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
         parser.add_argument("--profile", action="store_true",
                             help="print the seconds and the peak memory of every stage of each case")
+        parser.add_argument("--quiet", action="store_true", help="tell no progress, only results, warnings and errors")
+        parser.add_argument("--json_lines", action="store_true", help="tell the progress as a JSON object on each line")
         if subcommand == "predict":
             parser.add_argument("--dry_run", action="store_true",
                                 help="draw the geometry of every case and reconstruct nothing")
@@ -98,6 +100,7 @@ class InferenceCLI(LightningCLI):
             self._draw(datamodule.xray_cases(), model, datamodule.geometry)
             return
         model.profile = self.profile
+        model.progress.tell(self._flag("quiet"), self._flag("json_lines"))
         with model.progress:
             self.trainer.predict(model, datamodule=datamodule, return_predictions=False)
 
@@ -125,6 +128,7 @@ class InferenceCLI(LightningCLI):
         model.profile = self.profile
         model.measure(Scoring(self._get(self.config, "metrics"), self._get(self.config_init, "fid"),
                               self._get(self.config_init, "clip")))
+        model.progress.tell(self._flag("quiet"), self._flag("json_lines"))
         with model.progress:
             self.trainer.test(model, datamodule=datamodule, verbose=False)
 

@@ -220,7 +220,7 @@ class ReconstructionTask(lightning.LightningModule):
     def _start(self, cases: int) -> None:
         if isinstance(self.reconstructor, CascadePosterior):
             self.reconstructor.check_memory(self.device)
-        self.progress.begin(self.method_name, cases, self.reconstructor.steps())
+        self.progress.begin(self.method_name, cases, self.reconstructor.steps(), out=self.results.folder)
 
     def _report(self, case: dict) -> str:
         """The report of a case where it is used; says once that a prior without text uses none."""

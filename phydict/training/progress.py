@@ -10,6 +10,8 @@ import lightning
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from phydict.runtime.progress import duration
+
 
 class TrainingProgress(lightning.Callback):
     """Tells the steps that are done and what they log.
@@ -28,6 +30,7 @@ class TrainingProgress(lightning.Callback):
                             TimeRemainingColumn(), TextColumn("{task.description}"), console=console,
                             disable=not self.live)
         steps = trainer.estimated_stepping_batches
+        self.first, self.began = trainer.global_step, time.monotonic()
         self.total = steps if math.isfinite(steps) and steps > 0 else None
         self.task = self.bar.add_task("", total=self.total, completed=trainer.global_step)
         self.bar.start()
@@ -55,7 +58,10 @@ class TrainingProgress(lightning.Callback):
         if self.last_shown == trainer.global_step or self.live or not trainer.is_global_zero:
             return
         self.last_shown = trainer.global_step
-        of = f" of {self.total}" if self.total else ""
+        of, done = f" of {self.total}" if self.total else "", trainer.global_step - self.first
+        if self.total and done > 0 and trainer.global_step < self.total:
+            left = (time.monotonic() - self.began) / done * (self.total - trainer.global_step)
+            of += f", about {duration(left)} to go"
         print(f"step {trainer.global_step}{of}: {_logged(trainer)}", file=sys.stderr, flush=True)
 
 

@@ -1,0 +1,53 @@
+"""What a long run tells: what is done, what remains and for how long, in words or for machines, or nothing."""
+
+import json
+
+import pytest
+
+from phydict.runtime import progress as module
+from phydict.runtime.progress import CaseProgress, duration
+
+
+@pytest.fixture
+def told(capsys, monkeypatch):
+    """The lines of a run over three cases of two steps, each case 40 s long."""
+    def run(quiet: bool = False, json_lines: bool = False) -> list[str]:
+        now = [0.0]
+        monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
+        progress = CaseProgress(interval=10)
+        progress.tell(quiet, json_lines)
+        with progress:
+            progress.begin("sirt", 3, 2, out="there")
+            for case in "abc":
+                progress.case(case)
+                for _ in range(2):
+                    now[0] += 20
+                    progress.advance()
+                progress.finished("good")
+        return capsys.readouterr().err.splitlines()
+    return run
+
+
+def test_a_log_says_what_is_done_what_remains_for_how_long_and_where(told):
+    assert told() == ["sirt: 3 cases to reconstruct, results in there",
+                      "a: step 1 of 2", "a: step 2 of 2", "a: good (1 of 3, about 80 s to go)",
+                      "b: step 1 of 2", "b: step 2 of 2", "b: good (2 of 3, about 40 s to go)",
+                      "c: step 1 of 2", "c: step 2 of 2", "c: good (3 of 3)"]
+
+
+def test_machines_read_the_same_as_json(told):
+    begin, *events = map(json.loads, told(json_lines=True))
+    assert begin == {"event": "begin", "name": "sirt", "cases": 3, "steps": 2, "out": "there"}
+    cases = [event for event in events if event["event"] == "case"]
+    assert [(e["case"], e["done"], e["cases"], e["seconds_to_go"]) for e in cases] == [
+        ("a", 1, 3, 80.0), ("b", 2, 3, 40.0), ("c", 3, 3, 0.0)]
+
+
+def test_quiet_tells_nothing(told):
+    assert told(quiet=True) == [] == told(quiet=True, json_lines=True)
+
+
+@pytest.mark.parametrize("seconds, words", [(0.4, "0 s"), (99, "99 s"), (100, "2 min"), (5900, "98 min"),
+                                            (12000, "3 h 20 min")])
+def test_a_duration_is_in_words(seconds, words):
+    assert duration(seconds) == words

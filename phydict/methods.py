@@ -12,6 +12,7 @@ from torch import Tensor
 from phydict.baselines import CGLS, FDK, FISTATV, SIRT, DiffVox
 from phydict.datasets import format_report
 from phydict.grid import Grid
+from phydict.poses import FoundPoses, find_poses
 from phydict.posterior import (
     DAPS, DDS, DPS, CascadePosterior, DiffPIR, ExactDraw, GradientSteps, PnPDM, Posterior, PriorOnly, ProximalCG,
     Reward, Sampler, SplitGibbs, Unrolled)
@@ -22,9 +23,11 @@ from phydict.reconstruction import Reconstruction, Reconstructor
 from phydict.runtime.precision import check_precision
 from phydict.runtime.reading import reason
 from phydict.runtime.seeds import check_seed
+from phydict.runtime.warning import warn
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector, binned, binning
 from phydict.xray.checks import check_air, check_xrays
+from phydict.xray.poses.uncertain import Uncertain
 
 RELEASED_STEPS = GradientSteps(learning_rate=0.01, prior_mean=True, reward=Reward(
     lpips=0.5, random_backbone=True, dropout=True, squared=0.1, pixel_mean=True, view_sum=True, standardise=True,
@@ -147,13 +150,25 @@ def fit_to_grid(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam,
                                                     full_detector=True)
 
 
+def calibrated(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, uncertain: Uncertain,
+               display: bool) -> tuple[Tensor, FoundPoses]:
+    """The X-rays (K, V, U) without what was found of their gains and offsets, and the poses found (phydict.poses).
+
+    Warns of what few views cannot show, and of views that were corrected by more than was stated.
+    """
+    found = find_poses(xrays, beam, uncertain, grid, display, ready.mu_water)
+    for words in found.warnings():
+        warn(words)
+    return xrays if display else found.corrected(xrays), found
+
+
 def reconstruct(xrays: Tensor, beam: ConeBeam, prior: PriorContract | Refiner | str | Path | None = None,
                 method: str | Sampler | Reconstructor | None = None, report: str | None = None,
                 display: bool = False, seed: int = 0, guidance: float = 1.0, mu_water: float | None = None,
                 grid: Grid = Grid.cube(64), on_step=lambda: None,
                 super_resolution: SuperResolution | str | Path | None = None,
                 sr_guided: bool = True, samples: int = 1, precision: str = "auto",
-                projector: str = "auto") -> Reconstruction:
+                projector: str = "auto", uncertain: Uncertain | None = None) -> Reconstruction:
     """A CT volume from X-rays (K, V, U) and their geometry.
 
     xrays: tensor or array of line integrals; with display=True, of display values with an unknown gain and offset per
@@ -165,6 +180,7 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: PriorContract | Refiner | 
     samples: more than one gives their mean, and `deviation`, a map of how far they differ, as for `reconstructor`.
     precision: of the networks; "auto" is bfloat16 where the device computes it, float32 elsewhere.
     projector: the kind of `Projector`, such as "siddon"; "auto" is the fastest that suits the geometry.
+    uncertain: what the geometry does not know exactly, which is then found first; the result holds `beam` and `poses`.
     A detector finer than the grid can use is binned. Raises ValueError when X-rays, geometry and prior do not fit.
     """
     if not isinstance(beam, ConeBeam):
@@ -180,8 +196,13 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: PriorContract | Refiner | 
                           samples=samples, precision=precision)
     ready = ready if mu_water is None else ready.with_mu_water(mu_water)
     grid = ready.grid if isinstance(ready, Posterior | CascadePosterior) else grid
-    xrays, A = fit_to_grid(ready, grid, _real(xrays), beam, projector)
-    return ready.reconstruct(xrays, A, format_report(report), display, seed, on_step)
+    xrays = _real(xrays)
+    found: FoundPoses | None = None
+    if uncertain is not None:
+        xrays, found = calibrated(ready, grid, xrays, beam, uncertain, display)
+    xrays, A = fit_to_grid(ready, grid, xrays, found.beam if found else beam, projector)
+    result = ready.reconstruct(xrays, A, format_report(report), display, seed, on_step)
+    return found.added_to(result) if found else result
 
 
 def _real(xrays) -> Tensor:

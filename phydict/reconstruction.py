@@ -14,7 +14,7 @@ from torch import Tensor
 from phydict.grid import Grid
 from phydict.runtime.files import atomic_write
 from phydict.units import MU_WATER
-from phydict.xray import Projector
+from phydict.xray import ConeBeam, Projector
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,8 @@ class Reconstruction:
     voxels, where the method knows it;
     diverged_at: the step, counted from 1, from which on the misfit had risen until the end, None where it had not;
     precision: what the networks computed in, or, without any, the X-rays' type;
-    scatter: the mean share of the pixels' signal that was subtracted as scatter, and is no longer in xrays.
+    scatter: the mean share of the pixels' signal that was subtracted as scatter, and is no longer in xrays;
+    beam, poses: where poses were searched, the beam found, and what was corrected in it (phydict.poses).
     """
 
     volume: Tensor
@@ -50,6 +51,8 @@ class Reconstruction:
     diverged_at: int | None = None
     scatter: float = 0.0
     precision: str = "float32"
+    beam: ConeBeam | None = None
+    poses: dict | None = None
 
     def save_nifti(self, path: str | Path) -> None:
         """Writes the volume as float32 HU with the grid's affine (RAS+ mm), replacing the file only when complete."""

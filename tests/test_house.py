@@ -35,7 +35,7 @@ FLOORS = {
     "xray": 2, "diffusion": 2,
     "prior": 3, "datasets": 3, "reconstruction": 3, "guard": 3,
     "posterior": 4, "baselines": 4, "evaluation": 4,
-    "rivals": 5, "page": 5,
+    "rivals": 5, "page": 5, "poses": 5,
     "methods": 6,
     "training": 7, "inference": 7,
     "ablation": 8,

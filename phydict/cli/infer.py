@@ -48,6 +48,8 @@ class InferenceCLI(LightningCLI):
                             help="print the seconds and the peak memory of every stage of each case")
         parser.add_argument("--quiet", action="store_true", help="tell no progress, only results, warnings and errors")
         parser.add_argument("--json_lines", action="store_true", help="tell the progress as a JSON object on each line")
+        parser.add_argument("--calibrate", action="store_true",
+                            help="find first what the geometry file states as uncertain: poses, gains and offsets")
         if subcommand == "predict":
             parser.add_argument("--dry_run", action="store_true",
                                 help="draw the geometry of every case and reconstruct nothing")
@@ -81,6 +83,11 @@ class InferenceCLI(LightningCLI):
         """Whether each case's stages are timed and their memory measured."""
         return self._flag("profile")
 
+    @property
+    def calibrate(self) -> bool:
+        """Whether what the geometry is not sure of is found first."""
+        return self._flag("calibrate")
+
     def _flag(self, name: str) -> bool:
         value = self._get(self.config, name, False)
         if not isinstance(value, bool):
@@ -99,7 +106,7 @@ class InferenceCLI(LightningCLI):
             check_apart(model.pages, "model.out", datamodule.inputs("predict"))
             self._draw(datamodule.xray_cases(), model, datamodule.geometry)
             return
-        model.profile = self.profile
+        model.profile, model.calibrate = self.profile, self.calibrate
         model.progress.tell(self._flag("quiet"), self._flag("json_lines"))
         with model.progress:
             self.trainer.predict(model, datamodule=datamodule, return_predictions=False)
@@ -125,7 +132,7 @@ class InferenceCLI(LightningCLI):
 
     def test(self, model: ReconstructionTask, datamodule: ReconstructionData) -> None:
         """Simulate the X-rays of CTs, reconstruct and score them."""
-        model.profile = self.profile
+        model.profile, model.calibrate = self.profile, self.calibrate
         model.measure(Scoring(self._get(self.config, "metrics"), self._get(self.config_init, "fid"),
                               self._get(self.config_init, "clip")))
         model.progress.tell(self._flag("quiet"), self._flag("json_lines"))

@@ -21,6 +21,7 @@ from lightning.pytorch.utilities.exceptions import SIGTERMException
 from rich.console import Console
 from torch import Tensor
 
+from phydict.datasets.radiographs.xray_description import save_geometry
 from phydict.evaluation import CaseMetrics, Table, panel
 from phydict.evaluation.fid import Features, PlaneFID, load_features, save_features
 from phydict.evaluation.tables import fid_table
@@ -30,8 +31,9 @@ from phydict.inference.protocols import placed, resampled
 from phydict.inference.results import FEATURES, CaseResults
 from phydict.inference.scoring import Scoring
 from phydict.inference.settings import CascadeSettings, Sampling
-from phydict.methods import METHODS, default_method, fit_to_grid, reconstructor
+from phydict.methods import METHODS, calibrated, default_method, fit_to_grid, reconstructor
 from phydict.page import check_own_page, write_case_files
+from phydict.poses import FoundPoses
 from phydict.posterior import CascadePosterior, Sampler
 from phydict.prior import (
     MedSynCheckpoint, PriorContract, file_read, find_prior, fingerprint, load_super_resolution)
@@ -43,6 +45,7 @@ from phydict.runtime.progress import CaseProgress
 from phydict.runtime.seeds import case_seed, check_seed
 from phydict.runtime.warning import warn
 from phydict.units import HUWindow
+from phydict.xray.poses.uncertain import USUAL, Uncertain
 from phydict.xray.projectors.projector import METHODS as PROJECTORS
 
 SHOWN_LEVEL = 0.9
@@ -120,7 +123,7 @@ class ReconstructionTask(lightning.LightningModule):
         self.with_report = sampling.with_report
         self.progress = CaseProgress()
         self.cases: list[str] = []
-        self.profile = self.said_no_text = False
+        self.profile = self.calibrate = self.said_no_text = False
 
     def measure(self, scoring: Scoring) -> None:
         """Take these metrics in test."""
@@ -134,6 +137,8 @@ class ReconstructionTask(lightning.LightningModule):
     def setup(self, stage: str) -> None:
         data = self.trainer.datamodule
         self.settings["data"] = {"with_report": self.with_report} | data.settings(stage)
+        if self.calibrate:
+            self.settings["calibrate"] = True
         if stage == "test":
             self.settings |= self.scoring.settings()
             if data.protocol and data.protocol.grid and self.prior is None:
@@ -232,12 +237,16 @@ class ReconstructionTask(lightning.LightningModule):
         return "" if self.reads_no_text else case["report"]
 
     def _reconstruct(self, case: dict, seed: int) -> Reconstruction:
-        with stage("fit to grid"):
-            xrays, projector = fit_to_grid(self.reconstructor, self.grid, case["xrays"].to(self.device), case["beam"],
-                                           self.projector)
         ready = self.reconstructor.with_mu_water(case["mu_water"]) if "mu_water" in case else self.reconstructor
-        return ready.reconstruct(xrays, projector, case["report"], case.get("display", False), seed,
-                                 self.progress.advance)
+        xrays, beam, display = case["xrays"].to(self.device), case["beam"], case.get("display", False)
+        found: FoundPoses | None = None
+        if self.calibrate:
+            xrays, found = calibrated(ready, self.grid, xrays, beam, _uncertain(case), display)
+            beam = found.beam
+        with stage("fit to grid"):
+            xrays, projector = fit_to_grid(ready, self.grid, xrays, beam, self.projector)
+        result = ready.reconstruct(xrays, projector, case["report"], display, seed, self.progress.advance)
+        return found.added_to(result) if found else result
 
     def _finish(self, case: dict, result: Reconstruction, scores: dict | None = None,
                 truth: Tensor | None = None, features: Features | None = None) -> None:
@@ -245,6 +254,8 @@ class ReconstructionTask(lightning.LightningModule):
             if features:
                 save_features(folder / FEATURES, features)
             result.save_nifti(folder / "volume.nii.gz")
+            if result.beam is not None:
+                save_geometry(folder / "geometry_found.yaml", result.beam, case.get("description"))
             if result.deviation is not None:
                 save_nifti(folder / "deviation.nii.gz", result.deviation.numpy(), result.grid)
             uncertain, label = result.deviation, "standard deviation"
@@ -281,7 +292,7 @@ class ReconstructionTask(lightning.LightningModule):
                 "process_peak_memory_mb": peak_memory(CPU),
                 "mu_water": case.get("mu_water", self.reconstructor.mu_water), "views": len(result.xrays),
                 "precision": result.precision, "instruction_set": instruction_set(self.device),
-                "grid": result.grid.to_dict(), "seed": result.seed,
+                "grid": result.grid.to_dict(), "seed": result.seed, **({"poses": result.poses} if result.poses else {}),
                 "warnings": case["warnings"], "report": case["report"], "source": case["source"],
                 "settings": self.settings, "versions": versions()}
 
@@ -310,6 +321,20 @@ class ReconstructionTask(lightning.LightningModule):
             return []
         features = {case: load_features(self.results.folder / case / FEATURES, backbone) for case in cases}
         return [fid_table({self.method_name: features}, backbone, self.scoring.fid.replicates)]
+
+
+def _uncertain(case: dict) -> Uncertain:
+    """What a case's geometry file says not to know exactly; of simulated X-rays, what is usual.
+
+    Raises ValueError where a file of measured ones does not say it.
+    """
+    if "description" not in case:
+        return USUAL
+    if case["uncertain"] is None:
+        raise ValueError(f"--calibrate needs to know what {case['description'].source} is not sure of: state "
+                         "`uncertain:` there, such as {detector_shift_mm: 5, rotation_degrees: 2}, or leave "
+                         "--calibrate out")
+    return case["uncertain"]
 
 
 def _identity(role: str, prior: str | MedSynCheckpoint) -> dict:

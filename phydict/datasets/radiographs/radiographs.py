@@ -56,8 +56,9 @@ def load_xrays(folder: str | Path, geometry: str | Path | None = None, intensity
     geometry: a geometry file used instead of the folder's geometry.yaml: such a YAML, or any that
     `phydict.xray.geometry_files` reads. intensity: used instead of the YAML's block. Without either, DICOM's tags
     decide, other floating-point images are taken as line integrals, and integer images are refused.
-    Returns {"id": folder name, "xrays": (K,V,U) float32, "beam": ConeBeam, "report": str, "display": bool}; with
-    display True, the X-rays are display values whose gain and offset per view are unknown.
+    Returns {"id": folder name, "xrays": (K,V,U) float32, "beam": ConeBeam, "report": str, "display": bool,
+    "uncertain": Uncertain or None, "description": Description}; with display True, the X-rays are display values whose
+    gain and offset per view are unknown; uncertain: what the geometry file is not sure of; description: all it says.
     Raises FileNotFoundError for a missing folder, geometry or images, ValueError for everything that does not fit.
     """
     folder = own_or_shipped(folder)
@@ -97,7 +98,8 @@ def load_xrays(folder: str | Path, geometry: str | Path | None = None, intensity
                          "out of the images and of the geometry")
     return {"id": name_of(folder.absolute()), "beam": beam, "report": _read_report(folder / REPORT),
             "xrays": torch.from_numpy(described.orientation.apply(xrays).astype(np.float32)),
-            "display": intensity.kind == "display"}
+            "display": intensity.kind == "display", "uncertain": described.uncertain,
+            "description": described}
 
 
 def save_xrays(folder: str | Path, xrays: torch.Tensor | np.ndarray, beam: ConeBeam, report: str = "",

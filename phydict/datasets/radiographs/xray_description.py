@@ -6,6 +6,8 @@
     beam: {dicom: {source_to_isocentre: 765.0}}        values used instead of tags; see
     phydict.datasets.radiographs.dicom_beam intensity: {kind: counts, air: 50000}              see
     phydict.datasets.intensity orientation: {rotate_degrees: 0, flip_rows: false, flip_columns: false}
+    uncertain: {detector_shift_mm: 5, rotation_degrees: 2}    what is not exactly known, for a calibration; see
+    phydict.xray.poses.uncertain
 
 Without `beam:` the tags of DICOM images decide. Rotation is clockwise, in quarters, and comes before the flips. The
 beam, wherever it comes from, is that of the images once they are turned.
@@ -18,6 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import yaml
 
 from phydict.datasets.dicom import DicomTags
 from phydict.datasets.intensity import KINDS, Intensity, is_file_name
@@ -25,6 +28,7 @@ from phydict.datasets.radiographs.dicom_beam import tags_beam
 from phydict.runtime.yaml_file import read_yaml
 from phydict.xray.geometry import ConeBeam, pixel_sizes
 from phydict.xray.geometry_files import read_beam
+from phydict.xray.poses.uncertain import Uncertain
 
 GEOMETRY = "geometry.yaml"
 
@@ -68,6 +72,7 @@ class Description:
     beam: dict | None = None
     intensity: Intensity | None = None
     orientation: Orientation = Orientation()
+    uncertain: Uncertain | None = None
 
     @property
     def views(self) -> int | None:
@@ -113,11 +118,13 @@ def read_description(path: Path, needed: bool = True) -> Description:
         return Description(path, {"file": path.name})
     content = read_yaml(path)
     if not isinstance(content, dict):
-        raise ValueError(f"{path} must hold `beam:`, and may hold `intensity:` and `orientation:`")
+        raise ValueError(f"{path} must hold `beam:`, and may hold `intensity:`, `orientation:` and `uncertain:`")
     intensity, orientation = content.pop("intensity", None) or {}, content.pop("orientation", None) or {}
+    uncertain = content.pop("uncertain", None)
     if "beam" in content and len(content) > 1:
         unknown = ", ".join(reprlib.repr(key) for key in content if key != "beam")
-        raise ValueError(f"{path}: unknown key {unknown}; the keys are beam, intensity, orientation")
+        raise ValueError(f"{path}: unknown key {unknown}; the keys are beam, intensity, orientation, "
+                         "uncertain")
     beam = content.get("beam", content or None)
     _check_beam(path, beam)
     for block, value, kind in (("intensity", intensity, Intensity), ("orientation", orientation, Orientation)):
@@ -129,9 +136,24 @@ def read_description(path: Path, needed: bool = True) -> Description:
     if intensity and "kind" not in intensity:
         raise ValueError(f"{path}: `intensity:` needs `kind`, one of {', '.join(KINDS)}")
     try:
-        return Description(path, beam, Intensity(**intensity) if intensity else None, Orientation(**orientation))
+        return Description(path, beam, Intensity(**intensity) if intensity else None, Orientation(**orientation),
+                           None if uncertain is None else Uncertain.from_dict(uncertain))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
+
+
+def save_geometry(path: Path, beam: ConeBeam, described: Description | None = None) -> None:
+    """Write `beam` as geometry.yaml, with what `described`, the file of the same images, says of their intensity and
+    orientation; images that it names are named with their folder."""
+    content: dict = {"beam": beam.to_dict()}
+    if described and described.intensity:
+        folder = described.source.parent.absolute()
+        names = {name: [str(folder / file) for file in files] for name, files in described.intensity.references.items()}
+        content["intensity"] = {name: value for name, value in (vars(described.intensity) | names).items()
+                                if value != getattr(Intensity, name, None)}
+    if described:
+        content["orientation"] = vars(described.orientation)
+    path.write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
 
 
 def _check_beam(path: Path, beam) -> None:

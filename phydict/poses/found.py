@@ -1,0 +1,75 @@
+"""What a search of poses found, in words and figures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from torch import Tensor
+
+from phydict.reconstruction import Reconstruction
+from phydict.xray.geometry import ConeBeam
+
+NAMES = ("detector_shift_columns_mm", "detector_shift_rows_mm", "source_shift_columns_mm", "source_shift_rows_mm",
+         "source_to_detector_mm", "rotation_columns_degrees", "rotation_rows_degrees", "rotation_normal_degrees",
+         "gain", "offset")
+"""A view's unknowns: shifts in the direction from column to column and from row to row, rotations about these axes and
+about the detector's normal, what was measured as (1 + gain) times the line integral plus the offset."""
+
+LARGE = 3.0
+"""Corrections beyond so many of their stated standard deviations are warned of."""
+
+FEW = 2
+"""So many views or fewer cannot tell much of their poses from the volume."""
+
+
+@dataclass(frozen=True)
+class FoundPoses:
+    """The beam found; corrections of the nominal one and their standard errors (K, 10), as NAMES lists them.
+
+    deviations (10,): what was stated to be uncertain; 0: exactly known. The errors hold for the volume as it was found,
+    so that they are too small where volume and poses are entangled. misfits: relative residual of the search's own
+    volumes, at first and at last. The beam is the corrected one carried as a whole to the nominal one, which changes no
+    projection.
+    """
+
+    beam: ConeBeam
+    deviations: np.ndarray
+    corrections: np.ndarray
+    errors: np.ndarray
+    misfits: tuple[float, float]
+    seconds: float
+
+    def corrected(self, xrays: Tensor) -> Tensor:
+        """X-rays (K, V, U) without their gains and offsets."""
+        gain, offset = (xrays.new_tensor(self.corrections[:, n])[:, None, None] for n in (8, 9))
+        return (xrays - offset) / (1 + gain)
+
+    def record(self) -> dict:
+        """Plain lists, one value per view, of what was uncertain."""
+        chosen = [n for n, deviation in enumerate(self.deviations) if deviation > 0]
+        return {"corrections": {NAMES[n]: self.corrections[:, n].tolist() for n in chosen},
+                "standard_errors": {NAMES[n]: self.errors[:, n].tolist() for n in chosen},
+                "misfit_before": self.misfits[0], "misfit_after": self.misfits[1]}
+
+    def added_to(self, result: Reconstruction) -> Reconstruction:
+        """A reconstruction by the beam found, with what was found."""
+        seconds = {"calibrate": self.seconds} | result.seconds
+        return replace(result, beam=self.beam, poses=self.record(), seconds=seconds)
+
+    def warnings(self) -> list[str]:
+        """What is to be said: that few views cannot show depth, and which views were corrected by more than stated."""
+        said = []
+        if len(self.corrections) <= FEW:
+            said.append(f"{len(self.corrections)} views show the volume from so few sides that most of its depth, and "
+                        "of what was found of the poses, comes from the method and from the stated geometry: read "
+                        "outlines and large structures alone, and no sizes, places or densities of small ones")
+        for view, row in enumerate(self.corrections):
+            ratios = np.divide(np.abs(row), self.deviations, out=np.zeros_like(row), where=self.deviations > 0)
+            worst = int(ratios.argmax())
+            if ratios[worst] > LARGE:
+                unit = {"mm": " mm", "degrees": " degrees"}.get(NAMES[worst].rpartition("_")[2], "")
+                said.append(f"view {view} (counted from 0) was corrected by {row[worst]:.3g}{unit} in "
+                            f"{NAMES[worst]}, {ratios[worst]:.1f} times the stated {self.deviations[worst]:g}: check "
+                            "this view's geometry, or state more under `uncertain:`")
+        return said

@@ -1,0 +1,62 @@
+"""The whole scene moved: what no X-ray shows.
+
+A rotation and a shift of all views together with the volume change no line integral: six numbers of all views' poses
+cannot be found from X-rays, and are chosen.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from phydict.xray.geometry import ConeBeam
+
+STEPS = 20
+"""Of reweighted least squares, each of which halves what is left or better."""
+
+
+STEP = 1e-4
+"""mm and degrees of the differences that stand for derivatives."""
+
+
+def carried(beam: ConeBeam, motion: np.ndarray) -> ConeBeam:
+    """The beam moved as a whole: turned about the origin by the vector motion[3:] in degrees, then shifted by
+    motion[:3] in mm."""
+    turn = Rotation.from_rotvec(np.radians(motion[3:])).as_matrix().T
+    return ConeBeam(beam.sources @ turn + motion[:3], beam.detectors @ turn + motion[:3], beam.u @ turn, beam.v @ turn,
+                    beam.shape)
+
+
+def shadows(beam: ConeBeam, points: np.ndarray) -> np.ndarray:
+    """Where points (N, 3) appear on each detector: (K, N, 2) mm from its centre, from column to column and from row to
+    row."""
+    rays = points - beam.sources[:, None]
+    depth = (rays * beam.normals[:, None]).sum(2, keepdims=True)
+    hits = beam.sources[:, None] + rays * beam.distances[:, None, None] / depth - beam.detectors[:, None]
+    return np.stack([(hits * (step / np.linalg.norm(step, axis=1, keepdims=True))[:, None]).sum(2)
+                     for step in (beam.u, beam.v)], 2)
+
+
+def reprojection_errors(beam: ConeBeam, other: ConeBeam, points: np.ndarray) -> np.ndarray:
+    """Root mean square distance (K,) in mm on the detector between points' shadows in two beams."""
+    return np.sqrt(((shadows(beam, points) - shadows(other, points)) ** 2).sum(2).mean(1))
+
+
+def aligned(beam: ConeBeam, to: ConeBeam, points: np.ndarray) -> ConeBeam:
+    """The beam carried as a whole to where its shadows of `points` are most like those of another.
+
+    The sum of the views' root mean square distances is least (reweighted least squares), so that a few views far off
+    do not carry the others away.
+    """
+    for _ in range(STEPS):
+        here, wanted = shadows(beam, points), shadows(to, points)
+        slopes = np.stack([(shadows(carried(beam, STEP * unit), points) - here).ravel() / STEP for unit in np.eye(6)],
+                          1)
+        apart = wanted - here
+        weights = 1 / (np.sqrt((apart**2).sum(2).mean(1)) + 0.05)
+        root = np.sqrt(np.broadcast_to(weights[:, None, None], apart.shape)).ravel()
+        motion = np.linalg.lstsq(slopes * root[:, None], apart.ravel() * root, rcond=1e-9)[0]
+        beam = carried(beam, motion)
+        if np.abs(motion).max() < 1e-6:
+            break
+    return beam

@@ -1,0 +1,104 @@
+"""Poses found with the volume: what is marginalised, the true poses stay, and wrong ones are found."""
+
+import numpy as np
+import pytest
+import torch
+from laws import assert_adjoint, random_like
+
+from phydict.datasets import Thorax, build
+from phydict.grid import Grid
+from phydict.poses import find_poses
+from phydict.poses.blind import BlindMeasurement
+from phydict.poses.search import PoseSearch, halved, middle_points
+from phydict.posterior import Measurement
+from phydict.units import HUWindow, hu_to_mu
+from phydict.xray import ConeBeam, Projector
+from phydict.xray.poses.gauge import aligned, reprojection_errors
+from phydict.xray.poses.uncertain import Uncertain
+from phydict.xray.poses.unknowns import moved
+
+GRID = Grid.cube(24)
+BEAM = ConeBeam.orbit(8, 1150, 740, (48, 48), 12.5)
+UNCERTAIN = Uncertain(detector_shift_mm=5, source_shift_mm=5, source_to_detector_mm=5, rotation_degrees=2)
+POINTS = middle_points(GRID)
+SEARCH = PoseSearch(coarse=0, fine=10)
+
+
+@pytest.fixture(scope="module")
+def thorax():
+    return hu_to_mu(torch.from_numpy(build(Thorax.standard(), GRID)[0]))[None, None]
+
+
+def xrays(mu, beam):
+    return Projector(GRID, beam, "siddon", full_detector=True)(mu)[0]
+
+
+def error(beam, true):
+    """mm on the detector, root mean square over views, once the scene is carried to where it was."""
+    return float(np.sqrt((reprojection_errors(aligned(beam, true, POINTS), true, POINTS) ** 2).mean()))
+
+
+def blind(spread: float, now=None):
+    grid, beam = Grid.cube(6), ConeBeam.orbit(3, 1150, 740, (7, 9), 60.0)
+    plain = Measurement(Projector(grid, beam), random_like((3, 7, 9), seed=1).abs(), HUWindow())
+    changes = spread * random_like((3, 4, 7, 9), seed=2)
+    now = torch.zeros(3, 4, dtype=torch.float64) if now is None else now
+    return plain, changes, BlindMeasurement(plain, changes, now, 0.5)
+
+
+def test_what_is_left_of_the_data_term_is_its_minimum_over_the_unknowns():
+    now, x = random_like((3, 4), seed=3), random_like((1, 1, 6, 6, 6), seed=4).clamp(-1, 1)
+    plain, changes, marginal = blind(0.3, now)
+    residual = plain.y - plain.project(x) + torch.einsum("km,kmvu->kvu", now, changes)
+    columns, flat = changes.flatten(2).transpose(1, 2), residual.flatten(2)[0][..., None]
+    normal = columns.transpose(1, 2) @ columns / 0.25 + torch.eye(4)
+    best = torch.linalg.solve(normal, columns.transpose(1, 2) @ flat / 0.25)
+    least = ((flat - columns @ best).square().sum() / 0.25 + best.square().sum())
+    torch.testing.assert_close((marginal.y - marginal.project(x)).square().sum() / 0.25, least)
+
+
+def test_a_blind_measurement_has_an_exact_adjoint_and_does_not_see_large_unknowns():
+    plain, changes, marginal = blind(1e5)
+    assert_adjoint(marginal.linear, marginal.adjoint, (1, 1, 6, 6, 6))
+    assert marginal.filtered(changes[:, 1][None]).norm() < 1e-3 * changes[:, 1].norm()
+    torch.testing.assert_close(blind(0.0)[2].y, plain.y)
+
+
+def test_half_as_many_voxels_fill_the_same_box():
+    grid = Grid((8, 6, 5), affine=Grid.cube(8).affine)
+    np.testing.assert_allclose(halved(grid).corners(), grid.corners())
+    assert halved(grid).shape == (4, 3, 2)
+
+
+def test_random_errors_of_every_view_are_found(thorax):
+    true = moved(BEAM, np.random.default_rng(0).normal(0, 1, (8, 8)) * UNCERTAIN.poses)
+    found = find_poses(xrays(thorax, true), BEAM, UNCERTAIN, GRID, search=SEARCH)
+    before, after = error(BEAM, true), error(found.beam, true)
+    assert before > 8 and after < 3
+    assert found.misfits[1] < 0.5 * found.misfits[0]
+
+
+def test_true_poses_stay(thorax):
+    found = find_poses(xrays(thorax, BEAM), BEAM, UNCERTAIN, GRID, search=SEARCH)
+    assert error(found.beam, BEAM) < 1.5
+
+
+def test_one_wrong_view_is_found_corrected_and_named(thorax):
+    wrong = np.zeros((8, 8))
+    wrong[5, 0] = 40.0
+    true = moved(BEAM, wrong)
+    found = find_poses(xrays(thorax, true), BEAM, UNCERTAIN, GRID, search=SEARCH)
+    assert error(found.beam, true) < 3
+    said = found.warnings()
+    assert len(said) == 1 and said[0].startswith("view 5 (counted from 0) was corrected by")
+
+
+def test_gains_and_offsets_are_found_and_taken_out(thorax):
+    clean = xrays(thorax, BEAM)
+    gain, offset = np.linspace(-0.1, 0.1, 8), np.linspace(0.1, -0.1, 8)
+    drifted = (clean * torch.from_numpy(1 + gain)[:, None, None] + torch.from_numpy(offset)[:, None, None]).float()
+    found = find_poses(drifted, BEAM, Uncertain(gain=0.1, offset=0.1), GRID, search=SEARCH)
+    assert found.beam.same_as(BEAM)
+    left = (found.corrected(drifted) - clean).norm() / (drifted - clean).norm()
+    assert left < 0.3
+    assert set(found.record()["corrections"]) == {"gain", "offset"}

@@ -93,12 +93,9 @@ def test_one_wrong_view_is_found_corrected_and_named(thorax):
     assert len(said) == 1 and said[0].startswith("view 5 (counted from 0) was corrected by")
 
 
-def test_gains_and_offsets_are_found_and_taken_out(thorax):
+def test_gains_are_found_and_taken_out(thorax):
     clean = xrays(thorax, BEAM)
-    gain, offset = np.linspace(-0.1, 0.1, 8), np.linspace(0.1, -0.1, 8)
-    drifted = (clean * torch.from_numpy(1 + gain)[:, None, None] + torch.from_numpy(offset)[:, None, None]).float()
-    found = find_poses(drifted, BEAM, Uncertain(gain=0.1, offset=0.1), GRID, search=SEARCH)
-    assert found.beam.same_as(BEAM)
-    left = (found.corrected(drifted) - clean).norm() / (drifted - clean).norm()
-    assert left < 0.3
-    assert set(found.record()["corrections"]) == {"gain", "offset"}
+    drifted = (clean * torch.linspace(0.9, 1.1, 8)[:, None, None]).float()
+    found = find_poses(drifted, BEAM, Uncertain(gain=0.1), GRID, search=SEARCH)
+    assert found.beam.same_as(BEAM) and set(found.record()["corrections"]) == {"gain"}
+    assert (found.corrected(drifted) - clean).norm() < 0.3 * (drifted - clean).norm()

@@ -106,6 +106,8 @@ def find_poses(xrays: Tensor, beam: ConeBeam, uncertain: Uncertain, grid: Grid, 
             views.begin(state)
             for _ in range(rounds):
                 views.improve(state)
+            if n == 0:
+                sway = views.sway(state).double().numpy()
             if n == 0 and views.fits_as_stated(state):
                 state.theta = torch.zeros_like(state.theta)
                 break
@@ -113,7 +115,7 @@ def find_poses(xrays: Tensor, beam: ConeBeam, uncertain: Uncertain, grid: Grid, 
         if state.theta[:, :8].any():
             there = aligned(there, beam, middle_points(grid))
     return FoundPoses(there, deviations, state.theta.double().numpy(), state.errors.double().numpy(),
-                      (state.misfits[0], state.misfits[-1]), watch.seconds["calibrate"])
+                      (state.misfits[0], state.misfits[-1]), sway, watch.seconds["calibrate"])
 
 
 def halved(grid: Grid) -> Grid:

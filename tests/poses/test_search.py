@@ -93,6 +93,14 @@ def test_one_wrong_view_is_found_corrected_and_named(thorax):
     assert len(said) == 1 and said[0].startswith("view 5 (counted from 0) was corrected by")
 
 
+def test_breathing_between_the_views_is_said(thorax):
+    still = xrays(thorax, BEAM)
+    lower = xrays(torch.cat([thorax[..., 1:12], thorax[..., 12:13], thorax[..., 12:]], -1), BEAM)
+    breathed = torch.where((torch.arange(8) % 2 == 1)[:, None, None], lower, still)
+    said = [find_poses(y, BEAM, UNCERTAIN, GRID, search=SEARCH).warnings() for y in (still, breathed)]
+    assert not said[0] and any("the patient breathed or moved" in words for words in said[1])
+
+
 def test_gains_are_found_and_taken_out(thorax):
     clean = xrays(thorax, BEAM)
     drifted = (clean * torch.linspace(0.9, 1.1, 8)[:, None, None]).float()

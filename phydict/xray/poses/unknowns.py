@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.functional import jacobian
 
 from phydict.xray.geometry import ConeBeam
 
@@ -18,18 +21,20 @@ the rotation of source and detector together about the isocentre, a vector along
 
 def moved(beam: ConeBeam, values: np.ndarray) -> ConeBeam:
     """The beam with its views moved by `values` (K, 8), in mm and degrees, as POSE lists them."""
-    vectors = _vectors(beam)
-    found = torch.func.vmap(_moved)(torch.as_tensor(np.asarray(values, float)), vectors)
-    return ConeBeam(*found.unbind(1), beam.shape)
+    found = torch.stack([_moved(own, vectors) for own, vectors in _views(beam, values)])
+    return ConeBeam(*np.moveaxis(found.numpy(), 1, 0), beam.shape)
 
 
 def derivative(beam: ConeBeam, values: np.ndarray) -> Tensor:
     """What each unknown changes in source, detector, u and v at `values`: (K, 4, 3, 8), per mm and degree."""
-    return torch.func.vmap(torch.func.jacfwd(_moved))(torch.as_tensor(np.asarray(values, float)), _vectors(beam))
+    return torch.stack([jacobian(lambda x, vectors=vectors: _moved(x, vectors), own)
+                        for own, vectors in _views(beam, values)])
 
 
-def _vectors(beam: ConeBeam) -> Tensor:
-    return torch.as_tensor(np.stack([beam.sources, beam.detectors, beam.u, beam.v], 1))
+def _views(beam: ConeBeam, values: np.ndarray) -> Iterable[tuple[Tensor, Tensor]]:
+    """Each view's unknowns (8,) and vectors (4, 3)."""
+    vectors = np.stack([beam.sources, beam.detectors, beam.u, beam.v], 1)
+    return zip(torch.as_tensor(np.array(values, float)), torch.as_tensor(vectors), strict=True)
 
 
 def _moved(values: Tensor, vectors: Tensor) -> Tensor:

@@ -14,19 +14,20 @@ import phydict
 from phydict.datasets import body_mask, load_xrays
 from phydict.evaluation import mean_table, method_panel, panel, volume_metrics, write_csv
 
-METHODS = ("phydict_fast", "prior_only", "sirt")
+METHODS = ("phydict_learned", "phydict_fast", "sirt")
 
 if __name__ == "__main__":
     here, out = Path(__file__).parent, Path("runs/demo")
-    case, prior = load_xrays(here / "xrays"), phydict.load_prior()
+    case = load_xrays(here / "xrays")
     truth = torch.from_numpy(nibabel.load(here / "truth.nii.gz").get_fdata(dtype="float32"))
-    body = torch.from_numpy(body_mask(truth.numpy(), prior.grid.spacing))[None, None]
+    grid = phydict.Grid.cube(truth.shape[0])
+    body = torch.from_numpy(body_mask(truth.numpy(), grid.spacing))[None, None]
     out.mkdir(parents=True, exist_ok=True)
     rows, volumes = [], {}
     with Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()) as bar:
         for method in METHODS:
             steps = bar.add_task(method, total=phydict.METHODS[method].steps())
-            result = phydict.reconstruct(case["xrays"], case["beam"], prior, method, case["report"],
+            result = phydict.reconstruct(case["xrays"], case["beam"], None, method, case["report"],
                                          on_step=lambda: bar.advance(steps))
             scores = volume_metrics(result.volume[None, None], truth[None, None], body=body)
             rows.append({"case": "example", "method": method, "views": len(case["xrays"]), "grid": "64x64x64"} | scores
@@ -36,7 +37,7 @@ if __name__ == "__main__":
             panel(out / f"{method}.png", result.volume, result.grid, result.xrays, result.reprojection, truth,
                   title=f"{method}: {case['report'].partition('Impression:')[2].strip()}")
     captions = {row["method"]: f"{row['psnr']:.1f} dB, SSIM {row['ssim']:.2f}" for row in rows}
-    method_panel(out / "comparison.png", volumes, truth, prior.grid, captions)
+    method_panel(out / "comparison.png", volumes, truth, grid, captions)
     write_csv(out / "results.csv", rows)
     Console().print(mean_table(rows))
     print(f"picture: {out / 'comparison.png'}\nvolumes, X-ray fits and results.csv: {out}")

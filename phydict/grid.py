@@ -76,6 +76,26 @@ class Grid:
             raise ValueError(f"the side of a cube of voxels is a length in mm, but {side:g} was given")
         return cls((voxels,) * 3, (side / voxels,) * 3)
 
+    @classmethod
+    def box(cls, voxels, side=384.0, centre=(0.0, 0.0, 0.0)) -> Grid:
+        """`voxels` along each side of a box of `side` mm, one number or three each, whose centre lies `centre` mm from
+        the isocentre towards right, anterior and superior."""
+        shape, lengths, place = whole_sizes(voxels), np.atleast_1d(side), np.asarray(centre, float)
+        if shape is None or len(shape) not in (1, 3):
+            raise ValueError("a box has a whole number of voxels along each side, 1 or more, one for all or three, but "
+                             f"{reprlib.repr(voxels)} was given")
+        if lengths.shape not in ((1,), (3,)) or not ((lengths > 1e-3) & (lengths < 1e6)).all():
+            raise ValueError("the side of a box of voxels is a length in mm, one for all or three, but "
+                             f"{reprlib.repr(side)} was given")
+        if place.shape != (3,) or not (abs(place) < 1e6).all():
+            raise ValueError("the centre of a box of voxels is three numbers in mm from the isocentre, but "
+                             f"{reprlib.repr(centre)} was given")
+        shape = shape * 3 if len(shape) == 1 else shape
+        spacing = np.broadcast_to(lengths, 3) / shape
+        affine = np.diag([*spacing, 1.0])
+        affine[:3, 3] = place - spacing * (np.asarray(shape) - 1) / 2
+        return cls(shape, affine=affine)
+
     @property
     def centre(self) -> np.ndarray:
         """World position (3,) in mm of the grid's centre."""
@@ -103,6 +123,29 @@ class Grid:
     def to_dict(self) -> dict:
         """Plain lists, from which `Grid(**d)` builds the same grid."""
         return {"shape": list(self.shape), "affine": self.affine.tolist()}
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box of voxels: a whole chest, or a region of interest.
+
+    Args:
+        voxels: how many along each side, one number or three (right, anterior, superior)
+        side: their lengths in mm, one number or three
+        centre: of the box, in mm from the isocentre towards right, anterior and superior
+        keep_coarse: whether the coarse volume that was refined is written beside the volume
+    """
+
+    voxels: int | tuple[int, int, int] | None = None
+    side: float | tuple[float, float, float] = 384.0
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    keep_coarse: bool = False
+
+    def grid(self) -> Grid:
+        """Its voxels. Raises ValueError for what cannot be."""
+        if self.voxels is None:
+            raise ValueError("model.grid needs the number of voxels: give model.grid.voxels, such as 128")
+        return Grid.box(self.voxels, self.side, self.centre)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import reprlib
 from dataclasses import replace
 from pathlib import Path
@@ -9,23 +10,25 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from phydict.baselines import CGLS, FDK, FISTATV, SIRT, DiffVox
+from phydict.baselines import CGLS, FDK, FISTATV, SIRT, DiffVox, Region
+from phydict.baselines.baseline import Baseline
 from phydict.datasets import format_report
 from phydict.grid import Grid
 from phydict.poses import FoundPoses, find_poses
 from phydict.posterior import (
     DAPS, DDS, DPS, CascadePosterior, DiffPIR, ExactDraw, GradientSteps, PnPDM, Posterior, PriorOnly, ProximalCG,
-    Reward, Sampler, SplitGibbs, Unrolled)
+    Refined, Refinement, Reward, Sampler, SplitGibbs, Unrolled)
 from phydict.prior import (
     Cascade, MedSynCheckpoint, PriorContract, Refiner, SuperResolution, check_prior, find_prior, is_refiner,
     load_super_resolution)
 from phydict.reconstruction import Reconstruction, Reconstructor
 from phydict.runtime.precision import check_precision
-from phydict.runtime.reading import reason
+from phydict.runtime.reading import check_memory, reason
 from phydict.runtime.seeds import check_seed
 from phydict.runtime.warning import warn
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector, binned, binning
+from phydict.xray.boxes import along, covers
 from phydict.xray.checks import check_air, check_xrays
 from phydict.xray.poses.uncertain import Uncertain
 
@@ -86,6 +89,10 @@ def default_method(prior: PriorContract | Refiner | MedSynCheckpoint | str | Pat
     return SAMPLING_METHOD if sampled else DEFAULT_METHOD
 
 
+CHEST = Grid.cube(64)
+"""The voxels of methods that are bound to none; what lies outside a smaller box is taken from a reconstruction here."""
+
+
 def reconstructor(method: str | Sampler | Reconstructor, prior: PriorContract | Refiner | str | Path | None = None,
                   guidance: float = 1.0, name: str | None = None,
                   super_resolution: SuperResolution | str | Path | None = None, sr_guided: bool = True,
@@ -134,6 +141,25 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: PriorContract | 
     return replace(ready, sr_sampler=sr_sampler) if sr_sampler else ready
 
 
+def onto_grid(ready: Reconstructor, grid: Grid | None, refinement: Refinement = Refinement()) -> Reconstructor:
+    """The method on the voxels of `grid`; None leaves it as it is.
+
+    What is bound to voxels of its own, as a prior is, works there first and is then refined (`Refined`). A method
+    without a prior works on `grid` itself, on a box that leaves out a part of the chest after a coarse reconstruction
+    of the whole (`Region`). Raises ValueError where there is no way or not enough memory.
+    """
+    if grid is None or (ready.grid is not None and ready.grid.same_as(grid)):
+        return ready
+    if ready.grid is not None:
+        ready = Refined(ready, grid, refinement)
+    elif isinstance(ready, Baseline) and along(grid, CHEST) and not covers(grid, CHEST):
+        ready = Region(ready, grid, CHEST)
+    check_memory(4 * ready.volumes * math.prod(grid.shape), f"a reconstruction on "
+                 f"{' x '.join(map(str, grid.shape))} voxels, {ready.volumes} volumes of them at once,",
+                 "give fewer voxels, or a smaller box of them")
+    return ready
+
+
 def fit_to_grid(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam,
                 projector: str = "auto") -> tuple[Tensor, Projector]:
     """X-rays (K, V, U), binned unless the method wants the full detector, and the projector that goes with them on the
@@ -144,7 +170,7 @@ def fit_to_grid(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam,
     check_xrays(xrays, beam)
     check_air(xrays)
     beam.check(grid)
-    beam.check_scale(grid)
+    beam.check_scale(ready.survey or grid)
     factor = 1 if ready.full_detector else binning(grid, beam)
     return binned(xrays.float(), factor), Projector(grid, beam.binned(factor), projector, device=xrays.device,
                                                     full_detector=True)
@@ -165,18 +191,18 @@ def calibrated(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, 
 def reconstruct(xrays: Tensor, beam: ConeBeam, prior: PriorContract | Refiner | str | Path | None = None,
                 method: str | Sampler | Reconstructor | None = None, report: str | None = None,
                 display: bool = False, seed: int = 0, guidance: float = 1.0, mu_water: float | None = None,
-                grid: Grid = Grid.cube(64), on_step=lambda: None,
+                grid: Grid | None = None, on_step=lambda: None,
                 super_resolution: SuperResolution | str | Path | None = None,
                 sr_guided: bool = True, samples: int = 1, precision: str = "auto",
                 projector: str = "auto", uncertain: Uncertain | None = None) -> Reconstruction:
     """A CT volume from X-rays (K, V, U) and their geometry.
 
     xrays: tensor or array of line integrals; with display=True, of display values with an unknown gain and offset per
-    view. grid: for methods without a prior; others work on their prior's.
+    view. grid: the result's voxels, as for `onto_grid`; None for the prior's own, without a prior 64^3 of 6 mm.
     method: as for `reconstructor`; None for `default_method`'s. prior: as for `reconstructor`; report: radiology text,
     if any, which `format_report` lays out.
     mu_water: attenuation in 1/mm that water has in the X-rays (None: the method's own, near 65 keV).
-    super_resolution, sr_guided: the second stage of a cascade, as for `reconstructor`; the volume is then on its grid.
+    super_resolution, sr_guided: the second stage of a cascade, as for `reconstructor`; its grid counts as the prior's.
     samples: more than one gives their mean, and `deviation`, a map of how far they differ, as for `reconstructor`.
     precision: of the networks; "auto" is bfloat16 where the device computes it, float32 elsewhere.
     projector: the kind of `Projector`, such as "siddon"; "auto" is the fastest that suits the geometry.
@@ -186,7 +212,7 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: PriorContract | Refiner | 
     if not isinstance(beam, ConeBeam):
         raise ValueError(f"the geometry must be a ConeBeam, but {' '.join(reprlib.repr(beam).split())} was given; "
                          "ConeBeam.load reads one")
-    if not isinstance(grid, Grid):
+    if not isinstance(grid, Grid | None):
         raise ValueError(f"the grid must be a Grid, but {grid!r} was given; Grid.cube makes one")
     if not isinstance(report, str | None):
         raise ValueError(f"the report must be text, but {report!r} was given")
@@ -194,12 +220,11 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: PriorContract | Refiner | 
     method = default_method(prior, samples, guidance) if method is None else method
     ready = reconstructor(method, prior, guidance, super_resolution=super_resolution, sr_guided=sr_guided,
                           samples=samples, precision=precision)
-    ready = ready if mu_water is None else ready.with_mu_water(mu_water)
-    grid = ready.grid if isinstance(ready, Posterior | CascadePosterior) else grid
-    xrays = _real(xrays)
+    ready = onto_grid(ready if mu_water is None else ready.with_mu_water(mu_water), grid)
+    grid, xrays = ready.grid or grid or CHEST, _real(xrays)
     found: FoundPoses | None = None
     if uncertain is not None:
-        xrays, found = calibrated(ready, grid, xrays, beam, uncertain, display)
+        xrays, found = calibrated(ready, ready.survey or grid, xrays, beam, uncertain, display)
     xrays, A = fit_to_grid(ready, grid, xrays, found.beam if found else beam, projector)
     result = ready.reconstruct(xrays, A, format_report(report), display, seed, on_step)
     return found.added_to(result) if found else result

@@ -31,7 +31,8 @@ class Reconstruction:
     diverged_at: the step, counted from 1, from which on the misfit had risen until the end, None where it had not;
     precision: what the networks computed in, or, without any, the X-rays' type;
     scatter: the mean share of the pixels' signal that was subtracted as scatter, and is no longer in xrays;
-    beam, poses: where poses were searched, the beam found, and what was corrected in it (phydict.poses).
+    beam, poses: where poses were searched, the beam found, and what was corrected in it (phydict.poses);
+    coarse: the reconstruction on coarser voxels that was refined, or that says what lies outside a region of interest.
     """
 
     volume: Tensor
@@ -53,6 +54,7 @@ class Reconstruction:
     precision: str = "float32"
     beam: ConeBeam | None = None
     poses: dict | None = None
+    coarse: Reconstruction | None = None
 
     def save_nifti(self, path: str | Path) -> None:
         """Writes the volume as float32 HU with the grid's affine (RAS+ mm), replacing the file only when complete."""
@@ -82,12 +84,14 @@ class Reconstructor(ABC):
 
     full_detector: whether the method wants every pixel, instead of a detector binned to what the grid can hold.
     mu_water: attenuation in 1/mm that water has in the X-rays; between it and HU lies this factor.
+    volumes: how many volumes of its grid a reconstruction holds at most, in float32.
     citation: authors, title, venue and DOI or arXiv number of the method's publication.
     """
 
     full_detector = False
     citation = ""
     mu_water: float = MU_WATER
+    volumes = 20
 
     def __post_init__(self):
         if not 0 < self.mu_water < math.inf:
@@ -97,6 +101,16 @@ class Reconstructor(ABC):
     def with_mu_water(self, mu_water: float) -> Reconstructor:
         """The same method for X-rays in which water attenuates `mu_water` in 1/mm."""
         return replace(self, mu_water=mu_water)  # type: ignore[type-var]
+
+    @property
+    def grid(self) -> Grid | None:
+        """The voxels that the method is bound to; None where any will do."""
+        return None
+
+    @property
+    def survey(self) -> Grid | None:
+        """The coarse voxels over all that the rays meet, of a method that looks at these first; None for others."""
+        return None
 
     @abstractmethod
     def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,

@@ -151,7 +151,7 @@ def test_all_methods_see_the_same_xrays_and_score_as_in_a_test_of_their_own(tmp_
     main(["test", "--model.method=sirt", "--data.cts=phantom",
           "--data.phantoms=2", "--data.orbit.views=3", "--data.orbit.detector=[24,24]",
           f"--data.orbit.pixel=[{560 / 24},{560 / 24}]",
-          "--model.method.init_args.iterations=3", "--model.cube.voxels=16", f"--model.out={tmp_path}",
+          "--model.method.init_args.iterations=3", "--model.grid=16", f"--model.out={tmp_path}",
           "--trainer.accelerator=cpu"])
     for own in read_csv(tmp_path / "sirt" / "results.csv"):
         (row,) = (row for row in rows if row["method"] == "sirt" and row["case"] == own["case"])
@@ -266,7 +266,7 @@ def test_set_takes_the_place_of_a_files_axis_base_and_product(tmp_path):
     file = write(tmp_path, products=[{"base": {"seed": 3}, "axes": {"method": ["sirt", "tv"], "views": [2, 4]}},
                                      {"axes": {"method": ["cgls"]}}])
     trials = read_specification(file, ["method=[sirt,cgls]", "views=5", "seed=[1,2]", "voxels=24"]).trials
-    assert {(t.name, t.data.beam.views, t.seed, t.voxels) for t in trials} == {
+    assert {(t.name, t.data.beam.views, t.seed, t.scored().shape[0]) for t in trials} == {
         (name, 5, seed, 24) for name in ("sirt", "cgls") for seed in (1, 2)}
 
 
@@ -311,7 +311,8 @@ def test_delta_keeps_the_length_of_a_step():
     ({"axes": {"method": ["sirt"], "delta": [0.5]}}, ["delta"]),
     ({"axes": {"method": ["sirt"], "simulator": ["real"]}}, ["'real'", "polychromatic"]),
     ({"axes": {"method": ["sirt"], "simulator.kvp": [80]}}, ["simulator.kvp", "photons"]),
-    ({"axes": {"method": ["sirt", "prior_only"]}}, ["one grid"]),
+    ({"axes": {"method": ["sirt", "prior_only"], "voxels": [16, 24]}}, ["one grid"]),
+    ({"base": {"side": 200.0}, "axes": {"method": ["sirt"]}}, ["side", "give them too"]),
     ({"axes": {"method": ["sirt"]}, "cts": "folder"}, ["one of the two"]),
     ({"axes": {}}, ["no method"]), ({"products": []}, ["products"]), ({"products": [{"axis": {}}]}, ["'axis'"]),
     ({"axes": {"method": ["sirt"]}, "products": []}, ["not both"]), ({"axs": {}}, ["'axs'"]),

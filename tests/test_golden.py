@@ -65,7 +65,7 @@ def on_the_tiny_grid(name: str, dtype: torch.dtype, scene: str = "plain") -> dic
     elif isinstance(chosen, Sampler):
         chosen = Posterior(prior, chosen, guidance=2.0 if scene == "report" else 1.0, precision="float32",
                            samples=2 if scene == "samples" else 1)
-    grid = chosen.grid if hasattr(chosen, "grid") else Grid.cube(16)
+    grid = chosen.grid or Grid.cube(16)
     y = xrays(dtype)
     projector = Projector(grid, BEAM, full_detector=True)
     y = 0.3 * y + 0.1 if scene == "display" else y

@@ -920,7 +920,7 @@ def test_each_spoilt_ct_is_one_sentence_and_the_good_one_is_reconstructed(cts, t
 
 
 @pytest.mark.parametrize("change, words", [
-    (["--model.cube.voxels=0"], "a whole number of voxels"), (["--model.cube.voxels=100000"], "GiB of memory"),
+    (["--model.grid=0"], "a whole number of voxels"), (["--model.grid=100000"], "GiB of memory"),
     (["--model.seed=-1"], "a seed is a whole number"), ([f"--model.seed={2**70}"], "a seed is a whole number"),
     (["--model.method.init_args.mu_water=0"], "mu_water"), (["--model.method.init_args.mu_water=-1"], "mu_water"),
     (["--model.ou={tmp}/out"], "model.ou"), (["--data.xray={tmp}"], "data.xray"), (["--data.xray", "3"], "data.xray"),

@@ -70,7 +70,7 @@ def test_what_clashes_with_a_protocol_is_refused(given, sentence):
 
 def test_another_grid_and_measured_xrays_are_refused_by_the_command_line(tmp_path, capsys):
     args = sirt("test", tmp_path, "--data.cts=phantom", "--data.phantoms=1", "--data.protocol=x2ct")
-    assert "fixes 128 voxels over 320 mm" in refusal(capsys, main, [*args, "--model.cube.voxels=32"])
+    assert "fixes 128 voxels over 320 mm" in refusal(capsys, main, [*args, "--model.grid=32"])
     assert "predict takes measured ones" in refusal(capsys, main, sirt("predict", tmp_path, "--data.xrays=none",
                                                                  "--data.protocol=x2ct"))
 

@@ -12,13 +12,13 @@ from pathlib import Path
 import torch
 
 from phydict.ablation.spec import Specification
-from phydict.ablation.trials import Trial, key, prior_of
+from phydict.ablation.trials import Trial, key, prior_of, stage_of
 from phydict.evaluation import read_csv, write_csv
 from phydict.evaluation.fid import save_features
 from phydict.evaluation.metrics import MEASURES
-from phydict.inference.protocols import resampled
+from phydict.inference.protocols import cut_out, resampled
 from phydict.inference.scoring import Scoring
-from phydict.methods import fit_to_grid, reconstructor
+from phydict.methods import fit_to_grid, onto_grid, reconstructor
 from phydict.posterior import Sampler
 from phydict.reconstruction import Reconstruction
 from phydict.runtime.console import TRACEBACK, noted, sentence
@@ -112,7 +112,7 @@ def run(specification: Specification, device: torch.device, progress: CaseProgre
             found[acquisition] = trial.data.test_cases(*trial.scene())
         for case, source, make in found[acquisition]:
             name = key(trial, case, source, scoring.settings())
-            planned[name] = {"case": case} | trial.columns | {"grid": "x".join(map(str, trial.scene()[0].shape))}
+            planned[name] = {"case": case} | trial.columns | {"grid": "x".join(map(str, trial.scored().shape))}
             cases.setdefault(case, []).append((trial, name, make))
     results = Results(specification.out, planned)
     if scoring.network:
@@ -169,6 +169,8 @@ class MeasuredCase:
         self.warnings = list(made["warnings"])
         with noted(self.warnings, case):
             self.xrays = data.simulate(made, case_seed(trial.seed, case), self.grid, self.window, device)
+        if not (scored := trial.scored()).same_as(self.grid):
+            self.truth, self.grid = made | cut_out(made, self.grid, scored, self.window), scored
 
     def report(self, trial: Trial) -> str:
         """The report, where the trial uses it and its prior reads text."""
@@ -224,7 +226,9 @@ class Runner:
         seed = case_seed(trial.seed, scene.case)
         torch.manual_seed(seed)
         prior = _on(trial.prior, self.device) if isinstance(trial.method, Sampler) else None
-        ready = reconstructor(trial.method, prior, trial.guidance, trial.name, samples=trial.samples)
+        stage = _stage_on(trial.super_resolution, self.device) if trial.super_resolution else None
+        ready = reconstructor(trial.method, prior, trial.guidance, trial.name, stage, samples=trial.samples)
+        ready = onto_grid(ready, trial.box and trial.box.grid(), trial.refinement)
         xrays, projector = fit_to_grid(ready, trial.own()[0], scene.xrays.clone(), scene.beam, trial.projector)
         return ready.with_mu_water(scene.mu_water).reconstruct(
             xrays, projector, scene.report(trial), False, seed, on_step)
@@ -239,6 +243,11 @@ def features_file(out: Path, key: str) -> Path:
 def _on(file: str, device: torch.device):
     prior = prior_of(file)
     return prior.to(device) if isinstance(prior, torch.nn.Module) else prior
+
+
+@cache
+def _stage_on(file: str, device: torch.device):
+    return stage_of(file).to(device)
 
 
 def _attempt(work: Callable[[], object]) -> object | dict:

@@ -14,12 +14,13 @@ from types import MappingProxyType
 
 from phydict.ablation.cases import Cases
 from phydict.ablation.nested import changed, field_of, has_field, parsed, plain
-from phydict.grid import Grid
+from phydict.grid import Box, Grid
 from phydict.inference.data import ReconstructionData
+from phydict.inference.protocols import whole
 from phydict.inference.settings import Orbit
-from phydict.methods import METHODS
-from phydict.posterior import Sampler
-from phydict.prior import PriorContract, find_prior, fingerprint
+from phydict.methods import CHEST, METHODS
+from phydict.posterior import Refinement, Sampler
+from phydict.prior import PriorContract, find_prior, fingerprint, load_super_resolution
 from phydict.reconstruction import Reconstructor, describe
 from phydict.runtime.reading import reason
 from phydict.runtime.renamed import check_setting
@@ -41,12 +42,14 @@ SETTINGS: dict[str, tuple[type, object]] = {
     "views": (int, 8), "detector": (int, 448), "pixel": (float | None, None), "simulator": (str, "ideal"),
     "simulation_voxels": (int | None, None), "source_to_detector": (float, 1020.0),
     "source_to_isocentre": (float, 740.0), "geometry": (str | None, None),
-    "report": (bool, True), "voxels": (int, 64), "side": (float, 384.0),
+    "report": (bool, True), "voxels": (int | tuple[int, int, int] | None, None),
+    "side": (float | tuple[float, float, float], 384.0), "centre": (tuple[float, float, float], (0.0, 0.0, 0.0)),
+    "refine": (bool, True), "super_resolution": (str | None, None),
     "protocol": (str | None, None), "prior": (str | None, None), "guidance": (float, 1.0), "samples": (int, 1),
     "delta": (float | None, None), "projector": (str, "auto")}
 """Type and default of what an axis may be; beside these, method.<field> and simulator.<field>."""
 
-PRIOR_SETTINGS = ("prior", "guidance", "samples", "delta", "report")
+PRIOR_SETTINGS = ("prior", "guidance", "samples", "delta", "report", "refine", "super_resolution")
 """Settings that mean nothing to a method without a prior."""
 
 ORBIT_SETTINGS = ("views", "detector", "pixel", "source_to_detector", "source_to_isocentre")
@@ -62,8 +65,9 @@ class Trial:
 
     columns: what the table of results says of it; method, prior (a file, None where the method needs none), guidance,
     samples, seed: as in infer.py; data: the X-rays; like: for a method without a prior, the file of the prior whose
-    grid and HU window it takes; voxels, side: its grid where there is none; projector: the method's, as Projector's
-    `method`; X-rays are made by the automatic one.
+    grid and HU window it takes; box: the result's voxels, None for the method's own; refine: whether finer voxels than
+    a prior's are met with the X-rays, or interpolated; super_resolution: a second stage's file; projector: the
+    method's, as Projector's `method`; X-rays are made by the automatic one.
     """
 
     columns: dict
@@ -73,8 +77,9 @@ class Trial:
     guidance: float
     samples: int
     seed: int
-    voxels: int
-    side: float
+    box: Box | None = None
+    refine: bool = True
+    super_resolution: str | None = None
     like: str | None = None
     projector: str = "auto"
     with_report: bool = True
@@ -90,17 +95,32 @@ class Trial:
                                        (name != "method" and ("." in name or value != SETTINGS[name][1])))])
 
     def scene(self) -> tuple[Grid, HUWindow]:
-        """The grid of the truth, which is also scored on, and the HU window that the truth is clipped to."""
-        return self.data.scene(*self.own())
+        """The grid of the CT that X-rays are made of, and the HU window that it is clipped to."""
+        grid, window = self.own()
+        return self.data.scene(whole(grid) if self.box else grid, window)
 
     def own(self) -> tuple[Grid, HUWindow]:
-        """The method's own grid and HU window."""
+        """The result's grid and HU window."""
         file = self.prior or self.like
         if self.prior is None and self.data.protocol and self.data.protocol.grid:
             return self.data.protocol.grid, HUWindow()
-        if file is None:
-            return Grid.cube(self.voxels, self.side), HUWindow()
-        return prior_of(file).grid, prior_of(file).window
+        window = prior_of(file).window if file else HUWindow()
+        return self.box.grid() if self.box else self.first(), window
+
+    def first(self) -> Grid:
+        """The grid of the method before it is refined: of its second stage, its prior or the one that it goes by."""
+        if self.super_resolution:
+            return stage_of(self.super_resolution).grid
+        file = self.prior or self.like
+        return prior_of(file).grid if file else CHEST
+
+    def scored(self) -> Grid:
+        """The grid on which results are scored."""
+        return self.box.grid() if self.box else self.scene()[0]
+
+    @property
+    def refinement(self) -> Refinement:
+        return Refinement() if self.refine else Refinement(None)
 
     def identity(self) -> dict:
         """All that decides the numbers of a trial beside the case, as plain JSON values."""
@@ -112,15 +132,21 @@ class Trial:
             identity |= {"prior": prior.identity()} if isinstance(prior, PriorContract) else {
                 "prior_crc32": _crc(self.prior)}
             identity |= {"guidance": self.guidance, "samples": self.samples}
+        if self.super_resolution:
+            identity["super_resolution_crc32"] = _crc(self.super_resolution)
+        if self.prior is not None and self.box and not self.first().same_as(self.box.grid()):
+            identity["refinement"] = describe(self.refinement)
+        if self.box and not self.box.grid().same_as(grid):
+            identity["region"] = self.box.grid().to_dict()
         if self.projector != "auto":
             identity["projector"] = self.projector
         return json.loads(json.dumps(identity))
 
     def acquisition(self) -> str:
-        """Equal for trials whose X-rays are the same."""
+        """Equal for trials whose X-rays, and voxels to score on, are the same."""
         grid, window = self.scene()
         settings = self.data.settings("test") | {"seed": self.seed}
-        return json.dumps([settings, grid.to_dict(), describe(window)], sort_keys=True)
+        return json.dumps([settings, grid.to_dict(), self.scored().to_dict(), describe(window)], sort_keys=True)
 
 
 def trials_of(base: Mapping, axes: Mapping, methods: Mapping, cases: Cases,
@@ -156,11 +182,11 @@ def trials_of(base: Mapping, axes: Mapping, methods: Mapping, cases: Cases,
     like = next((trial.prior for trial in found if trial.prior), None)
     found = [trial if trial.prior else replace(trial, like=like) for trial in found]
     scenes = [trial.scene() for trial in found]
-    requested = [Grid.cube(trial.voxels, trial.side) for trial in found if {"voxels", "side"} & trial.columns.keys()]
+    results = [trial.own()[0] for trial in found] if not any(trial.data.protocol for trial in found) else []
     if any(window != scenes[0][1] for _, window in scenes) or not all(
-            grid.same_as(scenes[0][0]) for grid in [*requested, *(grid for grid, _ in scenes)]):
-        raise ValueError("the methods of a product are compared on one grid and HU window, but their priors, or voxels "
-                         "and side, give several: leave voxels and side out, or make products of their own")
+            grid.same_as(grids[0]) for grids in (results, [grid for grid, _ in scenes]) for grid in grids):
+        raise ValueError("the methods of a product are compared on one grid and HU window, but their priors, second "
+                         "stages, or voxels, side and centre, give several: give voxels, or make products of their own")
     return found, used
 
 
@@ -215,10 +241,13 @@ def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
                if name in given or name not in PRIOR_SETTINGS or with_prior}
     columns |= {name: given[name] for name in SETTINGS if name in given and name not in columns} | overrides
     prior = value["prior"] or str(method.default_prior) if with_prior else None
-    trial = Trial(columns, method, data, prior, value["guidance"], value["samples"], value["seed"],
-                  value["voxels"], value["side"], projector=value["projector"], with_report=value["report"])
-    meant = set(given) | set(overrides)
-    return trial, meant | ({"voxels", "side"} & set(settings))
+    box = None if value["voxels"] is None else Box(value["voxels"], value["side"], value["centre"])
+    if box is None and (alone := {"side", "centre", "refine"} & set(given)):
+        raise ValueError(f"{', '.join(sorted(alone))} of a box of voxels means nothing without voxels: give them too")
+    trial = Trial(columns, method, data, prior, value["guidance"], value["samples"], value["seed"], box,
+                  value["refine"], value["super_resolution"], projector=value["projector"],
+                  with_report=value["report"])
+    return trial, set(given) | set(overrides)
 
 
 def _orbit(given: Mapping) -> Orbit:
@@ -260,6 +289,12 @@ def refined_from(method: Sampler, delta: float, keep_iterations: bool = False) -
 def prior_of(file: str):
     """The prior in a file, or of a class, read once."""
     return find_prior(file)
+
+
+@cache
+def stage_of(file: str):
+    """The second stage in a file, read once."""
+    return load_super_resolution(file)
 
 
 @cache

@@ -3,7 +3,8 @@
 from phydict.baselines.cgls import CGLS
 from phydict.baselines.diffvox import DiffVox
 from phydict.baselines.fdk import FDK
+from phydict.baselines.region import Region
 from phydict.baselines.sirt import SIRT
 from phydict.baselines.tv import FISTATV
 
-__all__ = ["CGLS", "FDK", "FISTATV", "SIRT", "DiffVox"]
+__all__ = ["CGLS", "FDK", "FISTATV", "SIRT", "DiffVox", "Region"]

@@ -47,7 +47,10 @@ class Baseline(Reconstructor):
     Works on densities relative to water, so that HU do not depend on what water attenuates in the X-rays. Display
     values need a scale to start from: they are first matched to a water ellipse of a typical chest.
     Subclasses are frozen dataclasses with the fields mu_water (1/mm) and name beside their own.
+    local: whether a voxel's value depends on the X-rays alone, and not on which other voxels there are.
     """
+
+    local = False
 
     name: str
 
@@ -57,7 +60,9 @@ class Baseline(Reconstructor):
 
     @torch.no_grad()
     def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,
-                    seed: int = 0, on_step: Callable[[], None] = lambda: None) -> Reconstruction:
+                    seed: int = 0, on_step: Callable[[], None] = lambda: None,
+                    outside: Tensor | None = None) -> Reconstruction:
+        """As a Reconstructor; outside: line integrals (K, V, U) of what lies outside the voxels."""
         watch, A = Stopwatch(), CountingProjector(projector)
         check_xrays(xrays, A.beam)
         if not display:
@@ -66,11 +71,12 @@ class Baseline(Reconstructor):
             y = xrays[None] / self.mu_water
             if display:
                 y = match_views(xrays[None], A(typical_chest(A).to(xrays)))
+        beyond = torch.zeros_like(y) if outside is None else outside[None] / self.mu_water
         with watch.stage("sample"):
-            A.y, guard = y, Guard(A, on_step, self.steps())
-            density = self.solve(A, y, guard)
+            A.y, guard = y if self.local else y - beyond, Guard(A, on_step, self.steps())
+            density = self.solve(A, A.y, guard)
         with watch.stage("score"):
-            fit = guard.score(density, self.mu_water * A(density), self.mu_water * y)
+            fit = guard.score(density, self.mu_water * (A(density) + beyond), self.mu_water * y)
         return Reconstruction(
             volume=mu_to_hu(density[0, 0], 1.0).cpu(), grid=A.grid, method=self.name, seed=seed,
             **fit, seconds=watch.seconds, projector_calls=A.calls)

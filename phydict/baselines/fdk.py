@@ -41,6 +41,7 @@ class FDK(Baseline):
     citation = ("Feldkamp, Davis & Kress, Practical Cone-Beam Algorithm, Journal of the Optical Society of America "
                 "A 1(6), 1984, doi:10.1364/JOSAA.1.000612")
 
+    local = True
     hann: bool = True
     window: HUWindow | None = HUWindow()
     mu_water: float = MU_WATER

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from torch import Tensor
 
 from phydict.baselines.baseline import Baseline, CountingProjector, clip, empty
 from phydict.linalg.power_iteration import operator_norm
-from phydict.linalg.total_variation import tv_proximal
+from phydict.linalg.total_variation import finest_to_own, tv_proximal
 from phydict.units import MU_WATER, HUWindow
 
 
@@ -70,8 +70,3 @@ class FISTATV(Baseline):
             x, momentum = new, following
             on_step()
         return x
-
-
-def finest_to_own(spacing: Sequence[float]) -> list[float]:
-    """Per axis, the finest spacing divided by its own: what turns differences into slopes of equal unit."""
-    return [min(spacing) / s for s in spacing]

@@ -119,7 +119,7 @@ class InferenceCLI(LightningCLI):
             try:
                 with noted([], name):
                     case = load_xrays(folder, geometry) | {"id": name}
-                    print(*dry_run(model.pages / f"{name}.png", case, model.grid), sep="\n")
+                    print(*dry_run(model.pages / f"{name}.png", case, model.around), sep="\n")
             except (ValueError, OSError) as error:
                 if len(folders) == 1:
                     raise
@@ -147,6 +147,8 @@ def with_methods(args: list[str]) -> list[str]:
     and of no configuration, and for settings without a method.
     """
     given = [arg.partition("=")[0] for arg in args]
+    if any(option.startswith("--model.cube") for option in given):
+        raise ValueError("model.cube is now model.grid: rename it")
     chosen = any(option in ("--model", "--model.method", "--model.method.class_path") for option in given)
     out, rest = [], iter(args)
     for arg in rest:

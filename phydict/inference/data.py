@@ -137,7 +137,7 @@ class ReconstructionData(lightning.LightningDataModule):
 
     def test_dataloader(self) -> DataLoader:
         task = self.trainer.lightning_module
-        return self._loader(self.test_cases(*self.scene(task.grid, task.window)))
+        return self._loader(self.test_cases(*task.scene()))
 
     def test_cases(self, grid: Grid, window: HUWindow) -> list[tuple[str, str, Callable[[], dict]]]:
         """The CTs or phantoms of test: id, what identifies its data, and the function that makes it on `grid`."""

@@ -7,6 +7,7 @@ where the publications crop the middle of the scan.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,8 +18,10 @@ from phydict.datasets.cts.transforms import AIR, to_grid
 from phydict.evaluation import RANGE
 from phydict.grid import Grid
 from phydict.inference.settings import PAPER, Orbit
+from phydict.methods import CHEST
 from phydict.units import HUWindow
 from phydict.xray import Ideal, Simulator
+from phydict.xray.boxes import along, covers, in_other_voxels
 
 
 @dataclass(frozen=True)
@@ -78,7 +81,7 @@ class Protocol:
         """The protocol's voxels. Raises ValueError where others than the default are given."""
         if not any(given.same_as(grid) for grid in (self.grid, Grid.cube(64))):
             raise ValueError(f"data.protocol {self.name} fixes {self.cube[0]} voxels over {self.cube[1]:g} mm, but "
-                             f"model.cube has {given.shape[0]} over {given.extent[0]:g} mm: leave one of the two out")
+                             f"model.grid has {given.shape[0]} over {given.extent[0]:g} mm: leave one of the two out")
         return self.grid
 
 
@@ -106,6 +109,26 @@ def resampled(volume: Tensor, grid: Grid, onto: Grid) -> Tensor:
     if grid.same_as(onto):
         return volume
     return torch.from_numpy(to_grid(volume.cpu().numpy(), grid.affine, onto, AIR).astype(np.float32))
+
+
+def whole(grid: Grid) -> Grid:
+    """The voxels of the CT that X-rays are made of: those of the result where they hold the whole chest, centred, else
+    those of the chest, as long as the result's or half again."""
+    if along(grid, CHEST) and covers(grid, CHEST) and np.allclose(grid.centre, 0):
+        return grid
+    halvings = max(0, math.ceil(math.log2(CHEST.spacing[0] / min(grid.spacing)) - 0.1))
+    return Grid.cube(CHEST.shape[0] * 2 ** min(halvings, 2))
+
+
+def cut_out(case: dict, grid: Grid, box: Grid, window: HUWindow) -> dict:
+    """What a CT case on `grid` holds in a box: volume, from its finest, masks and, where it has one, affine."""
+    source = case.get("fine", case["volume"])
+    volume = resampled(window.to_hu(source)[0].cpu(), in_other_voxels(grid, source.shape[1:]), box)
+    masks = np.stack([to_grid(mask.cpu().numpy(), grid.affine, box, 0.0) for mask in case["masks"]])
+    found = {"volume": window.to_range(volume)[None], "masks": torch.from_numpy(masks.astype(np.float32))}
+    if "affine" in case:
+        found["affine"] = torch.from_numpy(placed(box, grid, case["affine"].numpy()).affine.copy())
+    return found
 
 
 def placed(grid: Grid, like: Grid, affine: np.ndarray) -> Grid:

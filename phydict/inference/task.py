@@ -25,16 +25,16 @@ from phydict.datasets.radiographs.xray_description import save_geometry
 from phydict.evaluation import CaseMetrics, Table, panel
 from phydict.evaluation.fid import Features, PlaneFID, load_features, save_features
 from phydict.evaluation.tables import fid_table
-from phydict.grid import Cube
+from phydict.grid import Box, Grid
 from phydict.inference.page import results_page
-from phydict.inference.protocols import placed, resampled
+from phydict.inference.protocols import cut_out, placed, resampled, whole
 from phydict.inference.results import FEATURES, CaseResults
 from phydict.inference.scoring import Scoring
 from phydict.inference.settings import CascadeSettings, Sampling
-from phydict.methods import METHODS, calibrated, default_method, fit_to_grid, reconstructor
+from phydict.methods import CHEST, METHODS, calibrated, default_method, fit_to_grid, onto_grid, reconstructor
 from phydict.page import check_own_page, write_case_files
 from phydict.poses import FoundPoses
-from phydict.posterior import CascadePosterior, Sampler
+from phydict.posterior import CascadePosterior, Refined, Sampler
 from phydict.prior import (
     MedSynCheckpoint, PriorContract, file_read, find_prior, fingerprint, load_super_resolution)
 from phydict.reconstruction import Reconstruction, Reconstructor, describe, save_nifti
@@ -71,14 +71,15 @@ class ReconstructionTask(lightning.LightningModule):
         out: output folder; cases go to <out>/<name>/<case>
         overwrite: do finished cases again; a new result takes the old one's place when it is complete
         seed: the only source of randomness; of each case in predict, as in Python, and by phydict.case_seed in test
-        cube: the grid of voxels, for methods without a prior
+        grid: the result's voxels along each side of 384 mm, such as 128, or a box: voxels, side, centre, keep_coarse;
+            none given: the prior's own, without a prior 64
         projector: auto (the fastest that suits the geometry), separable, siddon, eq4, joseph or matrix
     """
 
     def __init__(self, method: Sampler | Reconstructor | None = None, name: str | None = None,
                  prior: PriorContract | str | MedSynCheckpoint | None = None, sampling: Sampling = Sampling(),
                  super_resolution: CascadeSettings = CascadeSettings(), out: str = "runs/reconstructions",
-                 overwrite: bool = False, seed: int = 0, cube: Cube = Cube(), projector: str = "auto"):
+                 overwrite: bool = False, seed: int = 0, grid: int | Box | None = None, projector: str = "auto"):
         super().__init__()
         check_seed(seed)
         if projector not in PROJECTORS:
@@ -96,11 +97,11 @@ class ReconstructionTask(lightning.LightningModule):
         self.settings = {"name": name, "seed": seed, "method": describe(method)}
         if projector != "auto":
             self.settings["projector"] = projector
-        self.grid, self.window = cube.grid(), HUWindow()
+        self.window = HUWindow()
         prior = prior or (str(method.default_prior) if isinstance(method, Sampler) else None)
         self.prior = find_prior(prior) if isinstance(method, Sampler) else None
         if self.prior is not None:
-            self.grid, self.window = self.prior.grid, self.prior.window
+            self.window = self.prior.window
             own = isinstance(self.prior, PriorContract)
             self.settings |= {"prior": self.prior.identity()} if own else _identity("prior", prior)
             self.settings |= {"guidance": sampling.guidance}
@@ -112,18 +113,32 @@ class ReconstructionTask(lightning.LightningModule):
         if super_resolution.file:
             self.super_resolution = load_super_resolution(super_resolution.file)
             self.super_resolution.memory = int(super_resolution.memory * 2**30)
-            self.grid = self.super_resolution.grid
         self.reconstructor = reconstructor(
             method, self.prior, sampling.guidance, name, self.super_resolution, super_resolution.guided,
             super_resolution.sampler, super_resolution.noise_augmentation, sampling.samples, sampling.precision)
         if isinstance(self.reconstructor, CascadePosterior):
             self.settings |= _identity("super_resolution", super_resolution.file) | {
                 "sr_noise_augmentation": self.reconstructor.level, "second": describe(self.reconstructor.second)}
+        self._take(Box(grid) if isinstance(grid, int) else grid)
         self.metrics, self.scoring, self.slices = CaseMetrics([name]), Scoring(), None
         self.with_report = sampling.with_report
         self.progress = CaseProgress()
         self.cases: list[str] = []
         self.profile = self.calibrate = self.said_no_text = False
+
+    def _take(self, box: Box | None) -> None:
+        """Reconstruct on the voxels of a box, if one is given."""
+        self.keep_coarse = box is not None and box.keep_coarse
+        self.around = self.grid = self.reconstructor.grid or CHEST
+        self.plain = self.reconstructor
+        if box is None:
+            return
+        self.grid = box.grid()
+        self.around = whole(self.grid)
+        self.reconstructor = onto_grid(self.reconstructor, self.grid)
+        self.settings["grid"] = self.grid.to_dict()
+        if isinstance(self.reconstructor, Refined):
+            self.settings["refinement"] = describe(self.reconstructor.refinement)
 
     def measure(self, scoring: Scoring) -> None:
         """Take these metrics in test."""
@@ -142,9 +157,14 @@ class ReconstructionTask(lightning.LightningModule):
         if stage == "test":
             self.settings |= self.scoring.settings()
             if data.protocol and data.protocol.grid and self.prior is None:
-                self.grid = data.protocol.fixed_grid(self.grid)
+                self.grid = self.around = data.protocol.fixed_grid(self.grid)
+                self.reconstructor = self.plain
         check_apart(self.results.folder, "model.out", self.trainer.datamodule.inputs(stage))
         check_own_page(self.results.folder.parent, "model.out")
+
+    def scene(self) -> tuple[Grid, HUWindow]:
+        """The voxels and the HU range of the CTs that X-rays are made of."""
+        return self.trainer.datamodule.scene(self.around, self.window)
 
     def unfinished(self, sources: dict[str, str]) -> list[str]:
         """Of this run's cases, id -> what identifies their data, those that remain to be done."""
@@ -168,14 +188,18 @@ class ReconstructionTask(lightning.LightningModule):
     def _test(self, case: dict) -> None:
         data = self.trainer.datamodule
         case["beam"], seed = data.beam, case_seed(self.seed, case["id"])
-        grid, window = data.scene(self.grid, self.window)
+        grid, window = self.scene()
         with stage("simulate"):
             case["xrays"] = data.simulate(case, seed, grid, window, self.device)
         case["mu_water"] = data.simulator.effective_mu_water
+        if self.around is not self.grid:
+            case, grid = case | cut_out(case, grid, self.grid, window), self.grid
         result = self._reconstruct(case, seed)
         volume, truth = resampled(result.volume, self.grid, grid), window.to_hu(case["volume"])[0].cpu()
         if "affine" in case:  # back to its place in the CT it came from
-            result = replace(result, grid=placed(self.grid, grid, case["affine"].numpy()))
+            affine, coarse = case["affine"].numpy(), result.coarse
+            result = replace(result, grid=placed(self.grid, grid, affine), coarse=coarse and replace(
+                coarse, grid=placed(coarse.grid, grid, affine)))
         with stage("metrics"):
             scores = self.scoring.scores(volume, result.misfit, case, grid, window, self.device, data.protocol)
             features = self.scoring.features(volume, case, window, self.device)
@@ -223,8 +247,12 @@ class ReconstructionTask(lightning.LightningModule):
         self.trainer.strategy.barrier()
 
     def _start(self, cases: int) -> None:
-        if isinstance(self.reconstructor, CascadePosterior):
-            self.reconstructor.check_memory(self.device)
+        if isinstance(self.plain, CascadePosterior):
+            self.plain.check_memory(self.device)
+        if isinstance(self.reconstructor, Refined):
+            sizes = " and ".join(" x ".join(map(str, level.shape)) for level in self.reconstructor.levels)
+            print(f"no trained stage was given for {sizes} voxels: the X-rays and total variation alone refine to them",
+                  file=sys.stderr)
         self.progress.begin(self.method_name, cases, self.reconstructor.steps(), out=self.results.folder)
 
     def _report(self, case: dict) -> str:
@@ -241,7 +269,8 @@ class ReconstructionTask(lightning.LightningModule):
         xrays, beam, display = case["xrays"].to(self.device), case["beam"], case.get("display", False)
         found: FoundPoses | None = None
         if self.calibrate:
-            xrays, found = calibrated(ready, self.grid, xrays, beam, _uncertain(case), display)
+            xrays, found = calibrated(ready, ready.survey or self.grid, xrays, beam,
+                                       _uncertain(case), display)
             beam = found.beam
         with stage("fit to grid"):
             xrays, projector = fit_to_grid(ready, self.grid, xrays, beam, self.projector)
@@ -258,6 +287,8 @@ class ReconstructionTask(lightning.LightningModule):
                 save_geometry(folder / "geometry_found.yaml", result.beam, case.get("description"))
             if result.deviation is not None:
                 save_nifti(folder / "deviation.nii.gz", result.deviation.numpy(), result.grid)
+            if self.keep_coarse and result.coarse is not None:
+                result.coarse.save_nifti(folder / "coarse.nii.gz")
             uncertain, label = result.deviation, "standard deviation"
             if result.intervals:
                 uncertain, label = result.intervals[SHOWN_LEVEL], f"half of the {SHOWN_LEVEL:.0%} interval"

@@ -35,6 +35,11 @@ def differences_adjoint(p: Tensor, scales: Sequence[float] = UNIT) -> Tensor:
     return result
 
 
+def finest_to_own(spacing: Sequence[float]) -> list[float]:
+    """Per axis, the finest spacing divided by its own: what turns differences into slopes of equal unit."""
+    return [min(spacing) / s for s in spacing]
+
+
 def total_variation(x: Tensor, scales: Sequence[float] = UNIT, eps: float = 0.0) -> Tensor:
     """The sum over voxels of sqrt(|forward differences|^2 + eps^2)."""
     return (eps**2 + differences(x, scales).square().sum(0)).sqrt().sum()
@@ -67,15 +72,17 @@ class TVQuadraticMajorizer:
     it lowers the variation (lagged diffusivity, Vogel & Oman 1996, doi:10.1137/0917016).
     """
 
-    def __init__(self, x: Tensor, eps: float):
-        self.weights = 1 / (eps**2 + differences(x).square().sum(0)).sqrt()
+    def __init__(self, x: Tensor, eps: float, scales: Sequence[float] = UNIT):
+        self.scales = scales
+        self.weights = 1 / (eps**2 + differences(x, scales).square().sum(0)).sqrt()
 
     def gradient(self, x: Tensor) -> Tensor:
         """The quadratic's gradient at x, which is linear."""
-        return differences_adjoint(self.weights * differences(x))
+        return differences_adjoint(self.weights * differences(x, self.scales), self.scales)
 
     def diagonal(self) -> Tensor:
         """The diagonal of the quadratic's matrix: what `gradient` makes of a voxel there itself."""
-        inner = [self.weights.narrow(axis, 0, self.weights.shape[axis] - 1) for axis in (2, 3, 4)]
+        inner = [scale**2 * self.weights.narrow(axis, 0, self.weights.shape[axis] - 1)
+                 for axis, scale in zip((2, 3, 4), self.scales)]
         return torch.stack([pad(w, [0, 0] * (4 - axis) + [0, 1]) + pad(w, [0, 0] * (4 - axis) + [1, 0])
                             for axis, w in zip((2, 3, 4), inner)]).sum(0)

@@ -8,6 +8,7 @@ from phydict.posterior.likelihood.likelihood_draw import ExactDraw, LikelihoodDr
 from phydict.posterior.likelihood.reward import Reward
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.posterior import Posterior
+from phydict.posterior.refined import Refined, Refinement
 from phydict.posterior.samplers.daps import DAPS
 from phydict.posterior.samplers.dds import DDS
 from phydict.posterior.samplers.diffpir import DiffPIR
@@ -35,6 +36,8 @@ __all__ = [
            "Posterior",
            "PriorOnly",
            "ProximalCG",
+           "Refined",
+           "Refinement",
            "Reward",
            "Sampler",
            "SplitGibbs",

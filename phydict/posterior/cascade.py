@@ -22,7 +22,7 @@ from phydict.prior import Cascade
 from phydict.reconstruction import Reconstruction, Reconstructor
 from phydict.runtime.precision import check_precision, resolve_precision
 from phydict.runtime.profiling import Stopwatch
-from phydict.units import MU_WATER
+from phydict.units import MU_WATER, HUWindow
 from phydict.xray import Projector, binned, binning
 
 
@@ -64,6 +64,10 @@ class CascadePosterior(Reconstructor):
     def grid(self) -> Grid:
         """Where the reconstructed volumes live."""
         return self.cascade.super_resolution.grid
+
+    @property
+    def window(self) -> HUWindow:
+        return self.cascade.super_resolution.window
 
     @property
     def level(self) -> float:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from phydict.linalg.total_variation import finest_to_own
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import Projector
 from phydict.xray.calibration import match_views, subtract_scatter
@@ -23,13 +24,16 @@ class Measurement:
     """Line integrals y (1, K, V, U) and the affine operator P on CT volumes x (B, 1, X, Y, Z) in the prior's range.
 
     noise: standard deviation of the noise of y, as a share of its largest value or, as a tensor that expands to
-    (K, V, U), of each pixel; None: estimated from y where it is needed.
+    (K, V, U), of each pixel; None: estimated from y where it is needed. outside: line integrals (K, V, U) of what
+    lies outside the voxels, which P adds.
+    scales: per axis, the finest spacing of the voxels divided by their own.
     scatter_enabled: whether `subtract_scatter` subtracts scatter; calls: how many times A or its adjoint ran over all
     views, per volume of a batch; last_projection: what `project` last gave.
     """
 
     def __init__(self, projector: Projector, xrays: Tensor, window: HUWindow, display: bool = False,
-                 mu_water: float = MU_WATER, noise: float | Tensor | None = None):
+                 mu_water: float = MU_WATER, noise: float | Tensor | None = None,
+                 outside: Tensor | None = None):
         check_xrays(xrays, projector.beam)
         if not display:
             check_line_integrals(xrays)
@@ -37,6 +41,9 @@ class Measurement:
         self.projector, self.display = projector, xrays[None] if display else None
         self.slope, self.offset = window.mu_affine(mu_water)
         self.background = self.offset * projector(torch.ones(1, 1, *projector.grid.shape).to(xrays))
+        if outside is not None:
+            self.background = self.background + outside
+        self.scales = finest_to_own(projector.grid.spacing)
         self.y = xrays[None]
         self.scatter_enabled = False
         self.calls = 1

@@ -25,7 +25,7 @@ from phydict.runtime.profiling import Stopwatch, stage
 from phydict.runtime.ranges import check_between
 from phydict.runtime.reading import check_memory
 from phydict.runtime.warning import warn
-from phydict.units import MU_WATER
+from phydict.units import MU_WATER, HUWindow
 from phydict.xray import Projector
 
 MOST_GUIDANCE = 1_000_000
@@ -123,6 +123,10 @@ class Posterior(Reconstructor):
     def grid(self) -> Grid:
         """Where the reconstructed volumes live."""
         return self.prior.grid
+
+    @property
+    def window(self) -> HUWindow:
+        return self.prior.window
 
     @property
     def full_detector(self) -> bool:

@@ -11,12 +11,13 @@ import torch
 from torch import Tensor
 
 from phydict.baselines.baseline import Baseline, CountingProjector
+from phydict.grid import Grid
 from phydict.reconstruction import Reconstruction, Reconstructor
 from phydict.rivals.files import load_rival
 from phydict.rivals.rival import Rival
 from phydict.runtime.files import file_crc32
 from phydict.runtime.precision import check_precision, network_precision, precision_name
-from phydict.units import MU_WATER
+from phydict.units import MU_WATER, HUWindow
 from phydict.xray import Projector
 
 
@@ -80,6 +81,14 @@ class TrainedRival(Reconstructor):
                              "configs/rivals/<lifted, x2ct or xray2ctpa>.yaml` and `train.py export`, then give its "
                              "file as --model.method.init_args.file, or to ablate as --set <name>.method.file=<file>")
         return RivalAnswer(_loaded(self.file, self.weights_crc32), 0, self.precision, self.mu_water, self.name)
+
+    @property
+    def grid(self) -> Grid | None:
+        return None if self.file is None else self.answer.rival.grid
+
+    @property
+    def window(self) -> HUWindow:
+        return self.answer.rival.window
 
     def steps(self) -> int:
         return self.answer.steps()

@@ -57,7 +57,7 @@ class Rival(nn.Module):
         if not self.grid.same_as(grid):
             raise ValueError(
                 f"the rival was trained on {self.grid.shape} voxels of {self.grid.spacing} mm, but {grid.shape} of "
-                f"{grid.spacing} mm were given: give its own, by --model.cube.voxels and --model.cube.side")
+                f"{grid.spacing} mm were given: give its own")
         if self.beam is None:
             return
         if self.beam.views != beam.views:

@@ -37,7 +37,8 @@ def plain(message: str) -> str:
         return ours
     key = start[1]
     if nested := NESTED.search(text):
-        return plain(f'Parser key "{key}.init_args.{nested[1]}": {nested[2]}')
+        inside = "" if "phydict.grid.Box" in text else ".init_args"
+        return plain(f'Parser key "{key}{inside}.{nested[1]}": {nested[2]}')
     if problem := PROBLEM.search(text):
         return _of_class(key, problem[1], problem[2])
     given = next((value[1] or value[2] for value in GIVEN.finditer(text)), "something else")
@@ -63,6 +64,8 @@ def _wanted(text: str) -> str:
     """What a setting holds, by all types that the parser tried."""
     kinds = [KINDS[kind] for kind in re.findall(r"Expected an? <class '(\w+)'>", text) if kind in KINDS]
     kinds += [f"a list of {size}" for size in re.findall(r"Expected a tuple with (\d+) elements", text)]
+    if "phydict.grid.Box" in text:
+        return " or ".join([*kinds, KINDS["dict"]])
     kinds += ["the path of a class"] * bool(re.search("dot import path|import path format", text))
     kinds += [f"the path of a {name}" for name in re.findall(r"(?:to a|valid) subclass of (\w+)", text)]
     names = [name.strip(" '") for listed in re.findall(r"Expected a typing\.Literal\[(.*?)\]", text)

@@ -41,7 +41,7 @@ BEAM = ConeBeam.orbit(**ORBIT)
 PICKLE = b"cos\nsystem\n(S'touch pwned'\ntR."
 """Runs a command where it is unpickled."""
 
-SIRT = ["-c", "sirt", "--model.method.init_args.iterations=2", "--model.cube.voxels=16", "--trainer.accelerator=cpu"]
+SIRT = ["-c", "sirt", "--model.method.init_args.iterations=2", "--model.grid.voxels=16", "--trainer.accelerator=cpu"]
 
 
 @cache
@@ -179,7 +179,7 @@ class Place:
     def settings(self, content, command: str = "predict") -> None:
         """predict with a configuration file that holds `content`."""
         file = self.write("mine.yaml", content if isinstance(content, str | bytes) else yaml.safe_dump(content))
-        self.infer(command, "-c", "sirt", "-c", file, "--model.method.init_args.iterations=2", "--model.cube.voxels=16",
+        self.infer(command, "-c", "sirt", "-c", file, "--model.method.init_args.iterations=2", "--model.grid.voxels=16",
                    f"--data.xrays={self.case()}", f"--model.out={self.out}", "--trainer.accelerator=cpu")
 
     def ablate(self, content, *more) -> None:
@@ -281,12 +281,12 @@ def command_lines():
     yield "seed_everything in words", no, "seed", lambda p: p.predict(p.case(), "--seed_everything=often")
     yield "seed_everything below 0", None, "", lambda p: p.predict(p.case(), "--seed_everything=-5")
     yield "seed_everything too large", None, "", lambda p: p.predict(p.case(), "--seed_everything=99999999999999")
-    yield "voxels nan", no, "voxels", lambda p: p.predict(p.case(), "--model.cube.voxels=nan")
-    yield "voxels -4", no, "", lambda p: p.predict(p.case(), "--model.cube.voxels=-4")
-    yield "voxels 1", None, "", lambda p: p.predict(p.case(), "--model.cube.voxels=1")
-    yield "voxels 3", None, "", lambda p: p.predict(p.case(), "--model.cube.voxels=3")
-    yield "side of 1 mm", None, "", lambda p: p.predict(p.case(), "--model.cube.side=1")
-    yield "side inf", no, "", lambda p: p.predict(p.case(), "--model.cube.side=inf")
+    yield "voxels nan", no, "voxels", lambda p: p.predict(p.case(), "--model.grid.voxels=nan")
+    yield "voxels -4", no, "", lambda p: p.predict(p.case(), "--model.grid.voxels=-4")
+    yield "voxels 1", None, "", lambda p: p.predict(p.case(), "--model.grid.voxels=1")
+    yield "voxels 3", None, "", lambda p: p.predict(p.case(), "--model.grid.voxels=3")
+    yield "side of 1 mm", None, "", lambda p: p.predict(p.case(), "--model.grid={voxels: 4, side: 1}")
+    yield "side inf", no, "", lambda p: p.predict(p.case(), "--model.grid.side=inf")
     yield "iterations 10^12 dry", True, "", lambda p: p.dry(p.case(),
         "--model.method.init_args.iterations=1000000000000")
     yield "mu_water nan", no, "mu_water", lambda p: p.predict(p.case(), "--model.method.init_args.mu_water=nan")
@@ -374,7 +374,7 @@ def interruptions():
             p.case(f"case{k}")
         p.started()
         return [sys.executable, "-c", code, "predict", *SIRT[:2], "--model.method.init_args.iterations=400",
-                "--model.cube.voxels=32", "--trainer.accelerator=cpu", f"--data.xrays={p.given}",
+                "--model.grid.voxels=32", "--trainer.accelerator=cpu", f"--data.xrays={p.given}",
                 f"--model.out={p.out}", *more]
 
     def start(args, **settings) -> subprocess.Popen:

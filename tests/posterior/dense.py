@@ -7,6 +7,7 @@ from laws import random_like
 from torch import Tensor
 
 from phydict.diffusion import CosineSchedule, GaussianDenoiser
+from phydict.linalg.total_variation import UNIT
 
 SHAPE = (1, 1, 2, 3)
 N = 6
@@ -16,6 +17,8 @@ FINE = CosineSchedule(offset=1e-3, floor=1e-6)
 
 class DenseMeasurement:
     """y = A x + background, on states (B, 1, 1, 2, 3); stands in for phydict.posterior.Measurement."""
+
+    scales = UNIT
 
     def __init__(self, matrix: Tensor, y: Tensor, background: float = 0.0):
         self.matrix, self.y, self.background, self.calls = matrix, y[None], background, 0

@@ -35,7 +35,7 @@ class ProximalCG(LikelihoodStep):
     gradients on them and clips: air stays air, which is worth more than many iterations without the bounds. With a
     Gaussian prior, no total variation, bounds that do not act and enough iterations this is exactly E[x_0 | x_t, y];
     few iterations regularise, since what the views see best is corrected first. TV(z) sums sqrt(slope^2 + tv_eps^2)
-    over the voxels.
+    over the voxels, the differences along coarser axes scaled down to the finest spacing.
 
     Each restart replaces TV by the quadratic that touches it there (Vogel & Oman 1996, doi:10.1137/0917016), so the
     last step wants several, and conjugate gradients are preconditioned by the diagonal of that quadratic, which differs
@@ -79,7 +79,7 @@ class ProximalCG(LikelihoodStep):
             if self.refit_scatter:
                 measurement.subtract_scatter(reprojection)
             negative_gradient = measurement.adjoint(weights * (measurement.y - reprojection)) + weight * (x0 - z)
-            tv = TVQuadraticMajorizer(z, self.tv_eps) if tv_scale else None
+            tv = TVQuadraticMajorizer(z, self.tv_eps, measurement.scales) if tv_scale else None
             if tv:
                 negative_gradient = negative_gradient - tv_scale * tv.gradient(z)
 

@@ -1,0 +1,87 @@
+"""Region-of-interest tomography without a prior: what lies outside the box is taken from a coarse reconstruction."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from phydict.baselines.baseline import Baseline
+from phydict.grid import Grid
+from phydict.reconstruction import Reconstruction, Reconstructor
+from phydict.runtime.profiling import Stopwatch
+from phydict.units import hu_to_mu
+from phydict.xray import Projector, binned, binning
+from phydict.xray.boxes import outside_projection
+from phydict.xray.calibration import match_views
+
+
+@dataclass(frozen=True)
+class Region(Reconstructor):
+    """A baseline on a box that holds a part of the patient alone.
+
+    It first reconstructs the coarse `outer` box. The line integrals of what that shows outside the region are
+    subtracted from the X-rays, of which the region then explains the rest (Ziegler, Nielsen & Grass 2008, Medical
+    Physics 35(4)), unless the method is local. Display values are matched to the coarse volume.
+
+    Args:
+        method: the baseline
+        region: the voxels of the result
+        outer: those of the coarse reconstruction, which hold all that the rays meet
+    """
+
+    method: Baseline
+    region: Grid
+    outer: Grid
+
+    @property
+    def grid(self) -> Grid:
+        return self.region
+
+    @property
+    def survey(self) -> Grid:
+        return self.outer
+
+    @property
+    def full_detector(self) -> bool:  # type: ignore[override]
+        return self.method.full_detector
+
+    @property
+    def citation(self) -> str:  # type: ignore[override]
+        return self.method.citation
+
+    @property
+    def mu_water(self) -> float:  # type: ignore[override]
+        return self.method.mu_water
+
+    @property
+    def name(self) -> str:
+        return self.method.name
+
+    def with_mu_water(self, mu_water: float) -> Region:
+        return replace(self, method=self.method.with_mu_water(mu_water))
+
+    def steps(self) -> int:
+        return 2 * self.method.steps()
+
+    @torch.no_grad()
+    def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,
+                    seed: int = 0, on_step: Callable[[], None] = lambda: None) -> Reconstruction:
+        watch = Stopwatch()
+        with watch.stage("base"):
+            factor = 1 if self.full_detector else binning(self.outer, projector.beam)
+            coarse = self.method.reconstruct(
+                binned(xrays, factor), Projector(self.outer, projector.beam.binned(factor), projector.method,
+                                                 device=xrays.device, full_detector=True),
+                report, display, seed, on_step)
+        with watch.stage("outside"):
+            mu = hu_to_mu(coarse.volume.to(xrays), self.mu_water)
+            if display:
+                whole = Projector(self.outer, projector.beam, projector.method, device=xrays.device, full_detector=True)
+                xrays = match_views(xrays[None], whole(mu[None, None]))[0]
+            outside = outside_projection(mu, self.outer, projector)
+        found = self.method.reconstruct(xrays, projector, report, False, seed, on_step, outside)
+        return replace(found, coarse=coarse, seconds=watch.seconds | found.seconds,
+                       projector_calls=coarse.projector_calls + found.projector_calls)

@@ -1,0 +1,94 @@
+"""How sharp a reconstruction is: the width of edges, and the contrast of vessels and of nodules that were put in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool3d
+
+from phydict.grid import Grid
+
+VESSELS = 200
+"""How many of a lung's brightest voxels count as vessels."""
+
+SHELL = 1.5
+"""Radius, in a nodule's own, up to which its surroundings reach."""
+
+AXES = {"diaphragm": 2, "chest_wall": 0}
+"""The axis across each edge of the lungs."""
+
+
+def edge_profile(volume: Tensor, lung: Tensor, edge: str, reach: int = 5) -> Tensor:
+    """Mean profile (2 reach,) of a volume (X, Y, Z) across an edge of the lungs, from the lung outward.
+
+    lung: mask (X, Y, Z) in the truth. edge: "diaphragm", below the lowest lung voxel of each column, or "chest_wall",
+    beside the outermost one of each row. Lines on which less than `reach` voxels of lung or of other tissue meet at the
+    edge are left out. Raises ValueError where none is left.
+    """
+    axis = AXES[edge]
+    lines = [x.movedim(axis, -1).reshape(-1, x.shape[axis]) for x in (volume, lung > 0.5)]
+    both = [lines] if edge == "diaphragm" else [lines, [line.flip(-1) for line in lines]]
+    found = []
+    for values, inside in both:
+        first = inside.int().argmax(-1)
+        places = first[:, None] + torch.arange(reach - 1, -reach - 1, -1)
+        kept = inside.any(-1) & (places.amin(-1) >= 0) & (places.amax(-1) < values.shape[-1])
+        kept[kept.clone()] &= inside[kept].gather(-1, places[kept])[:, :reach].all(-1)
+        found.append(values[kept].gather(-1, places[kept]))
+    profiles = torch.cat(found)
+    if not len(profiles):
+        raise ValueError(f"no line crosses the {edge.replace('_', ' ')} with {reach} voxels on both sides: give the "
+                         "lungs' mask, or a smaller reach")
+    return profiles.mean(0)
+
+
+def edge_width(profile: Tensor, spacing: float) -> float:
+    """mm over which a profile rises from 10 to 90 % of the way between its ends; of `spacing` mm between samples."""
+    share = ((profile - profile[0]) / (profile[-1] - profile[0])).double().numpy()
+    share = np.maximum.accumulate(share)
+    places = np.arange(len(share))
+    low, high = (float(np.interp(level, share + 1e-9 * places, places)) for level in (0.1, 0.9))
+    return (high - low) * spacing
+
+
+def edge_spread(volume: Tensor, lung: Tensor, grid: Grid, edge: str, reach_mm: float = 24.0) -> float:
+    """Width in mm, 10 to 90 %, of a reconstruction's edge between lung and what is below or beside it; as
+    `edge_profile`."""
+    spacing = grid.spacing[AXES[edge]]
+    return edge_width(edge_profile(volume, lung, edge, max(2, round(reach_mm / spacing))), spacing)
+
+
+def vessel_visibility(volume: Tensor, truth: Tensor, lung: Tensor, count: int = VESSELS) -> float:
+    """How much of the vessels' contrast a volume (X, Y, Z) holds: that of the truth's `count` brightest lung voxels to
+    the mean of their 5^3 neighbourhoods, as a share of the truth's. 1: all of it, 0: none."""
+    contrasts = [x - avg_pool3d(x[None, None], 5, 1, 2, count_include_pad=False)[0, 0] for x in (volume, truth)]
+    inside = (lung > 0.5).flatten()
+    brightest = torch.where(inside, truth.flatten(), -torch.inf).topk(min(count, int(inside.sum()))).indices
+    found, expected = (float(contrast.flatten()[brightest].mean()) for contrast in contrasts)
+    return found / expected
+
+
+def nodule(grid: Grid, centre: Sequence[float], diameter: float, finer: int = 3) -> Tensor:
+    """Share (X, Y, Z) of each voxel that a ball of `diameter` mm around a world point (mm) fills, sampled `finer` times
+    along each side."""
+    steps = (np.arange(finer) - (finer - 1) / 2) / finer
+    places = [(np.arange(n)[:, None] + steps).ravel() for n in grid.shape]
+    middle = grid.index(centre)
+    squares = [((place - at) * s) ** 2 for place, at, s in zip(places, middle, grid.spacing)]
+    inside = squares[0][:, None, None] + squares[1][:, None] + squares[2] < (diameter / 2) ** 2
+    blocks = torch.from_numpy(inside)[None, None].float()
+    return avg_pool3d(blocks, finer)[0, 0]
+
+
+def recovered_contrast(with_nodule: Tensor, without: Tensor, grid: Grid, centre: Sequence[float], diameter: float,
+                       contrast: float) -> float:
+    """The share of a nodule's contrast (HU) that reconstructions (X, Y, Z) with and without it differ by: their mean
+    difference in the ball less that in the shell around it, up to SHELL radii."""
+    ball = nodule(grid, centre, diameter)
+    shell = (nodule(grid, centre, SHELL * diameter) - ball).clamp(min=0)
+    change = with_nodule - without
+    inside, around = (float((change * weight).sum() / weight.sum()) for weight in (ball, shell))
+    return (inside - around) / contrast

@@ -1,0 +1,178 @@
+"""A reconstruction on finer voxels than its method's own: upsampled and met with the X-rays, level by level."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from phydict.grid import Grid
+from phydict.guard import Guard
+from phydict.posterior.likelihood.likelihood import LikelihoodStep, ProximalCG
+from phydict.posterior.measurement import Measurement
+from phydict.reconstruction import Reconstruction, Reconstructor
+from phydict.runtime.profiling import Stopwatch
+from phydict.units import HUWindow, hu_to_mu
+from phydict.xray import Projector, binned, binning
+from phydict.xray.boxes import covers, interpolated, outside_projection, refinements
+
+AIR = -1000.0
+"""HU outside what a coarse volume covers."""
+
+
+class Bound(Protocol):
+    """A Reconstructor that is bound to voxels and an HU range of its own: a prior's, a cascade's or a rival's."""
+
+    full_detector: bool
+    citation: str
+    mu_water: float
+    name: str
+
+    @property
+    def grid(self) -> Grid: ...
+
+    @property
+    def window(self) -> HUWindow: ...
+
+    def steps(self) -> int: ...
+
+    def with_mu_water(self, mu_water: float) -> Reconstructor: ...
+
+    def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False, seed: int = 0,
+                    on_step: Callable[[], None] = lambda: None) -> Reconstruction: ...
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """How an estimate is refined on finer voxels.
+
+    Args:
+        step: towards the X-rays, such as ProximalCG, whose total variation takes a prior's place; none: interpolation
+            alone
+        x0_std: standard deviation of an interpolated estimate's error, in the range [-1, 1] of its HU window
+    """
+
+    step: LikelihoodStep | None = ProximalCG(iterations=10, restarts=3, tv_weight=10.0, tv_eps=0.003)
+    x0_std: float = 0.5
+
+    def __post_init__(self):
+        if not self.x0_std > 0:
+            raise ValueError(f"x0_std is a standard deviation above 0, but {self.x0_std} was given")
+
+
+@dataclass(frozen=True)
+class Refined(Reconstructor):
+    """`base` on its own voxels, then a refinement on finer ones, each time half as long, up to the target's.
+
+    At each level the estimate so far is interpolated trilinearly onto the finer voxels and is then where the
+    refinement starts and what it stays near. The X-rays are binned to what the level can hold. Where the
+    target's box leaves out a part of the base's, the line integrals of what the base shows there are added to those of
+    the box (region-of-interest tomography; Ziegler, Nielsen & Grass 2008, Medical Physics 35(4)). Scatter that the
+    base found is subtracted; display values are matched to the estimate anew.
+
+    Masks and deviations of the result are the base's, interpolated. Intervals, which are calibrated for the base's voxels
+    alone, stay with `Reconstruction.coarse`.
+
+    Args:
+        base: the method, bound to voxels of its own
+        target: the voxels of the result, along the same axes
+        refinement: how
+    """
+
+    base: Bound
+    target: Grid
+    refinement: Refinement = Refinement()
+
+    def __post_init__(self):
+        super().__post_init__()
+        refinements(self.base.grid, self.target)
+
+    @property
+    def grid(self) -> Grid:
+        return self.target
+
+    @property
+    def survey(self) -> Grid:
+        return self.base.grid
+
+    @property
+    def full_detector(self) -> bool:
+        return self.base.full_detector
+
+    @property
+    def citation(self) -> str:
+        return self.base.citation
+
+    @property
+    def mu_water(self) -> float:
+        return self.base.mu_water
+
+    @property
+    def name(self) -> str:
+        return self.base.name
+
+    @property
+    def levels(self) -> list[Grid]:
+        """The voxels of each refinement."""
+        return refinements(self.base.grid, self.target)
+
+    def with_mu_water(self, mu_water: float) -> Refined:
+        return replace(self, base=self.base.with_mu_water(mu_water))
+
+    def steps(self) -> int:
+        return self.base.steps() + len(self.levels)
+
+    @torch.no_grad()
+    def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,
+                    seed: int = 0, on_step: Callable[[], None] = lambda: None) -> Reconstruction:
+        if not self.target.same_as(projector.grid):
+            raise ValueError(
+                f"the target is {self.target.shape} voxels of {self.target.spacing} mm, but the X-rays are projected "
+                f"from {projector.grid.shape} voxels of {projector.grid.spacing} mm: use the target's grid")
+        watch, base, step = Stopwatch(), self.base, self.refinement.step
+        with watch.stage("base"):
+            y, A = self._seen(xrays, projector, base.grid)
+            coarse = base.reconstruct(y, A, report, display, seed, on_step)
+        volume, grid, calls, found = coarse.volume.to(xrays), base.grid, coarse.projector_calls, {}
+        for level in self.levels:
+            with watch.stage("refine"):
+                y, A = self._seen(xrays, projector, level)
+                x = base.window.to_range(interpolated(volume, grid, level, AIR))[None, None]
+                measurement = self._measurement(y, A, coarse, display)
+                measurement.reset_scatter(coarse.scatter > 0)
+                measurement.refit(x)
+                if step is not None:
+                    x = step(measurement, x, self.refinement.x0_std)
+                guard = Guard(measurement, on_step, 1)
+                guard()
+            volume, grid = base.window.to_hu(x[0, 0]), level
+            with watch.stage("score"):
+                measurement.match_gain_offset(x)
+                found = guard.score(x, measurement.project(x), measurement.y)
+            calls += measurement.calls
+        spread = coarse.deviation
+        return replace(
+            coarse, **found | {"diverged_at": coarse.diverged_at}, volume=volume.cpu(), grid=self.target,
+            coarse=coarse, projector_calls=calls, seconds=watch.seconds, intervals={},
+            masks=None if coarse.masks is None else torch.stack([
+                interpolated(mask, base.grid, self.target, 0.0) for mask in coarse.masks]),
+            deviation=None if spread is None else interpolated(spread, base.grid, self.target, 0.0))
+
+    def _seen(self, xrays: Tensor, projector: Projector, grid: Grid) -> tuple[Tensor, Projector]:
+        """The X-rays as a level sees them, binned to what its voxels can hold, and the projector to them."""
+        if grid.same_as(projector.grid):
+            return xrays, projector
+        factor = 1 if self.full_detector else binning(grid, projector.beam)
+        return binned(xrays, factor), Projector(grid, projector.beam.binned(factor), projector.method,
+                                                device=xrays.device, full_detector=True)
+
+    def _measurement(self, y: Tensor, A: Projector, coarse: Reconstruction, display: bool) -> Measurement:
+        """The X-rays as a problem on a level's voxels alone."""
+        outside = None
+        if not covers(self.target, coarse.grid):
+            mu = hu_to_mu(coarse.volume.to(y), self.mu_water)
+            outside = outside_projection(mu, coarse.grid, A)
+        return Measurement(A, y, self.base.window, display, self.mu_water, outside=outside)

@@ -1,0 +1,98 @@
+"""Boxes of voxels over and inside one another: what they share, volumes on other voxels, and finer and finer voxels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from phydict.grid import Grid
+from phydict.xray.projectors.projector import Projector
+
+ALONG = 1e-4
+"""Sine of the angle below which axes of two grids run along each other."""
+
+SLACK = 1e-3
+"""A share of a voxel by which a box may stand out of another one that covers it."""
+
+
+def along(grid: Grid, other: Grid) -> bool:
+    """Whether the voxels of both grids are stacked in the same directions."""
+    axes, others = (g.affine[:3, :3] / g.spacing for g in (grid, other))
+    return bool(abs(axes - others).max() < ALONG)
+
+
+def check_axes(grid: Grid, other: Grid) -> None:
+    """Raises ValueError unless the voxels of both grids are stacked in the same directions."""
+    if not along(grid, other):
+        raise ValueError("a volume is refined on voxels whose axes run along its own, but the given affine "
+                         f"{np.round(other.affine[:3, :3], 3).tolist()} is turned against "
+                         f"{np.round(grid.affine[:3, :3], 3).tolist()}: give a box along the same axes")
+
+
+def covers(grid: Grid, box: Grid) -> bool:
+    """Whether the box of `grid` holds that of another grid along the same axes."""
+    low, high = _faces(grid, box)
+    return bool((low >= -0.5 - SLACK).all() and (high <= np.asarray(grid.shape) - 0.5 + SLACK).all())
+
+
+def share_inside(grid: Grid, box: Grid) -> Tensor:
+    """The share (X, Y, Z) of each of the grid's voxels that lies in a box along the same axes."""
+    check_axes(grid, box)
+    shares = []
+    for n, low, high in zip(grid.shape, *_faces(grid, box)):
+        places = np.arange(n)
+        shares.append(torch.as_tensor((np.minimum(places + 0.5, high) - np.maximum(places - 0.5, low)).clip(0, 1)))
+    return shares[0][:, None, None] * shares[1][:, None] * shares[2]
+
+
+def interpolated(volume: Tensor, grid: Grid, onto: Grid, fill: float) -> Tensor:
+    """A volume (X, Y, Z) on `grid`, trilinearly on the voxels of another grid along the same axes; `fill` lies outside
+    its box."""
+    check_axes(grid, onto)
+    first, step = grid.index(onto.affine[:3, 3]), np.divide(onto.spacing, grid.spacing)
+    found = volume - fill
+    for axis, n in enumerate(grid.shape):
+        places = torch.as_tensor(first[axis] + step[axis] * np.arange(onto.shape[axis]))
+        inside = (places >= -0.5 - SLACK) & (places <= n - 0.5 + SLACK)
+        distance = (places.clamp(0, n - 1)[:, None] - torch.arange(n)).abs()
+        weights = ((1 - distance).clamp(min=0) * inside[:, None]).to(volume)
+        found = torch.tensordot(weights, found.movedim(axis, 0), 1).movedim(0, axis)
+    return found.contiguous() + fill
+
+
+def outside_projection(mu: Tensor, grid: Grid, projector: Projector) -> Tensor:
+    """Line integrals (K, V, U), along the projector's rays, of what of mu (X, Y, Z) in 1/mm on `grid` lies outside the
+    projector's own box."""
+    outside = mu * (1 - share_inside(grid, projector.grid)).to(mu)
+    return Projector(grid, projector.beam, projector.method, device=mu.device, full_detector=True)(
+        outside[None, None])[0]
+
+
+def refinements(start: Grid, target: Grid) -> list[Grid]:
+    """Grids over the target's box, each of voxels about half as long as those before it, `start`'s first, up to the
+    target; none where that is `start`."""
+    check_axes(start, target)
+    if start.same_as(target):
+        return []
+    halvings = max(1, round(math.log2(max(np.divide(start.spacing, target.spacing)))))
+    shapes = [[math.ceil(n / 2**k) for n in target.shape] for k in range(halvings - 1, 0, -1)]
+    return [in_other_voxels(target, shape) for shape in shapes] + [target]
+
+
+def in_other_voxels(grid: Grid, shape: Sequence[int]) -> Grid:
+    """The same box in other voxels."""
+    affine = grid.affine.copy()
+    affine[:3, :3] *= np.divide(grid.shape, shape)
+    affine[:3, 3] = grid.centre - affine[:3, :3] @ ((np.asarray(shape) - 1) / 2)
+    return Grid(tuple(shape), affine=affine)
+
+
+def _faces(grid: Grid, box: Grid) -> tuple[np.ndarray, np.ndarray]:
+    """The first and last faces (3,) of a box, as the grid's indices."""
+    first, last = (box.affine[:3, :3] @ ends + box.affine[:3, 3]
+                   for ends in (np.full(3, -0.5), np.asarray(box.shape) - 0.5))
+    return grid.index(first), grid.index(last)

@@ -1,0 +1,71 @@
+"""Sharpness: widths of blurred edges in closed form, and contrasts that scale as they must."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from phydict.evaluation.sharpness import edge_spread, edge_width, nodule, recovered_contrast, vessel_visibility
+from phydict.grid import Grid
+
+GRID = Grid.box((40, 24, 60), (120.0, 72.0, 120.0))  # 3, 3 and 2 mm
+
+
+def chest(sigma: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """HU of a box of lung in tissue, its faces blurred by a Gaussian of sigma mm, and the lung's mask."""
+    shares, inside = [], []
+    for axis, half in ((0, 36.0), (1, 24.0), (2, 33.0)):
+        places = (np.arange(GRID.shape[axis]) - (GRID.shape[axis] - 1) / 2) * GRID.spacing[axis]
+        shares.append(torch.tensor([(math.erf((half - p) / sigma / 2**0.5) + math.erf((half + p) / sigma / 2**0.5)) / 2
+                                    for p in places]))
+        inside.append(torch.from_numpy(abs(places) < half))
+    share, mask = (x[0][:, None, None] * x[1][:, None] * x[2] for x in (shares, inside))
+    return 50 - 850 * share, mask.float()
+
+
+@pytest.mark.parametrize("edge", ["diaphragm", "chest_wall"])
+@pytest.mark.parametrize("sigma", [4.0, 6.0])
+def test_a_blurred_step_is_as_wide_as_its_gaussian(edge, sigma):
+    hu, lung = chest(sigma)
+    inner = lung.clone()
+    inner[:, :9] = inner[:, -9:] = 0  # away from the other edges
+    assert edge_spread(hu, inner, GRID, edge) == pytest.approx(2.5631 * sigma, rel=0.1)
+
+
+def test_a_width_depends_on_neither_contrast_nor_direction_and_is_in_mm():
+    profile = torch.linspace(0, 1, 11) ** 2
+    width = edge_width(profile, 1.0)
+    assert width == pytest.approx(10 * (0.9**0.5 - 0.1**0.5), rel=0.02)
+    assert edge_width(700 - 300 * profile, 1.0) == pytest.approx(width, rel=1e-5)
+    assert edge_width(1 - profile.flip(0), 3.0) == pytest.approx(3 * width, rel=1e-5)
+
+
+def test_an_edge_that_no_line_crosses_is_refused():
+    with pytest.raises(ValueError, match="no line crosses the diaphragm"):
+        edge_spread(torch.zeros(GRID.shape), torch.zeros(GRID.shape), GRID, "diaphragm")
+
+
+def test_vessels_show_in_proportion_to_their_contrast():
+    lung = torch.zeros(GRID.shape)
+    lung[8:32, 6:18, 10:50] = 1
+    truth = torch.where(torch.rand(GRID.shape, generator=torch.Generator().manual_seed(0)) < 0.02, -300.0, -850.0)
+    for share in (1.0, 0.4, 0.0):
+        assert vessel_visibility(-850 + share * (truth + 850), truth, lung) == pytest.approx(share, abs=1e-5)
+    assert vessel_visibility(truth + 200, truth, lung) == pytest.approx(1, abs=1e-5)
+
+
+@pytest.mark.parametrize("diameter", [6.0, 12.0, 20.0])
+def test_a_nodule_has_its_volume_and_its_contrast_is_recovered(diameter):
+    centre = (10.0, -5.0, 7.0)
+    ball = nodule(GRID, centre, diameter)
+    assert float(ball.sum()) * math.prod(GRID.spacing) == pytest.approx(math.pi / 6 * diameter**3, rel=0.15)
+    without = torch.full(GRID.shape, -850.0)
+    index = torch.stack(torch.meshgrid(*map(torch.arange, GRID.shape), indexing="ij"), -1)
+    found = (ball[..., None] * index).sum((0, 1, 2)) / ball.sum()
+    np.testing.assert_allclose(found, GRID.index(centre), atol=0.1)
+    shares = [recovered_contrast(without + part * 400 * ball, without, GRID, centre, diameter, 400.0)
+              for part in (0.0, 0.5, 1.0)]
+    assert shares[0] == 0 and shares[1] == pytest.approx(shares[2] / 2) and 0.3 < shares[2] <= 1
+    everywhere = recovered_contrast(without + 100, without, GRID, centre, diameter, 400.0)
+    assert everywhere == pytest.approx(0, abs=1e-5)

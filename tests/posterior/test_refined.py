@@ -1,0 +1,167 @@
+"""Refinement on finer voxels: what it keeps, what it gains, and regions of interest."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from laws import random_like
+from prior.tiny import tiny_prior, tiny_super_resolution
+
+from phydict.baselines import CGLS, FISTATV, SIRT, Region
+from phydict.grid import Grid
+from phydict.methods import fit_to_grid, onto_grid, reconstruct, reconstructor
+from phydict.posterior import Measurement, PriorOnly, ProximalCG, Refined, Refinement
+from phydict.units import HUWindow, hu_to_mu
+from phydict.xray import ConeBeam, Projector
+
+BEAM = ConeBeam.orbit(6, 1020, 740, (56, 56), 10.0)
+FINE, WINDOW = Grid.cube(64), HUWindow(-1000, 600)
+
+
+def chest() -> torch.Tensor:
+    """HU (64, 64, 64) of an ellipse with two lungs and a small dense rod."""
+    x, y, z = torch.meshgrid(*[torch.linspace(-190, 190, 64)] * 3, indexing="ij")
+    hu = torch.full(FINE.shape, -1000.0)
+    hu[((x / 150) ** 2 + (y / 105) ** 2 < 1) & (z.abs() < 170)] = 30.0
+    hu[(((x.abs() - 70) / 50) ** 2 + (y / 75) ** 2 < 1) & (z.abs() < 130)] = -800.0
+    hu[((x - 70) ** 2 + (y - 10) ** 2 < 14**2) & (z.abs() < 60)] = 60.0
+    return hu
+
+
+@pytest.fixture(scope="module")
+def xrays() -> torch.Tensor:
+    return Projector(FINE, BEAM, full_detector=True)(hu_to_mu(chest())[None, None])[0]
+
+
+class Known:
+    """A method that is bound to voxels and knows the chest there by its means."""
+
+    full_detector, citation, mu_water, name, window, survey = False, "known", 0.02, "known", WINDOW, None
+
+    def __init__(self, voxels: int = 16):
+        self.grid = Grid.cube(voxels)
+
+    def steps(self):
+        return 1
+
+    def with_mu_water(self, mu_water):
+        return self
+
+    def reconstruct(self, xrays, projector, report="", display=False, seed=0, on_step=lambda: None):
+        found = reconstructor(PriorOnly(1), tiny_prior(False)).reconstruct(
+            *fit_to_grid(self, Grid.cube(16), xrays, projector.beam), display=display)
+        factor = 64 // self.grid.shape[0]
+        on_step()
+        return replace(found, volume=torch.nn.functional.avg_pool3d(chest()[None], factor)[0], grid=self.grid,
+                       masks=torch.rand(2, *self.grid.shape), deviation=torch.ones(self.grid.shape))
+
+
+def refined(grid: Grid, xrays: torch.Tensor, refinement: Refinement = Refinement(), voxels: int = 16, **settings):
+    ready = Refined(Known(voxels), grid, refinement)
+    return ready.reconstruct(*fit_to_grid(ready, grid, xrays, BEAM), **settings)
+
+
+def error(volume: torch.Tensor, truth: torch.Tensor) -> float:
+    return float((volume - truth).square().mean().sqrt())
+
+
+def test_the_own_grid_is_no_refinement_and_changes_nothing(xrays):
+    prior = tiny_prior(False)
+    own, same = (reconstruct(xrays, BEAM, prior, PriorOnly(2), grid=grid) for grid in (None, Grid.cube(16)))
+    assert own.volume.equal(same.volume) and same.coarse is None
+
+
+def test_refining_leaves_what_explains_the_xrays_to_the_solvers_tolerance():
+    x = WINDOW.to_range(chest())[None, None].double()
+    projector = Projector(FINE, BEAM, full_detector=True)
+    y = projector(WINDOW.to_mu(x))[0]
+    noise = 1e-4 * y.max() * random_like(y.shape)
+    for observed, tolerance in ((y, 1e-9), (y + noise, 2e-3)):
+        z = ProximalCG(10, 3)(Measurement(projector, observed, WINDOW), x, 0.2)
+        assert error(z, x) < tolerance
+
+
+def test_meeting_the_xrays_on_fine_voxels_beats_interpolation(xrays):
+    interpolated, met = (refined(FINE, xrays, refinement) for refinement in (Refinement(None), Refinement()))
+    assert met.misfit < 0.3 * interpolated.misfit
+    assert error(met.volume, chest()) < 0.8 * error(interpolated.volume, chest())
+    assert met.volume.shape == met.masks.shape[1:] == met.deviation.shape == FINE.shape and met.grid is FINE
+    assert met.coarse.volume.shape == (16,) * 3 and met.projector_calls > interpolated.projector_calls
+
+
+def test_every_level_is_one_step_and_figures_belong_to_the_volume(xrays):
+    steps, target = [], Grid.box((31, 40, 27), (384, 360, 390))
+    ready = Refined(Known(), target)
+    y, projector = fit_to_grid(ready, target, xrays, BEAM)
+    found = ready.reconstruct(y, projector, on_step=lambda: steps.append(1))
+    assert len(steps) == ready.steps() == 2 and set(found.seconds) == {"base", "refine", "score"}
+    again = projector(hu_to_mu(found.volume)[None, None])[0]
+    torch.testing.assert_close(found.reprojection, again + found.reprojection - again)
+    assert found.misfit == pytest.approx(float((found.reprojection - y).norm() / y.norm()), rel=1e-4)
+
+
+def test_a_region_is_the_full_reconstruction_inside_its_box(xrays):
+    """To 60 HU in the root mean square where the coarse volume outside is right to its voxels' 24 mm, and 4 times
+    better than where nothing is known of the outside."""
+    inner = (slice(24, 56), slice(16, 48), slice(20, 44))  # of a lung and the rod, cut laterally
+    region = Grid.box((32, 32, 24), (192.0, 192.0, 144.0), (48.0, 0.0, 0.0))
+    np.testing.assert_allclose(region.affine[:3, 3], FINE.affine[:3, :3] @ [24, 16, 20] + FINE.affine[:3, 3])
+    full, part = refined(FINE, xrays, voxels=32).volume[inner], refined(region, xrays, voxels=32)
+    assert error(part.volume, full) < 60
+    alone = FISTATV(60).reconstruct(*fit_to_grid(FISTATV(), region, xrays, BEAM))
+    assert error(part.volume, full) < 0.25 * error(alone.volume, full)
+    assert part.misfit < 0.05 and part.xrays.max() == pytest.approx(float(xrays.max()), rel=0.05)
+
+
+@pytest.mark.parametrize("method", [SIRT(40), CGLS(10, 3, HUWindow()), FISTATV(30)],
+                         ids=lambda method: method.name)
+def test_a_method_without_a_prior_accounts_for_what_lies_outside_its_box(xrays, method):
+    region = Grid.box((24, 32, 24), (144.0, 192.0, 144.0), (48.0, 0.0, 0.0))
+    truth = chest()[28:52, 16:48, 20:44]
+    ready = onto_grid(method, region)
+    assert isinstance(ready, Region) and ready.steps() == 2 * method.steps()
+    y, projector = fit_to_grid(ready, region, xrays, BEAM)
+    part, alone = (way.reconstruct(y, projector) for way in (ready, method))
+    assert error(part.volume, truth) < 0.8 * error(alone.volume, truth)
+    assert part.coarse.grid.shape == (64, 64, 64) and part.grid is region
+
+
+def test_a_local_method_gives_in_a_box_what_it_gives_there_in_the_whole(xrays):
+    region = Grid.box((24, 32, 24), (144.0, 192.0, 144.0), (48.0, 0.0, 0.0))
+    whole, part = (reconstruct(xrays, BEAM, method="fdk", grid=grid) for grid in (None, region))
+    torch.testing.assert_close(part.volume, whole.volume[28:52, 16:48, 20:44], atol=0.1, rtol=1e-4)
+    assert part.misfit == pytest.approx(whole.misfit, rel=0.3)
+
+
+def test_display_values_are_matched_by_what_the_coarse_volume_shows(xrays):
+    region = Grid.box(24, 144.0, (48.0, 0.0, 0.0))
+    for ready in (onto_grid(CGLS(10, 3, HUWindow()), region), Refined(Known(), region)):
+        y, projector = fit_to_grid(ready, region, 7 + 3 * xrays, BEAM)
+        found = ready.reconstruct(y, projector, display=True)
+        assert (found.xrays - fit_to_grid(ready, region, xrays, BEAM)[0]).norm() < 0.2 * xrays.norm()
+
+
+def test_a_trained_stage_comes_before_the_refinement(xrays):
+    ready = onto_grid(reconstructor(PriorOnly(2), tiny_prior(False), super_resolution=tiny_super_resolution()),
+                      Grid.cube(64))
+    assert [level.shape[0] for level in ready.levels] == [64] and ready.base.grid.shape[0] == 32
+    assert onto_grid(ready.base, Grid.cube(32)) is ready.base
+    found = ready.reconstruct(*fit_to_grid(ready, FINE, xrays, BEAM))
+    assert found.coarse.volume.shape == (32,) * 3 and found.misfit < found.coarse.misfit
+
+
+def test_the_attenuation_of_water_reaches_every_level(xrays):
+    way = {"prior": tiny_prior(False), "method": PriorOnly(2), "grid": Grid.cube(32)}
+    usual = reconstruct(xrays, BEAM, **way).volume
+    told, untold = (reconstruct(0.8 * xrays, BEAM, **way, **more).volume for more in ({"mu_water": 0.016}, {}))
+    assert error(told, usual) < 0.2 * error(untold, usual)
+
+
+@pytest.mark.parametrize("method", [PriorOnly(2), SIRT(2)], ids=["prior", "sirt"])
+def test_more_voxels_than_memory_are_refused_with_their_gib_before_work_starts(xrays, monkeypatch, method):
+    monkeypatch.setattr("os.sysconf", {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 2**18}.__getitem__)  # 1 GiB
+    steps, grid = [], Grid.cube(300)
+    with pytest.raises(ValueError, match=r"300 x 300 x 300 voxels.* would take [\d,.]+ GiB of memory.* has 1\.0"):
+        reconstruct(xrays, BEAM, tiny_prior(False), method, grid=grid, on_step=lambda: steps.append(1))
+    assert not steps

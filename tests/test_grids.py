@@ -1,0 +1,121 @@
+"""Any voxels on the command line: predict, test and ablate write them where they belong."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import nibabel
+import numpy as np
+import pytest
+import torch
+import yaml
+from command_lines import refusal
+from prior.tiny import tiny_prior
+
+from phydict.cli.infer import main
+from phydict.datasets import phantom_case, save_xrays
+from phydict.evaluation import read_csv
+from phydict.grid import Grid
+from phydict.inference.protocols import cut_out, placed, whole
+from phydict.prior import save_prior
+from phydict.units import HUWindow
+from phydict.xray import ConeBeam, Projector
+
+BEAM = ConeBeam.orbit(3, 1020.0, 740.0, (24, 24), 24.0)
+ORBIT = ["--data.orbit.views=3", "--data.orbit.detector=[24,24]", "--data.orbit.pixel=[24,24]"]
+REGION = Grid.box((15, 12, 9), (180.0, 120.0, 90.0), (40.0, -10.0, 20.0))
+BOX = ["--model.grid.voxels=[15,12,9]", "--model.grid.side=[180,120,90]", "--model.grid.centre=[40,-10,20]"]
+
+
+@pytest.fixture(scope="module")
+def prior(tmp_path_factory) -> Path:
+    file = tmp_path_factory.mktemp("prior") / "tiny.safetensors"
+    save_prior(tiny_prior(False), file)
+    return file
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("measured") / "anna"
+    truth = HUWindow().to_mu(phantom_case(1, Grid.cube(32))["volume"])
+    save_xrays(folder, Projector(Grid.cube(32), BEAM, full_detector=True)(truth[None])[0], BEAM)
+    return folder
+
+
+def arguments(command: str, out: Path, prior: Path, *more: str, method: str = "prior_only") -> list[str]:
+    return [command, f"--model.method={method}", "--model.method.init_args.iterations=2", f"--model.prior={prior}",
+            f"--model.out={out}", "--trainer.accelerator=cpu", *more]
+
+
+@pytest.mark.parametrize("method", ["prior_only", "sirt"])
+def test_predict_writes_any_box_with_its_affine_and_the_coarse_volume_on_request(measured, prior, tmp_path, capsys,
+                                                                                 method):
+    main(arguments("predict", tmp_path, prior, f"--data.xrays={measured}", *BOX, "--model.grid.keep_coarse=true",
+                   method=method))
+    folder = tmp_path / method / "anna"
+    fine, coarse = (nibabel.load(folder / name) for name in ("volume.nii.gz", "coarse.nii.gz"))
+    np.testing.assert_allclose(fine.affine, REGION.affine)
+    assert fine.shape == (15, 12, 9) and coarse.shape == ((16,) * 3 if method == "prior_only" else (64,) * 3)
+    np.testing.assert_allclose(coarse.affine, Grid.cube(coarse.shape[0]).affine)
+    said = json.loads((folder / "reconstruction.json").read_text())["settings"]
+    assert Grid(**said["grid"]).same_as(REGION) and ("refinement" in said) == (method == "prior_only")
+    told = "15 x 12 x 9 voxels: the X-rays and total variation alone" in capsys.readouterr().err
+    assert told == (method == "prior_only")
+
+
+def test_another_grid_is_another_setting(measured, prior, tmp_path, capsys):
+    main(arguments("predict", tmp_path, prior, f"--data.xrays={measured}", "--model.grid=24"))
+    assert not (tmp_path / "prior_only" / "anna" / "coarse.nii.gz").exists()
+    said = refusal(capsys, main, arguments("predict", tmp_path, prior, f"--data.xrays={measured}", "--model.grid=20"))
+    assert "other settings" in said or "settings" in said
+
+
+def test_test_and_ablate_score_a_region_alike_inside_its_box(prior, tmp_path):
+    main(arguments("test", tmp_path, prior, "--data.cts=phantom", "--data.phantoms=1", *ORBIT, *BOX,
+                   "--model.sampling.with_report=false"))
+    (row,) = read_csv(tmp_path / "prior_only" / "results.csv")
+    (case,) = (path for path in (tmp_path / "prior_only").iterdir() if path.is_dir())
+    np.testing.assert_allclose(nibabel.load(case / "volume.nii.gz").affine, REGION.affine)
+    spec = {"phantoms": 1, "out": str(tmp_path / "ablate"), "methods": {"plain": {"of": "prior_only", "refine": False}},
+            "base": {"voxels": [15, 12, 9], "side": [180, 120, 90], "centre": [40, -10, 20], "views": 3,
+                     "detector": 24, "pixel": 24, "method.iterations": 2, "prior": str(prior), "report": False},
+            "axes": {"method": ["prior_only", "plain", "sirt"]}}
+    (tmp_path / "spec.yaml").write_text(yaml.safe_dump(spec))
+    main(["ablate", "-c", str(tmp_path / "spec.yaml"), "--device", "cpu"])
+    rows = {own["method"]: own for own in read_csv(tmp_path / "ablate" / "results.csv")}
+    assert rows["prior_only"]["psnr"] == pytest.approx(row["psnr"], rel=1e-4)
+    assert rows["prior_only"]["misfit"] < rows["plain"]["misfit"] and rows["sirt"]["status"] == "ok"
+    assert {own["grid"] for own in rows.values()} == {"15x12x9"}
+
+
+def test_more_voxels_than_memory_are_refused_before_anything_is_written(measured, prior, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("os.sysconf", {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 2**18}.__getitem__)  # 1 GiB
+    said = refusal(capsys, main, arguments("predict", tmp_path / "out", prior, f"--data.xrays={measured}",
+                                           "--model.grid=300"))
+    assert "300 x 300 x 300 voxels" in said and "GiB" in said and not (tmp_path / "out").exists()
+
+
+def test_xrays_of_a_region_are_those_of_the_whole_chest():
+    assert whole(Grid.cube(96)).same_as(Grid.cube(96)) and whole(Grid.cube(80, 500.0)).same_as(Grid.cube(80, 500.0))
+    assert whole(REGION).same_as(Grid.cube(64)) and whole(Grid.box(64, 192.0)).same_as(Grid.cube(128))
+    assert whole(Grid.box(100, 100.0)).same_as(Grid.cube(256))
+
+
+def test_what_is_cut_out_lies_where_it_lay_in_the_ct():
+    scene, window = Grid.cube(16), HUWindow()
+    box = Grid.box((4, 5, 3), (96.0, 120.0, 72.0), (24.0, 12.0, -36.0))  # whole voxels of the scene
+    affine = np.diag([24.0, 24.0, 24.0, 1.0])
+    affine[:3, 3] = 7.0, -300.0, 1100.0
+    place = torch.linspace(-0.3, 0.3, 16)
+    ramp = (place[:, None, None] + 0.5 * place[:, None] - place)[None]  # which averages of neighbours leave as it is
+    case = {"volume": ramp, "masks": 0.5 + ramp.expand(3, -1, -1, -1) / 2, "affine": torch.from_numpy(affine)}
+    found = cut_out(case, scene, box, window)
+    part = (slice(None), slice(7, 11), slice(6, 11), slice(5, 8))
+    torch.testing.assert_close(found["volume"], case["volume"][part], atol=1e-5, rtol=0)
+    torch.testing.assert_close(found["masks"], case["masks"][part], atol=1e-5, rtol=0)
+    fine = torch.nn.functional.interpolate(ramp[None], 64, mode="trilinear")[0]
+    torch.testing.assert_close(cut_out(case | {"fine": fine}, scene, box, window)["volume"], found["volume"],
+                               atol=1e-5, rtol=0)
+    np.testing.assert_allclose(found["affine"][:3, 3], affine[:3, :3] @ [7, 6, 5] + affine[:3, 3])
+    np.testing.assert_allclose(placed(box, box, found["affine"].numpy()).affine, found["affine"])

@@ -1,0 +1,90 @@
+"""Boxes of voxels over and inside one another."""
+
+import numpy as np
+import pytest
+import torch
+from laws import random_like
+
+from phydict.grid import Box, Grid
+from phydict.xray import ConeBeam, Projector
+from phydict.xray.boxes import covers, interpolated, outside_projection, refinements, share_inside
+
+BASE = Grid.cube(16)
+BEAM = ConeBeam.orbit(3, 1020, 740, (28, 28), 20.0)
+
+
+def linear(grid: Grid) -> torch.Tensor:
+    """A volume that is affine in the world's coordinates, at a grid's voxels."""
+    index = np.stack(np.meshgrid(*map(np.arange, grid.shape), indexing="ij"), -1)
+    world = index @ grid.affine[:3, :3].T + grid.affine[:3, 3]
+    return torch.from_numpy(world @ [1.0, -2.0, 0.5] + 7.0)
+
+
+@pytest.mark.parametrize("voxels, side, centre", [
+    (16, 384.0, (0, 0, 0)), ((31, 17, 8), (310.0, 170.0, 160.0), (5.0, -10.0, 20.0)), ([9, 9, 9], 90, [0, 0, -60])])
+def test_a_box_has_the_sides_and_the_centre_that_were_given(voxels, side, centre):
+    grid = Box(voxels, side, centre).grid()
+    np.testing.assert_allclose(grid.extent, np.broadcast_to(side, 3))
+    np.testing.assert_allclose(grid.centre, centre, atol=1e-9)
+    assert grid.shape == tuple(np.broadcast_to(voxels, 3))
+
+
+@pytest.mark.parametrize("box, words", [
+    (Box(), "give model.grid.voxels"), (Box((4, 4)), "whole number of voxels"), (Box(0), "whole number of voxels"),
+    (Box(4, -1.0), "length in mm"), (Box(4, 10.0, (0, float("nan"), 0)), "three numbers in mm"),
+    (Box(100_000), "GiB of memory")])
+def test_a_box_that_cannot_be_is_refused(box, words):
+    with pytest.raises(ValueError, match=words):
+        box.grid()
+
+
+@pytest.mark.parametrize("onto", [Grid.cube(32), Grid.box((13, 8, 21), (200, 150, 230), (20, -30, 10))])
+def test_interpolation_keeps_what_is_linear_and_fills_what_lies_outside(onto):
+    found = interpolated(linear(BASE), BASE, onto, -5.0)
+    index = np.stack(np.meshgrid(*map(np.arange, onto.shape), indexing="ij"), -1)
+    inner = BASE.index(index @ onto.affine[:3, :3].T + onto.affine[:3, 3])
+    inner = torch.from_numpy(((inner >= 0) & (inner <= 15)).all(-1))
+    assert inner.float().mean() > 0.7
+    torch.testing.assert_close(found[inner], linear(onto)[inner])
+    beyond = interpolated(linear(BASE), BASE, Grid.box(4, 40.0, (400.0, 0.0, 0.0)), -5.0)
+    assert (beyond == -5).all()
+
+
+def test_shares_of_a_box_sum_to_its_volume_and_are_whole_inside():
+    box = Grid.box((5, 7, 9), (101.0, 200.0, 93.0), (11.0, -20.0, 30.0))
+    share = share_inside(BASE, box)
+    assert float(share.sum()) * np.prod(BASE.spacing) == pytest.approx(101 * 200 * 93)
+    assert share.max() == 1 and share.min() == 0
+    assert (share_inside(BASE, BASE) == 1).all()
+
+
+def test_what_lies_inside_and_outside_a_box_projects_to_the_whole():
+    box = Grid.box(8, (192.0, 192.0, 192.0))  # whose faces are those of voxels
+    mu = random_like(BASE.shape).abs()
+    inner = mu[4:12, 4:12, 4:12]
+    projector = Projector(box, BEAM, "siddon", full_detector=True)
+    whole = Projector(BASE, BEAM, "siddon", full_detector=True)(mu[None, None])[0]
+    found = outside_projection(mu, BASE, projector) + projector(inner[None, None].contiguous())[0]
+    torch.testing.assert_close(found, whole)
+
+
+def test_a_box_covers_itself_and_what_lies_inside_alone():
+    assert covers(BASE, BASE) and covers(BASE, Grid.box(3, 100.0)) and covers(Grid.cube(7, 400.0), BASE)
+    assert not covers(BASE, Grid.box(3, 100.0, (150.0, 0.0, 0.0))) and not covers(Grid.cube(64, 300.0), BASE)
+
+
+def test_voxels_halve_from_level_to_level_up_to_the_target():
+    assert refinements(BASE, Grid.cube(16)) == []
+    target = Grid.box((96, 50, 65), (360.0, 200.0, 384.0), (0.0, 10.0, 0.0))  # 3.75, 4 and 5.9 mm of 24 mm
+    levels = refinements(BASE, target)
+    assert [level.shape for level in levels] == [(24, 13, 17), (48, 25, 33), (96, 50, 65)]
+    for level in levels:
+        np.testing.assert_allclose(level.extent, target.extent)
+        np.testing.assert_allclose(level.centre, target.centre, atol=1e-9)
+    assert [level.shape[0] for level in refinements(Grid.cube(64), Grid.cube(256))] == [128, 256]
+
+
+def test_turned_axes_are_refused():
+    turned = Grid((4, 4, 4), affine=np.array([[0.0, -9, 0, 0], [9, 0, 0, 0], [0, 0, 9, 0], [0, 0, 0, 1]]))
+    with pytest.raises(ValueError, match="give a box along the same axes"):
+        refinements(BASE, turned)

@@ -73,8 +73,8 @@ class Refined(Reconstructor):
     the box (region-of-interest tomography; Ziegler, Nielsen & Grass 2008, Medical Physics 35(4)). Scatter that the
     base found is subtracted; display values are matched to the estimate anew.
 
-    Masks and deviations of the result are the base's, interpolated. Intervals, which are calibrated for the base's voxels
-    alone, stay with `Reconstruction.coarse`.
+    Masks and deviations of the result are the base's, interpolated. Intervals, which are calibrated for the base's
+    voxels alone, stay with `Reconstruction.coarse`.
 
     Args:
         base: the method, bound to voxels of its own

@@ -77,7 +77,7 @@ def test_a_file_is_read_anew_when_it_is_replaced(file):
 
 def test_what_a_rival_is_not_for_is_refused(file, tmp_path):
     with pytest.raises(ValueError, match=r"trained on \(16, 16, 16\) voxels"):
-        reconstruct(xrays(), ORBIT, method=TrainedRival(file), grid=Grid.cube(32))
+        TrainedRival(file).reconstruct(xrays(), Projector(Grid.cube(32), ORBIT, full_detector=True))
     with pytest.raises(ValueError, match="no file was given"):
         reconstruct(xrays(), ORBIT, method=TrainedRival(), grid=GRID)
     with pytest.raises(ValueError, match="there is no rival's file"):
@@ -88,6 +88,12 @@ def test_what_a_rival_is_not_for_is_refused(file, tmp_path):
         Rival(LiftedNetwork(), Grid.cube(20), WINDOW)
     with pytest.raises(ValueError, match="precision"):
         TrainedRival(file, "half")
+
+
+def test_other_voxels_are_refined_from_the_rivals_own(file):
+    found = reconstruct(xrays(), ORBIT, method=TrainedRival(file), grid=Grid.cube(32))
+    assert found.volume.shape == (32, 32, 32) and found.coarse.grid.same_as(GRID)
+    assert found.misfit < found.coarse.misfit
 
 
 def test_a_prior_is_no_rival_and_a_rival_no_prior(file, tmp_path):

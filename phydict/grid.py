@@ -90,11 +90,11 @@ class Grid:
         if place.shape != (3,) or not (abs(place) < 1e6).all():
             raise ValueError("the centre of a box of voxels is three numbers in mm from the isocentre, but "
                              f"{reprlib.repr(centre)} was given")
-        shape = shape * 3 if len(shape) == 1 else shape
-        spacing = np.broadcast_to(lengths, 3) / shape
+        x, y, z = shape * 3 if len(shape) == 1 else shape
+        spacing = np.broadcast_to(lengths, 3) / (x, y, z)
         affine = np.diag([*spacing, 1.0])
-        affine[:3, 3] = place - spacing * (np.asarray(shape) - 1) / 2
-        return cls(shape, affine=affine)
+        affine[:3, 3] = place - spacing * (np.array([x, y, z]) - 1) / 2
+        return cls((x, y, z), affine=affine)
 
     @property
     def centre(self) -> np.ndarray:

@@ -61,7 +61,7 @@ class Region(Reconstructor):
         return self.method.name
 
     def with_mu_water(self, mu_water: float) -> Region:
-        return replace(self, method=self.method.with_mu_water(mu_water))
+        return replace(self, method=self.method.with_mu_water(mu_water))  # type: ignore[arg-type]
 
     def steps(self) -> int:
         return 2 * self.method.steps()

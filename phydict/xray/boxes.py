@@ -85,10 +85,11 @@ def refinements(start: Grid, target: Grid) -> list[Grid]:
 
 def in_other_voxels(grid: Grid, shape: Sequence[int]) -> Grid:
     """The same box in other voxels."""
+    x, y, z = shape
     affine = grid.affine.copy()
     affine[:3, :3] *= np.divide(grid.shape, shape)
     affine[:3, 3] = grid.centre - affine[:3, :3] @ ((np.asarray(shape) - 1) / 2)
-    return Grid(tuple(shape), affine=affine)
+    return Grid((x, y, z), affine=affine)
 
 
 def _faces(grid: Grid, box: Grid) -> tuple[np.ndarray, np.ndarray]:

@@ -36,16 +36,15 @@ def test_a_rivals_file_gives_it_back(file):
     assert -1000 <= found.volume.min() < found.volume.max() <= 600
 
 
-def test_the_command_line_takes_a_rivals_file(file, tmp_path, monkeypatch, capsys):
+def test_the_command_line_takes_a_rivals_file(file, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     args = ["test", "--data.cts=phantom", "--data.phantoms=1", "--data.orbit.views=2", "--model.out=out",
             "--model.method=phydict.rivals.TrainedRival", f"--model.method.init_args.file={file}",
             "--model.name=lifted"]
-    infer([*args, "--model.cube.voxels=16"])
-    assert len(read_csv(tmp_path / "out" / "lifted" / "results.csv")) == 1
-    with pytest.raises(SystemExit):
-        infer([*args, "--model.cube.voxels=32", "--model.overwrite=true"])
-    assert "trained on (16, 16, 16) voxels" in capsys.readouterr().err
+    infer(args)
+    assert [row["grid"] for row in read_csv(tmp_path / "out" / "lifted" / "results.csv")] == ["16x16x16"]
+    infer([*args, "--model.grid=24", "--model.overwrite=true"])
+    assert [row["grid"] for row in read_csv(tmp_path / "out" / "lifted" / "results.csv")] == ["24x24x24"]
 
 
 def test_hu_do_not_depend_on_what_water_attenuates(file):

@@ -249,7 +249,7 @@ class ReconstructionTask(lightning.LightningModule):
     def _start(self, cases: int) -> None:
         if isinstance(self.plain, CascadePosterior):
             self.plain.check_memory(self.device)
-        if isinstance(self.reconstructor, Refined):
+        if isinstance(self.reconstructor, Refined) and not (self.progress.quiet or self.progress.json):
             sizes = " and ".join(" x ".join(map(str, level.shape)) for level in self.reconstructor.levels)
             print(f"no trained stage was given for {sizes} voxels: the X-rays and total variation alone refine to them",
                   file=sys.stderr)

@@ -269,8 +269,7 @@ class ReconstructionTask(lightning.LightningModule):
         xrays, beam, display = case["xrays"].to(self.device), case["beam"], case.get("display", False)
         found: FoundPoses | None = None
         if self.calibrate:
-            xrays, found = calibrated(ready, ready.survey or self.grid, xrays, beam,
-                                       _uncertain(case), display)
+            xrays, found = calibrated(ready, ready.survey or self.grid, xrays, beam, _uncertain(case), display)
             beam = found.beam
         with stage("fit to grid"):
             xrays, projector = fit_to_grid(ready, self.grid, xrays, beam, self.projector)

@@ -27,7 +27,7 @@ class Reconstruction:
     of the volume; masks: soft anatomy masks (M, X, Y, Z) in [0, 1] where the method gives them; deviation: HU
     (X, Y, Z), the standard deviation of the samples of which the volume is the mean, where there are several;
     intervals: level -> HU (X, Y, Z), half the width of the interval around the volume that is to hold that share of
-    voxels, where the method knows it;
+    voxels, where the method knows it, and interval_widening, the factor by which they are wider than calibrated;
     diverged_at: the step, counted from 1, from which on the misfit had risen until the end, None where it had not;
     precision: what the networks computed in, or, without any, the X-rays' type;
     scatter: the mean share of the pixels' signal that was subtracted as scatter, and is no longer in xrays;
@@ -49,6 +49,7 @@ class Reconstruction:
     masks: Tensor | None = None
     deviation: Tensor | None = None
     intervals: dict[float, Tensor] = field(default_factory=dict)
+    interval_widening: float = 1.0
     diverged_at: int | None = None
     scatter: float = 0.0
     precision: str = "float32"

@@ -316,7 +316,7 @@ class ReconstructionTask(lightning.LightningModule):
         return {"case": case["id"], "method": self.method_name,
                 "citation": self.reconstructor.citation, "scores": scores, "misfit": result.misfit,
                 "misfit_per_view": result.misfit_per_view, "diverged_at": result.diverged_at, "scatter": result.scatter,
-                "interval_90_hu": self._body_interval(result),
+                "interval_90_hu": self._body_interval(result), "interval_widening": result.interval_widening,
                 "seconds": result.seconds, "network_calls": result.network_calls,
                 "projector_calls": result.projector_calls,
                 "process_peak_memory_mb": peak_memory(CPU),

@@ -36,6 +36,9 @@ WIDENING = 0.25
 """Power of the residual, over the most in calibration, by which intervals widen: of held-out CTs' polychromatic X-rays,
 missed by 1.3 to 4 times their noise, 91 to 98 % of the body is then in the 90 % interval."""
 
+FAR_OUTSIDE = 5.0
+"""How many times the most residual in calibration is far outside of it."""
+
 SCATTER_WIDENING = 2.0
 """Factor by which they widen where scatter is subtracted, which shifts HU where a tube's spectrum was taken for it."""
 
@@ -176,31 +179,29 @@ class Posterior(Reconstructor):
             measurement.subtract_scatter(reprojection)
             fit = guard.score(states if self.samples == 1 else None, reprojection, measurement.y)
             deviation = (prior.window.half_width * states[:, 0].std(0)).cpu() if self.samples > 1 else None
-            intervals = self._intervals(denoiser, measurement, ct)
+            intervals, widening = self._intervals(denoiser, measurement, ct)
         return Reconstruction(
             volume=prior.window.to_hu(ct[0, 0]).cpu(), grid=prior.grid, method=self.name, seed=seed,
             **fit, seconds=watch.seconds,
             network_calls=denoiser.calls * (2 if report and self.guidance != 1 else 1),
             projector_calls=measurement.calls, masks=((state[1:] + 1) / 2).cpu(), deviation=deviation,
-            intervals=intervals, scatter=measurement.scatter,
+            intervals=intervals, interval_widening=widening, scatter=measurement.scatter,
             precision=precision_name(self.precision, xrays))
 
-    def _intervals(self, denoiser: CountingDenoiser, measurement: Measurement, ct: Tensor) -> dict[float, Tensor]:
-        """Level -> half-widths in HU (X, Y, Z), none where the network does not know them; wider, with a warning, where
-        X-rays are missed by more than in any scene that they were calibrated on, or hold scatter."""
+    def _intervals(self, denoiser: CountingDenoiser, measurement: Measurement, ct: Tensor
+                   ) -> tuple[dict[float, Tensor], float]:
+        """Level -> half-widths in HU (X, Y, Z), none where the network does not know them, and the factor by which they
+        are wider than calibrated: where X-rays are missed by more than in any scene of the calibration, or hold
+        scatter. Warns where they are missed by more than FAR_OUTSIDE as much."""
         if not isinstance(denoiser, CountingRefiner) or denoiser.half_widths is None:
-            return {}
+            return {}, 1.0
         residual, most = float(measurement.normalised_residual(ct)), float(self.prior.uncertainty.most_residual)
-        if residual > most:
-            warn(f"the X-rays are missed by {residual:.3g} times their noise, more than in any scene that the "
-                 f"intervals were calibrated on ({most:.3g}): they are widened, and may still be too narrow")
-        widening = max(1.0, residual / most) ** WIDENING
-        if measurement.scatter:
-            warn("scatter was subtracted, which the intervals were not calibrated on: they are widened, and may still "
-                 "be too narrow")
-            widening *= SCATTER_WIDENING
+        if residual > FAR_OUTSIDE * most:
+            warn(f"the X-rays are missed by {residual:.3g} times their noise, in the scenes that the intervals were "
+                 f"calibrated on by {most:.3g} at most: they are widened, and may still be too narrow")
+        widening = max(1.0, residual / most) ** WIDENING * (SCATTER_WIDENING if measurement.scatter else 1.0)
         widths = widening * self.prior.window.half_width * denoiser.half_widths[0].cpu()
-        return dict(zip(LEVELS, widths))
+        return dict(zip(LEVELS, widths)), widening
 
 
 def check_guidance(guidance: float) -> None:

@@ -1,0 +1,62 @@
+"""The examples do what their READMEs say, command by command, with a fast method where none is named."""
+
+import re
+import runpy
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import phydict
+from phydict.cli.infer import main as infer
+
+ROOT = Path(__file__).parents[1]
+EXAMPLE = ROOT / "data" / "example"
+FAST = ["--model.method=sirt", "--model.method.init_args.iterations=2"]
+
+
+def written(out: Path) -> Path:
+    """The one record below a folder."""
+    [record] = out.rglob("reconstruction.json")
+    return record
+
+
+@pytest.mark.filterwarnings("ignore")  # of a method that is stopped early
+@pytest.mark.parametrize("folder", sorted(file.parent for file in EXAMPLE.glob("*/README.md")), ids=lambda f: f.name)
+def test_the_commands_of_an_examples_readme_run(folder, tmp_path, monkeypatch):
+    text = (folder / "README.md").read_text()
+    assert text.count("\n") <= 16
+    commands = [shlex.split(line) for block in re.findall(r"```\n(.*?)```", text, re.DOTALL) for line in
+                block.splitlines()]
+    assert any(words[:2] == ["python", "infer.py"] for words in commands)
+    monkeypatch.chdir(ROOT)
+    for words in commands:
+        if words[0] == "export":
+            name, _, path = words[1].partition("=")
+            assert name == "PYTHONPATH"
+            monkeypatch.syspath_prepend(path)
+        else:
+            more = [] if "--model.method" in words else FAST
+            infer([*words[2:], *more, f"--model.out={tmp_path}", "--trainer.accelerator=cpu"])
+    assert written(tmp_path).with_name("volume.nii.gz").is_file() and (tmp_path / "index.html").is_file()
+
+
+def test_the_geometries_are_those_that_the_readmes_speak_of():
+    ours, rtk = (phydict.load_xrays(EXAMPLE / "xrays", file) for file in (None, EXAMPLE / "rtk" / "geometry.yaml"))
+    assert torch.equal(ours["xrays"], rtk["xrays"])
+    for name in ("sources", "detectors", "u", "v"):
+        np.testing.assert_allclose(getattr(rtk["beam"], name), getattr(ours["beam"], name), atol=1e-3)
+    two = phydict.load_xrays(EXAMPLE / "two_radiographs" / "xrays")
+    assert two["display"] and two["xrays"].shape == (2, 112, 112)
+    for name, tolerance in (("sources", 1e-2), ("detectors", 1e-2)):
+        np.testing.assert_allclose(getattr(two["beam"], name), getattr(ours["beam"], name)[[0, 2]], atol=tolerance)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_the_walkthrough_prints_and_saves_pictures(tmp_path, capsys):
+    runpy.run_path(str(EXAMPLE / "walkthrough.py"))["main"](tmp_path, ("fdk",))
+    said = capsys.readouterr().out
+    assert "8 X-rays of 224 x 224 pixels" in said and "740 mm" in said and "fdk: " in said
+    assert {"fdk.png", "fdk.nii.gz", "comparison.png"} <= {file.name for file in tmp_path.iterdir()}

@@ -157,8 +157,9 @@ class Refined(Reconstructor):
         return replace(
             coarse, **found | {"diverged_at": coarse.diverged_at}, volume=volume.cpu(), grid=self.target,
             coarse=coarse, projector_calls=calls, seconds=watch.seconds, intervals={},
-            masks=None if coarse.masks is None else torch.stack([
-                interpolated(mask, base.grid, self.target, 0.0) for mask in coarse.masks]),
+            masks=None if coarse.masks is None else torch.cat([
+                coarse.masks.new_zeros(0, *self.target.shape),
+                *(interpolated(mask, base.grid, self.target, 0.0)[None] for mask in coarse.masks)]),
             deviation=None if spread is None else interpolated(spread, base.grid, self.target, 0.0))
 
     def _seen(self, xrays: Tensor, projector: Projector, grid: Grid) -> tuple[Tensor, Projector]:

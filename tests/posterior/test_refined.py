@@ -101,6 +101,19 @@ def test_every_level_is_one_step_and_figures_belong_to_the_volume(xrays):
     assert found.misfit == pytest.approx(float((found.reprojection - y).norm() / y.norm()), rel=1e-4)
 
 
+class Bare(Known):
+    """The same without masks and deviation."""
+
+    def reconstruct(self, *args, **settings):
+        return replace(super().reconstruct(*args, **settings), masks=torch.zeros(0, 16, 16, 16), deviation=None)
+
+
+def test_what_has_no_masks_is_refined_too(xrays):
+    ready = Refined(Bare(), Grid.cube(24))
+    found = ready.reconstruct(*fit_to_grid(ready, ready.target, xrays, BEAM))
+    assert found.masks.shape == (0, 24, 24, 24) and found.deviation is None
+
+
 def test_a_region_is_the_full_reconstruction_inside_its_box(xrays):
     """To 60 HU in the root mean square where the coarse volume outside is right to its voxels' 24 mm, and 4 times
     better than where nothing is known of the outside."""

@@ -9,8 +9,8 @@ import pytest
 import torch
 import yaml
 from command_lines import refusal
-from test_inference import record, sirt
 
+from inference.runs import record, sirt
 from phydict.cli.infer import main
 from phydict.evaluation import read_csv
 from phydict.evaluation.published import psnr_slices, ssim_uniform

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import yaml
 from command_lines import refusal
-from test_inference import phantoms, record
 
+from inference.runs import phantoms, record
 from phydict.cli.infer import main
 from phydict.datasets.cts.segmentations import organs_beside
 from phydict.evaluation import backbones, perceptual, read_csv

@@ -1,0 +1,179 @@
+"""Options that cannot be meant: one sentence each, and nothing is written."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from command_lines import refusal
+from prior.medsyn_files import entries, super_resolution_unet, text_unet, write
+
+from inference.runs import BEAM, LAUGHS, ORBIT, contents, phantoms, sirt, with_prior
+from phydict.baselines import SIRT
+from phydict.cli.infer import main
+from phydict.grid import Grid
+from phydict.methods import reconstructor
+from phydict.posterior import PriorOnly
+from phydict.xray import Projector
+
+
+@pytest.mark.parametrize("place, name, how", [
+    (".", "cases", "is the input"), (".", "linked", "is the input"), ("cases", "anna", "lies inside"),
+    ("cases", "sirt", "lies inside"), ("cases/anna", "sirt", "lies inside"), ("..", "{parent}", "holds"),
+    ("linked", "anna", "lies inside")])
+def test_an_output_that_is_holds_or_lies_inside_the_input_is_refused(measured, tmp_path, capsys, place, name, how):
+    shutil.copytree(measured, tmp_path / "cases")
+    (tmp_path / "linked").symlink_to(tmp_path / "cases")
+    before = contents(tmp_path)
+    args = sirt("predict", tmp_path / place, f"--data.xrays={tmp_path / 'cases'}", "--model.overwrite=true",
+                f"--model.name={name.format(parent=tmp_path.name)}")
+    said = refusal(capsys, main, args)
+    assert how in said and "give another model.out" in said and contents(tmp_path) == before
+
+
+def test_a_list_of_cases_must_fit_the_folder(cts, tmp_path, capsys):
+    (tmp_path / "only.txt").write_text("b\nnobody\n")
+    args = sirt("test", tmp_path, f"--data.cts={cts}", *ORBIT, f"--data.only={tmp_path / 'only.txt'}")
+    said = refusal(capsys, main, args)
+    assert "nobody" in said and "data.only" in said
+
+
+def test_other_xrays_into_a_finished_folder_are_refused(scored, capsys):
+    for change in ("--data.orbit.views=4", "--data.simulation_voxels=128", "--data.simulator.noise=0.1"):
+        assert "other settings" in refusal(capsys, main, phantoms(scored.parent, 2, change))
+
+
+@pytest.mark.parametrize("change, words", [
+    (["--model.grid=0"], "a whole number of voxels"), (["--model.grid=100000"], "GiB of memory"),
+    (["--model.seed=-1"], "a seed is a whole number"), ([f"--model.seed={2**70}"], "a seed is a whole number"),
+    (["--model.method.init_args.mu_water=0"], "mu_water"), (["--model.method.init_args.mu_water=-1"], "mu_water"),
+    (["--model.ou={tmp}/out"], "model.ou"), (["--data.xray={tmp}"], "data.xray"), (["--data.xray", "3"], "data.xray"),
+    (["--config={tmp}/twice.yaml"], "twice.yaml: `model.seed` is given twice"),
+    (["--config={tmp}/laughs.yaml"], "by aliases"), (["--config={tmp}/latin.yaml"], "latin.yaml is not UTF-8"),
+    (["--config={tmp}/deep.yaml"], "nested more than 32 levels"),
+], ids=lambda value: value[0].strip("-") if isinstance(value, list) else "")
+def test_an_option_that_cannot_be_meant_is_one_sentence(change, words, measured, tmp_path, capsys):
+    for name, text in (("twice", "model: {seed: 1, seed: 2}"), ("deep", "[" * 20_000),
+                       ("laughs", "a: &a [1, 2, 3, 4, 5, 6, 7, 8, 9]\n" + LAUGHS), ("latin", "# \xe9")):
+        (tmp_path / f"{name}.yaml").write_text(text, encoding="latin-1")
+    change = [text.format(tmp=tmp_path) for text in change]
+    said = refusal(capsys, main, sirt("predict", tmp_path / "out", f"--data.xrays={measured}", *change))
+    assert words in said and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("change, words", [
+    ("--model.sampling.samples=1000000000", "samples=1000000000 states of"),
+    ("--model.sampling.guidance=nan", "model.sampling.guidance"),
+    ("--model.sampling.guidance=.nan", "the guidance scale lies between 0 and 1,000,000")])
+def test_an_option_of_a_prior_that_cannot_be_meant_is_one_sentence(change, words, prior, measured, tmp_path, capsys):
+    said = refusal(capsys, main, with_prior("predict", tmp_path / "out", prior, f"--data.xrays={measured}", change))
+    assert words in said and not (tmp_path / "out").exists()
+
+
+def test_a_fault_of_the_projects_own_shows_its_trace_and_on_request_every_refusal_does(measured, tmp_path, monkeypatch):
+    args = sirt("predict", tmp_path, f"--data.xrays={measured}")
+    with monkeypatch.context() as patch, pytest.raises(TypeError, match="a fault"):
+        patch.setattr(SIRT, "solve", lambda *_: exec("raise TypeError('a fault')"))
+        main(args)
+    monkeypatch.setenv("PHYDICT_TRACEBACK", "1")
+    with pytest.raises(ValueError, match="a seed is a whole number"):
+        main([*args, "--model.seed=-1"])
+
+
+def test_medsyns_second_stage_is_refused_before_anything_is_done_where_it_takes_too_much_memory(
+        measured, tmp_path, capsys):
+    base = write(tmp_path / "base" / "model_1.safetensors", entries(text_unet()))
+    second = write(tmp_path / "second" / "model.safetensors", entries(super_resolution_unet())).parent
+    said = refusal(capsys, main, with_prior("predict", tmp_path / "out", base, f"--data.xrays={measured}",
+                                      f"--model.super_resolution.file={second}", "--model.super_resolution.memory=1"))
+    assert "(256, 256, 256)" in said and "1 GiB are allowed" in said and "--model.super_resolution.memory " in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_stages_in_each_others_place_are_one_sentence(prior, fine, measured, tmp_path, capsys):
+    data = f"--data.xrays={measured}"
+    said = refusal(capsys, main, with_prior("predict", tmp_path / "out", fine, data))
+    assert "fine.safetensors' is a super-resolution stage, but a base prior" in said
+    said = refusal(capsys, main, with_prior("predict", tmp_path / "out", prior, data,
+                                      f"--model.super_resolution.file={prior}"))
+    assert "is a base prior, but a super-resolution stage" in said
+    said = refusal(capsys, main, sirt("predict", tmp_path / "out", data, f"--model.super_resolution.file={fine}"))
+    assert "SIRT has none" in said
+
+
+def test_a_prior_refuses_xrays_of_another_grid(prior):
+    posterior = reconstructor(PriorOnly(iterations=1), prior)
+    with pytest.raises(ValueError, match="16.*64.*use the prior's grid"):
+        posterior.reconstruct(torch.ones(3, 24, 24), Projector(Grid.cube(64), BEAM))
+
+
+@pytest.mark.parametrize("args, words", [
+    ([], ["predict", "test", "ablate", "such as: predict --data.xrays"]),
+    (["reconstruct"], ["'reconstruct'", "ablate"]),
+    (["--data.xrays", "somewhere"], ["predict", "test", "ablate"]), (["predict"], ["needs data.xrays"]),
+    (["test"], ["needs data.cts"]), (["ablate"], ["-c configs/ablate/"]),
+    (["ablate", "--phantoms", "3"], ["-c configs/ablate/"])], ids=lambda value: " ".join(value)[:20])
+def test_a_missing_command_or_input_says_what_to_give(args, words, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    said = refusal(capsys, main, args)
+    assert all(word in said for word in words), said
+
+
+@pytest.mark.parametrize("change, words", [
+    (["--data.viewz=3"], ["data.viewz"]),
+    (["--data.orbit.views=0"], ["one view"]),
+    (["--data.orbit.views=some"], ["data.orbit.views", "some"]),
+    (["--model.method.init_args.iteration=3"], ["iteration"]),
+    (["--data.orbit.source_to_isocentre=2000"], ["isocentre"]),
+    (["--config=nowhere.yaml"], ["nowhere.yaml"]),
+    (["--model.method=srit"], ["no method 'srit'", "sirt", "phydict_fast", "phydict.posterior.DDS"]),
+    (["--config={model: {method: 3}}"], ["model.method"]),
+    (["--model.sampling.precision=half"], ["precision is auto, float32 or bfloat16, but 'half' was given"]),
+], ids=lambda value: value[0] if value[0].startswith("--") else "")
+def test_a_bad_argument_is_one_sentence(change, words, tmp_path, capsys):
+    said = refusal(capsys, main, phantoms(tmp_path / "out", 1, *change))
+    assert all(word in said for word in words), said
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_unknown_key_of_a_config_file_is_named(tmp_path, capsys):
+    (tmp_path / "mine.yaml").write_text("model:\n  guidence: 2.0\n")
+    args = phantoms(tmp_path / "out", 1, f"--config={tmp_path / 'mine.yaml'}")
+    assert "model.guidence" in refusal(capsys, main, args)
+
+
+def test_an_impossible_setting_is_named_without_the_parsers_noise(prior, tmp_path, capsys):
+    said = refusal(capsys, main, ["test", "--model.method=phydict_fast", f"--model.prior={prior}",
+                                  "--model.method.init_args.iterations=0"])
+    assert "at least one iteration, but 0" in said and "Union" not in said
+
+
+def test_an_output_folder_that_cannot_be_is_one_sentence(measured, tmp_path, capsys):
+    (tmp_path / "file").write_text("mine")
+    for out in (tmp_path / "file", tmp_path / "file" / "deeper", Path("/proc/phydict")):
+        said = refusal(capsys, main, sirt("predict", out, f"--data.xrays={measured}"))
+        assert str(out) in said and "model.out" in said
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_a_read_only_disk_is_one_sentence(measured, tmp_path, capsys, monkeypatch):
+    def refuse(**_):
+        raise OSError(30, "Read-only file system")
+
+    monkeypatch.setattr("phydict.runtime.console.tempfile.TemporaryFile", refuse)
+    said = refusal(capsys, main, sirt("predict", tmp_path / "out", f"--data.xrays={measured}"))
+    assert "Read-only file system" in said and not (tmp_path / "out").exists()
+
+
+def test_samples_of_a_method_without_a_prior_are_refused(capsys, measured, tmp_path):
+    assert "leave samples at 1" in refusal(capsys, main, sirt("predict", tmp_path, f"--data.xrays={measured}",
+                                                        "--model.sampling.samples=3"))
+
+
+def test_a_run_that_is_not_finite_ends_in_one_sentence_and_leaves_no_case(measured, tmp_path, capsys, monkeypatch):
+    solve = SIRT.solve
+    monkeypatch.setattr(SIRT, "solve", lambda self, *given: solve(self, *given) * float("nan"))
+    said = refusal(capsys, main, sirt("predict", tmp_path, f"--data.xrays={measured / 'anna'}"))
+    assert "not finite from step 3 of 3 on" in said and not (tmp_path / "sirt" / "anna").exists()

@@ -28,7 +28,7 @@ def untrained(monkeypatch):
 
 
 def cases(folder, *more) -> list[str]:
-    return phantoms(folder, 2, "--model.cube.voxels=34", METRICS, *more)
+    return phantoms(folder, 2, "--model.grid=34", METRICS, *more)
 
 
 def test_test_measures_them_all_and_a_repeated_command_tables_the_same(tmp_path, untrained):
@@ -45,8 +45,8 @@ def test_test_measures_them_all_and_a_repeated_command_tables_the_same(tmp_path,
 
 
 def test_other_metrics_do_not_pass_for_those_of_a_finished_case(tmp_path, capsys, untrained):
-    main(phantoms(tmp_path, 1, "--model.cube.voxels=34"))
-    other = phantoms(tmp_path, 1, "--model.cube.voxels=34", "--metrics=[lpips]")
+    main(phantoms(tmp_path, 1, "--model.grid=34"))
+    other = phantoms(tmp_path, 1, "--model.grid=34", "--metrics=[lpips]")
     assert "other settings" in refusal(capsys, main, other)
 
 

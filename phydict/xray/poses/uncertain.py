@@ -37,7 +37,7 @@ class Uncertain:
     def __post_init__(self):
         for name, value in vars(self).items():
             most = MOST.get(name, MOST_MM)
-            if isinstance(value, bool) or not isinstance(value, Real) or not 0 <= value <= most:
+            if isinstance(value, bool) or not isinstance(value, Real) or not 0 <= float(value) <= most:
                 raise ValueError(f"uncertain {name} is a standard deviation from 0, exactly known, to {most:g}, but "
                                  f"{reprlib.repr(value)} was given")
         if not any(vars(self).values()):

@@ -21,8 +21,9 @@ the rotation of source and detector together about the isocentre, a vector along
 
 def moved(beam: ConeBeam, values: np.ndarray) -> ConeBeam:
     """The beam with its views moved by `values` (K, 8), in mm and degrees, as POSE lists them."""
-    found = torch.stack([_moved(own, vectors) for own, vectors in _views(beam, values)])
-    return ConeBeam(*np.moveaxis(found.numpy(), 1, 0), beam.shape)
+    vectors = torch.stack([_moved(own, vectors) for own, vectors in _views(beam, values)])
+    sources, detectors, u, v = np.moveaxis(vectors.numpy(), 1, 0)
+    return ConeBeam(sources, detectors, u, v, beam.shape)
 
 
 def derivative(beam: ConeBeam, values: np.ndarray) -> Tensor:

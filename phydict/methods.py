@@ -6,6 +6,7 @@ import math
 import reprlib
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -14,7 +15,6 @@ from phydict.baselines import CGLS, FDK, FISTATV, SIRT, DiffVox, Region
 from phydict.baselines.baseline import Baseline
 from phydict.datasets import format_report
 from phydict.grid import Grid
-from phydict.poses import FoundPoses, find_poses
 from phydict.posterior import (
     DAPS, DDS, DPS, CascadePosterior, DiffPIR, ExactDraw, GradientSteps, PnPDM, Posterior, PriorOnly, ProximalCG,
     Refined, Refinement, Reward, Sampler, SplitGibbs, Unrolled)
@@ -31,6 +31,9 @@ from phydict.xray import ConeBeam, Projector, binned, binning
 from phydict.xray.boxes import along, covers
 from phydict.xray.checks import check_air, check_xrays
 from phydict.xray.poses.uncertain import Uncertain
+
+if TYPE_CHECKING:
+    from phydict.poses import FoundPoses
 
 RELEASED_STEPS = GradientSteps(learning_rate=0.01, prior_mean=True, reward=Reward(
     lpips=0.5, random_backbone=True, dropout=True, squared=0.1, pixel_mean=True, view_sum=True, standardise=True,
@@ -182,6 +185,8 @@ def calibrated(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, 
 
     Warns of what few views cannot show, and of views that were corrected by more than was stated.
     """
+    from phydict.poses import find_poses  # and with it numba
+
     found = find_poses(xrays, beam, uncertain, grid, display, ready.mu_water)
     for words in found.warnings():
         warn(words)

@@ -47,7 +47,7 @@ def describe(folder, uncertain):
 
 
 def predict(case, out, *more):
-    return ["predict", "--model.method=sirt", "--model.method.init_args.iterations=5", "--model.cube.voxels=16",
+    return ["predict", "--model.method=sirt", "--model.method.init_args.iterations=5", "--model.grid.voxels=16",
             f"--data.xrays={case}", f"--model.out={out}", "--trainer.accelerator=cpu", *more]
 
 

@@ -27,8 +27,8 @@ from phydict.runtime.reading import check_memory, reason
 from phydict.runtime.seeds import check_seed
 from phydict.runtime.warning import warn
 from phydict.units import HUWindow
-from phydict.xray import ConeBeam, Projector, binned, binning
-from phydict.xray.boxes import along, covers
+from phydict.xray import ConeBeam, Projector
+from phydict.xray.boxes import along, covers, seen_by
 from phydict.xray.checks import check_air, check_xrays
 from phydict.xray.poses.uncertain import Uncertain
 
@@ -174,9 +174,7 @@ def fit_to_grid(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam,
     check_air(xrays)
     beam.check(grid)
     beam.check_scale(ready.survey or grid)
-    factor = 1 if ready.full_detector else binning(grid, beam)
-    return binned(xrays.float(), factor), Projector(grid, beam.binned(factor), projector, device=xrays.device,
-                                                    full_detector=True)
+    return seen_by(grid, xrays.float(), beam, ready.full_detector, projector)
 
 
 def calibrated(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, uncertain: Uncertain,

@@ -30,6 +30,14 @@ def arguments(folder: Path, cache: Path, *more: str) -> list[str]:
     return ["fit", f"--config={CONFIG}", *TINY, f"--data.cache={cache}", f"--out={folder}", *more]
 
 
+def refiner_arguments(config: Path, folder: Path, cache: Path, initial: str, *more: str) -> list[str]:
+    """`fit` by a configuration of a tiny refiner's stages, on three phantoms, everything written below `folder`."""
+    return ["fit", f"--config={config}", "--model.cube.voxels=16", "--model.window=[-1000,600]", "--data.phantoms=3",
+            "--data.holdout.phantoms=1", "--data.loading.epoch_size=2", "--model.scenes.most_views=4",
+            f"--model.initial={initial}", "--trainer.accelerator=cpu", "--trainer.log_every_n_steps=1",
+            "--precision=float32", "--trainer.max_steps=-1", f"--data.cache={cache}", f"--out={folder}", *more]
+
+
 def refusal(capsys, main: Callable[[list[str]], None], args: list[str]) -> str:
     """The one sentence on stderr with which a command line refuses `args`."""
     capsys.readouterr()

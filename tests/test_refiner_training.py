@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from command_lines import refusal, resumed_as_uninterrupted
+from command_lines import refiner_arguments, refusal, resumed_as_uninterrupted
 from prior.tiny import tiny_prior
 from torch.utils.data import default_collate
 
@@ -30,11 +30,7 @@ def prior_file(tmp_path_factory) -> str:
 
 
 def arguments(folder: Path, cache: Path, initial: str, *more: str) -> list[str]:
-    return ["fit", f"--config={CONFIG}", "--model.cube.voxels=16", "--model.window=[-1000,600]", "--data.phantoms=3",
-            "--data.holdout.phantoms=1", "--data.loading.epoch_size=2", "--model.scenes.most_views=4",
-            f"--model.initial={initial}", "--model.validation.views=[2]", "--trainer.accelerator=cpu",
-            "--trainer.log_every_n_steps=1", "--precision=float32", "--trainer.max_steps=-1",
-            f"--data.cache={cache}", f"--out={folder}", *more]
+    return refiner_arguments(CONFIG, folder, cache, initial, "--model.validation.views=[2]", *more)
 
 
 def test_a_resumed_run_is_the_uninterrupted_one_and_is_exported_as_a_refiner(tmp_path, cache, prior_file):

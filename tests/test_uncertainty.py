@@ -6,7 +6,7 @@ from pathlib import Path
 import nibabel
 import pytest
 import torch
-from command_lines import refusal, resumed_as_uninterrupted
+from command_lines import refiner_arguments, refusal, resumed_as_uninterrupted
 from prior.tiny import tiny_prior, tiny_refiner
 
 from phydict.cli.infer import main as infer
@@ -27,11 +27,7 @@ def views() -> torch.Tensor:
 
 
 def arguments(folder: Path, cache: Path, initial: str, *more: str) -> list[str]:
-    return ["fit", f"--config={CONFIG}", "--model.cube.voxels=16", "--model.window=[-1000,600]", "--data.phantoms=3",
-            "--data.holdout.phantoms=1", "--data.loading.epoch_size=2", "--model.scenes.most_views=4",
-            f"--model.initial={initial}", "--model.validation.scenes=2", "--trainer.accelerator=cpu",
-            "--trainer.log_every_n_steps=1", "--precision=float32", "--trainer.max_steps=-1",
-            f"--data.cache={cache}", f"--out={folder}", *more]
+    return refiner_arguments(CONFIG, folder, cache, initial, "--model.validation.scenes=2", *more)
 
 
 @pytest.fixture(scope="module")

@@ -13,8 +13,8 @@ from phydict.grid import Grid
 from phydict.reconstruction import Reconstruction, Reconstructor
 from phydict.runtime.profiling import Stopwatch
 from phydict.units import hu_to_mu
-from phydict.xray import Projector, binned, binning
-from phydict.xray.boxes import outside_projection
+from phydict.xray import Projector
+from phydict.xray.boxes import outside_projection, seen_by
 from phydict.xray.calibration import match_views
 
 
@@ -71,11 +71,8 @@ class Region(Reconstructor):
                     seed: int = 0, on_step: Callable[[], None] = lambda: None) -> Reconstruction:
         watch = Stopwatch()
         with watch.stage("base"):
-            factor = 1 if self.full_detector else binning(self.outer, projector.beam)
-            coarse = self.method.reconstruct(
-                binned(xrays, factor), Projector(self.outer, projector.beam.binned(factor), projector.method,
-                                                 device=xrays.device, full_detector=True),
-                report, display, seed, on_step)
+            seen = seen_by(self.outer, xrays, projector.beam, self.full_detector, projector.method)
+            coarse = self.method.reconstruct(*seen, report, display, seed, on_step)
         with watch.stage("outside"):
             mu = hu_to_mu(coarse.volume.to(xrays), self.mu_water)
             if display:

@@ -343,7 +343,6 @@ class ReconstructionTask(lightning.LightningModule):
             raise ValueError(f"{len(missing)} of {len(self.cases)} cases were not reconstructed "
                              f"({', '.join(missing)}): see the messages above, and run the same command again")
 
-
     def _further_tables(self, cases: list[str]) -> list[Table]:
         """The table of Frechet distances over finished cases, where they are measured."""
         backbone = self.scoring.fid.backbone

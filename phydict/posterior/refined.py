@@ -16,8 +16,8 @@ from phydict.posterior.measurement import Measurement
 from phydict.reconstruction import Reconstruction, Reconstructor
 from phydict.runtime.profiling import Stopwatch
 from phydict.units import HUWindow, hu_to_mu
-from phydict.xray import Projector, binned, binning
-from phydict.xray.boxes import covers, interpolated, outside_projection, refinements
+from phydict.xray import Projector
+from phydict.xray.boxes import covers, interpolated, outside_projection, refinements, seen_by
 
 AIR = -1000.0
 """HU outside what a coarse volume covers."""
@@ -166,9 +166,7 @@ class Refined(Reconstructor):
         """The X-rays as a level sees them, binned to what its voxels can hold, and the projector to them."""
         if grid.same_as(projector.grid):
             return xrays, projector
-        factor = 1 if self.full_detector else binning(grid, projector.beam)
-        return binned(xrays, factor), Projector(grid, projector.beam.binned(factor), projector.method,
-                                                device=xrays.device, full_detector=True)
+        return seen_by(grid, xrays, projector.beam, self.full_detector, projector.method)
 
     def _measurement(self, y: Tensor, A: Projector, coarse: Reconstruction, display: bool) -> Measurement:
         """The X-rays as a problem on a level's voxels alone."""

@@ -122,10 +122,8 @@ class BoundRefiner:
     def conclude(self, z: Tensor, evidence: Callable[[], Tensor]) -> None:
         """Is called with the last state and what computes the evidence there."""
 
-    def half_widths(self, z: Tensor, evidence: Tensor) -> Tensor | None:
+    def half_widths(self, z: Tensor, evidence: Tensor) -> Tensor:
         """Half-widths (B, len(LEVELS), X, Y, Z), in the prior's range, of the intervals around the CT of the last state
-        z, given the evidence there; None for a refiner without uncertainty."""
-        if self.refiner.uncertainty is None:
-            return None
+        z, given the evidence there; of a refiner with uncertainty."""
         with torch.no_grad(), network_precision(self.precision, z):
             return self.refiner.uncertainty.half_widths(z, evidence)

@@ -65,7 +65,7 @@ class UncertaintyTraining(StageTraining):
             z, evidence, _ = self._reconstruct(ct[None], rng)
             log_scale = self.prior.uncertainty(z, evidence)
             error = (z[:, :1] - ct).abs()
-            weight = 1 + self.body_weight * ((ct[None] > AIR_BELOW) | (tissue_of(z)[:, None] == 0))
+            weight = 1 + self.body_weight * _body(ct[None], z)
             losses.append((weight * (log_scale + error / log_scale.exp())).sum() / weight.sum())
         return torch.stack(losses).mean()
 
@@ -90,7 +90,7 @@ class UncertaintyTraining(StageTraining):
             rng = np.random.default_rng((self.seed, index, scene))
             z, evidence, measurement = self._reconstruct(ct, rng)
             error, log_scale = (z[:, :1] - ct).abs(), self.prior.uncertainty(z, evidence)
-            body = (ct > AIR_BELOW) | (tissue_of(z)[:, None] == 0)
+            body = _body(ct, z)
             self.log("val/rank", spearman_corrcoef(log_scale[body], error[body]), batch_size=1, sync_dist=True,
                      prog_bar=True)
             chosen = torch.from_numpy(rng.integers(error.numel(), size=VOXELS)).to(ct.device)
@@ -106,3 +106,8 @@ class UncertaintyTraining(StageTraining):
 
     def _describe(self) -> dict:
         return describe_refiner(self.prior)
+
+
+def _body(ct: Tensor, z: Tensor) -> Tensor:
+    """Which voxels (B, 1, X, Y, Z) are no air outside: those of tissue in the CT, and of lung in the state z."""
+    return (ct > AIR_BELOW) | (tissue_of(z)[:, None] == 0)

@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 
 from phydict.grid import Grid
+from phydict.xray.binning import binned, binning
+from phydict.xray.geometry import ConeBeam
 from phydict.xray.projectors.projector import Projector
 
 ALONG = 1e-4
@@ -17,6 +19,14 @@ ALONG = 1e-4
 
 SLACK = 1e-3
 """A share of a voxel by which a box may stand out of another one that covers it."""
+
+
+def seen_by(grid: Grid, xrays: Tensor, beam: ConeBeam, full_detector: bool, method: str = "auto"
+            ) -> tuple[Tensor, Projector]:
+    """X-rays (K, V, U), binned to what the voxels can hold unless every pixel is wanted, and the projector that goes
+    with them on their device; `method` as Projector's."""
+    factor = 1 if full_detector else binning(grid, beam)
+    return binned(xrays, factor), Projector(grid, beam.binned(factor), method, device=xrays.device, full_detector=True)
 
 
 def along(grid: Grid, other: Grid) -> bool:

@@ -2,6 +2,7 @@
 
 import json
 import re
+from pathlib import Path
 
 import pytest
 import torch
@@ -13,38 +14,10 @@ from phydict.cli.infer import main as infer
 from phydict.methods import reconstructor
 from phydict.prior import find_prior
 
-MODULE = '''
-from dataclasses import dataclass
+MODULE = (Path(__file__).parents[2] / "data" / "example" / "own_prior" / "my_prior.py").read_text() + '''
 
-import torch
-
-from phydict.diffusion import CosineSchedule
-from phydict.grid import Grid
-from phydict.prior import PriorContract
-from phydict.units import HUWindow
-
-
-@dataclass(frozen=True)
-class Mean:
-    """Answers with blurred states, drawn towards `hu`."""
-
-    x0: float
-    schedule: CosineSchedule = CosineSchedule()
-
-    def denoise(self, x, t):
-        signal, noise = (float(w) for w in self.schedule.scales(t))
-        smooth = torch.nn.functional.avg_pool3d(x, 3, 1, 1, count_include_pad=False) / signal
-        return torch.lerp(smooth, torch.full_like(x, self.x0), noise**2)
-
-
-class OwnPrior(PriorContract):
-    grid, window = Grid.cube(16), HUWindow()
-
-    def __init__(self, hu: float = -500.0):
-        self.hu = hu
-
-    def bind(self, report, guidance, precision):
-        return Mean(float(self.window.to_range(torch.tensor(self.hu))))
+class OwnPrior(MyPrior):
+    grid = Grid.cube(16)
 
 
 class Shapeless(OwnPrior):

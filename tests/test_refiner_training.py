@@ -7,6 +7,7 @@ import pytest
 import torch
 from command_lines import refiner_arguments, refusal, resumed_as_uninterrupted
 from prior.tiny import tiny_prior
+from torch.nn.functional import avg_pool3d, interpolate
 from torch.utils.data import default_collate
 
 from phydict.cli.train import main
@@ -14,8 +15,9 @@ from phydict.datasets import phantom_case
 from phydict.grid import Cube, Grid
 from phydict.methods import reconstruct
 from phydict.prior import Refiner, load_prior, save_prior
+from phydict.training.data import PriorData
 from phydict.training.refiner import RefinerTraining
-from phydict.training.scenes import Scenes
+from phydict.training.scenes import Scenes, fine_xrays
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 
@@ -84,3 +86,34 @@ def test_scenes_that_cannot_be_drawn_are_refused(settings, words):
 def test_a_prior_of_another_grid_is_refused(tmp_path, cache, prior_file, capsys):
     args = arguments(tmp_path, cache, prior_file, "--model.cube.voxels=32")
     assert "another grid or HU window" in refusal(capsys, main, args)
+
+
+def test_fine_xrays_of_blocks_are_those_of_their_means_where_rays_cannot_tell():
+    grid, rng = Grid.cube(16), torch.Generator().manual_seed(0)
+    projector = Projector(grid, ConeBeam.orbit(3, 1020, 740, (28, 28), 20.0), full_detector=True)
+    smooth = interpolate(torch.rand((1, 1, 3, 3, 3), generator=rng), (32, 32, 32), mode="trilinear") * 0.02
+    coarse, fine = projector(avg_pool3d(smooth, 2)), fine_xrays(smooth, projector)
+    assert fine.shape == coarse.shape
+    assert (fine - coarse).abs().mean() < 0.02 * coarse.mean()
+    grain = smooth + 0.02 * torch.rand((1, 1, 32, 32, 32), generator=rng)
+    lost = (fine_xrays(grain, projector) - projector(avg_pool3d(grain, 2))).abs().mean()
+    assert lost > 1.2 * (fine - coarse).abs().mean()
+
+
+def test_learnt_volumes_are_means_of_what_their_xrays_are_made_of(cache):
+    data = PriorData(phantoms=2, cache=str(cache), cube=Cube(16), simulation_voxels=32)
+    case = data.draws(0)[0]
+    torch.testing.assert_close(case["volume"], avg_pool3d(case["fine"], 2))
+    assert case["fine"].shape[1:] == (32, 32, 32) and case["masks"].shape[1:] == (16, 16, 16)
+    window = HUWindow(-1000, 600)
+    fine, ct = case["fine"][None], case["volume"][None]
+    made = [Scenes(fine=share).measure(ct, np.random.default_rng(3), Grid.cube(16), window, fine).y for share in (0, 1)]
+    assert made[0].shape == made[1].shape and not torch.equal(*made)
+    with pytest.raises(ValueError, match="multiple of model.cube.voxels, 16, but 40"):
+        PriorData(phantoms=2, cache=str(cache), cube=Cube(16), simulation_voxels=40)
+
+
+def test_a_refiner_learns_from_xrays_of_finer_volumes(tmp_path, cache, prior_file):
+    main(arguments(tmp_path, cache, prior_file, "--data.simulation_voxels=32", "--model.scenes.fine=1",
+                   "--trainer.max_epochs=1"))
+    assert (tmp_path / "last.ckpt").is_file()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import lightning
@@ -11,7 +12,7 @@ from torch.utils.data import ConcatDataset, DataLoader, Dataset, DistributedSamp
 from phydict.datasets import Augmentation, CTCases, CTSource, Thorax, report, split_by_patient
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM, CachedPhantoms
 from phydict.datasets.population import DrawnPatients
-from phydict.grid import Cube
+from phydict.grid import Cube, Grid
 from phydict.runtime.console import check_writable
 from phydict.runtime.seeds import check_seed
 from phydict.training.draws import MixedCases, training_parts
@@ -33,14 +34,20 @@ class PriorData(lightning.LightningDataModule):
         seed: of the draws and of the split into patients
         cube: tied to model.cube
         window: tied to model.window
+        simulation_voxels: voxels per side of the volumes that X-rays are made of, a multiple of model.cube.voxels; none
+            given: the model's own. For stages that learn from X-rays
     """
 
     def __init__(self, cts: str | None = None, source: CTSource = CTSource(), holdout: HoldOut = HoldOut(),
                  phantoms: int = 2000, loading: Loading = Loading(), cache: str = "runs/cache",
                  augmentation: Augmentation = Augmentation(), seed: int = 0, cube: Cube = Cube(),
-                 window: tuple[float, float] = (-1000.0, 1000.0)):
+                 window: tuple[float, float] = (-1000.0, 1000.0), simulation_voxels: int | None = None):
         super().__init__()
         check_seed(seed)
+        self.factor, rest = divmod(simulation_voxels or cube.voxels, cube.voxels)
+        if rest or self.factor < 1:
+            raise ValueError(f"data.simulation_voxels is a multiple of model.cube.voxels, {cube.voxels}, but "
+                             f"{simulation_voxels} was given")
         if not cts and not phantoms:
             raise ValueError("there is nothing to train on: give data.cts, or data.phantoms above 0")
         if phantoms < 0:
@@ -49,7 +56,7 @@ class PriorData(lightning.LightningDataModule):
             raise ValueError(f"data.cache {cache} lies inside data.cts {cts}: give a folder elsewhere")
         check_writable(Path(cache), "data.cache")
         window = HUWindow(*window)
-        self.grid, self.window = cube.grid(), window
+        self.grid, self.window = Grid.cube(self.factor * cube.voxels, cube.side), window
         self.phantoms = CachedPhantoms(0, phantoms, self.grid, window, Path(cache))
         files = source.find(cts) if cts else []
         for word in holdout.ids or []:
@@ -96,11 +103,12 @@ class PriorData(lightning.LightningDataModule):
         if self.population:
             self.population.prepare()  # here, before loader processes are forked
         return MixedCases(self.cts, self.phantoms, self.loading.ct_fraction, self.grid, self.window,
-                          self.loading.epoch_size, epoch, self.seed, self.augmentation, self.population)
+                          self.loading.epoch_size, epoch, self.seed, self.augmentation, self.population, self.factor)
 
     def val_dataloader(self) -> DataLoader:
-        return DataLoader(self.validation, 1, collate_fn=_collate, num_workers=self.loading.workers)
+        return DataLoader(self.validation, 1, collate_fn=partial(_collate, factor=self.factor),
+                          num_workers=self.loading.workers)
 
 
-def _collate(cases: list[dict]) -> dict:
-    return torch.utils.data.default_collate([training_parts(case) for case in cases])
+def _collate(cases: list[dict], factor: int) -> dict:
+    return torch.utils.data.default_collate([training_parts(case, factor) for case in cases])

@@ -74,16 +74,12 @@ class RefinerTraining(StageTraining):
         self.validation_views, self.calls = validation.views, len(method.times)
 
     def batch_loss(self, batch: dict, key: tuple[int, ...] = (0,), rank: int = 0, processes: int = 1) -> Tensor:
-        losses = []
-        for n in range(len(batch["volume"])):
-            rng = np.random.default_rng((*key, rank + n * processes))
-            case = {name: value[n:n + 1] for name, value in batch.items()}
-            losses.append(self._case_loss(case, rng))
+        losses = [self._case_loss(*drawn) for drawn in self.drawn(batch, key, rank, processes)]
         return torch.stack(losses).mean()
 
     def _case_loss(self, case: dict, rng: np.random.Generator) -> Tensor:
         ct, masks = case["volume"], 2 * case["masks"] - 1
-        measurement = self.scenes.measure(ct, rng, self.prior.grid, self.prior.window)
+        measurement = self.scenes.measure(ct, rng, self.prior.grid, self.prior.window, case.get("fine"))
         with_report = self.prior.prior.text is not None and rng.random() >= TEXT_DROPOUT
         learning = _Learning(self.prior, self.prior.prior.context([case["report"][0] if with_report else ""]))
         losses = []

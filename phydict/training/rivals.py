@@ -43,11 +43,11 @@ class RivalTraining(StageTraining):
 
     def batch_loss(self, batch: dict, key: tuple[int, ...] = (0,), rank: int = 0, processes: int = 1) -> Tensor:
         losses = []
-        for n, ct in enumerate(batch["volume"]):
-            rng = np.random.default_rng((*key, rank + n * processes))
-            measurement = self.scenes.measure(ct[None], rng, self.prior.grid, self.prior.window)
+        for case, rng in self.drawn(batch, key, rank, processes):
+            ct = case["volume"]
+            measurement = self.scenes.measure(ct, rng, self.prior.grid, self.prior.window, case.get("fine"))
             generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
-            losses.append(self.case_loss(ct[None], measurement.y / MU_WATER, measurement.projector.beam, generator))
+            losses.append(self.case_loss(ct, measurement.y / MU_WATER, measurement.projector.beam, generator))
         return torch.stack(losses).mean()
 
     def validation_step(self, batch: dict, index: int) -> None:

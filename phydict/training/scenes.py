@@ -8,12 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from phydict.grid import Grid
 from phydict.posterior import Measurement
 from phydict.runtime.ranges import check_fields
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
+from phydict.xray.boxes import in_other_voxels
 
 REACH = 1.48
 """Least distance from the isocentre to source and detector, over half the grid's side: their planes miss the grid."""
@@ -30,6 +32,8 @@ class Scenes:
         varied: share of scenes whose distances, pixels and detector place differ from the benchmarks'
         noise: least and most standard deviation of the noise, as a share of the largest line integral
         model_error: share of scenes with beam hardening and a scale that is off by up to 2 %
+        fine: share of scenes whose X-rays are made of the finer volume, where the data have one
+            (data.simulation_voxels), on a detector that is as much finer and is then binned
     """
 
     most_views: int = 32
@@ -38,10 +42,11 @@ class Scenes:
     varied: float = 0.4
     noise: tuple[float, float] = (5e-4, 0.02)
     model_error: float = 0.3
+    fine: float = 0.5
 
     def __post_init__(self):
         check_fields(self, "model.scenes", most_views=(1, 1000), orbit=(0, 1), arc=(0, 1), varied=(0, 1),
-                     model_error=(0, 1))
+                     model_error=(0, 1), fine=(0, 1))
         if 1.5 * self.orbit + self.arc > 1:
             raise ValueError("model.scenes has 1.5 orbit + arc of at most 1, but orbit "
                              f"{self.orbit} and arc {self.arc} were given")
@@ -69,10 +74,15 @@ class Scenes:
             beam = ConeBeam.orbit(360, *geometry).select(np.sort(rng.choice(360, views, replace=False)))
         return beam.shifted(columns=shift * pixels * pixel * scale) if shift else beam
 
-    def measure(self, ct: Tensor, rng: np.random.Generator, grid: Grid, window: HUWindow) -> Measurement:
-        """X-rays of a CT (1, 1, X, Y, Z) in the prior's range, as a measurement of a drawn scene."""
+    def measure(self, ct: Tensor, rng: np.random.Generator, grid: Grid, window: HUWindow,
+                fine: Tensor | None = None) -> Measurement:
+        """X-rays of a CT (1, 1, X, Y, Z) in the prior's range, as a measurement of a drawn scene on its grid; `fine`,
+        if given, is the same CT in finer voxels."""
         projector = Projector(grid, self.beam(rng, grid), full_detector=True)
-        y = projector(window.to_mu(ct))
+        if fine is not None and rng.random() < self.fine:
+            y = fine_xrays(window.to_mu(fine), projector)
+        else:
+            y = projector(window.to_mu(ct))
         if rng.random() < self.model_error:
             hardened = rng.uniform(0, 0.02) * y * (0.7 * float(y.max()) - y) / 2
             y = (1 + rng.uniform(-0.02, 0.02)) * (y + hardened)
@@ -80,3 +90,11 @@ class Scenes:
         noise = 0.005 if rng.random() < 0.4 else math.exp(rng.uniform(low, high))
         y = y + noise * y.max() * torch.from_numpy(rng.standard_normal(tuple(y.shape))).to(y)
         return Measurement(projector, y[0], window)
+
+
+def fine_xrays(mu: Tensor, projector: Projector) -> Tensor:
+    """What a projector's detector measures (1, K, V, U) of finer voxels (1, 1, X, Y, Z) of the same box: the mean line
+    integrals of as much finer pixels."""
+    factor = mu.shape[-1] // projector.grid.shape[-1]
+    grid = in_other_voxels(projector.grid, mu.shape[2:])
+    return avg_pool2d(Projector(grid, projector.beam.divided(factor), full_detector=True)(mu), factor)

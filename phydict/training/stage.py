@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import lightning
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -39,6 +40,13 @@ class StageTraining(lightning.LightningModule, ABC):
         All that is random follows from `key` and each sample's place in the batch that all `processes` share in turns,
         so that a resumed run repeats an uninterrupted one, and several processes do what one would.
         """
+
+    def drawn(self, batch: dict, key: tuple[int, ...], rank: int, processes: int
+              ) -> Iterator[tuple[dict, np.random.Generator]]:
+        """Each case of a batch, as a batch of its own, and what its scene is drawn from."""
+        for n in range(len(batch["volume"])):
+            yield ({name: value[n:n + 1] for name, value in batch.items()},
+                   np.random.default_rng((*key, rank + n * processes)))
 
     @abstractmethod
     def _describe(self) -> dict:

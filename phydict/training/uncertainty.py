@@ -60,20 +60,21 @@ class UncertaintyTraining(StageTraining):
 
     def batch_loss(self, batch: dict, key: tuple[int, ...] = (0,), rank: int = 0, processes: int = 1) -> Tensor:
         losses = []
-        for n, ct in enumerate(batch["volume"]):
-            rng = np.random.default_rng((*key, rank + n * processes))
-            z, evidence, _ = self._reconstruct(ct[None], rng)
+        for case, rng in self.drawn(batch, key, rank, processes):
+            ct = case["volume"]
+            z, evidence, _ = self._reconstruct(case, rng)
             log_scale = self.prior.uncertainty(z, evidence)
             error = (z[:, :1] - ct).abs()
-            weight = 1 + self.body_weight * _body(ct[None], z)
+            weight = 1 + self.body_weight * _body(ct, z)
             losses.append((weight * (log_scale + error / log_scale.exp())).sum() / weight.sum())
         return torch.stack(losses).mean()
 
     @torch.no_grad()
-    def _reconstruct(self, ct: Tensor, rng: np.random.Generator) -> tuple[Tensor, Tensor, Measurement]:
+    def _reconstruct(self, case: dict, rng: np.random.Generator) -> tuple[Tensor, Tensor, Measurement]:
         """The last state of a reconstruction, the evidence there, and its measurement."""
         with torch.autocast(self.device.type, enabled=False):
-            measurement = self.scenes.measure(ct, rng, self.prior.grid, self.prior.window)
+            measurement = self.scenes.measure(case["volume"], rng, self.prior.grid, self.prior.window,
+                                              case.get("fine"))
             ends = []
             for _ in self.method.estimates(self.prior.bind(), measurement, on_result=lambda *end: ends.append(end)):
                 pass
@@ -88,7 +89,7 @@ class UncertaintyTraining(StageTraining):
         ct = batch["volume"]
         for scene in range(self.validation.scenes):
             rng = np.random.default_rng((self.seed, index, scene))
-            z, evidence, measurement = self._reconstruct(ct, rng)
+            z, evidence, measurement = self._reconstruct(batch, rng)
             error, log_scale = (z[:, :1] - ct).abs(), self.prior.uncertainty(z, evidence)
             body = _body(ct, z)
             self.log("val/rank", spearman_corrcoef(log_scale[body], error[body]), batch_size=1, sync_dist=True,

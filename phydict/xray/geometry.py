@@ -185,6 +185,11 @@ class ConeBeam:
         return ConeBeam(self.sources, self.detectors, factor * self.u, factor * self.v,
                         (self.shape[0] // factor, self.shape[1] // factor))
 
+    def divided(self, factor: int) -> ConeBeam:
+        """The beam each of whose pixels is divided into factor x factor; `binned` undoes it."""
+        return ConeBeam(self.sources, self.detectors, self.u / factor, self.v / factor,
+                        (self.shape[0] * factor, self.shape[1] * factor))
+
     def check(self, grid: Grid) -> None:
         """Raise ValueError unless the whole box of voxels lies between every source and its detector's plane."""
         depth = (grid.corners() @ self.normals.T) - (self.sources * self.normals).sum(1)  # (8, K) from source plane

@@ -18,6 +18,7 @@ from phydict.prior import Refiner, load_prior, save_prior
 from phydict.training.data import PriorData
 from phydict.training.refiner import RefinerTraining
 from phydict.training.scenes import Scenes, fine_xrays
+from phydict.training.settings import Loading
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 
@@ -93,6 +94,7 @@ def test_fine_xrays_of_blocks_are_those_of_their_means_where_rays_cannot_tell():
     projector = Projector(grid, ConeBeam.orbit(3, 1020, 740, (28, 28), 20.0), full_detector=True)
     smooth = interpolate(torch.rand((1, 1, 3, 3, 3), generator=rng), (32, 32, 32), mode="trilinear") * 0.02
     coarse, fine = projector(avg_pool3d(smooth, 2)), fine_xrays(smooth, projector)
+    np.testing.assert_allclose(projector.beam.divided(2).binned(2).pixels(), projector.beam.pixels())
     assert fine.shape == coarse.shape
     assert (fine - coarse).abs().mean() < 0.02 * coarse.mean()
     grain = smooth + 0.02 * torch.rand((1, 1, 32, 32, 32), generator=rng)
@@ -101,19 +103,18 @@ def test_fine_xrays_of_blocks_are_those_of_their_means_where_rays_cannot_tell():
 
 
 def test_learnt_volumes_are_means_of_what_their_xrays_are_made_of(cache):
-    data = PriorData(phantoms=2, cache=str(cache), cube=Cube(16), simulation_voxels=32)
-    case = data.draws(0)[0]
-    torch.testing.assert_close(case["volume"], avg_pool3d(case["fine"], 2))
-    assert case["fine"].shape[1:] == (32, 32, 32) and case["masks"].shape[1:] == (16, 16, 16)
-    window = HUWindow(-1000, 600)
-    fine, ct = case["fine"][None], case["volume"][None]
-    made = [Scenes(fine=share).measure(ct, np.random.default_rng(3), Grid.cube(16), window, fine).y for share in (0, 1)]
+    data = PriorData(phantoms=2, cache=str(cache), cube=Cube(16), loading=Loading(simulation_voxels=32))
+    batch = data.collate([data.draws(0)[0]])
+    torch.testing.assert_close(batch["volume"], avg_pool3d(batch["fine"], 2))
+    assert batch["fine"].shape[2:] == (32, 32, 32) and batch["masks"].shape[2:] == (16, 16, 16)
+    ct, others = batch["volume"], (Grid.cube(16), HUWindow(-1000, 600), batch["fine"])
+    made = [Scenes(fine=share).measure(ct, np.random.default_rng(3), *others).y for share in (0, 1)]
     assert made[0].shape == made[1].shape and not torch.equal(*made)
     with pytest.raises(ValueError, match="multiple of model.cube.voxels, 16, but 40"):
-        PriorData(phantoms=2, cache=str(cache), cube=Cube(16), simulation_voxels=40)
+        PriorData(phantoms=2, cache=str(cache), cube=Cube(16), loading=Loading(simulation_voxels=40))
 
 
 def test_a_refiner_learns_from_xrays_of_finer_volumes(tmp_path, cache, prior_file):
-    main(arguments(tmp_path, cache, prior_file, "--data.simulation_voxels=32", "--model.scenes.fine=1",
+    main(arguments(tmp_path, cache, prior_file, "--data.loading.simulation_voxels=32", "--model.scenes.fine=1",
                    "--trainer.max_epochs=1"))
     assert (tmp_path / "last.ckpt").is_file()

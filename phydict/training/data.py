@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 
 import lightning
 import torch
+from torch.nn.functional import avg_pool3d
 from torch.utils.data import ConcatDataset, DataLoader, Dataset, DistributedSampler
 
 from phydict.datasets import Augmentation, CTCases, CTSource, Thorax, report, split_by_patient
@@ -34,20 +34,18 @@ class PriorData(lightning.LightningDataModule):
         seed: of the draws and of the split into patients
         cube: tied to model.cube
         window: tied to model.window
-        simulation_voxels: voxels per side of the volumes that X-rays are made of, a multiple of model.cube.voxels; none
-            given: the model's own. For stages that learn from X-rays
     """
 
     def __init__(self, cts: str | None = None, source: CTSource = CTSource(), holdout: HoldOut = HoldOut(),
                  phantoms: int = 2000, loading: Loading = Loading(), cache: str = "runs/cache",
                  augmentation: Augmentation = Augmentation(), seed: int = 0, cube: Cube = Cube(),
-                 window: tuple[float, float] = (-1000.0, 1000.0), simulation_voxels: int | None = None):
+                 window: tuple[float, float] = (-1000.0, 1000.0)):
         super().__init__()
         check_seed(seed)
-        self.factor, rest = divmod(simulation_voxels or cube.voxels, cube.voxels)
+        self.factor, rest = divmod(loading.simulation_voxels or cube.voxels, cube.voxels)
         if rest or self.factor < 1:
-            raise ValueError(f"data.simulation_voxels is a multiple of model.cube.voxels, {cube.voxels}, but "
-                             f"{simulation_voxels} was given")
+            raise ValueError(f"data.loading.simulation_voxels is a multiple of model.cube.voxels, {cube.voxels}, but "
+                             f"{loading.simulation_voxels} was given")
         if not cts and not phantoms:
             raise ValueError("there is nothing to train on: give data.cts, or data.phantoms above 0")
         if phantoms < 0:
@@ -96,19 +94,23 @@ class PriorData(lightning.LightningDataModule):
         draws = self.draws(self.trainer.current_epoch)
         turns = DistributedSampler(draws, self.trainer.world_size, self.trainer.global_rank, shuffle=False)
         return DataLoader(draws, self.loading.batch_size, sampler=turns, num_workers=self.loading.workers,
-                          drop_last=True)
+                          drop_last=True, collate_fn=self.collate)
 
     def draws(self, epoch: int) -> Dataset:
         """What is trained on in an epoch."""
         if self.population:
             self.population.prepare()  # here, before loader processes are forked
         return MixedCases(self.cts, self.phantoms, self.loading.ct_fraction, self.grid, self.window,
-                          self.loading.epoch_size, epoch, self.seed, self.augmentation, self.population, self.factor)
+                          self.loading.epoch_size, epoch, self.seed, self.augmentation, self.population)
 
     def val_dataloader(self) -> DataLoader:
-        return DataLoader(self.validation, 1, collate_fn=partial(_collate, factor=self.factor),
-                          num_workers=self.loading.workers)
+        return DataLoader(self.validation, 1, num_workers=self.loading.workers, collate_fn=self.collate)
 
-
-def _collate(cases: list[dict], factor: int) -> dict:
-    return torch.utils.data.default_collate([training_parts(case, factor) for case in cases])
+    def collate(self, cases: list[dict]) -> dict:
+        """A batch of cases in the model's voxels; drawn in finer ones, these are the batch's "fine" volumes, and their
+        means over blocks are what is learnt."""
+        batch = torch.utils.data.default_collate([training_parts(case) for case in cases])
+        if self.factor == 1:
+            return batch
+        means = {key: avg_pool3d(batch[key], self.factor) for key in ("volume", "masks")}
+        return batch | means | {"fine": batch["volume"]}

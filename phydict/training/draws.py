@@ -6,7 +6,6 @@ from abc import abstractmethod
 from collections.abc import Sequence
 
 import numpy as np
-from torch.nn.functional import avg_pool3d
 from torch.utils.data import Dataset
 
 from phydict.datasets.cts.augment import Augmentation, augment
@@ -15,7 +14,7 @@ from phydict.grid import Grid
 from phydict.units import HUWindow
 
 KEYS = ("volume", "masks", "has_masks", "report")
-"""The parts of a Case that training needs, beside the "fine" volume that its X-rays are made of."""
+"""The parts of a Case that training needs."""
 
 
 class Draws(Dataset):
@@ -44,15 +43,13 @@ class Draws(Dataset):
 
 
 class MixedCases(Draws):
-    """Deformed cases on a grid, of which blocks of `factor`^3 voxels are learnt; with a population, its share of the draws
-    from CTs is taken from there."""
+    """Deformed cases; with a population, its share of the draws from CTs is taken from there."""
 
     def __init__(self, cts: Sequence, phantoms: Sequence, ct_fraction: float, grid: Grid, window: HUWindow,
                  length: int, epoch: int, seed: int, augmentation: Augmentation = Augmentation(),
-                 population: DrawnPatients | None = None, factor: int = 1):
+                 population: DrawnPatients | None = None):
         super().__init__(cts, phantoms, ct_fraction, length, epoch, seed)
         self.grid, self.window, self.augmentation, self.population = grid, window, augmentation, population
-        self.factor = factor
 
     def source(self, rng: np.random.Generator) -> Sequence:
         source = super().source(rng)
@@ -61,15 +58,9 @@ class MixedCases(Draws):
         return self.population
 
     def item(self, drawn: dict, rng: np.random.Generator) -> dict:
-        deformed = augment(drawn, int(rng.integers(2**31)), self.grid, self.window, self.augmentation)
-        return training_parts(deformed, self.factor)
+        return training_parts(augment(drawn, int(rng.integers(2**31)), self.grid, self.window, self.augmentation))
 
 
-def training_parts(case: dict, factor: int = 1) -> dict:
-    """A Case without what training does not need; where it has finer voxels than are learnt, their means over blocks of
-    `factor`^3, beside its own volume as "fine"."""
-    parts = {key: case[key] for key in KEYS if key in case}
-    if factor == 1:
-        return parts
-    means = {key: avg_pool3d(parts[key], factor) for key in ("volume", "masks")}
-    return parts | means | {"fine": case["volume"]}
+def training_parts(case: dict) -> dict:
+    """A Case without what training does not need."""
+    return {key: case[key] for key in KEYS if key in case}

@@ -33,7 +33,7 @@ class Scenes:
         noise: least and most standard deviation of the noise, as a share of the largest line integral
         model_error: share of scenes with beam hardening and a scale that is off by up to 2 %
         fine: share of scenes whose X-rays are made of the finer volume, where the data have one
-            (data.simulation_voxels), on a detector that is as much finer and is then binned
+            (data.loading.simulation_voxels), on a detector that is as much finer and is then binned
     """
 
     most_views: int = 32

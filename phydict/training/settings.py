@@ -194,6 +194,8 @@ class Loading:
         workers: loader processes per device
         ct_fraction: share of draws taken from the CTs, in [0, 1]
         population: new patients drawn from the CTs, which a share of these draws is taken from
+        simulation_voxels: for stages that learn from X-rays, voxels per side of the volumes that these are made of, a
+            multiple of model.cube.voxels; none given: the model's own
     """
 
     epoch_size: int = 400
@@ -201,6 +203,7 @@ class Loading:
     workers: int = 0
     ct_fraction: float = 0.5
     population: PopulationSettings = PopulationSettings()
+    simulation_voxels: int | None = None
 
     def __post_init__(self):
         check_fields(self, "data.loading", epoch_size=(1, MOST_DRAWS), batch_size=(1, MOST_DRAWS),

@@ -85,11 +85,14 @@ def find_poses(xrays: Tensor, beam: ConeBeam, uncertain: Uncertain, grid: Grid, 
     """Poses and gains of X-rays (K, V, U) whose nominal geometry is `beam`.
 
     display: display values, whose gains and offsets are found too, from those that a typical chest would have on.
-    grid: of the reconstruction. Computed on the CPU. Raises ValueError where the data cannot hold the unknowns.
+    grid: of the reconstruction. Computed on the CPU. Raises ValueError where the data cannot hold the unknowns,
+    and where neither density nor size has a scale.
     """
     check_xrays(xrays, beam)
     beam.check(grid)
     uncertain.check(beam.views, xrays[0].numel())
+    if display:
+        uncertain.check_scale(beam)
     while max(grid.shape) > MOST_VOXELS:
         grid = halved(grid)
     watch, deviations, coarse = Stopwatch(), uncertain.deviations, halved(grid)

@@ -58,7 +58,8 @@ def load_xrays(folder: str | Path, geometry: str | Path | None = None, intensity
     decide, other floating-point images are taken as line integrals, and integer images are refused.
     Returns {"id": folder name, "xrays": (K,V,U) float32, "beam": ConeBeam, "report": str, "display": bool,
     "uncertain": Uncertain or None, "description": Description}; with display True, the X-rays are display values whose
-    gain and offset per view are unknown; uncertain: what the geometry file is not sure of; description: all it says.
+    gain and offset per view are unknown; uncertain: what the geometry file is not sure of, or, where CR and DX tags
+    state the beam and no file says it, `by_hand`; description: all that the file says.
     Raises FileNotFoundError for a missing folder, geometry or images, ValueError for everything that does not fit.
     """
     folder = own_or_shipped(folder)
@@ -98,7 +99,7 @@ def load_xrays(folder: str | Path, geometry: str | Path | None = None, intensity
                          "out of the images and of the geometry")
     return {"id": name_of(folder.absolute()), "beam": beam, "report": _read_report(folder / REPORT),
             "xrays": torch.from_numpy(described.orientation.apply(xrays).astype(np.float32)),
-            "display": intensity.kind == "display", "uncertain": described.uncertain,
+            "display": intensity.kind == "display", "uncertain": described.uncertain_of(beam, views.tags),
             "description": described}
 
 

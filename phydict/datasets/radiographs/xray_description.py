@@ -28,7 +28,7 @@ from phydict.datasets.radiographs.dicom_beam import tags_beam
 from phydict.runtime.yaml_file import read_yaml
 from phydict.xray.geometry import ConeBeam, pixel_sizes
 from phydict.xray.geometry_files import read_beam
-from phydict.xray.poses.uncertain import Uncertain
+from phydict.xray.poses.uncertain import Uncertain, by_hand
 
 GEOMETRY = "geometry.yaml"
 
@@ -84,10 +84,10 @@ class Description:
 
     def beam_of(self, shape: tuple[int, int], tags: list[DicomTags]) -> ConeBeam:
         """The beam for images of `shape` (V, U), turned, and their DICOM tags, if any. Raises ValueError."""
-        if self.beam is None or "dicom" in self.beam:
+        if self._left_to_tags:
             if not tags:
-                raise ValueError(f"{self.source} leaves the beam to DICOM's tags, but the images are not DICOM; state "
-                                 "`beam:`")
+                raise ValueError(f"{self.source} leaves the beam to DICOM's tags, but the images are not DICOM, so "
+                                 "that they have no scale; state `beam:` with pixel size and distances in mm")
             return tags_beam(tags, shape, (self.beam or {}).get("dicom"), self.orientation.turned,
                              f"`dicom:` of {self.source}")
         if "file" in self.beam:
@@ -96,6 +96,15 @@ class Description:
             return ConeBeam.from_dict(self.beam)
         except ValueError as error:
             raise ValueError(f"{self.source}: {error}") from error
+
+    @property
+    def _left_to_tags(self) -> bool:
+        return self.beam is None or "dicom" in self.beam
+
+    def uncertain_of(self, beam: ConeBeam, tags: list[DicomTags]) -> Uncertain | None:
+        """What is not sure of the beam: what the file says or, where CR and DX tags state the beam, what is usual."""
+        usual = self._left_to_tags and not any(frame.angiographic for frame in tags)
+        return by_hand(beam) if self.uncertain is None and usual else self.uncertain
 
     def reference_files(self, intensity: Intensity | None) -> dict[str, list[Path]]:
         """The flat and dark images that an intensity names, beside the geometry file."""

@@ -8,11 +8,14 @@ from numbers import Real
 
 import numpy as np
 
+from phydict.xray.geometry import ConeBeam
 from phydict.xray.poses.unknowns import POSE
 
 MOST = {"rotation_degrees": 20.0, "gain": 1.0, "offset": 10.0}
 """Standard deviations that are no longer small; MOST_MM for those in mm."""
 MOST_MM = 200.0
+MOST_STRETCH = 0.2
+"""Share of the source-detector distance by which it may be uncertain where a volume's density has no scale either."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +80,23 @@ class Uncertain:
             raise ValueError(f"{unknowns} unknowns of {views} views cannot be found from {views * pixels} pixels: "
                              "state fewer under `uncertain:`, or give finer images")
 
+    def check_scale(self, beam: ConeBeam) -> None:
+        """Raises ValueError where display values of a beam would have no scale at all, neither of density nor of
+        size."""
+        distance = float(beam.distances.min())
+        if self.source_to_detector_mm > MOST_STRETCH * distance:
+            raise ValueError(f"display values have no scale of density, and where {distance:.4g} mm from source to "
+                             f"detector are uncertain by {self.source_to_detector_mm:g} mm they have none of size "
+                             f"either: state source_to_detector_mm up to {MOST_STRETCH * distance:.0f} under "
+                             "`uncertain:`, with the pixel size and distances that go with it, or give line integrals")
+
 
 USUAL = Uncertain(detector_shift_mm=5.0, source_shift_mm=5.0, source_to_detector_mm=5.0, rotation_degrees=2.0)
 """For simulated X-rays, of which no file says it."""
+
+
+def by_hand(beam: ConeBeam) -> Uncertain:
+    """What is usual of radiographs for which a patient stands and turns between exposures: a magnification within 10 %
+    of what was noted among it."""
+    return Uncertain(detector_shift_mm=10.0, source_to_detector_mm=min(0.06 * float(beam.distances.min()), MOST_MM),
+                     rotation_degrees=4.0)

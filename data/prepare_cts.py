@@ -3,11 +3,10 @@
 from collections import Counter
 from pathlib import Path
 
-from jsonargparse import auto_cli
-
 from phydict.datasets.cts.preparation import SUMMARY, prepare_folder
 from phydict.datasets.cts.spaces import Settings, atlas_lungs
 from phydict.runtime.console import check_writable, cli_errors, quiet
+from phydict.runtime.telling import run_told
 
 
 def prepare(cts: str, out: str, voxels: int = 256, side: float = 384.0, space: str = "patient",
@@ -46,7 +45,7 @@ def prepare(cts: str, out: str, voxels: int = 256, side: float = 384.0, space: s
 def main(args: list[str] | None = None) -> None:
     """Command line; a bad input ends in one sentence and exit code 2."""
     with cli_errors(), quiet():
-        auto_cli(prepare, args=args, as_positional=True, exit_on_error=False, allow_abbrev=False)
+        run_told(prepare, args, positional=True)
 
 
 if __name__ == "__main__":

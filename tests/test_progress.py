@@ -6,6 +6,7 @@ import pytest
 
 from phydict.runtime import progress as module
 from phydict.runtime.progress import CaseProgress, duration
+from phydict.runtime.telling import telling
 
 
 @pytest.fixture
@@ -14,9 +15,7 @@ def told(capsys, monkeypatch):
     def run(quiet: bool = False, json_lines: bool = False) -> list[str]:
         now = [0.0]
         monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
-        progress = CaseProgress(interval=10)
-        progress.tell(quiet, json_lines)
-        with progress:
+        with telling(quiet, json_lines), CaseProgress(interval=10) as progress:
             progress.begin("sirt", 3, 2, out="there")
             for case in "abc":
                 progress.case(case)
@@ -30,9 +29,11 @@ def told(capsys, monkeypatch):
 
 def test_a_log_says_what_is_done_what_remains_for_how_long_and_where(told):
     assert told() == ["sirt: 3 cases to reconstruct, results in there",
-                      "a: step 1 of 2", "a: step 2 of 2", "a: good (1 of 3, about 80 s to go)",
-                      "b: step 1 of 2", "b: step 2 of 2", "b: good (2 of 3, about 40 s to go)",
-                      "c: step 1 of 2", "c: step 2 of 2", "c: good (3 of 3)"]
+                      "a: step 1 of 2, about 2 min to go", "a: step 2 of 2, about 80 s to go",
+                      "a: good (1 of 3, about 80 s to go)",
+                      "b: step 1 of 2, about 60 s to go", "b: step 2 of 2, about 40 s to go",
+                      "b: good (2 of 3, about 40 s to go)",
+                      "c: step 1 of 2, about 20 s to go", "c: step 2 of 2", "c: good (3 of 3)"]
 
 
 def test_machines_read_the_same_as_json(told):

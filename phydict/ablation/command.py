@@ -25,6 +25,7 @@ from phydict.runtime.files import alone_in
 from phydict.runtime.help import HelpFormatter, show_settings
 from phydict.runtime.progress import CaseProgress
 from phydict.runtime.reading import reason
+from phydict.runtime.telling import add_telling, telling
 
 
 def main(args: list[str] | None = None) -> None:
@@ -39,14 +40,13 @@ def main(args: list[str] | None = None) -> None:
         except Exception as error:  # torch has a kind for each reason
             raise ValueError(f"--device {device} cannot be used ({reason(error)[:100]}): give cpu, or leave it "
                              "out") from error
-        quiet_progress, json_lines = given.pop("quiet"), given.pop("json_lines")
+        manner = given.pop("quiet"), given.pop("json_lines")
         specification = read_specification(given.pop("config"), given.pop("set"), **given)
         check_writable(specification.out, "out")
         check_own_page(specification.out, "out")
         check_apart(specification.out, "out", [Path(cts)] if (cts := specification.cases.cts) else [])
         scoring = Scoring(specification.metrics, specification.fid, specification.clip)
-        with alone_in(specification.out, "out"), CaseProgress() as progress:
-            progress.tell(quiet_progress, json_lines)
+        with alone_in(specification.out, "out"), telling(*manner), CaseProgress() as progress:
             rows = run(specification, torch.device(device), progress, scoring)
         print(f"{len(rows)} rows in {specification.out / RESULTS}")
         entries = summarise(rows)
@@ -78,8 +78,7 @@ def _parser(args: Sequence[str]) -> ArgumentParser:
                         help=f"what is measured, instead of the file's: a list of {', '.join(METRICS)}")
     parser.add_argument("--out", type=str, help="folder of the results, instead of the file's")
     parser.add_argument("--device", type=str, help="cpu or cuda; left out: cuda where there is one")
-    parser.add_argument("--quiet", action="store_true", help="tell no progress, only results, warnings and errors")
-    parser.add_argument("--json_lines", action="store_true", help="tell the progress as a JSON object on each line")
+    add_telling(parser)
     words = {word for arg in args for word in re.findall(r"\w+", arg)}
     for name in reversed([name for name in METHODS if name in words]):
         show_settings(parser, name, METHODS[name], "method")

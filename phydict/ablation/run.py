@@ -26,6 +26,7 @@ from phydict.runtime.precision import instruction_set
 from phydict.runtime.profiling import peak_memory, profiled, reset_peak_memory
 from phydict.runtime.progress import CaseProgress
 from phydict.runtime.seeds import case_seed
+from phydict.runtime.telling import tell
 
 RESULTS, TABLES = "results.csv", ("tables.md", "tables.tex")
 """The results of a folder, and the tables that are made of them."""
@@ -118,11 +119,13 @@ def run(specification: Specification, device: torch.device, progress: CaseProgre
     if scoring.network:
         results.forget(lambda name: not features_file(specification.out, name).is_file())
     left = sum(name not in results.done for name in planned)
-    print(f"{len(planned) - left} of {len(planned)} rows are there already, {left} are to be run")
-    if results.others:
-        print(f"{len(results.others)} rows of other settings or data are kept in {results.file} and left out of tables")
+    tell(f"{len(planned) - left} of {len(planned)} rows are there already, {left} are to be run",
+         event="kept", cases=len(planned) - left, of=len(planned))
+    if others := len(results.others):
+        tell(f"{others} rows of other settings or data are kept in {results.file} and left out of tables",
+             event="others", cases=others, out=str(results.file))
     bench = Runner(device, scoring, specification.out)
-    progress.begin("ablate", left, verb="run", out=specification.out)
+    progress.begin("ablate", left, verb="run", out=specification.out, noun="row")
     for case, work in cases.items():
         groups: dict[str, list] = {}
         made = CaseCache()

@@ -11,6 +11,7 @@ from phydict.prior.stage_file import is_saved_prior
 from phydict.prior.text_file import build_text, has_text
 from phydict.rivals import NETWORKS, build_rival, save_rival
 from phydict.runtime.console import check_writable
+from phydict.runtime.telling import tell
 from phydict.training.checkpoints import read_checkpoint
 
 
@@ -31,14 +32,17 @@ def export_prior(checkpoint: str, out: str, overwrite: bool = False) -> None:
         raise ValueError(f"{out} is a prior already: add --overwrite true to replace it, or give another --out")
     content = read_checkpoint(checkpoint)
     header = content["phydict"]
+    stage, steps = header.get("stage", "base"), content.get("global_step")
+    tell(f"export: stage {stage} after {steps} steps, to {out}", event="begin", name="export", stage=stage, steps=steps,
+         out=out)
     weights = {k.removeprefix("prior."): w for k, w in content["state_dict"].items() if k.startswith("prior.")}
-    training = header.get("training", {"steps": content.get("global_step")})
-    if header.get("stage") == "super_resolution":
+    training = header.get("training", {"steps": steps})
+    if stage == "super_resolution":
         save_super_resolution(build_super_resolution(header, weights), out, training)
-    elif header.get("stage") in NETWORKS:
+    elif stage in NETWORKS:
         save_rival(build_rival(header, weights), out, training)
     else:
-        refiner = build_refiner(header, weights) if header.get("stage") == "refiner" else None
+        refiner = build_refiner(header, weights) if stage == "refiner" else None
         prior = refiner.prior if refiner else build_prior(header, weights)
         if has_text(header):
             weights = {k.removeprefix("prior."): w for k, w in weights.items()}

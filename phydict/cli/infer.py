@@ -8,12 +8,12 @@ from dataclasses import fields, is_dataclass
 from pathlib import Path
 
 import lightning
-from lightning.pytorch.cli import LightningCLI
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from phydict.ablation import main as ablate
 from phydict.cli.help import describe_commands, method_help, predict_help
 from phydict.cli.page import main as page
+from phydict.cli.telling import TellingCLI
 from phydict.datasets.radiographs.radiographs import load_xrays
 from phydict.inference.data import ReconstructionData
 from phydict.inference.dry_run import dry_run
@@ -30,7 +30,7 @@ COMMANDS = {"predict": "X-rays -> volumes", "test": "CTs -> X-rays -> volumes an
             "ablate": "methods compared on the same X-rays", "page": "results -> a page for the browser"}
 
 
-class InferenceCLI(LightningCLI):
+class InferenceCLI(TellingCLI):
     """predict and test only; no logs, no checkpoints, gradients allowed inside the steps."""
 
     def setup_parser(self, *args) -> None:
@@ -46,8 +46,6 @@ class InferenceCLI(LightningCLI):
         parser = super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
         parser.add_argument("--profile", action="store_true",
                             help="print the seconds and the peak memory of every stage of each case")
-        parser.add_argument("--quiet", action="store_true", help="tell no progress, only results, warnings and errors")
-        parser.add_argument("--json_lines", action="store_true", help="tell the progress as a JSON object on each line")
         parser.add_argument("--calibrate", action="store_true",
                             help="find first what the geometry file states as uncertain: poses, gains and offsets")
         if subcommand == "predict":
@@ -76,23 +74,7 @@ class InferenceCLI(LightningCLI):
     @property
     def dry_run(self) -> bool:
         """Whether the geometry is drawn and nothing reconstructed."""
-        return self._flag("dry_run")
-
-    @property
-    def profile(self) -> bool:
-        """Whether each case's stages are timed and their memory measured."""
-        return self._flag("profile")
-
-    @property
-    def calibrate(self) -> bool:
-        """Whether what the geometry is not sure of is found first."""
-        return self._flag("calibrate")
-
-    def _flag(self, name: str) -> bool:
-        value = self._get(self.config, name, False)
-        if not isinstance(value, bool):
-            raise ValueError(f"{name} is true or false, but {value!r} was given")
-        return value
+        return self.flag("dry_run")
 
     def instantiate_trainer(self, **kwargs) -> lightning.Trainer:
         with reading("the settings of trainer", "correct them"):
@@ -106,8 +88,7 @@ class InferenceCLI(LightningCLI):
             check_apart(model.pages, "model.out", datamodule.inputs("predict"))
             self._draw(datamodule.xray_cases(), model, datamodule.geometry)
             return
-        model.profile, model.calibrate = self.profile, self.calibrate
-        model.progress.tell(self._flag("quiet"), self._flag("json_lines"))
+        model.profile, model.calibrate = self.flag("profile"), self.flag("calibrate")
         with model.progress:
             self.trainer.predict(model, datamodule=datamodule, return_predictions=False)
 
@@ -132,10 +113,9 @@ class InferenceCLI(LightningCLI):
 
     def test(self, model: ReconstructionTask, datamodule: ReconstructionData) -> None:
         """Simulate the X-rays of CTs, reconstruct and score them."""
-        model.profile, model.calibrate = self.profile, self.calibrate
+        model.profile, model.calibrate = self.flag("profile"), self.flag("calibrate")
         model.measure(Scoring(self._get(self.config, "metrics"), self._get(self.config_init, "fid"),
                               self._get(self.config_init, "clip")))
-        model.progress.tell(self._flag("quiet"), self._flag("json_lines"))
         with model.progress:
             self.trainer.test(model, datamodule=datamodule, verbose=False)
 

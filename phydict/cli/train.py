@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import reprlib
 import sys
-from contextlib import nullcontext
 from pathlib import Path
 
 import lightning
@@ -18,6 +17,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from phydict.cli.export import export_prior, print_prior
 from phydict.cli.help import describe_commands, fit_help
+from phydict.cli.telling import TellingCLI
 from phydict.runtime.console import (
     check_apart, check_command, check_configured, check_processes, check_writable, cli_errors, quiet,
     read_configurations, with_configurations)
@@ -25,6 +25,7 @@ from phydict.runtime.files import alone_in, atomic_write
 from phydict.runtime.precision import PRECISIONS, resolve_precision, trainer_precision
 from phydict.runtime.help import HelpFormatter
 from phydict.runtime.reading import reading
+from phydict.runtime.telling import run_told, telling
 from phydict.training.prior import PriorTraining
 from phydict.training.checkpoints import BEST, HELD_OUT, RESUMED, BestCheckpoint, WholeCheckpoints, read_checkpoint
 from phydict.training.crops import SuperResolutionData
@@ -63,7 +64,7 @@ def stage_of(args: list[str]) -> str:
     return stage
 
 
-class PriorCLI(LightningCLI):
+class PriorCLI(TellingCLI):
     """fit and validate; ties the data's grid and HU window to the model's, and writes everything below `out`."""
 
     @staticmethod
@@ -125,9 +126,15 @@ class PriorCLI(LightningCLI):
         """Train, alone in the folder of the run."""
         out = Path(self.config.fit.out)
         check_apart(out, "--out", [Path(cts)] if (cts := self.config.fit.data.cts) else [])
-        with alone_in(out, "--out") if self.trainer.is_global_zero else nullcontext():
+        with alone_in(out, "--out") if self.trainer.is_global_zero else telling(quiet=True, json_lines=False):
             self._begin(out, ckpt_path)
-            self.trainer.fit(model, datamodule=datamodule, ckpt_path=ckpt_path, weights_only=weights_only)
+            try:
+                self.trainer.fit(model, datamodule=datamodule, ckpt_path=ckpt_path, weights_only=weights_only)
+            except BaseException as stop:
+                there = (out / CHECKPOINT).is_file()
+                stop.add_note(f"add --ckpt_path {out / CHECKPOINT}" if there else
+                              "run the same command again: no epoch was done, and nothing is kept")
+                raise
 
     def _begin(self, out: Path, resumed: str | None) -> None:
         """What comes before the first step. Raises ValueError where another training's files would be replaced."""
@@ -172,7 +179,7 @@ def main(args: list[str] | None = None) -> None:
     given = sys.argv[1:] if args is None else args
     with cli_errors(MisconfigurationException, to_resume="add --ckpt_path and the run's last.ckpt"), quiet():
         if given[:1] == ["export"]:
-            auto_cli(export_prior, args=given[1:], as_positional=False, exit_on_error=False, allow_abbrev=False)
+            run_told(export_prior, given[1:], f"{Path(sys.argv[0]).name} export")
         elif given[:1] == ["inspect-prior"]:
             auto_cli(print_prior, args=given[1:], exit_on_error=False, allow_abbrev=False)
         else:

@@ -43,6 +43,7 @@ from phydict.runtime.precision import instruction_set
 from phydict.runtime.profiling import CPU, peak_memory, profiled, stage
 from phydict.runtime.progress import CaseProgress
 from phydict.runtime.seeds import case_seed, check_seed
+from phydict.runtime.telling import tell
 from phydict.runtime.warning import warn
 from phydict.units import HUWindow
 from phydict.xray.poses.uncertain import USUAL, Uncertain
@@ -171,9 +172,10 @@ class ReconstructionTask(lightning.LightningModule):
         self.cases = list(sources)
         left = self.results.unfinished(sources, self.settings)
         if len(left) < len(sources) and self.trainer.is_global_zero:
-            print(f"{len(sources) - len(left)} of {len(sources)} cases are finished already and are kept"
-                  + (", so they are not profiled: --model.overwrite true does them again" if self.profile else ""),
-                  file=sys.stderr)
+            kept = len(sources) - len(left)
+            tell(f"{kept} of {len(sources)} cases are finished already and are kept"
+                 + (", so they are not profiled: --model.overwrite true does them again" if self.profile else ""),
+                 event="kept", cases=kept, of=len(sources))
         return left
 
     def predict_step(self, case: dict, index: int = 0) -> None:
@@ -249,10 +251,10 @@ class ReconstructionTask(lightning.LightningModule):
     def _start(self, cases: int) -> None:
         if isinstance(self.plain, CascadePosterior):
             self.plain.check_memory(self.device)
-        if isinstance(self.reconstructor, Refined) and not (self.progress.quiet or self.progress.json):
+        if isinstance(self.reconstructor, Refined):
             sizes = " and ".join(" x ".join(map(str, level.shape)) for level in self.reconstructor.levels)
-            print(f"no trained stage was given for {sizes} voxels: the X-rays and total variation alone refine to them",
-                  file=sys.stderr)
+            note = f"no trained stage was given for {sizes} voxels: the X-rays and total variation alone refine to them"
+            tell(note, event="note", text=note)
         self.progress.begin(self.method_name, cases, self.reconstructor.steps(), out=self.results.folder)
 
     def _report(self, case: dict) -> str:

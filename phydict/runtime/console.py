@@ -29,6 +29,8 @@ NOISE = (".*does not have many workers", ".*LeafSpec.*is deprecated", ".*is smal
          ".*args parameter is intended to run from within Python", "predict returned None",
          "You're resuming from a checkpoint that ended before the epoch ended",
          "You're using the WeightAveraging callback with a model that overrides the configure_model",
+         "You're using the WeightAveraging callback, but loading a checkpoint outside the 'fit' stage",
+         "The dirpath has changed from",
          r"Found \d+ module\(s\) in eval mode at the start of training")
 """Warnings that tell a user of the command lines nothing to act on."""
 
@@ -56,20 +58,20 @@ TRACEBACK = "PHYDICT_TRACEBACK"
 def cli_errors(*also: type[Exception], to_resume: str = "run the same command again") -> Iterator[None]:
     """Prints bad arguments, ValueError, OSError, FloatingPointError and `also` as one sentence and exits with code 2;
     the environment variable PHYDICT_TRACEBACK=1 shows the trace instead. A run that a signal stopped says how to resume
-    and exits with code 130 (SIGINT) or 143 (SIGTERM)."""
+    and exits with code 130 (SIGINT) or 143 (SIGTERM): as `to_resume` has it, or the note of what was raised."""
     try:
         yield
     except (KeyboardInterrupt, SystemExit) as stop:  # Lightning exits with 1 on SIGINT and without a code on SIGTERM
         interrupted = isinstance(stop, KeyboardInterrupt) or isinstance(stop.__context__, KeyboardInterrupt)
         if not interrupted and isinstance(stop, SystemExit) and stop.code is not None:
             raise
-        print(f"stopped by a signal; to resume, {to_resume}", file=sys.stderr)
+        print(f"stopped by a signal; to resume, {_advice(stop, to_resume)}", file=sys.stderr)
         raise SystemExit(130 if interrupted else 143) from None
     except (ValueError, OSError, FloatingPointError, ArgumentError, *also) as error:  # type: ignore[misc]
         if os.environ.get(TRACEBACK):
             raise
         full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
-        advice = f": free some space; to resume, {to_resume}" if full else ""
+        advice = f": free some space; to resume, {_advice(error, to_resume)}" if full else ""
         print(f"error: {sentence(error)}{advice}", file=sys.stderr)
         raise SystemExit(2) from None
     except RuntimeError as error:
@@ -77,6 +79,10 @@ def cli_errors(*also: type[Exception], to_resume: str = "run the same command ag
             raise
         print("stopped, because another process of this run ended; its message says why", file=sys.stderr)
         raise SystemExit(2) from None
+
+
+def _advice(stop: BaseException, to_resume: str) -> str:
+    return getattr(stop, "__notes__", [to_resume])[-1]
 
 
 def with_configurations(args: list[str], kinds: tuple[str, ...]) -> list[str]:

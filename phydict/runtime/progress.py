@@ -2,48 +2,41 @@
 
 from __future__ import annotations
 
-import json
-import sys
 import time
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from phydict.runtime.telling import bars_on, tell
 
 
 class CaseProgress:
     """Cases and the steps of the present case; a context manager that gives the terminal back however a run ends.
 
-    interval: seconds between two lines about one case where the output is no terminal. `tell` chooses otherwise.
+    interval: seconds between two lines about one case where the output is no terminal.
     """
 
     def __init__(self, interval: float = 60.0):
-        console = Console(stderr=True)
-        self.live, self.interval, self.quiet, self.json = console.is_terminal, interval, False, False
-        self.bars = Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
-                             TimeRemainingColumn(), console=console, disable=not self.live)
+        self.interval, self.bars, self.entered = interval, bars_on(Console(stderr=True)), False
 
     def __enter__(self) -> CaseProgress:
-        self.bars.start()
+        self.bars, self.entered = bars_on(Console(stderr=True)), True
         return self
 
     def __exit__(self, *_) -> None:
         self.bars.stop()
 
-    def tell(self, quiet: bool, json_lines: bool) -> None:
-        """Tells nothing, or, before it, a JSON object on each line; neither leaves it as it is."""
-        self.quiet, self.json = quiet, json_lines
-        if quiet or json_lines:
-            self.live, self.bars.disable = False, True
-
-    def begin(self, name: str, cases: int, steps: int = 0, verb: str = "reconstruct", out: str | Path = "") -> None:
+    def begin(self, name: str, cases: int, steps: int = 0, verb: str = "reconstruct", out: str | Path = "",
+              noun: str = "case") -> None:
         """A run over `cases` cases of `steps` steps each, 0 where steps are not followed, whose results go to `out`."""
+        where = f", results in {out}" if str(out) else ""
+        tell(f"{name}: {cases} {noun}{'' if cases == 1 else 's'} to {verb}{where}",
+             event="begin", name=name, cases=cases, steps=steps, out=str(out))
+        if self.entered:
+            self.bars.start()
         self.cases = self.bars.add_task(name, total=cases)
         self.steps = self.bars.add_task("", total=steps, visible=steps > 0)
         self.done, self.of, self.of_steps, self.began = 0, cases, steps, time.monotonic()
-        where = f", results in {out}" if str(out) else ""
-        self._line(f"{name}: {cases} {'case' if cases == 1 else 'cases'} to {verb}{where}",
-                   event="begin", name=name, cases=cases, steps=steps, out=str(out))
 
     def case(self, name: str) -> None:
         """The next case begins."""
@@ -54,24 +47,36 @@ class CaseProgress:
         """One step of the case is done."""
         self.bars.advance(self.steps)
         self.step += 1
+        share = min(self.step / self.of_steps, 1.0) if self.of_steps else 0.0
+        self.bars.update(self.cases, completed=self.done + share)
         if time.monotonic() - self.spoke > self.interval:
             self.spoke = time.monotonic()
-            of = f" of {self.of_steps}" if self.of_steps else ""
+            left = self._seconds_left(share) if share else None
+            of = f" of {self.of_steps}{to_go(left)}" if left is not None else ""
             self._line(f"{self.name}: step {self.step}{of}", event="step", case=self.name, step=self.step,
-                       steps=self.of_steps)
+                       steps=self.of_steps, seconds_to_go=left)
 
     def finished(self, summary: str) -> None:
         """The case is written."""
-        self.bars.advance(self.cases)
         self.done += 1
-        left = (time.monotonic() - self.began) / self.done * max(self.of - self.done, 0)
-        to_go = f", about {duration(left)} to go" if self.done < self.of else ""
-        self._line(f"{self.name}: {summary} ({self.done} of {self.of}{to_go})", event="case", case=self.name,
-                   summary=summary, done=self.done, cases=self.of, seconds_to_go=round(left, 1))
+        self.bars.update(self.cases, completed=self.done)
+        left = self._seconds_left()
+        self._line(f"{self.name}: {summary} ({self.done} of {self.of}{to_go(left)})", event="case", case=self.name,
+                   summary=summary, done=self.done, cases=self.of, seconds_to_go=left)
 
-    def _line(self, text: str, **event) -> None:
-        if not self.live and not self.quiet:
-            print(json.dumps(event) if self.json else text, file=sys.stderr, flush=True)
+    def _seconds_left(self, share: float = 0.0) -> float:
+        """As the cases done and this share of the present one have taken."""
+        done = self.done + share
+        return round((time.monotonic() - self.began) / done * max(self.of - done, 0), 1)
+
+    def _line(self, text: str, **event: object) -> None:
+        if self.bars.disable:
+            tell(text, **event)
+
+
+def to_go(seconds: float) -> str:
+    """What a line says of the seconds that are left: nothing where there are none."""
+    return f", about {duration(seconds)} to go" if seconds else ""
 
 
 def duration(seconds: float) -> str:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import torch
 from lightning.pytorch.callbacks import WeightAveraging
-from lightning.pytorch.utilities import rank_zero_only
 from torch import Tensor
 
 from phydict.datasets.phantoms.findings import KINDS
@@ -23,6 +21,7 @@ from phydict.prior import DetailNetwork, Prior, Refiner, TextEncoder, VolumeUNet
 from phydict.prior.unet import TextMap
 from phydict.reconstruction import Reconstructor
 from phydict.rivals import Rival
+from phydict.runtime.progress import CaseProgress
 from phydict.runtime.warning import warn
 from phydict.training.denoising import DenoisingTraining
 from phydict.training.reports import BATCH, learn_sentences
@@ -134,9 +133,12 @@ class PriorTraining(DenoisingTraining):
             return
         sentences = teaching_sentences(min(SENTENCES, BATCH * self.pretrain_steps), self.seed)
         words = [word for word in self.prior.text.vocabulary if word.isalpha() and len(word) > 1]
-        losses = learn_sentences(self.prior, sentences, self.pretrain_steps, self.seed, words)
-        _tell(f"report encoder and map of kinds learn {len(sentences)} sentences: loss {losses[0]:.3f} -> "
-              f"{losses[-1]:.3f}")
+        with CaseProgress() as progress:
+            progress.begin("report encoder and map of kinds", 1, self.pretrain_steps, "learn",
+                           noun=f"set of {len(sentences)} sentences")
+            progress.case("sentences")
+            losses = learn_sentences(self.prior, sentences, self.pretrain_steps, self.seed, words, progress.advance)
+            progress.finished(f"loss {losses[0]:.3f} -> {losses[-1]:.3f}")
 
     def _clean_state(self, batch: dict) -> tuple[Tensor, Tensor]:
         channels = self.prior.network.state_channels
@@ -198,8 +200,3 @@ def reconstruction_scores(prior: Prior | Refiner | Rival, ct: Tensor, views: int
     result = reconstruct(Ideal()(exact, prior.window.to_mu(ct), seed)[0], beam, prior, method, seed=seed,
                         grid=prior.grid)
     return volume_metrics(result.volume[None, None], prior.window.to_hu(ct))
-
-
-@rank_zero_only
-def _tell(message: str) -> None:
-    print(message, file=sys.stderr)

@@ -1,48 +1,65 @@
-"""How far a training is: a bar over its steps on a terminal, lines in a log file."""
+"""How far a training is: a bar over its steps on a terminal, lines in a log file, JSON for machines, or nothing."""
 
 from __future__ import annotations
 
 import math
-import sys
 import time
 
 import lightning
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import TextColumn
 
-from phydict.runtime.progress import duration
+from phydict.runtime.progress import CaseProgress, to_go
+from phydict.runtime.telling import bars_on, tell
+
+SHOWN = ("loss", "val/psnr")
+"""Of what is logged, what the bar has room for."""
 
 
 class TrainingProgress(lightning.Callback):
-    """Tells the steps that are done and what they log.
+    """Tells the steps that are done and what they log, and of `validate` the cases.
 
     Args:
         interval: seconds between two lines where the output is no terminal
     """
 
     def __init__(self, interval: float = 60.0):
-        self.interval, self.bar = interval, None
+        self.interval, self.bar, self.cases = interval, None, None
 
     def on_train_start(self, trainer, module) -> None:
-        console, self.spoke, self.last_shown = Console(stderr=True), time.monotonic(), -1
-        self.live = console.is_terminal and trainer.is_global_zero
-        self.bar = Progress(TextColumn("training"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
-                            TimeRemainingColumn(), TextColumn("{task.description}"), console=console,
-                            disable=not self.live)
         steps = trainer.estimated_stepping_batches
         self.first, self.began = trainer.global_step, time.monotonic()
+        self.spoke, self.last_shown = self.began, -1
         self.total = steps if math.isfinite(steps) and steps > 0 else None
-        self.task = self.bar.add_task("", total=self.total, completed=trainer.global_step)
+        console = Console(stderr=True)
+        self.bar = bars_on(console, TextColumn("{task.fields[logged]}"))
+        self.bar.disable |= not trainer.is_global_zero
+        of = f" of {self.total}" if self.total else ""
+        self._tell(trainer, f"training: step {self.first}{of}, results in {trainer.default_root_dir}", event="begin",
+                   name="training", step=self.first, steps=self.total, out=trainer.default_root_dir)
+        self.task = self.bar.add_task("training", total=self.total, completed=self.first, logged="")
         self.bar.start()
 
     def on_train_batch_end(self, trainer, module, outputs, batch, index) -> None:
-        self.bar.update(self.task, completed=trainer.global_step, description=_logged(trainer))
+        self.bar.update(self.task, completed=trainer.global_step, logged=_in_words(
+            {name: value for name, value in _logged(trainer).items() if name in SHOWN}))
         if time.monotonic() - self.spoke > self.interval:
             self._line(trainer)
+
+    def on_validation_start(self, trainer, module) -> None:
+        if trainer.state.fn == "validate" and trainer.is_global_zero:
+            self.cases = CaseProgress().__enter__()
+            self.cases.begin("validate", sum(trainer.num_val_batches), verb="measure")
+
+    def on_validation_batch_end(self, trainer, module, outputs, batch, index, loader=0) -> None:
+        if self.cases:
+            self.cases.case(f"case {index + 1}")
+            self.cases.finished("measured")
 
     def on_validation_end(self, trainer, module) -> None:
         if trainer.state.fn == "fit" and not trainer.sanity_checking:
             self._line(trainer)
+        self._close()
 
     def on_train_end(self, trainer, module) -> None:
         self._line(trainer)
@@ -51,19 +68,35 @@ class TrainingProgress(lightning.Callback):
     def on_exception(self, trainer, module, exception) -> None:
         if self.bar:
             self.bar.stop()
+        self._close()
+
+    def _close(self) -> None:
+        if self.cases:
+            self.cases.__exit__()
+            self.cases = None
 
     def _line(self, trainer) -> None:
         """A line about the present step, once."""
-        self.spoke = time.monotonic()
-        if self.last_shown == trainer.global_step or self.live or not trainer.is_global_zero:
+        self.spoke, step = time.monotonic(), trainer.global_step
+        if self.last_shown == step or not self.bar.disable:
             return
-        self.last_shown = trainer.global_step
-        of, done = f" of {self.total}" if self.total else "", trainer.global_step - self.first
-        if self.total and done > 0 and trainer.global_step < self.total:
-            left = (time.monotonic() - self.began) / done * (self.total - trainer.global_step)
-            of += f", about {duration(left)} to go"
-        print(f"step {trainer.global_step}{of}: {_logged(trainer)}", file=sys.stderr, flush=True)
+        self.last_shown = step
+        of, done, left = f" of {self.total}" if self.total else "", step - self.first, None
+        if self.total and done > 0:
+            left = round((time.monotonic() - self.began) / done * max(self.total - step, 0), 1)
+        logged = _logged(trainer)
+        self._tell(trainer, f"step {step}{of}{to_go(left or 0)}: {_in_words(logged)}", event="step", step=step,
+                   steps=self.total, seconds_to_go=left, **logged)
+
+    @staticmethod
+    def _tell(trainer, text: str, **event) -> None:
+        if trainer.is_global_zero:
+            tell(text, **event)
 
 
-def _logged(trainer) -> str:
-    return ", ".join(f"{name} {float(value):.4g}" for name, value in trainer.progress_bar_metrics.items())
+def _logged(trainer) -> dict[str, float]:
+    return {name: float(value) for name, value in trainer.progress_bar_metrics.items()}
+
+
+def _in_words(logged: dict[str, float]) -> str:
+    return ", ".join(f"{name} {value:.4g}" for name, value in logged.items())

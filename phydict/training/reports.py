@@ -8,7 +8,7 @@ states, and where in the chest these lie. Sentences that deny findings, or are o
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -27,10 +27,10 @@ STRANGE, NAMELESS = 0.35, 0.12
 
 
 def learn_sentences(prior: Prior, sentences: Sequence[tuple[str, tuple[int, ...]]], steps: int, seed: int = 0,
-                    words: Sequence[str] = ()) -> list[float]:
+                    words: Sequence[str] = (), on_step: Callable[[], None] = lambda: None) -> list[float]:
     """The report encoder and the map of kinds learn from sentences, each with the `examples` that it states.
 
-    words: any words that reports may hold. Returns the loss of each step.
+    words: any words that reports may hold; on_step: called after each step. Returns the loss of each step.
     """
     text, kind_map = prior.text, prior.network.text_map
     weights = [*text.parameters(), *kind_map.parameters()]
@@ -56,6 +56,7 @@ def learn_sentences(prior: Prior, sentences: Sequence[tuple[str, tuple[int, ...]
         loss.backward()
         optimizer.step()
         losses.append(float(loss.detach()))
+        on_step()
     for weight in resting:
         weight.requires_grad_(False)
     return losses

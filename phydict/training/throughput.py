@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Sequence
 
 import lightning
 import torch
-from lightning.pytorch.utilities import rank_zero_only
 from torch.utils.flop_counter import FlopCounterMode
 
 from phydict.prior import Prior, SuperResolution
 from phydict.runtime.precision import instruction_set
+from phydict.runtime.telling import tell
 
 REPEATS = 5
 """Matrix products of which the fastest counts."""
@@ -45,9 +44,11 @@ class Throughput(lightning.Callback):
         if self.peak is None:
             self.peak = matmul_peak(module.device, low) / 1e12
         weights = sum(weight.numel() for weight in module.prior.parameters() if weight.requires_grad)
-        _tell(f"training {weights / 1e6:.3g} M weights in {precision} on {instructions}: a sample costs "
-              f"{self.flop / 1e9:.3g} GFLOP forward and backward; a {precision} matrix product reaches {self.peak:.3g} "
-              "TFLOP/s on this device")
+        if trainer.is_global_zero:
+            tell(f"training {weights / 1e6:.3g} M weights in {precision} on {instructions}: a sample costs "
+                 f"{self.flop / 1e9:.3g} GFLOP forward and backward; a {precision} matrix product reaches "
+                 f"{self.peak:.3g} TFLOP/s on this device", event="costs", weights=weights, precision=precision,
+                 instruction_set=instructions, sample_flop=self.flop, peak_tflop_per_s=self.peak)
 
     def on_train_batch_start(self, trainer, module, batch, _) -> None:
         if not self.flop:
@@ -60,11 +61,6 @@ class Throughput(lightning.Callback):
             module.log("tflop_per_s", tflops, prog_bar=True, batch_size=samples)
             module.log("share_of_peak", tflops / (self.peak * trainer.world_size), batch_size=samples)
         self.began = now
-
-
-@rank_zero_only
-def _tell(message: str) -> None:
-    print(message, file=sys.stderr)
 
 
 def sample_flop(prior: Prior | SuperResolution, shape: Sequence[int]) -> int:

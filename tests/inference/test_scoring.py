@@ -64,7 +64,7 @@ def test_ablate_has_a_line_of_fid_for_each_method_and_resumes(tmp_path, untraine
     next((tmp_path / "out" / "features").iterdir()).unlink()
     capsys.readouterr()
     main(args)
-    assert "3 of 4 rows are there already" in capsys.readouterr().out
+    assert "3 of 4 rows are there already" in capsys.readouterr().err
     assert (tmp_path / "out" / "tables.md").read_text()[page.index("Frechet"):] == fid
 
 

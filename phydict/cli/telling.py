@@ -1,0 +1,27 @@
+"""What the command lines of training and of reconstruction tell of their progress."""
+
+from __future__ import annotations
+
+from lightning.pytorch.cli import LightningCLI
+
+from phydict.runtime.telling import add_telling, telling
+
+
+class TellingCLI(LightningCLI):
+    """A LightningCLI whose subcommands take --quiet and --json_lines."""
+
+    def _prepare_subcommand_parser(self, klass: type, subcommand: str, **kwargs):
+        parser = super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
+        add_telling(parser)
+        return parser
+
+    def flag(self, name: str) -> bool:
+        """An option that is on or off, in a configuration too."""
+        value = self._get(self.config, name, False)
+        if not isinstance(value, bool):
+            raise ValueError(f"{name} is true or false, but {value!r} was given")
+        return value
+
+    def _run_subcommand(self, subcommand: str) -> None:
+        with telling(self.flag("quiet"), self.flag("json_lines")):
+            super()._run_subcommand(subcommand)

@@ -1,0 +1,60 @@
+"""Whether a long run tells of its progress in words, in JSON for machines, or not at all."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+from jsonargparse import ArgumentParser
+from rich.console import Console
+from rich.progress import (
+    BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn)
+
+WORDS, JSON, NOTHING = "words", "json", "nothing"
+
+_MANNER: ContextVar[str] = ContextVar("manner", default=WORDS)
+
+
+@contextmanager
+def telling(quiet: bool, json_lines: bool) -> Iterator[None]:
+    """Runs inside tell nothing of their progress (quiet, which goes first), or a JSON object on each line."""
+    before = _MANNER.set(NOTHING if quiet else JSON if json_lines else WORDS)
+    try:
+        yield
+    finally:
+        _MANNER.reset(before)
+
+
+def add_telling(parser: ArgumentParser) -> None:
+    """The options of a command line that `telling` takes."""
+    parser.add_argument("--quiet", action="store_true", help="tell no progress, only results, warnings and errors")
+    parser.add_argument("--json_lines", action="store_true", help="tell the progress as a JSON object on each line")
+
+
+def tell(text: str, **event: object) -> None:
+    """A line on standard error: the text or, as `telling` has it, the event as JSON, or nothing."""
+    if _MANNER.get() != NOTHING:
+        print(text if _MANNER.get() == WORDS else json.dumps(event), file=sys.stderr, flush=True)
+
+
+def bars_on(console: Console, *columns: ProgressColumn) -> Progress:
+    """Bars with their count, the time so far and the time to go, that show on a terminal alone, and in words alone."""
+    return Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
+                    TimeRemainingColumn(), *columns, console=console,
+                    disable=not console.is_terminal or _MANNER.get() != WORDS)
+
+
+def run_told(function: Callable[..., object], args: Sequence[str] | None, program: str | None = None,
+             positional: bool = False) -> None:
+    """Runs a function with the options of a command line as its arguments, telling its progress as further ones say;
+    program: its name in the help."""
+    description = " ".join((function.__doc__ or "").partition("\n\n")[0].split())
+    parser = ArgumentParser(prog=program, description=description, exit_on_error=False, allow_abbrev=False)
+    parser.add_function_arguments(function, as_positional=positional, as_group=False)
+    add_telling(parser)
+    given = parser.instantiate(parser.parse_args(args)).as_dict()
+    with telling(given.pop("quiet"), given.pop("json_lines")):
+        function(**given)

@@ -1,0 +1,166 @@
+"""What every long command tells: on a terminal, in a log file, to machines, to nobody, and when it is stopped."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import re
+import runpy
+import signal
+import struct
+import sys
+import termios
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import pytest
+import yaml
+from command_lines import arguments
+from ct_files import save_ct, thorax_hu
+from inference.runs import phantoms, sirt, xrays
+
+from phydict.cli.infer import main as infer
+from phydict.cli.train import main as train
+from phydict.runtime.progress import CaseProgress
+from phydict.training import PriorTraining
+
+prepare_cts = runpy.run_path(str(Path(__file__).parents[1] / "data" / "prepare_cts.py"))["main"]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory, cache) -> Path:
+    """What the commands read: two folders of X-rays, two CTs, a comparison, a checkpoint."""
+    folder = tmp_path_factory.mktemp("made")
+    for name in "ab":
+        xrays(folder / "xrays" / name)
+        save_ct(folder / "cts" / f"{name}.nii.gz", thorax_hu())
+    (folder / "comparison.yaml").write_text(yaml.safe_dump({
+        "phantoms": 2, "base": {"voxels": 16, "detector": 24, "views": 3},
+        "axes": {"method": ["sirt"], "method.iterations": [3]}}))
+    train([*arguments(folder / "trained", cache, "--trainer.max_epochs=1", "--trainer.limit_val_batches=0"), "--quiet"])
+    return folder
+
+
+COMMANDS = {
+    "predict": (infer, lambda made, cache, out: sirt("predict", out, f"--data.xrays={made / 'xrays'}")),
+    "test": (infer, lambda made, cache, out: phantoms(out, 2)),
+    "ablate": (infer, lambda made, cache, out: ["ablate", "-c", str(made / "comparison.yaml"), "--out", str(out)]),
+    "fit": (train, lambda made, cache, out: arguments(
+        out, cache, "--trainer.max_epochs=2", "--progress.interval=0", "--trainer.limit_val_batches=0")),
+    "validate": (train, lambda made, cache, out: ["validate", *arguments(
+        out, cache, f"--ckpt_path={made / 'trained' / 'last.ckpt'}")[1:]]),
+    "export": (train, lambda made, cache, out: ["export", "--out", f"{out}.safetensors", "--checkpoint",
+                                                str(made / "trained" / "last.ckpt")]),
+    "prepare": (prepare_cts, lambda made, cache, out: [str(made / "cts"), str(out), "--voxels=32"]),
+}
+RESUMED = ("predict", "test", "ablate", "fit", "prepare")
+
+
+@pytest.fixture
+def run(made, cache, tmp_path, capfd) -> Callable[..., str]:
+    """Runs a command into <tmp_path>/out with more options and returns what it wrote to standard error."""
+    def told(command: str, *more: str, out: str = "out") -> str:
+        main, arguments_of = COMMANDS[command]
+        capfd.readouterr()
+        main([*arguments_of(made, cache, tmp_path / out), *more])
+        return capfd.readouterr().err
+    return told
+
+
+@contextmanager
+def terminal() -> Iterator[list[bytes]]:
+    """Standard error is a terminal of 80 columns inside; what was written to it is whole afterwards."""
+    ours, theirs = os.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+    written: list[bytes] = []
+
+    def read() -> None:
+        with suppress(OSError):  # the other end is closed
+            while some := os.read(ours, 4096):
+                written.append(some)
+
+    reader = threading.Thread(target=read, daemon=True)
+    reader.start()
+    with pytest.MonkeyPatch.context() as patch, open(theirs, "w") as stream:
+        patch.setenv("TERM", "xterm")
+        patch.setenv("COLUMNS", "80")
+        patch.setattr(sys, "stderr", stream)
+        yield written
+    reader.join(10)
+    os.close(ours)
+
+
+def stop_once(monkeypatch) -> None:
+    """Presses Ctrl-C after the first case and, in training, in the second epoch."""
+    finished, step = CaseProgress.finished, PriorTraining.training_step
+    pressed = []
+
+    def stopping(progress: CaseProgress, summary: str) -> None:
+        finished(progress, summary)
+        if "loss" not in summary and not pressed:
+            pressed.append(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
+
+    def stopping_step(task: PriorTraining, batch: dict, index: int) -> object:
+        if task.global_step == 5 and not pressed:
+            pressed.append(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
+        return step(task, batch, index)
+
+    monkeypatch.setattr(CaseProgress, "finished", stopping)
+    monkeypatch.setattr(PriorTraining, "training_step", stopping_step)
+
+
+@pytest.fixture
+def handlers() -> Iterator[None]:
+    """Lightning ignores SIGINT once it was stopped by it."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize("command", RESUMED)
+def test_ctrl_c_on_a_terminal_says_how_to_resume_and_a_log_file_tells_the_rest(command, run, handlers, tmp_path,
+                                                                               monkeypatch):
+    stop_once(monkeypatch)
+    with terminal() as written, pytest.raises(SystemExit) as stopped:
+        run(command)
+    assert stopped.value.code == 130
+    screen = b"".join(written).decode()
+    lines = [re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", line) for line in re.split(r"[\r\n]+", screen)]
+    bars = [line for line in lines if "━" in line]
+    assert bars and max(map(len, bars)) <= 80, bars
+    assert any(re.search(r"\d/\d+ \d:\d\d:\d\d [-\d]:[-\d]{2}:[-\d]{2}", bar) for bar in bars)  # so far, and to go
+    assert screen.rindex("\x1b[?25h") > screen.rindex("\x1b[?25l"), "the cursor is not given back"
+    assert any(f"results in {tmp_path / 'out'}" in line for line in lines)
+    advice = next(line for line in lines if line.startswith("stopped by a signal; to resume, "))
+    if command == "fit":
+        assert advice.endswith(f"add --ckpt_path {tmp_path / 'out' / 'last.ckpt'}")
+        more = [f"--ckpt_path={tmp_path / 'out' / 'last.ckpt'}"]
+    else:
+        assert advice.endswith("run the same command again")
+        more = []
+    log = run(command, *more)
+    assert f"results in {tmp_path / 'out'}" in log and "\x1b" not in log
+    wanted = r"step 5 of 8, about \d+ s to go: loss" if command == "fit" else r"\(1 of 1\)$"
+    assert re.search(wanted, log, flags=re.MULTILINE), log
+
+
+@pytest.mark.parametrize("command", sorted({*COMMANDS} - {"test"}))  # which is as predict
+def test_machines_read_a_json_object_on_each_line_and_quiet_tells_nothing(command, run, tmp_path):
+    events = [json.loads(line) for line in run(command, "--json_lines").splitlines()]
+    begins = [event for event in events if event["event"] == "begin"]
+    assert command == "validate" or any(str(tmp_path / "out") in str(event.get("out")) for event in begins)
+    assert command == "export" or events[-1]["seconds_to_go"] == 0
+    assert run(command, "--quiet", out="silent") == ""
+
+
+def test_a_training_stopped_before_its_first_checkpoint_says_that_nothing_is_kept(run, handlers, monkeypatch, capfd):
+    monkeypatch.setattr(PriorTraining, "training_step", lambda *_: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(SystemExit):
+        run("fit")
+    assert "run the same command again: no epoch was done" in capfd.readouterr().err

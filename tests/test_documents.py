@@ -1,6 +1,7 @@
 """What the documents say is so: links lead somewhere, figures are those of the CSVs, names and versions are today's."""
 
 import re
+import runpy
 import statistics
 from pathlib import Path
 
@@ -12,8 +13,8 @@ from phydict.evaluation import read_csv
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [ROOT / name for name in (
-    "README.md", "CHANGELOG.md", "CONTRIBUTING.md", "configs/README.md", "data/README.md", "data/prior/README.md",
-    "data/spectra/README.md", "tests/benchmark/README.md")] + sorted((ROOT / "data" / "example").glob("*/README.md"))
+    "README.md", "TRUST.md", "CHANGELOG.md", "CONTRIBUTING.md", "configs/README.md", "data/README.md",
+    "data/prior/README.md", "data/spectra/README.md", "tests/benchmark/README.md")] + sorted((ROOT / "data" / "example").glob("*/README.md"))
 README = DOCUMENTS[0].read_text()
 
 
@@ -53,6 +54,13 @@ def test_the_readmes_results_are_those_of_their_tables():
             of = [row for row in rows if row["method"] == name and int(row["views"]) == views]
             assert cell == f"{statistics.mean(float(row['psnr']) for row in of):.2f} / " \
                            f"{statistics.mean(float(row['ssim']) for row in of):.3f}", (name, views)
+
+
+def test_the_tables_of_how_far_to_trust_it_are_those_of_their_csvs():
+    page = ROOT / "TRUST.md"
+    trust = runpy.run_path(str(ROOT / "tests" / "benchmark" / "trust.py"))
+    assert all(f"<!-- {name} -->\n| " in page.read_text() for name in trust["TABLES"])
+    assert trust["filled"](page.read_text()) == page.read_text(), "run python tests/benchmark/trust.py"
 
 
 def test_the_citation_and_the_changelog_are_of_this_version():

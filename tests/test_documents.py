@@ -55,6 +55,8 @@ def test_the_readmes_results_are_those_of_their_tables():
             of = [row for row in rows if row["method"] == name and int(row["views"]) == views]
             assert cell == f"{statistics.mean(float(row['psnr']) for row in of):.2f} / " \
                            f"{statistics.mean(float(row['ssim']) for row in of):.3f}", (name, views)
+    seconds = [float(row["seconds"]) for row in refiner if row["simulator"] == "ideal" and int(row["views"]) <= 8]
+    assert f"take {min(seconds):.1f} to {max(seconds):.1f} s per volume" in README
 
 
 def test_the_tables_of_how_far_to_trust_it_are_those_of_their_csvs():

@@ -19,8 +19,8 @@ from phydict.posterior import (
     DAPS, DDS, DPS, CascadePosterior, DiffPIR, ExactDraw, GradientSteps, PnPDM, Posterior, PriorOnly, ProximalCG,
     Refined, Refinement, Reward, Sampler, SplitGibbs, Unrolled)
 from phydict.prior import (
-    Cascade, MedSynCheckpoint, PriorContract, Refiner, SuperResolution, check_prior, find_prior, is_refiner,
-    load_super_resolution)
+    DEFAULT_CORRECTION, Cascade, MedSynCheckpoint, PriorContract, Refiner, SuperResolution, check_prior, find_prior,
+    is_refiner, load_correction, load_super_resolution)
 from phydict.reconstruction import Reconstruction, Reconstructor
 from phydict.runtime.precision import check_precision
 from phydict.runtime.reading import check_memory, reason
@@ -144,17 +144,24 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: PriorContract | 
     return replace(ready, sr_sampler=sr_sampler) if sr_sampler else ready
 
 
+def correction_of(method: Sampler | Reconstructor) -> Path | None:
+    """The file of the network that corrects a method's estimates on finer voxels, where it has learnt from these."""
+    return DEFAULT_CORRECTION if isinstance(method, Unrolled) and DEFAULT_CORRECTION.is_file() else None
+
+
 def onto_grid(ready: Reconstructor, grid: Grid | None, refinement: Refinement = Refinement()) -> Reconstructor:
     """The method on the voxels of `grid`; None leaves it as it is.
 
-    What is bound to voxels of its own, as a prior is, works there first and is then refined (`Refined`). A method
-    without a prior works on `grid` itself, on a box that leaves out a part of the chest after a coarse reconstruction
-    of the whole (`Region`). Raises ValueError where there is no way or not enough memory.
+    What is bound to voxels of its own, as a prior is, works there first and is then refined (`Refined`), with a step
+    also by the network of `correction_of`. A method without a prior works on `grid` itself, on a box that leaves out a
+    part of the chest after a coarse reconstruction of the whole (`Region`). Raises ValueError where there is no way or
+    not enough memory.
     """
     if grid is None or (ready.grid is not None and ready.grid.same_as(grid)):
         return ready
     if ready.grid is not None:
-        ready = Refined(ready, grid, refinement)
+        file = correction_of(ready.sampler) if isinstance(ready, Posterior) and refinement.step else None
+        ready = Refined(ready, grid, refinement, load_correction(file) if file else None)
     elif isinstance(ready, Baseline) and along(grid, CHEST) and not covers(grid, CHEST):
         ready = Region(ready, grid, CHEST)
     check_memory(4 * ready.volumes * math.prod(grid.shape), f"a reconstruction on "

@@ -18,7 +18,7 @@ from phydict.grid import Box, Grid
 from phydict.inference.data import ReconstructionData
 from phydict.inference.protocols import whole
 from phydict.inference.settings import Orbit
-from phydict.methods import CHEST, METHODS
+from phydict.methods import CHEST, METHODS, correction_of
 from phydict.posterior import Refinement, Sampler
 from phydict.prior import PriorContract, find_prior, fingerprint, load_super_resolution
 from phydict.reconstruction import Reconstructor, describe
@@ -136,6 +136,8 @@ class Trial:
             identity["super_resolution_crc32"] = _crc(self.super_resolution)
         if self.prior is not None and self.box and not self.first().same_as(self.box.grid()):
             identity["refinement"] = describe(self.refinement)
+            if self.refine and (file := correction_of(self.method)):
+                identity["correction_crc32"] = _crc(str(file))
         if self.box and not self.box.grid().same_as(grid):
             identity["region"] = self.box.grid().to_dict()
         if self.projector != "auto":

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from phydict.prior.files import (
-    build_prior, build_refiner, build_super_resolution, save_prior, save_refiner, save_super_resolution)
+    build_correction, build_prior, build_refiner, build_super_resolution, save_correction, save_prior, save_refiner,
+    save_super_resolution)
 from phydict.prior.inspection import inspect_prior
 from phydict.prior.stage_file import is_saved_prior
 from phydict.prior.text_file import build_text, has_text
@@ -39,6 +40,8 @@ def export_prior(checkpoint: str, out: str, overwrite: bool = False) -> None:
     training = header.get("training", {"steps": steps})
     if stage == "super_resolution":
         save_super_resolution(build_super_resolution(header, weights), out, training)
+    elif stage == "refinement":
+        save_correction(build_correction(header, weights), out, training)
     elif stage in NETWORKS:
         save_rival(build_rival(header, weights), out, training)
     else:

@@ -31,6 +31,8 @@ from phydict.training.checkpoints import BEST, HELD_OUT, RESUMED, BestCheckpoint
 from phydict.training.crops import SuperResolutionData
 from phydict.training.data import PriorData
 from phydict.training.progress import TrainingProgress
+from phydict.training.reconstructions import ReconstructionData
+from phydict.training.refinement import RefinementTraining
 from phydict.training.refiner import RefinerTraining
 from phydict.training.rivals import LiftedTraining
 from phydict.training.stage import CHECKPOINT, StageTraining
@@ -45,6 +47,7 @@ COMMANDS = {"fit": "train a prior", "validate": "measure one on held-out cases",
 
 STAGES = {"base": (PriorTraining, PriorData), "super_resolution": (SuperResolutionTraining, SuperResolutionData),
           "refiner": (RefinerTraining, PriorData), "uncertainty": (UncertaintyTraining, PriorData),
+          "refinement": (RefinementTraining, ReconstructionData),
           "lifted": (LiftedTraining, PriorData), "x2ct": (X2CTTraining, PriorData),
           "xray2ctpa": (XrayToCTPATraining, PriorData)}
 """What trains a stage, and on which data."""

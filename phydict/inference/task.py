@@ -251,8 +251,8 @@ class ReconstructionTask(lightning.LightningModule):
     def _start(self, cases: int) -> None:
         if isinstance(self.plain, CascadePosterior):
             self.plain.check_memory(self.device)
-        if isinstance(self.reconstructor, Refined):
-            sizes = " and ".join(" x ".join(map(str, level.shape)) for level in self.reconstructor.levels)
+        if left := self.reconstructor.uncorrected if isinstance(self.reconstructor, Refined) else []:
+            sizes = " and ".join(" x ".join(map(str, level.shape)) for level in left)
             note = f"no trained stage was given for {sizes} voxels: the X-rays and total variation alone refine to them"
             tell(note, event="note", text=note)
         self.progress.begin(self.method_name, cases, self.reconstructor.steps(), out=self.results.folder)

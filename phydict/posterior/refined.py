@@ -11,10 +11,11 @@ from torch import Tensor
 
 from phydict.grid import Grid
 from phydict.guard import Guard
+from phydict.posterior.evidence import Evidence
 from phydict.posterior.likelihood.likelihood import LikelihoodStep, ProximalCG
 from phydict.posterior.measurement import Measurement
 from phydict.reconstruction import Reconstruction, Reconstructor
-from phydict.runtime.profiling import Stopwatch
+from phydict.runtime.profiling import Stopwatch, stage
 from phydict.units import HUWindow, hu_to_mu
 from phydict.xray import Projector
 from phydict.xray.boxes import covers, interpolated, outside_projection, refinements, seen_by
@@ -45,6 +46,18 @@ class Bound(Protocol):
                     on_step: Callable[[], None] = lambda: None) -> Reconstruction: ...
 
 
+class Correction(Protocol):
+    """A network that has learnt what refined estimates lack on voxels of one size."""
+
+    def suits(self, grid: Grid, window: HUWindow) -> bool:
+        """Whether it was trained for these voxels and HU."""
+        ...
+
+    def corrected(self, z: Tensor, evidence: Tensor) -> Tensor:
+        """An estimate z (1, 1, X, Y, Z) of the CT without what it lacks, given the evidence there."""
+        ...
+
+
 @dataclass(frozen=True)
 class Refinement:
     """How an estimate is refined on finer voxels.
@@ -53,14 +66,29 @@ class Refinement:
         step: towards the X-rays, such as ProximalCG, whose total variation takes a prior's place; none: interpolation
             alone
         x0_std: standard deviation of an interpolated estimate's error, in the range [-1, 1] of its HU window
+        final_step: towards the X-rays once more after a network's correction; none: that is the result
+        final_std: standard deviation of a correction's error
     """
 
     step: LikelihoodStep | None = ProximalCG(iterations=10, restarts=3, tv_weight=10.0, tv_eps=0.003)
     x0_std: float = 0.5
+    final_step: LikelihoodStep | None = ProximalCG(iterations=10, restarts=2, tv_weight=2.0, tv_eps=0.003)
+    final_std: float = 0.3
 
     def __post_init__(self):
-        if not self.x0_std > 0:
-            raise ValueError(f"x0_std is a standard deviation above 0, but {self.x0_std} was given")
+        for name in ("x0_std", "final_std"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} is a standard deviation above 0, but {getattr(self, name)} was given")
+
+    def __call__(self, measurement: Measurement, x: Tensor, network: Correction | None) -> Tensor:
+        """The refined estimate of an interpolated one x (1, 1, X, Y, Z)."""
+        z = x if self.step is None else self.step(measurement, x, self.x0_std)
+        if network is None:
+            return z
+        with stage("network"):
+            corrected = network.corrected(z, Evidence(measurement)(z, x, z))
+        measurement.refit(corrected)
+        return corrected if self.final_step is None else self.final_step(measurement, corrected, self.final_std)
 
 
 @dataclass(frozen=True)
@@ -80,11 +108,13 @@ class Refined(Reconstructor):
         base: the method, bound to voxels of its own
         target: the voxels of the result, along the same axes
         refinement: how
+        network: what corrects the estimates on voxels that it suits; none: nothing
     """
 
     base: Bound
     target: Grid
     refinement: Refinement = Refinement()
+    network: Correction | None = None
 
     def __post_init__(self):
         super().__post_init__()
@@ -119,6 +149,14 @@ class Refined(Reconstructor):
         """The voxels of each refinement."""
         return refinements(self.base.grid, self.target)
 
+    @property
+    def uncorrected(self) -> list[Grid]:
+        """Those that no network corrects on."""
+        return [level for level in self.levels if not self._network(level)]
+
+    def _network(self, level: Grid) -> Correction | None:
+        return self.network if self.network and self.network.suits(level, self.base.window) else None
+
     def with_mu_water(self, mu_water: float) -> Refined:
         return replace(self, base=self.base.with_mu_water(mu_water))
 
@@ -132,7 +170,7 @@ class Refined(Reconstructor):
             raise ValueError(
                 f"the target is {self.target.shape} voxels of {self.target.spacing} mm, but the X-rays are projected "
                 f"from {projector.grid.shape} voxels of {projector.grid.spacing} mm: use the target's grid")
-        watch, base, step = Stopwatch(), self.base, self.refinement.step
+        watch, base = Stopwatch(), self.base
         with watch.stage("base"):
             y, A = self._seen(xrays, projector, base.grid)
             coarse = base.reconstruct(y, A, report, display, seed, on_step)
@@ -144,8 +182,7 @@ class Refined(Reconstructor):
                 measurement = self._measurement(y, A, coarse, display)
                 measurement.reset_scatter(coarse.scatter > 0)
                 measurement.refit(x)
-                if step is not None:
-                    x = step(measurement, x, self.refinement.x0_std)
+                x = self.refinement(measurement, x, self._network(level))
                 guard = Guard(measurement, on_step, 1)
                 guard()
             volume, grid = base.window.to_hu(x[0, 0]), level

@@ -2,10 +2,12 @@
 
 from phydict.prior.cascade import Cascade
 from phydict.prior.contract import PriorContract, check_prior, find_prior
+from phydict.prior.correction import CorrectionNetwork
 from phydict.prior.detail import DetailNetwork
 from phydict.prior.files import (
-    DEFAULT_PRIOR, DEFAULT_REFINER, describe, describe_refiner, describe_super_resolution, file_read, fingerprint,
-    is_refiner, load_prior, load_super_resolution, save_prior, save_refiner, save_super_resolution)
+    DEFAULT_CORRECTION, DEFAULT_PRIOR, DEFAULT_REFINER, describe, describe_correction, describe_refiner,
+    describe_super_resolution, file_read, fingerprint, is_refiner, load_correction, load_prior, load_super_resolution,
+    save_correction, save_prior, save_refiner, save_super_resolution)
 from phydict.prior.inspection import inspect_prior
 from phydict.prior.local_unet import LocalUNet
 from phydict.prior.medsyn.checkpoint import MedSynCheckpoint
@@ -17,9 +19,10 @@ from phydict.prior.super_resolution import SuperResolution
 from phydict.prior.text import TextEncoder, learn_vocabulary
 from phydict.prior.unet import VolumeUNet
 
-__all__ = ["DEFAULT_PRIOR", "DEFAULT_REFINER", "STATE", "BoundPrior", "BoundRefiner", "Cascade", "DetailNetwork",
-           "LocalUNet", "MedSynCheckpoint", "MedSynPrior", "MedSynSuperResolution", "Prior", "PriorContract", "Refiner",
-           "SuperResolution", "TextEncoder", "VolumeUNet", "check_prior", "describe", "describe_refiner",
-           "describe_super_resolution", "file_read", "find_prior", "fingerprint", "inspect_prior", "is_refiner",
-           "learn_vocabulary", "load_prior", "load_super_resolution", "save_prior", "save_refiner",
+__all__ = ["DEFAULT_CORRECTION", "DEFAULT_PRIOR", "DEFAULT_REFINER", "STATE", "BoundPrior", "BoundRefiner",
+           "Cascade", "CorrectionNetwork", "DetailNetwork", "LocalUNet", "MedSynCheckpoint", "MedSynPrior",
+           "MedSynSuperResolution", "Prior", "PriorContract", "Refiner", "SuperResolution", "TextEncoder", "VolumeUNet",
+           "check_prior", "describe", "describe_correction", "describe_refiner", "describe_super_resolution",
+           "file_read", "find_prior", "fingerprint", "inspect_prior", "is_refiner", "learn_vocabulary",
+           "load_correction", "load_prior", "load_super_resolution", "save_correction", "save_prior", "save_refiner",
            "save_super_resolution"]

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from phydict.diffusion import CosineSchedule
 from phydict.grid import Grid
+from phydict.prior.correction import CorrectionNetwork
 from phydict.prior.detail import DetailNetwork
 from phydict.prior.local_unet import LocalUNet
 from phydict.prior.medsyn.checkpoint import (
@@ -34,6 +35,9 @@ DEFAULT_PRIOR = shipped("data/prior/phydict_64.safetensors")
 
 DEFAULT_REFINER = shipped("data/prior/refiner_64.safetensors")
 """The refiner that comes with the project."""
+
+DEFAULT_CORRECTION = shipped("data/prior/refinement_128.safetensors")
+"""What corrects its reconstructions on finer voxels, where that comes with the project."""
 
 
 def save_prior(prior: Prior, path: str | Path, training: dict | None = None, dtype: torch.dtype = torch.float16):
@@ -67,6 +71,12 @@ def save_refiner(refiner: Refiner, path: str | Path, training: dict | None = Non
     write_stage(Path(path), describe_refiner(refiner) | {"training": training or {}}, weights, dtype)
 
 
+def save_correction(network: CorrectionNetwork, path: str | Path, training: dict | None = None,
+                    dtype: torch.dtype = torch.float16):
+    """Writes `network` to one .safetensors file, as `save_prior` does."""
+    write_stage(Path(path), describe_correction(network) | {"training": training or {}}, network.state_dict(), dtype)
+
+
 def describe(prior: Prior) -> dict:
     """What a prior is, as plain JSON values: from this and the weights `load_prior` builds it again."""
     text = prior.text
@@ -96,6 +106,12 @@ def describe_refiner(refiner: Refiner) -> dict:
     """What a refiner is, as plain JSON values, for `build_refiner`: its prior, called by another stage."""
     return describe(refiner.prior) | {"stage": "refiner"} | (
         {"uncertainty": refiner.uncertainty.settings} if refiner.uncertainty else {})
+
+
+def describe_correction(network: CorrectionNetwork) -> dict:
+    """What a correction of finer voxels is, as plain JSON values, for `build_correction`."""
+    return {"format": FORMAT, "stage": "refinement", "grid": network.grid.to_dict(),
+            "hu_window": [network.window.low, network.window.high], "network": network.settings}
 
 
 def load_prior(path: str | Path | MedSynCheckpoint = DEFAULT_PRIOR,
@@ -136,6 +152,18 @@ def load_super_resolution(path: str | Path | MedSynCheckpoint,
         except ValueError as error:
             raise ValueError(f"'{path}' contradicts itself: {error}") from error
     return fine.to(device).eval().requires_grad_(False)
+
+
+def load_correction(path: str | Path = DEFAULT_CORRECTION, device: str = "cpu") -> CorrectionNetwork:
+    """The network in a file written by `save_correction`; as `load_prior`."""
+    path = own_or_shipped(path)
+    with refusing(path, ADVICE):
+        header, weights = read_stage(path, ("refinement",), device)
+        try:
+            network = build_correction(header, weights)
+        except ValueError as error:
+            raise ValueError(f"'{path}' contradicts itself: {error}") from error
+    return network.to(device).eval().requires_grad_(False)
 
 
 def is_refiner(given: object) -> bool:
@@ -209,3 +237,10 @@ def build_super_resolution(header: dict, weights: dict[str, Tensor]) -> SuperRes
             number_of(header, "detail_std"), number_of(header, "skip_std"))
 
     return built_network(made, {k: w.float() for k, w in weights.items()}, header, ("network",))
+
+
+def build_correction(header: dict, weights: dict[str, Tensor]) -> CorrectionNetwork:
+    """The network that `describe_correction` described, with these weights, as `build_prior` builds a prior."""
+    return built_network(lambda: CorrectionNetwork(**header["network"], grid=Grid(**header["grid"]),
+                                                   window=window_of(header)),
+                         {k: w.float() for k, w in weights.items()}, header, ("network",))

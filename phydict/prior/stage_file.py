@@ -25,7 +25,7 @@ MOST_HU, MOST_LAYERS = 1e6, 256
 """No window reaches as far, and no network has more blocks on its way down, or layers."""
 
 STAGES = {"base": "a base prior", "super_resolution": "a super-resolution stage", "refiner": "a refiner",
-          "lifted": "a rival", "x2ct": "a rival", "xray2ctpa": "a rival"}
+          "refinement": "a refinement on finer voxels", "lifted": "a rival", "x2ct": "a rival", "xray2ctpa": "a rival"}
 """What a file's header may call it, and what that is; a header that says nothing is of a base prior."""
 
 

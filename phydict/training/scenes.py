@@ -74,10 +74,10 @@ class Scenes:
             beam = ConeBeam.orbit(360, *geometry).select(np.sort(rng.choice(360, views, replace=False)))
         return beam.shifted(columns=shift * pixels * pixel * scale) if shift else beam
 
-    def measure(self, ct: Tensor, rng: np.random.Generator, grid: Grid, window: HUWindow,
-                fine: Tensor | None = None) -> Measurement:
-        """X-rays of a CT (1, 1, X, Y, Z) in the prior's range, as a measurement of a drawn scene on its grid; `fine`,
-        if given, is the same CT in finer voxels."""
+    def xrays(self, ct: Tensor, rng: np.random.Generator, grid: Grid, window: HUWindow,
+              fine: Tensor | None = None) -> tuple[Tensor, Projector]:
+        """X-rays (K, V, U) of a CT (1, 1, X, Y, Z) in the prior's range, of a drawn scene, and their projector from its
+        grid; `fine`, if given, is the same CT in finer voxels."""
         projector = Projector(grid, self.beam(rng, grid), full_detector=True)
         if fine is not None and rng.random() < self.fine:
             y = fine_xrays(window.to_mu(fine), projector)
@@ -89,7 +89,13 @@ class Scenes:
         low, high = np.log(self.noise)
         noise = 0.005 if rng.random() < 0.4 else math.exp(rng.uniform(low, high))
         y = y + noise * y.max() * torch.from_numpy(rng.standard_normal(tuple(y.shape))).to(y)
-        return Measurement(projector, y[0], window)
+        return y[0], projector
+
+    def measure(self, ct: Tensor, rng: np.random.Generator, grid: Grid, window: HUWindow,
+                fine: Tensor | None = None) -> Measurement:
+        """The same as a measurement."""
+        y, projector = self.xrays(ct, rng, grid, window, fine)
+        return Measurement(projector, y, window)
 
 
 def fine_xrays(mu: Tensor, projector: Projector) -> Tensor:

@@ -1,0 +1,82 @@
+"""The network of the refinement on finer voxels: what an estimate there lacks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import pad, silu
+
+from phydict.grid import Grid
+from phydict.prior.evidence_channels import EVIDENCE_CHANNELS
+from phydict.runtime.precision import network_precision
+from phydict.units import HUWindow
+
+INPUTS = 1 + EVIDENCE_CHANNELS
+"""The estimate and the evidence there."""
+
+TOLERANCE = 0.01
+"""A share of the spacing by which voxels may differ from those learnt on."""
+
+
+class CorrectionNetwork(nn.Module):
+    """Learns what an estimate of a CT lacks on fine voxels, from it and from the evidence there.
+
+    A UNet without normalisation, whose result a head of two convolutions joins with what it saw: at a voxel the answer
+    depends on voxels up to `reach` away alone. Untrained it answers with zeros.
+
+    channels: width of each level of the UNet, the first at half the resolution. width: of the head. grid: of the fine
+    voxels. window: HU that the range [-1, 1] stands for.
+    """
+
+    def __init__(self, channels: tuple[int, ...] = (32, 64, 96), width: int = 16, grid: Grid = Grid.cube(128),
+                 window: HUWindow = HUWindow()):
+        from monai.networks.nets import UNet
+
+        super().__init__()
+        self.grid, self.window = grid, window
+        self.settings = {"channels": list(channels), "width": width}
+        self.divisor = 2 ** (len(channels) - 1)
+        self.unet = UNet(3, INPUTS, width, tuple(channels), (2,) * (len(channels) - 1), num_res_units=2, norm=None,
+                         act="swish")
+        self.join = nn.Conv3d(width + INPUTS, width, 3, padding=1)
+        self.leave = nn.Conv3d(width, 1, 1)
+        nn.init.zeros_(self.leave.weight)
+        nn.init.zeros_(self.leave.bias)
+        self.to(memory_format=torch.channels_last_3d)
+
+    @property
+    def network(self) -> CorrectionNetwork:
+        return self
+
+    def network_inputs(self, shape: Sequence[int]) -> tuple[Tensor]:
+        """As for a Prior."""
+        return (torch.zeros(1, INPUTS, *shape),)
+
+    @property
+    def reach(self) -> int:
+        """Voxels beyond which nothing changes the result (a bound)."""
+        return 8 * self.divisor - 5
+
+    def suits(self, grid: Grid, window: HUWindow) -> bool:
+        """Whether it was trained for voxels of this size, wherever they are, and for this HU window."""
+        return window == self.window and np.allclose(grid.spacing, self.grid.spacing, rtol=TOLERANCE)
+
+    def forward(self, seen: Tensor) -> Tensor:
+        """The corrected estimate (B, 1, X, Y, Z) of an estimate and its evidence (B, INPUTS, X, Y, Z), in the prior's
+        range, for any sizes."""
+        sizes = seen.shape[2:]
+        missing = [n for size in reversed(sizes) for n in (0, -size % self.divisor)]
+        padded = pad(seen, missing, mode="replicate") if any(missing) else seen
+        padded = padded.contiguous(memory_format=torch.channels_last_3d)
+        h = silu(self.join(torch.cat([self.unet(padded), padded], 1)))
+        x, y, z = sizes
+        return seen[:, :1] + self.leave(h)[..., :x, :y, :z].to(seen.dtype)
+
+    @torch.no_grad()
+    def corrected(self, z: Tensor, evidence: Tensor) -> Tensor:
+        """As `forward`, of the estimate z (B, 1, X, Y, Z), held inside the range, in the device's best precision."""
+        with network_precision("auto", z):
+            return self.to(z.device)(torch.cat([z, evidence], 1)).clamp(-1, 1)

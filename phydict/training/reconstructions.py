@@ -1,0 +1,182 @@
+"""Lightning data for training a refinement: crops of reconstructions that are each made once."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool3d
+from torch.utils.data import ConcatDataset, Dataset
+
+from phydict.datasets import Augmentation, CTSource
+from phydict.datasets.cts.augment import augment
+from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM
+from phydict.datasets.surroundings.surroundings import Surroundings
+from phydict.grid import Cube, Grid
+from phydict.posterior import Posterior, Refined, Refinement, Unrolled
+from phydict.prior import DEFAULT_REFINER, Refiner, fingerprint, load_prior
+from phydict.runtime.ranges import check_fields
+from phydict.training.crops import CTVolumes, PhantomVolumes, mapped_volume
+from phydict.training.data import PriorData
+from phydict.training.draws import Draws
+from phydict.training.scenes import Scenes
+from phydict.training.settings import HoldOut, Loading
+from phydict.units import HUWindow
+from phydict.xray.boxes import refinements, seen_by
+
+FINER = 2
+"""How many times finer the voxels that X-rays are made of are than those of a reconstruction."""
+
+STRENGTH = Augmentation(girth=0, contrast=0, surroundings=Surroundings.none())
+"""How patients are changed: by what needs no masks."""
+
+
+@dataclass(frozen=True)
+class Made:
+    """The reconstructions that a refinement learns from.
+
+    Args:
+        reconstructions: how many are made to learn from
+        validation: how many of each held-out volume
+        crop: voxels along each side of what is learnt from at once
+    """
+
+    reconstructions: int = 60
+    validation: int = 2
+    crop: int = 64
+
+    def __post_init__(self):
+        check_fields(self, "data.made", reconstructions=(1, 1_000_000), validation=(1, 1000), crop=(8, 4096))
+
+
+class _Recording:
+    """In a network's place: keeps what it would see, and corrects nothing."""
+
+    seen: Tensor
+
+    def suits(self, grid: Grid, window: HUWindow) -> bool:
+        return True
+
+    def corrected(self, z: Tensor, evidence: Tensor) -> Tensor:
+        self.seen = torch.cat([z, evidence], 1)
+        return z
+
+
+class Reconstructions(Dataset):
+    """What a refinement sees, and last the truth: (C, X, Y, Z) in half precision, in the prior's range.
+
+    Item n shows volume n modulo their number, deformed unless `strength` is that of none, in a scene of its own. It is
+    made when missing and kept in `folder`.
+    """
+
+    def __init__(self, volumes: Sequence[np.ndarray], grid: Grid, base: str, scenes: Scenes, strength: Augmentation,
+                 folder: Path, length: int, seed: int):
+        self.volumes, self.grid, self.base, self.scenes, self.strength = volumes, grid, base, scenes, strength
+        self.folder, self.length, self.seed = folder, length, seed
+
+    def __len__(self) -> int:
+        return self.length
+
+    def __getitem__(self, n: int) -> np.ndarray:
+        return mapped_volume(self.folder / f"{n:05d}.npy", lambda: self._made(n))
+
+    @torch.no_grad()
+    def _made(self, n: int) -> Tensor:
+        rng, refiner = np.random.default_rng((self.seed, n)), load_prior(self.base)
+        volume, window = np.array(self.volumes[n % len(self.volumes)], np.float32), refiner.window
+        scene = Grid(volume.shape, self.grid.extent / volume.shape)
+        case = {"volume": torch.from_numpy(volume)[None], "masks": torch.zeros(0, *volume.shape), "report": "",
+                "id": str(n)}
+        ct = augment(case, int(rng.integers(2**31)), scene, window, self.strength)["volume"][None]
+        y, projector = self.scenes.xrays(ct, rng, scene, window)
+        record = _Recording()
+        refined = Refined(Posterior(refiner, Unrolled()), self.grid, Refinement(final_step=None), record)
+        refined.reconstruct(*seen_by(self.grid, y, projector.beam, False))
+        return torch.cat([record.seen, avg_pool3d(ct, FINER)], 1)[0]
+
+
+class Crops(Draws):
+    """Random cubes of reconstructions, half of them mirrored left to right: what is seen of so little has no side."""
+
+    def __init__(self, made: Dataset, size: int, length: int, epoch: int, seed: int):
+        super().__init__(made, [], 1.0, length, epoch, seed)
+        self.size = size
+
+    def item(self, drawn: np.ndarray, rng: np.random.Generator) -> dict:
+        for _ in range(4):
+            starts = [int(rng.integers(n - self.size + 1)) for n in drawn.shape[1:]]
+            crop = drawn[(slice(None), *(slice(start, start + self.size) for start in starts))]
+            if crop[-1].std() > 0.05:
+                break
+        crop = torch.from_numpy(crop.astype(np.float32))
+        return {"volume": crop.flip(1) if rng.random() < 0.5 else crop}
+
+
+class Whole(Dataset):
+    """Reconstructions as they are."""
+
+    def __init__(self, made: Reconstructions):
+        self.made = made
+
+    def __len__(self) -> int:
+        return len(self.made)
+
+    def __getitem__(self, n: int) -> dict:
+        return {"volume": torch.from_numpy(self.made[n].astype(np.float32)), "masks": torch.zeros(0), "has_masks":
+                torch.zeros(0), "report": ""}
+
+
+class ReconstructionData(PriorData):
+    """Crops of reconstructions for training a refinement.
+
+    Args:
+        made: the reconstructions
+        scenes: the X-rays of which they are made
+        cts: a NIfTI file, or a folder of any depth in CT-RATE's layout or any other
+        holdout: what validates instead of training
+        phantoms: number of different phantoms
+        loading: how crops are drawn
+        cache: folder for volumes and reconstructions, never inside the CTs' folder
+        initial: the refiner's file
+        cube: tied to model.cube
+        window: tied to model.window
+    """
+
+    def __init__(self, made: Made = Made(), scenes: Scenes = Scenes(most_views=16), cts: str | None = None,
+                 holdout: HoldOut = HoldOut(phantoms=0), phantoms: int = 0, loading: Loading = Loading(),
+                 cache: str = "runs/cache", initial: str = str(DEFAULT_REFINER), cube: Cube = Cube(128),
+                 window: tuple[float, float] = (-1000.0, 1000.0)):
+        super().__init__(cts, CTSource(), holdout, phantoms, loading, cache, cube=cube, window=window)
+        refiner = load_prior(initial)
+        if not isinstance(refiner, Refiner) or refiner.window != self.window:
+            raise ValueError(f"reconstructions are made by a refiner in the HU window {window}, but {initial} is none: "
+                             "give a refiner's file as data.initial, and model.window as its own")
+        if not refinements(refiner.grid, self.grid):
+            raise ValueError(f"reconstructions are refined to voxels finer than the refiner's, but model.cube has "
+                             f"{cube.voxels} as it has: give more")
+        if not made.crop <= cube.voxels:
+            raise ValueError(f"data.made.crop is at most the {cube.voxels} voxels of a reconstruction, but {made.crop} "
+                             "was given")
+        scene, folder = Grid.cube(FINER * cube.voxels, cube.side), self.cts.cache
+        trained, validated = (ConcatDataset([CTVolumes(cts, folder, scene, self.window),
+                                             PhantomVolumes(first, count, scene, self.window, folder)])
+                              for cts, first, count in ((self.cts.cts, 0, phantoms),
+                                                        (self.validation.datasets[1].cts, HELD_OUT_PHANTOM,
+                                                         holdout.phantoms)))
+        parts = [asdict(scenes), fingerprint(initial), scene.to_dict(), window, phantoms, self.held_out,
+                 [ct.id for ct in self.cts.cts]]
+        folder = folder / f"reconstructions-{hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]}"
+        self.crop, self.made = made.crop, Reconstructions(
+            trained, self.grid, initial, scenes, STRENGTH, folder / "trained", made.reconstructions, 0)
+        self.validation = Whole(Reconstructions(
+            validated, self.grid, initial, scenes, Augmentation.none(), folder / "validated",
+            made.validation * len(validated), 1))
+
+    def draws(self, epoch: int) -> Dataset:
+        return Crops(self.made, self.crop, self.loading.epoch_size, epoch, self.seed)

@@ -1,0 +1,133 @@
+"""The network that corrects reconstructions on fine voxels: what it keeps to, its training and its file."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from command_lines import refusal, resumed_as_uninterrupted
+from prior.tiny import tiny_prior, tiny_refiner
+from torch.nn.functional import pad
+
+from phydict.cli.train import main
+from phydict.grid import Cube, Grid
+from phydict.methods import fit_to_grid, reconstructor
+from phydict.posterior import Refined, Refinement, Unrolled
+from phydict.prior import load_correction, save_correction, save_prior, save_refiner
+from phydict.prior.correction import INPUTS, CorrectionNetwork
+from phydict.training.refinement import RefinementTraining
+from phydict.units import HUWindow
+from phydict.xray import ConeBeam, Projector
+
+CONFIG = Path(__file__).parents[1] / "configs" / "prior" / "refinement.yaml"
+FINE, WINDOW = Grid.cube(32), HUWindow(-1000, 600)
+BEAM = ConeBeam.orbit(3, 1020, 740, (56, 56), 10.0)
+
+
+def network(trained: bool = True, grid: Grid = FINE) -> CorrectionNetwork:
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        made = CorrectionNetwork((4, 8), 4, grid, WINDOW)
+        if trained:
+            torch.nn.init.normal_(made.leave.weight, std=0.1)
+    return made.eval().requires_grad_(False)
+
+
+def reconstructed(network: CorrectionNetwork | None, refinement: Refinement = Refinement(), order=(0, 1, 2)):
+    xrays = Projector(FINE, BEAM, full_detector=True)(0.02 * torch.ones(1, 1, *FINE.shape))[0]
+    ready = Refined(reconstructor(Unrolled((0.2,), (0.5, 0.3)), tiny_refiner()), FINE, refinement, network)
+    return ready.reconstruct(*fit_to_grid(ready, FINE, xrays[list(order)], BEAM.select(list(order))))
+
+
+@pytest.fixture(scope="module")
+def refiner_file(tmp_path_factory) -> str:
+    file = tmp_path_factory.mktemp("refiner") / "tiny.safetensors"
+    save_refiner(tiny_refiner(), file, dtype=torch.float32)
+    return str(file)
+
+
+def test_an_untrained_network_adds_only_the_last_step_and_another_grids_not_even_that():
+    plain = reconstructed(None)
+    torch.testing.assert_close(reconstructed(network(False), Refinement(final_step=None)).volume, plain.volume)
+    other = reconstructed(network(grid=Grid.cube(64)))
+    assert other.volume.equal(plain.volume)
+    assert reconstructed(network(False)).misfit < plain.misfit
+
+
+def test_the_last_step_meets_the_xrays_after_a_correction():
+    alone, met = (reconstructed(network(), refinement) for refinement in (Refinement(final_step=None), Refinement()))
+    assert (alone.volume - reconstructed(None).volume).abs().max() > 10
+    assert met.misfit < 0.5 * alone.misfit
+
+
+def test_the_order_of_the_views_changes_nothing():
+    one, other = reconstructed(network()), reconstructed(network(), order=(2, 0, 1))
+    torch.testing.assert_close(one.volume, other.volume, atol=0.5, rtol=0)
+
+
+def test_a_voxel_depends_on_its_neighbourhood_alone_so_that_a_crop_is_corrected_as_the_whole():
+    made, reach = network().double(), network().reach
+    seen = torch.randn(1, INPUTS, 64, 16, 16, dtype=torch.float64)
+    changed = pad(seen[..., :reach, :, :], (0, 0, 0, 0, 0, 64 - reach))
+    assert made(seen)[0, 0, 0].equal(made(changed)[0, 0, 0])
+    assert not made(seen)[0, 0, reach // 2].equal(made(changed)[0, 0, reach // 2])
+    crop = made(seen[..., 8:, :, :])[0, 0, reach:]
+    torch.testing.assert_close(crop, made(seen)[0, 0, 8 + reach:])
+
+
+def test_odd_sizes_are_corrected_as_their_voxels_repeated_at_the_end():
+    made, seen = network(), torch.randn(1, INPUTS, 17, 16, 15)
+    torch.testing.assert_close(made(seen), made(pad(seen, (0, 1, 0, 0, 0, 1), mode="replicate"))[..., :17, :, :15])
+
+
+def test_a_file_holds_the_network_and_no_other_stage_is_taken_for_it(tmp_path):
+    save_correction(network(), tmp_path / "fine.safetensors", dtype=torch.float32)
+    loaded, seen = load_correction(tmp_path / "fine.safetensors"), torch.randn(1, INPUTS, 16, 16, 16)
+    assert loaded(seen).equal(network()(seen)) and loaded.suits(Grid.cube(16, 192), WINDOW)
+    assert not loaded.suits(FINE, HUWindow()) and not loaded.suits(Grid.cube(16), WINDOW)
+    save_prior(tiny_prior(), tmp_path / "prior.safetensors")
+    with pytest.raises(ValueError, match="is a base prior, but a refinement on finer voxels is needed"):
+        load_correction(tmp_path / "prior.safetensors")
+
+
+def test_steps_on_one_crop_lower_its_loss():
+    task = RefinementTraining((4, 8), Cube(32), (-1000, 600))
+    draw = torch.Generator().manual_seed(0)
+    truth = torch.rand(1, 1, 16, 16, 16, generator=draw) - 0.5
+    seen = torch.cat([truth + 0.1, torch.randn(1, INPUTS - 1, 16, 16, 16, generator=draw)], 1)
+    optimizer, found = torch.optim.Adam(task.parameters(), 1e-2), []
+    for _ in range(20):
+        found.append(task.batch_loss({"volume": torch.cat([seen, truth], 1)}))
+        optimizer.zero_grad()
+        found[-1].backward()
+        optimizer.step()
+    assert found[-1] < found[0] - 0.3
+
+
+def arguments(folder: Path, cache: Path, initial: str, *more: str) -> list[str]:
+    return ["fit", f"--config={CONFIG}", "--model.cube.voxels=32", "--model.window=[-1000,600]",
+            "--model.channels=[4,8]", "--data.phantoms=2", "--data.holdout.phantoms=1", "--data.loading.epoch_size=2",
+            "--data.made.reconstructions=3", "--data.made.validation=1", "--data.made.crop=16",
+            "--data.scenes.most_views=3", f"--data.initial={initial}", f"--data.cache={cache}", f"--out={folder}",
+            "--trainer.accelerator=cpu", "--trainer.log_every_n_steps=1", "--trainer.max_steps=-1",
+            "--precision=float32", *more]
+
+
+def test_a_resumed_run_is_the_uninterrupted_one_and_makes_each_reconstruction_once(tmp_path, cache, refiner_file):
+    last = resumed_as_uninterrupted(main, lambda run, *more: arguments(run, cache, refiner_file, *more), tmp_path)
+    main(["export", "--checkpoint", str(last), "--out", str(tmp_path / "fine.safetensors")])
+    assert load_correction(tmp_path / "fine.safetensors").leave.weight.any()
+    files = {file: file.stat().st_mtime_ns for file in cache.rglob("reconstructions-*/*/*.npy")}
+    main(arguments(tmp_path / "again", cache, refiner_file, "--trainer.max_epochs=1"))
+    assert files and files == {file: file.stat().st_mtime_ns for file in cache.rglob("reconstructions-*/*/*.npy")}
+
+
+@pytest.mark.parametrize("given, words", [
+    (["--data.made.crop=48"], "data.made.crop is at most the 32 voxels"),
+    (["--model.cube.voxels=16", "--data.made.crop=8"], "voxels finer than the refiner's"),
+    (["--data.initial=prior.safetensors"], "give a refiner's file as data.initial"),
+    (["--model.window=[-1000,1000]"], "model.window as its own"),
+    (["--data.made.reconstructions=0"], "data.made")])
+def test_what_cannot_be_learnt_from_is_refused(tmp_path, cache, refiner_file, capsys, monkeypatch, given, words):
+    monkeypatch.chdir(tmp_path)
+    save_prior(tiny_prior(detail=True), "prior.safetensors")
+    assert words in refusal(capsys, main, arguments(tmp_path / "run", cache, refiner_file, *given))

@@ -126,6 +126,7 @@ def test_a_resumed_run_is_the_uninterrupted_one_and_makes_each_reconstruction_on
     (["--model.cube.voxels=16", "--data.made.crop=8"], "voxels finer than the refiner's"),
     (["--data.initial=prior.safetensors"], "give a refiner's file as data.initial"),
     (["--model.window=[-1000,1000]"], "model.window as its own"),
+    (["--data.loading.simulation_voxels=64"], "data.loading.simulation_voxels is 64: leave it out"),
     (["--data.made.reconstructions=0"], "data.made")])
 def test_what_cannot_be_learnt_from_is_refused(tmp_path, cache, refiner_file, capsys, monkeypatch, given, words):
     monkeypatch.chdir(tmp_path)

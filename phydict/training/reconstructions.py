@@ -153,6 +153,9 @@ class ReconstructionData(PriorData):
                  cache: str = "runs/cache", initial: str = str(DEFAULT_REFINER), cube: Cube = Cube(128),
                  window: tuple[float, float] = (-1000.0, 1000.0)):
         super().__init__(cts, CTSource(), holdout, phantoms, loading, cache, cube=cube, window=window)
+        if self.factor != 1:
+            raise ValueError(f"X-rays of reconstructions are made of {FINER * cube.voxels} voxels anyway, but "
+                             f"data.loading.simulation_voxels is {loading.simulation_voxels}: leave it out")
         refiner = load_prior(initial)
         if not isinstance(refiner, Refiner) or refiner.window != self.window:
             raise ValueError(f"reconstructions are made by a refiner in the HU window {window}, but {initial} is none: "

@@ -128,8 +128,7 @@ class Whole(Dataset):
         return len(self.made)
 
     def __getitem__(self, n: int) -> dict:
-        return {"volume": torch.from_numpy(self.made[n].astype(np.float32)), "masks": torch.zeros(0), "has_masks":
-                torch.zeros(0), "report": ""}
+        return {"volume": torch.from_numpy(self.made[n].astype(np.float32))}
 
 
 class ReconstructionData(PriorData):

@@ -111,10 +111,10 @@ class Crops(Draws):
     def item(self, drawn: np.ndarray, rng: np.random.Generator) -> dict:
         for _ in range(4):
             starts = [int(rng.integers(n - self.size + 1)) for n in drawn.shape[1:]]
-            crop = drawn[(slice(None), *(slice(start, start + self.size) for start in starts))]
+            cut = drawn[(slice(None), *(slice(start, start + self.size) for start in starts))]
+            crop = torch.from_numpy(cut.astype(np.float32))
             if crop[-1].std() > 0.05:
                 break
-        crop = torch.from_numpy(crop.astype(np.float32))
         return {"volume": crop.flip(1) if rng.random() < 0.5 else crop}
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 
 import numpy as np
 import torch
@@ -69,6 +70,22 @@ def vessel_visibility(volume: Tensor, truth: Tensor, lung: Tensor, count: int = 
     brightest = torch.where(inside, truth.flatten(), -torch.inf).topk(min(count, int(inside.sum()))).indices
     found, expected = (float(contrast.flatten()[brightest].mean()) for contrast in contrasts)
     return found / expected
+
+
+def sharpness_scores(volume: Tensor, truth: Tensor, lung: Tensor, grid: Grid) -> dict[str, float]:
+    """{"edge_diaphragm", "edge_chest_wall", "vessels"} of a volume (X, Y, Z) in HU on `grid`, each as a share of the
+    truth's: widths are 1 where edges are as sharp as there, more where they are blurred.
+
+    lung: mask (X, Y, Z) in the truth. An edge that no line crosses, and vessels without lungs, have no score.
+    """
+    scores = {}
+    for edge in AXES:
+        with suppress(ValueError):
+            found, true = (edge_spread(x, lung, grid, edge) for x in (volume, truth))
+            scores[f"edge_{edge}"] = found / true
+    if (lung > 0.5).any():
+        scores["vessels"] = vessel_visibility(volume, truth, lung)
+    return scores
 
 
 def nodule(grid: Grid, centre: Sequence[float], diameter: float, finer: int = 3) -> Tensor:

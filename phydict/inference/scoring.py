@@ -17,12 +17,13 @@ from phydict.evaluation.fid import Features, case_features
 from phydict.evaluation.organs import fine_grid, organ_scores
 from phydict.evaluation.perceptual import load_networks, lpips_scores
 from phydict.evaluation.published import PUBLISHED
+from phydict.evaluation.sharpness import sharpness_scores
 from phydict.grid import Grid
 from phydict.inference.data import case_scores
 from phydict.inference.protocols import Protocol
 from phydict.units import HUWindow
 
-METRICS = ("volume", "lpips", "fid", "organs", "clip")
+METRICS = ("volume", "lpips", "fid", "organs", "sharpness", "clip")
 
 
 @dataclass(frozen=True)
@@ -114,6 +115,8 @@ class Scoring:
             scores |= lpips_scores(volume, truth, device)
         if "organs" in self.metrics:
             scores |= organ_scores(volume, truth, grid, segmented(case, grid))
+        if "sharpness" in self.metrics and bool(case["has_masks"][0]):
+            scores |= sharpness_scores(volume, truth, case["masks"][0].cpu(), grid)
         if self.clip:
             scores |= clip_scores(self.clip.to(device), volume, truth, grid, case.get("ct_report", case["report"]))
         return scores

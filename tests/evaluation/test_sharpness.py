@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from phydict.evaluation.sharpness import edge_spread, edge_width, nodule, recovered_contrast, vessel_visibility
+from phydict.evaluation.sharpness import (
+    edge_spread, edge_width, nodule, recovered_contrast, sharpness_scores, vessel_visibility)
 from phydict.grid import Grid
 
 GRID = Grid.box((40, 24, 60), (120.0, 72.0, 120.0))  # 3, 3 and 2 mm
@@ -44,6 +45,15 @@ def test_a_width_depends_on_neither_contrast_nor_direction_and_is_in_mm():
 def test_an_edge_that_no_line_crosses_is_refused():
     with pytest.raises(ValueError, match="no line crosses the diaphragm"):
         edge_spread(torch.zeros(GRID.shape), torch.zeros(GRID.shape), GRID, "diaphragm")
+
+
+def test_scores_are_shares_of_the_truths_and_what_is_not_there_has_none():
+    (truth, lung), (blurred, _) = chest(4.0), chest(8.0)
+    assert sharpness_scores(truth, truth, lung, GRID) == pytest.approx(
+        {"edge_diaphragm": 1, "edge_chest_wall": 1, "vessels": 1})
+    found = sharpness_scores(blurred, truth, lung, GRID)
+    assert 1.5 < found["edge_diaphragm"] < 2.2 and 1.5 < found["edge_chest_wall"] < 2.2
+    assert sharpness_scores(truth, truth, torch.zeros_like(lung), GRID) == {}
 
 
 def test_vessels_show_in_proportion_to_their_contrast():

@@ -96,11 +96,11 @@ def test_steps_on_one_crop_lower_its_loss():
     seen = torch.cat([truth + 0.1, torch.randn(1, INPUTS - 1, 16, 16, 16, generator=draw)], 1)
     optimizer, found = torch.optim.Adam(task.parameters(), 1e-2), []
     for _ in range(20):
-        found.append(task.batch_loss({"volume": torch.cat([seen, truth], 1)}))
+        found.append(task.batch_loss({"volume": torch.cat([seen, truth], 1), "scale": torch.tensor([[0.01, 0.1]])}))
         optimizer.zero_grad()
         found[-1].backward()
         optimizer.step()
-    assert found[-1] < found[0] - 0.3
+    assert found[-1] < 0.5 * found[0]
 
 
 def arguments(folder: Path, cache: Path, initial: str, *more: str) -> list[str]:

@@ -11,6 +11,7 @@ from torch.nn.functional import pad, silu
 
 from phydict.grid import Grid
 from phydict.prior.evidence_channels import EVIDENCE_CHANNELS
+from phydict.prior.local_unet import PositionNorm
 from phydict.runtime.precision import network_precision
 from phydict.units import HUWindow
 
@@ -24,8 +25,8 @@ TOLERANCE = 0.01
 class CorrectionNetwork(nn.Module):
     """Learns what an estimate of a CT lacks on fine voxels, from it and from the evidence there.
 
-    A UNet without normalisation, whose result a head of two convolutions joins with what it saw: at a voxel the answer
-    depends on voxels up to `reach` away alone. Untrained it answers with zeros.
+    A UNet, whose result is normalised voxel by voxel and joined with what it saw by a head of two convolutions: at a
+    voxel the answer depends on voxels up to `reach` away alone. Untrained it corrects nothing.
 
     channels: width of each level of the UNet, the first at half the resolution. width: of the head. grid: of the fine
     voxels. window: HU that the range [-1, 1] stands for.
@@ -41,6 +42,7 @@ class CorrectionNetwork(nn.Module):
         self.divisor = 2 ** (len(channels) - 1)
         self.unet = UNet(3, INPUTS, width, tuple(channels), (2,) * (len(channels) - 1), num_res_units=2, norm=None,
                          act="swish")
+        self.norm = PositionNorm(width)
         self.join = nn.Conv3d(width + INPUTS, width, 3, padding=1)
         self.leave = nn.Conv3d(width, 1, 1)
         nn.init.zeros_(self.leave.weight)
@@ -71,7 +73,7 @@ class CorrectionNetwork(nn.Module):
         missing = [n for size in reversed(sizes) for n in (0, -size % self.divisor)]
         padded = pad(seen, missing, mode="replicate") if any(missing) else seen
         padded = padded.contiguous(memory_format=torch.channels_last_3d)
-        h = silu(self.join(torch.cat([self.unet(padded), padded], 1)))
+        h = silu(self.join(torch.cat([self.norm(self.unet(padded)), padded], 1)))
         x, y, z = sizes
         return seen[:, :1] + self.leave(h)[..., :x, :y, :z].to(seen.dtype)
 

@@ -33,6 +33,9 @@ from phydict.xray.boxes import refinements, seen_by
 FINER = 2
 """How many times finer the voxels that X-rays are made of are than those of a reconstruction."""
 
+SPARSE = 4
+"""Of how many voxels along each axis one tells the error of a whole reconstruction."""
+
 STRENGTH = Augmentation(girth=0, contrast=0, surroundings=Surroundings.none())
 """How patients are changed: by what needs no masks."""
 
@@ -102,7 +105,10 @@ class Reconstructions(Dataset):
 
 
 class Crops(Draws):
-    """Random cubes of reconstructions, half of them mirrored left to right: what is seen of so little has no side."""
+    """Random cubes of reconstructions, half of them mirrored left to right: what is seen of so little has no side.
+
+    "scale" (2,) are the mean squared and the mean absolute error of the reconstruction that a cube is cut from.
+    """
 
     def __init__(self, made: Dataset, size: int, length: int, epoch: int, seed: int):
         super().__init__(made, [], 1.0, length, epoch, seed)
@@ -115,7 +121,10 @@ class Crops(Draws):
             crop = torch.from_numpy(cut.astype(np.float32))
             if crop[-1].std() > 0.05:
                 break
-        return {"volume": crop.flip(1) if rng.random() < 0.5 else crop}
+        estimate, truth = (torch.from_numpy(drawn[i, ::SPARSE, ::SPARSE, ::SPARSE].astype(np.float32)) for i in (0, -1))
+        error = estimate - truth
+        return {"volume": crop.flip(1) if rng.random() < 0.5 else crop,
+                "scale": torch.stack([error.square().mean(), error.abs().mean()])}
 
 
 class Whole(Dataset):
@@ -182,3 +191,6 @@ class ReconstructionData(PriorData):
 
     def draws(self, epoch: int) -> Dataset:
         return Crops(self.made, self.crop, self.loading.epoch_size, epoch, self.seed)
+
+    def collate(self, cases: list[dict]) -> dict:
+        return torch.utils.data.default_collate(cases)

@@ -13,7 +13,7 @@ from prior.tiny import REPORTS, tiny_prior
 from phydict import METHODS, ConeBeam, Grid, HUWindow, Projector, reconstruct
 from phydict.baselines import CGLS, FISTATV, SIRT, DiffVox
 from phydict.diffusion import CosineSchedule, GaussianDenoiser
-from phydict.guard import risen_from
+from phydict.guard import check_ceiling, risen_from
 from phydict.methods import reconstructor
 from phydict.posterior import (
     DAPS, DDS, DPS, DiffPIR, ExactDraw, GradientSteps, Langevin, PnPDM, Posterior, PriorOnly, ProximalCG, SplitGibbs)
@@ -192,6 +192,28 @@ def test_line_integrals_of_no_chest_are_warned_of_and_display_values_of_any_size
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         reconstruct(scale * CLEAN, BEAM, prior, FAST, display=True)
+
+
+def test_a_gain_that_drifts_from_view_to_view_is_warned_of_and_views_without_air_are_not():
+    drifted = CLEAN - torch.linspace(1, 0.8, len(CLEAN)).log()[:, None, None]
+    with pytest.warns(UserWarning, match="air beside the patient reads from -?0.0. to 0.2.* drifted"):
+        reconstruct(drifted, BEAM, method=SIRT(2), grid=GRID)
+    for xrays, beam, settings in ((CLEAN, BEAM, {}), (drifted, BEAM, {"display": True}),
+                                  (drifted[..., 7:17], orbit(8, shape=(24, 10)), {})):
+        with warnings.catch_warnings():
+            warnings.filterwarnings("error", "air beside the patient")
+            reconstruct(xrays, beam, method=SIRT(2), grid=GRID, **settings)
+
+
+def test_what_is_denser_than_the_prior_knows_is_said_with_its_place_and_size():
+    x = torch.full(GRID.shape, -0.5)
+    x[8, 5, 6:9] = 1.0
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_ceiling(torch.full(GRID.shape, 0.97), GRID, HUWindow())
+        check_ceiling(x, Grid.cube(16, 96.0), HUWindow())  # 0.6 ml
+    with pytest.warns(UserWarning, match=r"41.5 ml are as dense as 1000 HU.*\(12, -60, -12\) mm.*metal"):
+        check_ceiling(x, GRID, HUWindow())
 
 
 def test_x_rays_that_no_volume_can_explain_have_a_misfit_near_one(prior):

@@ -13,7 +13,7 @@ from torch import Tensor
 from phydict.diffusion import Denoiser
 from phydict.diffusion.steps import noise_like
 from phydict.grid import Grid
-from phydict.guard import Guard
+from phydict.guard import Guard, check_ceiling
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.samplers.sampler import Sampler
 from phydict.posterior.samplers.split_gibbs import SplitGibbs
@@ -179,6 +179,7 @@ class Posterior(Reconstructor):
             measurement.subtract_scatter(reprojection)
             fit = guard.score(states if self.samples == 1 else None, reprojection, measurement.y)
             deviation = (prior.window.half_width * states[:, 0].std(0)).cpu() if self.samples > 1 else None
+            check_ceiling(ct[0, 0], prior.grid, prior.window)
             intervals, widening = self._intervals(denoiser, measurement, ct)
         return Reconstruction(
             volume=prior.window.to_hu(ct[0, 0]).cpu(), grid=prior.grid, method=self.name, seed=seed,

@@ -11,6 +11,10 @@ from phydict.xray.geometry import ConeBeam
 LINE_INTEGRAL_RANGE = 1.0, 20.0
 """Between these lies the largest line integral of a chest: 50 mm and 1 m of water."""
 
+AIR_BLOCKS, AIR_FLAT, AIR_DRIFT = 8, 0.05, 0.1
+"""Beside a patient a view's line integrals are those of air where the medians of so many blocks of rows differ by less
+than AIR_FLAT; between views those of air differ by less than AIR_DRIFT."""
+
 
 def check_xrays(xrays: Tensor, beam: ConeBeam) -> None:
     """Raises ValueError unless the X-rays (K, V, U) are finite, as many and as large as the beam's views, and none of
@@ -45,10 +49,19 @@ def check_air(xrays: Tensor) -> None:
 
 
 def check_line_integrals(xrays: Tensor) -> None:
-    """Warns of line integrals that no chest has."""
+    """Warns of line integrals (K, V, U) that no chest has, and of air that reads otherwise from view to view."""
     largest = float(xrays.max())
     low, high = LINE_INTEGRAL_RANGE
     if not low < largest < high:
         warn(f"the largest line integral is {largest:.3g}, but those of a chest lie between {low:g} and {high:g}: "
              "check that the X-rays are line integrals of attenuation in 1/mm along mm, or give "
              "display: true where they are display values")
+    width = max(1, xrays.shape[2] // 50)
+    sides = torch.cat([xrays[..., :width], xrays[..., -width:]], -1).float()
+    blocks = torch.stack([rows.flatten(1).median(1).values for rows in
+                          sides.tensor_split(min(AIR_BLOCKS, xrays.shape[1]), 1)])
+    air = blocks.median(0).values[blocks.amax(0) - blocks.amin(0) < AIR_FLAT]
+    if len(air) > 1 and air.max() - air.min() > AIR_DRIFT:
+        warn(f"air beside the patient reads from {float(air.min()):.2f} to {float(air.max()):.2f} from view to view, "
+             "but as a line integral it is 0: the tube's output or the detector's gain drifted, so that densities are "
+             "wrong; state `uncertain: {offset: 0.1}` and calibrate, or leave each view's own value of air at 0")

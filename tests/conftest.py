@@ -8,10 +8,36 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # before torch and numba are imported
 
 from pathlib import Path
 
+import nibabel
+import numpy as np
 import pytest
+from command_lines import arguments
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def cache(tmp_path_factory) -> Path:
-    """A folder for the prepared cases of a file's trainings."""
+    """A folder for the prepared cases of trainings."""
     return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory, cache) -> Path:
+    """The folder of an uninterrupted run of two epochs."""
+    from phydict.cli.train import main  # which takes seconds to import
+
+    folder = tmp_path_factory.mktemp("trained")
+    main(arguments(folder, cache, "--trainer.max_epochs=2"))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def cts(tmp_path_factory) -> Path:
+    """A folder of two small CTs."""
+    folder = tmp_path_factory.mktemp("cts")
+    for n in range(2):
+        hu = np.full((20, 20, 20), -1000, np.int16)
+        hu[4:16, 6:15, :] = 40 + n
+        image = nibabel.Nifti1Image(hu, np.diag([10.0, 10.0, 10.0, 1.0]))
+        image.set_sform(image.affine, code=1)
+        nibabel.save(image, folder / f"patient{n}.nii.gz")
+    return folder

@@ -1,0 +1,158 @@
+"""What a specification of an ablation means, and what it cannot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+from command_lines import refusal
+
+from ablation.runs import TINY, write
+from phydict.ablation import read_specification
+from phydict.ablation.nested import changed
+from phydict.ablation.trials import refined_from
+from phydict.cli.infer import main
+from phydict.methods import METHODS
+from phydict.posterior import DAPS, SplitGibbs
+from phydict.runtime.files import alone_in
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_a_setting_that_means_nothing_to_a_method_does_not_multiply_it(tmp_path):
+    trials = read_specification(write(
+        tmp_path, base=TINY | {"voxels": 64}, axes={"method": ["sirt", "phydict_fast"], "guidance": [1, 2],
+                                                    "method.t_start": [0.2, 0.4]})).trials
+    assert [trial.name for trial in trials] == ["sirt"] + ["phydict_fast"] * 4
+    assert "guidance" not in trials[0].columns and trials[-1].columns["method.t_start"] == 0.4
+    assert trials[-1].guidance == 2.0 and trials[-1].method.t_start == 0.4
+
+
+def test_named_variants_change_a_method_under_the_axes(tmp_path):
+    methods = {"mine": {"of": "phydict_paper", "method.likelihood.reward.lpips": 0, "method.iterations": 7}}
+    one, two = read_specification(write(tmp_path, base={}, methods=methods,
+                                        axes={"method.init_args.iterations": [7, 9]})).trials
+    assert (one.name, two.name) == ("mine", "mine") and (one.method.iterations, two.method.iterations) == (7, 9)
+    assert one.method.likelihood.reward.lpips == 0
+    assert changed(one.method, {"likelihood.reward.lpips": 1.0, "iterations": 50}, "method") == METHODS["phydict_paper"]
+
+
+@pytest.mark.parametrize("content", [
+    {"axes": {"method": ["phydict_fast"], "method.init_args.likelihood.variation": [1]}},
+    {"base": {"method.likelihood.variation": 1}, "axes": {"method": ["phydict_fast"]}},
+    {"methods": {"mine": {"of": "phydict_fast", "method.likelihood.variation": 1}}},
+    {"axes": {"method": ["phydict_fast"], "method.likelihood": [{"init_args": {"variation": 1}}]}}])
+def test_an_old_setting_is_refused_with_its_new_name(tmp_path, content):
+    with pytest.raises(ValueError, match="likelihood.*variation is now tv_weight: rename it"):
+        read_specification(write(tmp_path, **content))
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "configs" / "ablate").glob("*.yaml")), ids=lambda file: file.stem)
+def test_every_shipped_comparison_is_one(file):
+    assert read_specification(file, phantoms=1).trials
+
+
+def test_an_orbits_setting_means_nothing_beside_a_geometry_file(tmp_path):
+    with pytest.raises(ValueError, match="the setting views means nothing"):
+        read_specification(write(tmp_path, base={"method": "sirt", "voxels": 16, "geometry": "arc_90", "views": 3}))
+
+
+def test_set_takes_the_place_of_a_files_axis_base_and_product(tmp_path):
+    file = write(tmp_path, products=[{"base": {"seed": 3}, "axes": {"method": ["sirt", "tv"], "views": [2, 4]}},
+                                     {"axes": {"method": ["cgls"]}}])
+    trials = read_specification(file, ["method=[sirt,cgls]", "views=5", "seed=[1,2]", "voxels=24"]).trials
+    assert {(t.name, t.data.beam.views, t.seed, t.scored().shape[0]) for t in trials} == {
+        (name, 5, seed, 24) for name in ("sirt", "cgls") for seed in (1, 2)}
+
+
+@pytest.mark.parametrize("changes, words", [
+    (["views"], "name=value"), (["=3"], "name=value"), (["views=[2"], "value of views is not valid YAML"),
+    (["view=3"], "no setting 'view'"), (["projector=lines"], "no projector 'lines'"), (["method.steps=2"], "nothing"),
+    (["method=[no_module.Sampler]"], "no_module.Sampler cannot be made .*importable"), (["method=[sart]"], "'sart'"),
+    (["method=[pathlib.Path]"], "pathlib.Path is no method"), (["method=[sys.exit]"], "sys.exit is no method"),
+    (["views=[]"], "at least one value")])
+def test_a_set_that_cannot_be_meant_is_one_sentence(tmp_path, changes, words):
+    with pytest.raises(ValueError, match=words):
+        read_specification(write(tmp_path, axes={"method": ["sirt"]}), changes)
+
+
+def test_settings_that_hold_each_other_are_changed_together():
+    method = changed(METHODS["pnp_dm"], {"iterations": 8, "burn_in": 6}, "method")
+    assert (method.iterations, method.burn_in) == (8, 6)
+    assert changed(DAPS(), {"likelihood": {"class_path": "phydict.posterior.ExactDraw"}, "likelihood.iterations": 3},
+                   "method").likelihood.iterations == 3
+
+
+def test_delta_keeps_the_length_of_a_step():
+    paper = METHODS["phydict_paper"]
+    assert refined_from(paper, 0.8) == paper
+    for delta in (0.1, 0.5, 0.99):
+        method = refined_from(SplitGibbs(100), delta)
+        assert method.ec_delta / method.ec_steps == pytest.approx(1 / 100)
+    assert refined_from(paper, 0.0).steps() == paper.iterations
+
+
+@pytest.mark.parametrize("content, words", [
+    ({"axes": {"veiws": [2]}}, ["'veiws'", "views"]),
+    ({"axes": {"method": ["sirt"], "veiws": [2]}}, ["'veiws'", "views"]),
+    ({"axes": {"method": ["sart"]}}, ["'sart'", "sirt"]), ({"axes": {"method": [["sirt"]]}}, ["['sirt']"]),
+    ({"axes": {"method": []}}, ["method", "at least one"]), ({"axes": {"method": "sirt"}}, ["list", "'sirt'"]),
+    ({"axes": {"method": ["sirt"], "views": ["two"]}}, ["views", "int", "'two'"]),
+    ({"axes": {"method": ["sirt"], "views": [0]}}, ["one view"]),
+    ({"axes": {"method": ["sirt"], "views": [None]}}, ["views", "None"]),
+    ({"axes": {"method": ["sirt"], "method.iterations": [2.5]}}, ["method.iterations", "2.5"]),
+    ({"axes": {"method": ["sirt"], "method.steps": [2]}}, ["method.steps", "iterations"]),
+    ({"axes": {"method": ["tv"], "method.iterations": [0]}}, ["iterations of at least 1"]),
+    ({"axes": {"method": ["sirt"], "delta": [0.5]}}, ["delta"]),
+    ({"axes": {"method": ["sirt"], "simulator": ["real"]}}, ["'real'", "polychromatic"]),
+    ({"axes": {"method": ["sirt"], "simulator.kvp": [80]}}, ["simulator.kvp", "photons"]),
+    ({"axes": {"method": ["sirt", "prior_only"], "voxels": [16, 24]}}, ["one grid"]),
+    ({"base": {"side": 200.0}, "axes": {"method": ["sirt"]}}, ["side", "give them too"]),
+    ({"axes": {"method": ["sirt"]}, "cts": "folder"}, ["one of the two"]),
+    ({"axes": {}}, ["no method"]), ({"products": []}, ["products"]), ({"products": [{"axis": {}}]}, ["'axis'"]),
+    ({"axes": {"method": ["sirt"]}, "products": []}, ["not both"]), ({"axs": {}}, ["'axs'"]),
+    ({"methods": {"mine": {"of": "sart"}}}, ["'sart'"]), ({"methods": {"mine": {}}}, ["'mine'"]),
+    ({"methods": {"mine": {"of": "sirt", "method.iteration": 2}}}, ["method.iteration ", "iterations"]),
+    ({"base": TINY | {"method.iteration": 3}, "axes": {"method": ["sirt"]}}, ["method.iteration "]),
+    ({"axes": {"method": ["phydict_fast"], "method.iterations": [1]}}, ["phydict_fast: ", "2 iterations"]),
+    ({"axes": [1]}, ["axes", "mapping"])], ids=lambda value: str(value)[:60] if isinstance(value, dict) else "")
+def test_a_specification_that_cannot_be_meant_is_one_sentence(tmp_path, capsys, content, words):
+    said = refusal(capsys, main, ["ablate", "-c", str(write(tmp_path, **content))])
+    assert "spec.yaml" in said and all(word in said for word in words), said
+    assert not (tmp_path / "out").exists()
+
+
+def test_arguments_and_files_that_cannot_be_meant_are_one_sentence(tmp_path, capsys):
+    assert "nowhere.yaml" in refusal(capsys, main, ["ablate", "-c", str(tmp_path / "nowhere.yaml")])
+    file = write(tmp_path, axes={"method": ["trace"]})
+    assert "nowhere" in refusal(capsys, main, ["ablate", "-c", str(file), "--cts", str(tmp_path / "nowhere")])
+    (tmp_path / "bad.yaml").write_text("axes: [")
+    assert "bad.yaml is not valid YAML" in refusal(capsys, main, ["ablate", "-c", str(tmp_path / "bad.yaml")])
+    with alone_in(tmp_path / "out", "out"):
+        assert "another run" in refusal(capsys, main, ["ablate", "-c", str(file)])
+    (tmp_path / "out" / "results.csv").write_text("case,method\na,b\n")
+    assert "another out" in refusal(capsys, main, ["ablate", "-c", str(file)])
+
+
+@pytest.mark.parametrize("config", sorted((ROOT / "configs" / "ablate").glob("*.yaml")), ids=lambda file: file.stem)
+def test_every_committed_specification_can_be_run(config):
+    specification = read_specification(config, phantoms=1)
+    assert len(specification.trials) >= 5
+    if config.stem == "pareto":
+        told = yaml.safe_load(config.read_text())["methods"]
+        for views in (2, 8):
+            names = {trial.name for trial in specification.trials if trial.data.beam.views == views}
+            of = {told.get(name, {}).get("of", name) for name in names}
+            assert of >= set(METHODS) - {"trace", "phydict_released"}
+
+
+@pytest.mark.parametrize("content, words", [
+    ({"methods": {"mine": {"of": "trace", "methodnull.x": 1}}}, "methodnull.x means nothing"),
+    ({"products": [{"axes": {"method": ["trace"], "seed": list(range(500))}}] * 5}, "2,500 combinations"),
+    ({"axes": {"method": ["trace"], "views": ["9" * 500]}}, "an orbit needs at least one view")], ids=["part",
+    "products", "long"])
+def test_what_a_specification_cannot_mean_is_one_short_sentence(tmp_path, content, words):
+    with pytest.raises(ValueError, match=words) as caught:
+        read_specification(write(tmp_path, **content))
+    assert len(str(caught.value)) < 400

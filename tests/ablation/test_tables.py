@@ -1,0 +1,69 @@
+"""What tables and plots make of the rows of an ablation."""
+
+from __future__ import annotations
+
+import random
+
+from ablation.runs import ablate, row
+from phydict.ablation import plots
+from phydict.ablation.summary import summarise
+from phydict.ablation.tables import all_tables
+
+
+def test_a_case_counts_once_whatever_its_seeds_and_a_missing_case_takes_a_method_out():
+    rows = [row("a", "x", 10.0), row("a", "x", 20.0, seed=1), row("b", "x", 35.0), row("a", "y", 39.0),
+            row("b", "y", None), row("a", "z", 5.0), row("b", "z", 5.0)]
+    x, y, z = summarise(rows)
+    assert x.means["psnr"] == 25.0 and x.complete and not y.complete and y.label == "y (1 of 2 cases)"
+    table, differences = all_tables([x, y, z], rows)
+    text = table.markdown()
+    assert "| x | **0.625 [0.375, 0.875]** | **25.00 [15.00, 35.00]** |" in text
+    assert "| y (1 of 2 cases) | 0.975 | 39.00 |" in text
+    assert "y: refused: no." in text and "| z | <u>0.125 [0.125, 0.125]</u> |" in text
+    assert differences.title == "Methods, K = 8, ideal: less x, case by case"
+    assert "| y (1 of 2 cases) | 0.600 | 24.00 |" in differences.markdown()
+    assert "| z | -0.500 [-0.750, -0.250] | -20.00 [-30.00, -10.00] |" in differences.markdown()
+
+
+def test_each_condition_has_its_table_and_the_best_setting_stands_for_a_method():
+    rows = [row("a", "x", 20.0 + n + views / 10, views=views, **{"method.iterations": n}) for views in (2, 8)
+            for n in (1, 3, 2)] + [row("a", "y", 21.0, views=views) for views in (2, 8)]
+    tables = {table.title: table for table in all_tables(summarise(rows), rows)}
+    best = tables["Methods, K = 8: each at its setting of highest mean PSNR"]
+    assert [label for label, _, _ in best.lines] == ["x, iterations 3", "y"]
+    assert len(tables["Methods, K = 2: all settings"].lines) == 4
+    assert tables["PSNR (dB) ↑ against the number of views"].header == ["method", "K = 2", "K = 8"]
+    assert tables["PSNR (dB) ↑ against the number of views"].lines[1] == ("x, iterations 3", True, [23.2, 23.8])
+
+
+def test_the_table_of_delta_has_the_misfit_beside_ssim():
+    rows = [row("a", "x", 20.0 + d, delta=d) for d in (0.0, 0.8, 0.1)]
+    table = next(t for t in all_tables(summarise(rows), rows) if "delta" in t.header)
+    assert table.header[1:3] == ["SSIM ↑", "misfit ↓"]
+    assert [label for label, _, _ in table.lines] == ["0", "0.1", "0.8"]
+    assert [values[:2] for _, _, values in table.lines] == [[(20 + d) / 40, 1 / (20 + d)] for d in (0.0, 0.1, 0.8)]
+
+
+def test_the_front_holds_what_nothing_beats():
+    draw = random.Random(1)
+    for _ in range(100):
+        points = [(draw.randint(1, 6), draw.randint(1, 6)) for _ in range(draw.randint(1, 12))]
+        kept = [points[i] for i in plots.front(points)]
+        assert kept == sorted(set(kept)) and sorted(kept, key=lambda p: p[1]) == kept
+        for cost, gain in points:
+            beaten = any(c <= cost and g >= gain and (c, g) != (cost, gain) for c, g in points)
+            assert ((cost, gain) in kept) != beaten
+
+
+def test_every_plot_that_the_rows_allow_is_drawn(tmp_path):
+    rows = [row("a", method, 20.0 + n, views=views, seconds_network=0.5, **more) for views in (1, 8)
+            for n, (method, more) in enumerate([("x", {"delta": 0.0}), ("x", {"delta": 0.8}), ("y", {})])]
+    files = plots.write_plots(tmp_path, summarise(rows))
+    assert sorted(file.name for file in files) == sorted(p.name for p in tmp_path.iterdir())
+    assert {file.stem for file in files} == {"pareto_K_1", "pareto_K_8", "stages_K_1", "stages_K_8", "views", "delta"}
+
+
+def test_dollars_in_the_name_of_a_method_are_no_formula_of_its_plots(tmp_path):
+    names = ["a$\\frac$", "$x|[/b]"]
+    rows = ablate(tmp_path, methods={name: {"of": "sirt", "method.iterations": 2} for name in names})
+    assert {row["method"] for row in rows} == set(names) and list((tmp_path / "out").glob("*.png"))

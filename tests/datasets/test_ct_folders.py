@@ -1,0 +1,145 @@
+"""Folders of CTs, CT-RATE's and others: what is found, with which reports, and who is held out."""
+
+from __future__ import annotations
+
+import csv
+
+import numpy as np
+import pytest
+import torch
+from ct_files import AFFINE, save_ct
+
+from phydict.datasets.cts.ct_rate import CTCases, find_cts, patient_of, split_by_patient
+from phydict.datasets.cts.ct_rate_tables import read_reports
+from phydict.datasets.cts.transforms import Calibration, load_ct, prepare_ct
+from phydict.grid import Grid
+
+GRID = Grid.cube(32)
+
+
+def write_csv(path, columns, *rows):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([columns, *rows])
+    return path
+
+
+REPORT_COLUMNS = ("VolumeName", "ClinicalInformation_EN", "Technique_EN", "Findings_EN", "Impressions_EN")
+METADATA_COLUMNS = ("VolumeName", "RescaleIntercept", "RescaleSlope", "XYSpacing", "ZSpacing")
+
+
+def ct_rate(root, chest, version="_fixed"):
+    for name in ("1_a_1", "1_a_2", "1_b_1", "2_a_1", "10_a_1"):
+        patient, scan, _ = name.split("_")
+        save_ct(root / f"train{version}/train_{patient}/train_{patient}_{scan}/train_{name}.nii.gz", chest[:4, :4, :4])
+    write_csv(root / "radiology_text_reports/train_reports.csv", REPORT_COLUMNS,
+              ("train_1_a_1.nii.gz", "Not given.", "", "Nodule, 4 mm.", "Nodule."),
+              ("train_2_a_1.nii.gz", "", "", "Not given.", ""))
+    return root
+
+
+def test_ct_rate_is_found_with_its_reports(tmp_path, chest):
+    root = ct_rate(tmp_path, chest)
+    cts = find_cts(root)
+    assert [ct.id for ct in cts] == ["train_1_a_1", "train_1_a_2", "train_1_b_1", "train_2_a_1", "train_10_a_1"]
+    nodule = "Findings: Nodule, 4 mm. Impression: Nodule."
+    assert [ct.report for ct in cts] == [nodule, nodule, "", "", ""], "one report per scan"
+    assert find_cts(root / "train_fixed" / "train_1")[0].report == nodule
+    firsts = find_cts(root, first_reconstruction=True)
+    assert [ct.id for ct in firsts] == ["train_1_a_1", "train_1_b_1", "train_2_a_1", "train_10_a_1"]
+    (tmp_path / "no_chest.txt").write_text("train/train_2/train_2_a_1.nii.gz\n\n train_10_a_1.nii.gz\n")
+    assert len(find_cts(root, exclude=tmp_path / "no_chest.txt")) == 3
+
+
+def test_v1_takes_hu_and_spacing_from_the_metadata(tmp_path, chest):
+    root = tmp_path / "dataset"
+    stored = (chest[::-1, ::-1] + 8192).astype(np.int16)
+    save_ct(root / "valid/valid_1/valid_1_a/valid_1_a_1.nii.gz", stored, np.eye(4))
+    with pytest.raises(ValueError, match="need CT-RATE's metadata table"):
+        find_cts(root, fixed=False)
+    table = write_csv(root / "metadata/validation_metadata.csv", METADATA_COLUMNS,
+                      ("valid_1_a_1.nii.gz", "-8192", "1", "[6.0, 6.0]", "6.0"))
+    case = CTCases(find_cts(root, fixed=False), None, GRID)[0]
+    true = prepare_ct((chest.astype(np.float32), AFFINE), GRID)
+    torch.testing.assert_close(case["volume"], true["volume"], atol=1e-3, rtol=0)
+    write_csv(table, METADATA_COLUMNS, ("valid_2_a_1.nii.gz", "-8192", "1", "[6.0, 6.0]", "6.0"))
+    with pytest.raises(ValueError, match="1 of 1 volumes are not in the metadata .* valid_1_a_1"):
+        find_cts(root, fixed=False)
+    write_csv(table, METADATA_COLUMNS, ("valid_1_a_1.nii.gz", "-8192", "1", "6", "6.0"))
+    with pytest.raises(ValueError, match="metadata of valid_1_a_1.nii.gz .* cannot be read"):
+        find_cts(root, fixed=False)
+
+
+def test_where_both_versions_lie_side_by_side_fixed_chooses(tmp_path, chest):
+    ct_rate(ct_rate(tmp_path, chest, ""), chest, "_fixed")
+    assert all("train_fixed" in str(ct.path) for ct in find_cts(tmp_path))
+    ids = [ct.id for ct in find_cts(tmp_path)]
+    write_csv(tmp_path / "metadata/m.csv", METADATA_COLUMNS, *[(f"{i}.nii.gz", "0", "1", "[1, 1]", "1") for i in ids])
+    assert not any("train_fixed" in str(ct.path) for ct in find_cts(tmp_path, fixed=False))
+
+
+def test_a_flat_folder_and_a_single_file_need_no_reports(tmp_path, chest):
+    for name in ("b.nii.gz", "a.NII.GZ".lower(), "p10.nii", "p9.nii", ".hidden.nii"):
+        save_ct(tmp_path / name, chest[:4, :4, :4])
+    (tmp_path / "notes.txt").write_text("x")
+    assert [(ct.id, ct.report) for ct in find_cts(tmp_path)] == [("a", ""), ("b", ""), ("p9", ""), ("p10", "")]
+    assert [ct.id for ct in find_cts(tmp_path / "p9.nii")] == ["p9"]
+
+
+def test_files_of_the_same_name_in_patient_folders_are_told_apart(tmp_path, chest):
+    for folder in ("x", "y"):
+        save_ct(tmp_path / folder / "ct.nii", chest[:4, :4, :4])
+    assert [ct.id for ct in find_cts(tmp_path)] == ["x__ct", "y__ct"] and patient_of("x__ct") == "x"
+    save_ct(tmp_path / "x" / "again" / "ct.nii", chest[:4, :4, :4])
+    with pytest.raises(ValueError, match="would both become case x__ct"):
+        find_cts(tmp_path)
+
+
+def test_folders_without_cts_are_explained(tmp_path):
+    with pytest.raises(FileNotFoundError, match="it is empty"):
+        find_cts(tmp_path)
+    (tmp_path / "slice.dcm").write_text("x")
+    with pytest.raises(FileNotFoundError, match="its 1 files are of other kinds.*DICOM series with data/prepare_cts"):
+        find_cts(tmp_path)
+    with pytest.raises(FileNotFoundError, match="is not a NIfTI file"):
+        find_cts(tmp_path / "slice.dcm")
+    with pytest.raises(FileNotFoundError, match="there is no folder or file"):
+        find_cts(tmp_path / "absent")
+
+
+def test_report_tables_are_checked(tmp_path):
+    with pytest.raises(FileNotFoundError, match="there is no CSV table"):
+        read_reports(tmp_path / "absent.csv")
+    with pytest.raises(ValueError, match="lacks the columns Findings_EN, Impressions_EN"):
+        read_reports(write_csv(tmp_path / "a.csv", ("VolumeName",)))
+
+
+def test_a_table_of_reports_of_other_cts_is_refused_and_one_found_by_itself_warned_of(tmp_path, chest):
+    save_ct(tmp_path / "cts" / "mine.nii.gz", chest[:4, :4, :4])
+    table = write_csv(tmp_path / "others" / "train_reports.csv", REPORT_COLUMNS,
+                      ("train_1_a_1.nii.gz", "", "", "Nodule, 4 mm.", "Nodule."))
+    said = "none of the 1 reports in .* is of one of the 1 CTs in .*train_1_a_1, the first CT is mine"
+    with pytest.raises(ValueError, match=said):
+        find_cts(tmp_path / "cts", reports=table)
+    table.parent.rename(tmp_path / "radiology_text_reports")
+    with pytest.warns(UserWarning, match=said):
+        assert find_cts(tmp_path / "cts")[0].report == ""
+
+
+def test_a_patient_never_straddles_the_split():
+    ids = [f"train_{p}_{s}_{r}" for p in range(20) for s in "ab" for r in (1, 2)] + ["x__1", "x__2", "LIDC-IDRI-0002"]
+    for seed in range(20):
+        train, held = split_by_patient(ids, 0.25, seed)
+        assert sorted(train + held) == sorted(ids) and train and held
+        assert not {patient_of(i) for i in train} & {patient_of(i) for i in held}
+    assert split_by_patient(ids, 0.25, 3) == split_by_patient(ids, 0.25, 3) != split_by_patient(ids, 0.25, 4)
+    assert split_by_patient(["a", "b"], 0.01)[1] and not split_by_patient(ids, 0)[1]
+    with pytest.raises(ValueError, match="must lie in"):
+        split_by_patient(ids, 1.5)
+
+
+def test_metadata_of_voxels_that_no_ct_has_are_refused(tmp_path, chest):
+    file = save_ct(tmp_path / "a.nii.gz", chest)
+    for spacing in (1e30, 500.0, 1e-5):
+        with pytest.raises(ValueError, match="a.nii.gz has voxels .*; correct it in the metadata table"):
+            load_ct(file, Calibration(1, 0, (spacing,) * 3))

@@ -1,0 +1,112 @@
+"""Several processes, and flags of execution, train what one process would."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from command_lines import CONFIG, arguments, checkpoint, losses
+from torch.utils.data import default_collate
+
+from phydict.cli.train import main
+from phydict.grid import Cube
+from phydict.prior import VolumeUNet, load_prior
+from phydict.training import PriorTraining
+from phydict.training.data import PriorData
+from phydict.training.settings import TextSettings
+
+
+def two_processes(folder: Path, cache: Path, config: str, *more: str) -> subprocess.CompletedProcess:
+    """One epoch by two processes on one sample each per step, with a configuration for several devices."""
+    args = arguments(folder, cache, f"--config={CONFIG.with_name(config)}", "--trainer.max_epochs=1",
+                     "--data.loading.batch_size=1", "--trainer.devices=2", *more)
+    return subprocess.run([sys.executable, str(CONFIG.parents[2] / "train.py"), *args], capture_output=True, text=True,
+                          env=os.environ | {"OMP_NUM_THREADS": "1"}, timeout=300)
+
+
+def assert_same_curve(folder: Path, trained: Path, column: str = "loss", tolerance: float = 1e-4) -> None:
+    """The logged numbers of one epoch are those of the uninterrupted one-process run, to rounding: sums are taken in
+    another order, which Adam carries on."""
+    expected = {step: float(value) for step, value in losses(trained, column).items() if step < 4}
+    found = {step: float(value) for step, value in losses(folder, column).items()}
+    assert found == pytest.approx(expected, rel=tolerance)
+
+
+def test_two_processes_train_the_prior_that_one_would(tmp_path, cache, trained):
+    done = two_processes(tmp_path, cache, "ddp.yaml")
+    assert done.returncode == 0, done.stderr[-2000:]
+    for column in ("loss", "val/rmse_hu", "val/rmse_hu_t0.5", "samples"):
+        assert_same_curve(tmp_path, trained, column)
+    assert_same_curve(tmp_path, trained, "val/psnr", tolerance=1e-3)  # ten calls of the network carry rounding on
+    assert checkpoint(tmp_path)["phydict"]["training"] == {"steps": 4, "samples": 8}
+    assert list(tmp_path.glob("logs/**/samples/*.png"))
+
+
+def test_every_process_stops_where_one_of_them_has_a_loss_that_is_not_finite(tmp_path, cache):
+    (tmp_path / "train.py").write_text("""if True:
+        from phydict.training import PriorTraining
+        from phydict.cli.train import main
+        loss = PriorTraining.batch_loss
+        def broken(task, batch, key, rank, processes):
+            return loss(task, batch, key, rank, processes) * (float("nan") if rank == task.global_step == 1 else 1)
+        PriorTraining.batch_loss = broken
+        main()""")
+    args = arguments(tmp_path / "run", cache, f"--config={CONFIG.with_name('ddp.yaml')}", "--trainer.devices=2",
+                     "--data.loading.batch_size=1", "--trainer.max_epochs=1", "--model.text.encoder=none")
+    done = subprocess.run([sys.executable, str(tmp_path / "train.py"), *args], capture_output=True, text=True,
+                          env=os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(CONFIG.parents[2])}, timeout=300)
+    assert done.returncode == 2 and "Traceback" not in done.stderr, done.stderr[-2000:]
+    assert "error: the loss is nan after 1 steps: no checkpoint" in done.stderr
+    assert not (tmp_path / "run" / "last.ckpt").exists()
+
+
+@pytest.mark.slow
+def test_two_processes_with_half_the_weights_each_train_the_prior_that_one_would(tmp_path, cache, trained):
+    done = two_processes(tmp_path, cache, "fsdp.yaml")
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert_same_curve(tmp_path, trained)
+    assert list(tmp_path.glob("logs/**/samples/*.png"))
+    again = two_processes(tmp_path, cache, "fsdp.yaml", f"--ckpt_path={tmp_path / 'last.ckpt'}",
+                          "--trainer.max_epochs=2")
+    assert again.returncode == 0, again.stderr[-2000:]
+    expected = {step: float(value) for step, value in losses(trained).items() if step >= 4}
+    assert {step: float(value) for step, value in losses(tmp_path).items()} == pytest.approx(expected, rel=1e-3)
+    main(["export", f"--checkpoint={tmp_path / 'last.ckpt'}", f"--out={tmp_path / 'prior.safetensors'}"])
+    assert load_prior(tmp_path / "prior.safetensors").grid.shape == (16, 16, 16)
+
+
+@pytest.mark.slow
+def test_spread_weights_are_not_averaged(tmp_path, cache):
+    done = two_processes(tmp_path, cache, "fsdp.yaml",
+                         "--trainer.callbacks=lightning.pytorch.callbacks.EMAWeightAveraging")
+    assert done.returncode != 0 and "spread weights cannot be averaged" in done.stderr, done.stderr[-2000:]
+
+
+@pytest.mark.parametrize("flags, tolerance", [
+    (["--model.execution.gradient_checkpointing=true"], 1e-6), (["--model.execution.channels_last=false"], 1e-4),
+    (["--precision=bfloat16"], 0.03)], ids=["checkpointing", "layout", "bf16"])
+def test_flags_leave_the_loss_and_their_checkpoint_goes_on_without_them(flags, tolerance, trained, cache, tmp_path):
+    main(arguments(tmp_path, cache, "--trainer.max_epochs=1", "--trainer.limit_val_batches=0", *flags))
+    loss, expected = losses(tmp_path), losses(trained)
+    for step in range(4):
+        assert float(loss[step]) == pytest.approx(float(expected[step]), rel=tolerance)
+    main(arguments(tmp_path, cache, "--trainer.max_epochs=2", "--trainer.limit_val_batches=0",
+                   f"--ckpt_path={tmp_path / 'last.ckpt'}"))
+    assert checkpoint(tmp_path)["state_dict"].keys() == checkpoint(trained)["state_dict"].keys()
+    assert float(losses(tmp_path)[7]) == pytest.approx(float(expected[7]), rel=10 * tolerance)
+
+
+def test_a_batch_is_one_loss_however_many_processes_share_it(cache):
+    data = PriorData(phantoms=4, cache=str(cache), cube=Cube(16))
+    task = PriorTraining(VolumeUNet(4, 2, (8, 8), (False, True), 1, 8), TextSettings("none"), cube=Cube(16))
+    torch.nn.init.normal_(task.prior.network.unfold.weight, std=0.1)
+    batch = default_collate([data.phantoms[i] for i in range(4)])
+    shares = [{key: value[rank::2] for key, value in batch.items()} for rank in range(2)]
+    for key in ((0, 0), (0, 1)):
+        halves = [task.batch_loss(share, key, rank, 2) for rank, share in enumerate(shares)]
+        torch.testing.assert_close(sum(halves) / 2, task.batch_loss(batch, key))
+    assert task.batch_loss(batch, (0, 0)) != task.batch_loss(batch, (0, 1))

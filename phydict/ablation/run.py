@@ -106,12 +106,12 @@ def run(specification: Specification, device: torch.device, progress: CaseProgre
     Case by case; the X-rays of a case are simulated once for all trials that share an acquisition.
     """
     scoring = scoring or Scoring()
-    found, planned = {}, {}  # cases of an acquisition; key -> columns
+    cases_of, planned = {}, {}  # by acquisition; key -> columns
     cases: dict[str, list] = {}  # id -> trials, their rows' keys, and the functions that make the case
     for trial in specification.trials:
-        if (acquisition := trial.acquisition()) not in found:
-            found[acquisition] = trial.data.test_cases(*trial.scene())
-        for case, source, make in found[acquisition]:
+        if (acquisition := trial.acquisition()) not in cases_of:
+            cases_of[acquisition] = trial.data.test_cases(*trial.scene())
+        for case, source, make in cases_of[acquisition]:
             name = key(trial, case, source, scoring.settings())
             planned[name] = {"case": case} | trial.columns | {"grid": "x".join(map(str, trial.scored().shape))}
             cases.setdefault(case, []).append((trial, name, make))
@@ -124,7 +124,7 @@ def run(specification: Specification, device: torch.device, progress: CaseProgre
     if others := len(results.others):
         tell(f"{others} rows of other settings or data are kept in {results.file} and left out of tables",
              event="others", cases=others, out=str(results.file))
-    bench = Runner(device, scoring, specification.out)
+    runner = Runner(device, scoring, specification.out)
     progress.begin("ablate", left, verb="run", out=specification.out, noun="row")
     for case, work in cases.items():
         groups: dict[str, list] = {}
@@ -137,7 +137,7 @@ def run(specification: Specification, device: torch.device, progress: CaseProgre
             scene = _attempt(lambda: MeasuredCase(case, first, made.case(case, first, make), device))
             for trial, name, _ in group:
                 progress.case(f"{case}: {trial.label}")
-                measured = scene if isinstance(scene, dict) else bench.measure(trial, scene, progress.advance, name)
+                measured = scene if isinstance(scene, dict) else runner.measure(trial, scene, progress.advance, name)
                 results.add(name, measured)
                 progress.finished(f"{measured['seconds']:.2f} s, {measured['psnr']:.2f} dB"
                                   if measured["status"] == "ok" else f"{measured['status']}: {measured['error']}")
@@ -210,7 +210,7 @@ class Runner:
         finite = bool(result.volume.isfinite().all())
         scores = {}
         if finite:
-            volume = resampled(result.volume, trial.own()[0], scene.grid)
+            volume = resampled(result.volume, trial.result_scene()[0], scene.grid)
             scores = self.scoring.scores(volume, result.misfit, scene.truth, scene.grid, scene.window, self.device,
                                          trial.data.protocol)
             if features := self.scoring.features(volume, scene.truth, scene.window, self.device):
@@ -232,7 +232,7 @@ class Runner:
         stage = _stage_on(trial.super_resolution, self.device) if trial.super_resolution else None
         ready = reconstructor(trial.method, prior, trial.guidance, trial.name, stage, samples=trial.samples)
         ready = onto_grid(ready, trial.box and trial.box.grid(), trial.refinement)
-        xrays, projector = fit_to_grid(ready, trial.own()[0], scene.xrays.clone(), scene.beam, trial.projector)
+        xrays, projector = fit_to_grid(ready, trial.result_scene()[0], scene.xrays.clone(), scene.beam, trial.projector)
         return ready.with_mu_water(scene.mu_water).reconstruct(
             xrays, projector, scene.report(trial), False, seed, on_step)
 

@@ -96,10 +96,10 @@ class Trial:
 
     def scene(self) -> tuple[Grid, HUWindow]:
         """The grid of the CT that X-rays are made of, and the HU window that it is clipped to."""
-        grid, window = self.own()
+        grid, window = self.result_scene()
         return self.data.scene(whole(grid) if self.box else grid, window)
 
-    def own(self) -> tuple[Grid, HUWindow]:
+    def result_scene(self) -> tuple[Grid, HUWindow]:
         """The result's grid and HU window."""
         file = self.prior or self.like
         if self.prior is None and self.data.protocol and self.data.protocol.grid:
@@ -169,7 +169,7 @@ def trials_of(base: Mapping, axes: Mapping, methods: Mapping, cases: Cases,
     if (count := before + math.prod(map(len, axes.values()))) > MOST_TRIALS:
         raise ValueError(f"the axes stand for {count:,} combinations, but at most {MOST_TRIALS:,} are run: shorten "
                          "them")
-    found, used = [], set()
+    trials, used = [], set()
     for values in product(*axes.values()):
         combination = dict(zip(axes, values))
         name = combination.get("method", base.get("method"))
@@ -179,17 +179,17 @@ def trials_of(base: Mapping, axes: Mapping, methods: Mapping, cases: Cases,
         of = changes.pop("of", name)
         trial, meant = _trial(of, base | changes | combination | {"method": name}, cases)
         check_used(changes, meant, [trial])
-        found.append(trial)
+        trials.append(trial)
         used |= meant
-    like = next((trial.prior for trial in found if trial.prior), None)
-    found = [trial if trial.prior else replace(trial, like=like) for trial in found]
-    scenes = [trial.scene() for trial in found]
-    results = [trial.own()[0] for trial in found] if not any(trial.data.protocol for trial in found) else []
+    like = next((trial.prior for trial in trials if trial.prior), None)
+    trials = [trial if trial.prior else replace(trial, like=like) for trial in trials]
+    scenes = [trial.scene() for trial in trials]
+    results = [trial.result_scene()[0] for trial in trials] if not any(trial.data.protocol for trial in trials) else []
     if any(window != scenes[0][1] for _, window in scenes) or not all(
             grid.same_as(grids[0]) for grids in (results, [grid for grid, _ in scenes]) for grid in grids):
         raise ValueError("the methods of a product are compared on one grid and HU window, but their priors, second "
                          "stages, or voxels, side and centre, give several: give voxels, or make products of their own")
-    return found, used
+    return trials, used
 
 
 def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
@@ -205,14 +205,14 @@ def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
     simulator = SIMULATORS.get(given.get("simulator", "ideal"))
     if simulator is None:
         raise ValueError(f"there is no simulator {given['simulator']!r}: use one of {', '.join(SIMULATORS)}")
-    own = {"method": base, "simulator": simulator}
+    changeable = {"method": base, "simulator": simulator}
     changes: dict[str, dict] = {"method": {}, "simulator": {}}
     for name, value in settings.items():
         part, _, path = name.partition(".")
-        if path and part in own and has_field(own[part], path.split(".")):
+        if path and part in changeable and has_field(changeable[part], path.split(".")):
             changes[part][path] = value
     try:
-        method, simulator = (changed(own[part], changes[part], part) for part in own)
+        method, simulator = (changed(changeable[part], changes[part], part) for part in changeable)
     except ValueError as error:
         raise ValueError(f"{settings['method']}: {error}") from error
     if not isinstance(method, Sampler) or not has_field(method, ["ec_delta"]):
@@ -265,12 +265,12 @@ def method_of(name: object, known: Iterable[str] = ()) -> Sampler | Reconstructo
     """
     if isinstance(name, str) and name in METHODS:
         return METHODS[name]
-    module, _, own = name.rpartition(".") if isinstance(name, str) else ("", "", "")
+    module, _, attribute = name.rpartition(".") if isinstance(name, str) else ("", "", "")
     if not module:
         raise ValueError(f"there is no method {name!r}: use one of {', '.join([*known, *METHODS])}, or the path of a "
                          "class, such as my_module.MySampler")
     try:
-        kind = getattr(import_module(module), own)
+        kind = getattr(import_module(module), attribute)
         if isinstance(kind, type) and issubclass(kind, Sampler | Reconstructor) and is_dataclass(kind):
             return kind()
     except (Exception, SystemExit) as error:  # of whatever kind: another's code runs

@@ -8,12 +8,10 @@ Each finished case is one folder of the output; a stopped run resumes where it w
 from __future__ import annotations
 
 import os
-import platform
 import sys
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
-from importlib.metadata import version
 from pathlib import Path
 
 import lightning
@@ -21,23 +19,23 @@ from lightning.pytorch.utilities.exceptions import SIGTERMException
 from rich.console import Console
 from torch import Tensor
 
-from phydict.datasets.radiographs.xray_description import save_geometry
-from phydict.evaluation import CaseMetrics, Table, panel
+from phydict.evaluation import CaseMetrics, Table
 from phydict.evaluation.fid import Features, PlaneFID, load_features, save_features
 from phydict.evaluation.tables import fid_table
 from phydict.grid import Box, Grid
+from phydict.inference.case_files import body_interval, versions, write_result
 from phydict.inference.page import results_page
 from phydict.inference.protocols import cut_out, placed, resampled, whole
 from phydict.inference.results import FEATURES, CaseResults
 from phydict.inference.scoring import Scoring
 from phydict.inference.settings import CascadeSettings, Sampling
 from phydict.methods import CHEST, METHODS, calibrated, default_method, fit_to_grid, onto_grid, reconstructor
-from phydict.page import check_own_page, write_case_files
+from phydict.page import check_own_page
 from phydict.poses import FoundPoses
 from phydict.posterior import CascadePosterior, Refined, Sampler
 from phydict.prior import (
     MedSynCheckpoint, PriorContract, file_read, find_prior, fingerprint, load_super_resolution)
-from phydict.reconstruction import Reconstruction, Reconstructor, describe, save_nifti
+from phydict.reconstruction import Reconstruction, Reconstructor, describe
 from phydict.runtime.console import TRACEBACK, check_apart, check_writable, noted, sentence
 from phydict.runtime.precision import instruction_set
 from phydict.runtime.profiling import CPU, peak_memory, profiled, stage
@@ -48,12 +46,6 @@ from phydict.runtime.warning import warn
 from phydict.units import HUWindow
 from phydict.xray.poses.uncertain import USUAL, Uncertain
 from phydict.xray.projectors.projector import METHODS as PROJECTORS
-
-SHOWN_LEVEL = 0.9
-"""The level of the intervals that are written and shown."""
-
-TISSUE = -500.0
-"""HU above which a voxel is no air."""
 
 
 class ReconstructionTask(lightning.LightningModule):
@@ -281,44 +273,20 @@ class ReconstructionTask(lightning.LightningModule):
     def _finish(self, case: dict, result: Reconstruction, scores: dict | None = None,
                 truth: Tensor | None = None, features: Features | None = None) -> None:
         def write_files(folder: Path) -> None:
+            write_result(folder, case, result, self.method_name, truth, self.keep_coarse)
             if features:
                 save_features(folder / FEATURES, features)
-            result.save_nifti(folder / "volume.nii.gz")
-            if result.beam is not None:
-                save_geometry(folder / "geometry_found.yaml", result.beam, case.get("description"))
-            if result.deviation is not None:
-                save_nifti(folder / "deviation.nii.gz", result.deviation.numpy(), result.grid)
-            if self.keep_coarse and result.coarse is not None:
-                result.coarse.save_nifti(folder / "coarse.nii.gz")
-            uncertain, label = result.deviation, "standard deviation"
-            if result.intervals:
-                uncertain, label = result.intervals[SHOWN_LEVEL], f"half of the {SHOWN_LEVEL:.0%} interval"
-                save_nifti(folder / f"interval_{SHOWN_LEVEL * 100:.0f}.nii.gz", uncertain.numpy(), result.grid)
-            panel(folder / "panel.png", result.volume, result.grid, result.xrays, result.reprojection, truth,
-                  title=f"{case['id']}: {self.method_name}", deviation_hu=uncertain, deviation_label=label)
-            volumes = {"reconstruction": result.volume, "truth": truth, label: uncertain}
-            write_case_files(folder, result.grid, {k: v for k, v in volumes.items() if v is not None}, result.xrays,
-                             result.reprojection)
 
         with stage("write"):
             self.results.write(case["id"], self._record(case, result, scores), write_files)
         self.progress.finished(f"{sum(result.seconds.values()):.1f} s, misfit {result.misfit:.4f}")
-
-    @staticmethod
-    def _body_interval(result: Reconstruction) -> float | None:
-        """Half the interval's width in HU, mean over tissue and lungs; None where the method knows none."""
-        if not result.intervals:
-            return None
-        lung = result.masks[0] > 0.5 if len(result.masks) else False
-        inside = (result.volume > TISSUE) | lung
-        return float(result.intervals[SHOWN_LEVEL][inside].mean()) if inside.any() else None
 
     def _record(self, case: dict, result: Reconstruction, scores: dict | None) -> dict:
         """All that is known of a finished case, as plain JSON values; process_peak_memory_mb is in MiB."""
         return {"case": case["id"], "method": self.method_name,
                 "citation": self.reconstructor.citation, "scores": scores, "misfit": result.misfit,
                 "misfit_per_view": result.misfit_per_view, "diverged_at": result.diverged_at, "scatter": result.scatter,
-                "interval_90_hu": self._body_interval(result), "interval_widening": result.interval_widening,
+                "interval_90_hu": body_interval(result), "interval_widening": result.interval_widening,
                 "seconds": result.seconds, "network_calls": result.network_calls,
                 "projector_calls": result.projector_calls,
                 "process_peak_memory_mb": peak_memory(CPU),
@@ -378,9 +346,3 @@ def _identity(role: str, prior: str | MedSynCheckpoint) -> dict:
     file = file_read(prior)
     return {role: Path(prior).name if isinstance(prior, str) else describe(prior),
             f"{role}_crc32": fingerprint(prior)} | ({f"{role}_file": file} if file else {})
-
-
-def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that a result depends on."""
-    return {"python": platform.python_version()} | {
-        name: version(name) for name in ("phydict", "torch", "lightning", "monai", "torchmetrics", "numpy")}

@@ -99,8 +99,6 @@ def straight(index, axis: int, grid: Grid) -> ConeBeam:
     return ConeBeam([source], [pixel], [np.eye(3)[1 - axis]], [np.eye(3)[2]], (1, 1))
 
 
-# Faces, edges, corners, axes
-
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("offset", [(0, 0), (0.5, 0), (0, 0.5), (0.5, 0.5)], ids=["centre", "face", "face 2", "edge"])
@@ -149,8 +147,6 @@ def test_axis_and_45_degree_views(method, start, voxels, pixels):
     nearby = Projector(grid, ConeBeam.orbit(4, 1020, 740, pixels, 34.0, start=start + 1e-7), method)(mu)
     assert error(y, nearby) < (0.02 if method in BOXES else 1e-6)  # trilinear models are continuous, boxes are not
 
-
-# Sources near the volume, rays beside it
 
 def grazing(gap: float) -> tuple[Grid, ConeBeam]:
     """A source `gap` mm before the middle of the volume's posterior face, with rays up to 60 degrees off."""
@@ -220,8 +216,6 @@ def test_the_compiled_loops_pass_over_what_the_sparse_products_multiply_by_zero(
     torch.testing.assert_close(A.forward(mu), A.sparse.forward(mu), rtol=1e-10, atol=1e-12)
 
 
-# Shapes and spacings
-
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("shape", [(1, 16, 16), (16, 1, 16), (16, 16, 1), (1, 1, 16), (1, 1, 1)])
 def test_volumes_of_one_voxels_thickness(method, shape):
@@ -278,27 +272,15 @@ def test_fine_voxels_far_away():
         assert error(Projector(grid, beam, method)(mu.float()).double(), Projector(grid, beam, method)(mu)) < 2e-6
 
 
-# Precision
-
-def _precision(voxels: int, pixels: int, method: str, memory: int = 2**29) -> float:
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("voxels, pixels, memory", [
+    (64, 64, 2**29), pytest.param(256, 448, 2**33, marks=pytest.mark.slow)], ids=["64", "256"])
+def test_float32_is_float64_to_1e_5(voxels, pixels, memory, method):
     grid, beam = Grid.cube(voxels, 250), ConeBeam.orbit(1, 1020, 800, (pixels, pixels), 448 / pixels, start=0.3)
     mu, y = body(grid), random_like((1, 1, pixels, pixels)).abs()
     A = Projector(grid, beam, method, memory)
-    return max(error(A(mu.float()).double(), A(mu)), error(A.T(y.float()).double(), A.T(y)))
+    assert max(error(A(mu.float()).double(), A(mu)), error(A.T(y.float()).double(), A.T(y))) < 1e-5
 
-
-@pytest.mark.parametrize("method", METHODS)
-def test_float32_is_float64_to_1e_5_at_64(method):
-    assert _precision(64, 64, method) < 1e-5
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", METHODS)
-def test_float32_is_float64_to_1e_5_at_256(method):
-    assert _precision(256, 448, method, memory=2**33) < 1e-5
-
-
-# Contents and numbers of views
 
 @pytest.mark.parametrize("method", METHODS)
 def test_metal_is_fifty_times_its_voxels(method):
@@ -355,8 +337,6 @@ def test_the_memory_budget_does_not_show_in_the_plane_sweep(beam):
         torch.testing.assert_close(A.T(y), whole.T(y), rtol=1e-11, atol=1e-11)
 
 
-# Gradients
-
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("scene", ["axis views", "grazing", "thin"])
 def test_gradients_are_finite_and_what_finite_differences_say(method, scene):
@@ -375,8 +355,6 @@ def test_gradients_are_finite_and_what_finite_differences_say(method, scene):
         difference = (loss(mu + 1e-3 * direction) - loss(mu - 1e-3 * direction)) / 2e-3
     assert float((gradient * direction).sum()) == pytest.approx(float(difference), rel=1e-8)
 
-
-# Models
 
 @pytest.mark.parametrize("beam", [BEAM, TILTED, ConeBeam.orbit(4, 1020, 740, (15, 16), 30.0)],
                          ids=["upright", "tilted", "axis views"])

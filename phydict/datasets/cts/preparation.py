@@ -59,7 +59,7 @@ def prepare_folder(cts: str | Path, out: str | Path, settings: Settings = Settin
     rows = {source.id: row for source in sources if (row := _finished(source, out, settings)) is not None}
     left = [source for source in sources if source.id not in rows]
     with CaseProgress() as progress:
-        progress.begin("CTs", len(left), verb="prepare", out=out, noun="CT")
+        progress.begin("CTs", len(left), verb="prepare", out=out)
         for row in _prepared(left, out, settings, workers):
             rows[row["id"]] = row
             progress.case(row["id"])

@@ -1,0 +1,56 @@
+"""The files that a finished case leaves beside its record."""
+
+from __future__ import annotations
+
+import platform
+from importlib.metadata import version
+from pathlib import Path
+
+from torch import Tensor
+
+from phydict.datasets.radiographs.xray_description import save_geometry
+from phydict.evaluation import panel
+from phydict.page import write_case_files
+from phydict.reconstruction import Reconstruction, save_nifti
+
+SHOWN_LEVEL = 0.9
+"""The level of the intervals that are written and shown."""
+
+TISSUE = -500.0
+"""HU above which a voxel is no air."""
+
+
+def write_result(folder: Path, case: dict, result: Reconstruction, method: str, truth: Tensor | None,
+                 keep_coarse: bool) -> None:
+    """Writes volumes, panel and what the page shows of a case; truth: HU (X, Y, Z) on the result's voxels."""
+    result.save_nifti(folder / "volume.nii.gz")
+    if result.beam is not None:
+        save_geometry(folder / "geometry_found.yaml", result.beam, case.get("description"))
+    if result.deviation is not None:
+        save_nifti(folder / "deviation.nii.gz", result.deviation.numpy(), result.grid)
+    if keep_coarse and result.coarse is not None:
+        result.coarse.save_nifti(folder / "coarse.nii.gz")
+    uncertain, label = result.deviation, "standard deviation"
+    if result.intervals:
+        uncertain, label = result.intervals[SHOWN_LEVEL], f"half of the {SHOWN_LEVEL:.0%} interval"
+        save_nifti(folder / f"interval_{SHOWN_LEVEL * 100:.0f}.nii.gz", uncertain.numpy(), result.grid)
+    panel(folder / "panel.png", result.volume, result.grid, result.xrays, result.reprojection, truth,
+          title=f"{case['id']}: {method}", deviation_hu=uncertain, deviation_label=label)
+    volumes = {"reconstruction": result.volume, "truth": truth, label: uncertain}
+    write_case_files(folder, result.grid, {k: v for k, v in volumes.items() if v is not None}, result.xrays,
+                     result.reprojection)
+
+
+def body_interval(result: Reconstruction) -> float | None:
+    """Half the interval's width in HU, mean over tissue and lungs; None where the method knows none."""
+    if not result.intervals:
+        return None
+    lung = result.masks[0] > 0.5 if len(result.masks) else False
+    inside = (result.volume > TISSUE) | lung
+    return float(result.intervals[SHOWN_LEVEL][inside].mean()) if inside.any() else None
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that a result depends on."""
+    return {"python": platform.python_version()} | {
+        name: version(name) for name in ("phydict", "torch", "lightning", "monai", "torchmetrics", "numpy")}

@@ -36,8 +36,9 @@ WIDENING = 0.25
 """Power of the residual, over the most in calibration, by which intervals widen: of held-out CTs' polychromatic X-rays,
 missed by 1.3 to 4 times their noise, 91 to 98 % of the body is then in the 90 % interval."""
 
-FAR_OUTSIDE = 5.0
-"""How many times the most residual in calibration is far outside of it."""
+FAR_OUTSIDE = 4.5
+"""How many times the most residual in calibration is far outside of it: beyond a tube's spectrum, which is missed by 4
+times as much at most, and short of poses wrong by 5 mm and 2 degrees, of which eight views are missed by 4.9 times."""
 
 SCATTER_WIDENING = 2.0
 """Factor by which they widen where scatter is subtracted, which shifts HU where a tube's spectrum was taken for it."""
@@ -199,7 +200,8 @@ class Posterior(Reconstructor):
         residual, most = float(measurement.normalised_residual(ct)), float(self.prior.uncertainty.most_residual)
         if residual > FAR_OUTSIDE * most:
             warn(f"the X-rays are missed by {residual:.3g} times their noise, in the scenes that the intervals were "
-                 f"calibrated on by {most:.3g} at most: they are widened, and may still be too narrow")
+                 f"calibrated on by {most:.3g} at most: they are widened, and may still be too narrow; check geometry "
+                 "and scale, and whether the patient moved, or calibrate")
         widening = max(1.0, residual / most) ** WIDENING * (SCATTER_WIDENING if measurement.scatter else 1.0)
         widths = widening * self.prior.window.half_width * denoiser.half_widths[0].cpu()
         return dict(zip(LEVELS, widths)), widening

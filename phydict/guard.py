@@ -25,8 +25,8 @@ more than BAD_FIT, all of them are."""
 
 BONE, CEILING, CEILING_ML = 1000, 0.98, (3.0, 300.0)
 """Where so many ml, from least to most, hold CEILING or more of a range that reaches BONE in HU, something denser is
-suspected. Of two training CTs from eight views 0.4 ml did at most, of a CT in wrong poses 1.7 ml; with 5 ml of metal
-beside the spine 22 ml from eight views, 7 ml from four and nothing from two."""
+suspected. Of two training CTs from eight views 0.4 ml did at most, of one in wrong poses, which are said
+too, 9 ml; with 5 ml of metal beside the spine 22 ml from eight views, 7 ml from four and nothing from two."""
 
 
 class Operator(Protocol):

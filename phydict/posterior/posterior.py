@@ -38,7 +38,8 @@ missed by 1.3 to 4 times their noise, 91 to 98 % of the body is then in the 90 %
 
 FAR_OUTSIDE = 4.5
 """How many times the most residual in calibration is far outside of it: beyond a tube's spectrum, which is missed by 4
-times as much at most, and short of poses wrong by 5 mm and 2 degrees, of which eight views are missed by 4.9 times."""
+times as much at most, and short of poses wrong by 5 mm and 2 degrees, of which eight views of a training CT are missed
+by 5.5 times as much."""
 
 SCATTER_WIDENING = 2.0
 """Factor by which they widen where scatter is subtracted, which shifts HU where a tube's spectrum was taken for it."""

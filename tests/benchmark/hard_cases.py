@@ -1,10 +1,12 @@
-"""Hard cases: what the default and SIRT make of data and settings at the limits, and whether they say so.
+"""Hard cases: what methods make of data and settings at the limits, and whether they say so.
 
     python tests/benchmark/hard_cases.py <CT> [words in the names of cases]
 
 64^3 voxels of 6 mm; unless the case says otherwise, eight ideal views of 448 x 448 pixels with 0.5 % noise. Writes
 hard_cases.csv beside this file, a row per case and method, and keeps the rows that are there already: delete a row to
-have it computed anew; and from it the table hard_cases.md. Columns: worst_view_misfit and worst_view, the view that
+have it computed anew; and from it the tables of hard_cases.md. What tubes, detectors and patients do to ideal X-rays is
+in hard_scenes.py. Columns: inside_90, the share of voxels of more than -900 HU in truth inside the 90 % interval, and
+interval_widening, where the method knows intervals; worst_view_misfit and worst_view, the view that
 fits worst; error_rank_correlation, Spearman's, over voxels, of the deviation of eight samples with the true error of
 their mean, where samples were drawn; body_rank_correlation, the same over voxels of more than -900 HU in truth;
 difference_hu, root mean square difference from the volume that the case names; said: warnings, or the sentence with
@@ -27,6 +29,9 @@ import numpy as np
 import torch
 from scipy.ndimage import rotate
 from scipy.stats import spearmanr
+from hard_scenes import (
+    blurred, drifted, focal_spot, heeled, lagging, scaled, water_cube, without_left_lung)
+from poses import lowered, true_beam
 from torch import Tensor
 from torch.nn.functional import interpolate
 
@@ -41,15 +46,19 @@ from phydict.prior.files import DEFAULT_PRIOR
 from phydict.reconstruction import Reconstruction
 from phydict.runtime.console import sentence
 from phydict.xray import Ideal
+from phydict.xray.poses.uncertain import USUAL, Uncertain
 
 OUT = Path(__file__).with_suffix(".csv")
 COLUMNS = ("case", "method", "ssim", "psnr", "mae_hu", "misfit", "worst_view_misfit", "worst_view", "finite",
            "diverged_at", "error_rank_correlation", "body_rank_correlation",
-           "difference_hu", "said")
+           "difference_hu", "inside_90", "interval_widening", "said")
 GRID, WINDOW, BEAM = Grid.cube(64), HUWindow(), ConeBeam.orbit(8, 1020, 740, (448, 448), 1.25)
+FAR = ConeBeam.orbit(8, 1100, 740, (224, 224), 2.7)
+"""With room for detectors that stand a little closer."""
 FAST = METHODS["phydict_fast"]
 SAMPLED = replace(FAST, sampling_noise=1.0)
 CONTRADICTION = "Findings: There is a large right pneumothorax. Impression: Large right pneumothorax."
+THREE = ("phydict_learned", "phydict_fast", "tv")
 AGREEMENT = "Findings: The lungs are clear. Impression: No acute abnormality in the thorax."
 
 
@@ -73,7 +82,8 @@ class HardCases:
 
     def __init__(self, ct: Path):
         self.ct, self.prior = ct, load_prior(DEFAULT_PRIOR)
-        self.x = prepare_ct(ct, GRID)["volume"][None]
+        case = prepare_ct(ct, GRID)
+        self.x, self.lung = case["volume"][None], case["masks"][0] > 0.5
         self.truth = WINDOW.to_hu(self.x)[0, 0]
         self.xrays = self.simulated()
 
@@ -88,6 +98,10 @@ class HardCases:
         for group in (self._orbits, self._bad_views, self._bad_data):
             for name, make in group():
                 yield from ((name, method, make) for method in ("phydict_fast", "sirt"))
+                if name in ("eight views", "metal"):
+                    yield from ((name, method, make) for method in ("phydict_learned", "tv"))
+        for group in (self._exposures, self._patients):
+            yield from ((name, method, make) for name, make in group() for method in THREE)
         for group in (self._settings, self._precisions, self._seeds, self._samples, self._many_steps):
             yield from ((name, "phydict_fast", make) for name, make in group())
 
@@ -158,6 +172,50 @@ class HardCases:
         mu[..., 31:33, 22:24, 30:36] = 0.18
         return mu
 
+    def _exposures(self):
+        """What tubes, detectors and a patient who moves do to the X-rays."""
+        def of(xrays: Tensor, beam: ConeBeam = BEAM, **settings) -> Case:
+            return Case(xrays, self.truth, beam, settings)
+
+        def moved() -> Tensor:
+            return self.simulated(beam=true_beam(FAR, "random", 0))
+
+        def breathing() -> Tensor:
+            xrays = self.simulated(beam=FAR)
+            xrays[1::2] = self.simulated(WINDOW.to_mu(lowered(self.x[0])[None]), FAR)[1::2]
+            return xrays
+
+        yield "pose errors of 5 mm and 2 degrees", lambda: of(moved(), FAR)
+        yield "pose errors, calibrated", lambda: of(moved(), FAR, uncertain=USUAL)
+        yield "gain drift by 20 %", lambda: of(drifted(self.xrays))
+        yield "gain drift, calibrated", lambda: of(drifted(self.xrays), uncertain=Uncertain(gain=0.1, offset=0.2))
+        yield "heel effect of 30 %", lambda: of(heeled(self.xrays))
+        yield "detector blur of 3 mm", lambda: of(blurred(self.xrays, 3 / 1.25))
+        yield "detector lag of 5 %", lambda: of(lagging(self.xrays))
+        yield "focal spot of 3 mm", lambda: of(-torch.stack([
+            torch.exp(-self.simulated(beam=beam)) for beam in focal_spot(BEAM, 3)]).mean(0).log())
+        yield "breathing by 10 mm", lambda: of(breathing(), FAR)
+        yield "breathing by 10 mm, calibrated", lambda: of(breathing(), FAR, uncertain=USUAL)
+
+    def _patients(self):
+        """Patients unlike those of the training."""
+        def of(x: Tensor) -> Case:
+            return Case(self.simulated(WINDOW.to_mu(x)), WINDOW.to_hu(x)[0, 0])
+
+        def stout() -> Case:
+            """Of 55 cm, on voxels that hold 38 cm of them."""
+            factor = 550 / width(self.truth)
+            beam = ConeBeam.orbit(8, 1600, 1000, (448, 448), 2.2)
+            x = interpolate(self.x, size=(64, 64, 64), mode="trilinear")
+            xrays = self.simulated(WINDOW.to_mu(x), beam, Grid((64, 64, 64), (6 * factor, 6 * factor, 6.0)))
+            return Case(xrays, WINDOW.to_hu(scaled(self.x, (factor, factor, 1.0)))[0, 0], beam)
+
+        yield "child of 0.55 times the size", lambda: of(scaled(self.x, (0.55, 0.55, 0.55)))
+        yield "patient of 55 cm", stout
+        yield "cube of water of 20 cm", lambda: of(water_cube(self.x, in_range(0.0)))
+        yield "patient upside down", lambda: of(self.x.flip(-1))
+        yield "left lung removed", lambda: of(without_left_lung(self.x, self.lung, in_range(20.0)))
+
     def _larger(self) -> Case:
         """A patient of whom the volume holds the middle alone, seen from further away."""
         beam = ConeBeam.orbit(8, 1600, 1000, (448, 448), 1.6)
@@ -218,10 +276,21 @@ class HardCases:
                 make(), settings={"method": SAMPLED, "samples": 8})
 
 
+def in_range(hu: float) -> float:
+    return float(WINDOW.to_range(torch.tensor(hu)))
+
+
+def width(hu: Tensor) -> float:
+    """mm from side to side of what is denser than -300 HU in a quarter of its height or more."""
+    seen = (hu > -300).any(1).float().mean(1) >= 0.25
+    return GRID.spacing[0] * float(seen.sum())
+
+
 def row(name: str, method: str, case: Case, prior: Prior) -> dict:
     """One case by one method; what it says and what it refuses is part of the result."""
     settings = {"method": FAST if method == "phydict_fast" else method} | case.settings
-    result: Reconstruction = case.run() if case.run else reconstruct(case.xrays, case.beam, prior, **settings)
+    own = None if method == "phydict_learned" else prior
+    result: Reconstruction = case.run() if case.run else reconstruct(case.xrays, case.beam, own, **settings)
     scores = volume_metrics(result.volume[None, None], case.truth[None, None])
     worst, _ = worst_view(result.misfit_per_view)
     found = {"case": name, "method": method} | {key: scores[key] for key in ("ssim", "psnr", "mae_hu")} | {
@@ -231,6 +300,10 @@ def row(name: str, method: str, case: Case, prior: Prior) -> dict:
         error = (result.volume - case.truth).abs()
         for where, voxels in (("error", error >= 0), ("body", case.truth > -900)):
             found[f"{where}_rank_correlation"] = float(spearmanr(result.deviation[voxels], error[voxels]).statistic)
+    if result.intervals:
+        inside = (result.volume - case.truth).abs() <= result.intervals[0.9]
+        found |= {"inside_90": float(inside[case.truth > -900].float().mean()),
+                  "interval_widening": result.interval_widening}
     if case.compared_with:
         found["difference_hu"] = float((result.volume - case.compared_with()).square().mean().sqrt())
     return found
@@ -253,16 +326,41 @@ def attempt(name: str, method: str, make: Callable[[], Case], prior: Prior) -> d
 def table(rows: list[dict]) -> str:
     """The default's rows as Markdown, SIRT's PSNR beside its own; of what is said, the first clauses."""
     sirt = {row["case"]: row.get("psnr") for row in rows if row["method"] == "sirt"}
+    scenes = {row["case"] for row in rows if row["method"] == "tv"} - sirt.keys()
     lines = ["| case | PSNR (dB) | SIRT's | MAE (HU) | misfit | worst view's | what is said |",
              "|---|---:|---:|---:|---:|---:|---|"]
     for row in rows:
-        if row["method"] == "phydict_fast" and not row.keys() & {"difference_hu", "error_rank_correlation"}:
+        if row["method"] == "phydict_fast" and row["case"] not in scenes and not row.keys() & {
+                "difference_hu", "error_rank_correlation"}:
             figures = [(row.get("psnr"), 1), (sirt.get(row["case"]), 1), (row.get("mae_hu"), 0), (row.get("misfit"), 4),
                        (row.get("worst_view_misfit"), 4)]
             told = ["-" if figure is None else f"{figure:.{digits}f}" for figure, digits in figures]
-            said = [re.match("(refused: )?[^:,]*", part).group() for part in row.get("said", "-").split("; ")]
-            lines.append(f"| {' | '.join([row['case'], *told, '; '.join(said)])} |")
+            lines.append(f"| {' | '.join([row['case'], *told, clauses(row)])} |")
     return "\n".join(lines) + "\n"
+
+
+def scenes_table(rows: list[dict]) -> str:
+    """Rows of THREE as Markdown: each method's PSNR, what the default's interval holds, and what each says."""
+    lines = ["| case | PSNR (dB): learned | fast | tv | inside 90 % | widened by | what learned says | fast and tv |",
+             "|---|---:|---:|---:|---:|---:|---|---|"]
+    known = {(row["case"], row["method"]): row for row in rows}
+    for name in dict.fromkeys(row["case"] for row in rows if row["method"] == THREE[0]):
+        learned, fast, tv = (known.get((name, method), {}) for method in THREE)
+        psnr = [f"{row['psnr']:.1f}" if "psnr" in row else "-" for row in (learned, fast, tv)]
+        others = dict.fromkeys(said for row in (fast, tv) if (said := clauses(row)) != "-")
+        lines.append(f"| {' | '.join([name, *psnr])} | {100 * learned['inside_90']:.0f} | "
+                     f"{learned['interval_widening']:.1f} | {clauses(learned)} | {'; '.join(others) or '-'} |")
+    return "\n".join(lines) + "\n"
+
+
+def clauses(row: dict) -> str:
+    """The first clauses of what is said; views that were corrected are counted."""
+    parts = [re.match("(refused: )?[^:,]*", part).group() for part in row.get("said", "-").split("; ")
+             if not re.search("^check |^state | was corrected by | show the lower end ", part)]
+    corrected = len(re.findall(" was corrected by ", row.get("said", "")))
+    told = {f"views corrected by more than stated: {corrected}": corrected,
+            "the patient breathed or moved between the views": " show the lower end " in row.get("said", "")}
+    return "; ".join([*parts, *(words for words, true in told.items() if true)])
 
 
 if __name__ == "__main__":
@@ -276,4 +374,5 @@ if __name__ == "__main__":
             rows[name, method] = attempt(name, method, make, hard.prior)
             write_csv(OUT, sorted(rows.values(), key=lambda row: order.index((row["case"], row["method"]))))
             print({column: value for column, value in rows[name, method].items() if value != ""}, flush=True)
-    OUT.with_suffix(".md").write_text(table(read_csv(OUT)))
+    rows = read_csv(OUT)
+    OUT.with_suffix(".md").write_text(f"{table(rows)}\n{scenes_table(rows)}")

@@ -17,10 +17,11 @@ from phydict.methods import reconstruct
 from phydict.prior import Refiner, load_prior, save_prior
 from phydict.training.data import PriorData
 from phydict.training.refiner import RefinerTraining
-from phydict.training.scenes import Scenes, fine_xrays
+from phydict.training.scenes import Scenes
 from phydict.training.settings import Loading
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
+from phydict.xray.finer import FinerProjector
 
 CONFIG = Path(__file__).parents[1] / "configs" / "prior" / "refiner.yaml"
 
@@ -93,12 +94,12 @@ def test_fine_xrays_of_blocks_are_those_of_their_means_where_rays_cannot_tell():
     grid, rng = Grid.cube(16), torch.Generator().manual_seed(0)
     projector = Projector(grid, ConeBeam.orbit(3, 1020, 740, (28, 28), 20.0), full_detector=True)
     smooth = interpolate(torch.rand((1, 1, 3, 3, 3), generator=rng), (32, 32, 32), mode="trilinear") * 0.02
-    coarse, fine = projector(avg_pool3d(smooth, 2)), fine_xrays(smooth, projector)
+    coarse, fine = projector(avg_pool3d(smooth, 2)), FinerProjector(projector)(smooth)
     np.testing.assert_allclose(projector.beam.divided(2).binned(2).pixels(), projector.beam.pixels())
     assert fine.shape == coarse.shape
     assert (fine - coarse).abs().mean() < 0.02 * coarse.mean()
     grain = smooth + 0.02 * torch.rand((1, 1, 32, 32, 32), generator=rng)
-    lost = (fine_xrays(grain, projector) - projector(avg_pool3d(grain, 2))).abs().mean()
+    lost = (FinerProjector(projector)(grain) - projector(avg_pool3d(grain, 2))).abs().mean()
     assert lost > 1.2 * (fine - coarse).abs().mean()
 
 

@@ -6,6 +6,8 @@ on x is computed once.
 
 from __future__ import annotations
 
+from copy import copy
+
 import torch
 from torch import Tensor
 
@@ -14,6 +16,7 @@ from phydict.units import MU_WATER, HUWindow
 from phydict.xray import Projector
 from phydict.xray.calibration import match_views, subtract_scatter
 from phydict.xray.checks import check_line_integrals, check_xrays
+from phydict.xray.finer import FinerProjector
 from phydict.xray.noise_level import noise_level
 
 MAX_LINE_INTEGRAL = 30.0
@@ -26,6 +29,7 @@ class Measurement:
     noise: standard deviation of the noise of y, as a share of its largest value or, as a tensor that expands to
     (K, V, U), of each pixel; None: estimated from y where it is needed. outside: line integrals (K, V, U) of what
     lies outside the voxels, which P adds.
+    subgrid: line integrals (1, K, V, U) that P adds for what the voxels cannot hold, 0 until somebody sets them.
     scales: per axis, the finest spacing of the voxels divided by their own.
     scatter_enabled: whether `subtract_scatter` subtracts scatter; calls: how many times A or its adjoint ran over all
     views, per volume of a batch; last_projection: what `project` last gave.
@@ -43,6 +47,7 @@ class Measurement:
         self.background = self.offset * projector(torch.ones(1, 1, *projector.grid.shape).to(xrays))
         if outside is not None:
             self.background = self.background + outside
+        self.subgrid: Tensor | float = 0.0
         self.scales = finest_to_own(projector.grid.spacing)
         self.y = xrays[None]
         self.scatter_enabled = False
@@ -52,9 +57,18 @@ class Measurement:
     def project(self, x: Tensor) -> Tensor:
         """P(x): line integrals (B, K, V, U) of the CT x."""
         self.calls += len(x)
-        projected = self.slope * self.projector(x) + self.background
+        projected = self.slope * self.projector(x) + self.background + self.subgrid
         self.last_projection = projected.detach()
         return projected
+
+    def on(self, projector: FinerProjector) -> Measurement:
+        """The same X-rays, as they are now, as a problem on other voxels of the same box."""
+        other = copy(self)
+        ones, others = (torch.ones(1, 1, *of.grid.shape).to(self.y) for of in (self.projector, projector))
+        other.background = self.background + self.offset * (projector(others) - self.projector(ones))
+        other.projector, other.scales = projector, finest_to_own(projector.grid.spacing)
+        other.subgrid, other.calls = 0.0, 2
+        return other
 
     def linear(self, d: Tensor) -> Tensor:
         """The linear part of P, for differences d of CTs."""

@@ -8,14 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
 from phydict.grid import Grid
 from phydict.posterior import Measurement
 from phydict.runtime.ranges import check_fields
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
-from phydict.xray.boxes import in_other_voxels
+from phydict.xray.finer import FinerProjector
 
 REACH = 1.48
 """Least distance from the isocentre to source and detector, over half the grid's side: their planes miss the grid."""
@@ -80,7 +79,7 @@ class Scenes:
         grid; `fine`, if given, is the same CT in finer voxels."""
         projector = Projector(grid, self.beam(rng, grid), full_detector=True)
         if fine is not None and rng.random() < self.fine:
-            y = fine_xrays(window.to_mu(fine), projector)
+            y = FinerProjector(projector, fine.shape[-1] // ct.shape[-1])(window.to_mu(fine))
         else:
             y = projector(window.to_mu(ct))
         if rng.random() < self.model_error:
@@ -96,11 +95,3 @@ class Scenes:
         """The same as a measurement."""
         y, projector = self.xrays(ct, rng, grid, window, fine)
         return Measurement(projector, y, window)
-
-
-def fine_xrays(mu: Tensor, projector: Projector) -> Tensor:
-    """What a projector's detector measures (1, K, V, U) of finer voxels (1, 1, X, Y, Z) of the same box: the mean line
-    integrals of as much finer pixels."""
-    factor = mu.shape[-1] // projector.grid.shape[-1]
-    grid = in_other_voxels(projector.grid, mu.shape[2:])
-    return avg_pool2d(Projector(grid, projector.beam.divided(factor), full_detector=True)(mu), factor)

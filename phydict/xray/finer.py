@@ -1,0 +1,28 @@
+"""What a detector measures of finer voxels than a grid's."""
+
+from __future__ import annotations
+
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate
+
+from phydict.xray.boxes import in_other_voxels
+from phydict.xray.projectors.projector import Projector
+
+
+class FinerProjector:
+    """A projector's X-rays of the same box in voxels `factor` times finer.
+
+    Attenuation (B, 1, X, Y, Z) in 1/mm on `grid` -> mean line integrals (B, K, V, U) of factor^2 rays in each pixel.
+    T is the exact adjoint.
+    """
+
+    def __init__(self, projector: Projector, factor: int = 2):
+        self.beam, self.factor = projector.beam, factor
+        self.grid = in_other_voxels(projector.grid, [factor * n for n in projector.grid.shape])
+        self._rays = Projector(self.grid, projector.beam.divided(factor), full_detector=True)
+
+    def __call__(self, mu: Tensor) -> Tensor:
+        return avg_pool2d(self._rays(mu), self.factor)
+
+    def T(self, xrays: Tensor) -> Tensor:
+        return self._rays.T(interpolate(xrays, scale_factor=self.factor) / self.factor**2)

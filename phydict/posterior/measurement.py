@@ -16,7 +16,6 @@ from phydict.units import MU_WATER, HUWindow
 from phydict.xray import Projector
 from phydict.xray.calibration import match_views, subtract_scatter
 from phydict.xray.checks import check_line_integrals, check_xrays
-from phydict.xray.finer import FinerProjector
 from phydict.xray.noise_level import noise_level
 
 MAX_LINE_INTEGRAL = 30.0
@@ -61,7 +60,7 @@ class Measurement:
         self.last_projection = projected.detach()
         return projected
 
-    def on(self, projector: FinerProjector) -> Measurement:
+    def on(self, projector: Projector) -> Measurement:
         """The same X-rays, as they are now, as a problem on other voxels of the same box."""
         other = copy(self)
         ones, others = (torch.ones(1, 1, *of.grid.shape).to(self.y) for of in (self.projector, projector))

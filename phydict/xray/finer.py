@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
+from phydict.linalg.power_iteration import operator_norm
 from phydict.xray.boxes import in_other_voxels
 from phydict.xray.projectors.projector import Projector
 
 
-class FinerProjector:
+class FinerProjector(Projector):
     """A projector's X-rays of the same box in voxels `factor` times finer.
 
     Attenuation (B, 1, X, Y, Z) in 1/mm on `grid` -> mean line integrals (B, K, V, U) of factor^2 rays in each pixel.
@@ -20,9 +22,13 @@ class FinerProjector:
         self.beam, self.factor = projector.beam, factor
         self.grid = in_other_voxels(projector.grid, [factor * n for n in projector.grid.shape])
         self._rays = Projector(self.grid, projector.beam.divided(factor), full_detector=True)
+        self.method, self.reason = self._rays.method, self._rays.reason
 
     def __call__(self, mu: Tensor) -> Tensor:
         return avg_pool2d(self._rays(mu), self.factor)
 
     def T(self, xrays: Tensor) -> Tensor:
         return self._rays.T(interpolate(xrays, scale_factor=self.factor) / self.factor**2)
+
+    def norm(self) -> float:
+        return operator_norm(self, self.T, torch.ones(1, 1, *self.grid.shape))

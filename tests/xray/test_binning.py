@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 import torch
-from laws import random_like
+from laws import assert_adjoint, random_like
+from torch.nn.functional import avg_pool3d
 
 from phydict.units import MU_WATER
 from phydict.xray import ConeBeam, Grid, Projector, binned, binning
+from phydict.xray.finer import FinerProjector
 
 GRID = Grid.cube(64)
 DEFAULT = ConeBeam.orbit(8, 1020, 740, (448, 448), 1.25)
@@ -54,3 +56,11 @@ def test_binning_views_and_beam_together_measures_the_same():
     mu = MU_WATER * random_like((1, 1, 16, 16, 16)).abs()
     fine, coarse = Projector(grid, beam, full_detector=True)(mu)[0], Projector(grid, beam.binned(2))(mu)[0]
     assert (binned(fine, 2) - coarse).norm() < 0.02 * coarse.norm()
+
+
+def test_finer_voxels_and_rays_have_an_exact_adjoint_and_measure_the_same_of_what_is_smooth():
+    projector = Projector(Grid.cube(12), ConeBeam.orbit(3, 1020, 740, (14, 18), 30.0), full_detector=True)
+    finer = FinerProjector(projector)
+    assert_adjoint(finer, finer.T, (1, 1, 24, 24, 24), torch.float64, 1e-10)
+    smooth = torch.sin(torch.arange(24) / 7.0)[:, None, None].expand(1, 1, 24, 24, 24).abs().contiguous()
+    torch.testing.assert_close(finer(smooth), projector(avg_pool3d(smooth, 2)), rtol=0.05, atol=5.0)

@@ -116,8 +116,9 @@ def stop_once(monkeypatch) -> None:
 
 @pytest.fixture
 def handlers() -> Iterator[None]:
-    """Lightning ignores SIGINT once it was stopped by it."""
+    """Lightning ignores SIGINT once it was stopped by it, and so does Python where it was started in the background."""
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     for number, handler in before.items():
         signal.signal(number, handler)

@@ -34,7 +34,7 @@ def add_telling(parser: ArgumentParser) -> None:
     parser.add_argument("--json_lines", action="store_true", help="tell the progress as a JSON object on each line")
 
 
-def tell(text: str, **event: object) -> None:
+def tell(text: str, /, **event: object) -> None:
     """A line on standard error: the text or, as `telling` has it, the event as JSON, or nothing."""
     if _MANNER.get() != NOTHING:
         print(text if _MANNER.get() == WORDS else json.dumps(event), file=sys.stderr, flush=True)

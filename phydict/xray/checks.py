@@ -11,9 +11,9 @@ from phydict.xray.geometry import ConeBeam
 LINE_INTEGRAL_RANGE = 1.0, 20.0
 """Between these lies the largest line integral of a chest: 50 mm and 1 m of water."""
 
-AIR_BLOCKS, AIR_FLAT, AIR_DRIFT = 8, 0.05, 0.1
+AIR_BLOCKS, AIR_FLAT, AIR_MOST, AIR_DRIFT = 8, 0.05, 0.5, 0.1
 """Beside a patient a view's line integrals are those of air where the medians of so many blocks of rows differ by less
-than AIR_FLAT; between views those of air differ by less than AIR_DRIFT."""
+than AIR_FLAT and are below AIR_MOST; between views those of air differ by less than AIR_DRIFT."""
 
 
 def check_xrays(xrays: Tensor, beam: ConeBeam) -> None:
@@ -61,6 +61,7 @@ def check_line_integrals(xrays: Tensor) -> None:
     blocks = torch.stack([rows.flatten(1).median(1).values for rows in
                           sides.tensor_split(min(AIR_BLOCKS, xrays.shape[1]), 1)])
     air = blocks.median(0).values[blocks.amax(0) - blocks.amin(0) < AIR_FLAT]
+    air = air[air.abs() < AIR_MOST]
     if len(air) > 1 and air.max() - air.min() > AIR_DRIFT:
         warn(f"air beside the patient reads from {float(air.min()):.2f} to {float(air.max()):.2f} from view to view, "
              "but as a line integral it is 0: the tube's output or the detector's gain drifted, so that densities are "

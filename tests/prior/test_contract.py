@@ -46,6 +46,7 @@ def xrays():
     return phydict.load_xrays("data/example/xrays")
 
 
+@pytest.mark.filterwarnings("ignore:.*as dense as 1000 HU")
 def test_in_python_it_is_an_object_or_the_path_of_its_class(module, xrays):
     prior = find_prior(f"{module}.OwnPrior")
     given = xrays["xrays"], xrays["beam"]

@@ -46,15 +46,16 @@ def table(head: str, rows: Iterable[tuple]) -> str:
 
 def scenes(rows: list[dict], *columns: str) -> Iterator[tuple[tuple, list[dict]]]:
     """Rows by what they have in some columns, in their order."""
-    for place in dict.fromkeys(tuple(row[name] for name in columns) for row in rows):
-        yield place, [row for row in rows if tuple(row[name] for name in columns) == place]
+    for place in dict.fromkeys(tuple(map(row.get, columns)) for row in rows):
+        yield place, [row for row in rows if tuple(map(row.get, columns)) == place]
 
 
 def errors() -> str:
     rows = rows_of("refiner/results.csv", method="phydict_learned")
     return table("X-rays | K | body | lungs | whole volume", (
-        (simulator, int(views), *(shown(values(own, f"mae_hu{part}"), max) for part in ("_body", "_lung", "")))
-        for (simulator, views), own in scenes(rows, "simulator", "views")))
+        (simulator + (f", {int(voxels)}^3" if voxels else ""), int(views),
+         *(shown(values(own, f"mae_hu{part}"), max) for part in ("_body", "_lung", "")))
+        for (simulator, voxels, views), own in scenes(rows, "simulator", "simulation_voxels", "views")))
 
 
 def intervals() -> str:

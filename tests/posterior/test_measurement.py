@@ -110,8 +110,13 @@ def test_scatter_is_subtracted_where_it_is_sought_and_what_was_measured_can_be_h
 def test_scatter_is_believed_where_xrays_are_missed_and_it_explains_much_of_that(missed, believed):
     m = chest_views()[1](chest_views()[0])
     m.normalised_residual = lambda z: torch.as_tensor(missed)[z.long()]  # the results 0 and 1 miss by these
-    result = with_scatter(m, lambda: torch.zeros(1, 1, 1, 1, 1), lambda: torch.ones(1, 1, 1, 1, 1))
-    assert bool(result) == believed == m.scatter_enabled
+
+    def run(number: int) -> torch.Tensor:
+        m.subgrid = number  # what finer voxels add, sought anew by each run
+        return torch.full((1, 1, 1, 1, 1), number)
+
+    result = with_scatter(m, lambda: run(0), lambda: run(1))
+    assert bool(result) == believed == m.scatter_enabled == m.subgrid
 
 
 def test_display_values_have_no_scatter_to_subtract():

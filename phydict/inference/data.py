@@ -27,6 +27,7 @@ from phydict.runtime.reading import name_of, read_ids
 from phydict.runtime.shipped import configuration
 from phydict.units import HUWindow
 from phydict.xray import Ideal, Projector, Simulator
+from phydict.xray.boxes import in_other_voxels
 from phydict.xray.geometry_files import read_beam
 
 MOST_PHANTOMS = 100_000
@@ -173,7 +174,7 @@ class ReconstructionData(lightning.LightningDataModule):
     def simulate(self, case: dict, seed: int, grid: Grid, window: HUWindow, device: torch.device) -> Tensor:
         """X-rays (K, V, U) of a CT case, made on `device`."""
         source = case.get("fine", case["volume"]).to(device)
-        fine = _divided(grid, tuple(source.shape[-3:]))
+        fine = in_other_voxels(grid, source.shape[-3:])
         return self.simulator(Projector(fine, self.beam, full_detector=True), window.to_mu(source)[None], seed)[0]
 
     def _with_fine(self, grid: Grid, make: Callable[[Grid], dict]) -> dict:
@@ -184,7 +185,7 @@ class ReconstructionData(lightning.LightningDataModule):
         if voxels != factor * grid.shape[0]:
             raise ValueError(f"data.simulation_voxels must be a multiple of the reconstruction's {grid.shape[0]} "
                              f"voxels, but {voxels} was given")
-        fine = make(_divided(grid, tuple(factor * n for n in grid.shape)))["volume"]
+        fine = make(in_other_voxels(grid, [factor * n for n in grid.shape]))["volume"]
         return make(grid) | {"fine": fine, "volume": torch.nn.functional.avg_pool3d(fine, factor)}
 
     def transfer_batch_to_device(self, batch: dict, device: torch.device, dataloader_idx: int) -> dict:
@@ -208,11 +209,6 @@ def case_scores(volume: Tensor, misfit: float, case: dict, grid: Grid, window: H
     if lung is not None:  # a lung that the field of view cuts open is not filled in the body
         body |= lung > 0.5
     return volume_metrics(volume[None, None], truth, lung, body, scored.low, scored.high) | {"misfit": misfit}
-
-
-def _divided(grid: Grid, shape: tuple[int, int, int]) -> Grid:
-    """The same box in other voxels, centred on the isocentre."""
-    return Grid(shape, tuple(grid.extent / shape))
 
 
 def _ct_source(ct: CTFile) -> str:

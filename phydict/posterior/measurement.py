@@ -44,8 +44,7 @@ class Measurement:
         self.projector, self.display = projector, xrays[None] if display else None
         self.slope, self.offset = window.mu_affine(mu_water)
         self.background = self.offset * projector(torch.ones(1, 1, *projector.grid.shape).to(xrays))
-        if outside is not None:
-            self.background = self.background + outside
+        self.outside: Tensor | float = 0.0 if outside is None else outside
         self.subgrid: Tensor | float = 0.0
         self.scales = finest_to_own(projector.grid.spacing)
         self.y = xrays[None]
@@ -56,17 +55,16 @@ class Measurement:
     def project(self, x: Tensor) -> Tensor:
         """P(x): line integrals (B, K, V, U) of the CT x."""
         self.calls += len(x)
-        projected = self.slope * self.projector(x) + self.background + self.subgrid
+        projected = self.slope * self.projector(x) + self.background + self.outside + self.subgrid
         self.last_projection = projected.detach()
         return projected
 
     def on(self, projector: Projector) -> Measurement:
         """The same X-rays, as they are now, as a problem on other voxels of the same box."""
         other = copy(self)
-        ones, others = (torch.ones(1, 1, *of.grid.shape).to(self.y) for of in (self.projector, projector))
-        other.background = self.background + self.offset * (projector(others) - self.projector(ones))
+        other.background = self.offset * projector(torch.ones(1, 1, *projector.grid.shape).to(self.y))
         other.projector, other.scales = projector, finest_to_own(projector.grid.spacing)
-        other.subgrid, other.calls = 0.0, 2
+        other.subgrid, other.calls = 0.0, 1
         return other
 
     def linear(self, d: Tensor) -> Tensor:

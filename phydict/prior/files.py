@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
-from torch import Tensor
+from torch import Tensor, nn
 
 from phydict.diffusion import CosineSchedule
 from phydict.grid import Grid
@@ -29,6 +31,8 @@ from phydict.prior.unet import VolumeUNet
 from phydict.runtime.files import file_crc32
 from phydict.runtime.reading import refusing
 from phydict.runtime.shipped import own_or_shipped, shipped
+
+Network = TypeVar("Network", bound=nn.Module)
 
 DEFAULT_PRIOR = shipped("data/prior/phydict_64.safetensors")
 """The prior that comes with the project."""
@@ -126,17 +130,15 @@ def load_prior(path: str | Path | MedSynCheckpoint = DEFAULT_PRIOR,
     path = _found(path)
     if isinstance(path, MedSynCheckpoint) or is_medsyn(path):
         return load_medsyn(path, device)
-    with refusing(path, ADVICE):
-        header, weights = read_stage(path, ("base", "refiner"), device)
-        try:
-            build = build_refiner if header.get("stage") == "refiner" else build_prior
-            loaded = build(header, weights)
-            if has_text(header):
-                prior = loaded.prior if isinstance(loaded, Refiner) else loaded
-                prior.load_text = lambda: load_text(path, header["text"])
-        except ValueError as error:
-            raise ValueError(f"'{path}' contradicts itself: {error}") from error
-    return loaded.to(device).eval().requires_grad_(False)
+
+    def build(header: dict, weights: dict[str, Tensor]) -> Prior | Refiner:
+        loaded = (build_refiner if header.get("stage") == "refiner" else build_prior)(header, weights)
+        if has_text(header):
+            prior = loaded.prior if isinstance(loaded, Refiner) else loaded
+            prior.load_text = lambda: load_text(path, header["text"])
+        return loaded
+
+    return _loaded(path, ("base", "refiner"), build, device)
 
 
 def load_super_resolution(path: str | Path | MedSynCheckpoint,
@@ -145,25 +147,24 @@ def load_super_resolution(path: str | Path | MedSynCheckpoint,
     path = _found(path)
     if isinstance(path, MedSynCheckpoint) or is_medsyn(path):
         return load_medsyn_super_resolution(path, device)
-    with refusing(path, ADVICE):
-        header, weights = read_stage(path, ("super_resolution",), device)
-        try:
-            fine = build_super_resolution(header, weights)
-        except ValueError as error:
-            raise ValueError(f"'{path}' contradicts itself: {error}") from error
-    return fine.to(device).eval().requires_grad_(False)
+    return _loaded(path, ("super_resolution",), build_super_resolution, device)
 
 
 def load_correction(path: str | Path = DEFAULT_CORRECTION, device: str = "cpu") -> CorrectionNetwork:
     """The network in a file written by `save_correction`; as `load_prior`."""
-    path = own_or_shipped(path)
+    return _loaded(own_or_shipped(path), ("refinement",), build_correction, device)
+
+
+def _loaded(path: Path, stages: tuple[str, ...], build: Callable[[dict, dict[str, Tensor]], Network],
+            device: str) -> Network:
+    """What `build` makes of a file of one of these stages, ready to be used. Raises as `load_prior` says."""
     with refusing(path, ADVICE):
-        header, weights = read_stage(path, ("refinement",), device)
+        header, weights = read_stage(path, stages, device)
         try:
-            network = build_correction(header, weights)
+            loaded = build(header, weights)
         except ValueError as error:
             raise ValueError(f"'{path}' contradicts itself: {error}") from error
-    return network.to(device).eval().requires_grad_(False)
+    return loaded.to(device).eval().requires_grad_(False)
 
 
 def is_refiner(given: object) -> bool:

@@ -13,11 +13,14 @@ import yaml
 from command_lines import refusal
 from prior.tiny import tiny_prior
 
+from phydict.baselines import SIRT
 from phydict.cli.infer import main
 from phydict.datasets import phantom_case, save_xrays
 from phydict.evaluation import read_csv
 from phydict.grid import Grid
+from phydict.inference import ReconstructionTask
 from phydict.inference.protocols import cut_out, placed, whole
+from phydict.inference.settings import Sampling
 from phydict.prior import save_prior
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
@@ -62,6 +65,13 @@ def test_predict_writes_any_box_with_its_affine_and_the_coarse_volume_on_request
     assert Grid(**said["grid"]).same_as(REGION) and ("refinement" in said) == (method == "prior_only")
     told = "15 x 12 x 9 voxels: the X-rays and total variation alone" in capsys.readouterr().err
     assert told == (method == "prior_only")
+
+
+def test_the_default_method_predicts_on_128_voxels_unless_a_grid_or_another_network_is_given(prior):
+    assert ReconstructionTask().predicted.grid().same_as(Grid.cube(128))
+    assert ReconstructionTask().grid.same_as(Grid.cube(64))  # what test scores
+    for given in ({"grid": 64}, {"prior": str(prior)}, {"method": SIRT()}, {"sampling": Sampling(samples=2)}):
+        assert ReconstructionTask(**given).predicted is None
 
 
 def test_another_grid_is_another_setting(measured, prior, tmp_path, capsys):

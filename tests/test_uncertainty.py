@@ -17,6 +17,7 @@ from phydict.prior import load_prior, save_prior, save_refiner
 from phydict.prior.uncertainty import COVERAGES, LEVELS, TISSUES, Uncertainty, coverage_of, tissue_of
 from phydict.training.refiner import RefinerTraining
 from phydict.xray import ConeBeam, Projector
+from phydict.xray.boxes import interpolated
 
 CONFIG = Path(__file__).parents[1] / "configs" / "prior" / "uncertainty.yaml"
 GRID, BEAM = Grid.cube(16), ConeBeam.orbit(3, 1020, 740, (28, 28), 20.0)
@@ -95,6 +96,16 @@ def test_a_reconstruction_has_nested_intervals_where_its_refiner_knows_them(tmp_
     assert torch.equal(torch.stack(list(again.intervals.values())), widths)
     plain = reconstruct(views(), BEAM, tiny_refiner(), display=True)
     assert plain.intervals == {} and torch.equal(plain.volume, found.volume)
+
+
+def test_on_finer_voxels_intervals_widen_by_a_share_of_what_the_refinement_changed():
+    fine = Grid.cube(32)
+    found = reconstruct(views(), BEAM, tiny_refiner(uncertain=True), display=True, grid=fine)
+    change = (found.volume - interpolated(found.coarse.volume, GRID, fine, -1000.0)).abs()
+    assert list(found.intervals) == list(LEVELS) and change.max() > 1
+    for level, half_width in found.intervals.items():
+        own = interpolated(found.coarse.intervals[level], GRID, fine, 0.0)
+        torch.testing.assert_close(half_width - own, 0.3 * change, atol=1e-3, rtol=1e-3)
 
 
 def test_x_rays_missed_by_more_than_in_calibration_widen_the_intervals_and_far_more_warn():

@@ -32,7 +32,7 @@ from phydict.inference.settings import CascadeSettings, Sampling
 from phydict.methods import CHEST, METHODS, calibrated, default_method, fit_to_grid, onto_grid, reconstructor
 from phydict.page import check_own_page
 from phydict.poses import FoundPoses
-from phydict.posterior import CascadePosterior, Refined, Sampler
+from phydict.posterior import CascadePosterior, Refined, Sampler, Unrolled
 from phydict.prior import (
     MedSynCheckpoint, PriorContract, file_read, find_prior, fingerprint, load_super_resolution)
 from phydict.reconstruction import Reconstruction, Reconstructor, describe
@@ -46,6 +46,9 @@ from phydict.runtime.warning import warn
 from phydict.units import HUWindow
 from phydict.xray.poses.uncertain import USUAL, Uncertain
 from phydict.xray.projectors.projector import METHODS as PROJECTORS
+
+PREDICTED_VOXELS = 128
+"""Along each side of 384 mm, of what phydict_learned predicts: two to three times the seconds of its network's 64."""
 
 
 class ReconstructionTask(lightning.LightningModule):
@@ -65,7 +68,7 @@ class ReconstructionTask(lightning.LightningModule):
         overwrite: do finished cases again; a new result takes the old one's place when it is complete
         seed: the only source of randomness; of each case in predict, as in Python, and by phydict.case_seed in test
         grid: the result's voxels along each side of 384 mm, such as 128, or a box: voxels, side, centre, keep_coarse;
-            none given: the prior's own, without a prior 64
+            none given: the prior's own, without a prior 64; in predict, of phydict_learned with its own network, 128
         projector: auto (the fastest that suits the geometry), separable, siddon, eq4, joseph or matrix
     """
 
@@ -80,6 +83,8 @@ class ReconstructionTask(lightning.LightningModule):
         if method is None:
             chosen = default_method(prior, sampling.samples, sampling.guidance)
             method, name = METHODS[chosen], name or chosen
+        own_choice = prior is None and grid is None and not super_resolution.file
+        self.predicted = Box(PREDICTED_VOXELS) if own_choice and isinstance(method, Unrolled) else None
         name = type(method).__name__ if name is None else name
         if name in ("", "..") or name != Path(name).name:
             raise ValueError(f"model.name is the name of one folder inside model.out, but '{name}' was given")
@@ -106,12 +111,12 @@ class ReconstructionTask(lightning.LightningModule):
         if super_resolution.file:
             self.super_resolution = load_super_resolution(super_resolution.file)
             self.super_resolution.memory = int(super_resolution.memory * 2**30)
-        self.reconstructor = reconstructor(
+        self.plain = reconstructor(
             method, self.prior, sampling.guidance, name, self.super_resolution, super_resolution.guided,
             super_resolution.sampler, super_resolution.noise_augmentation, sampling.samples, sampling.precision)
-        if isinstance(self.reconstructor, CascadePosterior):
+        if isinstance(self.plain, CascadePosterior):
             self.settings |= _identity("super_resolution", super_resolution.file) | {
-                "sr_noise_augmentation": self.reconstructor.level, "second": describe(self.reconstructor.second)}
+                "sr_noise_augmentation": self.plain.level, "second": describe(self.plain.second)}
         self._take(Box(grid) if isinstance(grid, int) else grid)
         self.metrics, self.scoring, self.slices = CaseMetrics([name]), Scoring(), None
         self.with_report = sampling.with_report
@@ -122,13 +127,13 @@ class ReconstructionTask(lightning.LightningModule):
     def _take(self, box: Box | None) -> None:
         """Reconstruct on the voxels of a box, if one is given."""
         self.keep_coarse = box is not None and box.keep_coarse
-        self.around = self.grid = self.reconstructor.grid or CHEST
-        self.plain = self.reconstructor
+        self.around = self.grid = self.plain.grid or CHEST
+        self.reconstructor = self.plain
         if box is None:
             return
         self.grid = box.grid()
         self.around = whole(self.grid)
-        self.reconstructor = onto_grid(self.reconstructor, self.grid)
+        self.reconstructor = onto_grid(self.plain, self.grid)
         self.settings["grid"] = self.grid.to_dict()
         if isinstance(self.reconstructor, Refined):
             self.settings["refinement"] = describe(self.reconstructor.refinement)
@@ -147,6 +152,8 @@ class ReconstructionTask(lightning.LightningModule):
         self.settings["data"] = {"with_report": self.with_report} | data.settings(stage)
         if self.calibrate:
             self.settings["calibrate"] = True
+        if stage == "predict" and self.predicted:
+            self._take(self.predicted)
         if stage == "test":
             self.settings |= self.scoring.settings()
             if data.protocol and data.protocol.grid and self.prior is None:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from phydict.grid import Grid
 from phydict.guard import Guard
+from phydict.posterior.coarse_correction import CoarseCorrection, coarse_correction
 from phydict.posterior.evidence import Evidence
 from phydict.posterior.likelihood.likelihood import LikelihoodStep, ProximalCG
 from phydict.posterior.measurement import Measurement
@@ -22,6 +23,10 @@ from phydict.xray.boxes import covers, interpolated, outside_projection, refinem
 
 AIR = -1000.0
 """HU outside what a coarse volume covers."""
+
+
+CHANGE_SHARE = 0.3
+"""Share of the refinement's change by which intervals widen on finer voxels."""
 
 
 class Bound(Protocol):
@@ -68,27 +73,42 @@ class Refinement:
         x0_std: standard deviation of an interpolated estimate's error, in the range [-1, 1] of its HU window
         final_step: towards the X-rays once more after a network's correction; none: that is the result
         final_std: standard deviation of a correction's error
+        rounds: how often the base's own network, where that is a refiner, corrects the estimate on its voxels
+        round_step: towards the X-rays after each of these, from an estimate as wrong as an interpolated one
     """
 
     step: LikelihoodStep | None = ProximalCG(iterations=10, restarts=3, tv_weight=10.0, tv_eps=0.003)
     x0_std: float = 0.5
     final_step: LikelihoodStep | None = ProximalCG(iterations=10, restarts=2, tv_weight=2.0, tv_eps=0.003)
     final_std: float = 0.3
+    rounds: int = 2
+    round_step: LikelihoodStep = ProximalCG(iterations=10, restarts=2, tv_weight=10.0, tv_eps=0.003)
 
     def __post_init__(self):
+        if self.rounds < 0:
+            raise ValueError(f"rounds is a number of corrections, 0 or more, but {self.rounds} was given")
         for name in ("x0_std", "final_std"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} is a standard deviation above 0, but {getattr(self, name)} was given")
 
-    def __call__(self, measurement: Measurement, x: Tensor, network: Correction | None) -> Tensor:
+    def __call__(self, measurement: Measurement, x: Tensor, network: Correction | None,
+                 coarse: CoarseCorrection | None = None) -> Tensor:
         """The refined estimate of an interpolated one x (1, 1, X, Y, Z)."""
-        z = x if self.step is None else self.step(measurement, x, self.x0_std)
-        if network is None:
-            return z
-        with stage("network"):
-            corrected = network.corrected(z, Evidence(measurement)(z, x, z))
-        measurement.refit(corrected)
-        return corrected if self.final_step is None else self.final_step(measurement, corrected, self.final_std)
+        if self.step is None:
+            return x
+        z = self.step(measurement, x, self.x0_std)
+        if network is not None:
+            with stage("network"):
+                z = network.corrected(z, Evidence(measurement)(z, x, z))
+            z = self._met(self.final_step, measurement, z, self.final_std)
+        for _ in range(self.rounds if coarse else 0):
+            z = self._met(self.round_step, measurement, coarse(z), self.x0_std)
+        return z
+
+    @staticmethod
+    def _met(step: LikelihoodStep | None, measurement: Measurement, z: Tensor, std: float) -> Tensor:
+        measurement.refit(z)
+        return z if step is None else step(measurement, z, std)
 
 
 @dataclass(frozen=True)
@@ -96,13 +116,14 @@ class Refined(Reconstructor):
     """`base` on its own voxels, then a refinement on finer ones, each time half as long, up to the target's.
 
     At each level the estimate so far is interpolated trilinearly onto the finer voxels and is then where the
-    refinement starts and what it stays near. The X-rays are binned to what the level can hold. Where the
+    refinement starts and what it stays near. Where the base is a refiner and the level's voxels divide its own, its
+    network corrects the estimate there as well (`CoarseCorrection`). The X-rays are binned to what the level can hold. Where the
     target's box leaves out a part of the base's, the line integrals of what the base shows there are added to those of
     the box (region-of-interest tomography; Ziegler, Nielsen & Grass 2008, Medical Physics 35(4)). Scatter that the
     base found is subtracted; display values are matched to the estimate anew.
 
-    Masks and deviations of the result are the base's, interpolated. Intervals, which are calibrated for the base's
-    voxels alone, stay with `Reconstruction.coarse`.
+    Masks and deviations of the result are the base's, interpolated. Its intervals are the base's as well, and to both
+    sides wider by CHANGE_SHARE of what the refinement changed of the interpolated volume.
 
     Args:
         base: the method, bound to voxels of its own
@@ -172,9 +193,10 @@ class Refined(Reconstructor):
                 f"from {projector.grid.shape} voxels of {projector.grid.spacing} mm: use the target's grid")
         watch, base = Stopwatch(), self.base
         with watch.stage("base"):
-            y, A = self._seen(xrays, projector, base.grid)
-            coarse = base.reconstruct(y, A, report, display, seed, on_step)
+            seen = self._seen(xrays, projector, base.grid)
+            coarse = base.reconstruct(*seen, report, display, seed, on_step)
         volume, grid, calls, found = coarse.volume.to(xrays), base.grid, coarse.projector_calls, {}
+        network_calls = coarse.network_calls
         for level in self.levels:
             with watch.stage("refine"):
                 y, A = self._seen(xrays, projector, level)
@@ -182,7 +204,8 @@ class Refined(Reconstructor):
                 measurement = self._measurement(y, A, coarse, display)
                 measurement.reset_scatter(coarse.scatter > 0)
                 measurement.refit(x)
-                x = self.refinement(measurement, x, self._network(level))
+                correction = coarse_correction(base, level, self._measurement(*seen, coarse, display), coarse, report)
+                x = self.refinement(measurement, x, self._network(level), correction)
                 guard = Guard(measurement, on_step, 1)
                 guard()
             volume, grid = base.window.to_hu(x[0, 0]), level
@@ -190,10 +213,16 @@ class Refined(Reconstructor):
                 measurement.match_gain_offset(x)
                 found = guard.score(x, measurement.project(x), measurement.y)
             calls += measurement.calls
-        spread = coarse.deviation
+            if correction is not None:
+                calls += correction.measurement.calls
+                network_calls += correction.calls
+        spread, volume = coarse.deviation, volume.cpu()
+        change = (volume - interpolated(coarse.volume, base.grid, self.target, AIR)).abs()
         return replace(
-            coarse, **found | {"diverged_at": coarse.diverged_at}, volume=volume.cpu(), grid=self.target,
-            coarse=coarse, projector_calls=calls, seconds=watch.seconds, intervals={},
+            coarse, **found | {"diverged_at": coarse.diverged_at}, volume=volume, grid=self.target,
+            coarse=coarse, projector_calls=calls, network_calls=network_calls, seconds=watch.seconds,
+            intervals={level: interpolated(half_width, base.grid, self.target, 0.0) + CHANGE_SHARE * change
+                       for level, half_width in coarse.intervals.items()},
             masks=None if coarse.masks is None else torch.cat([
                 coarse.masks.new_zeros(0, *self.target.shape),
                 *(interpolated(mask, base.grid, self.target, 0.0)[None] for mask in coarse.masks)]),

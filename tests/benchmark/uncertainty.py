@@ -1,6 +1,6 @@
 """Whether the intervals of phydict_learned hold what they promise, on CTs that neither training nor calibration saw.
 
-    python tests/benchmark/uncertainty.py <folder of CTs> [refiner.safetensors]
+    python tests/benchmark/uncertainty.py <folder of CTs> [refiner.safetensors] [--only <words in a scene's name>]
 
 Writes uncertainty.csv beside this file: for each CT, number of views and scene, and for body and lung, the share of
 voxels inside the intervals of 50, 80, 90 and 95 %, the rank correlation of their width with the error, half their mean
@@ -18,7 +18,7 @@ from scipy.stats import spearmanr
 
 from phydict import ConeBeam, Grid, Projector, load_prior, reconstruct
 from phydict.datasets import body_mask, find_cts, prepare_ct
-from phydict.evaluation import write_csv
+from phydict.evaluation import read_csv, write_csv
 from phydict.prior import DEFAULT_REFINER
 from phydict.runtime.shipped import shipped
 from phydict.units import HUWindow
@@ -26,29 +26,32 @@ from phydict.xray import Ideal, Polychromatic
 from phydict.xray.binning import benchmark_orbit
 from phydict.xray.simulate import Simulator
 
-WINDOW, FINE = HUWindow(), 128
+WINDOW, BEYOND = HUWindow(), "voxels_"
+"""The range of HU, and how scenes on finer voxels than the refiner's are called."""
 
 
-def scenes(grid: Grid) -> Iterator[tuple[str, ConeBeam, Simulator]]:
+def scenes(grid: Grid) -> Iterator[tuple[str, ConeBeam, Simulator, Grid, Grid]]:
+    """Name, geometry, simulator, and the voxels of the result and of the volume that X-rays are made of."""
+    fine, finest = (Grid.cube(factor * grid.shape[0], grid.extent[0]) for factor in (2, 4))
     for views in (1, 2, 4, 8, 16):
-        yield "ideal", benchmark_orbit(grid, views), Ideal()
+        yield "ideal", benchmark_orbit(grid, views), Ideal(), grid, grid
     for views in (1, 2, 4, 8, 16):
-        yield "polychromatic", benchmark_orbit(grid, views), Polychromatic()
+        yield "polychromatic", benchmark_orbit(grid, views), Polychromatic(), grid, fine
     for name in ("arc_60", "truncated"):
-        yield name, ConeBeam.load(shipped(f"configs/geometry/{name}.yaml")), Ideal()
+        yield name, ConeBeam.load(shipped(f"configs/geometry/{name}.yaml")), Ideal(), grid, grid
+    for views in (1, 2, 4, 8, 16):
+        yield f"{BEYOND}{fine.shape[0]}", benchmark_orbit(finest, views), Ideal(), fine, finest
 
 
-def rows_of(ct, refiner) -> Iterator[dict]:
-    grid = refiner.grid
-    fine_grid = Grid.cube(FINE, grid.extent[0])
-    fine = prepare_ct(ct.path, fine_grid, WINDOW, id=ct.id)
-    for scene, beam, simulator in scenes(grid):
-        ideal = isinstance(simulator, Ideal)
-        case = prepare_ct(ct.path, grid, WINDOW, id=ct.id)
-        volume, made = (case["volume"], grid) if ideal else (fine["volume"], fine_grid)
-        xrays = simulator(Projector(made, beam, full_detector=True), WINDOW.to_mu(volume)[None], 0)[0]
-        found = reconstruct(xrays, beam, refiner, mu_water=simulator.effective_mu_water)
-        truth = WINDOW.to_hu(case["volume"] if ideal else torch.nn.functional.avg_pool3d(fine["volume"], 2))[0]
+def rows_of(ct, refiner, only: str) -> Iterator[dict]:
+    for scene, beam, simulator, grid, made in scenes(refiner.grid):
+        if only not in scene:
+            continue
+        case, source = (prepare_ct(ct.path, voxels, WINDOW, id=ct.id) for voxels in (grid, made))
+        xrays = simulator(Projector(made, beam, full_detector=True), WINDOW.to_mu(source["volume"])[None], 0)[0]
+        found = reconstruct(xrays, beam, refiner, mu_water=simulator.effective_mu_water,
+                            grid=grid if scene.startswith(BEYOND) else None)
+        truth = WINDOW.to_hu(torch.nn.functional.avg_pool3d(source["volume"], made.shape[0] // grid.shape[0]))[0]
         error, lung = (found.volume - truth).abs(), case["masks"][0] > 0.5
         body = torch.from_numpy(body_mask(truth.numpy(), grid.spacing)) | lung
         for part, mask in (("body", body), ("lung", lung)):
@@ -75,8 +78,10 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("cts", type=Path)
     parser.add_argument("refiner", nargs="?", type=Path, default=DEFAULT_REFINER)
+    parser.add_argument("--only", default="", help="words in the names of the scenes to compute anew; the rest is kept")
     given = parser.parse_args()
-    refiner = load_prior(given.refiner)
-    rows = [row for ct in find_cts(given.cts) for row in rows_of(ct, refiner)]
-    write_csv(Path(__file__).with_suffix(".csv"), rows)
+    refiner, out = load_prior(given.refiner), Path(__file__).with_suffix(".csv")
+    kept = [row for row in read_csv(out) if given.only not in row["scene"]] if given.only else []
+    rows = kept + [row for ct in find_cts(given.cts) for row in rows_of(ct, refiner, given.only)]
+    write_csv(out, rows)
     print(table(rows))

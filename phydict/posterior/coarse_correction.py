@@ -1,0 +1,68 @@
+"""What a network that knows coarse voxels finds of an estimate on finer ones."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool3d, interpolate
+
+from phydict.grid import Grid
+from phydict.posterior.discretisation import beyond_means
+from phydict.posterior.evidence import Evidence
+from phydict.posterior.measurement import Measurement
+from phydict.posterior.posterior import Posterior
+from phydict.prior import BoundRefiner
+from phydict.reconstruction import Reconstruction, Reconstructor
+from phydict.runtime.profiling import stage
+from phydict.xray.boxes import in_other_voxels
+from phydict.xray.finer import FinerProjector
+
+TIME = 0.15
+"""The label under which the network takes an estimate that the X-rays were met with: the last of Unrolled's."""
+
+
+class CoarseCorrection:
+    """A refiner's next call, at an estimate on finer voxels than its own.
+
+    The refiner sees the estimate's means over its voxels, and evidence from which what finer voxels explain of the
+    X-rays is taken: the coarse-grid correction of the full approximation scheme (Brandt 1977,
+    doi:10.1090/S0025-5718-1977-0431719-X), with a network where that solves. What it changes of the means is
+    interpolated and added.
+
+    refiner: bound to a report. measurement: the X-rays on the refiner's voxels. state: its last (1, C, X, Y, Z).
+    factor: how many times finer the estimates are, 2 or more. calls: of the network.
+    """
+
+    def __init__(self, refiner: BoundRefiner, measurement: Measurement, state: Tensor, factor: int):
+        self.refiner, self.measurement, self.factor, self.calls = refiner, measurement, factor, 0
+        self.start, self.state = state[:, :1], state
+        self.fine = measurement.on(FinerProjector(measurement.projector, factor))
+
+    def __call__(self, z: Tensor) -> Tensor:
+        """The corrected estimate of z (1, 1, X, Y, Z), in the prior's range."""
+        measurement, before = self.measurement, self.state[:, :1]
+        means = avg_pool3d(z, self.factor)
+        measurement.subgrid = beyond_means(measurement, self.fine, z)
+        measurement.refit(means)
+        evidence = Evidence(measurement)(means, before, self.start)
+        signal = float(self.refiner.schedule.scales(TIME)[0])
+        with stage("network"):
+            answer = self.refiner.refine(signal * torch.cat([means, self.state[:, 1:]], 1), TIME, evidence)
+        self.state, self.calls = answer.clamp(-1, 1), self.calls + 1
+        change = interpolate(self.state[:, :1] - means, scale_factor=self.factor, mode="trilinear")
+        return (z + change).clamp(-1, 1)
+
+
+def coarse_correction(base: Reconstructor, level: Grid, measurement: Measurement, found: Reconstruction, report: str
+                      ) -> CoarseCorrection | None:
+    """The correction of estimates on a level's voxels by the network of `base`, which has found a reconstruction of a
+    measurement on its own; None where it has no refiner, or where a whole number of the level's voxels do not make one
+    of its own along each axis."""
+    if not isinstance(base, Posterior) or not base.sampler.needs_refiner:
+        return None
+    factor = round(level.shape[0] / base.grid.shape[0])
+    if factor < 2 or not level.same_as(in_other_voxels(base.grid, [factor * n for n in base.grid.shape])):
+        return None
+    measurement.reset_scatter(found.scatter > 0)
+    state = torch.cat([base.window.to_range(found.volume)[None], 2 * found.masks - 1])[None].to(measurement.y)
+    return CoarseCorrection(base.prior.bind(report, base.guidance, base.precision), measurement, state, factor)

@@ -1,0 +1,81 @@
+"""A coarse network's call at an estimate on finer voxels: what it sees, and what it leaves."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+from laws import random_like
+from prior.tiny import tiny_prior, tiny_refiner
+
+from phydict.grid import Grid
+from phydict.methods import fit_to_grid, reconstructor
+from phydict.posterior import Measurement, PriorOnly, Refined, Refinement, Unrolled
+from phydict.posterior.coarse_correction import CoarseCorrection, coarse_correction
+from phydict.units import HUWindow
+from phydict.xray import ConeBeam, Projector
+from phydict.xray.finer import FinerProjector
+
+BEAM = ConeBeam.orbit(3, 1020, 740, (56, 56), 10.0)
+WINDOW, COARSE = HUWindow(-1000, 600), Grid.cube(16)
+UNROLLED = Unrolled((0.2,), (0.5, 0.3))
+
+
+class Answer:
+    """A refiner that answers `change` beyond the state it is shown, and keeps what it was shown."""
+
+    def __init__(self, change: float = 0.0):
+        self.change, self.schedule = change, SimpleNamespace(scales=lambda t: (torch.tensor(0.5), None))
+
+    def refine(self, x, t, evidence):
+        self.evidence = evidence
+        return 2 * x + self.change
+
+
+def measured(factor: int) -> tuple[Measurement, Measurement, torch.Tensor]:
+    """X-rays of a fine volume on the coarse and on its own voxels, and the volume."""
+    projector = Projector(COARSE, BEAM, full_detector=True)
+    fine = FinerProjector(projector, factor)
+    z = 0.9 * random_like((1, 1, *fine.grid.shape)).tanh()
+    y = fine(WINDOW.to_mu(z))[0]
+    return Measurement(projector, y, WINDOW), Measurement(fine, y, WINDOW), z
+
+
+@pytest.mark.parametrize("factor", [2, 4])
+def test_what_the_network_is_shown_holds_no_misfit_where_the_finer_voxels_have_none(factor):
+    coarse, fine, z = measured(factor)
+    refiner = Answer()
+    kept = CoarseCorrection(refiner, coarse, torch.zeros(1, 3, *COARSE.shape), factor)(z)
+    torch.testing.assert_close(kept, z)
+    torch.testing.assert_close(coarse.project(torch.nn.functional.avg_pool3d(z, factor)), fine.project(z))
+    assert refiner.evidence[:, 0].abs().max() < 1e-4
+
+
+def test_what_the_network_changes_of_the_means_is_added_to_every_voxel_of_theirs():
+    coarse, _, z = measured(2)
+    changed = CoarseCorrection(Answer(0.05), coarse, torch.zeros(1, 1, *COARSE.shape), 2)(z)
+    torch.testing.assert_close(changed, z + 0.05)
+
+
+def test_only_a_refiner_corrects_and_only_voxels_that_divide_its_own():
+    y = Projector(COARSE, BEAM, full_detector=True)(0.02 * torch.ones(1, 1, *COARSE.shape))[0]
+    learned, other = reconstructor(UNROLLED, tiny_refiner()), reconstructor(PriorOnly(1), tiny_prior(False))
+    seen = fit_to_grid(learned, COARSE, y, BEAM)
+    measurement, found = Measurement(seen[1], seen[0], learned.window), learned.reconstruct(*seen)
+    for level, factor in ((Grid.cube(32), 2), (Grid.cube(64), 4)):
+        assert coarse_correction(learned, level, measurement, found, "").factor == factor
+    for level in (COARSE, Grid.cube(24), Grid.box((32, 32, 30), (384, 384, 360)), Grid.cube(32, 300)):
+        assert coarse_correction(learned, level, measurement, found, "") is None
+    assert coarse_correction(other, Grid.cube(32), measurement, found, "") is None
+
+
+def test_every_round_is_a_call_of_the_network_and_none_is_refused_below_zero():
+    fine = Grid.cube(32)
+    y = Projector(fine, BEAM, full_detector=True)(0.02 * torch.ones(1, 1, *fine.shape))[0]
+
+    def calls(rounds: int) -> int:
+        ready = Refined(reconstructor(UNROLLED, tiny_refiner()), fine, Refinement(rounds=rounds))
+        return ready.reconstruct(*fit_to_grid(ready, fine, y, BEAM)).network_calls
+
+    assert [calls(rounds) - calls(0) for rounds in (1, 3)] == [1, 3]
+    with pytest.raises(ValueError, match="rounds is a number of corrections, 0 or more, but -1 was given"):
+        Refinement(rounds=-1)

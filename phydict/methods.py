@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import reprlib
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -185,14 +186,16 @@ def fit_to_grid(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam,
 
 
 def calibrated(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, uncertain: Uncertain,
-               display: bool) -> tuple[Tensor, FoundPoses]:
+               display: bool, on_round: Callable[[], None] = lambda: None) -> tuple[Tensor, FoundPoses]:
     """The X-rays (K, V, U) without what was found of their gains and offsets, and the poses found (phydict.poses).
+
+    on_round: called after each round of the search.
 
     Warns of what few views cannot show, and of views that were corrected by more than was stated.
     """
     from phydict.poses import find_poses  # and with it numba
 
-    found = find_poses(xrays, beam, uncertain, grid, display, ready.mu_water)
+    found = find_poses(xrays, beam, uncertain, grid, display, ready.mu_water, on_round=on_round)
     for words in found.warnings():
         warn(words)
     return xrays if display else found.corrected(xrays), found

@@ -32,7 +32,8 @@ def network(trained: bool = True, grid: Grid = FINE) -> CorrectionNetwork:
     return made.eval().requires_grad_(False)
 
 
-def reconstructed(network: CorrectionNetwork | None, refinement: Refinement = Refinement(rounds=0), order=(0, 1, 2)):
+def reconstructed(network: CorrectionNetwork | None, refinement: Refinement = Refinement(rounds=0),
+                  order=(0, 1, 2)):
     xrays = Projector(FINE, BEAM, full_detector=True)(0.02 * torch.ones(1, 1, *FINE.shape))[0]
     ready = Refined(reconstructor(Unrolled((0.2,), (0.5, 0.3)), tiny_refiner()), FINE, refinement, network)
     return ready.reconstruct(*fit_to_grid(ready, FINE, xrays[list(order)], BEAM.select(list(order))))
@@ -47,14 +48,16 @@ def refiner_file(tmp_path_factory) -> str:
 
 def test_an_untrained_network_adds_only_the_last_step_and_another_grids_not_even_that():
     plain = reconstructed(None)
-    torch.testing.assert_close(reconstructed(network(False), Refinement(final_step=None, rounds=0)).volume, plain.volume)
+    unmet = reconstructed(network(False), Refinement(final_step=None, rounds=0))
+    torch.testing.assert_close(unmet.volume, plain.volume)
     other = reconstructed(network(grid=Grid.cube(64)))
     assert other.volume.equal(plain.volume)
     assert reconstructed(network(False)).misfit < plain.misfit
 
 
 def test_the_last_step_meets_the_xrays_after_a_correction():
-    alone, met = (reconstructed(network(), refinement) for refinement in (Refinement(final_step=None, rounds=0), Refinement(rounds=0)))
+    alone, met = (reconstructed(network(), refinement)
+                  for refinement in (Refinement(final_step=None, rounds=0), Refinement(rounds=0)))
     assert (alone.volume - reconstructed(None).volume).abs().max() > 10
     assert met.misfit < 0.5 * alone.misfit
 

@@ -31,7 +31,7 @@ from phydict.inference.scoring import Scoring
 from phydict.inference.settings import CascadeSettings, Sampling
 from phydict.methods import CHEST, METHODS, calibrated, default_method, fit_to_grid, onto_grid, reconstructor
 from phydict.page import check_own_page
-from phydict.poses import FoundPoses
+from phydict.poses import FoundPoses, PoseSearch
 from phydict.posterior import CascadePosterior, Refined, Sampler, Unrolled
 from phydict.prior import (
     MedSynCheckpoint, PriorContract, file_read, find_prior, fingerprint, load_super_resolution)
@@ -254,7 +254,8 @@ class ReconstructionTask(lightning.LightningModule):
             sizes = " and ".join(" x ".join(map(str, level.shape)) for level in left)
             note = f"no trained stage was given for {sizes} voxels: the X-rays and total variation alone refine to them"
             tell(note, event="note", text=note)
-        self.progress.begin(self.method_name, cases, self.reconstructor.steps(), out=self.results.folder)
+        steps = self.reconstructor.steps() + (PoseSearch().rounds if self.calibrate else 0)
+        self.progress.begin(self.method_name, cases, steps, out=self.results.folder)
 
     def _report(self, case: dict) -> str:
         """The report of a case where it is used; says once that a prior without text uses none."""
@@ -270,7 +271,8 @@ class ReconstructionTask(lightning.LightningModule):
         xrays, beam, display = case["xrays"].to(self.device), case["beam"], case.get("display", False)
         found: FoundPoses | None = None
         if self.calibrate:
-            xrays, found = calibrated(ready, ready.survey or self.grid, xrays, beam, _uncertain(case), display)
+            xrays, found = calibrated(ready, ready.survey or self.grid, xrays, beam, _uncertain(case), display,
+                                      self.progress.advance)
             beam = found.beam
         with stage("fit to grid"):
             xrays, projector = fit_to_grid(ready, self.grid, xrays, beam, self.projector)

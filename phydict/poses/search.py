@@ -16,6 +16,7 @@ chosen: at the end the beam is carried to where its shadows are most like the no
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -78,14 +79,19 @@ class PoseSearch:
             raise ValueError(f"a search needs one round or more, but coarse={self.coarse} and fine={self.fine} were "
                              "given")
 
+    @property
+    def rounds(self) -> int:
+        return self.coarse + self.fine
+
 
 @torch.no_grad()
 def find_poses(xrays: Tensor, beam: ConeBeam, uncertain: Uncertain, grid: Grid, display: bool = False,
-               mu_water: float = MU_WATER, search: PoseSearch = PoseSearch()) -> FoundPoses:
+               mu_water: float = MU_WATER, search: PoseSearch = PoseSearch(),
+               on_round: Callable[[], None] = lambda: None) -> FoundPoses:
     """Poses and gains of X-rays (K, V, U) whose nominal geometry is `beam`.
 
     display: display values, whose gains and offsets are found too, from those that a typical chest would have on.
-    grid: of the reconstruction. Computed on the CPU. Raises ValueError where the data cannot hold the unknowns,
+    grid: of the reconstruction. Computed on the CPU. on_round: called after each of the search's rounds. Raises ValueError where the data cannot hold the unknowns,
     and where neither density nor size has a scale.
     """
     check_xrays(xrays, beam)
@@ -109,6 +115,7 @@ def find_poses(xrays: Tensor, beam: ConeBeam, uncertain: Uncertain, grid: Grid, 
             views.begin(state)
             for _ in range(rounds):
                 views.improve(state)
+                on_round()
             if n == 0:
                 sway = views.sway(state).double().numpy()
             if n == 0 and views.fits_as_stated(state):

@@ -14,6 +14,7 @@ from phydict.baselines import SIRT
 from phydict.cli.infer import main
 from phydict.datasets import Thorax, build, load_xrays, save_xrays
 from phydict.grid import Grid
+from phydict.poses import PoseSearch, find_poses
 from phydict.units import hu_to_mu
 from phydict.xray import ConeBeam, Projector
 from phydict.xray.poses.uncertain import Uncertain
@@ -84,6 +85,12 @@ def test_in_python_the_result_holds_the_beam(case):
     plain = reconstruct(given["xrays"], given["beam"], method=SIRT(iterations=20), grid=GRID)
     assert result.misfit < 0.7 * plain.misfit and plain.beam is None
     assert not result.beam.same_as(BEAM, 1.0)
+
+
+def test_every_round_of_the_search_is_told(case):
+    given, search, told = load_xrays(case), PoseSearch(2, 1), []
+    find_poses(given["xrays"], given["beam"], given["uncertain"], GRID, search=search, on_round=lambda: told.append(1))
+    assert len(told) == search.rounds == 3
 
 
 @pytest.mark.parametrize("uncertain, words", [

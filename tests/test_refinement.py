@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from command_lines import refusal, resumed_as_uninterrupted
@@ -14,7 +15,10 @@ from phydict.methods import fit_to_grid, reconstructor
 from phydict.posterior import Refined, Refinement, Unrolled
 from phydict.prior import load_correction, save_correction, save_prior, save_refiner
 from phydict.prior.correction import INPUTS, CorrectionNetwork
+from phydict.training.reconstructions import Made, ReconstructionData
 from phydict.training.refinement import RefinementTraining
+from phydict.training.scenes import Scenes
+from phydict.training.settings import HoldOut
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 
@@ -32,10 +36,10 @@ def network(trained: bool = True, grid: Grid = FINE) -> CorrectionNetwork:
     return made.eval().requires_grad_(False)
 
 
-def reconstructed(network: CorrectionNetwork | None, refinement: Refinement = Refinement(rounds=0),
-                  order=(0, 1, 2)):
+def reconstructed(network: CorrectionNetwork | None, refinement: Refinement = Refinement(), order=(0, 1, 2),
+                  precision: str = "auto"):
     xrays = Projector(FINE, BEAM, full_detector=True)(0.02 * torch.ones(1, 1, *FINE.shape))[0]
-    ready = Refined(reconstructor(Unrolled((0.2,), (0.5, 0.3)), tiny_refiner()), FINE, refinement, network)
+    ready = Refined(reconstructor(Unrolled((0.2,), (0.5, 0.3)), tiny_refiner(), precision=precision), FINE, refinement, network)
     return ready.reconstruct(*fit_to_grid(ready, FINE, xrays[list(order)], BEAM.select(list(order))))
 
 
@@ -46,24 +50,20 @@ def refiner_file(tmp_path_factory) -> str:
     return str(file)
 
 
-def test_an_untrained_network_adds_only_the_last_step_and_another_grids_not_even_that():
-    plain = reconstructed(None)
-    unmet = reconstructed(network(False), Refinement(final_step=None, rounds=0))
-    torch.testing.assert_close(unmet.volume, plain.volume)
-    other = reconstructed(network(grid=Grid.cube(64)))
-    assert other.volume.equal(plain.volume)
-    assert reconstructed(network(False)).misfit < plain.misfit
+def test_an_untrained_network_and_another_grids_change_nothing():
+    plain = reconstructed(None).volume
+    for other in (network(False), network(grid=Grid.cube(64))):
+        torch.testing.assert_close(reconstructed(other).volume, plain)
 
 
-def test_the_last_step_meets_the_xrays_after_a_correction():
-    alone, met = (reconstructed(network(), refinement)
-                  for refinement in (Refinement(final_step=None, rounds=0), Refinement(rounds=0)))
-    assert (alone.volume - reconstructed(None).volume).abs().max() > 10
+def test_the_xrays_are_met_again_after_a_correction():
+    alone, met = (reconstructed(network(), refinement) for refinement in (Refinement(call_step=None), Refinement()))
+    assert (alone.volume - reconstructed(None, Refinement(call_step=None)).volume).abs().max() > 10
     assert met.misfit < 0.5 * alone.misfit
 
 
 def test_the_order_of_the_views_changes_nothing():
-    one, other = reconstructed(network()), reconstructed(network(), order=(2, 0, 1))
+    one, other = (reconstructed(network(), Refinement(calls=1), order, "float32") for order in ((0, 1, 2), (2, 0, 1)))
     torch.testing.assert_close(one.volume, other.volume, atol=4.0, rtol=0)  # HU; CG carries rounding far
 
 
@@ -122,6 +122,27 @@ def test_a_resumed_run_is_the_uninterrupted_one_and_makes_each_reconstruction_on
     files = {file: file.stat().st_mtime_ns for file in cache.rglob("reconstructions-*/*/*.npy")}
     main(arguments(tmp_path / "again", cache, refiner_file, "--trainer.max_epochs=1"))
     assert files and files == {file: file.stat().st_mtime_ns for file in cache.rglob("reconstructions-*/*/*.npy")}
+
+
+def test_with_a_network_a_reconstruction_is_learnt_from_at_both_calls(tmp_path, refiner_file):
+    file = tmp_path / "fine.safetensors"
+    save_correction(network(), file, dtype=torch.float32)
+
+    def data(network: str | None) -> ReconstructionData:
+        return ReconstructionData(
+            Made(1, 1, 16, network), Scenes(most_views=3), phantoms=2, cache=str(tmp_path / "cache"),
+            holdout=HoldOut(phantoms=1), initial=refiner_file, cube=Cube(32), window=(-1000, 600))
+
+    first, both = data(None), data(str(file))
+    assert np.array_equal(both.made[0][:INPUTS], first.made[0][:INPUTS])
+    assert np.array_equal(both.made[0][-1], first.made[0][-1])
+    before, after = both.made[0][:INPUTS], both.made[0][INPUTS:-1]
+    assert len(after) == INPUTS and abs(after[0] - before[0]).max() > 0.01
+    crops = {float(both.draws(0).item(both.made[0], np.random.default_rng(n))["scale"][0]) for n in range(8)}
+    truth = both.made[0][-1, ::4, ::4, ::4].astype(np.float32)
+    errors = {float(np.square(seen[0, ::4, ::4, ::4].astype(np.float32) - truth).mean()) for seen in (before, after)}
+    assert sorted(crops) == pytest.approx(sorted(errors), rel=1e-4)
+    assert np.array_equal(both.validation[0]["volume"][0], both.validation.made[0][INPUTS].astype(np.float32))
 
 
 @pytest.mark.parametrize("given, words", [

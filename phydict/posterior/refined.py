@@ -67,48 +67,47 @@ class Correction(Protocol):
 class Refinement:
     """How an estimate is refined on finer voxels.
 
+    z = step(interpolated); then `calls` times z = call_step(coarse(network(z))), of what there is of the two.
+
     Args:
         step: towards the X-rays, such as ProximalCG, whose total variation takes a prior's place; none: interpolation
             alone
         x0_std: standard deviation of an interpolated estimate's error, in the range [-1, 1] of its HU window
-        final_step: towards the X-rays once more after a network's correction; none: that is the result
-        final_std: standard deviation of a correction's error
-        rounds: how often the base's own network, where that is a refiner, corrects the estimate on its voxels
-        round_step: towards the X-rays after each of these, from an estimate as wrong as an interpolated one
+        calls: how often the networks correct the estimate
+        call_step: towards the X-rays after that; none: not met again
+        call_std: standard deviation of a corrected estimate's error
     """
 
     step: LikelihoodStep | None = ProximalCG(iterations=10, restarts=3, tv_weight=10.0, tv_eps=0.003)
     x0_std: float = 0.5
-    final_step: LikelihoodStep | None = ProximalCG(iterations=10, restarts=2, tv_weight=2.0, tv_eps=0.003)
-    final_std: float = 0.3
-    rounds: int = 2
-    round_step: LikelihoodStep = ProximalCG(iterations=10, restarts=2, tv_weight=10.0, tv_eps=0.003)
+    calls: int = 2
+    call_step: LikelihoodStep | None = ProximalCG(iterations=10, restarts=1, tv_weight=5.0, tv_eps=0.003)
+    call_std: float = 0.3
 
     def __post_init__(self):
-        if self.rounds < 0:
-            raise ValueError(f"rounds is a number of corrections, 0 or more, but {self.rounds} was given")
-        for name in ("x0_std", "final_std"):
+        for name in ("x0_std", "call_std"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} is a standard deviation above 0, but {getattr(self, name)} was given")
+        if self.calls < 0:
+            raise ValueError(f"calls is a number of corrections, 0 or more, but {self.calls} was given")
 
     def __call__(self, measurement: Measurement, x: Tensor, network: Correction | None,
                  coarse: CoarseCorrection | None = None) -> Tensor:
-        """The refined estimate of an interpolated one x (1, 1, X, Y, Z)."""
+        """The refined estimate of an interpolated one x (1, 1, X, Y, Z), by a network on these voxels and one on coarse
+        ones."""
         if self.step is None:
             return x
-        z = self.step(measurement, x, self.x0_std)
-        if network is not None:
-            with stage("network"):
-                z = network.corrected(z, Evidence(measurement)(z, x, z))
-            z = self._met(self.final_step, measurement, z, self.final_std)
-        for _ in range(self.rounds if coarse else 0):
-            z = self._met(self.round_step, measurement, coarse(z), self.x0_std)
+        before, z = x, self.step(measurement, x, self.x0_std)
+        start = z
+        for _ in range(self.calls if network or coarse else 0):
+            if network is not None:
+                evidence = Evidence(measurement)(z, before, start)
+                with stage("network"):
+                    z = network.corrected(z, evidence)
+            before = z = z if coarse is None else coarse(z)
+            measurement.refit(z)
+            z = z if self.call_step is None else self.call_step(measurement, z, self.call_std)
         return z
-
-    @staticmethod
-    def _met(step: LikelihoodStep | None, measurement: Measurement, z: Tensor, std: float) -> Tensor:
-        measurement.refit(z)
-        return z if step is None else step(measurement, z, std)
 
 
 @dataclass(frozen=True)
@@ -117,10 +116,10 @@ class Refined(Reconstructor):
 
     At each level the estimate so far is interpolated trilinearly onto the finer voxels and is then where the
     refinement starts and what it stays near. Where the base is a refiner and the level's voxels divide its own, its
-    network corrects the estimate there as well (`CoarseCorrection`). The X-rays are binned to what the level can hold. Where the
-    target's box leaves out a part of the base's, the line integrals of what the base shows there are added to those of
-    the box (region-of-interest tomography; Ziegler, Nielsen & Grass 2008, Medical Physics 35(4)). Scatter that the
-    base found is subtracted; display values are matched to the estimate anew.
+    network corrects the estimate there as well (`CoarseCorrection`). The X-rays are binned to what the level can hold.
+    Where the target's box leaves out a part of the base's, the line integrals of what the base shows there are added to
+    those of the box (region-of-interest tomography; Ziegler, Nielsen & Grass 2008, Medical Physics 35(4)). Scatter that
+    the base found is subtracted; display values are matched to the estimate anew.
 
     Masks and deviations of the result are the base's, interpolated. Its intervals are the base's as well, and to both
     sides wider by CHANGE_SHARE of what the refinement changed of the interpolated volume.
@@ -213,6 +212,7 @@ class Refined(Reconstructor):
                 measurement.match_gain_offset(x)
                 found = guard.score(x, measurement.project(x), measurement.y)
             calls += measurement.calls
+            network_calls += self.refinement.calls if self._network(level) else 0
             if correction is not None:
                 calls += correction.measurement.calls
                 network_calls += correction.calls

@@ -20,7 +20,8 @@ from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM
 from phydict.datasets.surroundings.surroundings import Surroundings
 from phydict.grid import Cube, Grid
 from phydict.posterior import Posterior, Refined, Refinement, Unrolled
-from phydict.prior import DEFAULT_REFINER, Refiner, fingerprint, load_prior
+from phydict.prior import DEFAULT_REFINER, Refiner, fingerprint, load_correction, load_prior
+from phydict.prior.correction import INPUTS, CorrectionNetwork
 from phydict.runtime.ranges import check_fields
 from phydict.training.crops import CTVolumes, PhantomVolumes, mapped_volume
 from phydict.training.data import PriorData
@@ -48,40 +49,45 @@ class Made:
         reconstructions: how many are made to learn from
         validation: how many of each held-out volume
         crop: voxels along each side of what is learnt from at once
+        network: the file of a network of this kind; the reconstructions are then also shown as they are at the second
+            call, after its correction at the first
     """
 
     reconstructions: int = 60
     validation: int = 2
     crop: int = 64
+    network: str | None = None
 
     def __post_init__(self):
         check_fields(self, "data.made", reconstructions=(1, 1_000_000), validation=(1, 1000), crop=(8, 4096))
 
 
 class _Recording:
-    """In a network's place: keeps what it would see, and corrects nothing."""
+    """Keeps what a network sees at each call; without one nothing is corrected."""
 
-    seen: Tensor
+    def __init__(self, network: CorrectionNetwork | None):
+        self.network, self.seen = network, []
 
     def suits(self, grid: Grid, window: HUWindow) -> bool:
         return True
 
     def corrected(self, z: Tensor, evidence: Tensor) -> Tensor:
-        self.seen = torch.cat([z, evidence], 1)
-        return z
+        self.seen.append(torch.cat([z, evidence], 1))
+        return self.network.corrected(z, evidence) if self.network else z
 
 
 class Reconstructions(Dataset):
-    """What a refinement sees, and last the truth: (C, X, Y, Z) in half precision, in the prior's range.
+    """What a refinement sees, at each call of `network`, and last the truth: (calls INPUTS + 1, X, Y, Z) in half
+    precision, in the prior's range.
 
     Item n shows volume n modulo their number, deformed unless `strength` is that of none, in a scene of its own. It is
     made when missing and kept in `folder`.
     """
 
-    def __init__(self, volumes: Sequence[np.ndarray], grid: Grid, base: str, scenes: Scenes, strength: Augmentation,
-                 folder: Path, length: int, seed: int):
-        self.volumes, self.grid, self.base, self.scenes, self.strength = volumes, grid, base, scenes, strength
-        self.folder, self.length, self.seed = folder, length, seed
+    def __init__(self, volumes: Sequence[np.ndarray], grid: Grid, base: str, network: str | None, scenes: Scenes,
+                 strength: Augmentation, folder: Path, length: int, seed: int):
+        self.volumes, self.grid, self.base, self.network = volumes, grid, base, network
+        self.scenes, self.strength, self.folder, self.length, self.seed = scenes, strength, folder, length, seed
 
     def __len__(self) -> int:
         return self.length
@@ -98,14 +104,14 @@ class Reconstructions(Dataset):
                 "id": str(n)}
         ct = augment(case, int(rng.integers(2**31)), scene, window, self.strength)["volume"][None]
         y, projector = self.scenes.xrays(ct, rng, scene, window)
-        record = _Recording()
-        refined = Refined(Posterior(refiner, Unrolled()), self.grid, Refinement(final_step=None), record)
+        record = _Recording(load_correction(self.network) if self.network else None)
+        refined = Refined(Posterior(refiner, Unrolled()), self.grid, Refinement(calls=2 if self.network else 1), record)
         refined.reconstruct(*seen_by(self.grid, y, projector.beam, False))
-        return torch.cat([record.seen, avg_pool3d(ct, FINER)], 1)[0]
+        return torch.cat([*record.seen, avg_pool3d(ct, FINER)], 1)[0]
 
 
 class Crops(Draws):
-    """Random cubes of reconstructions, half of them mirrored left to right: what is seen of so little has no side.
+    """Random cubes of reconstructions at one of their calls, half of them mirrored left to right: what is seen of so little has no side.
 
     "scale" (2,) are the mean squared and the mean absolute error of the reconstruction that a cube is cut from.
     """
@@ -115,20 +121,23 @@ class Crops(Draws):
         self.size = size
 
     def item(self, drawn: np.ndarray, rng: np.random.Generator) -> dict:
+        first = INPUTS * int(rng.integers(len(drawn) // INPUTS))
+        channels = [*range(first, first + INPUTS), -1]
         for _ in range(4):
             starts = [int(rng.integers(n - self.size + 1)) for n in drawn.shape[1:]]
-            cut = drawn[(slice(None), *(slice(start, start + self.size) for start in starts))]
+            cut = drawn[(slice(None), *(slice(start, start + self.size) for start in starts))][channels]
             crop = torch.from_numpy(cut.astype(np.float32))
             if crop[-1].std() > 0.05:
                 break
-        estimate, truth = (torch.from_numpy(drawn[i, ::SPARSE, ::SPARSE, ::SPARSE].astype(np.float32)) for i in (0, -1))
+        estimate, truth = (torch.from_numpy(drawn[i, ::SPARSE, ::SPARSE, ::SPARSE].astype(np.float32))
+                           for i in (first, -1))
         error = estimate - truth
         return {"volume": crop.flip(1) if rng.random() < 0.5 else crop,
                 "scale": torch.stack([error.square().mean(), error.abs().mean()])}
 
 
 class Whole(Dataset):
-    """Reconstructions as they are."""
+    """Reconstructions as they are at the last call."""
 
     def __init__(self, made: Reconstructions):
         self.made = made
@@ -137,7 +146,7 @@ class Whole(Dataset):
         return len(self.made)
 
     def __getitem__(self, n: int) -> dict:
-        return {"volume": torch.from_numpy(self.made[n].astype(np.float32))}
+        return {"volume": torch.from_numpy(self.made[n][-INPUTS - 1:].astype(np.float32))}
 
 
 class ReconstructionData(PriorData):
@@ -180,13 +189,13 @@ class ReconstructionData(PriorData):
                               for cts, first, count in ((self.cts.cts, 0, phantoms),
                                                         (self.validation.datasets[1].cts, HELD_OUT_PHANTOM,
                                                          holdout.phantoms)))
-        parts = [asdict(scenes), fingerprint(initial), scene.to_dict(), window, phantoms, self.held_out,
+        parts = [asdict(scenes), fingerprint(initial), made.network and fingerprint(made.network), scene.to_dict(), window, phantoms, self.held_out,
                  [ct.id for ct in self.cts.cts]]
         folder = folder / f"reconstructions-{hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]}"
         self.crop, self.made = made.crop, Reconstructions(
-            trained, self.grid, initial, scenes, STRENGTH, folder / "trained", made.reconstructions, 0)
+            trained, self.grid, initial, made.network, scenes, STRENGTH, folder / "trained", made.reconstructions, 0)
         self.validation = Whole(Reconstructions(
-            validated, self.grid, initial, scenes, Augmentation.none(), folder / "validated",
+            validated, self.grid, initial, made.network, scenes, Augmentation.none(), folder / "validated",
             made.validation * len(validated), 1))
 
     def draws(self, epoch: int) -> Dataset:

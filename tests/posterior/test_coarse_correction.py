@@ -68,14 +68,14 @@ def test_only_a_refiner_corrects_and_only_voxels_that_divide_its_own():
     assert coarse_correction(other, Grid.cube(32), measurement, found, "") is None
 
 
-def test_every_round_is_a_call_of_the_network_and_none_is_refused_below_zero():
+def test_every_correction_is_a_call_of_the_network_and_less_than_none_is_refused():
     fine = Grid.cube(32)
     y = Projector(fine, BEAM, full_detector=True)(0.02 * torch.ones(1, 1, *fine.shape))[0]
 
-    def calls(rounds: int) -> int:
-        ready = Refined(reconstructor(UNROLLED, tiny_refiner()), fine, Refinement(rounds=rounds))
+    def network_calls(calls: int) -> int:
+        ready = Refined(reconstructor(UNROLLED, tiny_refiner()), fine, Refinement(calls=calls))
         return ready.reconstruct(*fit_to_grid(ready, fine, y, BEAM)).network_calls
 
-    assert [calls(rounds) - calls(0) for rounds in (1, 3)] == [1, 3]
-    with pytest.raises(ValueError, match="rounds is a number of corrections, 0 or more, but -1 was given"):
-        Refinement(rounds=-1)
+    assert [network_calls(calls) - network_calls(0) for calls in (1, 3)] == [1, 3]
+    with pytest.raises(ValueError, match="calls is a number of corrections, 0 or more, but -1 was given"):
+        Refinement(calls=-1)

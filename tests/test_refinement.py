@@ -39,7 +39,8 @@ def network(trained: bool = True, grid: Grid = FINE) -> CorrectionNetwork:
 def reconstructed(network: CorrectionNetwork | None, refinement: Refinement = Refinement(), order=(0, 1, 2),
                   precision: str = "auto"):
     xrays = Projector(FINE, BEAM, full_detector=True)(0.02 * torch.ones(1, 1, *FINE.shape))[0]
-    ready = Refined(reconstructor(Unrolled((0.2,), (0.5, 0.3)), tiny_refiner(), precision=precision), FINE, refinement, network)
+    base = reconstructor(Unrolled((0.2,), (0.5, 0.3)), tiny_refiner(), precision=precision)
+    ready = Refined(base, FINE, refinement, network)
     return ready.reconstruct(*fit_to_grid(ready, FINE, xrays[list(order)], BEAM.select(list(order))))
 
 

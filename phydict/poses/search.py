@@ -91,8 +91,8 @@ def find_poses(xrays: Tensor, beam: ConeBeam, uncertain: Uncertain, grid: Grid, 
     """Poses and gains of X-rays (K, V, U) whose nominal geometry is `beam`.
 
     display: display values, whose gains and offsets are found too, from those that a typical chest would have on.
-    grid: of the reconstruction. Computed on the CPU. on_round: called after each of the search's rounds. Raises ValueError where the data cannot hold the unknowns,
-    and where neither density nor size has a scale.
+    grid: of the reconstruction. on_round: called after each of the search's rounds. Computed on the CPU. Raises
+    ValueError where the data cannot hold the unknowns, and where neither density nor size has a scale.
     """
     check_xrays(xrays, beam)
     beam.check(grid)

@@ -111,7 +111,8 @@ class Reconstructions(Dataset):
 
 
 class Crops(Draws):
-    """Random cubes of reconstructions at one of their calls, half of them mirrored left to right: what is seen of so little has no side.
+    """Random cubes of reconstructions at one of their calls, half of them mirrored left to right: what is seen of so
+    little has no side.
 
     "scale" (2,) are the mean squared and the mean absolute error of the reconstruction that a cube is cut from.
     """
@@ -189,8 +190,8 @@ class ReconstructionData(PriorData):
                               for cts, first, count in ((self.cts.cts, 0, phantoms),
                                                         (self.validation.datasets[1].cts, HELD_OUT_PHANTOM,
                                                          holdout.phantoms)))
-        parts = [asdict(scenes), fingerprint(initial), made.network and fingerprint(made.network), scene.to_dict(), window, phantoms, self.held_out,
-                 [ct.id for ct in self.cts.cts]]
+        parts = [asdict(scenes), fingerprint(initial), made.network and fingerprint(made.network), scene.to_dict(),
+                 window, phantoms, self.held_out, [ct.id for ct in self.cts.cts]]
         folder = folder / f"reconstructions-{hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]}"
         self.crop, self.made = made.crop, Reconstructions(
             trained, self.grid, initial, made.network, scenes, STRENGTH, folder / "trained", made.reconstructions, 0)

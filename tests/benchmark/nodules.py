@@ -1,0 +1,107 @@
+"""Which nodules a user may hope to see: the share of their contrast that a reconstruction shows.
+
+    python tests/benchmark/nodules.py <folder of CTs> [--views 4 8 16] [--methods phydict_learned=64 ...]
+
+Into the lungs of a CT of 256^3 voxels a ball of each of SIZES is put, 50 mm or more apart, all denser than the lung by
+one of CONTRASTS. Each method, on its voxels, reconstructs K ideal views with and without them, of the same noise.
+Writes nodules.csv beside this file, a row per CT, method, K, contrast and size: the difference of the two in the ball
+less that in the shell around it, over the contrast (`recovered_contrast`); nodules.png, a curve per method; and prints
+the means over CTs. Rows that are there already are kept.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from statistics import mean
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from scipy.ndimage import binary_erosion
+from torch import Tensor
+
+from phydict import Grid, HUWindow, Projector, reconstruct
+from phydict.datasets import find_cts, prepare_ct
+from phydict.evaluation import read_csv, write_csv
+from phydict.evaluation.sharpness import nodule, recovered_contrast
+from phydict.runtime.seeds import case_seed
+from phydict.xray import Ideal
+from phydict.xray.binning import benchmark_orbit
+
+OUT = Path(__file__).with_suffix(".csv")
+WINDOW, FINE, COARSE = HUWindow(), Grid.cube(256), Grid.cube(64)
+SIZES, CONTRASTS = (6.0, 8.0, 10.0, 14.0, 20.0), (100.0, 300.0, 800.0)
+APART, FROM_EDGE = 50.0, 2
+"""mm between nodules, and voxels of 6 mm between their centres and the edge of a lung."""
+METHODS = ("phydict_learned=128", "phydict_learned=64", "tv=64")
+
+
+def places(lung: np.ndarray, random: np.random.Generator) -> list[np.ndarray]:
+    """World points (mm) in the lungs, one for each of SIZES or as many as there is room for."""
+    chosen: list[np.ndarray] = []
+    for index in random.permutation(np.argwhere(binary_erosion(lung, iterations=FROM_EDGE))):
+        point = COARSE.affine[:3, :3] @ index + COARSE.affine[:3, 3]
+        if len(chosen) < len(SIZES) and all(np.linalg.norm(point - other) >= APART for other in chosen):
+            chosen.append(point)
+    return chosen
+
+
+def reconstructed(hu: Tensor, views: int, method: str, seed: int) -> tuple[Tensor, Grid]:
+    """HU (X, Y, Z) by a method, named with its voxels, of ideal views of HU on FINE, and their grid."""
+    name, voxels = method.split("=")
+    beam, grid = benchmark_orbit(FINE, views), Grid.cube(int(voxels))
+    xrays = Ideal()(Projector(FINE, beam, full_detector=True), WINDOW.to_mu(WINDOW.to_range(hu))[None, None], seed)[0]
+    return reconstruct(xrays, beam, method=name, grid=grid).volume, grid
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("cts", type=Path)
+    parser.add_argument("--views", type=int, nargs="+", default=[4, 8, 16])
+    parser.add_argument("--methods", nargs="+", default=METHODS)
+    given = parser.parse_args()
+    rows = read_csv(OUT)
+    done = {(row["case"], row["method"], row["views"], row["contrast_hu"]) for row in rows}
+    for ct in find_cts(given.cts):
+        plain = WINDOW.to_hu(prepare_ct(ct.path, FINE, WINDOW, id=ct.id)["volume"])[0]
+        lung = prepare_ct(ct.path, COARSE, WINDOW, id=ct.id)["masks"][0].numpy() > 0.5
+        seed = case_seed(0, ct.id)
+        put = list(zip(places(lung, np.random.default_rng(seed)), SIZES))
+        for method, views in ((method, views) for method in given.methods for views in given.views):
+            missing = [contrast for contrast in CONTRASTS if (ct.id, method, views, contrast) not in done]
+            without, grid = reconstructed(plain, views, method, seed) if missing else (plain, FINE)
+            for contrast in missing:
+                balls = torch.stack([nodule(FINE, point, size) for point, size in put]).amax(0)
+                found, _ = reconstructed((plain + contrast * balls).clamp(max=WINDOW.high), views, method, seed)
+                rows += [{"case": ct.id, "method": method, "views": views, "contrast_hu": contrast, "diameter_mm": size,
+                          "recovered": recovered_contrast(found, without, grid, point, size, contrast)}
+                         for point, size in put]
+                write_csv(OUT, rows)
+                print(*rows[-1].values(), flush=True)
+    draw(rows)
+
+
+def draw(rows: list[dict]) -> None:
+    """Prints and plots the means over CTs."""
+    scenes = sorted({(row["views"], row["contrast_hu"]) for row in rows})
+    figure = Figure(figsize=(4 * len(CONTRASTS), 3 * len(scenes) / len(CONTRASTS)))
+    axes = figure.subplots(-(-len(scenes) // len(CONTRASTS)), len(CONTRASTS), sharex=True, sharey=True, squeeze=False)
+    for ax, (views, contrast) in zip(axes.flat, scenes):
+        for method in dict.fromkeys(row["method"] for row in rows):
+            own = [row for row in rows if (row["method"], row["views"], row["contrast_hu"]) == (method, views, contrast)]
+            means = [mean(row["recovered"] for row in own if row["diameter_mm"] == size) for size in SIZES if own]
+            if means:
+                ax.plot(SIZES, means, marker="o", label=method)
+                print("", views, f"{contrast:.0f}", method, *(f"{value:.2f}" for value in means), "", sep=" | ")
+        ax.set_title(f"K = {views}, {contrast:.0f} HU denser")
+        ax.grid(True, linewidth=0.3)
+    axes[0, 0].legend(fontsize=8)
+    figure.supxlabel("diameter (mm)")
+    figure.supylabel("share of the contrast that is shown")
+    figure.tight_layout()
+    figure.savefig(OUT.with_suffix(".png"), dpi=100)
+
+
+if __name__ == "__main__":
+    main()

@@ -88,12 +88,12 @@ def draw(rows: list[dict]) -> None:
     figure = Figure(figsize=(4 * len(CONTRASTS), 3 * len(scenes) / len(CONTRASTS)))
     axes = figure.subplots(-(-len(scenes) // len(CONTRASTS)), len(CONTRASTS), sharex=True, sharey=True, squeeze=False)
     for ax, (views, contrast) in zip(axes.flat, scenes):
-        for method in dict.fromkeys(row["method"] for row in rows):
-            own = [row for row in rows if (row["method"], row["views"], row["contrast_hu"]) == (method, views, contrast)]
-            means = [mean(row["recovered"] for row in own if row["diameter_mm"] == size) for size in SIZES if own]
-            if means:
-                ax.plot(SIZES, means, marker="o", label=method)
-                print("", views, f"{contrast:.0f}", method, *(f"{value:.2f}" for value in means), "", sep=" | ")
+        scene = [row for row in rows if (row["views"], row["contrast_hu"]) == (views, contrast)]
+        for method in dict.fromkeys(row["method"] for row in scene):
+            own = [row for row in scene if row["method"] == method]
+            means = [mean(row["recovered"] for row in own if row["diameter_mm"] == size) for size in SIZES]
+            ax.plot(SIZES, means, marker="o", label=method)
+            print("", views, f"{contrast:.0f}", method, *(f"{value:.2f}" for value in means), "", sep=" | ")
         ax.set_title(f"K = {views}, {contrast:.0f} HU denser")
         ax.grid(True, linewidth=0.3)
     axes[0, 0].legend(fontsize=8)

@@ -23,7 +23,7 @@ from phydict.units import hu_to_mu
 from phydict.xray import ConeBeam, Projector
 
 FILE = Path(__file__).with_suffix(".csv")
-DEFAULT = "phydict_fast=64x8,96x8,128x2,128x4,128x8,128x16,192x8,256x8"
+DEFAULT = "phydict_learned=64x2,64x8,64x16,64x32,128x2,128x8,128x16,128x32,256x8"
 SCENE = Grid.cube(96)
 
 

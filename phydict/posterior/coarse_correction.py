@@ -14,6 +14,7 @@ from phydict.posterior.posterior import Posterior
 from phydict.prior import BoundRefiner
 from phydict.reconstruction import Reconstruction, Reconstructor
 from phydict.runtime.profiling import stage
+from phydict.xray import Projector
 from phydict.xray.boxes import in_other_voxels
 from phydict.xray.finer import FinerProjector
 
@@ -53,16 +54,19 @@ class CoarseCorrection:
         return (z + change).clamp(-1, 1)
 
 
-def coarse_correction(base: Reconstructor, level: Grid, measurement: Measurement, found: Reconstruction, report: str
-                      ) -> CoarseCorrection | None:
-    """The correction of estimates on a level's voxels by the network of `base`, which has found a reconstruction of a
-    measurement on its own; None where it has no refiner, or where a whole number of the level's voxels do not make one
-    of its own along each axis."""
-    if not isinstance(base, Posterior) or not base.sampler.needs_refiner:
+def coarse_correction(base: Reconstructor, level: Grid, seen: tuple[Tensor, Projector], found: Reconstruction,
+                      report: str, display: bool) -> CoarseCorrection | None:
+    """The correction of estimates on a level's voxels by the network of `base`, which found a reconstruction of the
+    X-rays and the projector that it has `seen`; None where it has no refiner, where a whole number of the level's
+    voxels do not make one of its own along each axis, and where detectors are tilted, for which finer voxels cost too
+    much."""
+    xrays, projector = seen
+    if not isinstance(base, Posterior) or not base.sampler.needs_refiner or projector.method != "separable":
         return None
     factor = round(level.shape[0] / base.grid.shape[0])
     if factor < 2 or not level.same_as(in_other_voxels(base.grid, [factor * n for n in base.grid.shape])):
         return None
+    measurement = Measurement(projector, xrays, base.window, display, base.mu_water)
     measurement.reset_scatter(found.scatter > 0)
-    state = torch.cat([base.window.to_range(found.volume)[None], 2 * found.masks - 1])[None].to(measurement.y)
+    state = torch.cat([base.window.to_range(found.volume)[None], 2 * found.masks - 1])[None].to(xrays)
     return CoarseCorrection(base.prior.bind(report, base.guidance, base.precision), measurement, state, factor)

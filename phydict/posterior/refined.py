@@ -203,7 +203,7 @@ class Refined(Reconstructor):
                 measurement = self._measurement(y, A, coarse, display)
                 measurement.reset_scatter(coarse.scatter > 0)
                 measurement.refit(x)
-                correction = coarse_correction(base, level, self._measurement(*seen, coarse, display), coarse, report)
+                correction = coarse_correction(base, level, seen, coarse, report, display)
                 x = self.refinement(measurement, x, self._network(level), correction)
                 guard = Guard(measurement, on_step, 1)
                 guard()

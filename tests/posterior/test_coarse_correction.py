@@ -56,16 +56,20 @@ def test_what_the_network_changes_of_the_means_is_added_to_every_voxel_of_theirs
     torch.testing.assert_close(changed, z + 0.05)
 
 
-def test_only_a_refiner_corrects_and_only_voxels_that_divide_its_own():
+def test_only_a_refiner_corrects_on_voxels_that_divide_its_own_with_upright_detectors():
     y = Projector(COARSE, BEAM, full_detector=True)(0.02 * torch.ones(1, 1, *COARSE.shape))[0]
     learned, other = reconstructor(UNROLLED, tiny_refiner()), reconstructor(PriorOnly(1), tiny_prior(False))
     seen = fit_to_grid(learned, COARSE, y, BEAM)
-    measurement, found = Measurement(seen[1], seen[0], learned.window), learned.reconstruct(*seen)
-    for level, factor in ((Grid.cube(32), 2), (Grid.cube(64), 4)):
-        assert coarse_correction(learned, level, measurement, found, "").factor == factor
+    found = learned.reconstruct(*seen)
+
+    def correction(level: Grid, base=learned, seen=seen) -> CoarseCorrection | None:
+        return coarse_correction(base, level, seen, found, "", False)
+
+    assert [correction(Grid.cube(voxels)).factor for voxels in (32, 64)] == [2, 4]
     for level in (COARSE, Grid.cube(24), Grid.box((32, 32, 30), (384, 384, 360)), Grid.cube(32, 300)):
-        assert coarse_correction(learned, level, measurement, found, "") is None
-    assert coarse_correction(other, Grid.cube(32), measurement, found, "") is None
+        assert correction(level) is None
+    assert correction(Grid.cube(32), other) is None
+    assert correction(Grid.cube(32), seen=fit_to_grid(learned, COARSE, y, BEAM, "siddon")) is None
 
 
 def test_every_correction_is_a_call_of_the_network_and_less_than_none_is_refused():

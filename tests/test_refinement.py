@@ -109,7 +109,8 @@ def test_steps_on_one_crop_lower_its_loss():
 
 def arguments(folder: Path, cache: Path, initial: str, *more: str) -> list[str]:
     return ["fit", f"--config={CONFIG}", "--model.cube.voxels=32", "--model.window=[-1000,600]",
-            "--model.channels=[4,8]", "--data.phantoms=2", "--data.holdout.phantoms=1", "--data.loading.epoch_size=2",
+            "--model.channels=[4,8]", "--data.phantoms=2", "--data.holdout.phantoms=1",
+            "--data.loading.epoch_size=2", "--data.loading.batch_size=1",
             "--data.made.reconstructions=3", "--data.made.validation=1", "--data.made.crop=16",
             "--data.scenes.most_views=3", f"--data.initial={initial}", f"--data.cache={cache}", f"--out={folder}",
             "--trainer.accelerator=cpu", "--trainer.log_every_n_steps=1", "--trainer.max_steps=-1",

@@ -53,7 +53,7 @@ def refiner_file(tmp_path_factory) -> str:
 
 def test_an_untrained_network_and_another_grids_change_nothing():
     plain = reconstructed(None).volume
-    for other in (network(False), network(grid=Grid.cube(64))):
+    for other in (network(False), network(grid=Grid.cube(128))):
         torch.testing.assert_close(reconstructed(other).volume, plain)
 
 
@@ -87,6 +87,7 @@ def test_a_file_holds_the_network_and_no_other_stage_is_taken_for_it(tmp_path):
     save_correction(network(), tmp_path / "fine.safetensors", dtype=torch.float32)
     loaded, seen = load_correction(tmp_path / "fine.safetensors"), torch.randn(1, INPUTS, 16, 16, 16)
     assert loaded(seen).equal(network()(seen)) and loaded.suits(Grid.cube(16, 192), WINDOW)
+    assert loaded.suits(Grid.cube(64), WINDOW) and not loaded.suits(Grid.cube(48), WINDOW)
     assert not loaded.suits(FINE, HUWindow()) and not loaded.suits(Grid.cube(16), WINDOW)
     save_prior(tiny_prior(), tmp_path / "prior.safetensors")
     with pytest.raises(ValueError, match="is a base prior, but a refinement on finer voxels is needed"):

@@ -67,7 +67,8 @@ class Correction(Protocol):
 class Refinement:
     """How an estimate is refined on finer voxels.
 
-    z = step(interpolated); then `calls` times z = call_step(coarse(network(z))), of what there is of the two.
+    z = step(interpolated); then `calls` times z = call_step(coarse(network(z))), of what there is of the two. The
+    interpolation of what was refined before takes call_step at first as well.
 
     Args:
         step: towards the X-rays, such as ProximalCG, whose total variation takes a prior's place; none: interpolation
@@ -92,12 +93,13 @@ class Refinement:
             raise ValueError(f"calls is a number of corrections, 0 or more, but {self.calls} was given")
 
     def __call__(self, measurement: Measurement, x: Tensor, network: Correction | None,
-                 coarse: CoarseCorrection | None = None) -> Tensor:
+                 coarse: CoarseCorrection | None = None, refined: bool = False) -> Tensor:
         """The refined estimate of an interpolated one x (1, 1, X, Y, Z), by a network on these voxels and one on coarse
-        ones."""
+        ones. refined: whether what was interpolated had been refined."""
         if self.step is None:
             return x
-        before, z = x, self.step(measurement, x, self.x0_std)
+        first = (self.call_step, self.call_std) if refined and self.call_step else (self.step, self.x0_std)
+        before, z = x, first[0](measurement, x, first[1])
         start = z
         for _ in range(self.calls if network or coarse else 0):
             if network is not None:
@@ -204,7 +206,7 @@ class Refined(Reconstructor):
                 measurement.reset_scatter(coarse.scatter > 0)
                 measurement.refit(x)
                 correction = coarse_correction(base, level, seen, coarse, report, display)
-                x = self.refinement(measurement, x, self._network(level), correction)
+                x = self.refinement(measurement, x, self._network(level), correction, grid is not base.grid)
                 guard = Guard(measurement, on_step, 1)
                 guard()
             volume, grid = base.window.to_hu(x[0, 0]), level

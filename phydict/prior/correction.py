@@ -63,8 +63,10 @@ class CorrectionNetwork(nn.Module):
         return 8 * self.divisor - 5
 
     def suits(self, grid: Grid, window: HUWindow) -> bool:
-        """Whether it was trained for voxels of this size, wherever they are, and for this HU window."""
-        return window == self.window and np.allclose(grid.spacing, self.grid.spacing, rtol=TOLERANCE)
+        """Whether it was trained for this HU window and for voxels of this size, or twice as long ones, wherever they
+        are: what it has learnt of these serves voxels half as long as well."""
+        return window == self.window and any(
+            np.allclose(np.multiply(longer, grid.spacing), self.grid.spacing, rtol=TOLERANCE) for longer in (1, 2))
 
     def forward(self, seen: Tensor) -> Tensor:
         """The corrected estimate (B, 1, X, Y, Z) of an estimate and its evidence (B, INPUTS, X, Y, Z), in the prior's

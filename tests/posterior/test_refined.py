@@ -90,6 +90,15 @@ def test_meeting_the_xrays_on_fine_voxels_beats_interpolation(xrays):
     assert met.coarse.volume.shape == (16,) * 3 and met.projector_calls > interpolated.projector_calls
 
 
+def test_what_was_refined_before_is_met_as_after_a_correction():
+    projector, refinement = Projector(FINE, BEAM, full_detector=True), Refinement()
+    x = WINDOW.to_range(chest())[None, None]
+    y = 1.1 * projector(WINDOW.to_mu(x))[0]
+    first, later = (refinement(Measurement(projector, y, WINDOW), x, None, refined=refined) for refined in (False, True))
+    assert later.equal(refinement.call_step(Measurement(projector, y, WINDOW), x, refinement.call_std))
+    assert first.equal(refinement.step(Measurement(projector, y, WINDOW), x, refinement.x0_std))
+
+
 def test_every_level_is_one_step_and_figures_belong_to_the_volume(xrays):
     steps, target = [], Grid.box((31, 40, 27), (384, 360, 390))
     ready = Refined(Known(), target)

@@ -94,7 +94,7 @@ def test_what_was_refined_before_is_met_as_after_a_correction():
     projector, refinement = Projector(FINE, BEAM, full_detector=True), Refinement()
     x = WINDOW.to_range(chest())[None, None]
     y = 1.1 * projector(WINDOW.to_mu(x))[0]
-    first, later = (refinement(Measurement(projector, y, WINDOW), x, None, refined=refined) for refined in (False, True))
+    first, later = (refinement(Measurement(projector, y, WINDOW), x, None, refined=known) for known in (False, True))
     assert later.equal(refinement.call_step(Measurement(projector, y, WINDOW), x, refinement.call_std))
     assert first.equal(refinement.step(Measurement(projector, y, WINDOW), x, refinement.x0_std))
 

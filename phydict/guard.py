@@ -145,3 +145,16 @@ def risen_from(misfits: dict[int, float]) -> int | None:
         risen = misfit > max(RISE_FACTOR * smallest, RISE_MIN)
         first, smallest = (first or step) if risen else None, min(smallest, misfit)
     return first
+
+
+AIR_BELOW, ALIKE, MOST_OTHER = -900, 100, 0.05
+"""HU below which is air, HU around the median of the rest that count as one material, and the share of a volume that
+may be of neither for it to be one material in air: of a CT kept from training it is a fifth or more."""
+
+
+def one_material(volume: Tensor) -> bool:
+    """Whether a volume in HU (X, Y, Z) is air, or one material in air, such as a phantom of water; no chest is."""
+    dense = volume[volume >= AIR_BELOW]
+    if not len(dense):
+        return True
+    return int(((dense - dense.median()).abs() > ALIKE).sum()) < MOST_OTHER * volume.numel()

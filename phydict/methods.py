@@ -49,7 +49,7 @@ METHODS: dict[str, Sampler | Reconstructor] = {
         final_likelihood=ProximalCG(iterations=10, restarts=5, refit_scatter=True, weighted_least_squares=True,
                                     tv_weight=10.0, tv_eps=0.003)),
     # The default: a network trained on scenes of X-rays, four calls, each followed by conjugate gradients.
-    "phydict_learned": Unrolled(),
+    "phydict_learned": Unrolled(chests_only=True),
     # The paper's text: two gradient steps of 0.1 per timestep with LPIPS, then Extra Compute from delta = 0.8.
     "phydict_paper": SplitGibbs(iterations=50, likelihood=GradientSteps(reward=Reward(lpips=1.0)), ec_delta=0.8,
                                 ec_steps=40, full_detector=True),
@@ -134,7 +134,8 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: PriorContract | 
     check_prior(prior)
     name = name or type(method).__name__
     if super_resolution is None:
-        return Posterior(prior, method, guidance, name=name, precision=precision, samples=samples)
+        otherwise = FISTATV() if isinstance(method, Unrolled) and method.chests_only else None
+        return Posterior(prior, method, guidance, name=name, precision=precision, samples=samples, otherwise=otherwise)
     if samples != 1:
         raise ValueError(f"samples are drawn of a prior without a second stage, but {samples} were given with "
                          "super_resolution: leave one of the two out")

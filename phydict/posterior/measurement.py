@@ -29,6 +29,8 @@ class Measurement:
     (K, V, U), of each pixel; None: estimated from y where it is needed. outside: line integrals (K, V, U) of what
     lies outside the voxels, which P adds.
     subgrid: line integrals (1, K, V, U) that P adds for what the voxels cannot hold, 0 until somebody sets them.
+    model_variance: variance (K, 1, 1) of what a view's line integrals hold beside noise that no volume explains, which
+    ProximalCG counts as noise, 0 until somebody sets it.
     scales: per axis, the finest spacing of the voxels divided by their own.
     scatter_enabled: whether `subtract_scatter` subtracts scatter; calls: how many times A or its adjoint ran over all
     views, per volume of a batch; last_projection: what `project` last gave.
@@ -46,6 +48,7 @@ class Measurement:
         self.background = self.offset * projector(torch.ones(1, 1, *projector.grid.shape).to(xrays))
         self.outside: Tensor | float = 0.0 if outside is None else outside
         self.subgrid: Tensor | float = 0.0
+        self.model_variance: Tensor | float = 0.0
         self.scales = finest_to_own(projector.grid.spacing)
         self.y = xrays[None]
         self.scatter_enabled = False
@@ -89,10 +92,20 @@ class Measurement:
         level = self.noise if isinstance(self.noise, Tensor) else self.noise * self.y.max()
         return level.square().expand(self.y.shape[1:])
 
-    def normalised_residual(self, x: Tensor) -> Tensor:
-        """By how many times their noise the CTs x miss the X-rays, about 1 for the truth: (B, 1, 1, 1, 1)."""
+    def normalised_residual(self, x: Tensor, modelled: bool = False) -> Tensor:
+        """By how many times their noise the CTs x miss the X-rays, about 1 for the truth: (B, 1, 1, 1, 1).
+
+        modelled: what `model_variance` says counts as noise.
+        """
         residual = (self.project(x) - self.y).flatten(1).norm(dim=1)
-        return (residual / self.noise_variance.sum().clamp(min=1e-12).sqrt()).view(-1, 1, 1, 1, 1)
+        variance = self.noise_variance + (self.model_variance if modelled else 0.0)
+        return (residual / variance.sum().clamp(min=1e-12).sqrt()).view(-1, 1, 1, 1, 1)
+
+    def view_errors(self, projection: Tensor) -> Tensor:
+        """Root mean square (K,) by which projections (1, K, V, U) miss the line integrals of each view, beyond what its
+        noise does."""
+        error = (projection - self.y)[0].square() - self.noise_variance
+        return error.mean((1, 2)).clamp(min=0).sqrt()
 
     def match_gain_offset(self, x: Tensor) -> None:
         """Where the views are display values: refit their gain and offset to the projections of the CT x."""

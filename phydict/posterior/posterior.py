@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -13,7 +13,7 @@ from torch import Tensor
 from phydict.diffusion import Denoiser
 from phydict.diffusion.steps import noise_like
 from phydict.grid import Grid
-from phydict.guard import Guard, check_ceiling
+from phydict.guard import Guard, check_ceiling, one_material
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.samplers.sampler import Sampler
 from phydict.posterior.samplers.split_gibbs import SplitGibbs
@@ -94,6 +94,8 @@ class Posterior(Reconstructor):
     volume is the mean, and their standard deviation shows where it is uncertain. batch: how many of them go through
     the denoiser at once, where the sampler allows it; fewer need less memory. Sample i depends neither on samples nor,
     but for rounding, on batch.
+    otherwise: what reconstructs instead, from the same X-rays, where the volume is one material in air and no chest;
+    None: nothing does.
     """
 
     prior: PriorContract | Refiner
@@ -104,6 +106,7 @@ class Posterior(Reconstructor):
     precision: str = "auto"
     samples: int = 1
     batch: int = 4
+    otherwise: Reconstructor | None = None
 
     def __post_init__(self):
         super().__post_init__()
@@ -174,6 +177,13 @@ class Posterior(Reconstructor):
                 if self.samples > 1:
                     guard.finish(states[-1])
             states = torch.cat(states)
+        if self.otherwise and one_material(prior.window.to_hu(states[:, 0].mean(0))):
+            warn("the X-rays show one material in air and no chest, and of other objects the network knows nothing: a "
+                 "method without one reconstructed instead, and there are no intervals")
+            with watch.stage("otherwise"):
+                found = self.otherwise.with_mu_water(self.mu_water).reconstruct(xrays, projector, report, display, seed)
+            return replace(found, method=self.name, seconds=watch.seconds, network_calls=denoiser.calls,
+                           projector_calls=measurement.calls + found.projector_calls)
         with watch.stage("score"):
             state, ct = states.mean(0), states[:, :1].mean(0, keepdim=True)
             measurement.match_gain_offset(ct)
@@ -182,6 +192,7 @@ class Posterior(Reconstructor):
             fit = guard.score(states if self.samples == 1 else None, reprojection, measurement.y)
             deviation = (prior.window.half_width * states[:, 0].std(0)).cpu() if self.samples > 1 else None
             check_ceiling(ct[0, 0], prior.grid, prior.window)
+            say_contradictions(measurement)
             intervals, widening = self._intervals(denoiser, measurement, ct)
         return Reconstruction(
             volume=prior.window.to_hu(ct[0, 0]).cpu(), grid=prior.grid, method=self.name, seed=seed,
@@ -206,6 +217,18 @@ class Posterior(Reconstructor):
         widening = max(1.0, residual / most) ** WIDENING * (SCATTER_WIDENING if measurement.scatter else 1.0)
         widths = widening * self.prior.window.half_width * denoiser.half_widths[0].cpu()
         return dict(zip(LEVELS, widths)), widening
+
+
+def say_contradictions(measurement: Measurement) -> None:
+    """Warns where a part of the X-rays counted as noise because no volume explains it."""
+    variance = torch.as_tensor(measurement.model_variance).flatten()
+    views = variance.nonzero().flatten().tolist()
+    if views:
+        which = "any view" if len(views) == measurement.projector.beam.views else (
+            f"view {', '.join(map(str, views))} (counted from 0)")
+        warn(f"no volume explains {which}: as much of it as contradicts the rest counted as noise, so that the volume "
+             "follows it less and the prior more; check geometry and scale, and whether the patient moved, or "
+             "calibrate")
 
 
 def check_guidance(guidance: float) -> None:

@@ -96,10 +96,8 @@ class HardCases:
     def cases(self) -> Iterator[tuple[str, str, Callable[[], Case]]]:
         """Name, method and maker of every case: those that lie in the data are faced by SIRT too."""
         for group in (self._orbits, self._bad_views, self._bad_data):
-            for name, make in group():
-                yield from ((name, method, make) for method in ("phydict_fast", "sirt"))
-                if name in ("eight views", "metal"):
-                    yield from ((name, method, make) for method in ("phydict_learned", "tv"))
+            yield from ((name, method, make) for name, make in group()
+                        for method in ("phydict_fast", "sirt", "phydict_learned", "tv"))
         for group in (self._exposures, self._patients):
             yield from ((name, method, make) for name, make in group() for method in THREE)
         for group in (self._settings, self._precisions, self._seeds, self._samples, self._many_steps):
@@ -346,10 +344,11 @@ def scenes_table(rows: list[dict]) -> str:
     known = {(row["case"], row["method"]): row for row in rows}
     for name in dict.fromkeys(row["case"] for row in rows if row["method"] == THREE[0]):
         learned, fast, tv = (known.get((name, method), {}) for method in THREE)
-        psnr = [f"{row['psnr']:.1f}" if "psnr" in row else "-" for row in (learned, fast, tv)]
+        figures = [(row.get("psnr"), 1) for row in (learned, fast, tv)] + [
+            (100 * learned["inside_90"] if "inside_90" in learned else None, 0), (learned.get("interval_widening"), 1)]
+        told = ["-" if figure is None else f"{figure:.{digits}f}" for figure, digits in figures]
         others = dict.fromkeys(said for row in (fast, tv) if (said := clauses(row)) != "-")
-        lines.append(f"| {' | '.join([name, *psnr])} | {100 * learned['inside_90']:.0f} | "
-                     f"{learned['interval_widening']:.1f} | {clauses(learned)} | {'; '.join(others) or '-'} |")
+        lines.append(f"| {' | '.join([name, *told, clauses(learned), '; '.join(others) or '-'])} |")
     return "\n".join(lines) + "\n"
 
 

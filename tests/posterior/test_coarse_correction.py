@@ -17,7 +17,7 @@ from phydict.xray.finer import FinerProjector
 
 BEAM = ConeBeam.orbit(3, 1020, 740, (56, 56), 10.0)
 WINDOW, COARSE = HUWindow(-1000, 600), Grid.cube(16)
-UNROLLED = Unrolled((0.2,), (0.5, 0.3))
+UNROLLED = Unrolled((0.2,), (0.5, 0.3), contradiction=None)
 
 
 class Answer:

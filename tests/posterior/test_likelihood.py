@@ -34,6 +34,16 @@ def test_conjugate_gradients_solve_the_normal_equations(rows, noise, spread):
     torch.testing.assert_close(z, solved(m, X0, (noise / spread) ** 2), atol=1e-8, rtol=0)
 
 
+def test_what_no_volume_explains_counts_as_noise():
+    """The same of every ray is more noise of the step, of one ray alone nearly that ray left out."""
+    m, step = measurement(4), ProximalCG(40, noise=0.3, tolerance=1e-13)
+    m.model_variance = torch.full((4,), 0.5**2 - 0.3**2).double()
+    torch.testing.assert_close(step(m, X0, 0.2), solved(m, X0, (0.5 / 0.2) ** 2), atol=1e-8, rtol=0)
+    m.model_variance = torch.tensor([0.0, 0, 1e9, 0]).double()
+    without = DenseMeasurement(m.matrix[[0, 1, 3]], m.y[0, [0, 1, 3]], m.background)
+    torch.testing.assert_close(step(m, X0, 0.2), step(without, X0, 0.2), atol=1e-8, rtol=0)
+
+
 def test_each_iteration_lowers_the_objective_and_as_many_as_unknowns_suffice():
     m, noise, spread = measurement(9), 0.1, 0.5
 

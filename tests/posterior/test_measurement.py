@@ -112,11 +112,11 @@ def test_scatter_is_believed_where_xrays_are_missed_and_it_explains_much_of_that
     m.normalised_residual = lambda z: torch.as_tensor(missed)[z.long()]  # the results 0 and 1 miss by these
 
     def run(number: int) -> torch.Tensor:
-        m.subgrid = number  # what finer voxels add, sought anew by each run
+        m.subgrid = m.model_variance = number  # what finer voxels add, and what contradicts, sought anew by each run
         return torch.full((1, 1, 1, 1, 1), number)
 
     result = with_scatter(m, lambda: run(0), lambda: run(1))
-    assert bool(result) == believed == m.scatter_enabled == m.subgrid
+    assert bool(result) == believed == m.scatter_enabled == m.subgrid == m.model_variance
 
 
 def test_display_values_have_no_scatter_to_subtract():

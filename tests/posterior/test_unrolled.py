@@ -1,13 +1,15 @@
 """The unrolled reconstruction: its prior's own where nothing is learnt, and what its evidence says."""
 
+import warnings
 from dataclasses import replace
 
 import pytest
 import torch
 from prior.tiny import tiny_prior, tiny_refiner, tiny_super_resolution
 
-from phydict.diffusion import renoise
+from phydict.diffusion import CosineSchedule, renoise
 from phydict.grid import Grid
+from phydict.guard import one_material
 from phydict.methods import METHODS, reconstruct, reconstructor
 from phydict.posterior import Measurement, Posterior, PriorOnly, ProximalCG, SplitGibbs, Unrolled
 from phydict.posterior.discretisation import subgrid_projection
@@ -25,6 +27,10 @@ OTHERS = {
     "an arc of 60 degrees": ConeBeam.orbit(5, 1020, 740, (28, 28), 20.0, arc_degrees=60),
     "a detector that cuts the body": ConeBeam.orbit(4, 1020, 740, (10, 12), 20.0),
     "half a fan": ConeBeam(ORBIT.sources, ORBIT.detectors + 10 * ORBIT.u, ORBIT.u, ORBIT.v, ORBIT.shape)}
+
+
+COARSE = Unrolled(contradiction=None)
+"""On voxels as coarse as GRID's, what the first step leaves unexplained contradicts nothing."""
 
 
 def block() -> torch.Tensor:
@@ -55,7 +61,7 @@ def test_an_untrained_refiner_reconstructs_as_split_gibbs_without_noise_does():
     """From the state that the first likelihood step leaves, at the same times with the same steps."""
     refiner, m = tiny_refiner(untrained=True), measured()
     step = ProximalCG(4, 2)  # without total variation, which model error would raise
-    method = Unrolled((0.4, 0.2), (0.5, 0.3, 0.3), step, step, step, subgrid=None)
+    method = Unrolled((0.4, 0.2), (0.5, 0.3, 0.3), step, step, step, subgrid=None, contradiction=None)
     *_, result = method.estimates(refiner.bind(precision="float32"), m)
 
     class Levels(SplitGibbs):
@@ -115,6 +121,69 @@ def test_finer_voxels_are_asked_only_where_the_grid_misses_the_x_rays():
         assert not isinstance(m.subgrid, torch.Tensor) and torch.equal(z, other) == (name == "grid")
 
 
+EIGHT = ConeBeam.orbit(8, 1020, 740, (28, 28), 20.0)
+
+
+def contradicted(amount: float) -> Measurement:
+    """Eight views of the block, of which view 3 reads `amount` too much over half of its pixels."""
+    m = measured(EIGHT, noise=0.005)
+    m.y[:, 3, :14] += amount
+    return m
+
+
+class Knowing:
+    """A refiner that always answers with the block, and begins half-way to it."""
+
+    schedule, mean = CosineSchedule(), 0.5 * block()
+
+    def refine(self, *_):
+        return block()
+
+
+@torch.no_grad()
+def test_a_view_that_contradicts_the_others_counts_less_and_x_rays_that_agree_count_as_ever():
+    error = {}
+    for amount in (0.0, 2.0):
+        for method in (Unrolled(), Unrolled(contradiction=None)):
+            m = contradicted(amount)
+            *_, z = method.estimates(Knowing(), m)
+            error[amount, method.contradiction] = float((z - block()).norm())
+            if amount and method.contradiction:
+                variance = m.model_variance.flatten()
+                assert variance.argmax() == 3 and variance[3] > 10 * variance.median()
+            else:
+                assert m.model_variance == 0.0
+    assert error[0.0, Unrolled.contradiction] == error[0.0, None]
+    assert error[2.0, Unrolled.contradiction] < 0.5 * error[2.0, None]
+
+
+def test_what_no_volume_explains_is_said_and_not_where_nothing_counts_as_such():
+    xrays, refiner = contradicted(2.0).y[0], tiny_refiner(untrained=True)
+    with pytest.warns(UserWarning, match="no volume explains .*: as much of it as contradicts the rest"):
+        reconstruct(xrays, EIGHT, refiner, Unrolled(), precision="float32")
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", "no volume explains")
+        reconstruct(xrays, EIGHT, refiner, Unrolled(contradiction=None), precision="float32")
+
+
+def test_air_and_one_material_in_it_are_no_chest_and_a_body_with_a_hollow_is_another_thing():
+    hu, draw = WINDOW.to_hu(block())[0, 0].clone(), torch.Generator().manual_seed(0)
+    grain = 20 * torch.randn(hu.shape, generator=draw)
+    for air, material in ((hu < 1000, -1000.0), (hu < -900, 0.0), (hu > 1000, 600.0)):
+        assert one_material(torch.where(air, -1000.0, material) + grain)
+    hu[3:13, 4:8, 2:14] = -800  # an eighth of all
+    assert not one_material(hu + grain) and not one_material(1000 * torch.randn(hu.shape, generator=draw))
+
+
+def test_what_is_no_chest_is_reconstructed_without_a_network_and_that_is_said():
+    projector = Projector(GRID, EIGHT, full_detector=True)
+    xrays = projector(torch.full((1, 1, *GRID.shape), 0.02))[0]
+    with pytest.warns(UserWarning, match="one material in air and no chest.* reconstructed instead"):
+        found = reconstruct(xrays, EIGHT, tiny_refiner(uncertain=True), "phydict_learned", precision="float32")
+    assert torch.equal(found.volume, reconstruct(xrays, EIGHT, method="tv", grid=GRID).volume)
+    assert found.method == "phydict_learned" and found.network_calls and found.intervals == {}
+
+
 @pytest.mark.parametrize("subgrid, most, mean", [(None, 0.5, 0.1), (Unrolled.subgrid, 200, 1.0)])
 def test_views_in_another_order_give_the_same_volume(subgrid, most, mean):
     """To rounding, which bounded steps on finer voxels carry on in single voxels."""
@@ -127,7 +196,7 @@ def test_views_in_another_order_give_the_same_volume(subgrid, most, mean):
 
 @pytest.mark.parametrize("beam", OTHERS.values(), ids=OTHERS)
 def test_any_number_of_views_and_any_geometry_is_reconstructed_within_the_bounds(beam):
-    found = reconstruct(measured(beam, noise=0.02).y[0], beam, tiny_refiner(), "phydict_learned", precision="float32")
+    found = reconstruct(measured(beam, noise=0.02).y[0], beam, tiny_refiner(), COARSE, precision="float32")
     assert found.volume.isfinite().all() and found.volume.min() >= -1000 and found.volume.max() <= 600
     assert found.network_calls in (4, 8)  # eight where a misfit of so coarse a grid looks like scatter
     assert found.misfit < 0.1  # an untrained network's estimates are met by the likelihood steps all the same
@@ -184,7 +253,7 @@ def test_a_report_reaches_the_refiner():
 
 def test_display_values_are_reconstructed_whatever_their_gain():
     y = measured().y[0]
-    volumes = [reconstruct(gain * y + 0.1, ORBIT, tiny_refiner(), "phydict_learned", display=True,
+    volumes = [reconstruct(gain * y + 0.1, ORBIT, tiny_refiner(), COARSE, display=True,
                            precision="float32").volume for gain in (0.5, 2.0)]
     assert (volumes[0] - volumes[1]).abs().mean() < 2
 
@@ -209,7 +278,8 @@ def test_what_does_not_fit_is_refused_in_a_sentence(tmp_path):
     with pytest.raises(ValueError, match="needs a prior with a detail network"):
         Refiner(tiny_prior(), torch.zeros(4, *GRID.shape))
     for change, words in (({"times": ()}, "one or more"), ({"times": (0.0,), "x0_stds": (1, 1)}, "between 0 and 1"),
-                          ({"x0_stds": (0.1,)}, "5 numbers above 0"), ({"x0_stds": (0, 1, 1, 1, 1)}, "above 0")):
+                          ({"x0_stds": (0.1,)}, "5 numbers above 0"), ({"x0_stds": (0, 1, 1, 1, 1)}, "above 0"),
+                          ({"contradiction": -1.0}, "contradiction is")):
         with pytest.raises(ValueError, match=words):
             replace(METHODS["phydict_learned"], **change)
     save_prior(tiny_prior(), tmp_path / "prior.safetensors")

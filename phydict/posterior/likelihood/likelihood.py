@@ -40,6 +40,8 @@ class ProximalCG(LikelihoodStep):
     Each restart replaces TV by the quadratic that touches it there (Vogel & Oman 1996, doi:10.1137/0917016), so the
     last step wants several, and conjugate gradients are preconditioned by the diagonal of that quadratic, which differs
     by orders between flat parts and edges.
+    The `model_variance` of a measurement is added to noise^2.
+
     Hestenes & Stiefel 1952, doi:10.6028/jres.049.044; with bounds, More & Toraldo 1991, doi:10.1137/0801008; as data
     consistency in diffusion sampling, Chung et al. 2024, arXiv:2303.05754.
 
@@ -72,7 +74,8 @@ class ProximalCG(LikelihoodStep):
     def __call__(self, measurement: Measurement, x0: Tensor, x0_std: float) -> Tensor:
         weight = (self.noise / x0_std) ** 2
         z = x0.clamp(-1, 1)
-        weights = 1 / (1 + measurement.noise_variance / self.noise**2) if self.weighted_least_squares else 1.0
+        variance = measurement.model_variance + (measurement.noise_variance if self.weighted_least_squares else 0.0)
+        weights = 1 / (1 + variance / self.noise**2) if isinstance(variance, Tensor) else 1.0
         tv_scale = self.noise**2 * self.tv_weight
         for _ in range(self.restarts):
             reprojection = measurement.project(z)

@@ -17,7 +17,7 @@ from phydict.baselines.baseline import Baseline
 from phydict.datasets import format_report
 from phydict.grid import Grid
 from phydict.posterior import (
-    DAPS, DDS, DPS, CascadePosterior, DiffPIR, ExactDraw, GradientSteps, PnPDM, Posterior, PriorOnly, ProximalCG,
+    DAPS, DDS, DPS, CascadePosterior, DiffPIR, ExactDraw, GradientSteps, Metal, PnPDM, Posterior, PriorOnly, ProximalCG,
     Refined, Refinement, Reward, Sampler, SplitGibbs, Unrolled)
 from phydict.prior import (
     DEFAULT_CORRECTION, Cascade, MedSynCheckpoint, PriorContract, Refiner, SuperResolution, check_prior, find_prior,
@@ -45,6 +45,7 @@ METHODS: dict[str, Sampler | Reconstructor] = {
     # Conjugate gradients onto the X-rays at ten noise levels, the last counting each pixel by its noise.
     "phydict_fast": SplitGibbs(
         iterations=10, t_start=0.97, t_end=0.15, noise_fraction=0.4, momentum=0.5, sampling_noise=1.0, scatter=True,
+        metal=Metal(),
         likelihood=ProximalCG(iterations=7, restarts=1, tv_weight=10.0, tv_eps=0.003),
         final_likelihood=ProximalCG(iterations=10, restarts=5, refit_scatter=True, weighted_least_squares=True,
                                     tv_weight=10.0, tv_eps=0.003)),

@@ -15,6 +15,7 @@ from phydict.grid import Grid
 from phydict.runtime.files import atomic_write
 from phydict.units import MU_WATER
 from phydict.xray import ConeBeam, Projector
+from phydict.xray.carried import Carried
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,8 @@ class Reconstruction:
     precision: what the networks computed in, or, without any, the X-rays' type;
     scatter: the mean share of the pixels' signal that was subtracted as scatter, and is no longer in xrays;
     beam, poses: where poses were searched, the beam found, and what was corrected in it (phydict.poses);
-    coarse: the reconstruction on coarser voxels that was refined, or that says what lies outside a region of interest.
+    coarse: the reconstruction on coarser voxels that was refined, or that says what lies outside a region of interest;
+    carried: what of the volume is denser than the prior's window, such as metal, where it was found.
     """
 
     volume: Tensor
@@ -56,6 +58,12 @@ class Reconstruction:
     beam: ConeBeam | None = None
     poses: dict | None = None
     coarse: Reconstruction | None = None
+    carried: Carried | None = None
+
+    @property
+    def within(self) -> Tensor:
+        """The volume without what is carried beside it."""
+        return self.volume - self.carried.on(self.grid) if self.carried else self.volume
 
     def save_nifti(self, path: str | Path) -> None:
         """Writes the volume as float32 HU with the grid's affine (RAS+ mm), replacing the file only when complete."""

@@ -302,6 +302,7 @@ class ReconstructionTask(lightning.LightningModule):
                 "mu_water": case.get("mu_water", self.reconstructor.mu_water), "views": len(result.xrays),
                 "precision": result.precision, "instruction_set": instruction_set(self.device),
                 "grid": result.grid.to_dict(), "seed": result.seed, **({"poses": result.poses} if result.poses else {}),
+                **({"carried": result.carried.record()} if result.carried else {}),
                 "warnings": case["warnings"], "report": case["report"], "source": case["source"],
                 "settings": self.settings, "versions": versions()}
 

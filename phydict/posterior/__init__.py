@@ -7,6 +7,7 @@ from phydict.posterior.likelihood.likelihood import GradientSteps, LikelihoodSte
 from phydict.posterior.likelihood.likelihood_draw import ExactDraw, LikelihoodDraw
 from phydict.posterior.likelihood.reward import Reward
 from phydict.posterior.measurement import Measurement
+from phydict.posterior.metal import Metal
 from phydict.posterior.posterior import Posterior
 from phydict.posterior.refined import Refined, Refinement
 from phydict.posterior.samplers.daps import DAPS
@@ -32,6 +33,7 @@ __all__ = [
            "LikelihoodDraw",
            "LikelihoodStep",
            "Measurement",
+           "Metal",
            "PnPDM",
            "Posterior",
            "PriorOnly",

@@ -108,9 +108,10 @@ class CascadePosterior(Reconstructor):
             base = self._base(xrays, projector, report, display, seed, on_step)
         with watch.stage("prepare"):
             generator = torch.Generator().manual_seed(seed + 1)
-            state = torch.cat([fine.window.to_range(base.volume)[None], 2 * base.masks - 1])[None].to(xrays)
+            state = torch.cat([fine.window.to_range(base.within)[None], 2 * base.masks - 1])[None].to(xrays)
             state = state[:, :fine.coarse_channels]
             measurement = Measurement(projector, xrays, fine.window, display, self.mu_water)
+            measurement.carry(base.carried)
             if base.scatter:
                 measurement.reset_scatter(True)
                 measurement.refit(fine.upsample(state)[:, :1])
@@ -126,8 +127,11 @@ class CascadePosterior(Reconstructor):
             fit = guard.score(state, measurement.project(ct), measurement.y)
             masks = interpolate(base.masks[None], fine.grid.shape, mode="trilinear")[0]
             masks[:fine.state_channels - 1] = ((state[0, 1:] + 1) / 2).cpu()
+            volume = fine.window.to_hu(ct[0, 0]).cpu()
+            if base.carried:
+                volume = volume + base.carried.on(fine.grid)
         return Reconstruction(
-            volume=fine.window.to_hu(ct[0, 0]).cpu(), grid=fine.grid, method=self.name, seed=seed,
+            volume=volume, carried=base.carried, grid=fine.grid, method=self.name, seed=seed,
             **fit | {"diverged_at": base.diverged_at or guard.diverged_at}, seconds=watch.seconds,
             network_calls=base.network_calls + denoiser.calls,
             projector_calls=base.projector_calls + measurement.calls, masks=masks,

@@ -67,6 +67,7 @@ def coarse_correction(base: Reconstructor, level: Grid, seen: tuple[Tensor, Proj
     if factor < 2 or not level.same_as(in_other_voxels(base.grid, [factor * n for n in base.grid.shape])):
         return None
     measurement = Measurement(projector, xrays, base.window, display, base.mu_water)
+    measurement.carry(found.carried)
     measurement.reset_scatter(found.scatter > 0)
-    state = torch.cat([base.window.to_range(found.volume)[None], 2 * found.masks - 1])[None].to(xrays)
+    state = torch.cat([base.window.to_range(found.within)[None], 2 * found.masks - 1])[None].to(xrays)
     return CoarseCorrection(base.prior.bind(report, base.guidance, base.precision), measurement, state, factor)

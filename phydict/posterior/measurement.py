@@ -15,6 +15,7 @@ from phydict.linalg.total_variation import finest_to_own
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import Projector
 from phydict.xray.calibration import match_views, subtract_scatter
+from phydict.xray.carried import Carried
 from phydict.xray.checks import check_line_integrals, check_xrays
 from phydict.xray.noise_level import noise_level
 
@@ -28,6 +29,7 @@ class Measurement:
     noise: standard deviation of the noise of y, as a share of its largest value or, as a tensor that expands to
     (K, V, U), of each pixel; None: estimated from y where it is needed. outside: line integrals (K, V, U) of what
     lies outside the voxels, which P adds.
+    carried, beside: what is carried beside the CTs, if anything, and its line integrals (K, V, U), which P adds.
     subgrid: line integrals (1, K, V, U) that P adds for what the voxels cannot hold, 0 until somebody sets them.
     model_variance: variance (K, 1, 1) of what a view's line integrals hold beside noise that no volume explains, which
     ProximalCG counts as noise, 0 until somebody sets it.
@@ -49,6 +51,9 @@ class Measurement:
         self.outside: Tensor | float = 0.0 if outside is None else outside
         self.subgrid: Tensor | float = 0.0
         self.model_variance: Tensor | float = 0.0
+        self.beside: Tensor | float = 0.0
+        self.carried: Carried | None = None
+        self.window, self.mu_water = window, mu_water
         self.scales = finest_to_own(projector.grid.spacing)
         self.y = xrays[None]
         self.scatter_enabled = False
@@ -58,7 +63,7 @@ class Measurement:
     def project(self, x: Tensor) -> Tensor:
         """P(x): line integrals (B, K, V, U) of the CT x."""
         self.calls += len(x)
-        projected = self.slope * self.projector(x) + self.background + self.outside + self.subgrid
+        projected = self.slope * self.projector(x) + self.background + self.outside + self.beside + self.subgrid
         self.last_projection = projected.detach()
         return projected
 
@@ -69,6 +74,21 @@ class Measurement:
         other.projector, other.scales = projector, finest_to_own(projector.grid.spacing)
         other.subgrid, other.calls = 0.0, 1
         return other
+
+    def carry(self, carried: Carried | None) -> None:
+        """From now on P adds what is carried beside the CTs."""
+        self.carried = carried
+        self.beside = 0.0 if carried is None else carried.projection(self.projector).to(self.y)
+
+    @property
+    def fitted(self) -> tuple[Tensor, bool, Tensor | float, Tensor | float]:
+        """What was found of the X-rays beside the CT: without scatter or with gains matched, whether scatter is sought,
+        what finer voxels add, and what no volume explains."""
+        return self.y, self.scatter_enabled, self.subgrid, self.model_variance
+
+    @fitted.setter
+    def fitted(self, found: tuple[Tensor, bool, Tensor | float, Tensor | float]) -> None:
+        self.y, self.scatter_enabled, self.subgrid, self.model_variance = found
 
     def linear(self, d: Tensor) -> Tensor:
         """The linear part of P, for differences d of CTs."""

@@ -15,6 +15,7 @@ from phydict.diffusion.steps import noise_like
 from phydict.grid import Grid
 from phydict.guard import Guard, check_ceiling, one_material
 from phydict.posterior.measurement import Measurement
+from phydict.posterior.metal import said_of
 from phydict.posterior.samplers.sampler import Sampler
 from phydict.posterior.samplers.split_gibbs import SplitGibbs
 from phydict.prior import BoundRefiner, PriorContract, Refiner
@@ -27,6 +28,7 @@ from phydict.runtime.reading import check_memory
 from phydict.runtime.warning import warn
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import Projector
+from phydict.xray.carried import Carried
 
 MOST_GUIDANCE = 1_000_000
 """No scale of guidance is as large: it would overflow."""
@@ -191,16 +193,26 @@ class Posterior(Reconstructor):
             measurement.subtract_scatter(reprojection)
             fit = guard.score(states if self.samples == 1 else None, reprojection, measurement.y)
             deviation = (prior.window.half_width * states[:, 0].std(0)).cpu() if self.samples > 1 else None
-            check_ceiling(ct[0, 0], prior.grid, prior.window)
+            volume, carried = self._told(measurement, ct[0, 0])
             say_contradictions(measurement)
             intervals, widening = self._intervals(denoiser, measurement, ct)
         return Reconstruction(
-            volume=prior.window.to_hu(ct[0, 0]).cpu(), grid=prior.grid, method=self.name, seed=seed,
-            **fit, seconds=watch.seconds,
+            volume=volume, grid=prior.grid, method=self.name, seed=seed, **fit, seconds=watch.seconds,
             network_calls=denoiser.calls * (2 if report and self.guidance != 1 else 1),
             projector_calls=measurement.calls, masks=((state[1:] + 1) / 2).cpu(), deviation=deviation,
             intervals=intervals, interval_widening=widening, scatter=measurement.scatter,
-            precision=precision_name(self.precision, xrays))
+            precision=precision_name(self.precision, xrays), carried=carried)
+
+    def _told(self, measurement: Measurement, x: Tensor) -> tuple[Tensor, Carried | None]:
+        """HU (X, Y, Z) of a result x in the prior's range, and what of them is carried beside it. Says what is as dense
+        as the prior knows, or denser."""
+        volume, carried = self.prior.window.to_hu(x).cpu(), measurement.carried
+        if carried is None:
+            check_ceiling(x, self.prior.grid, self.prior.window)
+            return volume, None
+        warn(said_of(carried, self.prior.window))
+        carried = replace(carried, extra=carried.extra.cpu())
+        return volume + carried.on(self.prior.grid), carried
 
     def _intervals(self, denoiser: CountingDenoiser, measurement: Measurement, ct: Tensor
                    ) -> tuple[dict[float, Tensor], float]:

@@ -196,7 +196,7 @@ class Refined(Reconstructor):
         with watch.stage("base"):
             seen = self._seen(xrays, projector, base.grid)
             coarse = base.reconstruct(*seen, report, display, seed, on_step)
-        volume, grid, calls, found = coarse.volume.to(xrays), base.grid, coarse.projector_calls, {}
+        volume, grid, calls, found = coarse.within.to(xrays), base.grid, coarse.projector_calls, {}
         network_calls = coarse.network_calls
         for level in self.levels:
             with watch.stage("refine"):
@@ -219,7 +219,9 @@ class Refined(Reconstructor):
                 calls += correction.measurement.calls
                 network_calls += correction.calls
         spread, volume = coarse.deviation, volume.cpu()
-        change = (volume - interpolated(coarse.volume, base.grid, self.target, AIR)).abs()
+        change = (volume - interpolated(coarse.within, base.grid, self.target, AIR)).abs()
+        if coarse.carried:
+            volume = volume + coarse.carried.on(grid)
         return replace(
             coarse, **found | {"diverged_at": coarse.diverged_at}, volume=volume, grid=self.target,
             coarse=coarse, projector_calls=calls, network_calls=network_calls, seconds=watch.seconds,
@@ -240,6 +242,8 @@ class Refined(Reconstructor):
         """The X-rays as a problem on a level's voxels alone."""
         outside = None
         if not covers(self.target, coarse.grid):
-            mu = hu_to_mu(coarse.volume.to(y), self.mu_water)
+            mu = hu_to_mu(coarse.within.to(y), self.mu_water)
             outside = outside_projection(mu, coarse.grid, A)
-        return Measurement(A, y, self.base.window, display, self.mu_water, outside=outside)
+        measurement = Measurement(A, y, self.base.window, display, self.mu_water, outside=outside)
+        measurement.carry(coarse.carried)
+        return measurement

@@ -102,6 +102,14 @@ def in_other_voxels(grid: Grid, shape: Sequence[int]) -> Grid:
     return Grid((x, y, z), affine=affine)
 
 
+def part(grid: Grid, box: Sequence[slice]) -> Grid:
+    """The voxels of a grid in a box of indices."""
+    affine = grid.affine.copy()
+    affine[:3, 3] += affine[:3, :3] @ [side.start for side in box]
+    x, y, z = (side.stop - side.start for side in box)
+    return Grid((x, y, z), affine=affine)
+
+
 def _faces(grid: Grid, box: Grid) -> tuple[np.ndarray, np.ndarray]:
     """The first and last faces (3,) of a box, as the grid's indices."""
     first, last = (box.affine[:3, :3] @ ends + box.affine[:3, 3]

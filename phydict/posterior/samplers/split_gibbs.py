@@ -20,6 +20,7 @@ from phydict.diffusion import Denoiser, ddim, renoise
 from phydict.diffusion.steps import Generators, noise_like
 from phydict.posterior.likelihood.likelihood import LikelihoodStep, ProximalCG
 from phydict.posterior.measurement import Measurement
+from phydict.posterior.metal import Metal, with_metal
 from phydict.posterior.samplers.sampler import Sampler, ddim_sample
 from phydict.posterior.scatter import with_scatter
 from phydict.runtime.ranges import check_between
@@ -53,6 +54,7 @@ class SplitGibbs(Sampler):
             release
         scatter: where the result misses the X-rays by more than SCATTER_THRESHOLD times their noise, sample once more,
             subtracting the scatter that each estimate implies, and keep what that gives if it misses less
+        metal: how what is denser than the prior's window is sought; none: it is not
     """
 
     citation = ("Dai, Ghosh & Batmanghelich, PhyDiCT: Plug-and-Play CT Reconstruction from Sparse X-Rays via "
@@ -74,6 +76,7 @@ class SplitGibbs(Sampler):
     clip: bool = True
     final_denoise: bool = False
     scatter: bool = False
+    metal: Metal | None = None
     batches = True
 
     def __post_init__(self):
@@ -114,13 +117,16 @@ class SplitGibbs(Sampler):
 
     def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, generator: Generators,
                on_step: Callable[[], None] = lambda: None) -> Tensor:
-        if not self.scatter:
+        def run(on_step: Callable[[], None] = lambda: None) -> Tensor:
             return self._descend(denoiser, measurement, x, generator, on_step)
-        return with_scatter(measurement, lambda: self._descend(denoiser, measurement, x, generator, on_step),
-                            lambda: self._descend(denoiser, measurement, x, generator))
+
+        def explained(on_step: Callable[[], None] = lambda: None) -> Tensor:
+            return with_scatter(measurement, lambda: run(on_step), run) if self.scatter else run(on_step)
+
+        return with_metal(measurement, self.metal, lambda: explained(on_step), explained)
 
     def _descend(self, denoiser: Denoiser, measurement: Measurement, x: Tensor, generator: Generators,
-                 on_step: Callable[[], None] = lambda: None) -> Tensor:
+                 on_step: Callable[[], None]) -> Tensor:
         z = self._guided_pass(denoiser, measurement, x, self.times(denoiser), generator, on_step)
         if not self.ec_delta:
             return z

@@ -13,6 +13,7 @@ from phydict.posterior.discretisation import subgrid_projection
 from phydict.posterior.evidence import Evidence
 from phydict.posterior.likelihood.likelihood import LikelihoodStep, ProximalCG
 from phydict.posterior.measurement import Measurement
+from phydict.posterior.metal import Metal, with_metal
 from phydict.posterior.samplers.sampler import Sampler
 from phydict.posterior.scatter import with_scatter
 from phydict.prior import DEFAULT_REFINER, BoundRefiner
@@ -57,6 +58,7 @@ class Unrolled(Sampler):
             noise, in those of one voxel of water against air, of more than FEW_VIEWS views in proportion to the root of
             their number; none: it never does
         chests_only: whether one material in air is left to a method without a network (`Posterior.otherwise`)
+        metal: how what is denser than the prior's window is sought; none: it is not
     """
 
     citation = ("Adler & Oktem, Learned Primal-Dual Reconstruction, IEEE Transactions on Medical Imaging 37(6), 2018, "
@@ -71,6 +73,7 @@ class Unrolled(Sampler):
     subgrid: LikelihoodStep | None = ProximalCG(5, 1, tv_weight=10.0, tv_eps=0.003)
     contradiction: float | None = 0.5
     chests_only: bool = False
+    metal: Metal | None = Metal()
     default_prior = DEFAULT_REFINER
     needs_refiner = True
 
@@ -144,7 +147,10 @@ class Unrolled(Sampler):
             *_, z = self.estimates(denoiser, measurement, on_step, lambda *found: results.append(found))
             return z
 
-        z = with_scatter(measurement, lambda: result(on_step), lambda: result(lambda: None))
+        def explained(on_step: Callable[[], None] = lambda: None) -> Tensor:
+            return with_scatter(measurement, lambda: result(on_step), lambda: result(lambda: None))
+
+        z = with_metal(measurement, self.metal, lambda: explained(on_step), explained)
         for found, evidence in results:
             if torch.equal(found, z):
                 denoiser.conclude(z, evidence)

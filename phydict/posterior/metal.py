@@ -1,0 +1,156 @@
+"""Metal and whatever else is denser than a prior's window: found, and carried beside the prior."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate, max_pool3d
+
+from phydict.guard import BONE, CEILING, CEILING_ML, millilitres
+from phydict.linalg.conjugate_gradients import conjugate_gradients
+from phydict.linalg.total_variation import TVQuadraticMajorizer
+from phydict.posterior.measurement import Measurement
+from phydict.units import HUWindow
+from phydict.xray import Projector
+from phydict.xray.boxes import part
+from phydict.xray.carried import RAYS, Carried
+from phydict.xray.finer import FinerProjector
+
+
+@dataclass(frozen=True)
+class Metal:
+    """How what is denser than a prior's window is sought.
+
+    Where a result has `least_ml` to `most_ml` at the window's upper end, extra attenuation e is sought in these voxels
+    and their neighbours, on voxels half as long, together with the CT z around it:
+
+        min over z in [-1, 1], e >= 0 of |P(z) + B e - y|^2 / noise^2 + |z - x|^2 / x0_std^2 + 2 tv_weight TV(z)
+
+    x is the result with soft tissue in the place of those voxels. Total variation counts z alone, so that what is
+    dense and sharp comes to lie in e. After FREE restarts of conjugate gradients e is left where it reaches SHARE of
+    its largest value, for metal is compact and dense. The method then runs again with e counted as known, and all that
+    `rounds` times. e is believed where half of its voxels are denser by `least` than soft tissue and the X-rays are
+    missed by no more than WORSE times as much as without it.
+
+    Args:
+        least_ml: where less lies at the window's upper end, nothing is sought
+        most_ml: nor where more does
+        least: HU
+        rounds: of search and method
+        restarts: of conjugate gradients
+        iterations: of each restart
+    """
+
+    least_ml: float = CEILING_ML[0]
+    most_ml: float = CEILING_ML[1]
+    least: float = 1000.0
+    rounds: int = 2
+    restarts: int = 8
+    iterations: int = 10
+
+    def __post_init__(self):
+        if not 0 < self.least_ml <= self.most_ml:
+            raise ValueError("metal is sought where the window's upper end holds between least_ml and most_ml, 0 < "
+                             f"least_ml <= most_ml, but {self.least_ml} and {self.most_ml} were given")
+        for name in ("rounds", "restarts", "iterations"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is a number of 1 or more, but {getattr(self, name)} was given")
+
+
+NOISE, X0_STD, TV_WEIGHT, TV_EPS = 0.02, 0.3, 5.0, 0.003
+"""Of z, as the likelihood steps of phydict_learned have them."""
+
+SOFT = 40.0
+"""HU."""
+
+FREE, SHARE, WORSE = 2, 0.25, 1.2
+BOLDNESS = 10.0
+"""How many times further than its own column of B allows each voxel of e is moved at first: z, which total variation
+holds back, would else take what is sharp along the rays before e does."""
+
+
+def with_metal(measurement: Measurement, metal: Metal | None, first: Callable[[], Tensor],
+               again: Callable[[], Tensor]) -> Tensor:
+    """The states of `first`; where metal is found beside their first CT, those of `again`, run with it as
+    `measurement.carried`."""
+    z = first()
+    if metal is None or measurement.carried is not None or measurement.window.high < BONE:
+        return z
+    dense = z[:1, :1] >= CEILING
+    if not metal.least_ml <= millilitres(dense, measurement.projector.grid) <= metal.most_ml:
+        return z
+    plain, missed, where = measurement.fitted, measurement.normalised_residual(z[:, :1]).max(), grown(dense)
+    found = z
+    for _ in range(metal.rounds):
+        carried = beside(measurement, found[:1, :1], where, metal)
+        measurement.carry(carried)
+        found = again()
+        where = where | grown(found[:1, :1] >= CEILING)
+    as_metal = bool(carried.extra[carried.extra > 0].median() >= metal.least)
+    if as_metal and measurement.normalised_residual(found[:, :1]).max() <= WORSE * missed:
+        return found
+    measurement.carry(None)
+    measurement.fitted = plain
+    return z
+
+
+def beside(measurement: Measurement, x: Tensor, where: Tensor, metal: Metal) -> Carried:
+    """What lies beside a CT x (1, 1, X, Y, Z) in the voxels `where`, as `Metal` says."""
+    measurement.carry(None)
+    measurement.subgrid = 0.0
+    box = tuple(slice(int(i.min()), int(i.max()) + 1) for i in where[0, 0].nonzero(as_tuple=True))
+    projector = measurement.projector
+    B = FinerProjector(Projector(part(projector.grid, box), projector.beam, device=x.device, full_detector=True), RAYS)
+    allowed = interpolate(where[(..., *box)].to(x), scale_factor=RAYS) > 0
+    x = torch.where(where, float(measurement.window.to_range(torch.tensor(SOFT))), x)
+    z, e, slope = x, torch.zeros_like(allowed, dtype=x.dtype), measurement.slope
+    weight, tv_scale = (NOISE / X0_STD) ** 2, NOISE**2 * TV_WEIGHT
+    columns = slope**2 * max(B.grid.spacing) * B.T(torch.ones_like(measurement.y)) + 1e-6
+    for restart in range(metal.restarts):
+        if restart >= FREE:
+            allowed = e > SHARE * e.max()
+            e = e * allowed
+        residual = measurement.y - measurement.project(z) - slope * B(e)
+        tv = TVQuadraticMajorizer(z, TV_EPS, measurement.scales)
+        down = measurement.adjoint(residual) + weight * (x - z) - tv_scale * tv.gradient(z)
+        rise = slope * B.T(residual)
+
+        def normal(d: Tensor, tv=tv) -> Tensor:
+            dz, de = apart(d, z, e)
+            fitted = measurement.linear(dz) + slope * B(de)
+            return together(measurement.adjoint(fitted) + weight * dz + tv_scale * tv.gradient(dz),
+                            slope * B.T(fitted))
+
+        scale = together(1 / (weight + tv_scale * tv.diagonal()), BOLDNESS / columns) * together(
+            ~((z <= -1) & (down < 0) | (z >= 1) & (down > 0)), allowed & ~((e <= 0) & (rise < 0)))
+        dz, de = apart(conjugate_gradients(normal, together(down, rise) * (scale > 0), metal.iterations,
+                                           preconditioner=scale), z, e)
+        z, e = (z + dz).clamp(-1, 1), (e + de).clamp(min=0)
+    return Carried(measurement.window.half_width * e[0, 0], B.grid, measurement.mu_water)
+
+
+def together(z: Tensor, e: Tensor) -> Tensor:
+    """Two volumes as one row (1, N)."""
+    return torch.cat([z.flatten(), e.flatten()])[None]
+
+
+def apart(row: Tensor, z: Tensor, e: Tensor) -> tuple[Tensor, Tensor]:
+    """What `together` joined, of the shapes of z and e."""
+    return row[0, :z.numel()].view_as(z), row[0, z.numel():].view_as(e)
+
+
+def grown(mask: Tensor) -> Tensor:
+    """A mask (1, 1, X, Y, Z) with the neighbours of its voxels."""
+    return max_pool3d(mask.float(), 3, 1, 1) > 0
+
+
+def said_of(carried: Carried, window: HUWindow) -> str:
+    """What was carried, where, and what that leaves wrong."""
+    place = ", ".join(f"{mm:.0f}" for mm in carried.centre)
+    return (f"{carried.millilitres:.1f} ml as dense as metal were found, about {carried.density:.0f} HU above what "
+            f"surrounds them, around ({place}) mm: the volume holds them beside what the method knows, up to "
+            f"{window.high:g} HU; beam hardening and scatter of metal are not corrected, and intervals do not hold "
+            "there")

@@ -1,0 +1,58 @@
+"""What is too dense for a volume and is carried beside it, on voxels of its own."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from phydict.grid import Grid
+from phydict.units import MU_WATER
+from phydict.xray.boxes import interpolated
+from phydict.xray.projectors.projector import Projector
+
+RAYS = 2
+"""Rays along each side of a pixel, whose mean it measures: what is dense has sharp edges."""
+
+
+@dataclass(frozen=True)
+class Carried:
+    """HU `extra` (X, Y, Z) on `grid` that a volume on other voxels along the same axes lacks; mu_water: 1/mm."""
+
+    extra: Tensor
+    grid: Grid
+    mu_water: float = MU_WATER
+
+    def projection(self, projector: Projector) -> Tensor:
+        """Its line integrals (K, V, U) along a projector's rays."""
+        rays = Projector(self.grid, projector.beam.divided(RAYS), device=self.extra.device, full_detector=True)
+        return self.mu_water / 1000 * avg_pool2d(rays(self.extra[None, None]), RAYS)[0]
+
+    def on(self, grid: Grid) -> Tensor:
+        """The HU (X, Y, Z) that it adds to a volume on `grid`."""
+        return interpolated(self.extra, self.grid, grid, 0.0)
+
+    @property
+    def centre(self) -> np.ndarray:
+        """Its centre of mass (3,) in mm."""
+        index = self.extra.nonzero()
+        weights = self.extra[tuple(index.T)][:, None]
+        mean = ((weights * index).sum(0) / weights.sum()).double().cpu().numpy()
+        return self.grid.affine[:3, :3] @ mean + self.grid.affine[:3, 3]
+
+    @property
+    def density(self) -> float:
+        """HU by which it is denser than what surrounds it, if it had one density and its voxels were full or empty."""
+        return float(self.extra.square().sum() / self.extra.sum())
+
+    @property
+    def millilitres(self) -> float:
+        """Its volume at that density."""
+        return float(self.extra.sum()) / self.density * math.prod(self.grid.spacing) / 1000
+
+    def record(self) -> dict:
+        """As plain JSON values."""
+        return {"millilitres": self.millilitres, "density_hu": self.density, "centre_mm": self.centre.tolist()}

@@ -57,11 +57,13 @@ class CoarseCorrection:
 def coarse_correction(base: Reconstructor, level: Grid, seen: tuple[Tensor, Projector], found: Reconstruction,
                       report: str, display: bool) -> CoarseCorrection | None:
     """The correction of estimates on a level's voxels by the network of `base`, which found a reconstruction of the
-    X-rays and the projector that it has `seen`; None where it has no refiner, where a whole number of the level's
-    voxels do not make one of its own along each axis, and where detectors are tilted, for which finer voxels cost too
-    much."""
+    X-rays and the projector that it has `seen`; None where it has no refiner or left the X-rays to another method,
+    where a whole number of the level's voxels do not make one of its own along each axis, and where detectors are
+    tilted, for which finer voxels cost too much."""
     xrays, projector = seen
     if not isinstance(base, Posterior) or not base.sampler.needs_refiner or projector.method != "separable":
+        return None
+    if found.masks is None or len(found.masks) + 1 != base.prior.state_channels:
         return None
     factor = round(level.shape[0] / base.grid.shape[0])
     if factor < 2 or not level.same_as(in_other_voxels(base.grid, [factor * n for n in base.grid.shape])):

@@ -1,5 +1,6 @@
 """A coarse network's call at an estimate on finer voxels: what it sees, and what it leaves."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -62,13 +63,14 @@ def test_only_a_refiner_corrects_on_voxels_that_divide_its_own_with_upright_dete
     seen = fit_to_grid(learned, COARSE, y, BEAM)
     found = learned.reconstruct(*seen)
 
-    def correction(level: Grid, base=learned, seen=seen) -> CoarseCorrection | None:
+    def correction(level: Grid, base=learned, seen=seen, found=found) -> CoarseCorrection | None:
         return coarse_correction(base, level, seen, found, "", False)
 
     assert [correction(Grid.cube(voxels)).factor for voxels in (32, 64)] == [2, 4]
     for level in (COARSE, Grid.cube(24), Grid.box((32, 32, 30), (384, 384, 360)), Grid.cube(32, 300)):
         assert correction(level) is None
     assert correction(Grid.cube(32), other) is None
+    assert correction(Grid.cube(32), found=replace(found, masks=None)) is None
     assert correction(Grid.cube(32), seen=fit_to_grid(learned, COARSE, y, BEAM, "siddon")) is None
 
 

@@ -32,6 +32,7 @@ class Reconstruction:
     diverged_at: the step, counted from 1, from which on the misfit had risen until the end, None where it had not;
     precision: what the networks computed in, or, without any, the X-rays' type;
     scatter: the mean share of the pixels' signal that was subtracted as scatter, and is no longer in xrays;
+    model_variance: variance (K, 1, 1) of what counted as noise of each view because no volume explains it;
     beam, poses: where poses were searched, the beam found, and what was corrected in it (phydict.poses);
     coarse: the reconstruction on coarser voxels that was refined, or that says what lies outside a region of interest;
     carried: what of the volume is denser than the prior's window, such as metal, where it was found.
@@ -55,6 +56,7 @@ class Reconstruction:
     diverged_at: int | None = None
     scatter: float = 0.0
     precision: str = "float32"
+    model_variance: Tensor | float = 0.0
     beam: ConeBeam | None = None
     poses: dict | None = None
     coarse: Reconstruction | None = None

@@ -121,7 +121,8 @@ class Refined(Reconstructor):
     network corrects the estimate there as well (`CoarseCorrection`). The X-rays are binned to what the level can hold.
     Where the target's box leaves out a part of the base's, the line integrals of what the base shows there are added to
     those of the box (region-of-interest tomography; Ziegler, Nielsen & Grass 2008, Medical Physics 35(4)). Scatter that
-    the base found is subtracted; display values are matched to the estimate anew.
+    the base found is subtracted, and what it counted as noise of a view counts so; display values are matched to the
+    estimate anew. What a base without masks reconstructed, such as water, no network corrects.
 
     Masks and deviations of the result are the base's, interpolated. Its intervals are the base's as well, and to both
     sides wider by CHANGE_SHARE of what the refinement changed of the interpolated volume.
@@ -203,10 +204,12 @@ class Refined(Reconstructor):
                 y, A = self._seen(xrays, projector, level)
                 x = base.window.to_range(interpolated(volume, grid, level, AIR))[None, None]
                 measurement = self._measurement(y, A, coarse, display)
+                measurement.model_variance = coarse.model_variance
                 measurement.reset_scatter(coarse.scatter > 0)
                 measurement.refit(x)
                 correction = coarse_correction(base, level, seen, coarse, report, display)
-                x = self.refinement(measurement, x, self._network(level), correction, grid is not base.grid)
+                network = self._network(level) if coarse.masks is not None else None
+                x = self.refinement(measurement, x, network, correction, grid is not base.grid)
                 guard = Guard(measurement, on_step, 1)
                 guard()
             volume, grid = base.window.to_hu(x[0, 0]), level
@@ -214,7 +217,7 @@ class Refined(Reconstructor):
                 measurement.match_gain_offset(x)
                 found = guard.score(x, measurement.project(x), measurement.y)
             calls += measurement.calls
-            network_calls += self.refinement.calls if self._network(level) else 0
+            network_calls += self.refinement.calls if network else 0
             if correction is not None:
                 calls += correction.measurement.calls
                 network_calls += correction.calls

@@ -99,6 +99,21 @@ def test_what_was_refined_before_is_met_as_after_a_correction():
     assert first.equal(refinement.step(Measurement(projector, y, WINDOW), x, refinement.x0_std))
 
 
+def test_what_contradicts_counts_as_noise_on_finer_voxels_too(xrays):
+    class Doubting(Known):
+        def reconstruct(self, *args, **settings):
+            return replace(super().reconstruct(*args, **settings), model_variance=doubt)
+
+    def fits(doubted: torch.Tensor) -> list[float]:
+        nonlocal doubt
+        doubt, ready = doubted, Refined(Doubting(), FINE)
+        return ready.reconstruct(*fit_to_grid(ready, FINE, xrays, BEAM)).misfit_per_view
+
+    doubt = torch.zeros(6, 1, 1)
+    plain, second = fits(doubt), fits(torch.tensor([0.0, 1, 0, 0, 0, 0])[:, None, None])
+    assert second[1] > 1.5 * plain[1] and second[0] < 1.1 * plain[0]
+
+
 def test_every_level_is_one_step_and_figures_belong_to_the_volume(xrays):
     steps, target = [], Grid.box((31, 40, 27), (384, 360, 390))
     ready = Refined(Known(), target)

@@ -67,8 +67,9 @@ class Correction(Protocol):
 class Refinement:
     """How an estimate is refined on finer voxels.
 
-    z = step(interpolated); then `calls` times z = call_step(coarse(network(z))), of what there is of the two. The
-    interpolation of what was refined before takes call_step at first as well.
+    z = step(interpolated); then `calls` times z = call_step(coarse(network(z))), of what there is of the two, the last
+    time without the coarse one if there is the other. The interpolation of what was refined before takes call_step at
+    first as well.
 
     Args:
         step: towards the X-rays, such as ProximalCG, whose total variation takes a prior's place; none: interpolation
@@ -101,12 +102,14 @@ class Refinement:
         first = (self.call_step, self.call_std) if refined and self.call_step else (self.step, self.x0_std)
         before, z = x, first[0](measurement, x, first[1])
         start = z
-        for _ in range(self.calls if network or coarse else 0):
+        for left in reversed(range(self.calls if network or coarse else 0)):
             if network is not None:
                 evidence = Evidence(measurement)(z, before, start)
                 with stage("network"):
                     z = network.corrected(z, evidence)
-            before = z = z if coarse is None else coarse(z)
+            if coarse is not None and (left or network is None):
+                z = coarse(z)
+            before = z
             measurement.refit(z)
             z = z if self.call_step is None else self.call_step(measurement, z, self.call_std)
         return z

@@ -51,10 +51,10 @@ def refiner_file(tmp_path_factory) -> str:
     return str(file)
 
 
-def test_an_untrained_network_and_another_grids_change_nothing():
-    plain = reconstructed(None).volume
-    for other in (network(False), network(grid=Grid.cube(128))):
-        torch.testing.assert_close(reconstructed(other).volume, plain)
+def test_an_untrained_network_corrects_nothing_and_another_grids_takes_no_part():
+    z, evidence = torch.rand(1, 1, *FINE.shape) - 0.5, torch.randn(1, INPUTS - 1, *FINE.shape)
+    assert network(False).corrected(z, evidence).equal(z) and not network().corrected(z, evidence).equal(z)
+    assert reconstructed(network(grid=Grid.cube(128))).volume.equal(reconstructed(None).volume)
 
 
 def test_the_xrays_are_met_again_after_a_correction():

@@ -17,8 +17,8 @@ from statistics import mean
 
 import numpy as np
 import torch
+from lesions import GRID, places
 from matplotlib.figure import Figure
-from scipy.ndimage import binary_erosion
 from torch import Tensor
 
 from phydict import Grid, HUWindow, Projector, reconstruct
@@ -30,21 +30,9 @@ from phydict.xray import Ideal
 from phydict.xray.binning import benchmark_orbit
 
 OUT = Path(__file__).with_suffix(".csv")
-WINDOW, FINE, COARSE = HUWindow(), Grid.cube(256), Grid.cube(64)
+WINDOW, FINE = HUWindow(), Grid.cube(256)
 SIZES, CONTRASTS = (6.0, 8.0, 10.0, 14.0, 20.0), (100.0, 300.0, 800.0)
-APART, FROM_EDGE = 50.0, 2
-"""mm between nodules, and voxels of 6 mm between their centres and the edge of a lung."""
 METHODS = ("phydict_learned=128", "phydict_learned=64", "tv=64")
-
-
-def places(lung: np.ndarray, random: np.random.Generator) -> list[np.ndarray]:
-    """World points (mm) in the lungs, one for each of SIZES or as many as there is room for."""
-    chosen: list[np.ndarray] = []
-    for index in random.permutation(np.argwhere(binary_erosion(lung, iterations=FROM_EDGE))):
-        point = COARSE.affine[:3, :3] @ index + COARSE.affine[:3, 3]
-        if len(chosen) < len(SIZES) and all(np.linalg.norm(point - other) >= APART for other in chosen):
-            chosen.append(point)
-    return chosen
 
 
 def reconstructed(hu: Tensor, views: int, method: str, seed: int) -> tuple[Tensor, Grid]:
@@ -65,14 +53,14 @@ def main() -> None:
     done = {(row["case"], row["method"], row["views"], row["contrast_hu"]) for row in rows}
     for ct in find_cts(given.cts):
         plain = WINDOW.to_hu(prepare_ct(ct.path, FINE, WINDOW, id=ct.id)["volume"])[0]
-        lung = prepare_ct(ct.path, COARSE, WINDOW, id=ct.id)["masks"][0].numpy() > 0.5
+        lung = prepare_ct(ct.path, GRID, WINDOW, id=ct.id)["masks"][0].numpy() > 0.5
         seed = case_seed(0, ct.id)
         put = list(zip(places(lung, np.random.default_rng(seed)), SIZES))
+        balls = torch.stack([nodule(FINE, point, size) for point, size in put]).amax(0)
         for method, views in ((method, views) for method in given.methods for views in given.views):
             missing = [contrast for contrast in CONTRASTS if (ct.id, method, views, contrast) not in done]
             without, grid = reconstructed(plain, views, method, seed) if missing else (plain, FINE)
             for contrast in missing:
-                balls = torch.stack([nodule(FINE, point, size) for point, size in put]).amax(0)
                 found, _ = reconstructed((plain + contrast * balls).clamp(max=WINDOW.high), views, method, seed)
                 rows += [{"case": ct.id, "method": method, "views": views, "contrast_hu": contrast, "diameter_mm": size,
                           "recovered": recovered_contrast(found, without, grid, point, size, contrast)}

@@ -28,13 +28,14 @@ def with_scatter(measurement: Measurement, first: Callable[[], Tensor], again: C
         return z
     residual = measurement.normalised_residual(z[:, :1])
     if (residual > SCATTER_THRESHOLD).any():
-        found = measurement.subgrid, measurement.model_variance
+        plain = measurement.fitted
         measurement.reset_scatter(True)
         second = again()
         better = (residual > SCATTER_THRESHOLD) & (
             measurement.normalised_residual(second[:, :1]) < SCATTER_GAIN * residual)
-        measurement.reset_scatter(bool(better.any()))
-        if not better.any():
-            measurement.subgrid, measurement.model_variance = found
+        if better.any():
+            measurement.reset_scatter(True)
+        else:
+            measurement.fitted = plain
         z = torch.where(better, second, z)
     return z

@@ -37,7 +37,12 @@ class CoarseCorrection:
     def __init__(self, refiner: BoundRefiner, measurement: Measurement, state: Tensor, factor: int):
         self.refiner, self.measurement, self.factor, self.calls = refiner, measurement, factor, 0
         self.start, self.state = state[:, :1], state
-        self.fine = measurement.on(FinerProjector(measurement.projector, factor))
+        self.fine, self.evidence = measurement.on(FinerProjector(measurement.projector, factor)), Evidence(measurement)
+
+    @property
+    def projector_calls(self) -> int:
+        """How many times A or its adjoint ran over all views, on coarse and on finer voxels."""
+        return self.measurement.calls + self.fine.calls
 
     def __call__(self, z: Tensor) -> Tensor:
         """The corrected estimate of z (1, 1, X, Y, Z), in the prior's range."""
@@ -45,7 +50,8 @@ class CoarseCorrection:
         means = avg_pool3d(z, self.factor)
         measurement.subgrid = beyond_means(measurement, self.fine, z)
         measurement.refit(means)
-        evidence = Evidence(measurement)(means, before, self.start)
+        self.evidence.measure_noise()
+        evidence = self.evidence(means, before, self.start)
         signal = float(self.refiner.schedule.scales(TIME)[0])
         with stage("network"):
             answer = self.refiner.refine(signal * torch.cat([means, self.state[:, 1:]], 1), TIME, evidence)

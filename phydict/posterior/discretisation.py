@@ -21,13 +21,13 @@ def subgrid_projection(measurement: Measurement, x: Tensor, step: LikelihoodStep
     of the finer volume.
     """
     fine = measurement.on(FinerProjector(measurement.projector, FACTOR))
-    return beyond_means(measurement, fine, step(fine, interpolate(x, scale_factor=FACTOR, mode="trilinear"), x0_std))
+    found = beyond_means(measurement, fine, step(fine, interpolate(x, scale_factor=FACTOR, mode="trilinear"), x0_std))
+    measurement.calls += fine.calls
+    return found
 
 
 def beyond_means(measurement: Measurement, fine: Measurement, z: Tensor) -> Tensor:
     """Line integrals (1, K, V, U) that a CT z (1, 1, X, Y, Z) on the voxels of `fine`, a FinerProjector's, has beyond
     those of its means over the voxels of `measurement`."""
     measurement.subgrid = 0.0
-    found = fine.project(z) - measurement.project(avg_pool3d(z, fine.projector.factor))
-    measurement.calls += fine.calls
-    return found
+    return fine.project(z) - measurement.project(avg_pool3d(z, fine.projector.factor))

@@ -18,8 +18,8 @@ class Evidence:
     0: the residual's back-projection, one SIRT step C A' R (y - P(z)), R = 1 / A 1 and C = 1 / A' 1 (Gilbert 1972,
     doi:10.1016/0022-5193(72)90180-4); 1: the coverage log2(1 + n), n the number of views that see a voxel; 2: what the
     X-rays changed of the estimate before; 3: how the start of the reconstruction differs from z; 4: the noise of the
-    X-rays, log10 of its share of their largest value, plus 2.
-    The order of the views does not matter.
+    X-rays, log10 of its share of their largest value, plus 2, as they are at first or at the last `measure_noise`.
+    The order of the views does not matter. A' 1 is computed once.
     """
 
     def __init__(self, measurement: Measurement):
@@ -31,8 +31,12 @@ class Evidence:
         self.rows = torch.where(rays > 1e-3 * rays.max(), 1 / rays.clamp(min=1e-12), 0)
         self.columns = torch.where(seen > 1e-3 * seen.max(), 1 / seen.clamp(min=1e-12), 0)
         self.coverage = COVERAGE_SCALE * torch.log2(1 + views_seen(projector, seen))
-        level = measurement.noise_variance.mean().sqrt() / measurement.y.max().clamp(min=1e-6)
-        self.noise = torch.full_like(seen, float(level.clamp(1e-4, 1).log10()) + 2)
+        self.measure_noise()
+
+    def measure_noise(self) -> None:
+        """From now on the noise is that of the X-rays as they are now, such as after a refit."""
+        level = self.measurement.noise_variance.mean().sqrt() / self.measurement.y.max().clamp(min=1e-6)
+        self.noise = torch.full_like(self.columns, float(level.clamp(1e-4, 1).log10()) + 2)
 
     def __call__(self, z: Tensor, before: Tensor, start: Tensor) -> Tensor:
         """The channels at the estimate z; before: the estimate that the X-rays changed into z; start: the first z."""

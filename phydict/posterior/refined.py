@@ -101,12 +101,13 @@ class Refinement:
             return x
         first = (self.call_step, self.call_std) if refined and self.call_step else (self.step, self.x0_std)
         before, z = x, first[0](measurement, x, first[1])
-        start = z
+        start, evidence = z, Evidence(measurement) if network and self.calls else None
         for left in reversed(range(self.calls if network or coarse else 0)):
-            if network is not None:
-                evidence = Evidence(measurement)(z, before, start)
+            if network and evidence:
+                evidence.measure_noise()
+                seen = evidence(z, before, start)
                 with stage("network"):
-                    z = network.corrected(z, evidence)
+                    z = network.corrected(z, seen)
             if coarse is not None and (left or network is None):
                 z = coarse(z)
             before = z
@@ -222,7 +223,7 @@ class Refined(Reconstructor):
             calls += measurement.calls
             network_calls += self.refinement.calls if network else 0
             if correction is not None:
-                calls += correction.measurement.calls
+                calls += correction.projector_calls
                 network_calls += correction.calls
         spread, volume = coarse.deviation, volume.cpu()
         change = (volume - interpolated(coarse.within, base.grid, self.target, AIR)).abs()

@@ -1,6 +1,7 @@
 """A coarse network's call at an estimate on finer voxels: what it sees, and what it leaves."""
 
 from dataclasses import replace
+from itertools import pairwise
 from types import SimpleNamespace
 
 import pytest
@@ -12,6 +13,7 @@ from phydict.grid import Grid
 from phydict.methods import fit_to_grid, reconstructor
 from phydict.posterior import Measurement, PriorOnly, Refined, Refinement, Unrolled
 from phydict.posterior.coarse_correction import CoarseCorrection, coarse_correction
+from phydict.runtime.profiling import profiled
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 from phydict.xray.finer import FinerProjector
@@ -55,6 +57,18 @@ def test_what_the_network_changes_of_the_means_is_added_to_every_voxel_of_theirs
     coarse, _, z = measured(2)
     changed = CoarseCorrection(Answer(0.05), coarse, torch.zeros(1, 1, *COARSE.shape), 2)(z)
     torch.testing.assert_close(changed, z + 0.05)
+
+
+def test_the_back_projection_of_ones_is_made_once_and_each_call_takes_four_more():
+    coarse, _, z = measured(2)
+    correction = CoarseCorrection(Answer(0.05), coarse, torch.zeros(1, 1, *COARSE.shape), 2)
+    counts = [correction.projector_calls]
+    for _ in range(3):
+        with profiled() as profile:
+            z = correction(z)
+        counts.append(correction.projector_calls)
+        assert sum(use.calls for name, use in profile.uses.items() if name.endswith("projector")) == 4
+    assert [after - before for before, after in pairwise(counts)] == [4, 4, 4]
 
 
 def test_only_a_refiner_corrects_on_voxels_that_divide_its_own_with_upright_detectors():

@@ -16,7 +16,7 @@ from phydict.units import HUWindow, hu_to_mu
 from phydict.xray import ConeBeam, Projector
 
 BEAM = ConeBeam.orbit(6, 1020, 740, (56, 56), 10.0)
-FINE, WINDOW = Grid.cube(64), HUWindow(-1000, 600)
+COARSE, FINE, WINDOW = Grid.cube(16), Grid.cube(64), HUWindow(-1000, 600)
 
 
 def chest() -> torch.Tensor:
@@ -97,6 +97,38 @@ def test_what_was_refined_before_is_met_as_after_a_correction():
     first, later = (refinement(Measurement(projector, y, WINDOW), x, None, refined=known) for known in (False, True))
     assert later.equal(refinement.call_step(Measurement(projector, y, WINDOW), x, refinement.call_std))
     assert first.equal(refinement.step(Measurement(projector, y, WINDOW), x, refinement.x0_std))
+
+
+class Watched:
+    """Corrects nothing on any voxels, and keeps what noise it is told of and what there is."""
+
+    def __init__(self, measurement: Measurement):
+        self.measurement, self.told = measurement, []
+
+    def suits(self, grid, window):
+        return True
+
+    def corrected(self, z, evidence):
+        noise = self.measurement.noise_variance.mean().sqrt() / self.measurement.y.max()
+        self.told.append((10 ** (float(evidence[0, 4].mean()) - 2), float(noise)))
+        return z
+
+
+def test_a_correction_makes_the_back_projection_of_ones_once_and_is_told_of_the_noise_as_it_is():
+    projector, x = Projector(COARSE, BEAM), WINDOW.to_range(torch.nn.functional.avg_pool3d(chest()[None], 4))[None]
+    y = projector(WINDOW.to_mu(x))[0]
+    y = 5 + 3 * (y + 0.05 * random_like(y.shape))
+
+    def used(calls: int) -> tuple[int, list]:
+        measurement = Measurement(projector, y, WINDOW, display=True)
+        network = Watched(measurement)
+        Refinement(ProximalCG(1, 1), calls=calls, call_step=None)(measurement, x.clamp(-1, 0.5), network)
+        return measurement.calls, network.told
+
+    (none, _), (once, _), (thrice, told) = (used(calls) for calls in (0, 1, 3))
+    assert once - none == 4 and thrice - once == 2 * 3  # evidence takes two, a refit one, and A' 1 is the first's
+    assert all(seen == pytest.approx(noise, rel=1e-4) for seen, noise in told)
+    assert told[0] != pytest.approx(told[1], rel=1e-2)
 
 
 def test_what_contradicts_counts_as_noise_on_finer_voxels_too(xrays):

@@ -12,9 +12,11 @@ from torch.nn.functional import pad
 from phydict.cli.train import main
 from phydict.grid import Cube, Grid
 from phydict.methods import fit_to_grid, reconstructor
-from phydict.posterior import Refined, Refinement, Unrolled
+from phydict.posterior import Refined, Refinement, Unrolled, refined
+from phydict.posterior.coarse_correction import coarse_correction
 from phydict.prior import load_correction, save_correction, save_prior, save_refiner
 from phydict.prior.correction import INPUTS, CorrectionNetwork
+from phydict.runtime.profiling import profiled
 from phydict.training.reconstructions import Made, ReconstructionData
 from phydict.training.refinement import RefinementTraining
 from phydict.training.scenes import Scenes
@@ -61,6 +63,21 @@ def test_the_xrays_are_met_again_after_a_correction():
     alone, met = (reconstructed(network(), refinement) for refinement in (Refinement(call_step=None), Refinement()))
     assert (alone.volume - reconstructed(None, Refinement(call_step=None)).volume).abs().max() > 10
     assert met.misfit < 0.5 * alone.misfit
+
+
+@pytest.mark.parametrize("corrects, refinement, calls", [
+    (True, Refinement(None), 0), (False, Refinement(calls=0), 0), (True, Refinement(calls=1), 1),
+    (True, Refinement(), 3), (False, Refinement(), 2)])
+def test_a_refinement_prepares_what_it_uses_and_counts_what_happens(monkeypatch, corrects, refinement, calls):
+    prepared = []
+    monkeypatch.setattr(refined, "coarse_correction", lambda *given: prepared.append(coarse_correction(*given))
+                        or prepared[0])
+    with profiled(memory=False) as profile:
+        found = reconstructed(network() if corrects else None, refinement)
+    assert found.network_calls - found.coarse.network_calls == calls
+    assert len(prepared) == (calls > corrects) and all(correction.calls for correction in prepared)
+    assert found.projector_calls - found.coarse.projector_calls == sum(
+        profile.uses[name].calls for name in ("refine / projector", "score / projector"))
 
 
 def test_the_order_of_the_views_changes_nothing():

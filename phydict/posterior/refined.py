@@ -93,6 +93,11 @@ class Refinement:
         if self.calls < 0:
             raise ValueError(f"calls is a number of corrections, 0 or more, but {self.calls} was given")
 
+    @property
+    def corrections(self) -> int:
+        """How often the networks correct an estimate: one that is interpolated alone never."""
+        return self.calls if self.step else 0
+
     def __call__(self, measurement: Measurement, x: Tensor, network: Correction | None,
                  coarse: CoarseCorrection | None = None, refined: bool = False) -> Tensor:
         """The refined estimate of an interpolated one x (1, 1, X, Y, Z), by a network on these voxels and one on coarse
@@ -211,8 +216,10 @@ class Refined(Reconstructor):
                 measurement.model_variance = coarse.model_variance
                 measurement.reset_scatter(coarse.scatter > 0)
                 measurement.refit(x)
-                correction = coarse_correction(base, level, seen, coarse, report, display)
-                network = self._network(level) if coarse.masks is not None else None
+                corrections = self.refinement.corrections if coarse.masks is not None else 0
+                network = self._network(level) if corrections else None
+                others = corrections - 1 if network else corrections
+                correction = coarse_correction(base, level, seen, coarse, report, display) if others > 0 else None
                 x = self.refinement(measurement, x, network, correction, grid is not base.grid)
                 guard = Guard(measurement, on_step, 1)
                 guard()
@@ -221,7 +228,7 @@ class Refined(Reconstructor):
                 measurement.match_gain_offset(x)
                 found = guard.score(x, measurement.project(x), measurement.y)
             calls += measurement.calls
-            network_calls += self.refinement.calls if network else 0
+            network_calls += corrections if network else 0
             if correction is not None:
                 calls += correction.projector_calls
                 network_calls += correction.calls

@@ -98,6 +98,7 @@ def test_a_reconstruction_has_nested_intervals_where_its_refiner_knows_them(tmp_
     assert torch.equal(torch.stack(list(again.intervals.values())), widths)
     plain = reconstruct(views(), BEAM, tiny_refiner(), display=True)
     assert plain.intervals == {} and torch.equal(plain.volume, found.volume)
+    assert found.projector_calls - plain.projector_calls == 2  # the evidence at the result
 
 
 def test_on_finer_voxels_intervals_widen_by_a_share_of_what_the_refinement_changed():

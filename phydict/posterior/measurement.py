@@ -117,7 +117,11 @@ class Measurement:
 
         modelled: what `model_variance` says counts as noise.
         """
-        residual = (self.project(x) - self.y).flatten(1).norm(dim=1)
+        return self.normalised_error(self.project(x), modelled)
+
+    def normalised_error(self, projection: Tensor, modelled: bool = False) -> Tensor:
+        """The normalised residual of CTs whose projections (B, K, V, U) are known."""
+        residual = (projection - self.y).flatten(1).norm(dim=1)
         variance = self.noise_variance + (self.model_variance if modelled else 0.0)
         return (residual / variance.sum().clamp(min=1e-12).sqrt()).view(-1, 1, 1, 1, 1)
 

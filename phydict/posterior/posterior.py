@@ -195,7 +195,7 @@ class Posterior(Reconstructor):
             deviation = (prior.window.half_width * states[:, 0].std(0)).cpu() if self.samples > 1 else None
             volume, carried = self._told(measurement, ct[0, 0])
             say_contradictions(measurement)
-            intervals, widening = self._intervals(denoiser, measurement, ct)
+            intervals, widening = self._intervals(denoiser, measurement, reprojection)
         return Reconstruction(
             volume=volume, grid=prior.grid, method=self.name, seed=seed, **fit, seconds=watch.seconds,
             network_calls=denoiser.calls * (2 if report and self.guidance != 1 else 1),
@@ -214,14 +214,14 @@ class Posterior(Reconstructor):
         carried = replace(carried, extra=carried.extra.cpu())
         return volume + carried.on(self.prior.grid), carried
 
-    def _intervals(self, denoiser: CountingDenoiser, measurement: Measurement, ct: Tensor
+    def _intervals(self, denoiser: CountingDenoiser, measurement: Measurement, reprojection: Tensor
                    ) -> tuple[dict[float, Tensor], float]:
         """Level -> half-widths in HU (X, Y, Z), none where the network does not know them, and the factor by which they
         are wider than calibrated: where X-rays are missed by more than in any scene of the calibration, or hold
         scatter. Warns where they are missed by more than FAR_OUTSIDE as much."""
         if not isinstance(denoiser, CountingRefiner) or denoiser.half_widths is None:
             return {}, 1.0
-        residual, most = float(measurement.normalised_residual(ct)), float(self.prior.uncertainty.most_residual)
+        residual, most = float(measurement.normalised_error(reprojection)), float(self.prior.uncertainty.most_residual)
         if residual > FAR_OUTSIDE * most:
             warn(f"the X-rays are missed by {residual:.3g} times their noise, in the scenes that the intervals were "
                  f"calibrated on by {most:.3g} at most: they are widened, and may still be too narrow; check geometry "

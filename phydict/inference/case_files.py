@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import platform
-from importlib.metadata import version
 from pathlib import Path
 
 from torch import Tensor
 
 from phydict.datasets.radiographs.xray_description import save_geometry
 from phydict.evaluation import panel
+from phydict.evaluation.fid import Features, save_features
+from phydict.inference.results import FEATURES
 from phydict.page import write_case_files
 from phydict.reconstruction import Reconstruction, save_nifti
 
@@ -21,8 +21,9 @@ TISSUE = -500.0
 
 
 def write_result(folder: Path, case: dict, result: Reconstruction, method: str, truth: Tensor | None,
-                 keep_coarse: bool) -> None:
-    """Writes volumes, panel and what the page shows of a case; truth: HU (X, Y, Z) on the result's voxels."""
+                 keep_coarse: bool, features: Features | None = None) -> None:
+    """Writes volumes, panel, what the page shows of a case and the features of its slices; truth: HU (X, Y, Z) on the
+    result's voxels."""
     result.save_nifti(folder / "volume.nii.gz")
     if result.beam is not None:
         save_geometry(folder / "geometry_found.yaml", result.beam, case.get("description"))
@@ -39,6 +40,8 @@ def write_result(folder: Path, case: dict, result: Reconstruction, method: str, 
     volumes = {"reconstruction": result.volume, "truth": truth, label: uncertain}
     write_case_files(folder, result.grid, {k: v for k, v in volumes.items() if v is not None}, result.xrays,
                      result.reprojection)
+    if features:
+        save_features(folder / FEATURES, features)
 
 
 def body_interval(result: Reconstruction) -> float | None:
@@ -48,9 +51,3 @@ def body_interval(result: Reconstruction) -> float | None:
     lung = result.masks[0] > 0.5 if len(result.masks) else False
     inside = (result.volume > TISSUE) | lung
     return float(result.intervals[SHOWN_LEVEL][inside].mean()) if inside.any() else None
-
-
-def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that a result depends on."""
-    return {"python": platform.python_version()} | {
-        name: version(name) for name in ("phydict", "torch", "lightning", "monai", "torchmetrics", "numpy")}

@@ -16,35 +16,32 @@ from pathlib import Path
 
 import lightning
 from lightning.pytorch.utilities.exceptions import SIGTERMException
-from rich.console import Console
 from torch import Tensor
 
-from phydict.evaluation import CaseMetrics, Table
-from phydict.evaluation.fid import Features, PlaneFID, load_features, save_features
-from phydict.evaluation.tables import fid_table
+from phydict.evaluation import CaseMetrics
+from phydict.evaluation.fid import Features, PlaneFID
 from phydict.grid import Box, Grid
-from phydict.inference.case_files import body_interval, versions, write_result
-from phydict.inference.page import results_page
+from phydict.inference.calibration import uncertain_of
+from phydict.inference.case_files import write_result
 from phydict.inference.protocols import cut_out, placed, resampled, whole
-from phydict.inference.results import FEATURES, CaseResults
+from phydict.inference.record import cascade_settings, case_record, grid_settings, method_settings, prior_settings
+from phydict.inference.results import CaseResults
 from phydict.inference.scoring import Scoring
 from phydict.inference.settings import CascadeSettings, Sampling
+from phydict.inference.summary import summarise
 from phydict.methods import CHEST, METHODS, calibrated, default_method, fit_to_grid, onto_grid, reconstructor
 from phydict.page import check_own_page
 from phydict.poses import FoundPoses, PoseSearch
 from phydict.posterior import CascadePosterior, Refined, Sampler, Unrolled
-from phydict.prior import (
-    MedSynCheckpoint, PriorContract, file_read, find_prior, fingerprint, load_super_resolution)
-from phydict.reconstruction import Reconstruction, Reconstructor, describe
+from phydict.prior import MedSynCheckpoint, PriorContract, find_prior, load_super_resolution
+from phydict.reconstruction import Reconstruction, Reconstructor
 from phydict.runtime.console import TRACEBACK, check_apart, check_writable, noted, sentence
-from phydict.runtime.precision import instruction_set
-from phydict.runtime.profiling import CPU, peak_memory, profiled, stage
+from phydict.runtime.profiling import profiled, stage
 from phydict.runtime.progress import CaseProgress
 from phydict.runtime.seeds import case_seed, check_seed
 from phydict.runtime.telling import tell
 from phydict.runtime.warning import warn
 from phydict.units import HUWindow
-from phydict.xray.poses.uncertain import USUAL, Uncertain
 from phydict.xray.projectors.projector import METHODS as PROJECTORS
 
 PREDICTED_VOXELS = 128
@@ -92,21 +89,13 @@ class ReconstructionTask(lightning.LightningModule):
         self.projector = projector
         self.results = CaseResults(Path(out) / name, overwrite)
         check_writable(self.results.folder, "model.out")
-        self.settings = {"name": name, "seed": seed, "method": describe(method)}
-        if projector != "auto":
-            self.settings["projector"] = projector
+        self.settings = method_settings(name, seed, method, projector)
         self.window = HUWindow()
         prior = prior or (str(method.default_prior) if isinstance(method, Sampler) else None)
         self.prior = find_prior(prior) if isinstance(method, Sampler) else None
         if self.prior is not None:
             self.window = self.prior.window
-            own = isinstance(self.prior, PriorContract)
-            self.settings |= {"prior": self.prior.identity()} if own else _identity("prior", prior)
-            self.settings |= {"guidance": sampling.guidance}
-            if sampling.samples != 1:
-                self.settings["samples"] = sampling.samples
-            if sampling.precision != "auto":
-                self.settings["precision"] = sampling.precision
+            self.settings |= prior_settings(self.prior, prior, sampling)
         self.super_resolution = None
         if super_resolution.file:
             self.super_resolution = load_super_resolution(super_resolution.file)
@@ -115,8 +104,7 @@ class ReconstructionTask(lightning.LightningModule):
             method, self.prior, sampling.guidance, name, self.super_resolution, super_resolution.guided,
             super_resolution.sampler, super_resolution.noise_augmentation, sampling.samples, sampling.precision)
         if isinstance(self.plain, CascadePosterior):
-            self.settings |= _identity("super_resolution", super_resolution.file) | {
-                "sr_noise_augmentation": self.plain.level, "second": describe(self.plain.second)}
+            self.settings |= cascade_settings(super_resolution.file, self.plain)
         self._take(Box(grid) if isinstance(grid, int) else grid)
         self.metrics, self.scoring, self.slices = CaseMetrics([name]), Scoring(), None
         self.with_report = sampling.with_report
@@ -134,9 +122,7 @@ class ReconstructionTask(lightning.LightningModule):
         self.grid = box.grid()
         self.around = whole(self.grid)
         self.reconstructor = onto_grid(self.plain, self.grid)
-        self.settings["grid"] = self.grid.to_dict()
-        if isinstance(self.reconstructor, Refined):
-            self.settings["refinement"] = describe(self.reconstructor.refinement)
+        self.settings |= grid_settings(self.grid, self.reconstructor)
 
     def measure(self, scoring: Scoring) -> None:
         """Take these metrics in test."""
@@ -271,7 +257,7 @@ class ReconstructionTask(lightning.LightningModule):
         xrays, beam, display = case["xrays"].to(self.device), case["beam"], case.get("display", False)
         found: FoundPoses | None = None
         if self.calibrate:
-            xrays, found = calibrated(ready, ready.survey or self.grid, xrays, beam, _uncertain(case), display,
+            xrays, found = calibrated(ready, ready.survey or self.grid, xrays, beam, uncertain_of(case), display,
                                       self.progress.advance)
             beam = found.beam
         with stage("fit to grid"):
@@ -281,78 +267,12 @@ class ReconstructionTask(lightning.LightningModule):
 
     def _finish(self, case: dict, result: Reconstruction, scores: dict | None = None,
                 truth: Tensor | None = None, features: Features | None = None) -> None:
-        def write_files(folder: Path) -> None:
-            write_result(folder, case, result, self.method_name, truth, self.keep_coarse)
-            if features:
-                save_features(folder / FEATURES, features)
-
         with stage("write"):
-            self.results.write(case["id"], self._record(case, result, scores), write_files)
+            record = case_record(case, result, self.method_name, self.reconstructor, scores, self.settings, self.device)
+            self.results.write(case["id"], record, lambda folder: write_result(
+                folder, case, result, self.method_name, truth, self.keep_coarse, features))
         self.progress.finished(f"{sum(result.seconds.values()):.1f} s, misfit {result.misfit:.4f}")
-
-    def _record(self, case: dict, result: Reconstruction, scores: dict | None) -> dict:
-        """All that is known of a finished case, as plain JSON values; process_peak_memory_mb is in MiB."""
-        return {"case": case["id"], "method": self.method_name,
-                "citation": self.reconstructor.citation, "scores": scores, "misfit": result.misfit,
-                "misfit_per_view": result.misfit_per_view, "diverged_at": result.diverged_at, "scatter": result.scatter,
-                "interval_90_hu": body_interval(result), "interval_widening": result.interval_widening,
-                "seconds": result.seconds, "network_calls": result.network_calls,
-                "projector_calls": result.projector_calls,
-                "process_peak_memory_mb": peak_memory(CPU),
-                "mu_water": case.get("mu_water", self.reconstructor.mu_water), "views": len(result.xrays),
-                "precision": result.precision, "instruction_set": instruction_set(self.device),
-                "grid": result.grid.to_dict(), "seed": result.seed, **({"poses": result.poses} if result.poses else {}),
-                **({"carried": result.carried.record()} if result.carried else {}),
-                "warnings": case["warnings"], "report": case["report"], "source": case["source"],
-                "settings": self.settings, "versions": versions()}
 
     def summarise(self) -> None:
         """Prints and writes the scores of this run's cases. Raises ValueError, naming them, where some have failed."""
-        missing = self.results.missing()
-        finished = [case for case in self.cases if case not in missing]
-        tables = self.results.summarise(finished, self._further_tables(finished), self.trainer.datamodule.protocol,
-                                        self.scoring.empty)
-        console = Console()
-        console.width = max(console.width, 80 if console.is_terminal else 120)
-        for table in tables:
-            console.print(table)
-        print(f"results in {self.results.folder}")
-        if finished:
-            print(f"page: {results_page(self.results.folder.parent)}")
-        if missing:
-            raise ValueError(f"{len(missing)} of {len(self.cases)} cases were not reconstructed "
-                             f"({', '.join(missing)}): see the messages above, and run the same command again")
-
-    def _further_tables(self, cases: list[str]) -> list[Table]:
-        """The table of Frechet distances over finished cases, where they are measured."""
-        backbone = self.scoring.fid.backbone
-        if self.slices is None or not cases:
-            return []
-        features = {case: load_features(self.results.folder / case / FEATURES, backbone) for case in cases}
-        return [fid_table({self.method_name: features}, backbone, self.scoring.fid.replicates)]
-
-
-def _uncertain(case: dict) -> Uncertain:
-    """What a case's geometry file says not to know exactly; of simulated X-rays and, with a warning, of radiographs
-    whose tags are their geometry, what is usual.
-
-    Raises ValueError where a file of other measured ones does not say it.
-    """
-    if "description" not in case:
-        return USUAL
-    if case["uncertain"] is None:
-        raise ValueError(f"--calibrate needs to know what {case['description'].source} is not sure of: state "
-                         "`uncertain:` there, such as {detector_shift_mm: 5, rotation_degrees: 2}, or leave "
-                         "--calibrate out")
-    if case["description"].uncertain is None:
-        stated = ", ".join(f"{name}: {value:g}" for name, value in vars(case["uncertain"]).items() if value)
-        warn(f"the tags do not say how exactly source and detector stood: taken is what is usual where a patient turns "
-             f"by hand ({stated}); state `uncertain:` in {case['description'].source.name} for other values")
-    return case["uncertain"]
-
-
-def _identity(role: str, prior: str | MedSynCheckpoint) -> dict:
-    """What a record holds of a prior: its name, CRC-32 and, where it was chosen from a folder of MedSyn's, its file."""
-    file = file_read(prior)
-    return {role: Path(prior).name if isinstance(prior, str) else describe(prior),
-            f"{role}_crc32": fingerprint(prior)} | ({f"{role}_file": file} if file else {})
+        summarise(self.results, self.cases, self.method_name, self.scoring, self.trainer.datamodule.protocol)

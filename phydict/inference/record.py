@@ -1,0 +1,77 @@
+"""What is written of a finished case: the settings that decide its result, and what is known of it."""
+
+from __future__ import annotations
+
+import platform
+from importlib.metadata import version
+from pathlib import Path
+
+import torch
+
+from phydict.grid import Grid
+from phydict.inference.case_files import body_interval
+from phydict.inference.settings import Sampling
+from phydict.posterior import CascadePosterior, Refined, Sampler
+from phydict.prior import MedSynCheckpoint, Prior, PriorContract, Refiner, file_read, fingerprint
+from phydict.reconstruction import Reconstruction, Reconstructor, describe
+from phydict.runtime.precision import instruction_set
+from phydict.runtime.profiling import CPU, peak_memory
+
+
+def method_settings(name: str, seed: int, method: Sampler | Reconstructor, projector: str) -> dict:
+    """Those of a method, and of the projector where one is chosen."""
+    return {"name": name, "seed": seed, "method": describe(method)} | (
+        {"projector": projector} if projector != "auto" else {})
+
+
+def prior_settings(prior: Prior | Refiner | PriorContract, given: str | MedSynCheckpoint | PriorContract,
+                   sampling: Sampling) -> dict:
+    """Those of a prior, given as an object or by its file, and of how it is sampled."""
+    settings = {"prior": prior.identity()} if isinstance(prior, PriorContract) else _identity("prior", given)
+    settings["guidance"] = sampling.guidance
+    if sampling.samples != 1:
+        settings["samples"] = sampling.samples
+    if sampling.precision != "auto":
+        settings["precision"] = sampling.precision
+    return settings
+
+
+def cascade_settings(file: str | MedSynCheckpoint, cascade: CascadePosterior) -> dict:
+    """Those of a second stage, given by its file."""
+    return _identity("super_resolution", file) | {
+        "sr_noise_augmentation": cascade.level, "second": describe(cascade.second)}
+
+
+def grid_settings(grid: Grid, method: Reconstructor) -> dict:
+    """Those of voxels that were chosen, and of the refinement to them."""
+    return {"grid": grid.to_dict()} | (
+        {"refinement": describe(method.refinement)} if isinstance(method, Refined) else {})
+
+
+def case_record(case: dict, result: Reconstruction, name: str, method: Reconstructor, scores: dict | None,
+                settings: dict, device: torch.device) -> dict:
+    """All that is known of a finished case, as plain JSON values; process_peak_memory_mb is in MiB."""
+    return {"case": case["id"], "method": name, "citation": method.citation, "scores": scores,
+            "misfit": result.misfit, "misfit_per_view": result.misfit_per_view, "diverged_at": result.diverged_at,
+            "scatter": result.scatter, "interval_90_hu": body_interval(result),
+            "interval_widening": result.interval_widening, "seconds": result.seconds,
+            "network_calls": result.network_calls, "projector_calls": result.projector_calls,
+            "process_peak_memory_mb": peak_memory(CPU), "mu_water": case.get("mu_water", method.mu_water),
+            "views": len(result.xrays), "precision": result.precision, "instruction_set": instruction_set(device),
+            "grid": result.grid.to_dict(), "seed": result.seed, **({"poses": result.poses} if result.poses else {}),
+            **({"carried": result.carried.record()} if result.carried else {}), "warnings": case["warnings"],
+            "report": case["report"], "source": case["source"], "settings": settings, "versions": versions()}
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that a result depends on."""
+    return {"python": platform.python_version()} | {
+        name: version(name) for name in ("phydict", "torch", "lightning", "monai", "torchmetrics", "numpy")}
+
+
+def _identity(role: str, file: str | MedSynCheckpoint) -> dict:
+    """What a record holds of a prior's or a stage's file: its name, CRC-32 and, where it was chosen from a folder of
+    MedSyn's, which."""
+    read = file_read(file)
+    return {role: Path(file).name if isinstance(file, str) else describe(file),
+            f"{role}_crc32": fingerprint(file)} | ({f"{role}_file": read} if read else {})

@@ -1,0 +1,39 @@
+"""What a run ends with: the tables of its finished cases, their page, and the names of those that have failed."""
+
+from __future__ import annotations
+
+from rich.console import Console
+
+from phydict.evaluation import Table
+from phydict.evaluation.fid import load_features
+from phydict.evaluation.tables import fid_table
+from phydict.inference.page import results_page
+from phydict.inference.protocols import Protocol
+from phydict.inference.results import FEATURES, CaseResults
+from phydict.inference.scoring import Scoring
+
+
+def summarise(results: CaseResults, cases: list[str], name: str, scoring: Scoring, protocol: Protocol | None) -> None:
+    """Prints and writes the scores of a run's cases by a method of this name. Raises ValueError, naming them, where
+    some have failed."""
+    missing = results.missing()
+    finished = [case for case in cases if case not in missing]
+    console = Console()
+    console.width = max(console.width, 80 if console.is_terminal else 120)
+    for table in results.summarise(finished, _distances(results, finished, name, scoring), protocol, scoring.empty):
+        console.print(table)
+    print(f"results in {results.folder}")
+    if finished:
+        print(f"page: {results_page(results.folder.parent)}")
+    if missing:
+        raise ValueError(f"{len(missing)} of {len(cases)} cases were not reconstructed "
+                         f"({', '.join(missing)}): see the messages above, and run the same command again")
+
+
+def _distances(results: CaseResults, cases: list[str], name: str, scoring: Scoring) -> list[Table]:
+    """The table of Frechet distances over finished cases, where they are measured."""
+    if scoring.network is None or not cases:
+        return []
+    backbone = scoring.fid.backbone
+    features = {case: load_features(results.folder / case / FEATURES, backbone) for case in cases}
+    return [fid_table({name: features}, backbone, scoring.fid.replicates)]

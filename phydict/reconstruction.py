@@ -7,6 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
+from typing import Any, Self
 
 import numpy as np
 from torch import Tensor
@@ -136,6 +137,37 @@ class Reconstructor(ABC):
     @abstractmethod
     def steps(self) -> int:
         """How often `reconstruct` calls on_step."""
+
+
+class Delegating(Reconstructor):
+    """A method that reconstructs on the voxels `target` by another one, its `base`, whose name, needs and citation are
+    its own. Both are fields of a subclass, a frozen dataclass."""
+
+    base: Any
+    target: Grid
+
+    @property
+    def grid(self) -> Grid:
+        return self.target
+
+    @property
+    def full_detector(self) -> bool:  # type: ignore[override]
+        return self.base.full_detector
+
+    @property
+    def citation(self) -> str:  # type: ignore[override]
+        return self.base.citation
+
+    @property
+    def mu_water(self) -> float:  # type: ignore[override]
+        return self.base.mu_water
+
+    @property
+    def name(self) -> str:
+        return self.base.name
+
+    def with_mu_water(self, mu_water: float) -> Self:
+        return replace(self, base=self.base.with_mu_water(mu_water))  # type: ignore[type-var]
 
 
 def describe(settings) -> dict:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from phydict.baselines.baseline import Baseline
 from phydict.grid import Grid
-from phydict.reconstruction import Reconstruction, Reconstructor
+from phydict.reconstruction import Delegating, Reconstruction
 from phydict.runtime.profiling import Stopwatch
 from phydict.units import hu_to_mu
 from phydict.xray import Projector
@@ -19,7 +19,7 @@ from phydict.xray.calibration import match_views
 
 
 @dataclass(frozen=True)
-class Region(Reconstructor):
+class Region(Delegating):
     """A baseline on a box that holds a part of the patient alone.
 
     It first reconstructs the coarse `outer` box. The line integrals of what that shows outside the region are
@@ -27,44 +27,21 @@ class Region(Reconstructor):
     Physics 35(4)), unless the method is local. Display values are matched to the coarse volume.
 
     Args:
-        method: the baseline
-        region: the voxels of the result
+        base: the baseline
+        target: the voxels of the result
         outer: those of the coarse reconstruction, which hold all that the rays meet
     """
 
-    method: Baseline
-    region: Grid
+    base: Baseline
+    target: Grid
     outer: Grid
-
-    @property
-    def grid(self) -> Grid:
-        return self.region
 
     @property
     def survey(self) -> Grid:
         return self.outer
 
-    @property
-    def full_detector(self) -> bool:  # type: ignore[override]
-        return self.method.full_detector
-
-    @property
-    def citation(self) -> str:  # type: ignore[override]
-        return self.method.citation
-
-    @property
-    def mu_water(self) -> float:  # type: ignore[override]
-        return self.method.mu_water
-
-    @property
-    def name(self) -> str:
-        return self.method.name
-
-    def with_mu_water(self, mu_water: float) -> Region:
-        return replace(self, method=self.method.with_mu_water(mu_water))  # type: ignore[arg-type]
-
     def steps(self) -> int:
-        return 2 * self.method.steps()
+        return 2 * self.base.steps()
 
     @torch.no_grad()
     def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,
@@ -72,13 +49,13 @@ class Region(Reconstructor):
         watch = Stopwatch()
         with watch.stage("base"):
             seen = seen_by(self.outer, xrays, projector.beam, self.full_detector, projector.method)
-            coarse = self.method.reconstruct(*seen, report, display, seed, on_step)
+            coarse = self.base.reconstruct(*seen, report, display, seed, on_step)
         with watch.stage("outside"):
             mu = hu_to_mu(coarse.volume.to(xrays), self.mu_water)
             if display:
                 whole = Projector(self.outer, projector.beam, projector.method, device=xrays.device, full_detector=True)
                 xrays = match_views(xrays[None], whole(mu[None, None]))[0]
             outside = outside_projection(mu, self.outer, projector)
-        found = self.method.reconstruct(xrays, projector, report, False, seed, on_step, outside)
+        found = self.base.reconstruct(xrays, projector, report, False, seed, on_step, outside)
         return replace(found, coarse=coarse, seconds=watch.seconds | found.seconds,
                        projector_calls=coarse.projector_calls + found.projector_calls)

@@ -15,7 +15,7 @@ from phydict.posterior.coarse_correction import CoarseCorrection, coarse_correct
 from phydict.posterior.evidence import Evidence
 from phydict.posterior.likelihood.likelihood import LikelihoodStep, ProximalCG
 from phydict.posterior.measurement import Measurement
-from phydict.reconstruction import Reconstruction, Reconstructor
+from phydict.reconstruction import Delegating, Reconstruction, Reconstructor
 from phydict.runtime.profiling import Stopwatch, stage
 from phydict.units import HUWindow, hu_to_mu
 from phydict.xray import Projector
@@ -122,7 +122,7 @@ class Refinement:
 
 
 @dataclass(frozen=True)
-class Refined(Reconstructor):
+class Refined(Delegating):
     """`base` on its own voxels, then a refinement on finer ones, each time half as long, up to the target's.
 
     At each level the estimate so far is interpolated trilinearly onto the finer voxels and is then where the
@@ -153,28 +153,8 @@ class Refined(Reconstructor):
         refinements(self.base.grid, self.target)
 
     @property
-    def grid(self) -> Grid:
-        return self.target
-
-    @property
     def survey(self) -> Grid:
         return self.base.grid
-
-    @property
-    def full_detector(self) -> bool:
-        return self.base.full_detector
-
-    @property
-    def citation(self) -> str:
-        return self.base.citation
-
-    @property
-    def mu_water(self) -> float:
-        return self.base.mu_water
-
-    @property
-    def name(self) -> str:
-        return self.base.name
 
     @property
     def levels(self) -> list[Grid]:
@@ -188,9 +168,6 @@ class Refined(Reconstructor):
 
     def _network(self, level: Grid) -> Correction | None:
         return self.network if self.network and self.network.suits(level, self.base.window) else None
-
-    def with_mu_water(self, mu_water: float) -> Refined:
-        return replace(self, base=self.base.with_mu_water(mu_water))
 
     def steps(self) -> int:
         return self.base.steps() + len(self.levels)

@@ -8,7 +8,7 @@ import torch
 from laws import random_like
 from prior.tiny import tiny_prior, tiny_super_resolution
 
-from phydict.baselines import CGLS, FISTATV, SIRT, Region
+from phydict.baselines import CGLS, FDK, FISTATV, SIRT, Region
 from phydict.grid import Grid
 from phydict.methods import fit_to_grid, onto_grid, reconstruct, reconstructor
 from phydict.posterior import Measurement, PriorOnly, ProximalCG, Refined, Refinement
@@ -218,6 +218,16 @@ def test_a_trained_stage_comes_before_the_refinement(xrays):
     assert onto_grid(ready.base, Grid.cube(32)) is ready.base
     found = ready.reconstruct(*fit_to_grid(ready, FINE, xrays, BEAM))
     assert found.coarse.volume.shape == (32,) * 3 and found.misfit < found.coarse.misfit
+
+
+@pytest.mark.parametrize("ready", [
+    Region(FDK(name="mine"), Grid.cube(24), FINE), Refined(reconstructor(PriorOnly(2), tiny_prior(False)), FINE)],
+    ids=lambda ready: type(ready).__name__)
+def test_a_method_that_works_by_another_one_is_asked_what_that_is_asked(ready):
+    told, base = ready.with_mu_water(0.016), ready.base
+    assert told == replace(ready, base=base.with_mu_water(0.016)) and told.mu_water == 0.016 != ready.mu_water
+    assert (told.name, told.citation, told.full_detector) == (base.name, base.citation, base.full_detector)
+    assert told.grid is ready.target and base.citation
 
 
 def test_the_attenuation_of_water_reaches_every_level(xrays):

@@ -119,8 +119,8 @@ def method_panel(path: str | Path, volumes: Mapping[str, object], truth_hu, grid
 
 
 def _page(width: float, upper: float, lower: float, title: str):
-    """A figure of `width` inches with a title strip and two subfigures of the given heights (the lower may be None)."""
-    strip = 0.45
+    """A figure of `width` inches with a strip for a title and subfigures of these heights (the lower may be None)."""
+    strip = 0.45 if title else 0.05
     figure = Figure(figsize=(width, strip + upper + lower), dpi=110, facecolor="white")
     FigureCanvasAgg(figure)
     heights = [strip, upper] + ([lower] if lower else [])

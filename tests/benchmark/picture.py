@@ -1,56 +1,72 @@
-"""The README's picture: a real CT and what four methods make of eight simulated X-rays of it.
+"""Pictures of a CT beside what phydict_learned and total variation make of eight and two X-rays of it.
 
-    python tests/benchmark/picture.py <CT>
+    python tests/benchmark/picture.py <CT> [128 or 256]
 
-Runs `infer.py test` once per preset; writes data/pictures/real_ct.png. Where LPIPS' trained backbone is not on the
-machine, phydict_paper runs with LPIPS weight 0 and is named so.
+X-rays are made of 256^3 voxels, 0.5 % noise. Writes data/pictures/grid_<voxels>.jpg: the CT, phydict_learned on these
+voxels and on 64^3, and, for 128, total variation; and, for 128, the README's real_ct.jpg, without 64^3.
 """
 
-import subprocess
-import sys
-import tempfile
+from __future__ import annotations
+
+import argparse
 from pathlib import Path
 
-import nibabel
+from torch import Tensor
+from torch.nn.functional import avg_pool3d
 
-from phydict import HUWindow
+from phydict import METHODS, Grid, HUWindow, Projector, reconstruct
+from phydict.baselines import FISTATV
 from phydict.datasets import find_cts, prepare_ct
-from phydict.evaluation import method_panel, read_csv
-from phydict.grid import Grid
-from phydict.posterior.likelihood.reward import load_lpips
+from phydict.evaluation import method_panel, volume_metrics
+from phydict.xray import Ideal
+from phydict.xray.binning import benchmark_orbit
 
-ROOT = Path(__file__).parents[2]
-WITHOUT_LPIPS = ("--model.method.init_args.likelihood.init_args.reward.lpips", "0",
-                 "--model.name", "phydict_paper (LPIPS 0)")
-
-
-def presets() -> dict[str, tuple[str, ...]]:
-    """Preset name -> extra arguments."""
-    try:
-        load_lpips("vgg", False)
-        paper = ()
-    except FileNotFoundError as error:
-        print(error)
-        paper = WITHOUT_LPIPS
-    return {"phydict_fast": (), "tv": (), "sirt": (), "phydict_paper": paper}
+PICTURES = Path(__file__).parents[2] / "data" / "pictures"
+WINDOW, FINEST = HUWindow(), Grid.cube(256)
+COARSE = "64^3"
 
 
-def picture(ct: str, out: Path, rows: list[dict]) -> None:
-    """The CT and its reconstructions by all methods, with their scores."""
-    case, grid = find_cts(ct)[0], Grid.cube(64)
-    truth = HUWindow().to_hu(prepare_ct(case.path, grid)["volume"][0])
-    volumes = {row["method"]: nibabel.load(out / row["method"] / case.id / "volume.nii.gz").get_fdata() for row in rows}
-    captions = {row["method"]: f"{row['psnr']:.1f} dB, SSIM {row['ssim']:.2f}, {row['seconds']:.1f} s" for row in rows}
-    method_panel(ROOT / "data" / "pictures" / "real_ct.png", volumes, truth, grid, captions)
+def seen(volume: Tensor, views: int) -> Tensor:
+    """X-rays (K, V, U) of a CT (1, X, Y, Z) on FINEST, in the prior's range."""
+    projector = Projector(FINEST, benchmark_orbit(FINEST, views), full_detector=True)
+    return Ideal()(projector, WINDOW.to_mu(volume)[None], 0)[0]
+
+
+def on(volume: Tensor, voxels: int) -> Tensor:
+    """A cube (X, Y, Z) in finer voxels, its own repeated."""
+    for axis in range(3):
+        volume = volume.repeat_interleave(voxels // volume.shape[axis], axis)
+    return volume
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("ct", type=Path)
+    parser.add_argument("voxels", type=int, nargs="?", default=128, choices=(128, 256))
+    given = parser.parse_args()
+    grid = Grid.cube(given.voxels)
+    source = prepare_ct(find_cts(given.ct)[0].path, FINEST, WINDOW)["volume"]
+    truth = WINDOW.to_hu(avg_pool3d(source, FINEST.shape[0] // given.voxels))[0]
+    tried = {"phydict_learned": ("phydict_learned", given.voxels),
+             f"phydict_learned, {COARSE}": ("phydict_learned", 64)}
+    if given.voxels == 128:
+        tried["tv"] = (FISTATV(iterations=200, weight=2 * METHODS["tv"].weight), given.voxels)
+    volumes, captions = {}, {}
+    for views in (8, 2):
+        xrays, beam = seen(source, views), benchmark_orbit(FINEST, views)
+        for name, (method, voxels) in tried.items():
+            found = reconstruct(xrays, beam, method=method, grid=Grid.cube(voxels)).volume
+            label = f"{name}, {views} views"
+            volumes[label] = on(found, given.voxels)
+            scores = volume_metrics(volumes[label][None, None], truth[None, None])
+            captions[label] = f"{scores['psnr']:.1f} dB, SSIM {scores['ssim']:.2f}"
+            print(label, captions[label], flush=True)
+    method_panel(PICTURES / f"grid_{given.voxels}.jpg", volumes, truth, grid, captions)
+    if given.voxels == 128:
+        shown = [label for label in volumes if COARSE not in label]
+        method_panel(PICTURES / "real_ct.jpg", {label: volumes[label] for label in shown}, truth, grid,
+                     {label: captions[label] for label in shown})
 
 
 if __name__ == "__main__":
-    if len(sys.argv) != 2:
-        raise SystemExit("give a CT: python tests/benchmark/picture.py <CT>")
-    rows = []
-    with tempfile.TemporaryDirectory() as out:
-        for preset, extra in presets().items():
-            subprocess.run([sys.executable, "infer.py", "test", "--model.method", preset,
-                            "--data.cts", sys.argv[1], "--model.out", out, *extra], cwd=ROOT, check=True)
-            rows += read_csv(Path(out) / (WITHOUT_LPIPS[-1] if extra else preset) / "results.csv")
-        picture(sys.argv[1], Path(out), rows)
+    main()

@@ -41,7 +41,7 @@ class Unrolled(Sampler):
     Where the first step misses a view, beyond its noise, by more than `contradiction`, as with wrong poses,
     a flipped view, a gain that drifts or a patient who moves, no volume explains it: the excess counts from then on as
     noise of that view (`Measurement.model_variance`), so that volumes follow it less and the prior and the other views
-    more.
+    more. Where scatter is sought, of which the first step knows little, the second tells that.
 
     Where a ProximalCG at the end misses the X-rays by more than their noise, as it does a tube's spectrum, the excess
     is model error, which counts as noise (Morozov 1966): the step is repeated with its total variation weighted by the
@@ -105,7 +105,7 @@ class Unrolled(Sampler):
         on_step()
         for n, t in enumerate(self.times):
             channels = evidence(z[:, :1], before[:, :1], start[:, :1])
-            if n == 0 and self.contradiction is not None:
+            if n == int(measurement.scatter_enabled) and self.contradiction is not None:
                 voxel = measurement.slope * max(measurement.projector.grid.spacing)
                 usual = self.contradiction * voxel * max(1.0, measurement.projector.beam.views / FEW_VIEWS) ** 0.5
                 excess = measurement.view_errors(measurement.last_projection).square() - usual**2

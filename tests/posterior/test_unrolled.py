@@ -7,6 +7,7 @@ import pytest
 import torch
 from prior.tiny import tiny_prior, tiny_refiner, tiny_super_resolution
 
+from phydict.datasets import Thorax, build
 from phydict.diffusion import CosineSchedule, renoise
 from phydict.grid import Grid
 from phydict.guard import one_material
@@ -15,8 +16,8 @@ from phydict.posterior import Measurement, Posterior, PriorOnly, ProximalCG, Spl
 from phydict.posterior.discretisation import subgrid_projection
 from phydict.posterior.evidence import CHANGE_SCALE, COVERAGE_SCALE, RESIDUAL_SCALE, Evidence
 from phydict.prior import Prior, Refiner, load_prior, save_prior, save_refiner
-from phydict.units import HUWindow
-from phydict.xray import ConeBeam, Projector
+from phydict.units import HUWindow, hu_to_mu
+from phydict.xray import ConeBeam, Polychromatic, Projector
 from phydict.xray.finer import FinerProjector
 
 GRID, WINDOW = Grid.cube(16), HUWindow(-1000, 600)
@@ -155,6 +156,14 @@ def test_a_view_that_contradicts_the_others_counts_less_and_x_rays_that_agree_co
                 assert m.model_variance == 0.0
     assert error[0.0, Unrolled.contradiction] == error[0.0, None]
     assert error[2.0, Unrolled.contradiction] < 0.5 * error[2.0, None]
+
+
+def test_scatter_that_the_first_step_knows_little_of_contradicts_nothing():
+    grid, simulator, beam = Grid.cube(64), Polychromatic(scatter=0.06), ConeBeam.orbit(4, 1020, 740, (112, 112), 5.0)
+    mu = hu_to_mu(torch.from_numpy(build(Thorax.standard(), grid)[0]).float())
+    xrays = simulator(Projector(grid, beam, full_detector=True), mu[None, None], 1)[0]
+    found = reconstruct(xrays, beam, mu_water=simulator.effective_mu_water)
+    assert found.scatter > 0.1 and found.model_variance == 0.0
 
 
 def test_what_no_volume_explains_is_said_and_not_where_nothing_counts_as_such():

@@ -322,7 +322,7 @@ def attempt(name: str, method: str, make: Callable[[], Case], prior: Prior) -> d
 
 
 def table(rows: list[dict]) -> str:
-    """The default's rows as Markdown, SIRT's PSNR beside its own; of what is said, the first clauses."""
+    """Rows of phydict_fast as Markdown, SIRT's PSNR beside its own; of what is said, the first clauses."""
     sirt = {row["case"]: row.get("psnr") for row in rows if row["method"] == "sirt"}
     scenes = {row["case"] for row in rows if row["method"] == "tv"} - sirt.keys()
     lines = ["| case | PSNR (dB) | SIRT's | MAE (HU) | misfit | worst view's | what is said |",
@@ -338,7 +338,7 @@ def table(rows: list[dict]) -> str:
 
 
 def scenes_table(rows: list[dict]) -> str:
-    """Rows of THREE as Markdown: each method's PSNR, what the default's interval holds, and what each says."""
+    """Rows of THREE as Markdown: each method's PSNR, what the first one's interval holds, and what each says."""
     lines = ["| case | PSNR (dB): learned | fast | tv | inside 90 % | widened by | what learned says | fast and tv |",
              "|---|---:|---:|---:|---:|---:|---|---|"]
     known = {(row["case"], row["method"]): row for row in rows}

@@ -45,7 +45,7 @@ from phydict.units import HUWindow
 from phydict.xray.projectors.projector import METHODS as PROJECTORS
 
 PREDICTED_VOXELS = 128
-"""Along each side of 384 mm, of what phydict_learned predicts: two to three times the seconds of its network's 64."""
+"""Along each side of 384 mm, of what phydict_learned predicts: about three times the seconds of its network's 64."""
 
 
 class ReconstructionTask(lightning.LightningModule):

@@ -87,7 +87,7 @@ def poses() -> str:
     columns = ("psnr_correct", "psnr_wrong", "psnr_calibrated", "reprojection_mm_before", "reprojection_mm")
     return table("errors | K | CTs | right geometry | wrong | calibrated | mm before | mm after", (
         (kind, int(views), len(own), *(f"{mean(values(own, column)):.1f}" for column in columns))
-        for (kind, views), own in scenes(rows_of("poses.csv"), "errors", "views")))
+        for (kind, views), own in scenes(rows_of("poses.csv", method="phydict_learned"), "errors", "views")))
 
 
 def radiographs() -> str:

@@ -93,10 +93,11 @@ class Refinement:
         if self.calls < 0:
             raise ValueError(f"calls is a number of corrections, 0 or more, but {self.calls} was given")
 
-    @property
-    def corrections(self) -> int:
-        """How often the networks correct an estimate: one that is interpolated alone never."""
-        return self.calls if self.step else 0
+    def corrections(self, network: bool) -> tuple[int, int]:
+        """How often a network on the voxels, if there is one, and one on coarse ones correct an estimate: what is
+        interpolated alone never."""
+        calls = self.calls if self.step else 0
+        return (calls, max(calls - 1, 0)) if network else (0, calls)
 
     def __call__(self, measurement: Measurement, x: Tensor, network: Correction | None,
                  coarse: CoarseCorrection | None = None, refined: bool = False) -> Tensor:
@@ -193,10 +194,9 @@ class Refined(Delegating):
                 measurement.model_variance = coarse.model_variance
                 measurement.reset_scatter(coarse.scatter > 0)
                 measurement.refit(x)
-                corrections = self.refinement.corrections if coarse.masks is not None else 0
-                network = self._network(level) if corrections else None
-                others = corrections - 1 if network else corrections
-                correction = coarse_correction(base, level, seen, coarse, report, display) if others > 0 else None
+                network = self._network(level) if coarse.masks is not None else None
+                own, others = self.refinement.corrections(network is not None) if coarse.masks is not None else (0, 0)
+                correction = coarse_correction(base, level, seen, coarse, report, display) if others else None
                 x = self.refinement(measurement, x, network, correction, grid is not base.grid)
                 guard = Guard(measurement, on_step, 1)
                 guard()
@@ -205,7 +205,7 @@ class Refined(Delegating):
                 measurement.match_gain_offset(x)
                 found = guard.score(x, measurement.project(x), measurement.y)
             calls += measurement.calls
-            network_calls += corrections if network else 0
+            network_calls += own
             if correction is not None:
                 calls += correction.projector_calls
                 network_calls += correction.calls

@@ -11,7 +11,7 @@ convolution of the temporal layers reads tokens that lie in the order (row, colu
 
 from __future__ import annotations
 
-import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -140,7 +140,7 @@ class PositionBias(nn.Module):
 
 
 class Codebook(nn.Module):
-    """The codes that tokens are replaced by, unit vectors (1, codes, width)."""
+    """The codes that tokens are replaced by (1, codes, width), moving means of unit vectors and so shorter than 1."""
 
     embed: Tensor
 
@@ -158,7 +158,8 @@ class Quantiser(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         codes = self._codebook.embed[0]
-        nearest = [(normalize(part, dim=-1) @ codes.T).argmax(-1) for part in x.flatten(0, -2).split(4096)]
+        directions = normalize(codes, dim=-1).T
+        nearest = [(normalize(part, dim=-1) @ directions).argmax(-1) for part in x.flatten(0, -2).split(4096)]
         return codes[torch.cat(nearest)].view(*x.shape[:-1], -1)
 
 
@@ -209,10 +210,11 @@ class CTCLIP(nn.Module):
 
     @torch.no_grad()
     def text(self, report: str) -> Tensor:
-        """The unit latent (1, latent) of a report, cut at 512 words."""
+        """The unit latent (1, latent) of a report, worded by `plain` and cut at 512 words."""
         if self.text_transformer is None:
             raise ValueError("CT-CLIP was read without its text tower: give clip.text")
-        words = self.tokenizer(report, return_tensors="pt", padding="max_length", truncation=True, max_length=512)
+        words = self.tokenizer(plain(report), return_tensors="pt", padding="max_length", truncation=True,
+                               max_length=512)
         words = words.to(self.to_text_latent.weight.device)
         first = self.text_transformer(**words).last_hidden_state[:, 0]
         return normalize(self.to_text_latent(first), dim=-1)
@@ -243,17 +245,22 @@ def load_ct_clip(file: str | Path, text: str | Path | None = None, towers: Tower
     return model.eval().requires_grad_(False)
 
 
-def prepared(hu: Tensor, grid: Grid, towers: Towers = Towers()) -> Tensor:
-    """A volume (X, Y, Z) in HU, RAS+, as CT-CLIP reads it: (1, 1, frames, side, side) in [-1, 1].
+def plain(report: str) -> str:
+    """A report as CT-CLIP's inference reads it: findings, then impression, without headings, quotes and brackets."""
+    return re.sub("[\"'()]", "", re.sub(r"(^Findings|(^| )Impression): ", " ", report)).strip()
 
-    Axes to left, posterior, superior; 0.75 x 0.75 x 1.5 mm by linear interpolation; clipped to [-1000, 1000] HU; cut or
-    padded with air about the middle; slices first.
+
+def prepared(hu: Tensor, grid: Grid, towers: Towers = Towers()) -> Tensor:
+    """A volume (X, Y, Z) in HU, RAS+, as CT-CLIP's inference reads it: (1, 1, frames, side, side) in [-1, 1].
+
+    Axes to left, posterior, superior; clipped to [-1000, 1000] HU; 0.75 x 0.75 x 1.5 mm by linear interpolation; cut or
+    padded with air about the middle, an odd voxel at the far end; slices first.
     """
-    sizes = [max(1, int(n * mm / step)) for n, mm, step in zip(grid.shape, grid.spacing, (0.75, 0.75, 1.5))]
-    volume = interpolate(hu.float().flip(0, 1)[None, None], sizes, mode="trilinear").clamp(-1000, 1000) / 1000
+    sizes = [max(1, int(n * (mm / step))) for n, mm, step in zip(grid.shape, grid.spacing, (0.75, 0.75, 1.5))]
+    volume = interpolate(hu.float().clamp(-1000, 1000).flip(0, 1)[None, None], sizes, mode="trilinear") / 1000
     margins: list[int] = []
     for have, want in zip(sizes[::-1], (towers.frames, towers.side, towers.side)):
-        before = math.floor((want - have) / 2)
+        before = int((want - have) / 2)
         margins += [before, want - have - before]
     return pad(volume, margins, value=-1.0).permute(0, 1, 4, 2, 3)
 

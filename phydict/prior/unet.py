@@ -99,8 +99,14 @@ class VolumeUNet(nn.Module):
         self.run_with()
 
     def draw_kinds(self, kinds: Sequence[str]) -> None:
-        """A new, untaught map of what reports say, which changes nothing yet: a KindMap, or without kinds a TextMap."""
+        """A new, untaught map of what reports say: a KindMap, or without kinds a TextMap.
+
+        What the network makes of a map stays where it had one of the same kinds; else the new one changes nothing yet.
+        """
+        same = bool(kinds) and self.settings.get("kinds") == list(kinds)
         self.text_map = KindMap(self.context_dim, kinds) if kinds else TextMap(self.context_dim)
+        if same:
+            return
         self.hint = nn.Conv3d(self.text_map.channels, self.settings["channels"][0], 1)
         nn.init.zeros_(self.hint.weight)
         nn.init.zeros_(self.hint.bias)

@@ -39,7 +39,7 @@ class TextSettings:
     reports: list[str] | None = None
     texts: str | None = None
     dropout: float = 0.1
-    pretrain_steps: int = 1000
+    pretrain_steps: int = 2000
     frozen: bool = True
     renew: bool = False
 

@@ -44,6 +44,15 @@ def test_an_untaught_map_changes_nothing_and_learns():
     assert net.hint.weight.grad.abs().max() > 0 and net.hint.weight.shape[1] == len(KINDS)
 
 
+def test_what_a_network_makes_of_a_kinds_map_stays_with_a_new_map_of_the_same_kinds(prior):
+    network, used = prior.network, prior.network.hint.weight.clone()
+    before = network.text_map
+    network.draw_kinds(KINDS)
+    assert network.text_map is not before and torch.equal(network.hint.weight, used)
+    network.draw_kinds((*KINDS[:2], "emphysema"))
+    assert not network.hint.weight.any()
+
+
 @pytest.fixture
 def prior():
     made = tiny_prior()

@@ -9,7 +9,8 @@ import torch
 
 from phydict.datasets.phantoms.findings import KINDS
 from phydict.datasets.phantoms.places import examples, extents
-from phydict.datasets.prose import naming_words
+from phydict.datasets.phantoms.teaching import teaching_sentences
+from phydict.datasets.prose import naming_words, written_words
 from phydict.grid import Grid
 from phydict.prior import Prior, TextEncoder, VolumeUNet, learn_vocabulary
 from phydict.training.reports import Disguise, Targets, learn_sentences
@@ -87,6 +88,21 @@ def test_learning_replays_from_its_seed_and_leaves_what_rests_at_rest():
     assert run() == run()
 
 
+def test_a_short_lesson_of_written_sentences_teaches_the_side_of_what_others_state():
+    torch.manual_seed(0)
+    text = TextEncoder.small(learn_vocabulary([*written_words(), *STRANGE]), 64, 2, 64, sentences=8)
+    taught = Prior(VolumeUNet(4, 2, (16, 16), (False, True), 1, 8, 64, KINDS), Grid.cube(16, 384.0), HUWindow(), text)
+    learn_sentences(taught, teaching_sentences(8_000, 1), 250, words=STRANGE)
+    found, right = examples(), []
+    with torch.no_grad():
+        for sentence, stated in teaching_sentences(600, 2):
+            if len(stated) == 1 and found[stated[0]].side in SIDES:
+                _, extent = taught.network.text_map.answers(text.read_sentences([sentence])[None])
+                halves = extent[0, 0, KINDS.index(found[stated[0]].kind)].unflatten(0, (2, -1)).sum(1)
+                right.append(bool(halves[1] > halves[0]) == (found[stated[0]].side == "right"))
+    assert len(right) > 50 and mean(right) > 0.85, mean(right)
+
+
 def test_a_disguised_sentence_keeps_every_word_that_tells_or_states_nothing():
     disguise, draw, kept = Disguise([*STRANGE, "no", "nodule"]), np.random.default_rng(0), 0
     for text, stated in STATED * 60:
@@ -95,6 +111,7 @@ def test_a_disguised_sentence_keeps_every_word_that_tells_or_states_nothing():
                    for line in (text, words)]
         if findings:
             assert findings == stated and telling[0] == telling[1]
+            assert re.findall("right|left|lower", words) == re.findall("right|left|lower", text)
             kept += 1
         else:
             assert not set(telling[1]) & set(naming_words())

@@ -11,13 +11,13 @@ from phydict.datasets.prose import elsewhere, phrases, sentences
 
 def written_words() -> list[str]:
     """Every word that a written report may hold, in lower case and in order."""
-    filled_in = {"right", "left", "upper", "middle", "lower", "bilateral", "an", "nor"}
-    return sorted(_words(_lists(elsewhere)) | set(telling_words()) | filled_in)
+    return sorted(_words(_lists(elsewhere)) | set(telling_words()) | {"an"})
 
 
 def telling_words() -> list[str]:
     """The words by which findings are stated, placed or denied, in lower case and in order."""
-    return sorted(_words([*_lists(phrases), sentences.COMBINED, list(sentences.ABBREVIATIONS.values())]))
+    filled_in = {"right", "left", "upper", "middle", "lower", "bilateral", "nor"}
+    return sorted(_words([*_lists(phrases), sentences.COMBINED, list(sentences.ABBREVIATIONS.values())]) | filled_in)
 
 
 def naming_words() -> list[str]:

@@ -92,7 +92,7 @@ def test_a_short_lesson_of_written_sentences_teaches_the_side_of_what_others_sta
     torch.manual_seed(0)
     text = TextEncoder.small(learn_vocabulary([*written_words(), *STRANGE]), 64, 2, 64, sentences=8)
     taught = Prior(VolumeUNet(4, 2, (16, 16), (False, True), 1, 8, 64, KINDS), Grid.cube(16, 384.0), HUWindow(), text)
-    learn_sentences(taught, teaching_sentences(8_000, 1), 250, words=STRANGE)
+    learn_sentences(taught, teaching_sentences(8_000, 1), 400, words=STRANGE)
     found, right = examples(), []
     with torch.no_grad():
         for sentence, stated in teaching_sentences(600, 2):

@@ -17,7 +17,7 @@ def conjugate_gradients(operator: Callable[[Tensor], Tensor], right: Tensor, ite
     inverse; where it is 0, d stays 0. on_step: called `iterations` times, as each is done or found needless.
     """
     over = tuple(range(1, right.ndim))
-    residual, d = right, torch.zeros_like(right)
+    residual, d = right.clone(), torch.zeros_like(right)
     direction = preconditioner * residual
     energy = (residual * direction).sum(over, keepdim=True)
     stop = energy * tolerance**2
@@ -27,9 +27,10 @@ def conjugate_gradients(operator: Callable[[Tensor], Tensor], right: Tensor, ite
             curvature = (direction * product).sum(over, keepdim=True)
             active = (energy > stop) & (curvature > 0)
             step = torch.where(active, energy / curvature, 0)
-            d, residual = d + step * direction, residual - step * product
+            d.addcmul_(step, direction)
+            residual.addcmul_(step, product, value=-1)
             scaled = preconditioner * residual
             previous, energy = energy, torch.where(active, (residual * scaled).sum(over, keepdim=True), energy)
-            direction = scaled + torch.where(active, energy / previous, 0) * direction
+            direction.mul_(torch.where(active, energy / previous, 0)).add_(scaled)
         on_step()
     return d

@@ -17,21 +17,24 @@ UNIT = (1.0, 1.0, 1.0)
 
 def differences(x: Tensor, scales: Sequence[float] = UNIT) -> Tensor:
     """Scaled forward differences (3, B, 1, X, Y, Z) of x (B, 1, X, Y, Z) along its last three axes, 0 at the end."""
-    result = x.new_zeros(3, *x.shape)
-    for axis, scale in enumerate(scales):
-        n = x.shape[2 + axis] - 1
-        result[axis].narrow(2 + axis, 0, n).copy_(scale * x.diff(dim=2 + axis))
+    result = x.new_empty(3, *x.shape)
+    for axis, scale in enumerate(scales, 2):
+        own, n = result[axis - 2], x.shape[axis] - 1
+        own.narrow(axis, 0, n).copy_(x.diff(dim=axis))
+        own.narrow(axis, n, 1).zero_()
+        if scale != 1:
+            own.mul_(scale)
     return result
 
 
 def differences_adjoint(p: Tensor, scales: Sequence[float] = UNIT) -> Tensor:
     """The exact adjoint of `differences`: (3, B, 1, X, Y, Z) -> (B, 1, X, Y, Z)."""
     result = torch.zeros_like(p[0])
-    for axis, scale in enumerate(scales):
-        n = p.shape[3 + axis] - 1
-        inner = scale * p[axis].narrow(2 + axis, 0, n)
-        result.narrow(2 + axis, 0, n).sub_(inner)
-        result.narrow(2 + axis, 1, n).add_(inner)
+    for axis, scale in enumerate(scales, 2):
+        n = p.shape[1 + axis] - 1
+        inner = p[axis - 2].narrow(axis, 0, n)
+        result.narrow(axis, 0, n).sub_(inner, alpha=scale)
+        result.narrow(axis, 1, n).add_(inner, alpha=scale)
     return result
 
 
@@ -77,8 +80,14 @@ class TVQuadraticMajorizer:
         self.weights = 1 / (eps**2 + differences(x, scales).square().sum(0)).sqrt()
 
     def gradient(self, x: Tensor) -> Tensor:
-        """The quadratic's gradient at x, which is linear."""
-        return differences_adjoint(self.weights * differences(x, self.scales), self.scales)
+        """The quadratic's gradient at x, which is linear: adjoint of differences (w differences), an axis at a time."""
+        result = torch.zeros_like(x)
+        for axis, scale in enumerate(self.scales, 2):
+            n = x.shape[axis] - 1
+            flux = x.diff(dim=axis).mul_(self.weights.narrow(axis, 0, n))
+            result.narrow(axis, 0, n).sub_(flux, alpha=scale**2)
+            result.narrow(axis, 1, n).add_(flux, alpha=scale**2)
+        return result
 
     def diagonal(self) -> Tensor:
         """The diagonal of the quadratic's matrix: what `gradient` makes of a voxel there itself."""

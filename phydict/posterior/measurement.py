@@ -98,7 +98,7 @@ class Measurement:
     def adjoint(self, r: Tensor) -> Tensor:
         """The exact adjoint of `linear`: (B, K, V, U) -> (B, 1, X, Y, Z)."""
         self.calls += len(r)
-        return self.slope * self.projector.T(r)
+        return self.projector.T(self.slope * r)
 
     def norm(self) -> float:
         """The largest singular value of `linear`."""

@@ -87,8 +87,8 @@ class ProximalCG(LikelihoodStep):
                 negative_gradient = negative_gradient - tv_scale * tv.gradient(z)
 
             def normal(d, tv=tv):
-                fitted = measurement.adjoint(weights * measurement.linear(d)) + weight * d
-                return fitted + tv_scale * tv.gradient(d) if tv else fitted
+                fitted = measurement.adjoint(weights * measurement.linear(d)).add_(d, alpha=weight)
+                return fitted.add_(tv.gradient(d), alpha=tv_scale) if tv else fitted
 
             inactive_mask = ~((z <= -1) & (negative_gradient < 0) | (z >= 1) & (negative_gradient > 0))
             scale = 1 / (weight + tv_scale * tv.diagonal()) if tv else torch.ones_like(z)

@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 UNIT = (1.0, 1.0, 1.0)
 
@@ -77,7 +76,11 @@ class TVQuadraticMajorizer:
 
     def __init__(self, x: Tensor, eps: float, scales: Sequence[float] = UNIT):
         self.scales = scales
-        self.weights = 1 / (eps**2 + differences(x, scales).square().sum(0)).sqrt()
+        squares = torch.full_like(x, eps**2)
+        for axis, scale in enumerate(scales, 2):
+            slopes = x.diff(dim=axis).mul_(scale)
+            squares.narrow(axis, 0, x.shape[axis] - 1).addcmul_(slopes, slopes)
+        self.weights = squares.rsqrt_()
 
     def gradient(self, x: Tensor) -> Tensor:
         """The quadratic's gradient at x, which is linear: adjoint of differences (w differences), an axis at a time."""
@@ -91,7 +94,10 @@ class TVQuadraticMajorizer:
 
     def diagonal(self) -> Tensor:
         """The diagonal of the quadratic's matrix: what `gradient` makes of a voxel there itself."""
-        inner = [scale**2 * self.weights.narrow(axis, 0, self.weights.shape[axis] - 1)
-                 for axis, scale in zip((2, 3, 4), self.scales)]
-        return torch.stack([pad(w, [0, 0] * (4 - axis) + [0, 1]) + pad(w, [0, 0] * (4 - axis) + [1, 0])
-                            for axis, w in zip((2, 3, 4), inner)]).sum(0)
+        result = torch.zeros_like(self.weights)
+        for axis, scale in enumerate(self.scales, 2):
+            n = result.shape[axis] - 1
+            inner = self.weights.narrow(axis, 0, n)
+            result.narrow(axis, 0, n).add_(inner, alpha=scale**2)
+            result.narrow(axis, 1, n).add_(inner, alpha=scale**2)
+        return result

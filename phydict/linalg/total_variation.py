@@ -59,12 +59,16 @@ def tv_proximal(v: Tensor, weight: float, scales: Sequence[float], clip: Callabl
     step = 1 / (4 * sum(s**2 for s in scales) * weight)
     ahead, momentum = dual, 1.0
     for _ in range(iterations):
-        tried = ahead + step * differences(clip(v - weight * differences_adjoint(ahead, scales)), scales)
-        new = tried / tried.square().sum(0).sqrt().clamp(min=1)
+        descended = clip(v.sub(differences_adjoint(ahead, scales), alpha=weight))
+        new = differences(descended, scales).mul_(step).add_(ahead)
+        lengths = new[0].square()
+        for own in new[1:]:
+            lengths.addcmul_(own, own)
+        new.div_(lengths.sqrt_().clamp_(min=1))
         following = (1 + (1 + 4 * momentum**2) ** 0.5) / 2
-        ahead = new + (momentum - 1) / following * (new - dual)
+        ahead = torch.sub(new, dual).mul_((momentum - 1) / following).add_(new)
         dual, momentum = new, following
-    return clip(v - weight * differences_adjoint(dual, scales)), dual
+    return clip(v.sub(differences_adjoint(dual, scales), alpha=weight)), dual
 
 
 class TVQuadraticMajorizer:

@@ -76,7 +76,7 @@ class Targets:
 
     @torch.no_grad()
     def begin(self, kind_map: KindMap) -> None:
-        """Each kind's maps begin as the principal components of its examples' extents, of which sentences are then mixed:
+        """Each kind's maps begin as the principal components of its examples' extents, for sentences to be mixed of:
         from random maps, places are learnt after kinds, and hardly in the same steps."""
         for kind in range(len(KINDS)):
             own = self.extents[[place for place, of in enumerate(self.kinds) if of == kind]]

@@ -148,6 +148,13 @@ def test_contradicted_views_widen_the_intervals_and_the_warning_says_how_much():
     assert found.interval_widening > 1 and f"{found.interval_widening:.1f} times as wide" in words[0]
 
 
+def test_no_interval_is_wider_than_the_window_in_which_volume_and_truth_lie():
+    refiner = tiny_refiner(uncertain=True)
+    refiner.uncertainty.quantiles.mul_(1e6)
+    found = reconstruct(views(), BEAM, refiner, display=True)
+    assert all(float(half_width.max()) == 2 * refiner.window.half_width for half_width in found.intervals.values())
+
+
 def test_subtracted_scatter_widens_the_intervals():
     found = reconstruct(views(), BEAM, tiny_refiner(uncertain=True))
     assert found.scatter > 0 and found.interval_widening == 2

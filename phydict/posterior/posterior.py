@@ -42,6 +42,9 @@ FAR_OUTSIDE = 4.5
 """How many times the most residual in calibration is far outside of it: beyond a tube's spectrum, which is missed by 4
 times as much at most. What views contradict counts as noise there, and has a warning of its own."""
 
+WIDEST = 2.0
+"""Half-width of the widest interval, in the prior's range [-1, 1], of which it then leaves out nothing."""
+
 CONTRADICTION_WIDENING = 0.4
 """Power of the noise of a view, with what contradicts the rest counted as such, over its own, by the geometric mean of
 which over the views intervals widen: in eight scenes of two held-out CTs, 4 to 16 views in poses wrong by up to 5 mm
@@ -235,7 +238,7 @@ class Posterior(Reconstructor):
                  "and scale, and whether the patient moved, or calibrate")
         widening = max(1.0, residual / most) ** WIDENING * contradiction_widening(measurement)
         widening *= SCATTER_WIDENING if measurement.scatter else 1.0
-        widths = widening * self.prior.window.half_width * denoiser.half_widths[0].cpu()
+        widths = self.prior.window.half_width * (widening * denoiser.half_widths[0].cpu()).clamp(max=WIDEST)
         return dict(zip(LEVELS, widths)), widening
 
 

@@ -112,9 +112,9 @@ def noticed() -> str:
 
 def reports() -> str:
     rows = rows_of("text.csv", prior="phydict_64")
-    return table("report | error (HU) | whole volume: PSNR (dB)", (
-        (case, f"{mean(values(own, 'region_mae_hu')):.0f}", f"{mean(values(own, 'psnr')):.2f}")
-        for (case,), own in scenes(rows, "method")))
+    return table("K | report | error (HU) | whole volume: PSNR (dB)", (
+        (int(views), case, f"{mean(values(own, 'region_mae_hu')):.0f}", f"{mean(values(own, 'psnr')):.2f}")
+        for (views, case), own in scenes(rows, "views", "method")))
 
 
 TABLES = {made.__name__: made for made in (

@@ -30,11 +30,15 @@ def differences_adjoint(p: Tensor, scales: Sequence[float] = UNIT) -> Tensor:
     """The exact adjoint of `differences`: (3, B, 1, X, Y, Z) -> (B, 1, X, Y, Z)."""
     result = torch.zeros_like(p[0])
     for axis, scale in enumerate(scales, 2):
-        n = p.shape[1 + axis] - 1
-        inner = p[axis - 2].narrow(axis, 0, n)
-        result.narrow(axis, 0, n).sub_(inner, alpha=scale)
-        result.narrow(axis, 1, n).add_(inner, alpha=scale)
+        _add_adjoint(result, p[axis - 2].narrow(axis, 0, p.shape[1 + axis] - 1), axis, scale)
     return result
+
+
+def _add_adjoint(result: Tensor, flux: Tensor, axis: int, scale: float) -> None:
+    """Adds, in place, the adjoint of the forward differences along one axis, of what lies between its voxels."""
+    n = flux.shape[axis]
+    result.narrow(axis, 0, n).sub_(flux, alpha=scale)
+    result.narrow(axis, 1, n).add_(flux, alpha=scale)
 
 
 def finest_to_own(spacing: Sequence[float]) -> list[float]:
@@ -59,16 +63,13 @@ def tv_proximal(v: Tensor, weight: float, scales: Sequence[float], clip: Callabl
     step = 1 / (4 * sum(s**2 for s in scales) * weight)
     ahead, momentum = dual, 1.0
     for _ in range(iterations):
-        descended = clip(v.sub(differences_adjoint(ahead, scales), alpha=weight))
+        descended = clip(v - differences_adjoint(ahead, scales).mul_(weight))
         new = differences(descended, scales).mul_(step).add_(ahead)
-        lengths = new[0].square()
-        for own in new[1:]:
-            lengths.addcmul_(own, own)
-        new.div_(lengths.sqrt_().clamp_(min=1))
+        new.div_(new.square().sum(0).sqrt_().clamp_(min=1))
         following = (1 + (1 + 4 * momentum**2) ** 0.5) / 2
         ahead = torch.sub(new, dual).mul_((momentum - 1) / following).add_(new)
         dual, momentum = new, following
-    return clip(v.sub(differences_adjoint(dual, scales), alpha=weight)), dual
+    return clip(v - differences_adjoint(dual, scales).mul_(weight)), dual
 
 
 class TVQuadraticMajorizer:
@@ -90,10 +91,8 @@ class TVQuadraticMajorizer:
         """The quadratic's gradient at x, which is linear: adjoint of differences (w differences), an axis at a time."""
         result = torch.zeros_like(x)
         for axis, scale in enumerate(self.scales, 2):
-            n = x.shape[axis] - 1
-            flux = x.diff(dim=axis).mul_(self.weights.narrow(axis, 0, n))
-            result.narrow(axis, 0, n).sub_(flux, alpha=scale**2)
-            result.narrow(axis, 1, n).add_(flux, alpha=scale**2)
+            flux = x.diff(dim=axis).mul_(self.weights.narrow(axis, 0, x.shape[axis] - 1))
+            _add_adjoint(result, flux, axis, scale**2)
         return result
 
     def diagonal(self) -> Tensor:

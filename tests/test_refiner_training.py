@@ -42,6 +42,9 @@ def test_a_resumed_run_is_the_uninterrupted_one_and_is_exported_as_a_refiner(tmp
     main(["export", "--checkpoint", str(last), "--out", str(tmp_path / "refiner.safetensors")])
     refiner = load_prior(tmp_path / "refiner.safetensors")
     assert isinstance(refiner, Refiner) and refiner.entrance.weight.any() and refiner.gate[-1].weight.any()
+    begun = load_prior(prior_file).state_dict()
+    for name, weight in refiner.first.state_dict().items():
+        torch.testing.assert_close(weight, begun[name], rtol=1e-3, atol=1e-6)  # written in half precision
     beam = ConeBeam.orbit(3, 1020, 740, (28, 28), 20.0)
     y = Projector(Grid.cube(16), beam, full_detector=True)(torch.full((1, 1, 16, 16, 16), 0.01))[0]
     found = reconstruct(y, beam, refiner, "phydict_learned", report="Small nodule.")

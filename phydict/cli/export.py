@@ -46,9 +46,9 @@ def export_prior(checkpoint: str, out: str, overwrite: bool = False) -> None:
         save_rival(build_rival(header, weights), out, training)
     else:
         refiner = build_refiner(header, weights) if stage == "refiner" else None
-        prior = refiner.prior if refiner else build_prior(header, weights)
+        prior = refiner.reader if refiner else build_prior(header, weights)
         if has_text(header):
-            weights = {k.removeprefix("prior."): w for k, w in weights.items()}
+            weights = {k.removeprefix("prior.").removeprefix("first."): w for k, w in weights.items()}
             prior.text = build_text(header["text"], {k: w for k, w in weights.items() if k.startswith("text.")})
         if refiner:
             save_refiner(refiner, out, training)

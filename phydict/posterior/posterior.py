@@ -85,6 +85,10 @@ class CountingRefiner(CountingDenoiser):
     def mean(self) -> Tensor:
         return self._denoiser.mean
 
+    @property
+    def begins(self) -> bool:
+        return self._denoiser.begins
+
     def refine(self, x: Tensor, t: float, evidence: Tensor) -> Tensor:
         return self._count(x, lambda: self._denoiser.refine(x, t, evidence))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
@@ -66,12 +67,13 @@ def save_super_resolution(fine: SuperResolution, path: str | Path, training: dic
 
 
 def save_refiner(refiner: Refiner, path: str | Path, training: dict | None = None, dtype: torch.dtype = torch.float16):
-    """Writes `refiner`, with the prior that it is made of, to one .safetensors file, as `save_prior` does."""
-    if refiner.prior.text is None and refiner.prior.load_text is not None:
-        refiner.prior.text = refiner.prior.load_text()
-    copied = refiner.prior.text is not None and not refiner.prior.text.source
-    weights = {k.replace("prior.text.", "text.", 1): w for k, w in refiner.state_dict().items()
-               if copied or not k.startswith("prior.text.")}
+    """Writes `refiner`, with the priors that it is made of, to one .safetensors file, as `save_prior` does."""
+    reader = refiner.reader
+    if reader.text is None and reader.load_text is not None:
+        reader.text = reader.load_text()
+    copied = reader.text is not None and not reader.text.source
+    named = {re.sub(r"^(prior|first)\.text\.", "text.", k): w for k, w in refiner.state_dict().items()}
+    weights = {k: w for k, w in named.items() if copied or not k.startswith("text.")}
     write_stage(Path(path), describe_refiner(refiner) | {"training": training or {}}, weights, dtype)
 
 
@@ -108,8 +110,10 @@ def describe_super_resolution(fine: SuperResolution) -> dict:
 
 def describe_refiner(refiner: Refiner) -> dict:
     """What a refiner is, as plain JSON values, for `build_refiner`: its prior, called by another stage."""
-    return describe(refiner.prior) | {"stage": "refiner"} | (
-        {"uncertainty": refiner.uncertainty.settings} if refiner.uncertainty else {})
+    first = describe(refiner.first) if refiner.first else {}
+    return (describe(refiner.prior) | {"stage": "refiner", "text": describe(refiner.reader)["text"]}
+            | ({"uncertainty": refiner.uncertainty.settings} if refiner.uncertainty else {})
+            | ({"first": {key: value for key, value in first.items() if key != "text"}} if first else {}))
 
 
 def describe_correction(network: CorrectionNetwork) -> dict:
@@ -134,8 +138,8 @@ def load_prior(path: str | Path | MedSynCheckpoint = DEFAULT_PRIOR,
     def build(header: dict, weights: dict[str, Tensor]) -> Prior | Refiner:
         loaded = (build_refiner if header.get("stage") == "refiner" else build_prior)(header, weights)
         if has_text(header):
-            prior = loaded.prior if isinstance(loaded, Refiner) else loaded
-            prior.load_text = lambda: load_text(path, header["text"])
+            reader = loaded.reader if isinstance(loaded, Refiner) else loaded
+            reader.load_text = lambda: load_text(path, header["text"])
         return loaded
 
     return _loaded(path, ("base", "refiner"), build, device)
@@ -220,10 +224,16 @@ def build_refiner(header: dict, weights: dict[str, Tensor]) -> Refiner:
     def made() -> Refiner:
         prior = _untrained(header)
         uncertainty = Uncertainty(**header["uncertainty"]) if "uncertainty" in header else None
-        return Refiner(prior, torch.zeros(prior.state_channels, *prior.grid.shape), uncertainty)
+        return Refiner(prior, torch.zeros(prior.state_channels, *prior.grid.shape), uncertainty,
+                       _untrained(header["first"]) if "first" in header else None)
 
-    weights = {k: w.float() for k, w in weights.items() if not k.startswith(("text.", "prior.text."))}
-    return built_network(made, weights, header, ("network", "detail", "uncertainty"))
+    first = header.get("first", {})
+    if not isinstance(first, dict):
+        raise ValueError(f"first is {first}, where a mapping of settings is needed")
+    described = header | {f"first.{name}": settings for name, settings in first.items()}
+    weights = {k: w.float() for k, w in weights.items() if not k.startswith(("text.", "prior.text.", "first.text."))}
+    return built_network(made, weights, described, ("network", "detail", "uncertainty", "first.network",
+                                                    "first.detail"))
 
 
 def build_super_resolution(header: dict, weights: dict[str, Tensor]) -> SuperResolution:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor, nn
 from phydict.diffusion import CosineSchedule
 from phydict.grid import Grid
 from phydict.prior.evidence_channels import EVIDENCE_CHANNELS
-from phydict.prior.prior import Prior
+from phydict.prior.prior import BoundPrior, Prior
 from phydict.prior.uncertainty import Uncertainty
 from phydict.prior.unet import VolumeUNet
 from phydict.runtime.precision import network_precision
@@ -30,13 +31,15 @@ class Refiner(nn.Module):
 
     prior: whose weights are trained on; it needs a detail network. mean: the state (C, X, Y, Z) that an unrolled
     reconstruction starts from. uncertainty: what says how far the last state may be off, None for a refiner without.
+    first: a prior, left as it is, that reads reports instead: with one, a reconstruction from few X-rays starts from
+    what it makes of both, and the calls hear of the report by that alone. None for a refiner whose calls read reports.
     """
 
-    def __init__(self, prior: Prior, mean: Tensor, uncertainty: Uncertainty | None = None):
+    def __init__(self, prior: Prior, mean: Tensor, uncertainty: Uncertainty | None = None, first: Prior | None = None):
         super().__init__()
         if prior.detail is None:
             raise ValueError("a refiner needs a prior with a detail network, but this one has none: give another prior")
-        self.prior, self.uncertainty = prior, uncertainty
+        self.prior, self.uncertainty, self.first = prior, uncertainty, None
         block, width = prior.network.block, prior.network.settings["channels"][0]
         self.entrance = nn.Conv3d(EVIDENCE_CHANNELS * block**3, width, 1)
         self.detail_entrance = nn.Conv3d(EVIDENCE_CHANNELS, prior.detail.settings["width"], 3, padding=1)
@@ -47,6 +50,29 @@ class Refiner(nn.Module):
             nn.init.zeros_(layer.bias)
         self.detail_entrance.to(memory_format=torch.channels_last_3d)
         self.register_buffer("mean", mean)
+        if first is not None:
+            self.begin_with(first)
+
+    def begin_with(self, first: Prior) -> None:
+        """Reports are read by `first`, of the same grid, HU window, state and noise schedule, and no more by the calls.
+        Raises ValueError for another."""
+        if (not first.grid.same_as(self.grid) or first.window != self.window or first.schedule != self.schedule
+                or first.state_channels != self.state_channels):
+            raise ValueError("a refiner begins with a prior of its own grid, HU window, state and noise schedule, but "
+                             "others were given: give another prior")
+        self.first = deepcopy(first).eval().requires_grad_(False)
+        self.prior.text = self.prior.load_text = None
+
+    def train(self, mode: bool = True) -> Refiner:
+        super().train(mode)
+        if self.first is not None:
+            self.first.eval()
+        return self
+
+    @property
+    def reader(self) -> Prior:
+        """The prior that reads reports."""
+        return self.first or self.prior
 
     @property
     def grid(self) -> Grid:
@@ -75,7 +101,7 @@ class Refiner(nn.Module):
     @property
     def reads_text(self) -> bool:
         """As for a Prior."""
-        return self.prior.reads_text
+        return self.reader.reads_text
 
     def forward(self, x: Tensor, t: Tensor, context: Tensor, evidence: Tensor) -> Tensor:
         """Clean estimate of the state x (B, C, X, Y, Z) at times t (B,), in x's dtype."""
@@ -93,16 +119,23 @@ class Refiner(nn.Module):
         if guidance != 1:
             raise ValueError(f"a refiner is guided by the X-rays alone, but a guidance scale of {guidance} was given: "
                              "leave it at 1, or use phydict_fast")
-        return BoundRefiner(self, self.prior.bind(report, 1.0, precision).context, precision)
+        heard = self.reader.bind(report, 1.0, precision)
+        if self.first is None:
+            return BoundRefiner(self, heard.context, precision)
+        return BoundRefiner(self, self.prior.null, precision, heard if report else None)
 
 
 @dataclass(frozen=True)
 class BoundRefiner:
-    """A refiner with its context fixed."""
+    """A refiner with its context fixed.
+
+    first: the denoiser that a reconstruction from few X-rays begins with; None: it starts from the mean.
+    """
 
     refiner: Refiner
     context: Tensor
     precision: str = "auto"
+    first: BoundPrior | None = None
 
     @property
     def schedule(self) -> CosineSchedule:
@@ -112,6 +145,15 @@ class BoundRefiner:
     def mean(self) -> Tensor:
         """The state (1, C, X, Y, Z) to start from."""
         return self.refiner.mean[None]
+
+    @property
+    def begins(self) -> bool:
+        """Whether there is what a reconstruction from few X-rays begins with."""
+        return self.first is not None
+
+    def denoise(self, x: Tensor, t: float) -> Tensor:
+        """What `first` answers."""
+        return self.first.denoise(x, t)
 
     def refine(self, x: Tensor, t: float, evidence: Tensor) -> Tensor:
         """The clean state of x (B, C, X, Y, Z) at time t, given the evidence (B, EVIDENCE_CHANNELS, X, Y, Z)."""

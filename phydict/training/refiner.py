@@ -10,7 +10,7 @@ from torch import Tensor
 
 from phydict.grid import Cube
 from phydict.posterior import Sampler, Unrolled
-from phydict.prior import DEFAULT_PRIOR, BoundRefiner, Prior, Refiner, describe_refiner, load_prior
+from phydict.prior import DEFAULT_PRIOR, BoundPrior, BoundRefiner, Prior, Refiner, describe_refiner, load_prior
 from phydict.reconstruction import Reconstructor
 from phydict.training.prior import reconstruction_scores
 from phydict.training.scenes import Scenes
@@ -65,11 +65,13 @@ class RefinerTraining(StageTraining):
         if not found.grid.same_as(cube.grid()) or found.window != HUWindow(*window):
             raise ValueError(f"the prior {initial} has another grid or HU window than this training: "
                              "set model.cube and model.window to its own")
-        refiner = found if isinstance(found, Refiner) else Refiner(found, _mean(found))
+        refiner = found if isinstance(found, Refiner) else Refiner(found, _mean(found), first=_reading(found))
         refiner.uncertainty = None  # of what it was
         super().__init__(refiner.train().requires_grad_(True), optimisation, seed)
-        if refiner.prior.load_text is not None:
-            refiner.prior.text = refiner.prior.load_text()
+        if refiner.reader.load_text is not None:
+            refiner.reader.text = refiner.reader.load_text()
+        if refiner.first is not None:
+            refiner.first.requires_grad_(False)
         self.method, self.scenes, self.body_weight, self.mask_weight = method, scenes, body_weight, mask_weight
         self.validation_views, self.calls = validation.views, len(method.times)
 
@@ -80,8 +82,11 @@ class RefinerTraining(StageTraining):
     def _case_loss(self, case: dict, rng: np.random.Generator) -> Tensor:
         ct, masks = case["volume"], 2 * case["masks"] - 1
         measurement = self.scenes.measure(ct, rng, self.prior.grid, self.prior.window, case.get("fine"))
-        with_report = self.prior.prior.text is not None and rng.random() >= TEXT_DROPOUT
-        learning = _Learning(self.prior, self.prior.prior.context([case["report"][0] if with_report else ""]))
+        with_report = self.prior.reader.text is not None and rng.random() >= TEXT_DROPOUT
+        report = case["report"][0] if with_report else ""
+        first, heard = self.prior.first, self.prior.reader.context([report])
+        learning = _Learning(self.prior, heard) if first is None else _Learning(
+            self.prior, self.prior.prior.null, first=BoundPrior(first, heard, 1.0, "auto") if report else None)
         losses = []
         for x0, _ in zip(self.method.estimates(learning, measurement), range(self.calls)):
             loss = log_error(x0[:, :1], ct, self.body_weight)
@@ -119,6 +124,11 @@ def log_scores(module: StageTraining, batch: dict, index: int, views: Sequence[i
         mean = float(np.mean([found[name] for found in scores]))
         module.log(f"val/{name}", mean, prog_bar=name == "psnr", sync_dist=True, batch_size=1)
     module.log("samples", float(module.samples), rank_zero_only=True, batch_size=1)
+
+
+def _reading(prior: Prior) -> Prior | None:
+    """What a refiner of this prior reads reports with: the prior, if it does."""
+    return prior if prior.reads_text else None
 
 
 @torch.no_grad()

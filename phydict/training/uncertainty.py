@@ -52,8 +52,9 @@ class UncertaintyTraining(StageTraining):
                              "set model.cube and model.window to its own")
         refiner.uncertainty = network or refiner.uncertainty or Uncertainty(refiner.state_channels)
         super().__init__(refiner, optimisation, seed)
-        if refiner.prior.load_text is not None:  # to be written with the rest
-            refiner.prior.text = refiner.prior.load_text().requires_grad_(False)
+        reader = refiner.reader
+        if reader.load_text is not None:  # to be written with the rest
+            reader.text = reader.load_text().requires_grad_(False)
         refiner.uncertainty.requires_grad_(True)
         self.method, self.scenes, self.validation, self.body_weight = method, scenes, validation, body_weight
         self.held_out: list[tuple[Tensor, ...]] = []

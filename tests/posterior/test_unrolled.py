@@ -135,7 +135,7 @@ def contradicted(amount: float) -> Measurement:
 class Knowing:
     """A refiner that always answers with the block, and begins half-way to it."""
 
-    schedule, mean = CosineSchedule(), 0.5 * block()
+    schedule, mean, begins = CosineSchedule(), 0.5 * block(), False
 
     def refine(self, *_):
         return block()

@@ -38,8 +38,11 @@ def tiny_prior(text: bool = True, voxels: int = 16, seed: int = 0, detail: bool 
 
 
 def tiny_refiner(text: bool = True, voxels: int = 16, seed: int = 0, untrained: bool = False,
-                 uncertain: bool = False) -> Refiner:
-    """A refiner of `tiny_prior`, whose entrances and gate answer to the evidence unless it is to be untrained."""
+                 uncertain: bool = False, begins: bool = False) -> Refiner:
+    """A refiner of `tiny_prior`, whose entrances and gate answer to the evidence unless it is to be untrained.
+
+    begins: with another such prior to begin with.
+    """
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         refiner = Refiner(tiny_prior(text, voxels, seed, True), 0.3 * torch.randn(4, voxels, voxels, voxels))
@@ -47,6 +50,8 @@ def tiny_refiner(text: bool = True, voxels: int = 16, seed: int = 0, untrained: 
             if not untrained:
                 torch.nn.init.normal_(layer.weight, std=0.2)
         refiner.uncertainty = Uncertainty(4, (4, 8)) if uncertain else None
+        if begins:
+            refiner.begin_with(tiny_prior(text, voxels, seed + 1, True))
     return refiner.eval().requires_grad_(False)
 
 

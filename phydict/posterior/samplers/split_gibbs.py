@@ -118,15 +118,16 @@ class SplitGibbs(Sampler):
     def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, generator: Generators,
                on_step: Callable[[], None] = lambda: None) -> Tensor:
         def run(on_step: Callable[[], None] = lambda: None) -> Tensor:
-            return self._descend(denoiser, measurement, x, generator, on_step)
+            return self.one_pass(denoiser, measurement, x, generator, on_step)
 
         def explained(on_step: Callable[[], None] = lambda: None) -> Tensor:
             return with_scatter(measurement, lambda: run(on_step), run) if self.scatter else run(on_step)
 
         return with_metal(measurement, self.metal, lambda: explained(on_step), explained)
 
-    def _descend(self, denoiser: Denoiser, measurement: Measurement, x: Tensor, generator: Generators,
-                 on_step: Callable[[], None]) -> Tensor:
+    def one_pass(self, denoiser: Denoiser, measurement: Measurement, x: Tensor, generator: Generators,
+                 on_step: Callable[[], None] = lambda: None) -> Tensor:
+        """As `sample`, but nothing is looked for in what the X-rays miss: neither scatter nor metal."""
         z = self._guided_pass(denoiser, measurement, x, self.times(denoiser), generator, on_step)
         if not self.ec_delta:
             return z

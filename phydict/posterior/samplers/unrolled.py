@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from phydict.diffusion.steps import Generators
+from phydict.diffusion.steps import Generators, noise_like
 from phydict.posterior.discretisation import subgrid_projection
 from phydict.posterior.evidence import Evidence
 from phydict.posterior.likelihood.likelihood import LikelihoodStep, ProximalCG
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.metal import Metal, with_metal
 from phydict.posterior.samplers.sampler import Sampler
+from phydict.posterior.samplers.split_gibbs import SplitGibbs
 from phydict.posterior.scatter import with_scatter
 from phydict.prior import DEFAULT_REFINER, BoundRefiner
 
@@ -31,8 +32,11 @@ kept from training 0.3 voxels of 8 polychromatic views at most and 0.6 of 32, bu
 
 @dataclass(frozen=True)
 class Unrolled(Sampler):
-    """z = start(mean); then for each time: x0 = refine(z, evidence), z = likelihood(x0). Deterministic. Once
+    """z = start(start_state); then for each time: x0 = refine(z, evidence), z = likelihood(x0). Deterministic. Once
     more with scatter subtracted, as SplitGibbs does.
+
+    The start state is what chests are on average. From few views with a report, and with a refiner that has a prior to
+    begin with, it is instead what this prior makes of both.
 
     Where the steps up to half of the calls still miss the X-rays by more than their noise, what the grid cannot hold of
     them is sought on finer voxels (`subgrid_projection`) and from then on counted as known: real X-rays are never made
@@ -49,7 +53,7 @@ class Unrolled(Sampler):
 
     Args:
         times: labels in (0, 1) under which the refiner's network takes each z, as if it were a noisy state of that time
-        x0_stds: standard deviation of the error of each x0, in the prior's range, that of the mean first
+        x0_stds: standard deviation of the error of each x0, in the prior's range, that of the start state first
         start: the first step towards the X-rays
         likelihood: the steps towards the X-rays between the calls
         final_likelihood: the last step towards the X-rays
@@ -59,6 +63,8 @@ class Unrolled(Sampler):
             their number; none: it never does
         chests_only: whether one material in air is left to a method without a network (`Posterior.otherwise`)
         metal: how what is denser than the prior's window is sought; none: it is not
+        first: how the prior that a refiner begins with is sampled, in one pass (`SplitGibbs.one_pass`); none: it is not
+        first_views: the most views, with a report, for which it is
     """
 
     citation = ("Adler & Oktem, Learned Primal-Dual Reconstruction, IEEE Transactions on Medical Imaging 37(6), 2018, "
@@ -74,6 +80,9 @@ class Unrolled(Sampler):
     contradiction: float | None = 0.5
     chests_only: bool = False
     metal: Metal | None = Metal()
+    first: SplitGibbs | None = SplitGibbs(
+        5, ProximalCG(7, 1, tv_weight=10.0, tv_eps=0.003), t_start=0.97, t_end=0.15, noise_fraction=0.4, momentum=0.5)
+    first_views: int = 6
     default_prior = DEFAULT_REFINER
     needs_refiner = True
 
@@ -98,7 +107,7 @@ class Unrolled(Sampler):
         on_result: is given the result, and what computes the evidence there.
         """
         measurement.subgrid = measurement.model_variance = 0.0
-        before = refiner.mean.to(measurement.y)
+        before = self.start_state(refiner, measurement)
         measurement.refit(before[:, :1])
         evidence = Evidence(measurement)
         z = start = self._meet(self.start, measurement, before, self.x0_stds[0])
@@ -129,6 +138,15 @@ class Unrolled(Sampler):
             on_step()
         on_result(z, lambda: evidence(z[:, :1], before[:, :1], start[:, :1]))
         yield z
+
+    def start_state(self, refiner: BoundRefiner, measurement: Measurement) -> Tensor:
+        """The state (1, C, X, Y, Z) before the first step: of few views with a report what the refiner's prior to begin
+        with makes of both, in one pass from noise that is always the same."""
+        mean = refiner.mean.to(measurement.y)
+        if self.first is None or not refiner.begins or measurement.projector.beam.views > self.first_views:
+            return mean
+        generator = torch.Generator().manual_seed(0)
+        return self.first.one_pass(refiner, measurement, noise_like(mean, generator), generator)
 
     def _misses(self, measurement: Measurement, z: Tensor) -> bool:
         """Whether the X-rays hold more than their noise beyond z, for which `subgrid` may look."""

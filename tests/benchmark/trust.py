@@ -111,7 +111,7 @@ def noticed() -> str:
 
 
 def reports() -> str:
-    rows = rows_of("text.csv", prior="phydict_64_reports")
+    rows = rows_of("text.csv", prior="refiner_64")
     return table("K | report | error (HU) | whole volume: PSNR (dB)", (
         (int(views), case, f"{mean(values(own, 'region_mae_hu')):.0f}", f"{mean(values(own, 'psnr')):.2f}")
         for (views, case), own in scenes(rows, "views", "method")))

@@ -64,7 +64,7 @@ class Unrolled(Sampler):
         chests_only: whether one material in air is left to a method without a network (`Posterior.otherwise`)
         metal: how what is denser than the prior's window is sought; none: it is not
         first: how the prior that a refiner begins with is sampled, in one pass (`SplitGibbs.one_pass`); none: it is not
-        first_views: the most views, with a report, for which it is
+        first_views: the most views, with a report, for which it is; more say themselves what a report could add
     """
 
     citation = ("Adler & Oktem, Learned Primal-Dual Reconstruction, IEEE Transactions on Medical Imaging 37(6), 2018, "
@@ -82,7 +82,7 @@ class Unrolled(Sampler):
     metal: Metal | None = Metal()
     first: SplitGibbs | None = SplitGibbs(
         5, ProximalCG(7, 1, tv_weight=10.0, tv_eps=0.003), t_start=0.97, t_end=0.15, noise_fraction=0.4, momentum=0.5)
-    first_views: int = 6
+    first_views: int = 3
     default_prior = DEFAULT_REFINER
     needs_refiner = True
 

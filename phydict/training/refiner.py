@@ -65,7 +65,9 @@ class RefinerTraining(StageTraining):
         if not found.grid.same_as(cube.grid()) or found.window != HUWindow(*window):
             raise ValueError(f"the prior {initial} has another grid or HU window than this training: "
                              "set model.cube and model.window to its own")
-        refiner = found if isinstance(found, Refiner) else Refiner(found, _mean(found), first=_reading(found))
+        refiner = found
+        if isinstance(found, Prior):
+            refiner = Refiner(found, _mean(found), first=found if found.reads_text else None)
         refiner.uncertainty = None  # of what it was
         super().__init__(refiner.train().requires_grad_(True), optimisation, seed)
         if refiner.reader.load_text is not None:
@@ -124,11 +126,6 @@ def log_scores(module: StageTraining, batch: dict, index: int, views: Sequence[i
         mean = float(np.mean([found[name] for found in scores]))
         module.log(f"val/{name}", mean, prog_bar=name == "psnr", sync_dist=True, batch_size=1)
     module.log("samples", float(module.samples), rank_zero_only=True, batch_size=1)
-
-
-def _reading(prior: Prior) -> Prior | None:
-    """What a refiner of this prior reads reports with: the prior, if it does."""
-    return prior if prior.reads_text else None
 
 
 @torch.no_grad()

@@ -110,10 +110,13 @@ def describe_super_resolution(fine: SuperResolution) -> dict:
 
 def describe_refiner(refiner: Refiner) -> dict:
     """What a refiner is, as plain JSON values, for `build_refiner`: its prior, called by another stage."""
-    first = describe(refiner.first) if refiner.first else {}
-    return (describe(refiner.prior) | {"stage": "refiner", "text": describe(refiner.reader)["text"]}
-            | ({"uncertainty": refiner.uncertainty.settings} if refiner.uncertainty else {})
-            | ({"first": {key: value for key, value in first.items() if key != "text"}} if first else {}))
+    described = describe(refiner.prior) | {"stage": "refiner"}
+    if refiner.uncertainty:
+        described["uncertainty"] = refiner.uncertainty.settings
+    if refiner.first:
+        first = describe(refiner.first)
+        described |= {"text": first.pop("text"), "first": first}
+    return described
 
 
 def describe_correction(network: CorrectionNetwork) -> dict:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from copy import deepcopy
 from dataclasses import dataclass
 
 import torch
@@ -55,12 +54,12 @@ class Refiner(nn.Module):
 
     def begin_with(self, first: Prior) -> None:
         """Reports are read by `first`, of the same grid, HU window, state and noise schedule, and no more by the calls.
-        Raises ValueError for another."""
+        It becomes a part of this refiner. Raises ValueError for another."""
         if (not first.grid.same_as(self.grid) or first.window != self.window or first.schedule != self.schedule
                 or first.state_channels != self.state_channels):
             raise ValueError("a refiner begins with a prior of its own grid, HU window, state and noise schedule, but "
                              "others were given: give another prior")
-        self.first = deepcopy(first).eval().requires_grad_(False)
+        self.first = first.eval().requires_grad_(False)
         self.prior.text = self.prior.load_text = None
 
     def train(self, mode: bool = True) -> Refiner:
@@ -119,10 +118,14 @@ class Refiner(nn.Module):
         if guidance != 1:
             raise ValueError(f"a refiner is guided by the X-rays alone, but a guidance scale of {guidance} was given: "
                              "leave it at 1, or use phydict_fast")
-        heard = self.reader.bind(report, 1.0, precision)
+        context, first = self.told(self.reader.bind(report, 1.0, precision), bool(report))
+        return BoundRefiner(self, context, precision, first)
+
+    def told(self, heard: BoundPrior, reported: bool) -> tuple[Tensor, BoundPrior | None]:
+        """Of what the reader has heard, the context (1, L, D) of the calls, and the denoiser to begin with, if any."""
         if self.first is None:
-            return BoundRefiner(self, heard.context, precision)
-        return BoundRefiner(self, self.prior.null, precision, heard if report else None)
+            return heard.context, None
+        return self.prior.null, heard if reported else None
 
 
 @dataclass(frozen=True)

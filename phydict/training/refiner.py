@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import deepcopy
 
 import numpy as np
 import torch
@@ -67,7 +68,7 @@ class RefinerTraining(StageTraining):
                              "set model.cube and model.window to its own")
         refiner = found
         if isinstance(found, Prior):
-            refiner = Refiner(found, _mean(found), first=found if found.reads_text else None)
+            refiner = Refiner(found, _mean(found), first=deepcopy(found) if found.reads_text else None)
         refiner.uncertainty = None  # of what it was
         super().__init__(refiner.train().requires_grad_(True), optimisation, seed)
         if refiner.reader.load_text is not None:
@@ -86,9 +87,9 @@ class RefinerTraining(StageTraining):
         measurement = self.scenes.measure(ct, rng, self.prior.grid, self.prior.window, case.get("fine"))
         with_report = self.prior.reader.text is not None and rng.random() >= TEXT_DROPOUT
         report = case["report"][0] if with_report else ""
-        first, heard = self.prior.first, self.prior.reader.context([report])
-        learning = _Learning(self.prior, heard) if first is None else _Learning(
-            self.prior, self.prior.prior.null, first=BoundPrior(first, heard, 1.0, "auto") if report else None)
+        reader = self.prior.reader
+        context, first = self.prior.told(BoundPrior(reader, reader.context([report]), 1.0), bool(report))
+        learning = _Learning(self.prior, context, first=first)
         losses = []
         for x0, _ in zip(self.method.estimates(learning, measurement), range(self.calls)):
             loss = log_error(x0[:, :1], ct, self.body_weight)

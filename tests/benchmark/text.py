@@ -28,8 +28,7 @@ from phydict.xray.binning import benchmark_orbit
 
 REPORTS = ("right report", "none", "wrong side")
 
-NORMAL = ("The lungs are clear. No pleural effusion or pneumothorax. Heart size is normal. "
-          "No nodules or masses.")
+NORMAL = "The lungs are clear. No pleural effusion or pneumothorax. Heart size is normal. No nodules or masses."
 
 
 def one_sided(count: int, grid: phydict.Grid) -> list[tuple[int, torch.Tensor]]:

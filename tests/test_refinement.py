@@ -144,6 +144,16 @@ def test_a_resumed_run_is_the_uninterrupted_one_and_makes_each_reconstruction_on
     assert files and files == {file: file.stat().st_mtime_ns for file in cache.rglob("reconstructions-*/*/*.npy")}
 
 
+def test_held_out_reconstructions_are_those_of_their_own_volumes(tmp_path, refiner_file):
+    def validated(phantoms: int) -> Path:
+        data = ReconstructionData(
+            Made(1, 1, 16), Scenes(most_views=3), phantoms=2, cache=str(tmp_path / "cache"),
+            holdout=HoldOut(phantoms=phantoms), initial=refiner_file, cube=Cube(32), window=(-1000, 600))
+        return data.validation.made.folder
+
+    assert validated(1) == validated(1) != validated(2)
+
+
 def test_with_a_network_a_reconstruction_is_learnt_from_at_both_calls(tmp_path, refiner_file):
     file = tmp_path / "fine.safetensors"
     save_correction(network(), file, dtype=torch.float32)

@@ -14,7 +14,9 @@ from phydict.cli.train import main
 from phydict.datasets import phantom_case
 from phydict.grid import Cube, Grid
 from phydict.methods import reconstruct
+from phydict.posterior import measurement
 from phydict.prior import Refiner, load_prior, save_prior
+from phydict.runtime.warning import warn
 from phydict.training.data import PriorData
 from phydict.training.refiner import RefinerTraining
 from phydict.training.scenes import Scenes
@@ -62,6 +64,32 @@ def test_steps_on_one_batch_lower_its_loss(prior_file):
         found[-1].backward()
         optimizer.step()
     assert found[-1] < found[0] - 0.3
+
+
+def test_masks_that_are_not_known_teach_nothing(prior_file):
+    task = RefinerTraining(cube=Cube(16), window=(-1000, 600), initial=prior_file)
+    case = phantom_case(3, Grid.cube(16), HUWindow(-1000, 600))
+    case["has_masks"] = torch.tensor([True, False, False])
+    other = case | {"masks": case["masks"] * torch.tensor([1.0, 0.0, 0.5])[:, None, None, None]}
+    with torch.no_grad():
+        one, same, known = (float(task.batch_loss(default_collate([drawn]), (1,))) for drawn in (
+            case, other, case | {"masks": 1 - case["masks"]}))
+    assert one == same != known
+
+
+def test_more_views_than_degrees_can_be_drawn():
+    scenes = Scenes(most_views=1000, orbit=0.0, arc=0.0)
+    assert max(scenes.beam(np.random.default_rng(seed), Grid.cube(16)).views for seed in range(40)) > 360
+
+
+def test_nobody_is_warned_of_what_a_scene_was_drawn_with(recwarn, monkeypatch):
+    monkeypatch.setattr(measurement, "check_line_integrals", lambda y: warn("these line integrals are doubtful"))
+    scenes, grid, ct = Scenes(), Grid.cube(16), torch.zeros(1, 1, 16, 16, 16)
+    scenes.measure(ct, np.random.default_rng(0), grid, HUWindow())
+    assert not recwarn.list
+    y, projector = scenes.xrays(ct, np.random.default_rng(0), grid, HUWindow())
+    with pytest.warns(UserWarning, match="doubtful"):
+        measurement.Measurement(projector, y, HUWindow())
 
 
 def test_every_drawn_scene_can_be_reconstructed_on_its_grid():

@@ -61,14 +61,21 @@ def test_calibrated_intervals_hold_their_share_in_each_tissue_and_coverage():
     assert network.most_residual == 3
 
 
+def test_voxels_beyond_16_million_calibrate():
+    network, ratios = Uncertainty(4, (4, 8)), torch.linspace(0, 1, 2**24 + 2)
+    places = torch.zeros(len(ratios), dtype=torch.uint8)
+    network.calibrate(ratios, places, places, torch.ones(1))
+    torch.testing.assert_close(network.quantiles[0, 0], torch.tensor(LEVELS), atol=1e-6, rtol=0)
+
+
 def test_few_voxels_take_the_quantiles_of_their_tissue_and_a_tissue_of_few_those_of_all():
     network = Uncertainty(4, (4, 8))
     ratios = torch.cat([torch.linspace(0, 1, 9000), torch.full((50,), 7.0), torch.full((60,), 9.0)])
     tissues = torch.cat([torch.zeros(9050), torch.ones(60)]).long()
     coverages = torch.cat([torch.zeros(9000), torch.ones(50), torch.ones(60)]).long()
     network.calibrate(ratios, tissues, coverages, torch.ones(1))
-    assert torch.equal(network.quantiles[0, 1], ratios[:9050].quantile(torch.tensor(LEVELS)))
-    assert torch.equal(network.quantiles[1, 1], ratios.quantile(torch.tensor(LEVELS)))
+    torch.testing.assert_close(network.quantiles[0, 1], ratios[:9050].quantile(torch.tensor(LEVELS)))
+    torch.testing.assert_close(network.quantiles[1, 1], ratios.quantile(torch.tensor(LEVELS)))
     assert torch.equal(network.quantiles[2], network.quantiles[1])
 
 

@@ -1,33 +1,49 @@
-"""Tables of the Frechet distance of slices, made of the features that the rows of a comparison have left."""
+"""Tables and a CSV of the Frechet distance of slices, made of the features that a comparison's rows have left."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
 from phydict.ablation.run import features_file
 from phydict.ablation.summary import Entry, conditions, format_settings
 from phydict.datasets import patient_of
-from phydict.evaluation.fid import load_features
+from phydict.evaluation import write_csv
+from phydict.evaluation.fid import NAMES, load_features
 from phydict.evaluation.tables import Table, fid_table
 from phydict.inference.scoring import Scoring
 
 
+FID = "fid.csv"
+"""The distances in a folder of results."""
+
+
 def fid_tables(out: Path, entries: Sequence[Entry], scoring: Scoring) -> list[Table]:
-    """A table for each condition, with a line per entry; none where the distance is not measured.
+    """A table for each condition, with a line per entry, and FID with the same numbers; none where the distance is not
+    measured.
 
     Of several seeds of a case each counts as a case of the same patient.
     """
     if scoring.network is None:
         return []
-    tables, backbone = [], scoring.fid.backbone
+    rows, tables, backbone = [], [], scoring.fid.backbone
     for condition, group in conditions(entries):
         features = {entry.label: {name: load_features(features_file(out, key), backbone)
                                   for name, key in _named(entry.rows)} for entry in group if entry.rows}
         if features:
             tables.append(fid_table(features, backbone, scoring.fid.replicates,
                                     format_settings("Frechet distance of slices (FID)", condition)))
+            rows += [{"method": label} | condition | {"fid_backbone": backbone, "cases": len(features[label])}
+                     | _numbers(values) for label, _, values in tables[-1].lines]
+    write_csv(out / FID, rows)
     return tables
+
+
+def _numbers(values: Sequence) -> dict[str, float]:
+    """Each distance, and the ends of its interval where it has one."""
+    return {f"{name}{end}": number for name, value in zip(NAMES, values)
+            for end, number in zip(("", "_low", "_high"), value) if not math.isnan(number)}
 
 
 def _named(rows: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:

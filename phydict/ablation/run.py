@@ -6,6 +6,7 @@ import os
 import reprlib
 import warnings
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
@@ -173,7 +174,8 @@ class MeasuredCase:
         with noted(self.warnings, case):
             self.xrays = data.simulate(made, case_seed(trial.seed, case), self.grid, self.window, device)
         if not (scored := trial.scored()).same_as(self.grid):
-            self.truth, self.grid = made | cut_out(made, self.grid, scored, self.window), scored
+            whole = {name: value for name, value in made.items() if name != "features"}
+            self.truth, self.grid = whole | cut_out(made, self.grid, scored, self.window), scored
 
     def report(self, trial: Trial) -> str:
         """The report, where the trial uses it and its prior reads text."""
@@ -195,11 +197,15 @@ class Runner:
             self.warm.add(state)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # the measured run repeats them
-                _attempt(lambda: self._reconstruct(trial, scene, WarmUp(on_step)))
+                _attempt(lambda: self._warm_up(trial, scene, on_step))
         warned = list(scene.warnings)
         with noted(warned, f"{scene.case}, {trial.label}"):
             measured = _attempt(lambda: self._measured(trial, scene, on_step, key))
         return measured | {"warning": "; ".join(warned) or None}
+
+    def _warm_up(self, trial: Trial, scene: MeasuredCase, on_step: Callable[[], None]) -> None:
+        with suppress(WarmUp.Warm):
+            self._reconstruct(trial, scene, WarmUp(on_step))
 
     def _measured(self, trial: Trial, scene: MeasuredCase, on_step: Callable[[], None], key: str) -> dict:
         known = reset_peak_memory(self.device)

@@ -142,7 +142,7 @@ def deltas(entries: Sequence[Entry]) -> list[tuple[str, list[Entry]]]:
     """What has a curve over Extra Compute's delta: a label, and its entries from delta 0 up."""
     groups: dict[str, list] = {}
     for entry in entries:
-        if "delta" in entry.settings:
+        if entry.settings.get("delta") is not None:  # none given is the method's own
             others = {name: value for name, value in entry.settings.items() if name != "delta"}
             groups.setdefault(format_settings(entry.method, others, entry.condition), []).append(entry)
     return [(label, sorted(group, key=lambda entry: entry.settings["delta"])) for label, group in groups.items()]

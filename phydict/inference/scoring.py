@@ -21,6 +21,7 @@ from phydict.evaluation.sharpness import sharpness_scores
 from phydict.grid import Grid
 from phydict.inference.data import case_scores
 from phydict.inference.protocols import Protocol
+from phydict.runtime.files import file_crc32
 from phydict.units import HUWindow
 
 METRICS = ("volume", "lpips", "fid", "organs", "sharpness", "clip")
@@ -84,13 +85,15 @@ class Scoring:
             load_networks()
         self.network = SliceFeatures(fid.backbone, fid.weights) if "fid" in self.metrics else None
         self.clip = load_ct_clip(clip.weights, clip.text) if clip.weights else None
+        self.checksums = {f"{name}_weights_crc32": file_crc32(Path(file)) for name, file in (
+            ("fid", fid.weights), ("clip", clip.weights)) if file}
 
     def settings(self) -> dict:
         """What decides the scores beyond those that are always taken; empty where there is nothing."""
         further = [name for name in self.metrics if name != "volume"]
         return ({"metrics": further} if further else {}) | (
             {"fid_backbone": self.fid.backbone} if self.network else {}) | (
-            {"clip_text": self.clip.text_transformer is not None} if self.clip else {})
+            {"clip_text": self.clip.text_transformer is not None} if self.clip else {}) | self.checksums
 
     @property
     def empty(self) -> dict[str, str]:

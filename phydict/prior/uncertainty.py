@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -71,18 +72,22 @@ class Uncertainty(nn.Module):
         residuals: by how many times their noise the reconstructions missed their X-rays. A tissue or coverage of few
         voxels takes the quantiles of all.
         """
-        levels = torch.tensor(LEVELS, dtype=ratios.dtype)
         for t in range(len(TISSUES)):
             of_tissue = ratios[tissues == t]
-            shared = of_tissue.quantile(levels) if len(of_tissue) >= FEWEST else ratios.quantile(levels)
+            shared = _quantiles(of_tissue if len(of_tissue) >= FEWEST else ratios)
             for n in range(COVERAGES):
                 own = ratios[(tissues == t) & (coverages == n)]
-                self.quantiles[t, n] = own.quantile(levels) if len(own) >= FEWEST else shared
+                self.quantiles[t, n] = _quantiles(own) if len(own) >= FEWEST else shared
         self.most_residual.copy_(residuals.max())
 
 
 FEWEST = 2000
 """Voxels from which a tissue and a coverage have quantiles of their own."""
+
+
+def _quantiles(ratios: Tensor) -> Tensor:
+    """Those of LEVELS; torch's own take no more than 2^24 values."""
+    return torch.from_numpy(np.quantile(ratios.cpu().numpy(), LEVELS)).to(ratios)
 
 
 def tissue_of(z: Tensor) -> Tensor:

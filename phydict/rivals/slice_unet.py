@@ -50,7 +50,7 @@ class StackAttention(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         batch, channels, across, down, slices = x.shape
         h = self.norm(x).permute(0, 2, 3, 4, 1).reshape(-1, slices, channels)
-        h = h + waves(torch.arange(slices, device=x.device).to(h), channels)
+        h = h + waves(torch.arange(float(slices), device=x.device), channels).to(h)
         q, k, v = self.enter(h).unflatten(2, (3, HEADS, -1)).permute(2, 0, 3, 1, 4)
         h = self.leave(scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2))
         return x + h.view(batch, across, down, slices, channels).permute(0, 4, 1, 2, 3)

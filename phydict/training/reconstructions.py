@@ -191,7 +191,7 @@ class ReconstructionData(PriorData):
                                                         (self.validation.datasets[1].cts, HELD_OUT_PHANTOM,
                                                          holdout.phantoms)))
         parts = [asdict(scenes), fingerprint(initial), made.network and fingerprint(made.network), scene.to_dict(),
-                 window, phantoms, self.held_out, [ct.id for ct in self.cts.cts]]
+                 window, phantoms, holdout.phantoms, self.held_out, [ct.id for ct in self.cts.cts]]
         folder = folder / f"reconstructions-{hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]}"
         self.crop, self.made = made.crop, Reconstructions(
             trained, self.grid, initial, made.network, scenes, STRENGTH, folder / "trained", made.reconstructions, 0)

@@ -83,7 +83,8 @@ class RefinerTraining(StageTraining):
         return torch.stack(losses).mean()
 
     def _case_loss(self, case: dict, rng: np.random.Generator) -> Tensor:
-        ct, masks = case["volume"], 2 * case["masks"] - 1
+        ct, kinds = case["volume"], self.prior.state_channels - 1
+        masks, known = 2 * case["masks"][:, :kinds] - 1, case["has_masks"][:, :kinds]
         measurement = self.scenes.measure(ct, rng, self.prior.grid, self.prior.window, case.get("fine"))
         with_report = self.prior.reader.text is not None and rng.random() >= TEXT_DROPOUT
         report = case["report"][0] if with_report else ""
@@ -93,8 +94,8 @@ class RefinerTraining(StageTraining):
         losses = []
         for x0, _ in zip(self.method.estimates(learning, measurement), range(self.calls)):
             loss = log_error(x0[:, :1], ct, self.body_weight)
-            if bool(case["has_masks"].any()) and self.prior.state_channels > 1:
-                loss = loss + self.mask_weight * ((x0[:, 1:] - masks).square().mean() + 1e-4).log()
+            if bool(known.any()):
+                loss = loss + self.mask_weight * ((x0[:, 1:] - masks)[known].square().mean() + 1e-4).log()
             losses.append(loss)
         return torch.stack(losses).mean()
 

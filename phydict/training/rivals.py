@@ -24,16 +24,19 @@ class RivalTraining(StageTraining):
     """Learns a rival from CTs and X-rays of drawn scenes.
 
     made: the rival to train; scenes: its X-rays; views: numbers of X-rays from which validation reconstructs; initial:
-    a rival's file to continue from; seed: of scenes, noise and whatever else is drawn.
+    a rival's file to continue from, one that is not bound to a geometry also of another grid; seed: of scenes, noise
+    and whatever else is drawn.
     """
 
     def __init__(self, made: Rival, scenes: Scenes, views: tuple[int, ...], optimisation: Optimisation,
                  initial: str | None, seed: int):
         rival = made if initial is None else load_rival(initial)
-        for part in ("stage", "grid", "hu_window", "beam"):
+        bound = ("grid", "beam") if made.network.bound else ()
+        for part in ("stage", "hu_window", *bound):
             if rival.describe()[part] != made.describe()[part]:
                 raise ValueError(f"the rival {initial} and this training differ in '{part}': give another "
                                  "model.initial, or the settings that it was trained with")
+        rival = Rival(rival.network, made.grid, made.window, made.beam)
         super().__init__(rival.train().requires_grad_(True), optimisation, seed)
         self.scenes, self.validation_views = scenes, views
 

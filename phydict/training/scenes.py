@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,7 +71,8 @@ class Scenes:
         elif kind < 1.5 * self.orbit + self.arc:
             beam = ConeBeam.orbit(views, *geometry, start=start, arc=math.radians(rng.uniform(40, 220)))
         else:
-            beam = ConeBeam.orbit(360, *geometry).select(np.sort(rng.choice(360, views, replace=False)))
+            angles = max(360, self.most_views)
+            beam = ConeBeam.orbit(angles, *geometry).select(np.sort(rng.choice(angles, views, replace=False)))
         return beam.shifted(columns=shift * pixels * pixel * scale) if shift else beam
 
     def xrays(self, ct: Tensor, rng: np.random.Generator, grid: Grid, window: HUWindow,
@@ -92,6 +94,8 @@ class Scenes:
 
     def measure(self, ct: Tensor, rng: np.random.Generator, grid: Grid, window: HUWindow,
                 fine: Tensor | None = None) -> Measurement:
-        """The same as a measurement."""
+        """The same as a measurement; of what was drawn into it nobody is warned."""
         y, projector = self.xrays(ct, rng, grid, window, fine)
-        return Measurement(projector, y, window)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return Measurement(projector, y, window)

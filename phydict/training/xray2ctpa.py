@@ -67,6 +67,9 @@ class XrayToCTPATraining(RivalTraining):
                  cube: Cube = Cube(), window: tuple[float, float] = (-1000.0, 1000.0),
                  optimisation: Optimisation = Optimisation(1e-4), latent: LatentSettings = LatentSettings(),
                  initial: str | None = None, seed: int = 0):
+        if initial and (given := [part for part in ("autoencoder", "encoder") if getattr(latent, part)]):
+            raise ValueError(f"model.initial brings all of its weights, but model.latent.{given[0]} was given beside "
+                             "it: leave one of the two out")
         network, grid = network or XrayToCTPANetwork(), cube.grid()
         for part in ("autoencoder", "encoder"):
             if file := getattr(latent, part):

@@ -111,6 +111,11 @@ def test_one_untimed_call_per_setting_stops_after_two_steps(tmp_path, monkeypatc
     assert [len(list(group)) for _, group in itertools.groupby(steps)] == [2, 4, 4]
 
 
+def test_the_untimed_call_ends_no_run_that_is_to_show_where_it_fails(tmp_path, monkeypatch, trace):
+    monkeypatch.setenv("PHYDICT_TRACEBACK", "1")
+    assert {row["status"] for row in ablate(tmp_path, axes={"method": ["trace"]})} == {"ok"}
+
+
 @pytest.mark.parametrize("error, status, again", [(ValueError("Two\nlines."), "refused", 0),
                                                   (RuntimeError("no memory"), "failed", 1)])
 def test_a_method_that_gives_up_is_a_row_with_its_sentence(tmp_path, monkeypatch, trace, error, status, again):

@@ -37,7 +37,7 @@ def test_each_condition_has_its_table_and_the_best_setting_stands_for_a_method()
 
 
 def test_the_table_of_delta_has_the_misfit_beside_ssim():
-    rows = [row("a", "x", 20.0 + d, delta=d) for d in (0.0, 0.8, 0.1)]
+    rows = [row("a", "x", 20.0 + d, delta=d) for d in (0.0, 0.8, 0.1)] + [row("a", "x", 21.0, delta=None)]
     table = next(t for t in all_tables(summarise(rows), rows) if "delta" in t.header)
     assert table.header[1:3] == ["SSIM ↑", "misfit ↓"]
     assert [label for label, _, _ in table.lines] == ["0", "0.1", "0.8"]

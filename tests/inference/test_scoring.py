@@ -12,8 +12,10 @@ from inference.runs import phantoms, record
 from phydict.cli.infer import main
 from phydict.datasets.cts.segmentations import organs_beside
 from phydict.evaluation import backbones, perceptual, read_csv
+from phydict.evaluation.fid import NAMES
 from phydict.evaluation.organs import dice
 from phydict.grid import Grid
+from phydict.inference import scoring
 from phydict.inference.scoring import FIDSettings, Scoring
 from phydict.runtime.lpips_networks import load_lpips
 
@@ -61,6 +63,9 @@ def test_ablate_has_a_line_of_fid_for_each_method_and_resumes(tmp_path, untraine
     page = (tmp_path / "out" / "tables.md").read_text()
     fid = page[page.index("Frechet"):]
     assert "| sirt |" in fid and "| tv |" in fid and "LPIPS alex" in page[:page.index("Frechet")]
+    for row in read_csv(tmp_path / "out" / "fid.csv"):
+        (line,) = (line for line in fid.splitlines() if line.startswith(f"| {row['method']} |"))
+        assert all(f"{row[name]:.3f}" in line for name in NAMES) and row["cases"] == 2
     next((tmp_path / "out" / "features").iterdir()).unlink()
     capsys.readouterr()
     main(args)
@@ -98,6 +103,30 @@ def test_lungs_that_are_segmented_beside_a_ct_are_those_of_the_truth(tmp_path):
     assert found.keys() == {"lung"}
     assert dice(found["lung"], lung.repeat(2, 0).repeat(2, 1).repeat(2, 2) > 0) > 0.999  # but for its corners
     assert organs_beside(tmp_path / "bert.nii.gz", grid) == {}
+
+
+def test_the_distance_of_a_region_is_that_of_its_own_slices(tmp_path, untrained):
+    """Also after that of the whole of the same case."""
+    def distances(name: str, products: list) -> dict:
+        file = tmp_path / f"{name}.yaml"
+        file.write_text(yaml.safe_dump({
+            "out": str(tmp_path / name), "phantoms": 2, "metrics": ["fid"], "fid": {"replicates": 0},
+            "base": {"detector": 24, "views": 3, "method.iterations": 2}, "products": products}))
+        main(["ablate", "-c", str(file), "--device", "cpu"])
+        return {row["method"]: row["fid"] for row in read_csv(tmp_path / name / "fid.csv")}
+
+    whole = {"base": {"voxels": 48}, "axes": {"method": ["tv"]}}
+    region = {"base": {"voxels": 34, "side": 272.0}, "axes": {"method": ["sirt"]}}
+    assert distances("both", [whole, region])["sirt"] == distances("alone", [region])["sirt"]
+
+
+def test_other_weights_of_a_network_are_another_score(tmp_path, monkeypatch):
+    monkeypatch.setattr(scoring, "SliceFeatures", lambda *_: object())
+    file, found = tmp_path / "inception.pth", []
+    for content in (b"one", b"two"):
+        file.write_bytes(content)
+        found.append(Scoring(["fid"], FIDSettings("inception", str(file))).settings())
+    assert found[0] != found[1]
 
 
 def test_settings_name_what_decides_the_scores_and_nothing_by_default(untrained):

@@ -5,15 +5,15 @@ from pathlib import Path
 import pytest
 import torch
 from command_lines import refusal, resumed_as_uninterrupted
-from rivals.tiny_rivals import GRID, lively
+from rivals.tiny_rivals import GRID, lively, tiny_lifted, tiny_x2ct
 from torch.utils.data import default_collate
 
 from phydict.cli.infer import main as infer
 from phydict.cli.train import main
 from phydict.datasets import phantom_case
 from phydict.evaluation import read_csv
-from phydict.grid import Cube
-from phydict.rivals import LiftedNetwork, X2CTNetwork, XrayToCTPANetwork, load_rival
+from phydict.grid import Cube, Grid
+from phydict.rivals import LiftedNetwork, X2CTNetwork, XrayToCTPANetwork, load_rival, save_rival
 from phydict.training.rivals import LiftedTraining, OrbitScenes
 from phydict.training.x2ct import Adversary, X2CTTraining
 from phydict.training.xray2ctpa import XrayToCTPATraining
@@ -92,6 +92,19 @@ def test_validation_takes_the_x_rays_that_a_bound_rival_holds_for(monkeypatch):
     monkeypatch.setattr(task, "log", lambda name, value, **how: found.update({name: value}))
     task.validation_step(default_collate([phantom_case(3, GRID, HUWindow(-1000, 600))]), 0)
     assert found["val/psnr"] == found["val/psnr_2"] > 5
+
+
+def test_what_is_bound_to_no_geometry_goes_on_with_other_voxels_and_what_is_bound_does_not(tmp_path):
+    file = tmp_path / "rival.safetensors"
+    save_rival(tiny_lifted(), file, dtype=torch.float32)
+    going = LiftedTraining(cube=Cube(32), window=(-1000, 600), initial=str(file)).prior
+    assert going.grid.same_as(Grid.cube(32))
+    for name, weight in tiny_lifted().state_dict().items():
+        assert torch.equal(weight, going.state_dict()[name])
+    save_rival(tiny_x2ct(), file)
+    with pytest.raises(ValueError, match="differ in 'beam'"):
+        X2CTTraining(X2CTNetwork(8, 4, (2, 2), (4, 8, 8)), OrbitScenes(views=3), Cube(16), (-1000, 600),
+                     initial=str(file))
 
 
 def test_training_that_cannot_be_is_refused(tmp_path, cache, capsys):

@@ -27,6 +27,14 @@ def test_views_at_right_angles_are_turned_by_permuting_axes():
     torch.testing.assert_close(second, volumes[0, 1].permute(0, 1, 3, 2).flip(3), atol=1e-5, rtol=0)
 
 
+def test_places_are_not_rounded_to_the_networks_precision():
+    volumes = torch.randn(1, 3, 2, *GRID.shape, generator=torch.Generator().manual_seed(0))
+    theta = turns(GRID, bound_orbit(GRID, 3), volumes)
+    plain = turned(volumes, theta)
+    with torch.autocast("cpu", torch.bfloat16):
+        torch.testing.assert_close(turned(volumes, theta), plain, atol=1e-5, rtol=0)
+
+
 @pytest.mark.parametrize("voxel", [(8, 7, 8), (6, 9, 7), (9, 8, 10)])
 def test_a_point_near_the_isocentre_is_lifted_to_its_place(voxel):
     volume = torch.zeros(1, 1, *GRID.shape)

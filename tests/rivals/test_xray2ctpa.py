@@ -9,6 +9,7 @@ from phydict.grid import Cube, Grid
 from phydict.methods import reconstruct
 from phydict.rivals import RivalAnswer, XrayToCTPANetwork
 from phydict.rivals.rival import WATER_MM, bound_orbit
+from phydict.rivals.slice_unet import StackAttention, waves
 from phydict.training.rivals import OrbitScenes
 from phydict.training.xray2ctpa import LatentSettings, XrayToCTPATraining
 from phydict.units import MU_WATER
@@ -57,6 +58,14 @@ def test_views_in_another_order_give_the_same_ct():
     torch.testing.assert_close(one, other, atol=1e-4, rtol=0)
 
 
+def test_the_code_of_a_slice_is_its_own_in_the_networks_precision():
+    attend, codes = StackAttention(8), []
+    attend.enter.register_forward_pre_hook(lambda _, given: codes.append(given[0].detach()))
+    with torch.autocast("cpu", torch.bfloat16):
+        attend(torch.zeros(1, 8, 1, 1, 256, dtype=torch.bfloat16))
+    torch.testing.assert_close(codes[0][0].float(), waves(torch.arange(256.0), 8), atol=0.01, rtol=0)
+
+
 def test_each_part_learns_in_its_own_time():
     first, then = task(autoencoder_steps=1), task(autoencoder_steps=0)
     for training, learnt in ((first, "autoencoder"), (then, "denoiser"), (then, "encoder")):
@@ -77,6 +86,8 @@ def test_ones_own_weights_are_taken_and_others_are_refused(tmp_path):
         assert torch.equal(weight, taken.prior.network.autoencoder.state_dict()[name])
     with pytest.raises(ValueError, match="does not hold the weights of this XrayEmbedding"):
         XrayToCTPATraining(other, latent=LatentSettings(encoder=file), **settings)
+    with pytest.raises(ValueError, match=r"model\.initial brings all of its weights"):
+        XrayToCTPATraining(other, latent=LatentSettings(encoder=file), initial=file, **settings)
     with pytest.raises(ValueError, match=r"nowhere\.safetensors"):
         XrayToCTPATraining(other, latent=LatentSettings(encoder=str(tmp_path / "nowhere.safetensors")), **settings)
 

@@ -115,7 +115,7 @@ class Unrolled(Sampler):
         for n, t in enumerate(self.times):
             channels = evidence(z[:, :1], before[:, :1], start[:, :1])
             if n == int(measurement.scatter_enabled) and self.contradiction is not None:
-                voxel = measurement.slope * max(measurement.projector.grid.spacing)
+                voxel = measurement.mu_water * max(measurement.projector.grid.spacing)
                 usual = self.contradiction * voxel * max(1.0, measurement.projector.beam.views / FEW_VIEWS) ** 0.5
                 excess = measurement.view_errors(measurement.last_projection).square() - usual**2
                 if (excess > 0).any():

@@ -49,6 +49,13 @@ class _OneDNN(torch.autograd.Function):
         return *(part.to_dense() if part is not None and part.is_mkldnn else part for part in parts), None, None, None
 
 
+def channels_last(network: nn.Module) -> None:
+    """Lays the channels of every nn.Conv3d of a network side by side in memory, in place: faster where they are few."""
+    for module in network.modules():
+        if isinstance(module, nn.Conv3d):
+            module.to(memory_format=torch.channels_last_3d)
+
+
 def speed_up(network: nn.Module) -> None:
     """Makes every nn.Conv3d of a network a FastConv3d, in place; weights and their names stay."""
     for module in network.modules():

@@ -7,7 +7,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from phydict.prior.convolution import speed_up
+from phydict.prior.convolution import channels_last, speed_up
 
 
 class PatchDiscriminator(nn.Module):
@@ -25,6 +25,7 @@ class PatchDiscriminator(nn.Module):
         for layer in (*self.layers, self.leave):
             nn.init.normal_(layer.weight, std=0.02)
         speed_up(self)
+        channels_last(self)
 
     def forward(self, ct: Tensor, lifted: Tensor) -> Tensor:
         """CT (B, 1, X, Y, Z) and lifted X-rays (B, K, X, Y, Z) -> one score for each patch."""

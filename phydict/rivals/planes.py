@@ -50,6 +50,6 @@ def turned(volumes: Tensor, theta: Tensor) -> Tensor:
     """Volumes (B, K, C, depth, row, column), each in its view's frame, in the grid's: (B, K, C, X, Y, Z). Rays are
     taken as parallel; 0 where a voxel lies outside a view's cube."""
     flat = volumes.flatten(0, 1).to(theta)
-    with torch.autocast(theta.device.type, enabled=False):  # which would round places to bfloat16
-        grid = affine_grid(theta.repeat(len(volumes), 1, 1), list(flat.shape), align_corners=False)
-    return grid_sample(flat, grid, align_corners=False).unflatten(0, volumes.shape[:2])
+    turn = theta.double().repeat(len(volumes), 1, 1)  # autocast rounds single precision to bfloat16
+    grid = affine_grid(turn, list(flat.shape), align_corners=False)
+    return grid_sample(flat, grid.to(theta), align_corners=False).unflatten(0, volumes.shape[:2])

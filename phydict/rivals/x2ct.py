@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
 from phydict.grid import Grid
-from phydict.prior.convolution import speed_up
+from phydict.prior.convolution import channels_last, speed_up
 from phydict.prior.unet import check_sizes
 from phydict.rivals.network import Geometry, RivalNetwork
 from phydict.rivals.planes import on_planes, plane_places, turned, turns
@@ -124,6 +124,7 @@ class X2CTNetwork(RivalNetwork):
                     nn.init.zeros_(layer.bias)
         nn.init.constant_(self.leave.bias, 0.1)  # the last ReLU lets gradients pass where the volume starts
         speed_up(self)
+        channels_last(self)
 
     def check(self, grid: Grid) -> None:
         if set(grid.shape) != {self.side} or max(grid.spacing) - min(grid.spacing) > 1e-3 * min(grid.spacing):

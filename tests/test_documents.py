@@ -14,7 +14,7 @@ from phydict.evaluation import read_csv
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [ROOT / name for name in (
     "README.md", "TRUST.md", "CHANGELOG.md", "CONTRIBUTING.md", "configs/README.md", "data/README.md",
-    "data/prior/README.md", "data/spectra/README.md", "tests/benchmark/README.md")]
+    "data/prior/README.md", "data/rivals/README.md", "data/spectra/README.md", "tests/benchmark/README.md")]
 DOCUMENTS += sorted((ROOT / "data" / "example").glob("*/README.md"))
 README = DOCUMENTS[0].read_text()
 

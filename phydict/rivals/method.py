@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -17,6 +16,7 @@ from phydict.rivals.files import load_rival
 from phydict.rivals.rival import Rival
 from phydict.runtime.files import file_crc32
 from phydict.runtime.precision import check_precision, network_precision, precision_name
+from phydict.runtime.shipped import own_or_shipped
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import Projector
 
@@ -57,7 +57,7 @@ class TrainedRival(Reconstructor):
     It reads no report. Another grid than its own is refused, and of a rival that is bound to one geometry any other.
 
     Args:
-        file: the rival's .safetensors file
+        file: the rival's .safetensors file, or the name of a shipped one, data/rivals/lifted_64.safetensors
         precision: of its network: auto, float32 or bfloat16
     """
 
@@ -102,7 +102,7 @@ class TrainedRival(Reconstructor):
 
 def _checksum(file: str) -> int:
     try:
-        return file_crc32(Path(file))
+        return file_crc32(own_or_shipped(file))
     except OSError as error:
         raise ValueError(f"there is no rival's file {file}: give the .safetensors file that train.py export wrote"
                          ) from error
@@ -111,4 +111,4 @@ def _checksum(file: str) -> int:
 @lru_cache(4)
 def _loaded(file: str, checksum: int) -> Rival:
     """The rival in a file, read once for each of its contents."""
-    return load_rival(file)
+    return load_rival(own_or_shipped(file))

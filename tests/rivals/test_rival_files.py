@@ -8,12 +8,14 @@ from prior.tiny import tiny_prior
 from rivals.tiny_rivals import GRID, WINDOW, body, tiny_lifted
 
 from phydict.cli.infer import main as infer
+from phydict.datasets import phantom_case
+from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM
 from phydict.evaluation import read_csv
 from phydict.grid import Grid
-from phydict.methods import reconstruct
+from phydict.methods import METHODS, reconstruct
 from phydict.prior import load_prior, save_prior
 from phydict.rivals import LiftedNetwork, Rival, RivalAnswer, TrainedRival, load_rival, save_rival
-from phydict.units import MU_WATER
+from phydict.units import MU_WATER, HUWindow, hu_to_mu
 from phydict.xray import ConeBeam, Projector
 
 ORBIT = ConeBeam.orbit(3, 1020, 740, (28, 28), 20.0)
@@ -45,6 +47,16 @@ def test_the_command_line_takes_a_rivals_file(file, tmp_path, monkeypatch):
     assert [row["grid"] for row in read_csv(tmp_path / "out" / "lifted" / "results.csv")] == ["16x16x16"]
     infer([*args, "--model.grid=24", "--model.overwrite=true"])
     assert [row["grid"] for row in read_csv(tmp_path / "out" / "lifted" / "results.csv")] == ["24x24x24"]
+
+
+def test_the_shipped_rival_is_found_from_any_folder_and_has_learnt_chests(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    grid, beam = Grid.cube(64), ConeBeam.orbit(2, 1020, 740, (112, 112), 5.0)
+    truth = HUWindow().to_hu(phantom_case(HELD_OUT_PHANTOM, grid, HUWindow())["volume"])[0]
+    y = Projector(grid, beam, full_detector=True)(hu_to_mu(truth)[None, None])[0]
+    errors = [(reconstruct(y, beam, method=method).volume - truth).square().mean() for method in (
+        TrainedRival("data/rivals/lifted_64.safetensors"), METHODS["tv"])]
+    assert errors[0] < errors[1]
 
 
 def test_hu_do_not_depend_on_what_water_attenuates(file):

@@ -189,7 +189,7 @@ def _show_xrays(figure, height: float, xrays, reprojection) -> None:
             ax = figure.add_subplot(cells[row, column])
             shown = ax.imshow(np.ma.masked_invalid(images[view]), SIGNED if signed else GREY, vmin=limits[0],
                               vmax=limits[1], interpolation="nearest")
-            heading = f"view {view + 1} of {len(measured)}" if row == 0 else ""
+            heading = f"view {view} of {len(measured)}" if row == 0 else ""
             _finish(ax, f"misfit {per_view[view]:.3g}" if signed else heading)
             if column == 0:
                 ax.set_ylabel(name, fontsize=9)

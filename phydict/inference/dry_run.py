@@ -40,15 +40,15 @@ def dry_run(path: str | Path, case: dict, grid: Grid) -> list[str]:
     xrays = binned(case["xrays"].float(), factor).numpy()
     geometry_page(path, coarse, grid, xrays, thorax, hu, title=case["id"])
     agreements = [agreement(*pair) for pair in zip(xrays, thorax)]
-    mirrored = [str(k) for k, words in enumerate(agreements, 1) if words.endswith("with flip_columns changed")]
+    mirrored = [str(k) for k, words in enumerate(agreements) if words.endswith("with flip_columns changed")]
     if mirrored:
         warn(f"{case['id']}: view {', '.join(mirrored)} agrees better with a standard thorax when mirrored: "
              "check on which side the source stands, for a left lateral (LL) view at the patient's right, 270 "
              "degrees of an orbit, or change flip_columns")
     values = [correlation(*pair) for pair in zip(xrays, thorax)]
     unlike = [k for k, value in enumerate(values) if value < LOW_VIEW or median(values) < LOW_MEDIAN]
-    if unlike := [str(k + 1) for k in unlike if "better" not in agreements[k]]:
+    if unlike := [str(k) for k in unlike if "better" not in agreements[k]]:
         warn(f"{case['id']}: view {', '.join(unlike)} agrees little with a standard thorax in this geometry (median of "
              f"all {median(values):.2f}): check distances, size of the pixels, turn and order of the views")
     return [f"{case['id']} view {k}: {sides}; {words}"
-            for k, (sides, words) in enumerate(zip(view_sides(coarse, grid), agreements), 1)]
+            for k, (sides, words) in enumerate(zip(view_sides(coarse, grid), agreements))]

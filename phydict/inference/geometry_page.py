@@ -82,7 +82,7 @@ def geometry_page(path: str | Path, beam: ConeBeam, grid: Grid, xrays: np.ndarra
     cells = lower.subplots(2, len(shown), squeeze=False, gridspec_kw={
         "left": 0.05, "right": 0.98, "bottom": 0.08, "top": 0.84, "wspace": 0.1, "hspace": 0.08})
     for (top, bottom), k in zip(cells.T, shown):
-        top.set_title(f"view {k + 1}\n" + sides[k].replace(", ", "\n"), fontsize=8, pad=3)
+        top.set_title(f"view {k}\n" + sides[k].replace(", ", "\n"), fontsize=8, pad=3)
         for ax, image in ((top, xrays[k]), (bottom, thorax[k])):
             ax.imshow(image, "gray", interpolation="nearest",
                       aspect=float(np.linalg.norm(beam.v[k]) / np.linalg.norm(beam.u[k])))
@@ -107,7 +107,7 @@ def _draw(ax: Axes, beam: ConeBeam, grid: Grid, thorax_hu: np.ndarray, name: str
         ax.plot(*np.array(corners)[:, seen].T, color=colour, linewidth=2)
         ax.plot(*np.array([beam.sources[k], beam.detectors[k]])[:, seen].T, color=colour, linewidth=0.5)
         ax.plot(*beam.sources[k, seen], "o", color=colour, markersize=5)
-        ax.annotate(str(k + 1), beam.sources[k, seen], xytext=(5, 5), textcoords="offset points", fontsize=8)
+        ax.annotate(str(k), beam.sources[k, seen], xytext=(5, 5), textcoords="offset points", fontsize=8)
     every = np.concatenate([beam.pixels()[:, ::max(rows - 1, 1), ::max(columns - 1, 1)].reshape(-1, 3), beam.sources,
                             grid.corners()])[:, seen]
     margin = 0.1 * np.ptp(every, axis=0).max()  # where the letters stand

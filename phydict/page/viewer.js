@@ -114,7 +114,7 @@ class Viewer {
     this.view = 0;
     const most = Math.max(...misfits.map(value => value ?? 0), 1e-9);
     byId("bars").replaceChildren(...misfits.map((value, view) => element("button", {
-      type: "button", "aria-label": `view ${view + 1}: misfit ${value?.toPrecision(3) ?? "unknown"}`,
+      type: "button", "aria-label": `view ${view}: misfit ${value?.toPrecision(3) ?? "unknown"}`,
       onclick: () => { this.view = view; this.drawXrays(); }},
       element("span", {style: `height: ${100 * (value ?? 0) / most}%`}))));
     this.misfits = misfits;
@@ -217,7 +217,7 @@ class Viewer {
 
   drawXrays() {
     for (const [n, bar] of [...byId("bars").children].entries()) bar.setAttribute("aria-pressed", n === this.view);
-    byId("view-name").textContent = `view ${this.view + 1} of ${this.misfits.length}, misfit ` +
+    byId("view-name").textContent = `view ${this.view} of ${this.misfits.length}, misfit ` +
       `${this.misfits[this.view]?.toPrecision(3) ?? "unknown"}`;
     if (!this.xrays) return;
     const {shape: [, tall, wide], low, step, measured, rendered} = this.xrays, size = wide * tall;

@@ -47,6 +47,10 @@ def parse_yaml(text: str, name: object) -> object:
     try:
         return _Reader(name, text).document()
     except yaml.YAMLError as error:
+        tabs = [n for n, line in enumerate(text.splitlines(), 1) if "\t" in line[:len(line) - len(line.lstrip())]]
+        if tabs:
+            raise ValueError(f"{name} is not valid YAML: line {tabs[0]} is indented by a tab, where YAML wants "
+                             "spaces") from error
         raise ValueError(f"{name} is not valid YAML: {' '.join(str(error).split())}") from error
 
 

@@ -54,8 +54,8 @@ def check_line_integrals(xrays: Tensor) -> None:
     low, high = LINE_INTEGRAL_RANGE
     if not low < largest < high:
         warn(f"the largest line integral is {largest:.3g}, but those of a chest lie between {low:g} and {high:g}: "
-             "check that the X-rays are line integrals of attenuation in 1/mm along mm, or give "
-             "display: true where they are display values")
+             "check that the X-rays are line integrals of attenuation in 1/mm along mm; of display values state "
+             "`intensity: {kind: display, bright_is_dense: true}` in geometry.yaml, or in Python display=True")
     width = max(1, xrays.shape[2] // 50)
     sides = torch.cat([xrays[..., :width], xrays[..., -width:]], -1).float()
     blocks = torch.stack([rows.flatten(1).median(1).values for rows in

@@ -31,6 +31,8 @@ MOST_RADIANS = 4 * math.pi
 """An angle in radians beyond two turns was meant in degrees."""
 LEAST_MM, MOST_MM = 1e-6, 1e9
 """No pixel's side is shorter, and no length as long: they would be those of a mistake, and underflow or overflow."""
+SHORT_MM = 200
+"""Of a distance from source to detector that may have been meant in another unit, where it fits no volume."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,12 +205,13 @@ class ConeBeam:
             room = f"a source_to_isocentre of {least} to {most} mm would do with" if least <= most else (
                 f"no source_to_isocentre would do, since {2 * least} mm are needed, with")
             culprit = "source" if near <= 0 else "detector"
+            units = ", with lengths in mm, not in cm or m" if distance < SHORT_MM else ""
             raise ValueError(
                 f"view {k}: the {culprit} lies inside the volume or the volume extends behind it: "
                 f"source to volume centre is {centre[k]:.1f} mm and volume centre to detector is "
                 f"{distance - centre[k]:.1f} mm along the view, but the volume reaches {centre[k] - near:.1f} mm from "
                 f"its centre; {room} this source_to_detector of {distance:g} mm; move the source or the detector, or "
-                "give a smaller volume")
+                f"give a smaller volume{units}")
 
     def is_upright(self, grid: Grid) -> bool:
         """Whether every detector's columns of pixels run along the grid's third axis."""

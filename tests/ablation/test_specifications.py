@@ -129,6 +129,8 @@ def test_arguments_and_files_that_cannot_be_meant_are_one_sentence(tmp_path, cap
     assert "nowhere" in refusal(capsys, main, ["ablate", "-c", str(file), "--cts", str(tmp_path / "nowhere")])
     (tmp_path / "bad.yaml").write_text("axes: [")
     assert "bad.yaml is not valid YAML" in refusal(capsys, main, ["ablate", "-c", str(tmp_path / "bad.yaml")])
+    (tmp_path / "bad.yaml").write_text("axes:\n\tviews: [2]\n")
+    assert "line 2 is indented by a tab" in refusal(capsys, main, ["ablate", "-c", str(tmp_path / "bad.yaml")])
     with alone_in(tmp_path / "out", "out"):
         assert "another run" in refusal(capsys, main, ["ablate", "-c", str(file)])
     (tmp_path / "out" / "results.csv").write_text("case,method\na,b\n")

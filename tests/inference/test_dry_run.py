@@ -25,7 +25,7 @@ def test_a_dry_run_draws_every_case_and_reconstructs_nothing(measured, tmp_path,
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 7 and lines[-1] == f"pages in {tmp_path / 'dry_run'}"
     pose, agreement = lines[0].rsplit(" ", 1)
-    assert pose == "anna view 1: source posterior, columns to left, rows to inferior; agreement"
+    assert pose == "anna view 0: source posterior, columns to left, rows to inferior; agreement"
     assert float(agreement) > 0.7
     assert not any("better" in line for line in lines)
 
@@ -58,7 +58,7 @@ def test_a_dry_run_goes_on_after_a_bad_case_and_names_it_at_the_end(measured, tm
         main(sirt("predict", tmp_path / "out", f"--data.xrays={tmp_path / 'cases'}", "--dry_run"))
     out, err = capsys.readouterr()
     said = [line for line in err.splitlines() if line.startswith("error: ")]
-    assert stopped.value.code == 2 and names(tmp_path / "out" / "dry_run") == ["bert.png"] and "bert view 1" in out
+    assert stopped.value.code == 2 and names(tmp_path / "out" / "dry_run") == ["bert.png"] and "bert view 0" in out
     assert said[0].startswith("error: anna: ") and "1 of 2 cases cannot be reconstructed (anna)" in said[1]
 
 
@@ -71,7 +71,7 @@ def test_a_dry_run_warns_of_a_left_lateral_view_told_to_stand_at_90_degrees(tmp_
         main(sirt("predict", tmp_path / "out", f"--data.xrays={tmp_path / name}", "--dry_run"))
         said = [line for line in capsys.readouterr().err.splitlines() if "mirrored" in line]
         assert len(said) == (name == "wrong"), name
-    assert "wrong: view 1 " in said[0] and "(LL)" in said[0] and "270" in said[0]
+    assert "wrong: view 0 " in said[0] and "(LL)" in said[0] and "270" in said[0]
 
 
 def test_a_dry_run_belongs_to_predict(tmp_path, capsys):

@@ -150,10 +150,10 @@ def test_truth_and_other_methods_stand_beside_a_volume_at_the_same_place(shown, 
 def test_xrays_follow_the_bars_and_the_slider(shown):
     page = shown("#sirt%2Fanna")
     assert [bar.get_attribute("aria-label") for bar in page.locator("#bars button").all()] == [
-        "view 1: misfit 0.100", "view 2: misfit 0.200", "view 3: misfit 0.0500"]
+        "view 0: misfit 0.100", "view 1: misfit 0.200", "view 2: misfit 0.0500"]
     first = look(page, "#xray")
     page.locator("#bars button").nth(1).click()
-    assert page.inner_text("#view-name") == "view 2 of 3, misfit 0.200" and look(page, "#xray") != first
+    assert page.inner_text("#view-name") == "view 1 of 3, misfit 0.200" and look(page, "#xray") != first
     second = look(page, "#xray")
     page.fill("#wipe", "100")
     assert look(page, "#xray") != second

@@ -164,6 +164,11 @@ def test_the_default_geometry_clears_its_volume():
     ConeBeam.orbit(8, 1020, 740, (448, 448), 1.25).check(Grid.cube(64))
 
 
+def test_lengths_in_metres_are_told_of():
+    with pytest.raises(ValueError, match="lengths in mm, not in cm or m"):
+        ConeBeam.orbit(8, 1.02, 0.74, (448, 448), 0.00125).check(Grid.cube(64))
+
+
 def test_yaml_round_trip_keeps_every_pose(tmp_path):
     tilted = ConeBeam([[3, -700, 20]], [[1, 300, 4]], [[-2, 0.1, 0]], [[0.1, 2, -3]], (5, 6))
     for beam in (tilted, orbit(3, start=0.1)):

@@ -18,6 +18,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from phydict.cli.export import export_prior, print_prior
 from phydict.cli.help import describe_commands, fit_help
 from phydict.cli.telling import TellingCLI
+from phydict.prior import DEFAULT_REFINER
 from phydict.runtime.console import (
     check_apart, check_command, check_configured, check_processes, check_writable, cli_errors, quiet,
     read_configurations, with_configurations)
@@ -35,6 +36,7 @@ from phydict.training.reconstructions import ReconstructionData
 from phydict.training.refinement import RefinementTraining
 from phydict.training.refiner import RefinerTraining
 from phydict.training.rivals import LiftedTraining
+from phydict.training.rollouts import ReplayTraining, RollOutData
 from phydict.training.stage import CHECKPOINT, StageTraining
 from phydict.training.super_resolution import SuperResolutionTraining
 from phydict.training.throughput import Throughput
@@ -46,8 +48,8 @@ COMMANDS = {"fit": "train a prior", "validate": "measure one on held-out cases",
             "inspect-prior": "what a file is"}
 
 STAGES = {"base": (PriorTraining, PriorData), "super_resolution": (SuperResolutionTraining, SuperResolutionData),
-          "refiner": (RefinerTraining, PriorData), "uncertainty": (UncertaintyTraining, PriorData),
-          "refinement": (RefinementTraining, ReconstructionData),
+          "refiner": (RefinerTraining, PriorData), "replay": (ReplayTraining, RollOutData),
+          "uncertainty": (UncertaintyTraining, PriorData), "refinement": (RefinementTraining, ReconstructionData),
           "lifted": (LiftedTraining, PriorData), "x2ct": (X2CTTraining, PriorData),
           "xray2ctpa": (XrayToCTPATraining, PriorData)}
 """What trains a stage, and on which data."""
@@ -100,6 +102,9 @@ class PriorCLI(TellingCLI):
             parser.link_arguments(f"model.{name}", f"data.{name}")
         if self.model_class is PriorTraining:
             parser.link_arguments("data.reports", "model.text.reports", apply_on="instantiate")
+        if self.model_class is ReplayTraining:
+            parser.set_defaults({"model.initial": str(DEFAULT_REFINER)})
+            parser.link_arguments("model.initial", "data.rollouts.initial")
         if self.model_class is SuperResolutionTraining:
             parser.link_arguments("model.factor", "data.crops.factor")
         else:

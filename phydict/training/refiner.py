@@ -76,7 +76,11 @@ class RefinerTraining(StageTraining):
         if refiner.first is not None:
             refiner.first.requires_grad_(False)
         self.method, self.scenes, self.body_weight, self.mask_weight = method, scenes, body_weight, mask_weight
-        self.validation_views, self.calls = validation.views, len(method.times)
+        self.validation_views = validation.views
+
+    @property
+    def calls(self) -> int:
+        return len(self.method.times)
 
     def batch_loss(self, batch: dict, key: tuple[int, ...] = (0,), rank: int = 0, processes: int = 1) -> Tensor:
         losses = [self._case_loss(*drawn) for drawn in self.drawn(batch, key, rank, processes)]
@@ -93,11 +97,16 @@ class RefinerTraining(StageTraining):
         learning = _Learning(self.prior, context, first=first)
         losses = []
         for x0, _ in zip(self.method.estimates(learning, measurement), range(self.calls)):
-            loss = log_error(x0[:, :1], ct, self.body_weight)
-            if bool(known.any()):
-                loss = loss + self.mask_weight * ((x0[:, 1:] - masks)[known].square().mean() + 1e-4).log()
-            losses.append(loss)
+            losses.append(self.call_loss(x0, ct, masks, known))
         return torch.stack(losses).mean()
+
+    def call_loss(self, x0: Tensor, ct: Tensor, masks: Tensor, known: Tensor) -> Tensor:
+        """The loss of one call's answer x0 (1, C, X, Y, Z); of the masks (1, C - 1, X, Y, Z) those that are known,
+        (1, C - 1) or for each voxel, teach."""
+        loss = log_error(x0[:, :1], ct, self.body_weight)
+        if bool(known.any()):
+            loss = loss + self.mask_weight * ((x0[:, 1:] - masks)[known].square().mean() + 1e-4).log()
+        return loss
 
     def validation_step(self, batch: dict, index: int) -> None:
         log_scores(self, batch, index, self.validation_views, self.method)

@@ -1,0 +1,80 @@
+"""Training a refiner on stored calls: they are those of its reconstructions, and a resumed run repeats itself."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from command_lines import refiner_arguments, refusal, resumed_as_uninterrupted
+from prior.tiny import tiny_prior, tiny_refiner
+
+from phydict.cli.train import main
+from phydict.grid import Cube
+from phydict.prior import Refiner, load_prior, save_prior, save_refiner
+from phydict.training.refiner import RefinerTraining
+from phydict.training.rollouts import ReplayTraining, RollOutData, RollOuts, RollOutSettings
+from phydict.training.scenes import Scenes
+from phydict.training.settings import Loading
+
+CONFIG = Path(__file__).parents[1] / "configs" / "prior" / "replay.yaml"
+SETTINGS = {"cube": Cube(16), "window": (-1000, 600)}
+
+
+@pytest.fixture(scope="module")
+def refiner_file(tmp_path_factory) -> str:
+    file = tmp_path_factory.mktemp("refiner") / "tiny.safetensors"
+    save_refiner(tiny_refiner(), file, dtype=torch.float32)
+    return str(file)
+
+
+def rollouts(refiner_file: str, cache: Path, count: int = 1, **more) -> RollOutData:
+    settings = RollOutSettings(count, Scenes(most_views=4), refiner_file)
+    return RollOutData(settings, phantoms=2, cache=str(cache), **SETTINGS, **more)
+
+
+def test_single_calls_are_learnt_from_as_a_whole_reconstruction_is(refiner_file, cache):
+    data = rollouts(refiner_file, cache)
+    whole = RefinerTraining(scenes=data.rollouts.settings.scenes, initial=refiner_file, **SETTINGS)
+    single = ReplayTraining(initial=refiner_file, **SETTINGS)
+    draws, found = data.draws(0), {}
+    for i in range(40):
+        batch = data.collate([draws[i]])
+        found[int(batch["call"])] = single.batch_loss(batch)
+    live = whole._case_loss(data._case(0), np.random.default_rng((0, 0)))
+    torch.testing.assert_close(torch.stack([found[n] for n in range(whole.calls)]).mean(), live, rtol=2e-3, atol=2e-3)
+
+
+def test_calls_of_finer_volumes_and_masks_that_are_not_known_are_kept_as_such(refiner_file, cache, monkeypatch):
+    data = rollouts(refiner_file, cache, loading=Loading(simulation_voxels=32))
+    case, kinds = data._case(0), load_prior(refiner_file).state_channels - 1
+    assert case["fine"].shape[-1] == 32
+    case["has_masks"] = torch.tensor([[True, False, False]])
+    monkeypatch.setattr(data.rollouts, "drawn", lambda n: case)
+    item = data.draws(0)[0]
+    assert item["masks"].isnan().flatten(1).all(1).tolist() == [False, True, True][:kinds]
+    torch.testing.assert_close(item["volume"], case["volume"][0], rtol=1e-3, atol=1e-3)
+    assert ReplayTraining(initial=refiner_file, **SETTINGS).batch_loss(data.collate([item])).isfinite()
+
+
+def test_a_resumed_run_is_the_uninterrupted_one_and_makes_each_roll_out_once(tmp_path, refiner_file, monkeypatch):
+    cache, made, make = tmp_path / "cache", [], RollOuts._made
+    monkeypatch.setattr(RollOuts, "_made", lambda self, n: (made.append(n), make(self, n))[1])
+
+    def fit(run: Path, *more: str) -> list[str]:
+        args = refiner_arguments(CONFIG, run, cache, refiner_file, "--model.validation.views=[2]",
+                                 "--data.rollouts.count=2", *more)
+        return [arg.replace("--model.scenes", "--data.rollouts.scenes") for arg in args]
+
+    last = resumed_as_uninterrupted(main, fit, tmp_path)
+    main(["export", "--checkpoint", str(last), "--out", str(tmp_path / "refiner.safetensors")])
+    learnt, begun = load_prior(tmp_path / "refiner.safetensors"), load_prior(refiner_file)
+    assert isinstance(learnt, Refiner) and not torch.equal(learnt.entrance.weight, begun.entrance.weight)
+    [folder] = cache.glob("**/rollouts-*")
+    assert made and sorted(made) == sorted(int(file.stem) for file in folder.iterdir())
+
+
+def test_a_prior_that_is_no_refiner_has_no_roll_outs(tmp_path, cache, capsys):
+    save_prior(tiny_prior(detail=True), tmp_path / "prior.safetensors", dtype=torch.float32)
+    args = refiner_arguments(CONFIG, tmp_path / "run", cache, str(tmp_path / "prior.safetensors"))
+    args = [arg for arg in args if not arg.startswith("--model.scenes")]
+    assert "give a refiner's file as model.initial" in refusal(capsys, main, args)

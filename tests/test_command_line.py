@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from command_lines import refusal
 
 from phydict.cli.infer import main as infer
 from phydict.cli.train import main as train
@@ -130,12 +131,10 @@ BOMB = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
 
 
 @pytest.mark.parametrize("name", ["inline", "with:colon.yaml"])
-def test_anchors_that_repeat_each_other_are_refused_wherever_they_stand(empty, name):
+def test_anchors_that_repeat_each_other_are_refused_wherever_they_stand(empty, capsys, name):
     (empty / "with:colon.yaml").write_text(BOMB)
-    done = subprocess.run([sys.executable, "-c", "import sys; from phydict.cli.infer import main; main(sys.argv[1:])",
-                           "predict", "-c", BOMB if name == "inline" else name, "--data.xrays", "x"],
-                          capture_output=True, text=True, timeout=120, env=os.environ | {"PYTHONPATH": str(ROOT)})
-    assert done.returncode == 2 and done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
+    said = refusal(capsys, infer, ["predict", "-c", BOMB if name == "inline" else name, "--data.xrays", "x"])
+    assert "by aliases" in said
 
 
 @pytest.mark.parametrize("content, words", [

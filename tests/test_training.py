@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -35,16 +36,18 @@ def test_the_loss_falls(tmp_path, cache):
 
 
 def test_a_log_file_tells_steps_in_whole_lines_and_nothing_of_lightnings(tmp_path, cache):
-    for more in (["--trainer.max_steps=3"], ["--trainer.max_steps=6", f"--ckpt_path={tmp_path / 'last.ckpt'}"]):
-        args = [arg for arg in arguments(tmp_path, cache, "--progress.interval=0") if "enable_" not in arg]
-        run = subprocess.run([sys.executable, "-c", "from phydict.cli.train import main; main()", *args, *more],
-                             capture_output=True, text=True, cwd=CONFIG.parents[2], timeout=300)
-        assert run.returncode == 0, run.stderr[-2000:]
-        said = (run.stdout + run.stderr).splitlines()
-        last = f"step {more[0].split('=')[1]} of {more[0].split('=')[1]}: loss "
+    both = "import json, sys; from phydict.cli.train import main; [main(args) for args in json.loads(sys.argv[1])]"
+    args = [arg for arg in arguments(tmp_path, cache, "--progress.interval=0") if "enable_" not in arg]
+    runs = [[*args, *more] for more in (["--trainer.max_steps=3"], [
+        "--trainer.max_steps=6", f"--ckpt_path={tmp_path / 'last.ckpt'}"])]
+    done = subprocess.run([sys.executable, "-c", both, json.dumps(runs)], capture_output=True, text=True,
+                          cwd=CONFIG.parents[2], timeout=300)
+    assert done.returncode == 0, done.stderr[-2000:]
+    said = (done.stdout + done.stderr).splitlines()
+    for last in ("step 3 of 3: loss ", "step 6 of 6: loss "):
         assert any(line.startswith(last) and "samples_per_s" in line for line in said), said
-        known = ("step ", "training", "report ", "sentences: ", "Seed")
-        assert all(line.startswith(known) for line in said)
+    known = ("step ", "training", "report ", "sentences: ", "Seed")
+    assert all(line.startswith(known) for line in said), said
 
 
 def test_each_epoch_has_draws_of_its_own_whatever_the_configuration_says(tmp_path, cache, monkeypatch, capsys):

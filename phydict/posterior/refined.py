@@ -209,7 +209,7 @@ class Refined(Delegating):
             if correction is not None:
                 calls += correction.projector_calls
                 network_calls += correction.calls
-        spread, volume = coarse.deviation, volume.cpu()
+        deviation, volume = coarse.deviation, volume.cpu()
         change = (volume - interpolated(coarse.within, base.grid, self.target, AIR)).abs()
         if coarse.carried:
             volume = volume + coarse.carried.on(grid)
@@ -221,7 +221,7 @@ class Refined(Delegating):
             masks=None if coarse.masks is None else torch.cat([
                 coarse.masks.new_zeros(0, *self.target.shape),
                 *(interpolated(mask, base.grid, self.target, 0.0)[None] for mask in coarse.masks)]),
-            deviation=None if spread is None else interpolated(spread, base.grid, self.target, 0.0))
+            deviation=None if deviation is None else interpolated(deviation, base.grid, self.target, 0.0))
 
     def _seen(self, xrays: Tensor, projector: Projector, grid: Grid) -> tuple[Tensor, Projector]:
         """The X-rays as a level sees them, binned to what its voxels can hold, and the projector to them."""

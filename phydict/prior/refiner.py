@@ -118,10 +118,10 @@ class Refiner(nn.Module):
         if guidance != 1:
             raise ValueError(f"a refiner is guided by the X-rays alone, but a guidance scale of {guidance} was given: "
                              "leave it at 1, or use phydict_fast")
-        context, first = self.told(self.reader.bind(report, 1.0, precision), bool(report))
+        context, first = self.conditioning(self.reader.bind(report, 1.0, precision), bool(report))
         return BoundRefiner(self, context, precision, first)
 
-    def told(self, heard: BoundPrior, reported: bool) -> tuple[Tensor, BoundPrior | None]:
+    def conditioning(self, heard: BoundPrior, reported: bool) -> tuple[Tensor, BoundPrior | None]:
         """Of what the reader has heard, the context (1, L, D) of the calls, and the denoiser to begin with, if any."""
         if self.first is None:
             return heard.context, None

@@ -93,7 +93,7 @@ class RefinerTraining(StageTraining):
         with_report = self.prior.reader.text is not None and rng.random() >= TEXT_DROPOUT
         report = case["report"][0] if with_report else ""
         reader = self.prior.reader
-        context, first = self.prior.told(BoundPrior(reader, reader.context([report]), 1.0), bool(report))
+        context, first = self.prior.conditioning(BoundPrior(reader, reader.context([report]), 1.0), bool(report))
         learning = _Learning(self.prior, context, first=first)
         losses = []
         for x0, _ in zip(self.method.estimates(learning, measurement), range(self.calls)):

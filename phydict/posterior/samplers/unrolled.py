@@ -110,7 +110,7 @@ class Unrolled(Sampler):
         before = self.start_state(refiner, measurement)
         measurement.refit(before[:, :1])
         evidence = Evidence(measurement)
-        z = start = self._meet(self.start, measurement, before, self.x0_stds[0])
+        z = start = self._likelihood_step(self.start, measurement, before, self.x0_stds[0])
         on_step()
         for n, t in enumerate(self.times):
             channels = evidence(z[:, :1], before[:, :1], start[:, :1])
@@ -127,14 +127,14 @@ class Unrolled(Sampler):
             measurement.refit(before[:, :1])
             last = n + 1 == len(self.times)
             step = self.final_likelihood if last else self.likelihood
-            z = self._meet(step, measurement, before, self.x0_stds[n + 1])
+            z = self._likelihood_step(step, measurement, before, self.x0_stds[n + 1])
             if n + 1 == len(self.times) // 2 and self._misses(measurement, z):
                 measurement.subgrid = subgrid_projection(measurement, z[:, :1], self.subgrid, self.x0_stds[0])
             if last and isinstance(step, ProximalCG):
                 excess = float(measurement.normalised_residual(z[:, :1], modelled=True).max()) ** 2
                 if excess > 1:
                     smoother = replace(step, tv_weight=step.tv_weight * min(excess, MOST_SMOOTHING))
-                    z = self._meet(smoother, measurement, before, self.x0_stds[n + 1])
+                    z = self._likelihood_step(smoother, measurement, before, self.x0_stds[n + 1])
             on_step()
         on_result(z, lambda: evidence(z[:, :1], before[:, :1], start[:, :1]))
         yield z
@@ -154,7 +154,7 @@ class Unrolled(Sampler):
                 and float(measurement.normalised_residual(z[:, :1], modelled=True).max()) > 1)
 
     @staticmethod
-    def _meet(step: LikelihoodStep, measurement: Measurement, x0: Tensor, x0_std: float) -> Tensor:
+    def _likelihood_step(step: LikelihoodStep, measurement: Measurement, x0: Tensor, x0_std: float) -> Tensor:
         return torch.cat([step(measurement, x0[:, :1], x0_std).clamp(-1, 1), x0[:, 1:]], 1)
 
     def sample(self, denoiser: BoundRefiner, measurement: Measurement, x: Tensor, generator: Generators,

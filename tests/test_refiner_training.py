@@ -19,7 +19,7 @@ from phydict.prior import Refiner, load_prior, save_prior
 from phydict.runtime.warning import warn
 from phydict.training.data import PriorData
 from phydict.training.refiner import RefinerTraining
-from phydict.training.scenes import Scenes
+from phydict.training.scenes import PHOTONS, Scenes
 from phydict.training.settings import Loading
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
@@ -100,6 +100,25 @@ def test_every_drawn_scene_can_be_reconstructed_on_its_grid():
             beam.check(grid)
             seen.add(beam.views)
     assert min(seen) == 1 and max(seen) > 24
+
+
+@pytest.mark.parametrize("kind", ["misplaced", "scatter", "counting"])
+def test_what_befalls_a_scene_is_of_its_kind_and_the_stated_geometry_stays(kind):
+    grid, window = Grid.cube(16), HUWindow(-1000, 600)
+    ct = phantom_case(3, grid, window)["volume"][None]
+    quiet = {"noise": (1e-9, 2e-9), "model_error": 0.0, "most_views": 4}
+    for seed in range(6):
+        stated = Scenes(**quiet).xrays(ct, np.random.default_rng(seed), grid, window)[1]
+        y, projector = Scenes(**quiet | {kind: 1.0}).xrays(ct, np.random.default_rng(seed), grid, window)
+        assert stated.beam.same_as(projector.beam) and y.isfinite().all()
+        exact = projector(window.to_mu(ct))[0].double()
+        error = y.double() - exact
+        if kind == "misplaced":  # by millimetres
+            assert error.std() > 1e-3 * exact.max() and error.mean().abs() < 0.05 * exact.mean()
+        if kind == "scatter":  # adds to what is left of the rays
+            assert error.mean() < -0.005 and ((-y.double()).exp() - (-exact).exp()).mean() > 0
+        if kind == "counting":  # more where less is left
+            assert (error.square() * (-exact).exp()).mean() < 1.5 / PHOTONS[0]
 
 
 def test_scenes_scale_with_the_grid():

@@ -16,9 +16,20 @@ from phydict.runtime.ranges import check_fields
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 from phydict.xray.finer import FinerProjector
+from phydict.xray.polychromatic import scatter_of
+from phydict.xray.poses.unknowns import POSE, moved
 
 REACH = 1.48
 """Least distance from the isocentre to source and detector, over half the grid's side: their planes miss the grid."""
+
+
+MISPLACED = (1.5, 1.5, 1.5, 1.5, 1.5, 0.0, 0.3, 0.0)
+"""Standard deviations of the poses' errors (poses.unknowns.POSE), in mm and degrees; detectors stay upright."""
+
+SCATTER, SCATTER_MM = (0.02, 0.08), 60.0
+"""Least and most amplitude of `scatter_of`, and its width."""
+
+PHOTONS = (1e4, 1e6)
 
 
 @dataclass(frozen=True)
@@ -34,6 +45,9 @@ class Scenes:
         model_error: share of scenes with beam hardening and a scale that is off by up to 2 %
         fine: share of scenes whose X-rays are made of the finer volume, where the data have one
             (data.loading.simulation_voxels), on a detector that is as much finer and is then binned
+        misplaced: share of scenes whose views are not exactly where they are stated to be
+        scatter: share of scenes with scattered radiation
+        counting: share of scenes with the noise of 10^4 to 10^6 counted photons per pixel instead
     """
 
     most_views: int = 32
@@ -43,10 +57,13 @@ class Scenes:
     noise: tuple[float, float] = (5e-4, 0.02)
     model_error: float = 0.3
     fine: float = 0.5
+    misplaced: float = 0.0
+    scatter: float = 0.0
+    counting: float = 0.0
 
     def __post_init__(self):
-        check_fields(self, "model.scenes", most_views=(1, 1000), orbit=(0, 1), arc=(0, 1), varied=(0, 1),
-                     model_error=(0, 1), fine=(0, 1))
+        shares = ("orbit", "arc", "varied", "model_error", "fine", "misplaced", "scatter", "counting")
+        check_fields(self, "model.scenes", most_views=(1, 1000), **dict.fromkeys(shares, (0, 1)))
         if 1.5 * self.orbit + self.arc > 1:
             raise ValueError("model.scenes has 1.5 orbit + arc of at most 1, but orbit "
                              f"{self.orbit} and arc {self.arc} were given")
@@ -79,14 +96,24 @@ class Scenes:
               fine: Tensor | None = None) -> tuple[Tensor, Projector]:
         """X-rays (K, V, U) of a CT (1, 1, X, Y, Z) in the prior's range, of a drawn scene, and their projector from its
         grid; `fine`, if given, is the same CT in finer voxels."""
-        projector = Projector(grid, self.beam(rng, grid), full_detector=True)
+        scale = grid.extent[0] / 384
+        projector = true = Projector(grid, self.beam(rng, grid), full_detector=True)
+        if _happens(self.misplaced, rng):
+            true = Projector(grid, _moved(projector.beam, rng, scale), full_detector=True)
         if fine is not None and rng.random() < self.fine:
-            y = FinerProjector(projector, fine.shape[-1] // ct.shape[-1])(window.to_mu(fine))
+            y = FinerProjector(true, fine.shape[-1] // ct.shape[-1])(window.to_mu(fine))
         else:
-            y = projector(window.to_mu(ct))
+            y = true(window.to_mu(ct))
         if rng.random() < self.model_error:
             hardened = rng.uniform(0, 0.02) * y * (0.7 * float(y.max()) - y) / 2
             y = (1 + rng.uniform(-0.02, 0.02)) * (y + hardened)
+        if _happens(self.scatter, rng):
+            primary = (-y[0]).exp()
+            y = -(primary + scatter_of(primary, true.beam, rng.uniform(*SCATTER), SCATTER_MM * scale)).log()[None]
+        if _happens(self.counting, rng):
+            photons = math.exp(rng.uniform(*np.log(PHOTONS)))
+            counts = torch.from_numpy(rng.poisson(photons * (-y.double()).exp().numpy(force=True))).clamp(min=0.5)
+            return -(counts / photons).log().to(y)[0], projector
         low, high = np.log(self.noise)
         noise = 0.005 if rng.random() < 0.4 else math.exp(rng.uniform(low, high))
         y = y + noise * y.max() * torch.from_numpy(rng.standard_normal(tuple(y.shape))).to(y)
@@ -99,3 +126,14 @@ class Scenes:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             return Measurement(projector, y, window)
+
+
+def _happens(share: float, rng: np.random.Generator) -> bool:
+    """Whether something that befalls a share of the scenes does; what befalls none draws nothing."""
+    return share > 0 and rng.random() < share
+
+
+def _moved(beam: ConeBeam, rng: np.random.Generator, scale: float) -> ConeBeam:
+    """Where the views of a beam really are."""
+    lengths = np.where([kind.endswith("_mm") for kind in POSE], scale, 1.0)
+    return moved(beam, rng.standard_normal((beam.views, len(POSE))) * MISPLACED * lengths)

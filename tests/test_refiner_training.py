@@ -40,7 +40,8 @@ def arguments(folder: Path, cache: Path, initial: str, *more: str) -> list[str]:
 
 
 def test_a_resumed_run_is_the_uninterrupted_one_and_is_exported_as_a_refiner(tmp_path, cache, prior_file):
-    last = resumed_as_uninterrupted(main, lambda run, *more: arguments(run, cache, prior_file, *more), tmp_path)
+    last = resumed_as_uninterrupted(main, lambda run, *more: arguments(
+        run, cache, prior_file, "--trainer.limit_val_batches=0", *more), tmp_path)
     main(["export", "--checkpoint", str(last), "--out", str(tmp_path / "refiner.safetensors")])
     refiner = load_prior(tmp_path / "refiner.safetensors")
     assert isinstance(refiner, Refiner) and refiner.entrance.weight.any() and refiner.gate[-1].weight.any()

@@ -61,7 +61,7 @@ def test_a_resumed_run_is_the_uninterrupted_one_and_makes_each_roll_out_once(tmp
     monkeypatch.setattr(RollOuts, "_made", lambda self, n: (made.append(n), make(self, n))[1])
 
     def fit(run: Path, *more: str) -> list[str]:
-        args = refiner_arguments(CONFIG, run, cache, refiner_file, "--model.validation.views=[2]",
+        args = refiner_arguments(CONFIG, run, cache, refiner_file, "--trainer.limit_val_batches=0",
                                  "--data.rollouts.count=2", *more)
         return [arg.replace("--model.scenes", "--data.rollouts.scenes") for arg in args]
 

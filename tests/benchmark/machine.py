@@ -62,9 +62,10 @@ def reconstruction(precision: str, repeats: int) -> dict:
 
     import phydict
     from phydict.evaluation import volume_metrics
+    from phydict.prior import DEFAULT_PRIOR
 
     here = Path(__file__).parents[2] / "data" / "example"
-    case, prior = phydict.load_xrays(here / "xrays"), phydict.load_prior(phydict.methods.DEFAULT_PRIOR)
+    case, prior = phydict.load_xrays(here / "xrays"), phydict.load_prior(DEFAULT_PRIOR)
     truth = torch.from_numpy(nibabel.load(here / "truth.nii.gz").get_fdata(dtype="float32"))[None, None]
     first, seconds, found = timed(lambda: phydict.reconstruct(
         case["xrays"], case["beam"], prior, report=case["report"], precision=precision), repeats)

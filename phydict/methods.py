@@ -17,11 +17,38 @@ from phydict.baselines.baseline import Baseline
 from phydict.datasets import format_report
 from phydict.grid import Grid
 from phydict.posterior import (
-    DAPS, DDS, DPS, CascadePosterior, DiffPIR, ExactDraw, GradientSteps, Metal, PnPDM, Posterior, PriorOnly, ProximalCG,
-    Refined, Refinement, Reward, Sampler, SplitGibbs, Unrolled)
+    DAPS,
+    DDS,
+    DPS,
+    CascadePosterior,
+    DiffPIR,
+    ExactDraw,
+    GradientSteps,
+    Metal,
+    PnPDM,
+    Posterior,
+    PriorOnly,
+    ProximalCG,
+    Refined,
+    Refinement,
+    Reward,
+    Sampler,
+    SplitGibbs,
+    Unrolled,
+)
 from phydict.prior import (
-    DEFAULT_CORRECTION, Cascade, MedSynCheckpoint, PriorContract, Refiner, SuperResolution, check_prior, find_prior,
-    is_refiner, load_correction, load_super_resolution)
+    DEFAULT_CORRECTION,
+    Cascade,
+    MedSynCheckpoint,
+    PriorContract,
+    Refiner,
+    SuperResolution,
+    check_prior,
+    find_prior,
+    is_refiner,
+    load_correction,
+    load_super_resolution,
+)
 from phydict.reconstruction import Reconstruction, Reconstructor
 from phydict.runtime.precision import check_precision
 from phydict.runtime.reading import check_memory, reason

@@ -16,7 +16,19 @@ from phydict.diffusion import CosineSchedule, GaussianDenoiser
 from phydict.guard import check_ceiling, risen_from
 from phydict.methods import reconstructor
 from phydict.posterior import (
-    DAPS, DDS, DPS, DiffPIR, ExactDraw, GradientSteps, Langevin, PnPDM, Posterior, PriorOnly, ProximalCG, SplitGibbs)
+    DAPS,
+    DDS,
+    DPS,
+    DiffPIR,
+    ExactDraw,
+    GradientSteps,
+    Langevin,
+    PnPDM,
+    Posterior,
+    PriorOnly,
+    ProximalCG,
+    SplitGibbs,
+)
 from phydict.xray import Ideal
 from phydict.xray.residuals import misfits
 

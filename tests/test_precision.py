@@ -15,7 +15,12 @@ from phydict.baselines import SIRT
 from phydict.posterior import Posterior, PriorOnly
 from phydict.runtime import precision
 from phydict.runtime.precision import (
-    computes_bfloat16, instruction_set, network_precision, precision_name, resolve_precision)
+    computes_bfloat16,
+    instruction_set,
+    network_precision,
+    precision_name,
+    resolve_precision,
+)
 
 CPU = torch.device("cpu")
 AVX2 = {"ONEDNN_MAX_CPU_ISA": "AVX2", "ATEN_CPU_CAPABILITY": "avx2"}

@@ -14,7 +14,6 @@ from phydict.evaluation.fid import NAMES, load_features
 from phydict.evaluation.tables import Table, fid_table
 from phydict.inference.scoring import Scoring
 
-
 FID = "fid.csv"
 """The distances in a folder of results."""
 

@@ -12,7 +12,15 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from phydict.ablation.summary import (
-    SHOWN_MEASURES, Entry, best_settings, compared_geometries, compared_views, conditions, deltas, format_settings)
+    SHOWN_MEASURES,
+    Entry,
+    best_settings,
+    compared_geometries,
+    compared_views,
+    conditions,
+    deltas,
+    format_settings,
+)
 from phydict.evaluation.gallery import literal
 from phydict.runtime.files import atomic_write
 

@@ -8,7 +8,15 @@ from types import MappingProxyType
 
 from phydict.ablation.run import TABLES
 from phydict.ablation.summary import (
-    SHOWN_MEASURES, Entry, best_settings, compared_geometries, compared_views, conditions, deltas, format_settings)
+    SHOWN_MEASURES,
+    Entry,
+    best_settings,
+    compared_geometries,
+    compared_views,
+    conditions,
+    deltas,
+    format_settings,
+)
 from phydict.evaluation.bootstrap import difference
 from phydict.evaluation.metrics import MEASURES, RANGE
 from phydict.evaluation.tables import INTERVAL, Table, caption, doubts, empty_notes, interval_note, listed

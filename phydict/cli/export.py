@@ -5,8 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 from phydict.prior.files import (
-    build_correction, build_prior, build_refiner, build_super_resolution, save_correction, save_prior, save_refiner,
-    save_super_resolution)
+    build_correction,
+    build_prior,
+    build_refiner,
+    build_super_resolution,
+    save_correction,
+    save_prior,
+    save_refiner,
+    save_super_resolution,
+)
 from phydict.prior.inspection import inspect_prior
 from phydict.prior.stage_file import is_saved_prior
 from phydict.prior.text_file import build_text, has_text

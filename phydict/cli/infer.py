@@ -21,7 +21,16 @@ from phydict.inference.scoring import METRICS, CLIPSettings, FIDSettings, Scorin
 from phydict.inference.task import ReconstructionTask
 from phydict.methods import METHODS
 from phydict.runtime.console import (
-    CONFIGURATION, check_apart, check_command, check_processes, cli_errors, noted, quiet, read_configuration, sentence)
+    CONFIGURATION,
+    check_apart,
+    check_command,
+    check_processes,
+    cli_errors,
+    noted,
+    quiet,
+    read_configuration,
+    sentence,
+)
 from phydict.runtime.help import HelpFormatter
 from phydict.runtime.reading import reading
 from phydict.runtime.shipped import configuration

@@ -20,17 +20,25 @@ from phydict.cli.help import describe_commands, fit_help
 from phydict.cli.telling import TellingCLI
 from phydict.prior import DEFAULT_REFINER
 from phydict.runtime.console import (
-    check_apart, check_command, check_configured, check_processes, check_writable, cli_errors, quiet,
-    read_configurations, with_configurations)
+    check_apart,
+    check_command,
+    check_configured,
+    check_processes,
+    check_writable,
+    cli_errors,
+    quiet,
+    read_configurations,
+    with_configurations,
+)
 from phydict.runtime.files import alone_in, atomic_write
-from phydict.runtime.precision import PRECISIONS, resolve_precision, trainer_precision
 from phydict.runtime.help import HelpFormatter
+from phydict.runtime.precision import PRECISIONS, resolve_precision, trainer_precision
 from phydict.runtime.reading import reading
 from phydict.runtime.telling import run_told, telling
-from phydict.training.prior import PriorTraining
 from phydict.training.checkpoints import BEST, HELD_OUT, RESUMED, BestCheckpoint, WholeCheckpoints, read_checkpoint
 from phydict.training.crops import SuperResolutionData
 from phydict.training.data import PriorData
+from phydict.training.prior import PriorTraining
 from phydict.training.progress import TrainingProgress
 from phydict.training.reconstructions import ReconstructionData
 from phydict.training.refinement import RefinementTraining

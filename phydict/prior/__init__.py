@@ -5,9 +5,24 @@ from phydict.prior.contract import PriorContract, check_prior, find_prior
 from phydict.prior.correction import CorrectionNetwork
 from phydict.prior.detail import DetailNetwork
 from phydict.prior.files import (
-    DEFAULT_CORRECTION, DEFAULT_PRIOR, DEFAULT_REFINER, describe, describe_correction, describe_refiner,
-    describe_super_resolution, file_read, fingerprint, is_refiner, load_correction, load_prior, load_super_resolution,
-    save_correction, save_prior, save_refiner, save_super_resolution)
+    DEFAULT_CORRECTION,
+    DEFAULT_PRIOR,
+    DEFAULT_REFINER,
+    describe,
+    describe_correction,
+    describe_refiner,
+    describe_super_resolution,
+    file_read,
+    fingerprint,
+    is_refiner,
+    load_correction,
+    load_prior,
+    load_super_resolution,
+    save_correction,
+    save_prior,
+    save_refiner,
+    save_super_resolution,
+)
 from phydict.prior.inspection import inspect_prior
 from phydict.prior.local_unet import LocalUNet
 from phydict.prior.medsyn.checkpoint import MedSynCheckpoint

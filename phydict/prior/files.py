@@ -18,13 +18,27 @@ from phydict.prior.correction import CorrectionNetwork
 from phydict.prior.detail import DetailNetwork
 from phydict.prior.local_unet import LocalUNet
 from phydict.prior.medsyn.checkpoint import (
-    FILES, MedSynCheckpoint, as_checkpoint, is_medsyn, load_medsyn, load_medsyn_super_resolution)
+    FILES,
+    MedSynCheckpoint,
+    as_checkpoint,
+    is_medsyn,
+    load_medsyn,
+    load_medsyn_super_resolution,
+)
 from phydict.prior.medsyn.prior import MedSynPrior
 from phydict.prior.medsyn.super_resolution import MedSynSuperResolution
 from phydict.prior.prior import STATE, Prior
 from phydict.prior.refiner import Refiner
 from phydict.prior.stage_file import (
-    ADVICE, FORMAT, built_network, number_of, read_stage, whole_of, window_of, write_stage)
+    ADVICE,
+    FORMAT,
+    built_network,
+    number_of,
+    read_stage,
+    whole_of,
+    window_of,
+    write_stage,
+)
 from phydict.prior.super_resolution import SuperResolution
 from phydict.prior.text_file import has_text, load_text
 from phydict.prior.uncertainty import Uncertainty

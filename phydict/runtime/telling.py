@@ -11,7 +11,14 @@ from contextvars import ContextVar
 from jsonargparse import ArgumentParser
 from rich.console import Console
 from rich.progress import (
-    BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn)
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 WORDS, JSON, NOTHING = "words", "json", "nothing"
 

@@ -11,8 +11,8 @@ import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
-from phydict.prior.stage_file import STAGES
 from phydict.prior.finite import check_finite
+from phydict.prior.stage_file import STAGES
 from phydict.prior.tensors import read_torch
 from phydict.runtime.files import atomic_write
 from phydict.runtime.reading import not_written

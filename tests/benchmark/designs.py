@@ -30,10 +30,10 @@ from phydict.evaluation import read_csv, write_csv
 from phydict.prior import Prior, VolumeUNet
 from phydict.runtime.console import quiet
 from phydict.runtime.precision import trainer_precision
-from phydict.training.prior import PriorTraining, reconstruction_scores
 from phydict.training.data import PriorData
-from phydict.training.settings import HoldOut, Loading, PriorOptimisation, TextSettings
 from phydict.training.denoising import denoising_errors
+from phydict.training.prior import PriorTraining, reconstruction_scores
+from phydict.training.settings import HoldOut, Loading, PriorOptimisation, TextSettings
 from phydict.training.stage import CHECKPOINT
 
 FILE = Path(__file__).with_suffix(".csv")

@@ -27,11 +27,10 @@ from pathlib import Path
 import nibabel
 import numpy as np
 import torch
+from hard_scenes import blurred, drifted, focal_spot, heeled, lagging, scaled, water_cube, without_left_lung
+from poses import lowered, true_beam
 from scipy.ndimage import rotate
 from scipy.stats import spearmanr
-from hard_scenes import (
-    blurred, drifted, focal_spot, heeled, lagging, scaled, water_cube, without_left_lung)
-from poses import lowered, true_beam
 from torch import Tensor
 from torch.nn.functional import interpolate
 

@@ -12,7 +12,13 @@ from pathlib import Path
 import torch
 from prior.tiny import tiny_prior
 from stranger_files import (
-    NO, dicoms_of_strangers, geometry_by_hand, pictures_of_attackers, priors_of_strangers, volumes_of_strangers)
+    NO,
+    dicoms_of_strangers,
+    geometry_by_hand,
+    pictures_of_attackers,
+    priors_of_strangers,
+    volumes_of_strangers,
+)
 from tries import BEAM, ROOT, SIRT, xrays
 
 import phydict

@@ -18,8 +18,7 @@ import numpy as np
 import torch
 
 import phydict
-from phydict.datasets import (
-    Thorax, body_mask, find_cts, pathology_region, phantom_case, prepare_ct, report, wrong_side)
+from phydict.datasets import Thorax, body_mask, find_cts, pathology_region, phantom_case, prepare_ct, report, wrong_side
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM
 from phydict.evaluation import volume_metrics, write_csv
 from phydict.prior import DEFAULT_PRIOR, Prior

@@ -21,11 +21,11 @@ from phydict.datasets.population.findings import put_findings
 from phydict.datasets.population.organs import expansion
 from phydict.datasets.population.registration import overlap
 from phydict.datasets.population.velocity import flow, jacobian, places, resize, sample
+from phydict.datasets.surroundings.couches import Couch
 from phydict.grid import Cube, Grid
 from phydict.training.crops import SuperResolutionData
 from phydict.training.data import PriorData
 from phydict.training.draws import MixedCases
-from phydict.datasets.surroundings.couches import Couch
 from phydict.training.settings import HoldOut, Loading
 from phydict.units import HUWindow
 

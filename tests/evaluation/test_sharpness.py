@@ -7,7 +7,13 @@ import pytest
 import torch
 
 from phydict.evaluation.sharpness import (
-    edge_spread, edge_width, nodule, recovered_contrast, sharpness_scores, vessel_visibility)
+    edge_spread,
+    edge_width,
+    nodule,
+    recovered_contrast,
+    sharpness_scores,
+    vessel_visibility,
+)
 from phydict.grid import Grid
 
 GRID = Grid.box((40, 24, 60), (120.0, 72.0, 120.0))  # 3, 3 and 2 mm

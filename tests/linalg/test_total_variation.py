@@ -7,7 +7,13 @@ import torch
 from laws import assert_adjoint, random_like
 
 from phydict.linalg.total_variation import (
-    UNIT, TVQuadraticMajorizer, differences, differences_adjoint, total_variation, tv_proximal)
+    UNIT,
+    TVQuadraticMajorizer,
+    differences,
+    differences_adjoint,
+    total_variation,
+    tv_proximal,
+)
 
 pytestmark = pytest.mark.smoke
 

@@ -7,8 +7,8 @@ from itertools import product
 import nibabel
 import numpy as np
 import pytest
-from page.made import finish
 
+from page.made import finish
 from phydict.grid import Grid
 from phydict.inference.page import results_page
 

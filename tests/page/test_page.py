@@ -9,8 +9,8 @@ import nibabel
 import numpy as np
 import pytest
 import torch
-from page.made import TURNED, finish, random_hu
 
+from page.made import TURNED, finish, random_hu
 from phydict.cli.infer import main
 from phydict.evaluation import Table, write_csv
 from phydict.evaluation.metrics import MEASURES

@@ -10,7 +10,14 @@ from safetensors.torch import load_file, save_file
 
 from phydict.grid import Grid
 from phydict.prior import (
-    Cascade, LocalUNet, SuperResolution, load_prior, load_super_resolution, save_prior, save_super_resolution)
+    Cascade,
+    LocalUNet,
+    SuperResolution,
+    load_prior,
+    load_super_resolution,
+    save_prior,
+    save_super_resolution,
+)
 from phydict.units import HUWindow
 from prior.tiny import tiny_prior, tiny_super_resolution
 

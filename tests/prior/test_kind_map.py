@@ -5,7 +5,6 @@ import json
 import pytest
 import torch
 from laws import random_like
-from prior.tiny import REPORTS, tiny_prior
 from safetensors import safe_open
 from safetensors.torch import save_file
 
@@ -13,6 +12,7 @@ from phydict.prior import VolumeUNet, load_prior, save_prior
 from phydict.prior.kind_map import KindMap
 from phydict.prior.sentences import split_sentences
 from phydict.prior.unet import TextMap
+from prior.tiny import REPORTS, tiny_prior
 
 KINDS = ("nodule", "effusion", "mass")
 

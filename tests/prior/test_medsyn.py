@@ -19,7 +19,14 @@ from phydict.methods import reconstructor
 from phydict.posterior import PriorOnly, ProximalCG, SplitGibbs
 from phydict.prior import MedSynPrior, MedSynSuperResolution, TextEncoder, learn_vocabulary
 from phydict.prior.medsyn.networks import (
-    ChannelNorm, SelfAttention, Sinusoid, SuperResolutionUNet, TextUNet, from_slices, to_slices)
+    ChannelNorm,
+    SelfAttention,
+    Sinusoid,
+    SuperResolutionUNet,
+    TextUNet,
+    from_slices,
+    to_slices,
+)
 from phydict.prior.medsyn.prior import atlas_grid
 from phydict.xray import ConeBeam
 from prior.medsyn_files import super_resolution_unet, text_unet

@@ -15,7 +15,15 @@ from phydict.grid import Grid
 from phydict.inference import ReconstructionData, ReconstructionTask
 from phydict.inference.settings import Orbit
 from phydict.prior import (
-    MedSynCheckpoint, TextEncoder, file_read, fingerprint, inspect_prior, load_prior, load_super_resolution, save_prior)
+    MedSynCheckpoint,
+    TextEncoder,
+    file_read,
+    fingerprint,
+    inspect_prior,
+    load_prior,
+    load_super_resolution,
+    save_prior,
+)
 from phydict.prior.medsyn.prior import MedSynPrior
 from phydict.prior.medsyn.super_resolution import MedSynSuperResolution
 from phydict.units import HUWindow

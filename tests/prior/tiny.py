@@ -12,7 +12,15 @@ from phydict.grid import Grid
 from phydict.methods import METHODS
 from phydict.posterior import Sampler
 from phydict.prior import (
-    DetailNetwork, LocalUNet, Prior, Refiner, SuperResolution, TextEncoder, VolumeUNet, learn_vocabulary)
+    DetailNetwork,
+    LocalUNet,
+    Prior,
+    Refiner,
+    SuperResolution,
+    TextEncoder,
+    VolumeUNet,
+    learn_vocabulary,
+)
 from phydict.prior.uncertainty import Uncertainty
 from phydict.reconstruction import Reconstructor
 from phydict.units import HUWindow

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from rivals.tiny_rivals import GRID, body, tilted, tiny_lifted
 from torch.nn.functional import avg_pool2d
 
 from phydict.grid import Grid
@@ -11,6 +10,7 @@ from phydict.rivals import LiftedNetwork
 from phydict.rivals.sampling import all_places, halved, pooled
 from phydict.units import MU_WATER
 from phydict.xray import ConeBeam, Projector
+from rivals.tiny_rivals import GRID, body, tilted, tiny_lifted
 
 ORBIT = ConeBeam.orbit(3, 1020, 740, (28, 28), 20.0)
 BEAMS = {"orbit": ORBIT, "tilted": tilted(4)}

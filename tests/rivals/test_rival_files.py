@@ -5,7 +5,6 @@ from dataclasses import replace
 import pytest
 import torch
 from prior.tiny import tiny_prior
-from rivals.tiny_rivals import GRID, WINDOW, body, tiny_lifted
 
 from phydict.cli.infer import main as infer
 from phydict.datasets import phantom_case
@@ -17,6 +16,7 @@ from phydict.prior import load_prior, save_prior
 from phydict.rivals import LiftedNetwork, Rival, RivalAnswer, TrainedRival, load_rival, save_rival
 from phydict.units import MU_WATER, HUWindow, hu_to_mu
 from phydict.xray import ConeBeam, Projector
+from rivals.tiny_rivals import GRID, WINDOW, body, tiny_lifted
 
 ORBIT = ConeBeam.orbit(3, 1020, 740, (28, 28), 20.0)
 

@@ -5,7 +5,6 @@ from pathlib import Path
 import pytest
 import torch
 from command_lines import refusal, resumed_as_uninterrupted
-from rivals.tiny_rivals import GRID, lively, tiny_lifted, tiny_x2ct
 from torch.utils.data import default_collate
 
 from phydict.cli.infer import main as infer
@@ -18,6 +17,7 @@ from phydict.training.rivals import LiftedTraining, OrbitScenes
 from phydict.training.x2ct import Adversary, X2CTTraining
 from phydict.training.xray2ctpa import XrayToCTPATraining
 from phydict.units import HUWindow
+from rivals.tiny_rivals import GRID, lively, tiny_lifted, tiny_x2ct
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "rivals"
 TINY = {"lifted": ["--model.network.class_path=phydict.rivals.LiftedNetwork",

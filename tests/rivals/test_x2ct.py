@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from rivals.tiny_rivals import GRID, body, lively, tiny_x2ct
 from torch.nn.functional import mse_loss
 
 from phydict.grid import Cube, Grid
@@ -15,6 +14,7 @@ from phydict.training.rivals import OrbitScenes
 from phydict.training.x2ct import Adversary, X2CTTraining
 from phydict.units import MU_WATER
 from phydict.xray import ConeBeam, Projector
+from rivals.tiny_rivals import GRID, body, lively, tiny_x2ct
 
 
 def test_views_at_right_angles_are_turned_by_permuting_axes():

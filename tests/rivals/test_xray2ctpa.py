@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from rivals.tiny_rivals import GRID, body, lively, tiny_xray2ctpa
 from safetensors.torch import save_file
 
 from phydict.grid import Cube, Grid
@@ -14,6 +13,7 @@ from phydict.training.rivals import OrbitScenes
 from phydict.training.xray2ctpa import LatentSettings, XrayToCTPATraining
 from phydict.units import MU_WATER
 from phydict.xray import Projector
+from rivals.tiny_rivals import GRID, body, lively, tiny_xray2ctpa
 
 BEAM = bound_orbit(GRID, 2)
 

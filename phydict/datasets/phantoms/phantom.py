@@ -18,7 +18,15 @@ from phydict.datasets.phantoms.findings import Finding
 from phydict.datasets.phantoms.lungs import airways, focal_findings, lung_tissue, pleural_space, vessels
 from phydict.datasets.phantoms.skeleton import arm_end, bones
 from phydict.datasets.phantoms.thorax import (
-    SIDES, Thorax, ellipsoid, report, smooth_max, superellipse, without, wrong_side)
+    SIDES,
+    Thorax,
+    ellipsoid,
+    report,
+    smooth_max,
+    superellipse,
+    without,
+    wrong_side,
+)
 from phydict.grid import Grid
 from phydict.units import HUWindow
 

@@ -25,6 +25,7 @@ from phydict.posterior.samplers.sampler import Sampler, ddim_sample
 from phydict.posterior.scatter import with_scatter
 from phydict.runtime.ranges import check_between
 
+
 @dataclass(frozen=True)
 class SplitGibbs(Sampler):
     """Samples p(x | Y, report) with one denoiser call and one likelihood step per noise level, twice where

@@ -100,6 +100,9 @@ def test_every_drawn_scene_can_be_reconstructed_on_its_grid():
             beam = Scenes().beam(np.random.default_rng(seed), grid)
             beam.check(grid)
             seen.add(beam.views)
+            tilted = Scenes(tilted=1.0).beam(np.random.default_rng(seed), grid)
+            tilted.check(grid)
+            assert beam.is_upright(grid) and not tilted.is_upright(grid)
     assert min(seen) == 1 and max(seen) > 24
 
 

@@ -31,6 +31,8 @@ SCATTER, SCATTER_MM = (0.02, 0.08), 60.0
 
 PHOTONS = (1e4, 1e6)
 
+TILT_DEGREES = 20.0
+
 
 @dataclass(frozen=True)
 class Scenes:
@@ -42,12 +44,13 @@ class Scenes:
         arc: share of limited arcs, of 40 to 220 degrees; the rest has views at irregular angles
         varied: share of scenes whose distances, pixels and detector place differ from the benchmarks'
         noise: least and most standard deviation of the noise, as a share of the largest line integral
-        model_error: share of scenes with beam hardening and a scale that is off by up to 2 %
+        model_error: share of scenes with beam hardening and a scale that is off by up to 3 %
         fine: share of scenes whose X-rays are made of the finer volume, where the data have one
             (data.loading.simulation_voxels), on a detector that is as much finer and is then binned
         misplaced: share of scenes whose views are not exactly where they are stated to be
         scatter: share of scenes with scattered radiation
         counting: share of scenes with the noise of 10^4 to 10^6 counted photons per pixel instead
+        tilted: share of scenes whose detectors are tilted, all by the same up to 20 degrees; their projections are slow
     """
 
     most_views: int = 32
@@ -60,9 +63,11 @@ class Scenes:
     misplaced: float = 0.0
     scatter: float = 0.0
     counting: float = 0.0
+    tilted: float = 0.0
 
     def __post_init__(self):
-        shares = ("orbit", "arc", "varied", "model_error", "fine", "misplaced", "scatter", "counting")
+        shares = ("orbit", "arc", "varied", "model_error", "fine", "misplaced", "scatter", "counting",
+                  "tilted")
         check_fields(self, "model.scenes", most_views=(1, 1000), **dict.fromkeys(shares, (0, 1)))
         if 1.5 * self.orbit + self.arc > 1:
             raise ValueError("model.scenes has 1.5 orbit + arc of at most 1, but orbit "
@@ -75,9 +80,11 @@ class Scenes:
         scale, side = grid.extent[0] / 384, grid.shape[0]
         views = int(np.clip(round(self.most_views ** rng.random()), 1, self.most_views))
         source, centre, pixel, pixels, shift = 1020.0, 740.0, 5.0 * 64 / side, 112 * side // 64, 0.0
-        if rng.random() < self.varied:
+        tilt = math.radians(rng.uniform(-TILT_DEGREES, TILT_DEGREES)) if _happens(self.tilted, rng) else 0.0
+        if rng.random() < self.varied or tilt:
             source = rng.uniform(950, 1400)
-            centre = np.clip(source * rng.uniform(0.55, 0.75), REACH * 192, source - REACH * 192)
+            reach = 192 * (REACH * math.cos(tilt) + math.sin(abs(tilt)))
+            centre = np.clip(source * rng.uniform(0.55, 0.75), reach, source - reach)
             pixel *= rng.uniform(0.8, 1.2)
             pixels = int(rng.uniform(0.4, 1.15) * pixels)
             shift = rng.uniform(-0.25, 0.25) * (rng.random() < 0.3)
@@ -90,6 +97,8 @@ class Scenes:
         else:
             angles = max(360, self.most_views)
             beam = ConeBeam.orbit(angles, *geometry).select(np.sort(rng.choice(angles, views, replace=False)))
+        if tilt:
+            beam = beam.tilted(math.degrees(tilt))
         return beam.shifted(columns=shift * pixels * pixel * scale) if shift else beam
 
     def xrays(self, ct: Tensor, rng: np.random.Generator, grid: Grid, window: HUWindow,
@@ -106,7 +115,7 @@ class Scenes:
             y = true(window.to_mu(ct))
         if rng.random() < self.model_error:
             hardened = rng.uniform(0, 0.02) * y * (0.7 * float(y.max()) - y) / 2
-            y = (1 + rng.uniform(-0.02, 0.02)) * (y + hardened)
+            y = (1 + rng.uniform(-0.03, 0.03)) * (y + hardened)
         if _happens(self.scatter, rng):
             primary = (-y[0]).exp()
             y = -(primary + scatter_of(primary, true.beam, rng.uniform(*SCATTER), SCATTER_MM * scale)).log()[None]

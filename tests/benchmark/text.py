@@ -1,17 +1,21 @@
 """Does the report matter? Held-out phantoms from few X-rays with the right report, none, and a wrong-side one.
 
     python tests/benchmark/text.py [prior.safetensors ...] [--phantoms 48] [--views 1 2 4] [--guidance 1]
+                                   [--first_views N]
     python tests/benchmark/text.py [prior.safetensors ...] --cts <folder of CTs> [--views 1 2 4]
 
 The second: what a report that all is normal does to CTs, in text_cts.csv beside this file.
 
 Without a prior, the shipped one. The error is the mean absolute HU error over the voxels that the phantom's findings
 changed; where the method knows intervals, inside_90 is the share of these voxels, and of the body's, in the 90 % one.
-Writes text.csv beside this file, and prints means and paired differences to the same case without a report, each with
-its standard error. Only phantoms with a one-sided finding of at least 50 ml count: others have no wrong side.
+Writes text.csv beside this file, where rows of other priors and numbers of views stay, and prints means and paired
+differences to the same case without a report, each with its standard error. With --first_views the refiner hears
+reports with up to N views, and its rows say so. Only phantoms with a one-sided finding of at least 50 ml count: others
+have no wrong side.
 """
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +24,8 @@ import torch
 import phydict
 from phydict.datasets import Thorax, body_mask, find_cts, pathology_region, phantom_case, prepare_ct, report, wrong_side
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM
-from phydict.evaluation import volume_metrics, write_csv
+from phydict.evaluation import read_csv, volume_metrics, write_csv
+from phydict.methods import METHODS
 from phydict.prior import DEFAULT_PRIOR, Prior
 from phydict.xray import Ideal
 from phydict.xray.binning import benchmark_orbit
@@ -43,7 +48,8 @@ def one_sided(count: int, grid: phydict.Grid) -> list[tuple[int, torch.Tensor]]:
     return found
 
 
-def compared(name: str, prior: Prior, cases: list[tuple[int, torch.Tensor]], views: int, guidance: float) -> list[dict]:
+def compared(name: str, prior: Prior, cases: list[tuple[int, torch.Tensor]], views: int, guidance: float,
+             method=None) -> list[dict]:
     """One row for each phantom and report, reconstructed from a number of X-rays."""
     rows = []
     beam = phydict.ConeBeam.orbit(views, 1020.0, 740.0, shape=(112, 112), pixel=(5.0, 5.0))
@@ -54,7 +60,7 @@ def compared(name: str, prior: Prior, cases: list[tuple[int, torch.Tensor]], vie
         truth = prior.window.to_hu(case["volume"])[None]
         body = torch.from_numpy(body_mask(truth[0, 0].numpy(), prior.grid.spacing))[None, None]
         for kind, text in zip(REPORTS, (report(thorax), "", report(wrong_side(thorax)))):
-            result = phydict.reconstruct(xrays, beam, prior, report=text, seed=seed, guidance=guidance)
+            result = phydict.reconstruct(xrays, beam, prior, method, text, seed=seed, guidance=guidance)
             error = (result.volume - truth[0, 0]).abs()
             rows.append({"prior": name, "case": f"phantom-{seed}", "finding": thorax.findings[0].kind, "method": kind,
                          "views": views, "guidance": guidance, "region_mae_hu": float(error[region].mean())}
@@ -103,19 +109,22 @@ if __name__ == "__main__":
     parser.add_argument("--phantoms", type=int, default=48)
     parser.add_argument("--views", type=int, nargs="+", default=[1, 2, 4])
     parser.add_argument("--guidance", type=float, default=1.0)
+    parser.add_argument("--first_views", type=int)
     parser.add_argument("--cts", type=Path)
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
     out = given.out or Path(__file__).with_name("text_cts.csv" if given.cts else "text.csv")
-    rows = []
+    method, suffix = None, ""
+    if given.first_views is not None:
+        method = replace(METHODS["phydict_learned"], first_views=given.first_views)
+        suffix = f" (first_views {given.first_views})"
     for file in given.priors:
-        prior = phydict.load_prior(file)
+        prior, name = phydict.load_prior(file), file.stem + suffix
         cases = [] if given.cts else one_sided(given.phantoms, prior.grid)
         for views in given.views:
             if given.cts:
-                rows += spared(file.stem, prior, given.cts, views)
+                found = spared(name, prior, given.cts, views)
             else:
-                found = compared(file.stem, prior, cases, views, given.guidance)
-                print(f"{file.stem}:\n{summary(found)}", flush=True)
-                rows += found
-            write_csv(out, rows)
+                found = compared(name, prior, cases, views, given.guidance, method)
+                print(f"{name}:\n{summary(found)}", flush=True)
+            write_csv(out, [row for row in read_csv(out) if (row["prior"], row["views"]) != (name, views)] + found)

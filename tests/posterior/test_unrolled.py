@@ -1,13 +1,15 @@
 """The unrolled reconstruction: its prior's own where nothing is learnt, and what its evidence says."""
 
 import warnings
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from prior.tiny import tiny_prior, tiny_refiner, tiny_super_resolution
 
-from phydict.datasets import Thorax, build
+from phydict.datasets import Thorax, build, load_xrays
 from phydict.diffusion import CosineSchedule, renoise
 from phydict.grid import Grid
 from phydict.guard import one_material
@@ -15,7 +17,8 @@ from phydict.methods import METHODS, reconstruct, reconstructor
 from phydict.posterior import Measurement, Posterior, PriorOnly, ProximalCG, SplitGibbs, Unrolled
 from phydict.posterior.discretisation import subgrid_projection
 from phydict.posterior.evidence import CHANGE_SCALE, COVERAGE_SCALE, RESIDUAL_SCALE, Evidence
-from phydict.prior import Prior, Refiner, load_prior, save_prior, save_refiner
+from phydict.prior import BoundRefiner, Prior, Refiner, load_prior, save_prior, save_refiner
+from phydict.runtime.precision import computes_bfloat16
 from phydict.units import HUWindow, hu_to_mu
 from phydict.xray import ConeBeam, Polychromatic, Projector
 from phydict.xray.finer import FinerProjector
@@ -201,6 +204,59 @@ def test_views_in_another_order_give_the_same_volume(subgrid, most, mean):
             for xrays, beam in ((y, ORBIT), (y[order], ORBIT.select(order)))]
     apart = (both[0] - both[1]).abs()
     assert apart.max() < most and apart.mean() < mean
+
+
+@dataclass(frozen=True)
+class Mirrored(BoundRefiner):
+    """What a refiner is to a patient whose left is right."""
+
+    @property
+    def mean(self) -> torch.Tensor:
+        return super().mean.flip(2)
+
+    def refine(self, x: torch.Tensor, t: float, evidence: torch.Tensor) -> torch.Tensor:
+        return super().refine(x.flip(2), t, evidence.flip(2)).flip(2)
+
+
+def of_kind(kind: type[BoundRefiner], bound: BoundRefiner) -> BoundRefiner:
+    return kind(*(getattr(bound, field.name) for field in fields(bound)))
+
+
+def test_mirrored_views_and_a_mirrored_network_give_the_mirrored_volume():
+    """Without total variation, whose forward differences know left from right."""
+    own, mirror = measured(noise=0.01, dtype=torch.float64), np.array([-1.0, 1.0, 1.0])
+    beam = ConeBeam(ORBIT.sources * mirror, ORBIT.detectors * mirror, ORBIT.u * mirror, ORBIT.v * mirror, ORBIT.shape)
+    other = Measurement(Projector(GRID, beam, full_detector=True), own.y[0], WINDOW)
+    bound = tiny_refiner().double().bind(precision="float32")
+    plain = replace(Unrolled(subgrid=None), **{name: replace(getattr(Unrolled, name), tv_weight=0.0)
+                                               for name in ("start", "likelihood", "final_likelihood")})
+    for volume, mirrored in zip(plain.estimates(bound, own), plain.estimates(of_kind(Mirrored, bound), other)):
+        torch.testing.assert_close(mirrored.flip(2), volume, rtol=0, atol=1e-10)
+        assert (mirrored - volume).abs().mean() > 0.1
+
+
+@dataclass(frozen=True)
+class Oracle(BoundRefiner):
+    """Knows the truth."""
+
+    def refine(self, x: torch.Tensor, t: float, evidence: torch.Tensor) -> torch.Tensor:
+        return torch.cat([block().to(x), x[:, 1:]], 1)
+
+
+@pytest.mark.parametrize("noise", [0.001, 0.01, 0.03])
+def test_the_truth_is_kept_and_x_rays_are_met_to_their_noise(noise):
+    m = measured(noise=noise)
+    *_, found = COARSE.estimates(of_kind(Oracle, tiny_refiner().bind()), m)
+    residual = (m.project(found[:, :1]) - m.y).square().mean().sqrt() / (noise * measured().y.max())
+    assert 0.7 < residual < 1.1
+    assert WINDOW.half_width * (found[:, :1] - block()).square().mean().sqrt() < 3e3 * noise + 5
+
+
+@pytest.mark.skipif(not computes_bfloat16(torch.device("cpu")), reason="this processor does not compute bfloat16")
+def test_bfloat16_changes_the_reconstruction_of_the_example_by_less_than_2_hu():
+    case = load_xrays(Path(__file__).parents[2] / "data" / "example" / "xrays")
+    full, half = (reconstruct(case["xrays"], case["beam"], precision=kind).volume for kind in ("float32", "bfloat16"))
+    assert 0 < (full - half).square().mean().sqrt() < 2
 
 
 @pytest.mark.parametrize("beam", OTHERS.values(), ids=OTHERS)

@@ -7,7 +7,7 @@ import reprlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from torch import Tensor
@@ -40,6 +40,7 @@ from phydict.prior import (
     DEFAULT_CORRECTION,
     Cascade,
     MedSynCheckpoint,
+    MedSynSuperResolution,
     PriorContract,
     Refiner,
     SuperResolution,
@@ -127,9 +128,9 @@ CHEST = Grid.cube(64)
 
 def reconstructor(method: str | Sampler | Reconstructor, prior: PriorContract | Refiner | str | Path | None = None,
                   guidance: float = 1.0, name: str | None = None,
-                  super_resolution: SuperResolution | str | Path | None = None, sr_guided: bool = True,
-                  sr_sampler: Sampler | None = None, sr_noise_augmentation: float | None = None, samples: int = 1,
-                  precision: str = "auto") -> Reconstructor:
+                  super_resolution: SuperResolution | MedSynSuperResolution | str | Path | None = None,
+                  sr_guided: bool = True, sr_sampler: Sampler | None = None, sr_noise_augmentation: float | None = None,
+                  samples: int = 1, precision: str = "auto") -> Reconstructor:
     """A method ready to reconstruct: a name of METHODS, a sampler (which needs a prior), or a Reconstructor.
 
     prior: what keeps PriorContract, as Prior does, for Unrolled a Refiner, or its file, or the path of its class; None
@@ -153,23 +154,24 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: PriorContract | 
         if samples != 1:
             raise ValueError(f"several samples are drawn of a prior, but {type(method).__name__} has none: leave "
                              f"samples at 1 instead of {samples}, or use a method with a prior")
-        return replace(method, name=name) if name else method
+        return replace(method, name=name) if name else method  # type: ignore[type-var]
     if not isinstance(method, Sampler):
         given = f"the class {method.__name__}, not an object of it," if isinstance(method, type) else repr(method)
         raise ValueError(f"a method is a name ({', '.join(METHODS)}), a Sampler or a Reconstructor, but {given} was "
                          "given")
-    prior = find_prior(prior or method.default_prior) if prior is None or isinstance(prior, str | Path) else prior
-    check_prior(prior)
+    found: Any = find_prior(prior or method.default_prior) if prior is None or isinstance(prior, str | Path) else prior
+    check_prior(found)
     name = name or type(method).__name__
     if super_resolution is None:
         otherwise = FISTATV() if isinstance(method, Unrolled) and method.chests_only else None
-        return Posterior(prior, method, guidance, name=name, precision=precision, samples=samples, otherwise=otherwise)
+        return Posterior(found, method, guidance, name=name, precision=precision, samples=samples, otherwise=otherwise)
     if samples != 1:
         raise ValueError(f"samples are drawn of a prior without a second stage, but {samples} were given with "
                          "super_resolution: leave one of the two out")
+    fine: Any = super_resolution
     if isinstance(super_resolution, str | Path):
-        super_resolution = load_super_resolution(super_resolution)
-    ready = CascadePosterior(Cascade(prior, super_resolution), method, sr_guided, noise=sr_noise_augmentation,
+        fine = load_super_resolution(super_resolution)
+    ready = CascadePosterior(Cascade(found, fine), method, sr_guided, noise=sr_noise_augmentation,
                              guidance=guidance, name=name, precision=precision)
     return replace(ready, sr_sampler=sr_sampler) if sr_sampler else ready
 
@@ -191,7 +193,7 @@ def onto_grid(ready: Reconstructor, grid: Grid | None, refinement: Refinement = 
         return ready
     if ready.grid is not None:
         file = correction_of(ready.sampler) if isinstance(ready, Posterior) and refinement.step else None
-        ready = Refined(ready, grid, refinement, load_correction(file) if file else None)
+        ready = Refined(cast(Any, ready), grid, refinement, load_correction(file) if file else None)
     elif isinstance(ready, Baseline) and along(grid, CHEST) and not covers(grid, CHEST):
         ready = Region(ready, grid, CHEST)
     check_memory(4 * ready.volumes * math.prod(grid.shape), f"a reconstruction on "
@@ -234,7 +236,7 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: PriorContract | Refiner | 
                 method: str | Sampler | Reconstructor | None = None, report: str | None = None,
                 display: bool = False, seed: int = 0, guidance: float = 1.0, mu_water: float | None = None,
                 grid: Grid | None = None, on_step=lambda: None,
-                super_resolution: SuperResolution | str | Path | None = None,
+                super_resolution: SuperResolution | MedSynSuperResolution | str | Path | None = None,
                 sr_guided: bool = True, samples: int = 1, precision: str = "auto",
                 projector: str = "auto", uncertain: Uncertain | None = None) -> Reconstruction:
     """A CT volume from X-rays (K, V, U) and their geometry.

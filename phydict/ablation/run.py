@@ -60,7 +60,7 @@ class Results:
         if others and not self.file.exists():
             raise ValueError(f"{folder} holds {others[0]}, but no {RESULTS} of this command, and is not written to: "
                              "give another out, or move that away")
-        stored = {row.get("key"): row for row in read_csv(self.file)}
+        stored: dict = {row.get("key"): row for row in read_csv(self.file)}
         if None in stored:
             raise ValueError(f"{self.file} has rows without a key, so that it is no table of this command: give "
                              "another out")
@@ -189,7 +189,7 @@ class Runner:
     out: where the features of slices are kept, where the Frechet distance is measured."""
 
     def __init__(self, device: torch.device, scoring: Scoring, out: Path):
-        self.device, self.scoring, self.out, self.warm = device, scoring, out, set()
+        self.device, self.scoring, self.out, self.warm = device, scoring, out, set[str]()
 
     def measure(self, trial: Trial, scene: MeasuredCase, on_step: Callable[[], None], key: str) -> dict:
         """The measured columns of one trial on one case, the row of `key`."""
@@ -237,7 +237,7 @@ class Runner:
         prior = _on(trial.prior, self.device) if isinstance(trial.method, Sampler) else None
         stage = _stage_on(trial.super_resolution, self.device) if trial.super_resolution else None
         ready = reconstructor(trial.method, prior, trial.guidance, trial.name, stage, samples=trial.samples)
-        ready = onto_grid(ready, trial.box and trial.box.grid(), trial.refinement)
+        ready = onto_grid(ready, trial.box.grid() if trial.box else None, trial.refinement)
         xrays, projector = fit_to_grid(ready, trial.result_scene()[0], scene.xrays.clone(), scene.beam, trial.projector)
         return ready.with_mu_water(scene.mu_water).reconstruct(
             xrays, projector, scene.report(trial), False, seed, on_step)
@@ -259,7 +259,7 @@ def _stage_on(file: str, device: torch.device):
     return stage_of(file).to(device)
 
 
-def _attempt(work: Callable[[], object]) -> object | dict:
+def _attempt(work: Callable[[], object]):
     """What `work` gives, or the columns of a row that says why there is nothing; with PHYDICT_TRACEBACK=1 the trace of
     a failure instead."""
     try:

@@ -82,7 +82,7 @@ def _specification(content, given: Mapping, changed: dict) -> Specification:
     common = dotted(_mapping(content.get("base"), "base")) | {
         name: value for name, value in changed.items() if not isinstance(value, list)}
     lists = {name: value for name, value in changed.items() if isinstance(value, list)}
-    trials, used, planned = {}, set(), []
+    trials, used, planned = dict[str, Trial](), set[str](), list[Trial]()
     for entry in products:
         _check_keys(entry, ("base", "axes"), "a product")
         base, axes = ({setting: value for setting, value in dotted(_mapping(entry.get(name), name)).items()

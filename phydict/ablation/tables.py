@@ -81,17 +81,17 @@ def _method_table(title: str, entries: Sequence[Entry], notes: Sequence[str]) ->
 
 def _difference_tables(title: str, entries: Sequence[Entry], notes: Sequence[str]) -> list[Table]:
     """What each method has more than the first one on the same cases; none without a second one."""
-    first, *others = [entry for entry in entries if entry.cases] or [None]
+    compared = [entry for entry in entries if entry.cases]
     names = _measured(OF_DIFFERENCES, entries)
     lines: list[tuple[str, bool, list]] = []
-    for entry in others:
-        values = [difference(entry.values.get(name, {}), first.values.get(name, {})) for name in names]
+    for entry in compared[1:]:
+        values = [difference(entry.values.get(name, {}), compared[0].values.get(name, {})) for name in names]
         lines.append((entry.label, False, values))
     if not interval_note(lines):
         return []
     measures = [SHOWN_MEASURES[name] for name in names]
-    return [Table(f"{title}: less {first.name}, case by case", ["method", *(m.heading for m in measures)], measures,
-                  lines, [INTERVAL, *notes])]
+    return [Table(f"{title}: less {compared[0].name}, case by case", ["method", *(m.heading for m in measures)],
+                  measures, lines, [INTERVAL, *notes])]
 
 
 def _delta_table(label: str, entries: Sequence[Entry], notes: Sequence[str]) -> Table:
@@ -137,7 +137,7 @@ def _caption(rows: Sequence[dict]) -> str:
     count = len({row["case"] for row in rows})
     over = f"Mean over {count} {'case' if count == 1 else 'cases'}"
     how = " on ".join(filter(None, (listed(rows, name) for name in ("precision", "instruction_set"))))
-    protocols = {row.get("protocol") for row in rows}
+    protocols: set = {row.get("protocol") for row in rows}
     window = protocol_of(*protocols).window if len(protocols) == 1 and None not in protocols else RANGE
     return caption(over, rows, {"Grid": "grid", "Seeds": "seed"}, window) + (
         f" Seconds: one reconstruction after a warm-up, {listed(rows, 'device') or 'none'}, threads "

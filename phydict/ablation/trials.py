@@ -37,7 +37,7 @@ MOST_TRIALS = 2000
 
 SIMULATORS: dict[str, Simulator] = {"ideal": Ideal(), "polychromatic": Polychromatic()}
 
-SETTINGS: dict[str, tuple[type, object]] = {
+SETTINGS: dict[str, tuple] = {
     "method": (str, None), "seed": (int, 0),
     "views": (int, 8), "detector": (int, 448), "pixel": (float | None, None), "simulator": (str, "ideal"),
     "simulation_voxels": (int | None, None), "source_to_detector": (float, 1020.0),
@@ -151,7 +151,7 @@ class Trial:
         return json.dumps([settings, grid.to_dict(), self.scored().to_dict(), describe(window)], sort_keys=True)
 
 
-def trials_of(base: Mapping, axes: Mapping, methods: Mapping, cases: Cases,
+def trials_of(base: dict, axes: dict, methods: Mapping, cases: Cases,
             before: int) -> tuple[list[Trial], set[str]]:
     """The trials of one product, those that come out the same still among them, and the settings that mean anything
     to one of them; of other products there are `before` trials."""
@@ -254,7 +254,7 @@ def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
 
 def _orbit(given: Mapping) -> Orbit:
     """The part of a protocol's orbit that is given beside it."""
-    sizes = {name: (given[name],) * 2 for name in ("detector", "pixel") if given.get(name) is not None}
+    sizes: dict = {name: (given[name],) * 2 for name in ("detector", "pixel") if given.get(name) is not None}
     return Orbit(given.get("views"), given.get("source_to_detector"), given.get("source_to_isocentre"), **sizes)
 
 
@@ -280,7 +280,7 @@ def method_of(name: object, known: Iterable[str] = ()) -> Sampler | Reconstructo
                      "phydict.reconstruction.Reconstructor, as a dataclass")
 
 
-def refined_from(method: Sampler, delta: float, keep_iterations: bool = False) -> Sampler:
+def refined_from(method, delta: float, keep_iterations: bool = False) -> Sampler:
     """A method with Extra Compute from `delta`, 0 for none, in steps of the length of the first pass' unless its
     number of steps is to be kept."""
     iterations = method.ec_steps if keep_iterations else max(1, round(delta * method.iterations))
@@ -325,6 +325,6 @@ def check_used(names: Iterable[str], used: set[str], trials: Sequence[Trial]) ->
         if name not in used:
             part = name.partition(".")[0]
             owners = {type(trial.method) if part == "method" else type(trial.data.simulator): 0 for trial in trials}
-            known = ", ".join(dict.fromkeys(f.name for owner in owners for f in fields(owner)))
+            known = ", ".join(dict.fromkeys(f.name for kind in owners for f in fields(kind)))  # type: ignore[arg-type]
             raise ValueError(f"the setting {name} means nothing to any method or simulator here"
                              + (f", whose fields are {known}" if "." in name else ""))

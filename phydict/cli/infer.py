@@ -68,7 +68,7 @@ class InferenceCLI(TellingCLI):
         predict_help(parser, subcommand, COMMANDS[subcommand])
         return parser
 
-    def parse_arguments(self, parser, args: list[str]) -> None:
+    def parse_arguments(self, parser, args) -> None:
         args = with_methods(args)
         if "-h" in args or "--help" in args:
             for subparser in self._subcommand_parsers.values():
@@ -194,7 +194,7 @@ def _named(name: str) -> dict:
     return {"name": name, "method": _written(METHODS[name])}
 
 
-def _written(settings: object) -> dict:
+def _written(settings) -> dict:
     """Nested settings as a configuration writes them."""
     kind, values = type(settings), {field.name: getattr(settings, field.name) for field in fields(settings)}
     return {"class_path": f"{kind.__module__}.{kind.__qualname__}", "init_args": {

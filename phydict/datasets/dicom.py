@@ -37,7 +37,7 @@ class DicomTags:
     source_to_detector: float | None
     source_to_isocentre: float | None
     magnification: float | None
-    pixel: tuple[float, float] | None
+    pixel: tuple[float, ...] | None
     primary_degrees: float | None
     secondary_degrees: float | None
     patient_orientation: tuple[str, str] | None
@@ -202,8 +202,7 @@ def _number(dataset: pydicom.Dataset, frame: int, keyword: str, name: str) -> fl
 def _angle(dataset: pydicom.Dataset, frame: int, keyword: str, name: str) -> float | None:
     """A positioner angle with its increment: one value per frame counts from the first, a single one is the step."""
     angle = _number(dataset, frame, keyword, name)
-    steps = None if angle is None else tag_numbers(dataset, frame, f"{keyword}Increment", name)
-    if steps is None:
+    if angle is None or (steps := tag_numbers(dataset, frame, f"{keyword}Increment", name)) is None:
         return angle
     if len(steps) == 1:
         return angle + frame * steps[0]

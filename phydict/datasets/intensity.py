@@ -73,7 +73,8 @@ class Intensity:
         value = getattr(self, name)
         if value is None:
             return
-        if isinstance(value, bool) or not isinstance(value, Real) or not abs(value) < LARGEST_PIXEL:
+        real = isinstance(value, Real) and not isinstance(value, bool)
+        if not real or not abs(value) < LARGEST_PIXEL:
             raise ValueError(f"intensity needs a number for {name}, but {reprlib.repr(value)} was given; give a "
                              "finite one without quotes")
         object.__setattr__(self, name, float(value))
@@ -100,9 +101,9 @@ class Intensity:
             return y
         if self.kind == "display":
             return pixels / full_scale if self.bright_is_dense else 1 - pixels / full_scale
-        references = references or {}
-        dark = references.get("dark", self.dark or 0.0)
-        air = np.asarray(references.get("flat", self.air) - dark)
+        stated: dict = {"dark": self.dark or 0.0, "flat": self.air, **(references or {})}
+        dark = stated["dark"]
+        air = np.asarray(stated["flat"] - dark)
         if not (air > 0).all():
             raise ValueError(f"air is not above dark in {int((~(air > 0)).sum())} of {air.size} pixels; check which "
                              "image is which, and repair dead pixels")

@@ -20,7 +20,7 @@ def open_nifti(path: Path) -> SpatialImage:
     """
     import nibabel
 
-    image = nibabel.load(path)
+    image: SpatialImage = nibabel.load(path)  # type: ignore[assignment]  # its stub knows no formats
     shape, kind = image.header.get_data_shape(), image.get_data_dtype()
     if kind.kind not in "iuf":
         raise ValueError(f"its voxels are of type {kind}, such as colours or complex numbers; one real number each is "

@@ -68,7 +68,7 @@ def read_texts(path: str | Path) -> list[str]:
     with reading(f"the texts in '{path}'", "give a UTF-8 file with one text, or one JSON object, a line"):
         lines = [line for line in Path(path).read_text(encoding="utf-8").splitlines() if line.strip()]
         entries = [json.loads(line) if line.lstrip().startswith("{") else {"text": line} for line in lines]
-        texts = [text.get("text") or text.get("caption") for text in entries]
+        texts: list = [text.get("text") or text.get("caption") for text in entries]
     if not texts or not all(isinstance(text, str) for text in texts):
         raise ValueError(f"the file '{path}' holds no texts, or a line without one: give one text, or one JSON object "
                          "with \"text\" or \"caption\", a line")

@@ -17,7 +17,8 @@ class Denoiser(Protocol):
     A denoiser that is differentiable where x requires a gradient serves every sampler; DPS alone needs that.
     """
 
-    schedule: CosineSchedule
+    @property
+    def schedule(self) -> CosineSchedule: ...
 
     def denoise(self, x: Tensor, t: float) -> Tensor: ...
 

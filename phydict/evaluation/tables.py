@@ -38,7 +38,7 @@ class Table:
     title: str
     header: list[str]
     measures: list[Measure]
-    lines: list[tuple[str, bool, list[Value | None]]]
+    lines: Sequence[tuple[str, bool, Sequence[Value | None]]]
     notes: list[str]
 
     def markdown(self) -> str:

@@ -48,6 +48,6 @@ def body_interval(result: Reconstruction) -> float | None:
     """Half the interval's width in HU, mean over tissue and lungs; None where the method knows none."""
     if not result.intervals:
         return None
-    lung = result.masks[0] > 0.5 if len(result.masks) else False
+    lung = result.masks[0] > 0.5 if result.masks is not None and len(result.masks) else False
     inside = (result.volume > TISSUE) | lung
     return float(result.intervals[SHOWN_LEVEL][inside].mean()) if inside.any() else None

@@ -7,6 +7,7 @@ import zlib
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import lightning
 import torch
@@ -71,6 +72,8 @@ class ReconstructionData(lightning.LightningDataModule):
             luna16 or sparc
     """
 
+    trainer: Any
+
     def __init__(self, xrays: str | None = None, geometry: str | None = None, cts: str | None = None,
                  source: CTSource = CTSource(), only: str | None = None, phantoms: int = 4,
                  orbit: Orbit = Orbit(), simulator: Simulator = Ideal(), simulation_voxels: int | None = None,
@@ -129,7 +132,7 @@ class ReconstructionData(lightning.LightningDataModule):
         """The files and folders that a stage (predict, test) reads its cases from."""
         if stage == "predict":
             cases = self.xray_cases()
-            return [Path(self.xrays), *cases.values()]
+            return [Path(str(self.xrays)), *cases.values()]
         return [Path(self.cts)] if self.cts and self.cts != "phantom" else []
 
     def predict_dataloader(self) -> DataLoader:
@@ -140,7 +143,7 @@ class ReconstructionData(lightning.LightningDataModule):
         task = self.trainer.lightning_module
         return self._loader(self.test_cases(*task.scene()))
 
-    def test_cases(self, grid: Grid, window: HUWindow) -> list[tuple[str, str, Callable[[], dict]]]:
+    def test_cases(self, grid: Grid, window: HUWindow) -> list[tuple[str, str, Callable[..., dict]]]:
         """The CTs or phantoms of test: id, what identifies its data, and the function that makes it on `grid`."""
         if not self.cts:
             raise ValueError("test needs data.cts: a NIfTI file, a folder of CTs, or the word phantom")

@@ -47,8 +47,8 @@ def dry_run(path: str | Path, case: dict, grid: Grid) -> list[str]:
              "degrees of an orbit, or change flip_columns")
     values = [correlation(*pair) for pair in zip(xrays, thorax)]
     unlike = [k for k, value in enumerate(values) if value < LOW_VIEW or median(values) < LOW_MEDIAN]
-    if unlike := [str(k) for k in unlike if "better" not in agreements[k]]:
-        warn(f"{case['id']}: view {', '.join(unlike)} agrees little with a standard thorax in this geometry (median of "
+    if named := [str(k) for k in unlike if "better" not in agreements[k]]:
+        warn(f"{case['id']}: view {', '.join(named)} agrees little with a standard thorax in this geometry (median of "
              f"all {median(values):.2f}): check distances, size of the pixels, turn and order of the views")
     return [f"{case['id']} view {k}: {sides}; {words}"
             for k, (sides, words) in enumerate(zip(view_sides(coarse, grid), agreements))]

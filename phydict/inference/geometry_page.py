@@ -47,7 +47,7 @@ def agreement(xray: np.ndarray, thorax: np.ndarray) -> str:
     """How well a view (V, U) correlates with the standard thorax's, and what clearly agrees better, if anything: a
     flip, or the image inverted."""
     scores = {name: correlation(xray[::rows, ::columns], thorax) for name, (rows, columns) in FLIPS.items()}
-    best = max(scores, key=scores.get)
+    best = max(scores, key=scores.__getitem__)
     label = f"agreement {scores['as it is']:.2f}"
     if max(0, scores[best]) < -scores["as it is"]:
         return f"{label}, better ({-scores['as it is']:.2f}) inverted"
@@ -74,7 +74,7 @@ def geometry_page(path: str | Path, beam: ConeBeam, grid: Grid, xrays: np.ndarra
     shown = np.linspace(0, beam.views - 1, min(beam.views, MOST_VIEWS)).round().astype(int)
     figure = Figure(figsize=(max(2.1 * len(shown), 12.0), 12.6), dpi=110, facecolor="white")
     FigureCanvasAgg(figure)
-    upper, lower = figure.subfigures(2, 1, height_ratios=[7, 5.6], hspace=0)
+    upper, lower = figure.subfigures(2, 1, height_ratios=[7, 5.6], hspace=0)  # type: ignore[misc]
     upper.suptitle(literal(title), fontsize=13)
     for ax, (name, axis) in zip(upper.subplots(1, 2), DRAWN.items()):
         _draw(ax, beam, grid, thorax_hu, name, axis)
@@ -107,7 +107,7 @@ def _draw(ax: Axes, beam: ConeBeam, grid: Grid, thorax_hu: np.ndarray, name: str
         ax.plot(*np.array(corners)[:, seen].T, color=colour, linewidth=2)
         ax.plot(*np.array([beam.sources[k], beam.detectors[k]])[:, seen].T, color=colour, linewidth=0.5)
         ax.plot(*beam.sources[k, seen], "o", color=colour, markersize=5)
-        ax.annotate(str(k), beam.sources[k, seen], xytext=(5, 5), textcoords="offset points", fontsize=8)
+        ax.annotate(str(k), tuple(beam.sources[k, seen]), xytext=(5, 5), textcoords="offset points", fontsize=8)
     every = np.concatenate([beam.pixels()[:, ::max(rows - 1, 1), ::max(columns - 1, 1)].reshape(-1, 3), beam.sources,
                             grid.corners()])[:, seen]
     margin = 0.1 * np.ptp(every, axis=0).max()  # where the letters stand

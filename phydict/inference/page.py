@@ -62,15 +62,15 @@ def _case(folder: Path, path: Path) -> Case | None:
 
 
 def _make_case_files(path: Path) -> None:
-    image = nib.load(path / "volume.nii.gz")
+    image: nib.Nifti1Image = nib.load(path / "volume.nii.gz")  # type: ignore[assignment]
     volumes = {"reconstruction": np.asarray(image.dataobj)}
     for name, label in (("interval_90", "half of the 90% interval"), ("deviation", "standard deviation")):
         if len(volumes) == 1 and (path / f"{name}.nii.gz").is_file():
-            volumes[label] = np.asarray(nib.load(path / f"{name}.nii.gz").dataobj)
-    write_case_files(path, Grid(image.shape, affine=image.affine), volumes)
+            volumes[label] = np.asarray(nib.load(path / f"{name}.nii.gz").dataobj)  # type: ignore[attr-defined]
+    write_case_files(path, Grid(volumes["reconstruction"].shape, affine=image.affine), volumes)
 
 
-def _mean_tables(scored: list[dict]) -> list[Table]:
+def _mean_tables(scored: list) -> list[Table]:
     """The means over scored cases by method, where there are any."""
     if not scored:
         return []

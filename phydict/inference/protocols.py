@@ -78,11 +78,12 @@ class Protocol:
         return fixed
 
     def fixed_grid(self, given: Grid) -> Grid:
-        """The protocol's voxels. Raises ValueError where others than the default are given."""
-        if not any(given.same_as(grid) for grid in (self.grid, Grid.cube(64))):
-            raise ValueError(f"data.protocol {self.name} fixes {self.cube[0]} voxels over {self.cube[1]:g} mm, but "
+        """The protocol's voxels, if any. Raises ValueError where others than the default are given."""
+        own = self.grid or given
+        if not any(given.same_as(grid) for grid in (own, Grid.cube(64))):
+            raise ValueError(f"data.protocol {self.name} fixes {own.shape[0]} voxels over {own.extent[0]:g} mm, but "
                              f"model.grid has {given.shape[0]} over {given.extent[0]:g} mm: leave one of the two out")
-        return self.grid
+        return own
 
 
 PROTOCOLS = {protocol.name: protocol for protocol in (

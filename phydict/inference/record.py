@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -24,8 +25,7 @@ def method_settings(name: str, seed: int, method: Sampler | Reconstructor, proje
         {"projector": projector} if projector != "auto" else {})
 
 
-def prior_settings(prior: Prior | Refiner | PriorContract, given: str | MedSynCheckpoint | PriorContract,
-                   sampling: Sampling) -> dict:
+def prior_settings(prior: Prior | Refiner | PriorContract, given: Any, sampling: Sampling) -> dict:
     """Those of a prior, given as an object or by its file, and of how it is sampled."""
     settings = {"prior": prior.identity()} if isinstance(prior, PriorContract) else _identity("prior", given)
     settings["guidance"] = sampling.guidance

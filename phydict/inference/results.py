@@ -97,9 +97,9 @@ class CaseResults:
         empty: scores that may stay empty -> why."""
         rows = []
         for case in cases:
-            record = self._there(case).record
-            if record["scores"]:
-                rows.append(score_row(case, record))
+            there = self._there(case)
+            if there and there.record["scores"]:
+                rows.append(score_row(case, there.record))
         if not rows:
             return []
         table = mean_table(rows, window=protocol.window if protocol else RANGE, empty=empty)

@@ -23,6 +23,7 @@ from phydict.evaluation.fid import Features, PlaneFID
 from phydict.grid import Box, Grid
 from phydict.inference.calibration import uncertain_of
 from phydict.inference.case_files import write_result
+from phydict.inference.data import ReconstructionData
 from phydict.inference.protocols import cut_out, placed, resampled, whole
 from phydict.inference.record import cascade_settings, case_record, grid_settings, method_settings, prior_settings
 from phydict.inference.results import CaseResults
@@ -92,7 +93,7 @@ class ReconstructionTask(lightning.LightningModule):
         self.settings = method_settings(name, seed, method, projector)
         self.window = HUWindow()
         prior = prior or (str(method.default_prior) if isinstance(method, Sampler) else None)
-        self.prior = find_prior(prior) if isinstance(method, Sampler) else None
+        self.prior = find_prior(prior) if prior and isinstance(method, Sampler) else None
         if self.prior is not None:
             self.window = self.prior.window
             self.settings |= prior_settings(self.prior, prior, sampling)
@@ -103,10 +104,11 @@ class ReconstructionTask(lightning.LightningModule):
         self.plain = reconstructor(
             method, self.prior, sampling.guidance, name, self.super_resolution, super_resolution.guided,
             super_resolution.sampler, super_resolution.noise_augmentation, sampling.samples, sampling.precision)
-        if isinstance(self.plain, CascadePosterior):
+        if isinstance(self.plain, CascadePosterior) and super_resolution.file:
             self.settings |= cascade_settings(super_resolution.file, self.plain)
         self._take(Box(grid) if isinstance(grid, int) else grid)
-        self.metrics, self.scoring, self.slices = CaseMetrics([name]), Scoring(), None
+        self.metrics, self.scoring = CaseMetrics([name]), Scoring()
+        self.slices: PlaneFID | None = None
         self.with_report = sampling.with_report
         self.progress = CaseProgress()
         self.cases: list[str] = []
@@ -133,8 +135,12 @@ class ReconstructionTask(lightning.LightningModule):
     def reads_no_text(self) -> bool:
         return self.prior is not None and not self.prior.reads_text
 
+    @property
+    def _data(self) -> ReconstructionData:
+        return self.trainer.datamodule  # type: ignore[attr-defined]
+
     def setup(self, stage: str) -> None:
-        data = self.trainer.datamodule
+        data = self._data
         self.settings["data"] = {"with_report": self.with_report} | data.settings(stage)
         if self.calibrate:
             self.settings["calibrate"] = True
@@ -145,12 +151,12 @@ class ReconstructionTask(lightning.LightningModule):
             if data.protocol and data.protocol.grid and self.prior is None:
                 self.grid = self.around = data.protocol.fixed_grid(self.grid)
                 self.reconstructor = self.plain
-        check_apart(self.results.folder, "model.out", self.trainer.datamodule.inputs(stage))
+        check_apart(self.results.folder, "model.out", data.inputs(stage))
         check_own_page(self.results.folder.parent, "model.out")
 
     def scene(self) -> tuple[Grid, HUWindow]:
         """The voxels and the HU range of the CTs that X-rays are made of."""
-        return self.trainer.datamodule.scene(self.around, self.window)
+        return self._data.scene(self.around, self.window)
 
     def unfinished(self, sources: dict[str, str]) -> list[str]:
         """Of this run's cases, id -> what identifies their data, those that remain to be done."""
@@ -173,7 +179,7 @@ class ReconstructionTask(lightning.LightningModule):
         self._finish(case, self._reconstruct(case, self.seed))
 
     def _test(self, case: dict) -> None:
-        data = self.trainer.datamodule
+        data = self._data
         case["beam"], seed = data.beam, case_seed(self.seed, case["id"])
         grid, window = self.scene()
         with stage("simulate"):
@@ -222,10 +228,10 @@ class ReconstructionTask(lightning.LightningModule):
             self.log_dict({f"{self.method_name}/{name}": value for name, value in self.slices.compute().items()})
 
     def on_predict_start(self) -> None:
-        self._start(self.trainer.num_predict_batches[0])
+        self._start(int(self.trainer.num_predict_batches[0]))
 
     def on_test_start(self) -> None:
-        self._start(self.trainer.num_test_batches[0])
+        self._start(int(self.trainer.num_test_batches[0]))
 
     def on_predict_end(self) -> None:
         self.trainer.strategy.barrier()
@@ -275,4 +281,4 @@ class ReconstructionTask(lightning.LightningModule):
 
     def summarise(self) -> None:
         """Prints and writes the scores of this run's cases. Raises ValueError, naming them, where some have failed."""
-        summarise(self.results, self.cases, self.method_name, self.scoring, self.trainer.datamodule.protocol)
+        summarise(self.results, self.cases, self.method_name, self.scoring, self._data.protocol)

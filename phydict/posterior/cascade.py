@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -75,7 +76,7 @@ class CascadePosterior(Reconstructor):
         return self.cascade.super_resolution.default_noise if self.noise is None else self.noise
 
     @property
-    def full_detector(self) -> bool:
+    def full_detector(self) -> bool:  # type: ignore[override]
         return self.sampler.full_detector or self.second.full_detector
 
     @property
@@ -84,7 +85,7 @@ class CascadePosterior(Reconstructor):
         return (self.sr_sampler if self.sr_guided else self.unguided).suited(self.cascade.super_resolution)
 
     @property
-    def citation(self) -> str:
+    def citation(self) -> str:  # type: ignore[override]
         return self.sampler.citation
 
     def steps(self) -> int:
@@ -108,7 +109,8 @@ class CascadePosterior(Reconstructor):
             base = self._base(xrays, projector, report, display, seed, on_step)
         with watch.stage("prepare"):
             generator = torch.Generator().manual_seed(seed + 1)
-            state = torch.cat([fine.window.to_range(base.within)[None], 2 * base.masks - 1])[None].to(xrays)
+            masks: Tensor = base.masks  # type: ignore[assignment]  # a prior gives them
+            state = torch.cat([fine.window.to_range(base.within)[None], 2 * masks - 1])[None].to(xrays)
             state = state[:, :fine.coarse_channels]
             measurement = Measurement(projector, xrays, fine.window, display, self.mu_water)
             measurement.carry(base.carried)
@@ -125,7 +127,7 @@ class CascadePosterior(Reconstructor):
             ct = state[:, :1]
             measurement.match_gain_offset(ct)
             fit = guard.score(state, measurement.project(ct), measurement.y)
-            masks = interpolate(base.masks[None], fine.grid.shape, mode="trilinear")[0]
+            masks = interpolate(masks[None], fine.grid.shape, mode="trilinear")[0]
             masks[:fine.state_channels - 1] = ((state[0, 1:] + 1) / 2).cpu()
             volume = fine.window.to_hu(ct[0, 0]).cpu()
             if base.carried:
@@ -140,7 +142,7 @@ class CascadePosterior(Reconstructor):
     def _base(self, xrays: Tensor, projector: Projector, report: str, display: bool, seed: int,
               on_step: Callable[[], None]) -> Reconstruction:
         """The base stage's reconstruction, from X-rays binned to what its grid can hold."""
-        prior, beam = self.cascade.base, projector.beam
+        prior, beam = cast(Any, self.cascade.base), projector.beam
         factor = 1 if self.sampler.full_detector else binning(prior.grid, beam)
         coarse = Projector(prior.grid, beam.binned(factor), device=xrays.device, full_detector=True)
         posterior = Posterior(prior, self.sampler, self.guidance, self.mu_water, self.name, self.precision)

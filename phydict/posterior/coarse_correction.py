@@ -11,8 +11,8 @@ from phydict.posterior.discretisation import beyond_means
 from phydict.posterior.evidence import Evidence
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.posterior import Posterior
-from phydict.prior import BoundRefiner
-from phydict.reconstruction import Reconstruction, Reconstructor
+from phydict.prior import BoundRefiner, Refiner
+from phydict.reconstruction import Reconstruction
 from phydict.runtime.profiling import stage
 from phydict.xray import Projector
 from phydict.xray.boxes import in_other_voxels
@@ -60,14 +60,14 @@ class CoarseCorrection:
         return (z + change).clamp(-1, 1)
 
 
-def coarse_correction(base: Reconstructor, level: Grid, seen: tuple[Tensor, Projector], found: Reconstruction,
+def coarse_correction(base: object, level: Grid, seen: tuple[Tensor, Projector], found: Reconstruction,
                       report: str, display: bool) -> CoarseCorrection | None:
     """The correction of estimates on a level's voxels by the network of `base`, which found a reconstruction of the
     X-rays and the projector that it has `seen`; None where it has no refiner or left the X-rays to another method,
     where a whole number of the level's voxels do not make one of its own along each axis, and where detectors are
     tilted, for which finer voxels cost too much."""
     xrays, projector = seen
-    if not isinstance(base, Posterior) or not base.sampler.needs_refiner or projector.method != "separable":
+    if not isinstance(base, Posterior) or not isinstance(base.prior, Refiner) or projector.method != "separable":
         return None
     if found.masks is None or len(found.masks) + 1 != base.prior.state_channels:
         return None

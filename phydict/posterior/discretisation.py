@@ -30,4 +30,4 @@ def beyond_means(measurement: Measurement, fine: Measurement, z: Tensor) -> Tens
     """Line integrals (1, K, V, U) that a CT z (1, 1, X, Y, Z) on the voxels of `fine`, a FinerProjector's, has beyond
     those of its means over the voxels of `measurement`."""
     measurement.subgrid = 0.0
-    return fine.project(z) - measurement.project(avg_pool3d(z, fine.projector.factor))
+    return fine.project(z) - measurement.project(avg_pool3d(z, z.shape[2] // measurement.projector.grid.shape[0]))

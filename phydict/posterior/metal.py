@@ -104,7 +104,7 @@ def beside(measurement: Measurement, x: Tensor, where: Tensor, metal: Metal) -> 
     box = tuple(slice(int(i.min()), int(i.max()) + 1) for i in where[0, 0].nonzero(as_tuple=True))
     projector = measurement.projector
     B = FinerProjector(Projector(part(projector.grid, box), projector.beam, device=x.device, full_detector=True), RAYS)
-    allowed = interpolate(where[(..., *box)].to(x), scale_factor=RAYS) > 0
+    allowed = interpolate(where[:, :, *box].to(x), scale_factor=RAYS) > 0
     x = torch.where(where, float(measurement.window.to_range(torch.tensor(SOFT))), x)
     z, e, slope = x, torch.zeros_like(allowed, dtype=x.dtype), measurement.slope
     weight, tv_scale = (NOISE / X0_STD) ** 2, NOISE**2 * TV_WEIGHT

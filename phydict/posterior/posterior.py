@@ -58,7 +58,7 @@ SCATTER_WIDENING = 2.0
 class CountingDenoiser:
     """A denoiser that counts its calls, one for each state of a batch, and shows a guard what it estimates."""
 
-    def __init__(self, denoiser: Denoiser | BoundRefiner, guard: Guard):
+    def __init__(self, denoiser: Denoiser, guard: Guard):
         self.schedule, self._denoiser, self.guard, self.calls = denoiser.schedule, denoiser, guard, 0
 
     def denoise(self, x: Tensor, t: float) -> Tensor:
@@ -79,6 +79,7 @@ class CountingRefiner(CountingDenoiser):
     """A refiner that counts its calls, as CountingDenoiser does a denoiser's, and keeps the half-widths of the last
     state's intervals."""
 
+    _denoiser: BoundRefiner
     half_widths: Tensor | None = None
 
     @property
@@ -151,11 +152,11 @@ class Posterior(Reconstructor):
         return self.prior.window
 
     @property
-    def full_detector(self) -> bool:
+    def full_detector(self) -> bool:  # type: ignore[override]
         return self.sampler.full_detector
 
     @property
-    def citation(self) -> str:
+    def citation(self) -> str:  # type: ignore[override]
         return self.sampler.citation
 
     def steps(self) -> int:
@@ -181,16 +182,16 @@ class Posterior(Reconstructor):
             denoiser = counting(prior.bind(report, self.guidance, self.precision), guard)
             state = torch.empty(1, prior.state_channels, *prior.grid.shape, device=xrays.device)
         with watch.stage("sample"):
-            states = []
+            drawn = []
             for first in range(0, self.samples, together):
                 guard.reset()
                 generators = [torch.Generator().manual_seed(s) for s in seeds[first:first + together]]
                 x = noise_like(state.expand(len(generators), -1, -1, -1, -1), generators).to(xrays.dtype)
                 generator = generators if len(generators) > 1 else generators[0]
-                states.append(sampler.sample(denoiser, measurement, x, generator, guard))
+                drawn.append(sampler.sample(denoiser, measurement, x, generator, guard))
                 if self.samples > 1:
-                    guard.finish(states[-1])
-            states = torch.cat(states)
+                    guard.finish(drawn[-1])
+            states = torch.cat(drawn)
         if self.otherwise and one_material(prior.window.to_hu(states[:, 0].mean(0))):
             warn("the X-rays show one material in air and no chest, and of other objects the network knows nothing: a "
                  "method without one reconstructed instead, and there are no intervals")
@@ -232,10 +233,11 @@ class Posterior(Reconstructor):
         are wider than calibrated: where X-rays are missed by more than in any scene of the calibration, contradict each
         other, or hold scatter. Warns where they are missed by more than FAR_OUTSIDE as much, less what counted as
         noise."""
-        if not isinstance(denoiser, CountingRefiner) or denoiser.half_widths is None:
+        uncertainty = self.prior.uncertainty if isinstance(self.prior, Refiner) else None
+        if uncertainty is None or not isinstance(denoiser, CountingRefiner) or denoiser.half_widths is None:
             return {}, 1.0
         residual = float(measurement.normalised_error(reprojection, modelled=True))
-        most = float(self.prior.uncertainty.most_residual)
+        most = float(uncertainty.most_residual)
         if residual > FAR_OUTSIDE * most:
             warn(f"the X-rays are missed by {residual:.3g} times their noise, in the scenes that the intervals were "
                  f"calibrated on by {most:.3g} at most: they are widened, and may still be too narrow; check geometry "

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad, silu
 
 from phydict.grid import Grid
+from phydict.prior.convolution import lay_out, silence
 from phydict.prior.evidence_channels import EVIDENCE_CHANNELS
 from phydict.prior.local_unet import PositionNorm
 from phydict.runtime.precision import network_precision
@@ -40,14 +41,13 @@ class CorrectionNetwork(nn.Module):
         self.grid, self.window = grid, window
         self.settings = {"channels": list(channels), "width": width}
         self.divisor = 2 ** (len(channels) - 1)
-        self.unet = UNet(3, INPUTS, width, tuple(channels), (2,) * (len(channels) - 1), num_res_units=2, norm=None,
-                         act="swish")
+        self.unet = UNet(3, INPUTS, width, tuple(channels), (2,) * (len(channels) - 1), num_res_units=2, act="swish",
+                         norm=None)  # type: ignore[arg-type]  # which MONAI takes for no norm
         self.norm = PositionNorm(width)
         self.join = nn.Conv3d(width + INPUTS, width, 3, padding=1)
         self.leave = nn.Conv3d(width, 1, 1)
-        nn.init.zeros_(self.leave.weight)
-        nn.init.zeros_(self.leave.bias)
-        self.to(memory_format=torch.channels_last_3d)
+        silence(self.leave)
+        lay_out(self)
 
     @property
     def network(self) -> CorrectionNetwork:

@@ -8,6 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import silu
 
+from phydict.prior.convolution import lay_out, silence
+
 FREQUENCIES = 8
 
 
@@ -25,9 +27,8 @@ class DetailNetwork(nn.Module):
         self.middle = nn.ModuleList(nn.Conv3d(width, width, 3, padding=1) for _ in range(layers))
         self.leave = nn.Conv3d(width, state_channels, 3, padding=1)
         self.time = nn.Sequential(nn.Linear(2 * FREQUENCIES, 64), nn.SiLU(), nn.Linear(64, 2 * width * (layers + 1)))
-        nn.init.zeros_(self.leave.weight)
-        nn.init.zeros_(self.leave.bias)
-        self.to(memory_format=torch.channels_last_3d)
+        silence(self.leave)
+        lay_out(self)
 
     def forward(self, difference: Tensor, estimate: Tensor, t: Tensor, offset: Tensor | None = None) -> Tensor:
         """Difference of state and estimate, and the estimate (B, C, X, Y, Z), at times t (B,) -> (B, C, X, Y, Z).

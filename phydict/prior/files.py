@@ -6,11 +6,10 @@ import json
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
-from torch import Tensor, nn
+from torch import Tensor
 
 from phydict.diffusion import CosineSchedule
 from phydict.grid import Grid
@@ -32,6 +31,7 @@ from phydict.prior.refiner import Refiner
 from phydict.prior.stage_file import (
     ADVICE,
     FORMAT,
+    Network,
     built_network,
     number_of,
     read_stage,
@@ -46,8 +46,6 @@ from phydict.prior.unet import VolumeUNet
 from phydict.runtime.files import file_crc32
 from phydict.runtime.reading import refusing
 from phydict.runtime.shipped import own_or_shipped, shipped
-
-Network = TypeVar("Network", bound=nn.Module)
 
 DEFAULT_PRIOR = shipped("data/prior/phydict_64.safetensors")
 """The prior that comes with the project."""
@@ -99,13 +97,12 @@ def save_correction(network: CorrectionNetwork, path: str | Path, training: dict
 
 def describe(prior: Prior) -> dict:
     """What a prior is, as plain JSON values: from this and the weights `load_prior` builds it again."""
-    text = prior.text
-    if text is not None:
-        text = {"source": text.source, "length": text.length, "width": text.width,
-                "layers": text.bert.config.num_hidden_layers,
-                "vocabulary": None if text.source else text.vocabulary,
-                **({"padded_to": text.padded_to} if text.padded_to else {}),
-                **({"sentences": text.sentences} if text.sentences else {})}
+    own = prior.text
+    text = None if own is None else {
+        "source": own.source, "length": own.length, "width": own.width, "layers": own.bert.config.num_hidden_layers,
+        "vocabulary": None if own.source else own.vocabulary,
+        **({"padded_to": own.padded_to} if own.padded_to else {}),
+        **({"sentences": own.sentences} if own.sentences else {})}
     return {"format": FORMAT, "stage": "base", "grid": prior.grid.to_dict(),
             "hu_window": [prior.window.low, prior.window.high], "state": STATE[:prior.network.state_channels],
             "sigma_data": prior.sigma_data, "skip_std": prior.skip_std, "schedule": vars(prior.schedule),

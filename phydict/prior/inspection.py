@@ -42,8 +42,9 @@ def _inspect_file(file: Path) -> dict[str, str]:
                 header = json.loads((opened.metadata() or {}).get("phydict", "null"))
         else:
             content = read_torch(file)
-            header = content.get("phydict") if isinstance(content, dict) else None
-            entries = content.get("state_dict", {}) if header else read_tensors(file)
+            saved = content if isinstance(content, dict) else {}
+            header = saved.get("phydict")
+            entries = saved.get("state_dict", {}) if header else read_tensors(file)
         if header:
             report, used = _inspect_phydict(header, entries, file.suffix == ".safetensors"), [*entries]
         else:

@@ -7,7 +7,7 @@ from einops import rearrange
 from torch import Tensor, nn
 from torch.nn.functional import layer_norm
 
-from phydict.prior.convolution import speed_up
+from phydict.prior.convolution import lay_out, silence, speed_up
 from phydict.prior.unet import check_sizes
 
 
@@ -39,8 +39,8 @@ class LocalUNet(nn.Module):
 
         super().__init__()
         check_sizes(block=block, channels=channels, res_blocks=res_blocks)
-        self.settings = {"in_channels": in_channels, "out_channels": out_channels, "block": block,
-                         "channels": list(channels), "res_blocks": res_blocks}
+        self.settings: dict = {"in_channels": in_channels, "out_channels": out_channels, "block": block,
+                               "channels": list(channels), "res_blocks": res_blocks}
         self.in_channels, self.out_channels, self.block = in_channels, out_channels, block
         self.divisor = block * 2 ** (len(channels) - 1)
         self.fold = nn.Conv3d(in_channels * block**3 + 1, channels[0], 1)
@@ -55,11 +55,10 @@ class LocalUNet(nn.Module):
                     setattr(module, name, PositionNorm(child.num_channels))
         self.unfold = nn.Conv3d(channels[0], out_channels * block**3, 1)
         # MONAI's output convolution starts at zero; two zero layers in a row would never learn.
-        nn.init.xavier_uniform_(self.unet.out[-1].conv.weight)
-        nn.init.zeros_(self.unfold.weight)
-        nn.init.zeros_(self.unfold.bias)
+        nn.init.xavier_uniform_(self.unet.out[-1].get_parameter("conv.weight"))
+        silence(self.unfold)
         speed_up(self)
-        self.to(memory_format=torch.channels_last_3d)
+        lay_out(self)
 
     @property
     def reach(self) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -15,6 +16,9 @@ from phydict.prior.text import TextEncoder
 from phydict.prior.unet import VolumeUNet
 from phydict.runtime.precision import network_precision
 from phydict.units import HUWindow
+
+if TYPE_CHECKING:
+    from phydict.prior.medsyn.prior import MedSynPrior
 
 STATE = ("ct", "lung", "airway", "vessel")
 """The channels of the state: the CT volume, then soft anatomy masks mapped to [-1, 1]."""
@@ -97,9 +101,9 @@ class Prior(nn.Module):
         x0 = share * x / a + out * answer
         if self.detail is None:
             return x0
-        return self._with_detail(x0, x, a, self.sigma_data * answer, t, offsets[1])
+        return self._with_detail(self.detail, x0, x, a, self.sigma_data * answer, t, offsets[1])
 
-    def _with_detail(self, x0: Tensor, x: Tensor, a: Tensor, estimate: Tensor, t: Tensor,
+    def _with_detail(self, detail: DetailNetwork, x0: Tensor, x: Tensor, a: Tensor, estimate: Tensor, t: Tensor,
                      offset: Tensor | None) -> Tensor:
         """`x0` and what the detail network adds. In training it is always run, so that every process does the
         same."""
@@ -113,8 +117,8 @@ class Prior(nn.Module):
         size = (sigma**2 + self.skip_std**2).sqrt()
         inward, out = (w[active].view(-1, 1, 1, 1, 1) for w in (1 / size, reached * sigma * self.skip_std / size))
         estimate = estimate[active]
-        answer = self.detail(inward * (x[active] / a[active] - estimate), estimate, t[active].to(x.dtype),
-                             None if offset is None else offset[active])
+        answer = detail(inward * (x[active] / a[active] - estimate), estimate, t[active].to(x.dtype),
+                        None if offset is None else offset[active])
         return x0.index_add(0, active, out * answer.to(out))
 
     def network_inputs(self, shape: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
@@ -139,7 +143,7 @@ class Prior(nn.Module):
         if guidance < 0:
             raise ValueError(f"the guidance scale is at least 0, but {guidance} was given")
         context = self.context([report])
-        if report:
+        if report and self.text is not None:
             self.text.check([report])
         return BoundPrior(self, context, guidance if report else 1.0, precision)
 
@@ -148,7 +152,7 @@ class Prior(nn.Module):
 class BoundPrior:
     """A Denoiser: a prior with its context fixed. Two network calls per step when guidance is not 1."""
 
-    prior: Prior
+    prior: Prior | MedSynPrior
     context: Tensor
     guidance: float
     precision: str = "auto"

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from phydict.diffusion import CosineSchedule
 from phydict.grid import Grid
+from phydict.prior.convolution import lay_out, silence
 from phydict.prior.evidence_channels import EVIDENCE_CHANNELS
 from phydict.prior.prior import BoundPrior, Prior
 from phydict.prior.uncertainty import Uncertainty
@@ -34,6 +35,9 @@ class Refiner(nn.Module):
     what it makes of both, and the calls hear of the report by that alone. None for a refiner whose calls read reports.
     """
 
+    mean: Tensor
+    first: Prior | None
+
     def __init__(self, prior: Prior, mean: Tensor, uncertainty: Uncertainty | None = None, first: Prior | None = None):
         super().__init__()
         if prior.detail is None:
@@ -45,9 +49,8 @@ class Refiner(nn.Module):
         self.gate = nn.Sequential(nn.Conv3d(EVIDENCE_CHANNELS + 1, GATE_WIDTH, 1), nn.SiLU(),
                                   nn.Conv3d(GATE_WIDTH, 1, 1))
         for layer in (self.entrance, self.detail_entrance, self.gate[-1]):
-            nn.init.zeros_(layer.weight)
-            nn.init.zeros_(layer.bias)
-        self.detail_entrance.to(memory_format=torch.channels_last_3d)
+            silence(layer)
+        lay_out(self.detail_entrance)
         self.register_buffer("mean", mean)
         if first is not None:
             self.begin_with(first)
@@ -156,7 +159,7 @@ class BoundRefiner:
 
     def denoise(self, x: Tensor, t: float) -> Tensor:
         """What `first` answers."""
-        return self.first.denoise(x, t)
+        return self.first.denoise(x, t)  # type: ignore[union-attr]  # is called where it `begins`
 
     def refine(self, x: Tensor, t: float, evidence: Tensor) -> Tensor:
         """The clean state of x (B, C, X, Y, Z) at time t, given the evidence (B, EVIDENCE_CHANNELS, X, Y, Z)."""
@@ -171,4 +174,4 @@ class BoundRefiner:
         """Half-widths (B, len(LEVELS), X, Y, Z), in the prior's range, of the intervals around the CT of the last state
         z, given the evidence there; of a refiner with uncertainty."""
         with torch.no_grad(), network_precision(self.precision, z):
-            return self.refiner.uncertainty.half_widths(z, evidence)
+            return self.refiner.uncertainty.half_widths(z, evidence)  # type: ignore[union-attr]

@@ -6,6 +6,7 @@ import json
 import reprlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -16,6 +17,8 @@ from phydict.prior.finite import check_finite, not_finite
 from phydict.runtime.files import atomic_write
 from phydict.runtime.reading import not_written, reason
 from phydict.units import HUWindow
+
+Network = TypeVar("Network", bound=nn.Module)
 
 FORMAT = 1
 
@@ -77,8 +80,8 @@ def check_stage(header: dict, stages: Sequence[str], name: str) -> None:
                          "here: give the file of that stage")
 
 
-def built_network(made: Callable[[], nn.Module], weights: dict[str, Tensor], header: dict,
-           networks: tuple[str, ...]) -> nn.Module:
+def built_network(made: Callable[[], Network], weights: dict[str, Tensor], header: dict,
+                  networks: tuple[str, ...]) -> Network:
     """What `made` makes of a header, with these weights. What does not fit them is refused before it takes memory.
 
     networks: the header's keys whose values are settings of networks.

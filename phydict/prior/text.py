@@ -56,7 +56,8 @@ class TextEncoder(nn.Module):
         self.trainable, self.padded_to, self.sentences = trainable, padded_to, sentences
         self.bert.requires_grad_(trainable)
         self._kept: dict[str, tuple[Tensor, Tensor]] = {}
-        self._kept_of, self._kept_bytes = None, 0
+        self._kept_of: tuple | None = None
+        self._kept_bytes = 0
         self._checked: set[str] = set()
 
     @property
@@ -105,7 +106,7 @@ class TextEncoder(nn.Module):
     def vocabulary(self) -> list[str]:
         """The words in the order of their token ids."""
         words = self.tokenizer.get_vocab()
-        return sorted(words, key=words.get)
+        return sorted(words, key=words.__getitem__)
 
     def forward(self, reports: list[str]) -> tuple[Tensor, Tensor]:
         """Reports -> states (B, L, D) and their mask (B, L), True where cross-attention looks: at tokens or sentences,
@@ -155,12 +156,12 @@ class TextEncoder(nn.Module):
         return torch.cat(states)[torch.tensor(order, device=self.bert.device).argsort()]
 
     def _read(self, reports: list[str]) -> tuple[Tensor, Tensor]:
-        return self._read_by_sentence(reports) if self.sentences else self._read_as_a_whole(reports)
+        return self._read_by_sentence(reports, self.sentences) if self.sentences else self._read_as_a_whole(reports)
 
-    def _read_by_sentence(self, reports: list[str]) -> tuple[Tensor, Tensor]:
-        split = [split_sentences(report)[:self.sentences] for report in reports]
-        states = torch.zeros(len(reports), self.sentences, self.width, device=self.bert.device, dtype=self.bert.dtype)
-        mask = torch.tensor([[place < len(own) for place in range(self.sentences)] for own in split])
+    def _read_by_sentence(self, reports: list[str], most: int) -> tuple[Tensor, Tensor]:
+        split = [split_sentences(report)[:most] for report in reports]
+        states = torch.zeros(len(reports), most, self.width, device=self.bert.device, dtype=self.bert.dtype)
+        mask = torch.tensor([[place < len(own) for place in range(most)] for own in split])
         if mask.any():
             states[mask] = self.read_sentences([sentence for own in split for sentence in own]).to(states)
         return states, mask.to(states.device)

@@ -71,11 +71,10 @@ class Tiles:
         axes = [self.weights(n) for n in volumes[0].shape[2:]]
         if all(len(axis) == 1 for axis in axes):
             return function(*volumes)
-        blended = None
-        for tile in product(*axes):
-            part = (..., *(voxels for voxels, _ in tile))
+        for n, tile in enumerate(product(*axes)):
+            part: tuple = (..., *(voxels for voxels, _ in tile))
             result = function(*(volume[part] for volume in volumes))
-            if blended is None:
+            if not n:
                 blended = result.new_zeros(*result.shape[:2], *volumes[0].shape[2:])
             x, y, z = (weight.to(result) for _, weight in tile)
             blended[part] += result * x[:, None, None] * y[:, None] * z

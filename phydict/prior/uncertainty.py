@@ -42,20 +42,25 @@ class Uncertainty(nn.Module):
     state_channels: C; channels: width of each level of the UNet.
     """
 
+    quantiles: Tensor
+    most_residual: Tensor
+
     def __init__(self, state_channels: int = 4, channels: tuple[int, ...] = (16, 32, 64)):
         from monai.networks.nets import UNet
 
         super().__init__()
         self.settings = {"state_channels": state_channels, "channels": list(channels)}
         self.unet = UNet(3, state_channels + EVIDENCE_CHANNELS + INPUTS, 1, tuple(channels),
-                         (2,) * (len(channels) - 1), num_res_units=2, norm=None, act="swish")
+                         (2,) * (len(channels) - 1), num_res_units=2, act="swish",
+                         norm=None)  # type: ignore[arg-type]  # which MONAI takes for no norm
         own = -torch.log1p(-torch.tensor(LEVELS))
         self.register_buffer("quantiles", own.expand(len(TISSUES), COVERAGES, -1).clone())
         self.register_buffer("most_residual", torch.tensor(UNBOUNDED))
 
     def forward(self, z: Tensor, evidence: Tensor) -> Tensor:
         """log b (B, 1, X, Y, Z), b in the prior's range."""
-        steepness = sum(torch.gradient(z[:, :1], dim=d)[0].abs() for d in (2, 3, 4))
+        slopes = [torch.gradient(z[:, :1], dim=d)[0].abs() for d in (2, 3, 4)]
+        steepness = slopes[0] + slopes[1] + slopes[2]
         sizes = evidence[:, 2:4].abs()
         return self.unet(torch.cat([z, evidence, 2 * steepness, sizes], 1)).float().sub(3.5).clamp(*LOG_SCALE)
 

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 from torch.utils.checkpoint import checkpoint
 
-from phydict.prior.convolution import speed_up
+from phydict.prior.convolution import lay_out, silence, speed_up
 from phydict.prior.kind_map import KindMap
 
 
@@ -77,7 +77,7 @@ class VolumeUNet(nn.Module):
 
         super().__init__()
         check_sizes(block=block, channels=channels, res_blocks=res_blocks, head_channels=head_channels)
-        self.settings = {
+        self.settings: dict = {
             "state_channels": state_channels, "block": block, "channels": list(channels),
             "attention": list(attention), "res_blocks": res_blocks, "head_channels": head_channels,
             "context_dim": context_dim}
@@ -92,9 +92,8 @@ class VolumeUNet(nn.Module):
             use_flash_attention=True)
         self.unfold = nn.Conv3d(channels[0], state_channels * block**3, 1)
         # MONAI's output convolution starts at zero; two zero layers in a row would never learn.
-        nn.init.xavier_uniform_(self.unet.out[-1].conv.weight)
-        nn.init.zeros_(self.unfold.weight)
-        nn.init.zeros_(self.unfold.bias)
+        nn.init.xavier_uniform_(self.unet.out[-1].get_parameter("conv.weight"))
+        silence(self.unfold)
         speed_up(self)
         self.run_with()
 
@@ -108,8 +107,7 @@ class VolumeUNet(nn.Module):
         if same:
             return
         self.hint = nn.Conv3d(self.text_map.channels, self.settings["channels"][0], 1)
-        nn.init.zeros_(self.hint.weight)
-        nn.init.zeros_(self.hint.bias)
+        silence(self.hint)
         speed_up(self.hint)
         if kinds:  # which older files do not name
             self.settings["kinds"] = list(kinds)
@@ -128,7 +126,7 @@ class VolumeUNet(nn.Module):
         channels_last: lay channels side by side in memory. compiled: torch.compile, anew for each shape of input.
         """
         self.memory_format = torch.channels_last_3d if channels_last else torch.contiguous_format
-        self.to(memory_format=self.memory_format)
+        lay_out(self, self.memory_format)
         for block in self.blocks():
             vars(block).pop("forward", None)
             if gradient_checkpointing:

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, interpolate
 
 from phydict.grid import Grid
-from phydict.prior.convolution import speed_up
+from phydict.prior.convolution import silence, speed_up
 from phydict.prior.unet import check_sizes
 from phydict.rivals.network import Geometry, RivalNetwork
 from phydict.rivals.sampling import all_places, halved, pooled, seen
@@ -24,8 +24,7 @@ class ResidualBlock(nn.Module):
         conv = {2: nn.Conv2d, 3: nn.Conv3d}[dimensions]
         self.first, self.second = (conv(channels, channels, 3, padding=1) for _ in range(2))
         self.norm = nn.GroupNorm(1, channels)
-        nn.init.zeros_(self.second.weight)
-        nn.init.zeros_(self.second.bias)
+        silence(self.second)
 
     def forward(self, x: Tensor) -> Tensor:
         return x + self.second(nn.functional.silu(self.first(self.norm(x))))
@@ -67,8 +66,7 @@ class VolumeDecoder(nn.Module):
         self.back = nn.ModuleList(ResidualBlock(c, 3) for c in channels[:-1])
         self.up = nn.ModuleList(nn.Conv3d(b, a, 1) for a, b in pairwise(channels))
         self.leave = nn.Conv3d(channels[0], 1, 3, padding=1)
-        nn.init.zeros_(self.leave.weight)
-        nn.init.zeros_(self.leave.bias)
+        silence(self.leave)
 
     def forward(self, fine: Tensor, coarse: Tensor) -> Tensor:
         """(B, fine, X, Y, Z) and (B, coarse, X/2, Y/2, Z/2) -> (B, 1, X, Y, Z)."""
@@ -115,7 +113,7 @@ class LiftedNetwork(RivalNetwork):
 
     def forward(self, y: Tensor, places: Tensor, half_places: Tensor) -> Tensor:
         fine, coarse = (h.unflatten(0, y.shape[:2]) for h in self.encoder(y.flatten(0, 1)[:, None]))
-        pixels = tuple(y.shape[2:])
+        pixels = (y.shape[2], y.shape[3])
         fine = pooled(torch.cat([y[:, :, None], fine.to(y)], 2), places, pixels)
         coarse = pooled(coarse, half_places, pixels, 2)
         count = torch.log2(1 + seen(places).sum(0)).expand(len(y), 1, -1, -1, -1)

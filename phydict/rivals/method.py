@@ -44,10 +44,11 @@ class RivalAnswer(Baseline):
         return self.rival.window.to_mu(x, 1.0)
 
     def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,
-                    seed: int = 0, on_step: Callable[[], None] = lambda: None) -> Reconstruction:
+                    seed: int = 0, on_step: Callable[[], None] = lambda: None,
+                    outside: Tensor | None = None) -> Reconstruction:
         seeded = replace(self, seed=seed)
-        return replace(super(RivalAnswer, seeded).reconstruct(xrays, projector, report, display, seed, on_step),
-                       network_calls=self.steps(), precision=precision_name(self.precision, xrays))
+        found = super(RivalAnswer, seeded).reconstruct(xrays, projector, report, display, seed, on_step, outside)
+        return replace(found, network_calls=self.steps(), precision=precision_name(self.precision, xrays))
 
 
 @dataclass(frozen=True)

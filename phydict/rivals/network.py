@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -39,7 +40,7 @@ class RivalNetwork(nn.Module, ABC):
         """What the network needs to know of grid and beam, as tensors of the type and on the device of `like`."""
 
     @abstractmethod
-    def forward(self, y: Tensor, *geometry: Tensor) -> Tensor:
+    def forward(self, *inputs: Any, **named: Any) -> Tensor:
         """X-rays y (B, K, V, U) -> CT (B, 1, X, Y, Z) in [-1, 1], without clipping; of a diffusion, what a step of its
         training calls, with the arguments of `inputs`."""
 

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, scaled_dot_product_attention, silu
 
+from phydict.prior.convolution import silence
+
 HEADS = 4
 GROUPS = 4
 
@@ -44,8 +46,7 @@ class StackAttention(nn.Module):
         super().__init__()
         self.norm = nn.GroupNorm(1, channels)
         self.enter, self.leave = nn.Linear(channels, 3 * channels, bias=False), nn.Linear(channels, channels)
-        nn.init.zeros_(self.leave.weight)
-        nn.init.zeros_(self.leave.bias)
+        silence(self.leave)
 
     def forward(self, x: Tensor) -> Tensor:
         batch, channels, across, down, slices = x.shape
@@ -75,8 +76,7 @@ class SliceUNet(nn.Module):
         self.back = nn.ModuleList(SliceBlock(a + b, a, known) for a, b in pairwise(widths))
         self.last = SliceBlock(2 * widths[0], widths[0], known)
         self.leave = nn.Conv3d(widths[0], channels, 1)
-        nn.init.zeros_(self.leave.weight)
-        nn.init.zeros_(self.leave.bias)
+        silence(self.leave)
 
     def forward(self, x: Tensor, t: Tensor, condition: Tensor) -> Tensor:
         """x (B, C, X, Y, slices), times t (B,) in [0, 1], condition (B, D) -> noise of x's shape."""

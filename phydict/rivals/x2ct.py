@@ -109,8 +109,9 @@ class X2CTNetwork(RivalNetwork):
         self.side = BOTTOM * 2 ** len(blocks)
         self.enter, self.stages, widths = nn.Conv2d(1, stem, 7, padding=3), nn.ModuleList(), [stem]
         for layers in blocks:
-            self.stages.append(Stage(widths[-1], growth, layers))
-            widths.append(self.stages[-1].out_channels)
+            stage = Stage(widths[-1], growth, layers)
+            self.stages.append(stage)
+            widths.append(stage.out_channels)
         self.a = ConnectionA(widths[-1], channels[-1])
         self.b = nn.ModuleList(ConnectionB(width, out) for width, out in zip(widths, channels))
         below = [*channels[1:], channels[-1]]
@@ -122,7 +123,8 @@ class X2CTNetwork(RivalNetwork):
                 nn.init.normal_(layer.weight, std=0.02)
                 if layer.bias is not None:
                     nn.init.zeros_(layer.bias)
-        nn.init.constant_(self.leave.bias, 0.1)  # the last ReLU lets gradients pass where the volume starts
+        # The last ReLU lets gradients pass where the volume starts.
+        nn.init.constant_(self.leave.get_parameter("bias"), 0.1)
         speed_up(self)
         channels_last(self)
 

@@ -59,6 +59,7 @@ class XrayToCTPANetwork(RivalNetwork):
 
     stage = "xray2ctpa"
     bound = True
+    largest: Tensor
 
     def __init__(self, image_channels: tuple[int, ...] = (16, 32, 64, 64), embedding: int = 256,
                  slice_channels: tuple[int, ...] = (32, 64, 64), channels: tuple[int, ...] = (32, 64, 128),

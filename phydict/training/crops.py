@@ -17,7 +17,7 @@ from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM, CachedPhantoms
 from phydict.grid import Cube
 from phydict.runtime.warning import warn
 from phydict.training.data import PriorData
-from phydict.training.draws import Draws
+from phydict.training.draws import Draws, Items
 from phydict.training.settings import Crops, HoldOut, Loading
 from phydict.units import HUWindow
 
@@ -36,7 +36,7 @@ def mapped_volume(file: Path, make: Callable[[], Tensor]) -> np.ndarray:
 class PhantomVolumes(CachedPhantoms):
     """The CTs alone of CachedPhantoms, as `mapped_volume`s."""
 
-    def __getitem__(self, i: int) -> np.ndarray:
+    def __getitem__(self, i: int):
         seed = self.first_seed + i
         return mapped_volume(self.folder / f"{seed:07d}.npy",
                              lambda: phantom_case(seed, self.grid, self.window)["volume"][0])
@@ -45,7 +45,9 @@ class PhantomVolumes(CachedPhantoms):
 class CTVolumes(CTCases):
     """The CTs alone of CTCases, as `mapped_volume`s."""
 
-    def __getitem__(self, index: int) -> np.ndarray:
+    cache: Path
+
+    def __getitem__(self, index: int):
         ct = self.cts[index]
         return mapped_volume(self.cache / f"{ct.id}-{self.key(ct)}.npy", lambda: prepare_ct(
             ct.path, self.grid, self.window, id=ct.id, calibration=ct.calibration)["volume"][0])
@@ -59,7 +61,7 @@ class CropDataset(Draws):
     side to matter).
     """
 
-    def __init__(self, cts: Dataset, phantoms: Dataset, ct_fraction: float, window: HUWindow, size: int, align: int,
+    def __init__(self, cts: Items, phantoms: Items, ct_fraction: float, window: HUWindow, size: int, align: int,
                  length: int, epoch: int, seed: int, augmented: bool = True):
         super().__init__(cts, phantoms, ct_fraction, length, epoch, seed)
         self.window, self.size, self.align, self.augmented = window, size, align, augmented
@@ -112,16 +114,16 @@ class SuperResolutionData(PriorData):
         if not 0 < crops.size <= cube.voxels or crops.size % crops.factor:
             raise ValueError(f"data.crops.size is a multiple of the factor {crops.factor}, up to the {cube.voxels} "
                              f"voxels of a volume, but {crops.size} was given")
-        self.crops, cache = crops, self.cts.cache
-        held_out = self.validation.datasets[1].cts
-        self.phantoms = PhantomVolumes(0, phantoms, self.grid, self.window, cache)
-        self.cts = CTVolumes(self.cts.cts, cache, self.grid, self.window)
+        self.crops, folder = crops, Path(cache)
+        self.phantoms = PhantomVolumes(0, phantoms, self.grid, self.window, folder)
+        self.cts = CTVolumes(self.cts.cts, folder, self.grid, self.window)
         self.validation = ConcatDataset([self._fixed([], [], 0)] + [
-            self._fixed([], PhantomVolumes(HELD_OUT_PHANTOM + i, 1, self.grid, self.window, cache), crops.validation)
+            self._fixed([], PhantomVolumes(HELD_OUT_PHANTOM + i, 1, self.grid, self.window, folder), crops.validation)
             for i in range(holdout.phantoms)] + [
-            self._fixed(CTVolumes([ct], cache, self.grid, self.window), [], crops.validation) for ct in held_out])
+            self._fixed(CTVolumes([ct], folder, self.grid, self.window), [], crops.validation)
+            for ct in self.held_out_cts.cts])
 
-    def _fixed(self, cts: Dataset | list, phantoms: Dataset | list, count: int) -> CropDataset:
+    def _fixed(self, cts: Items, phantoms: Items, count: int) -> CropDataset:
         return CropDataset(cts, phantoms, 1.0, self.window, self.crops.size, self.crops.factor, count, 0, 0,
                            augmented=False)
 

@@ -36,6 +36,8 @@ class PriorData(lightning.LightningDataModule):
         window: tied to model.window
     """
 
+    trainer: lightning.Trainer
+
     def __init__(self, cts: str | None = None, source: CTSource = CTSource(), holdout: HoldOut = HoldOut(),
                  phantoms: int = 2000, loading: Loading = Loading(), cache: str = "runs/cache",
                  augmentation: Augmentation = Augmentation(), seed: int = 0, cube: Cube = Cube(),
@@ -53,9 +55,9 @@ class PriorData(lightning.LightningDataModule):
         if cts and Path(cache).resolve().is_relative_to(Path(cts).resolve()):
             raise ValueError(f"data.cache {cache} lies inside data.cts {cts}: give a folder elsewhere")
         check_writable(Path(cache), "data.cache")
-        window = HUWindow(*window)
-        self.grid, self.window = Grid.cube(self.factor * cube.voxels, cube.side), window
-        self.phantoms = CachedPhantoms(0, phantoms, self.grid, window, Path(cache))
+        hu = HUWindow(*window)
+        self.grid, self.window = Grid.cube(self.factor * cube.voxels, cube.side), hu
+        self.phantoms = CachedPhantoms(0, phantoms, self.grid, hu, Path(cache))
         files = source.find(cts) if cts else []
         for word in holdout.ids or []:
             if not any(word in f.id for f in files):
@@ -67,11 +69,11 @@ class PriorData(lightning.LightningDataModule):
             raise ValueError("there is nothing to train on: data.holdout holds out every CT, and data.phantoms is 0")
         self.held_out = [f.id for f in held_out]
         validating = set(self.held_out)
-        self.cts = CTCases([f for f in files if f.id not in validating], cache, self.grid, window)
+        self.cts = CTCases([f for f in files if f.id not in validating], cache, self.grid, hu)
         self.population = DrawnPatients(self.cts, loading.population) if loading.population.share else None
-        self.validation = ConcatDataset([
-            CachedPhantoms(HELD_OUT_PHANTOM, holdout.phantoms, self.grid, window, Path(cache)),
-            CTCases(held_out, cache, self.grid, window)])
+        self.held_out_cts = CTCases(held_out, cache, self.grid, hu)
+        self.validation: Dataset = ConcatDataset([
+            CachedPhantoms(HELD_OUT_PHANTOM, holdout.phantoms, self.grid, hu, Path(cache)), self.held_out_cts])
         self.reports = [f.report for f in files if f.report]
         self.reports += [report(Thorax.draw(s)) for s in range(min(phantoms, 1000))]
         self.reports += self.population.reports(1000) if self.population else []
@@ -82,7 +84,7 @@ class PriorData(lightning.LightningDataModule):
             self.population.prepare()
 
     def train_dataloader(self) -> DataLoader:
-        every = self.trainer.reload_dataloaders_every_n_epochs
+        every = self.trainer.reload_dataloaders_every_n_epochs  # type: ignore[attr-defined]
         if every != 1:
             raise ValueError("each epoch has draws of its own, so that trainer.reload_dataloaders_every_n_epochs must "
                              f"be 1, but {every} was given: leave it out, or set it to 1 on a Trainer of your own")
@@ -92,7 +94,8 @@ class PriorData(lightning.LightningDataModule):
                              f"device ({least}): raise it, or lower data.loading.batch_size")
         # Lightning's own sampler would shuffle: several processes take turns, so that each step sees what one would.
         draws = self.draws(self.trainer.current_epoch)
-        turns = DistributedSampler(draws, self.trainer.world_size, self.trainer.global_rank, shuffle=False)
+        turns: DistributedSampler = DistributedSampler(draws, self.trainer.world_size, self.trainer.global_rank,
+                                                       shuffle=False)
         return DataLoader(draws, self.loading.batch_size, sampler=turns, num_workers=self.loading.workers,
                           drop_last=True, collate_fn=self.collate)
 

@@ -26,6 +26,8 @@ class DenoisingTraining(StageTraining):
     what denoises a held-out case (`_denoiser`).
     """
 
+    prior: Prior | SuperResolution
+
     def __init__(self, prior: Prior | SuperResolution, typical_std: float, optimisation: Optimisation,
                  preview_steps: int, seed: int, mask_weight: float = 0.0):
         super().__init__(prior, optimisation, seed)

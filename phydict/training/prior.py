@@ -17,10 +17,9 @@ from phydict.evaluation import method_panel, volume_metrics
 from phydict.grid import Cube
 from phydict.methods import reconstruct
 from phydict.posterior import Sampler
-from phydict.prior import DetailNetwork, Prior, Refiner, TextEncoder, VolumeUNet, describe, learn_vocabulary, load_prior
+from phydict.prior import DetailNetwork, Prior, TextEncoder, VolumeUNet, describe, learn_vocabulary, load_prior
 from phydict.prior.unet import TextMap
 from phydict.reconstruction import Reconstructor
-from phydict.rivals import Rival
 from phydict.runtime.progress import CaseProgress
 from phydict.runtime.warning import warn
 from phydict.training.denoising import DenoisingTraining
@@ -53,6 +52,8 @@ class PriorTraining(DenoisingTraining):
         seed: of times, noise and text dropout
     """
 
+    prior: Prior
+
     def __init__(self, network: VolumeUNet | None = None, text: TextSettings = TextSettings(),
                  detail: DetailNetwork | None = None, cube: Cube = Cube(),
                  window: tuple[float, float] = (-1000.0, 1000.0), optimisation: PriorOptimisation = PriorOptimisation(),
@@ -72,26 +73,27 @@ class PriorTraining(DenoisingTraining):
         new_text = text.renew or not initial
         super().__init__(prior, optimisation.sigma_data, optimisation, validation.preview_steps, seed,
                          optimisation.mask_weight)
-        if self.prior.text is not None and text.reports:
-            self.prior.text.check(text.reports)
+        reader = self.prior.text
+        if reader is not None and text.reports:
+            reader.check(text.reports)
         self.prior.network.run_with(execution.gradient_checkpointing, execution.channels_last, execution.compile)
-        own_text = self.prior.text is not None and self.prior.text.source is None
+        own_text = reader is not None and reader.source is None
         self.text_dropout, self.pretrain_steps = text.dropout, text.pretrain_steps if own_text and new_text else 0
         self.validation_views = validation.views
-        if own_text and text.frozen and (self.pretrain_steps or not new_text):
-            self._keep_text()
+        if reader is not None and own_text and text.frozen and (self.pretrain_steps or not new_text):
+            self._keep_text(reader)
 
-    def _keep_text(self) -> None:
+    def _keep_text(self, reader: TextEncoder) -> None:
         """What reads reports and draws what they say stays as it is."""
-        self.prior.text.trainable = False
-        for part in (self.prior.text, self.prior.network.text_map, self.prior.null):
+        reader.trainable = False
+        for part in (reader, self.prior.network.text_map, self.prior.null):
             part.requires_grad_(False)
 
     def configure_model(self) -> None:
         mesh = self.device_mesh  # only of a strategy that spreads the weights
         if mesh is None:
             return
-        if any(isinstance(callback, WeightAveraging) for callback in self.trainer.callbacks):
+        if any(isinstance(one, WeightAveraging) for one in self.trainer.callbacks):  # type: ignore[attr-defined]
             raise ValueError("spread weights cannot be averaged: train without EMAWeightAveraging "
                              "(trainer.callbacks: null), as configs/prior/fsdp.yaml does")
         # A sharded optimizer resumes only if it has moved each of its weights: those that denoising leaves alone rest.
@@ -129,7 +131,7 @@ class PriorTraining(DenoisingTraining):
 
         It belongs before `fit`, since distributed training watches every backward pass from there on.
         """
-        if not self.pretrain_steps:
+        if not self.pretrain_steps or self.prior.text is None:
             return
         sentences = teaching_sentences(min(SENTENCES, BATCH * self.pretrain_steps), self.seed)
         words = [word for word in self.prior.text.vocabulary if word.isalpha() and len(word) > 1]
@@ -190,11 +192,11 @@ def _text_encoder(text: TextSettings, network: VolumeUNet) -> TextEncoder | None
     return TextEncoder.small(vocabulary, network.context_dim, length=SENTENCE_LENGTH, sentences=MOST_SENTENCES)
 
 
-def reconstruction_scores(prior: Prior | Refiner | Rival, ct: Tensor, views: int, seed: int,
+def reconstruction_scores(prior, ct: Tensor, views: int, seed: int,
                           method: str | Sampler | Reconstructor | None = None,
                           beam: ConeBeam | None = None) -> dict[str, float]:
     """SSIM, PSNR (dB) and MAE (HU) of a method's reconstruction, without a report, from ideal X-rays of a CT
-    (1, 1, X, Y, Z) in the prior's range, on `beam` or `benchmark_orbit`."""
+    (1, 1, X, Y, Z) in the range of `prior`, a Prior, Refiner or Rival, on `beam` or `benchmark_orbit`."""
     beam = beam or benchmark_orbit(prior.grid, views)
     exact = Projector(prior.grid, beam, device=ct.device, full_detector=True)
     result = reconstruct(Ideal()(exact, prior.window.to_mu(ct), seed)[0], beam, prior, method, seed=seed,

@@ -7,7 +7,7 @@ import time
 
 import lightning
 from rich.console import Console
-from rich.progress import TextColumn
+from rich.progress import Progress, TextColumn
 
 from phydict.runtime.progress import CaseProgress, to_go
 from phydict.runtime.telling import bars_on, tell
@@ -24,7 +24,9 @@ class TrainingProgress(lightning.Callback):
     """
 
     def __init__(self, interval: float = 60.0):
-        self.interval, self.bar, self.cases = interval, None, None
+        self.interval = interval
+        self.bar: Progress = None  # type: ignore[assignment]  # from the start of training on
+        self.cases: CaseProgress | None = None
 
     def on_train_start(self, trainer, module) -> None:
         steps = trainer.estimated_stepping_batches

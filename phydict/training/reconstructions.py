@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ from phydict.prior.correction import INPUTS, CorrectionNetwork
 from phydict.runtime.ranges import check_fields
 from phydict.training.crops import CTVolumes, PhantomVolumes, mapped_volume
 from phydict.training.data import PriorData
-from phydict.training.draws import Draws
+from phydict.training.draws import Draws, Items
 from phydict.training.scenes import Scenes
 from phydict.training.settings import HoldOut, Loading
 from phydict.units import HUWindow
@@ -66,7 +66,7 @@ class _Recording:
     """Keeps what a network sees at each call; without one nothing is corrected."""
 
     def __init__(self, network: CorrectionNetwork | None):
-        self.network, self.seen = network, []
+        self.network, self.seen = network, list[Tensor]()
 
     def suits(self, grid: Grid, window: HUWindow) -> bool:
         return True
@@ -84,7 +84,7 @@ class Reconstructions(Dataset):
     made when missing and kept in `folder`.
     """
 
-    def __init__(self, volumes: Sequence[np.ndarray], grid: Grid, base: str, network: str | None, scenes: Scenes,
+    def __init__(self, volumes: Items, grid: Grid, base: str, network: str | None, scenes: Scenes,
                  strength: Augmentation, folder: Path, length: int, seed: int):
         self.volumes, self.grid, self.base, self.network = volumes, grid, base, network
         self.scenes, self.strength, self.folder, self.length, self.seed = scenes, strength, folder, length, seed
@@ -97,15 +97,16 @@ class Reconstructions(Dataset):
 
     @torch.no_grad()
     def _made(self, n: int) -> Tensor:
-        rng, refiner = np.random.default_rng((self.seed, n)), load_prior(self.base)
+        rng, refiner = np.random.default_rng((self.seed, n)), cast(Refiner, load_prior(self.base))
         volume, window = np.array(self.volumes[n % len(self.volumes)], np.float32), refiner.window
-        scene = Grid(volume.shape, self.grid.extent / volume.shape)
+        scene = Grid(volume.shape, tuple(self.grid.extent / volume.shape))
         case = {"volume": torch.from_numpy(volume)[None], "masks": torch.zeros(0, *volume.shape), "report": "",
                 "id": str(n)}
         ct = augment(case, int(rng.integers(2**31)), scene, window, self.strength)["volume"][None]
         y, projector = self.scenes.xrays(ct, rng, scene, window)
         record = _Recording(load_correction(self.network) if self.network else None)
-        refined = Refined(Posterior(refiner, Unrolled()), self.grid, Refinement(calls=2 if self.network else 1), record)
+        base: Any = Posterior(refiner, Unrolled())
+        refined = Refined(base, self.grid, Refinement(calls=2 if self.network else 1), record)
         refined.reconstruct(*seen_by(self.grid, y, projector.beam, False))
         return torch.cat([*record.seen, avg_pool3d(ct, FINER)], 1)[0]
 
@@ -117,7 +118,7 @@ class Crops(Draws):
     "scale" (2,) are the mean squared and the mean absolute error of the reconstruction that a cube is cut from.
     """
 
-    def __init__(self, made: Dataset, size: int, length: int, epoch: int, seed: int):
+    def __init__(self, made: Items, size: int, length: int, epoch: int, seed: int):
         super().__init__(made, [], 1.0, length, epoch, seed)
         self.size = size
 
@@ -184,12 +185,13 @@ class ReconstructionData(PriorData):
         if not made.crop <= cube.voxels:
             raise ValueError(f"data.made.crop is at most the {cube.voxels} voxels of a reconstruction, but {made.crop} "
                              "was given")
-        scene, folder = Grid.cube(FINER * cube.voxels, cube.side), self.cts.cache
-        trained, validated = (ConcatDataset([CTVolumes(cts, folder, scene, self.window),
-                                             PhantomVolumes(first, count, scene, self.window, folder)])
-                              for cts, first, count in ((self.cts.cts, 0, phantoms),
-                                                        (self.validation.datasets[1].cts, HELD_OUT_PHANTOM,
-                                                         holdout.phantoms)))
+        scene, folder = Grid.cube(FINER * cube.voxels, cube.side), Path(cache)
+        volumes: list[ConcatDataset] = [
+            ConcatDataset([CTVolumes(cts, folder, scene, self.window),
+                           PhantomVolumes(first, count, scene, self.window, folder)])
+            for cts, first, count in ((self.cts.cts, 0, phantoms),
+                                      (self.held_out_cts.cts, HELD_OUT_PHANTOM, holdout.phantoms))]
+        trained, validated = volumes
         parts = [asdict(scenes), fingerprint(initial), made.network and fingerprint(made.network), scene.to_dict(),
                  window, phantoms, holdout.phantoms, self.held_out, [ct.id for ct in self.cts.cts]]
         folder = folder / f"reconstructions-{hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]}"

@@ -26,6 +26,8 @@ class RefinementTraining(StageTraining):
         initial: a network's file to go on from, which then decides its size
     """
 
+    prior: CorrectionNetwork
+
     def __init__(self, channels: tuple[int, ...] = (32, 64, 96), cube: Cube = Cube(128),
                  window: tuple[float, float] = (-1000.0, 1000.0), optimisation: Optimisation = Optimisation(),
                  body_weight: float = 2.0, initial: str | None = None):

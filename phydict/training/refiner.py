@@ -55,6 +55,8 @@ class RefinerTraining(StageTraining):
         seed: of scenes and noise
     """
 
+    prior: Refiner
+
     def __init__(self, method: Unrolled = Unrolled(), scenes: Scenes = Scenes(), cube: Cube = Cube(),
                  window: tuple[float, float] = (-1000.0, 1000.0), optimisation: Optimisation = Optimisation(),
                  validation: RefinerValidation = RefinerValidation(), body_weight: float = 2.0,
@@ -66,9 +68,8 @@ class RefinerTraining(StageTraining):
         if not found.grid.same_as(cube.grid()) or found.window != HUWindow(*window):
             raise ValueError(f"the prior {initial} has another grid or HU window than this training: "
                              "set model.cube and model.window to its own")
-        refiner = found
-        if isinstance(found, Prior):
-            refiner = Refiner(found, _mean(found), first=deepcopy(found) if found.reads_text else None)
+        refiner = found if isinstance(found, Refiner) else Refiner(
+            found, _mean(found), first=deepcopy(found) if found.reads_text else None)
         refiner.uncertainty = None  # of what it was
         super().__init__(refiner.train().requires_grad_(True), optimisation, seed)
         if refiner.reader.load_text is not None:
@@ -79,7 +80,7 @@ class RefinerTraining(StageTraining):
         self.validation_views = validation.views
 
     @property
-    def calls(self) -> int:
+    def calls(self) -> int:  # type: ignore[override]
         return len(self.method.times)
 
     def batch_loss(self, batch: dict, key: tuple[int, ...] = (0,), rank: int = 0, processes: int = 1) -> Tensor:

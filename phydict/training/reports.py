@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from typing import cast
 
 import numpy as np
 import torch
@@ -20,6 +21,7 @@ from phydict.datasets.phantoms.places import examples, extents
 from phydict.datasets.prose import naming_words, telling_words
 from phydict.prior.kind_map import KindMap
 from phydict.prior.prior import Prior
+from phydict.prior.text import TextEncoder
 
 BATCH, LEARNING_RATE = 64, 2e-3
 EXTENT_WEIGHT = 40.0
@@ -35,7 +37,7 @@ def learn_sentences(prior: Prior, sentences: Sequence[tuple[str, tuple[int, ...]
 
     words: any words that reports may hold; on_step: called after each step. Returns the loss of each step.
     """
-    text, kind_map = prior.text, prior.network.text_map
+    text, kind_map = cast(TextEncoder, prior.text), cast(KindMap, prior.network.text_map)
     weights = [*text.parameters(), *kind_map.parameters()]
     resting = [weight for weight in weights if not weight.requires_grad]
     for weight in weights:
@@ -48,7 +50,7 @@ def learn_sentences(prior: Prior, sentences: Sequence[tuple[str, tuple[int, ...]
     for step in range(steps):
         for group in optimizer.param_groups:
             group["lr"] = LEARNING_RATE * min(1, (step + 1) / 50, 2 * (1 - step / steps))
-        picked = [disguise(*sentences[i], draw) for i in draw.integers(len(sentences), size=BATCH)]
+        picked = [disguise(*sentences[int(i)], draw) for i in draw.integers(len(sentences), size=BATCH)]
         states = text.read_sentences([sentence for sentence, _ in picked])
         states = torch.cat([states, prior.null[0].detach().to(states)])  # which stands for no sentence
         score, extent = kind_map.answers(states[None])

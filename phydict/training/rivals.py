@@ -28,6 +28,8 @@ class RivalTraining(StageTraining):
     and whatever else is drawn.
     """
 
+    prior: Rival
+
     def __init__(self, made: Rival, scenes: Scenes, views: tuple[int, ...], optimisation: Optimisation,
                  initial: str | None, seed: int):
         rival = made if initial is None else load_rival(initial)

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
@@ -22,7 +23,7 @@ from phydict.prior.evidence_channels import EVIDENCE_CHANNELS
 from phydict.runtime.ranges import check_fields
 from phydict.training.crops import mapped_volume
 from phydict.training.data import PriorData
-from phydict.training.draws import Draws
+from phydict.training.draws import Draws, Items
 from phydict.training.refiner import RefinerTraining
 from phydict.training.scenes import Scenes
 from phydict.training.settings import HoldOut, Loading
@@ -77,7 +78,7 @@ class RollOuts(Dataset):
 
     @cached_property
     def _refiner(self) -> Refiner:
-        return load_prior(self.settings.initial)
+        return cast(Refiner, load_prior(self.settings.initial))
 
     @torch.no_grad()
     def _made(self, n: int) -> Tensor:
@@ -97,7 +98,7 @@ class Calls(Draws):
     """Single calls of roll-outs: "state" and "evidence" as the network is given them, "call" its number, "volume" and
     "masks" what it should answer; masks are NaN where they are not known."""
 
-    def __init__(self, rollouts: Dataset, channels: int, length: int, epoch: int, seed: int):
+    def __init__(self, rollouts: Items, channels: int, length: int, epoch: int, seed: int):
         super().__init__(rollouts, [], 1.0, length, epoch, seed)
         self.channels = channels
 
@@ -140,7 +141,7 @@ class RollOutData(PriorData):
         parts = [asdict(rollouts), fingerprint(rollouts.initial), str(method), cube.voxels, window, phantoms, seed,
                  asdict(augmentation), loading.ct_fraction, asdict(loading.population), self.factor, self.held_out,
                  [ct.id for ct in self.cts.cts]]
-        folder = self.cts.cache / f"rollouts-{hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]}"
+        folder = Path(cache) / f"rollouts-{hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]}"
         self.rollouts = RollOuts(self._case, rollouts, method, folder, seed)
 
     @cached_property

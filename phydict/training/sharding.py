@@ -15,7 +15,7 @@ def shard(prior: Prior, mesh: DeviceMesh) -> Prior:
     Each block of the network is gathered when it computes and let go after; the rest is one group, gathered by
     `forward` and by `context` alike. Names of weights stay. From here on every process must make the same calls.
     """
-    prior.to(memory_format=torch.contiguous_format)  # the only one that can be spread
+    prior.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]  # the only one that can be spread
     for block in prior.network.blocks():
         fully_shard(block, mesh=mesh)
     fully_shard(prior, mesh=mesh)

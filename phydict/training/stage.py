@@ -9,9 +9,10 @@ from pathlib import Path
 import lightning
 import numpy as np
 import torch
+from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 
-from phydict.prior import Prior, Refiner, SuperResolution
+from phydict.prior import CorrectionNetwork, Prior, Refiner, SuperResolution
 from phydict.prior.finite import not_finite
 from phydict.prior.stage_file import check_stage
 from phydict.rivals import Rival
@@ -29,7 +30,8 @@ class StageTraining(lightning.LightningModule, ABC):
 
     calls = 1
 
-    def __init__(self, prior: Prior | SuperResolution | Refiner | Rival, optimisation: Optimisation, seed: int):
+    def __init__(self, prior: Prior | SuperResolution | Refiner | CorrectionNetwork | Rival,
+                 optimisation: Optimisation, seed: int):
         super().__init__()
         self.prior, self.optimisation, self.seed, self.samples = prior, optimisation, seed, 0
 
@@ -85,7 +87,7 @@ class StageTraining(lightning.LightningModule, ABC):
             return f"no checkpoint had been written, so {anew}"
         return f"the last good checkpoint is {last}, so resume from it with --ckpt_path, or {anew}"
 
-    def configure_optimizers(self) -> dict:
+    def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         weights = [w for w in self.parameters() if w.requires_grad]
         optimizer = torch.optim.AdamW(weights, self.optimisation.learning_rate,
                                       weight_decay=self.optimisation.weight_decay)

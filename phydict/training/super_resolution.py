@@ -34,6 +34,8 @@ class SuperResolutionTraining(DenoisingTraining):
         seed: of times and noise
     """
 
+    prior: SuperResolution
+
     def __init__(self, network: LocalUNet | None = None, cube: Cube = Cube(256), factor: int = 4,
                  window: tuple[float, float] = (-1000.0, 1000.0), detail_std: float = 0.08, most_noise: float = 0.3,
                  optimisation: Optimisation = Optimisation(), validation: Previews = Previews(),
@@ -43,7 +45,8 @@ class SuperResolutionTraining(DenoisingTraining):
                                detail_std=detail_std)
         if initial:
             first = load_super_resolution(initial)
-            if not first.grid.same_as(fine.grid) or first.window != fine.window or first.factor != factor:
+            if (not isinstance(first, SuperResolution) or not first.grid.same_as(fine.grid)
+                    or first.window != fine.window or first.factor != factor):
                 raise ValueError(f"the stage {initial} has another grid, HU window or factor than this training: set "
                                  "model.cube, model.window and model.factor to its own")
             fine = first.train().requires_grad_(True)
@@ -78,7 +81,7 @@ class SuperResolutionTraining(DenoisingTraining):
 
     def _write_preview(self, file: Path, batch: dict, x0: Tensor, sample: Tensor) -> None:
         upsampled = self.prior.upsample(avg_pool3d(x0, self.prior.factor))
-        volumes = {"coarse, upsampled": upsampled, "sample": sample}
+        (x, y, z), volumes = x0.shape[2:], {"coarse, upsampled": upsampled, "sample": sample}
         to_hu = self.prior.window.to_hu
         method_panel(file, {name: to_hu(volume[0, 0].cpu()) for name, volume in volumes.items()},
-                     to_hu(x0[0, 0].cpu()), Grid(x0.shape[2:], self.prior.grid.spacing), title="crop")
+                     to_hu(x0[0, 0].cpu()), Grid((x, y, z), self.prior.grid.spacing), title="crop")

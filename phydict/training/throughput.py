@@ -32,7 +32,8 @@ class Throughput(lightning.Callback):
         if peak is not None and not peak > 0:
             raise ValueError(f"throughput.peak is a positive number of TFLOP/s, but {peak} was given: leave it out to "
                              "have it measured")
-        self.peak, self.began, self.flop = peak, None, 0
+        self.peak, self.flop = peak, 0
+        self.began: float | None = None
 
     def on_fit_start(self, trainer, module) -> None:
         self.began, self.flop = None, 0

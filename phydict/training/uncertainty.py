@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -38,6 +40,8 @@ class UncertaintyTraining(StageTraining):
         initial: the refiner's file
         seed: of scenes and noise
     """
+
+    prior: Any  # a Refiner with uncertainty
 
     def __init__(self, network: Uncertainty | None = None, method: Unrolled = Unrolled(), scenes: Scenes = Scenes(),
                  cube: Cube = Cube(), window: tuple[float, float] = (-1000.0, 1000.0),
@@ -104,7 +108,8 @@ class UncertaintyTraining(StageTraining):
     def on_validation_epoch_end(self) -> None:
         if self.held_out:
             found = [torch.cat(parts) for parts in zip(*self.held_out)]
-            self.prior.uncertainty.calibrate(*[self.all_gather(part).flatten() for part in found])
+            everywhere = [self.all_gather(part).flatten() for part in found]  # type: ignore[union-attr]
+            self.prior.uncertainty.calibrate(*everywhere)
 
     def _describe(self) -> dict:
         return describe_refiner(self.prior)

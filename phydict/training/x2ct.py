@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import cast
 
 import torch
+from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 from torch.func import functional_call
 from torch.nn.functional import l1_loss, mse_loss
@@ -73,14 +75,14 @@ class X2CTTraining(RivalTraining):
         self.discriminator = PatchDiscriminator(scenes.views, adversary.width, adversary.layers)
         self.adversary = adversary
 
-    def configure_optimizers(self) -> dict:
+    def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         optimizers = super().configure_optimizers()
         for group in optimizers["optimizer"].param_groups:
             group["betas"] = BETAS
         return optimizers
 
     def case_loss(self, ct: Tensor, water: Tensor, beam: ConeBeam, generator: torch.Generator) -> Tensor:
-        y, network = water / WATER_MM, self.prior.network
+        y, network = water / WATER_MM, cast(X2CTNetwork, self.prior.network)
         geometry = network.geometry(self.prior.grid, beam, y)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(int(torch.randint(2**31, (1,), generator=generator)))  # of the dropout

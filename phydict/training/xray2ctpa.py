@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import torch
 from safetensors.torch import load_file
@@ -86,7 +87,7 @@ class XrayToCTPATraining(RivalTraining):
     def case_loss(self, ct: Tensor, water: Tensor, beam: ConeBeam, generator: torch.Generator) -> Tensor:
         if self.learns_slices:
             return self._slices_loss(ct, generator)
-        network, y = self.prior.network, water / WATER_MM
+        network, y = cast(XrayToCTPANetwork, self.prior.network), water / WATER_MM
         with torch.no_grad():
             latent = network.latent(ct).float()
             if not network.largest:  # the autoencoder came with weights of its own
@@ -98,7 +99,7 @@ class XrayToCTPATraining(RivalTraining):
         return l1_loss(network(signal * x0 + sigma * noise, t, y, directions).float(), noise)
 
     def _slices_loss(self, ct: Tensor, generator: torch.Generator) -> Tensor:
-        network = self.prior.network
+        network = cast(XrayToCTPANetwork, self.prior.network)
         chosen = torch.randperm(ct.shape[-1], generator=generator)[:self.latent.slices]
         slices = ct[0, :, :, :, chosen.to(ct.device)].permute(3, 0, 1, 2)
         mean, std = (part.float() for part in network.autoencoder.encode(slices))

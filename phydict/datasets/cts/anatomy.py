@@ -147,7 +147,7 @@ def _fill(lungs: np.ndarray, airway: np.ndarray, hu: np.ndarray, spacing: np.nda
     return filled, filled & (hu > VESSEL_ABOVE) & (depth > SURFACE_MM)
 
 
-def _box(mask: np.ndarray, margin) -> tuple[slice, slice, slice]:
+def _box(mask: np.ndarray, margin) -> tuple[slice, ...]:
     """The slices of the box around a mask, widened by `margin` voxels (a number or one per axis)."""
     margin = np.broadcast_to(margin, 3)
     ends = [np.flatnonzero(mask.any(axis=tuple({0, 1, 2} - {a})))[[0, -1]] for a in range(3)]

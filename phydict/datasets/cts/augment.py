@@ -179,8 +179,8 @@ def _rescanned(case: dict, generator: torch.Generator, grid: Grid, window: HUWin
     if strength.contrast:
         hu = change_contrast(hu, masks, strength.contrast * (2 * float(amount) - 1))
     if chance[0] < strength.surroundings.field:
-        middle = tuple(FIELD_SHIFT_MM * (2 * float(place) - 1) for place in centre)
-        hu, masks = cut_field(hu, masks, grid, FIELD_MM[0] + float(diameter) * (FIELD_MM[1] - FIELD_MM[0]), middle)
+        x, y = (FIELD_SHIFT_MM * (2 * float(place) - 1) for place in centre)
+        hu, masks = cut_field(hu, masks, grid, FIELD_MM[0] + float(diameter) * (FIELD_MM[1] - FIELD_MM[0]), (x, y))
     if chance[1] < strength.surroundings.ends and not case["report"].strip():
         hu, masks = cut_ends(hu, masks, grid, *_ends(hu, grid, ends))
     return case | {"volume": window.to_range(hu), "masks": masks}

@@ -20,7 +20,7 @@ def write_arrays(file: Path, arrays: dict[str, np.ndarray]) -> None:
     Raises OSError, in one sentence, where it cannot be written; nothing of it is left then.
     """
     with _cached(file) as stream:
-        np.savez_compressed(stream, **arrays)
+        np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]  # none is called allow_pickle
 
 
 def write_array(file: Path, array: np.ndarray) -> None:
@@ -29,7 +29,7 @@ def write_array(file: Path, array: np.ndarray) -> None:
     with _cached(file) as stream:
         header = np.lib.format.header_data_from_array_1_0(array)
         np.lib.format.write_array_header_1_0(stream, header)
-        stream.write(array)  # np.save would not notice that a full disk takes no more of an array's end
+        stream.write(array.data)  # np.save would not notice that a full disk takes no more of an array's end
 
 
 @contextmanager

@@ -95,7 +95,7 @@ def find_cts(root: str | Path, reports: str | Path | None = None, metadata: str 
     given table of reports without any of the CTs; one that was found by itself is warned of.
     """
     root = Path(root)
-    files = {}
+    files: dict[str, Path] = {}
     for path in _nifti_files(root):
         id = _id(path, root)
         if id in files and NAME.fullmatch(id) and _is_fixed(path) != _is_fixed(files[id]):
@@ -220,7 +220,7 @@ class CTCases(Dataset):
     def __getitem__(self, index: int) -> dict:
         ct = self.cts[index]
         file = self.cache and self.cache / f"{ct.id}-{self.key(ct)}.npz"
-        packed = file and read_arrays(file)
+        packed = read_arrays(file) if file else None
         if packed is None:
             packed = _pack(load_case(ct, self.grid, self.window))
             if file:

@@ -40,7 +40,8 @@ def _calibration(path: str | Path, row: dict[str, str]) -> Calibration:
     """What a row of metadata says."""
     slope, intercept, z_mm = (_numbers(path, row, name, 1)[0] for name in ("RescaleSlope", "RescaleIntercept",
                                                                            "ZSpacing"))
-    spacing = (*_numbers(path, row, "XYSpacing", 2), z_mm)
+    x_mm, y_mm = _numbers(path, row, "XYSpacing", 2)
+    spacing = (x_mm, y_mm, z_mm)
     if min(spacing) <= 0:
         raise ValueError(f"the metadata of {row['VolumeName']} in {path} give it voxels of {spacing} mm; correct "
                          "XYSpacing and ZSpacing")

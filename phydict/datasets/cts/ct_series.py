@@ -89,8 +89,8 @@ def _header(path: Path) -> pydicom.Dataset:
 
 def _geometry(path: Path, header: pydicom.Dataset) -> dict[str, np.ndarray]:
     """The numbers of the tags NEEDED of one slice. Raises ValueError."""
-    tags = {keyword: tag_numbers(header, 0, keyword, path.name, count) for keyword, count in NEEDED.items()}
-    if missing := [keyword for keyword, numbers in tags.items() if numbers is None]:
+    tags = {keyword: tag_numbers(header, 0, keyword, path.name, count) or () for keyword, count in NEEDED.items()}
+    if missing := [keyword for keyword, numbers in tags.items() if not numbers]:
         raise ValueError(f"{path.name} lacks {', '.join(missing)}; export the series again")
     if min(tags["PixelSpacing"]) <= 0:
         raise ValueError(f"PixelSpacing of {path.name} must be positive, but {list(tags['PixelSpacing'])} mm was "

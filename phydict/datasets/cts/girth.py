@@ -32,8 +32,8 @@ class Girth:
     grows, and growth: what it gains at the sides, both over the superellipse's half-axis.
     """
 
-    centre: tuple[float, float]
-    half: tuple[float, float]
+    centre: tuple[float, ...]
+    half: tuple[float, ...]
     band: float
     growth: float
 

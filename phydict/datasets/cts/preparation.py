@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from phydict.datasets.cts.anatomy import MASKS, body_mask, lung_box_centre, lung_box_size, segment
+from phydict.datasets.cts.ct_rate import CTFile
 from phydict.datasets.cts.prepared import RECORD, VOLUME, read_record, write_prepared
 from phydict.datasets.cts.segmentations import lungs_by_lungmask, read_segmentation, segmentations_beside
 from phydict.datasets.cts.sources import Source, find_sources
@@ -64,9 +65,9 @@ def prepare_folder(cts: str | Path, out: str | Path, settings: Settings = Settin
             rows[row["id"]] = row
             progress.case(row["id"])
             progress.finished(row["status"] + (f": {row['reason']}" if row["reason"] else ""))
-    rows = [rows[source.id] for source in sources]
-    _write_summary(out / SUMMARY, rows)
-    return rows
+    summary = [rows[source.id] for source in sources]
+    _write_summary(out / SUMMARY, summary)
+    return summary
 
 
 def _finished(source: Source, out: Path, settings: Settings) -> dict | None:
@@ -111,8 +112,12 @@ def _prepared(sources: list[Source], out: Path, settings: Settings, workers: int
 def _end_with_parent() -> None:
     """In a worker: leaves Ctrl-C to the parent, and ends when the parent does."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-    threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
+
+    def end_after(parent) -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=end_after, args=(multiprocessing.parent_process(),), daemon=True).start()
 
 
 def prepare_source(source: Source, out: Path, settings: Settings) -> dict:
@@ -134,7 +139,7 @@ def prepare_source(source: Source, out: Path, settings: Settings) -> dict:
         return row | facts
     row |= facts | {"status": "prepared", "window_low": settings.window[0], "window_high": settings.window[1]}
     record = {"id": source.id, "space": settings.space, "extent": settings.extent, "window": settings.window,
-              "report": "" if source.is_dicom else source.ct.report, "settings": asdict(settings),
+              "report": source.ct.report if isinstance(source.ct, CTFile) else "", "settings": asdict(settings),
               "fingerprint": fingerprint, "row": row}
     try:
         with atomic_directory(out / source.id, lambda: _finished(source, out, settings) is None) as partial:

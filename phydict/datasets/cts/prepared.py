@@ -41,7 +41,7 @@ def write_prepared(folder: Path, grid: Grid, images: dict[str, np.ndarray], reco
     affine, medsyn = grid.affine, record["space"] == "medsyn"
     if medsyn:
         affine = affine @ _medsyn_index(grid.shape)
-        atlas = Grid(grid.shape, np.asarray(record["extent"]) / grid.shape).affine @ _medsyn_index(grid.shape)
+        atlas = Grid(grid.shape, tuple(np.asarray(record["extent"]) / grid.shape)).affine @ _medsyn_index(grid.shape)
         record = record | {"atlas_affine": atlas.tolist()}
     for name, image in images.items():
         image = np.ascontiguousarray(image[::-1].transpose(2, 1, 0)) if medsyn else image
@@ -122,10 +122,10 @@ def read_prepared(path: Path, grid: Grid, window: HUWindow) -> dict:
         def sampled(image, pad):
             return to_grid(image, affine, target, pad)
 
-    masks = [np.zeros(grid.shape) if mask is None else sampled(mask, 0.0).clip(0, 1) for mask in masks]
+    stacked = np.stack([np.zeros(grid.shape) if mask is None else sampled(mask, 0.0).clip(0, 1) for mask in masks])
     volume = window.to_range(sampled(hu, AIR))
     return {"id": record["id"], "volume": torch.from_numpy(volume.astype(np.float32))[None],
-            "masks": torch.from_numpy(np.stack(masks).astype(np.float32)), "has_masks": torch.from_numpy(known),
+            "masks": torch.from_numpy(stacked.astype(np.float32)), "has_masks": torch.from_numpy(known),
             "report": record["report"], "affine": torch.from_numpy(placed), "centred_on": "lungs"}
 
 

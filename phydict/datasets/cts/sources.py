@@ -28,15 +28,15 @@ class Source:
 
     @property
     def place(self) -> Path:
-        return self.ct.folder if self.is_dicom else self.ct.path
+        return self.ct.folder if isinstance(self.ct, Series) else self.ct.path
 
     def load(self) -> tuple[np.ndarray, np.ndarray]:
         """HU (X, Y, Z) in RAS+ and the affine. Raises ValueError and OSError."""
-        return load_series(self.ct) if self.is_dicom else load_ct(self.ct.path, self.ct.calibration)
+        return load_series(self.ct) if isinstance(self.ct, Series) else load_ct(self.ct.path, self.ct.calibration)
 
     def fingerprint(self) -> dict:
         """What identifies this input: its files' number and bytes, those of its segmentations included."""
-        files = [*(self.ct.files if self.is_dicom else (self.ct.path,)),
+        files = [*(self.ct.files if isinstance(self.ct, Series) else (self.ct.path,)),
                  *(file for files in segmentations_beside(self.beside).values() for file in files)]
         return {"files": len(files), "bytes": sum(file.stat().st_size for file in files)}
 

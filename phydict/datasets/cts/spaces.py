@@ -66,9 +66,9 @@ class Settings:
         """The voxels in the patient's world, for lungs in a box of `lung_mm` (3,) around `lung_centre` (3,)."""
         shape, extent = (self.voxels,) * 3, np.asarray(self.extent)
         if self.space == "patient":
-            return centred(Grid(shape, extent / shape), lung_centre)
+            return centred(Grid(shape, tuple(extent / shape)), lung_centre)
         shrink = lung_mm / self.atlas_lungs_mm
-        return centred(Grid(shape, extent * shrink / shape), lung_centre - shrink * self.atlas_offset_mm)
+        return centred(Grid(shape, tuple(extent * shrink / shape)), lung_centre - shrink * self.atlas_offset_mm)
 
 
 def atlas_lungs(mask: Path) -> dict:

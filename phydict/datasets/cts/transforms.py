@@ -84,9 +84,9 @@ def to_ras(volume: np.ndarray, affine: np.ndarray) -> tuple[np.ndarray, np.ndarr
     from monai.data import MetaTensor
     from monai.transforms import Orientationd
 
-    image = MetaTensor(torch.from_numpy(np.ascontiguousarray(volume, np.float32))[None], affine=affine)
-    image = Orientationd("ct", axcodes="RAS", labels=None)({"ct": image})["ct"]
-    return image.as_tensor()[0].numpy(), image.affine.numpy().astype(float)
+    image = MetaTensor(torch.from_numpy(np.ascontiguousarray(volume, np.float32))[None], affine=torch.as_tensor(affine))
+    turned: dict = Orientationd("ct", axcodes="RAS", labels=None)({"ct": image})
+    return turned["ct"].as_tensor()[0].numpy(), turned["ct"].affine.numpy().astype(float)
 
 
 def _check_header(path: Path, header, calibration: Calibration | None) -> None:

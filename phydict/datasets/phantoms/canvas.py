@@ -44,7 +44,7 @@ class Canvas:
         self.axes = []
         for row, origin in zip(matrix, start):
             used = [c * i for c, i in zip(row, index) if abs(c) > 1e-6] or [0 * index[0]]
-            self.axes.append(np.float32(sum(used) + origin))
+            self.axes.append(np.asarray(sum(used) + origin, np.float32))
         self.straight_y = self.axes[1]
         self.axes[1] = self.straight_y - np.float32(thorax.bend(self.axes[2]))
 
@@ -73,14 +73,14 @@ class Canvas:
         box = tuple(slice(a, b) for a, b in zip(first, last))
         return box, [axis[tuple(s if n > 1 else slice(None) for s, n in zip(box, axis.shape))] for axis in self.axes]
 
-    def blob(self, centre, half, axes=np.eye(3)):
+    def blob(self, centre, half, axes=np.eye(3)) -> tuple[tuple[slice, ...], np.ndarray]:
         """(box, share) of an ellipsoid."""
         half = np.broadcast_to(np.asarray(half, float), 3)
         reach = np.sqrt(((np.asarray(axes) * half[:, None]) ** 2).sum(0))
         box, (x, y, z) = self.box(np.asarray(centre) - reach, np.asarray(centre) + reach)
         return box, self.soft(ellipsoid(x, y, z, centre, axes, half))
 
-    def pipe(self, points, radius, wall: float = 0.0):
+    def pipe(self, points, radius, wall: float = 0.0) -> tuple[tuple[slice, ...], np.ndarray]:
         """(box, share) of a wide round tube through `points` (M, 3) with `radius` mm, a number or one per point."""
         points = np.asarray(points, float)
         radius = np.broadcast_to(np.asarray(radius, float), len(points)) + wall

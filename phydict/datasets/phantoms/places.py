@@ -78,5 +78,6 @@ def _around_the_heart(t: Thorax, finding: Finding) -> tuple[np.ndarray, np.ndarr
     reach = np.sqrt(((axes * half[:, None]) ** 2).sum(0))
     points = centre + reach * np.random.default_rng(0).uniform(-1, 1, (9000, 3))
     inner = t.heart_ellipsoid(t.heart)
-    inside = (ellipsoid(*points.T, centre, axes, half) < 0) & (ellipsoid(*points.T, *inner) > 0)
+    x, y, z = points.T
+    inside = (ellipsoid(x, y, z, centre, axes, half) < 0) & (ellipsoid(x, y, z, *inner) > 0)
     return points, inside * (8 * reach.prod() / len(points))

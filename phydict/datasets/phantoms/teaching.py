@@ -23,16 +23,17 @@ def teaching_sentences(count: int, seed: int = 0) -> list[tuple[str, tuple[int, 
 
 def _sentence(pen: Pen) -> tuple[str, tuple[Finding, ...]]:
     task = pen.rng.random()
+    findings: tuple[Finding, ...] = ()
     if task < 0.25:
-        text, findings = unrelated(pen, inside=True), ()
+        text = unrelated(pen, inside=True)
     elif task < 0.45:
         kinds = pen.rng.permutation(len(KINDS))[:1 + int(4 * pen.rng.random() ** 2)]
-        text, findings = pen.deny([KINDS[kind] for kind in kinds]), ()
+        text = pen.deny([KINDS[kind] for kind in kinds])
     elif task < 0.49:
-        text, findings = pen.resolve(pen.pick(KINDS)), ()
+        text = pen.resolve(pen.pick(KINDS))
     elif task < 0.54:
-        text, findings = pen.pick(pen.pick([phrases.NORMAL_HEART, phrases.CLEAR_LUNGS, phrases.CLEAR_PLEURA,
-                                            phrases.NORMAL_CHEST])), ()
+        text = pen.pick(pen.pick([phrases.NORMAL_HEART, phrases.CLEAR_LUNGS, phrases.CLEAR_PLEURA,
+                                  phrases.NORMAL_CHEST]))
     else:
         text, findings = _statement(pen)
     if pen.chance(0.1):

@@ -109,7 +109,7 @@ class Thorax:
         uniform = rng.uniform
         size = uniform(0.93, 1.06)
         height = size * uniform(236, 282)
-        offset = tuple(float(v) for v in uniform(-15, 15, 3))
+        offset = tuple(uniform(-15, 15, 3).tolist())
         contrast = bool(rng.random() < 0.6)
         blood = (uniform(110, 300), uniform(120, 260)) if contrast else (uniform(35, 50),) * 2
         apex, base = offset[2] + height / 2, offset[2] - height / 2
@@ -130,7 +130,7 @@ class Thorax:
             spine=uniform(16.5, 20.0), vertebra=size * uniform(21, 25), rib_slope=uniform(0.95, 1.45),
             kyphosis=uniform(8, 28), aorta=uniform(11.5, 16.0), trachea=uniform(5.8, 8.2),
             parenchyma=uniform(-905, -812), gravity=uniform(15, 45), bone=uniform(150, 280), contrast=contrast,
-            blood=tuple(float(v) for v in blood), cava=float(blood[0] * (uniform(1.0, 3.0) if contrast else 1.0)),
+            blood=(float(blood[0]), float(blood[1])), cava=float(blood[0] * (uniform(1.0, 3.0) if contrast else 1.0)),
             liver_hu=uniform(45, 65) + (45 if contrast else 0), gas=uniform(0.0, 1.0),
             couch=Couch.draw(pose) if pose.random() < 0.9 else None,
             arms=ARMS[int(pose.integers(len(ARMS)))] if pose.random() < 0.2 else (True, True),

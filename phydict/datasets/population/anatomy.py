@@ -77,8 +77,9 @@ class Anatomy:
         weights = share * rng.dirichlet(np.ones(count)) + (1 - share) * np.eye(count)[patient]
         along = rng.standard_normal(len(modes)).clip(-MOST_DEVIATIONS, MOST_DEVIATIONS)
         weights = weights + variation.modes * along @ modes
-        organs = [float(bound * rng.uniform(-1, 1)) for bound in (variation.lungs, variation.heart, variation.liver)]
-        return cls(patient, tuple(weights.tolist()), *organs, findings_of(seed, variation.findings))
+        lungs, heart, liver = (
+            float(bound * rng.uniform(-1, 1)) for bound in (variation.lungs, variation.heart, variation.liver))
+        return cls(patient, tuple(weights.tolist()), lungs, heart, liver, findings_of(seed, variation.findings))
 
     def towards_patient(self, share: float) -> Anatomy:
         """This anatomy, `share` of the way nearer to the shape of its own patient; its findings stay."""

@@ -72,11 +72,11 @@ class DrawnPatients(Dataset):
         return self.count
 
     def __getitem__(self, seed: int) -> dict:
-        self.prepare()
+        population = self.prepare()
         file = self.drawn and self.drawn / f"{seed:07d}.npz"
-        packed = file and read_arrays(file)
+        packed = read_arrays(file) if file else None
         if packed is None:
-            case = self.population.case(self.population.draw(seed, self.settings.variation), seed)
+            case = population.case(population.draw(seed, self.settings.variation), seed)
             packed = {"volume": case["volume"].numpy().astype(np.float16),
                       "masks": (255 * case["masks"].numpy()).round().astype(np.uint8),
                       "has_masks": case["has_masks"].numpy(), "report": np.array(case["report"])}
@@ -91,10 +91,10 @@ class DrawnPatients(Dataset):
         drawn = [(seed, findings_of(seed, self.settings.variation.findings)) for seed in range(min(most, self.count))]
         return [write_report(findings, seed % 2 == 0, seed) for seed, findings in drawn if findings]
 
-    def prepare(self) -> None:
+    def prepare(self) -> Population:
         """Registers the CTs, or reads how they were; for use before several processes draw."""
         if self.population is not None:
-            return
+            return self.population
         cases = [self.cts[i] for i in range(len(self.cts))]
         faults = {i: "no lungs were found in it" for i, case in enumerate(cases) if not case["has_masks"][0]}
         usable = [i for i in range(len(cases)) if i not in faults]
@@ -113,12 +113,13 @@ class DrawnPatients(Dataset):
         self.overlaps = [registered[i].overlap for i in left if i != template]
         self.population = Population([cases[i] for i in left], torch.stack([registered[i].velocity for i in left]),
                                      left.index(template), self.cts.grid, self.cts.window)
+        return self.population
 
     def _registered(self, images: dict[int, torch.Tensor], template: int) -> dict[int, Registered]:
         keys = {i: self.cts.key(self.cts.cts[i]) for i in images}
         files = {i: self.folder and self.folder / f"{self.cts.cts[i].id}-{self._key(keys[i], keys[template])}.npz"
                  for i in images}
-        stored = {i: files[i] and read_arrays(files[i]) for i in images}
+        stored = {i: read_arrays(file) if file else None for i, file in files.items()}
         registered = {i: Registered(torch.from_numpy(one["velocity"]), float(one["overlap"]), float(one["least"]))
                  for i, one in stored.items() if one is not None}
         left = [i for i in images if i not in registered]
@@ -129,8 +130,8 @@ class DrawnPatients(Dataset):
                 progress.case(self.cts.cts[i].id)
                 image = images[i]
                 registered[i] = register(images[template], image) if i != template else Registered.template(image)
-                if files[i]:
-                    write_arrays(files[i], {name: np.asarray(value) for name, value in vars(registered[i]).items()})
+                if file := files[i]:
+                    write_arrays(file, {name: np.asarray(value) for name, value in vars(registered[i]).items()})
                 progress.finished(f"lungs overlap by {registered[i].overlap:.2f}")
         return dict(sorted(registered.items()))
 

@@ -74,12 +74,12 @@ def register(fixed: Tensor, moving: Tensor) -> Registered:
 
     correlation = LocalNormalizedCrossCorrelationLoss(kernel_size=5, smooth_dr=1e-3, reduction="none")
     weights = torch.tensor([1.0, 2.0, 1.0]).view(3, 1, 1, 1)
-    free = None
+    free = torch.zeros(0)
     for factor, steps, rate in LEVELS:
         shape = [max(n // factor, 8) for n in fixed.shape[1:]]
         lattice = [n // 2 for n in shape]
         f, m, start = resize(fixed, shape), resize(moving, shape), places(shape)
-        free = (torch.zeros(3, *lattice) if free is None else resize(free.detach(), lattice)).requires_grad_()
+        free = (torch.zeros(3, *lattice) if not free.numel() else resize(free.detach(), lattice)).requires_grad_()
         optimizer = torch.optim.Adam([free], rate)
         for _ in range(steps):
             velocity = smooth(free, WIDTH)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from phydict.datasets.prose import elsewhere, phrases
 if TYPE_CHECKING:
     from phydict.datasets.phantoms.findings import Finding
 
+Option = TypeVar("Option")
 ABBREVIATIONS = {("right", "upper"): "RUL", ("right", "middle"): "RML", ("right", "lower"): "RLL",
                  ("left", "upper"): "LUL", ("left", "lower"): "LLL"}
 PLURAL = re.compile(r"\b\w+(?<!s)(?<!i)(?<!u)s\b|\bbullae\b")
@@ -42,7 +43,7 @@ class Pen:
     def __init__(self, rng: np.random.Generator, exact: bool = True):
         self.rng, self.exact = rng, exact
 
-    def pick(self, options: Sequence[str]) -> str:
+    def pick(self, options: Sequence[Option]) -> Option:
         return options[int(self.rng.random() * len(options))]
 
     def chance(self, share: float) -> bool:

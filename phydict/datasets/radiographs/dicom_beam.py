@@ -24,7 +24,6 @@ import math
 import reprlib
 
 import numpy as np
-from pydicom.datadict import tag_for_keyword
 from pydicom.tag import Tag
 
 from phydict.datasets.dicom import DicomTags
@@ -47,7 +46,8 @@ def tags_beam(tags: list[DicomTags], shape: tuple[int, int], overrides: dict | N
     stated = _per_frame(overrides or {}, len(tags), source)
     poses = [_pose(frame, {name: values[k] for name, values in stated.items()}, turned)
              for k, frame in enumerate(tags)]
-    return ConeBeam(*(np.stack(part) for part in zip(*poses)), shape)
+    sources, detectors, u, v = (np.stack(part) for part in zip(*poses))
+    return ConeBeam(sources, detectors, u, v, shape)
 
 
 def _per_frame(overrides: dict, frames: int, source: str) -> dict[str, list]:
@@ -120,7 +120,7 @@ def _check(tags: DicomTags, values: dict) -> None:
 
 
 def _tag(keyword: str) -> str:
-    tag = Tag(tag_for_keyword(keyword))
+    tag = Tag(keyword)
     return f"({tag.group:04x},{tag.element:04x})"
 
 
@@ -133,7 +133,7 @@ def _oriented(name: str, orientation, right: np.ndarray, down: np.ndarray) -> tu
             raise ValueError(f"{name}: PatientOrientation {shown} must name directions by R, L, A, P, H, F")
         wanted = sum(np.array(DIRECTIONS[letter], float) for letter in word)
         steps.append(max((right, -right, down, -down), key=lambda step: step @ wanted))
-        along.append(steps[-1] @ wanted / max(np.linalg.norm(wanted), 1e-12))
+        along.append(steps[-1] @ wanted / max(float(np.linalg.norm(wanted)), 1e-12))
     if len(steps) != 2 or abs(steps[0] @ steps[1]) > 0.5 or min(along) < 0.3:
         raise ValueError(f"{name}: PatientOrientation {shown} does not give two directions across this view; correct "
                          "it or the positioner angles under `beam: {dicom: ...}` in geometry.yaml")

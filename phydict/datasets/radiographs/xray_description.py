@@ -84,16 +84,17 @@ class Description:
 
     def beam_of(self, shape: tuple[int, int], tags: list[DicomTags]) -> ConeBeam:
         """The beam for images of `shape` (V, U), turned, and their DICOM tags, if any. Raises ValueError."""
+        beam = self.beam or {}
         if self._left_to_tags:
             if not tags:
                 raise ValueError(f"{self.source} leaves the beam to DICOM's tags, but the images are not DICOM, so "
                                  "that they have no scale; state `beam:` with pixel size and distances in mm")
-            return tags_beam(tags, shape, (self.beam or {}).get("dicom"), self.orientation.turned,
+            return tags_beam(tags, shape, beam.get("dicom"), self.orientation.turned,
                              f"`dicom:` of {self.source}")
-        if "file" in self.beam:
-            return read_beam(self.source.parent / self.beam["file"], shape, self.beam.get("pixel"))
+        if "file" in beam:
+            return read_beam(self.source.parent / beam["file"], shape, beam.get("pixel"))
         try:
-            return ConeBeam.from_dict(self.beam)
+            return ConeBeam.from_dict(beam)
         except ValueError as error:
             raise ValueError(f"{self.source}: {error}") from error
 
@@ -131,8 +132,8 @@ def read_description(path: Path, needed: bool = True) -> Description:
     intensity, orientation = content.pop("intensity", None) or {}, content.pop("orientation", None) or {}
     uncertain = content.pop("uncertain", None)
     if "beam" in content and len(content) > 1:
-        unknown = ", ".join(reprlib.repr(key) for key in content if key != "beam")
-        raise ValueError(f"{path}: unknown key {unknown}; the keys are beam, intensity, orientation, "
+        unknown = [reprlib.repr(key) for key in content if key != "beam"]
+        raise ValueError(f"{path}: unknown key {', '.join(unknown)}; the keys are beam, intensity, orientation, "
                          "uncertain")
     beam = content.get("beam", content or None)
     _check_beam(path, beam)
@@ -170,7 +171,7 @@ def _check_beam(path: Path, beam) -> None:
     if beam is not None and not isinstance(beam, dict):
         raise ValueError(f"{path}: `beam:` must be a mapping, but {reprlib.repr(beam)} was found")
     for key, allowed in (("file", ("file", "pixel")), ("dicom", ("dicom",))):
-        unknown = [reprlib.repr(name) for name in beam or {} if key in beam and name not in allowed]
+        unknown = [reprlib.repr(name) for name in beam or {} if beam and key in beam and name not in allowed]
         if unknown:
             raise ValueError(f"{path}: unknown key {', '.join(unknown)} in `beam:`; the keys are {', '.join(allowed)}")
     if beam and not is_file_name(beam.get("file", "")):

@@ -84,8 +84,8 @@ def _read_picture(path: Path) -> np.ndarray:
         warnings.simplefilter("error", Image.DecompressionBombWarning)
         opened = Image.open(path)
     with opened as image:
-        if getattr(image, "n_frames", 1) > 1:
-            raise ValueError(f"it holds {image.n_frames} pages; store one image per file")
+        if (pages := getattr(image, "n_frames", 1)) > 1:
+            raise ValueError(f"it holds {pages} pages; store one image per file")
         check_held(math.prod(image.size), path, f"pixels, {image.height} x {image.width},", 8 * MOST_SQUEEZED)
         image.load()
         if image.mode in GREY:

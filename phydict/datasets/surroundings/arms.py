@@ -51,13 +51,14 @@ class Arm:
         radius = self.radius * np.clip(1.05 - 0.0009 * down, 0.6, 1)
         axis = np.hypot(x - beside - self.side * self.tilt[0] * down, y - lying - self.tilt[1] * down)
         distance = np.maximum(axis - radius, (self.top - down) * 0.7)
-        density, inner = 0.0, -1000.0
+        density: float | np.ndarray = 0.0
+        inner = -1000.0
         for depth, hu in ((distance, SKIN_HU), (distance + 1.6, FAT_HU), (distance + self.fat, MUSCLE_HU),
                           (np.maximum(axis - self.bone, distance + self.fat), CORTEX_HU),
                           (np.maximum(axis - 0.55 * self.bone, distance + self.fat), MARROW_HU)):
             density = density + (hu - inner) / 1000 * scene.soft(depth)
             inner = hu
-        scene.add(density)
+        scene.add(np.asarray(density))
 
     def _reach(self, scene: Scene, lying: float) -> float:
         """mm from the body's middle to its side at the arm's height, in the lower half of the scan."""

@@ -54,10 +54,10 @@ class Couch:
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> Couch:
-        width, thickness, curve, core, under = list(KINDS.values())[int(rng.integers(len(KINDS)))]
+        width, thicknesses, curve, core, under = list(KINDS.values())[int(rng.integers(len(KINDS)))]
         uniform = rng.uniform
         gap = uniform(-8, 2) if rng.random() < 0.6 else uniform(0, 35)
-        thickness = float(uniform(*thickness))
+        thickness = float(uniform(*thicknesses))
         parallel = rng.random() < (0.6 if curve[0] else 0.3)
         return cls(
             float(uniform(*width)), thickness, float(gap), float(np.clip(rng.normal(0, 12), -SHIFT_MM, SHIFT_MM)),

@@ -63,10 +63,11 @@ def surround(hu: np.ndarray, body: np.ndarray, grid: Grid, seed: int, shares: Su
     kind depends on `seed` and its own share alone.
     """
     arms, leads, cover, couches, field = (np.random.default_rng([seed, stream]) for stream in range(5))
-    drawn = [*(Arm.draw_pair(arms) if arms.random() < shares.arms else []),
-             *(Lead.draw_set(leads) if leads.random() < shares.leads else []),
-             *([Cover.draw(cover)] if cover.random() < shares.cover else []),
-             *([Couch.draw(couches)] if couch and couches.random() < shares.couch else [])]
+    drawn: list[Arm | Lead | Cover | Couch] = [
+        *(Arm.draw_pair(arms) if arms.random() < shares.arms else []),
+        *(Lead.draw_set(leads) if leads.random() < shares.leads else []),
+        *([Cover.draw(cover)] if cover.random() < shares.cover else []),
+        *([Couch.draw(couches)] if couch and couches.random() < shares.couch else [])]
     if not drawn or not body.any():
         return hu
     scene = Scene(np.array(hu, np.float32), body, grid, _field(field, body, grid))

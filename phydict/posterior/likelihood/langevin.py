@@ -5,16 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
-from phydict.diffusion.steps import noise_like
+from phydict.diffusion.steps import Generators, noise_like
 from phydict.posterior.likelihood.likelihood_draw import LikelihoodDraw
 from phydict.posterior.normalised import NormalisedMeasurement
 
 
 def langevin(score: Callable[[Tensor], Tensor], z: Tensor, step: float, iterations: int,
-             generator: torch.Generator) -> Tensor:
+             generator: Generators) -> Tensor:
     """z <- z + step score(z) + sqrt(2 step) noise, `iterations` times; score is the gradient of the log density."""
     for _ in range(iterations):
         z = z + step * score(z) + (2 * step) ** 0.5 * noise_like(z, generator)
@@ -44,7 +43,7 @@ class Langevin(LikelihoodDraw):
             raise ValueError("Langevin dynamics need at least 1 iteration, a step above 0 and a last_share in (0, 1], "
                              f"but {self.iterations}, {self.step} and {self.last_share} were given")
 
-    def __call__(self, measurement: NormalisedMeasurement, x0: Tensor, x0_std: float, generator: torch.Generator,
+    def __call__(self, measurement: NormalisedMeasurement, x0: Tensor, x0_std: float, generator: Generators,
                  progress: float) -> Tensor:
         step = min(self.step * (1 - progress * (1 - self.last_share)), 1 / (measurement.noise**-2 + x0_std**-2))
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
-from phydict.diffusion.steps import noise_like
+from phydict.diffusion.steps import Generators, noise_like
 from phydict.posterior.normalised import NormalisedMeasurement, nearest_fit
 
 
@@ -19,7 +18,7 @@ class LikelihoodDraw(ABC):
     """
 
     @abstractmethod
-    def __call__(self, measurement: NormalisedMeasurement, x0: Tensor, x0_std: float, generator: torch.Generator,
+    def __call__(self, measurement: NormalisedMeasurement, x0: Tensor, x0_std: float, generator: Generators,
                  progress: float) -> Tensor: ...
 
 
@@ -39,7 +38,7 @@ class ExactDraw(LikelihoodDraw):
     iterations: int = 30
     tolerance: float = 1e-4
 
-    def __call__(self, measurement: NormalisedMeasurement, x0: Tensor, x0_std: float, generator: torch.Generator,
+    def __call__(self, measurement: NormalisedMeasurement, x0: Tensor, x0_std: float, generator: Generators,
                  progress: float) -> Tensor:
         start = x0 + x0_std * noise_like(x0, generator)
         y = measurement.y.expand(len(x0), *measurement.y.shape[1:])

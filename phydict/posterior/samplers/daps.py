@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from phydict.diffusion import Denoiser, renoise
-from phydict.diffusion.steps import noise_like
+from phydict.diffusion.steps import Generators, noise_like
 from phydict.posterior.likelihood.langevin import Langevin
 from phydict.posterior.likelihood.likelihood_draw import LikelihoodDraw
 from phydict.posterior.measurement import Measurement
@@ -76,7 +76,7 @@ class DAPS(Sampler):
         """Standard deviation of x_0 around its estimate at noise level sigma."""
         return sigma if self.prior_std is None else sigma / (1 + (sigma / self.prior_std) ** 2) ** 0.5
 
-    def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, generator: torch.Generator,
+    def sample(self, denoiser: Denoiser, measurement: Measurement, x: Tensor, generator: Generators,
                on_step: Callable[[], None] = lambda: None) -> Tensor:
         m, schedule = NormalisedMeasurement(measurement, self.noise), denoiser.schedule
         sigmas = [float(schedule.sigma(schedule.time(s)))

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from phydict.diffusion import Denoiser, noise_in
+from phydict.diffusion.steps import Generators
 from phydict.posterior.likelihood.admm_tv import ADMMTV
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.normalised import NormalisedMeasurement, nearest_fit
@@ -57,7 +58,7 @@ class DDS(Sampler):
     def steps(self) -> int:
         return self.iterations
 
-    def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, generator: torch.Generator,
+    def sample(self, denoiser: Denoiser, measurement: Measurement, x: Tensor, generator: Generators,
                on_step: Callable[[], None] = lambda: None) -> Tensor:
         m, schedule = NormalisedMeasurement(measurement, noise=1.0), denoiser.schedule
         tv = self.tv.begin(x[:, :1]) if self.tv else None

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from phydict.diffusion import Denoiser, noise_in
+from phydict.diffusion.steps import Generators
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.normalised import NormalisedMeasurement, check_noise, nearest_fit
 from phydict.posterior.samplers.noise_levels import stochastic_ddim_step
@@ -57,7 +58,7 @@ class DiffPIR(Sampler):
     def steps(self) -> int:
         return self.iterations
 
-    def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, generator: torch.Generator,
+    def sample(self, denoiser: Denoiser, measurement: Measurement, x: Tensor, generator: Generators,
                on_step: Callable[[], None] = lambda: None) -> Tensor:
         m, schedule = NormalisedMeasurement(measurement, self.noise), denoiser.schedule
         times = [(1 - i / self.iterations) ** self.spacing for i in range(self.iterations)]

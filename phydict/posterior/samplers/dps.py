@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from phydict.diffusion import Denoiser, noise_in
+from phydict.diffusion.steps import Generators
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.normalised import NormalisedMeasurement
 from phydict.posterior.samplers.noise_levels import stochastic_ddim_step
@@ -50,7 +51,7 @@ class DPS(Sampler):
     def steps(self) -> int:
         return self.iterations
 
-    def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, generator: torch.Generator,
+    def sample(self, denoiser: Denoiser, measurement: Measurement, x: Tensor, generator: Generators,
                on_step: Callable[[], None] = lambda: None) -> Tensor:
         m, schedule = NormalisedMeasurement(measurement, noise=1.0), denoiser.schedule
         for t, s in schedule.steps(self.iterations):

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor
 
-from phydict.diffusion import CosineSchedule, Denoiser, noise_in, renoise
-from phydict.diffusion.steps import noise_like
+from phydict.diffusion import CosineSchedule, Denoiser, ddim, noise_in, renoise
+from phydict.diffusion.steps import Generators, noise_like
 
 
 def polynomial_levels(high: float, low: float, n: int, power: float = 7.0) -> list[float]:
@@ -24,7 +23,7 @@ def times_of(schedule: CosineSchedule, levels: Sequence[float]) -> list[float]:
 
 
 def stochastic_ddim_step(schedule: CosineSchedule, x0: Tensor, eps: Tensor, s: float, kept: float,
-                         generator: torch.Generator) -> Tensor:
+                         generator: Generators) -> Tensor:
     """The clean state x0 at time s, with noise of which `kept` in [0, 1] is eps and the rest new: renoise(x0, s,
     kept eps + sqrt(1 - kept^2) noise). kept 1 is DDIM, 0 forgets the path."""
     if kept < 1:
@@ -33,7 +32,7 @@ def stochastic_ddim_step(schedule: CosineSchedule, x0: Tensor, eps: Tensor, s: f
 
 
 def denoise_along(denoiser: Denoiser, x: Tensor, times: Sequence[float],
-                  generator: torch.Generator | None = None) -> Tensor:
+                  generator: Generators | None = None) -> Tensor:
     """The clean end, in [-1, 1], of the state x at times[0] that is taken down through the prior's noise levels.
 
     Without `generator` along the probability flow (DDIM); with it by ancestral steps, whose end is a draw from
@@ -43,6 +42,6 @@ def denoise_along(denoiser: Denoiser, x: Tensor, times: Sequence[float],
     for t, s in zip(times, [*times[1:], None]):
         x0 = denoiser.denoise(x, t).clamp(-1, 1)
         if s is not None:
-            kept = 1.0 if generator is None else float(schedule.sigma(s) / schedule.sigma(t))
-            x = stochastic_ddim_step(schedule, x0, noise_in(schedule, x0, x, t), s, kept, generator)
+            x = ddim(schedule, x0, x, t, s) if generator is None else stochastic_ddim_step(
+                schedule, x0, noise_in(schedule, x0, x, t), s, float(schedule.sigma(s) / schedule.sigma(t)), generator)
     return x0

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from phydict.diffusion import Denoiser
+from phydict.diffusion.steps import Generators
 from phydict.posterior.likelihood.likelihood_draw import ExactDraw, LikelihoodDraw
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.normalised import NormalisedMeasurement, check_noise
@@ -76,7 +77,7 @@ class PnPDM(Sampler):
     def steps(self) -> int:
         return self.iterations
 
-    def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, generator: torch.Generator,
+    def sample(self, denoiser: Denoiser, measurement: Measurement, x: Tensor, generator: Generators,
                on_step: Callable[[], None] = lambda: None) -> Tensor:
         m, schedule = NormalisedMeasurement(measurement, self.noise), denoiser.schedule
         grid = polynomial_levels(self.sigma_max, self.sigma_min, self.levels)

@@ -37,7 +37,7 @@ class PriorOnly(Sampler):
             return self
         return replace(self, final_denoise=getattr(prior, "ends_at_zero", False))
 
-    def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, generator: Generators,
+    def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, generator: Generators | None,
                on_step: Callable[[], None] = lambda: None) -> Tensor:
-        final_denoise = self.suited(denoiser).final_denoise
+        final_denoise = bool(self.suited(denoiser).final_denoise)
         return ddim_sample(denoiser, x, self.iterations, on_step=on_step, final_denoise=final_denoise)

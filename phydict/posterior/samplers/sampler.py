@@ -30,7 +30,7 @@ class Sampler(ABC):
     batches = False
 
     @abstractmethod
-    def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, generator: Generators,
+    def sample(self, denoiser: Denoiser, measurement: Measurement, x: Tensor, generator: Generators,
                on_step: Callable[[], None] = lambda: None) -> Tensor:
         """Noise x (B, C, X, Y, Z) at time 1 -> clean states; `generator` is the source of any further noise."""
 

@@ -116,7 +116,7 @@ class SplitGibbs(Sampler):
             return list(denoiser.schedule.steps(self.iterations, last=self.t_end))
         return [(1.0, self.t_start), *denoiser.schedule.steps(self.iterations - 1, self.t_start, self.t_end)]
 
-    def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, generator: Generators,
+    def sample(self, denoiser: Denoiser, measurement: Measurement, x: Tensor, generator: Generators,
                on_step: Callable[[], None] = lambda: None) -> Tensor:
         def run(on_step: Callable[[], None] = lambda: None) -> Tensor:
             return self.one_pass(denoiser, measurement, x, generator, on_step)

@@ -114,10 +114,11 @@ class Unrolled(Sampler):
         on_step()
         for n, t in enumerate(self.times):
             channels = evidence(z[:, :1], before[:, :1], start[:, :1])
-            if n == int(measurement.scatter_enabled) and self.contradiction is not None:
+            seen = measurement.last_projection
+            if n == int(measurement.scatter_enabled) and self.contradiction is not None and seen is not None:
                 voxel = measurement.mu_water * max(measurement.projector.grid.spacing)
                 usual = self.contradiction * voxel * max(1.0, measurement.projector.beam.views / FEW_VIEWS) ** 0.5
-                excess = measurement.view_errors(measurement.last_projection).square() - usual**2
+                excess = measurement.view_errors(seen).square() - usual**2
                 if (excess > 0).any():
                     measurement.model_variance = CAUTION**2 * excess.clamp(min=0)[:, None, None]
             signal = float(refiner.schedule.scales(t)[0])
@@ -128,7 +129,7 @@ class Unrolled(Sampler):
             last = n + 1 == len(self.times)
             step = self.final_likelihood if last else self.likelihood
             z = self._likelihood_step(step, measurement, before, self.x0_stds[n + 1])
-            if n + 1 == len(self.times) // 2 and self._misses(measurement, z):
+            if self.subgrid is not None and n + 1 == len(self.times) // 2 and self._misses(measurement, z):
                 measurement.subgrid = subgrid_projection(measurement, z[:, :1], self.subgrid, self.x0_stds[0])
             if last and isinstance(step, ProximalCG):
                 excess = float(measurement.normalised_residual(z[:, :1], modelled=True).max()) ** 2
@@ -150,15 +151,15 @@ class Unrolled(Sampler):
 
     def _misses(self, measurement: Measurement, z: Tensor) -> bool:
         """Whether the X-rays hold more than their noise beyond z, for which `subgrid` may look."""
-        return (self.subgrid is not None and measurement.projector.method == "separable"
+        return (measurement.projector.method == "separable"
                 and float(measurement.normalised_residual(z[:, :1], modelled=True).max()) > 1)
 
     @staticmethod
     def _likelihood_step(step: LikelihoodStep, measurement: Measurement, x0: Tensor, x0_std: float) -> Tensor:
         return torch.cat([step(measurement, x0[:, :1], x0_std).clamp(-1, 1), x0[:, 1:]], 1)
 
-    def sample(self, denoiser: BoundRefiner, measurement: Measurement, x: Tensor, generator: Generators,
-               on_step: Callable[[], None] = lambda: None) -> Tensor:
+    def sample(self, denoiser: BoundRefiner, measurement: Measurement, x: Tensor,  # type: ignore[override]
+               generator: Generators, on_step: Callable[[], None] = lambda: None) -> Tensor:
         results = []
 
         def result(on_step: Callable[[], None]) -> Tensor:

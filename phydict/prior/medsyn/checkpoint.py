@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
+from typing import cast
 
 import torch
 from safetensors import safe_open
@@ -225,7 +226,7 @@ def load_medsyn(checkpoint: MedSynCheckpoint | str | Path, device: str = "cpu") 
     stage, or where its weights are not exactly the network's.
     """
     checkpoint = as_checkpoint(checkpoint)
-    prior = MedSynPrior(_network(checkpoint, 1))
+    prior = MedSynPrior(cast("TextUNet", _network(checkpoint, 1)))
     prior.load_text = lambda: _load_text(checkpoint, prior.null.shape[1])
     return prior.to(device).eval().requires_grad_(False)
 
@@ -233,7 +234,8 @@ def load_medsyn(checkpoint: MedSynCheckpoint | str | Path, device: str = "cpu") 
 def load_medsyn_super_resolution(checkpoint: MedSynCheckpoint | str | Path,
                                  device: str = "cpu") -> MedSynSuperResolution:
     """MedSyn's 256^3 super-resolution stage, ready to denoise; raises as `load_medsyn` does."""
-    return MedSynSuperResolution(_network(as_checkpoint(checkpoint), 2)).to(device).eval().requires_grad_(False)
+    network = cast("SuperResolutionUNet", _network(as_checkpoint(checkpoint), 2))
+    return MedSynSuperResolution(network).to(device).eval().requires_grad_(False)
 
 
 def as_checkpoint(given: MedSynCheckpoint | str | Path) -> MedSynCheckpoint:

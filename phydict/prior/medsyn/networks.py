@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import cast
 
 import torch
 from einops import rearrange
@@ -19,7 +20,7 @@ GROUPS, HEAD_WIDTH = 8, 32
 IN_SLICE, IN_VOLUME = (1, 3, 3), (3, 3, 3)
 """Kernels of the convolutions within slices and across them."""
 
-RESIZE = {"kernel_size": (1, 4, 4), "stride": (1, 2, 2), "padding": (0, 1, 1)}
+RESIZE: dict = {"kernel_size": (1, 4, 4), "stride": (1, 2, 2), "padding": (0, 1, 1)}
 """The convolutions that halve or double rows and columns."""
 
 
@@ -28,25 +29,25 @@ class Sinusoid(nn.Module):
 
     def __init__(self, width: int):
         super().__init__()
-        self.half = width // 2
+        self.frequencies = width // 2
 
     def forward(self, t: Tensor) -> Tensor:
-        exponent = torch.arange(self.half, device=t.device, dtype=t.dtype) / (self.half - 1)
+        exponent = torch.arange(self.frequencies, device=t.device, dtype=t.dtype) / (self.frequencies - 1)
         angle = t[:, None] * torch.exp(-math.log(10000) * exponent)
         return torch.cat([angle.sin(), angle.cos()], 1)
 
 
 class Block(nn.Module):
-    """Convolution, group norm, scale and shift, SiLU."""
+    """Convolution, group norm, scale and shift (`modulation`, where there is one), SiLU."""
 
     def __init__(self, inward: int, outward: int, kernel: tuple[int, int, int]):
         super().__init__()
-        self.proj = nn.Conv3d(inward, outward, kernel, padding=tuple(k // 2 for k in kernel))
+        self.proj = nn.Conv3d(inward, outward, kernel, padding=(kernel[0] // 2, kernel[1] // 2, kernel[2] // 2))
         self.norm = nn.GroupNorm(GROUPS, outward)
 
-    def forward(self, x: Tensor, scale: Tensor | None = None, shift: Tensor | None = None) -> Tensor:
+    def forward(self, x: Tensor, *modulation: Tensor) -> Tensor:
         x = self.norm(self.proj(x))
-        return silu(x if scale is None else torch.addcmul(shift, x, 1 + scale), inplace=True)
+        return silu(torch.addcmul(modulation[1], x, 1 + modulation[0]) if modulation else x, inplace=True)
 
 
 class ResidualBlock(nn.Module):
@@ -176,12 +177,12 @@ class SliceUNet(nn.Module):
 
     def time(self, t: Tensor) -> Tensor:
         """Times (B,) in [0, 1] -> (B, time_width)."""
-        return self.time_mlp(1000 * t.to(self.time_mlp[1].weight.dtype))
+        return self.time_mlp(1000 * t.to(self.time_mlp[1].get_parameter("weight").dtype))
 
     def down(self, x: Tensor, time: Tensor) -> tuple[Tensor, list[Tensor]]:
         """The deepest features, and those that the way up takes back in."""
         skipped = []
-        for level in self.downs:
+        for level in cast("Sequence[nn.ModuleDict]", self.downs):
             x = level["1"](level["0"](x, time), time)
             skipped.append(x)
             if self.resize in level:
@@ -190,7 +191,7 @@ class SliceUNet(nn.Module):
         return x, skipped
 
     def up(self, x: Tensor, skipped: list[Tensor], time: Tensor) -> Tensor:
-        for level in self.ups:
+        for level in cast("Sequence[nn.ModuleDict]", self.ups):
             x = torch.cat([x, skipped.pop()], 1)
             x = level["0"](x, time)
             if self.upsample_first and self.resize in level:

@@ -36,7 +36,7 @@ patient's."""
 
 def atlas_grid(voxels: int) -> Grid:
     """`voxels`^3 voxels over MedSyn's atlas, centred on the isocentre: 64 at stage 1, 256 at stage 2."""
-    return Grid((voxels,) * 3, tuple(side / voxels for side in FIELD))
+    return Grid((voxels,) * 3, (FIELD[0] / voxels, FIELD[1] / voxels, FIELD[2] / voxels))
 
 
 class MedSynPrior(nn.Module):

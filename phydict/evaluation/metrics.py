@@ -70,6 +70,8 @@ MEASURES = {
     "cldice_vessel": Measure("clDice vessels", True, 3),
     "edge_diaphragm": Measure("diaphragm's width", False, 2),
     "edge_chest_wall": Measure("chest wall's width", False, 2),
+    "edge_ribs": Measure("ribs' width", False, 2),
+    "ribs": Measure("ribs' contrast", True, 2),
     "vessels": Measure("vessels' contrast", True, 2),
     "clip_t2i": Measure("CLIP T2I (%)", True, 2),
     "clip_i2i": Measure("CLIP I2I (%)", True, 2),

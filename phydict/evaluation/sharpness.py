@@ -1,4 +1,4 @@
-"""How sharp a reconstruction is: the width of edges, and the contrast of vessels and of nodules that were put in."""
+"""How sharp a reconstruction is: the width of edges, and the contrast of ribs, vessels and nodules that were put in."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from contextlib import suppress
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool3d
+from torch.nn.functional import avg_pool3d, max_pool3d
 
 from phydict.grid import Grid
 
@@ -17,6 +17,9 @@ VESSELS = 200
 
 SHELL = 1.5
 """Radius, in a nodule's own, up to which its surroundings reach."""
+
+BONE, WALL_MM, RIB_MM = 200.0, 24.0, 12.0
+"""Ribs: from how many HU on, how near to a lung, and how far above and below their middle they are looked at."""
 
 AXES = {"diaphragm": 2, "chest_wall": 0}
 """The axis across each edge of the lungs."""
@@ -62,6 +65,27 @@ def edge_spread(volume: Tensor, lung: Tensor, grid: Grid, edge: str, reach_mm: f
     return edge_width(edge_profile(volume, lung, edge, max(2, round(reach_mm / spacing))), spacing)
 
 
+def rib_profile(volume: Tensor, truth: Tensor, lung: Tensor, grid: Grid) -> Tensor:
+    """Mean profile of a volume (X, Y, Z) from the middle of the truth's ribs to RIB_MM above and below.
+
+    A middle is a voxel of BONE or more that is the highest of its column within RIB_MM and lies at most WALL_MM outside
+    of a lung (mask (X, Y, Z)). Raises ValueError where there is none.
+    """
+    reach = max(2, round(RIB_MM / grid.spacing[2]))
+    near = [2 * max(1, round(WALL_MM / spacing)) + 1 for spacing in grid.spacing]
+    inside = lung[None, None].float()
+    for axis, size in enumerate(near):
+        window = [size if axis == other else 1 for other in range(3)]
+        inside = max_pool3d(inside, window, 1, [n // 2 for n in window])
+    column = max_pool3d(truth[None, None], (1, 1, 2 * reach + 1), 1, (0, 0, reach))[0, 0]
+    middle = (truth >= BONE) & (truth == column) & (inside[0, 0] > 0.5) & (lung <= 0.5)
+    middle[:, :, :reach] = middle[:, :, -reach:] = False
+    if not middle.any():
+        raise ValueError(f"no rib of {BONE:g} HU or more lies beside the lungs' mask: give the lungs of this volume")
+    x, y, z = middle.nonzero(as_tuple=True)
+    return torch.stack([(volume[x, y, z + step] + volume[x, y, z - step]).mean() / 2 for step in range(reach + 1)])
+
+
 def vessel_visibility(volume: Tensor, truth: Tensor, lung: Tensor, count: int = VESSELS) -> float:
     """How much of the vessels' contrast a volume (X, Y, Z) holds: that of the truth's `count` brightest lung voxels to
     the mean of their 5^3 neighbourhoods, as a share of the truth's. 1: all of it, 0: none."""
@@ -73,16 +97,21 @@ def vessel_visibility(volume: Tensor, truth: Tensor, lung: Tensor, count: int = 
 
 
 def sharpness_scores(volume: Tensor, truth: Tensor, lung: Tensor, grid: Grid) -> dict[str, float]:
-    """{"edge_diaphragm", "edge_chest_wall", "vessels"} of a volume (X, Y, Z) in HU on `grid`, each as a share of the
-    truth's: widths are 1 where edges are as sharp as there, more where they are blurred.
+    """{"edge_diaphragm", "edge_chest_wall", "edge_ribs", "ribs", "vessels"} of a volume (X, Y, Z) in HU on `grid`, each
+    as a share of the truth's: widths (edge_) are 1 where edges are as sharp as there, more where they are blurred; of
+    ribs, from their middle to between them, and of vessels the contrast is 1 where all of it is there.
 
-    lung: mask (X, Y, Z) in the truth. An edge that no line crosses, and vessels without lungs, have no score.
+    lung: mask (X, Y, Z) in the truth. An edge that no line crosses, and ribs and vessels without lungs, have no score.
     """
     scores = {}
     for edge in AXES:
         with suppress(ValueError):
             found, true = (edge_spread(x, lung, grid, edge) for x in (volume, truth))
             scores[f"edge_{edge}"] = found / true
+    with suppress(ValueError):
+        ribs, true_ribs = (rib_profile(x, truth, lung, grid) for x in (volume, truth))
+        scores["edge_ribs"] = edge_width(ribs, 1.0) / edge_width(true_ribs, 1.0)
+        scores["ribs"] = float((ribs[0] - ribs[-1]) / (true_ribs[0] - true_ribs[-1]))
     if (lung > 0.5).any():
         scores["vessels"] = vessel_visibility(volume, truth, lung)
     return scores

@@ -1,6 +1,7 @@
 """What the training of phydict_learned's network was worth: CTs reconstructed with weights from along the way.
 
-    python tests/benchmark/refiner_training.py <folder of CTs> <core-hours>=<refiner.safetensors> ... [--views 1 2 4 8 16]
+    python tests/benchmark/refiner_training.py <folder of CTs> <core-hours>=<refiner.safetensors> ...
+                                               [--views 1 2 4 8 16]
 
 core-hours: of training that the weights have seen. Writes refiner_training.csv beside this file, where rows of other
 core-hours and CTs stay, and prints the mean over the CTs. X-rays are ideal ones of the same voxels.
@@ -44,8 +45,9 @@ if __name__ == "__main__":
     out = HERE.with_suffix(".csv")
     for hours, file in (pair.split("=") for pair in given.weights):
         found = scored(phydict.load_prior(file or DEFAULT_REFINER), float(hours), given.cts, given.views)
-        made = {(row["case"], row["core_hours"], row["views"]) for row in found}
-        write_csv(out, [row for row in read_csv(out) if (row["case"], row["core_hours"], row["views"]) not in made] + found)
+        made = [(row["case"], row["core_hours"], row["views"]) for row in found]
+        kept = [row for row in read_csv(out) if (row["case"], row["core_hours"], row["views"]) not in made]
+        write_csv(out, kept + found)
         by_views = defaultdict(list)
         for row in found:
             by_views[row["views"]].append(row["psnr"])

@@ -4,8 +4,8 @@
 
 Writes uncertainty.csv beside this file: for each CT, number of views and scene, and for body and lung, the share of
 voxels inside the intervals of 50, 80, 90 and 95 %, the rank correlation of their width with the error, half their mean
-width at 90 %, and half the width that one interval for all of these voxels would need to hold 90 % of them. The last
-line of a scene's table is the mean over CTs.
+width at 90 %, and half the width that one interval for all of these voxels would need to hold 90 % of them. Draws
+uncertainty.png, the reliability diagram, and prints the means over the CTs.
 """
 
 import argparse
@@ -14,6 +14,7 @@ from pathlib import Path
 from statistics import mean
 
 import torch
+from matplotlib.figure import Figure
 from scipy.stats import spearmanr
 
 from phydict import ConeBeam, Grid, Projector, load_prior, reconstruct
@@ -74,6 +75,26 @@ def table(rows: list[dict]) -> str:
     return "\n".join(lines)
 
 
+def draw_reliability(rows: list[dict], path: Path) -> None:
+    """The share of voxels inside against the share promised, a line per scene, body beside lung."""
+    figure = Figure((10, 5), layout="constrained")
+    levels = [int(name.removeprefix("inside_")) for name in rows[0] if name.startswith("inside_")]
+    for part, axes in zip(("body", "lung"), figure.subplots(1, 2, sharey=True)):
+        axes.fill_between([45, 100], [40, 95], [50, 105], color="0.92", label="within 5 points")
+        axes.plot([45, 100], [45, 100], color="0.5", linewidth=1)
+        for color, scene in enumerate(dict.fromkeys(row["scene"] for row in rows)):
+            of_scene = [row for row in rows if (row["scene"], row["part"]) == (scene, part)]
+            for views in dict.fromkeys(row["views"] for row in of_scene):
+                shares = [mean(100 * row[f"inside_{level}"] for row in of_scene if row["views"] == views)
+                          for level in levels]
+                axes.plot(levels, shares, "o-", color=f"C{color}", markersize=2 + views**0.5, linewidth=0.8,
+                          label=scene.replace("_", " ") if views == of_scene[0]["views"] else None)
+        axes.set(title=part, xlabel="promised (%)", xlim=(45, 100), ylim=(35, 102))
+    figure.axes[0].set_ylabel("voxels inside (%), mean over the CTs")
+    figure.axes[0].legend(fontsize="small", title="larger: more views", title_fontsize="small")
+    figure.savefig(path, dpi=100)
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("cts", type=Path)
@@ -84,4 +105,5 @@ if __name__ == "__main__":
     kept = [row for row in read_csv(out) if given.only not in row["scene"]] if given.only else []
     rows = kept + [row for ct in find_cts(given.cts) for row in rows_of(ct, refiner, given.only)]
     write_csv(out, rows)
+    draw_reliability(rows, out.with_suffix(".png"))
     print(table(rows))

@@ -11,6 +11,7 @@ from phydict.evaluation.sharpness import (
     edge_width,
     nodule,
     recovered_contrast,
+    rib_profile,
     sharpness_scores,
     vessel_visibility,
 )
@@ -60,6 +61,29 @@ def test_scores_are_shares_of_the_truths_and_what_is_not_there_has_none():
     found = sharpness_scores(blurred, truth, lung, GRID)
     assert 1.5 < found["edge_diaphragm"] < 2.2 and 1.5 < found["edge_chest_wall"] < 2.2
     assert sharpness_scores(truth, truth, torch.zeros_like(lung), GRID) == {}
+
+
+def walled(sigma: float, share: float = 1.0) -> tuple[torch.Tensor, torch.Tensor]:
+    """HU of a lung beside a wall with a rib every 30 mm of its height, a Gaussian of sigma mm and share * 600 HU high,
+    and the lung's mask."""
+    lung = torch.zeros(GRID.shape)
+    lung[8:32] = 1
+    height = (torch.arange(GRID.shape[2]) - 30) * GRID.spacing[2]
+    ribs = torch.exp(-(torch.remainder(height + 15, 30) - 15) ** 2 / (2 * sigma**2))
+    hu = torch.where(lung > 0, -850.0, 0.0)
+    hu[5:8] = 600 * share * ribs
+    return hu, lung
+
+
+def test_ribs_are_found_and_their_width_and_contrast_are_their_own():
+    truth, lung = walled(4.0)
+    profile = rib_profile(truth, truth, lung, GRID)
+    assert profile[0] == 600 and profile[-1] == pytest.approx(600 * math.exp(-(12**2) / 32), rel=1e-3)
+    flat = sharpness_scores(walled(4.0, 0.5)[0], truth, lung, GRID)
+    assert flat["ribs"] == pytest.approx(0.5) and flat["edge_ribs"] == pytest.approx(1, rel=1e-3)
+    wide = sharpness_scores(walled(6.0)[0], truth, lung, GRID)
+    assert 1.1 < wide["edge_ribs"] < 1.6 and 0.8 < wide["ribs"] < 1
+    assert "ribs" not in sharpness_scores(truth.clamp(max=100), truth.clamp(max=100), lung, GRID)
 
 
 def test_vessels_show_in_proportion_to_their_contrast():

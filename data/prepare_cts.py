@@ -6,7 +6,7 @@ from pathlib import Path
 from phydict.datasets.cts.preparation import SUMMARY, prepare_folder
 from phydict.datasets.cts.spaces import Settings, atlas_lungs
 from phydict.runtime.console import check_writable, cli_errors, quiet
-from phydict.runtime.telling import run_told
+from phydict.runtime.telling import run_command
 
 
 def prepare(cts: str, out: str, voxels: int = 256, side: float = 384.0, space: str = "patient",
@@ -45,7 +45,7 @@ def prepare(cts: str, out: str, voxels: int = 256, side: float = 384.0, space: s
 def main(args: list[str] | None = None) -> None:
     """Command line; a bad input ends in one sentence and exit code 2."""
     with cli_errors(), quiet():
-        run_told(prepare, args, positional=True)
+        run_command(prepare, args, positional=True)
 
 
 if __name__ == "__main__":

@@ -38,11 +38,10 @@ from phydict.posterior import (
 )
 from phydict.prior import (
     DEFAULT_CORRECTION,
+    AnyPrior,
     Cascade,
     MedSynCheckpoint,
     MedSynSuperResolution,
-    PriorContract,
-    Refiner,
     SuperResolution,
     check_prior,
     find_prior,
@@ -114,7 +113,7 @@ DEFAULT_METHOD, SAMPLING_METHOD = "phydict_learned", "phydict_fast"
 """The method where none is given, and the one where what is given needs a prior that is sampled."""
 
 
-def default_method(prior: PriorContract | Refiner | MedSynCheckpoint | str | Path | None = None, samples: int = 1,
+def default_method(prior: AnyPrior | MedSynCheckpoint | str | Path | None = None, samples: int = 1,
                    guidance: float = 1.0) -> str:
     """The method where none is given: DEFAULT_METHOD, or SAMPLING_METHOD with a prior that is no refiner, with several
     samples, or with guidance."""
@@ -126,7 +125,7 @@ CHEST = Grid.cube(64)
 """The voxels of methods that are bound to none; what lies outside a smaller box is taken from a reconstruction here."""
 
 
-def reconstructor(method: str | Sampler | Reconstructor, prior: PriorContract | Refiner | str | Path | None = None,
+def reconstructor(method: str | Sampler | Reconstructor, prior: AnyPrior | str | Path | None = None,
                   guidance: float = 1.0, name: str | None = None,
                   super_resolution: SuperResolution | MedSynSuperResolution | str | Path | None = None,
                   sr_guided: bool = True, sr_sampler: Sampler | None = None, sr_noise_augmentation: float | None = None,
@@ -159,7 +158,7 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: PriorContract | 
         given = f"the class {method.__name__}, not an object of it," if isinstance(method, type) else repr(method)
         raise ValueError(f"a method is a name ({', '.join(METHODS)}), a Sampler or a Reconstructor, but {given} was "
                          "given")
-    found: Any = find_prior(prior or method.default_prior) if prior is None or isinstance(prior, str | Path) else prior
+    found = find_prior(prior or method.default_prior) if prior is None or isinstance(prior, str | Path) else prior
     check_prior(found)
     name = name or type(method).__name__
     if super_resolution is None:
@@ -168,10 +167,9 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: PriorContract | 
     if samples != 1:
         raise ValueError(f"samples are drawn of a prior without a second stage, but {samples} were given with "
                          "super_resolution: leave one of the two out")
-    fine: Any = super_resolution
     if isinstance(super_resolution, str | Path):
-        fine = load_super_resolution(super_resolution)
-    ready = CascadePosterior(Cascade(found, fine), method, sr_guided, noise=sr_noise_augmentation,
+        super_resolution = load_super_resolution(super_resolution)
+    ready = CascadePosterior(Cascade(found, super_resolution), method, sr_guided, noise=sr_noise_augmentation,
                              guidance=guidance, name=name, precision=precision)
     return replace(ready, sr_sampler=sr_sampler) if sr_sampler else ready
 
@@ -232,7 +230,7 @@ def calibrated(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, 
     return xrays if display else found.corrected(xrays), found
 
 
-def reconstruct(xrays: Tensor, beam: ConeBeam, prior: PriorContract | Refiner | str | Path | None = None,
+def reconstruct(xrays: Tensor, beam: ConeBeam, prior: AnyPrior | str | Path | None = None,
                 method: str | Sampler | Reconstructor | None = None, report: str | None = None,
                 display: bool = False, seed: int = 0, guidance: float = 1.0, mu_water: float | None = None,
                 grid: Grid | None = None, on_step=lambda: None,

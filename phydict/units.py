@@ -14,6 +14,9 @@ from dataclasses import dataclass
 MU_WATER = 0.02
 """Linear attenuation of water in 1/mm near 65 keV, the effective energy of a chest X-ray."""
 
+AIR = -1000.0
+"""HU of air, and of what lies outside of a CT."""
+
 
 def hu_to_mu(hu, mu_water: float = MU_WATER):
     """Linear attenuation in 1/mm of `hu` (any array or tensor), not below zero."""

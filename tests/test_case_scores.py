@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from phydict.grid import Grid
-from phydict.inference.data import case_scores
+from phydict.inference.scoring import case_scores
 from phydict.units import HUWindow
 
 GRID, WINDOW = Grid.cube(32), HUWindow()

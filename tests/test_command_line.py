@@ -70,12 +70,14 @@ def test_an_unknown_configuration_is_one_sentence_that_lists_what_there_is(empty
 @pytest.mark.parametrize("main, command", [(infer, "predict"), (train, "fit")], ids=["infer", "train"])
 @pytest.mark.parametrize("path, new", [
     ("model.method.init_args.warm_start", "t_start"), ("model.method.init_args.renewed", "eta"),
+    ("model.method.init_args.trust", "prior_weight"),
     ("model.method.init_args.final_likelihood.init_args.variation", "tv_weight"),
     ("model.fine_noise", "noise_augmentation"), ("model.text_steps", "pretrain_steps"),
     ("data.augmentation.waves", "elastic_mm"),
     ("data.augmentation.table", "surroundings.table"), ("model.fine_sampler", "model.super_resolution.sampler"),
-    ("model.voxels", "model.cube.voxels"), ("model.text", "model.text.encoder"), ("data.views", "data.orbit.views"),
-    ("data.holdout", "data.holdout.ids"), ("model.super_resolution", "model.super_resolution.file")])
+    ("model.voxels", "model.grid (of infer.py) or model.cube.voxels (of train.py)"),
+    ("model.text", "model.text.encoder"), ("data.views", "data.orbit.views"), ("data.holdout", "data.holdout.ids"),
+    ("model.super_resolution", "model.super_resolution.file")])
 def test_an_old_setting_is_refused_with_its_new_name(empty, capsys, main, command, path, new):
     settings = 1
     for name in reversed(path.split(".")):

@@ -17,7 +17,7 @@ from phydict.posterior.coarse_correction import coarse_correction
 from phydict.prior import load_correction, save_correction, save_prior, save_refiner
 from phydict.prior.correction import INPUTS, CorrectionNetwork
 from phydict.runtime.profiling import profiled
-from phydict.training.reconstructions import Made, ReconstructionData
+from phydict.training.reconstructions import ReconstructionData, RefinementCases
 from phydict.training.refinement import RefinementTraining
 from phydict.training.scenes import Scenes
 from phydict.training.settings import HoldOut
@@ -147,7 +147,7 @@ def test_a_resumed_run_is_the_uninterrupted_one_and_makes_each_reconstruction_on
 def test_held_out_reconstructions_are_those_of_their_own_volumes(tmp_path, refiner_file):
     def validated(phantoms: int) -> Path:
         data = ReconstructionData(
-            Made(1, 1, 16), Scenes(most_views=3), phantoms=2, cache=str(tmp_path / "cache"),
+            RefinementCases(1, 1, 16), Scenes(most_views=3), phantoms=2, cache=str(tmp_path / "cache"),
             holdout=HoldOut(phantoms=phantoms), initial=refiner_file, cube=Cube(32), window=(-1000, 600))
         return data.validation.made.folder
 
@@ -160,7 +160,7 @@ def test_with_a_network_a_reconstruction_is_learnt_from_at_both_calls(tmp_path, 
 
     def data(network: str | None) -> ReconstructionData:
         return ReconstructionData(
-            Made(1, 1, 16, network), Scenes(most_views=3), phantoms=2, cache=str(tmp_path / "cache"),
+            RefinementCases(1, 1, 16, network), Scenes(most_views=3), phantoms=2, cache=str(tmp_path / "cache"),
             holdout=HoldOut(phantoms=1), initial=refiner_file, cube=Cube(32), window=(-1000, 600))
 
     first, both = data(None), data(str(file))

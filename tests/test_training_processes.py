@@ -80,10 +80,10 @@ def test_two_processes_with_half_the_weights_each_train_the_prior_that_one_would
 
 
 @pytest.mark.slow
-def test_spread_weights_are_not_averaged(tmp_path, cache):
+def test_sharded_weights_are_not_averaged(tmp_path, cache):
     done = two_processes(tmp_path, cache, "fsdp.yaml",
                          "--trainer.callbacks=lightning.pytorch.callbacks.EMAWeightAveraging")
-    assert done.returncode != 0 and "spread weights cannot be averaged" in done.stderr, done.stderr[-2000:]
+    assert done.returncode != 0 and "sharded weights cannot be averaged" in done.stderr, done.stderr[-2000:]
 
 
 @pytest.mark.parametrize("flags, tolerance", [

@@ -14,6 +14,7 @@ import torch
 
 from phydict.ablation.spec import Specification
 from phydict.ablation.trials import Trial, key, prior_of, stage_of
+from phydict.datasets.case import Case, lacking
 from phydict.evaluation import read_csv, write_csv
 from phydict.evaluation.fid import save_features
 from phydict.evaluation.metrics import MEASURES
@@ -152,7 +153,7 @@ class CaseCache:
     def __init__(self):
         self._kept = {}
 
-    def case(self, case: str, trial: Trial, make: Callable[[], dict]) -> dict:
+    def case(self, case: str, trial: Trial, make: Callable[[], Case]) -> Case:
         """A case as a trial needs it, with the warnings that making it took."""
         grid, window = trial.scene()
         like = str((grid.to_dict(), window, trial.data.simulation_voxels))
@@ -166,7 +167,7 @@ class CaseCache:
 class MeasuredCase:
     """One case under one acquisition: X-rays for all methods, and the truth, which no method is shown."""
 
-    def __init__(self, case: str, trial: Trial, made: dict, device: torch.device):
+    def __init__(self, case: str, trial: Trial, made: Case, device: torch.device):
         self.case, self.truth = case, made
         (self.grid, self.window), data = trial.scene(), trial.data
         self.beam, self.mu_water = data.beam, data.simulator.effective_mu_water
@@ -174,13 +175,12 @@ class MeasuredCase:
         with noted(self.warnings, case):
             self.xrays = data.simulate(made, case_seed(trial.seed, case), self.grid, self.window, device)
         if not (scored := trial.scored()).same_as(self.grid):
-            whole = {name: value for name, value in made.items() if name != "features"}
-            self.truth, self.grid = whole | cut_out(made, self.grid, scored, self.window), scored
+            self.truth, self.grid = lacking(made, "features") | cut_out(made, self.grid, scored, self.window), scored
 
     def report(self, trial: Trial) -> str:
         """The report, where the trial uses it and its prior reads text."""
         prior = prior_of(trial.prior) if trial.prior else None
-        return self.truth["report"] if prior is not None and prior.reads_text and trial.with_report else ""
+        return self.truth["report"] if getattr(prior, "reads_text", False) and trial.with_report else ""
 
 
 class Runner:

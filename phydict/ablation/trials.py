@@ -20,16 +20,17 @@ from phydict.inference.protocols import whole
 from phydict.inference.settings import Orbit
 from phydict.methods import CHEST, METHODS, correction_of
 from phydict.posterior import Refinement, Sampler
-from phydict.prior import PriorContract, find_prior, fingerprint, load_super_resolution
+from phydict.prior import find_prior, fingerprint, load_super_resolution, own_identity
 from phydict.reconstruction import Reconstructor, describe
 from phydict.runtime.reading import reason
 from phydict.runtime.renamed import check_setting
 from phydict.runtime.seeds import check_seed
 from phydict.units import HUWindow
 from phydict.xray import Ideal, Polychromatic, Simulator
+from phydict.xray.orbits import PIXEL, PIXELS, SOURCE_TO_DETECTOR, SOURCE_TO_ISOCENTRE
 from phydict.xray.projectors.projector import METHODS as PROJECTORS
 
-SIDE = 560.0
+SIDE = PIXELS * PIXEL
 """mm along each side of the simulated detector unless the size of its pixels is given."""
 
 MOST_TRIALS = 2000
@@ -39,9 +40,9 @@ SIMULATORS: dict[str, Simulator] = {"ideal": Ideal(), "polychromatic": Polychrom
 
 SETTINGS: dict[str, tuple] = {
     "method": (str, None), "seed": (int, 0),
-    "views": (int, 8), "detector": (int, 448), "pixel": (float | None, None), "simulator": (str, "ideal"),
-    "simulation_voxels": (int | None, None), "source_to_detector": (float, 1020.0),
-    "source_to_isocentre": (float, 740.0), "geometry": (str | None, None),
+    "views": (int, 8), "detector": (int, PIXELS), "pixel": (float | None, None), "simulator": (str, "ideal"),
+    "simulation_voxels": (int | None, None), "source_to_detector": (float, SOURCE_TO_DETECTOR),
+    "source_to_isocentre": (float, SOURCE_TO_ISOCENTRE), "geometry": (str | None, None),
     "report": (bool, True), "voxels": (int | tuple[int, int, int] | None, None),
     "side": (float | tuple[float, float, float], 384.0), "centre": (tuple[float, float, float], (0.0, 0.0, 0.0)),
     "refine": (bool, True), "super_resolution": (str | None, None),
@@ -128,9 +129,8 @@ class Trial:
         identity = {"name": self.name, "method": describe(self.method), "seed": self.seed, "grid": grid.to_dict(),
                     "window": describe(window), "data": {"with_report": self.with_report} | self.data.settings("test")}
         if self.prior is not None:
-            prior = prior_of(self.prior)
-            identity |= {"prior": prior.identity()} if isinstance(prior, PriorContract) else {
-                "prior_crc32": _crc(self.prior)}
+            own = own_identity(prior_of(self.prior), self.prior)
+            identity |= {"prior_crc32": _crc(self.prior)} if own is None else {"prior": own}
             identity |= {"guidance": self.guidance, "samples": self.samples}
         if self.super_resolution:
             identity["super_resolution_crc32"] = _crc(self.super_resolution)

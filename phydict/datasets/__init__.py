@@ -1,5 +1,6 @@
 """Files to Cases: procedural thoraxes, chest CTs with reports, and measured X-rays."""
 
+from phydict.datasets.case import Case
 from phydict.datasets.cts.anatomy import MASKS, body_mask, segment
 from phydict.datasets.cts.augment import Augmentation, Deformation, augment
 from phydict.datasets.cts.ct_rate import CTCases, CTFile, CTSource, find_cts, load_case, patient_of, split_by_patient
@@ -20,6 +21,7 @@ __all__ = [
            "CTFile",
            "CTSource",
            "Calibration",
+           "Case",
            "Deformation",
            "Finding",
            "Intensity",

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from phydict.datasets.case import Case
 from phydict.runtime.warning import warn
 from phydict.xray.poses.uncertain import USUAL, Uncertain
 
 
-def uncertain_of(case: dict) -> Uncertain:
+def uncertain_of(case: Case) -> Uncertain:
     """What a case's geometry file says not to know exactly; of simulated X-rays and, with a warning, of radiographs
     whose tags are their geometry, what is usual.
 

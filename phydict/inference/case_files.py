@@ -6,6 +6,7 @@ from pathlib import Path
 
 from torch import Tensor
 
+from phydict.datasets.case import Case
 from phydict.datasets.radiographs.xray_description import save_geometry
 from phydict.evaluation import panel
 from phydict.evaluation.fid import Features, save_features
@@ -20,7 +21,7 @@ TISSUE = -500.0
 """HU above which a voxel is no air."""
 
 
-def write_result(folder: Path, case: dict, result: Reconstruction, method: str, truth: Tensor | None,
+def write_result(folder: Path, case: Case, result: Reconstruction, method: str, truth: Tensor | None,
                  keep_coarse: bool, features: Features | None = None) -> None:
     """Writes volumes, panel, what the page shows of a case and the features of its slices; truth: HU (X, Y, Z) on the
     result's voxels."""

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from phydict.datasets import CTFile, CTSource, body_mask, find_xrays, load_case, load_xrays, phantom_case
+from phydict.datasets import CTFile, CTSource, find_xrays, load_case, load_xrays, phantom_case
+from phydict.datasets.case import Case
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM, PHANTOM_VERSION
-from phydict.evaluation import RANGE, volume_metrics
 from phydict.grid import Grid
 from phydict.inference.protocols import protocol_of
 from phydict.inference.settings import Orbit
@@ -43,9 +43,9 @@ class LazyCases(Dataset):
     def __len__(self) -> int:
         return len(self.makers)
 
-    def __getitem__(self, i: int) -> dict:
+    def __getitem__(self, i: int) -> Case:
         name, source, make = self.makers[i]
-        case = {"id": name, "index": i, "source": source, "warnings": []}
+        case: Case = {"id": name, "index": i, "source": source, "warnings": []}
         try:
             with noted(case["warnings"], name):
                 return make() | case
@@ -143,7 +143,7 @@ class ReconstructionData(lightning.LightningDataModule):
         task = self.trainer.lightning_module
         return self._loader(self.test_cases(*task.scene()))
 
-    def test_cases(self, grid: Grid, window: HUWindow) -> list[tuple[str, str, Callable[..., dict]]]:
+    def test_cases(self, grid: Grid, window: HUWindow) -> list[tuple[str, str, Callable[..., Case]]]:
         """The CTs or phantoms of test: id, what identifies its data, and the function that makes it on `grid`."""
         if not self.cts:
             raise ValueError("test needs data.cts: a NIfTI file, a folder of CTs, or the word phantom")
@@ -174,13 +174,13 @@ class ReconstructionData(lightning.LightningDataModule):
             crc = file_crc32(file, named) if file.is_file() else named
         return f"files crc32 {crc:08x}"
 
-    def simulate(self, case: dict, seed: int, grid: Grid, window: HUWindow, device: torch.device) -> Tensor:
+    def simulate(self, case: Case, seed: int, grid: Grid, window: HUWindow, device: torch.device) -> Tensor:
         """X-rays (K, V, U) of a CT case, made on `device`."""
         source = case.get("fine", case["volume"]).to(device)
         fine = in_other_voxels(grid, source.shape[-3:])
         return self.simulator(Projector(fine, self.beam, full_detector=True), window.to_mu(source)[None], seed)[0]
 
-    def _with_fine(self, grid: Grid, make: Callable[[Grid], dict]) -> dict:
+    def _with_fine(self, grid: Grid, make: Callable[[Grid], Case]) -> Case:
         """A case; where X-rays are made of a finer volume, that one as "fine", and its block means as the truth."""
         if not self.simulation_voxels:
             return make(grid)
@@ -191,7 +191,7 @@ class ReconstructionData(lightning.LightningDataModule):
         fine = make(in_other_voxels(grid, [factor * n for n in grid.shape]))["volume"]
         return make(grid) | {"fine": fine, "volume": torch.nn.functional.avg_pool3d(fine, factor)}
 
-    def transfer_batch_to_device(self, batch: dict, device: torch.device, dataloader_idx: int) -> dict:
+    def transfer_batch_to_device(self, batch: Case, device: torch.device, dataloader_idx: int) -> Case:
         return batch  # a case holds its beam, which has no device; its X-rays are moved when they are reconstructed
 
     def _loader(self, makers: list[tuple]) -> DataLoader:
@@ -199,19 +199,6 @@ class ReconstructionData(lightning.LightningDataModule):
         cases = LazyCases([maker for maker in makers if maker[0] in left])
         self.trainer.strategy.barrier()  # every process has looked before any process finishes a case
         return DataLoader(cases, None)
-
-
-def case_scores(volume: Tensor, misfit: float, case: dict, grid: Grid, window: HUWindow,
-                scored: HUWindow = RANGE) -> dict[str, float]:
-    """Scores of a reconstructed volume (X, Y, Z) in HU on `grid` against the CT case that its X-rays were made of, in
-    the HU range `scored`: over the whole volume, in the body, which leaves out couch and air (`body_mask` of the CT),
-    and in the lungs if known."""
-    truth = window.to_hu(case["volume"])[None].cpu()
-    lung = case["masks"][None, :1].cpu() if bool(case["has_masks"][0]) else None
-    body = torch.from_numpy(body_mask(truth[0, 0].numpy(), grid.spacing))[None, None]
-    if lung is not None:  # a lung that the field of view cuts open is not filled in the body
-        body |= lung > 0.5
-    return volume_metrics(volume[None, None], truth, lung, body, scored.low, scored.high) | {"misfit": misfit}
 
 
 def _ct_source(ct: CTFile) -> str:

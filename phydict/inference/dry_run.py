@@ -8,6 +8,7 @@ from statistics import median
 import torch
 
 from phydict.datasets import Thorax, build
+from phydict.datasets.case import Case
 from phydict.grid import Grid
 from phydict.inference.geometry_page import agreement, correlation, geometry_page, view_sides
 from phydict.runtime.warning import warn
@@ -22,7 +23,7 @@ the median was 0.72 to 0.86 on five chest CTs and 0.50 on a sixth whose lungs ar
 0.26 to 0.49. A wrong order of views stays above."""
 
 
-def dry_run(path: str | Path, case: dict, grid: Grid) -> list[str]:
+def dry_run(path: str | Path, case: Case, grid: Grid) -> list[str]:
     """Write the geometry page of an X-ray Case as PNG; returns one line per view that says what is seen in it, and
     warns of views that look mirrored or unlike a thorax in this geometry.
 

@@ -14,12 +14,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from phydict.datasets.cts.transforms import AIR, to_grid
+from phydict.datasets.case import Case
+from phydict.datasets.cts.transforms import to_grid
 from phydict.evaluation import RANGE
 from phydict.grid import Grid
 from phydict.inference.settings import PAPER, Orbit
 from phydict.methods import CHEST
-from phydict.units import HUWindow
+from phydict.units import AIR, HUWindow
 from phydict.xray import Ideal, Simulator
 from phydict.xray.boxes import along, covers, in_other_voxels
 
@@ -121,12 +122,12 @@ def whole(grid: Grid) -> Grid:
     return Grid.cube(CHEST.shape[0] * 2 ** min(halvings, 2))
 
 
-def cut_out(case: dict, grid: Grid, box: Grid, window: HUWindow) -> dict:
+def cut_out(case: Case, grid: Grid, box: Grid, window: HUWindow) -> Case:
     """What a CT case on `grid` holds in a box: volume, from its finest, masks and, where it has one, affine."""
     source = case.get("fine", case["volume"])
     volume = resampled(window.to_hu(source)[0].cpu(), in_other_voxels(grid, source.shape[1:]), box)
     masks = np.stack([to_grid(mask.cpu().numpy(), grid.affine, box, 0.0) for mask in case["masks"]])
-    found = {"volume": window.to_range(volume)[None], "masks": torch.from_numpy(masks.astype(np.float32))}
+    found: Case = {"volume": window.to_range(volume)[None], "masks": torch.from_numpy(masks.astype(np.float32))}
     if "affine" in case:
         found["affine"] = torch.from_numpy(placed(box, grid, case["affine"].numpy()).affine.copy())
     return found

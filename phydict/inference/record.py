@@ -9,11 +9,12 @@ from typing import Any
 
 import torch
 
+from phydict.datasets.case import Case
 from phydict.grid import Grid
 from phydict.inference.case_files import body_interval
 from phydict.inference.settings import Sampling
 from phydict.posterior import CascadePosterior, Refined, Sampler
-from phydict.prior import MedSynCheckpoint, Prior, PriorContract, Refiner, file_read, fingerprint
+from phydict.prior import AnyPrior, MedSynCheckpoint, file_read, fingerprint, own_identity
 from phydict.reconstruction import Reconstruction, Reconstructor, describe
 from phydict.runtime.precision import instruction_set
 from phydict.runtime.profiling import CPU, peak_memory
@@ -25,9 +26,10 @@ def method_settings(name: str, seed: int, method: Sampler | Reconstructor, proje
         {"projector": projector} if projector != "auto" else {})
 
 
-def prior_settings(prior: Prior | Refiner | PriorContract, given: Any, sampling: Sampling) -> dict:
-    """Those of a prior, given as an object or by its file, and of how it is sampled."""
-    settings = {"prior": prior.identity()} if isinstance(prior, PriorContract) else _identity("prior", given)
+def prior_settings(prior: AnyPrior, given: Any, sampling: Sampling) -> dict:
+    """Those of a prior, given as an object, by its file or by its class, and of how it is sampled."""
+    own = own_identity(prior, given)
+    settings = _identity("prior", given) if own is None else {"prior": own}
     settings["guidance"] = sampling.guidance
     if sampling.samples != 1:
         settings["samples"] = sampling.samples
@@ -48,7 +50,7 @@ def grid_settings(grid: Grid, method: Reconstructor) -> dict:
         {"refinement": describe(method.refinement)} if isinstance(method, Refined) else {})
 
 
-def case_record(case: dict, result: Reconstruction, name: str, method: Reconstructor, scores: dict | None,
+def case_record(case: Case, result: Reconstruction, name: str, method: Reconstructor, scores: dict | None,
                 settings: dict, device: torch.device) -> dict:
     """All that is known of a finished case, as plain JSON values; process_peak_memory_mb is in MiB."""
     return {"case": case["id"], "method": name, "citation": method.citation, "scores": scores,

@@ -9,8 +9,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from phydict.datasets import body_mask
+from phydict.datasets.case import Case
 from phydict.datasets.cts.segmentations import organs_beside
-from phydict.evaluation import RANGE
+from phydict.evaluation import RANGE, volume_metrics
 from phydict.evaluation.backbones import SliceFeatures
 from phydict.evaluation.ct_clip import clip_scores, load_ct_clip
 from phydict.evaluation.fid import Features, case_features
@@ -19,7 +21,6 @@ from phydict.evaluation.perceptual import load_networks, lpips_scores
 from phydict.evaluation.published import PUBLISHED
 from phydict.evaluation.sharpness import sharpness_scores
 from phydict.grid import Grid
-from phydict.inference.data import case_scores
 from phydict.inference.protocols import Protocol
 from phydict.runtime.files import file_crc32
 from phydict.units import HUWindow
@@ -105,7 +106,7 @@ class Scoring:
         return {"clip_t2i": "CXR-BERT was not given (clip.text)" if self.clip.text_transformer is None else
                 "no case has a report"}
 
-    def scores(self, volume: Tensor, misfit: float, case: dict, grid: Grid, window: HUWindow,
+    def scores(self, volume: Tensor, misfit: float, case: Case, grid: Grid, window: HUWindow,
                device: torch.device, protocol: Protocol | None = None) -> dict[str, float]:
         """Metric -> value of a reconstructed volume (X, Y, Z) in HU on `grid`, of a CT case as `case_scores` takes it;
         in the HU range of a protocol, and with its own scores."""
@@ -124,7 +125,7 @@ class Scoring:
             scores |= clip_scores(self.clip.to(device), volume, truth, grid, case.get("ct_report", case["report"]))
         return scores
 
-    def features(self, volume: Tensor, case: dict, window: HUWindow, device: torch.device) -> Features | None:
+    def features(self, volume: Tensor, case: Case, window: HUWindow, device: torch.device) -> Features | None:
         """The features of the slices of volume and truth, where FID is measured; the truth's are kept in the case."""
         if self.network is None:
             return None
@@ -133,7 +134,20 @@ class Scoring:
         return case["features"]
 
 
-def segmented(case: dict, grid: Grid) -> dict:
+def case_scores(volume: Tensor, misfit: float, case: Case, grid: Grid, window: HUWindow,
+                scored: HUWindow = RANGE) -> dict[str, float]:
+    """Scores of a reconstructed volume (X, Y, Z) in HU on `grid` against the CT case that its X-rays were made of, in
+    the HU range `scored`: over the whole volume, in the body, which leaves out couch and air (`body_mask` of the CT),
+    and in the lungs if known."""
+    truth = window.to_hu(case["volume"])[None].cpu()
+    lung = case["masks"][None, :1].cpu() if bool(case["has_masks"][0]) else None
+    body = torch.from_numpy(body_mask(truth[0, 0].numpy(), grid.spacing))[None, None]
+    if lung is not None:  # a lung that the field of view cuts open is not filled in the body
+        body |= lung > 0.5
+    return volume_metrics(volume[None, None], truth, lung, body, scored.low, scored.high) | {"misfit": misfit}
+
+
+def segmented(case: Case, grid: Grid) -> dict:
     """Organs that are segmented beside a case's CT, on the finer voxels on which organs are compared; often none."""
     file: Path | None = case.get("file")
     if file is None or "affine" not in case:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from phydict.posterior import Sampler
 from phydict.prior import MedSynCheckpoint
 from phydict.xray import ConeBeam
+from phydict.xray.orbits import PIXEL, PIXELS, SOURCE_TO_DETECTOR, SOURCE_TO_ISOCENTRE
 
 
 @dataclass(frozen=True)
@@ -88,5 +89,5 @@ class Orbit:
                               arc_degrees=None if arc == PAPER.arc else arc)
 
 
-PAPER = Orbit(8, 1020.0, 740.0, (448, 448), (1.25, 1.25), 360.0)
+PAPER = Orbit(8, SOURCE_TO_DETECTOR, SOURCE_TO_ISOCENTRE, (PIXELS, PIXELS), (PIXEL, PIXEL), 360.0)
 """The paper's orbit, and the default."""

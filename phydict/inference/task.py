@@ -18,6 +18,7 @@ import lightning
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 from torch import Tensor
 
+from phydict.datasets.case import Case
 from phydict.evaluation import CaseMetrics
 from phydict.evaluation.fid import Features, PlaneFID
 from phydict.grid import Box, Grid
@@ -112,7 +113,7 @@ class ReconstructionTask(lightning.LightningModule):
         self.with_report = sampling.with_report
         self.progress = CaseProgress()
         self.cases: list[str] = []
-        self.profile = self.calibrate = self.said_no_text = False
+        self.profile = self.calibrate = self.warned_of_text = False
 
     def _take(self, box: Box | None) -> None:
         """Reconstruct on the voxels of a box, if one is given."""
@@ -133,7 +134,7 @@ class ReconstructionTask(lightning.LightningModule):
 
     @property
     def reads_no_text(self) -> bool:
-        return self.prior is not None and not self.prior.reads_text
+        return self.prior is not None and not getattr(self.prior, "reads_text", False)
 
     @property
     def _data(self) -> ReconstructionData:
@@ -169,16 +170,16 @@ class ReconstructionTask(lightning.LightningModule):
                  event="kept", cases=kept, of=len(sources))
         return left
 
-    def predict_step(self, case: dict, index: int = 0) -> None:
+    def predict_step(self, case: Case, index: int = 0) -> None:
         self._attempt(case, self._predict)
 
-    def test_step(self, case: dict, index: int = 0) -> None:
+    def test_step(self, case: Case, index: int = 0) -> None:
         self._attempt(case, self._test)
 
-    def _predict(self, case: dict) -> None:
+    def _predict(self, case: Case) -> None:
         self._finish(case, self._reconstruct(case, self.seed))
 
-    def _test(self, case: dict) -> None:
+    def _test(self, case: Case) -> None:
         data = self._data
         case["beam"], seed = data.beam, case_seed(self.seed, case["id"])
         grid, window = self.scene()
@@ -201,7 +202,7 @@ class ReconstructionTask(lightning.LightningModule):
             self.slices.update(case["index"], features)
         self._finish(case, result, scores, resampled(truth, grid, self.grid), features)
 
-    def _attempt(self, case: dict, work: Callable[[dict], None]) -> None:
+    def _attempt(self, case: Case, work: Callable[[Case], None]) -> None:
         """Bad input ends the run, or, where there are more cases, this one alone; a signal ends it between cases."""
         if self.trainer.received_sigterm:
             raise SIGTERMException
@@ -249,16 +250,16 @@ class ReconstructionTask(lightning.LightningModule):
         steps = self.reconstructor.steps() + (PoseSearch().rounds if self.calibrate else 0)
         self.progress.begin(self.method_name, cases, steps, out=self.results.folder)
 
-    def _report(self, case: dict) -> str:
+    def _report(self, case: Case) -> str:
         """The report of a case where it is used; says once that a prior without text uses none."""
         if not case["report"] or not self.with_report:
             return ""
-        if self.reads_no_text and not self.said_no_text:
+        if self.reads_no_text and not self.warned_of_text:
             warn("the prior was trained without text: reports are not used")
-            self.said_no_text = True
+            self.warned_of_text = True
         return "" if self.reads_no_text else case["report"]
 
-    def _reconstruct(self, case: dict, seed: int) -> Reconstruction:
+    def _reconstruct(self, case: Case, seed: int) -> Reconstruction:
         ready = self.reconstructor.with_mu_water(case["mu_water"]) if "mu_water" in case else self.reconstructor
         xrays, beam, display = case["xrays"].to(self.device), case["beam"], case.get("display", False)
         found: FoundPoses | None = None
@@ -271,7 +272,7 @@ class ReconstructionTask(lightning.LightningModule):
         result = ready.reconstruct(xrays, projector, case["report"], display, seed, self.progress.advance)
         return found.added_to(result) if found else result
 
-    def _finish(self, case: dict, result: Reconstruction, scores: dict | None = None,
+    def _finish(self, case: Case, result: Reconstruction, scores: dict | None = None,
                 truth: Tensor | None = None, features: Features | None = None) -> None:
         with stage("write"):
             record = case_record(case, result, self.method_name, self.reconstructor, scores, self.settings, self.device)

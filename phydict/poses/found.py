@@ -17,14 +17,14 @@ NAMES = ("detector_shift_columns_mm", "detector_shift_rows_mm", "source_shift_co
 """A view's unknowns: shifts in the direction from column to column and from row to row, rotations about these axes and
 about the detector's normal, what was measured as (1 + gain) times the line integral plus the offset."""
 
-LARGE = 3.0
+LARGE_CORRECTION = 3.0
 """Corrections beyond so many of their stated standard deviations are warned of."""
 
 SWAY, SWAY_ERRORS = 0.6, 4.0
 """Views whose sway is more mm and more of its standard errors are warned of. On two training CTs at rest it was 0.4 at
 most; where the lower half of the chest was 10 mm lower in every second view it was 0.6 to 1.8."""
 
-FEW = 2
+FEW_VIEWS = 2
 """So many views or fewer cannot tell much of their poses, and nothing of a sway, from the volume."""
 
 FEW_WIDENING = 1.5
@@ -66,7 +66,7 @@ class FoundPoses:
 
     def added_to(self, result: Reconstruction) -> Reconstruction:
         """A reconstruction by the beam found, with what was found, and with wider intervals where that is little."""
-        little = len(self.corrections) <= FEW and self.deviations[:len(POSE)].any()
+        little = len(self.corrections) <= FEW_VIEWS and self.deviations[:len(POSE)].any()
         factor = FEW_WIDENING if little else 1.0
         seconds = {"calibrate": self.seconds} | result.seconds
         return replace(result, beam=self.beam, poses=self.record(), seconds=seconds,
@@ -76,7 +76,7 @@ class FoundPoses:
     def warnings(self) -> list[str]:
         """What is to be said: that few views cannot show depth, and which views were corrected by more than stated."""
         said = []
-        if len(self.corrections) <= FEW:
+        if len(self.corrections) <= FEW_VIEWS:
             said.append(f"{len(self.corrections)} views show the volume from so few sides that most of its depth, and "
                         "of what was found of the poses, comes from the method and from the stated geometry: read "
                         "outlines and large structures alone, and no sizes, places or densities of small ones; lengths "
@@ -84,13 +84,13 @@ class FoundPoses:
         for view, row in enumerate(self.corrections):
             ratios = np.divide(np.abs(row), self.deviations, out=np.zeros_like(row), where=self.deviations > 0)
             worst = int(ratios.argmax())
-            if ratios[worst] > LARGE:
+            if ratios[worst] > LARGE_CORRECTION:
                 unit = {"mm": " mm", "degrees": " degrees"}.get(NAMES[worst].rpartition("_")[2], "")
                 said.append(f"view {view} (counted from 0) was corrected by {row[worst]:.3g}{unit} in "
                             f"{NAMES[worst]}, {ratios[worst]:.1f} times the stated {self.deviations[worst]:g}: check "
                             "this view's geometry, or state more under `uncertain:`")
         size, error = np.abs(self.sway[0]), self.sway[1]
-        moved = np.flatnonzero((size > SWAY) & (size > SWAY_ERRORS * error) & (len(size) > FEW))
+        moved = np.flatnonzero((size > SWAY) & (size > SWAY_ERRORS * error) & (len(size) > FEW_VIEWS))
         if len(moved):
             said.append(f"view {', '.join(map(str, moved))} (counted from 0) show the lower end of the body up to "
                         f"{size.max():.1f} mm away from where the volume of all views has it, which no pose explains: "

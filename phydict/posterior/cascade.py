@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -99,41 +98,41 @@ class CascadePosterior(Reconstructor):
     @torch.no_grad()
     def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,
                     seed: int = 0, on_step: Callable[[], None] = lambda: None) -> Reconstruction:
-        fine, watch = self.cascade.super_resolution, Stopwatch()
-        if not fine.grid.same_as(projector.grid):
+        stage, watch = self.cascade.super_resolution, Stopwatch()
+        if not stage.grid.same_as(projector.grid):
             raise ValueError(
-                f"the super-resolution stage makes {fine.grid.shape} voxels of {fine.grid.spacing} mm, but the X-rays "
-                f"are projected from {projector.grid.shape} voxels of {projector.grid.spacing} mm: use its grid")
+                f"the super-resolution stage makes {stage.grid.shape} voxels of {stage.grid.spacing} mm, but the "
+                f"X-rays are projected from {projector.grid.shape} voxels of {projector.grid.spacing} mm: use its grid")
         self.check_memory(xrays.device, xrays.dtype)
         with watch.stage("base"):
             base = self._base(xrays, projector, report, display, seed, on_step)
         with watch.stage("prepare"):
             generator = torch.Generator().manual_seed(seed + 1)
             masks: Tensor = base.masks  # type: ignore[assignment]  # a prior gives them
-            state = torch.cat([fine.window.to_range(base.within)[None], 2 * masks - 1])[None].to(xrays)
-            state = state[:, :fine.coarse_channels]
-            measurement = Measurement(projector, xrays, fine.window, display, self.mu_water)
+            state = torch.cat([stage.window.to_range(base.within)[None], 2 * masks - 1])[None].to(xrays)
+            state = state[:, :stage.coarse_channels]
+            measurement = Measurement(projector, xrays, stage.window, display, self.mu_water)
             measurement.carry(base.carried)
             if base.scatter:
                 measurement.reset_scatter(True)
-                measurement.refit(fine.upsample(state)[:, :1])
+                measurement.refit(stage.upsample(state)[:, :1])
                 measurement.scatter_enabled = False  # the base stage's is kept
             guard = Guard(measurement, on_step, self.second.steps())
-            denoiser = CountingDenoiser(fine.bind(state, self.level, self.precision, generator), guard)
-            x = noise_like(torch.empty(1, fine.state_channels, *fine.grid.shape, device=xrays.device), generator)
+            denoiser = CountingDenoiser(stage.bind(state, self.level, self.precision, generator), guard)
+            x = noise_like(torch.empty(1, stage.state_channels, *stage.grid.shape, device=xrays.device), generator)
         with watch.stage("sample"):
             state = self.second.sample(denoiser, measurement, x, generator, guard)
         with watch.stage("score"):
             ct = state[:, :1]
             measurement.match_gain_offset(ct)
             fit = guard.score(state, measurement.project(ct), measurement.y)
-            masks = interpolate(masks[None], fine.grid.shape, mode="trilinear")[0]
-            masks[:fine.state_channels - 1] = ((state[0, 1:] + 1) / 2).cpu()
-            volume = fine.window.to_hu(ct[0, 0]).cpu()
+            masks = interpolate(masks[None], stage.grid.shape, mode="trilinear")[0]
+            masks[:stage.state_channels - 1] = ((state[0, 1:] + 1) / 2).cpu()
+            volume = stage.window.to_hu(ct[0, 0]).cpu()
             if base.carried:
-                volume = volume + base.carried.on(fine.grid)
+                volume = volume + base.carried.on(stage.grid)
         return Reconstruction(
-            volume=volume, carried=base.carried, grid=fine.grid, method=self.name, seed=seed,
+            volume=volume, carried=base.carried, grid=stage.grid, method=self.name, seed=seed,
             **fit | {"diverged_at": base.diverged_at or guard.diverged_at}, seconds=watch.seconds,
             network_calls=base.network_calls + denoiser.calls,
             projector_calls=base.projector_calls + measurement.calls, masks=masks,
@@ -142,7 +141,7 @@ class CascadePosterior(Reconstructor):
     def _base(self, xrays: Tensor, projector: Projector, report: str, display: bool, seed: int,
               on_step: Callable[[], None]) -> Reconstruction:
         """The base stage's reconstruction, from X-rays binned to what its grid can hold."""
-        prior, beam = cast(Any, self.cascade.base), projector.beam
+        prior, beam = self.cascade.base, projector.beam
         factor = 1 if self.sampler.full_detector else binning(prior.grid, beam)
         coarse = Projector(prior.grid, beam.binned(factor), device=xrays.device, full_detector=True)
         posterior = Posterior(prior, self.sampler, self.guidance, self.mu_water, self.name, self.precision)

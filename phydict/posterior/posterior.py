@@ -18,7 +18,7 @@ from phydict.posterior.measurement import Measurement
 from phydict.posterior.metal import said_of
 from phydict.posterior.samplers.sampler import Sampler
 from phydict.posterior.samplers.split_gibbs import SplitGibbs
-from phydict.prior import BoundRefiner, PriorContract, Refiner
+from phydict.prior import AnyPrior, BoundRefiner, Refiner
 from phydict.prior.uncertainty import LEVELS
 from phydict.reconstruction import Reconstruction, Reconstructor
 from phydict.runtime.precision import check_precision, precision_name
@@ -113,7 +113,7 @@ class Posterior(Reconstructor):
     None: nothing does.
     """
 
-    prior: PriorContract | Refiner
+    prior: AnyPrior
     sampler: Sampler = field(default_factory=SplitGibbs)
     guidance: float = 1.0
     mu_water: float = MU_WATER
@@ -206,7 +206,7 @@ class Posterior(Reconstructor):
             measurement.subtract_scatter(reprojection)
             fit = guard.score(states if self.samples == 1 else None, reprojection, measurement.y)
             deviation = (prior.window.half_width * states[:, 0].std(0)).cpu() if self.samples > 1 else None
-            volume, carried = self._told(measurement, ct[0, 0])
+            volume, carried = self._volume(measurement, ct[0, 0])
             intervals, widening = self._intervals(denoiser, measurement, reprojection)
             say_contradictions(measurement, widening if intervals else None)
         return Reconstruction(
@@ -216,7 +216,7 @@ class Posterior(Reconstructor):
             intervals=intervals, interval_widening=widening, scatter=measurement.scatter,
             model_variance=measurement.model_variance, precision=precision_name(self.precision, xrays), carried=carried)
 
-    def _told(self, measurement: Measurement, x: Tensor) -> tuple[Tensor, Carried | None]:
+    def _volume(self, measurement: Measurement, x: Tensor) -> tuple[Tensor, Carried | None]:
         """HU (X, Y, Z) of a result x in the prior's range, and what of them is carried beside it. Says what is as dense
         as the prior knows, or denser."""
         volume, carried = self.prior.window.to_hu(x).cpu(), measurement.carried

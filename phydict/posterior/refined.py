@@ -17,13 +17,9 @@ from phydict.posterior.likelihood.likelihood import LikelihoodStep, ProximalCG
 from phydict.posterior.measurement import Measurement
 from phydict.reconstruction import Delegating, Reconstruction, Reconstructor
 from phydict.runtime.profiling import Stopwatch, stage
-from phydict.units import HUWindow, hu_to_mu
+from phydict.units import AIR, HUWindow, hu_to_mu
 from phydict.xray import Projector
 from phydict.xray.boxes import covers, interpolated, outside_projection, refinements, seen_by
-
-AIR = -1000.0
-"""HU outside what a coarse volume covers."""
-
 
 CHANGE_SHARE = 0.3
 """Share of the refinement's change by which intervals widen on finer voxels."""
@@ -32,10 +28,17 @@ CHANGE_SHARE = 0.3
 class Bound(Protocol):
     """A Reconstructor that is bound to voxels and an HU range of its own: a prior's, a cascade's or a rival's."""
 
-    full_detector: bool
-    citation: str
-    mu_water: float
-    name: str
+    @property
+    def full_detector(self) -> bool: ...
+
+    @property
+    def citation(self) -> str: ...
+
+    @property
+    def mu_water(self) -> float: ...
+
+    @property
+    def name(self) -> str: ...
 
     @property
     def grid(self) -> Grid: ...

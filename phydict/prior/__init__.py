@@ -1,15 +1,15 @@
 """The diffusion prior of CT: networks, report encoder, cascade, and their files with grid and HU window."""
 
 from phydict.prior.cascade import Cascade
-from phydict.prior.contract import PriorContract, check_prior, find_prior
+from phydict.prior.contract import AnyPrior, PriorContract, check_prior, find_prior, own_identity
 from phydict.prior.correction import CorrectionNetwork
 from phydict.prior.detail import DetailNetwork
 from phydict.prior.files import (
     DEFAULT_CORRECTION,
     DEFAULT_PRIOR,
     DEFAULT_REFINER,
-    describe,
     describe_correction,
+    describe_prior,
     describe_refiner,
     describe_super_resolution,
     file_read,
@@ -34,10 +34,10 @@ from phydict.prior.super_resolution import SuperResolution
 from phydict.prior.text import TextEncoder, learn_vocabulary
 from phydict.prior.unet import VolumeUNet
 
-__all__ = ["DEFAULT_CORRECTION", "DEFAULT_PRIOR", "DEFAULT_REFINER", "STATE", "BoundPrior", "BoundRefiner",
+__all__ = ["DEFAULT_CORRECTION", "DEFAULT_PRIOR", "DEFAULT_REFINER", "STATE", "AnyPrior", "BoundPrior", "BoundRefiner",
            "Cascade", "CorrectionNetwork", "DetailNetwork", "LocalUNet", "MedSynCheckpoint", "MedSynPrior",
            "MedSynSuperResolution", "Prior", "PriorContract", "Refiner", "SuperResolution", "TextEncoder", "VolumeUNet",
-           "check_prior", "describe", "describe_correction", "describe_refiner", "describe_super_resolution",
+           "check_prior", "describe_correction", "describe_prior", "describe_refiner", "describe_super_resolution",
            "file_read", "find_prior", "fingerprint", "inspect_prior", "is_refiner", "learn_vocabulary",
-           "load_correction", "load_prior", "load_super_resolution", "save_correction", "save_prior", "save_refiner",
-           "save_super_resolution"]
+           "load_correction", "load_prior", "load_super_resolution", "own_identity", "save_correction", "save_prior",
+           "save_refiner", "save_super_resolution"]

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from phydict.prior.prior import Prior
+from phydict.prior.contract import AnyPrior
+from phydict.prior.medsyn.super_resolution import MedSynSuperResolution
 from phydict.prior.super_resolution import SuperResolution
 
 
@@ -17,26 +18,26 @@ class Cascade:
     Raises ValueError where the stages do not fit: cube, window, factor, or channels.
     """
 
-    base: Prior
-    super_resolution: SuperResolution
+    base: AnyPrior
+    super_resolution: SuperResolution | MedSynSuperResolution
 
     def __post_init__(self):
-        base, fine = self.base, self.super_resolution
-        if not np.allclose(base.grid.extent, fine.grid.extent) or not np.allclose(base.grid.centre, fine.grid.centre):
+        base, stage = self.base, self.super_resolution
+        if not np.allclose(base.grid.extent, stage.grid.extent) or not np.allclose(base.grid.centre, stage.grid.centre):
             raise ValueError(f"the base prior's cube has sides of {_mm(base)} mm and the super-resolution stage's of "
-                             f"{_mm(fine)} mm, or another centre: use stages trained with the same model.cube.side")
-        if base.window != fine.window:
+                             f"{_mm(stage)} mm, or another centre: use stages trained with the same model.cube.side")
+        if base.window != stage.window:
             raise ValueError(f"the base prior's HU window is [{base.window.low:g}, {base.window.high:g}] and the "
-                             f"super-resolution stage's [{fine.window.low:g}, {fine.window.high:g}]: use stages "
+                             f"super-resolution stage's [{stage.window.low:g}, {stage.window.high:g}]: use stages "
                              "trained with the same model.window")
-        if tuple(fine.factor * n for n in base.grid.shape) != fine.grid.shape:
-            raise ValueError(f"the super-resolution stage makes {fine.grid.shape} voxels from a factor {fine.factor} "
+        if tuple(stage.factor * n for n in base.grid.shape) != stage.grid.shape:
+            raise ValueError(f"the super-resolution stage makes {stage.grid.shape} voxels from a factor {stage.factor} "
                              f"less, but the base prior has {base.grid.shape}: use stages of "
                              "matching model.cube.voxels")
-        if base.state_channels < fine.coarse_channels:
-            raise ValueError(f"the super-resolution stage needs {fine.coarse_channels} channels of the base prior, "
+        if base.state_channels < stage.coarse_channels:
+            raise ValueError(f"the super-resolution stage needs {stage.coarse_channels} channels of the base prior, "
                              f"which has {base.state_channels}")
 
 
-def _mm(stage: Prior | SuperResolution) -> str:
+def _mm(stage: AnyPrior | SuperResolution | MedSynSuperResolution) -> str:
     return " x ".join(f"{side:g}" for side in stage.grid.extent)

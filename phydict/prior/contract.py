@@ -5,6 +5,11 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from importlib import import_module
 from pathlib import Path
+from typing import Protocol
+from zlib import crc32
+
+import torch
+from torch import nn
 
 from phydict.diffusion import Denoiser
 from phydict.grid import Grid
@@ -45,6 +50,21 @@ class PriorContract(ABC):
         return {"class": f"{type(self).__module__}.{type(self).__qualname__}"} | plain
 
 
+class AnyPrior(Protocol):
+    """What keeps the contract, derived from PriorContract or not: what `load_prior` returns does as well."""
+
+    @property
+    def grid(self) -> Grid: ...
+
+    @property
+    def window(self) -> HUWindow: ...
+
+    @property
+    def state_channels(self) -> int: ...
+
+    def bind(self, report: str, guidance: float, precision: str, /) -> Denoiser: ...
+
+
 def check_prior(prior: object) -> None:
     """Raises ValueError unless an object keeps the contract; it need not derive from PriorContract."""
     kinds = {"grid": Grid, "window": HUWindow, "state_channels": int}
@@ -55,17 +75,39 @@ def check_prior(prior: object) -> None:
                          f"{type(prior).__name__} lacks {', '.join(bad)}: see phydict.prior.PriorContract")
 
 
-def find_prior(given: str | Path | MedSynCheckpoint | PriorContract):
+def is_class_path(given: object) -> bool:
+    """Whether what is given as a prior is the path of a class, such as my_module.MyPrior, and no file."""
+    module, _, name = given.rpartition(".") if isinstance(given, str) else ("", "", "")
+    return bool(module and name[:1].isupper()) and not Path(str(given)).exists()
+
+
+def own_identity(prior: AnyPrior, given: object) -> dict | None:
+    """What decides the answers of a prior given as an object or by the path of its class: its own `identity`, or its
+    plain attributes and the CRC-32 of its weights; None for one that is read from a file."""
+    if isinstance(given, str | Path | MedSynCheckpoint) and not is_class_path(given):
+        return None
+    if callable(own := getattr(prior, "identity", None)):
+        return own()
+    identity, crc = PriorContract.identity(prior), 0  # type: ignore[arg-type]  # which asks for attributes alone
+    if not isinstance(prior, nn.Module):
+        return identity
+    for weight in prior.state_dict().values():
+        crc = crc32(weight.cpu().contiguous().flatten().view(torch.uint8).numpy(), crc)
+    return identity | {"weights_crc32": crc}
+
+
+def find_prior(given: str | Path | MedSynCheckpoint | AnyPrior) -> AnyPrior:
     """The prior that is given: an object that keeps the contract, what `load_prior` reads, or one with its defaults by
     the path of its class.
 
     Raises as `load_prior`, and ValueError where the class cannot be imported or made, or keeps no contract.
     """
-    if isinstance(given, PriorContract):
+    if not isinstance(given, str | Path | MedSynCheckpoint):
+        check_prior(given)
         return given
-    module, _, name = str(given).rpartition(".")
-    if isinstance(given, MedSynCheckpoint | Path) or not (module and name[:1].isupper()) or Path(given).exists():
+    if not is_class_path(given):
         return load_prior(given)
+    module, _, name = str(given).rpartition(".")
     try:
         prior = getattr(import_module(module), name)()
     except (Exception, SystemExit) as error:  # of whatever kind: another's code runs

@@ -69,13 +69,13 @@ def save_prior(prior: Prior, path: str | Path, training: dict | None = None, dty
     weights = prior.state_dict()
     if prior.text is not None and prior.text.source:  # a pretrained BERT is named, not copied
         weights = {k: w for k, w in weights.items() if not k.startswith("text.")}
-    write_stage(Path(path), describe(prior) | {"training": training or {}}, weights, dtype)
+    write_stage(Path(path), describe_prior(prior) | {"training": training or {}}, weights, dtype)
 
 
-def save_super_resolution(fine: SuperResolution, path: str | Path, training: dict | None = None,
+def save_super_resolution(stage: SuperResolution, path: str | Path, training: dict | None = None,
                           dtype: torch.dtype = torch.float16):
-    """Writes `fine` to one .safetensors file, as `save_prior` does."""
-    write_stage(Path(path), describe_super_resolution(fine) | {"training": training or {}}, fine.state_dict(), dtype)
+    """Writes `stage` to one .safetensors file, as `save_prior` does."""
+    write_stage(Path(path), describe_super_resolution(stage) | {"training": training or {}}, stage.state_dict(), dtype)
 
 
 def save_refiner(refiner: Refiner, path: str | Path, training: dict | None = None, dtype: torch.dtype = torch.float16):
@@ -95,7 +95,7 @@ def save_correction(network: CorrectionNetwork, path: str | Path, training: dict
     write_stage(Path(path), describe_correction(network) | {"training": training or {}}, network.state_dict(), dtype)
 
 
-def describe(prior: Prior) -> dict:
+def describe_prior(prior: Prior) -> dict:
     """What a prior is, as plain JSON values: from this and the weights `load_prior` builds it again."""
     own = prior.text
     text = None if own is None else {
@@ -110,22 +110,22 @@ def describe(prior: Prior) -> dict:
             **({"detail": prior.detail.settings} if prior.detail else {})}  # which older files do not name
 
 
-def describe_super_resolution(fine: SuperResolution) -> dict:
+def describe_super_resolution(stage: SuperResolution) -> dict:
     """What a super-resolution stage is, as plain JSON values, for `build_super_resolution`."""
-    return {"format": FORMAT, "stage": "super_resolution", "grid": fine.grid.to_dict(),
-            "hu_window": [fine.window.low, fine.window.high], "factor": fine.factor,
-            "state": STATE[:fine.state_channels], "coarse_state": STATE[:fine.coarse_channels],
-            "detail_std": fine.detail_std, "skip_std": fine.skip_std, "schedule": vars(fine.schedule),
-            "network": fine.network.settings}
+    return {"format": FORMAT, "stage": "super_resolution", "grid": stage.grid.to_dict(),
+            "hu_window": [stage.window.low, stage.window.high], "factor": stage.factor,
+            "state": STATE[:stage.state_channels], "coarse_state": STATE[:stage.coarse_channels],
+            "detail_std": stage.detail_std, "skip_std": stage.skip_std, "schedule": vars(stage.schedule),
+            "network": stage.network.settings}
 
 
 def describe_refiner(refiner: Refiner) -> dict:
     """What a refiner is, as plain JSON values, for `build_refiner`: its prior, called by another stage."""
-    described = describe(refiner.prior) | {"stage": "refiner"}
+    described = describe_prior(refiner.prior) | {"stage": "refiner"}
     if refiner.uncertainty:
         described["uncertainty"] = refiner.uncertainty.settings
     if refiner.first:
-        first = describe(refiner.first)
+        first = describe_prior(refiner.first)
         described |= {"text": first.pop("text"), "first": first}
     return described
 
@@ -218,7 +218,7 @@ def file_read(path: str | Path | MedSynCheckpoint) -> str | None:
 
 
 def build_prior(header: dict, weights: dict[str, Tensor]) -> Prior:
-    """The prior that `describe` described, with these weights; those of the text encoder ("text.") are left out.
+    """The prior that `describe_prior` described, with these weights; those of the text encoder ("text.") are left out.
 
     Raises ValueError where header and weights do not fit together.
     """

@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 SAMPLER = {
     "fresh_noise": "noise_fraction", "overshoot": "momentum", "randomised_noise": "sampling_noise",
     "warm_start": "t_start", "last": "t_end", "refine_from": "ec_delta", "refine_iterations": "ec_steps",
-    "refine_guided": "ec_guided", "at_zero": "final_denoise", "renewed": "eta (of DDS) or zeta (of DiffPIR)"}
+    "refine_guided": "ec_guided", "at_zero": "final_denoise", "renewed": "eta (of DDS) or zeta (of DiffPIR)",
+    "trust": "prior_weight"}
 LIKELIHOOD = {"variation": "tv_weight", "edge": "tv_eps", "refit": "refit_scatter",
               "weighted": "weighted_least_squares"}
 FIELDS = {"method": SAMPLER, "sampler": SAMPLER, "likelihood": LIKELIHOOD, "final_likelihood": LIKELIHOOD,
@@ -16,16 +17,18 @@ FIELDS = {"method": SAMPLER, "sampler": SAMPLER, "likelihood": LIKELIHOOD, "fina
 """Of the settings in each place, old name -> new name."""
 
 GROUPS = {
-    "model.cube": ("voxels", "side"), "model.sampling": ("guidance", "samples", "precision"),
+    "model.sampling": ("guidance", "samples", "precision"),
     "model.optimisation": ("learning_rate", "weight_decay", "warmup", "decay_from", "decay_steps", "sigma_data",
                            "mask_weight"),
     "model.validation": ("preview_steps",), "model.execution": ("gradient_checkpointing", "channels_last", "compile"),
     "data.source": ("reports", "metadata", "fixed", "first_reconstruction", "exclude"),
     "data.orbit": ("views", "source_to_detector", "source_to_isocentre", "detector", "pixel"),
     "data.loading": ("epoch_size", "batch_size", "workers", "ct_fraction")}
-"""Groups of settings that once lay beside them, model.voxels as model.cube.voxels."""
+"""Groups of settings that once lay beside them, model.guidance as model.sampling.guidance."""
 
 PLACES = {
+    "model.voxels": "model.grid (of infer.py) or model.cube.voxels (of train.py)",
+    "model.side": "model.grid.side (of infer.py) or model.cube.side (of train.py)",
     "model.guide_fine": "model.super_resolution.guided", "model.sr_guided": "model.super_resolution.guided",
     "model.fine_sampler": "model.super_resolution.sampler", "model.sr_sampler": "model.super_resolution.sampler",
     "model.fine_noise": "model.super_resolution.noise_augmentation",

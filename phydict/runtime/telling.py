@@ -20,7 +20,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-WORDS, JSON, NOTHING = "words", "json", "nothing"
+WORDS, JSON, SILENCE = "words", "json", "silence"
 
 _MANNER: ContextVar[str] = ContextVar("manner", default=WORDS)
 
@@ -28,7 +28,7 @@ _MANNER: ContextVar[str] = ContextVar("manner", default=WORDS)
 @contextmanager
 def telling(quiet: bool, json_lines: bool) -> Iterator[None]:
     """Runs inside tell nothing of their progress (quiet, which goes first), or a JSON object on each line."""
-    before = _MANNER.set(NOTHING if quiet else JSON if json_lines else WORDS)
+    before = _MANNER.set(SILENCE if quiet else JSON if json_lines else WORDS)
     try:
         yield
     finally:
@@ -43,7 +43,7 @@ def add_telling(parser: ArgumentParser) -> None:
 
 def tell(text: str, /, **event: object) -> None:
     """A line on standard error: the text or, as `telling` has it, the event as JSON, or nothing."""
-    if _MANNER.get() != NOTHING:
+    if _MANNER.get() != SILENCE:
         print(text if _MANNER.get() == WORDS else json.dumps(event), file=sys.stderr, flush=True)
 
 
@@ -54,8 +54,8 @@ def bars_on(console: Console, *columns: ProgressColumn) -> Progress:
                     disable=not console.is_terminal or _MANNER.get() != WORDS)
 
 
-def run_told(function: Callable[..., object], args: Sequence[str] | None, program: str | None = None,
-             positional: bool = False) -> None:
+def run_command(function: Callable[..., object], args: Sequence[str] | None, program: str | None = None,
+                positional: bool = False) -> None:
     """Runs a function with the options of a command line as its arguments, telling its progress as further ones say;
     program: its name in the help."""
     description = " ".join((function.__doc__ or "").partition("\n\n")[0].split())

@@ -12,14 +12,13 @@ from torch.utils.data import ConcatDataset, Dataset
 
 from phydict.datasets import CTCases, CTSource, Deformation, phantom_case, prepare_ct
 from phydict.datasets.cts.cache import write_array
-from phydict.datasets.cts.transforms import AIR
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM, CachedPhantoms
 from phydict.grid import Cube
 from phydict.runtime.warning import warn
 from phydict.training.data import PriorData
 from phydict.training.draws import Draws, Items
 from phydict.training.settings import Crops, HoldOut, Loading
-from phydict.units import HUWindow
+from phydict.units import AIR, HUWindow
 
 
 def mapped_volume(file: Path, make: Callable[[], Tensor]) -> np.ndarray:

@@ -72,7 +72,7 @@ class DenoisingTraining(StageTraining):
         self.log("samples", float(self.samples), rank_zero_only=True, batch_size=len(x0))
         folder = Path(self.trainer.log_dir or self.trainer.default_root_dir) / "samples"  # asks every process
         painted = index < 2 and self.preview_steps
-        if painted and (self.trainer.is_global_zero or self.device_mesh):  # spread weights need every process's help
+        if painted and (self.trainer.is_global_zero or self.device_mesh):  # sharded weights need every process's help
             sample = ddim_sample(denoiser, noise, self.preview_steps)
         if painted and self.trainer.is_global_zero:
             self._write_preview(folder / f"step{self.global_step:06d}_{index}.png", batch, x0, sample)

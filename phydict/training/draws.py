@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 import numpy as np
 from torch.utils.data import Dataset
 
+from phydict.datasets.case import Case
 from phydict.datasets.cts.augment import Augmentation, augment
 from phydict.datasets.population import DrawnPatients
 from phydict.grid import Grid
@@ -65,10 +67,10 @@ class MixedCases(Draws):
             return source
         return self.population
 
-    def item(self, drawn: dict, rng: np.random.Generator) -> dict:
+    def item(self, drawn: Case, rng: np.random.Generator) -> dict:
         return training_parts(augment(drawn, int(rng.integers(2**31)), self.grid, self.window, self.augmentation))
 
 
-def training_parts(case: dict) -> dict:
+def training_parts(case: Mapping) -> dict:
     """A Case without what training does not need."""
     return {key: case[key] for key in KEYS if key in case}

@@ -17,7 +17,7 @@ from phydict.evaluation import method_panel, volume_metrics
 from phydict.grid import Cube
 from phydict.methods import reconstruct
 from phydict.posterior import Sampler
-from phydict.prior import DetailNetwork, Prior, TextEncoder, VolumeUNet, describe, learn_vocabulary, load_prior
+from phydict.prior import DetailNetwork, Prior, TextEncoder, VolumeUNet, describe_prior, learn_vocabulary, load_prior
 from phydict.prior.unet import TextMap
 from phydict.reconstruction import Reconstructor
 from phydict.runtime.progress import CaseProgress
@@ -90,11 +90,11 @@ class PriorTraining(DenoisingTraining):
             part.requires_grad_(False)
 
     def configure_model(self) -> None:
-        mesh = self.device_mesh  # only of a strategy that spreads the weights
+        mesh = self.device_mesh  # only of a strategy that shards the weights
         if mesh is None:
             return
         if any(isinstance(one, WeightAveraging) for one in self.trainer.callbacks):  # type: ignore[attr-defined]
-            raise ValueError("spread weights cannot be averaged: train without EMAWeightAveraging "
+            raise ValueError("sharded weights cannot be averaged: train without EMAWeightAveraging "
                              "(trainer.callbacks: null), as configs/prior/fsdp.yaml does")
         # A sharded optimizer resumes only if it has moved each of its weights: those that denoising leaves alone rest.
         if isinstance(self.prior.network.text_map, TextMap):
@@ -110,7 +110,7 @@ class PriorTraining(DenoisingTraining):
         return self.prior.bind(batch["report"][0] if self.prior.text is not None else "")
 
     def _describe(self) -> dict:
-        return describe(self.prior)
+        return describe_prior(self.prior)
 
     def validation_step(self, batch: dict, index: int) -> None:
         super().validation_step(batch, index)

@@ -12,7 +12,7 @@ from rich.progress import Progress, TextColumn
 from phydict.runtime.progress import CaseProgress, to_go
 from phydict.runtime.telling import bars_on, tell
 
-SHOWN = ("loss", "val/psnr")
+BAR_METRICS = ("loss", "val/psnr")
 """Of what is logged, what the bar has room for."""
 
 
@@ -44,7 +44,7 @@ class TrainingProgress(lightning.Callback):
 
     def on_train_batch_end(self, trainer, module, outputs, batch, index) -> None:
         self.bar.update(self.task, completed=trainer.global_step, logged=_in_words(
-            {name: value for name, value in _logged(trainer).items() if name in SHOWN}))
+            {name: value for name, value in _logged(trainer).items() if name in BAR_METRICS}))
         if time.monotonic() - self.spoke > self.interval:
             self._line(trainer)
 

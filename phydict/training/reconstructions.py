@@ -6,7 +6,7 @@ import hashlib
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from torch.nn.functional import avg_pool3d
 from torch.utils.data import ConcatDataset, Dataset
 
 from phydict.datasets import Augmentation, CTSource
+from phydict.datasets.case import Case
 from phydict.datasets.cts.augment import augment
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM
 from phydict.datasets.surroundings.surroundings import Surroundings
@@ -42,7 +43,7 @@ STRENGTH = Augmentation(girth=0, contrast=0, surroundings=Surroundings.none())
 
 
 @dataclass(frozen=True)
-class Made:
+class RefinementCases:
     """The reconstructions that a refinement learns from.
 
     Args:
@@ -100,18 +101,17 @@ class Reconstructions(Dataset):
         rng, refiner = np.random.default_rng((self.seed, n)), cast(Refiner, load_prior(self.base))
         volume, window = np.array(self.volumes[n % len(self.volumes)], np.float32), refiner.window
         scene = Grid(volume.shape, tuple(self.grid.extent / volume.shape))
-        case = {"volume": torch.from_numpy(volume)[None], "masks": torch.zeros(0, *volume.shape), "report": "",
-                "id": str(n)}
+        case: Case = {"volume": torch.from_numpy(volume)[None], "masks": torch.zeros(0, *volume.shape), "report": "",
+                      "id": str(n)}
         ct = augment(case, int(rng.integers(2**31)), scene, window, self.strength)["volume"][None]
         y, projector = self.scenes.xrays(ct, rng, scene, window)
         record = _Recording(load_correction(self.network) if self.network else None)
-        base: Any = Posterior(refiner, Unrolled())
-        refined = Refined(base, self.grid, Refinement(calls=2 if self.network else 1), record)
+        refined = Refined(Posterior(refiner, Unrolled()), self.grid, Refinement(calls=2 if self.network else 1), record)
         refined.reconstruct(*seen_by(self.grid, y, projector.beam, False))
         return torch.cat([*record.seen, avg_pool3d(ct, FINER)], 1)[0]
 
 
-class Crops(Draws):
+class ReconstructionCrops(Draws):
     """Random cubes of reconstructions at one of their calls, half of them mirrored left to right: what is seen of so
     little has no side.
 
@@ -167,10 +167,10 @@ class ReconstructionData(PriorData):
         window: tied to model.window
     """
 
-    def __init__(self, made: Made = Made(), scenes: Scenes = Scenes(most_views=16), cts: str | None = None,
-                 holdout: HoldOut = HoldOut(phantoms=0), phantoms: int = 0, loading: Loading = Loading(),
-                 cache: str = "runs/cache", initial: str = str(DEFAULT_REFINER), cube: Cube = Cube(128),
-                 window: tuple[float, float] = (-1000.0, 1000.0)):
+    def __init__(self, made: RefinementCases = RefinementCases(), scenes: Scenes = Scenes(most_views=16),
+                 cts: str | None = None, holdout: HoldOut = HoldOut(phantoms=0), phantoms: int = 0,
+                 loading: Loading = Loading(), cache: str = "runs/cache", initial: str = str(DEFAULT_REFINER),
+                 cube: Cube = Cube(128), window: tuple[float, float] = (-1000.0, 1000.0)):
         super().__init__(cts, CTSource(), holdout, phantoms, loading, cache, cube=cube, window=window)
         if self.factor != 1:
             raise ValueError(f"X-rays of reconstructions are made of {FINER * cube.voxels} voxels anyway, but "
@@ -202,7 +202,7 @@ class ReconstructionData(PriorData):
             made.validation * len(validated), 1))
 
     def draws(self, epoch: int) -> Dataset:
-        return Crops(self.made, self.crop, self.loading.epoch_size, epoch, self.seed)
+        return ReconstructionCrops(self.made, self.crop, self.loading.epoch_size, epoch, self.seed)
 
     def collate(self, cases: list[dict]) -> dict:
         return torch.utils.data.default_collate(cases)

@@ -46,11 +46,11 @@ def learn_sentences(prior: Prior, sentences: Sequence[tuple[str, tuple[int, ...]
     targets.begin(kind_map)
     disguise = Disguise(words)
     optimizer = torch.optim.AdamW(weights)
-    draw, losses = np.random.default_rng(seed), []
+    rng, losses = np.random.default_rng(seed), []
     for step in range(steps):
         for group in optimizer.param_groups:
             group["lr"] = LEARNING_RATE * min(1, (step + 1) / 50, 2 * (1 - step / steps))
-        picked = [disguise(*sentences[int(i)], draw) for i in draw.integers(len(sentences), size=BATCH)]
+        picked = [disguise(*sentences[int(i)], rng) for i in rng.integers(len(sentences), size=BATCH)]
         states = text.read_sentences([sentence for sentence, _ in picked])
         states = torch.cat([states, prior.null[0].detach().to(states)])  # which stands for no sentence
         score, extent = kind_map.answers(states[None])
@@ -109,18 +109,18 @@ class Disguise:
         self.words = [word for word in words if word not in self.telling]
 
     def __call__(self, sentence: str, findings: tuple[int, ...],
-                 draw: np.random.Generator) -> tuple[str, tuple[int, ...]]:
-        case = draw.random()
+                 rng: np.random.Generator) -> tuple[str, tuple[int, ...]]:
+        case = rng.random()
         if not self.words or case > STRANGE + NAMELESS:
             return sentence, findings
         parts = re.findall(r"\w+|[^\w\s]", sentence)
         if case < NAMELESS:
-            return " ".join(self._any(draw) if part.lower() in self.naming else part for part in parts), ()
-        parts = [self._any(draw) if part.isalpha() and part.lower() not in self.telling and draw.random() < 0.4
+            return " ".join(self._any(rng) if part.lower() in self.naming else part for part in parts), ()
+        parts = [self._any(rng) if part.isalpha() and part.lower() not in self.telling and rng.random() < 0.4
                  else part for part in parts]
-        for _ in range(int(draw.integers(0, 4))):
-            parts.insert(int(draw.integers(len(parts) + 1)), self._any(draw))
+        for _ in range(int(rng.integers(0, 4))):
+            parts.insert(int(rng.integers(len(parts) + 1)), self._any(rng))
         return " ".join(parts), findings
 
-    def _any(self, draw: np.random.Generator) -> str:
-        return self.words[int(draw.integers(len(self.words)))]
+    def _any(self, rng: np.random.Generator) -> str:
+        return self.words[int(rng.integers(len(self.words)))]

@@ -110,7 +110,7 @@ class PriorValidation(Previews):
 
     Args:
         views: X-rays from which validation reconstructs each held-out case by phydict_fast, to tell which weights are
-            best; 0: none, as where weights are spread over devices
+            best; 0: none, as where weights are sharded over devices
     """
 
     views: int = 4

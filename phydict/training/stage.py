@@ -67,7 +67,7 @@ class StageTraining(lightning.LightningModule, ABC):
         return loss
 
     def on_validation_start(self) -> None:
-        if self.device_mesh is None:  # the parts of spread weights are looked at when they are put together
+        if self.device_mesh is None:  # the parts of sharded weights are looked at when they are put together
             self._check_weights(self.state_dict())
 
     def _check_weights(self, *states: Mapping[str, Tensor]) -> None:

@@ -41,21 +41,21 @@ class SuperResolutionTraining(DenoisingTraining):
                  optimisation: Optimisation = Optimisation(), validation: Previews = Previews(),
                  initial: str | None = None, seed: int = 0):
         check_between("model.most_noise", most_noise)
-        fine = SuperResolution(network or LocalUNet(), cube.grid(), HUWindow(*window), factor,
+        stage = SuperResolution(network or LocalUNet(), cube.grid(), HUWindow(*window), factor,
                                detail_std=detail_std)
         if initial:
             first = load_super_resolution(initial)
-            if (not isinstance(first, SuperResolution) or not first.grid.same_as(fine.grid)
-                    or first.window != fine.window or first.factor != factor):
+            if (not isinstance(first, SuperResolution) or not first.grid.same_as(stage.grid)
+                    or first.window != stage.window or first.factor != factor):
                 raise ValueError(f"the stage {initial} has another grid, HU window or factor than this training: set "
                                  "model.cube, model.window and model.factor to its own")
-            fine = first.train().requires_grad_(True)
-        super().__init__(fine, fine.detail_std, optimisation, validation.preview_steps, seed)
+            stage = first.train().requires_grad_(True)
+        super().__init__(stage, stage.detail_std, optimisation, validation.preview_steps, seed)
         self.most_noise = most_noise
 
     def configure_model(self) -> None:
         if self.device_mesh is not None:
-            raise ValueError("a super-resolution stage is too small to spread its weights over devices: train it with "
+            raise ValueError("a super-resolution stage is too small to be sharded over devices: train it with "
                              "configs/prior/ddp.yaml instead of fsdp.yaml")
 
     def _clean_state(self, batch: dict) -> tuple[Tensor, Tensor]:

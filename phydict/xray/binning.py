@@ -8,12 +8,14 @@ from torch import Tensor
 
 from phydict.grid import Grid
 from phydict.xray.geometry import ConeBeam
+from phydict.xray.orbits import PIXEL, PIXELS, SOURCE_TO_DETECTOR, SOURCE_TO_ISOCENTRE
 
 
 def benchmark_orbit(grid: Grid, views: int, arc_degrees: float = 360.0) -> ConeBeam:
     """The benchmarks' orbit where the grid has 384 mm, in proportion for others, view k at arc k / views."""
     scale = grid.extent[0] / 384
-    return ConeBeam.orbit(views, 1020 * scale, 740 * scale, (448, 448), 1.25 * scale, arc_degrees=arc_degrees)
+    return ConeBeam.orbit(views, SOURCE_TO_DETECTOR * scale, SOURCE_TO_ISOCENTRE * scale, (PIXELS, PIXELS),
+                          PIXEL * scale, arc_degrees=arc_degrees)
 
 
 def binning(grid: Grid, beam: ConeBeam) -> int:

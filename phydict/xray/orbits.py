@@ -7,6 +7,9 @@ import numpy as np
 Poses = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 """Sources, detectors' centres, and steps from column to column and from row to row, each (K, 3)."""
 
+SOURCE_TO_DETECTOR, SOURCE_TO_ISOCENTRE, PIXELS, PIXEL = 1020.0, 740.0, 448, 1.25
+"""The paper's orbit: distances in mm, pixels along each side of the detector, and mm along each side of a pixel."""
+
 
 def on_circle(angles: np.ndarray, source_to_detector: float, source_to_isocentre: float,
               pixel: tuple[float, float]) -> Poses:

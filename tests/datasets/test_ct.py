@@ -14,9 +14,9 @@ import torch
 from ct_files import AFFINE, LIVER, save_ct
 
 from phydict.datasets.cts.ct_rate import CTCases, find_cts
-from phydict.datasets.cts.transforms import AIR, Calibration, covering_grid, load_ct, prepare_ct, to_grid
+from phydict.datasets.cts.transforms import Calibration, covering_grid, load_ct, prepare_ct, to_grid
 from phydict.grid import Grid
-from phydict.units import HUWindow
+from phydict.units import AIR, HUWindow
 
 GRID = Grid.cube(32)
 

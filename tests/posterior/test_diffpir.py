@@ -17,19 +17,19 @@ def sample(settings, x=X, data=None, seed=0):
     return settings.sample(denoiser(V), data or measurement(), x, torch.Generator().manual_seed(seed))
 
 
-@pytest.mark.parametrize("trust", [1.0, 3.0])
-def test_one_level_is_the_minimiser_of_its_own_objective(trust):
+@pytest.mark.parametrize("weight", [1.0, 3.0])
+def test_one_level_is_the_minimiser_of_its_own_objective(weight):
     m, prior = measurement(), denoiser(V)
-    found = sample(DiffPIR(1, 1.0, trust, 0.0, NOISE, 50))
-    spread = float(FINE.sigma(1.0)) / trust**0.5
+    found = sample(DiffPIR(1, 1.0, weight, 0.0, NOISE, 50))
+    spread = float(FINE.sigma(1.0)) / weight**0.5
     expected, _ = condition(m, prior.denoise(X, 1.0), spread**2, NOISE)
     torch.testing.assert_close(found.flatten(), expected, atol=1e-6, rtol=0)
 
 
-@pytest.mark.parametrize("trust, zeta", [(1.0, 0.5), (1.0, 1.0), (4.0, 0.5)])
-def test_the_mean_tends_to_the_posteriors_and_the_spread_to_a_known_share_of_it(trust, zeta):
-    mean, covariance = condition(measurement(), denoiser(V).mean, V, NOISE * trust**0.5)
-    samples = sample(DiffPIR(600, 1.0, trust, zeta, NOISE, 6), random_like((4000, *SHAPE), seed=11))
+@pytest.mark.parametrize("weight, zeta", [(1.0, 0.5), (1.0, 1.0), (4.0, 0.5)])
+def test_the_mean_tends_to_the_posteriors_and_the_spread_to_a_known_share_of_it(weight, zeta):
+    mean, covariance = condition(measurement(), denoiser(V).mean, V, NOISE * weight**0.5)
+    samples = sample(DiffPIR(600, 1.0, weight, zeta, NOISE, 6), random_like((4000, *SHAPE), seed=11))
     found, spread = moments(samples)
     torch.testing.assert_close(found, mean, atol=0.012, rtol=0)
     expected = (1 + (1 - zeta) ** 0.5) / 2 * covariance
@@ -75,7 +75,7 @@ def test_the_result_depends_on_the_seed_alone():
 
 
 @pytest.mark.parametrize("settings", [
-    {"iterations": 0}, {"trust": 0.0}, {"spacing": -1.0}, {"zeta": 1.5}, {"noise": 0.0}])
+    {"iterations": 0}, {"prior_weight": 0.0}, {"spacing": -1.0}, {"zeta": 1.5}, {"noise": 0.0}])
 def test_impossible_settings_are_refused(settings):
     with pytest.raises(ValueError, match=str(next(iter(settings.values())))):
         DiffPIR(**settings)

@@ -2,6 +2,7 @@
 
 import json
 import re
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,8 @@ from command_lines import refusal
 
 import phydict
 from phydict.cli.infer import main as infer
-from phydict.methods import reconstructor
+from phydict.inference import ReconstructionTask
+from phydict.methods import METHODS, reconstructor
 from phydict.prior import find_prior
 
 MODULE = (Path(__file__).parents[2] / "data" / "example" / "own_prior" / "my_prior.py").read_text() + '''
@@ -25,6 +27,19 @@ class Shapeless(OwnPrior):
         denoiser = super().bind(report, guidance, precision)
         object.__setattr__(denoiser, "denoise", lambda x, t: x[..., :1])
         return denoiser
+
+
+class Underived:
+    grid, window, state_channels, bind = OwnPrior.grid, HUWindow(), 1, OwnPrior.bind
+
+    def __init__(self, hu: float = -500.0):
+        self.hu = hu
+
+
+class Weighted(Underived, torch.nn.Module):
+    def __init__(self, weight: float = 0.0):
+        torch.nn.Module.__init__(self)
+        self.weight, self.hu = torch.nn.Parameter(torch.full((2,), weight)), -500.0
 
 
 class Unbound:
@@ -72,12 +87,27 @@ def test_on_the_command_line_it_is_a_class_with_its_settings(module, tmp_path):
     assert levels[0] != levels[1]
 
 
-def test_an_ablation_compares_with_it(module, tmp_path):
+@pytest.mark.parametrize("name", ["OwnPrior", "Underived"])
+def test_an_ablation_compares_with_it(name, module, tmp_path):
     (tmp_path / "ablate.yaml").write_text(yaml.safe_dump({
         "out": str(tmp_path / "out"), "phantoms": 1,
-        "axes": {"prior": [f"{module}.OwnPrior"], "method": ["prior_only"], "views": [2], "detector": [32]}}))
+        "axes": {"prior": [f"{module}.{name}"], "method": ["prior_only"], "views": [2], "detector": [32]}}))
     infer(["ablate", "-c", str(tmp_path / "ablate.yaml"), "--device", "cpu"])
-    assert f"{module}.OwnPrior" in (tmp_path / "out" / "results.csv").read_text()
+    assert f"{module}.{name}" in (tmp_path / "out" / "results.csv").read_text()
+
+
+@pytest.mark.filterwarnings("ignore:the prior was trained without text")
+def test_it_need_not_derive_from_the_contract(module, xrays, tmp_path):
+    infer(["predict", "--data.xrays", "data/example/xrays", "--model.method", "prior_only", "--model.out",
+           str(tmp_path), "--model.prior", f"{module}.Underived"])
+    record = json.loads(next(tmp_path.rglob("reconstruction.json")).read_text())
+    assert record["settings"]["prior"] == {"class": f"{module}.Underived", "hu": -500.0}
+    made = vars(import_module(module))
+    tasks = [ReconstructionTask(METHODS["prior_only"], prior=prior, out=str(tmp_path / "python")) for prior in (
+        made["Underived"](), made["Underived"](-300.0), made["Weighted"](), made["Weighted"](1.0))]
+    settings = [task.settings["prior"] for task in tasks]
+    assert settings[0] == record["settings"]["prior"] and settings[1]["hu"] == -300.0
+    assert settings[2] | {"weights_crc32": settings[3]["weights_crc32"]} == settings[3] != settings[2]
 
 
 def test_what_keeps_no_contract_is_refused_in_one_sentence(module, xrays, tmp_path):

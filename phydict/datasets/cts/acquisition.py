@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from phydict.datasets.cts.anatomy import body_mask
-from phydict.datasets.cts.transforms import AIR
 from phydict.grid import Grid
+from phydict.units import AIR
 
 LEAST_BLOOD = 45.0
 """HU of blood without contrast agent, below which none is lowered."""

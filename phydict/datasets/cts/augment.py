@@ -8,14 +8,14 @@ from dataclasses import dataclass, fields, replace
 
 import torch
 
+from phydict.datasets.case import Case, lacking
 from phydict.datasets.cts.acquisition import change_contrast, cut_ends, cut_field, without_table
 from phydict.datasets.cts.anatomy import body_mask
 from phydict.datasets.cts.girth import Girth
-from phydict.datasets.cts.transforms import AIR
 from phydict.datasets.surroundings.surroundings import Surroundings, surround
 from phydict.grid import Grid
 from phydict.runtime.ranges import check_fields
-from phydict.units import HUWindow
+from phydict.units import AIR, HUWindow
 
 NAMES_A_SIDE = re.compile(r"\b(left|right|middle lobe|lingula\w*|[LR](UL|ML|LL)?)\b", re.IGNORECASE)
 """What makes an English report one of a side."""
@@ -123,7 +123,7 @@ class Deformation:
             points = points * torch.tensor([-1.0, 1, 1])
         return self.girth.source(points) if self.girth else points
 
-    def apply(self, case: dict, grid: Grid, window: HUWindow) -> dict:
+    def apply(self, case: Case, grid: Grid, window: HUWindow) -> Case:
         """The deformed Case; volume and masks are sampled at the same points, air and zeros outside."""
         half = torch.tensor([n * s / 2 for n, s in zip(grid.shape, grid.spacing)])
         points = (self.sample_points(grid) / half).flip(-1)[None]  # grid_sample wants z, y, x of the last axis first
@@ -132,12 +132,12 @@ class Deformation:
         state = torch.nn.functional.grid_sample(state[None], points, padding_mode="zeros", align_corners=False)[0]
         hu = window.to_hu(state[:1] + air)
         hu = AIR + self.hu_scale * (hu - AIR) + self.hu_offset * ((hu - AIR) / 200).clamp(0, 1)
-        moved = {key: value for key, value in case.items() if key not in ("affine", "centred_on")}
-        return moved | {"volume": window.to_range(hu), "masks": state[1:].clamp(0, 1)}
+        return lacking(case, "affine", "centred_on") | {
+            "volume": window.to_range(hu), "masks": state[1:].clamp(0, 1)}
 
 
-def augment(case: dict, seed: int | torch.Generator, grid: Grid = Grid.cube(64), window: HUWindow = HUWindow(),
-            strength: Augmentation = Augmentation()) -> dict:
+def augment(case: Case, seed: int | torch.Generator, grid: Grid = Grid.cube(64), window: HUWindow = HUWindow(),
+            strength: Augmentation = Augmentation()) -> Case:
     """A Case deformed by `Deformation.draw(seed, strength)`; the same integer seed gives the same Case.
 
     The place in the source CT ("affine") is dropped. Raises ValueError for a Case on another grid or with X-rays.
@@ -172,7 +172,7 @@ def augment(case: dict, seed: int | torch.Generator, grid: Grid = Grid.cube(64),
     return _rescanned(case, generator, grid, window, strength)
 
 
-def _rescanned(case: dict, generator: torch.Generator, grid: Grid, window: HUWindow, strength: Augmentation) -> dict:
+def _rescanned(case: Case, generator: torch.Generator, grid: Grid, window: HUWindow, strength: Augmentation) -> Case:
     """The Case with another contrast of the blood, in a smaller field of view or in a shorter scan, by chance."""
     chance, amount, diameter, centre, ends = torch.rand(8, generator=generator).split((2, 1, 1, 2, 2))
     hu, masks = window.to_hu(case["volume"]), case["masks"]

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset
 
+from phydict.datasets.case import Case
 from phydict.datasets.cts.cache import read_arrays, write_arrays
 from phydict.datasets.cts.ct_rate_tables import read_calibrations, read_reports
 from phydict.datasets.cts.prepared import VOLUME, is_prepared, read_prepared, read_record
@@ -192,7 +193,7 @@ def split_by_patient(ids: list[str], fraction: float, seed: int = 0) -> tuple[li
     return [id for id in ids if patient_of(id) not in held], [id for id in ids if patient_of(id) in held]
 
 
-def load_case(ct: CTFile, grid: Grid, window: HUWindow) -> dict:
+def load_case(ct: CTFile, grid: Grid, window: HUWindow) -> Case:
     """The Case of a CT, prepared now or read as it was prepared. Raises what `prepare_ct` and `read_prepared` raise."""
     case = read_prepared(ct.path, grid, window) if is_prepared(ct.path) else prepare_ct(
         ct.path, grid, window, id=ct.id, calibration=ct.calibration)
@@ -217,7 +218,7 @@ class CTCases(Dataset):
     def __len__(self) -> int:
         return len(self.cts)
 
-    def __getitem__(self, index: int) -> dict:
+    def __getitem__(self, index: int) -> Case:
         ct = self.cts[index]
         file = self.cache and self.cache / f"{ct.id}-{self.key(ct)}.npz"
         packed = read_arrays(file) if file else None
@@ -235,13 +236,13 @@ class CTCases(Dataset):
         return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]
 
 
-def _pack(case: dict) -> dict[str, np.ndarray]:
+def _pack(case: Case) -> dict[str, np.ndarray]:
     return {"volume": case["volume"].numpy().astype(np.float16),
             "masks": (case["masks"].numpy() * 255).round().astype(np.uint8), "has_masks": case["has_masks"].numpy(),
             "affine": case["affine"].numpy(), "centred_on": np.array(case["centred_on"])}
 
 
-def _unpack(packed: dict[str, np.ndarray]) -> dict:
+def _unpack(packed: dict[str, np.ndarray]) -> Case:
     return {"volume": torch.from_numpy(packed["volume"].astype(np.float32)),
             "masks": torch.from_numpy(packed["masks"].astype(np.float32) / 255),
             "has_masks": torch.from_numpy(packed["has_masks"]), "affine": torch.from_numpy(packed["affine"]),

@@ -18,12 +18,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from phydict.datasets.case import Case
 from phydict.datasets.cts.anatomy import MASKS
-from phydict.datasets.cts.transforms import AIR, centred, load_ct, to_grid
+from phydict.datasets.cts.transforms import centred, load_ct, to_grid
 from phydict.grid import Grid
 from phydict.runtime.reading import read_text, reading
 from phydict.runtime.warning import warn
-from phydict.units import HUWindow
+from phydict.units import AIR, HUWindow
 
 RECORD, VOLUME = "case.json", "ct.nii.gz"
 MEDSYN_AXES = np.array([[0, 0, -1, 0], [0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1.0]])
@@ -91,7 +92,7 @@ def read_record(path: Path) -> dict:
         return record
 
 
-def read_prepared(path: Path, grid: Grid, window: HUWindow) -> dict:
+def read_prepared(path: Path, grid: Grid, window: HUWindow) -> Case:
     """The Case of the prepared volume `path` on `grid`, as `prepare_ct` would give it.
 
     Where the grid's box is the case's own and divides its voxels, nothing is resampled: the voxels are taken as they

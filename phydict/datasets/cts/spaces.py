@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from phydict.datasets.cts.anatomy import lung_box_centre, lung_box_size
-from phydict.datasets.cts.transforms import AIR, centred, load_ct
+from phydict.datasets.cts.transforms import centred, load_ct
 from phydict.grid import Grid
+from phydict.units import AIR
 
 SPACES, SEGMENTERS = ("patient", "medsyn"), ("threshold", "lungmask")
 ATLAS_MM = (316.0, 316.0, 292.0)

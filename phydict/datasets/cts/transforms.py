@@ -13,14 +13,14 @@ import numpy as np
 import scipy
 import torch
 
+from phydict.datasets.case import Case
 from phydict.datasets.cts.anatomy import lung_box_centre, segment
 from phydict.datasets.nifti_file import open_nifti
 from phydict.grid import Grid
 from phydict.runtime.reading import name_of, reading
 from phydict.runtime.warning import warn
-from phydict.units import HUWindow
+from phydict.units import AIR, HUWindow
 
-AIR = -1000.0
 SEGMENTATION_MM = 2.0
 LARGEST_VOXEL, FURTHEST = 100.0, 1e6
 """mm that no voxel's side and no CT's distance from its origin reach."""
@@ -221,7 +221,7 @@ def case_id(path: str | Path) -> str:
 
 def prepare_ct(ct: str | Path | tuple[np.ndarray, np.ndarray], grid: Grid = Grid.cube(64),
                window: HUWindow = HUWindow(), report: str = "", id: str | None = None,
-               calibration: Calibration | None = None) -> dict:
+               calibration: Calibration | None = None) -> Case:
     """A Case from a CT file, or from (hu, affine): the grid's box centred on the lungs, -1000 HU outside the scan.
 
     Returns {"id", "volume" (1,X,Y,Z) in [-1,1], "masks" (3,X,Y,Z) in [0,1] for lung, airway, vessel, "has_masks" (3,),

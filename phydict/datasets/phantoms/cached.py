@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset
 
+from phydict.datasets.case import Case
 from phydict.datasets.cts.cache import read_arrays, write_arrays
 from phydict.datasets.phantoms.phantom import phantom_case
 from phydict.datasets.phantoms.thorax import Thorax, report
@@ -32,7 +33,7 @@ class CachedPhantoms(Dataset):
     def __len__(self) -> int:
         return self.count
 
-    def __getitem__(self, i: int) -> dict:
+    def __getitem__(self, i: int) -> Case:
         seed = self.first_seed + i
         file = self.folder / f"{seed:07d}.npz"
         stored = read_arrays(file)

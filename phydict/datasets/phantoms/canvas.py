@@ -8,8 +8,7 @@ import scipy
 from phydict.datasets.phantoms.thorax import Thorax, ellipsoid
 from phydict.datasets.phantoms.tubes import Tubes
 from phydict.grid import Grid
-
-AIR = -1000.0
+from phydict.units import AIR
 
 
 class Texture:

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from phydict.datasets.phantoms.canvas import AIR, Canvas, Texture
+from phydict.datasets.phantoms.canvas import Canvas, Texture
 from phydict.datasets.phantoms.findings import PLEURAL, Finding
 from phydict.datasets.phantoms.thorax import SIDES, Thorax
 from phydict.datasets.phantoms.tubes import Tubes, tree
+from phydict.units import AIR
 
 
 def lung_tissue(canvas: Canvas, texture: np.ndarray) -> np.ndarray:

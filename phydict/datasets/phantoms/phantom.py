@@ -13,7 +13,8 @@ import numpy as np
 import scipy
 import torch
 
-from phydict.datasets.phantoms.canvas import AIR, Canvas, Texture
+from phydict.datasets.case import Case
+from phydict.datasets.phantoms.canvas import Canvas, Texture
 from phydict.datasets.phantoms.findings import Finding
 from phydict.datasets.phantoms.lungs import airways, focal_findings, lung_tissue, pleural_space, vessels
 from phydict.datasets.phantoms.skeleton import arm_end, bones
@@ -28,7 +29,7 @@ from phydict.datasets.phantoms.thorax import (
     wrong_side,
 )
 from phydict.grid import Grid
-from phydict.units import HUWindow
+from phydict.units import AIR, HUWindow
 
 __all__ = ["Finding", "Thorax", "build", "pathology_region", "phantom_case", "report", "without", "wrong_side"]
 
@@ -249,7 +250,7 @@ def change_by_findings(thorax: Thorax, grid: Grid) -> np.ndarray:
     return build(thorax, grid)[0] - build(without(thorax), grid)[0]
 
 
-def phantom_case(seed: int, grid: Grid | None = None, window: HUWindow = HUWindow()) -> dict:
+def phantom_case(seed: int, grid: Grid | None = None, window: HUWindow = HUWindow()) -> Case:
     """The Case of one seed: id, volume (1, X, Y, Z) in the prior's range, masks (3, X, Y, Z), has_masks (3,), report.
 
     `grid` defaults to 64^3 voxels of 6 mm. The same seed, grid and window give the same bits.

@@ -7,12 +7,12 @@ import scipy
 import torch
 from torch import Tensor
 
+from phydict.datasets.case import Case, lacking
 from phydict.datasets.cts.acquisition import without_table
-from phydict.datasets.cts.transforms import AIR
 from phydict.datasets.population.registration import scanned
 from phydict.datasets.population.velocity import flow, places, resize, sample
 from phydict.grid import Grid
-from phydict.units import HUWindow
+from phydict.units import AIR, HUWindow
 
 BACK_MM = 60.0
 """mm to either side of the middle in which the back's place is measured."""
@@ -34,7 +34,7 @@ def sources(shape: Tensor, patient: Tensor, voxels) -> Tensor:
     return places(voxels) + resize(moved, voxels)
 
 
-def carry(case: dict, points: Tensor, grid: Grid, window: HUWindow, lungs: float = 0.0) -> dict:
+def carry(case: Case, points: Tensor, grid: Grid, window: HUWindow, lungs: float = 0.0) -> Case:
     """The Case whose voxels take volume and masks at `points` (3, X, Y, Z) of this one, air beyond it.
 
     lungs: logarithm of the factor by which they are inflated; their tissue keeps its mass. The table keeps its form and
@@ -51,8 +51,8 @@ def carry(case: dict, points: Tensor, grid: Grid, window: HUWindow, lungs: float
     moved = torch.maximum(moved, _shifted(table, shift, grid))
     seen = _seen(hu, points, grid)
     moved = torch.where(seen, moved, AIR)
-    kept = {key: value for key, value in case.items() if key not in ("affine", "centred_on")}
-    return kept | {"volume": window.to_range(moved), "masks": masks.clamp(0, 1) * seen}
+    return lacking(case, "affine", "centred_on") | {
+        "volume": window.to_range(moved), "masks": masks.clamp(0, 1) * seen}
 
 
 def _cubic(image: np.ndarray, points: Tensor) -> np.ndarray:

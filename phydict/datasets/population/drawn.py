@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset
 
+from phydict.datasets.case import Case
 from phydict.datasets.cts.cache import read_arrays, write_arrays
 from phydict.datasets.cts.ct_rate import CTCases, patient_of
 from phydict.datasets.phantoms.findings import write_report
@@ -71,7 +72,7 @@ class DrawnPatients(Dataset):
     def __len__(self) -> int:
         return self.count
 
-    def __getitem__(self, seed: int) -> dict:
+    def __getitem__(self, seed: int) -> Case:
         population = self.prepare()
         file = self.drawn and self.drawn / f"{seed:07d}.npz"
         packed = read_arrays(file) if file else None

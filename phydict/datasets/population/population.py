@@ -14,6 +14,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from phydict.datasets.case import Case
 from phydict.datasets.phantoms.findings import write_report
 from phydict.datasets.population.anatomy import Anatomy, Variation, principal_modes
 from phydict.datasets.population.carry import carry, sources
@@ -37,7 +38,7 @@ class Population:
     template: the index of the one whose velocity is 0.
     """
 
-    def __init__(self, cases: Sequence[dict], velocities: Tensor, template: int, grid: Grid, window: HUWindow):
+    def __init__(self, cases: Sequence[Case], velocities: Tensor, template: int, grid: Grid, window: HUWindow):
         self.cases, self.velocities, self.template = cases, velocities, template
         self.grid, self.window = grid, window
 
@@ -75,7 +76,7 @@ class Population:
         """Where an anatomy's voxels take their values in its patient's CT, (3, X, Y, Z) in half-widths of the box."""
         return sources(self.velocity(anatomy), self.velocities[anatomy.patient], self.grid.shape)
 
-    def case(self, anatomy: Anatomy, seed: int = 0) -> dict:
+    def case(self, anatomy: Anatomy, seed: int = 0) -> Case:
         """The Case of an anatomy. seed: of its findings' looks and of its report's words.
 
         A patient's own report is kept. A report is written where findings were put in; else it is empty.
@@ -88,8 +89,8 @@ class Population:
         hu, masks = self.window.to_hu(case["volume"]), case["masks"]
         blood = hu[0][organs(hu[0], masks, self.grid)["heart"] > 0]
         contrast = bool(len(blood)) and float(blood.median()) > CONTRAST_HU
-        changed, masks, findings = put_findings(hu[0].numpy(), masks.numpy(), self.grid, anatomy.findings, contrast,
-                                                seed)
+        changed, shares, findings = put_findings(hu[0].numpy(), masks.numpy(), self.grid, anatomy.findings, contrast,
+                                                 seed)
         volume = self.window.to_range(torch.from_numpy(changed).float())[None]
-        return case | {"volume": volume, "masks": torch.from_numpy(masks).float(),
+        return case | {"volume": volume, "masks": torch.from_numpy(shares).float(),
                        "report": write_report(findings, contrast, seed) if findings else case["report"]}

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from phydict.datasets.case import Case
 from phydict.datasets.cts.acquisition import without_table
-from phydict.datasets.cts.transforms import AIR
 from phydict.datasets.population.velocity import flow, jacobian, places, resize, sample, smooth
 from phydict.grid import Grid
-from phydict.units import HUWindow
+from phydict.units import AIR, HUWindow
 
 MOST_VOXELS = 64
 """Voxels along each side on which CTs are registered; finer ones are averaged."""
@@ -54,7 +54,7 @@ class Registered:
         return "" if self.least > 0 else "its deformation tears"
 
 
-def features(case: dict, grid: Grid, window: HUWindow) -> Tensor:
+def features(case: Case, grid: Grid, window: HUWindow) -> Tensor:
     """What is registered of a Case: HU of tissue, lungs, bone and what was scanned, (4, X, Y, Z) in [0, 1]."""
     hu = window.to_hu(case["volume"])
     body = without_table(hu, grid)

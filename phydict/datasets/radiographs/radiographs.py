@@ -16,6 +16,7 @@ import torch
 import yaml
 from PIL import Image
 
+from phydict.datasets.case import Case
 from phydict.datasets.dicom import DicomTags, read_dicom, shown, tags_intensity
 from phydict.datasets.intensity import KINDS, Intensity
 from phydict.datasets.natural_order import natural_order
@@ -50,7 +51,7 @@ def find_xrays(path: str | Path) -> list[Path]:
     return cases
 
 
-def load_xrays(folder: str | Path, geometry: str | Path | None = None, intensity: Intensity | None = None) -> dict:
+def load_xrays(folder: str | Path, geometry: str | Path | None = None, intensity: Intensity | None = None) -> Case:
     """The Case of one folder of X-rays.
 
     geometry: a geometry file used instead of the folder's geometry.yaml: such a YAML, or any that

@@ -1,10 +1,10 @@
 """DiffPIR: a proximal step onto the X-rays per noise level, then diffusion with partly zeta noise.
 
-| here                          | publication                                            |
-|-------------------------------|--------------------------------------------------------|
-| denoise(x, t)                 | Algorithm 1, line 3                                    |
-| nearest_fit(m, x0, rho_t)     | line 4, rho_t = trust sigma_y^2 / sigma_t^2            |
-| noise_in, stochastic_ddim_step      | lines 5 and 6, zeta = zeta                          |
+| here                           | publication                                        |
+|--------------------------------|----------------------------------------------------|
+| denoise(x, t)                  | Algorithm 1, line 3                                |
+| nearest_fit(m, x0, rho_t)      | line 4, rho_t = prior_weight sigma_y^2 / sigma_t^2 |
+| noise_in, stochastic_ddim_step | lines 5 and 6, zeta = zeta                         |
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from phydict.posterior.samplers.sampler import Sampler
 @dataclass(frozen=True)
 class DiffPIR(Sampler):
     """Zhu et al. 2023. For many steps on a Gaussian prior its mean is the posterior's, under data of variance
-    trust noise^2; its covariance is (1 + sqrt(1 - zeta)) / 2 times the posterior's.
+    prior_weight noise^2; its covariance is (1 + sqrt(1 - zeta)) / 2 times the posterior's.
 
     Args:
         iterations: noise levels
         spacing: their times are (1 - i / iterations)^spacing, dense near pure noise as published (there called
             quadratic), even at 1
-        trust: the published lambda, weight of the prior's estimate
+        prior_weight: the published lambda, weight of the prior's estimate
         zeta: the published zeta, share of the noise's variance that is new at each level
         noise: standard deviation of the line integrals' error
         cg_iterations: of conjugate gradients at each level, in place of the published closed forms
@@ -43,16 +43,16 @@ class DiffPIR(Sampler):
 
     iterations: int = 100
     spacing: float = 0.5
-    trust: float = 1.0
+    prior_weight: float = 1.0
     zeta: float = 0.1
     noise: float = 0.02
     cg_iterations: int = 5
 
     def __post_init__(self):
         check_noise(self.noise)
-        if self.iterations < 1 or not self.spacing > 0 or not self.trust > 0 or not 0 <= self.zeta <= 1:
-            raise ValueError("DiffPIR needs at least 1 iteration, spacing and trust above 0 and a zeta share in "
-                             f"[0, 1], but {self.iterations}, {self.spacing}, {self.trust} and {self.zeta} were "
+        if self.iterations < 1 or not self.spacing > 0 or not self.prior_weight > 0 or not 0 <= self.zeta <= 1:
+            raise ValueError("DiffPIR needs at least 1 iteration, spacing and prior_weight above 0 and a zeta share in "
+                             f"[0, 1], but {self.iterations}, {self.spacing}, {self.prior_weight} and {self.zeta} were "
                              "given")
 
     def steps(self) -> int:
@@ -65,7 +65,7 @@ class DiffPIR(Sampler):
         for t, s in zip(times, [*times[1:], 0.0]):
             x0 = denoiser.denoise(x, t).clamp(-1, 1)
             measurement.match_gain_offset(x0[:, :1])
-            weight = self.trust * (m.noise / float(schedule.sigma(t))) ** 2
+            weight = self.prior_weight * (m.noise / float(schedule.sigma(t))) ** 2
             ct = nearest_fit(m, x0[:, :1], weight, self.cg_iterations).clamp(-1, 1)
             z = torch.cat([ct, x0[:, 1:]], 1)
             x = stochastic_ddim_step(schedule, z, noise_in(schedule, z, x, t), s, (1 - self.zeta) ** 0.5, generator)

@@ -11,9 +11,9 @@ import numpy as np
 from phydict.xray.geometry import ConeBeam
 from phydict.xray.poses.unknowns import POSE
 
-MOST = {"rotation_degrees": 20.0, "gain": 1.0, "offset": 10.0}
-"""Standard deviations that are no longer small; MOST_MM for those in mm."""
-MOST_MM = 200.0
+MOST_DEVIATION = {"rotation_degrees": 20.0, "gain": 1.0, "offset": 10.0}
+"""Standard deviations that are no longer small; MOST_DEVIATION_MM for those in mm."""
+MOST_DEVIATION_MM = 200.0
 MOST_STRETCH = 0.2
 """Share of the source-detector distance by which it may be uncertain where a volume's density has no scale either."""
 
@@ -39,7 +39,7 @@ class Uncertain:
 
     def __post_init__(self):
         for name, value in vars(self).items():
-            most = MOST.get(name, MOST_MM)
+            most = MOST_DEVIATION.get(name, MOST_DEVIATION_MM)
             if isinstance(value, bool) or not isinstance(value, Real) or not 0 <= float(value) <= most:
                 raise ValueError(f"uncertain {name} is a standard deviation from 0, exactly known, to {most:g}, but "
                                  f"{reprlib.repr(value)} was given")
@@ -98,5 +98,5 @@ USUAL = Uncertain(detector_shift_mm=5.0, source_shift_mm=5.0, source_to_detector
 def by_hand(beam: ConeBeam) -> Uncertain:
     """What is usual of radiographs for which a patient stands and turns between exposures: a magnification within 10 %
     of what was noted among it."""
-    return Uncertain(detector_shift_mm=10.0, source_to_detector_mm=min(0.06 * float(beam.distances.min()), MOST_MM),
-                     rotation_degrees=4.0)
+    return Uncertain(detector_shift_mm=10.0, rotation_degrees=4.0,
+                     source_to_detector_mm=min(0.06 * float(beam.distances.min()), MOST_DEVIATION_MM))

@@ -20,7 +20,7 @@ from torch.nn.functional import interpolate
 
 from phydict.datasets import find_cts, prepare_ct
 from phydict.evaluation import mean_table, read_csv, write_csv
-from phydict.inference.data import case_scores
+from phydict.inference.scoring import case_scores
 from phydict.prior import load_super_resolution
 
 FILE = Path(__file__).with_suffix(".csv")

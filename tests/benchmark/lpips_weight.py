@@ -19,7 +19,7 @@ from torch import Tensor
 
 from phydict.datasets import CTFile, load_case
 from phydict.evaluation import write_csv
-from phydict.inference.data import case_scores
+from phydict.inference.scoring import case_scores
 from phydict.methods import METHODS, fit_to_grid, reconstructor
 from phydict.posterior import GradientSteps, Reward, Sampler
 from phydict.posterior.measurement import Measurement

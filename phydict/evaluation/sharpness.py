@@ -65,8 +65,8 @@ def edge_spread(volume: Tensor, lung: Tensor, grid: Grid, edge: str, reach_mm: f
     return edge_width(edge_profile(volume, lung, edge, max(2, round(reach_mm / spacing))), spacing)
 
 
-def rib_profile(volume: Tensor, truth: Tensor, lung: Tensor, grid: Grid) -> Tensor:
-    """Mean profile of a volume (X, Y, Z) from the middle of the truth's ribs to RIB_MM above and below.
+def rib_profile(volumes: Tensor, truth: Tensor, lung: Tensor, grid: Grid) -> Tensor:
+    """Mean profiles of volumes (..., X, Y, Z) from the middle of the truth's ribs to RIB_MM above and below.
 
     A middle is a voxel of BONE or more that is the highest of its column within RIB_MM and lies at most WALL_MM outside
     of a lung (mask (X, Y, Z)). Raises ValueError where there is none.
@@ -83,7 +83,8 @@ def rib_profile(volume: Tensor, truth: Tensor, lung: Tensor, grid: Grid) -> Tens
     if not middle.any():
         raise ValueError(f"no rib of {BONE:g} HU or more lies beside the lungs' mask: give the lungs of this volume")
     x, y, z = middle.nonzero(as_tuple=True)
-    return torch.stack([(volume[x, y, z + step] + volume[x, y, z - step]).mean() / 2 for step in range(reach + 1)])
+    return torch.stack([(volumes[..., x, y, z + step] + volumes[..., x, y, z - step]).mean(-1) / 2
+                        for step in range(reach + 1)], -1)
 
 
 def vessel_visibility(volume: Tensor, truth: Tensor, lung: Tensor, count: int = VESSELS) -> float:
@@ -109,7 +110,7 @@ def sharpness_scores(volume: Tensor, truth: Tensor, lung: Tensor, grid: Grid) ->
             found, true = (edge_spread(x, lung, grid, edge) for x in (volume, truth))
             scores[f"edge_{edge}"] = found / true
     with suppress(ValueError):
-        ribs, true_ribs = (rib_profile(x, truth, lung, grid) for x in (volume, truth))
+        ribs, true_ribs = rib_profile(torch.stack([volume, truth]), truth, lung, grid)
         scores["edge_ribs"] = edge_width(ribs, 1.0) / edge_width(true_ribs, 1.0)
         scores["ribs"] = float((ribs[0] - ribs[-1]) / (true_ribs[0] - true_ribs[-1]))
     if (lung > 0.5).any():

@@ -15,6 +15,8 @@ from torch.utils.data import default_collate
 from phydict.cli.train import main
 from phydict.grid import Cube
 from phydict.prior import VolumeUNet, load_prior
+from phydict.runtime.precision import computes_bfloat16
+from phydict.runtime.profiling import CPU
 from phydict.training import PriorTraining
 from phydict.training.data import PriorData
 from phydict.training.settings import TextSettings
@@ -46,6 +48,7 @@ def test_two_processes_train_the_prior_that_one_would(tmp_path, cache, trained):
     assert list(tmp_path.glob("logs/**/samples/*.png"))
 
 
+@pytest.mark.slow
 def test_every_process_stops_where_one_of_them_has_a_loss_that_is_not_finite(tmp_path, cache):
     (tmp_path / "train.py").write_text("""if True:
         from phydict.training import PriorTraining
@@ -88,7 +91,9 @@ def test_sharded_weights_are_not_averaged(tmp_path, cache):
 
 @pytest.mark.parametrize("flags, tolerance", [
     (["--model.execution.gradient_checkpointing=true"], 1e-6), (["--model.execution.channels_last=false"], 1e-4),
-    (["--precision=bfloat16"], 0.03)], ids=["checkpointing", "layout", "bf16"])
+    pytest.param(["--precision=bfloat16"], 0.03, marks=pytest.mark.skipif(
+        not computes_bfloat16(CPU), reason="this processor does not compute bfloat16"))],
+    ids=["checkpointing", "layout", "bf16"])
 def test_flags_leave_the_loss_and_their_checkpoint_goes_on_without_them(flags, tolerance, trained, cache, tmp_path):
     main(arguments(tmp_path, cache, "--trainer.max_epochs=1", "--trainer.limit_val_batches=0", *flags))
     loss, expected = losses(tmp_path), losses(trained)

@@ -227,6 +227,7 @@ def test_a_cached_draw_is_the_draw_and_other_variations_are_other_files(drawn, m
     assert other[1]["volume"].sub(patient["volume"]).abs().max() < 1e-3
 
 
+@pytest.mark.slow
 def test_two_processes_share_a_cache(folder, tmp_path):
     code = """if True:
         import sys

@@ -155,6 +155,7 @@ def test_realistic_xrays_are_made_and_come_out_in_hu(scored, tmp_path):
     assert density.mean() == pytest.approx(ideal.mean(), rel=0.05) and not np.allclose(density, ideal, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_two_processes_split_the_cases_and_agree_with_one(scored, tmp_path):
     run = subprocess.run([sys.executable, str(ROOT / "infer.py"), *phantoms(tmp_path, 3, "--trainer.devices=2")],
                          capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"}, timeout=150)

@@ -31,9 +31,9 @@ class Metal:
 
     x is the result with soft tissue in the place of those voxels. Total variation counts z alone, so that what is
     dense and sharp comes to lie in e. After FREE restarts of conjugate gradients e is left where it reaches SHARE of
-    its largest value, for metal is compact and dense. The method then runs again with e counted as known, and all that
-    `rounds` times. e is believed where it is denser by `least` than soft tissue, as no bone is, and the X-rays are
-    missed by no more than WORSE times as much as without it.
+    its largest value, for metal is compact and dense. The method then runs again with e counted as known, unless e
+    falls short of PROMISING times `least`, and all that `rounds` times. e is believed where it is denser by `least` than
+    soft tissue, as no bone is, and the X-rays are missed by no more than WORSE times as much as without it.
 
     Args:
         least_ml: where less lies at the window's upper end, nothing is sought
@@ -67,6 +67,10 @@ SOFT = 40.0
 """HU."""
 
 FREE, SHARE, WORSE = 2, 0.25, 1.2
+PROMISING = 0.75
+"""The share of the density to be reached at which the method runs again: of rods put into training CTs, of 3000 HU and
+more, 2200 HU and more were found at first, of shoulders without metal 1300 at most; the second round adds a tenth."""
+
 BOLDNESS = 10.0
 """How many times further than its own column of B allows each voxel of e is moved at first: z, which total variation
 holds back, would else take what is sharp along the rays before e does."""
@@ -84,17 +88,23 @@ def with_metal(measurement: Measurement, metal: Metal | None, first: Callable[[]
         return z
     plain, missed, where = measurement.fitted, measurement.normalised_residual(z[:, :1]).max(), grown(dense)
     found = z
+
+    def given_up() -> Tensor:
+        measurement.carry(None)
+        measurement.fitted = plain
+        return z
+
     for _ in range(metal.rounds):
         carried = beside(measurement, found[:1, :1], where, metal)
+        if carried.density < PROMISING * metal.least:
+            return given_up()
         measurement.carry(carried)
         found = again()
         where = where | grown(found[:1, :1] >= CEILING)
     as_well = measurement.normalised_residual(found[:, :1]).max() <= WORSE * missed
     if carried.density >= metal.least and as_well:
         return found
-    measurement.carry(None)
-    measurement.fitted = plain
-    return z
+    return given_up()
 
 
 def beside(measurement: Measurement, x: Tensor, where: Tensor, metal: Metal) -> Carried:

@@ -100,6 +100,14 @@ def test_metal_that_does_not_help_is_given_up_and_nothing_is_left_of_it():
     assert torch.equal(m.project(plain), measured().project(plain))
 
 
+def test_what_falls_far_short_of_the_density_is_given_up_before_the_method_runs_again():
+    m = measured()
+    plain = Method(m)()
+    z = with_metal(m, Metal(least=2 * DENSITY), Method(m), lambda: pytest.fail("it ran again"))
+    assert torch.equal(z, plain) and m.carried is None
+    assert torch.equal(m.project(plain), measured().project(plain))
+
+
 def test_metal_is_believed_from_the_density_on_that_is_said_of_it():
     found = []
     for share in (0.0, 0.99, 1.01):

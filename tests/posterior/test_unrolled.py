@@ -147,18 +147,19 @@ class Knowing:
 @torch.no_grad()
 def test_a_view_that_contradicts_the_others_counts_less_and_x_rays_that_agree_count_as_ever():
     error = {}
-    for amount in (0.0, 2.0):
+    for amount in (0.0, 0.5, 2.0):
         for method in (Unrolled(), Unrolled(contradiction=None)):
             m = contradicted(amount)
             *_, z = method.estimates(Knowing(), m)
             error[amount, method.contradiction] = float((z - block()).norm())
             if amount and method.contradiction:
                 variance = m.model_variance.flatten()
-                assert variance.argmax() == 3 and variance[3] > 10 * variance.median()
+                assert variance.argmax() == 3 and variance[3] > 10 * variance.sort().values[-2]
             else:
                 assert m.model_variance == 0.0
     assert error[0.0, Unrolled.contradiction] == error[0.0, None]
-    assert error[2.0, Unrolled.contradiction] < 0.5 * error[2.0, None]
+    for amount in (0.5, 2.0):
+        assert error[amount, Unrolled.contradiction] < 0.5 * error[amount, None]
 
 
 def test_scatter_that_the_first_step_knows_little_of_contradicts_nothing():

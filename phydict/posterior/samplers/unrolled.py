@@ -25,9 +25,14 @@ MOST_SMOOTHING = 10.0
 CAUTION = 3.0
 """Standard deviation that a view's contradiction counts as, over its root mean square: neighbouring pixels share it."""
 
+OUTLIER, SHARED = 2.2, 0.45
+"""A view whose error is OUTLIER times the median's is doubted from half of the usual limit on: of one that was shifted it
+is 2.8 to 3.2 times, of right ones 2.05 at most. Of the worst view's error, SHARED may be seen in others because of it,
+and does not count against them: with one view flipped 0.25 to 0.5. Both of CTs that evaluate nothing."""
+
 FEW_VIEWS = 8
-"""Views beyond which the first step, of bounded length, leaves more of each, as the root of their number: on two CTs
-kept from training 0.3 voxels of 8 polychromatic views at most and 0.6 of 32, but 1.2 of 8 in wrong poses."""
+"""Views beyond which the first step, of bounded length, leaves more of each, as the root of their number: on five
+CTs 0.26 to 0.36 voxels of 8 polychromatic views at most and 0.3 to 0.42 of 16, but 1.3 to 1.5 of 8 in wrong poses."""
 
 
 @dataclass(frozen=True)
@@ -42,10 +47,12 @@ class Unrolled(Sampler):
     them is sought on finer voxels (`subgrid_projection`) and from then on counted as known: real X-rays are never made
     on a grid. Not where detectors are tilted, for which finer voxels cost too much.
 
-    Where the first step misses a view, beyond its noise, by more than `contradiction`, as with wrong poses,
-    a flipped view, a gain that drifts or a patient who moves, no volume explains it: the excess counts from then on as
+    Where the first step misses a view, beyond its noise, by more than `contradiction`, or by more than half of it and
+    OUTLIER times as much as the median view, and by more than SHARED of the worst view's error, as with wrong poses, a
+    flipped view, a gain that drifts or a patient who moves, no volume explains it: the excess counts from then on as
     noise of that view (`Measurement.model_variance`), so that volumes follow it less and the prior and the other views
-    more. Where scatter is sought, of which the first step knows little, the second tells that.
+    more. Where scatter is sought, of which the first step knows little, the second
+    tells that.
 
     Where a ProximalCG at the end misses the X-rays by more than their noise, as it does a tube's spectrum, the excess
     is model error, which counts as noise (Morozov 1966): the step is repeated with its total variation weighted by the
@@ -77,7 +84,7 @@ class Unrolled(Sampler):
     final_likelihood: LikelihoodStep = ProximalCG(10, 4, refit_scatter=True, weighted_least_squares=True,
                                                   tv_weight=2.0, tv_eps=0.003)
     subgrid: LikelihoodStep | None = ProximalCG(5, 1, tv_weight=10.0, tv_eps=0.003)
-    contradiction: float | None = 0.5
+    contradiction: float | None = 0.4
     chests_only: bool = False
     metal: Metal | None = Metal()
     first: SplitGibbs | None = SplitGibbs(
@@ -116,11 +123,7 @@ class Unrolled(Sampler):
             channels = evidence(z[:, :1], before[:, :1], start[:, :1])
             seen = measurement.last_projection
             if n == int(measurement.scatter_enabled) and self.contradiction is not None and seen is not None:
-                voxel = measurement.mu_water * max(measurement.projector.grid.spacing)
-                usual = self.contradiction * voxel * max(1.0, measurement.projector.beam.views / FEW_VIEWS) ** 0.5
-                excess = measurement.view_errors(seen).square() - usual**2
-                if (excess > 0).any():
-                    measurement.model_variance = CAUTION**2 * excess.clamp(min=0)[:, None, None]
+                self._doubt_views(measurement, seen, self.contradiction)
             signal = float(refiner.schedule.scales(t)[0])
             x0 = refiner.refine(signal * z, t, channels)
             yield x0
@@ -139,6 +142,17 @@ class Unrolled(Sampler):
             on_step()
         on_result(z, lambda: evidence(z[:, :1], before[:, :1], start[:, :1]))
         yield z
+
+    @staticmethod
+    def _doubt_views(measurement: Measurement, seen: Tensor, contradiction: float) -> None:
+        """Counts as noise of each view what projections `seen` (1, K, V, U) miss of it too much to be explained."""
+        voxel = measurement.mu_water * max(measurement.projector.grid.spacing)
+        usual = contradiction * voxel * max(1.0, measurement.projector.beam.views / FEW_VIEWS) ** 0.5
+        errors = measurement.view_errors(seen)
+        like_others = (OUTLIER * errors.median()).clamp(usual / 2, usual)
+        excess = errors.square() - torch.maximum(like_others, SHARED * errors.max()).square()
+        if (excess > 0).any():
+            measurement.model_variance = CAUTION**2 * excess.clamp(min=0)[:, None, None]
 
     def start_state(self, refiner: BoundRefiner, measurement: Measurement) -> Tensor:
         """The state (1, C, X, Y, Z) before the first step: of few views with a report what the refiner's prior to begin

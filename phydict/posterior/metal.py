@@ -32,8 +32,8 @@ class Metal:
     x is the result with soft tissue in the place of those voxels. Total variation counts z alone, so that what is
     dense and sharp comes to lie in e. After FREE restarts of conjugate gradients e is left where it reaches SHARE of
     its largest value, for metal is compact and dense. The method then runs again with e counted as known, unless e
-    falls short of PROMISING times `least`, and all that `rounds` times. e is believed where it is denser by `least` than
-    soft tissue, as no bone is, and the X-rays are missed by no more than WORSE times as much as without it.
+    falls short of PROMISING times `least`, and all that `rounds` times. e is believed where it is denser by `least`
+    than soft tissue, as no bone is, and the X-rays are missed by no more than WORSE times as much as without it.
 
     Args:
         least_ml: where less lies at the window's upper end, nothing is sought

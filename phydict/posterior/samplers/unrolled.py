@@ -26,9 +26,9 @@ CAUTION = 3.0
 """Standard deviation that a view's contradiction counts as, over its root mean square: neighbouring pixels share it."""
 
 OUTLIER, SHARED = 2.2, 0.45
-"""A view whose error is OUTLIER times the median's is doubted from half of the usual limit on: of one that was shifted it
-is 2.8 to 3.2 times, of right ones 2.05 at most. Of the worst view's error, SHARED may be seen in others because of it,
-and does not count against them: with one view flipped 0.25 to 0.5. Both of CTs that evaluate nothing."""
+"""A view whose error is OUTLIER times the median's is doubted from half of the usual limit on: of one that was shifted
+it is 2.8 to 3.2 times, of right ones 2.05 at most. Of the worst view's error, SHARED may be seen in others because of
+it, and does not count against them: with one view flipped 0.25 to 0.5. Both of CTs that evaluate nothing."""
 
 FEW_VIEWS = 8
 """Views beyond which the first step, of bounded length, leaves more of each, as the root of their number: on five

@@ -47,8 +47,8 @@ WIDEST = 2.0
 
 WORST_VIEW = 16.0
 """The ratio, of the noise of a view with what contradicts the rest counted as such to its own, from which on intervals
-widen by its root, whatever the other views say: with one of eight views flipped, negated or another's, of a held-out CT,
-58 to 87 % of the body is otherwise in the 90 % interval."""
+widen by its root, whatever the other views say: with one of eight views flipped, negated or another's, of a held-out
+CT, 58 to 87 % of the body is otherwise in the 90 % interval."""
 
 CONTRADICTION_WIDENING = 0.4
 """Power of these ratios by the geometric mean of which over the views intervals widen: in eight scenes of two held-out

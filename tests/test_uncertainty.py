@@ -1,6 +1,7 @@
 """How far a refiner's reconstruction may be off: intervals that hold their share, their training and their files."""
 
 import json
+from itertools import pairwise
 from pathlib import Path
 
 import nibabel
@@ -15,6 +16,7 @@ from phydict.grid import Cube, Grid
 from phydict.methods import reconstruct
 from phydict.posterior import Measurement, Unrolled
 from phydict.posterior.posterior import contradiction_widening
+from phydict.posterior.refined import ON_FINER
 from phydict.prior import load_prior, save_prior, save_refiner
 from phydict.prior.uncertainty import COVERAGES, LEVELS, TISSUES, Uncertainty, coverage_of, tissue_of
 from phydict.training.refiner import RefinerTraining
@@ -111,14 +113,16 @@ def test_a_reconstruction_has_nested_intervals_where_its_refiner_knows_them(tmp_
     assert found.projector_calls - plain.projector_calls == 2  # the evidence at the result
 
 
-def test_on_finer_voxels_intervals_widen_by_a_share_of_what_the_refinement_changed():
+def test_on_finer_voxels_intervals_are_a_share_of_the_coarse_ones_and_of_what_the_refinement_changed():
     fine = Grid.cube(32)
     found = reconstruct(views(), BEAM, tiny_refiner(uncertain=True), display=True, grid=fine)
     change = (found.volume - interpolated(found.coarse.volume, GRID, fine, -1000.0)).abs()
     assert list(found.intervals) == list(LEVELS) and change.max() > 1
     for level, half_width in found.intervals.items():
-        own = interpolated(found.coarse.intervals[level], GRID, fine, 0.0)
-        torch.testing.assert_close(half_width - own, 0.3 * change, atol=1e-3, rtol=1e-3)
+        own, changed = ON_FINER[level]
+        expected = own * interpolated(found.coarse.intervals[level], GRID, fine, 0.0) + changed * change
+        torch.testing.assert_close(half_width, expected, atol=1e-3, rtol=1e-3)
+    assert all((wide >= narrow).all() for narrow, wide in pairwise(found.intervals.values()))
 
 
 def test_x_rays_missed_by_more_than_in_calibration_widen_the_intervals_and_far_more_warn():

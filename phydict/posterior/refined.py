@@ -21,8 +21,9 @@ from phydict.units import AIR, HUWindow, hu_to_mu
 from phydict.xray import Projector
 from phydict.xray.boxes import covers, interpolated, outside_projection, refinements, seen_by
 
-CHANGE_SHARE = 0.3
-"""Share of the refinement's change by which intervals widen on finer voxels."""
+ON_FINER = {0.5: (0.8, 0.0), 0.8: (1.0, 0.0), 0.9: (1.0, 0.1), 0.95: (1.0, 0.2)}
+"""Level -> the shares of a coarse interval and of the refinement's change of which one on finer voxels is the sum: of
+two CTs kept from training these hold 39 to 53, 75 to 89, 85 to 96 and 91 to 98 % of the body from 1 to 16 views."""
 
 
 class Bound(Protocol):
@@ -137,8 +138,8 @@ class Refined(Delegating):
     the base found is subtracted, and what it counted as noise of a view counts so; display values are matched to the
     estimate anew. What a base without masks reconstructed, such as water, no network corrects.
 
-    Masks and deviations of the result are the base's, interpolated. Its intervals are the base's as well, and to both
-    sides wider by CHANGE_SHARE of what the refinement changed of the interpolated volume.
+    Masks and deviations of the result are the base's, interpolated. Its intervals are made of the base's and of what
+    the refinement changed of the interpolated volume, as ON_FINER says.
 
     Args:
         base: the method, bound to voxels of its own
@@ -219,8 +220,8 @@ class Refined(Delegating):
         return replace(
             coarse, **found | {"diverged_at": coarse.diverged_at}, volume=volume, grid=self.target,
             coarse=coarse, projector_calls=calls, network_calls=network_calls, seconds=watch.seconds,
-            intervals={level: interpolated(half_width, base.grid, self.target, 0.0) + CHANGE_SHARE * change
-                       for level, half_width in coarse.intervals.items()},
+            intervals={level: ON_FINER[level][0] * interpolated(half_width, base.grid, self.target, 0.0)
+                       + ON_FINER[level][1] * change for level, half_width in coarse.intervals.items()},
             masks=None if coarse.masks is None else torch.cat([
                 coarse.masks.new_zeros(0, *self.target.shape),
                 *(interpolated(mask, base.grid, self.target, 0.0)[None] for mask in coarse.masks)]),

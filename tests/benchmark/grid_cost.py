@@ -4,7 +4,7 @@
 
 X-rays of the standard thorax, on the paper's orbit, each size once after a small one that loads and compiles. Without
 arguments the sizes of DEFAULT. own_mib is the peak of the process less what it held before. Writes grid_cost.csv beside
-this file and leaves the rows of other methods.
+this file and leaves the rows of other methods and of machines with other instructions.
 """
 
 import sys
@@ -18,6 +18,7 @@ from phydict.evaluation import read_csv, write_csv
 from phydict.grid import Grid
 from phydict.methods import METHODS, reconstruct
 from phydict.posterior import Sampler
+from phydict.runtime.precision import instruction_set
 from phydict.runtime.profiling import CPU, peak_memory, reset_peak_memory
 from phydict.units import hu_to_mu
 from phydict.xray import ConeBeam, Projector
@@ -25,6 +26,8 @@ from phydict.xray import ConeBeam, Projector
 FILE = Path(__file__).with_suffix(".csv")
 DEFAULT = "phydict_learned=64x2,64x8,64x16,64x32,128x2,128x8,128x16,128x32,256x8"
 SCENE = Grid.cube(96)
+SAME = ("method", "voxels", "views", "instruction_set")
+"""What a row is made anew of."""
 
 
 def measured(method: str, voxels: int, views: int) -> dict:
@@ -37,7 +40,8 @@ def measured(method: str, voxels: int, views: int) -> dict:
     peak = peak_memory(CPU)
     return {"method": method, "voxels": voxels, "views": views, "seconds": round(sum(found.seconds.values()), 2),
             "seconds_refine": round(found.seconds.get("refine", 0.0), 2), "peak_mib": round(peak),
-            "own_mib": round(peak - before), "threads": torch.get_num_threads()}
+            "own_mib": round(peak - before), "threads": torch.get_num_threads(),
+            "instruction_set": instruction_set(CPU)}
 
 
 def exponents(rows: list[dict], name: str) -> list[float]:
@@ -57,10 +61,10 @@ if __name__ == "__main__":
         reconstruct(torch.rand(2, 448, 448) + 1, beam, method=method, grid=small)
         for voxels, views in (map(int, size.split("x")) for size in sizes.split(",")):
             row = measured(method, voxels, views)
-            rows = [old for old in rows if [old[k] for k in ("method", "voxels", "views")] != [method, voxels, views]]
+            rows = [old for old in rows if any(old[k] != row[k] for k in SAME)]
             write_csv(FILE, rows := [*rows, row])
             print(row, flush=True)
-    for method in dict.fromkeys(row["method"] for row in rows):
-        own = [row for row in rows if row["method"] == method]
-        print(method, {name: exponents(own, name) for name in ("seconds", "seconds_refine", "own_mib")
+    for method, instructions in dict.fromkeys((row["method"], row["instruction_set"]) for row in rows):
+        own = [row for row in rows if (row["method"], row["instruction_set"]) == (method, instructions)]
+        print(method, instructions, {name: exponents(own, name) for name in ("seconds", "seconds_refine", "own_mib")
                        if sum(bool(row[name]) for row in own) > 2})

@@ -51,8 +51,7 @@ class Unrolled(Sampler):
     OUTLIER times as much as the median view, and by more than SHARED of the worst view's error, as with wrong poses, a
     flipped view, a gain that drifts or a patient who moves, no volume explains it: the excess counts from then on as
     noise of that view (`Measurement.model_variance`), so that volumes follow it less and the prior and the other views
-    more. Where scatter is sought, of which the first step knows little, the second
-    tells that.
+    more. Where scatter is sought, of which the first step knows little, the second tells that.
 
     Where a ProximalCG at the end misses the X-rays by more than their noise, as it does a tube's spectrum, the excess
     is model error, which counts as noise (Morozov 1966): the step is repeated with its total variation weighted by the

@@ -30,6 +30,7 @@ from phydict.posterior import (
     SplitGibbs,
 )
 from phydict.xray import Ideal
+from phydict.xray.checks import with_air_at_zero
 from phydict.xray.residuals import misfits
 
 pytestmark = [pytest.mark.filterwarnings(f"ignore:{said}") for said in
@@ -206,15 +207,29 @@ def test_line_integrals_of_no_chest_are_warned_of_and_display_values_of_any_size
         reconstruct(scale * CLEAN, BEAM, prior, FAST, display=True)
 
 
-def test_a_gain_that_drifts_from_view_to_view_is_warned_of_and_views_without_air_are_not():
-    drifted = CLEAN - torch.linspace(1, 0.8, len(CLEAN)).log()[:, None, None]
-    with pytest.warns(UserWarning, match="air beside the patient reads from -?0.0. to 0.2.* drifted"):
-        reconstruct(drifted, BEAM, method=SIRT(2), grid=GRID)
-    for xrays, beam, settings in ((CLEAN, BEAM, {}), (drifted, BEAM, {"display": True}),
+def test_a_gain_that_drifts_is_taken_out_by_the_air_and_where_none_is_seen_nothing_is():
+    exact = views(simulator=Ideal(0))
+    drifted = exact - torch.linspace(1, 0.8, len(exact)).log()[:, None, None]
+    with pytest.warns(UserWarning, match="air beside the patient reads from -?0.0. to 0.2.* drifted.*is subtracted. If"):
+        found = reconstruct(drifted, BEAM, method=SIRT(2), grid=GRID)
+    assert (found.volume - reconstruct(exact, BEAM, method=SIRT(2), grid=GRID).volume).abs().max() < 0.1
+    for xrays, beam, settings in ((exact, BEAM, {}), (drifted, BEAM, {"display": True}),
                                   (drifted[..., 7:17], orbit(8, shape=(24, 10)), {})):
         with warnings.catch_warnings():
             warnings.filterwarnings("error", "air beside the patient")
             reconstruct(xrays, beam, method=SIRT(2), grid=GRID, **settings)
+
+
+def test_air_is_the_thinner_side_of_a_view_and_views_without_it_keep_their_values():
+    exact = views(simulator=Ideal(0))
+    drifted = exact - torch.linspace(1, 0.8, len(exact)).log()[:, None, None]
+    drifted[1, :, -1] += 0.3  # a couch seen edge-on
+    drifted[2] += 0.02 * torch.arange(24)[:, None]  # what differs from row to row is not air
+    with pytest.warns(UserWarning, match="is subtracted, but not of the 1 views that show no air"):
+        found = with_air_at_zero(drifted)
+    assert torch.equal(found[2], drifted[2])
+    for view in (0, 1, 3, 7):
+        assert (found[view, :, :-1] - exact[view, :, :-1]).abs().max() < 1e-5
 
 
 def test_what_is_denser_than_the_prior_knows_is_said_with_its_place_and_size():

@@ -15,7 +15,7 @@ from phydict.runtime.profiling import Stopwatch
 from phydict.units import HUWindow, mu_to_hu
 from phydict.xray import Projector
 from phydict.xray.calibration import match_views
-from phydict.xray.checks import check_line_integrals, check_xrays
+from phydict.xray.checks import check_line_integrals, check_xrays, with_air_at_zero
 
 
 class CountingProjector:
@@ -67,6 +67,7 @@ class Baseline(Reconstructor):
         check_xrays(xrays, A.beam)
         if not display:
             check_line_integrals(xrays)
+            xrays = with_air_at_zero(xrays)
         with watch.stage("prepare"):
             y = xrays[None] / self.mu_water
             if display:

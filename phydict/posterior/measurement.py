@@ -16,7 +16,7 @@ from phydict.units import MU_WATER, HUWindow
 from phydict.xray import Projector
 from phydict.xray.calibration import match_views, subtract_scatter
 from phydict.xray.carried import Carried
-from phydict.xray.checks import check_line_integrals, check_xrays
+from phydict.xray.checks import check_line_integrals, check_xrays, with_air_at_zero
 from phydict.xray.noise_level import noise_level
 
 MAX_LINE_INTEGRAL = 30.0
@@ -44,6 +44,7 @@ class Measurement:
         check_xrays(xrays, projector.beam)
         if not display:
             check_line_integrals(xrays)
+            xrays = with_air_at_zero(xrays)
         self.noise, self.measured = noise, xrays[None]
         self.projector, self.display = projector, xrays[None] if display else None
         self.slope, self.offset = window.mu_affine(mu_water)

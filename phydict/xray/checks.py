@@ -12,8 +12,8 @@ LINE_INTEGRAL_RANGE = 1.0, 20.0
 """Between these lies the largest line integral of a chest: 50 mm and 1 m of water."""
 
 AIR_BLOCKS, AIR_FLAT, AIR_MOST, AIR_DRIFT = 8, 0.05, 0.5, 0.1
-"""Beside a patient a view's line integrals are those of air where the medians of so many blocks of rows differ by less
-than AIR_FLAT and are below AIR_MOST; between views those of air differ by less than AIR_DRIFT."""
+"""At a side of the detector a view's line integrals are those of air where the medians of so many blocks of rows differ
+by less than AIR_FLAT and are below AIR_MOST; between views those of air differ by less than AIR_DRIFT."""
 
 
 def check_xrays(xrays: Tensor, beam: ConeBeam) -> None:
@@ -49,20 +49,30 @@ def check_air(xrays: Tensor) -> None:
 
 
 def check_line_integrals(xrays: Tensor) -> None:
-    """Warns of line integrals (K, V, U) that no chest has, and of air that reads otherwise from view to view."""
+    """Warns of line integrals (K, V, U) that no chest has."""
     largest = float(xrays.max())
     low, high = LINE_INTEGRAL_RANGE
     if not low < largest < high:
         warn(f"the largest line integral is {largest:.3g}, but those of a chest lie between {low:g} and {high:g}: "
              "check that the X-rays are line integrals of attenuation in 1/mm along mm; of display values state "
              "`intensity: {kind: display, bright_is_dense: true}` in geometry.yaml, or in Python display=True")
+
+
+def with_air_at_zero(xrays: Tensor) -> Tensor:
+    """The line integrals (K, V, U), less what each view reads in air where that differs from view to view, which is
+    said in a warning: of a tube's output or a detector's gain that drifts. Views that show no air stay."""
     width = max(1, xrays.shape[2] // 50)
-    sides = torch.cat([xrays[..., :width], xrays[..., -width:]], -1).float()
-    blocks = torch.stack([rows.flatten(1).median(1).values for rows in
-                          sides.tensor_split(min(AIR_BLOCKS, xrays.shape[1]), 1)])
-    air = blocks.median(0).values[blocks.amax(0) - blocks.amin(0) < AIR_FLAT]
-    air = air[air.abs() < AIR_MOST]
-    if len(air) > 1 and air.max() - air.min() > AIR_DRIFT:
-        warn(f"air beside the patient reads from {float(air.min()):.2f} to {float(air.max()):.2f} from view to view, "
-             "but as a line integral it is 0: the tube's output or the detector's gain drifted, so that densities are "
-             "wrong; state `uncertain: {offset: 0.1}` and calibrate, or leave each view's own value of air at 0")
+    sides = torch.stack([xrays[..., :width], xrays[..., -width:]]).float()
+    blocks = torch.stack([rows.flatten(2).median(2).values for rows in
+                          sides.tensor_split(min(AIR_BLOCKS, xrays.shape[1]), 2)])
+    level = blocks.median(0).values
+    is_air = (blocks.amax(0) - blocks.amin(0) < AIR_FLAT) & (level.abs() < AIR_MOST)
+    air = torch.where(is_air, level, torch.inf).amin(0)
+    seen = air.isfinite()
+    if seen.sum() < 2 or air[seen].max() - air[seen].min() <= AIR_DRIFT:
+        return xrays
+    few = "" if seen.all() else f", but not of the {len(air) - int(seen.sum())} views that show no air"
+    warn(f"air beside the patient reads from {float(air[seen].min()):.2f} to {float(air[seen].max()):.2f} from view to "
+         "view, but as a line integral it is 0: the tube's output or the detector's gain drifted; each view's own value "
+         f"of air is subtracted{few}. If what lies there is not air, crop it off")
+    return xrays - torch.where(seen, air, 0).to(xrays)[:, None, None]

@@ -32,6 +32,7 @@ class Reconstruction:
     voxels, where the method knows it, and interval_widening, the factor by which they are wider than calibrated;
     diverged_at: the step, counted from 1, from which on the misfit had risen until the end, None where it had not;
     precision: what the networks computed in, or, without any, the X-rays' type;
+    hardened: whether the line integrals bent as a tube's do, and are straightened in xrays;
     scatter: the mean share of the pixels' signal that was subtracted as scatter, and is no longer in xrays;
     model_variance: variance (K, 1, 1) of what counted as noise of each view because no volume explains it;
     beam, poses: where poses were searched, the beam found, and what was corrected in it (phydict.poses);
@@ -55,6 +56,7 @@ class Reconstruction:
     intervals: dict[float, Tensor] = field(default_factory=dict)
     interval_widening: float = 1.0
     diverged_at: int | None = None
+    hardened: bool = False
     scatter: float = 0.0
     precision: str = "float32"
     model_variance: Tensor | float = 0.0

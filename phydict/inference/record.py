@@ -55,7 +55,7 @@ def case_record(case: Case, result: Reconstruction, name: str, method: Reconstru
     """All that is known of a finished case, as plain JSON values; process_peak_memory_mb is in MiB."""
     return {"case": case["id"], "method": name, "citation": method.citation, "scores": scores,
             "misfit": result.misfit, "misfit_per_view": result.misfit_per_view, "diverged_at": result.diverged_at,
-            "scatter": result.scatter, "interval_90_hu": body_interval(result),
+            "hardened": result.hardened, "scatter": result.scatter, "interval_90_hu": body_interval(result),
             "interval_widening": result.interval_widening, "seconds": result.seconds,
             "network_calls": result.network_calls, "projector_calls": result.projector_calls,
             "process_peak_memory_mb": peak_memory(CPU), "mu_water": case.get("mu_water", method.mu_water),

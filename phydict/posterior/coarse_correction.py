@@ -77,6 +77,8 @@ def coarse_correction(base: object, level: Grid, seen: tuple[Tensor, Projector],
     measurement = Measurement(projector, xrays, base.window, display, base.mu_water)
     measurement.carry(found.carried)
     measurement.model_variance = found.model_variance
+    if found.hardened:
+        measurement.straighten()
     measurement.reset_scatter(found.scatter > 0)
     state = torch.cat([base.window.to_range(found.within)[None], 2 * found.masks - 1])[None].to(xrays)
     return CoarseCorrection(base.prior.bind(report, base.guidance, base.precision), measurement, state, factor)

@@ -14,7 +14,7 @@ from torch import Tensor
 from phydict.linalg.total_variation import finest_to_own
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import Projector
-from phydict.xray.calibration import match_views, subtract_scatter
+from phydict.xray.calibration import match_views, subtract_scatter, without_hardening
 from phydict.xray.carried import Carried
 from phydict.xray.checks import check_line_integrals, check_xrays, with_air_at_zero
 from phydict.xray.noise_level import noise_level
@@ -34,6 +34,7 @@ class Measurement:
     model_variance: variance (K, 1, 1) of what a view's line integrals hold beside noise that no volume explains, which
     ProximalCG counts as noise, 0 until somebody sets it.
     scales: per axis, the finest spacing of the voxels divided by their own.
+    hardened: whether the line integrals were straightened as those of a tube.
     scatter_enabled: whether `subtract_scatter` subtracts scatter; calls: how many times A or its adjoint ran over all
     views, per volume of a batch; last_projection: what `project` last gave.
     """
@@ -57,7 +58,7 @@ class Measurement:
         self.window, self.mu_water = window, mu_water
         self.scales = finest_to_own(projector.grid.spacing)
         self.y = xrays[None]
-        self.scatter_enabled = False
+        self.hardened = self.scatter_enabled = False
         self.calls = 1
         self.last_projection: Tensor | None = None
 
@@ -82,14 +83,15 @@ class Measurement:
         self.beside = 0.0 if carried is None else carried.projection(self.projector).to(self.y)
 
     @property
-    def fitted(self) -> tuple[Tensor, bool, Tensor | float, Tensor | float]:
-        """What was found of the X-rays beside the CT: without scatter or with gains matched, whether scatter is sought,
-        what finer voxels add, and what no volume explains."""
-        return self.y, self.scatter_enabled, self.subgrid, self.model_variance
+    def fitted(self) -> tuple[Tensor, Tensor, bool, bool, Tensor | float, Tensor | float]:
+        """What was found of the X-rays beside the CT: line integrals without scatter or with gains matched, and with
+        it; whether they were straightened, whether scatter is sought, what finer voxels add, and what no volume
+        explains."""
+        return self.y, self.measured, self.hardened, self.scatter_enabled, self.subgrid, self.model_variance
 
     @fitted.setter
-    def fitted(self, found: tuple[Tensor, bool, Tensor | float, Tensor | float]) -> None:
-        self.y, self.scatter_enabled, self.subgrid, self.model_variance = found
+    def fitted(self, found: tuple[Tensor, Tensor, bool, bool, Tensor | float, Tensor | float]) -> None:
+        self.y, self.measured, self.hardened, self.scatter_enabled, self.subgrid, self.model_variance = found
 
     def linear(self, d: Tensor) -> Tensor:
         """The linear part of P, for differences d of CTs."""
@@ -142,6 +144,12 @@ class Measurement:
         self.match_gain_offset(x)
         if self.scatter_enabled:
             self.subtract_scatter(self.project(x))
+
+    def straighten(self) -> None:
+        """From now on the line integrals are those of a tube, straightened; once."""
+        if not self.hardened:
+            self.hardened, self.measured = True, without_hardening(self.measured, self.mu_water)
+            self.y = self.measured
 
     @property
     def can_estimate_scatter(self) -> bool:

@@ -217,8 +217,9 @@ class Posterior(Reconstructor):
             volume=volume, grid=prior.grid, method=self.name, seed=seed, **fit, seconds=watch.seconds,
             network_calls=denoiser.calls * (2 if report and self.guidance != 1 else 1),
             projector_calls=measurement.calls, masks=((state[1:] + 1) / 2).cpu(), deviation=deviation,
-            intervals=intervals, interval_widening=widening, scatter=measurement.scatter,
-            model_variance=measurement.model_variance, precision=precision_name(self.precision, xrays), carried=carried)
+            intervals=intervals, interval_widening=widening, hardened=measurement.hardened,
+            scatter=measurement.scatter, model_variance=measurement.model_variance,
+            precision=precision_name(self.precision, xrays), carried=carried)
 
     def _volume(self, measurement: Measurement, x: Tensor) -> tuple[Tensor, Carried | None]:
         """HU (X, Y, Z) of a result x in the prior's range, and what of them is carried beside it. Says what is as dense

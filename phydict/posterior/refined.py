@@ -196,6 +196,8 @@ class Refined(Delegating):
                 x = base.window.to_range(interpolated(volume, grid, level, AIR))[None, None]
                 measurement = self._measurement(y, A, coarse, display)
                 measurement.model_variance = coarse.model_variance
+                if coarse.hardened:
+                    measurement.straighten()
                 measurement.reset_scatter(coarse.scatter > 0)
                 measurement.refit(x)
                 network = self._network(level) if coarse.masks is not None else None

@@ -11,6 +11,7 @@ from torch import Tensor
 from phydict.diffusion.steps import Generators, noise_like
 from phydict.posterior.discretisation import subgrid_projection
 from phydict.posterior.evidence import Evidence
+from phydict.posterior.hardening import with_hardening
 from phydict.posterior.likelihood.likelihood import LikelihoodStep, ProximalCG
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.metal import Metal, with_metal
@@ -38,7 +39,8 @@ CTs 0.26 to 0.36 voxels of 8 polychromatic views at most and 0.3 to 0.42 of 16, 
 @dataclass(frozen=True)
 class Unrolled(Sampler):
     """z = start(start_state); then for each time: x0 = refine(z, evidence), z = likelihood(x0). Deterministic. Once
-    more with scatter subtracted, as SplitGibbs does.
+    more with line integrals straightened, where they bend as a tube's do, and with scatter subtracted, as SplitGibbs
+    does.
 
     The start state is what chests are on average. From few views with a report, and with a refiner that has a prior to
     begin with, it is instead what this prior makes of both.
@@ -53,7 +55,7 @@ class Unrolled(Sampler):
     noise of that view (`Measurement.model_variance`), so that volumes follow it less and the prior and the other views
     more. Where scatter is sought, of which the first step knows little, the second tells that.
 
-    Where a ProximalCG at the end misses the X-rays by more than their noise, as it does a tube's spectrum, the excess
+    Where a ProximalCG at the end misses the X-rays by more than their noise, as it does in wrong poses, the excess
     is model error, which counts as noise (Morozov 1966): the step is repeated with its total variation weighted by the
     squared normalised residual.
 
@@ -179,8 +181,11 @@ class Unrolled(Sampler):
             *_, z = self.estimates(denoiser, measurement, on_step, lambda *found: results.append(found))
             return z
 
+        def again() -> Tensor:
+            return result(lambda: None)
+
         def explained(on_step: Callable[[], None] = lambda: None) -> Tensor:
-            return with_scatter(measurement, lambda: result(on_step), lambda: result(lambda: None))
+            return with_scatter(measurement, lambda: with_hardening(measurement, lambda: result(on_step), again), again)
 
         z = with_metal(measurement, self.metal, lambda: explained(on_step), explained)
         for found, evidence in results:

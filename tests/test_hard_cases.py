@@ -210,7 +210,7 @@ def test_line_integrals_of_no_chest_are_warned_of_and_display_values_of_any_size
 def test_a_gain_that_drifts_is_taken_out_by_the_air_and_where_none_is_seen_nothing_is():
     exact = views(simulator=Ideal(0))
     drifted = exact - torch.linspace(1, 0.8, len(exact)).log()[:, None, None]
-    with pytest.warns(UserWarning, match="air beside the patient reads from -?0.0. to 0.2.* drifted.*is subtracted. If"):
+    with pytest.warns(UserWarning, match="air beside the patient reads from -?0.0. to 0.2.*own value of air is sub"):
         found = reconstruct(drifted, BEAM, method=SIRT(2), grid=GRID)
     assert (found.volume - reconstruct(exact, BEAM, method=SIRT(2), grid=GRID).volume).abs().max() < 0.1
     for xrays, beam, settings in ((exact, BEAM, {}), (drifted, BEAM, {"display": True}),

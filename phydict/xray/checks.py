@@ -73,6 +73,6 @@ def with_air_at_zero(xrays: Tensor) -> Tensor:
         return xrays
     few = "" if seen.all() else f", but not of the {len(air) - int(seen.sum())} views that show no air"
     warn(f"air beside the patient reads from {float(air[seen].min()):.2f} to {float(air[seen].max()):.2f} from view to "
-         "view, but as a line integral it is 0: the tube's output or the detector's gain drifted; each view's own value "
-         f"of air is subtracted{few}. If what lies there is not air, crop it off")
+         "view, but as a line integral it is 0: the tube's output or the detector's gain drifted; each view's own "
+         f"value of air is subtracted{few}. If what lies there is not air, crop it off")
     return xrays - torch.where(seen, air, 0).to(xrays)[:, None, None]

@@ -6,9 +6,11 @@ from laws import assert_adjoint, assert_linear, random_like
 
 from phydict.grid import Grid
 from phydict.posterior import Measurement
+from phydict.posterior.hardening import with_hardening
 from phydict.posterior.scatter import with_scatter
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
+from phydict.xray.calibration import UNBENT_PATH, without_hardening
 
 GRID = Grid.cube(6)
 BEAM = ConeBeam.orbit(3, 1020, 740, (7, 9), 60.0)
@@ -117,6 +119,30 @@ def test_scatter_is_believed_where_xrays_are_missed_and_it_explains_much_of_that
 
     result = with_scatter(m, lambda: run(0), lambda: run(1))
     assert bool(result) == believed == m.scatter_enabled == m.subgrid == m.model_variance
+
+
+@pytest.mark.parametrize("curvature, missed, believed", [
+    (1e-3, (2.0, 1.0), True), (1e-3, (2.0, 1.95), False), (1e-3, (1.0, 0.5), False), (0.0, (2.0, 1.0), False)])
+def test_hardening_is_believed_where_line_integrals_bend_and_straight_ones_are_missed_by_less(
+        curvature, missed, believed):
+    m = chest_views()[1](chest_views()[0])
+    bent = m.y + curvature * m.y * (m.y - UNBENT_PATH * m.mu_water)
+    m.project = lambda z: bent
+    m.normalised_error = lambda projection: torch.tensor(missed[0])
+    m.normalised_residual = lambda z: torch.tensor(missed[1])
+    runs = []
+
+    def run() -> torch.Tensor:
+        runs.append(m.hardened)
+        return torch.full((1, 1, 1, 1, 1), len(runs))
+
+    assert with_hardening(m, run, run) == (2 if believed else 1)
+    assert m.hardened == believed and torch.equal(
+        m.y[0], without_hardening(chest_views()[0], m.mu_water) if believed else chest_views()[0])
+    m.reset_scatter(False)
+    assert m.hardened == believed == (not torch.equal(m.y[0], chest_views()[0]))
+    if believed:  # what is straight stays so, and is asked no more
+        assert with_hardening(m, run, run) == 3
 
 
 def test_display_values_have_no_scatter_to_subtract():

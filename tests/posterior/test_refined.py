@@ -14,6 +14,7 @@ from phydict.methods import fit_to_grid, onto_grid, reconstruct, reconstructor
 from phydict.posterior import Measurement, PriorOnly, ProximalCG, Refined, Refinement
 from phydict.units import HUWindow, hu_to_mu
 from phydict.xray import ConeBeam, Projector
+from phydict.xray.calibration import without_hardening
 
 BEAM = ConeBeam.orbit(6, 1020, 740, (56, 56), 10.0)
 COARSE, FINE, WINDOW = Grid.cube(16), Grid.cube(64), HUWindow(-1000, 600)
@@ -144,6 +145,16 @@ def test_what_contradicts_counts_as_noise_on_finer_voxels_too(xrays):
     doubt = torch.zeros(6, 1, 1)
     plain, second = fits(doubt), fits(torch.tensor([0.0, 1, 0, 0, 0, 0])[:, None, None])
     assert second[1] > 1.5 * plain[1] and second[0] < 1.1 * plain[0]
+
+
+def test_line_integrals_that_the_base_straightened_are_straight_on_finer_voxels(xrays):
+    class Hardened(Known):
+        def reconstruct(self, *args, **settings):
+            return replace(super().reconstruct(*args, **settings), hardened=True)
+
+    plain, straight = (Refined(known(), Grid.cube(32)).reconstruct(*fit_to_grid(Known(32), Grid.cube(32), xrays, BEAM))
+                       for known in (Known, Hardened))
+    torch.testing.assert_close(straight.xrays, without_hardening(plain.xrays, Known.mu_water))
 
 
 def test_every_level_is_one_step_and_figures_belong_to_the_volume(xrays):

@@ -20,7 +20,7 @@ from phydict.posterior.evidence import CHANGE_SCALE, COVERAGE_SCALE, RESIDUAL_SC
 from phydict.prior import BoundRefiner, Prior, Refiner, load_prior, save_prior, save_refiner
 from phydict.runtime.precision import computes_bfloat16
 from phydict.units import HUWindow, hu_to_mu
-from phydict.xray import ConeBeam, Polychromatic, Projector
+from phydict.xray import ConeBeam, Ideal, Polychromatic, Projector
 from phydict.xray.finer import FinerProjector
 
 GRID, WINDOW = Grid.cube(16), HUWindow(-1000, 600)
@@ -168,6 +168,15 @@ def test_scatter_that_the_first_step_knows_little_of_contradicts_nothing():
     xrays = simulator(Projector(grid, beam, full_detector=True), mu[None, None], 1)[0]
     found = reconstruct(xrays, beam, mu_water=simulator.effective_mu_water)
     assert found.scatter > 0.1 and found.model_variance == 0.0
+
+
+def test_a_tubes_hardening_is_taken_out_and_not_of_what_has_none():
+    grid, beam = Grid.cube(64), ConeBeam.orbit(8, 1020, 740, (112, 112), 5.0)
+    mu = hu_to_mu(torch.from_numpy(build(Thorax.standard(), grid)[0]).float())
+    for simulator in (Polychromatic(), Ideal()):
+        xrays = simulator(Projector(grid, beam, full_detector=True), mu[None, None], 1)[0]
+        found = reconstruct(xrays, beam, mu_water=simulator.effective_mu_water)
+        assert found.hardened == isinstance(simulator, Polychromatic) and found.scatter == 0
 
 
 def test_what_no_volume_explains_is_said_and_not_where_nothing_counts_as_such():

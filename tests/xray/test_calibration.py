@@ -1,10 +1,12 @@
-"""Scatter is found by comparison with a reference, and nothing else is taken for it."""
+"""Scatter and hardening are found by comparison with a reference, and nothing else is taken for them."""
 
 import pytest
 import torch
 from laws import random_like
 
-from phydict.xray.calibration import LARGEST_SHARE, subtract_scatter
+from phydict.xray.calibration import HARDENING, LARGEST_SHARE, UNBENT_PATH, bend, subtract_scatter, without_hardening
+from phydict.xray.materials import partial_densities
+from phydict.xray.polychromatic import Polychromatic
 
 V, U = 24, 32
 DOWN, ALONG = torch.meshgrid(torch.linspace(-1, 1, V), torch.linspace(-1, 1, U), indexing="ij")
@@ -49,3 +51,17 @@ def test_the_signal_is_never_used_up(reference):
     found = subtract_scatter(CLEAN.float(), torch.full_like(CLEAN, reference).float())
     assert found.isfinite().all() and (found - CLEAN <= -torch.log(torch.tensor(1 - LARGEST_SHARE)) + 1e-4).all()
     assert (found - CLEAN >= -1e-5).all()
+
+
+@pytest.mark.parametrize("scintillator", [0.45, None])
+@pytest.mark.parametrize("kvp", [70, 80, 100, 120])
+def test_water_behind_any_tube_is_straight_without_hardening(kvp, scintillator):
+    tube = Polychromatic(kvp, scintillator=scintillator)
+    thickness, mu = torch.linspace(0, 450, 91, dtype=torch.float64), tube.effective_mu_water
+    water = partial_densities(torch.zeros(1, dtype=torch.float64), tube.ct_energy)
+    measured = -torch.log(tube.primary(thickness * water)[0])
+    straight = without_hardening(measured, mu)
+    assert (measured - mu * thickness).abs().max() > 0.4 and (straight - mu * thickness).abs().max() < 0.06
+    assert straight[thickness == UNBENT_PATH] == pytest.approx(mu * UNBENT_PATH, abs=1e-9)
+    assert bend(measured, mu * thickness, mu) == pytest.approx(HARDENING, rel=0.1)
+    assert abs(bend(straight, mu * thickness, mu)) < 0.1 * HARDENING

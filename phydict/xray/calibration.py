@@ -16,7 +16,7 @@ LARGEST_SHARE = 0.9
 
 HARDENING = 0.011
 """By how much a tube's line integrals m of water bend: m + HARDENING m (m - m_0) is straight in the water's thickness,
-within 0.06 over 450 mm, where m itself errs by 0.4 to 0.65. The best value is 0.0105 to 0.0121 for tubes of 70 to 120
+within 0.07 over 450 mm, where m itself errs by 0.4 to 0.65. The best value is 0.0105 to 0.0121 for tubes of 70 to 120
 kVp, with an ideal detector or caesium iodide."""
 
 UNBENT_PATH = 200.0

@@ -61,7 +61,7 @@ def test_water_behind_any_tube_is_straight_without_hardening(kvp, scintillator):
     water = partial_densities(torch.zeros(1, dtype=torch.float64), tube.ct_energy)
     measured = -torch.log(tube.primary(thickness * water)[0])
     straight = without_hardening(measured, mu)
-    assert (measured - mu * thickness).abs().max() > 0.4 and (straight - mu * thickness).abs().max() < 0.06
+    assert (measured - mu * thickness).abs().max() > 0.4 and (straight - mu * thickness).abs().max() < 0.07
     assert straight[thickness == UNBENT_PATH] == pytest.approx(mu * UNBENT_PATH, abs=1e-9)
     assert bend(measured, mu * thickness, mu) == pytest.approx(HARDENING, rel=0.1)
     assert abs(bend(straight, mu * thickness, mu)) < 0.1 * HARDENING

@@ -55,8 +55,8 @@ def subtract_scatter(xrays: Tensor, reference: Tensor, order: int = 3) -> Tensor
 
 
 def without_hardening(xrays: Tensor, mu_water: float) -> Tensor:
-    """Line integrals (K, V, U) of a tube's rays, straightened as those of water are (Joseph & Spital 1978, Journal of
-    Computer Assisted Tomography 2(1), for a tube that is not known); mu_water: in 1/mm, behind UNBENT_PATH."""
+    """Line integrals (K, V, U) of a tube's rays, straightened as those of water are (Herman 1979,
+    doi:10.1088/0031-9155/24/1/008, for a tube that is not known); mu_water: in 1/mm, behind UNBENT_PATH."""
     return xrays + HARDENING * xrays * (xrays - UNBENT_PATH * mu_water)
 
 

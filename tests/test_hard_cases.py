@@ -213,7 +213,7 @@ def test_a_gain_that_drifts_is_taken_out_by_the_air_and_where_none_is_seen_nothi
     with pytest.warns(UserWarning, match="air beside the patient reads from -?0.0. to 0.2.*own value of air is sub"):
         found = reconstruct(drifted, BEAM, method=SIRT(2), grid=GRID)
     assert (found.volume - reconstruct(exact, BEAM, method=SIRT(2), grid=GRID).volume).abs().max() < 0.1
-    for xrays, beam, settings in ((exact, BEAM, {}), (drifted, BEAM, {"display": True}),
+    for xrays, beam, settings in ((exact, BEAM, {}), (drifted, BEAM, {"display": True}), (drifted + 0.2, BEAM, {}),
                                   (drifted[..., 7:17], orbit(8, shape=(24, 10)), {})):
         with warnings.catch_warnings():
             warnings.filterwarnings("error", "air beside the patient")

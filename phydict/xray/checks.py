@@ -60,7 +60,8 @@ def check_line_integrals(xrays: Tensor) -> None:
 
 def with_air_at_zero(xrays: Tensor) -> Tensor:
     """The line integrals (K, V, U), less what each view reads in air where that differs from view to view, which is
-    said in a warning: of a tube's output or a detector's gain that drifts. Views that show no air stay."""
+    said in a warning: of a tube's output or a detector's gain that drifts. Views that show no air stay, and all of
+    them where none reads it as 0 within AIR_DRIFT, as where the patient fills the detector."""
     width = max(1, xrays.shape[2] // 50)
     sides = torch.stack([xrays[..., :width], xrays[..., -width:]]).float()
     blocks = torch.stack([rows.flatten(2).median(2).values for rows in
@@ -69,7 +70,7 @@ def with_air_at_zero(xrays: Tensor) -> Tensor:
     is_air = (blocks.amax(0) - blocks.amin(0) < AIR_FLAT) & (level.abs() < AIR_MOST)
     air = torch.where(is_air, level, torch.inf).amin(0)
     seen = air.isfinite()
-    if seen.sum() < 2 or air[seen].max() - air[seen].min() <= AIR_DRIFT:
+    if seen.sum() < 2 or air[seen].max() - air[seen].min() <= AIR_DRIFT or air.abs().min() > AIR_DRIFT:
         return xrays
     few = "" if seen.all() else f", but not of the {len(air) - int(seen.sum())} views that show no air"
     warn(f"air beside the patient reads from {float(air[seen].min()):.2f} to {float(air[seen].max()):.2f} from view to "

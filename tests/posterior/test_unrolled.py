@@ -171,7 +171,7 @@ def test_scatter_that_the_first_step_knows_little_of_contradicts_nothing():
 
 
 def test_a_tubes_hardening_is_taken_out_and_not_of_what_has_none():
-    grid, beam = Grid.cube(64), ConeBeam.orbit(8, 1020, 740, (112, 112), 5.0)
+    grid, beam = Grid.cube(64), ConeBeam.orbit(4, 1020, 740, (112, 112), 5.0)
     mu = hu_to_mu(torch.from_numpy(build(Thorax.standard(), grid)[0]).float())
     for simulator in (Polychromatic(), Ideal()):
         xrays = simulator(Projector(grid, beam, full_detector=True), mu[None, None], 1)[0]

@@ -75,10 +75,6 @@ def coarse_correction(base: object, level: Grid, seen: tuple[Tensor, Projector],
     if factor < 2 or not level.same_as(in_other_voxels(base.grid, [factor * n for n in base.grid.shape])):
         return None
     measurement = Measurement(projector, xrays, base.window, display, base.mu_water)
-    measurement.carry(found.carried)
-    measurement.model_variance = found.model_variance
-    if found.hardened:
-        measurement.straighten()
-    measurement.reset_scatter(found.scatter > 0)
+    measurement.adopt(found)
     state = torch.cat([base.window.to_range(found.within)[None], 2 * found.masks - 1])[None].to(xrays)
     return CoarseCorrection(base.prior.bind(report, base.guidance, base.precision), measurement, state, factor)

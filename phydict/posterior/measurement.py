@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from phydict.linalg.total_variation import finest_to_own
+from phydict.reconstruction import Reconstruction
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import Projector
 from phydict.xray.calibration import match_views, subtract_scatter, without_hardening
@@ -81,6 +82,15 @@ class Measurement:
         """From now on P adds what is carried beside the CTs."""
         self.carried = carried
         self.beside = 0.0 if carried is None else carried.projection(self.projector).to(self.y)
+
+    def adopt(self, found: Reconstruction) -> None:
+        """Holds of the X-rays what a reconstruction from them found beside the CT, on other voxels: what is carried,
+        what counts as noise of a view, hardening, and whether there is scatter."""
+        self.carry(found.carried)
+        self.model_variance = found.model_variance
+        if found.hardened:
+            self.straighten()
+        self.reset_scatter(found.scatter > 0)
 
     @property
     def fitted(self) -> tuple[Tensor, Tensor, bool, bool, Tensor | float, Tensor | float]:

@@ -195,10 +195,6 @@ class Refined(Delegating):
                 y, A = self._seen(xrays, projector, level)
                 x = base.window.to_range(interpolated(volume, grid, level, AIR))[None, None]
                 measurement = self._measurement(y, A, coarse, display)
-                measurement.model_variance = coarse.model_variance
-                if coarse.hardened:
-                    measurement.straighten()
-                measurement.reset_scatter(coarse.scatter > 0)
                 measurement.refit(x)
                 network = self._network(level) if coarse.masks is not None else None
                 own, others = self.refinement.corrections(network is not None) if coarse.masks is not None else (0, 0)
@@ -242,5 +238,5 @@ class Refined(Delegating):
             mu = hu_to_mu(coarse.within.to(y), self.mu_water)
             outside = outside_projection(mu, coarse.grid, A)
         measurement = Measurement(A, y, self.base.window, display, self.mu_water, outside=outside)
-        measurement.carry(coarse.carried)
+        measurement.adopt(coarse)
         return measurement

@@ -12,6 +12,8 @@
     baselines        reconstruction without a prior                                 yardsticks
     evaluation       metrics, tables, picture panels                                scores
     rivals           published networks from X-rays to CT, re-implemented           yardsticks
+    page             a page for the browser beside every result
+    poses            geometry found with the volume
     methods          the named methods, and `reconstruct` in one call
     training         priors and super-resolution stages                             Lightning
     inference        X-rays -> volumes, CTs -> scores                               Lightning

@@ -5,17 +5,16 @@ from __future__ import annotations
 import os
 import resource
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import nibabel
 import numpy as np
 import pytest
 import torch
-from command_lines import CONFIG, arguments, checkpoint, losses, refusal
+from command_lines import arguments, checkpoint, losses, refusal
 from prior.medsyn_files import entries, text_unet, write
 from prior.tiny import tiny_prior
+from processes import Python
 
 from phydict.cli.train import main
 from phydict.prior import load_prior, save_prior
@@ -146,12 +145,12 @@ def test_a_killed_run_leaves_its_folder_free_even_while_its_loaders_live_on(tmp_
             if os.fork() == 0:
                 print(os.getpid(), flush=True)
             time.sleep(60)"""
-    run = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True,
-                           cwd=CONFIG.parents[2])
-    loader = int(run.stdout.readline())
+    run = Python(code, tmp_path)
+    run.wait_for(lambda: run.out.endswith("\n"))
+    loader = int(run.out)
     with pytest.raises(ValueError, match="another run"), alone_in(tmp_path, "--out"):
         pass
-    run.kill()
+    run.process.kill()
     run.wait(60)
     with alone_in(tmp_path, "--out"):
         os.kill(loader, signal.SIGKILL)  # was alive until now

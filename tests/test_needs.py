@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from posterior.test_posterior import BEAM, views
+from posterior.scene import BEAM, views
 from prior.tiny import REPORTS, tiny_for, tiny_prior
 
 from phydict import METHODS, ConeBeam, Grid, reconstruct

@@ -8,7 +8,7 @@ import warnings
 
 import pytest
 import torch
-from posterior.test_posterior import PROJECTOR, views
+from posterior.scene import PROJECTOR, views
 from prior.tiny import tiny_prior
 
 from phydict.baselines import SIRT

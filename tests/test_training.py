@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
-import subprocess
-import sys
-import time
 
 import numpy as np
 import pytest
 import torch
 from command_lines import CONFIG, arguments, checkpoint, losses, refusal
 from prior.tiny import tiny_prior
+from processes import TRAIN, Python
 from torch.utils.data import default_collate
 
 from phydict.cli.train import main
@@ -40,10 +37,9 @@ def test_a_log_file_tells_steps_in_whole_lines_and_nothing_of_lightnings(tmp_pat
     args = [arg for arg in arguments(tmp_path, cache, "--progress.interval=0") if "enable_" not in arg]
     runs = [[*args, *more] for more in (["--trainer.max_steps=3"], [
         "--trainer.max_steps=6", f"--ckpt_path={tmp_path / 'last.ckpt'}"])]
-    done = subprocess.run([sys.executable, "-c", both, json.dumps(runs)], capture_output=True, text=True,
-                          cwd=CONFIG.parents[2], timeout=300)
-    assert done.returncode == 0, done.stderr[-2000:]
-    said = (done.stdout + done.stderr).splitlines()
+    done = Python(both, json.dumps(runs))
+    assert done.wait() == 0, done.err[-2000:]
+    said = (done.out + done.err).splitlines()
     for last in ("step 3 of 3: loss ", "step 6 of 6: loss "):
         assert any(line.startswith(last) and "samples_per_s" in line for line in said), said
     known = ("step ", "training", "report ", "sentences: ", "Seed")
@@ -76,10 +72,8 @@ def test_a_killed_run_goes_on_as_if_it_had_not_been(tmp_path, trained, cache):
             return step(task, batch, index)
         PriorTraining.training_step = fatal_step
         main(sys.argv[1:])"""
-    done = subprocess.run([sys.executable, "-c", killed, *arguments(tmp_path, cache, "--trainer.max_epochs=2")],
-                          capture_output=True, text=True, cwd=CONFIG.parents[2],
-                          env=os.environ | {"OMP_NUM_THREADS": str(torch.get_num_threads())})  # sums in the same order
-    assert done.returncode == -signal.SIGKILL, done.stderr[-2000:]
+    done = Python(killed, *arguments(tmp_path, cache, "--trainer.max_epochs=2"))
+    assert done.wait() == -signal.SIGKILL, done.err[-2000:]
     assert checkpoint(tmp_path)["global_step"] == 4
     torch.manual_seed(99)  # the new process knows nothing of the old one's random numbers
     main(arguments(tmp_path, cache, "--trainer.max_epochs=2", f"--ckpt_path={tmp_path / 'last.ckpt'}",
@@ -154,16 +148,10 @@ def test_the_held_out_cts_are_written_down(cts, cache, tmp_path):
 
 
 def test_a_signal_is_no_success(cache, tmp_path):
-    train = subprocess.Popen(
-        [sys.executable, str(CONFIG.parents[2] / "train.py"), *arguments(tmp_path, cache, "--trainer.max_epochs=9999")],
-        stderr=subprocess.PIPE, text=True)
-    for _ in range(600):
-        if (tmp_path / "last.ckpt").exists():
-            break
-        time.sleep(0.1)
-    train.terminate()
-    _, said = train.communicate(timeout=60)
-    assert train.returncode == 143 and "--ckpt_path" in said.splitlines()[-1], said
+    train = Python(TRAIN, *arguments(tmp_path, cache, "--trainer.max_epochs=9999"))
+    train.wait_for((tmp_path / "last.ckpt").exists)
+    train.process.terminate()
+    assert train.wait(60) == 143 and "--ckpt_path" in train.err.splitlines()[-1], train.err
 
 
 def test_a_damaged_phantom_in_the_cache_is_made_again(tmp_path):

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from lightning.pytorch.cli import LightningCLI
 
 from phydict.runtime.telling import add_telling, telling
 
 
 class TellingCLI(LightningCLI):
-    """A LightningCLI whose subcommands take --quiet and --json_lines."""
+    """A LightningCLI whose subcommands take --quiet and --json_lines, and of which the one that is given is built alone."""
+
+    def __init__(self, *classes: Any, args: list[str], **settings: Any):
+        every = self.subcommands()
+        if args[:1] and args[0] in every:
+            self.subcommands = lambda: {args[0]: every[args[0]]}  # type: ignore[method-assign]
+        super().__init__(*classes, args=args, **settings)
 
     def _prepare_subcommand_parser(self, klass: type, subcommand: str, **kwargs):
         parser = super()._prepare_subcommand_parser(klass, subcommand, **kwargs)

@@ -89,7 +89,7 @@ class FoundPoses:
                 said.append(f"view {view} (counted from 0) was corrected by {row[worst]:.3g}{unit} in "
                             f"{NAMES[worst]}, {ratios[worst]:.1f} times the stated {self.deviations[worst]:g}: check "
                             "this view's geometry, or state more under `uncertain:`")
-        size, error = np.abs(self.sway[0]), self.sway[1]
+        size, error = np.abs(self.sway[0] - self.sway[0].mean()), self.sway[1]  # what all share is the volume's
         moved = np.flatnonzero((size > SWAY) & (size > SWAY_ERRORS * error) & (len(size) > FEW_VIEWS))
         if len(moved):
             said.append(f"view {', '.join(map(str, moved))} (counted from 0) show the lower end of the body up to "

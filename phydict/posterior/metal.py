@@ -87,7 +87,7 @@ def with_metal(measurement: Measurement, metal: Metal | None, first: Callable[[]
     dense = z[:1, :1] >= CEILING
     if not metal.least_ml <= millilitres(dense, measurement.projector.grid) <= metal.most_ml:
         return z
-    plain, missed, where = measurement.fitted, measurement.normalised_residual(z[:, :1]).max(), grown(dense)
+    plain, residual, where = measurement.fitted, measurement.normalised_residual(z[:, :1]).max(), grown(dense)
     found = z
     for _ in range(metal.rounds):
         carried = beside(measurement, found[:1, :1], where, metal)
@@ -97,7 +97,7 @@ def with_metal(measurement: Measurement, metal: Metal | None, first: Callable[[]
         found = again()
         where = where | grown(found[:1, :1] >= CEILING)
     else:
-        as_well = measurement.normalised_residual(found[:, :1]).max() <= WORSE * missed
+        as_well = measurement.normalised_residual(found[:, :1]).max() <= WORSE * residual
         if carried.density >= metal.least and as_well:
             return found
     measurement.carry(None)

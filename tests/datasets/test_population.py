@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +9,7 @@ import nibabel
 import numpy as np
 import pytest
 import torch
+from processes import Python
 from scipy import ndimage
 
 from phydict.datasets import CTCases, Thorax, build, find_cts, without
@@ -237,13 +236,11 @@ def test_two_processes_share_a_cache(folder, tmp_path):
         cts = CTCases(find_cts(sys.argv[1])[:2], sys.argv[2], Grid.cube(16))
         drawn = DrawnPatients(cts, PopulationSettings(1.0, draws=3))
         print([round(float(drawn[i]["volume"].double().sum()), 6) for i in range(3)])"""
-    runs = [subprocess.Popen([sys.executable, "-c", code, str(folder), str(tmp_path)], stdout=subprocess.PIPE,
-                             stderr=subprocess.PIPE, text=True, cwd=ROOT) for _ in range(2)]
-    said = [run.communicate(timeout=300) for run in runs]
-    assert all(run.returncode == 0 for run in runs), said
+    runs = [Python(code, folder, tmp_path) for _ in range(2)]
+    assert all(run.wait() == 0 for run in runs), [run.err for run in runs]
     third = DrawnPatients(CTCases(find_cts(folder)[:2], tmp_path, Grid.cube(16)), PopulationSettings(1.0, draws=3))
     sums = [round(float(third[i]["volume"].double().sum()), 6) for i in range(3)]
-    assert [out.strip() for out, _ in said] == [str(sums)] * 2
+    assert [run.out.strip() for run in runs] == [str(sums)] * 2
     assert not list(tmp_path.rglob("*.part.*")) and len(list(third.drawn.iterdir())) == 3
 
 

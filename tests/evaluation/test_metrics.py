@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from processes import FORKS
 from scipy.ndimage import correlate1d
 
 from phydict.evaluation.fid import PlaneFID
@@ -267,7 +268,8 @@ def of_process(rank: int, store: str, out: str) -> None:
 
 
 def test_two_processes_equal_one(tmp_path):
-    torch.multiprocessing.spawn(of_process, (str(tmp_path / "store"), str(tmp_path / "out")), nprocs=2)
+    files = str(tmp_path / "store"), str(tmp_path / "out")
+    torch.multiprocessing.start_processes(of_process, files, nprocs=2, start_method=FORKS.get_start_method())
     alone = CaseMetrics(["fdk", "gibbs"])
     for (case, method), psnr in VALUES.items():
         alone.update(case, method, {"psnr": psnr}, seconds=case)

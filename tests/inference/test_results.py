@@ -13,8 +13,9 @@ from contextlib import contextmanager
 
 import pytest
 from command_lines import refusal
+from processes import INFER, Python
 
-from inference.runs import FILES, ORBIT, ROOT, contents, names, phantoms, record, sirt, stamp, volume
+from inference.runs import FILES, ORBIT, contents, names, phantoms, record, sirt, stamp, volume
 from phydict.baselines import SIRT
 from phydict.cli.infer import main
 from phydict.datasets import load_xrays
@@ -201,13 +202,10 @@ def test_one_bad_case_spoils_no_other(measured, tmp_path, capsys):
 
 def test_a_signal_ends_the_run_between_cases_and_is_no_success(tmp_path):
     args = phantoms(tmp_path, 200)
-    run = subprocess.Popen([sys.executable, str(ROOT / "infer.py"), *args], stderr=subprocess.PIPE, text=True)
-    for line in run.stderr:
-        if "misfit" in line:
-            break
-    run.terminate()
-    said = run.stderr.read()
-    assert run.wait(60) == 143 and "run the same command again" in said
+    run = Python(INFER, *args)
+    run.wait_for(lambda: "misfit" in run.err)
+    run.process.terminate()
+    assert run.wait(60) == 143 and "run the same command again" in run.err
     done = names(tmp_path / "sirt")
     assert 1 <= len(done) < 200 and all(names(tmp_path / "sirt" / case) == FILES for case in done)
 

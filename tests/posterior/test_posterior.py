@@ -14,24 +14,13 @@ from phydict.posterior import GradientSteps, Posterior, PriorOnly, ProximalCG, S
 from phydict.prior import load_prior, save_prior
 from phydict.reconstruction import describe
 from phydict.units import HUWindow
-from phydict.xray import ConeBeam, Projector
+from phydict.xray import Projector
+from posterior.scene import BEAM, GRID, PROJECTOR, views
 
-BEAM = ConeBeam.orbit(4, 1020, 740, (14, 14), 40.0)
-GRID = Grid.cube(16)
-PROJECTOR = Projector(GRID, BEAM)
 FAST = SplitGibbs(8, ProximalCG(4), ProximalCG(4), t_start=0.7)
 SAMPLERS = {
     "fast": FAST, "noisy": SplitGibbs(6, noise_fraction=0.2), "paper": SplitGibbs(
         5, GradientSteps(), ec_delta=0.5, ec_steps=3), "prior": PriorOnly(5)}
-
-
-def views(seed=0):
-    """Line integrals of an ellipse of soft tissue with a random hollow."""
-    mu = torch.zeros(1, 1, *GRID.shape)
-    mu[:, :, 3:13, 4:12] = 0.02
-    low = 4 + seed % 4
-    mu[:, :, low:low + 4, 6:10, 5:11] = 0.005
-    return PROJECTOR(mu)[0]
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from phydict.diffusion.steps import noise_like
 from phydict.posterior import Measurement, Posterior, PriorOnly, ProximalCG, SplitGibbs
 from phydict.posterior.posterior import sample_seed
 from posterior.dense import SHAPE, N, measurement
-from posterior.test_posterior import BEAM, PROJECTOR, views
+from posterior.scene import BEAM, PROJECTOR, views
 
 SAMPLER = SplitGibbs(4, ProximalCG(3), ProximalCG(3), t_start=0.7, noise_fraction=0.0, sampling_noise=0.6)
 

@@ -17,6 +17,7 @@ from phydict.methods import METHODS, reconstruct, reconstructor
 from phydict.posterior import Measurement, Posterior, PriorOnly, ProximalCG, SplitGibbs, Unrolled
 from phydict.posterior.discretisation import subgrid_projection
 from phydict.posterior.evidence import CHANGE_SCALE, COVERAGE_SCALE, RESIDUAL_SCALE, Evidence
+from phydict.posterior.hardening import with_hardening
 from phydict.prior import BoundRefiner, Prior, Refiner, load_prior, save_prior, save_refiner
 from phydict.runtime.precision import computes_bfloat16
 from phydict.units import HUWindow, hu_to_mu
@@ -170,7 +171,20 @@ def test_scatter_that_the_first_step_knows_little_of_contradicts_nothing():
     assert found.scatter > 0.1 and found.model_variance == 0.0
 
 
-def test_a_tubes_hardening_is_taken_out_and_not_of_what_has_none():
+@pytest.mark.parametrize("simulator", [Polychromatic(), Ideal()], ids=lambda simulator: type(simulator).__name__)
+def test_a_tubes_hardening_is_taken_out_and_not_of_what_has_none(simulator):
+    grid, window = Grid.cube(64), HUWindow()
+    projector = Projector(grid, ConeBeam.orbit(4, 1020, 740, (112, 112), 5.0), full_detector=True)
+    hu = torch.from_numpy(build(Thorax.standard(), grid)[0]).float()[None, None].clamp(-1000, 1000)
+    m = Measurement(projector, simulator(projector, hu_to_mu(hu), 1)[0], window, mu_water=simulator.effective_mu_water)
+    bent, truth, runs = float(m.normalised_residual(window.to_range(hu))), window.to_range(hu), []
+    with_hardening(m, lambda: truth, lambda: (runs.append(m.hardened), truth)[1])
+    assert m.hardened == isinstance(simulator, Polychromatic) and runs == [True] * m.hardened
+    assert float(m.normalised_residual(truth)) < 0.7 * bent or not m.hardened
+
+
+@pytest.mark.slow
+def test_what_was_straightened_stands_in_the_record():
     grid, beam = Grid.cube(64), ConeBeam.orbit(4, 1020, 740, (112, 112), 5.0)
     mu = hu_to_mu(torch.from_numpy(build(Thorax.standard(), grid)[0]).float())
     for simulator in (Polychromatic(), Ideal()):
@@ -265,7 +279,8 @@ def test_the_truth_is_kept_and_x_rays_are_met_to_their_noise(noise):
 @pytest.mark.skipif(not computes_bfloat16(torch.device("cpu")), reason="this processor does not compute bfloat16")
 def test_bfloat16_changes_the_reconstruction_of_the_example_by_less_than_2_hu():
     case = load_xrays(Path(__file__).parents[2] / "data" / "example" / "xrays")
-    full, half = (reconstruct(case["xrays"], case["beam"], precision=kind).volume for kind in ("float32", "bfloat16"))
+    xrays, beam = case["xrays"][::2], case["beam"].select(slice(None, None, 2))
+    full, half = (reconstruct(xrays, beam, precision=kind).volume for kind in ("float32", "bfloat16"))
     assert 0 < (full - half).square().mean().sqrt() < 2
 
 

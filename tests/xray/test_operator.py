@@ -102,7 +102,8 @@ def test_selecting_views_and_batching_change_nothing(method):
     y = Projector(grid, BEAM, method)(mu)
     for k in range(3):
         alone = Projector(grid, BEAM.select(k), method)(mu[k:k + 1])
-        torch.testing.assert_close(alone, y[k:k + 1, k:k + 1], rtol=0, atol=1e-12 if method == "joseph" else 0)
+        sums = 1e-12 if method in ("joseph", "matrix") else 0  # of several views or volumes, in another order
+        torch.testing.assert_close(alone, y[k:k + 1, k:k + 1], rtol=0, atol=sums)
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -10,13 +10,13 @@ from phydict.runtime.telling import add_telling, telling
 
 
 class TellingCLI(LightningCLI):
-    """A LightningCLI whose subcommands take --quiet and --json_lines, and of which the one that is given is built alone."""
+    """A LightningCLI whose subcommands take --quiet and --json_lines, and which builds the one that is given alone."""
 
-    def __init__(self, *classes: Any, args: list[str], **settings: Any):
+    def __init__(self, model: type, data: type, *, args: list[str], **settings: Any):
         every = self.subcommands()
         if args[:1] and args[0] in every:
             self.subcommands = lambda: {args[0]: every[args[0]]}  # type: ignore[method-assign]
-        super().__init__(*classes, args=args, **settings)
+        super().__init__(model, data, args=args, **settings)
 
     def _prepare_subcommand_parser(self, klass: type, subcommand: str, **kwargs):
         parser = super()._prepare_subcommand_parser(klass, subcommand, **kwargs)

@@ -125,13 +125,13 @@ def test_on_finer_voxels_intervals_are_a_share_of_the_coarse_ones_and_of_what_th
     assert all((wide >= narrow).all() for narrow, wide in pairwise(found.intervals.values()))
 
 
-def test_x_rays_missed_by_more_than_in_calibration_widen_the_intervals_and_far_more_warn():
+def test_a_residual_larger_than_in_calibration_widens_the_intervals_and_a_far_larger_one_warns():
     refiner = tiny_refiner(uncertain=True)
     usual = reconstruct(views(), BEAM, refiner, display=True)
     refiner.uncertainty.most_residual.fill_(1e-3)
-    with pytest.warns(UserWarning, match="that the intervals were calibrated on by 0.001 at most") as said:
+    with pytest.warns(UserWarning, match="that the intervals were calibrated on 0.001 at most") as said:
         wider = reconstruct(views(), BEAM, refiner, display=True)
-    residual = float(str(said[0].message).split("missed by ")[1].split(" times")[0])
+    residual = float(str(said[0].message).split("X-rays is ")[1].split(" times")[0])
     assert usual.interval_widening == 1
     assert wider.interval_widening == pytest.approx((residual / 1e-3) ** 0.25, rel=0.01)
     torch.testing.assert_close(wider.intervals[0.9], wider.interval_widening * usual.intervals[0.9])

@@ -33,10 +33,10 @@ class Metal:
     dense and sharp comes to lie in e. After FREE restarts of conjugate gradients e is left where it reaches SHARE of
     its largest value, for metal is compact and dense. The method then runs again with e counted as known, unless e
     falls short of PROMISING times `least`, and all that `rounds` times. e is believed where it is denser by `least`
-    than soft tissue, as no bone is, and the X-rays are missed by no more than WORSE times as much as without it.
+    than soft tissue, as no bone is, and the residual of the X-rays is at most WORSE times that without it.
 
     Args:
-        least_ml: where less lies at the window's upper end, nothing is sought
+        least_ml: where less lies at the window's upper end, no metal is estimated
         most_ml: nor where more does
         least: HU; of training CTs without metal 1100 are found at a shoulder, of pieces of 3000 HU 2700
         rounds: of search and method

@@ -35,12 +35,12 @@ MOST_GUIDANCE = 1_000_000
 
 
 WIDENING = 0.25
-"""Power of the residual, over the most in calibration, by which intervals widen: of held-out CTs' polychromatic X-rays,
-missed by 1.3 to 4 times their noise, 91 to 98 % of the body is then in the 90 % interval."""
+"""Power of the residual, over the most in calibration, by which intervals widen: of held-out CTs, from
+polychromatic X-rays with residuals of 1.3 to 4 times their noise, 91 to 98 % of the body is then in the 90 % one."""
 
 FAR_OUTSIDE = 4.5
-"""How many times the most residual in calibration is far outside of it: beyond a tube's spectrum, which is missed by 4
-times as much at most. What views contradict counts as noise there, and has a warning of its own."""
+"""How many times the most residual in calibration is far outside of it: beyond a tube's spectrum, whose residual is 4
+times as large at most. What views contradict counts as noise there, and has a warning of its own."""
 
 WIDEST = 2.0
 """Half-width of the widest interval, in the prior's range [-1, 1], of which it then leaves out nothing."""
@@ -235,18 +235,18 @@ class Posterior(Reconstructor):
     def _intervals(self, denoiser: CountingDenoiser, measurement: Measurement, reprojection: Tensor
                    ) -> tuple[dict[float, Tensor], float]:
         """Level -> half-widths in HU (X, Y, Z), none where the network does not know them, and the factor by which they
-        are wider than calibrated: where X-rays are missed by more than in any scene of the calibration, contradict each
-        other, or hold scatter. Warns where they are missed by more than FAR_OUTSIDE as much, less what counted as
-        noise."""
+        are wider than calibrated: where the residual of the X-rays is larger than in any scene of the calibration, or
+        they contradict each other or hold scatter. Warns where it is more than FAR_OUTSIDE times as large, less what
+        counted as noise."""
         uncertainty = self.prior.uncertainty if isinstance(self.prior, Refiner) else None
         if uncertainty is None or not isinstance(denoiser, CountingRefiner) or denoiser.half_widths is None:
             return {}, 1.0
         residual = float(measurement.normalised_error(reprojection, modelled=True))
         most = float(uncertainty.most_residual)
         if residual > FAR_OUTSIDE * most:
-            warn(f"the X-rays are missed by {residual:.3g} times their noise, in the scenes that the intervals were "
-                 f"calibrated on by {most:.3g} at most: they are widened, and may still be too narrow; check geometry "
-                 "and scale, and whether the patient moved, or calibrate")
+            warn(f"the residual of the X-rays is {residual:.3g} times their noise, in the scenes that the intervals "
+                 f"were calibrated on {most:.3g} at most: they are widened, and may still be too narrow; check the "
+                 "geometry and the scale, and whether the patient moved, or calibrate")
         widening = max(1.0, residual / most) ** WIDENING * contradiction_widening(measurement)
         widening *= SCATTER_WIDENING if measurement.scatter else 1.0
         widths = self.prior.window.half_width * (widening * denoiser.half_widths[0].cpu()).clamp(max=WIDEST)

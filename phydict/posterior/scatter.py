@@ -10,9 +10,9 @@ from torch import Tensor
 from phydict.posterior.measurement import Measurement
 
 SCATTER_THRESHOLD = 2.5
-"""Times their noise that X-rays are missed by before scatter is looked for: on the CTs that it was chosen on, ideal
-ones are missed by 1.4 at most (those without noise by whatever the grid cannot hold), polychromatic ones by 1.4 to 3.5,
-those with scatter of 6 % by 2.7 to 17, fewer views by less."""
+"""The residual of X-rays, in units of their noise, from which on scatter is estimated: on the CTs that it was chosen on
+ideal ones have 1.4 at most (those without noise whatever the grid cannot hold), polychromatic ones 1.4 to 3.5, those
+with scatter of 6 % 2.7 to 17, fewer views less."""
 
 SCATTER_GAIN = 0.6
 """What scatter, subtracted, must bring that residual down to, as a share of it, to be believed: on training CTs at 3 mm

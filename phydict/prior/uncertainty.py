@@ -74,7 +74,7 @@ class Uncertainty(nn.Module):
         """Sets the quantiles to those of held-out patients.
 
         ratios: |e| / b of voxels (N,); tissues, coverages: what `tissue_of` and `coverage_of` say of them (N,);
-        residuals: by how many times their noise the reconstructions missed their X-rays. A tissue or coverage of few
+        residuals: of the reconstructions' X-rays, in units of their noise. A tissue or coverage of few
         voxels takes the quantiles of all.
         """
         for t in range(len(TISSUES)):

@@ -79,6 +79,7 @@ def test_an_exported_checkpoint_is_a_prior_with_the_averaged_weights(tmp_path, t
     file = tmp_path / "prior" / "tiny.safetensors"
     main(["export", f"--checkpoint={trained / 'last.ckpt'}", "--out", str(file)])
     assert str(file) in capsys.readouterr().out
+    assert file.stat().st_mode == (trained / "last.ckpt").stat().st_mode  # whoever reads the one reads the other
     prior = load_prior(file)
     averaged = checkpoint(trained)["state_dict"]
     for name, weight in prior.state_dict().items():
@@ -197,6 +198,12 @@ def test_what_cannot_be_exported_is_one_sentence(spoil, words, trained, tmp_path
     said = refusal(capsys, main, ["export", f"--checkpoint={file}", f"--out={out}"])
     assert all(word in said for word in [*words, "spoilt.ckpt"]), said
     assert not out.exists()
+
+
+def test_a_checkpoint_that_is_not_there_is_answered_with_those_beside_it(trained, tmp_path, capsys):
+    missing = trained / "better.ckpt"
+    said = refusal(capsys, main, ["export", f"--checkpoint={missing}", f"--out={tmp_path / 'out.safetensors'}"])
+    assert "last.ckpt" in said and "better.ckpt" in said
 
 
 def test_inspecting_tells_what_training_and_medsyn_left(trained, tmp_path, capsys):

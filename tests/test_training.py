@@ -147,6 +147,11 @@ def test_the_held_out_cts_are_written_down(cts, cache, tmp_path):
     assert (tmp_path / "held_out.txt").read_text() == "patient1\n"
 
 
+def test_it_is_said_that_no_ct_is_held_out(cts, tmp_path):
+    with pytest.warns(UserWarning, match="no CT is held out, since 0.2 of 1 is none"):
+        PriorData(str(cts / "patient0.nii.gz"), holdout=HoldOut(fraction=0.2), phantoms=2, cache=str(tmp_path))
+
+
 def test_a_signal_is_no_success(cache, tmp_path):
     train = Python(TRAIN, *arguments(tmp_path, cache, "--trainer.max_epochs=9999"))
     train.wait_for((tmp_path / "last.ckpt").exists)

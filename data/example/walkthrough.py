@@ -22,7 +22,7 @@ def main(out: Path, methods=METHODS) -> None:
     print(f"1. {views} X-rays of {rows} x {columns} pixels, line integrals up to {case['xrays'].max():.1f}")
     distance = torch.from_numpy(case["beam"].sources).norm(dim=1).mean()
     print(f"2. the sources stand {distance:.0f} mm from the isocentre; the report: {case['report']}")
-    truth = torch.from_numpy(nibabel.load(here / "truth.nii.gz").get_fdata(dtype="float32"))
+    truth = torch.from_numpy(nibabel.load(here / "truth.nii.gz").get_fdata(dtype="float32").copy())
     volumes, captions = {}, {}
     for method in methods:
         result = phydict.reconstruct(case["xrays"], case["beam"], method=method, report=case["report"])
@@ -30,7 +30,7 @@ def main(out: Path, methods=METHODS) -> None:
         captions[method] = f"{scores['psnr']:.1f} dB, misfit {result.misfit:.4f}"
         print(f"3. {method}: {captions[method]}, {sum(result.seconds.values()):.1f} s")
         worst = max(range(views), key=result.misfit_per_view.__getitem__)
-        print(f"   the view that fits worst is {worst + 1}, misfit {result.misfit_per_view[worst]:.4f}")
+        print(f"   the view that fits worst is {worst} (counted from 0), misfit {result.misfit_per_view[worst]:.4f}")
         for level, half_width in result.intervals.items():
             inside = ((result.volume - truth).abs() <= half_width).float().mean()
             print(f"   the {level:.0%} interval holds {inside:.0%} of the voxels")

@@ -55,9 +55,9 @@ class InferenceCLI(TellingCLI):
         parser = super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
         parser.add_argument("--profile", action="store_true",
                             help="print the seconds and the peak memory of every stage of each case")
-        parser.add_argument("--calibrate", action="store_true",
-                            help="find first what the geometry file states as uncertain: poses, gains and offsets")
         if subcommand == "predict":
+            parser.add_argument("--calibrate", action="store_true",
+                                help="find first what the geometry file states as uncertain: poses, gains and offsets")
             parser.add_argument("--dry_run", action="store_true",
                                 help="draw the geometry of every case and reconstruct nothing")
         if subcommand == "test":

@@ -96,6 +96,8 @@ class ReconstructionData(lightning.LightningDataModule):
         self.simulator = self.protocol.fixed_simulator(simulator) if self.protocol else simulator
         self.geometry_file = configuration(geometry, ("geometry",)) if geometry else None
         self.beam, self._beam_settings = self.orbit.beam(), self.orbit.settings()
+        self._of_test = {"only": only is not None, "orbit": orbit != Orbit(), "simulator": simulator != Ideal(),
+                         "simulation_voxels": simulation_voxels is not None, "protocol": protocol is not None}
         if cts and self.geometry_file:
             self.beam = read_beam(self.geometry_file)
             crc = file_crc32(self.geometry_file)
@@ -118,9 +120,9 @@ class ReconstructionData(lightning.LightningDataModule):
         """Id -> folder of X-rays. Raises ValueError without data.xrays."""
         if not self.xrays:
             raise ValueError("predict needs data.xrays: a folder of X-ray images with geometry.yaml")
-        if self.protocol:
-            raise ValueError(f"data.protocol {self.protocol.name} is a way to simulate X-rays and to score, but "
-                             "predict takes measured ones: leave it out, or use test")
+        for name in (name for name, given in self._of_test.items() if given):
+            raise ValueError(f"data.{name} is a setting of test, which simulates X-rays of CTs, but predict takes "
+                             "measured ones: leave it out, or use test")
         folders = find_xrays(self.xrays)
         cases = {name_of(os.path.abspath(folder)): folder for folder in folders}
         if len(cases) < len(folders):
@@ -147,6 +149,9 @@ class ReconstructionData(lightning.LightningDataModule):
         """The CTs or phantoms of test: id, what identifies its data, and the function that makes it on `grid`."""
         if not self.cts:
             raise ValueError("test needs data.cts: a NIfTI file, a folder of CTs, or the word phantom")
+        if self.xrays:
+            raise ValueError(f"data.xrays ({self.xrays}) are for predict, but test simulates X-rays of data.cts: leave "
+                             "one out")
         if self.cts == "phantom":
             return [(f"phantom-{seed:06d}", f"phantom version {PHANTOM_VERSION}", lambda s=seed: self._with_fine(
                         grid, lambda g: phantom_case(s, g, window)))

@@ -63,8 +63,8 @@ class CaseResults:
             if there and self.overwrite:
                 self._check_own(case, there)
             elif there and (other := self._other(case, there)):
-                raise ValueError(f"{self.folder / case} was finished with other {other}: set model.overwrite to true, "
-                                 "or give another model.out")
+                raise ValueError(f"{self.folder / case} was finished with other {other}: add --model.overwrite true, "
+                                 "or give another --model.out")
         return [case for case, there in self._before.items() if self.overwrite or not there]
 
     def missing(self) -> list[str]:

@@ -246,7 +246,7 @@ class Posterior(Reconstructor):
         if residual > FAR_OUTSIDE * most:
             warn(f"the residual of the X-rays is {residual:.3g} times their noise, in the scenes that the intervals "
                  f"were calibrated on {most:.3g} at most: they are widened, and may still be too narrow; check the "
-                 "geometry and the scale, and whether the patient moved, or calibrate")
+                 "geometry and the scale, and whether the patient moved")
         widening = max(1.0, residual / most) ** WIDENING * contradiction_widening(measurement)
         widening *= SCATTER_WIDENING if measurement.scatter else 1.0
         widths = self.prior.window.half_width * (widening * denoiser.half_widths[0].cpu()).clamp(max=WIDEST)
@@ -272,8 +272,8 @@ def say_contradictions(measurement: Measurement, widening: float | None) -> None
             f"view {', '.join(map(str, views))} (counted from 0)")
         wider = "" if widening is None else f", and intervals are {widening:.1f} times as wide as calibrated"
         warn(f"no volume explains {which}: as much of it as contradicts the rest counted as noise, so that the volume "
-             f"follows it less and the prior more{wider}; check geometry and scale, and whether the patient moved, or "
-             "calibrate")
+             f"follows it less and the prior more{wider}; check geometry and scale, and whether the patient "
+             "moved")
 
 
 def check_guidance(guidance: float) -> None:

@@ -11,7 +11,8 @@ from torch import Tensor, nn
 FILES = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth", "squeeze": "squeezenet1_1-b8a52dc0.pth"}
 """Backbone -> the file of its trained weights, torchvision's."""
 
-OF_A_REWARD = "set the reward's lpips weight to 0, or set random_backbone: true"
+OF_A_REWARD = ("set the reward's lpips weight to 0 (--model.method.init_args.likelihood.init_args.reward.lpips 0), or "
+               "set random_backbone: true")
 
 
 @lru_cache(maxsize=4)

@@ -29,7 +29,10 @@ def read_checkpoint(path: str | Path) -> dict:
     """A checkpoint that training wrote. Raises FileNotFoundError, or ValueError when it is truncated, holds code, is
     another's or holds weights that are not finite."""
     if not Path(path).is_file():
-        raise FileNotFoundError(f"there is no checkpoint {path}: give a .ckpt file that training wrote")
+        beside = sorted(file.name for file in Path(path).parent.glob("*.ckpt"))
+        raise FileNotFoundError(f"there is no checkpoint {path}: give a .ckpt file that training wrote" + (
+            f", such as {', '.join(beside)} beside it ({BEST} is written when held-out cases are reconstructed)"
+            if beside else ""))
     checkpoint = read_torch(path)
     if not isinstance(checkpoint, dict) or "phydict" not in checkpoint:
         raise ValueError(f"{path} is no checkpoint of a prior: give a .ckpt file that training wrote")

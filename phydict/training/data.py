@@ -15,6 +15,7 @@ from phydict.datasets.population import DrawnPatients
 from phydict.grid import Cube, Grid
 from phydict.runtime.console import check_writable
 from phydict.runtime.seeds import check_seed
+from phydict.runtime.warning import warn
 from phydict.training.draws import MixedCases, training_parts
 from phydict.training.settings import HoldOut, Loading
 from phydict.units import HUWindow
@@ -67,6 +68,9 @@ class PriorData(lightning.LightningDataModule):
         held_out = [f for f in files if f.id in validating or any(word in f.id for word in holdout.ids or [])]
         if len(held_out) == len(files) and not phantoms:
             raise ValueError("there is nothing to train on: data.holdout holds out every CT, and data.phantoms is 0")
+        if files and not held_out and holdout.fraction:
+            warn(f"no CT is held out, since {holdout.fraction:g} of {len(files)} is none: give more CTs, or name some "
+                 "by data.holdout.ids")
         self.held_out = [f.id for f in held_out]
         validating = set(self.held_out)
         self.cts = CTCases([f for f in files if f.id not in validating], cache, self.grid, hu)

@@ -35,7 +35,8 @@ def values(rows: Iterable[dict], column: str, scale: float = 1.0) -> list[float]
 
 def shown(found: list[float], worst: Callable[[list[float]], float], digits: int = 0) -> str:
     """The mean and, in brackets, the worst of some numbers."""
-    return f"{mean(found):.{digits}f} ({worst(found):.{digits}f})"
+    average, least = (round(value, digits) + 0.0 for value in (mean(found), worst(found)))  # no -0
+    return f"{average:.{digits}f} ({least:.{digits}f})"
 
 
 def table(head: str, rows: Iterable[tuple]) -> str:
@@ -77,7 +78,7 @@ def geometries() -> str:
     def lost(own: list[dict]) -> list[float]:
         return [whole[row["case"]] - float(row["psnr_body"]) for row in own]
 
-    return table("geometry | K | PSNR body | lost", (
+    return table("geometry | K | PSNR body | lost (gained: negative)", (
         (f"`{name}`", int(views), shown(values(own, "psnr_body"), min, 1),
          "" if name == "paper_orbit" else shown(lost(own), max, 1))
         for (name, views), own in scenes(rows, "geometry", "views")))

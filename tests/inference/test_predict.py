@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import nibabel
 import numpy as np
@@ -117,6 +118,16 @@ def test_a_sample_of_the_prior_depends_on_the_seed_alone_and_is_that_of_python(p
         np.testing.assert_array_equal(found, expected.volume.numpy())
     assert found.shape == (16, 16, 16)
     assert not np.array_equal(found, volume(tmp_path / "both" / "prior_only" / "bert"))
+
+
+@pytest.mark.slow
+def test_x_rays_or_cts_alone_are_enough(tmp_path, monkeypatch):
+    example = ROOT / "data" / "example"
+    monkeypatch.chdir(tmp_path)
+    main(["predict", f"--data.xrays={example / 'xrays'}"])
+    main(["test", f"--data.cts={example / 'truth.nii.gz'}"])
+    assert volume(Path("runs/reconstructions/phydict_learned/xrays")).shape == (128, 128, 128)
+    assert list(tmp_path.glob("runs/*/phydict_learned/results.csv"))
 
 
 @pytest.mark.slow

@@ -109,6 +109,20 @@ def test_a_prior_refuses_xrays_of_another_grid(prior):
         posterior.reconstruct(torch.ones(3, 24, 24), Projector(Grid.cube(64), BEAM))
 
 
+@pytest.mark.parametrize("name, change", [
+    ("orbit", "orbit.views=4"), ("simulator", "simulator.noise=0.1"), ("simulation_voxels", "simulation_voxels=128"),
+    ("only", "only=nowhere.txt"), ("protocol", "protocol=x2ct")])
+def test_what_simulates_x_rays_is_refused_where_they_were_measured(name, change, measured, tmp_path, capsys):
+    said = refusal(capsys, main, sirt("predict", tmp_path / "out", f"--data.xrays={measured}", f"--data.{change}"))
+    assert f"data.{name} is a setting of test" in said and not (tmp_path / "out").exists()
+
+
+def test_measured_x_rays_and_their_calibration_are_refused_where_x_rays_are_simulated(measured, tmp_path, capsys):
+    assert "leave one out" in refusal(capsys, main, phantoms(tmp_path / "out", 1, f"--data.xrays={measured}"))
+    assert "--calibrate" in refusal(capsys, main, phantoms(tmp_path / "out", 1, "--calibrate"))
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize("args, words", [
     ([], ["predict", "test", "ablate", "such as: predict --data.xrays"]),
     (["reconstruct"], ["'reconstruct'", "ablate"]),

@@ -134,10 +134,10 @@ def check_hu(hu: np.ndarray, name: str) -> None:
     if not low.size or mode > -900:
         air = f"the most frequent value below -300 is {mode:.0f}" if low.size else "no value lies below -300"
         warn(f"{name} does not look like HU: {air}, but air should lie near -1000; check slope, intercept "
-             "and whether `fixed` is right")
+             "and whether `fixed` (data.source.fixed) is right")
     elif tissue < 0.01:
         warn(f"{name} does not look like HU: only {100 * tissue:.1f} % of it lies above -200; it may have "
-             "been rescaled twice, check whether `fixed` is right")
+             "been rescaled twice, check whether `fixed` (data.source.fixed) is right")
 
 
 def to_grid(volume: np.ndarray, affine: np.ndarray, grid: Grid, pad: float) -> np.ndarray:

@@ -123,7 +123,7 @@ def read_description(path: Path, needed: bool = True) -> Description:
         if not needed:
             return Description(path)
         raise FileNotFoundError(f"there is no geometry file {path}; write one with `beam:` and `intensity:` beside the "
-                                "images, or give geometry=")
+                                "images, or give a file by --data.geometry (in Python geometry=)")
     if path.suffix.lower() not in (".yaml", ".yml"):
         return Description(path, {"file": path.name})
     content = read_yaml(path)

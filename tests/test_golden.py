@@ -123,7 +123,7 @@ def golden() -> dict:
 @pytest.mark.parametrize("name, scene", [case for case in scenes() if case[1] != "cascade"])
 def test_a_method_gives_its_golden_figures_in_double_precision(golden, name, scene):
     """To 0.01 HU, as instruction sets round in other ways; DiffVox's signs of residuals carry that further."""
-    tolerances = (2e-3, 1.0) if (name, scene) == ("diffvox", "display") else (1e-5, 0.01)
+    tolerances = (5e-3, 3.0) if (name, scene) == ("diffvox", "display") else (1e-5, 0.01)
     assert_same(on_the_tiny_grid(name, torch.float64, scene), golden[f"{name}, {scene}"], *tolerances)
 
 
@@ -135,7 +135,7 @@ def test_a_method_gives_its_golden_figures_in_single_precision(golden, name, sce
 
 
 @pytest.mark.parametrize("name", [
-    pytest.param(name, marks=[] if name in ("phydict_fast", "cgls") else [pytest.mark.slow])
+    pytest.param(name, marks=[] if name == "cgls" else [pytest.mark.slow])
     for name in ON_THE_EXAMPLE])
 def test_a_method_gives_its_golden_figures_on_the_example(golden, name):
     assert_same(on_the_example(name), golden[f"{name}, example"], 1e-3, 2.0)

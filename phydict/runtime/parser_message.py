@@ -26,7 +26,7 @@ def plain(message: str) -> str:
     if flag := re.fullmatch(r"argument (--\S+): ignored explicit argument '(.*)'", text):
         return f"{flag[1]} takes no value, but {_short(flag[2])} was given"
     if unknown := re.fullmatch(r"unrecognized arguments: (.*)", text):
-        return f"there is no option {_short(unknown[1])}: --help lists what there is"
+        return f"there is no option {_short(unknown[1].split()[0])}: --help lists what there is"
     if unloaded := UNLOADED.match(text):
         return (f"{unloaded[1]} is a mapping of settings, but {_short(unloaded[3])} was given"
                 if ": Unable to load config " in unloaded[4] else plain(unloaded[4]))
@@ -51,12 +51,13 @@ def plain(message: str) -> str:
 
 def _of_class(key: str, path: str, reason: str) -> str:
     if option := re.fullmatch(r"Option '(.*)' is not accepted", reason):
-        return f"{key}: {path} has no setting {option[1]}"
+        return f"{key}: {path} has no setting {option[1]}; the same command with --help lists what it has"
     if reason.endswith("has no attribute 'keys'"):
         return f"{key}.init_args is a mapping of the settings of {path}, but something else was given"
     reason = re.sub(r"^module '([^']*)' has no attribute '([^']*)'", r"\1 has no \2", reason)
     if " has no " in reason or reason.startswith("No module named"):
-        return f"{key} is the path of a class, but {path} cannot be imported ({reason})"
+        hint = ": put its folder on PYTHONPATH" if reason.startswith("No module named") else ""
+        return f"{key} is the path of a class, but {path} cannot be imported ({reason}){hint}"
     return f"{key}: {reason}"
 
 

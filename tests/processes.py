@@ -7,7 +7,7 @@ import os
 import sys
 import time
 from pathlib import Path
-from tempfile import mkdtemp
+from tempfile import TemporaryDirectory
 
 FORKS = multiprocessing.get_context("forkserver")
 FORKS.set_forkserver_preload(["phydict.cli.train", "phydict.cli.infer"])
@@ -27,7 +27,8 @@ class Python:
     """A process that runs `code` with these arguments."""
 
     def __init__(self, code: str, *arguments: object):
-        self.folder = Path(mkdtemp())
+        self.kept = TemporaryDirectory()  # removed with this object
+        self.folder = Path(self.kept.name)
         self.process = FORKS.Process(target=_run, args=(code, list(map(str, arguments)), self.folder))
         self.process.start()
 

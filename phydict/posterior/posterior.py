@@ -272,8 +272,7 @@ def say_contradictions(measurement: Measurement, widening: float | None) -> None
             f"view {', '.join(map(str, views))} (counted from 0)")
         wider = "" if widening is None else f", and intervals are {widening:.1f} times as wide as calibrated"
         warn(f"no volume explains {which}: as much of it as contradicts the rest counted as noise, so that the volume "
-             f"follows it less and the prior more{wider}; check geometry and scale, and whether the patient "
-             "moved")
+             f"follows it less and the prior more{wider}; check geometry and scale, and whether the patient moved")
 
 
 def check_guidance(guidance: float) -> None:

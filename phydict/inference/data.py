@@ -96,8 +96,9 @@ class ReconstructionData(lightning.LightningDataModule):
         self.simulator = self.protocol.fixed_simulator(simulator) if self.protocol else simulator
         self.geometry_file = configuration(geometry, ("geometry",)) if geometry else None
         self.beam, self._beam_settings = self.orbit.beam(), self.orbit.settings()
-        self._of_test = {"only": only is not None, "orbit": orbit != Orbit(), "simulator": simulator != Ideal(),
-                         "simulation_voxels": simulation_voxels is not None, "protocol": protocol is not None}
+        changed = {"only": only is not None, "orbit": orbit != Orbit(), "simulator": simulator != Ideal(),
+                   "simulation_voxels": simulation_voxels is not None, "protocol": protocol is not None}
+        self._of_test = [name for name, given in changed.items() if given]
         if cts and self.geometry_file:
             self.beam = read_beam(self.geometry_file)
             crc = file_crc32(self.geometry_file)
@@ -120,9 +121,9 @@ class ReconstructionData(lightning.LightningDataModule):
         """Id -> folder of X-rays. Raises ValueError without data.xrays."""
         if not self.xrays:
             raise ValueError("predict needs data.xrays: a folder of X-ray images with geometry.yaml")
-        for name in (name for name, given in self._of_test.items() if given):
-            raise ValueError(f"data.{name} is a setting of test, which simulates X-rays of CTs, but predict takes "
-                             "measured ones: leave it out, or use test")
+        if self._of_test:
+            raise ValueError(f"data.{self._of_test[0]} is a setting of test, which simulates X-rays of CTs, but "
+                             "predict takes measured ones: leave it out, or use test")
         folders = find_xrays(self.xrays)
         cases = {name_of(os.path.abspath(folder)): folder for folder in folders}
         if len(cases) < len(folders):

@@ -40,10 +40,7 @@ def write_stage(path: Path, header: dict, weights: dict[str, Tensor], dtype: tor
         raise ValueError(f"'{path}' was not written, since its weights are not finite in {dtype}: {broken}")
     try:
         with atomic_write(path) as part:
-            part.touch()
-            mode = part.stat().st_mode  # that of a user's other files, where safetensors lets nobody else read
             save_file(tensors, part, {"phydict": json.dumps(header)})
-            part.chmod(mode)
     except (SafetensorError, OSError) as error:
         raise not_written(f"'{path}'", error, "give another place") from error
 

@@ -19,11 +19,15 @@ ASIDE = ".set-aside-by-phydict"
 @contextmanager
 def atomic_write(final: Path) -> Iterator[Path]:
     """A path of the same ending to write to; when the block ends well that file takes `final`'s place, else it is
-    removed."""
+    removed. Whoever may read the user's other files may read it, even where a library writes for its owner alone."""
     final.parent.mkdir(parents=True, exist_ok=True)
     part = final.with_name(f".{os.getpid()}.part.{final.name}")
     try:
+        part.touch()
+        mode = part.stat().st_mode
+        part.unlink()
         yield part
+        part.chmod(mode)
         _sync(part)
         part.replace(final)
     finally:

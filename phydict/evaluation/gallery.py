@@ -17,6 +17,8 @@ import torch
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
@@ -180,22 +182,27 @@ def _show_xrays(figure, height: float, xrays, reprojection) -> None:
     views = np.linspace(0, len(measured) - 1, count).round().astype(int)
     low, high = _scale(np.concatenate([rows[name][views].ravel() for name in rows if name != "residual"]))
     spread = np.abs(_scale(rows["residual"][views])).max() if "residual" in rows else 0.0
-    cells = figure.add_gridspec(len(rows), MOST_VIEWS, wspace=0.06, hspace=0.22, left=0.045, right=0.93,
-                                bottom=0.1 / height, top=1 - 0.3 / height)
+    cells = figure.add_gridspec(len(rows), 1, hspace=0.22, left=0.045, right=0.93, bottom=0.1 / height,
+                                top=1 - 0.3 / height)
+    tall, wide = measured.shape[1:]
+    apart = wide + max(1, round(0.06 * wide))
+    width = MOST_VIEWS * apart - (apart - wide)
     for row, (name, images) in enumerate(rows.items()):
         signed = name == "residual"
-        limits = (-spread, spread) if signed else (low, high)
+        colours = ScalarMappable(Normalize(*((-spread, spread) if signed else (low, high))), SIGNED if signed else GREY)
+        strip = np.ones((tall, width, 4))
+        ax = figure.add_subplot(cells[row, 0])
         for column, view in enumerate(views):
-            ax = figure.add_subplot(cells[row, column])
-            shown = ax.imshow(np.ma.masked_invalid(images[view]), SIGNED if signed else GREY, vmin=limits[0],
-                              vmax=limits[1], interpolation="nearest")
-            heading = f"view {view} of {len(measured)}" if row == 0 else ""
-            _finish(ax, f"misfit {per_view[view]:.3g}" if signed else heading)
-            if column == 0:
-                ax.set_ylabel(name, fontsize=9)
-        place = cells[row, count - 1].get_position(figure)
-        bar = figure.add_axes((place.x1 + 0.015, place.y0, 0.012, place.height))
-        figure.colorbar(shown, cax=bar).ax.tick_params(labelsize=7)
+            start = column * apart
+            strip[:, start:start + wide] = colours.cmap(colours.norm(np.ma.masked_invalid(images[view])))
+            heading = f"misfit {per_view[view]:.3g}" if signed else "" if row else f"view {view} of {len(measured)}"
+            ax.annotate(heading, ((start + wide / 2) / width, 1), (0, 3), "axes fraction", "offset points", fontsize=9,
+                        ha="center")
+        ax.imshow(strip, interpolation="nearest")
+        _finish(ax, "")
+        ax.set_ylabel(name, fontsize=9)
+        bar = ax.inset_axes(((count * apart - (apart - wide)) / width + 0.017, 0, 0.0135, 1))
+        figure.colorbar(colours, cax=bar).ax.tick_params(labelsize=7)
 
 
 def _scale(values: np.ndarray) -> tuple[float, float]:

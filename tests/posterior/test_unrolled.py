@@ -167,7 +167,8 @@ def test_scatter_that_the_first_step_knows_little_of_contradicts_nothing():
     grid, simulator, beam = Grid.cube(64), Polychromatic(scatter=0.06), ConeBeam.orbit(4, 1020, 740, (112, 112), 5.0)
     mu = hu_to_mu(torch.from_numpy(build(Thorax.standard(), grid)[0]).float())
     xrays = simulator(Projector(grid, beam, full_detector=True), mu[None, None], 1)[0]
-    found = reconstruct(xrays, beam, mu_water=simulator.effective_mu_water)
+    two_calls = Unrolled((0.35, 0.25), (0.5, 0.3, 0.3))
+    found = reconstruct(xrays, beam, method=two_calls, mu_water=simulator.effective_mu_water)
     assert found.scatter > 0.1 and found.model_variance == 0.0
 
 

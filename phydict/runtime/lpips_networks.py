@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from functools import lru_cache
 
 import torch
@@ -27,8 +28,9 @@ def load_lpips(backbone: str, random_backbone: bool, otherwise: str = OF_A_REWAR
     import lpips
 
     try:
-        with torch.random.fork_rng():  # an untrained backbone is the same in every process
-            torch.manual_seed(0)
+        with torch.random.fork_rng(), warnings.catch_warnings():
+            warnings.filterwarnings("ignore", module="torchvision")  # lpips calls it in a way of before
+            torch.manual_seed(0)  # an untrained backbone is the same in every process
             network = lpips.LPIPS(net=backbone, pnet_rand=random_backbone, verbose=False)
     except OSError as error:
         raise FileNotFoundError(

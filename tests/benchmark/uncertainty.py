@@ -3,9 +3,10 @@
     python tests/benchmark/uncertainty.py <folder of CTs> [refiner.safetensors] [--only <words in a scene's name>]
 
 Writes uncertainty.csv beside this file: for each CT, number of views and scene, and for body and lung, the share of
-voxels inside the intervals of 50, 80, 90 and 95 %, the rank correlation of their width with the error, half their mean
-width at 90 %, and half the width that one interval for all of these voxels would need to hold 90 % of them. Draws
-uncertainty.png, the reliability diagram, and prints the means over the CTs.
+voxels inside the intervals of 50, 80, 90 and 95 %; the rank correlation of their width with the error, and beside it
+that of the error's own root mean square over the LOCAL^3 voxels around; half their mean width at 90 %, and half the
+width that one interval for all of these voxels would need to hold 90 % of them. Draws uncertainty.png, the reliability
+diagram, and prints the means over the CTs.
 """
 
 import argparse
@@ -29,6 +30,8 @@ from phydict.xray.simulate import Simulator
 
 WINDOW, BEYOND = HUWindow(), "voxels_"
 """The range of HU, and how scenes on finer voxels than the refiner's are called."""
+LOCAL = 5
+"""Voxels along the side of the cube whose errors tell how large one of them is."""
 
 
 def scenes(grid: Grid) -> Iterator[tuple[str, ConeBeam, Simulator, Grid, Grid]]:
@@ -54,6 +57,7 @@ def rows_of(ct, refiner, only: str) -> Iterator[dict]:
                             grid=grid if scene.startswith(BEYOND) else None)
         truth = WINDOW.to_hu(torch.nn.functional.avg_pool3d(source["volume"], made.shape[0] // grid.shape[0]))[0]
         error, lung = (found.volume - truth).abs(), case["masks"][0] > 0.5
+        around = torch.nn.functional.avg_pool3d(error.square()[None], LOCAL, 1, LOCAL // 2)[0]
         body = torch.from_numpy(body_mask(truth.numpy(), grid.spacing)) | lung
         for part, mask in (("body", body), ("lung", lung)):
             inside = {f"inside_{100 * level:.0f}": float((error <= width)[mask].float().mean())
@@ -61,6 +65,7 @@ def rows_of(ct, refiner, only: str) -> Iterator[dict]:
             width = found.intervals[0.9][mask]
             yield {"case": ct.id, "method": "phydict_learned", "scene": scene, "views": beam.views, "part": part,
                    **inside, "rank_correlation": float(spearmanr(width, error[mask])[0]),
+                   "rank_correlation_around": float(spearmanr(around[mask], error[mask])[0]),
                    "half_width_90_hu": float(width.mean()), "constant_90_hu": float(error[mask].quantile(0.9))}
 
 

@@ -336,6 +336,11 @@ def test_a_report_in_another_encoding_is_named(tmp_path):
     fails("report.txt is not UTF-8 text", tmp_path)
 
 
+def test_a_folder_in_the_place_of_a_report_is_named(tmp_path):
+    (write(tmp_path, images()) / "report.txt").mkdir()
+    fails("report.txt is a folder", tmp_path, IsADirectoryError)
+
+
 def test_mixed_pixel_types_are_refused(tmp_path):
     folder = write(tmp_path, np.ones((2, *SHAPE), np.uint8), "png")
     np.save(folder / "view_1.npy", images()[1])

@@ -217,4 +217,7 @@ def _mean(paths: list[Path], shape: tuple[int, int]) -> np.ndarray:
 
 
 def _read_report(path: Path) -> str:
+    if path.is_dir():
+        raise IsADirectoryError(f"{path} is a folder, but a report is a text file of that name: rename the folder, or "
+                                "put the text in its place")
     return format_report(read_text(path, MOST_REPORT)) if path.is_file() else ""

@@ -57,10 +57,10 @@ def test_calibrated_intervals_hold_their_share_in_each_tissue_and_coverage():
 
     given = ratios()
     network.calibrate(given.flatten(), tissues.expand_as(given).flatten(), coverages.expand_as(given).flatten(),
-                      torch.tensor([1.0, 3.0]))
+                      torch.tensor([1.0] * 9 + [2.0] * 9 + [3.0, 50.0]))
     held = (ratios()[..., None] <= network.quantiles[tissues, coverages]).float().mean(0)
     torch.testing.assert_close(held, torch.tensor(LEVELS).expand_as(held), atol=0.015, rtol=0)
-    assert network.most_residual == 3
+    assert 2 <= network.most_residual <= 3  # one scene of twenty says nothing of what is usual
 
 
 def test_voxels_beyond_16_million_calibrate():
@@ -129,7 +129,7 @@ def test_a_residual_larger_than_in_calibration_widens_the_intervals_and_a_far_la
     refiner = tiny_refiner(uncertain=True)
     usual = reconstruct(views(), BEAM, refiner, display=True)
     refiner.uncertainty.most_residual.fill_(1e-3)
-    with pytest.warns(UserWarning, match="that the intervals were calibrated on 0.001 at most") as said:
+    with pytest.warns(UserWarning, match="usually at most 0.001 in the scenes") as said:
         wider = reconstruct(views(), BEAM, refiner, display=True)
     residual = float(str(said[0].message).split("X-rays is ")[1].split(" times")[0])
     assert usual.interval_widening == 1

@@ -235,7 +235,7 @@ class Posterior(Reconstructor):
     def _intervals(self, denoiser: CountingDenoiser, measurement: Measurement, reprojection: Tensor
                    ) -> tuple[dict[float, Tensor], float]:
         """Level -> half-widths in HU (X, Y, Z), none where the network does not know them, and the factor by which they
-        are wider than calibrated: where the residual of the X-rays is larger than in any scene of the calibration, or
+        are wider than calibrated: where the residual of the X-rays is larger than was usual in the calibration, or
         they contradict each other or hold scatter. Warns where it is more than FAR_OUTSIDE times as large, less what
         counted as noise."""
         uncertainty = self.prior.uncertainty if isinstance(self.prior, Refiner) else None
@@ -244,9 +244,9 @@ class Posterior(Reconstructor):
         residual = float(measurement.normalised_error(reprojection, modelled=True))
         most = float(uncertainty.most_residual)
         if residual > FAR_OUTSIDE * most:
-            warn(f"the residual of the X-rays is {residual:.3g} times their noise, in the scenes that the intervals "
-                 f"were calibrated on {most:.3g} at most: they are widened, and may still be too narrow; check the "
-                 "geometry and the scale, and whether the patient moved")
+            warn(f"the residual of the X-rays is {residual:.3g} times their noise, and usually at most {most:.3g} in "
+                 "the scenes that the intervals were calibrated on: they are widened, and may still be too narrow; "
+                 "check the geometry and the scale, and whether the patient moved")
         widening = max(1.0, residual / most) ** WIDENING * contradiction_widening(measurement)
         widening *= SCATTER_WIDENING if measurement.scatter else 1.0
         widths = self.prior.window.half_width * (widening * denoiser.half_widths[0].cpu()).clamp(max=WIDEST)

@@ -75,7 +75,7 @@ class Uncertainty(nn.Module):
 
         ratios: |e| / b of voxels (N,); tissues, coverages: what `tissue_of` and `coverage_of` say of them (N,);
         residuals: of the reconstructions' X-rays, in units of their noise. A tissue or coverage of few
-        voxels takes the quantiles of all.
+        voxels takes the quantiles of all. ORDINARY of the residuals are no larger than `most_residual`.
         """
         for t in range(len(TISSUES)):
             of_tissue = ratios[tissues == t]
@@ -83,11 +83,13 @@ class Uncertainty(nn.Module):
             for n in range(COVERAGES):
                 own = ratios[(tissues == t) & (coverages == n)]
                 self.quantiles[t, n] = _quantiles(own) if len(own) >= FEWEST else shared
-        self.most_residual.copy_(residuals.max())
+        self.most_residual.copy_(residuals.quantile(ORDINARY))
 
 
 FEWEST = 2000
 """Voxels from which a tissue and a coverage have quantiles of their own."""
+ORDINARY = 0.9
+"""The share of a calibration's scenes whose residual widens nothing: the largest of 48 was twice the next."""
 
 
 def _quantiles(ratios: Tensor) -> Tensor:

@@ -18,6 +18,7 @@ from phydict.posterior import Measurement, Posterior, PriorOnly, ProximalCG, Spl
 from phydict.posterior.discretisation import subgrid_projection
 from phydict.posterior.evidence import CHANGE_SCALE, COVERAGE_SCALE, RESIDUAL_SCALE, Evidence
 from phydict.posterior.hardening import with_hardening
+from phydict.posterior.samplers import unrolled
 from phydict.prior import BoundRefiner, Prior, Refiner, load_prior, save_prior, save_refiner
 from phydict.runtime.precision import computes_bfloat16
 from phydict.units import HUWindow, hu_to_mu
@@ -124,6 +125,22 @@ def test_finer_voxels_are_asked_only_where_the_grid_misses_the_x_rays():
         assert isinstance(m.subgrid, torch.Tensor) == (name == "finer")
         *_, other = Unrolled(subgrid=None).estimates(refiner, m)
         assert not isinstance(m.subgrid, torch.Tensor) and torch.equal(z, other) == (name == "grid")
+
+
+@torch.no_grad()
+def test_what_finer_voxels_add_is_left_out_of_a_view_that_misses_more_with_it(monkeypatch):
+    def spoilt(m: Measurement, *given) -> torch.Tensor:
+        found = subgrid_projection(m, *given)
+        found[:, 1] += m.y.max()
+        return found
+
+    m, m_spoilt = (fine_scene(noise=1e-3)[0] for _ in range(2))
+    refiner = tiny_refiner().bind(precision="float32")
+    for measurement, step in ((m, subgrid_projection), (m_spoilt, spoilt)):
+        monkeypatch.setattr(unrolled, "subgrid_projection", step)
+        list(Unrolled().estimates(refiner, measurement))
+    assert m.subgrid.abs().amax((2, 3)).min() > 0 and not m_spoilt.subgrid[:, 1].any()
+    assert torch.equal(m_spoilt.subgrid[:, ::2], m.subgrid[:, ::2])
 
 
 EIGHT = ConeBeam.orbit(8, 1020, 740, (28, 28), 20.0)

@@ -31,6 +31,11 @@ OUTLIER, SHARED = 2.2, 0.45
 it is 2.8 to 3.2 times, of right ones 2.05 at most. Of the worst view's error, SHARED may be seen in others because of
 it, and does not count against them: with one view flipped 0.25 to 0.5. Both of CTs that evaluate nothing."""
 
+UNLIKE_FINER = 3.0
+"""By how many times its error beyond noise a view may miss the volume at hand more with what finer voxels add to it:
+1.1 to 2.5 times of X-rays made on finer voxels, 3 times and more of those made on the grid, which sharp edges along the
+rays of a view may take for the others. Of two CTs that evaluate nothing."""
+
 FEW_VIEWS = 8
 """Views beyond which the first step, of bounded length, leaves more of each, as the root of their number: on five
 CTs 0.26 to 0.36 voxels of 8 polychromatic views at most and 0.3 to 0.42 of 16, but 1.3 to 1.5 of 8 in wrong poses."""
@@ -47,7 +52,8 @@ class Unrolled(Sampler):
 
     Where the steps up to half of the calls still miss the X-rays by more than their noise, what the grid cannot hold of
     them is sought on finer voxels (`subgrid_projection`) and from then on counted as known: real X-rays are never made
-    on a grid. Not where detectors are tilted, for which finer voxels cost too much.
+    on a grid. Not in a view whose error grows more than UNLIKE_FINER times by it, nor where detectors are tilted, for
+    which finer voxels cost too much.
 
     Where the first step misses a view, beyond its noise, by more than `contradiction`, or by more than half of it and
     OUTLIER times as much as the median view, and by more than SHARED of the worst view's error, as with wrong poses, a
@@ -134,7 +140,10 @@ class Unrolled(Sampler):
             step = self.final_likelihood if last else self.likelihood
             z = self._likelihood_step(step, measurement, before, self.x0_stds[n + 1])
             if self.subgrid is not None and n + 1 == len(self.times) // 2 and self._misses(measurement, z):
+                missed = measurement.view_errors(measurement.last_projection)  # type: ignore[arg-type]  # it projected
                 measurement.subgrid = subgrid_projection(measurement, z[:, :1], self.subgrid, self.x0_stds[0])
+                still = measurement.view_errors(measurement.project(z[:, :1]))
+                measurement.subgrid = measurement.subgrid * (still <= UNLIKE_FINER * missed)[:, None, None]
             if last and isinstance(step, ProximalCG):
                 excess = float(measurement.normalised_residual(z[:, :1], modelled=True).max()) ** 2
                 if excess > 1:

@@ -31,10 +31,10 @@ OUTLIER, SHARED = 2.2, 0.45
 it is 2.8 to 3.2 times, of right ones 2.05 at most. Of the worst view's error, SHARED may be seen in others because of
 it, and does not count against them: with one view flipped 0.25 to 0.5. Both of CTs that evaluate nothing."""
 
-UNLIKE_FINER = 3.0
+UNLIKE_FINER = 6.0
 """By how many times its error beyond noise a view may miss the volume at hand more with what finer voxels add to it:
-1.1 to 2.5 times of X-rays made on finer voxels, 3 times and more of those made on the grid, which sharp edges along the
-rays of a view may take for the others. Of two CTs that evaluate nothing."""
+0.8 to 3.9 times of X-rays made on finer voxels; of those made on the grid, in a tomosynthesis, 3 to 16 times and more,
+since sharp edges along its rays look like finer voxels. Of two CTs that evaluate nothing."""
 
 FEW_VIEWS = 8
 """Views beyond which the first step, of bounded length, leaves more of each, as the root of their number: on five

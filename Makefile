@@ -11,7 +11,7 @@ demo: environment
 	$(RUN) data/example/demo.py
 
 test: environment
-	$(RUN) -m pytest -n auto --maxprocesses 4 --dist loadfile
+	$(RUN) -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 lint: environment
 	$(RUN) -m ruff check

@@ -184,25 +184,28 @@ def _show_xrays(figure, height: float, xrays, reprojection) -> None:
     spread = np.abs(_scale(rows["residual"][views])).max() if "residual" in rows else 0.0
     cells = figure.add_gridspec(len(rows), 1, hspace=0.22, left=0.045, right=0.93, bottom=0.1 / height,
                                 top=1 - 0.3 / height)
+    headings = {"measured": [f"view {view} of {len(measured)}" for view in views]}
+    if "residual" in rows:
+        headings["residual"] = [f"misfit {per_view[view]:.3g}" for view in views]
     tall, wide = measured.shape[1:]
-    apart = wide + max(1, round(0.06 * wide))
-    width = MOST_VIEWS * apart - (apart - wide)
+    gap = max(1, round(0.06 * wide))
+    starts = (wide + gap) * np.arange(MOST_VIEWS)
+    width = starts[-1] + wide
     for row, (name, images) in enumerate(rows.items()):
-        signed = name == "residual"
-        colours = ScalarMappable(Normalize(*((-spread, spread) if signed else (low, high))), SIGNED if signed else GREY)
+        limits, colours = ((-spread, spread), SIGNED) if name == "residual" else ((low, high), GREY)
+        mapped = ScalarMappable(Normalize(*limits), colours)
         strip = np.ones((tall, width, 4))
+        for start, view in zip(starts, views):
+            strip[:, start:start + wide] = mapped.cmap(mapped.norm(np.ma.masked_invalid(images[view])))
         ax = figure.add_subplot(cells[row, 0])
-        for column, view in enumerate(views):
-            start = column * apart
-            strip[:, start:start + wide] = colours.cmap(colours.norm(np.ma.masked_invalid(images[view])))
-            heading = f"misfit {per_view[view]:.3g}" if signed else "" if row else f"view {view} of {len(measured)}"
-            ax.annotate(heading, ((start + wide / 2) / width, 1), (0, 3), "axes fraction", "offset points", fontsize=9,
-                        ha="center")
         ax.imshow(strip, interpolation="nearest")
         _finish(ax, "")
         ax.set_ylabel(name, fontsize=9)
-        bar = ax.inset_axes(((count * apart - (apart - wide)) / width + 0.017, 0, 0.0135, 1))
-        figure.colorbar(colours, cax=bar).ax.tick_params(labelsize=7)
+        for start, heading in zip(starts, headings.get(name, [])):
+            ax.annotate(heading, ((start + wide / 2) / width, 1), (0, 3), "axes fraction", "offset points", fontsize=9,
+                        ha="center")
+        bar = ax.inset_axes(((starts[count - 1] + wide) / width + 0.017, 0, 0.0135, 1))
+        figure.colorbar(mapped, cax=bar).ax.tick_params(labelsize=7)
 
 
 def _scale(values: np.ndarray) -> tuple[float, float]:

@@ -29,7 +29,7 @@ def load_lpips(backbone: str, random_backbone: bool, otherwise: str = OF_A_REWAR
 
     try:
         with torch.random.fork_rng(), warnings.catch_warnings():
-            warnings.filterwarnings("ignore", module="torchvision")  # lpips calls it in a way of before
+            warnings.filterwarnings("ignore", module="torchvision")  # of whose older interface lpips makes use
             torch.manual_seed(0)  # an untrained backbone is the same in every process
             network = lpips.LPIPS(net=backbone, pnet_rand=random_backbone, verbose=False)
     except OSError as error:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import cast
 
 import torch
 from torch import Tensor
@@ -140,12 +139,8 @@ class Unrolled(Sampler):
             last = n + 1 == len(self.times)
             step = self.final_likelihood if last else self.likelihood
             z = self._likelihood_step(step, measurement, before, self.x0_stds[n + 1])
-            if self.subgrid is not None and n + 1 == len(self.times) // 2 and self._misses(measurement, z):
-                projection = cast(Tensor, measurement.last_projection)
-                finer = subgrid_projection(measurement, z[:, :1], self.subgrid, self.x0_stds[0])
-                without, with_it = ((seen - measurement.y)[0].flatten(1).norm(dim=1)
-                                    for seen in (projection, projection + finer))
-                measurement.subgrid = finer * (with_it <= UNLIKE_FINER * without)[:, None, None]
+            if n + 1 == len(self.times) // 2:
+                measurement.subgrid = self._subgrid_of(measurement, z[:, :1])
             if last and isinstance(step, ProximalCG):
                 excess = float(measurement.normalised_residual(z[:, :1], modelled=True).max()) ** 2
                 if excess > 1:
@@ -175,10 +170,18 @@ class Unrolled(Sampler):
         generator = torch.Generator().manual_seed(0)
         return self.first.one_pass(refiner, measurement, noise_like(mean, generator), generator)
 
-    def _misses(self, measurement: Measurement, z: Tensor) -> bool:
-        """Whether the X-rays hold more than their noise beyond z, for which `subgrid` may look."""
-        return (measurement.projector.method == "separable"
-                and float(measurement.normalised_residual(z[:, :1], modelled=True).max()) > 1)
+    def _subgrid_of(self, measurement: Measurement, x: Tensor) -> Tensor | float:
+        """What finer voxels add to the projections of the CT x: of views that it does not make much worse, and nothing
+        where the X-rays hold no more than their noise beyond x."""
+        if self.subgrid is None or measurement.projector.method != "separable":
+            return 0.0
+        projection = measurement.project(x)
+        if not (measurement.normalised_error(projection, modelled=True) > 1).any():
+            return 0.0
+        finer = subgrid_projection(measurement, x, self.subgrid, self.x0_stds[0])
+        without, with_it = ((seen - measurement.y)[0].flatten(1).norm(dim=1)
+                            for seen in (projection, projection + finer))
+        return finer * (with_it <= UNLIKE_FINER * without)[:, None, None]
 
     @staticmethod
     def _likelihood_step(step: LikelihoodStep, measurement: Measurement, x0: Tensor, x0_std: float) -> Tensor:

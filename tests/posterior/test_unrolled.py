@@ -181,7 +181,7 @@ def test_a_view_that_contradicts_the_others_counts_less_and_x_rays_that_agree_co
 
 
 def test_scatter_that_the_first_step_knows_little_of_contradicts_nothing():
-    grid, simulator, beam = Grid.cube(64), Polychromatic(scatter=0.06), ConeBeam.orbit(4, 1020, 740, (112, 112), 5.0)
+    grid, simulator, beam = Grid.cube(64), Polychromatic(scatter=0.06), ConeBeam.orbit(4, 1020, 740, (56, 56), 10.0)
     mu = hu_to_mu(torch.from_numpy(build(Thorax.standard(), grid)[0]).float())
     xrays = simulator(Projector(grid, beam, full_detector=True), mu[None, None], 1)[0]
     two_calls = Unrolled((0.35, 0.25), (0.5, 0.3, 0.3))

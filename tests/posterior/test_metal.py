@@ -35,11 +35,11 @@ def body(metal: float = DENSITY) -> tuple[Tensor, Tensor]:
     return hu + rod, rod
 
 
-def measured(metal: float = DENSITY, display: bool = False) -> Measurement:
+def measured(metal: float = DENSITY, display: bool = False, beam: ConeBeam = BEAM) -> Measurement:
     """X-rays of finer voxels."""
-    y = Ideal()(Projector(FINE, BEAM, full_detector=True), hu_to_mu(body(metal)[0]))[0]
+    y = Ideal()(Projector(FINE, beam, full_detector=True), hu_to_mu(body(metal)[0]))[0]
     y = 0.3 * y + 0.1 if display else y
-    return Measurement(Projector(GRID, BEAM, full_detector=True), y, WINDOW, display)
+    return Measurement(Projector(GRID, beam, full_detector=True), y, WINDOW, display)
 
 
 class Method:
@@ -83,6 +83,14 @@ def test_what_is_switched_off_or_below_bone_is_not_sought():
         m.window = window
         with_metal(m, settings, Method(m), lambda: pytest.fail("it ran again"))
         assert m.carried is None
+
+
+@pytest.mark.parametrize("display", [False, True])
+def test_two_display_images_of_unknown_gain_have_no_metal_and_two_of_line_integrals_have(display):
+    m = measured(display=display, beam=BEAM.select([0, 2]))
+    method = Method(m)
+    with_metal(m, Metal(), method, method)
+    assert (m.carried is None) == display == (method.runs == 1)
 
 
 def test_metal_that_does_not_help_is_given_up_and_nothing_is_left_of_it():
@@ -176,7 +184,7 @@ def test_finer_voxels_and_several_samples_hold_the_metal_too():
     assert samples.volume.max() > 3000
 
 
-@pytest.mark.parametrize("wrong", [{"least_ml": 0.0}, {"least_ml": 9.0, "most_ml": 8.0}, {"rounds": 0},
+@pytest.mark.parametrize("wrong", [{"least_ml": 0.0}, {"least_ml": 9.0, "most_ml": 8.0}, {"rounds": 0}, {"least_views": 0},
                                    {"iterations": 0}, {"least_ml": math.nan}])
 def test_wrong_settings_are_refused(wrong):
     with pytest.raises(ValueError, match="given"):

@@ -76,7 +76,7 @@ METHODS: dict[str, Sampler | Reconstructor] = {
         likelihood=ProximalCG(iterations=7, restarts=1, tv_weight=10.0, tv_eps=0.003),
         final_likelihood=ProximalCG(iterations=10, restarts=5, refit_scatter=True, weighted_least_squares=True,
                                     tv_weight=10.0, tv_eps=0.003)),
-    # The default: a network trained on scenes of X-rays, four calls, each followed by conjugate gradients.
+    # The default: a network trained on scenes of X-rays, four or six calls, each followed by conjugate gradients.
     "phydict_learned": Unrolled(chests_only=True),
     # The paper's text: two gradient steps of 0.1 per timestep with LPIPS, then Extra Compute from delta = 0.8.
     "phydict_paper": SplitGibbs(iterations=50, likelihood=GradientSteps(reward=Reward(lpips=1.0)), ec_delta=0.8,

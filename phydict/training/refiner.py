@@ -97,7 +97,8 @@ class RefinerTraining(StageTraining):
         context, first = self.prior.conditioning(BoundPrior(reader, reader.context([report]), 1.0), bool(report))
         learning = _Learning(self.prior, context, first=first)
         losses = []
-        for x0, _ in zip(self.method.estimates(learning, measurement), range(self.calls)):
+        calls = self.method.calls(measurement.projector.beam.views)
+        for _, x0 in zip(calls, self.method.estimates(learning, measurement)):  # and not the step after the last
             losses.append(self.call_loss(x0, ct, masks, known))
         return torch.stack(losses).mean()
 

@@ -169,7 +169,7 @@ class ReplayTraining(RefinerTraining):
     calls = 1
 
     def batch_loss(self, batch: dict, key: tuple[int, ...] = (0,), rank: int = 0, processes: int = 1) -> Tensor:
-        times = torch.tensor(self.method.times, device=self.device)[batch["call"]]
+        times = torch.tensor(self.method.times + self.method.more_times, device=self.device)[batch["call"]]
         context = self.prior.prior.null.expand(len(times), -1, -1)
         x0, known = self.prior(batch["state"], times, context, batch["evidence"]), ~batch["masks"].isnan()
         return torch.stack([self.call_loss(*case) for case in zip(

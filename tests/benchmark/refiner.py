@@ -38,7 +38,7 @@ from phydict.xray.binning import benchmark_orbit
 CUBE, VIEWS, DRAWS, RATE = Cube(32), (2, 4, 8, 16), 300, 1e-3
 HELD_OUT = ["LIDC-IDRI-0004", "CPTAC-LSCC-C3N-00247"]
 STEP = ProximalCG(10, 3, refit_scatter=True, tv_weight=5.0, tv_eps=0.003)
-ONE, THREE = (Unrolled(times, (0.5,) + (0.3,) * len(times), likelihood=STEP)
+ONE, THREE = (Unrolled(times, (0.5,) + (0.3,) * len(times), likelihood=STEP, more_times=())
               for times in ((0.35,), (0.35, 0.25, 0.2)))
 
 

@@ -3,23 +3,27 @@
     python tests/benchmark/refiner_training.py <folder of CTs> <core-hours>=<refiner.safetensors> ...
                                                [--views 1 2 4 8 16]
 
-core-hours: of training that the weights have seen. Writes refiner_training.csv beside this file, where rows of other
-core-hours and CTs stay, and prints the mean over the CTs. X-rays are ideal ones of the same voxels.
+core-hours: of training that the weights have seen; from any number of views they are called four times. Writes
+refiner_training.csv beside this file, where rows of other core-hours and CTs stay, and prints the mean over the CTs.
+X-rays are ideal ones of the same voxels.
 """
 
 import argparse
 from collections import defaultdict
+from dataclasses import replace
 from pathlib import Path
 from statistics import mean
 
 import phydict
 from phydict.datasets import find_cts, prepare_ct
 from phydict.evaluation import read_csv, volume_metrics, write_csv
+from phydict.methods import METHODS
 from phydict.prior import DEFAULT_REFINER
 from phydict.xray import Ideal, Projector
 from phydict.xray.binning import benchmark_orbit
 
 HERE = Path(__file__)
+METHOD = replace(METHODS["phydict_learned"], more_times=())
 
 
 def scored(refiner: phydict.prior.Refiner, core_hours: float, folder: Path, views: list[int]) -> list[dict]:
@@ -30,7 +34,7 @@ def scored(refiner: phydict.prior.Refiner, core_hours: float, folder: Path, view
         for number in views:
             projector = Projector(refiner.grid, benchmark_orbit(refiner.grid, number), full_detector=True)
             xrays = Ideal()(projector, refiner.window.to_mu(volume), 0)[0]
-            found = phydict.reconstruct(xrays, projector.beam, refiner, grid=refiner.grid)
+            found = phydict.reconstruct(xrays, projector.beam, refiner, METHOD, grid=refiner.grid)
             rows.append({"case": ct.id, "core_hours": core_hours, "views": number}
                         | volume_metrics(found.volume[None, None], refiner.window.to_hu(volume)))
     return rows

@@ -184,8 +184,8 @@ def test_finer_voxels_and_several_samples_hold_the_metal_too():
     assert samples.volume.max() > 3000
 
 
-@pytest.mark.parametrize("wrong", [{"least_ml": 0.0}, {"least_ml": 9.0, "most_ml": 8.0}, {"rounds": 0}, {"least_views": 0},
-                                   {"iterations": 0}, {"least_ml": math.nan}])
+@pytest.mark.parametrize("wrong", [{"least_ml": 0.0}, {"least_ml": 9.0, "most_ml": 8.0}, {"rounds": 0},
+                                   {"least_views": 0}, {"iterations": 0}, {"least_ml": math.nan}])
 def test_wrong_settings_are_refused(wrong):
     with pytest.raises(ValueError, match="given"):
         Metal(**wrong)

@@ -38,6 +38,10 @@ class KindMap(nn.Module):
         drawn = (score.sigmoid()[..., None] * extent).amax(1)
         return drawn.unflatten(2, (self.cells,) * 3)
 
+    def stated(self, context: Tensor) -> Tensor:
+        """Context (B, L, D) -> the probability of each kind that some state states it (B, kinds)."""
+        return self.score(self.read(context)).sigmoid().amax(1)
+
     def scores(self, context: Tensor) -> Tensor:
         """Context (B, L, D) -> how much of each kind is drawn (B, kinds): the mean of its map."""
         return self(context).mean((2, 3, 4))

@@ -12,6 +12,7 @@ from phydict.diffusion import CosineSchedule
 from phydict.grid import Grid
 from phydict.prior.convolution import lay_out, silence
 from phydict.prior.evidence_channels import EVIDENCE_CHANNELS
+from phydict.prior.kind_map import KindMap
 from phydict.prior.prior import BoundPrior, Prior
 from phydict.prior.uncertainty import Uncertainty
 from phydict.prior.unet import VolumeUNet
@@ -19,6 +20,10 @@ from phydict.runtime.precision import network_precision
 from phydict.units import HUWindow
 
 GATE_WIDTH = 16
+
+STATED = 0.5
+"""Probability from which a report counts as stating a finding. Phantoms' with findings have 0.96 and more, those
+without, and sentences that deny or call all normal, 0.01 at most."""
 
 
 class Refiner(nn.Module):
@@ -32,7 +37,9 @@ class Refiner(nn.Module):
     prior: whose weights are trained on; it needs a detail network. mean: the state (C, X, Y, Z) that an unrolled
     reconstruction starts from. uncertainty: what says how far the last state may be off, None for a refiner without.
     first: a prior, left as it is, that reads reports instead: with one, a reconstruction from few X-rays starts from
-    what it makes of both, and the calls hear of the report by that alone. None for a refiner whose calls read reports.
+    what it makes of both, and the calls hear of the report by that alone. A report that states no finding of those that
+    it knows counts as none: that all is normal cost real CTs 0.6 dB from one view. None for a refiner whose calls read
+    reports.
     """
 
     mean: Tensor
@@ -128,7 +135,9 @@ class Refiner(nn.Module):
         """Of what the reader has heard, the context (1, L, D) of the calls, and the denoiser to begin with, if any."""
         if self.first is None:
             return heard.context, None
-        return self.prior.null, heard if reported else None
+        kinds = self.first.network.text_map
+        nothing = isinstance(kinds, KindMap) and not bool((kinds.stated(heard.context) > STATED).any())
+        return self.prior.null, heard if reported and not nothing else None
 
 
 @dataclass(frozen=True)

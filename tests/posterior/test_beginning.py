@@ -61,6 +61,19 @@ def test_each_report_starts_elsewhere():
     assert min(float((one - other).abs().max()) for one, other in itertools.pairwise(starts)) > 1e-3
 
 
+@pytest.mark.parametrize("probability, heard", [(0.4, False), (0.6, True)])
+def test_a_report_that_states_no_finding_counts_as_none(probability, heard):
+    refiner = tiny_refiner(begins=True)
+    refiner.first.network.draw_kinds(["effusion", "nodule"])
+    score = refiner.first.network.text_map.score
+    torch.nn.init.zeros_(score.weight)
+    score.bias.data = torch.logit(torch.tensor([0.1, probability]))
+    told, untold = (refiner.bind(report, precision="float32") for report in (REPORTS[0], ""))
+    assert told.begins == heard and not untold.begins
+    starts = [METHOD.start_state(bound, measured(FEW)) for bound in (told, untold)]
+    assert torch.equal(*starts) != heard
+
+
 def test_neither_the_seed_nor_the_order_of_the_views_counts():
     refiner, y = tiny_refiner(begins=True), xrays(FEW)
     settings = {"report": REPORTS[0], "precision": "float32"}

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import time
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
+from functools import cache
+from typing import cast
 
 import lightning
 import torch
+from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from phydict.prior import Prior, SuperResolution
@@ -68,10 +72,18 @@ def sample_flop(prior: Prior | SuperResolution, shape: Sequence[int]) -> int:
     """FLOP of the network's forward and backward pass over one state of `shape` voxels; nothing is computed. What a
     prior's detail network does, a tenth of it by default, is not counted."""
     with torch.device("meta"):
-        network = type(prior.network)(**prior.network.settings)
         inputs = prior.network_inputs(shape)
+    kind = cast(Hashable, type(prior.network))
+    return _network_flop(kind, json.dumps(prior.network.settings), tuple((part.shape, part.dtype) for part in inputs))
+
+
+@cache
+def _network_flop(kind: type[nn.Module], settings: str, inputs: tuple[tuple[torch.Size, torch.dtype], ...]) -> int:
+    """As `sample_flop`, of a network of these settings (JSON) and inputs."""
+    with torch.device("meta"):
+        network, given = kind(**json.loads(settings)), [torch.zeros(shape, dtype=dtype) for shape, dtype in inputs]
     with FlopCounterMode(display=False) as counter:
-        network(*inputs).sum().backward()
+        network(*given).sum().backward()
     return counter.get_total_flops()
 
 

@@ -40,7 +40,7 @@ class KindMap(nn.Module):
 
     def stated(self, context: Tensor) -> Tensor:
         """Context (B, L, D) -> the probability of each kind that some state states it (B, kinds)."""
-        return self.score(self.read(context)).sigmoid().amax(1)
+        return self.answers(context)[0].sigmoid().amax(1)
 
     def scores(self, context: Tensor) -> Tensor:
         """Context (B, L, D) -> how much of each kind is drawn (B, kinds): the mean of its map."""

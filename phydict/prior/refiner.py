@@ -136,8 +136,9 @@ class Refiner(nn.Module):
         if self.first is None:
             return heard.context, None
         kinds = self.first.network.text_map
-        nothing = isinstance(kinds, KindMap) and not bool((kinds.stated(heard.context) > STATED).any())
-        return self.prior.null, heard if reported and not nothing else None
+        if reported and isinstance(kinds, KindMap):
+            reported = bool((kinds.stated(heard.context) > STATED).any())
+        return self.prior.null, heard if reported else None
 
 
 @dataclass(frozen=True)

@@ -148,7 +148,7 @@ class Unrolled(Sampler):
             yield x0
             before = x0.detach().clamp(-1, 1)
             measurement.refit(before[:, :1])
-            last, x0_std = n + 1 == len(times), self.x0_stds[min(n, len(self.times) - 1) + 1]
+            last, x0_std = n + 1 == len(times), self.x0_stds[min(n + 1, len(self.times))]
             step = self.final_likelihood if last else self.likelihood
             z = self._likelihood_step(step, measurement, before, x0_std)
             if n + 1 == len(self.times) // 2:

@@ -16,7 +16,6 @@ from phydict.guard import one_material
 from phydict.methods import METHODS, reconstruct, reconstructor
 from phydict.posterior import Measurement, Posterior, PriorOnly, ProximalCG, SplitGibbs, Unrolled
 from phydict.posterior.discretisation import subgrid_projection
-from phydict.posterior.evidence import CHANGE_SCALE, COVERAGE_SCALE, RESIDUAL_SCALE, Evidence
 from phydict.posterior.hardening import with_hardening
 from phydict.posterior.samplers import unrolled
 from phydict.prior import BoundRefiner, Prior, Refiner, load_prior, save_prior, save_refiner
@@ -24,9 +23,8 @@ from phydict.runtime.precision import computes_bfloat16
 from phydict.units import HUWindow, hu_to_mu
 from phydict.xray import ConeBeam, Ideal, Polychromatic, Projector
 from phydict.xray.finer import FinerProjector
+from posterior.hollow import GRID, ORBIT, WINDOW, block, measured
 
-GRID, WINDOW = Grid.cube(16), HUWindow(-1000, 600)
-ORBIT = ConeBeam.orbit(3, 1020, 740, (28, 28), 20.0)
 OTHERS = {
     "one view": ConeBeam.orbit(1, 1020, 740, (28, 28), 20.0),
     "33 views": ConeBeam.orbit(33, 1020, 740, (28, 28), 20.0),
@@ -37,21 +35,6 @@ OTHERS = {
 
 COARSE = Unrolled(contradiction=None)
 """On voxels as coarse as GRID's, what the first step leaves unexplained contradicts nothing."""
-
-
-def block() -> torch.Tensor:
-    """Soft tissue with a hollow, in air: (1, 1, 16, 16, 16) in the prior's range."""
-    hu = torch.full((1, 1, *GRID.shape), -1000.0)
-    hu[:, :, 3:13, 4:12, 2:14] = 40
-    hu[:, :, 5:8, 6:10, 5:11] = -800
-    return WINDOW.to_range(hu)
-
-
-def measured(beam: ConeBeam = ORBIT, dtype: torch.dtype = torch.float32, noise: float = 0.0) -> Measurement:
-    projector = Projector(GRID, beam, full_detector=True)
-    y = projector(WINDOW.to_mu(block().double()))
-    y = y + noise * y.max() * torch.randn(y.shape, generator=torch.Generator().manual_seed(0), dtype=y.dtype)
-    return Measurement(projector, y[0].to(dtype), WINDOW)
 
 
 def test_an_untrained_refiner_is_its_prior_to_the_last_digit():
@@ -322,31 +305,6 @@ def test_the_result_does_not_depend_on_the_seed():
     y = measured().y[0]
     volumes = [reconstruct(y, ORBIT, tiny_refiner(), "phydict_learned", seed=seed).volume for seed in (0, 1)]
     assert torch.equal(*volumes)
-
-
-def test_exact_x_rays_of_the_estimate_leave_no_residual_and_the_back_projection_lowers_one():
-    m = measured(dtype=torch.float64)
-    evidence, truth = Evidence(m), block().double()
-    assert evidence(truth, truth, truth)[:, 0].abs().max() < 1e-9 * RESIDUAL_SCALE
-    z = truth + 0.1 * (truth > -0.5)
-    step = evidence(z, truth, truth)[:, :1] / RESIDUAL_SCALE
-    before, after = ((m.project(x) - m.y).norm() for x in (z, z + step))
-    assert after < 0.5 * before
-
-
-def test_the_coverage_counts_the_views_that_see_a_voxel():
-    narrow = ConeBeam.orbit(4, 1020, 740, (28, 6), 20.0)
-    for beam in (ORBIT, narrow):
-        coverage = 2 ** (Evidence(measured(beam)).coverage / COVERAGE_SCALE) - 1
-        assert float(coverage[0, 0, 6:10, 6:10, 6:10].mean()) == pytest.approx(beam.views, rel=0.1)
-    assert coverage[0, 0, 0, 0, 8] < 1  # a corner that the narrow detector misses
-
-
-def test_the_evidence_tells_changes_of_the_estimate_and_the_noise():
-    evidence, zeros = Evidence(measured(noise=0.01)), torch.zeros(1, 1, *GRID.shape)
-    channels = evidence(zeros + 0.3, zeros + 0.1, zeros)
-    torch.testing.assert_close(channels[:, 2:4], CHANGE_SCALE * torch.stack([zeros[:, 0] + 0.2, zeros[:, 0] - 0.3], 1))
-    assert 10 ** (float(channels[0, 4].mean()) - 2) == pytest.approx(0.01, rel=0.3)
 
 
 def test_a_refiners_file_gives_it_back(tmp_path):

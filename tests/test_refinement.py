@@ -1,5 +1,6 @@
 """The network that corrects reconstructions on fine voxels: what it keeps to, its training and its file."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from torch.nn.functional import pad
 from phydict.cli.train import main
 from phydict.grid import Cube, Grid
 from phydict.methods import fit_to_grid, reconstructor
-from phydict.posterior import Refined, Refinement, Unrolled, refined
+from phydict.posterior import ProximalCG, Refined, Refinement, Unrolled, refined
 from phydict.posterior.coarse_correction import coarse_correction
 from phydict.prior import load_correction, save_correction, save_prior, save_refiner
 from phydict.prior.correction import INPUTS, CorrectionNetwork
@@ -78,6 +79,23 @@ def test_a_refinement_prepares_what_it_uses_and_counts_what_happens(monkeypatch,
     assert len(prepared) == (calls > corrects) and all(correction.calls for correction in prepared)
     assert found.projector_calls - found.coarse.projector_calls == sum(
         profile.uses[name].calls for name in ("refine / projector", "score / projector"))
+
+
+@pytest.mark.parametrize("views", [1, 2])
+@pytest.mark.parametrize("corrects", [True, False])
+def test_from_few_views_total_variation_weighs_less_and_no_coarse_network_corrects(monkeypatch, views, corrects):
+    def lighter(step: ProximalCG) -> ProximalCG:
+        return replace(step, tv_weight=step.tv_weight * views / 3)
+
+    usual, correction = Refinement(), network() if corrects else None
+    stated = replace(usual, step=lighter(usual.step), call_step=lighter(usual.call_step), calls=1, few_views=0)
+    monkeypatch.setattr(refined, "coarse_correction", lambda *_: None)
+    expected = reconstructed(correction, replace(stated, calls=int(corrects)), range(views))
+    monkeypatch.undo()
+    found = reconstructed(correction, usual, range(views))
+    assert found.volume.equal(expected.volume) and not found.volume.equal(
+        reconstructed(correction, replace(usual, few_views=0), range(views)).volume)
+    assert found.network_calls - found.coarse.network_calls == corrects
 
 
 def test_the_order_of_the_views_changes_nothing():
@@ -160,7 +178,7 @@ def test_with_a_network_a_reconstruction_is_learnt_from_at_both_calls(tmp_path, 
 
     def data(network: str | None) -> ReconstructionData:
         return ReconstructionData(
-            RefinementCases(1, 1, 16, network), Scenes(most_views=3), phantoms=2, cache=str(tmp_path / "cache"),
+            RefinementCases(1, 1, 16, network), Scenes(most_views=200), phantoms=2, cache=str(tmp_path / "cache"),
             holdout=HoldOut(phantoms=1), initial=refiner_file, cube=Cube(32), window=(-1000, 600))
 
     first, both = data(None), data(str(file))

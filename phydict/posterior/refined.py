@@ -82,6 +82,9 @@ class Refinement:
         calls: how often the networks correct the estimate
         call_step: towards the X-rays after that; none: not met again
         call_std: standard deviation of a corrected estimate's error
+        coarse: whether a network that knows coarse voxels corrects the estimate as well
+        few_views: with fewer views the total variation of both steps weighs as many times less, the estimate is
+            corrected at most once, and by no network on coarse voxels
     """
 
     step: LikelihoodStep | None = ProximalCG(iterations=10, restarts=3, tv_weight=10.0, tv_eps=0.003)
@@ -89,6 +92,8 @@ class Refinement:
     calls: int = 2
     call_step: LikelihoodStep | None = ProximalCG(iterations=10, restarts=1, tv_weight=5.0, tv_eps=0.003)
     call_std: float = 0.3
+    coarse: bool = True
+    few_views: int = 3
 
     def __post_init__(self):
         for name in ("x0_std", "call_std"):
@@ -97,11 +102,20 @@ class Refinement:
         if self.calls < 0:
             raise ValueError(f"calls is a number of corrections, 0 or more, but {self.calls} was given")
 
+    def of_views(self, views: int) -> Refinement:
+        """How it is done from so many X-rays."""
+        if views >= self.few_views:
+            return self
+        step, call_step = (replace(step, tv_weight=step.tv_weight * views / self.few_views)
+                           if isinstance(step, ProximalCG) else step for step in (self.step, self.call_step))
+        return replace(self, step=step, call_step=call_step, calls=min(self.calls, 1), coarse=False)
+
     def corrections(self, network: bool) -> tuple[int, int]:
         """How often a network on the voxels, if there is one, and one on coarse ones correct an estimate: what is
         interpolated alone never."""
-        calls = self.calls if self.step else 0
-        return (calls, max(calls - 1, 0)) if network else (0, calls)
+        own = self.calls if self.step and network else 0
+        others = self.calls - network if self.step and self.coarse else 0
+        return own, max(others, 0)
 
     def __call__(self, measurement: Measurement, x: Tensor, network: Correction | None,
                  coarse: CoarseCorrection | None = None, refined: bool = False) -> Tensor:
@@ -184,7 +198,7 @@ class Refined(Delegating):
             raise ValueError(
                 f"the target is {self.target.shape} voxels of {self.target.spacing} mm, but the X-rays are projected "
                 f"from {projector.grid.shape} voxels of {projector.grid.spacing} mm: use the target's grid")
-        watch, base = Stopwatch(), self.base
+        watch, base, refinement = Stopwatch(), self.base, self.refinement.of_views(projector.beam.views)
         with watch.stage("base"):
             seen = self._seen(xrays, projector, base.grid)
             coarse = base.reconstruct(*seen, report, display, seed, on_step)
@@ -197,9 +211,9 @@ class Refined(Delegating):
                 measurement = self._measurement(y, A, coarse, display)
                 measurement.refit(x)
                 network = self._network(level) if coarse.masks is not None else None
-                own, others = self.refinement.corrections(network is not None) if coarse.masks is not None else (0, 0)
+                own, others = refinement.corrections(network is not None) if coarse.masks is not None else (0, 0)
                 correction = coarse_correction(base, level, seen, coarse, report, display) if others else None
-                x = self.refinement(measurement, x, network, correction, grid is not base.grid)
+                x = refinement(measurement, x, network, correction, grid is not base.grid)
                 guard = Guard(measurement, on_step, 1)
                 guard()
             volume, grid = base.window.to_hu(x[0, 0]), level

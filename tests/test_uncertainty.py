@@ -15,8 +15,8 @@ from phydict.cli.train import main
 from phydict.grid import Cube, Grid
 from phydict.methods import reconstruct
 from phydict.posterior import Measurement, Unrolled
-from phydict.posterior.posterior import contradiction_widening
 from phydict.posterior.refined import ON_FINER
+from phydict.posterior.widening import contradiction_widening
 from phydict.prior import load_prior, save_prior, save_refiner
 from phydict.prior.uncertainty import COVERAGES, LEVELS, TISSUES, Uncertainty, coverage_of, tissue_of
 from phydict.training.refiner import RefinerTraining

@@ -18,6 +18,7 @@ from phydict.posterior.measurement import Measurement
 from phydict.posterior.metal import said_of
 from phydict.posterior.samplers.sampler import Sampler
 from phydict.posterior.samplers.split_gibbs import SplitGibbs
+from phydict.posterior.widening import limited_angle_factor, say_contradictions, widening_of
 from phydict.prior import AnyPrior, BoundRefiner, Refiner
 from phydict.prior.uncertainty import LEVELS
 from phydict.reconstruction import Reconstruction, Reconstructor
@@ -34,29 +35,8 @@ MOST_GUIDANCE = 1_000_000
 """No scale of guidance is as large: it would overflow."""
 
 
-WIDENING = 0.25
-"""Power of the residual, over the most in calibration, by which intervals widen: of held-out CTs, from
-polychromatic X-rays with residuals of 1.3 to 4 times their noise, 91 to 98 % of the body is then in the 90 % one."""
-
-FAR_OUTSIDE = 4.5
-"""How many times the most residual in calibration is far outside of it: beyond a tube's spectrum, whose residual is 4
-times as large at most. What views contradict counts as noise there, and has a warning of its own."""
-
 WIDEST = 2.0
 """Half-width of the widest interval, in the prior's range [-1, 1], of which it then leaves out nothing."""
-
-WORST_VIEW = 16.0
-"""The ratio, of the noise of a view with what contradicts the rest counted as such to its own, from which on intervals
-widen by its root, whatever the other views say: with one of eight views flipped, negated or another's, of a held-out
-CT, 58 to 87 % of the body is otherwise in the 90 % interval."""
-
-CONTRADICTION_WIDENING = 0.4
-"""Power of the geometric mean of these ratios over the views by which intervals widen: in eight scenes of two held-out
-CTs, 4 to 16 views in poses wrong by up to 5 mm and 2 degrees or with breathing by 10 mm, 88 to 92 % of the body is then
-in the 90 % interval, before 75 to 92 %. A gain that drifts by 20 %, which they see less of, is held to 70 % on one."""
-
-SCATTER_WIDENING = 2.0
-"""Factor by which they widen where scatter is subtracted, which shifts HU where a tube's spectrum was taken for it."""
 
 
 class CountingDenoiser:
@@ -235,44 +215,14 @@ class Posterior(Reconstructor):
     def _intervals(self, denoiser: CountingDenoiser, measurement: Measurement, reprojection: Tensor
                    ) -> tuple[dict[float, Tensor], float]:
         """Level -> half-widths in HU (X, Y, Z), none where the network does not know them, and the factor by which they
-        are wider than calibrated: where the residual of the X-rays is larger than was usual in the calibration, or
-        they contradict each other or hold scatter. Warns where it is more than FAR_OUTSIDE times as large, less what
-        counted as noise."""
+        are wider than calibrated."""
         uncertainty = self.prior.uncertainty if isinstance(self.prior, Refiner) else None
         if uncertainty is None or not isinstance(denoiser, CountingRefiner) or denoiser.half_widths is None:
             return {}, 1.0
-        residual = float(measurement.normalised_error(reprojection, modelled=True))
-        most = float(uncertainty.most_residual)
-        if residual > FAR_OUTSIDE * most:
-            warn(f"the residual of the X-rays is {residual:.3g} times their noise, and usually at most {most:.3g} in "
-                 "the scenes that the intervals were calibrated on: they are widened, and may still be too narrow; "
-                 "check the geometry and the scale, and whether the patient moved")
-        widening = max(1.0, residual / most) ** WIDENING * contradiction_widening(measurement)
-        widening *= SCATTER_WIDENING if measurement.scatter else 1.0
-        widths = self.prior.window.half_width * (widening * denoiser.half_widths[0].cpu()).clamp(max=WIDEST)
+        widening = widening_of(measurement, reprojection, float(uncertainty.most_residual))
+        factor = widening * limited_angle_factor(measurement.projector)
+        widths = self.prior.window.half_width * (factor * denoiser.half_widths[0].cpu()).clamp(max=WIDEST)
         return dict(zip(LEVELS, widths)), widening
-
-
-def contradiction_widening(measurement: Measurement) -> float:
-    """The factor, 1 or more, by which intervals widen where a part of the X-rays counted as noise because no volume
-    explains it, by all views or by the worst; 1 where nothing did."""
-    own = measurement.noise_variance.mean((1, 2)).clamp(min=1e-12)
-    counted = torch.as_tensor(measurement.model_variance).flatten().to(own)
-    ratios = (1 + counted / own).sqrt()
-    return max(float(ratios.log().mean().exp()) ** CONTRADICTION_WIDENING, (float(ratios.max()) / WORST_VIEW) ** 0.5)
-
-
-def say_contradictions(measurement: Measurement, widening: float | None) -> None:
-    """Warns where a part of the X-rays counted as noise because no volume explains it; widening: of the intervals, if
-    there are any."""
-    variance = torch.as_tensor(measurement.model_variance).flatten()
-    views = variance.nonzero().flatten().tolist()
-    if views:
-        which = "any view" if len(views) == measurement.projector.beam.views else (
-            f"view {', '.join(map(str, views))} (counted from 0)")
-        wider = "" if widening is None else f", and intervals are {widening:.1f} times as wide as calibrated"
-        warn(f"no volume explains {which}: as much of it as contradicts the rest counted as noise, so that the volume "
-             f"follows it less and the prior more{wider}; check geometry and scale, and whether the patient moved")
 
 
 def check_guidance(guidance: float) -> None:

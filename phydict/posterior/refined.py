@@ -23,7 +23,7 @@ from phydict.xray.boxes import covers, interpolated, outside_projection, refinem
 
 ON_FINER = {0.5: (0.85, 0.0), 0.8: (1.0, 0.0), 0.9: (1.0, 0.1), 0.95: (1.0, 0.2)}
 """Level -> the shares of a coarse interval and of the refinement's change of which one on finer voxels is the sum: of
-two CTs kept from training these hold 42 to 53, 79 to 88, 89 to 95 and 95 to 98 % of the body from 1 to 16 views."""
+two CTs kept from training these hold 43 to 52, 75 to 86, 85 to 95 and 92 to 99 % of the body from 1 to 16 views."""
 
 
 class Bound(Protocol):
@@ -93,7 +93,7 @@ class Refinement:
     call_step: LikelihoodStep | None = ProximalCG(iterations=10, restarts=1, tv_weight=5.0, tv_eps=0.003)
     call_std: float = 0.3
     coarse: bool = True
-    few_views: int = 3
+    few_views: int = 2
 
     def __post_init__(self):
         for name in ("x0_std", "call_std"):

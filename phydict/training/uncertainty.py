@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from torchmetrics.functional import spearman_corrcoef
 
 from phydict.grid import Cube
 from phydict.posterior import Measurement, Unrolled
+from phydict.posterior.widening import limited_angle_factor
 from phydict.prior import DEFAULT_REFINER, Refiner, describe_refiner, load_prior
 from phydict.prior.uncertainty import AIR_BELOW, Uncertainty, coverage_of, tissue_of
 from phydict.training.scenes import Scenes
@@ -67,8 +69,8 @@ class UncertaintyTraining(StageTraining):
         losses = []
         for case, rng in self.drawn(batch, key, rank, processes):
             ct = case["volume"]
-            z, evidence, _ = self._reconstruct(case, rng)
-            log_scale = self.prior.uncertainty(z, evidence)
+            z, evidence, measurement = self._reconstruct(case, rng)
+            log_scale = self._log_scale(z, evidence, measurement)
             error = (z[:, :1] - ct).abs()
             weight = 1 + self.body_weight * _body(ct, z)
             losses.append((weight * (log_scale + error / log_scale.exp())).sum() / weight.sum())
@@ -86,6 +88,10 @@ class UncertaintyTraining(StageTraining):
             [(z, evidence)] = ends
             return z, evidence(), measurement
 
+    def _log_scale(self, z: Tensor, evidence: Tensor, measurement: Measurement) -> Tensor:
+        """What the network says of the log of the errors' scale, and what is known of the scene's angles."""
+        return self.prior.uncertainty(z, evidence) + math.log(limited_angle_factor(measurement.projector))
+
     def on_validation_start(self) -> None:
         super().on_validation_start()
         self.held_out = []
@@ -95,7 +101,7 @@ class UncertaintyTraining(StageTraining):
         for scene in range(self.validation.scenes):
             rng = np.random.default_rng((self.seed, index, scene))
             z, evidence, measurement = self._reconstruct(batch, rng)
-            error, log_scale = (z[:, :1] - ct).abs(), self.prior.uncertainty(z, evidence)
+            error, log_scale = (z[:, :1] - ct).abs(), self._log_scale(z, evidence, measurement)
             body = _body(ct, z)
             self.log("val/rank", spearman_corrcoef(log_scale[body], error[body]), batch_size=1, sync_dist=True,
                      prog_bar=True)

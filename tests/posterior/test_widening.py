@@ -1,0 +1,53 @@
+"""How widely views see a patient, and by how much intervals widen for it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from prior.tiny import tiny_refiner
+
+from phydict.methods import reconstruct
+from phydict.posterior import posterior
+from phydict.posterior.widening import angular_spread, limited_angle_factor
+from phydict.xray import ConeBeam, Projector
+from posterior.hollow import GRID, ORBIT, measured
+
+
+def seen(views: int, arc_degrees: float = 360.0, start: float = 0.0) -> Projector:
+    return Projector(GRID, ConeBeam.orbit(views, 1020, 740, (28, 28), 20.0, arc_degrees=arc_degrees, start=start))
+
+
+@pytest.mark.parametrize("start", [0.0, 0.4, 2.0])
+@pytest.mark.parametrize("degrees", [20.0, 60.0, 90.0, 180.0])
+def test_the_spread_of_an_arc_is_its_second_moment_wherever_it_starts(degrees, start):
+    """(1 - sin(a) / a) / 2 of the angle a, which many views fill."""
+    arc = np.radians(degrees)
+    assert angular_spread(seen(1000, degrees, start)) == pytest.approx((1 - np.sin(arc) / arc) / 2, abs=1e-3)
+
+
+def test_opposite_views_see_along_one_line_and_a_full_orbit_evenly():
+    assert angular_spread(seen(2)) == pytest.approx(0, abs=1e-9) == angular_spread(seen(1))
+    assert [angular_spread(seen(views)) for views in (3, 4, 17)] == pytest.approx([0.5] * 3)
+
+
+def test_intervals_widen_with_more_views_of_a_limited_angle_and_never_for_a_full_orbit_or_few_views():
+    assert all(limited_angle_factor(seen(views)) == 1 for views in (1, 2, 3, 32, 200))
+    assert limited_angle_factor(seen(6, 40.0)) == 1
+    more_views = [limited_angle_factor(seen(views, 60.0)) for views in (6, 8, 16, 32)]
+    wider = [limited_angle_factor(seen(16, degrees)) for degrees in (40.0, 60.0, 90.0, 140.0, 180.0)]
+    assert more_views == sorted(set(more_views)) and wider == sorted(wider, reverse=True) and wider[-1] == 1
+
+
+def test_a_limited_angle_belongs_to_the_calibration_so_that_nothing_counts_as_widened(monkeypatch):
+    refiner = tiny_refiner(uncertain=True)
+
+    def found():
+        return reconstruct(measured().y[0], ORBIT, refiner, "phydict_learned", precision="float32")
+
+    usual = found()
+    monkeypatch.setattr(posterior, "limited_angle_factor", lambda _: 1.5)
+    wider = found()
+    assert wider.interval_widening == usual.interval_widening
+    for level, half_width in usual.intervals.items():
+        torch.testing.assert_close(wider.intervals[level], (1.5 * half_width).clamp(max=2 * refiner.window.half_width))

@@ -1,4 +1,4 @@
-"""By how much intervals are wider than a network says: where scenes are not those that it was calibrated on."""
+"""By how much intervals are wider than a network says: of scenes unlike its calibration's, and of limited angles."""
 
 from __future__ import annotations
 

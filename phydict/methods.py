@@ -246,7 +246,7 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: AnyPrior | str | Path | No
     mu_water: attenuation in 1/mm that water has in the X-rays (None: the method's own, near 65 keV).
     super_resolution, sr_guided: the second stage of a cascade, as for `reconstructor`; its grid counts as the prior's.
     samples: more than one gives their mean, and `deviation`, a map of how far they differ, as for `reconstructor`.
-    precision: of the networks; "auto" is bfloat16 where the device computes it, float32 elsewhere.
+    precision: of the networks; "auto" is bfloat16 where the device computes it faster, else float32.
     projector: the kind of `Projector`, such as "siddon"; "auto" is the fastest that suits the geometry.
     uncertain: what the geometry does not know exactly, which is then found first; the result holds `beam` and `poses`.
     A detector finer than the grid can use is binned. Raises ValueError when X-rays, geometry and prior do not fit.

@@ -15,7 +15,9 @@ from phydict.baselines import SIRT
 from phydict.posterior import Posterior, PriorOnly
 from phydict.runtime import precision
 from phydict.runtime.precision import (
+    bfloat16_gain,
     computes_bfloat16,
+    gains_by_bfloat16,
     instruction_set,
     network_precision,
     precision_name,
@@ -35,16 +37,20 @@ def said_anew():
 
 @pytest.fixture
 def hardware(monkeypatch):
-    """Makes the CPU one that computes bfloat16, or not."""
-    return lambda able: monkeypatch.setattr(precision, "computes_bfloat16", lambda device: able)
+    """Makes the CPU one that computes bfloat16, so many times faster than float32, or not."""
+    def able(gain: float) -> None:
+        monkeypatch.setattr(precision, "computes_bfloat16", lambda device: gain > 0)
+        monkeypatch.setattr(precision, "bfloat16_gain", lambda device: gain)
+    return able
 
 
-@pytest.mark.parametrize("asked, able, state, chosen", [
-    ("auto", True, torch.float32, torch.bfloat16), ("auto", False, torch.float32, torch.float32),
-    ("auto", True, torch.float64, torch.float64), ("float32", True, torch.float32, torch.float32),
-    ("float32", True, torch.float64, torch.float64), ("bfloat16", True, torch.float64, torch.bfloat16)])
-def test_the_hardware_decides_unless_someone_asks(hardware, asked, able, state, chosen):
-    hardware(able)
+@pytest.mark.parametrize("asked, gain, state, chosen", [
+    ("auto", 2, torch.float32, torch.bfloat16), ("auto", 0, torch.float32, torch.float32),
+    ("auto", 0.5, torch.float32, torch.float32), ("auto", 2, torch.float64, torch.float64),
+    ("float32", 2, torch.float32, torch.float32), ("float32", 2, torch.float64, torch.float64),
+    ("bfloat16", 2, torch.float64, torch.bfloat16), ("bfloat16", 0.5, torch.float32, torch.bfloat16)])
+def test_the_hardware_and_its_speed_decide_unless_someone_asks(hardware, asked, gain, state, chosen):
+    hardware(gain)
     assert resolve_precision(asked, CPU, state) == chosen
     with network_precision(asked, torch.zeros(1, dtype=state)) as used:
         assert used == chosen
@@ -53,13 +59,27 @@ def test_the_hardware_decides_unless_someone_asks(hardware, asked, able, state, 
 
 
 def test_slow_bfloat16_runs_and_warns_once_with_the_factor(hardware, monkeypatch):
-    hardware(False)
+    hardware(0)
     monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX2")
     with pytest.warns(RuntimeWarning, match="AVX2 does not compute it.*about 200 times slower"):
         assert resolve_precision("bfloat16", CPU) == torch.bfloat16
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert resolve_precision("bfloat16", CPU) == torch.bfloat16
+
+
+def test_bfloat16_that_is_slower_than_float32_warns_with_the_factor(hardware):
+    hardware(0.4)
+    with pytest.warns(RuntimeWarning, match=r"computes it 2\.5 times slower than float32"):
+        assert resolve_precision("bfloat16", CPU) == torch.bfloat16
+
+
+@pytest.mark.skipif(not computes_bfloat16(CPU), reason="this processor does not compute bfloat16")
+def test_the_gain_is_measured_once_so_that_a_process_keeps_to_a_precision(monkeypatch):
+    gain = bfloat16_gain(CPU)
+    assert 0.05 < gain < 50
+    monkeypatch.setattr(precision, "time", None)
+    assert bfloat16_gain(CPU) == gain
 
 
 def test_a_gpu_without_bfloat16_computes_in_float32_and_is_named_once(monkeypatch):
@@ -100,7 +120,7 @@ def test_a_processor_with_bfloat16_is_named_so():
     said = instruction_set(CPU)
     assert said.startswith(torch.backends.cpu.get_cpu_capability())
     assert said.endswith(("with bfloat16", "with AMX")) == computes_bfloat16(CPU)
-    assert precision_name("auto", torch.zeros(1)) == ("bfloat16" if computes_bfloat16(CPU) else "float32")
+    assert precision_name("auto", torch.zeros(1)) == ("bfloat16" if gains_by_bfloat16(CPU) else "float32")
 
 
 @pytest.mark.parametrize("asked", ["float32", "bfloat16"])

@@ -15,7 +15,7 @@ from phydict.grid import Cube, Grid
 from phydict.methods import fit_to_grid, reconstructor
 from phydict.posterior import ProximalCG, Refined, Refinement, Unrolled, refined
 from phydict.posterior.coarse_correction import coarse_correction
-from phydict.prior import load_correction, save_correction, save_prior, save_refiner
+from phydict.prior import correction, load_correction, save_correction, save_prior, save_refiner
 from phydict.prior.correction import INPUTS, CorrectionNetwork
 from phydict.runtime.profiling import profiled
 from phydict.training.reconstructions import ReconstructionData, RefinementCases
@@ -52,6 +52,16 @@ def refiner_file(tmp_path_factory) -> str:
     file = tmp_path_factory.mktemp("refiner") / "tiny.safetensors"
     save_refiner(tiny_refiner(), file, dtype=torch.float32)
     return str(file)
+
+
+@pytest.mark.parametrize("shape", [(32, 24, 20), (30, 21, 17)])
+def test_slab_by_slab_the_correction_is_that_of_the_whole(monkeypatch, shape):
+    corrects, seen = network(), torch.randn(1, INPUTS, *shape)
+    torch.nn.init.normal_(corrects.join.weight, std=0.3)
+    whole = corrects(seen)
+    for planes in (2, 6, 10):
+        monkeypatch.setattr(correction, "SLAB_VOXELS", planes * 24 * 20)
+        torch.testing.assert_close(corrects(seen), whole, atol=1e-6, rtol=1e-5)
 
 
 def test_an_untrained_network_corrects_nothing_and_another_grids_takes_no_part():

@@ -97,7 +97,7 @@ class PriorCLI(TellingCLI):
         parser.add_argument("--out", default="runs/prior", help="folder for checkpoint, logs and samples")
         parser.add_argument("--stage", default="base", choices=list(STAGES), help="what to train")
         parser.add_argument("--precision", default="auto", choices=list(PRECISIONS),
-                            help="of the network: bfloat16 where the device computes it and float32 elsewhere (auto), "
+                            help="of the network: bfloat16 where the device computes it faster, else float32 (auto), "
                                  "or one of the two; trainer.precision takes Lightning's own names instead")
         parser.add_lightning_class_args(ModelCheckpoint, "checkpoint")
         parser.set_defaults({"checkpoint.filename": "last", "checkpoint.enable_version_counter": False,

@@ -17,7 +17,7 @@ class Sampling:
     Args:
         guidance: scale of classifier-free guidance when a report is given; 1: none
         samples: how many are drawn; of several the volume is the mean, and deviation.nii.gz their standard deviation
-        precision: of the networks: auto (bfloat16 where the device computes it), float32 or bfloat16
+        precision: of the networks: auto (bfloat16 where the device computes it faster), float32 or bfloat16
         with_report: whether the cases' reports are used
     """
 

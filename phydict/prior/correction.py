@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad, silu
 
 from phydict.grid import Grid
-from phydict.prior.convolution import lay_out, silence
+from phydict.prior.convolution import lay_out, silence, speed_up
 from phydict.prior.evidence_channels import EVIDENCE_CHANNELS
 from phydict.prior.local_unet import PositionNorm
 from phydict.runtime.precision import network_precision
@@ -18,6 +18,10 @@ from phydict.units import HUWindow
 
 INPUTS = 1 + EVIDENCE_CHANNELS
 """The estimate and the evidence there."""
+
+SLAB_VOXELS = 2**22
+"""Voxels, up to those of whole planes, that the layers of full resolution see at once: more take memory and gain no
+time."""
 
 TOLERANCE = 0.01
 """A share of the spacing by which voxels may differ from those learnt on."""
@@ -47,6 +51,7 @@ class CorrectionNetwork(nn.Module):
         self.join = nn.Conv3d(width + INPUTS, width, 3, padding=1)
         self.leave = nn.Conv3d(width, 1, 1)
         silence(self.leave)
+        speed_up(self)
         lay_out(self)
 
     @property
@@ -75,9 +80,23 @@ class CorrectionNetwork(nn.Module):
         missing = [n for size in reversed(sizes) for n in (0, -size % self.divisor)]
         padded = pad(seen, missing, mode="replicate") if any(missing) else seen
         padded = padded.contiguous(memory_format=torch.channels_last_3d)
-        h = silu(self.join(torch.cat([self.norm(self.unet(padded)), padded], 1)))
+        down, below, up = self.unet.model
         x, y, z = sizes
-        return seen[:, :1] + self.leave(h)[..., :x, :y, :z].to(seen.dtype)
+        lacking = self._lacking(up, below(down(padded)), padded)
+        return seen[:, :1] + lacking[..., :x, :y, :z].to(seen.dtype)
+
+    def _lacking(self, up: nn.Module, coarse: Tensor, padded: Tensor) -> Tensor:
+        """What the estimate lacks, by the layers of full resolution: the UNet's last, which knows one plane before and
+        one behind of its input (B, C, X / 2, Y / 2, Z / 2), and the head, which knows one more of both."""
+        planes = coarse.shape[2]
+        slab = max(SLAB_VOXELS // padded[0, 0, :2].numel(), 1)
+        slabs = []
+        for start in range(0, planes, slab):
+            stop = min(start + slab, planes)
+            first, last = max(start - 1, 0), min(stop + 2, planes)
+            h = torch.cat([self.norm(up(coarse[:, :, first:last])), padded[:, :, 2 * first:2 * last]], 1)
+            slabs.append(self.leave(silu(self.join(h)))[:, :, 2 * (start - first):2 * (stop - first)])
+        return torch.cat(slabs, 2)
 
     @torch.no_grad()
     def corrected(self, z: Tensor, evidence: Tensor) -> Tensor:

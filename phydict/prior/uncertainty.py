@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from phydict.prior.convolution import speed_up
 from phydict.prior.evidence_channels import COVERAGE_SCALE, EVIDENCE_CHANNELS
 
 LEVELS = (0.5, 0.8, 0.9, 0.95)
@@ -53,6 +54,7 @@ class Uncertainty(nn.Module):
         self.unet = UNet(3, state_channels + EVIDENCE_CHANNELS + INPUTS, 1, tuple(channels),
                          (2,) * (len(channels) - 1), num_res_units=2, act="swish",
                          norm=None)  # type: ignore[arg-type]  # which MONAI takes for no norm
+        speed_up(self)
         own = -torch.log1p(-torch.tensor(LEVELS))
         self.register_buffer("quantiles", own.expand(len(TISSUES), COVERAGES, -1).clone())
         self.register_buffer("most_residual", torch.tensor(UNBOUNDED))

@@ -55,6 +55,17 @@ def test_a_frozen_network_and_frozen_inputs_get_the_gradients_they_need():
     torch.testing.assert_close(inputs[1].grad, inputs[0].grad)
 
 
+def test_monais_swish_keeps_its_values_and_its_weight():
+    from monai.networks.blocks.activation import Swish
+
+    x = torch.linspace(-20, 20, 100)
+    network = nn.Sequential(Swish(), nn.Sequential(Swish(2.0)))
+    expected = network(x)
+    speed_up(network)
+    assert type(network[0]) is nn.SiLU and type(network[1][0]) is Swish
+    torch.testing.assert_close(network(x), expected)
+
+
 def test_a_small_input_goes_to_onednn_and_others_as_torch_likes(monkeypatch):
     asked = []
     monkeypatch.setattr(_OneDNN, "apply", lambda x, *_: asked.append(x.shape) or x)

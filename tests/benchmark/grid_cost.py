@@ -40,7 +40,7 @@ def measured(method: str, voxels: int, views: int) -> dict:
     peak = peak_memory(CPU)
     return {"method": method, "voxels": voxels, "views": views, "seconds": round(sum(found.seconds.values()), 2),
             "seconds_refine": round(found.seconds.get("refine", 0.0), 2), "peak_mib": round(peak),
-            "own_mib": round(peak - before), "threads": torch.get_num_threads(),
+            "own_mib": round(peak - before), "threads": torch.get_num_threads(), "precision": found.precision,
             "instruction_set": instruction_set(CPU)}
 
 

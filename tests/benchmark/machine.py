@@ -9,11 +9,14 @@ a newer processor from more than AVX2. `first` is a process' first time, for a r
 `seconds` is the fastest of the times after it.
 
 Errors: of a network call, the root mean square in HU from float64; of a reconstruction, `psnr` (dB) against the CT that
-the example's X-rays were made of; of a training step, the first loss. Writes machine.csv beside this file.
+the example's X-rays were made of; of a training step, the first loss. Writes machine.csv beside this file and leaves the
+rows of other processors.
 """
 
 import json
 import os
+import platform
+import re
 import subprocess
 import sys
 import tempfile
@@ -96,8 +99,14 @@ def measure(what: str, precision: str, threads: int, repeats: int) -> dict:
         found = network_call(precision, repeats, SHAPES.get(shape))
     else:
         found = {"reconstruction": reconstruction, "training step": training_step}[kind](precision, repeats)
-    return {"measured": what, "instruction_set": instruction_set(torch.device("cpu")), "precision": precision,
-            "threads": threads} | found
+    return {"measured": what, "processor": processor(), "instruction_set": instruction_set(torch.device("cpu")),
+            "precision": precision, "threads": threads} | found
+
+
+def processor() -> str:
+    """What the system calls its processor."""
+    names = re.findall(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text()) if sys.platform == "linux" else []
+    return names[0] if names else platform.processor()
 
 
 def in_a_process(what: str, precision: str, threads: int, limited: bool) -> dict:
@@ -116,13 +125,13 @@ if __name__ == "__main__":
     if len(sys.argv) > 1:
         print(json.dumps(measure(sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4]))))
         sys.exit()
-    from phydict.evaluation import write_csv
+    from phydict.evaluation import read_csv, write_csv
 
-    rows = []
+    file, rows = Path(__file__).with_suffix(".csv"), []
     for what, threads, (limited, precision) in product(
             ("network call", "reconstruction", "training step"), (1, 2),
             ((False, "bfloat16"), (False, "float32"), (True, "float32"))):
         rows.append(in_a_process(what, precision, threads, limited))
     for shape, (limited, precision) in product(SHAPES, ((False, "bfloat16"), (True, "float32"))):
         rows.append(in_a_process(f"network call, {shape}", precision, 2, limited))
-    write_csv(Path(__file__).with_suffix(".csv"), rows)
+    write_csv(file, [row for row in read_csv(file) if row["processor"] != rows[0]["processor"]] + rows)

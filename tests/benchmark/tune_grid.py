@@ -1,6 +1,6 @@
-"""Settings on 128^3 voxels, tried on a CT kept for training: the refinement's, and those of methods without a prior.
+"""Settings on fine voxels, tried on a CT kept for training: the refinement's, and those of methods without a prior.
 
-    python tests/benchmark/tune_grid.py <a training CT> <views> [refinement|tv|cgls|sirt|diffvox ...]
+    python tests/benchmark/tune_grid.py <a training CT> <voxels>x<views> [refinement|tv|cgls|sirt|diffvox ...]
 
 X-rays are made on 256^3 voxels of 1.5 mm, with the default noise. The refinement starts from `phydict_fast` on 64^3,
 reconstructed once. Writes tune_grid.csv beside this file and leaves the rows of other settings.
@@ -26,16 +26,19 @@ from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Ideal, Projector
 
 FILE = Path(__file__).with_suffix(".csv")
-SCENE, GRID, WINDOW = Grid.cube(256), Grid.cube(128), HUWindow()
+SCENE, WINDOW = Grid.cube(256), HUWindow()
 STEP = ProximalCG(10, 3, tv_weight=10.0, tv_eps=0.003)
 SETTINGS = {
     "refinement": [Refinement(None), Refinement(STEP, 0.1), Refinement(STEP, 0.2), Refinement(STEP, 0.5),
                    Refinement(replace(STEP, tv_weight=5.0), 0.2), Refinement(replace(STEP, tv_weight=20.0), 0.2),
                    Refinement(replace(STEP, restarts=2), 0.5), Refinement(STEP, 1.0)],
-    "tv": [FISTATV(200, weight) for weight in (3e-4, 6e-4)],
+    "tv": [FISTATV(200, weight) for weight in (3e-4, 6e-4, 1.2e-3, 2.4e-3)],
     "cgls": [CGLS(10, 20, WINDOW), CGLS(10, 10, WINDOW)],
     "sirt": [SIRT(300), SIRT()],
     "diffvox": [DiffVox(300, smoothness) for smoothness in (50.0, 100.0)]}
+
+SAME = ("case", "method", "voxels", "views", "settings")
+"""What a row is made anew of."""
 
 
 class Once(Posterior):
@@ -47,10 +50,11 @@ class Once(Posterior):
         return self.made
 
 
-def main(ct: str, views: int, names: list[str]) -> None:
+def main(ct: str, voxels: int, views: int, names: list[str]) -> None:
+    grid = Grid.cube(voxels)
     case = find_cts(ct)[0]
     volume = prepare_ct(case.path, SCENE, WINDOW, id=case.id)["volume"]
-    truth = WINDOW.to_hu(avg_pool3d(volume[None], 2))
+    truth = WINDOW.to_hu(avg_pool3d(volume[None], SCENE.shape[0] // voxels))
     beam = ConeBeam.orbit(views, 1020, 740, (448, 448), 1.25)
     xrays = Ideal()(Projector(SCENE, beam, full_detector=True), WINDOW.to_mu(volume)[None],
                     zlib.crc32(f"0/{case.id}".encode()))[0]
@@ -58,18 +62,18 @@ def main(ct: str, views: int, names: list[str]) -> None:
     base, rows = Once(default.prior, default.sampler), read_csv(FILE)
     for name in names:
         for settings in SETTINGS[name]:
-            ready = onto_grid(base, GRID, settings) if name == "refinement" else settings
+            ready = onto_grid(base, grid, settings) if name == "refinement" else settings
             began = time.process_time()
-            found = ready.reconstruct(*fit_to_grid(ready, GRID, xrays, beam))
-            row = {"case": case.id, "method": name, "views": views, "settings": json.dumps(describe(settings)),
-                   **volume_metrics(found.volume[None, None], truth), "misfit": found.misfit,
+            found = ready.reconstruct(*fit_to_grid(ready, grid, xrays, beam))
+            row = {"case": case.id, "method": name, "voxels": voxels, "views": views,
+                   "settings": json.dumps(describe(settings)), **volume_metrics(found.volume[None, None], truth), "misfit": found.misfit,
                    "cpu_seconds": round(time.process_time() - began, 1)}
-            rows = [old for old in rows if any(old[k] != row[k] for k in ("case", "method", "views", "settings"))]
+            rows = [old for old in rows if any(old[k] != row[k] for k in SAME)]
             write_csv(FILE, rows := [*rows, row])
-            print(views, name, row["settings"], f"{row['psnr']:.2f} dB, {row['cpu_seconds']} s", flush=True)
+            print(voxels, views, name, row["settings"], f"{row['psnr']:.2f} dB, {row['cpu_seconds']} s", flush=True)
 
 
 if __name__ == "__main__":
     if len(sys.argv) < 3:
-        raise SystemExit("give a training CT and a number of views: python tests/benchmark/tune_grid.py <CT> 8")
-    main(sys.argv[1], int(sys.argv[2]), sys.argv[3:] or list(SETTINGS))
+        raise SystemExit("give a training CT and voxels x views: python tests/benchmark/tune_grid.py <CT> 128x8")
+    main(sys.argv[1], *map(int, sys.argv[2].split("x")), sys.argv[3:] or list(SETTINGS))

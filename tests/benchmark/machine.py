@@ -9,8 +9,8 @@ a newer processor from more than AVX2. `first` is a process' first time, for a r
 `seconds` is the fastest of the times after it.
 
 Errors: of a network call, the root mean square in HU from float64; of a reconstruction, `psnr` (dB) against the CT that
-the example's X-rays were made of; of a training step, the first loss. Writes machine.csv beside this file and leaves the
-rows of other processors.
+the example's X-rays were made of; of a training step, the first loss. Writes machine.csv beside this file and leaves
+the rows of other processors.
 """
 
 import json

@@ -66,8 +66,8 @@ def main(ct: str, voxels: int, views: int, names: list[str]) -> None:
             began = time.process_time()
             found = ready.reconstruct(*fit_to_grid(ready, grid, xrays, beam))
             row = {"case": case.id, "method": name, "voxels": voxels, "views": views,
-                   "settings": json.dumps(describe(settings)), **volume_metrics(found.volume[None, None], truth), "misfit": found.misfit,
-                   "cpu_seconds": round(time.process_time() - began, 1)}
+                   "settings": json.dumps(describe(settings)), **volume_metrics(found.volume[None, None], truth),
+                   "misfit": found.misfit, "cpu_seconds": round(time.process_time() - began, 1)}
             rows = [old for old in rows if any(old[k] != row[k] for k in SAME)]
             write_csv(FILE, rows := [*rows, row])
             print(voxels, views, name, row["settings"], f"{row['psnr']:.2f} dB, {row['cpu_seconds']} s", flush=True)

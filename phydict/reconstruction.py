@@ -98,14 +98,12 @@ class Reconstructor(ABC):
 
     full_detector: whether the method wants every pixel, instead of a detector binned to what the grid can hold.
     mu_water: attenuation in 1/mm that water has in the X-rays; between it and HU lies this factor.
-    volumes: how many volumes of its grid a reconstruction holds at most, in float32.
     citation: authors, title, venue and DOI or arXiv number of the method's publication.
     """
 
     full_detector = False
     citation = ""
     mu_water: float = MU_WATER
-    volumes = 20
 
     def __post_init__(self):
         if not 0 < self.mu_water < math.inf:
@@ -115,6 +113,11 @@ class Reconstructor(ABC):
     def with_mu_water(self, mu_water: float) -> Reconstructor:
         """The same method for X-rays in which water attenuates `mu_water` in 1/mm."""
         return replace(self, mu_water=mu_water)  # type: ignore[type-var]
+
+    @property
+    def volumes(self) -> int:
+        """How many volumes of its grid a reconstruction holds at most, in float32."""
+        return 20
 
     @property
     def grid(self) -> Grid | None:

@@ -11,6 +11,7 @@ from prior.tiny import tiny_prior, tiny_refiner
 from torch.nn.functional import pad
 
 from phydict.cli.train import main
+from phydict.evaluation import read_csv
 from phydict.grid import Cube, Grid
 from phydict.methods import fit_to_grid, reconstructor
 from phydict.posterior import ProximalCG, Refined, Refinement, Unrolled, refined
@@ -89,6 +90,25 @@ def test_a_refinement_prepares_what_it_uses_and_counts_what_happens(monkeypatch,
     assert len(prepared) == (calls > corrects) and all(correction.calls for correction in prepared)
     assert found.projector_calls - found.coarse.projector_calls == sum(
         profile.uses[name].calls for name in ("refine / projector", "score / projector"))
+
+
+@pytest.mark.parametrize("factor, refinement, alone", [
+    (2, Refinement(), False), (3, Refinement(), False), (2.5, Refinement(), True),
+    (2, Refinement(coarse=False), True), (2, Refinement(calls=0), True), (2, Refinement(None), False)])
+def test_voxels_that_the_xrays_alone_refine_to_are_told(factor, refinement, alone):
+    base = reconstructor(Unrolled((0.2,), (0.5, 0.3)), tiny_refiner())
+    target = Grid.cube(round(factor * base.grid.shape[0]))
+    assert any(level.same_as(target) for level in Refined(base, target, refinement).uncorrected) == alone
+    assert not Refined(base, FINE, refinement, network()).uncorrected
+
+
+def test_a_refinement_by_a_network_takes_the_memory_that_is_asked_for():
+    cost = Path(__file__).parent / "benchmark" / "grid_cost.csv"
+    measured = [row["own_mib"] for row in read_csv(cost) if row["voxels"] == 256]
+    base = reconstructor(Unrolled((0.2,), (0.5, 0.3)), tiny_refiner())
+    asked = Refined(base, FINE, network=network()).volumes * 256**3 * 4 / 2**20
+    assert measured and max(measured) <= asked < 1.5 * min(measured)
+    assert Refined(base, FINE).volumes < Refined(base, FINE, network=network()).volumes
 
 
 @pytest.mark.parametrize("corrects", [True, False])

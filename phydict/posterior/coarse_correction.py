@@ -60,21 +60,32 @@ class CoarseCorrection:
         return (z + change).clamp(-1, 1)
 
 
+def knows(base: object, level: Grid) -> bool:
+    """Whether the network of `base` corrects estimates on a level's voxels: that of a refiner, where a whole number of
+    them, two or more, makes one of its own along each axis."""
+    return isinstance(base, Posterior) and isinstance(base.prior, Refiner) and _factor(base.grid, level) >= 2
+
+
+def _factor(grid: Grid, level: Grid) -> int:
+    """How many of a level's voxels make one of the grid's along each axis; 0 where they do not."""
+    factor = round(level.shape[0] / grid.shape[0])
+    fits = factor > 0 and level.same_as(in_other_voxels(grid, [factor * n for n in grid.shape]))
+    return factor if fits else 0
+
+
 def coarse_correction(base: object, level: Grid, seen: tuple[Tensor, Projector], found: Reconstruction,
                       report: str, display: bool) -> CoarseCorrection | None:
     """The correction of estimates on a level's voxels by the network of `base`, which found a reconstruction of the
-    X-rays and the projector that it has `seen`; None where it has no refiner or left the X-rays to another method,
-    where a whole number of the level's voxels do not make one of its own along each axis, and where detectors are
-    tilted, for which finer voxels cost too much."""
+    X-rays and the projector that it has `seen`; None where it `knows` no such voxels or left the X-rays to another
+    method, and where detectors are tilted, for which finer voxels cost too much."""
     xrays, projector = seen
-    if not isinstance(base, Posterior) or not isinstance(base.prior, Refiner) or projector.method != "separable":
+    if not knows(base, level) or projector.method != "separable":
         return None
+    assert isinstance(base, Posterior) and isinstance(base.prior, Refiner)
     if found.masks is None or len(found.masks) + 1 != base.prior.state_channels:
-        return None
-    factor = round(level.shape[0] / base.grid.shape[0])
-    if factor < 2 or not level.same_as(in_other_voxels(base.grid, [factor * n for n in base.grid.shape])):
         return None
     measurement = Measurement(projector, xrays, base.window, display, base.mu_water)
     measurement.adopt(found)
     state = torch.cat([base.window.to_range(found.within)[None], 2 * found.masks - 1])[None].to(xrays)
-    return CoarseCorrection(base.prior.bind(report, base.guidance, base.precision), measurement, state, factor)
+    refiner = base.prior.bind(report, base.guidance, base.precision)
+    return CoarseCorrection(refiner, measurement, state, _factor(base.grid, level))

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from phydict.grid import Grid
 from phydict.guard import Guard
-from phydict.posterior.coarse_correction import CoarseCorrection, coarse_correction
+from phydict.posterior.coarse_correction import CoarseCorrection, coarse_correction, knows
 from phydict.posterior.evidence import Evidence
 from phydict.posterior.likelihood.likelihood import LikelihoodStep, ProximalCG
 from phydict.posterior.measurement import Measurement
@@ -24,6 +24,10 @@ from phydict.xray.boxes import covers, interpolated, outside_projection, refinem
 ON_FINER = {0.5: (0.85, 0.0), 0.8: (1.0, 0.0), 0.9: (1.0, 0.1), 0.95: (1.0, 0.2)}
 """Level -> the shares of a coarse interval and of the refinement's change of which one on finer voxels is the sum: of
 two CTs kept from training these hold 43 to 52, 75 to 86, 85 to 95 and 92 to 99 % of the body from 1 to 16 views."""
+
+CORRECTED_VOLUMES = 55
+"""Volumes of the finest voxels that a refinement by a network on them holds at most, in float32
+(tests/benchmark/grid_cost.csv)."""
 
 
 class Bound(Protocol):
@@ -181,9 +185,17 @@ class Refined(Delegating):
         return refinements(self.base.grid, self.target)
 
     @property
+    def volumes(self) -> int:
+        return CORRECTED_VOLUMES if any(map(self._network, self.levels)) else super().volumes
+
+    @property
     def uncorrected(self) -> list[Grid]:
-        """Those that no network corrects on."""
-        return [level for level in self.levels if not self._network(level)]
+        """Those that the X-rays are met on and no network corrects on."""
+        if self.refinement.step is None:
+            return []
+        coarse = self.refinement.coarse and self.refinement.calls > 0
+        return [level for level in self.levels
+                if not self._network(level) and not (coarse and knows(self.base, level))]
 
     def _network(self, level: Grid) -> Correction | None:
         return self.network if self.network and self.network.suits(level, self.base.window) else None

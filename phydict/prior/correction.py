@@ -80,7 +80,7 @@ class CorrectionNetwork(nn.Module):
         missing = [n for size in reversed(sizes) for n in (0, -size % self.divisor)]
         padded = pad(seen, missing, mode="replicate") if any(missing) else seen
         padded = padded.contiguous(memory_format=torch.channels_last_3d)
-        down, below, up = self.unet.model
+        down, below, up = self.unet.model.children()
         x, y, z = sizes
         lacking = self._lacking(up, below(down(padded)), padded)
         return seen[:, :1] + lacking[..., :x, :y, :z].to(seen.dtype)

@@ -73,14 +73,17 @@ def main() -> None:
 def draw(rows: list[dict]) -> None:
     """Prints and plots the means over CTs."""
     scenes = sorted({(row["views"], row["contrast_hu"]) for row in rows})
+    methods = sorted({row["method"] for row in rows})
     figure = Figure(figsize=(4 * len(CONTRASTS), 3 * len(scenes) / len(CONTRASTS)))
     axes = figure.subplots(-(-len(scenes) // len(CONTRASTS)), len(CONTRASTS), sharex=True, sharey=True, squeeze=False)
     for ax, (views, contrast) in zip(axes.flat, scenes):
         scene = [row for row in rows if (row["views"], row["contrast_hu"]) == (views, contrast)]
-        for method in dict.fromkeys(row["method"] for row in scene):
+        for color, method in enumerate(methods):
             own = [row for row in scene if row["method"] == method]
+            if not own:
+                continue
             means = [mean(row["recovered"] for row in own if row["diameter_mm"] == size) for size in SIZES]
-            ax.plot(SIZES, means, marker="o", label=method)
+            ax.plot(SIZES, means, marker="o", color=f"C{color}", label=method)
             print("", views, f"{contrast:.0f}", method, *(f"{value:.2f}" for value in means), "", sep=" | ")
         ax.set_title(f"K = {views}, {contrast:.0f} HU denser")
         ax.grid(True, linewidth=0.3)

@@ -229,6 +229,7 @@ def test_with_a_network_a_reconstruction_is_learnt_from_at_both_calls(tmp_path, 
     (["--data.initial=prior.safetensors"], "give a refiner's file as data.initial"),
     (["--model.window=[-1000,1000]"], "model.window as its own"),
     (["--data.loading.simulation_voxels=64"], "data.loading.simulation_voxels is 64: leave it out"),
+    (["--data.loading.population.share=0.5"], "data.loading.population.share is 0.5: set it to 0"),
     (["--data.made.reconstructions=0"], "data.made")])
 def test_what_cannot_be_learnt_from_is_refused(tmp_path, cache, refiner_file, capsys, monkeypatch, given, words):
     monkeypatch.chdir(tmp_path)

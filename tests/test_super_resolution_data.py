@@ -125,3 +125,9 @@ def test_held_out_cts_alone_validate_on_fixed_crops(tmp_path):
 def test_a_crop_that_cannot_be_is_refused(crop, factor, tmp_path):
     with pytest.raises(ValueError, match="data.crops.size is a multiple"):
         SuperResolutionData(Crops(crop, factor), phantoms=1, cube=Cube(16), cache=str(tmp_path))
+
+
+def test_crops_are_drawn_from_volumes_of_one_size_alone(tmp_path):
+    with pytest.raises(ValueError, match="data.loading.simulation_voxels is 32: leave it out"):
+        SuperResolutionData(Crops(8, 2), phantoms=1, loading=Loading(simulation_voxels=32), cube=Cube(16),
+                            cache=str(tmp_path))

@@ -14,7 +14,7 @@ from processes import TRAIN, Python
 from torch.utils.data import default_collate
 
 from phydict.cli.train import main
-from phydict.datasets import phantom_case
+from phydict.datasets import CTSource, phantom_case
 from phydict.datasets.phantoms.cached import CachedPhantoms
 from phydict.grid import Cube, Grid
 from phydict.training import PriorTraining
@@ -128,6 +128,21 @@ def test_held_out_cts_only_validate_and_draws_mix_cts_with_phantoms(cts, tmp_pat
     both = [{key: case[key] for key in ("volume", "masks", "has_masks")} for case in (data.phantoms[0], data.cts[0])]
     for pair in (both, both[::-1]):  # in either order, as a loader process writes into the first case's dtype
         assert default_collate(pair)["has_masks"].dtype == torch.bool
+
+
+def test_a_held_out_patients_other_scans_and_reports_are_not_learnt_from(cts, tmp_path):
+    folder = tmp_path / "train"
+    for scan in ("train_1_a_1", "train_1_b_2", "train_2_a_1"):
+        place = folder / scan[:7] / scan[:9]
+        place.mkdir(parents=True, exist_ok=True)
+        (place / f"{scan}.nii.gz").write_bytes((cts / "patient0.nii.gz").read_bytes())
+    (tmp_path / "reports.csv").write_text("VolumeName,Findings_EN,Impressions_EN\n" + "".join(
+        f"{scan}.nii.gz,Words of {scan}.,\n" for scan in ("train_1_a_1", "train_1_b_2", "train_2_a_1")))
+    data = PriorData(str(folder), CTSource(reports=str(tmp_path / "reports.csv")), HoldOut(["train_1_a"], phantoms=1),
+                     phantoms=2, cache=str(tmp_path / "cache"), cube=Cube(16))
+    assert [ct.id for ct in data.cts.cts] == ["train_2_a_1"] and len(data.held_out) == 2
+    assert [words for words in data.reports if "Words of" in words] == [
+        words for words in data.reports if "train_2" in words] != []
 
 
 def test_a_gpu_that_is_not_there_is_not_asked_for_its_precision(cache, tmp_path, monkeypatch):

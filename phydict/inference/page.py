@@ -53,21 +53,21 @@ def _case(folder: Path, path: Path) -> Case | None:
         record = json.loads((path / RECORD).read_text())
         score_row(record["case"], record | {"scores": record["scores"] or {}})
         float(record["misfit"]), list(record["misfit_per_view"])
-        if not all((path / name).is_file() for name in CASE_FILES):
-            _make_case_files(path)
+        if missing := [name for name in CASE_FILES if not (path / name).is_file()]:
+            _make_case_files(path, missing)
     except Exception as error:  # whatever a damaged record or volume leads to
         warn(f"{path} is left out of the page, since its files are damaged ({type(error).__name__}: {error})")
         return None
     return Case(path.relative_to(folder).as_posix(), sorted(os.listdir(path)), record)
 
 
-def _make_case_files(path: Path) -> None:
+def _make_case_files(path: Path, missing: list[str]) -> None:
     image: nib.Nifti1Image = nib.load(path / "volume.nii.gz")  # type: ignore[assignment]
     volumes = {"reconstruction": np.asarray(image.dataobj)}
     for name, label in (("interval_90", "half of the 90% interval"), ("deviation", "standard deviation")):
         if len(volumes) == 1 and (path / f"{name}.nii.gz").is_file():
             volumes[label] = np.asarray(nib.load(path / f"{name}.nii.gz").dataobj)  # type: ignore[attr-defined]
-    write_case_files(path, Grid(volumes["reconstruction"].shape, affine=image.affine), volumes)
+    write_case_files(path, Grid(volumes["reconstruction"].shape, affine=image.affine), volumes, names=missing)
 
 
 def _mean_tables(scored: list) -> list[Table]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import zlib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import nibabel as nib
@@ -31,13 +31,18 @@ THUMBNAIL_SIDE = 96
 
 
 def write_case_files(folder: Path, grid: Grid, volumes: Mapping[str, Tensor | np.ndarray],
-                     xrays: Tensor | None = None, reprojection: Tensor | None = None) -> None:
-    """Writes what the page shows of a case into its folder.
+                     xrays: Tensor | None = None, reprojection: Tensor | None = None,
+                     names: Collection[str] = CASE_FILES) -> None:
+    """Writes what the page shows of a case into its folder, of `names` alone.
 
     volumes: name -> HU (X, Y, Z) on `grid`, "reconstruction" first, then "truth" where it is known and how uncertain a
     voxel is, by any other name; kept as int16 in RAS+, rounded. xrays, reprojection: line integrals (K, V, U), kept as
     uint16 over the range of both; None where they are not known.
     """
+    if THUMBNAIL in names:
+        _write_thumbnail(folder / THUMBNAIL, next(iter(volumes.values())), grid)
+    if VIEW not in names:
+        return
     turn = nib.io_orientation(grid.affine)
     affine = grid.affine @ nib.orientations.inv_ornt_aff(turn, grid.shape)
     with atomic_write(folder / VIEW) as part, part.open("w", encoding="ascii") as file:
@@ -50,7 +55,6 @@ def write_case_files(folder: Path, grid: Grid, volumes: Mapping[str, Tensor | np
             file.write(f'"X-rays": {json.dumps(_xrays(np.asarray(xrays), np.asarray(reprojection)))},\n')
         file.write(f'"shape": {list(turned.shape)}, "affine": {affine[:3].tolist()}, '
                    f'"inverse": {np.linalg.inv(affine)[:3].tolist()}}});\n')
-    _write_thumbnail(folder / THUMBNAIL, next(iter(volumes.values())), grid)
 
 
 def packed(array: np.ndarray) -> str:

@@ -44,7 +44,7 @@ function caseRow(case_) {
   const row = [
     {text: record.case, value: null, label: true,
      node: element("button", {class: "name", type: "button", onclick: open}, record.case)},
-    {text: "", value: null, label: true, node: picture ? element("img", {
+    {text: record.case, value: null, label: true, node: picture ? element("img", {
       loading: "lazy", alt: "", src: `${case_.folder}/${picture.url}`, onclick: open}) : ""},
     {text: record.method, value: null, label: true},
     {text: String(record.views ?? "–"), value: record.views ?? null}];
@@ -98,7 +98,7 @@ function showRun() {
     return row;
   }), made.notes)), plot(points, error) ?? "");
   if (cases.length) {
-    const header = ["case", "", "method", "views", ...measures.map(measure => measure.label), "warnings"];
+    const header = ["case", "picture", "method", "views", ...measures.map(measure => measure.label), "warnings"];
     const rows = cases.map(caseRow), own = table("Cases", header, rows, [
       "Best of each case in bold, second underlined. A name opens the case."]);
     const filter = element("input", {type: "search", oninput: () => {
@@ -145,7 +145,7 @@ async function showCase(key) {
   byId("case-scores").textContent = content.measures.filter(({name}) => (scores[name] ?? null) !== null)
     .map(({name, label, decimals}) => `${label} ${scores[name].toFixed(decimals)}`).join(", ");
   byId("warnings").replaceChildren(...(record.warnings ?? []).map(text => element("li", {}, text)));
-  byId("report").textContent = record.report || "none was used";
+  byId("report").textContent = record.report || ("report" in record ? "none was given" : "not kept in this table");
   byId("files").replaceChildren(...files.filter(({name}) => name !== "view.js").map(({name, url}) => element("li", {},
     element("a", {href: `${folder}/${url}`}, name))));
   const {settings, versions, grid, report, warnings, scores: _, files: __, ...facts} = record;
@@ -164,13 +164,14 @@ async function showCase(key) {
     viewer ??= new Viewer();
     viewer.show(volumes, xrays, record.misfit_per_view ?? []);
     await offerOthers(case_, volumes);
-    byId("state").textContent = "";
   } catch (error) {
-    byId("state").textContent = `The volume is not shown: ${folder}/view.js cannot be used, since ${error.message}. ` +
+    if (opened === key) byId("state").textContent = `The volume is not shown: ${folder}/view.js cannot be used, since ${error.message}. ` +
       "Make the page anew: infer.py page <folder>.";
   } finally {
-    byId("case-name").focus({preventScroll: true});
-    byId("case").scrollIntoView();
+    if (opened === key) {
+      byId("case-name").focus({preventScroll: true});
+      byId("case").scrollIntoView();
+    }
   }
 }
 
@@ -182,11 +183,16 @@ async function offerOthers(case_, volumes) {
   byId("other").replaceChildren(...choices.map(([name], n) => element("option", {value: n}, name)));
   byId("other").value = volumes.truth ? 1 : 0;
   const choose = async () => {
-    const [name, chosen] = choices[byId("other").value];
-    const other = chosen?.record ? Object.assign(Object.create(Volume.prototype),
-      (await load(chosen)).volumes.reconstruction, {name}) : chosen;
-    const shown = viewer.compare(other);
-    byId("state").textContent = shown ? "" : `The volume of ${name} lies askew to this one and is not shown beside it.`;
+    const value = byId("other").value, [name, chosen] = choices[value];
+    let other = chosen, problem = "";
+    if (chosen?.record) try {
+      other = Object.assign(Object.create(Volume.prototype), (await load(chosen)).volumes.reconstruction, {name});
+    } catch (error) {
+      [other, problem] = [null, `${chosen.folder}/view.js cannot be used, since ${error.message}`];
+    }
+    if (opened !== keyOf(case_) || byId("other").value !== value) return;
+    if (!viewer.compare(other)) problem = "it lies askew to this one";
+    byId("state").textContent = problem && `The volume of ${name} is not shown beside this one: ${problem}.`;
   };
   byId("other").onchange = choose;
   await choose();

@@ -48,7 +48,9 @@ class Viewer {
     for (const [name, window] of Object.entries(WINDOWS))
       byId("windows").append(element("button", {type: "button", onclick: () => this.setWindow(...window)}, name), " ");
     for (const id of ["level", "width"])
-      byId(id).addEventListener("input", () => this.setWindow(+byId("level").value, Math.max(+byId("width").value, 1)));
+      byId(id).addEventListener("input", () => {
+        if (byId(id).value !== "") this.setWindow(+byId("level").value, Math.max(+byId("width").value, 1));
+      });
     byId("way").addEventListener("change", () => this.draw());
     byId("overlay").addEventListener("change", () => this.draw());
     byId("wipe").addEventListener("input", () => this.drawXrays());
@@ -110,7 +112,8 @@ class Viewer {
     this.other = null;
     byId("overlay-label").hidden = !this.uncertainty;
     byId("overlay-name").textContent = `${this.uncertainty?.name} as overlay`;
-    byId("xrays").hidden = !xrays;
+    for (const id of ["xray", "residual"]) byId(id).parentNode.hidden = !xrays;
+    byId("xrays").hidden = !xrays && !misfits.length;
     this.view = 0;
     const most = Math.max(...misfits.map(value => value ?? 0), 1e-9);
     byId("bars").replaceChildren(...misfits.map((value, view) => element("button", {

@@ -41,7 +41,7 @@ class FoundPoses:
     so that they are too small where volume and poses are entangled. misfits: relative residual of the search's own
     volumes, at first and at last. sway (2, K): by how many mm on the detector each view shows the lower end of the body
     moved against the upper one, and the standard error of that. The beam is the corrected one carried as a whole to the
-    nominal one, which changes no projection.
+    nominal one, which changes no projection. display: of display values, whose gains and offsets are unknown anyway.
     """
 
     beam: ConeBeam
@@ -51,6 +51,7 @@ class FoundPoses:
     misfits: tuple[float, float]
     sway: np.ndarray
     seconds: float
+    display: bool = False
 
     def corrected(self, xrays: Tensor) -> Tensor:
         """X-rays (K, V, U) without their gains and offsets."""
@@ -81,8 +82,9 @@ class FoundPoses:
                         "of what was found of the poses, comes from the method and from the stated geometry: read "
                         "outlines and large structures alone, and no sizes, places or densities of small ones; lengths "
                         "are as right as the stated distances")
+        known = (self.deviations == 0) | (self.display & (np.arange(len(NAMES)) >= len(POSE)))
         for view, row in enumerate(self.corrections):
-            ratios = np.divide(np.abs(row), self.deviations, out=np.zeros_like(row), where=self.deviations > 0)
+            ratios = np.divide(np.abs(row), self.deviations, out=np.zeros_like(row), where=~known)
             worst = int(ratios.argmax())
             if ratios[worst] > LARGE_CORRECTION:
                 unit = {"mm": " mm", "degrees": " degrees"}.get(NAMES[worst].rpartition("_")[2], "")

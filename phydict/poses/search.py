@@ -120,14 +120,14 @@ def find_poses(xrays: Tensor, beam: ConeBeam, uncertain: Uncertain, grid: Grid, 
                 on_round()
             if n == 0:
                 sway = views.sway(state).double().numpy()
-            if n == 0 and views.fits_as_stated(state):
-                state.theta = torch.zeros_like(state.theta)
+            if n == 0 and deviations[:8].any() and views.fits_as_stated(state):
+                state.theta, state.misfits = torch.zeros_like(state.theta), state.misfits[:1]
                 break
         there = moved(beam, state.theta[:, :8].double().numpy())
         if state.theta[:, :8].any():
             there = aligned(there, beam, middle_points(grid))
     return FoundPoses(there, deviations, state.theta.double().numpy(), state.errors.double().numpy(),
-                      (state.misfits[0], state.misfits[-1]), sway, watch.seconds["calibrate"])
+                      (state.misfits[0], state.misfits[-1]), sway, watch.seconds["calibrate"], display)
 
 
 def halved(grid: Grid) -> Grid:

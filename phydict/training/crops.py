@@ -110,6 +110,9 @@ class SuperResolutionData(PriorData):
             raise ValueError(f"a super-resolution stage learns from CTs and phantoms alone, but "
                              f"data.loading.population.share is {loading.population.share}: set it to 0")
         super().__init__(cts, source, holdout, phantoms, loading, cache, seed=seed, cube=cube, window=window)
+        if self.factor != 1:
+            raise ValueError(f"a super-resolution stage learns from volumes of {cube.voxels} voxels alone, but "
+                             f"data.loading.simulation_voxels is {loading.simulation_voxels}: leave it out")
         if not 0 < crops.size <= cube.voxels or crops.size % crops.factor:
             raise ValueError(f"data.crops.size is a multiple of the factor {crops.factor}, up to the {cube.voxels} "
                              f"voxels of a volume, but {crops.size} was given")

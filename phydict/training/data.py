@@ -9,7 +9,7 @@ import torch
 from torch.nn.functional import avg_pool3d
 from torch.utils.data import ConcatDataset, DataLoader, Dataset, DistributedSampler
 
-from phydict.datasets import Augmentation, CTCases, CTSource, Thorax, report, split_by_patient
+from phydict.datasets import Augmentation, CTCases, CTSource, Thorax, patient_of, report, split_by_patient
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM, CachedPhantoms
 from phydict.datasets.population import DrawnPatients
 from phydict.grid import Cube, Grid
@@ -65,7 +65,8 @@ class PriorData(lightning.LightningDataModule):
                 raise ValueError(f"data.holdout.ids names '{word}', but no CT has that in its id"
                                  + (f" (the first id is {files[0].id})" if files else "") + ": correct or remove it")
         validating = set(split_by_patient([f.id for f in files], holdout.fraction, seed)[1])
-        held_out = [f for f in files if f.id in validating or any(word in f.id for word in holdout.ids or [])]
+        named = {patient_of(f.id) for f in files if any(word in f.id for word in holdout.ids or [])}
+        held_out = [f for f in files if f.id in validating or patient_of(f.id) in named]
         if len(held_out) == len(files) and not phantoms:
             raise ValueError("there is nothing to train on: data.holdout holds out every CT, and data.phantoms is 0")
         if files and not held_out and holdout.fraction:
@@ -78,7 +79,7 @@ class PriorData(lightning.LightningDataModule):
         self.held_out_cts = CTCases(held_out, cache, self.grid, hu)
         self.validation: Dataset = ConcatDataset([
             CachedPhantoms(HELD_OUT_PHANTOM, holdout.phantoms, self.grid, hu, Path(cache)), self.held_out_cts])
-        self.reports = [f.report for f in files if f.report]
+        self.reports = [f.report for f in files if f.report and f.id not in validating]
         self.reports += [report(Thorax.draw(s)) for s in range(min(phantoms, 1000))]
         self.reports += self.population.reports(1000) if self.population else []
         self.loading, self.seed, self.augmentation = loading, seed, augmentation

@@ -171,6 +171,9 @@ class ReconstructionData(PriorData):
                  cts: str | None = None, holdout: HoldOut = HoldOut(phantoms=0), phantoms: int = 0,
                  loading: Loading = Loading(), cache: str = "runs/cache", initial: str = str(DEFAULT_REFINER),
                  cube: Cube = Cube(128), window: tuple[float, float] = (-1000.0, 1000.0)):
+        if loading.population.share:
+            raise ValueError(f"a refinement learns from reconstructions of CTs and phantoms alone, but "
+                             f"data.loading.population.share is {loading.population.share}: set it to 0")
         super().__init__(cts, CTSource(), holdout, phantoms, loading, cache, cube=cube, window=window)
         if self.factor != 1:
             raise ValueError(f"X-rays of reconstructions are made of {FINER * cube.voxels} voxels anyway, but "

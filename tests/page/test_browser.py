@@ -134,6 +134,34 @@ def test_windows_overlay_and_difference_change_what_is_shown(shown):
     assert look(page, "[data-plane=axial][data-row='1']") != beside
 
 
+def test_a_window_can_be_typed_anew(shown):
+    page = shown("#sirt%2Fanna")
+    page.click("#width")
+    page.keyboard.press("Control+a")
+    page.keyboard.press("Delete")
+    page.keyboard.type("1500")
+    assert page.input_value("#width") == "1500"
+
+
+def test_without_xrays_the_misfit_of_each_view_is_shown_alone(shown, tmp_path):
+    folder = finish(tmp_path, "anna", "sirt")
+    (folder / "view.js").unlink()
+    results_page(tmp_path)
+    page = shown("#sirt%2Fanna", folder=tmp_path)
+    assert [page.is_visible(name) for name in ("#xray", "#residual", "#bars")] == [False, False, True]
+    page.locator("#bars button").nth(1).click()
+    assert page.inner_text("#view-name") == "view 1 of 3, misfit 0.200"
+
+
+def test_another_methods_missing_volume_is_said_in_a_sentence(shown, tmp_path):
+    finish(tmp_path, "anna", "sirt"), finish(tmp_path, "anna", "tv")
+    results_page(tmp_path)
+    (tmp_path / "tv" / "anna" / "view.js").write_text("phydictView(null);")
+    page = shown("#sirt%2Fanna", folder=tmp_path)
+    page.select_option("#other", label="tv")
+    page.wait_for_function("document.getElementById('state').textContent.includes('The volume of tv is not shown')")
+
+
 def test_truth_and_other_methods_stand_beside_a_volume_at_the_same_place(shown, results):
     page = shown("#sirt%2Fanna")
     assert set(readout(page)[1]) == {"reconstruction", "truth", "standard deviation"}

@@ -108,6 +108,14 @@ def test_the_page_is_made_anew_of_what_older_runs_left(tmp_path, capsys):
     assert results.unfinished({"anna": "crc32 1"}, {"seed": 0}) == ["anna"]
 
 
+def test_a_missing_thumbnail_is_made_and_what_else_the_page_shows_stays(tmp_path):
+    folder = finish(tmp_path, "anna", "sirt")
+    (folder / "thumbnail.png").unlink()
+    shown = (folder / "view.js").read_bytes()
+    results_page(tmp_path)
+    assert (folder / "thumbnail.png").is_file() and (folder / "view.js").read_bytes() == shown
+
+
 def test_the_page_of_one_method_is_that_of_its_folder(tmp_path):
     finish(tmp_path, "anna", "sirt"), finish(tmp_path, "anna", "tv")
     assert [case["folder"] for case in content(results_page(tmp_path / "sirt"))["cases"]] == ["anna"]

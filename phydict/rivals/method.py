@@ -55,7 +55,7 @@ class RivalAnswer(Baseline):
 class TrainedRival(Reconstructor):
     """A rival from its file, such as `train.py fit -c configs/rivals/lifted.yaml` and `train.py export` write it.
 
-    It reads no report. Another grid than its own is refused, and of a rival that is bound to one geometry any other.
+    It reads no report. Finer voxels are refined from its own; a rival that is bound to one geometry refuses any other.
 
     Args:
         file: the rival's .safetensors file, or the name of a shipped one, data/rivals/lifted_64.safetensors

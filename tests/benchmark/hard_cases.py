@@ -353,8 +353,8 @@ def scenes_table(rows: list[dict]) -> str:
 
 def clauses(row: dict) -> str:
     """The first clauses of what is said; views that were corrected are counted."""
-    parts = [re.match("(refused: )?[^:,]*", part).group() for part in row.get("said", "-").split("; ")
-             if not re.search("^check |^state | was corrected by | show the lower end ", part)]
+    parts = [re.match("(refused: )?([^:,]|,(?= [0-9]))*", part).group() for part in row.get("said", "-").split("; ")
+             if not re.search("^check |^state |^of display values | was corrected by | show the lower end ", part)]
     corrected = len(re.findall(" was corrected by ", row.get("said", "")))
     told = {f"views corrected by more than stated: {corrected}": corrected,
             "the patient breathed or moved between the views": " show the lower end " in row.get("said", "")}

@@ -34,6 +34,7 @@ from phydict.runtime.console import (
 from phydict.runtime.help import HelpFormatter
 from phydict.runtime.reading import reading
 from phydict.runtime.shipped import configuration
+from phydict.runtime.telling import exclaim
 
 COMMANDS = {"predict": "X-rays -> volumes", "test": "CTs -> X-rays -> volumes and scores",
             "ablate": "methods compared on the same X-rays", "page": "results -> a page for the browser"}
@@ -114,7 +115,7 @@ class InferenceCLI(TellingCLI):
                 if len(folders) == 1:
                     raise
                 bad.append(name)
-                print(f"error: {name}: {sentence(error)}", file=sys.stderr)
+                exclaim("error", f"{name}: {sentence(error)}")
         print(f"pages in {model.pages}")
         if bad:
             raise ValueError(f"{len(bad)} of {len(folders)} cases cannot be reconstructed ({', '.join(bad)}): see the "

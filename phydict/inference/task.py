@@ -8,7 +8,6 @@ Each finished case is one folder of the output; a stopped run resumes where it w
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
@@ -41,7 +40,7 @@ from phydict.runtime.console import TRACEBACK, check_apart, check_writable, note
 from phydict.runtime.profiling import profiled, stage
 from phydict.runtime.progress import CaseProgress
 from phydict.runtime.seeds import case_seed, check_seed
-from phydict.runtime.telling import tell
+from phydict.runtime.telling import exclaim, tell
 from phydict.runtime.warning import warn
 from phydict.units import HUWindow
 from phydict.xray.projectors.projector import METHODS as PROJECTORS
@@ -221,7 +220,7 @@ class ReconstructionTask(lightning.LightningModule):
             if len(self.cases) == 1:
                 raise
             self.progress.finished("not reconstructed")
-            print(f"error: {case['id']}: {sentence(error)}", file=sys.stderr)
+            exclaim("error", f"{case['id']}: {sentence(error)}")
 
     def on_test_epoch_end(self) -> None:
         self.log_dict(self.metrics.compute())

@@ -21,6 +21,7 @@ from phydict.runtime.parser_message import plain
 from phydict.runtime.reading import one_line
 from phydict.runtime.renamed import check_options, check_setting
 from phydict.runtime.shipped import configuration
+from phydict.runtime.telling import exclaim
 from phydict.runtime.yaml_file import parse_yaml, read_yaml
 
 NOISE = (".*does not have many workers", ".*LeafSpec.*is deprecated", ".*is smaller than the logging interval",
@@ -248,4 +249,4 @@ def noted(texts: list[str], name: str) -> Iterator[None]:
 
 
 def _show(message: Warning | str, *_) -> None:
-    print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)
+    exclaim("warning", " ".join(str(message).split()))

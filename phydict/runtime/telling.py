@@ -47,6 +47,13 @@ def tell(text: str, /, **event: object) -> None:
         print(text if _MANNER.get() == WORDS else json.dumps(event), file=sys.stderr, flush=True)
 
 
+def exclaim(kind: str, text: str) -> None:
+    """A warning, or an error that does not end the run, on standard error: as JSON where progress is, and never
+    silenced."""
+    print(json.dumps({"event": kind, "text": text}) if _MANNER.get() == JSON else f"{kind}: {text}", file=sys.stderr,
+          flush=True)
+
+
 def bars_on(console: Console, *columns: ProgressColumn) -> Progress:
     """Bars with their count, the time so far and the time to go, that show on a terminal alone, and in words alone."""
     return Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import os
 import subprocess
 import sys
@@ -76,6 +77,19 @@ def test_a_doubtful_ct_marks_its_row_its_record_and_the_table(tmp_path, capsys):
         assert all(sentence in err for sentence in record(tmp_path / "out" / "sirt" / case)["warnings"])
     for text in ((tmp_path / "out" / "sirt" / "results.md").read_text(), " ".join(out.split())):
         assert "Doubtful" in text and "air, attenuation, cm, plus1024, wrapped" in text and "warned" in text
+
+
+@pytest.mark.filterwarnings("default::UserWarning")
+def test_machines_read_warnings_and_failed_cases_as_json_too(tmp_path, capsys):
+    write_ct(tmp_path / "cts" / "air.nii.gz", 0, change=DOUBTFUL["air"])
+    (tmp_path / "cts" / "cut.nii.gz").write_bytes((tmp_path / "cts" / "air.nii.gz").read_bytes()[:200])
+    with pytest.raises(SystemExit):
+        main(sirt("test", tmp_path / "out", f"--data.cts={tmp_path / 'cts'}", *ORBIT, "--json_lines"))
+    *lines, last = capsys.readouterr().err.splitlines()
+    events = [json.loads(line) for line in lines]
+    assert {"begin", "case", "warning", "error"} <= {event["event"] for event in events}
+    assert all("cut" in event["text"] for event in events if event["event"] == "error")
+    assert last.startswith("error: ") and "cut" in last  # with which the command ends
 
 
 def test_a_good_case_has_no_mark(tmp_path):

@@ -165,8 +165,8 @@ async function showCase(key) {
     viewer.show(volumes, xrays, record.misfit_per_view ?? []);
     await offerOthers(case_, volumes);
   } catch (error) {
-    if (opened === key) byId("state").textContent = `The volume is not shown: ${folder}/view.js cannot be used, since ${error.message}. ` +
-      "Make the page anew: infer.py page <folder>.";
+    if (opened === key) byId("state").textContent = `The volume is not shown: ${folder}/view.js cannot be used, ` +
+      `since ${error.message}. Make the page anew: infer.py page <folder>.`;
   } finally {
     if (opened === key) {
       byId("case-name").focus({preventScroll: true});

@@ -193,9 +193,9 @@ class Refined(Delegating):
         """Those that the X-rays are met on and no network corrects on."""
         if self.refinement.step is None:
             return []
-        coarse = self.refinement.coarse and self.refinement.calls > 0
+        _, others = self.refinement.corrections(network=False)
         return [level for level in self.levels
-                if not self._network(level) and not (coarse and knows(self.base, level))]
+                if not self._network(level) and not (others and knows(self.base, level))]
 
     def _network(self, level: Grid) -> Correction | None:
         return self.network if self.network and self.network.suits(level, self.base.window) else None

@@ -66,6 +66,10 @@ class StageTraining(lightning.LightningModule, ABC):
         self.log("loss", mean, prog_bar=True, batch_size=len(batch["volume"]))
         return loss
 
+    def on_train_batch_end(self, outputs: object, batch: object, index: int) -> None:
+        if self.global_step == self.trainer.max_steps:
+            self.trainer.should_stop = True  # Lightning then validates, wherever in its epoch the last step lies
+
     def on_validation_start(self) -> None:
         if self.device_mesh is None:  # the parts of sharded weights are looked at when they are put together
             self._check_weights(self.state_dict())

@@ -160,6 +160,14 @@ def test_machines_read_a_json_object_on_each_line_and_quiet_tells_nothing(comman
     assert run(command, "--quiet", out="silent") == ""
 
 
+def test_a_run_that_overwrites_says_that_it_begins_anew(run, handlers, monkeypatch, capfd):
+    run("predict")
+    stop_once(monkeypatch)
+    with pytest.raises(SystemExit):
+        run("predict", "--model.overwrite=true")
+    assert "with --model.overwrite true does the finished cases again" in capfd.readouterr().err
+
+
 def test_a_training_stopped_before_its_first_checkpoint_says_that_nothing_is_kept(run, handlers, monkeypatch, capfd):
     monkeypatch.setattr(PriorTraining, "training_step", lambda *_: signal.raise_signal(signal.SIGINT))
     with pytest.raises(SystemExit):

@@ -36,6 +36,19 @@ def test_a_log_says_what_is_done_what_remains_for_how_long_and_where(told):
                       "c: step 1 of 2, about 20 s to go", "c: step 2 of 2", "c: good (3 of 3)"]
 
 
+def test_a_case_may_have_steps_of_its_own(capsys, monkeypatch):
+    now = iter(range(0, 1000, 20))
+    monkeypatch.setattr(module.time, "monotonic", lambda: float(next(now)))
+    with telling(False, False), CaseProgress(interval=10) as progress:
+        progress.begin("ablate", 1, verb="run", noun="row")
+        progress.case("fast")
+        progress.advance()  # of a run that warms up
+        progress.follow(4)
+        progress.advance()
+    assert [line.split(",")[0] for line in capsys.readouterr().err.splitlines()] == [
+        "ablate: 1 row to run", "fast: step 1", "fast: step 1 of 4"]
+
+
 def test_machines_read_the_same_as_json(told):
     begin, *events = map(json.loads, told(json_lines=True))
     assert begin == {"event": "begin", "name": "sirt", "cases": 3, "steps": 2, "out": "there"}

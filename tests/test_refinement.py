@@ -192,6 +192,14 @@ def test_a_resumed_run_is_the_uninterrupted_one_and_makes_each_reconstruction_on
     assert files and files == {file: file.stat().st_mtime_ns for file in cache.rglob("reconstructions-*/*/*.npy")}
 
 
+def test_another_seed_makes_other_reconstructions_and_the_same_held_out_ones(tmp_path, refiner_file):
+    first, second = (ReconstructionData(
+        RefinementCases(1, 1, 16, seed=seed), Scenes(most_views=3), phantoms=2, cache=str(tmp_path / "cache"),
+        initial=refiner_file, cube=Cube(32), window=(-1000, 600)) for seed in (0, 1))
+    assert not np.array_equal(first.made[0], second.made[0])
+    assert first.validation.made.folder == second.validation.made.folder
+
+
 def test_held_out_reconstructions_are_those_of_their_own_volumes(tmp_path, refiner_file):
     def validated(phantoms: int) -> Path:
         data = ReconstructionData(

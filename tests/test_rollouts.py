@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from command_lines import refiner_arguments, refusal, resumed_as_uninterrupted
+from ct_files import save_ct, thorax_hu
 from prior.tiny import tiny_prior, tiny_refiner
 
 from phydict.cli.train import main
@@ -71,6 +72,20 @@ def test_a_resumed_run_is_the_uninterrupted_one_and_makes_each_roll_out_once(tmp
     assert isinstance(learnt, Refiner) and not torch.equal(learnt.entrance.weight, begun.entrance.weight)
     [folder] = cache.glob("**/rollouts-*")
     assert made and sorted(made) == sorted(int(file.stem) for file in folder.iterdir())
+
+
+def test_roll_outs_are_kept_for_more_of_them_and_not_for_other_cases(tmp_path, refiner_file, monkeypatch):
+    def folder(count: int = 1) -> Path:
+        return rollouts(refiner_file, tmp_path / "cache", count, cts=str(tmp_path / "cts")).rollouts.folder
+
+    file = tmp_path / "cts" / "a.nii.gz"
+    save_ct(file, thorax_hu())
+    first = folder()
+    assert folder(count=3) == first
+    save_ct(file, thorax_hu() + 10)
+    assert (second := folder()) != first
+    monkeypatch.setattr("phydict.datasets.phantoms.cached.PHANTOM_VERSION", 0)
+    assert folder() not in (first, second)
 
 
 def test_a_prior_that_is_no_refiner_has_no_roll_outs(tmp_path, cache, capsys):

@@ -172,7 +172,7 @@ def test_subtracted_scatter_widens_the_intervals():
 
 
 @pytest.mark.filterwarnings("ignore:no volume explains")
-def test_predict_writes_the_interval_beside_the_volume(tmp_path, refiner_file, monkeypatch):
+def test_predict_writes_the_interval_beside_the_volume(tmp_path, refiner_file, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "xrays"
     folder.mkdir()
@@ -185,7 +185,8 @@ def test_predict_writes_the_interval_beside_the_volume(tmp_path, refiner_file, m
     record = json.loads((case / "reconstruction.json").read_text())
     interval, volume = (nibabel.load(case / name) for name in ("interval_90.nii.gz", "volume.nii.gz"))
     assert (interval.affine == volume.affine).all() and (interval.get_fdata() > 0).all()
-    assert record["interval_widening"] >= (2 if record["scatter"] else 1)
+    assert (widening := record["interval_widening"]) >= (2 if record["scatter"] else 1)
+    assert (f"intervals {widening:.1f} times as wide as calibrated" in capsys.readouterr().err) == (widening >= 1.05)
     assert 0 < record["interval_90_hu"] <= interval.get_fdata().max()
 
 

@@ -126,7 +126,7 @@ def run(specification: Specification, device: torch.device, progress: CaseProgre
     if others := len(results.others):
         tell(f"{others} rows of other settings or data are kept in {results.file} and left out of tables",
              event="others", cases=others, out=str(results.file))
-    runner = Runner(device, scoring, specification.out)
+    runner = Runner(device, scoring, specification.out, progress)
     progress.begin("ablate", left, verb="run", out=specification.out, noun="row")
     for case, work in cases.items():
         groups: dict[str, list] = {}
@@ -139,7 +139,7 @@ def run(specification: Specification, device: torch.device, progress: CaseProgre
             scene = _attempt(lambda: MeasuredCase(case, first, made.case(case, first, make), device))
             for trial, name, _ in group:
                 progress.case(f"{case}: {trial.label}")
-                measured = scene if isinstance(scene, dict) else runner.measure(trial, scene, progress.advance, name)
+                measured = scene if isinstance(scene, dict) else runner.measure(trial, scene, name)
                 results.add(name, measured)
                 progress.finished(f"{measured['seconds']:.2f} s, {measured['psnr']:.2f} dB"
                                   if measured["status"] == "ok" else f"{measured['status']}: {measured['error']}")
@@ -188,29 +188,29 @@ class Runner:
 
     out: where the features of slices are kept, where the Frechet distance is measured."""
 
-    def __init__(self, device: torch.device, scoring: Scoring, out: Path):
-        self.device, self.scoring, self.out, self.warm = device, scoring, out, set[str]()
+    def __init__(self, device: torch.device, scoring: Scoring, out: Path, progress: CaseProgress):
+        self.device, self.scoring, self.out, self.progress, self.warm = device, scoring, out, progress, set[str]()
 
-    def measure(self, trial: Trial, scene: MeasuredCase, on_step: Callable[[], None], key: str) -> dict:
+    def measure(self, trial: Trial, scene: MeasuredCase, key: str) -> dict:
         """The measured columns of one trial on one case, the row of `key`."""
         if (state := str(trial.identity() | {"seed": None})) not in self.warm:
             self.warm.add(state)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # the measured run repeats them
-                _attempt(lambda: self._warm_up(trial, scene, on_step))
+                _attempt(lambda: self._warm_up(trial, scene))
         warned = list(scene.warnings)
         with noted(warned, f"{scene.case}, {trial.label}"):
-            measured = _attempt(lambda: self._measured(trial, scene, on_step, key))
+            measured = _attempt(lambda: self._measured(trial, scene, key))
         return measured | {"warning": "; ".join(warned) or None}
 
-    def _warm_up(self, trial: Trial, scene: MeasuredCase, on_step: Callable[[], None]) -> None:
+    def _warm_up(self, trial: Trial, scene: MeasuredCase) -> None:
         with suppress(WarmUp.Warm):
-            self._reconstruct(trial, scene, WarmUp(on_step))
+            self._reconstruct(trial, scene, WarmUp(self.progress.advance))
 
-    def _measured(self, trial: Trial, scene: MeasuredCase, on_step: Callable[[], None], key: str) -> dict:
+    def _measured(self, trial: Trial, scene: MeasuredCase, key: str) -> dict:
         known = reset_peak_memory(self.device)
         with profiled(memory=False) as profile:
-            result = self._reconstruct(trial, scene, on_step)
+            result = self._reconstruct(trial, scene, self.progress.advance)
         peak = peak_memory(self.device) if known else None
         seconds = result.seconds | profile.seconds("network", "projector")
         finite = bool(result.volume.isfinite().all())
@@ -238,6 +238,7 @@ class Runner:
         stage = _stage_on(trial.super_resolution, self.device) if trial.super_resolution else None
         ready = reconstructor(trial.method, prior, trial.guidance, trial.name, stage, samples=trial.samples)
         ready = onto_grid(ready, trial.box.grid() if trial.box else None, trial.refinement)
+        self.progress.follow(ready.steps())
         xrays, projector = fit_to_grid(ready, trial.result_scene()[0], scene.xrays.clone(), scene.beam, trial.projector)
         return ready.with_mu_water(scene.mu_water).reconstruct(
             xrays, projector, scene.report(trial), False, seed, on_step)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 
@@ -99,7 +101,7 @@ class InferenceCLI(TellingCLI):
             self._draw(datamodule.xray_cases(), model, datamodule.geometry)
             return
         model.profile, model.calibrate = self.flag("profile"), self.flag("calibrate")
-        with model.progress:
+        with _resumable(model):
             self.trainer.predict(model, datamodule=datamodule, return_predictions=False)
 
     @staticmethod
@@ -126,8 +128,19 @@ class InferenceCLI(TellingCLI):
         model.profile, model.calibrate = self.flag("profile"), self.flag("calibrate")
         model.measure(Scoring(self._get(self.config, "metrics"), self._get(self.config_init, "fid"),
                               self._get(self.config_init, "clip")))
-        with model.progress:
+        with _resumable(model):
             self.trainer.test(model, datamodule=datamodule, verbose=False)
+
+
+@contextmanager
+def _resumable(model: ReconstructionTask) -> Iterator[None]:
+    """The progress of a run, which says how it is resumed if it is stopped."""
+    with model.progress:
+        try:
+            yield
+        except BaseException as stop:
+            stop.add_note(model.results.to_resume)
+            raise
 
 
 def with_methods(args: list[str]) -> list[str]:

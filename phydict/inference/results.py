@@ -44,6 +44,8 @@ class CaseResults:
 
     def __init__(self, folder: Path, overwrite: bool = False):
         self.folder, self.overwrite = folder, overwrite
+        self.to_resume = "run the same command again" + (
+            ", which with --model.overwrite true does the finished cases again as well" if overwrite else "")
         self._sources: dict[str, str] = {}
         self._settings: dict = {}
         self._before: dict[str, Finished | None] = {}

@@ -27,7 +27,7 @@ def summarise(results: CaseResults, cases: list[str], name: str, scoring: Scorin
         print(f"page: {results_page(results.folder.parent)}")
     if missing:
         raise ValueError(f"{len(missing)} of {len(cases)} cases were not reconstructed "
-                         f"({', '.join(missing)}): see the messages above, and run the same command again")
+                         f"({', '.join(missing)}): see the messages above, and {results.to_resume}")
 
 
 def _distances(results: CaseResults, cases: list[str], name: str, scoring: Scoring) -> list[Table]:

@@ -48,6 +48,9 @@ from phydict.xray.projectors.projector import METHODS as PROJECTORS
 PREDICTED_VOXELS = 128
 """Along each side of 384 mm, of what phydict_learned predicts: about three times the seconds of its network's 64."""
 
+WIDER = 1.05
+"""The factor, of intervals over those that were calibrated, from which on it is told."""
+
 
 class ReconstructionTask(lightning.LightningModule):
     """Reconstructs every case with one method and writes it; in test, scores it against the CT it came from.
@@ -277,8 +280,15 @@ class ReconstructionTask(lightning.LightningModule):
             record = case_record(case, result, self.method_name, self.reconstructor, scores, self.settings, self.device)
             self.results.write(case["id"], record, lambda folder: write_result(
                 folder, case, result, self.method_name, truth, self.keep_coarse, features))
-        self.progress.finished(f"{sum(result.seconds.values()):.1f} s, misfit {result.misfit:.4f}")
+        self.progress.finished(_said_of(result))
 
     def summarise(self) -> None:
         """Prints and writes the scores of this run's cases. Raises ValueError, naming them, where some have failed."""
         summarise(self.results, self.cases, self.method_name, self.scoring, self._data.protocol)
+
+
+def _said_of(result: Reconstruction) -> str:
+    """What a line tells of a finished case."""
+    wider = result.interval_widening
+    return (f"{sum(result.seconds.values()):.1f} s, misfit {result.misfit:.4f}"
+            + (f", intervals {wider:.1f} times as wide as calibrated" if wider >= WIDER else ""))

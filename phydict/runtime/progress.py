@@ -43,6 +43,11 @@ class CaseProgress:
         self.bars.reset(self.steps, description=name)
         self.name, self.step, self.spoke = name, 0, time.monotonic()
 
+    def follow(self, steps: int) -> None:
+        """The present case has so many steps of its own, none of which is done."""
+        self.step, self.of_steps = 0, steps
+        self.bars.reset(self.steps, total=steps, visible=steps > 0)
+
     def advance(self) -> None:
         """One step of the case is done."""
         self.bars.advance(self.steps)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 
 import lightning
@@ -12,6 +13,7 @@ from torch.utils.data import ConcatDataset, DataLoader, Dataset, DistributedSamp
 from phydict.datasets import Augmentation, CTCases, CTSource, Thorax, patient_of, report, split_by_patient
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM, CachedPhantoms
 from phydict.datasets.population import DrawnPatients
+from phydict.datasets.population.drawn import POPULATION_VERSION
 from phydict.grid import Cube, Grid
 from phydict.runtime.console import check_writable
 from phydict.runtime.seeds import check_seed
@@ -83,6 +85,14 @@ class PriorData(lightning.LightningDataModule):
         self.reports += [report(Thorax.draw(s)) for s in range(min(phantoms, 1000))]
         self.reports += self.population.reports(1000) if self.population else []
         self.loading, self.seed, self.augmentation = loading, seed, augmentation
+
+    def origin(self) -> list:
+        """Of which files and of which versions of phantoms and new patients the cases to train on are, as plain JSON
+        values: what is stored of them is of other cases where this differs."""
+        drawn = [self.phantoms.folder.name, len(self.phantoms)]
+        if self.population:
+            drawn += [POPULATION_VERSION, asdict(self.loading.population)]
+        return [drawn, *([ct.id, self.cts.key(ct)] for ct in self.cts.cts)]
 
     def prepare_data(self) -> None:
         if self.population and self.trainer.state.fn == "fit":

@@ -24,6 +24,7 @@ from phydict.posterior import Posterior, Refined, Refinement, Unrolled
 from phydict.prior import DEFAULT_REFINER, Refiner, fingerprint, load_correction, load_prior
 from phydict.prior.correction import INPUTS, CorrectionNetwork
 from phydict.runtime.ranges import check_fields
+from phydict.runtime.seeds import check_seed
 from phydict.training.crops import CTVolumes, PhantomVolumes, mapped_volume
 from phydict.training.data import PriorData
 from phydict.training.draws import Draws, Items
@@ -52,14 +53,17 @@ class RefinementCases:
         crop: voxels along each side of what is learnt from at once
         network: the file of a network of this kind; the reconstructions are then also shown as they are at the second
             call, after its correction at the first
+        seed: of the scenes that are learnt from, for a further run to learn from others
     """
 
     reconstructions: int = 60
     validation: int = 2
     crop: int = 64
     network: str | None = None
+    seed: int = 0
 
     def __post_init__(self):
+        check_seed(self.seed)
         check_fields(self, "data.made", reconstructions=(1, 1_000_000), validation=(1, 1000), crop=(8, 4096))
 
 
@@ -196,10 +200,11 @@ class ReconstructionData(PriorData):
                                       (self.held_out_cts.cts, HELD_OUT_PHANTOM, holdout.phantoms))]
         trained, validated = volumes
         parts = [asdict(scenes), fingerprint(initial), made.network and fingerprint(made.network), scene.to_dict(),
-                 window, phantoms, holdout.phantoms, self.held_out, [ct.id for ct in self.cts.cts]]
+                 self.origin(), holdout.phantoms, [[ct.id, self.held_out_cts.key(ct)] for ct in self.held_out_cts.cts]]
         folder = folder / f"reconstructions-{hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]}"
         self.crop, self.made = made.crop, Reconstructions(
-            trained, self.grid, initial, made.network, scenes, STRENGTH, folder / "trained", made.reconstructions, 0)
+            trained, self.grid, initial, made.network, scenes, STRENGTH, folder / f"trained-{made.seed}",
+            made.reconstructions, made.seed)
         self.validation = Whole(Reconstructions(
             validated, self.grid, initial, made.network, scenes, Augmentation.none(), folder / "validated",
             made.validation * len(validated), 1))

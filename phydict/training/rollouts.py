@@ -138,9 +138,8 @@ class RollOutData(PriorData):
                              f"but {rollouts.initial} is none: give a refiner's file as model.initial, and model.cube "
                              "and model.window as its own")
         self.channels, method = refiner.state_channels, Unrolled()
-        parts = [asdict(rollouts), fingerprint(rollouts.initial), str(method), cube.voxels, window, phantoms, seed,
-                 asdict(augmentation), loading.ct_fraction, asdict(loading.population), self.factor, self.held_out,
-                 [ct.id for ct in self.cts.cts]]
+        parts = [asdict(rollouts.scenes), fingerprint(rollouts.initial), str(method), seed, asdict(augmentation),
+                 loading.ct_fraction, self.factor, self.origin()]
         folder = Path(cache) / f"rollouts-{hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]}"
         self.rollouts = RollOuts(self._case, rollouts, method, folder, seed)
 

@@ -26,7 +26,7 @@ class Surroundings:
 
     Args:
         table: couch and clothes are taken away
-        couch: another couch is put in, of those without one
+        couch: another couch is put in, of those whose own is gone, by `table` or by `Augmentation.girth`
         cover: a sheet, clothes or a blanket lies on the body
         leads: ECG leads, cables or tubes lie on the chest
         arms: one or both arms lie beside the body

@@ -153,7 +153,7 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: AnyPrior | str |
         if samples != 1:
             raise ValueError(f"several samples are drawn of a prior, but {type(method).__name__} has none: leave "
                              f"samples at 1 instead of {samples}, or use a method with a prior")
-        return replace(method, name=name) if name else method  # type: ignore[type-var]
+        return method.with_name(name) if name else method
     if not isinstance(method, Sampler):
         given = f"the class {method.__name__}, not an object of it," if isinstance(method, type) else repr(method)
         raise ValueError(f"a method is a name ({', '.join(METHODS)}), a Sampler or a Reconstructor, but {given} was "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -96,11 +97,13 @@ def save_nifti(path: str | Path, volume: np.ndarray, grid: Grid) -> None:
 class Reconstructor(ABC):
     """Turns X-rays into a CT volume. Implementations are dataclasses of settings; one object serves many cases.
 
+    name: what its results call the method.
     full_detector: whether the method wants every pixel, instead of a detector binned to what the grid can hold.
     mu_water: attenuation in 1/mm that water has in the X-rays; between it and HU lies this factor.
     citation: authors, title, venue and DOI or arXiv number of the method's publication.
     """
 
+    name: str = ""
     full_detector = False
     citation = ""
     mu_water: float = MU_WATER
@@ -112,7 +115,18 @@ class Reconstructor(ABC):
 
     def with_mu_water(self, mu_water: float) -> Reconstructor:
         """The same method for X-rays in which water attenuates `mu_water` in 1/mm."""
-        return replace(self, mu_water=mu_water)  # type: ignore[type-var]
+        return self._changed("mu_water", mu_water)
+
+    def with_name(self, name: str) -> Reconstructor:
+        """The same method by another name."""
+        return self._changed("name", name)
+
+    def _changed(self, name: str, value: object) -> Reconstructor:
+        if name in getattr(self, "__dataclass_fields__", {}):
+            return replace(self, **{name: value})  # type: ignore[type-var]
+        changed = copy(self)
+        object.__setattr__(changed, name, value)  # of a frozen class that does not declare it
+        return changed
 
     @property
     def volumes(self) -> int:
@@ -168,7 +182,7 @@ class Delegating(Reconstructor):
         return self.base.mu_water
 
     @property
-    def name(self) -> str:
+    def name(self) -> str:  # type: ignore[override]
         return self.base.name
 
     def with_mu_water(self, mu_water: float) -> Self:

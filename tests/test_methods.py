@@ -14,8 +14,10 @@ from phydict.grid import Grid
 from phydict.methods import METHODS, default_method, reconstruct, reconstructor
 from phydict.posterior import CascadePosterior, Posterior, PriorOnly, ProximalCG, Sampler, SplitGibbs
 from phydict.prior import MedSynCheckpoint, save_prior, save_refiner, save_super_resolution
+from phydict.reconstruction import Reconstruction, Reconstructor
 from phydict.units import MU_WATER, HUWindow, hu_to_mu
 from phydict.xray import ConeBeam, Projector, binned, binning
+from phydict.xray.residuals import misfits
 
 GRID = Grid.cube(64)
 DEFAULT = ConeBeam.orbit(8, 1020, 740, (448, 448), 1.25)
@@ -38,6 +40,28 @@ def test_sirt_in_one_call_finds_the_ball_in_its_exact_line_integrals():
     mass = float(hu_to_mu(result.volume).sum()) * 6**3
     assert mass == pytest.approx(MU_WATER * 4 / 3 * np.pi * 90**3, rel=0.1)
     assert result.volume[26:38, 26:38, 26:38].mean() == pytest.approx(0, abs=100)
+
+
+def test_a_strangers_method_is_named_and_scaled_though_it_declares_neither():
+    @dataclass(frozen=True)
+    class Water(Reconstructor):
+        hu: float = 0.0
+
+        def reconstruct(self, xrays, projector, report="", display=False, seed=0, on_step=lambda: None):
+            density = torch.full(projector.grid.shape, 1 + self.hu / 1000)
+            reprojection = projector(self.mu_water * density[None, None])[0]
+            return Reconstruction(1000 * (density - 1), projector.grid, self.name, seed, **misfits(reprojection, xrays),
+                                  seconds={}, xrays=xrays, reprojection=reprojection)
+
+        def steps(self) -> int:
+            return 0
+
+    beam = ConeBeam.orbit(2, 1020, 740, (14, 14), 40.0)
+    named = reconstructor(Water(-500), name="half water")
+    assert (named.name, named.hu, Water().name) == ("half water", -500, "")
+    plain, scaled = (reconstruct(ball(beam, 90.0), beam, method=named, mu_water=mu) for mu in (None, 2 * MU_WATER))
+    assert plain.method == "half water"
+    torch.testing.assert_close(scaled.reprojection, 2 * plain.reprojection)
 
 
 def test_hu_do_not_depend_on_the_beams_attenuation_of_water_once_it_is_stated():

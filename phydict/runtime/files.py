@@ -21,7 +21,7 @@ def atomic_write(final: Path) -> Iterator[Path]:
     """A path of the same ending to write to; when the block ends well that file takes `final`'s place, else it is
     removed. Whoever may read the user's other files may read it, even where a library writes for its owner alone."""
     final.parent.mkdir(parents=True, exist_ok=True)
-    part = final.with_name(f".{os.getpid()}.part.{final.name}")
+    part = final.with_name(f".{_writer()}.part.{final.name}")
     try:
         part.touch()
         mode = part.stat().st_mode
@@ -30,6 +30,7 @@ def atomic_write(final: Path) -> Iterator[Path]:
         part.chmod(mode)
         _sync(part)
         part.replace(final)
+        _sync(final.parent)
     finally:
         part.unlink(missing_ok=True)
 
@@ -77,7 +78,8 @@ def alone_in(folder: Path, option: str) -> Iterator[None]:
     """Makes the folder; raises ValueError where another process is inside with it. `option` is what the user may
     change.
 
-    However the process ends, the next one may go in at once, even while processes that it forked live on.
+    However the process ends, the next one may go in at once, even while processes that it forked live on, and removes
+    the files that it had begun to write.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / ".lock", "a") as lock:
@@ -88,6 +90,7 @@ def alone_in(folder: Path, option: str) -> Iterator[None]:
             raise ValueError(f"another run writes to {folder}: wait for its end, or give another {option}") from error
         except OSError:  # a file system without locks
             pass
+        remove_leftovers(folder)
         yield
 
 
@@ -101,13 +104,15 @@ def check_replaceable(folder: Path, written: Collection[str], option: str) -> No
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Removes what processes of this machine that are no more had begun to write as folders below `folder`, and puts
-    back what they had set aside."""
+    """Removes what processes of this machine that are no more had begun to write as files and folders in `folder`, and
+    puts back what they had set aside."""
     with undisturbed(folder):
         for partial in folder.glob(".*.partial"):
-            host, _, process = partial.name.removesuffix(".partial").rpartition(".")
-            if host.endswith("." + socket.gethostname()) and process.isdigit() and not _runs(int(process)):
+            if _is_of_none(partial.name.removesuffix(".partial")):
                 shutil.rmtree(partial, ignore_errors=True)
+        for part in folder.glob(".*.part.*"):
+            if _is_of_none(part.name.partition(".part.")[0]):
+                part.unlink(missing_ok=True)
 
 
 def _take_place(partial: Path, final: Path) -> None:
@@ -115,6 +120,7 @@ def _take_place(partial: Path, final: Path) -> None:
         if os.path.lexists(final):
             final.rename(_aside(final))
         partial.rename(final)
+        _sync(final.parent)
     finally:
         _settle(final)
 
@@ -135,11 +141,21 @@ def _aside(final: Path) -> Path:
 
 
 def _partial(final: Path) -> Path:
-    return final.with_name(f".{final.name}.{socket.gethostname()}.{os.getpid()}.partial")
+    return final.with_name(f".{final.name}.{_writer()}.partial")
+
+
+def _writer() -> str:
+    return f"{socket.gethostname()}.{os.getpid()}"
+
+
+def _is_of_none(name: str) -> bool:
+    """Whether a name ends in a `_writer` of this machine that is no more."""
+    host, _, process = name.rpartition(".")
+    return host.endswith("." + socket.gethostname()) and process.isdigit() and not _runs(int(process))
 
 
 def _sync(path: Path) -> None:
-    """Waits until the disk holds a file or a folder."""
+    """Waits until the disk holds a file or what a folder lists."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

@@ -13,6 +13,7 @@ import numpy as np
 import yaml
 
 from phydict.grid import Grid, whole_sizes
+from phydict.runtime.files import atomic_write
 from phydict.runtime.reading import check_memory
 from phydict.runtime.warning import warn
 from phydict.runtime.yaml_file import read_yaml
@@ -264,7 +265,8 @@ class ConeBeam:
 
     def save(self, path: str | Path) -> None:
         """Write the beam as YAML in the vector form (keys sources, detectors, u, v in mm, shape)."""
-        Path(path).write_text(yaml.safe_dump(self.to_dict(), sort_keys=False, default_flow_style=None))
+        with atomic_write(Path(path)) as part:
+            part.write_text(yaml.safe_dump(self.to_dict(), sort_keys=False, default_flow_style=None))
 
     @classmethod
     def load(cls, path: str | Path) -> ConeBeam:

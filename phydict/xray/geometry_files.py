@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from phydict.runtime.files import atomic_write
 from phydict.runtime.reading import read_npy, read_text, reading, reason
 from phydict.xray.geometry import ConeBeam
 from phydict.xray.rtk import check_beam, read_rtk, write_rtk
@@ -69,10 +70,12 @@ def write_beam(path: str | Path, beam: ConeBeam) -> None:
     elif ending == ".xml":
         write_rtk(path, beam)
     elif ending == ".npy":
-        np.save(path, vectors)
+        with atomic_write(Path(path)) as part, part.open("wb") as file:
+            np.save(file, vectors)
     else:
         lines = [",".join(COLUMNS), *(",".join(repr(float(value)) for value in row) for row in vectors)]
-        Path(path).write_text("\n".join(lines) + "\n")
+        with atomic_write(Path(path)) as part:
+            part.write_text("\n".join(lines) + "\n")
 
 
 def _ending(path: Path) -> str:

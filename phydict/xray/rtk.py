@@ -22,6 +22,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from phydict.runtime.files import atomic_write
 from phydict.runtime.reading import read_text, reason
 from phydict.xray.geometry import ConeBeam, pixel_sizes
 
@@ -81,7 +82,8 @@ def write_rtk(path: str | Path, beam: ConeBeam) -> None:
         ElementTree.SubElement(projection, "Matrix").text = "\n" + "\n".join(rows) + "\n"
     ElementTree.indent(root)
     text = ElementTree.tostring(root, encoding="unicode")
-    Path(path).write_text(f'<?xml version="1.0"?>\n<!DOCTYPE RTKGEOMETRY>\n{text}\n')
+    with atomic_write(Path(path)) as part:
+        part.write_text(f'<?xml version="1.0"?>\n<!DOCTYPE RTKGEOMETRY>\n{text}\n')
 
 
 def check_beam(function: str, path, beam) -> None:

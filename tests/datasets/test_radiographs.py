@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 
@@ -67,6 +68,23 @@ def test_saving_again_leaves_no_old_report_and_refuses_to_mix_with_other_images(
     assert load_xrays(tmp_path)["report"] == ""
     with pytest.raises(FileExistsError, match="view_0.npy, view_1.npy"):
         save_xrays(tmp_path, images(), beam, png=True, overwrite=True)
+
+
+@pytest.mark.parametrize("png", [False, True])
+def test_saving_that_fails_leaves_the_old_case_whole(tmp_path, monkeypatch, png):
+    beam, written = ConeBeam.orbit(2, 1020, 740, SHAPE, 70), []
+
+    def full(*_, **__) -> None:
+        written.append(1)
+        if len(written) == 2:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    save_xrays(tmp_path, images(), beam, "old", png)
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+    monkeypatch.setattr(Image.Image if png else np, "save", full)
+    with pytest.raises(OSError, match="No space"):
+        save_xrays(tmp_path, images() + 1, beam, "new", png, overwrite=True)
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
 
 
 def test_saving_checks_the_xrays_against_the_beam(tmp_path):

@@ -15,6 +15,7 @@ from rich.console import Console
 from phydict.evaluation import Table, mean_table, read_csv, summarise, write_csv
 from phydict.evaluation.metrics import MEASURES
 from phydict.evaluation.tables import ranks
+from phydict.runtime.files import alone_in, atomic_write, remove_leftovers
 from phydict.units import HUWindow
 
 ROWS = [
@@ -68,7 +69,7 @@ def test_an_error_while_writing_leaves_the_old_file_and_nothing_else(tmp_path, m
     assert read_csv(path) == ROWS[:1] and os.listdir(tmp_path) == ["t.csv"]
 
 
-def test_a_process_killed_while_writing_leaves_the_old_file(tmp_path, monkeypatch):
+def test_a_process_killed_while_writing_leaves_the_old_file_and_the_next_run_nothing_else(tmp_path):
     path = tmp_path / "t.csv"
     write_csv(path, ROWS[:1])
     child = os.fork()
@@ -77,7 +78,12 @@ def test_a_process_killed_while_writing_leaves_the_old_file(tmp_path, monkeypatc
         write_csv(path, ROWS)
         os._exit(0)
     assert os.WTERMSIG(os.waitpid(child, 0)[1]) == 9
-    assert read_csv(path) == ROWS[:1]
+    assert read_csv(path) == ROWS[:1] and len(os.listdir(tmp_path)) == 2
+    (tmp_path / f".elsewhere.{child}.part.t.csv").touch()  # another machine's, which may live
+    with alone_in(tmp_path, "out"), atomic_write(tmp_path / "now.csv") as part:
+        part.touch()
+        remove_leftovers(tmp_path)
+    assert {*os.listdir(tmp_path)} == {"t.csv", "now.csv", ".lock", f".elsewhere.{child}.part.t.csv"}
 
 
 def cells(rows: list[dict]) -> dict[str, dict[str, str]]:

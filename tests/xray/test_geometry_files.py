@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 
 import numpy as np
@@ -46,6 +47,16 @@ def rtk(tmp_path, views, head="<SourceToIsocenterDistance>740</SourceToIsocenter
 def test_what_is_written_is_read_back(tmp_path, make, ending):
     write_beam(tmp_path / f"beam.{ending}", make())
     assert read_beam(tmp_path / f"beam.{ending}", SHAPE, PIXEL).same_as(make(), tolerance=1e-9)
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_writing_that_fails_leaves_the_old_file(tmp_path, monkeypatch, ending):
+    write_beam(tmp_path / f"beam.{ending}", orbit())
+    monkeypatch.setattr(os, "fsync", lambda _: (_ for _ in ()).throw(OSError("No space left on device")))
+    with pytest.raises(OSError, match="No space"):
+        write_beam(tmp_path / f"beam.{ending}", random_poses())
+    assert read_beam(tmp_path / f"beam.{ending}", SHAPE, PIXEL).same_as(orbit())
+    assert [file.name for file in tmp_path.iterdir()] == [f"beam.{ending}"]
 
 
 def test_rtk_gantry_angles_follow_iec_61217_for_a_supine_patient(tmp_path):

@@ -8,6 +8,7 @@ DICOM with one or more frames, in the natural order of their names: view_2 comes
 from __future__ import annotations
 
 import os
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from phydict.datasets.natural_order import natural_order
 from phydict.datasets.radiographs.xray_description import GEOMETRY, Description, read_description
 from phydict.datasets.radiographs.xray_images import ENDINGS, image_files, is_dicom, read_image
 from phydict.datasets.reports import format_report
+from phydict.runtime.files import atomic_write
 from phydict.runtime.reading import name_of, read_text
 from phydict.runtime.shipped import own_or_shipped
 from phydict.xray.geometry import ConeBeam
@@ -130,19 +132,23 @@ def save_xrays(folder: str | Path, xrays: torch.Tensor | np.ndarray, beam: ConeB
         raise FileExistsError(f"{folder} already holds {', '.join(there[:3])}; give another folder, or overwrite=True")
     low, high = float(xrays.min()), float(xrays.max())
     scale = max(high - low, 1e-6) / 65535
-    for name, image in zip(names, xrays):
-        if png:
-            levels = np.rint((image.astype(np.float64) - low) / scale).clip(0, 65535).astype(np.uint16)
-            Image.fromarray(levels).save(folder / name)
-        else:
-            np.save(folder / name, image)
     intensity = {"kind": "line_integrals"} | ({"scale": scale, "offset": low} if png else {})
     content = {"beam": beam.to_dict(), "intensity": intensity,
                "orientation": {"flip_rows": False, "flip_columns": False}}
-    (folder / GEOMETRY).write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
-    if report:
-        (folder / REPORT).write_text(report + "\n", encoding="utf-8")
-    else:
+    with ExitStack() as whole:  # all is written before any of it takes its place
+        def part(name: str) -> Path:
+            return whole.enter_context(atomic_write(folder / name))
+
+        part(GEOMETRY).write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
+        for name, image in zip(names, xrays):
+            if png:
+                levels = np.rint((image.astype(np.float64) - low) / scale).clip(0, 65535).astype(np.uint16)
+                Image.fromarray(levels).save(part(name))
+            else:
+                np.save(part(name), image)
+        if report:
+            part(REPORT).write_text(report + "\n", encoding="utf-8")
+    if not report:
         (folder / REPORT).unlink(missing_ok=True)
 
 

@@ -25,6 +25,7 @@ import yaml
 from phydict.datasets.dicom import DicomTags
 from phydict.datasets.intensity import KINDS, Intensity, is_file_name
 from phydict.datasets.radiographs.dicom_beam import tags_beam
+from phydict.runtime.files import atomic_write
 from phydict.runtime.yaml_file import read_yaml
 from phydict.xray.geometry import ConeBeam, pixel_sizes
 from phydict.xray.geometry_files import read_beam
@@ -163,7 +164,8 @@ def save_geometry(path: Path, beam: ConeBeam, described: Description | None = No
                                 if value != getattr(Intensity, name, None)}
     if described:
         content["orientation"] = vars(described.orientation)
-    path.write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
+    with atomic_write(path) as part:
+        part.write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
 
 
 def _check_beam(path: Path, beam) -> None:

@@ -83,7 +83,9 @@ def test_an_old_setting_is_refused_with_its_new_name(empty, capsys, main, comman
     for name in reversed(path.split(".")):
         settings = {name: settings}
     (empty / "old.yaml").write_text(yaml.safe_dump(settings))
-    for args in ([f"--{path}=1"], [f"--{path}", "1"], ["-c", "old.yaml"]):
+    inline = yaml.safe_dump(settings, default_flow_style=True)
+    outer, nested = path.partition(".")[0], yaml.safe_dump(next(iter(settings.values())), default_flow_style=True)
+    for args in ([f"--{path}=1"], [f"--{path}", "1"], ["-c", "old.yaml"], ["-c", inline], [f"--{outer}={nested}"]):
         with pytest.raises(SystemExit) as stopped:
             main([command, *args])
         said = capsys.readouterr().err

@@ -19,7 +19,7 @@ from phydict.posterior.coarse_correction import coarse_correction
 from phydict.prior import correction, load_correction, save_correction, save_prior, save_refiner
 from phydict.prior.correction import INPUTS, CorrectionNetwork
 from phydict.runtime.profiling import profiled
-from phydict.training.reconstructions import ReconstructionData, RefinementCases
+from phydict.training.reconstructions import RefinementCases, RefinementData
 from phydict.training.refinement import RefinementTraining
 from phydict.training.scenes import Scenes
 from phydict.training.settings import HoldOut
@@ -193,7 +193,7 @@ def test_a_resumed_run_is_the_uninterrupted_one_and_makes_each_reconstruction_on
 
 
 def test_another_seed_makes_other_reconstructions_and_the_same_held_out_ones(tmp_path, refiner_file):
-    first, second = (ReconstructionData(
+    first, second = (RefinementData(
         RefinementCases(1, 1, 16, seed=seed), Scenes(most_views=3), phantoms=2, cache=str(tmp_path / "cache"),
         initial=refiner_file, cube=Cube(32), window=(-1000, 600)) for seed in (0, 1))
     assert not np.array_equal(first.made[0], second.made[0])
@@ -202,7 +202,7 @@ def test_another_seed_makes_other_reconstructions_and_the_same_held_out_ones(tmp
 
 def test_held_out_reconstructions_are_those_of_their_own_volumes(tmp_path, refiner_file):
     def validated(phantoms: int) -> Path:
-        data = ReconstructionData(
+        data = RefinementData(
             RefinementCases(1, 1, 16), Scenes(most_views=3), phantoms=2, cache=str(tmp_path / "cache"),
             holdout=HoldOut(phantoms=phantoms), initial=refiner_file, cube=Cube(32), window=(-1000, 600))
         return data.validation.made.folder
@@ -214,8 +214,8 @@ def test_with_a_network_a_reconstruction_is_learnt_from_at_both_calls(tmp_path, 
     file = tmp_path / "fine.safetensors"
     save_correction(network(), file, dtype=torch.float32)
 
-    def data(network: str | None) -> ReconstructionData:
-        return ReconstructionData(
+    def data(network: str | None) -> RefinementData:
+        return RefinementData(
             RefinementCases(1, 1, 16, network), Scenes(most_views=20), phantoms=2, cache=str(tmp_path / "cache"),
             holdout=HoldOut(phantoms=1), initial=refiner_file, cube=Cube(32), window=(-1000, 600))
 

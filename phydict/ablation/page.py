@@ -11,7 +11,7 @@ from phydict.ablation.tables import all_tables
 from phydict.evaluation import read_csv
 from phydict.evaluation.metrics import MEASURES
 from phydict.evaluation.tables import Table
-from phydict.page import Case, Contents, check_own_page, write_page
+from phydict.page import Contents, PageCase, check_own_page, write_page
 
 
 def is_comparison(folder: Path) -> bool:
@@ -41,12 +41,12 @@ def comparison_page(folder: Path, rows: Sequence[Mapping], entries: Sequence[Ent
                                        plots=sorted(path.name for path in folder.glob("*.png")), links=kept))
 
 
-def _case(entry: Entry, row: Mapping) -> Case:
+def _case(entry: Entry, row: Mapping) -> PageCase:
     """A row as a case, known by its method, settings and seed."""
     scores = {name: row[name] for name in MEASURES if row.get(name) is not None}
     record = {name: value for name, value in row.items() if name not in scores and value is not None}
     group = format_settings(str(row["case"]), entry.condition)
-    return Case("", (), record | {
+    return PageCase("", (), record | {
         "method": format_settings(entry.name, entry.condition, {"seed": row.get("seed", 0)}),
         "scores": scores, "misfit": row.get("misfit"), "seconds": {"all": row["seconds"]} if "seconds" in row else {},
         "warnings": [row["warning"]] if row.get("warning") else []}, group)

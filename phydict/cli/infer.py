@@ -23,7 +23,6 @@ from phydict.inference.scoring import METRICS, CLIPSettings, FIDSettings, Scorin
 from phydict.inference.task import ReconstructionTask
 from phydict.methods import METHODS
 from phydict.runtime.console import (
-    CONFIGURATION,
     check_apart,
     check_command,
     check_processes,
@@ -35,6 +34,7 @@ from phydict.runtime.console import (
 )
 from phydict.runtime.help import HelpFormatter
 from phydict.runtime.reading import reading
+from phydict.runtime.renamed import CONFIGURATION
 from phydict.runtime.shipped import configuration
 from phydict.runtime.telling import exclaim
 

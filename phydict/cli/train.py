@@ -40,7 +40,7 @@ from phydict.training.crops import SuperResolutionData
 from phydict.training.data import PriorData
 from phydict.training.prior import PriorTraining
 from phydict.training.progress import TrainingProgress
-from phydict.training.reconstructions import ReconstructionData
+from phydict.training.reconstructions import RefinementData
 from phydict.training.refinement import RefinementTraining
 from phydict.training.refiner import RefinerTraining
 from phydict.training.rivals import LiftedTraining
@@ -57,7 +57,7 @@ COMMANDS = {"fit": "train a prior", "validate": "measure one on held-out cases",
 
 STAGES = {"base": (PriorTraining, PriorData), "super_resolution": (SuperResolutionTraining, SuperResolutionData),
           "refiner": (RefinerTraining, PriorData), "replay": (ReplayTraining, RollOutData),
-          "uncertainty": (UncertaintyTraining, PriorData), "refinement": (RefinementTraining, ReconstructionData),
+          "uncertainty": (UncertaintyTraining, PriorData), "refinement": (RefinementTraining, RefinementData),
           "lifted": (LiftedTraining, PriorData), "x2ct": (X2CTTraining, PriorData),
           "xray2ctpa": (XrayToCTPATraining, PriorData)}
 """What trains a stage, and on which data."""

@@ -14,7 +14,7 @@ from phydict.evaluation.tables import Table
 from phydict.grid import Grid
 from phydict.inference.protocols import protocol_of
 from phydict.inference.results import RECORD, TABLE, score_row
-from phydict.page import CASE_FILES, Case, Contents, check_own_page, write_case_files, write_page
+from phydict.page import CASE_FILES, Contents, PageCase, check_own_page, write_case_files, write_page
 from phydict.runtime.warning import warn
 
 
@@ -47,7 +47,7 @@ def _case_folders(folder: Path) -> list[Path]:
     return sorted(path for path in folders if not any(part[:1] == "." for part in path.relative_to(folder).parts))
 
 
-def _case(folder: Path, path: Path) -> Case | None:
+def _case(folder: Path, path: Path) -> PageCase | None:
     """A finished case, None, with a warning, where its files are damaged."""
     try:
         record = json.loads((path / RECORD).read_text())
@@ -58,7 +58,7 @@ def _case(folder: Path, path: Path) -> Case | None:
     except Exception as error:  # whatever a damaged record or volume leads to
         warn(f"{path} is left out of the page, since its files are damaged ({type(error).__name__}: {error})")
         return None
-    return Case(path.relative_to(folder).as_posix(), sorted(os.listdir(path)), record)
+    return PageCase(path.relative_to(folder).as_posix(), sorted(os.listdir(path)), record)
 
 
 def _make_case_files(path: Path, missing: list[str]) -> None:

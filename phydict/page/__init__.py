@@ -5,6 +5,6 @@ and are loaded when it is opened.
 """
 
 from phydict.page.case_files import CASE_FILES, write_case_files
-from phydict.page.document import PAGE, Case, Contents, check_own_page, write_page
+from phydict.page.document import PAGE, Contents, PageCase, check_own_page, write_page
 
-__all__ = ["CASE_FILES", "PAGE", "Case", "Contents", "check_own_page", "write_case_files", "write_page"]
+__all__ = ["CASE_FILES", "PAGE", "Contents", "PageCase", "check_own_page", "write_case_files", "write_page"]

@@ -26,7 +26,7 @@ SHARED = ("settings", "versions")
 
 
 @dataclass(frozen=True)
-class Case:
+class PageCase:
     """A finished case. folder: from the page's folder to its own, with forward slashes; files: names in it that are
     linked; record: all that is known of it, plain JSON values, of which case, method, scores, misfit and seconds (per
     stage) are needed; group: those of which the best is marked, left out the cases of one name."""
@@ -44,7 +44,7 @@ class Contents:
 
     title: str
     tables: Sequence[Table] = ()
-    cases: Sequence[Case] = ()
+    cases: Sequence[PageCase] = ()
     points: Sequence[Mapping] = ()
     error: str = "mae_hu"
     plots: Sequence[str] = ()
@@ -91,7 +91,7 @@ def _content(contents: Contents) -> dict:
             "links": [_file(name) for name in contents.links]}
 
 
-def _case(case: Case, shared: dict[str, int]) -> dict:
+def _case(case: PageCase, shared: dict[str, int]) -> dict:
     record = dict(case.record)
     for name in SHARED:
         record[name] = shared.setdefault(json.dumps(record.get(name), sort_keys=True), len(shared))

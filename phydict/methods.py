@@ -162,7 +162,7 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: AnyPrior | str |
     check_prior(found)
     name = name or type(method).__name__
     if super_resolution is None:
-        otherwise = FISTATV() if isinstance(method, Unrolled) and method.chests_only else None
+        otherwise = FISTATV() if method.chests_only else None
         return Posterior(found, method, guidance, name=name, precision=precision, samples=samples, otherwise=otherwise)
     if samples != 1:
         raise ValueError(f"samples are drawn of a prior without a second stage, but {samples} were given with "
@@ -176,7 +176,8 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: AnyPrior | str |
 
 def correction_of(method: Sampler | Reconstructor) -> Path | None:
     """The file of the network that corrects a method's estimates on finer voxels, where it has learnt from these."""
-    return DEFAULT_CORRECTION if isinstance(method, Unrolled) and DEFAULT_CORRECTION.is_file() else None
+    learnt = isinstance(method, Sampler) and method.needs_refiner
+    return DEFAULT_CORRECTION if learnt and DEFAULT_CORRECTION.is_file() else None
 
 
 def onto_grid(ready: Reconstructor, grid: Grid | None, refinement: Refinement = Refinement()) -> Reconstructor:

@@ -33,7 +33,7 @@ from phydict.inference.summary import summarise
 from phydict.methods import CHEST, METHODS, calibrated, default_method, fit_to_grid, onto_grid, reconstructor
 from phydict.page import check_own_page
 from phydict.poses import FoundPoses, PoseSearch
-from phydict.posterior import CascadePosterior, Refined, Sampler, Unrolled
+from phydict.posterior import CascadePosterior, Refined, Sampler
 from phydict.prior import MedSynCheckpoint, PriorContract, find_prior, load_super_resolution
 from phydict.reconstruction import Reconstruction, Reconstructor
 from phydict.runtime.console import TRACEBACK, check_apart, check_writable, noted, sentence
@@ -85,7 +85,8 @@ class ReconstructionTask(lightning.LightningModule):
             chosen = default_method(prior, sampling.samples, sampling.guidance)
             method, name = METHODS[chosen], name or chosen
         own_choice = prior is None and grid is None and not super_resolution.file
-        self.predicted = Box(PREDICTED_VOXELS) if own_choice and isinstance(method, Unrolled) else None
+        learnt = isinstance(method, Sampler) and method.needs_refiner
+        self.predicted = Box(PREDICTED_VOXELS) if own_choice and learnt else None
         name = type(method).__name__ if name is None else name
         if name in ("", "..") or name != Path(name).name:
             raise ValueError(f"model.name is the name of one folder inside model.out, but '{name}' was given")

@@ -19,13 +19,15 @@ class Sampler(ABC):
     """Settings of a sampling method; `sample` turns noise into a clean state.
 
     full_detector, citation: as for a Reconstructor. default_prior: the file of its network where none is given;
-    needs_refiner: whether that is a Refiner. batches: whether the states of a batch do not influence each other,
+    needs_refiner: whether that is a Refiner. chests_only: whether one material in air is left to a method without a
+    network (`Posterior.otherwise`). batches: whether the states of a batch do not influence each other,
     so that several samples may be drawn at once, with one generator for each.
     """
 
     full_detector = False
     default_prior = DEFAULT_PRIOR
     needs_refiner = False
+    chests_only = False
     citation = ""
     batches = False
 

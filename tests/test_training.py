@@ -156,10 +156,14 @@ def test_a_gpu_that_is_not_there_is_not_asked_for_its_precision(cache, tmp_path,
     assert (tmp_path / "last.ckpt").exists()
 
 
-def test_the_held_out_cts_are_written_down(cts, cache, tmp_path):
-    main(arguments(tmp_path, cache, "--trainer.max_epochs=1", "--trainer.limit_train_batches=1",
-                   "--trainer.limit_val_batches=0", f"--data.cts={cts}", "--data.holdout.ids=[patient1]"))
+def test_the_held_out_cts_are_written_down_and_told(cts, cache, tmp_path, capsys):
+    args = arguments(tmp_path, cache, "--trainer.max_epochs=1", "--trainer.limit_train_batches=1",
+                     "--trainer.limit_val_batches=0", f"--data.cts={cts}")
+    main([*args, "--data.holdout.ids=[patient1]"])
     assert (tmp_path / "held_out.txt").read_text() == "patient1\n"
+    assert "1 of 2 CTs are held out" in capsys.readouterr().err
+    main([*args, f"--out={tmp_path / 'all'}"])
+    assert "no CT is held out, so that none tells which weights are best" in capsys.readouterr().err
 
 
 def test_it_is_said_that_no_ct_is_held_out(cts, tmp_path):

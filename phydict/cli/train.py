@@ -34,7 +34,7 @@ from phydict.runtime.files import alone_in, atomic_write
 from phydict.runtime.help import HelpFormatter
 from phydict.runtime.precision import PRECISIONS, resolve_precision, trainer_precision
 from phydict.runtime.reading import reading
-from phydict.runtime.telling import run_command, telling
+from phydict.runtime.telling import run_command, tell, telling
 from phydict.training.checkpoints import BEST, HELD_OUT, RESUMED, BestCheckpoint, WholeCheckpoints, read_checkpoint
 from phydict.training.crops import SuperResolutionData
 from phydict.training.data import PriorData
@@ -140,10 +140,15 @@ class PriorCLI(TellingCLI):
     def fit(self, model: StageTraining, datamodule: PriorData, ckpt_path: str | None = None,
             weights_only: bool | None = None) -> None:
         """Train, alone in the folder of the run."""
-        out = Path(self.config.fit.out)
-        check_apart(out, "--out", [Path(cts)] if (cts := self.config.fit.data.cts) else [])
+        out, cts = Path(self.config.fit.out), self.config.fit.data.cts
+        check_apart(out, "--out", [Path(cts)] if cts else [])
         with alone_in(out, "--out") if self.trainer.is_global_zero else telling(quiet=True, json_lines=False):
             self._begin(out, ckpt_path)
+            if cts:
+                held_out, trained = datamodule.held_out, len(datamodule.cts)
+                tell(f"{len(held_out)} of {len(held_out) + trained} CTs are held out for validation" if held_out else
+                     "no CT is held out, so that none tells which weights are best: data.holdout.ids may name some",
+                     event="held_out", cts=held_out)
             try:
                 self.trainer.fit(model, datamodule=datamodule, ckpt_path=ckpt_path, weights_only=weights_only)
             except BaseException as stop:

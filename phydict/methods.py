@@ -121,7 +121,7 @@ def default_method(prior: AnyPrior | MedSynCheckpoint | str | Path | None = None
     return SAMPLING_METHOD if sampled else DEFAULT_METHOD
 
 
-CHEST = Grid.cube(64)
+DEFAULT_GRID = Grid.cube(64)
 """The voxels of methods that are bound to none; what lies outside a smaller box is taken from a reconstruction here."""
 
 
@@ -180,7 +180,7 @@ def correction_of(method: Sampler | Reconstructor) -> Path | None:
     return DEFAULT_CORRECTION if learnt and DEFAULT_CORRECTION.is_file() else None
 
 
-def onto_grid(ready: Reconstructor, grid: Grid | None, refinement: Refinement = Refinement()) -> Reconstructor:
+def onto_grid(method: Reconstructor, grid: Grid | None, refinement: Refinement = Refinement()) -> Reconstructor:
     """The method on the voxels of `grid`; None leaves it as it is.
 
     What is bound to voxels of its own, as a prior is, works there first and is then refined (`Refined`), with a step
@@ -188,20 +188,20 @@ def onto_grid(ready: Reconstructor, grid: Grid | None, refinement: Refinement = 
     part of the chest after a coarse reconstruction of the whole (`Region`). Raises ValueError where there is no way or
     not enough memory.
     """
-    if grid is None or (ready.grid is not None and ready.grid.same_as(grid)):
-        return ready
-    if ready.grid is not None:
-        file = correction_of(ready.sampler) if isinstance(ready, Posterior) and refinement.step else None
-        ready = Refined(cast(Any, ready), grid, refinement, load_correction(file) if file else None)
-    elif isinstance(ready, Baseline) and along(grid, CHEST) and not covers(grid, CHEST):
-        ready = Region(ready, grid, CHEST)
-    check_memory(4 * ready.volumes * math.prod(grid.shape), f"a reconstruction on "
-                 f"{' x '.join(map(str, grid.shape))} voxels, {ready.volumes} volumes of them at once,",
+    if grid is None or (method.grid is not None and method.grid.same_as(grid)):
+        return method
+    if method.grid is not None:
+        file = correction_of(method.sampler) if isinstance(method, Posterior) and refinement.step else None
+        method = Refined(cast(Any, method), grid, refinement, load_correction(file) if file else None)
+    elif isinstance(method, Baseline) and along(grid, DEFAULT_GRID) and not covers(grid, DEFAULT_GRID):
+        method = Region(method, grid, DEFAULT_GRID)
+    check_memory(4 * method.volumes * math.prod(grid.shape), f"a reconstruction on "
+                 f"{' x '.join(map(str, grid.shape))} voxels, {method.volumes} volumes of them at once,",
                  "give fewer voxels, or a smaller box of them")
-    return ready
+    return method
 
 
-def fit_to_grid(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam,
+def fit_to_grid(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam,
                 projector: str = "auto") -> tuple[Tensor, Projector]:
     """X-rays (K, V, U), binned unless the method wants the full detector, and the projector that goes with them on the
     X-rays' device; `projector` is its kind, as Projector's `method`.
@@ -211,11 +211,11 @@ def fit_to_grid(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam,
     check_xrays(xrays, beam)
     check_air(xrays)
     beam.check(grid)
-    beam.check_scale(ready.survey or grid)
-    return seen_by(grid, xrays.float(), beam, ready.full_detector, projector)
+    beam.check_scale(method.survey or grid)
+    return seen_by(grid, xrays.float(), beam, method.full_detector, projector)
 
 
-def calibrated(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, uncertain: Uncertain,
+def calibrated(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, uncertain: Uncertain,
                display: bool, on_round: Callable[[], None] = lambda: None) -> tuple[Tensor, FoundPoses]:
     """The X-rays (K, V, U) without what was found of their gains and offsets, and the poses found (phydict.poses).
 
@@ -225,7 +225,7 @@ def calibrated(ready: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, 
     """
     from phydict.poses import find_poses  # and with it numba
 
-    found = find_poses(xrays, beam, uncertain, grid, display, ready.mu_water, on_round=on_round)
+    found = find_poses(xrays, beam, uncertain, grid, display, method.mu_water, on_round=on_round)
     for words in found.warnings():
         warn(words)
     return xrays if display else found.corrected(xrays), found
@@ -264,7 +264,7 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: AnyPrior | str | Path | No
     ready = reconstructor(method, prior, guidance, super_resolution=super_resolution, sr_guided=sr_guided,
                           samples=samples, precision=precision)
     ready = onto_grid(ready if mu_water is None else ready.with_mu_water(mu_water), grid)
-    grid, xrays = ready.grid or grid or CHEST, _real(xrays)
+    grid, xrays = ready.grid or grid or DEFAULT_GRID, _real(xrays)
     found: FoundPoses | None = None
     if uncertain is not None:
         xrays, found = calibrated(ready, ready.survey or grid, xrays, beam, uncertain, display)

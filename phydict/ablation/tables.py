@@ -19,7 +19,7 @@ from phydict.ablation.summary import (
 )
 from phydict.evaluation.bootstrap import difference
 from phydict.evaluation.metrics import MEASURES, RANGE
-from phydict.evaluation.tables import INTERVAL, Table, caption, doubts, empty_notes, interval_note, listed
+from phydict.evaluation.tables import INTERVAL, Table, caption, warning_notes, empty_notes, interval_note, listed
 from phydict.inference.protocols import protocol_of
 from phydict.runtime.files import atomic_write
 
@@ -44,7 +44,7 @@ def all_tables(entries: Sequence[Entry], rows: Sequence[dict],
                empty: Mapping[str, str] = MappingProxyType({})) -> list[Table]:
     """Every table that the entries of some rows allow; empty: scores that may stay empty -> why they then do."""
     measured = {name for entry in entries for name in entry.values}
-    notes, tables = [_caption(rows), *empty_notes(empty, measured), *doubts(rows)], []
+    notes, tables = [_caption(rows), *empty_notes(empty, measured), *warning_notes(rows)], []
     for condition, group in conditions(entries):
         title = format_settings("Methods", condition or {name: rows[0][name] for name in ("views", "simulator")})
         best = best_settings(group)

@@ -18,7 +18,7 @@ from phydict.grid import Box, Grid
 from phydict.inference.data import ReconstructionData
 from phydict.inference.protocols import whole
 from phydict.inference.settings import Orbit
-from phydict.methods import CHEST, METHODS, correction_of
+from phydict.methods import DEFAULT_GRID, METHODS, correction_of
 from phydict.posterior import Refinement, Sampler
 from phydict.prior import find_prior, fingerprint, load_super_resolution, own_identity
 from phydict.reconstruction import Reconstructor, describe
@@ -113,7 +113,7 @@ class Trial:
         if self.super_resolution:
             return stage_of(self.super_resolution).grid
         file = self.prior or self.like
-        return prior_of(file).grid if file else CHEST
+        return prior_of(file).grid if file else DEFAULT_GRID
 
     def scored(self) -> Grid:
         """The grid on which results are scored."""

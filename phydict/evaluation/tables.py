@@ -136,7 +136,7 @@ def mean_table(rows: Iterable[Mapping], by: str = "method", metrics: Sequence[st
     over = f"Mean ± standard deviation over n = {' to '.join(map(str, counts))} cases{unequal}"
     return Table(f"Scores by {by}", [by, *(measure.heading for measure in measures)], measures, lines,
                  [caption(over, rows, {"Grid": "grid", "Views": "views"}, window), *interval_note(lines),
-                  *empty_notes(empty, measured), *doubts(rows, by)])
+                  *empty_notes(empty, measured), *warning_notes(rows, by)])
 
 
 def fid_table(methods: Mapping[str, Mapping[str, Features]], backbone: str, replicates: int,
@@ -194,7 +194,7 @@ def warned_cases(rows: Sequence[Mapping], by: str = "method") -> dict[str, list[
     return {group: list(cases) for group, cases in warned.items()}
 
 
-def doubts(rows: Sequence[Mapping], by: str = "method") -> list[str]:
+def warning_notes(rows: Sequence[Mapping], by: str = "method") -> list[str]:
     """The note on cases with a warning, where there are any."""
     warned = "; ".join(f"{group}: {', '.join(cases)}" for group, cases in warned_cases(rows, by).items())
     return [f"Doubtful cases, by the column warning: {warned}."] if warned else []

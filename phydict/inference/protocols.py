@@ -19,7 +19,7 @@ from phydict.datasets.cts.transforms import to_grid
 from phydict.evaluation import RANGE
 from phydict.grid import Grid
 from phydict.inference.settings import PAPER, Orbit
-from phydict.methods import CHEST
+from phydict.methods import DEFAULT_GRID
 from phydict.units import AIR, HUWindow
 from phydict.xray import Ideal, Simulator
 from phydict.xray.boxes import along, covers, in_other_voxels
@@ -116,10 +116,10 @@ def resampled(volume: Tensor, grid: Grid, onto: Grid) -> Tensor:
 def whole(grid: Grid) -> Grid:
     """The voxels of the CT that X-rays are made of: those of the result where they hold the whole chest, centred, else
     those of the chest, as long as the result's or half again."""
-    if along(grid, CHEST) and covers(grid, CHEST) and np.allclose(grid.centre, 0):
+    if along(grid, DEFAULT_GRID) and covers(grid, DEFAULT_GRID) and np.allclose(grid.centre, 0):
         return grid
-    halvings = max(0, math.ceil(math.log2(CHEST.spacing[0] / min(grid.spacing)) - 0.1))
-    return Grid.cube(CHEST.shape[0] * 2 ** min(halvings, 2))
+    halvings = max(0, math.ceil(math.log2(DEFAULT_GRID.spacing[0] / min(grid.spacing)) - 0.1))
+    return Grid.cube(DEFAULT_GRID.shape[0] * 2 ** min(halvings, 2))
 
 
 def cut_out(case: Case, grid: Grid, box: Grid, window: HUWindow) -> Case:

@@ -30,7 +30,7 @@ from phydict.inference.results import CaseResults
 from phydict.inference.scoring import Scoring
 from phydict.inference.settings import CascadeSettings, Sampling
 from phydict.inference.summary import summarise
-from phydict.methods import CHEST, METHODS, calibrated, default_method, fit_to_grid, onto_grid, reconstructor
+from phydict.methods import DEFAULT_GRID, METHODS, calibrated, default_method, fit_to_grid, onto_grid, reconstructor
 from phydict.page import check_own_page
 from phydict.poses import FoundPoses, PoseSearch
 from phydict.posterior import CascadePosterior, Refined, Sampler
@@ -121,7 +121,7 @@ class ReconstructionTask(lightning.LightningModule):
     def _take(self, box: Box | None) -> None:
         """Reconstruct on the voxels of a box, if one is given."""
         self.keep_coarse = box is not None and box.keep_coarse
-        self.around = self.grid = self.plain.grid or CHEST
+        self.around = self.grid = self.plain.grid or DEFAULT_GRID
         self.reconstructor = self.plain
         if box is None:
             return

@@ -21,7 +21,7 @@ VIEW, THUMBNAIL = "view.js", "thumbnail.png"
 CASE_FILES = (VIEW, THUMBNAIL)
 """The files of a case that only the page needs."""
 
-EMPTY = -2**15
+NO_VALUE = -2**15
 """The int16 of a voxel that is not finite."""
 
 XRAY_SIDE = 256
@@ -68,7 +68,7 @@ def _int16(volume: Tensor | np.ndarray) -> np.ndarray:
     hu = np.asarray(volume)
     out = np.empty(hu.shape, np.int16)
     for x, values in enumerate(hu):  # slice by slice, so that a large volume needs no second copy in float
-        whole = np.where(np.isfinite(values), np.rint(values).clip(EMPTY + 1, -EMPTY - 1), EMPTY)
+        whole = np.where(np.isfinite(values), np.rint(values).clip(NO_VALUE + 1, -NO_VALUE - 1), NO_VALUE)
         out[x] = whole
     return out
 

@@ -161,7 +161,7 @@ def grown(mask: Tensor) -> Tensor:
     return max_pool3d(mask.float(), 3, 1, 1) > 0
 
 
-def said_of(carried: Carried, window: HUWindow) -> str:
+def carried_note(carried: Carried, window: HUWindow) -> str:
     """What was carried, where, and what that leaves wrong."""
     place = ", ".join(f"{mm:.0f}" for mm in carried.centre)
     return (f"{carried.millilitres:.1f} ml as dense as metal were found, about {carried.density:.0f} HU above what "

@@ -15,10 +15,10 @@ from phydict.diffusion.steps import noise_like
 from phydict.grid import Grid
 from phydict.guard import Guard, check_ceiling, one_material
 from phydict.posterior.measurement import Measurement
-from phydict.posterior.metal import said_of
+from phydict.posterior.metal import carried_note
 from phydict.posterior.samplers.sampler import Sampler
 from phydict.posterior.samplers.split_gibbs import SplitGibbs
-from phydict.posterior.widening import limited_angle_factor, say_contradictions, widening_of
+from phydict.posterior.widening import limited_angle_factor, warn_of_contradictions, widening_of
 from phydict.prior import AnyPrior, BoundRefiner, Refiner
 from phydict.prior.uncertainty import LEVELS
 from phydict.reconstruction import Reconstruction, Reconstructor
@@ -192,7 +192,7 @@ class Posterior(Reconstructor):
             deviation = (prior.window.half_width * states[:, 0].std(0)).cpu() if self.samples > 1 else None
             volume, carried = self._volume(measurement, ct[0, 0])
             intervals, widening = self._intervals(denoiser, measurement, reprojection)
-            say_contradictions(measurement, widening if intervals else None)
+            warn_of_contradictions(measurement, widening if intervals else None)
         return Reconstruction(
             volume=volume, grid=prior.grid, method=self.name, seed=seed, **fit, seconds=watch.seconds,
             network_calls=denoiser.calls * (2 if report and self.guidance != 1 else 1),
@@ -208,7 +208,7 @@ class Posterior(Reconstructor):
         if carried is None:
             check_ceiling(x, self.prior.grid, self.prior.window)
             return volume, None
-        warn(said_of(carried, self.prior.window))
+        warn(carried_note(carried, self.prior.window))
         carried = replace(carried, extra=carried.extra.cpu())
         return volume + carried.on(self.prior.grid), carried
 

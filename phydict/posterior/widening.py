@@ -60,7 +60,7 @@ def contradiction_widening(measurement: Measurement) -> float:
     return max(float(ratios.log().mean().exp()) ** CONTRADICTION_WIDENING, (float(ratios.max()) / WORST_VIEW) ** 0.5)
 
 
-def say_contradictions(measurement: Measurement, widening: float | None) -> None:
+def warn_of_contradictions(measurement: Measurement, widening: float | None) -> None:
     """Warns where a part of the X-rays counted as noise because no volume explains it; widening: of the intervals, if
     there are any."""
     variance = torch.as_tensor(measurement.model_variance).flatten()

@@ -18,7 +18,7 @@ MOST_TEXT = 2**24
 MOST_SQUEEZED = 1100
 """Times by which a file shrinks at most when it is compressed: deflate, the best of those that are read, 1032."""
 
-MOST_SAID = 800
+MAX_MESSAGE = 800
 """Characters of a sentence about what cannot be read; it may quote a file."""
 
 
@@ -57,9 +57,9 @@ def refusing(name: object, advice: str) -> Iterator[None]:
 
 
 def one_line(text: str) -> str:
-    """A text without line breaks, cut off after MOST_SAID characters."""
+    """A text without line breaks, cut off after MAX_MESSAGE characters."""
     text = " ".join(text.split())
-    return text if len(text) <= MOST_SAID else f"{text[:MOST_SAID]} ..."
+    return text if len(text) <= MAX_MESSAGE else f"{text[:MAX_MESSAGE]} ..."
 
 
 def not_written(what: str, error: Exception, instead: str) -> OSError:

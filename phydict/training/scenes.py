@@ -27,7 +27,7 @@ REACH = 1.48
 MISPLACED = (1.5, 1.5, 1.5, 1.5, 1.5, 0.0, 0.3, 0.0)
 """Standard deviations of the poses' errors (poses.unknowns.POSE), in mm and degrees; detectors stay upright."""
 
-SCATTER, SCATTER_MM = (0.02, 0.08), 60.0
+SCATTER_AMPLITUDE, SCATTER_MM = (0.02, 0.08), 60.0
 """Least and most amplitude of `scatter_of`, and its width."""
 
 PHOTONS = (1e4, 1e6)
@@ -119,8 +119,8 @@ class Scenes:
             hardened = rng.uniform(0, 0.02) * y * (0.7 * float(y.max()) - y) / 2
             y = (1 + rng.uniform(-0.03, 0.03)) * (y + hardened)
         if _happens(self.scatter, rng):
-            primary = (-y[0]).exp()
-            y = -(primary + scatter_of(primary, true.beam, rng.uniform(*SCATTER), SCATTER_MM * scale)).log()[None]
+            primary, amplitude = (-y[0]).exp(), rng.uniform(*SCATTER_AMPLITUDE)
+            y = -(primary + scatter_of(primary, true.beam, amplitude, SCATTER_MM * scale)).log()[None]
         if _happens(self.counting, rng):
             photons = math.exp(rng.uniform(*np.log(PHOTONS)))
             counts = torch.from_numpy(rng.poisson(photons * (-y.double()).exp().numpy(force=True))).clamp(min=0.5)

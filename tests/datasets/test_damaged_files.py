@@ -18,7 +18,7 @@ from phydict.datasets.dicom import read_dicom
 from phydict.datasets.radiographs.xray_images import read_image
 from phydict.prior.finite import not_finite
 from phydict.reconstruction import save_nifti
-from phydict.runtime.reading import MOST_SAID, Unreadable, reading, refusing
+from phydict.runtime.reading import MAX_MESSAGE, Unreadable, reading, refusing
 from phydict.runtime.seeds import check_seed
 
 
@@ -67,7 +67,7 @@ def test_a_name_with_line_breaks_does_not_break_the_sentence(tmp_path):
     assert "\n" not in str(caught.value)
     with pytest.raises(Unreadable) as caught, refusing(table, "save it again"):
         raise ValueError("[" * 10_000)
-    assert len(str(caught.value)) < MOST_SAID + 10
+    assert len(str(caught.value)) < MAX_MESSAGE + 10
 
 
 def _tiff(width: int, height: int) -> bytes:

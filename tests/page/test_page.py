@@ -17,7 +17,7 @@ from phydict.evaluation.metrics import MEASURES
 from phydict.inference.page import results_page
 from phydict.inference.results import RECORD, CaseResults
 from phydict.page import CASE_FILES, PAGE, Contents, write_case_files, write_page
-from phydict.page.case_files import EMPTY
+from phydict.page.case_files import NO_VALUE
 
 HOSTILE = "</script><script>alert(1)</script> \"'&# %é😀<!--CONTENT-->"
 
@@ -57,7 +57,7 @@ def test_voxels_that_are_not_finite_and_beyond_int16_are_marked_and_clipped(tmp_
     hu[0, 0, 0], hu[1, 0, 0], hu[2, 0, 0] = torch.nan, torch.inf, 1e6
     write_case_files(tmp_path, TURNED, {"reconstruction": hu})
     volume = volume_in(tmp_path)
-    assert (volume == EMPTY).sum() == 2 and (volume == 32767).sum() == 1
+    assert (volume == NO_VALUE).sum() == 2 and (volume == 32767).sum() == 1
 
 
 @pytest.mark.parametrize("shape, shown", [((2, 40, 30), (2, 40, 30)), ((1, 600, 301), (1, 200, 100))])

@@ -142,7 +142,7 @@ class Unrolled(Sampler):
             channels = evidence(z[:, :1], before[:, :1], start[:, :1])
             seen = measurement.last_projection
             if n == int(measurement.scatter_enabled) and self.contradiction is not None and seen is not None:
-                self._doubt_views(measurement, seen, self.contradiction)
+                self._check_views_fit(measurement, seen, self.contradiction)
             signal = float(refiner.schedule.scales(t)[0])
             x0 = refiner.refine(signal * z, t, channels)
             yield x0
@@ -164,7 +164,7 @@ class Unrolled(Sampler):
         yield z
 
     @staticmethod
-    def _doubt_views(measurement: Measurement, seen: Tensor, contradiction: float) -> None:
+    def _check_views_fit(measurement: Measurement, seen: Tensor, contradiction: float) -> None:
         """Counts as noise of each view what projections `seen` (1, K, V, U) miss of it too much to be explained."""
         voxel = measurement.mu_water * max(measurement.projector.grid.spacing)
         usual = contradiction * voxel * max(1.0, measurement.projector.beam.views / FEW_VIEWS) ** 0.5

@@ -19,7 +19,7 @@ from phydict.ablation.summary import (
 )
 from phydict.evaluation.bootstrap import difference
 from phydict.evaluation.metrics import MEASURES, RANGE
-from phydict.evaluation.tables import INTERVAL, Table, caption, warning_notes, empty_notes, interval_note, listed
+from phydict.evaluation.tables import INTERVAL, Table, caption, empty_notes, interval_note, listed, warning_notes
 from phydict.inference.protocols import protocol_of
 from phydict.runtime.files import atomic_write
 

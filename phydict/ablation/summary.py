@@ -131,11 +131,15 @@ def best_settings(entries: Sequence[Entry], measure: str = "psnr") -> list[Entry
     """Of each method the entry with the highest mean of `measure`, complete ones first."""
     best: dict[str, Entry] = {}
     for entry in entries:
-        rank = (entry.complete, entry.means.get(measure, -math.inf))
         other = best.get(entry.method)
-        if other is None or rank > (other.complete, other.means.get(measure, -math.inf)):
+        if other is None or rank(entry, measure) > rank(other, measure):
             best[entry.method] = entry
     return list(best.values())
+
+
+def rank(entry: Entry, measure: str = "psnr") -> tuple[bool, float]:
+    """What orders entries by the mean of `measure`, those of all cases above others."""
+    return entry.complete, entry.means.get(measure, -math.inf)
 
 
 def deltas(entries: Sequence[Entry]) -> list[tuple[str, list[Entry]]]:

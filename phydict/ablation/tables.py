@@ -16,6 +16,7 @@ from phydict.ablation.summary import (
     conditions,
     deltas,
     format_settings,
+    rank,
 )
 from phydict.evaluation.bootstrap import difference
 from phydict.evaluation.metrics import MEASURES, RANGE
@@ -80,17 +81,20 @@ def _method_table(title: str, entries: Sequence[Entry], notes: Sequence[str]) ->
 
 
 def _difference_tables(title: str, entries: Sequence[Entry], notes: Sequence[str]) -> list[Table]:
-    """What each method has more than the first one on the same cases; none without a second one."""
+    """What each method has more than the one of highest mean PSNR on the same cases; none without a second one."""
     compared = [entry for entry in entries if entry.cases]
-    names = _measured(OF_DIFFERENCES, entries)
+    if len(compared) < 2:
+        return []
+    best, names = max(compared, key=rank), _measured(OF_DIFFERENCES, entries)
     lines: list[tuple[str, bool, list]] = []
-    for entry in compared[1:]:
-        values = [difference(entry.values.get(name, {}), compared[0].values.get(name, {})) for name in names]
-        lines.append((entry.label, False, values))
+    for entry in compared:
+        if entry is not best:
+            values = [difference(entry.values.get(name, {}), best.values.get(name, {})) for name in names]
+            lines.append((entry.label, False, values))
     if not interval_note(lines):
         return []
     measures = [SHOWN_MEASURES[name] for name in names]
-    return [Table(f"{title}: less {compared[0].name}, case by case", ["method", *(m.heading for m in measures)],
+    return [Table(f"{title}: less {best.name}, case by case", ["method", *(m.heading for m in measures)],
                   measures, lines, [INTERVAL, *notes])]
 
 

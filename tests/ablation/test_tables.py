@@ -20,7 +20,7 @@ def test_a_case_counts_once_whatever_its_seeds_and_a_missing_case_takes_a_method
     assert "| x | **0.625 [0.375, 0.875]** | **25.00 [15.00, 35.00]** |" in text
     assert "| y (1 of 2 cases) | 0.975 | 39.00 |" in text
     assert "y: refused: no." in text and "| z | <u>0.125 [0.125, 0.125]</u> |" in text
-    assert differences.title == "Methods, K = 8, ideal: less x, case by case"
+    assert differences.title == "Methods, K = 8, ideal: less x, case by case"  # y lacks a case
     assert "| y (1 of 2 cases) | 0.600 | 24.00 |" in differences.markdown()
     assert "| z | -0.500 [-0.750, -0.250] | -20.00 [-30.00, -10.00] |" in differences.markdown()
 

@@ -53,7 +53,7 @@ def _parsed(hint, value, name: str):
     try:
         if value is None and NoneType not in get_args(hint):
             raise TypeError
-        return parser.instantiate_classes(parser.parse_object({"value": value})).value
+        return parser.instantiate(parser.parse_object({"value": value})).value
     except (ArgumentError, TypeError, ValueError) as error:
         wanted = getattr(hint, "__name__", str(hint))
         raise ValueError(f"{name} takes a value of type {wanted}, but {reprlib.repr(value)} was given") from error

@@ -11,8 +11,8 @@ from phydict.xray.calibration import bend
 
 BENT = 8e-5
 """Bend that line integrals show against those of what was made of them, from which on a tube's are supposed where their
-residual is large as well: on the CTs that it was chosen on, ideal ones show 0.8e-4 at most, those of scattered counts and
-of wrong poses none, and polychromatic ones from three views on 0.8e-4 to 13e-4."""
+residual is large as well: on the CTs that it was chosen on, ideal ones show 0.8e-4 at most, counted ones and those of
+wrong poses none, and polychromatic ones from four views on 0.8e-4 to 13e-4."""
 
 RESIDUAL, LEFT = 1.1, 0.95
 """The residual of bent line integrals, in units of their noise, from which on they are straightened (on the same CTs

@@ -103,12 +103,13 @@ def test_the_checkpoint_that_reconstructs_best_is_kept(tmp_path, cache, monkeypa
     assert load_prior(tmp_path / "prior.safetensors").grid.shape == (16, 16, 16)
 
 
-def test_the_last_weights_are_validated_wherever_in_its_epoch_a_training_ends(tmp_path, cache, monkeypatch):
+@pytest.mark.parametrize("every, expected", [(1, {3: 10, 5: 20}), (5, {5: 10})])
+def test_the_last_weights_are_validated_wherever_a_training_ends(tmp_path, cache, monkeypatch, every, expected):
     scores = iter((10.0, 20.0))
     monkeypatch.setattr("phydict.training.prior.reconstruction_scores",
                         lambda *_: {"psnr": next(scores), "ssim": 0.5})
-    main(arguments(tmp_path, cache, "--trainer.max_steps=6"))
-    assert {step: float(value) for step, value in losses(tmp_path, "val/psnr").items()} == {3: 10, 5: 20}
+    main(arguments(tmp_path, cache, "--trainer.max_steps=6", f"--trainer.check_val_every_n_epoch={every}"))
+    assert {step: float(value) for step, value in losses(tmp_path, "val/psnr").items()} == expected
     assert torch.load(tmp_path / "best.ckpt", map_location="cpu", weights_only=True)["global_step"] == 6
     assert checkpoint(tmp_path)["global_step"] == 6
 

@@ -67,8 +67,10 @@ class StageTraining(lightning.LightningModule, ABC):
         return loss
 
     def on_train_batch_end(self, outputs: object, batch: object, index: int) -> None:
-        if self.global_step == self.trainer.max_steps:
-            self.trainer.should_stop = True  # Lightning then validates, wherever in its epoch the last step lies
+        if self.global_step == self.trainer.max_steps:  # Lightning then validates, whichever epoch it is
+            self.trainer.should_stop = True
+            if self.trainer.check_val_every_n_epoch:
+                self.trainer.check_val_every_n_epoch = 1
 
     def on_validation_start(self) -> None:
         if self.device_mesh is None:  # the parts of sharded weights are looked at when they are put together

@@ -57,7 +57,7 @@ from phydict.runtime.warning import warn
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 from phydict.xray.boxes import along, covers, seen_by
-from phydict.xray.checks import check_air, check_xrays
+from phydict.xray.checks import check_air, check_xrays, with_air_at_zero
 from phydict.xray.poses.uncertain import Uncertain
 
 if TYPE_CHECKING:
@@ -158,18 +158,18 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: AnyPrior | str |
         given = f"the class {method.__name__}, not an object of it," if isinstance(method, type) else repr(method)
         raise ValueError(f"a method is a name ({', '.join(METHODS)}), a Sampler or a Reconstructor, but {given} was "
                          "given")
-    found = find_prior(prior or method.default_prior) if prior is None or isinstance(prior, str | Path) else prior
-    check_prior(found)
+    loaded = find_prior(prior or method.default_prior) if prior is None or isinstance(prior, str | Path) else prior
+    check_prior(loaded)
     name = name or type(method).__name__
     if super_resolution is None:
         otherwise = FISTATV() if method.chests_only else None
-        return Posterior(found, method, guidance, name=name, precision=precision, samples=samples, otherwise=otherwise)
+        return Posterior(loaded, method, guidance, name=name, precision=precision, samples=samples, otherwise=otherwise)
     if samples != 1:
         raise ValueError(f"samples are drawn of a prior without a second stage, but {samples} were given with "
                          "super_resolution: leave one of the two out")
     if isinstance(super_resolution, str | Path):
         super_resolution = load_super_resolution(super_resolution)
-    ready = CascadePosterior(Cascade(found, super_resolution), method, sr_guided, noise=sr_noise_augmentation,
+    ready = CascadePosterior(Cascade(loaded, super_resolution), method, sr_guided, noise=sr_noise_augmentation,
                              guidance=guidance, name=name, precision=precision)
     return replace(ready, sr_sampler=sr_sampler) if sr_sampler else ready
 
@@ -225,10 +225,12 @@ def calibrated(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam,
     """
     from phydict.poses import find_poses  # and with it numba
 
-    found = find_poses(xrays, beam, uncertain, grid, display, method.mu_water, on_round=on_round)
-    for words in found.warnings():
+    if not display:
+        xrays = with_air_at_zero(xrays)  # which the reconstruction would see no more once offsets are found
+    poses = find_poses(xrays, beam, uncertain, grid, display, method.mu_water, on_round=on_round)
+    for words in poses.warnings():
         warn(words)
-    return xrays if display else found.corrected(xrays), found
+    return xrays if display else poses.corrected(xrays), poses
 
 
 def reconstruct(xrays: Tensor, beam: ConeBeam, prior: AnyPrior | str | Path | None = None,
@@ -265,12 +267,12 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: AnyPrior | str | Path | No
                           samples=samples, precision=precision)
     ready = onto_grid(ready if mu_water is None else ready.with_mu_water(mu_water), grid)
     grid, xrays = ready.grid or grid or DEFAULT_GRID, _real(xrays)
-    found: FoundPoses | None = None
+    poses: FoundPoses | None = None
     if uncertain is not None:
-        xrays, found = calibrated(ready, ready.survey or grid, xrays, beam, uncertain, display)
-    xrays, A = fit_to_grid(ready, grid, xrays, found.beam if found else beam, projector)
+        xrays, poses = calibrated(ready, ready.survey or grid, xrays, beam, uncertain, display)
+    xrays, A = fit_to_grid(ready, grid, xrays, poses.beam if poses else beam, projector)
     result = ready.reconstruct(xrays, A, format_report(report), display, seed, on_step)
-    return found.added_to(result) if found else result
+    return poses.added_to(result) if poses else result
 
 
 def _real(xrays) -> Tensor:

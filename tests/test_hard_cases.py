@@ -30,7 +30,7 @@ from phydict.posterior import (
     SplitGibbs,
 )
 from phydict.xray import Ideal
-from phydict.xray.checks import with_air_at_zero
+from phydict.xray.checks import check_line_integrals, with_air_at_zero
 from phydict.xray.residuals import misfits
 
 pytestmark = [pytest.mark.filterwarnings(f"ignore:{said}") for said in
@@ -207,6 +207,18 @@ def test_line_integrals_of_no_chest_are_warned_of_and_display_values_of_any_size
         reconstruct(scale * CLEAN, BEAM, prior, FAST, display=True)
 
 
+def test_views_that_cut_the_patient_off_at_both_sides_are_warned_of_where_they_are_most_of_them():
+    narrow = CLEAN[..., 9:15]
+    with pytest.warns(UserWarning, match="8 of 8 views cut the patient off at the left and right side"):
+        check_line_integrals(narrow)
+    half_fan = torch.cat([CLEAN[:4, :, 9:], CLEAN[4:, :, :15]])
+    mostly_whole = torch.where(torch.arange(8)[:, None, None] < 4, 5.0, CLEAN)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for xrays in (CLEAN, half_fan, mostly_whole):
+            check_line_integrals(xrays)
+
+
 def test_a_gain_that_drifts_is_taken_out_by_the_air_and_where_none_is_seen_nothing_is():
     exact = views(simulator=Ideal(0))
     drifted = exact - torch.linspace(1, 0.8, len(exact)).log()[:, None, None]
@@ -216,6 +228,7 @@ def test_a_gain_that_drifts_is_taken_out_by_the_air_and_where_none_is_seen_nothi
     for xrays, beam, settings in ((exact, BEAM, {}), (drifted, BEAM, {"display": True}), (drifted + 0.2, BEAM, {}),
                                   (drifted[..., 7:17], orbit(8, shape=(24, 10)), {})):
         with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", ".* cut the patient off")
             warnings.filterwarnings("error", "air beside the patient")
             reconstruct(xrays, beam, method=SIRT(2), grid=GRID, **settings)
 

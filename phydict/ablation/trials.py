@@ -129,8 +129,8 @@ class Trial:
         identity = {"name": self.name, "method": describe(self.method), "seed": self.seed, "grid": grid.to_dict(),
                     "window": describe(window), "data": {"with_report": self.with_report} | self.data.settings("test")}
         if self.prior is not None:
-            own = own_identity(prior_of(self.prior), self.prior)
-            identity |= {"prior_crc32": _crc(self.prior)} if own is None else {"prior": own}
+            prior_identity = own_identity(prior_of(self.prior), self.prior)
+            identity |= {"prior_crc32": _crc(self.prior)} if prior_identity is None else {"prior": prior_identity}
             identity |= {"guidance": self.guidance, "samples": self.samples}
         if self.super_resolution:
             identity["super_resolution_crc32"] = _crc(self.super_resolution)

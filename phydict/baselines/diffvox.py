@@ -65,9 +65,9 @@ class DiffVox(Baseline):
             adam.zero_grad()
             density = softplus(x - SHIFT, SHARPNESS)
             with torch.no_grad():
-                slope = A.T((A(density) - y).sign()) / y.numel()  # of the data term, by the adjoint
+                gradient = A.T((A(density) - y).sign()) / y.numel()  # of the data term, by the adjoint
             roughness = sum(density.diff(dim=axis).abs().sum() for axis in (2, 3, 4)) / density.numel()
-            ((slope * density).sum() + self.smoothness * roughness).backward()
+            ((gradient * density).sum() + self.smoothness * roughness).backward()
             adam.step()
             cycle.step()
             on_step()

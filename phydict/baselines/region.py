@@ -48,14 +48,14 @@ class Region(Delegating):
                     seed: int = 0, on_step: Callable[[], None] = lambda: None) -> Reconstruction:
         watch = Stopwatch()
         with watch.stage("base"):
-            seen = seen_by(self.outer, xrays, projector.beam, self.full_detector, projector.method)
-            coarse = self.base.reconstruct(*seen, report, display, seed, on_step)
+            binned = seen_by(self.outer, xrays, projector.beam, self.full_detector, projector.method)
+            coarse = self.base.reconstruct(*binned, report, display, seed, on_step)
         with watch.stage("outside"):
             mu = hu_to_mu(coarse.volume.to(xrays), self.mu_water)
             if display:
                 whole = Projector(self.outer, projector.beam, projector.method, device=xrays.device, full_detector=True)
                 xrays = match_views(xrays[None], whole(mu[None, None]))[0]
             outside = outside_projection(mu, self.outer, projector)
-        found = self.base.reconstruct(xrays, projector, report, False, seed, on_step, outside)
-        return replace(found, coarse=coarse, seconds=watch.seconds | found.seconds,
-                       projector_calls=coarse.projector_calls + found.projector_calls)
+        result = self.base.reconstruct(xrays, projector, report, False, seed, on_step, outside)
+        return replace(result, coarse=coarse, seconds=watch.seconds | result.seconds,
+                       projector_calls=coarse.projector_calls + result.projector_calls)

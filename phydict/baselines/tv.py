@@ -49,6 +49,10 @@ class FISTATV(Baseline):
         if not self.weight >= 0:
             raise ValueError(f"the weight of total variation must not be negative, but {self.weight} was given")
 
+    @property
+    def volumes(self) -> int:
+        return 36  # the proximal step works on gradients and dual of three components each
+
     def steps(self) -> int:
         return self.iterations
 

@@ -21,8 +21,8 @@ def write_csv(path: str | Path, rows: Iterable[Mapping]) -> None:
     To append: `write_csv(path, read_csv(path) + new_rows)`.
     """
     rows = list(rows)
-    seen = dict.fromkeys(key for row in rows for key in row)
-    columns = [name for name in TEXT_COLUMNS if name in seen] + [name for name in seen if name not in TEXT_COLUMNS]
+    keys = dict.fromkeys(key for row in rows for key in row)
+    columns = [name for name in TEXT_COLUMNS if name in keys] + [name for name in keys if name not in TEXT_COLUMNS]
     with atomic_write(Path(path)) as part, part.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)

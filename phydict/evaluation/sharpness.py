@@ -35,14 +35,14 @@ def edge_profile(volume: Tensor, lung: Tensor, edge: str, reach: int = 5) -> Ten
     axis = AXES[edge]
     lines = [x.movedim(axis, -1).reshape(-1, x.shape[axis]) for x in (volume, lung > 0.5)]
     both = [lines] if edge == "diaphragm" else [lines, [line.flip(-1) for line in lines]]
-    found = []
+    crossing = []
     for values, inside in both:
         first = inside.int().argmax(-1)
         places = first[:, None] + torch.arange(reach - 1, -reach - 1, -1)
         kept = inside.any(-1) & (places.amin(-1) >= 0) & (places.amax(-1) < values.shape[-1])
         kept[kept.clone()] &= inside[kept].gather(-1, places[kept])[:, :reach].all(-1)
-        found.append(values[kept].gather(-1, places[kept]))
-    profiles = torch.cat(found)
+        crossing.append(values[kept].gather(-1, places[kept]))
+    profiles = torch.cat(crossing)
     if not len(profiles):
         raise ValueError(f"no line crosses the {edge.replace('_', ' ')} with {reach} voxels on both sides: give the "
                          "lungs' mask, or a smaller reach")
@@ -93,8 +93,8 @@ def vessel_visibility(volume: Tensor, truth: Tensor, lung: Tensor, count: int = 
     contrasts = [x - avg_pool3d(x[None, None], 5, 1, 2, count_include_pad=False)[0, 0] for x in (volume, truth)]
     inside = (lung > 0.5).flatten()
     brightest = torch.where(inside, truth.flatten(), -torch.inf).topk(min(count, int(inside.sum()))).indices
-    found, expected = (float(contrast.flatten()[brightest].mean()) for contrast in contrasts)
-    return found / expected
+    measured, expected = (float(contrast.flatten()[brightest].mean()) for contrast in contrasts)
+    return measured / expected
 
 
 def sharpness_scores(volume: Tensor, truth: Tensor, lung: Tensor, grid: Grid) -> dict[str, float]:
@@ -107,8 +107,8 @@ def sharpness_scores(volume: Tensor, truth: Tensor, lung: Tensor, grid: Grid) ->
     scores = {}
     for edge in AXES:
         with suppress(ValueError):
-            found, true = (edge_spread(x, lung, grid, edge) for x in (volume, truth))
-            scores[f"edge_{edge}"] = found / true
+            spread, true_spread = (edge_spread(x, lung, grid, edge) for x in (volume, truth))
+            scores[f"edge_{edge}"] = spread / true_spread
     with suppress(ValueError):
         ribs, true_ribs = rib_profile(torch.stack([volume, truth]), truth, lung, grid)
         scores["edge_ribs"] = edge_width(ribs, 1.0) / edge_width(true_ribs, 1.0)

@@ -96,20 +96,20 @@ def geometry_page(path: str | Path, beam: ConeBeam, grid: Grid, xrays: np.ndarra
 
 def _draw(ax: Axes, beam: ConeBeam, grid: Grid, thorax_hu: np.ndarray, name: str, axis: int) -> None:
     """One plane of the geometry around the thorax in its box of voxels."""
-    seen = [0, axis]
-    (left, low), (right, high) = grid.corners()[:, seen].min(0), grid.corners()[:, seen].max(0)
+    axes = [0, axis]
+    (left, low), (right, high) = grid.corners()[:, axes].min(0), grid.corners()[:, axes].max(0)
     ax.imshow(plane(thorax_hu, grid, name)[0], GREY, vmin=DISPLAY[0], vmax=DISPLAY[1], extent=(right, left, low, high))
     rows, columns = beam.shape
     for k in range(beam.views):
         colour = f"C{k % 10}"
         corners = [beam.detectors[k] + i * columns / 2 * beam.u[k] + j * rows / 2 * beam.v[k]
                    for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))]
-        ax.plot(*np.array(corners)[:, seen].T, color=colour, linewidth=2)
-        ax.plot(*np.array([beam.sources[k], beam.detectors[k]])[:, seen].T, color=colour, linewidth=0.5)
-        ax.plot(*beam.sources[k, seen], "o", color=colour, markersize=5)
-        ax.annotate(str(k), tuple(beam.sources[k, seen]), xytext=(5, 5), textcoords="offset points", fontsize=8)
+        ax.plot(*np.array(corners)[:, axes].T, color=colour, linewidth=2)
+        ax.plot(*np.array([beam.sources[k], beam.detectors[k]])[:, axes].T, color=colour, linewidth=0.5)
+        ax.plot(*beam.sources[k, axes], "o", color=colour, markersize=5)
+        ax.annotate(str(k), tuple(beam.sources[k, axes]), xytext=(5, 5), textcoords="offset points", fontsize=8)
     every = np.concatenate([beam.pixels()[:, ::max(rows - 1, 1), ::max(columns - 1, 1)].reshape(-1, 3), beam.sources,
-                            grid.corners()])[:, seen]
+                            grid.corners()])[:, axes]
     margin = 0.1 * np.ptp(every, axis=0).max()  # where the letters stand
     (left, low), (right, high) = every.min(0) - margin, every.max(0) + margin
     ax.set(xlim=(right, left), ylim=(low, high), aspect="equal", xlabel="mm", ylabel="mm", title=name)

@@ -80,11 +80,12 @@ class Protocol:
 
     def fixed_grid(self, given: Grid) -> Grid:
         """The protocol's voxels, if any. Raises ValueError where others than the default are given."""
-        own = self.grid or given
-        if not any(given.same_as(grid) for grid in (own, Grid.cube(64))):
-            raise ValueError(f"data.protocol {self.name} fixes {own.shape[0]} voxels over {own.extent[0]:g} mm, but "
-                             f"model.grid has {given.shape[0]} over {given.extent[0]:g} mm: leave one of the two out")
-        return own
+        fixed = self.grid or given
+        if not any(given.same_as(grid) for grid in (fixed, Grid.cube(64))):
+            raise ValueError(f"data.protocol {self.name} fixes {fixed.shape[0]} voxels over {fixed.extent[0]:g} mm, "
+                             f"but model.grid has {given.shape[0]} over {given.extent[0]:g} mm: leave one of the two "
+                             "out")
+        return fixed
 
 
 PROTOCOLS = {protocol.name: protocol for protocol in (
@@ -127,10 +128,10 @@ def cut_out(case: Case, grid: Grid, box: Grid, window: HUWindow) -> Case:
     source = case.get("fine", case["volume"])
     volume = resampled(window.to_hu(source)[0].cpu(), in_other_voxels(grid, source.shape[1:]), box)
     masks = np.stack([to_grid(mask.cpu().numpy(), grid.affine, box, 0.0) for mask in case["masks"]])
-    found: Case = {"volume": window.to_range(volume)[None], "masks": torch.from_numpy(masks.astype(np.float32))}
+    cut: Case = {"volume": window.to_range(volume)[None], "masks": torch.from_numpy(masks.astype(np.float32))}
     if "affine" in case:
-        found["affine"] = torch.from_numpy(placed(box, grid, case["affine"].numpy()).affine.copy())
-    return found
+        cut["affine"] = torch.from_numpy(placed(box, grid, case["affine"].numpy()).affine.copy())
+    return cut
 
 
 def placed(grid: Grid, like: Grid, affine: np.ndarray) -> Grid:

@@ -28,8 +28,8 @@ def method_settings(name: str, seed: int, method: Sampler | Reconstructor, proje
 
 def prior_settings(prior: AnyPrior, given: Any, sampling: Sampling) -> dict:
     """Those of a prior, given as an object, by its file or by its class, and of how it is sampled."""
-    own = own_identity(prior, given)
-    settings = _identity("prior", given) if own is None else {"prior": own}
+    identity = own_identity(prior, given)
+    settings = _identity("prior", given) if identity is None else {"prior": identity}
     settings["guidance"] = sampling.guidance
     if sampling.samples != 1:
         settings["samples"] = sampling.samples

@@ -161,10 +161,10 @@ class CaseResults:
         table, page = self.folder / TABLE, self.folder / "results.md"
         if table.is_file():
             with table.open("rb") as file:
-                own = file.read(12) == b"case,method,"
+                replaceable = file.read(12) == b"case,method,"
         else:
-            own = not os.path.lexists(page)
-        if not own:
+            replaceable = not os.path.lexists(page)
+        if not replaceable:
             raise ValueError(f"{table if table.is_file() else page} is no table of this command, and is not replaced: "
                              "move it away, or give another model.out")
 

@@ -265,15 +265,15 @@ class ReconstructionTask(lightning.LightningModule):
     def _reconstruct(self, case: Case, seed: int) -> Reconstruction:
         ready = self.reconstructor.with_mu_water(case["mu_water"]) if "mu_water" in case else self.reconstructor
         xrays, beam, display = case["xrays"].to(self.device), case["beam"], case.get("display", False)
-        found: FoundPoses | None = None
+        poses: FoundPoses | None = None
         if self.calibrate:
-            xrays, found = calibrated(ready, ready.survey or self.grid, xrays, beam, uncertain_of(case), display,
+            xrays, poses = calibrated(ready, ready.survey or self.grid, xrays, beam, uncertain_of(case), display,
                                       self.progress.advance)
-            beam = found.beam
+            beam = poses.beam
         with stage("fit to grid"):
             xrays, projector = fit_to_grid(ready, self.grid, xrays, beam, self.projector)
         result = ready.reconstruct(xrays, projector, case["report"], display, seed, self.progress.advance)
-        return found.added_to(result) if found else result
+        return poses.added_to(result) if poses else result
 
     def _finish(self, case: Case, result: Reconstruction, scores: dict | None = None,
                 truth: Tensor | None = None, features: Features | None = None) -> None:

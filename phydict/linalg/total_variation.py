@@ -18,11 +18,11 @@ def differences(x: Tensor, scales: Sequence[float] = UNIT) -> Tensor:
     """Scaled forward differences (3, B, 1, X, Y, Z) of x (B, 1, X, Y, Z) along its last three axes, 0 at the end."""
     result = x.new_empty(3, *x.shape)
     for axis, scale in enumerate(scales, 2):
-        own, n = result[axis - 2], x.shape[axis] - 1
-        own.narrow(axis, 0, n).copy_(x.diff(dim=axis))
-        own.narrow(axis, n, 1).zero_()
+        difference, n = result[axis - 2], x.shape[axis] - 1
+        difference.narrow(axis, 0, n).copy_(x.diff(dim=axis))
+        difference.narrow(axis, n, 1).zero_()
         if scale != 1:
-            own.mul_(scale)
+            difference.mul_(scale)
     return result
 
 

@@ -55,11 +55,11 @@ def check_own_page(folder: Path, option: str) -> None:
     """Raises ValueError where a page of someone else's would be replaced; `option` is what the user may change."""
     path = folder / PAGE
     if os.path.lexists(path):
-        own = path.is_file() and not path.is_symlink()
-        if own:
+        replaceable = path.is_file() and not path.is_symlink()
+        if replaceable:
             with path.open("rb") as file:
-                own = SIGNED.encode() in file.read(1000)
-        if not own:
+                replaceable = SIGNED.encode() in file.read(1000)
+        if not replaceable:
             raise ValueError(f"{path} is no page of results by phydict, and is not replaced: move it away, or give "
                              f"another {option}")
 

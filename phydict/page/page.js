@@ -99,12 +99,12 @@ function showRun() {
   }), made.notes)), plot(points, error) ?? "");
   if (cases.length) {
     const header = ["case", "picture", "method", "views", ...measures.map(measure => measure.label), "warnings"];
-    const rows = cases.map(caseRow), own = table("Cases", header, rows, [
+    const rows = cases.map(caseRow), caseTable = table("Cases", header, rows, [
       "Best of each case in bold, second underlined. A name opens the case."]);
     const filter = element("input", {type: "search", oninput: () => {
-      for (const row of own.querySelectorAll("tbody tr")) row.hidden = !row.dataset.key.includes(filter.value);
+      for (const row of caseTable.querySelectorAll("tbody tr")) row.hidden = !row.dataset.key.includes(filter.value);
     }});
-    run.append(element("p", {}, element("label", {}, "show cases and methods with ", filter)), own);
+    run.append(element("p", {}, element("label", {}, "show cases and methods with ", filter)), caseTable);
   }
   run.append(
     ...plots.map(({name, url}) => element("p", {},

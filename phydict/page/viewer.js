@@ -108,7 +108,7 @@ class Viewer {
     const {reconstruction, truth, ...further} = volumes;
     [this.volume, this.uncertainty, this.xrays] = [reconstruction, Object.values(further)[0] ?? null, xrays];
     this.at = this.volume.shape.map(size => Math.floor(size / 2));
-    this.own = this.volume.indices(this.volume);
+    this.indices = this.volume.indices(this.volume);
     this.other = null;
     byId("overlay-label").hidden = !this.uncertainty;
     byId("overlay-name").textContent = `${this.uncertainty?.name} as overlay`;
@@ -160,8 +160,8 @@ class Viewer {
     for (const [name, plane] of Object.entries(PLANES)) {
       const {across, x, y, edges} = plane, [wide, tall] = [volume.shape[x], volume.shape[y]];
       const ratio = tall * volume.spacing[y] / (wide * volume.spacing[x]);
-      const hu = volume.plane(plane, at[across], this.own);
-      const spread = byId("overlay").checked && this.uncertainty?.plane(plane, at[across], this.own);
+      const hu = volume.plane(plane, at[across], this.indices);
+      const spread = byId("overlay").checked && this.uncertainty?.plane(plane, at[across], this.indices);
       const beside = other?.volume.plane(plane, at[across], other.indices);
       const colours = [spread ? (value, n) => {
         const part = 0.8 * share(spread[n], 0, SPREAD), [base] = grey(value);
@@ -199,11 +199,11 @@ class Viewer {
   }
 
   readOut() {
-    const {volume, at, other} = this, said = [[volume.name, volume.at(at)]];
-    if (other) said.push([other.volume.name, other.volume.at(at.map((index, axis) => other.indices[axis][index]))]);
-    if (this.uncertainty) said.push([this.uncertainty.name, this.uncertainty.at(at)]);
+    const {volume, at, other} = this, readings = [[volume.name, volume.at(at)]];
+    if (other) readings.push([other.volume.name, other.volume.at(at.map((index, axis) => other.indices[axis][index]))]);
+    if (this.uncertainty) readings.push([this.uncertainty.name, this.uncertainty.at(at)]);
     byId("readout").textContent = `(${world(volume.affine, at).map(mm => mm.toFixed(1)).join(", ")}) mm RAS+: ` +
-      said.map(([name, hu]) => `${name} ${hu === EMPTY ? "no value" : hu + " HU"}`).join(", ");
+      readings.map(([name, hu]) => `${name} ${hu === EMPTY ? "no value" : hu + " HU"}`).join(", ");
   }
 
   drawTurning() {

@@ -35,7 +35,7 @@ from phydict.units import MU_WATER, HUWindow
 from phydict.xray import ConeBeam, Projector, binned, binning
 from phydict.xray.calibration import match_views
 from phydict.xray.checks import check_xrays
-from phydict.xray.poses.gauge import aligned
+from phydict.xray.poses.gauge import aligned, reprojection_errors
 from phydict.xray.poses.sensitivity import pose_derivatives
 from phydict.xray.poses.uncertain import Uncertain
 from phydict.xray.poses.unknowns import moved
@@ -120,14 +120,23 @@ def find_poses(xrays: Tensor, beam: ConeBeam, uncertain: Uncertain, grid: Grid, 
                 on_round()
             if n == 0:
                 sway = views.sway(state).double().numpy()
-            if n == 0 and deviations[:8].any() and views.fits_as_stated(state):
+            if n == 0 and views.fits_as_stated(state):
                 state.theta, state.misfits = torch.zeros_like(state.theta), state.misfits[:1]
                 break
-        there = moved(beam, state.theta[:, :8].double().numpy())
+        there, points = moved(beam, state.theta[:, :8].double().numpy()), middle_points(grid)
         if state.theta[:, :8].any():
-            there = aligned(there, beam, middle_points(grid))
+            there = aligned(there, beam, points)
+        shift = np.stack([reprojection_errors(there, beam, points), stated_shift(beam, uncertain, points)])
     return FoundPoses(there, deviations, state.theta.double().numpy(), state.errors.double().numpy(),
-                      (state.misfits[0], state.misfits[-1]), sway, watch.seconds["calibrate"], display)
+                      (state.misfits[0], state.misfits[-1]), sway, shift, watch.seconds["calibrate"], display)
+
+
+def stated_shift(beam: ConeBeam, uncertain: Uncertain, points: np.ndarray) -> np.ndarray:
+    """Root mean square distance (K,) in mm on the detector by which points' shadows shift where each unknown of a pose
+    is off by its standard deviation."""
+    each = [reprojection_errors(moved(beam, np.tile(unknown, (beam.views, 1))), beam, points)
+            for unknown in np.diag(uncertain.poses)]
+    return np.sqrt(np.square(each).sum(0))
 
 
 def halved(grid: Grid) -> Grid:
@@ -214,9 +223,9 @@ class Views:
     def changes(self, state: State) -> Tensor:
         """What a standard deviation of each unknown changes in the corrected X-rays: (K, 10, V, U)."""
         mu = WINDOW.to_mu(state.x[0, 0], self.mu_water)
-        integrals, slopes = pose_derivatives(mu, self.grid, self.beam, state.theta[:, :8].double().numpy())
+        integrals, derivatives = pose_derivatives(mu, self.grid, self.beam, state.theta[:, :8].double().numpy())
         ones = torch.ones_like(integrals) / (1 + state.theta[:, 8, None, None])
-        changes = torch.cat([slopes, torch.stack([integrals / (1 + state.theta[:, 8, None, None]), ones], 1)], 1)
+        changes = torch.cat([derivatives, torch.stack([integrals / (1 + state.theta[:, 8, None, None]), ones], 1)], 1)
         return changes * self.deviations[:, None, None]
 
     def sway(self, state: State) -> Tensor:
@@ -228,10 +237,10 @@ class Views:
         """
         plain = self.measurement(state.theta)
         residual = plain.y[0] - plain.project(state.x)[0]
-        slopes = pose_derivatives(WINDOW.to_mu(state.x[0, 0], self.mu_water), self.grid, self.beam,
-                                  state.theta[:, :8].double().numpy())[1]
+        derivatives = pose_derivatives(WINDOW.to_mu(state.x[0, 0], self.mu_water), self.grid, self.beam,
+                                       state.theta[:, :8].double().numpy())[1]
         ramp = torch.linspace(-0.5, 0.5, residual.shape[1])[:, None]
-        columns = torch.cat([self.changes(state), (slopes[:, 1] * ramp)[:, None]], 1).flatten(2)
+        columns = torch.cat([self.changes(state), (derivatives[:, 1] * ramp)[:, None]], 1).flatten(2)
         columns = columns[:, columns.abs().amax((0, 2)) > 0]
         covariance = torch.linalg.inv(columns @ columns.transpose(1, 2))
         fitted = (covariance @ (columns @ residual.flatten(1)[..., None]))[..., 0]

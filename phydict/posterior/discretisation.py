@@ -21,9 +21,10 @@ def subgrid_projection(measurement: Measurement, x: Tensor, step: LikelihoodStep
     of the finer volume.
     """
     fine = measurement.on(FinerProjector(measurement.projector, FACTOR))
-    found = beyond_means(measurement, fine, step(fine, interpolate(x, scale_factor=FACTOR, mode="trilinear"), x0_std))
+    projection = beyond_means(
+        measurement, fine, step(fine, interpolate(x, scale_factor=FACTOR, mode="trilinear"), x0_std))
     measurement.calls += fine.calls
-    return found
+    return projection
 
 
 def beyond_means(measurement: Measurement, fine: Measurement, z: Tensor) -> Tensor:

@@ -25,12 +25,12 @@ class Evidence:
     def __init__(self, measurement: Measurement):
         projector = measurement.projector
         rays = measurement.background / measurement.offset
-        seen = projector.T(torch.ones_like(measurement.y))
+        backprojection = projector.T(torch.ones_like(measurement.y))
         measurement.calls += 1
         self.measurement = measurement
         self.rows = torch.where(rays > 1e-3 * rays.max(), 1 / rays.clamp(min=1e-12), 0)
-        self.columns = torch.where(seen > 1e-3 * seen.max(), 1 / seen.clamp(min=1e-12), 0)
-        self.coverage = COVERAGE_SCALE * torch.log2(1 + views_seen(projector, seen))
+        self.columns = torch.where(backprojection > 1e-3 * backprojection.max(), 1 / backprojection.clamp(min=1e-12), 0)
+        self.coverage = COVERAGE_SCALE * torch.log2(1 + views_seen(projector, backprojection))
         self.measure_noise()
 
     def measure_noise(self) -> None:

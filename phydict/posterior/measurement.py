@@ -100,8 +100,8 @@ class Measurement:
         return self.y, self.measured, self.hardened, self.scatter_enabled, self.subgrid, self.model_variance
 
     @fitted.setter
-    def fitted(self, found: tuple[Tensor, Tensor, bool, bool, Tensor | float, Tensor | float]) -> None:
-        self.y, self.measured, self.hardened, self.scatter_enabled, self.subgrid, self.model_variance = found
+    def fitted(self, values: tuple[Tensor, Tensor, bool, bool, Tensor | float, Tensor | float]) -> None:
+        self.y, self.measured, self.hardened, self.scatter_enabled, self.subgrid, self.model_variance = values
 
     def linear(self, d: Tensor) -> Tensor:
         """The linear part of P, for differences d of CTs."""

@@ -94,18 +94,18 @@ def with_metal(measurement: Measurement, metal: Metal | None, first: Callable[[]
     if not metal.least_ml <= millilitres(dense, measurement.projector.grid) <= metal.most_ml:
         return z
     plain, residual, where = measurement.fitted, measurement.normalised_residual(z[:, :1]).max(), grown(dense)
-    found = z
+    states = z
     for _ in range(metal.rounds):
-        carried = beside(measurement, found[:1, :1], where, metal)
+        carried = beside(measurement, states[:1, :1], where, metal)
         if carried.density < PROMISING * metal.least:
             break
         measurement.carry(carried)
-        found = again()
-        where = where | grown(found[:1, :1] >= CEILING)
+        states = again()
+        where = where | grown(states[:1, :1] >= CEILING)
     else:
-        as_well = measurement.normalised_residual(found[:, :1]).max() <= WORSE * residual
+        as_well = measurement.normalised_residual(states[:, :1]).max() <= WORSE * residual
         if carried.density >= metal.least and as_well:
-            return found
+            return states
     measurement.carry(None)
     measurement.fitted = plain
     return z

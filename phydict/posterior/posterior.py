@@ -180,9 +180,10 @@ class Posterior(Reconstructor):
             warn("the X-rays show one material in air and no chest, and of other objects the network knows nothing: a "
                  "method without one reconstructed instead, and there are no intervals")
             with watch.stage("otherwise"):
-                found = self.otherwise.with_mu_water(self.mu_water).reconstruct(xrays, projector, report, display, seed)
-            return replace(found, method=self.name, seconds=watch.seconds, network_calls=denoiser.calls,
-                           projector_calls=measurement.calls + found.projector_calls)
+                result = self.otherwise.with_mu_water(self.mu_water).reconstruct(
+                    xrays, projector, report, display, seed)
+            return replace(result, method=self.name, seconds=watch.seconds, network_calls=denoiser.calls,
+                           projector_calls=measurement.calls + result.projector_calls)
         with watch.stage("score"):
             state, ct = states.mean(0), states[:, :1].mean(0, keepdim=True)
             measurement.match_gain_offset(ct)

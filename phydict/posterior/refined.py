@@ -117,9 +117,9 @@ class Refinement:
     def corrections(self, network: bool) -> tuple[int, int]:
         """How often a network on the voxels, if there is one, and one on coarse ones correct an estimate: what is
         interpolated alone never."""
-        own = self.calls if self.step and network else 0
-        others = self.calls - network if self.step and self.coarse else 0
-        return own, max(others, 0)
+        fine_calls = self.calls if self.step and network else 0
+        coarse_calls = self.calls - network if self.step and self.coarse else 0
+        return fine_calls, max(coarse_calls, 0)
 
     def __call__(self, measurement: Measurement, x: Tensor, network: Correction | None,
                  coarse: CoarseCorrection | None = None, refined: bool = False) -> Tensor:
@@ -133,9 +133,9 @@ class Refinement:
         for left in reversed(range(self.calls if network or coarse else 0)):
             if network and evidence:
                 evidence.measure_noise()
-                seen = evidence(z, before, start)
+                channels = evidence(z, before, start)
                 with stage("network"):
-                    z = network.corrected(z, seen)
+                    z = network.corrected(z, channels)
             if coarse is not None and (left or network is None):
                 z = coarse(z)
             before = z
@@ -193,9 +193,9 @@ class Refined(Delegating):
         """Those that the X-rays are met on and no network corrects on."""
         if self.refinement.step is None:
             return []
-        _, others = self.refinement.corrections(network=False)
+        _, coarse_calls = self.refinement.corrections(network=False)
         return [level for level in self.levels
-                if not self._network(level) and not (others and knows(self.base, level))]
+                if not self._network(level) and not (coarse_calls and knows(self.base, level))]
 
     def _network(self, level: Grid) -> Correction | None:
         return self.network if self.network and self.network.suits(level, self.base.window) else None
@@ -212,28 +212,29 @@ class Refined(Delegating):
                 f"from {projector.grid.shape} voxels of {projector.grid.spacing} mm: use the target's grid")
         watch, base, refinement = Stopwatch(), self.base, self.refinement.of_views(projector.beam.views)
         with watch.stage("base"):
-            seen = self._seen(xrays, projector, base.grid)
-            coarse = base.reconstruct(*seen, report, display, seed, on_step)
-        volume, grid, calls, found = coarse.within.to(xrays), base.grid, coarse.projector_calls, {}
+            binned = self._binned(xrays, projector, base.grid)
+            coarse = base.reconstruct(*binned, report, display, seed, on_step)
+        volume, grid, calls, scores = coarse.within.to(xrays), base.grid, coarse.projector_calls, {}
         network_calls = coarse.network_calls
         for level in self.levels:
             with watch.stage("refine"):
-                y, A = self._seen(xrays, projector, level)
+                y, A = self._binned(xrays, projector, level)
                 x = base.window.to_range(interpolated(volume, grid, level, AIR))[None, None]
                 measurement = self._measurement(y, A, coarse, display)
                 measurement.refit(x)
                 network = self._network(level) if coarse.masks is not None else None
-                own, others = refinement.corrections(network is not None) if coarse.masks is not None else (0, 0)
-                correction = coarse_correction(base, level, seen, coarse, report, display) if others else None
+                fine_calls, coarse_calls = (refinement.corrections(network is not None)
+                                            if coarse.masks is not None else (0, 0))
+                correction = coarse_correction(base, level, binned, coarse, report, display) if coarse_calls else None
                 x = refinement(measurement, x, network, correction, grid is not base.grid)
                 guard = Guard(measurement, on_step, 1)
                 guard()
             volume, grid = base.window.to_hu(x[0, 0]), level
             with watch.stage("score"):
                 measurement.match_gain_offset(x)
-                found = guard.score(x, measurement.project(x), measurement.y)
+                scores = guard.score(x, measurement.project(x), measurement.y)
             calls += measurement.calls
-            network_calls += own
+            network_calls += fine_calls
             if correction is not None:
                 calls += correction.projector_calls
                 network_calls += correction.calls
@@ -242,7 +243,7 @@ class Refined(Delegating):
         if coarse.carried:
             volume = volume + coarse.carried.on(grid)
         return replace(
-            coarse, **found | {"diverged_at": coarse.diverged_at}, volume=volume, grid=self.target,
+            coarse, **scores | {"diverged_at": coarse.diverged_at}, volume=volume, grid=self.target,
             coarse=coarse, projector_calls=calls, network_calls=network_calls, seconds=watch.seconds,
             intervals={level: ON_FINER[level][0] * interpolated(half_width, base.grid, self.target, 0.0)
                        + ON_FINER[level][1] * change for level, half_width in coarse.intervals.items()},
@@ -251,7 +252,7 @@ class Refined(Delegating):
                 *(interpolated(mask, base.grid, self.target, 0.0)[None] for mask in coarse.masks)]),
             deviation=None if deviation is None else interpolated(deviation, base.grid, self.target, 0.0))
 
-    def _seen(self, xrays: Tensor, projector: Projector, grid: Grid) -> tuple[Tensor, Projector]:
+    def _binned(self, xrays: Tensor, projector: Projector, grid: Grid) -> tuple[Tensor, Projector]:
         """The X-rays as a level sees them, binned to what its voxels can hold, and the projector to them."""
         if grid.same_as(projector.grid):
             return xrays, projector

@@ -31,10 +31,10 @@ in the 90 % interval, before 75 to 92 %. A gain that drifts by 20 %, which they 
 SCATTER_WIDENING = 2.0
 """Factor by which they widen where scatter is subtracted, which shifts HU where a tube's spectrum was taken for it."""
 
-FEW_VIEWS, WIDE_SPREAD, LIMITED_POWER = 6, 0.35, 0.6
+LIMITED_ANGLE_VIEWS, WIDE_SPREAD, LIMITED_POWER = 6, 0.35, 0.6
 """Views up to which, and `angular_spread` from which on, errors are as large as the network says that tells their size;
-and the power of the views over FEW_VIEWS by which more of them come from one line at most. Over 144 scenes of two
-held-out CTs, from 3 to 32 views, what is left of the differences between scenes has a standard deviation of 10 %,
+and the power of the views over LIMITED_ANGLE_VIEWS by which more of them come from one line at most. Over 144 scenes of
+two held-out CTs, from 3 to 32 views, what is left of the differences between scenes has a standard deviation of 10 %,
 otherwise 16 %; with 16 to 32 views from less than 60 degrees errors are 1.6 to 1.9 times as large as it says."""
 
 
@@ -54,9 +54,9 @@ def widening_of(measurement: Measurement, reprojection: Tensor, most_residual: f
 def contradiction_widening(measurement: Measurement) -> float:
     """The factor, 1 or more, by which intervals widen where a part of the X-rays counted as noise because no volume
     explains it, by all views or by the worst; 1 where nothing did."""
-    own = measurement.noise_variance.mean((1, 2)).clamp(min=1e-12)
-    counted = torch.as_tensor(measurement.model_variance).flatten().to(own)
-    ratios = (1 + counted / own).sqrt()
+    noise = measurement.noise_variance.mean((1, 2)).clamp(min=1e-12)
+    counted = torch.as_tensor(measurement.model_variance).flatten().to(noise)
+    ratios = (1 + counted / noise).sqrt()
     return max(float(ratios.log().mean().exp()) ** CONTRADICTION_WIDENING, (float(ratios.max()) / WORST_VIEW) ** 0.5)
 
 
@@ -85,4 +85,4 @@ def limited_angle_factor(projector: Projector) -> float:
     """The factor, 1 or more, by which errors are larger than the network says that tells their size where many views
     come from a limited angle, which it does not see."""
     narrow = max(0.0, 1 - angular_spread(projector) / WIDE_SPREAD)
-    return max(1.0, projector.beam.views / FEW_VIEWS) ** (LIMITED_POWER * narrow)
+    return max(1.0, projector.beam.views / LIMITED_ANGLE_VIEWS) ** (LIMITED_POWER * narrow)

@@ -86,8 +86,8 @@ def own_identity(prior: AnyPrior, given: object) -> dict | None:
     plain attributes and the CRC-32 of its weights; None for one that is read from a file."""
     if isinstance(given, str | Path | MedSynCheckpoint) and not is_class_path(given):
         return None
-    if callable(own := getattr(prior, "identity", None)):
-        return own()
+    if callable(method := getattr(prior, "identity", None)):
+        return method()
     identity, crc = PriorContract.identity(prior), 0  # type: ignore[arg-type]  # which asks for attributes alone
     if not isinstance(prior, nn.Module):
         return identity

@@ -97,12 +97,13 @@ def save_correction(network: CorrectionNetwork, path: str | Path, training: dict
 
 def describe_prior(prior: Prior) -> dict:
     """What a prior is, as plain JSON values: from this and the weights `load_prior` builds it again."""
-    own = prior.text
-    text = None if own is None else {
-        "source": own.source, "length": own.length, "width": own.width, "layers": own.bert.config.num_hidden_layers,
-        "vocabulary": None if own.source else own.vocabulary,
-        **({"padded_to": own.padded_to} if own.padded_to else {}),
-        **({"sentences": own.sentences} if own.sentences else {})}
+    encoder = prior.text
+    text = None if encoder is None else {
+        "source": encoder.source, "length": encoder.length, "width": encoder.width,
+        "layers": encoder.bert.config.num_hidden_layers,
+        "vocabulary": None if encoder.source else encoder.vocabulary,
+        **({"padded_to": encoder.padded_to} if encoder.padded_to else {}),
+        **({"sentences": encoder.sentences} if encoder.sentences else {})}
     return {"format": FORMAT, "stage": "base", "grid": prior.grid.to_dict(),
             "hu_window": [prior.window.low, prior.window.high], "state": STATE[:prior.network.state_channels],
             "sigma_data": prior.sigma_data, "skip_std": prior.skip_std, "schedule": vars(prior.schedule),
@@ -145,7 +146,7 @@ def load_prior(path: str | Path | MedSynCheckpoint = DEFAULT_PRIOR,
     FileNotFoundError when there is no file, ValueError when it is truncated, is no prior, or holds weights that are not
     finite.
     """
-    path = _found(path)
+    path = _resolved(path)
     if isinstance(path, MedSynCheckpoint) or is_medsyn(path):
         return load_medsyn(path, device)
 
@@ -162,7 +163,7 @@ def load_prior(path: str | Path | MedSynCheckpoint = DEFAULT_PRIOR,
 def load_super_resolution(path: str | Path | MedSynCheckpoint,
                           device: str = "cpu") -> SuperResolution | MedSynSuperResolution:
     """The super-resolution stage in a file written by `save_super_resolution`, or MedSyn's; as `load_prior`."""
-    path = _found(path)
+    path = _resolved(path)
     if isinstance(path, MedSynCheckpoint) or is_medsyn(path):
         return load_medsyn_super_resolution(path, device)
     return _loaded(path, ("super_resolution",), build_super_resolution, device)
@@ -196,20 +197,20 @@ def is_refiner(given: object) -> bool:
         return False
 
 
-def _found(path: str | Path | MedSynCheckpoint) -> Path | MedSynCheckpoint:
+def _resolved(path: str | Path | MedSynCheckpoint) -> Path | MedSynCheckpoint:
     return path if isinstance(path, MedSynCheckpoint) else own_or_shipped(path)
 
 
 def fingerprint(path: str | Path | MedSynCheckpoint) -> int:
     """CRC-32 of the file that `load_prior` or `load_super_resolution` reads: two priors with different ones are not the
     same."""
-    return file_crc32(as_checkpoint(_found(path)).file)
+    return file_crc32(as_checkpoint(_resolved(path)).file)
 
 
 def file_read(path: str | Path | MedSynCheckpoint) -> str | None:
     """Of a folder of MedSyn's, the file that is read and, in brackets, which weights it holds by its name; None for a
     file."""
-    given = as_checkpoint(_found(path))
+    given = as_checkpoint(_resolved(path))
     if Path(given.path).is_file():
         return None
     file = given.file

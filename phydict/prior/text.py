@@ -127,14 +127,14 @@ class TextEncoder(nn.Module):
             return
         self._checked.update(new)
         tokens = self.tokenizer(new, add_special_tokens=False, verbose=False)["input_ids"]
-        sizes, read, unit = [len(own) + 2 for own in tokens], self.padded_to or self.length, "tokens"
+        sizes, read, unit = [len(ids) + 2 for ids in tokens], self.padded_to or self.length, "tokens"
         if self.sentences:
             sizes, read, unit = [len(split_sentences(report)) for report in new], self.sentences, "sentences"
         excess = [size - read for size in sizes if size > read]
         if excess:
             warn(f"{len(excess)} of {len(new)} reports are longer than the {read} {unit} that the text "
                  f"encoder reads: up to {max(excess)} {unit} at their end are left out")
-        unknown = [sum(token == self.tokenizer.unk_token_id for token in own) / max(len(own), 1) for own in tokens]
+        unknown = [sum(token == self.tokenizer.unk_token_id for token in ids) / max(len(ids), 1) for ids in tokens]
         foreign = [share for share in unknown if share > FOREIGN]
         if foreign:
             warn(f"{len(foreign)} of {len(new)} reports are in words that the text encoder does not know, up "
@@ -143,15 +143,15 @@ class TextEncoder(nn.Module):
 
     def read_sentences(self, sentences: list[str]) -> Tensor:
         """Sentences -> the state of each (N, D). Those of like length are read together, padded to the longest."""
-        tokens = [torch.tensor(own) for own in
+        tokens = [torch.tensor(sentence) for sentence in
                   self.tokenizer(sentences, truncation=True, max_length=self.length)["input_ids"]]
         order = sorted(range(len(tokens)), key=lambda place: len(tokens[place]))
         states = []
         for first in range(0, len(order), TOGETHER):
-            own = [tokens[place] for place in order[first:first + TOGETHER]]
-            ids = pad_sequence(own, batch_first=True, padding_value=self.tokenizer.pad_token_id)
-            seen = torch.arange(ids.shape[1]) < torch.tensor([[len(sentence)] for sentence in own])
-            states.append(self.bert(input_ids=ids.to(self.bert.device), attention_mask=seen.to(
+            batch = [tokens[place] for place in order[first:first + TOGETHER]]
+            ids = pad_sequence(batch, batch_first=True, padding_value=self.tokenizer.pad_token_id)
+            mask = torch.arange(ids.shape[1]) < torch.tensor([[len(sentence)] for sentence in batch])
+            states.append(self.bert(input_ids=ids.to(self.bert.device), attention_mask=mask.to(
                 self.bert.device, torch.long)).last_hidden_state[:, 0])
         return torch.cat(states)[torch.tensor(order, device=self.bert.device).argsort()]
 
@@ -161,9 +161,9 @@ class TextEncoder(nn.Module):
     def _read_by_sentence(self, reports: list[str], most: int) -> tuple[Tensor, Tensor]:
         split = [split_sentences(report)[:most] for report in reports]
         states = torch.zeros(len(reports), most, self.width, device=self.bert.device, dtype=self.bert.dtype)
-        mask = torch.tensor([[place < len(own) for place in range(most)] for own in split])
+        mask = torch.tensor([[place < len(sentences) for place in range(most)] for sentences in split])
         if mask.any():
-            states[mask] = self.read_sentences([sentence for own in split for sentence in own]).to(states)
+            states[mask] = self.read_sentences([sentence for sentences in split for sentence in sentences]).to(states)
         return states, mask.to(states.device)
 
     def _read_as_a_whole(self, reports: list[str]) -> tuple[Tensor, Tensor]:
@@ -176,8 +176,8 @@ class TextEncoder(nn.Module):
         mask = tokens["attention_mask"].to(self.bert.device)
         states = self.bert(
             input_ids=tokens["input_ids"].to(self.bert.device), attention_mask=mask).last_hidden_state
-        seen = torch.ones_like(mask) if self.padded_to else mask
-        return states[:, :self.length], seen[:, :self.length].bool()
+        attended = torch.ones_like(mask) if self.padded_to else mask
+        return states[:, :self.length], attended[:, :self.length].bool()
 
     def _read_once(self, report: str) -> tuple[Tensor, Tensor]:
         """What `_read` says of one report, without its batch axis: from the cache, or put there."""

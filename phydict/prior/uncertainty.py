@@ -55,14 +55,14 @@ class Uncertainty(nn.Module):
                          (2,) * (len(channels) - 1), num_res_units=2, act="swish",
                          norm=None)  # type: ignore[arg-type]  # which MONAI takes for no norm
         speed_up(self)
-        own = -torch.log1p(-torch.tensor(LEVELS))
-        self.register_buffer("quantiles", own.expand(len(TISSUES), COVERAGES, -1).clone())
+        quantiles = -torch.log1p(-torch.tensor(LEVELS))
+        self.register_buffer("quantiles", quantiles.expand(len(TISSUES), COVERAGES, -1).clone())
         self.register_buffer("most_residual", torch.tensor(UNBOUNDED))
 
     def forward(self, z: Tensor, evidence: Tensor) -> Tensor:
         """log b (B, 1, X, Y, Z), b in the prior's range."""
-        slopes = [torch.gradient(z[:, :1], dim=d)[0].abs() for d in (2, 3, 4)]
-        steepness = slopes[0] + slopes[1] + slopes[2]
+        gradients = [torch.gradient(z[:, :1], dim=d)[0].abs() for d in (2, 3, 4)]
+        steepness = gradients[0] + gradients[1] + gradients[2]
         sizes = evidence[:, 2:4].abs()
         return self.unet(torch.cat([z, evidence, 2 * steepness, sizes], 1)).float().sub(3.5).clamp(*LOG_SCALE)
 
@@ -83,8 +83,8 @@ class Uncertainty(nn.Module):
             of_tissue = ratios[tissues == t]
             shared = _quantiles(of_tissue if len(of_tissue) >= FEWEST else ratios)
             for n in range(COVERAGES):
-                own = ratios[(tissues == t) & (coverages == n)]
-                self.quantiles[t, n] = _quantiles(own) if len(own) >= FEWEST else shared
+                of_both = ratios[(tissues == t) & (coverages == n)]
+                self.quantiles[t, n] = _quantiles(of_both) if len(of_both) >= FEWEST else shared
         self.most_residual.copy_(residuals.quantile(ORDINARY))
 
 

@@ -47,8 +47,8 @@ class RivalAnswer(Baseline):
                     seed: int = 0, on_step: Callable[[], None] = lambda: None,
                     outside: Tensor | None = None) -> Reconstruction:
         seeded = replace(self, seed=seed)
-        found = super(RivalAnswer, seeded).reconstruct(xrays, projector, report, display, seed, on_step, outside)
-        return replace(found, network_calls=self.steps(), precision=precision_name(self.precision, xrays))
+        result = super(RivalAnswer, seeded).reconstruct(xrays, projector, report, display, seed, on_step, outside)
+        return replace(result, network_calls=self.steps(), precision=precision_name(self.precision, xrays))
 
 
 @dataclass(frozen=True)

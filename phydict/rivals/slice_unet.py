@@ -30,11 +30,11 @@ class SliceBlock(nn.Module):
         self.first = nn.Conv3d(channels, out, (3, 3, 1), padding=(1, 1, 0))
         self.second = nn.Conv3d(out, out, (3, 3, 1), padding=(1, 1, 0))
         self.norms = nn.ModuleList(nn.GroupNorm(GROUPS, n) for n in (channels, out))
-        self.told = nn.Linear(condition, 2 * out)
+        self.modulation = nn.Linear(condition, 2 * out)
         self.past = nn.Conv3d(channels, out, 1) if channels != out else nn.Identity()
 
     def forward(self, x: Tensor, condition: Tensor) -> Tensor:
-        scale, shift = self.told(silu(condition))[..., None, None, None].chunk(2, 1)
+        scale, shift = self.modulation(silu(condition))[..., None, None, None].chunk(2, 1)
         h = self.norms[1](self.first(silu(self.norms[0](x)))) * (1 + scale) + shift
         return self.past(x) + self.second(silu(h))
 

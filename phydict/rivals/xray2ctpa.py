@@ -38,8 +38,8 @@ class XrayEmbedding(nn.Module):
         h = y.flatten(0, 1)[:, None]
         for down, block in zip(self.down, self.blocks):
             h = avg_pool2d(block(down(h)), 2, ceil_mode=True)
-        seen = self.look(nn.functional.adaptive_avg_pool2d(h, 4).flatten(1)).unflatten(0, y.shape[:2])
-        return self.leave(seen + self.place(directions)).mean(1)
+        embedding = self.look(nn.functional.adaptive_avg_pool2d(h, 4).flatten(1)).unflatten(0, y.shape[:2])
+        return self.leave(embedding + self.place(directions)).mean(1)
 
 
 class XrayToCTPANetwork(RivalNetwork):

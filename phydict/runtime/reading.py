@@ -18,6 +18,9 @@ MOST_TEXT = 2**24
 MOST_SQUEEZED = 1100
 """Times by which a file shrinks at most when it is compressed: deflate, the best of those that are read, 1032."""
 
+CONTROL_GROUPS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
+"""Where Linux says how much memory a container has, as a number of bytes or "max"."""
+
 MAX_MESSAGE = 800
 """Characters of a sentence about what cannot be read; it may quote a file."""
 
@@ -133,8 +136,15 @@ def check_held(promised: int, path: Path, what: str, times: int = MOST_SQUEEZED)
 
 
 def check_memory(needed: int, what: str, advice: str) -> None:
-    """Raises ValueError, with both numbers, where `what` takes more bytes than this machine has memory."""
-    there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    """Raises ValueError, with both numbers, where `what` takes more bytes than this machine, or the container that this
+    runs in, has memory."""
+    there = min([os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"), *container_limits()])
     if needed > there:
         raise ValueError(f"{what} would take {needed / 2**30:,.1f} GiB of memory, but this machine has "
                          f"{there / 2**30:,.1f}; {advice}")
+
+
+def container_limits() -> list[int]:
+    """Bytes of memory that control groups of either version allow, where they say so."""
+    texts = [path.read_text().strip() for path in CONTROL_GROUPS if os.access(path, os.R_OK)]
+    return [int(text) for text in texts if text.isdigit()]

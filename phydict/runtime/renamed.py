@@ -32,7 +32,7 @@ GROUPS = {
 """Groups of settings that once lay beside them, model.guidance as model.sampling.guidance."""
 
 PLACES = {
-    "model.voxels": "model.grid (of infer.py) or model.cube.voxels (of train.py)",
+    "model.calibrate": "calibrate", "model.voxels": "model.grid (of infer.py) or model.cube.voxels (of train.py)",
     "model.side": "model.grid.side (of infer.py) or model.cube.side (of train.py)",
     "model.guide_fine": "model.super_resolution.guided", "model.sr_guided": "model.super_resolution.guided",
     "model.fine_sampler": "model.super_resolution.sampler", "model.sr_sampler": "model.super_resolution.sampler",

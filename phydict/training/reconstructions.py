@@ -71,13 +71,13 @@ class _Recording:
     """Keeps what a network sees at each call; without one nothing is corrected."""
 
     def __init__(self, network: CorrectionNetwork | None):
-        self.network, self.seen = network, list[Tensor]()
+        self.network, self.inputs = network, list[Tensor]()
 
     def suits(self, grid: Grid, window: HUWindow) -> bool:
         return True
 
     def corrected(self, z: Tensor, evidence: Tensor) -> Tensor:
-        self.seen.append(torch.cat([z, evidence], 1))
+        self.inputs.append(torch.cat([z, evidence], 1))
         return self.network.corrected(z, evidence) if self.network else z
 
 
@@ -112,7 +112,7 @@ class Reconstructions(Dataset):
         record = _Recording(load_correction(self.network) if self.network else None)
         refined = Refined(Posterior(refiner, Unrolled()), self.grid, Refinement(calls=2 if self.network else 1), record)
         refined.reconstruct(*seen_by(self.grid, y, projector.beam, False))
-        return torch.cat([*record.seen, avg_pool3d(ct, FINER)], 1)[0]
+        return torch.cat([*record.inputs, avg_pool3d(ct, FINER)], 1)[0]
 
 
 class ReconstructionCrops(Draws):

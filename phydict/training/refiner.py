@@ -61,15 +61,15 @@ class RefinerTraining(StageTraining):
                  window: tuple[float, float] = (-1000.0, 1000.0), optimisation: Optimisation = Optimisation(),
                  validation: RefinerValidation = RefinerValidation(), body_weight: float = 2.0,
                  mask_weight: float = 0.1, initial: str = str(DEFAULT_PRIOR), seed: int = 0):
-        found = load_prior(initial)
-        if not isinstance(found, Prior | Refiner):
+        loaded = load_prior(initial)
+        if not isinstance(loaded, Prior | Refiner):
             raise ValueError(f"a refiner begins with a prior of phydict's own, but {initial} is MedSyn's: give another "
                              "model.initial")
-        if not found.grid.same_as(cube.grid()) or found.window != HUWindow(*window):
+        if not loaded.grid.same_as(cube.grid()) or loaded.window != HUWindow(*window):
             raise ValueError(f"the prior {initial} has another grid or HU window than this training: "
                              "set model.cube and model.window to its own")
-        refiner = found if isinstance(found, Refiner) else Refiner(
-            found, _mean(found), first=deepcopy(found) if found.reads_text else None)
+        refiner = loaded if isinstance(loaded, Refiner) else Refiner(
+            loaded, _mean(loaded), first=deepcopy(loaded) if loaded.reads_text else None)
         refiner.uncertainty = None  # of what it was
         super().__init__(refiner.train().requires_grad_(True), optimisation, seed)
         if refiner.reader.load_text is not None:
@@ -132,11 +132,11 @@ def log_scores(module: StageTraining, batch: dict, index: int, views: Sequence[i
     scores = []
     with torch.autocast(module.device.type, enabled=False):
         for count in views:
-            found = reconstruction_scores(module.prior, batch["volume"], count, index, method, beam)
-            module.log(f"val/psnr_{count}", found["psnr"], sync_dist=True, batch_size=1)
-            scores.append(found)
+            view_scores = reconstruction_scores(module.prior, batch["volume"], count, index, method, beam)
+            module.log(f"val/psnr_{count}", view_scores["psnr"], sync_dist=True, batch_size=1)
+            scores.append(view_scores)
     for name in ("psnr", "ssim"):
-        mean = float(np.mean([found[name] for found in scores]))
+        mean = float(np.mean([view_scores[name] for view_scores in scores]))
         module.log(f"val/{name}", mean, prog_bar=name == "psnr", sync_dist=True, batch_size=1)
     module.log("samples", float(module.samples), rank_zero_only=True, batch_size=1)
 

@@ -81,8 +81,8 @@ class Targets:
         """Each kind's maps begin as the principal components of its examples' extents, for sentences to be mixed of:
         from random maps, places are learnt after kinds, and hardly in the same steps."""
         for kind in range(len(KINDS)):
-            own = self.extents[[place for place, of in enumerate(self.kinds) if of == kind]]
-            components = torch.linalg.svd(own, full_matrices=False).Vh[:kind_map.maps.shape[1]]
+            kind_extents = self.extents[[place for place, of in enumerate(self.kinds) if of == kind]]
+            components = torch.linalg.svd(kind_extents, full_matrices=False).Vh[:kind_map.maps.shape[1]]
             kind_map.maps[kind] = 0
             kind_map.maps[kind, :len(components)] = components
 

@@ -51,10 +51,10 @@ class RollOutSettings:
 class _Recording(BoundRefiner):
     """Keeps what a refiner is given at each call."""
 
-    seen: list[Tensor] = field(default_factory=list)
+    inputs: list[Tensor] = field(default_factory=list)
 
     def refine(self, x: Tensor, t: float, evidence: Tensor) -> Tensor:
-        self.seen.extend([x, evidence])
+        self.inputs.extend([x, evidence])
         return super().refine(x, t, evidence)
 
 
@@ -91,7 +91,7 @@ class RollOuts(Dataset):
                                                    refiner.window, case.get("fine"))
         for _ in self.method.estimates(recording, measurement):
             pass
-        return torch.cat([*recording.seen, case["volume"], masks], 1)[0]
+        return torch.cat([*recording.inputs, case["volume"], masks], 1)[0]
 
 
 class Calls(Draws):
@@ -105,9 +105,9 @@ class Calls(Draws):
     def item(self, drawn: np.ndarray, rng: np.random.Generator) -> dict:
         width = self.channels + EVIDENCE_CHANNELS
         call = int(rng.integers(len(drawn) // width))
-        seen = torch.from_numpy(drawn[call * width:(call + 1) * width].astype(np.float32))
+        inputs = torch.from_numpy(drawn[call * width:(call + 1) * width].astype(np.float32))
         truth = torch.from_numpy(drawn[-self.channels:].astype(np.float32))
-        return {"state": seen[:self.channels], "evidence": seen[self.channels:], "call": call, "volume": truth[:1],
+        return {"state": inputs[:self.channels], "evidence": inputs[self.channels:], "call": call, "volume": truth[:1],
                 "masks": truth[1:]}
 
 

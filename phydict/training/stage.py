@@ -102,8 +102,8 @@ class StageTraining(lightning.LightningModule, ABC):
 
     def on_save_checkpoint(self, checkpoint: dict) -> None:
         self._check_weights(checkpoint["state_dict"], checkpoint.get("current_model_state", {}))
-        seen = {"steps": self.trainer.global_step, "samples": self.samples}
-        checkpoint["phydict"] = self._describe() | {"training": seen}
+        progress = {"steps": self.trainer.global_step, "samples": self.samples}
+        checkpoint["phydict"] = self._describe() | {"training": progress}
 
     def on_load_checkpoint(self, checkpoint: dict) -> None:
         resumed, current = {"stage": "base"} | checkpoint["phydict"], self._describe()

@@ -113,8 +113,8 @@ class UncertaintyTraining(StageTraining):
 
     def on_validation_epoch_end(self) -> None:
         if self.held_out:
-            found = [torch.cat(parts) for parts in zip(*self.held_out)]
-            everywhere = [self.all_gather(part).flatten() for part in found]  # type: ignore[union-attr]
+            columns = [torch.cat(parts) for parts in zip(*self.held_out)]
+            everywhere = [self.all_gather(part).flatten() for part in columns]  # type: ignore[union-attr]
             self.prior.uncertainty.calibrate(*everywhere)
 
     def _describe(self) -> dict:

@@ -64,14 +64,14 @@ def interpolated(volume: Tensor, grid: Grid, onto: Grid, fill: float) -> Tensor:
     its box."""
     check_axes(grid, onto)
     first, step = grid.index(onto.affine[:3, 3]), np.divide(onto.spacing, grid.spacing)
-    found = volume - fill
+    result = volume - fill
     for axis, n in enumerate(grid.shape):
         places = torch.as_tensor(first[axis] + step[axis] * np.arange(onto.shape[axis]))
         inside = (places >= -0.5 - SLACK) & (places <= n - 0.5 + SLACK)
         distance = (places.clamp(0, n - 1)[:, None] - torch.arange(n)).abs()
         weights = ((1 - distance).clamp(min=0) * inside[:, None]).to(volume)
-        found = torch.tensordot(weights, found.movedim(axis, 0), 1).movedim(0, axis)
-    return found.contiguous() + fill
+        result = torch.tensordot(weights, result.movedim(axis, 0), 1).movedim(0, axis)
+    return result.contiguous() + fill
 
 
 def outside_projection(mu: Tensor, grid: Grid, projector: Projector) -> Tensor:

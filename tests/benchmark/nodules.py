@@ -1,6 +1,6 @@
 """Which nodules a user may hope to see: the share of their contrast that a reconstruction shows.
 
-    python tests/benchmark/nodules.py <folder of CTs> [--views 4 8 16] [--methods phydict_learned=64 ...]
+    python tests/benchmark/nodules.py <folder of CTs> [--views 2 4 8 16] [--methods phydict_learned=64 ...]
 
 Into the lungs of a CT of 256^3 voxels a ball of each of SIZES is put, 50 mm or more apart, all denser than the lung by
 one of CONTRASTS. Each method, on its voxels, reconstructs K ideal views with and without them, of the same noise.
@@ -22,6 +22,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from phydict import Grid, HUWindow, Projector, reconstruct
+from phydict.baselines import FISTATV
 from phydict.datasets import find_cts, prepare_ct
 from phydict.evaluation import read_csv, write_csv
 from phydict.evaluation.sharpness import nodule, recovered_contrast
@@ -33,20 +34,22 @@ OUT = Path(__file__).with_suffix(".csv")
 WINDOW, FINE = HUWindow(), Grid.cube(256)
 SIZES, CONTRASTS = (6.0, 8.0, 10.0, 14.0, 20.0), (100.0, 300.0, 800.0)
 METHODS = ("phydict_learned=128", "phydict_learned=64", "tv=64")
+"""Method and voxels; the weight of total variation grows with their number along an axis, from its default on 64."""
 
 
 def reconstructed(hu: Tensor, views: int, method: str, seed: int) -> tuple[Tensor, Grid]:
     """HU (X, Y, Z) by a method, named with its voxels, of ideal views of HU on FINE, and their grid."""
     name, voxels = method.split("=")
+    ready = FISTATV(weight=int(voxels) / 64 * FISTATV.weight) if name == "tv" else name
     beam, grid = benchmark_orbit(FINE, views), Grid.cube(int(voxels))
     xrays = Ideal()(Projector(FINE, beam, full_detector=True), WINDOW.to_mu(WINDOW.to_range(hu))[None, None], seed)[0]
-    return reconstruct(xrays, beam, method=name, grid=grid).volume, grid
+    return reconstruct(xrays, beam, method=ready, grid=grid).volume, grid
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("cts", type=Path)
-    parser.add_argument("--views", type=int, nargs="+", default=[4, 8, 16])
+    parser.add_argument("--views", type=int, nargs="+", default=[2, 4, 8, 16])
     parser.add_argument("--methods", nargs="+", default=METHODS)
     given = parser.parse_args()
     rows = read_csv(OUT)

@@ -222,6 +222,23 @@ def test_a_missing_volume_is_said_in_a_sentence(shown, tmp_path):
     page.wait_for_function("document.getElementById('state').textContent.includes('cannot be used, since it is dama')")
 
 
+def test_a_projection_from_behind_is_the_mirrored_one_from_the_front_and_those_between_are_others(shown):
+    page = shown("#sirt%2Fanna")
+    turning = "canvas[aria-label^='Projection']"
+
+    def at(angle: int) -> np.ndarray:
+        page.fill("[aria-label='Angle of the projection']", str(angle))
+        grey = page.eval_on_selector(turning, """canvas => [canvas.width, ...canvas.getContext('2d').getImageData(
+            0, 0, canvas.width, canvas.height).data.filter((_, place) => place % 4 === 0)]""")
+        return np.array(grey[1:]).reshape(-1, grey[0])
+
+    for pressed in ("false", "true"):
+        front, side, back = at(0), at(90), at(180)
+        assert front.std() > 10 and np.abs(front - back[:, ::-1]).mean() < 2 < 10 < np.abs(front - side).mean()
+        assert page.get_attribute("button:text-is('mean')", "aria-pressed") == pressed
+        page.click("button:text-is('mean')")
+
+
 def test_light_and_dark_follow_the_system(shown):
     backs = [shown(scheme=scheme).eval_on_selector("body", "body => getComputedStyle(body).backgroundColor")
              for scheme in ("light", "dark")]

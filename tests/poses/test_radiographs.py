@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -71,10 +72,12 @@ def test_intervals_widen_where_the_poses_of_few_views_were_searched_and_nowhere_
     def widening(views, **uncertain):
         beam = ConeBeam.orbit(views, 1800, 1400, (48, 48), 10.0)
         found = FoundPoses(beam, Uncertain(**uncertain).deviations, np.zeros((views, 10)), np.ones((views, 10)),
-                           (0.1, 0.1), np.zeros((2, views)), 1.0)
+                           (0.1, 0.1), np.zeros((2, views)), np.zeros((2, views)), 1.0)
         plain = Reconstruction(torch.zeros(2, 2, 2), Grid.cube(2), "any", 0, 0.0, [0.0] * views, {}, torch.zeros(1),
                                torch.zeros(1), intervals={0.9: torch.full((2, 2, 2), 100.0)}, interval_widening=2.0)
-        result = found.added_to(plain)
+        result, widest = found.added_to(plain), replace(plain, intervals={0.9: torch.full((2, 2, 2), 1990.0)})
+        assert found.added_to(widest).intervals[0.9].max() <= 2000  # HU, the whole window
+        assert found.added_to(replace(plain, intervals={})).interval_widening == plain.interval_widening
         return float(result.intervals[0.9].max()) / 100, result.interval_widening / 2
 
     assert widening(2, rotation_degrees=2) == (FEW_WIDENING, FEW_WIDENING)

@@ -60,13 +60,13 @@ def cut_field(hu: torch.Tensor, masks: torch.Tensor, grid: Grid, diameter: float
     """
     x, y = ((torch.arange(n) - (n - 1) / 2) * s - c for n, s, c in zip(grid.shape, grid.spacing, centre))
     edge = (torch.hypot(x[:, None], y) - diameter / 2) / float(np.mean(grid.spacing[:2]))
-    seen = (0.5 - edge).clamp(0, 1)[..., None]
-    return AIR + seen * (hu - AIR), masks * seen
+    inside = (0.5 - edge).clamp(0, 1)[..., None]
+    return AIR + inside * (hu - AIR), masks * inside
 
 
 def cut_ends(hu: torch.Tensor, masks: torch.Tensor, grid: Grid, low: float,
              high: float) -> tuple[torch.Tensor, torch.Tensor]:
     """HU and masks of a scan from z = `low` to `high`, mm from the grid's centre: air, and masks of 0, beyond."""
     z = (torch.arange(grid.shape[2]) - (grid.shape[2] - 1) / 2) * grid.spacing[2]
-    seen = (0.5 + torch.minimum(z - low, high - z) / grid.spacing[2]).clamp(0, 1)
-    return AIR + seen * (hu - AIR), masks * seen
+    inside = (0.5 + torch.minimum(z - low, high - z) / grid.spacing[2]).clamp(0, 1)
+    return AIR + inside * (hu - AIR), masks * inside

@@ -235,9 +235,9 @@ def _scanner(canvas: Canvas, masks: np.ndarray) -> None:
         canvas.hu = AIR + unresolved * (above * scipy.special.ndtr(above) + density)
     world = [axis + offset for axis, offset in zip((canvas.axes[0], canvas.straight_y, canvas.axes[2]), t.offset)]
     across = np.hypot(world[0], world[1]) if t.round_field else np.maximum(np.abs(world[0]), np.abs(world[1]))
-    seen = canvas.soft(across - t.field / 2) * canvas.soft(np.maximum(t.scan[0] - world[2], world[2] - t.scan[1]))
-    canvas.hu = np.maximum(AIR + seen * (canvas.hu - AIR), AIR).astype(np.float32)
-    masks *= seen
+    scanned = canvas.soft(across - t.field / 2) * canvas.soft(np.maximum(t.scan[0] - world[2], world[2] - t.scan[1]))
+    canvas.hu = np.maximum(AIR + scanned * (canvas.hu - AIR), AIR).astype(np.float32)
+    masks *= scanned
 
 
 def pathology_region(thorax: Thorax, grid: Grid, threshold: float = 30.0) -> np.ndarray:

@@ -277,8 +277,8 @@ def ellipsoid(x, y, z, centre, axes, half):
     parts = [(axis[0] * (x - centre[0]) + axis[1] * (y - centre[1]) + axis[2] * (z - centre[2])) / length
              for axis, length in zip(axes, half)]
     size = np.sqrt(sum(part**2 for part in parts))
-    slope = np.sqrt(sum((part / length) ** 2 for part, length in zip(parts, half)))
-    return np.where(size > 1e-4, size * (size - 1) / np.maximum(slope, 1e-6), -np.min(half))
+    gradient = np.sqrt(sum((part / length) ** 2 for part, length in zip(parts, half)))
+    return np.where(size > 1e-4, size * (size - 1) / np.maximum(gradient, 1e-6), -np.min(half))
 
 
 def smooth_max(a, b, width: float):

@@ -17,7 +17,7 @@ from phydict.units import AIR, HUWindow
 BACK_MM = 60.0
 """mm to either side of the middle in which the back's place is measured."""
 
-LEAST_SEEN = 0.9
+LEAST_SCANNED = 0.9
 """Share of a slice's middle that must come from slices that were scanned, or the scan ends before it."""
 
 
@@ -49,10 +49,10 @@ def carry(case: Case, points: Tensor, grid: Grid, window: HUWindow, lungs: float
     moved = AIR + (moved - AIR) * torch.exp(-lungs * aerated)
     shift = _back(moved[0], grid) - _back(body[0], grid)
     moved = torch.maximum(moved, _shifted(table, shift, grid))
-    seen = _seen(hu, points, grid)
-    moved = torch.where(seen, moved, AIR)
+    in_scan = _scanned_slices(hu, points, grid)
+    moved = torch.where(in_scan, moved, AIR)
     return lacking(case, "affine", "centred_on") | {
-        "volume": window.to_range(moved), "masks": masks.clamp(0, 1) * seen}
+        "volume": window.to_range(moved), "masks": masks.clamp(0, 1) * in_scan}
 
 
 def _cubic(image: np.ndarray, points: Tensor) -> np.ndarray:
@@ -76,8 +76,8 @@ def _shifted(table: Tensor, voxels: float, grid: Grid) -> Tensor:
     return AIR + sample(table - AIR, points, "zeros")
 
 
-def _seen(hu: Tensor, points: Tensor, grid: Grid) -> Tensor:
+def _scanned_slices(hu: Tensor, points: Tensor, grid: Grid) -> Tensor:
     """Which slices (1, 1, Z) of the new CT come from slices that were scanned, judged by the middle of each."""
     from_scan = sample(scanned(hu).expand_as(hu).contiguous(), points, "zeros")[0]
     quarter = [slice(n // 4, n - n // 4) for n in grid.shape[:2]]
-    return (from_scan[tuple(quarter)] > 0.5).float().mean((0, 1)).gt(LEAST_SEEN)[None, None]
+    return (from_scan[tuple(quarter)] > 0.5).float().mean((0, 1)).gt(LEAST_SCANNED)[None, None]

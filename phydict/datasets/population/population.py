@@ -51,9 +51,9 @@ class Population:
     def expansions(self) -> dict[str, Tensor]:
         """For each organ the velocity (3, x, y, z) that multiplies its volume by e."""
         case = self.cases[self.template]
-        found = organs(self.window.to_hu(case["volume"][0]), case["masks"], self.grid)
+        shares = organs(self.window.to_hu(case["volume"][0]), case["masks"], self.grid)
         lattice = self.velocities.shape[2:]
-        return {name: expansion(resize(found[name][None], lattice)[0], self.grid.extent, PULL[name])
+        return {name: expansion(resize(shares[name][None], lattice)[0], self.grid.extent, PULL[name])
                 for name in ORGANS}
 
     def velocity(self, anatomy: Anatomy) -> Tensor:

@@ -84,11 +84,11 @@ def register(fixed: Tensor, moving: Tensor) -> Registered:
         for _ in range(steps):
             velocity = smooth(free, WIDTH)
             moved = sample(m, start + resize(flow(velocity), shape))
-            seen = f[3:] * moved[3:]
-            error = ((moved[:3] - f[:3]) ** 2 * weights * seen).sum() + 1e-9
-            alike = (correlation(moved[None, :1], f[None, :1])[0] * seen).sum()
+            coverage = f[3:] * moved[3:]
+            error = ((moved[:3] - f[:3]) ** 2 * weights * coverage).sum() + 1e-9
+            alike = (correlation(moved[None, :1], f[None, :1])[0] * coverage).sum()
             bent = sum((velocity.diff(dim=a + 1) ** 2).mean() * n**2 for a, n in enumerate(lattice))
-            loss = (10 * error + 0.5 * alike) / seen.sum().clamp(min=1) + BENDING * bent
+            loss = (10 * error + 0.5 * alike) / coverage.sum().clamp(min=1) + BENDING * bent
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()

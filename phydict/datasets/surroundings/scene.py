@@ -33,9 +33,9 @@ class Scene:
         slices = np.flatnonzero(body.any((0, 1)))
         self.slices = slice(int(slices[0]), int(slices[-1]) + 1)
         self.low, self.high = (self.axes[2][slices[i]] + d * grid.spacing[2] / 2 for i, d in ((0, -1), (-1, 1)))
-        seen = np.ones(grid.shape[:2]) if field is None else self.soft(np.hypot(
+        in_field = np.ones(grid.shape[:2]) if field is None else self.soft(np.hypot(
             self.axes[0][:, None] - self.middle[0], self.axes[1] - self.middle[1]) - field / 2)
-        self.seen = (seen[..., None] * ~body).astype(np.float32)
+        self.free = (in_field[..., None] * ~body).astype(np.float32)
 
     @cached_property
     def middle(self) -> tuple[float, float]:
@@ -77,7 +77,7 @@ class Scene:
         """Add matter of `density` (water is 1), averaged over each voxel of `box`, to the share of it that is free."""
         hu, span = self.hu[box], np.zeros((1, 1, self.grid.shape[2]), np.float32)
         span[..., self.slices] = 1
-        hu += 1000 * np.clip(-hu / 1000, 0, 1) * self.seen[box] * span[:, :, box[2]] * density
+        hu += 1000 * np.clip(-hu / 1000, 0, 1) * self.free[box] * span[:, :, box[2]] * density
 
     def add_tubes(self, tubes: Tubes) -> None:
         """Add tubes given in mm from the grid's centre."""

@@ -19,6 +19,7 @@ from phydict.posterior.samplers.sampler import Sampler
 from phydict.posterior.samplers.split_gibbs import SplitGibbs
 from phydict.posterior.scatter import with_scatter
 from phydict.prior import DEFAULT_REFINER, BoundRefiner
+from phydict.runtime.warning import warn
 
 MOST_SMOOTHING = 10.0
 """Most by which model error raises the weight of total variation."""
@@ -33,10 +34,10 @@ it, and does not count against them: with one view flipped 0.25 to 0.5. Both of 
 
 UNLIKE_FINER = 2.5
 """By how many times a view may miss the volume at hand more with what finer voxels add to it: 1.3 to 2.0 times of
-X-rays made on finer voxels; of those made on the grid, in a tomosynthesis, 1.9 to 3.1 times, since sharp edges along
+X-rays made on finer voxels; of those made on the grid, in a tomosynthesis, 1.8 to 3.0 times, since sharp edges along
 its rays look like finer voxels. Of two CTs that evaluate nothing."""
 
-FEW_VIEWS = 8
+FIRST_STEP_VIEWS = 8
 """Views beyond which the first step, of bounded length, leaves more of each, as the root of their number: on five
 CTs 0.26 to 0.36 voxels of 8 polychromatic views at most and 0.3 to 0.42 of 16, but 1.3 to 1.5 of 8 in wrong poses."""
 
@@ -73,8 +74,8 @@ class Unrolled(Sampler):
         final_likelihood: the last step towards the X-rays
         subgrid: the step on finer voxels; none: what the grid cannot hold is left in the X-rays
         contradiction: root mean square error of a view's line integrals beyond its noise, from which on it counts as
-            noise, in those of one voxel of water against air, of more than FEW_VIEWS views in proportion to the root of
-            their number; none: it never does
+            noise, in those of one voxel of water against air, of more than FIRST_STEP_VIEWS views in proportion to the
+            root of their number; none: it never does
         chests_only: whether one material in air is left to a method without a network (`Posterior.otherwise`)
         metal: how what is denser than the prior's window is sought; none: it is not
         first: how the prior that a refiner begins with is sampled, in one pass (`SplitGibbs.one_pass`); none: it is not
@@ -140,9 +141,9 @@ class Unrolled(Sampler):
         on_step()
         for n, t in enumerate(times):
             channels = evidence(z[:, :1], before[:, :1], start[:, :1])
-            seen = measurement.last_projection
-            if n == int(measurement.scatter_enabled) and self.contradiction is not None and seen is not None:
-                self._check_views_fit(measurement, seen, self.contradiction)
+            projection = measurement.last_projection
+            if n == int(measurement.scatter_enabled) and self.contradiction is not None and projection is not None:
+                self._check_views_fit(measurement, projection, self.contradiction)
             signal = float(refiner.schedule.scales(t)[0])
             x0 = refiner.refine(signal * z, t, channels)
             yield x0
@@ -164,11 +165,11 @@ class Unrolled(Sampler):
         yield z
 
     @staticmethod
-    def _check_views_fit(measurement: Measurement, seen: Tensor, contradiction: float) -> None:
-        """Counts as noise of each view what projections `seen` (1, K, V, U) miss of it too much to be explained."""
+    def _check_views_fit(measurement: Measurement, projection: Tensor, contradiction: float) -> None:
+        """Counts as noise of each view what a `projection` (1, K, V, U) misses of it too much to be explained."""
         voxel = measurement.mu_water * max(measurement.projector.grid.spacing)
-        usual = contradiction * voxel * max(1.0, measurement.projector.beam.views / FEW_VIEWS) ** 0.5
-        errors = measurement.view_errors(seen)
+        usual = contradiction * voxel * max(1.0, measurement.projector.beam.views / FIRST_STEP_VIEWS) ** 0.5
+        errors = measurement.view_errors(projection)
         like_others = (OUTLIER * errors.median()).clamp(usual / 2, usual)
         excess = errors.square() - torch.maximum(like_others, SHARED * errors.max()).square()
         if (excess > 0).any():
@@ -192,8 +193,8 @@ class Unrolled(Sampler):
         if not (measurement.normalised_error(projection, modelled=True) > 1).any():
             return 0.0
         finer = subgrid_projection(measurement, x, self.subgrid, self.x0_stds[0])
-        without, with_it = ((seen - measurement.y)[0].flatten(1).norm(dim=1)
-                            for seen in (projection, projection + finer))
+        without, with_it = ((projected - measurement.y)[0].flatten(1).norm(dim=1)
+                            for projected in (projection, projection + finer))
         return finer * (with_it <= UNLIKE_FINER * without)[:, None, None]
 
     @staticmethod
@@ -205,7 +206,7 @@ class Unrolled(Sampler):
         results = []
 
         def result(on_step: Callable[[], None]) -> Tensor:
-            *_, z = self.estimates(denoiser, measurement, on_step, lambda *found: results.append(found))
+            *_, z = self.estimates(denoiser, measurement, on_step, lambda *pair: results.append(pair))
             return z
 
         def again() -> Tensor:
@@ -214,8 +215,12 @@ class Unrolled(Sampler):
         def explained(on_step: Callable[[], None] = lambda: None) -> Tensor:
             return with_scatter(measurement, lambda: with_hardening(measurement, lambda: result(on_step), again), again)
 
+        views = measurement.projector.beam.views
+        if self.first is not None and denoiser.begins and views > self.first_views:
+            warn(f"the report is not used: {views} X-rays show themselves what it could add, up to {self.first_views} "
+                 "do not; phydict_fast with a prior that reads reports uses it at any number")
         z = with_metal(measurement, self.metal, lambda: explained(on_step), explained)
-        for found, evidence in results:
-            if torch.equal(found, z):
+        for state, evidence in results:
+            if torch.equal(state, z):
                 denoiser.conclude(z, evidence)
         return z

@@ -50,12 +50,12 @@ def aligned(beam: ConeBeam, to: ConeBeam, points: np.ndarray) -> ConeBeam:
     """
     for _ in range(STEPS):
         here, wanted = shadows(beam, points), shadows(to, points)
-        slopes = np.stack([(shadows(carried(beam, STEP * unit), points) - here).ravel() / STEP for unit in np.eye(6)],
-                          1)
+        jacobian = np.stack([(shadows(carried(beam, STEP * unit), points) - here).ravel() / STEP for unit in np.eye(6)],
+                            1)
         apart = wanted - here
         weights = 1 / (np.sqrt((apart**2).sum(2).mean(1)) + 0.05)
         root = np.sqrt(np.broadcast_to(weights[:, None, None], apart.shape)).ravel()
-        motion = np.linalg.lstsq(slopes * root[:, None], apart.ravel() * root, rcond=1e-9)[0]
+        motion = np.linalg.lstsq(jacobian * root[:, None], apart.ravel() * root, rcond=1e-9)[0]
         beam = carried(beam, motion)
         if np.abs(motion).max() < 1e-6:
             break

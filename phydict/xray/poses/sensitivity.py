@@ -43,25 +43,25 @@ def pose_derivatives(mu: Tensor, grid: Grid, beam: ConeBeam, values: np.ndarray)
     lengths = torch.as_tensor(ray_lengths(there)).to(mu)
     ray = torch.as_tensor(there.pixels() - there.sources[:, None, None]).to(mu)
     integrals = lengths * torch.as_tensor(images)
-    slopes = torch.as_tensor(ends) @ torch.as_tensor(np.linalg.inv(grid.affine[:3, :3])).to(mu)
-    slopes = slopes * lengths[..., None, None]
+    gradients = torch.as_tensor(ends) @ torch.as_tensor(np.linalg.inv(grid.affine[:3, :3])).to(mu)
+    gradients = gradients * lengths[..., None, None]
     stretch = ray * (integrals / lengths**2)[..., None]
-    slopes = slopes + torch.stack([-stretch, stretch], -2)  # (K, V, U, 2, 3)
+    gradients = gradients + torch.stack([-stretch, stretch], -2)  # (K, V, U, 2, 3)
     change = derivative(beam, values).to(mu)
     rows, columns = (torch.arange(n).to(mu) - (n - 1) / 2 for n in beam.shape)
-    pixel = slopes[..., 1, :]
-    found = torch.einsum("kvua,kam->kmvu", slopes[..., 0, :], change[:, 0])
-    found += torch.einsum("kvua,kam->kmvu", pixel, change[:, 1])
-    found += torch.einsum("kvua,u,kam->kmvu", pixel, columns, change[:, 2])
-    found += torch.einsum("kvua,v,kam->kmvu", pixel, rows, change[:, 3])
-    return integrals, found
+    pixel = gradients[..., 1, :]
+    derivatives = torch.einsum("kvua,kam->kmvu", gradients[..., 0, :], change[:, 0])
+    derivatives += torch.einsum("kvua,kam->kmvu", pixel, change[:, 1])
+    derivatives += torch.einsum("kvua,u,kam->kmvu", pixel, columns, change[:, 2])
+    derivatives += torch.einsum("kvua,v,kam->kmvu", pixel, rows, change[:, 3])
+    return integrals, derivatives
 
 
 @compiled()
 def _integrate(volume, image, ends, ray, count):
     """Fills image (V, U) with the mean over a ray, of `count` samples, of a volume with a margin of one empty voxel,
     and ends (V, U, 2, 3) with what moves of its source and its pixel by a voxel add to that."""
-    way, index, part, slope = np.empty(3), np.empty(3, np.int64), np.empty(3), np.empty(3)
+    way, index, part, gradient = np.empty(3), np.empty(3, np.int64), np.empty(3), np.empty(3)
     for r in range(image.shape[0]):
         for c in range(image.shape[1]):
             aim(ray, r, c, way)
@@ -80,23 +80,23 @@ def _integrate(volume, image, ends, ray, count):
                     index[a] = int(place)
                     part[a] = place - index[a]
                 if inside:
-                    value = _sample(volume, index, part, slope)
+                    value = _sample(volume, index, part, gradient)
                     image[r, c] += value / count
                     for a in range(3):
-                        ends[r, c, 0, a] += (1 - t) * slope[a] / count
-                        ends[r, c, 1, a] += t * slope[a] / count
+                        ends[r, c, 0, a] += (1 - t) * gradient[a] / count
+                        ends[r, c, 1, a] += t * gradient[a] / count
 
 
 @compiled()
-def _sample(volume, index, part, slope):
-    """The trilinear value at index + part; fills its slope (3,) per voxel."""
+def _sample(volume, index, part, gradient):
+    """The trilinear value at index + part; fills its gradient (3,) per voxel."""
     i, j, k = index
     x, y, z = part
     a, b, c, d = volume[i, j, k], volume[i, j, k + 1], volume[i, j + 1, k], volume[i, j + 1, k + 1]
     e, f, g, h = (volume[i + 1, j, k], volume[i + 1, j, k + 1], volume[i + 1, j + 1, k], volume[i + 1, j + 1, k + 1])
     near_low, near_high, far_low, far_high = a + z * (b - a), c + z * (d - c), e + z * (f - e), g + z * (h - g)
     near, far = near_low + y * (near_high - near_low), far_low + y * (far_high - far_low)
-    slope[0] = far - near
-    slope[1] = (1 - x) * (near_high - near_low) + x * (far_high - far_low)
-    slope[2] = (1 - x) * ((1 - y) * (b - a) + y * (d - c)) + x * ((1 - y) * (f - e) + y * (h - g))
+    gradient[0] = far - near
+    gradient[1] = (1 - x) * (near_high - near_low) + x * (far_high - far_low)
+    gradient[2] = (1 - x) * ((1 - y) * (b - a) + y * (d - c)) + x * ((1 - y) * (f - e) + y * (h - g))
     return near + x * (far - near)

@@ -21,15 +21,15 @@ the rotation of source and detector together about the isocentre, a vector along
 
 def moved(beam: ConeBeam, values: np.ndarray) -> ConeBeam:
     """The beam with its views moved by `values` (K, 8), in mm and degrees, as POSE lists them."""
-    vectors = torch.stack([_moved(own, vectors) for own, vectors in _views(beam, values)])
+    vectors = torch.stack([_moved(unknowns, vectors) for unknowns, vectors in _views(beam, values)])
     sources, detectors, u, v = np.moveaxis(vectors.numpy(), 1, 0)
     return ConeBeam(sources, detectors, u, v, beam.shape)
 
 
 def derivative(beam: ConeBeam, values: np.ndarray) -> Tensor:
     """What each unknown changes in source, detector, u and v at `values`: (K, 4, 3, 8), per mm and degree."""
-    return torch.stack([jacobian(lambda x, vectors=vectors: _moved(x, vectors), own)
-                        for own, vectors in _views(beam, values)])
+    return torch.stack([jacobian(lambda x, vectors=vectors: _moved(x, vectors), unknowns)
+                        for unknowns, vectors in _views(beam, values)])
 
 
 def _views(beam: ConeBeam, values: np.ndarray) -> Iterable[tuple[Tensor, Tensor]]:

@@ -288,7 +288,6 @@ def test_bfloat16_changes_the_reconstruction_of_the_example_by_less_than_2_hu():
     assert 0 < (full - half).square().mean().sqrt() < 2
 
 
-@pytest.mark.filterwarnings("ignore:.* cut the patient off")
 @pytest.mark.parametrize("beam", OTHERS.values(), ids=OTHERS)
 def test_any_number_of_views_and_any_geometry_is_reconstructed_within_the_bounds(beam):
     found = reconstruct(measured(beam, noise=0.02).y[0], beam, tiny_refiner(), COARSE, precision="float32")

@@ -17,7 +17,7 @@ from phydict.cli.infer import main
 from phydict.datasets import Thorax, build, load_xrays
 from phydict.grid import Grid
 from phydict.poses import FoundPoses, PoseSearch, find_poses
-from phydict.poses.found import FEW_WIDENING
+from phydict.poses.found import FEW_WIDENING, SWAY_WIDENING
 from phydict.poses.search import middle_points
 from phydict.prior import save_refiner
 from phydict.reconstruction import Reconstruction
@@ -68,11 +68,11 @@ def test_display_values_whose_distance_is_open_too_are_refused_and_line_integral
     assert find_poses(display, BEAM, open_distance, GRID, display=True, search=search).beam.views == 2
 
 
-def test_intervals_widen_where_the_poses_of_few_views_were_searched_and_nowhere_else():
-    def widening(views, **uncertain):
+def test_intervals_widen_where_the_poses_of_few_views_were_searched_or_the_patient_moved():
+    def widening(views, sway=0.0, **uncertain):
         beam = ConeBeam.orbit(views, 1800, 1400, (48, 48), 10.0)
         found = FoundPoses(beam, Uncertain(**uncertain).deviations, np.zeros((views, 10)), np.ones((views, 10)),
-                           (0.1, 0.1), np.zeros((2, views)), np.zeros((2, views)), 1.0)
+                           (0.1, 0.1), np.outer([sway, 0.1], np.arange(views)), np.zeros((2, views)), 1.0)
         plain = Reconstruction(torch.zeros(2, 2, 2), Grid.cube(2), "any", 0, 0.0, [0.0] * views, {}, torch.zeros(1),
                                torch.zeros(1), intervals={0.9: torch.full((2, 2, 2), 100.0)}, interval_widening=2.0)
         result, widest = found.added_to(plain), replace(plain, intervals={0.9: torch.full((2, 2, 2), 1990.0)})
@@ -81,7 +81,8 @@ def test_intervals_widen_where_the_poses_of_few_views_were_searched_and_nowhere_
         return float(result.intervals[0.9].max()) / 100, result.interval_widening / 2
 
     assert widening(2, rotation_degrees=2) == (FEW_WIDENING, FEW_WIDENING)
-    assert widening(2, gain=0.1) == widening(3, rotation_degrees=2) == (1, 1)
+    assert widening(2, gain=0.1) == widening(3, rotation_degrees=2) == widening(3, 0.5, gain=0.1) == (1, 1)
+    assert widening(3, 2.0, rotation_degrees=2) == (SWAY_WIDENING, SWAY_WIDENING)  # between the first view and the last
 
 
 @pytest.mark.filterwarnings("default")

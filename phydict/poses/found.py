@@ -111,7 +111,7 @@ class FoundPoses:
         """What is to be said: that few views cannot show depth, and which views were corrected by more than stated."""
         messages = []
         if len(self.corrections) <= UNDETERMINED_VIEWS:
-            wider = f"; intervals are {FEW_WIDENING} times as wide for it" if self.undetermined else ""
+            wider = f"; intervals, if any, are {FEW_WIDENING} times as wide for it" if self.undetermined else ""
             messages.append(f"{len(self.corrections)} views show the volume from so few sides that most of its depth, "
                             "and of what was found of the poses, comes from the method and from the stated geometry: "
                             "read outlines and large structures alone, and no sizes, places or densities of small "
@@ -131,5 +131,5 @@ class FoundPoses:
             messages.append(f"view {', '.join(map(str, swaying))} (counted from 0) show the lower end of the body up "
                             f"to {self._relative_sway().max():.1f} mm away from where the volume of all views has it, "
                             "which no pose explains: the patient breathed or moved between the views, and the volume "
-                            f"is blurred there; intervals are {SWAY_WIDENING} times as wide for it")
+                            f"is blurred there; intervals, if any, are {SWAY_WIDENING} times as wide for it")
         return messages

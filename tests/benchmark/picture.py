@@ -47,9 +47,10 @@ def main() -> None:
     grid = Grid.cube(given.voxels)
     source = prepare_ct(find_cts(given.ct)[0].path, FINEST, WINDOW)["volume"]
     truth = WINDOW.to_hu(avg_pool3d(source, FINEST.shape[0] // given.voxels))[0]
-    tv = FISTATV(iterations=200, weight=given.voxels / 64 * METHODS["tv"].weight)
     tried = {"phydict_learned": ("phydict_learned", given.voxels),
-             f"phydict_learned, {COARSE}": ("phydict_learned", 64), "tv": (tv, given.voxels)}
+             f"phydict_learned, {COARSE}": ("phydict_learned", 64)}
+    if given.voxels == 128:
+        tried["tv"] = (FISTATV(iterations=200, weight=2 * METHODS["tv"].weight), given.voxels)
     volumes, captions = {}, {}
     for views in (8, 2):
         xrays, beam = seen(source, views), benchmark_orbit(FINEST, views)

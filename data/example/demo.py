@@ -27,15 +27,14 @@ if __name__ == "__main__":
     with Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()) as bar:
         for method in METHODS:
             steps = bar.add_task(method, total=phydict.METHODS[method].steps())
-            result = phydict.reconstruct(case["xrays"], case["beam"], None, method, case["report"],
-                                         on_step=lambda: bar.advance(steps))
+            result = phydict.reconstruct(case["xrays"], case["beam"], method=method, on_step=lambda: bar.advance(steps))
             scores = volume_metrics(result.volume[None, None], truth[None, None], body=body)
             rows.append({"case": "example", "method": method, "views": len(case["xrays"]), "grid": "64x64x64"} | scores
                         | {"misfit": result.misfit, "seconds": sum(result.seconds.values())})
             volumes[method] = result.volume
             result.save_nifti(out / f"{method}.nii.gz")
             panel(out / f"{method}.png", result.volume, result.grid, result.xrays, result.reprojection, truth,
-                  title=f"{method}: {case['report'].partition('Impression:')[2].strip()}")
+                  title=f"{method}, {len(case['xrays'])} X-rays")
     captions = {row["method"]: f"{row['psnr']:.1f} dB, SSIM {row['ssim']:.2f}" for row in rows}
     method_panel(out / "comparison.png", volumes, truth, grid, captions)
     write_csv(out / "results.csv", rows)

@@ -21,11 +21,12 @@ def main(out: Path, methods=METHODS) -> None:
     views, rows, columns = case["xrays"].shape
     print(f"1. {views} X-rays of {rows} x {columns} pixels, line integrals up to {case['xrays'].max():.1f}")
     distance = torch.from_numpy(case["beam"].sources).norm(dim=1).mean()
-    print(f"2. the sources stand {distance:.0f} mm from the isocentre; the report: {case['report']}")
+    print(f"2. the sources stand {distance:.0f} mm from the isocentre; the report, which up to three X-rays need: "
+          f"{case['report']}")
     truth = torch.from_numpy(nibabel.load(here / "truth.nii.gz").get_fdata(dtype="float32").copy())
     volumes, captions = {}, {}
     for method in methods:
-        result = phydict.reconstruct(case["xrays"], case["beam"], method=method, report=case["report"])
+        result = phydict.reconstruct(case["xrays"], case["beam"], method=method)
         scores = volume_metrics(result.volume[None, None], truth[None, None])
         captions[method] = f"{scores['psnr']:.1f} dB, misfit {result.misfit:.4f}"
         print(f"3. {method}: {captions[method]}, {sum(result.seconds.values()):.1f} s")

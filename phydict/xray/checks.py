@@ -36,6 +36,12 @@ def check_xrays(xrays: Tensor, beam: ConeBeam) -> None:
                          "out of the X-rays and of the geometry")
 
 
+def outer_columns(xrays: Tensor) -> Tensor:
+    """A fiftieth of the columns of views (K, V, U), one or more, at each side of the detector: (2, K, V, columns)."""
+    width = max(1, xrays.shape[2] // 50)
+    return torch.stack([xrays[..., :width], xrays[..., -width:]])
+
+
 def check_air(xrays: Tensor) -> None:
     """Warns where views (K, V, U) look inverted: more than half of the pixels in their outermost columns, where air is
     seen, or what is thin where the detector is narrow, lie in the uppermost tenth of their range (median view)."""
@@ -43,8 +49,7 @@ def check_air(xrays: Tensor) -> None:
     views = views[:, ::max(1, views.shape[1] // 10_000)]
     rank = max(1, views.shape[1] // 100)
     low, high = views.kthvalue(rank).values, views.kthvalue(views.shape[1] + 1 - rank).values
-    width = max(1, xrays.shape[2] // 50)
-    sides = torch.cat([xrays[..., :width], xrays[..., -width:]], -1).flatten(1)
+    sides = outer_columns(xrays).movedim(0, 1).flatten(1)
     share = (sides > (high - 0.1 * (high - low))[:, None]).float().mean(1)
     if share.median() > 0.5:
         warn("the X-rays are densest at their left and right sides, where air should be seen, as inverted "
@@ -61,10 +66,9 @@ def check_line_integrals(xrays: Tensor) -> None:
              "check that the X-rays are line integrals of attenuation in 1/mm along mm; of display values state "
              "`intensity: {kind: display, bright_is_dense: true}` in geometry.yaml, or in Python display=True")
         return
-    rows, width = xrays.shape[1], max(1, xrays.shape[2] // 50)
-    middle = xrays[:, rows // 4:rows - rows // 4].float()
-    sides = torch.stack([middle[..., :width], middle[..., -width:]]).flatten(2).median(2).values.amin(0)
-    if (views := int((sides > CUT_OFF).sum())) > len(xrays) / 2:
+    quarter = xrays.shape[1] // 4
+    middle = outer_columns(xrays[:, quarter:xrays.shape[1] - quarter]).float()
+    if (views := int((middle.flatten(2).median(2).values.amin(0) > CUT_OFF).sum())) > len(xrays) / 2:
         warn(f"{views} of {len(xrays)} views cut the patient off at the left and right side of the detector: what lies "
              "beyond is the method's guess, and HU near it are less certain; a wider detector would show it")
 
@@ -73,8 +77,7 @@ def with_air_at_zero(xrays: Tensor) -> Tensor:
     """The line integrals (K, V, U), less what each view reads in air where that differs from view to view, which is
     said in a warning: of a tube's output or a detector's gain that drifts. Views that show no air stay, and all of
     them where none reads it as 0 within AIR_DRIFT, as where the patient fills the detector."""
-    width = max(1, xrays.shape[2] // 50)
-    sides = torch.stack([xrays[..., :width], xrays[..., -width:]]).float()
+    sides = outer_columns(xrays).float()
     blocks = torch.stack([rows.flatten(2).median(2).values for rows in
                           sides.tensor_split(min(AIR_BLOCKS, xrays.shape[1]), 2)])
     level = blocks.median(0).values

@@ -38,9 +38,10 @@ from phydict.runtime.telling import run_command, tell, telling
 from phydict.training.checkpoints import BEST, HELD_OUT, RESUMED, BestCheckpoint, WholeCheckpoints, read_checkpoint
 from phydict.training.crops import SuperResolutionData
 from phydict.training.data import PriorData
+from phydict.training.finer_uncertainty import FinerUncertaintyTraining
 from phydict.training.prior import PriorTraining
 from phydict.training.progress import TrainingProgress
-from phydict.training.reconstructions import RefinementData
+from phydict.training.reconstructions import RefinedResultsData, RefinementData
 from phydict.training.refinement import RefinementTraining
 from phydict.training.refiner import RefinerTraining
 from phydict.training.rivals import LiftedTraining
@@ -58,6 +59,7 @@ COMMANDS = {"fit": "train a prior", "validate": "measure one on held-out cases",
 STAGES = {"base": (PriorTraining, PriorData), "super_resolution": (SuperResolutionTraining, SuperResolutionData),
           "refiner": (RefinerTraining, PriorData), "replay": (ReplayTraining, RollOutData),
           "uncertainty": (UncertaintyTraining, PriorData), "refinement": (RefinementTraining, RefinementData),
+          "finer_uncertainty": (FinerUncertaintyTraining, RefinedResultsData),
           "lifted": (LiftedTraining, PriorData), "x2ct": (X2CTTraining, PriorData),
           "xray2ctpa": (XrayToCTPATraining, PriorData)}
 """What trains a stage, and on which data."""

@@ -15,6 +15,8 @@ from phydict.posterior.coarse_correction import CoarseCorrection, coarse_correct
 from phydict.posterior.evidence import Evidence
 from phydict.posterior.likelihood.likelihood import LikelihoodStep, ProximalCG
 from phydict.posterior.measurement import Measurement
+from phydict.posterior.posterior import WIDEST
+from phydict.prior.finer_uncertainty import SEEN_LEVEL
 from phydict.reconstruction import Delegating, Reconstruction, Reconstructor
 from phydict.runtime.profiling import Stopwatch, stage
 from phydict.units import AIR, HUWindow, hu_to_mu
@@ -68,6 +70,11 @@ class Correction(Protocol):
 
     def corrected(self, z: Tensor, evidence: Tensor) -> Tensor:
         """An estimate z (1, 1, X, Y, Z) of the CT without what it lacks, given the evidence there."""
+        ...
+
+    def half_widths(self, grid: Grid, seen: Tensor) -> Tensor | None:
+        """Half-widths (1, levels, X, Y, Z) of intervals around the result, given SEEN (1, 4, X, Y, Z); None where it
+        knows none on these voxels."""
         ...
 
 
@@ -156,8 +163,9 @@ class Refined(Delegating):
     the base found is subtracted, and what it counted as noise of a view counts so; display values are matched to the
     estimate anew. What a base without masks reconstructed, such as water, no network corrects.
 
-    Masks and deviations of the result are the base's, interpolated. Its intervals are made of the base's and of what
-    the refinement changed of the interpolated volume, as ON_FINER says.
+    Masks and deviations of the result are the base's, interpolated. Its intervals are the network's where it knows
+    them, on still finer voxels interpolated, and else made of the base's and of what the refinement changed of the
+    interpolated volume, as ON_FINER says.
 
     Args:
         base: the method, bound to voxels of its own
@@ -215,20 +223,22 @@ class Refined(Delegating):
             binned = self._binned(xrays, projector, base.grid)
             coarse = base.reconstruct(*binned, report, display, seed, on_step)
         volume, grid, calls, scores = coarse.within.to(xrays), base.grid, coarse.projector_calls, {}
-        network_calls = coarse.network_calls
+        network_calls, known = coarse.network_calls, None
         for level in self.levels:
             with watch.stage("refine"):
                 y, A = self._binned(xrays, projector, level)
-                x = base.window.to_range(interpolated(volume, grid, level, AIR))[None, None]
+                start = base.window.to_range(interpolated(volume, grid, level, AIR))[None, None]
                 measurement = self._measurement(y, A, coarse, display)
-                measurement.refit(x)
+                measurement.refit(start)
                 network = self._network(level) if coarse.masks is not None else None
                 fine_calls, coarse_calls = (refinement.corrections(network is not None)
                                             if coarse.masks is not None else (0, 0))
                 correction = coarse_correction(base, level, binned, coarse, report, display) if coarse_calls else None
-                x = refinement(measurement, x, network, correction, grid is not base.grid)
+                x = refinement(measurement, start, network, correction, grid is not base.grid)
                 guard = Guard(measurement, on_step, 1)
                 guard()
+                if network is not None and coarse.intervals and coarse.masks is not None and len(coarse.masks):
+                    known = self._known_intervals(network, level, x, start, coarse) or known
             volume, grid = base.window.to_hu(x[0, 0]), level
             with watch.stage("score"):
                 measurement.match_gain_offset(x)
@@ -239,18 +249,36 @@ class Refined(Delegating):
                 calls += correction.projector_calls
                 network_calls += correction.calls
         deviation, volume = coarse.deviation, volume.cpu()
-        change = (volume - interpolated(coarse.within, base.grid, self.target, AIR)).abs()
+        intervals = self._intervals(coarse, volume, known)
         if coarse.carried:
             volume = volume + coarse.carried.on(grid)
         return replace(
             coarse, **scores | {"diverged_at": coarse.diverged_at}, volume=volume, grid=self.target,
             coarse=coarse, projector_calls=calls, network_calls=network_calls, seconds=watch.seconds,
-            intervals={level: ON_FINER[level][0] * interpolated(half_width, base.grid, self.target, 0.0)
-                       + ON_FINER[level][1] * change for level, half_width in coarse.intervals.items()},
+            intervals=intervals,
             masks=None if coarse.masks is None else torch.cat([
                 coarse.masks.new_zeros(0, *self.target.shape),
                 *(interpolated(mask, base.grid, self.target, 0.0)[None] for mask in coarse.masks)]),
             deviation=None if deviation is None else interpolated(deviation, base.grid, self.target, 0.0))
+
+    def _known_intervals(self, network: Correction, level: Grid, x: Tensor, start: Tensor, coarse: Reconstruction
+                         ) -> tuple[dict[float, Tensor], Grid] | None:
+        """The half-widths in HU that a network knows on a level's voxels, and these; None where it knows none."""
+        window = self.base.window
+        widths = network.half_widths(level, seen_of(x, start, coarse, window, level))
+        if widths is None:
+            return None
+        return dict(zip(coarse.intervals, window.half_width * widths[0].clamp(max=WIDEST).cpu())), level
+
+    def _intervals(self, coarse: Reconstruction, volume: Tensor, known: tuple[dict[float, Tensor], Grid] | None
+                   ) -> dict[float, Tensor]:
+        """Level -> half-widths in HU (X, Y, Z) on the target's voxels, from those `known` or else the coarse ones."""
+        if known is not None:
+            return {level: interpolated(half_width, known[1], self.target, 0.0)
+                    for level, half_width in known[0].items()}
+        change = (volume - interpolated(coarse.within, coarse.grid, self.target, AIR)).abs()
+        return {level: ON_FINER[level][0] * interpolated(half_width, coarse.grid, self.target, 0.0)
+                + ON_FINER[level][1] * change for level, half_width in coarse.intervals.items()}
 
     def _binned(self, xrays: Tensor, projector: Projector, grid: Grid) -> tuple[Tensor, Projector]:
         """The X-rays as a level sees them, binned to what its voxels can hold, and the projector to them."""
@@ -267,3 +295,12 @@ class Refined(Delegating):
         measurement = Measurement(A, y, self.base.window, display, self.mu_water, outside=outside)
         measurement.adopt(coarse)
         return measurement
+
+
+def seen_of(x: Tensor, start: Tensor, coarse: Reconstruction, window: HUWindow, level: Grid) -> Tensor:
+    """What a FinerUncertainty sees (1, SEEN, X, Y, Z) of an estimate x on a level's voxels, of `start`, which it was
+    interpolated from, both (1, 1, X, Y, Z) in the prior's range, and of the coarse result."""
+    assert coarse.masks is not None
+    width, lung = (interpolated(of_coarse, coarse.grid, level, 0.0)[None, None].to(x)
+                   for of_coarse in (coarse.intervals[SEEN_LEVEL] / window.half_width, coarse.masks[0]))
+    return torch.cat([x.clamp(-1, 1), start, width, lung], 1)

@@ -12,6 +12,7 @@ from torch.nn.functional import pad, silu
 from phydict.grid import Grid
 from phydict.prior.convolution import lay_out, silence, speed_up
 from phydict.prior.evidence_channels import EVIDENCE_CHANNELS
+from phydict.prior.finer_uncertainty import FinerUncertainty
 from phydict.prior.local_unet import PositionNorm
 from phydict.runtime.precision import network_precision
 from phydict.units import HUWindow
@@ -34,15 +35,17 @@ class CorrectionNetwork(nn.Module):
     voxel the answer depends on voxels up to `reach` away alone. Untrained it corrects nothing.
 
     channels: width of each level of the UNet, the first at half the resolution. width: of the head. grid: of the fine
-    voxels. window: HU that the range [-1, 1] stands for.
+    voxels. window: HU that the range [-1, 1] stands for. uncertainty: what knows how far the result may be off.
     """
 
+    uncertainty: FinerUncertainty | None
+
     def __init__(self, channels: tuple[int, ...] = (32, 64, 96), width: int = 16, grid: Grid = Grid.cube(128),
-                 window: HUWindow = HUWindow()):
+                 window: HUWindow = HUWindow(), uncertainty: FinerUncertainty | None = None):
         from monai.networks.nets import UNet
 
         super().__init__()
-        self.grid, self.window = grid, window
+        self.grid, self.window, self.uncertainty = grid, window, uncertainty
         self.settings = {"channels": list(channels), "width": width}
         self.divisor = 2 ** (len(channels) - 1)
         self.unet = UNet(3, INPUTS, width, tuple(channels), (2,) * (len(channels) - 1), num_res_units=2, act="swish",
@@ -70,8 +73,11 @@ class CorrectionNetwork(nn.Module):
     def suits(self, grid: Grid, window: HUWindow) -> bool:
         """Whether it was trained for this HU window and for voxels of this size, or twice as long ones, wherever they
         are: what it has learnt of these serves voxels half as long as well."""
-        return window == self.window and any(
-            np.allclose(np.multiply(longer, grid.spacing), self.grid.spacing, rtol=TOLERANCE) for longer in (1, 2))
+        return window == self.window and any(self._has_voxels(grid, times) for times in (1, 2))
+
+    def _has_voxels(self, grid: Grid, times: int) -> bool:
+        """Whether its own voxels are so many times as long as a grid's."""
+        return np.allclose(np.multiply(times, grid.spacing), self.grid.spacing, rtol=TOLERANCE)
 
     def forward(self, seen: Tensor) -> Tensor:
         """The corrected estimate (B, 1, X, Y, Z) of an estimate and its evidence (B, INPUTS, X, Y, Z), in the prior's
@@ -103,3 +109,12 @@ class CorrectionNetwork(nn.Module):
         """As `forward`, of the estimate z (B, 1, X, Y, Z), held inside the range, in the device's best precision."""
         with network_precision("auto", z):
             return self.to(z.device)(torch.cat([z, evidence], 1)).clamp(-1, 1)
+
+    @torch.no_grad()
+    def half_widths(self, grid: Grid, seen: Tensor) -> Tensor | None:
+        """As FinerUncertainty's, where there is one and voxels are those it learnt on, and else None."""
+        if self.uncertainty is None or not self._has_voxels(grid, 1):
+            return None
+        self.to(seen.device)
+        with network_precision("auto", seen):
+            return self.uncertainty.half_widths(seen)

@@ -15,6 +15,7 @@ from phydict.diffusion import CosineSchedule
 from phydict.grid import Grid
 from phydict.prior.correction import CorrectionNetwork
 from phydict.prior.detail import DetailNetwork
+from phydict.prior.finer_uncertainty import FinerUncertainty
 from phydict.prior.local_unet import LocalUNet
 from phydict.prior.medsyn.checkpoint import (
     FILES,
@@ -49,6 +50,10 @@ from phydict.runtime.shipped import own_or_shipped, shipped
 
 DEFAULT_PRIOR = shipped("data/prior/phydict_64.safetensors")
 """The prior that comes with the project."""
+
+UNHEARD = ("phydict_64 has unlearnt what reports state, and a report costs phydict_fast 4 dB from one X-ray: leave "
+           "reports out, or give data/prior/phydict_64_reports.safetensors")
+"""What is warned of when the first report is given to DEFAULT_PRIOR."""
 
 DEFAULT_REFINER = shipped("data/prior/refiner_64.safetensors")
 """The refiner that comes with the project."""
@@ -133,8 +138,9 @@ def describe_refiner(refiner: Refiner) -> dict:
 
 def describe_correction(network: CorrectionNetwork) -> dict:
     """What a correction of finer voxels is, as plain JSON values, for `build_correction`."""
+    uncertainty = {"uncertainty": network.uncertainty.settings} if network.uncertainty else {}
     return {"format": FORMAT, "stage": "refinement", "grid": network.grid.to_dict(),
-            "hu_window": [network.window.low, network.window.high], "network": network.settings}
+            "hu_window": [network.window.low, network.window.high], "network": network.settings, **uncertainty}
 
 
 def load_prior(path: str | Path | MedSynCheckpoint = DEFAULT_PRIOR,
@@ -155,6 +161,7 @@ def load_prior(path: str | Path | MedSynCheckpoint = DEFAULT_PRIOR,
         if has_text(header):
             reader = loaded.reader if isinstance(loaded, Refiner) else loaded
             reader.load_text = lambda: load_text(path, header["text"])
+            reader.unheard = UNHEARD if path == DEFAULT_PRIOR else ""
         return loaded
 
     return _loaded(path, ("base", "refiner"), build, device)
@@ -267,6 +274,9 @@ def build_super_resolution(header: dict, weights: dict[str, Tensor]) -> SuperRes
 
 def build_correction(header: dict, weights: dict[str, Tensor]) -> CorrectionNetwork:
     """The network that `describe_correction` described, with these weights, as `build_prior` builds a prior."""
-    return built_network(lambda: CorrectionNetwork(**header["network"], grid=Grid(**header["grid"]),
-                                                   window=window_of(header)),
-                         {k: w.float() for k, w in weights.items()}, header, ("network",))
+    def made() -> CorrectionNetwork:
+        uncertainty = FinerUncertainty(**header["uncertainty"]) if "uncertainty" in header else None
+        return CorrectionNetwork(**header["network"], grid=Grid(**header["grid"]), window=window_of(header),
+                                 uncertainty=uncertainty)
+
+    return built_network(made, {k: w.float() for k, w in weights.items()}, header, ("network", "uncertainty"))

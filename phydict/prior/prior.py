@@ -15,6 +15,7 @@ from phydict.prior.detail import DetailNetwork
 from phydict.prior.text import TextEncoder
 from phydict.prior.unet import VolumeUNet
 from phydict.runtime.precision import network_precision
+from phydict.runtime.warning import warn
 from phydict.units import HUWindow
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ class Prior(nn.Module):
     ends_at_zero: whether its own inference ends with a call at time 0 (see PriorOnly).
     network: F; detail: D, None for a prior without; text: the report encoder, None for a prior without text, or a
     function that loads it when the first report arrives; grid, window: where and in which HU range the volumes live;
-    sigma_data: standard deviation of the state; skip_std: see above.
+    sigma_data: standard deviation of the state; skip_std: see above. unheard: what is warned of at the first report.
     """
 
     ends_at_zero = False
@@ -60,7 +61,7 @@ class Prior(nn.Module):
                              f"{network.context_dim}: build the network with context_dim {text.width}")
         self.network, self.detail, self.text, self.load_text = network, detail, text, load_text
         self.grid, self.window, self.schedule, self.sigma_data = grid, window, schedule, sigma_data
-        self.skip_std = skip_std
+        self.skip_std, self.unheard = skip_std, ""
         self.null = nn.Parameter(0.02 * torch.randn(1, 1, network.context_dim))
 
     def context(self, reports: Sequence[str]) -> Tensor:
@@ -70,6 +71,9 @@ class Prior(nn.Module):
         """
         if not any(reports):
             return self.null.expand(len(reports), 1, -1)
+        if self.unheard:
+            warn(self.unheard)
+            self.unheard = ""
         if self.text is None:
             if self.load_text is None:
                 raise ValueError("this prior was trained without text, but a report was given: leave the report out")

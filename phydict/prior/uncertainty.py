@@ -61,10 +61,8 @@ class Uncertainty(nn.Module):
 
     def forward(self, z: Tensor, evidence: Tensor) -> Tensor:
         """log b (B, 1, X, Y, Z), b in the prior's range."""
-        gradients = [torch.gradient(z[:, :1], dim=d)[0].abs() for d in (2, 3, 4)]
-        steepness = gradients[0] + gradients[1] + gradients[2]
         sizes = evidence[:, 2:4].abs()
-        return self.unet(torch.cat([z, evidence, 2 * steepness, sizes], 1)).float().sub(3.5).clamp(*LOG_SCALE)
+        return self.unet(torch.cat([z, evidence, 2 * steepness(z[:, :1]), sizes], 1)).float().sub(3.5).clamp(*LOG_SCALE)
 
     def half_widths(self, z: Tensor, evidence: Tensor) -> Tensor:
         """Half-widths (B, len(LEVELS), X, Y, Z), in the prior's range, of the intervals around the CT of z."""
@@ -81,10 +79,8 @@ class Uncertainty(nn.Module):
         """
         for t in range(len(TISSUES)):
             of_tissue = ratios[tissues == t]
-            shared = _quantiles(of_tissue if len(of_tissue) >= FEWEST else ratios)
             for n in range(COVERAGES):
-                of_both = ratios[(tissues == t) & (coverages == n)]
-                self.quantiles[t, n] = _quantiles(of_both) if len(of_both) >= FEWEST else shared
+                self.quantiles[t, n] = quantiles_of(ratios[(tissues == t) & (coverages == n)], of_tissue, ratios)
         self.most_residual.copy_(residuals.quantile(ORDINARY))
 
 
@@ -94,9 +90,16 @@ ORDINARY = 0.9
 """The share of a calibration's scenes whose residual widens nothing: the largest of 48 was twice the next."""
 
 
-def _quantiles(ratios: Tensor) -> Tensor:
-    """Those of LEVELS; torch's own take no more than 2^24 values."""
-    return torch.from_numpy(np.quantile(ratios.cpu().numpy(), LEVELS)).to(ratios)
+def quantiles_of(*ratios: Tensor) -> Tensor:
+    """Those of LEVELS (len(LEVELS),), of the first of several sets of values (N,) that are not few, or the last;
+    torch's own take no more than 2^24 values."""
+    enough = next((values for values in ratios if len(values) >= FEWEST), ratios[-1])
+    return torch.from_numpy(np.quantile(enough.cpu().numpy(), LEVELS)).to(enough)
+
+
+def steepness(ct: Tensor) -> Tensor:
+    """The size of the differences along the three axes, summed, of a CT (B, 1, X, Y, Z)."""
+    return sum((torch.gradient(ct, dim=d)[0].abs() for d in (2, 3, 4)), start=torch.zeros_like(ct))
 
 
 def tissue_of(z: Tensor) -> Tensor:

@@ -10,7 +10,16 @@ import torch
 from torch.nn.functional import avg_pool3d
 from torch.utils.data import ConcatDataset, DataLoader, Dataset, DistributedSampler
 
-from phydict.datasets import Augmentation, CTCases, CTSource, Thorax, patient_of, report, split_by_patient
+from phydict.datasets import (
+    Augmentation,
+    CTCases,
+    CTSource,
+    Thorax,
+    as_one_patient,
+    patient_of,
+    report,
+    split_by_patient,
+)
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM, CachedPhantoms
 from phydict.datasets.population import DrawnPatients
 from phydict.datasets.population.drawn import POPULATION_VERSION
@@ -72,8 +81,8 @@ class PriorData(lightning.LightningDataModule):
         if len(held_out) == len(files) and not phantoms:
             raise ValueError("there is nothing to train on: data.holdout holds out every CT, and data.phantoms is 0")
         if files and not held_out and holdout.fraction:
-            warn(f"no CT is held out, since {holdout.fraction:g} of {len(files)} is none: give more CTs, or name some "
-                 "by data.holdout.ids")
+            warn(f"no CT is held out, since {holdout.fraction:g} of {len(files)} is none"
+                 f"{as_one_patient(f.id for f in files)}: give more CTs, or name some by data.holdout.ids")
         self.held_out = [f.id for f in held_out]
         validating = set(self.held_out)
         self.cts = CTCases([f for f in files if f.id not in validating], cache, self.grid, hu)

@@ -21,8 +21,10 @@ from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM
 from phydict.datasets.surroundings.surroundings import Surroundings
 from phydict.grid import Cube, Grid
 from phydict.posterior import Posterior, Refined, Refinement, Unrolled
-from phydict.prior import DEFAULT_REFINER, Refiner, fingerprint, load_correction, load_prior
+from phydict.posterior.refined import seen_of
+from phydict.prior import DEFAULT_CORRECTION, DEFAULT_REFINER, Refiner, fingerprint, load_correction, load_prior
 from phydict.prior.correction import INPUTS, CorrectionNetwork
+from phydict.prior.finer_uncertainty import SEEN
 from phydict.runtime.ranges import check_fields
 from phydict.runtime.seeds import check_seed
 from phydict.training.crops import CTVolumes, PhantomVolumes, mapped_volume
@@ -30,8 +32,9 @@ from phydict.training.data import PriorData
 from phydict.training.draws import Draws, Items
 from phydict.training.scenes import Scenes
 from phydict.training.settings import HoldOut, Loading
-from phydict.units import HUWindow
-from phydict.xray.boxes import refinements, seen_by
+from phydict.units import AIR, HUWindow
+from phydict.xray import Projector
+from phydict.xray.boxes import interpolated, refinements, seen_by
 
 FINER = 2
 """How many times finer the voxels that X-rays are made of are than those of a reconstruction."""
@@ -80,14 +83,21 @@ class _Recording:
         self.inputs.append(torch.cat([z, evidence], 1))
         return self.network.corrected(z, evidence) if self.network else z
 
+    def half_widths(self, grid: Grid, seen: Tensor) -> None:
+        return None
+
 
 class Reconstructions(Dataset):
     """What a refinement sees, at each call of `network`, and last the truth: (calls INPUTS + 1, X, Y, Z) in half
     precision, in the prior's range.
 
+    name: of its folders. channels: of what is seen at a call. default_network: the file that stands for None.
+
     Item n shows volume n modulo their number, deformed unless `strength` is that of none, in a scene of its own. It is
     made when missing and kept in `folder`.
     """
+
+    name, channels, default_network = "reconstructions", INPUTS, cast(str | None, None)
 
     def __init__(self, volumes: Items, grid: Grid, base: str, network: str | None, scenes: Scenes,
                  strength: Augmentation, folder: Path, length: int, seed: int):
@@ -109,26 +119,46 @@ class Reconstructions(Dataset):
                       "id": str(n)}
         ct = augment(case, int(rng.integers(2**31)), scene, window, self.strength)["volume"][None]
         y, projector = self.scenes.xrays(ct, rng, scene, window)
+        seen = self._seen(Posterior(refiner, Unrolled()), *seen_by(self.grid, y, projector.beam, False))
+        return torch.cat([seen, avg_pool3d(ct, FINER)], 1)[0]
+
+    def _seen(self, base: Posterior, xrays: Tensor, projector: Projector) -> Tensor:
+        """What is seen (1, calls INPUTS, X, Y, Z) of a reconstruction by `base`."""
         record = _Recording(load_correction(self.network) if self.network else None)
-        refined = Refined(Posterior(refiner, Unrolled()), self.grid, Refinement(calls=2 if self.network else 1), record)
-        refined.reconstruct(*seen_by(self.grid, y, projector.beam, False))
-        return torch.cat([*record.inputs, avg_pool3d(ct, FINER)], 1)[0]
+        refinement = Refinement(calls=2 if self.network else 1)
+        Refined(base, self.grid, refinement, record).reconstruct(xrays, projector)
+        return torch.cat(record.inputs, 1)
+
+
+class RefinedResults(Reconstructions):
+    """What a FinerUncertainty sees of the results of `network`, and last the truth: (SEEN + 1, X, Y, Z)."""
+
+    name, channels, default_network = "results", SEEN, str(DEFAULT_CORRECTION)
+
+    def _seen(self, base: Posterior, xrays: Tensor, projector: Projector) -> Tensor:
+        network = load_correction(cast(str, self.network))
+        found = Refined(base, self.grid, Refinement(), network).reconstruct(xrays, projector)
+        assert found.coarse is not None
+        start = interpolated(found.coarse.within, found.coarse.grid, self.grid, AIR)
+        x, start = (base.window.to_range(hu)[None, None] for hu in (found.within, start))
+        return seen_of(x, start, found.coarse, base.window, self.grid)
 
 
 class ReconstructionCrops(Draws):
     """Random cubes of reconstructions at one of their calls, half of them mirrored left to right: what is seen of so
     little has no side.
 
-    "scale" (2,) are the mean squared and the mean absolute error of the reconstruction that a cube is cut from.
+    channels: of what is seen at a call. "scale" (2,) are the mean squared and the mean absolute error of the
+    reconstruction that a cube is cut from.
     """
 
-    def __init__(self, made: Items, size: int, length: int, epoch: int, seed: int):
+    def __init__(self, made: Reconstructions, size: int, length: int, epoch: int, seed: int):
         super().__init__(made, [], 1.0, length, epoch, seed)
-        self.size = size
+        self.size, self.channels = size, made.channels
 
     def item(self, drawn: np.ndarray, rng: np.random.Generator) -> dict:
-        first = INPUTS * int(rng.integers(len(drawn) // INPUTS))
-        channels = [*range(first, first + INPUTS), -1]
+        first = self.channels * int(rng.integers(len(drawn) // self.channels))
+        channels = [*range(first, first + self.channels), -1]
         for _ in range(4):
             starts = [int(rng.integers(n - self.size + 1)) for n in drawn.shape[1:]]
             cut = drawn[(slice(None), *(slice(start, start + self.size) for start in starts))][channels]
@@ -152,7 +182,7 @@ class Whole(Dataset):
         return len(self.made)
 
     def __getitem__(self, n: int) -> dict:
-        return {"volume": torch.from_numpy(self.made[n][-INPUTS - 1:].astype(np.float32))}
+        return {"volume": torch.from_numpy(self.made[n][-self.made.channels - 1:].astype(np.float32))}
 
 
 class RefinementData(PriorData):
@@ -170,6 +200,8 @@ class RefinementData(PriorData):
         cube: tied to model.cube
         window: tied to model.window
     """
+
+    kind: type[Reconstructions] = Reconstructions
 
     def __init__(self, made: RefinementCases = RefinementCases(), scenes: Scenes = Scenes(most_views=16),
                  cts: str | None = None, holdout: HoldOut = HoldOut(phantoms=0), phantoms: int = 0,
@@ -199,14 +231,15 @@ class RefinementData(PriorData):
             for cts, first, count in ((self.cts.cts, 0, phantoms),
                                       (self.held_out_cts.cts, HELD_OUT_PHANTOM, holdout.phantoms))]
         trained, validated = volumes
-        parts = [asdict(scenes), fingerprint(initial), made.network and fingerprint(made.network), scene.to_dict(),
+        network = made.network or self.kind.default_network
+        parts = [asdict(scenes), fingerprint(initial), network and fingerprint(network), scene.to_dict(),
                  self.origin(), holdout.phantoms, [[ct.id, self.held_out_cts.key(ct)] for ct in self.held_out_cts.cts]]
-        folder = folder / f"reconstructions-{hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]}"
-        self.crop, self.made = made.crop, Reconstructions(
-            trained, self.grid, initial, made.network, scenes, STRENGTH, folder / f"trained-{made.seed}",
+        folder = folder / f"{self.kind.name}-{hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]}"
+        self.crop, self.made = made.crop, self.kind(
+            trained, self.grid, initial, network, scenes, STRENGTH, folder / f"trained-{made.seed}",
             made.reconstructions, made.seed)
-        self.validation = Whole(Reconstructions(
-            validated, self.grid, initial, made.network, scenes, Augmentation.none(), folder / "validated",
+        self.validation = Whole(self.kind(
+            validated, self.grid, initial, network, scenes, Augmentation.none(), folder / "validated",
             made.validation * len(validated), 1))
 
     def draws(self, epoch: int) -> Dataset:
@@ -214,3 +247,20 @@ class RefinementData(PriorData):
 
     def collate(self, cases: list[dict]) -> dict:
         return torch.utils.data.default_collate(cases)
+
+
+class RefinedResultsData(RefinementData):
+    """Crops of results for training a FinerUncertainty; settings as RefinementData's, with the network of
+    `made.network`, the shipped one if left out, and a refiner with intervals."""
+
+    kind = RefinedResults
+
+    def __init__(self, made: RefinementCases = RefinementCases(), scenes: Scenes = Scenes(most_views=16),
+                 cts: str | None = None, holdout: HoldOut = HoldOut(phantoms=0), phantoms: int = 0,
+                 loading: Loading = Loading(), cache: str = "runs/cache", initial: str = str(DEFAULT_REFINER),
+                 cube: Cube = Cube(128), window: tuple[float, float] = (-1000.0, 1000.0)):
+        refiner = load_prior(initial)
+        if isinstance(refiner, Refiner) and refiner.uncertainty is None:
+            raise ValueError(f"intervals on finer voxels are made of a refiner's own, but {initial} has none: "
+                             "train them first, with configs/prior/uncertainty.yaml")
+        super().__init__(made, scenes, cts, holdout, phantoms, loading, cache, initial, cube, window)

@@ -226,6 +226,13 @@ def test_a_cached_draw_is_the_draw_and_other_variations_are_other_files(drawn, m
     assert other[1]["volume"].sub(patient["volume"]).abs().max() < 1e-3
 
 
+def test_a_stored_draw_is_not_that_of_the_same_patients_with_other_reports(drawn):
+    told = CTCases([replace(ct, report="Findings: mine.") for ct in drawn.cts.cts], drawn.cts.cache, GRID)
+    with_reports = DrawnPatients(told, drawn.settings)
+    assert {drawn[seed]["report"] for seed in range(2)} != {"Findings: mine."}
+    assert {with_reports[seed]["report"] for seed in range(2)} == {"Findings: mine."}
+
+
 @pytest.mark.slow
 def test_two_processes_share_a_cache(folder, tmp_path):
     code = """if True:
@@ -295,6 +302,8 @@ def test_fewer_than_two_patients_are_refused(folder, tmp_path):
     files = find_cts(folder)
     with pytest.raises(ValueError, match=r"at least 2 patients, but there is 1 to train on \(patient0\)"):
         DrawnPatients(CTCases(files[:1], None, GRID))
+    with pytest.raises(ValueError, match="; 3 CTs in the subfolder scans count as one patient's, give that folder"):
+        DrawnPatients(CTCases([replace(ct, id=f"scans__{ct.id}") for ct in files], None, GRID))
     water(tmp_path)
     drawn = DrawnPatients(CTCases([files[0], *find_cts(tmp_path)], None, Grid.cube(16)))
     with pytest.warns(UserWarning, match="water"), pytest.raises(ValueError, match="1 of 2 could be registered"):

@@ -11,6 +11,7 @@ from safetensors.torch import load_file, save_file
 
 from phydict.prior import TextEncoder, describe_prior, inspect_prior, load_prior, save_prior
 from phydict.prior.text_file import build_text
+from phydict.runtime.shipped import shipped
 from prior.tiny import REPORTS, tiny_prior, write_cxr_bert
 
 X = random_like((1, 4, 16, 16, 16), torch.float32, seed=1)
@@ -214,3 +215,11 @@ def test_a_text_encoder_that_contradicts_its_header_names_the_file(file, change)
     prior = load_prior(with_header(file, text=text | change))
     with pytest.raises(ValueError, match="tiny.safetensors' contradicts itself: the text encoder"):
         prior.bind(REPORTS[0])
+
+
+def test_the_shipped_prior_that_unlearnt_reports_says_so_at_the_first_and_the_one_that_hears_them_does_not(recwarn):
+    prior, hears = load_prior(), load_prior(shipped("data/prior/phydict_64_reports.safetensors"))
+    for loaded in (prior, hears):
+        loaded.context([""])
+        loaded.context(["a nodule in the left lung"])
+    assert ["phydict_64 has unlearnt what reports state" in str(w.message) for w in recwarn] == [True]

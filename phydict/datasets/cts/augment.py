@@ -38,7 +38,8 @@ class Augmentation:
         scale: change of the size, at most, along each axis, as a share of it
         shift: length in mm, at most
         elastic_mm: mm, amplitude of the slowest bending
-        girth: share of the cases, in [0, 1], whose body becomes up to 300 to 600 mm wide and loses its table
+        girth: share of the cases, in [0, 1], whose body's wall grows or shrinks towards a width of 300 to 600 mm, as
+            far as GROWTH in girth.py lets it, and that lose their table
         hu_scale: change of HU + 1000, at most, as a share of it
         hu_offset: change of HU, at most, in tissue only
         contrast: change of HU, at most, in blood only

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -48,6 +49,14 @@ def patient_of(id: str) -> str:
     """The patient of a Case id: CT-RATE's train_12 of train_12_a_1, `folder` of `folder__name`, else the id itself."""
     match = NAME.fullmatch(id)
     return match["patient"] if match else id.split("__")[0]
+
+
+def as_one_patient(ids: Iterable[str]) -> str:
+    """What to tell where several CTs are the scans of a single patient, since all lie in one subfolder; else ""."""
+    patients = [patient_of(id) for id in ids]
+    if len(patients) < 2 or len(set(patients)) > 1:
+        return ""
+    return f"; {len(patients)} CTs in the subfolder {patients[0]} count as one patient's, give that folder"
 
 
 def scan_of(id: str) -> str:

@@ -12,7 +12,7 @@ from torch.utils.data import Dataset
 
 from phydict.datasets.case import Case
 from phydict.datasets.cts.cache import read_arrays, write_arrays
-from phydict.datasets.cts.ct_rate import CTCases, patient_of
+from phydict.datasets.cts.ct_rate import CTCases, as_one_patient, patient_of
 from phydict.datasets.phantoms.findings import write_report
 from phydict.datasets.population.anatomy import Variation, findings_of
 from phydict.datasets.population.population import Population
@@ -21,7 +21,7 @@ from phydict.runtime.progress import CaseProgress
 from phydict.runtime.ranges import check_fields
 from phydict.runtime.warning import warn
 
-POPULATION_VERSION = 1
+POPULATION_VERSION = 2
 """Raised whenever a registration or a draw of the same seed comes out differently; older files are not read then."""
 
 MOST_DRAWS = 10_000_000
@@ -63,8 +63,9 @@ class DrawnPatients(Dataset):
         if len(picked) < 2:
             raise ValueError(f"a population is drawn from the CTs of at least 2 patients, but there "
                              f"{'is 1' if picked else 'are 0'} to train on"
-                             + (f" ({cts.cts[picked[0]].id})" if picked else "") + ": give more CTs, or set "
-                             "data.loading.population.share to 0")
+                             + (f" ({cts.cts[picked[0]].id})" if picked else "")
+                             + as_one_patient(ct.id for ct in cts.cts)
+                             + ": give more CTs, or set data.loading.population.share to 0")
         self.cts = CTCases([cts.cts[i] for i in picked], cts.cache, cts.grid, cts.window)
         self.folder = cts.cache and cts.cache / f"population{POPULATION_VERSION}"
         self.population: Population | None = None
@@ -109,8 +110,8 @@ class DrawnPatients(Dataset):
         if len(left) < 2:
             raise ValueError(f"a population is drawn from at least 2 CTs, but {len(left)} of {len(cases)} could be "
                              "registered: give other CTs, or set data.loading.population.share to 0")
-        self.drawn = self.folder and self.folder / self._key([self.cts.key(self.cts.cts[i]) for i in left],
-                                                             asdict(self.settings.variation))
+        self.drawn = self.folder and self.folder / self._key(
+            [[self.cts.key(self.cts.cts[i]), cases[i]["report"]] for i in left], asdict(self.settings.variation))
         self.overlaps = [registered[i].overlap for i in left if i != template]
         self.population = Population([cases[i] for i in left], torch.stack([registered[i].velocity for i in left]),
                                      left.index(template), self.cts.grid, self.cts.window)

@@ -1,0 +1,81 @@
+"""Training what says how far a refiner's reconstruction on finer voxels may be off."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torchmetrics.functional import spearman_corrcoef
+
+from phydict.grid import Cube
+from phydict.prior import DEFAULT_CORRECTION, describe_correction, load_correction
+from phydict.prior.correction import CorrectionNetwork
+from phydict.prior.finer_uncertainty import SEEN, FinerUncertainty, tissue_of_seen
+from phydict.prior.uncertainty import TISSUES
+from phydict.training.settings import Optimisation
+from phydict.training.stage import StageTraining
+from phydict.units import HUWindow
+
+OUTSIDE = TISSUES.index("air")
+
+
+class FinerUncertaintyTraining(StageTraining):
+    """Learns the FinerUncertainty of a CorrectionNetwork, whose own weights stay as they are, from crops of its
+    results, as UncertaintyTraining learns a refiner's; each validation calibrates it.
+
+    Args:
+        network: what is learnt; none given: the initial network's, or the default FinerUncertainty
+        cube: of the fine voxels
+        window: HU that the prior's range [-1, 1] stands for
+        optimisation: how the weights are learnt
+        body_weight: how many times more a voxel of the body counts than one of air, plus 1
+        initial: the CorrectionNetwork's file
+    """
+
+    prior: CorrectionNetwork
+
+    def __init__(self, network: FinerUncertainty | None = None, cube: Cube = Cube(128),
+                 window: tuple[float, float] = (-1000.0, 1000.0), optimisation: Optimisation = Optimisation(),
+                 body_weight: float = 9.0, initial: str = str(DEFAULT_CORRECTION)):
+        corrects = load_correction(initial)
+        if not corrects.grid.same_as(cube.grid()) or corrects.window != HUWindow(*window):
+            raise ValueError(f"the network {initial} has another grid or HU window than this training: "
+                             "set model.cube and model.window to its own")
+        corrects.uncertainty = network or corrects.uncertainty or FinerUncertainty()
+        super().__init__(corrects, optimisation, 0)
+        corrects.uncertainty.train().requires_grad_(True)
+        self.body_weight = body_weight
+        self.held_out: list[tuple[Tensor, Tensor]] = []
+
+    def batch_loss(self, batch: dict, key: tuple[int, ...] = (0,), rank: int = 0, processes: int = 1) -> Tensor:
+        log_scale, error, tissue = self._compared(batch["volume"])
+        weight = 1 + self.body_weight * (tissue != OUTSIDE)
+        return (weight * (log_scale + error / log_scale.exp())).sum() / weight.sum()
+
+    def _compared(self, volume: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """What the network says of the log of the errors' scale, the errors, and the tissues, (B, X, Y, Z) each, of
+        what is seen and the truth (B, SEEN + 1, X, Y, Z)."""
+        seen = volume[:, :SEEN]
+        assert self.prior.uncertainty is not None
+        return (self.prior.uncertainty(seen)[:, 0], (seen[:, 0] - volume[:, SEEN]).abs(), tissue_of_seen(seen))
+
+    def on_validation_start(self) -> None:
+        super().on_validation_start()
+        self.held_out = []
+
+    def validation_step(self, batch: dict, index: int) -> None:
+        log_scale, error, tissue = self._compared(batch["volume"])
+        body = tissue != OUTSIDE
+        self.log("val/rank", spearman_corrcoef(log_scale[body].float(), error[body]), batch_size=1, sync_dist=True,
+                 prog_bar=True)
+        self.held_out.append(((error / log_scale.exp()).flatten(), tissue.flatten()))
+        self.log("samples", float(self.samples), rank_zero_only=True, batch_size=1)
+
+    def on_validation_epoch_end(self) -> None:
+        if self.held_out:
+            ratios, tissues = (self.all_gather(torch.cat(parts)).flatten()  # type: ignore[union-attr]
+                               for parts in zip(*self.held_out))
+            assert self.prior.uncertainty is not None
+            self.prior.uncertainty.calibrate(ratios, tissues)
+
+    def _describe(self) -> dict:
+        return describe_correction(self.prior)

@@ -103,21 +103,35 @@ class Trial:
     def result_scene(self) -> tuple[Grid, HUWindow]:
         """The result's grid and HU window."""
         file = self.prior or self.like
-        if self.prior is None and self.data.protocol and self.data.protocol.grid:
-            return self.data.protocol.grid, HUWindow()
+        if self.own is None and self.fixed:
+            return self.fixed, HUWindow()
         window = prior_of(file).window if file else HUWindow()
         return self.box.grid() if self.box else self.first(), window
 
-    def first(self) -> Grid:
-        """The grid of the method before it is refined: of its second stage, its prior or the one that it goes by."""
+    @property
+    def own(self) -> Grid | None:
+        """The grid that the method is bound to: of its second stage, its prior or its weights; None where any will
+        do."""
         if self.super_resolution:
             return stage_of(self.super_resolution).grid
-        file = self.prior or self.like
-        return prior_of(file).grid if file else DEFAULT_GRID
+        if isinstance(self.method, Reconstructor):
+            return self.method.grid
+        return prior_of(self.prior).grid if self.prior else None
+
+    @property
+    def fixed(self) -> Grid | None:
+        """The grid of a protocol that has one."""
+        return self.data.protocol.grid if self.data.protocol else None
+
+    def first(self) -> Grid:
+        """The grid of the method before it is refined: its own, or the one that it goes by."""
+        if self.own:
+            return self.own
+        return prior_of(self.like).grid if self.like else DEFAULT_GRID
 
     def scored(self) -> Grid:
         """The grid on which results are scored."""
-        return self.box.grid() if self.box else self.scene()[0]
+        return self.box.grid() if self.box and not self.fixed else self.scene()[0]
 
     @property
     def refinement(self) -> Refinement:
@@ -249,6 +263,8 @@ def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
     trial = Trial(columns, method, data, prior, value["guidance"], value["samples"], value["seed"], box,
                   value["refine"], value["super_resolution"], projector=value["projector"],
                   with_report=value["report"])
+    if box and data.protocol:
+        data.protocol.check_voxels(box.grid(), trial.own is not None)
     return trial, set(given) | set(overrides)
 
 

@@ -94,6 +94,8 @@ class ReconstructionData(lightning.LightningDataModule):
                              f"{geometry} was given: leave one of the two out")
         self.orbit = self.protocol.fixed_orbit(orbit) if self.protocol else orbit.filled()
         self.simulator = self.protocol.fixed_simulator(simulator) if self.protocol else simulator
+        if self.protocol:
+            self.protocol.check_simulation(simulation_voxels)
         self.geometry_file = configuration(geometry, ("geometry",)) if geometry else None
         self.beam, self._beam_settings = self.orbit.beam(), self.orbit.settings()
         changed = {"only": only is not None, "orbit": orbit != Orbit(), "simulator": simulator != Ideal(),

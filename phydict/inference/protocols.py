@@ -1,8 +1,8 @@
 """Published evaluations by name: what geometry, voxels, HU range, noise and scores their figures were taken with.
 
-A method without a prior works on the protocol's voxels; one with a prior works on the prior's, and its volume is
-resampled onto the protocol's, on which the X-rays are made and the scores are taken. CTs are centred on the lungs,
-where the publications crop the middle of the scan.
+A method that is bound to no voxels works on the protocol's; one with a prior, or a trained rival, works on its own, and
+its volume is resampled onto the protocol's, on which the X-rays are made and the scores are taken. CTs are centred on
+the lungs, where the publications crop the middle of the scan.
 """
 
 from __future__ import annotations
@@ -78,14 +78,34 @@ class Protocol:
                              f"{given} was given: leave one of the two out")
         return fixed
 
-    def fixed_grid(self, given: Grid) -> Grid:
-        """The protocol's voxels, if any. Raises ValueError where others than the default are given."""
-        fixed = self.grid or given
-        if not any(given.same_as(grid) for grid in (fixed, Grid.cube(64))):
-            raise ValueError(f"data.protocol {self.name} fixes {fixed.shape[0]} voxels over {fixed.extent[0]:g} mm, "
-                             f"but model.grid has {given.shape[0]} over {given.extent[0]:g} mm: leave one of the two "
-                             "out")
-        return fixed
+    def check_simulation(self, voxels: int | None) -> None:
+        """Raises ValueError where X-rays are to be made of other voxels, along each side, than the protocol's."""
+        if self.cube and voxels not in (None, self.cube[0]):
+            raise ValueError(f"data.protocol {self.name} makes X-rays of {self.cube[0]} voxels along each side, but "
+                             f"data.simulation_voxels {voxels} was given: leave one of the two out")
+
+    def check_voxels(self, given: Grid | None, bound: bool) -> None:
+        """Raises ValueError where a method is given voxels for its result that contradict the protocol's: others than
+        these, or, where it is bound to voxels of its own, a box that leaves out a part both of these and of the
+        chest."""
+        fixed = self.grid
+        if fixed is None or given is None or given.same_as(fixed):
+            return
+        if not bound:
+            raise ValueError(f"data.protocol {self.name} fixes {_told(fixed)}, but {_told(given)} were given: leave "
+                             "one of the two out")
+        if not any(covers(given, box) for box in (fixed, DEFAULT_GRID)):
+            raise ValueError(f"data.protocol {self.name} scores {_told(fixed)}, but {_told(given)} were given, which "
+                             f"leave out a part of them: give a box that holds the chest, {DEFAULT_GRID.extent[0]:g} "
+                             "mm, or leave one of the two out")
+
+
+def _told(grid: Grid) -> str:
+    """The number of voxels of a box along its sides, these in mm, and where its centre is unless at the isocentre."""
+    sizes, sides = (values[:1] if len(set(values)) == 1 else values
+                    for values in (grid.shape, (*grid.extent.round(3),)))
+    place = "" if np.allclose(grid.centre, 0) else f" around ({', '.join(f'{x:g}' for x in grid.centre)})"
+    return f"{' x '.join(map(str, sizes))} voxels over {' x '.join(f'{side:g}' for side in sides)} mm{place}"
 
 
 PROTOCOLS = {protocol.name: protocol for protocol in (

@@ -123,9 +123,10 @@ class ReconstructionTask(lightning.LightningModule):
         self.keep_coarse = box is not None and box.keep_coarse
         self.around = self.grid = self.plain.grid or DEFAULT_GRID
         self.reconstructor = self.plain
-        if box is None:
+        self.chosen = None if box is None else box.grid()
+        if self.chosen is None:
             return
-        self.grid = box.grid()
+        self.grid = self.chosen
         self.around = whole(self.grid)
         self.reconstructor = onto_grid(self.plain, self.grid)
         self.settings |= grid_settings(self.grid, self.reconstructor)
@@ -152,9 +153,11 @@ class ReconstructionTask(lightning.LightningModule):
             self._take(self.predicted)
         if stage == "test":
             self.settings |= self.scoring.settings()
-            if data.protocol and data.protocol.grid and self.prior is None:
-                self.grid = self.around = data.protocol.fixed_grid(self.grid)
-                self.reconstructor = self.plain
+            if data.protocol and data.protocol.grid:
+                data.protocol.check_voxels(self.chosen, self.plain.grid is not None)
+                if self.plain.grid is None:
+                    self.grid, self.reconstructor = data.protocol.grid, self.plain
+                self.around = self.grid
         check_apart(self.results.folder, "model.out", data.inputs(stage))
         check_own_page(self.results.folder.parent, "model.out")
 

@@ -9,8 +9,9 @@ import pytest
 import torch
 import yaml
 from command_lines import refusal
+from rivals.tiny_rivals import tiny_lifted
 
-from inference.runs import record, sirt
+from inference.runs import record, sirt, volume, with_prior
 from phydict.cli.infer import main
 from phydict.evaluation import read_csv
 from phydict.evaluation.published import psnr_slices, ssim_uniform
@@ -18,6 +19,7 @@ from phydict.grid import Cube, Grid
 from phydict.inference import ReconstructionData, protocols, scoring
 from phydict.inference.protocols import PROTOCOLS, placed, resampled
 from phydict.inference.settings import Orbit
+from phydict.rivals import save_rival
 from phydict.units import HUWindow
 from phydict.xray import Ideal, Polychromatic
 
@@ -62,10 +64,35 @@ def test_without_a_protocol_everything_is_as_it_was():
     ({"protocol": "luna16", "orbit": Orbit(arc=360.0)}, "arc at 180.0"),
     ({"protocol": "luna16", "geometry": "paper_orbit"}, "data.geometry paper_orbit was given"),
     ({"protocol": "luna16", "simulator": Polychromatic()}, "fixes the X-rays as ideal ones with noise 0"),
+    ({"protocol": "x2ct", "simulation_voxels": 256}, "X-rays of 128 voxels along each side, but .* 256 was given"),
 ])
 def test_what_clashes_with_a_protocol_is_refused(given, sentence):
     with pytest.raises(ValueError, match=sentence):
         ReconstructionData(cts="phantom", **given)
+
+
+def test_the_simulation_s_voxels_may_be_the_protocol_s():
+    assert ReconstructionData(protocol="x2ct", simulation_voxels=128).simulation_voxels == 128
+    assert ReconstructionData(protocol="phydict", simulation_voxels=128).simulation_voxels == 128
+
+
+@pytest.mark.parametrize("given, bound, sentence", [
+    (Grid.cube(64), False, "fixes 128 voxels over 320 mm, but 64 voxels over 384 mm were given"),
+    (Grid.box((128, 128, 100), (320, 320, 250)), False, "but 128 x 128 x 100 voxels over 320 x 320 x 250 mm were"),
+    (Grid.box(128, 320, (0, 20, 0)), False, r"but 128 voxels over 320 mm around \(0, 20, 0\) were given"),
+    (Grid.cube(32, 192.0), True, "scores 128 voxels over 320 mm, but 32 voxels over 192 mm .* leave out a part"),
+    (Grid.box(128, 320, (0, 20, 0)), True, "leave out a part of them: give a box that holds the chest, 384 mm, or")])
+def test_voxels_that_contradict_a_protocols_are_refused(given, bound, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        PROTOCOLS["x2ct"].check_voxels(given, bound)
+
+
+def test_voxels_that_hold_a_protocols_or_the_chest_are_taken():
+    for given in (None, Grid.cube(128, 320.0), Grid.cube(64, 330.0), Grid.cube(128)):
+        PROTOCOLS["x2ct"].check_voxels(given, True)
+    PROTOCOLS["luna16"].check_voxels(Grid.cube(128), True)  # a prior's cube is smaller than the protocol's
+    PROTOCOLS["x2ct"].check_voxels(Grid.cube(128, 320.0), False)
+    PROTOCOLS["phydict"].check_voxels(Grid.cube(32, 100.0), False)
 
 
 def test_another_grid_and_measured_xrays_are_refused_by_the_command_line(tmp_path, capsys):
@@ -122,6 +149,56 @@ def test_a_method_on_other_voxels_keeps_its_place_in_the_ct():
     moved[:3, 3] += (5, -7, 11)
     assert placed(own, like, moved).centre == pytest.approx((5, -7, 11))
     assert np.array_equal(placed(like, like, moved).affine, moved)
+
+
+def bound_methods(prior, folder) -> dict[str, list[str]]:
+    """Options of a method with a prior, and of a rival, on 16^3 voxels of their own."""
+    save_rival(tiny_lifted(), folder / "lifted.safetensors")
+    return {"prior_only": with_prior("test", folder, prior),
+            "lifted": ["test", "--model.method=phydict.rivals.TrainedRival", "--model.name=lifted",
+                       f"--model.method.init_args.file={folder / 'lifted.safetensors'}", f"--model.out={folder}",
+                       "--trainer.accelerator=cpu"]}
+
+
+def test_what_is_bound_to_its_own_voxels_is_resampled_onto_a_protocols(tmp_path, small, prior, monkeypatch):
+    shapes = []
+
+    def kept(volume, truth, scored):
+        shapes.append((tuple(volume.shape), tuple(truth.shape)))
+        return ssim_uniform(volume, truth, scored)
+
+    monkeypatch.setitem(scoring.PUBLISHED, "ssim_uniform", kept)
+    of = ["--data.cts=phantom", "--data.phantoms=1", "--data.protocol=small", "--model.sampling.with_report=false"]
+    for name, arguments in bound_methods(prior, tmp_path).items():
+        for more, voxels in ([], 16), (["--model.grid=32", "--model.overwrite=true"], 32):
+            main([*arguments, *of, *more])
+            assert volume(tmp_path / name / "phantom-1000000").shape == (voxels,) * 3
+    assert set(shapes) == {((24,) * 3, (24,) * 3)} and len(shapes) == 4
+
+
+def test_a_region_is_refused_beside_a_protocol_in_which_it_would_be_scored_alone(tmp_path, small, prior, capsys):
+    for arguments in bound_methods(prior, tmp_path).values():
+        said = refusal(capsys, main, [*arguments, "--data.cts=phantom", "--data.phantoms=1", "--data.protocol=small",
+                                      "--model.grid.voxels=32", "--model.grid.side=192"])
+        assert "small scores 24 voxels over 409.6 mm, but 32 voxels over 192 mm were given" in said
+
+
+def test_ablate_resamples_rivals_and_refuses_voxels_as_test_does(tmp_path, small, prior, capsys):
+    bound_methods(prior, tmp_path)
+    file, out = tmp_path / "spec.yaml", tmp_path / "out"
+    lifted = {"of": "phydict.rivals.TrainedRival", "method.file": str(tmp_path / "lifted.safetensors")}
+    file.write_text(yaml.safe_dump({"out": str(out), "phantoms": 1, "base": {"protocol": "small"}, "methods": {
+        "lifted": lifted}, "axes": {"method": ["fdk", "lifted"]}}))
+    main(["ablate", "-c", str(file), "--device", "cpu"])
+    assert {(row["method"], row["status"], row["grid"]) for row in read_csv(out / "results.csv")} == {
+        ("fdk", "ok", "24x24x24"), ("lifted", "ok", "24x24x24")}
+    args = ["ablate", "-c", str(file), "--device", "cpu", "--out", str(tmp_path / "other"), "--set"]
+    assert "small fixes 24 voxels over 409.6 mm, but 32 voxels over 384 mm" in refusal(
+        capsys, main, [*args, "method=[fdk]", "voxels=32"])
+    assert "small scores 24 voxels over 409.6 mm, but 32 voxels over 192 mm" in refusal(
+        capsys, main, [*args, "method=[lifted]", "voxels=32", "side=192"])
+    main([*args, "method=[lifted]", "voxels=32"])
+    assert [row["grid"] for row in read_csv(tmp_path / "other" / "results.csv")] == ["24x24x24"]
 
 
 def test_ablate_compares_methods_by_a_protocol(tmp_path, small):

@@ -8,6 +8,7 @@ from torch import Tensor
 from phydict.evaluation.metrics import RANGE
 from phydict.evaluation.planes import PLANES, slices
 from phydict.runtime.lpips_networks import load_lpips, lpips_distances
+from phydict.units import HUWindow
 
 BACKBONES = ("alex", "squeeze")
 OTHERWISE = "leave lpips out of the metrics"
@@ -21,13 +22,14 @@ def load_networks() -> None:
 
 
 @torch.no_grad()
-def lpips_scores(hu: Tensor, true_hu: Tensor, device: torch.device | str = "cpu") -> dict[str, float]:
+def lpips_scores(hu: Tensor, true_hu: Tensor, device: torch.device | str = "cpu",
+                 scored: HUWindow = RANGE) -> dict[str, float]:
     """{"lpips_alex", "lpips_squeeze"}: means over a plane's slices, then over the planes, of volumes (X, Y, Z).
 
-    Both are clipped to `RANGE` and mapped to [-1, 1]. Computed in float32 on `device`. Raises ValueError where slices
-    are too small for a backbone.
+    Both are clipped to the HU range `scored` and mapped to [-1, 1]. Computed in float32 on `device`. Raises ValueError
+    where slices are too small for a backbone.
     """
-    x, y = (RANGE.to_range(volume.float()).to(device) for volume in (hu, true_hu))
+    x, y = (scored.to_range(volume.float()).to(device) for volume in (hu, true_hu))
     scores = {}
     for backbone in BACKBONES:
         network = load_lpips(backbone, False, OTHERWISE).to(device)

@@ -116,7 +116,7 @@ class Scoring:
         if protocol:
             scores |= {name: PUBLISHED[name](volume, truth, scored) for name in protocol.scores}
         if "lpips" in self.metrics:
-            scores |= lpips_scores(volume, truth, device)
+            scores |= lpips_scores(volume, truth, device, scored)
         if "organs" in self.metrics:
             scores |= organ_scores(volume, truth, grid, segmented(case, grid))
         if "sharpness" in self.metrics and bool(case["has_masks"][0]):

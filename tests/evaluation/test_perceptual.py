@@ -9,6 +9,7 @@ from phydict.evaluation import perceptual
 from phydict.evaluation.perceptual import load_networks, lpips_scores
 from phydict.runtime import lpips_networks
 from phydict.runtime.lpips_networks import load_lpips
+from phydict.units import HUWindow
 
 
 @pytest.fixture
@@ -32,6 +33,13 @@ def test_what_lies_beyond_the_range_is_not_seen(untrained):
     truth[:, :, 20:] = 1000
     far = torch.where(truth == 1000, 3000.0, truth)
     assert lpips_scores(far, truth) == pytest.approx({"lpips_alex": 0, "lpips_squeeze": 0}, abs=1e-6)
+
+
+def test_the_range_is_the_one_that_is_scored(untrained):
+    truth = noise(0)
+    truth[:, :, 20:] = 1000
+    far = torch.where(truth == 1000, 1400.0, truth)
+    assert all(score > 1e-6 for score in lpips_scores(far, truth, scored=HUWindow(-1000, 1500)).values())
 
 
 def test_slices_that_are_too_small_and_a_missing_backbone_are_refused(untrained, monkeypatch, tmp_path):

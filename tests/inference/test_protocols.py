@@ -131,6 +131,15 @@ def test_a_protocols_scores_are_those_of_its_grid_and_range(tmp_path, small, mon
     assert record(tmp_path / "sirt" / "phantom-1000000")["settings"]["data"]["protocol"] == "small"
 
 
+def test_lpips_is_taken_in_a_protocols_range(tmp_path, small, monkeypatch):
+    ranges = []
+    monkeypatch.setattr(scoring, "load_networks", lambda: None)
+    monkeypatch.setattr(scoring, "lpips_scores", lambda volume, truth, device, scored: ranges.append(scored) or {})
+    main(sirt("test", tmp_path, "--data.cts=phantom", "--data.phantoms=1", "--data.protocol=small",
+              "--metrics=[lpips]"))
+    assert ranges == [small.hu]
+
+
 def test_a_volume_is_resampled_where_it_lies_and_means_are_kept():
     fine, coarse = Grid.cube(24, 240.0), Grid.cube(12, 240.0)
     hu = torch.randn(12, 12, 12, generator=torch.Generator().manual_seed(0))

@@ -103,20 +103,13 @@ class Trial:
     def result_scene(self) -> tuple[Grid, HUWindow]:
         """The result's grid and HU window."""
         file = self.prior or self.like
-        if self.own is None and self.fixed:
-            return self.fixed, HUWindow()
         window = prior_of(file).window if file else HUWindow()
         return self.box.grid() if self.box else self.first(), window
 
     @property
-    def own(self) -> Grid | None:
-        """The grid that the method is bound to: of its second stage, its prior or its weights; None where any will
-        do."""
-        if self.super_resolution:
-            return stage_of(self.super_resolution).grid
-        if isinstance(self.method, Reconstructor):
-            return self.method.grid
-        return prior_of(self.prior).grid if self.prior else None
+    def bound(self) -> bool:
+        """Whether the method has voxels of its own: a prior's, or those of its weights."""
+        return isinstance(self.method, Sampler) or self.method.grid is not None
 
     @property
     def fixed(self) -> Grid | None:
@@ -124,10 +117,14 @@ class Trial:
         return self.data.protocol.grid if self.data.protocol else None
 
     def first(self) -> Grid:
-        """The grid of the method before it is refined: its own, or the one that it goes by."""
-        if self.own:
-            return self.own
-        return prior_of(self.like).grid if self.like else DEFAULT_GRID
+        """The grid of the method before it is refined: of its second stage, its prior or the one that it goes by; by a
+        protocol that has one its weights' own, or the protocol's."""
+        if self.super_resolution:
+            return stage_of(self.super_resolution).grid
+        if self.fixed and isinstance(self.method, Reconstructor):
+            return self.method.grid or self.fixed
+        file = self.prior or self.like
+        return prior_of(file).grid if file else DEFAULT_GRID
 
     def scored(self) -> Grid:
         """The grid on which results are scored."""
@@ -264,7 +261,7 @@ def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
                   value["refine"], value["super_resolution"], projector=value["projector"],
                   with_report=value["report"])
     if box and data.protocol:
-        data.protocol.check_voxels(box.grid(), trial.own is not None)
+        data.protocol.check_voxels(box.grid(), trial.bound)
     return trial, set(given) | set(overrides)
 
 

@@ -50,10 +50,10 @@ def main(args: list[str] | None = None) -> None:
             rows = run(specification, torch.device(device), progress, scoring)
         print(f"{len(rows)} rows in {specification.out / RESULTS}")
         entries = summarise(rows)
-        tables = all_tables(entries, rows, scoring.empty) + fid_tables(specification.out, entries, scoring)
+        tables = all_tables(entries, scoring.empty) + fid_tables(specification.out, entries, scoring)
         written = write_tables(specification.out, tables) + write_plots(specification.out, entries)
         print(f"tables and plots in {specification.out}: {', '.join(path.name for path in written)}")
-        print(f"page: {comparison_page(specification.out, rows, entries, tables)}")
+        print(f"page: {comparison_page(specification.out, entries, tables)}")
 
 
 def _parser(args: Sequence[str]) -> ArgumentParser:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from phydict.ablation.run import features_file
@@ -29,7 +29,7 @@ def fid_tables(out: Path, entries: Sequence[Entry], scoring: Scoring) -> list[Ta
     rows, tables, backbone = [], [], scoring.fid.backbone
     for condition, group in conditions(entries):
         features = {entry.label: {name: load_features(features_file(out, key), backbone)
-                                  for name, key in _named(entry.rows)} for entry in group if entry.rows}
+                                  for name, key in _named(entry.counted)} for entry in group if entry.counted}
         if features:
             tables.append(fid_table(features, backbone, scoring.fid.replicates,
                                     format_settings("Frechet distance of slices (FID)", condition)))
@@ -45,7 +45,9 @@ def _numbers(values: Sequence) -> dict[str, float]:
             for end, number in zip(("", "_low", "_high"), value) if not math.isnan(number)}
 
 
-def _named(rows: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
-    """A name for each row of a case and a key, of the case's patient (`patient_of`), and the key."""
-    repeats = [sum(other == case for other, _ in rows[:i]) for i, (case, _) in enumerate(rows)]
-    return [(f"{patient_of(case)}__{case}__{n}" if n else case, key) for (case, key), n in zip(rows, repeats)]
+def _named(rows: Sequence[Mapping]) -> list[tuple[str, str]]:
+    """A name for each row of a case, of the case's patient (`patient_of`), and the row's key."""
+    cases = [row["case"] for row in rows]
+    repeats = [cases[:i].count(case) for i, case in enumerate(cases)]
+    return [(f"{patient_of(case)}__{case}__{n}" if n else case, row["key"])
+            for case, n, row in zip(cases, repeats, rows)]

@@ -22,17 +22,15 @@ def is_comparison(folder: Path) -> bool:
 def page_anew(folder: Path) -> Path:
     """Writes the page of a folder's table; returns its path. Tables of Frechet distances, which ablate
     makes of features, are in tables.md alone."""
-    rows = read_csv(folder / RESULTS)
-    entries = summarise(rows)
-    return comparison_page(folder, rows, entries, all_tables(entries, rows))
+    entries = summarise(read_csv(folder / RESULTS))
+    return comparison_page(folder, entries, all_tables(entries))
 
 
-def comparison_page(folder: Path, rows: Sequence[Mapping], entries: Sequence[Entry], tables: Sequence[Table]) -> Path:
-    """Writes the page of rows, their entries and tables, with the plots in the folder; returns its path. Raises
+def comparison_page(folder: Path, entries: Sequence[Entry], tables: Sequence[Table]) -> Path:
+    """Writes the page of entries, with their rows, and tables, with the plots in the folder; returns its path. Raises
     ValueError where a page of someone else's is in its place."""
     check_own_page(folder, "out")
-    by_key = {row["key"]: row for row in rows}
-    cases = [_case(entry, by_key[key]) for entry in entries for _, key in entry.rows]
+    cases = [_case(entry, row) for entry in entries for row in entry.counted]
     points = [{"name": format_settings(entry.label, entry.condition), "series": entry.method,
                "seconds": entry.means["seconds"], "error": entry.means.get("mae_hu")}
               for entry in entries if "seconds" in entry.means]

@@ -31,7 +31,7 @@ class Entry:
 
     settings: those that differ among the method's entries, beside its name; values: measure -> {case: value}, the
     seeds of a case averaged, of those measures that all its cases have; cases, of: how many cases it has and how many
-    it was to have; error: why one is missing; rows: the case and the key of each row that counts.
+    it was to have; rows: of results; error: why one of them does not count.
     """
 
     method: str
@@ -40,8 +40,13 @@ class Entry:
     values: dict[str, dict[str, float]]
     cases: int
     of: int
+    rows: Sequence[Mapping]
     error: str | None = None
-    rows: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def counted(self) -> list[Mapping]:
+        """The rows that its values are of."""
+        return [row for row in self.rows if row["status"] == "ok"]
 
     @cached_property
     def means(self) -> dict[str, float]:
@@ -160,8 +165,8 @@ def _entry(rows: Sequence[Mapping], changed: Sequence[str], varying: Sequence[st
               if len(scores := case_values(good, name)) == cases > 0}
     error = next((f"{row['status']}: {row['error']}" for row in rows if row["status"] != "ok"), None)
     return Entry(first["method"], {n: first[n] for n in changed if n in first},
-                 {n: first[n] for n in varying if n in first}, values, cases, len({row["case"] for row in rows}), error,
-                 tuple((row["case"], str(row.get("key"))) for row in good))
+                 {n: first[n] for n in varying if n in first}, values, cases, len({row["case"] for row in rows}), rows,
+                 error)
 
 
 def _varying(rows: Sequence[Mapping], names: Sequence[str]) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
@@ -21,7 +21,7 @@ from phydict.ablation.summary import (
 from phydict.evaluation.bootstrap import difference
 from phydict.evaluation.metrics import MEASURES, RANGE
 from phydict.evaluation.tables import INTERVAL, Table, caption, empty_notes, interval_note, listed, warning_notes
-from phydict.inference.protocols import protocol_of
+from phydict.inference.protocols import Protocol, protocol_of
 from phydict.runtime.files import atomic_write
 
 FURTHER = tuple(name for name in MEASURES if name not in (
@@ -41,27 +41,26 @@ OF_DELTA = ("ssim", "misfit", "psnr", "mae_hu", *FURTHER, "seconds")
 """Columns of the table of Extra Compute, the misfit beside SSIM: what looks better may fit the X-rays worse."""
 
 
-def all_tables(entries: Sequence[Entry], rows: Sequence[dict],
-               empty: Mapping[str, str] = MappingProxyType({})) -> list[Table]:
-    """Every table that the entries of some rows allow; empty: scores that may stay empty -> why they then do."""
-    measured = {name for entry in entries for name in entry.values}
-    notes, tables = [_caption(rows), *empty_notes(empty, measured), *warning_notes(rows)], []
+def all_tables(entries: Sequence[Entry], empty: Mapping[str, str] = MappingProxyType({})) -> list[Table]:
+    """Every table that entries allow; empty: scores that may stay empty -> why they then do."""
+    tables = []
     for condition, group in conditions(entries):
-        title = format_settings("Methods", condition or {name: rows[0][name] for name in ("views", "simulator")})
+        title = format_settings("Methods", condition or {name: group[0].rows[0][name]
+                                                         for name in ("views", "simulator")})
         best = best_settings(group)
         if len(best) < len(group):
-            tables.append(_method_table(f"{title}: each at its setting of highest mean PSNR", best,
-                                        [*notes, "The settings were chosen by these cases' own PSNR."]))
+            tables.append(_method_table(f"{title}: each at its setting of highest mean PSNR", best, empty,
+                                        ["The settings were chosen by these cases' own PSNR."]))
             title += ": all settings"
-        tables.append(_method_table(title, group, notes))
-        tables += _difference_tables(title.removesuffix(": all settings"), best, notes[1:])
+        tables.append(_method_table(title, group, empty))
+        tables += _difference_tables(title.removesuffix(": all settings"), best)
     for rest, group in compared_views(entries):
         columns = {k: f"K = {k}" for k in sorted({entry.condition["views"] for entry in group})}
-        tables += _axis_tables("against the number of views", rest, group, columns, "views", notes)
+        tables += _axis_tables("against the number of views", rest, group, columns, "views")
     for rest, group in compared_geometries(entries):
         columns = {file: Path(file).stem for file in dict.fromkeys(entry.condition["geometry"] for entry in group)}
-        tables += _axis_tables("by geometry", rest, group, columns, "geometry", notes)
-    return tables + [_delta_table(label, group, notes) for label, group in deltas(entries)]
+        tables += _axis_tables("by geometry", rest, group, columns, "geometry")
+    return tables + [_delta_table(label, group, empty) for label, group in deltas(entries)]
 
 
 def write_tables(folder: Path, tables: Sequence[Table]) -> list[Path]:
@@ -75,12 +74,12 @@ def write_tables(folder: Path, tables: Sequence[Table]) -> list[Path]:
     return list(files)
 
 
-def _method_table(title: str, entries: Sequence[Entry], notes: Sequence[str]) -> Table:
+def _method_table(title: str, entries: Sequence[Entry], empty: Mapping[str, str], notes: Sequence[str] = ()) -> Table:
     """Method x measures, under one condition."""
-    return _entry_table(title, "method", OF_METHODS, [(entry.label, entry) for entry in entries], notes)
+    return _entry_table(title, "method", OF_METHODS, [(entry.label, entry) for entry in entries], empty, notes)
 
 
-def _difference_tables(title: str, entries: Sequence[Entry], notes: Sequence[str]) -> list[Table]:
+def _difference_tables(title: str, entries: Sequence[Entry]) -> list[Table]:
     """What each method has more than the one of highest mean PSNR on the same cases; none without a second one."""
     compared = [entry for entry in entries if entry.cases]
     if len(compared) < 2:
@@ -95,26 +94,28 @@ def _difference_tables(title: str, entries: Sequence[Entry], notes: Sequence[str
         return []
     measures = [SHOWN_MEASURES[name] for name in names]
     return [Table(f"{title}: less {best.name}, case by case", ["method", *(m.heading for m in measures)],
-                  measures, lines, [INTERVAL, *notes])]
+                  measures, lines, [INTERVAL, *_origins(entries)])]
 
 
-def _delta_table(label: str, entries: Sequence[Entry], notes: Sequence[str]) -> Table:
+def _delta_table(label: str, entries: Sequence[Entry], empty: Mapping[str, str]) -> Table:
     """Extra Compute's delta x measures: the form of the paper's Table 2, with the misfit beside SSIM."""
     return _entry_table(f"Extra Compute's delta: {label}", "delta", OF_DELTA,
-                        [(f"{entry.settings['delta']:g}{entry.lacking}", entry) for entry in entries], notes)
+                        [(f"{entry.settings['delta']:g}{entry.lacking}", entry) for entry in entries], empty)
 
 
 def _entry_table(title: str, first: str, names: Sequence[str], lines: Sequence[tuple[str, Entry]],
-                 notes: Sequence[str]) -> Table:
-    names = _measured(names, [entry for _, entry in lines])
+                 empty: Mapping[str, str], notes: Sequence[str] = ()) -> Table:
+    entries = [entry for _, entry in lines]
+    names = _measured(names, entries, empty)
     measures = [SHOWN_MEASURES[name] for name in names]
     printed = [(label, entry.complete, [entry.estimate(name) for name in names]) for label, entry in lines]
+    why = empty_notes(empty, {name for entry in entries for name in entry.values})
     return Table(title, [first, *(measure.heading for measure in measures)], measures, printed,
-                 [*notes, *interval_note(printed), *_reasons([entry for _, entry in lines])])
+                 [_caption(entries), *why, *_origins(entries), *notes, *interval_note(printed), *_reasons(entries)])
 
 
-def _axis_tables(title: str, rest: dict, group: Sequence[Entry], columns: Mapping[object, str], axis: str,
-                 notes: Sequence[str]) -> list[Table]:
+def _axis_tables(title: str, rest: dict, group: Sequence[Entry], columns: Mapping[object, str],
+                 axis: str) -> list[Table]:
     """Method x values of an axis, a table for each measure: the form of the paper's Table 3. columns: value ->
     heading."""
     tables: list[Table] = []
@@ -127,25 +128,37 @@ def _axis_tables(title: str, rest: dict, group: Sequence[Entry], columns: Mappin
                     [line[k].estimate(name) if k in line else None for k in columns]) for label, line in lines.items()]
         tables.append(Table(
             format_settings(f"{measure.heading} {title}", rest), ["method", *columns.values()],
-            [measure] * len(columns), printed, [*notes, *interval_note(printed), *_reasons(group)]))
+            [measure] * len(columns), printed,
+            [_caption(group), *_origins(group), *interval_note(printed), *_reasons(group)]))
     return tables
 
 
-def _measured(names: Sequence[str], entries: Sequence[Entry]) -> list[str]:
-    """The measures without those of FURTHER that no entry has."""
-    return [name for name in names if name not in FURTHER or any(name in entry.values for entry in entries)]
+def _measured(names: Sequence[str], entries: Sequence[Entry], empty: Iterable[str] = ()) -> list[str]:
+    """The measures without those of FURTHER that no entry has, unless they are to be shown `empty`."""
+    return [name for name in names if name not in FURTHER or name in empty
+            or any(name in entry.values for entry in entries)]
 
 
-def _caption(rows: Sequence[dict]) -> str:
-    """What the numbers of the tables were taken from."""
+def _caption(entries: Sequence[Entry]) -> str:
+    """What the numbers of a table of entries were taken from."""
+    rows = [row for entry in entries for row in entry.rows]
     count = len({row["case"] for row in rows})
     over = f"Mean over {count} {'case' if count == 1 else 'cases'}"
     how = " on ".join(filter(None, (listed(rows, name) for name in ("precision", "instruction_set"))))
-    protocols: set = {row.get("protocol") for row in rows}
-    window = protocol_of(*protocols).window if len(protocols) == 1 and None not in protocols else RANGE
+    window = next((protocol.window for protocol in _protocols(rows)), RANGE)
     return caption(over, rows, {"Grid": "grid", "Seeds": "seed"}, window) + (
         f" Seconds: one reconstruction after a warm-up, {listed(rows, 'device') or 'none'}, threads "
         f"{listed(rows, 'threads') or 'none'}{how and f', {how}'}; loading and scoring excluded.")
+
+
+def _origins(entries: Sequence[Entry]) -> list[str]:
+    """The protocol that the rows of a table's entries were taken by, and the cases that are doubtful."""
+    rows = [row for entry in entries for row in entry.rows]
+    return [*(protocol.note for protocol in _protocols(rows)), *warning_notes(rows)]
+
+
+def _protocols(rows: Sequence[Mapping]) -> list[Protocol]:
+    return [protocol_of(name) for name in dict.fromkeys(row.get("protocol") for row in rows) if name is not None]
 
 
 def _reasons(entries: Sequence[Entry]) -> list[str]:

@@ -15,7 +15,7 @@ def test_a_case_counts_once_whatever_its_seeds_and_a_missing_case_takes_a_method
             row("b", "y", None), row("a", "z", 5.0), row("b", "z", 5.0)]
     x, y, z = summarise(rows)
     assert x.means["psnr"] == 25.0 and x.complete and not y.complete and y.label == "y (1 of 2 cases)"
-    table, differences = all_tables([x, y, z], rows)
+    table, differences = all_tables([x, y, z])
     text = table.markdown()
     assert "| x | **0.625 [0.375, 0.875]** | **25.00 [15.00, 35.00]** |" in text
     assert "| y (1 of 2 cases) | 0.975 | 39.00 |" in text
@@ -28,7 +28,7 @@ def test_a_case_counts_once_whatever_its_seeds_and_a_missing_case_takes_a_method
 def test_each_condition_has_its_table_and_the_best_setting_stands_for_a_method():
     rows = [row("a", "x", 20.0 + n + views / 10, views=views, **{"method.iterations": n}) for views in (2, 8)
             for n in (1, 3, 2)] + [row("a", "y", 21.0, views=views) for views in (2, 8)]
-    tables = {table.title: table for table in all_tables(summarise(rows), rows)}
+    tables = {table.title: table for table in all_tables(summarise(rows))}
     best = tables["Methods, K = 8: each at its setting of highest mean PSNR"]
     assert [label for label, _, _ in best.lines] == ["x, iterations 3", "y"]
     assert len(tables["Methods, K = 2: all settings"].lines) == 4
@@ -36,9 +36,27 @@ def test_each_condition_has_its_table_and_the_best_setting_stands_for_a_method()
     assert tables["PSNR (dB) ↑ against the number of views"].lines[1] == ("x, iterations 3", True, [23.2, 23.8])
 
 
+def test_a_table_says_what_its_own_rows_rest_on_alone():
+    rows = [row("a", "x", 20.0, views=2, protocol="x2ct", warning="odd", threads=1),
+            row("a", "y", 21.0, views=2, protocol="x2ct", threads=1),
+            row("a", "x", 22.0, views=8, protocol="sparc", threads=2), row("b", "y", 23.0, views=8, protocol="sparc")]
+    of_x2ct, of_sparc = ["\n".join(table.notes) for table in all_tables(summarise(rows))]
+    assert "Doubtful cases, by the column warning: x: a." in of_x2ct and "Doubtful" not in of_sparc
+    assert "Protocol x2ct" in of_x2ct and "data range 2500 HU" in of_x2ct and "threads 1;" in of_x2ct
+    assert "Protocol sparc" in of_sparc and "data range 2048 HU" in of_sparc and "threads 2;" in of_sparc
+    assert "sparc" not in of_x2ct and "Mean over 1 case;" in of_x2ct and "Mean over 2 cases;" in of_sparc
+
+
+def test_columns_that_stay_empty_are_kept_with_the_reason():
+    entries = summarise([row("a", "x", 20.0), row("a", "y", 21.0)])
+    (table,) = all_tables(entries, {"clip_t2i": "no weights were given"})
+    assert "CLIP T2I (%) ↑" in table.header and "CLIP T2I (%): empty, since no weights were given." in table.notes
+    assert "CLIP T2I" not in all_tables(entries)[0].markdown()
+
+
 def test_the_table_of_delta_has_the_misfit_beside_ssim():
     rows = [row("a", "x", 20.0 + d, delta=d) for d in (0.0, 0.8, 0.1)] + [row("a", "x", 21.0, delta=None)]
-    table = next(t for t in all_tables(summarise(rows), rows) if "delta" in t.header)
+    table = next(t for t in all_tables(summarise(rows)) if "delta" in t.header)
     assert table.header[1:3] == ["SSIM ↑", "misfit ↓"]
     assert [label for label, _, _ in table.lines] == ["0", "0.1", "0.8"]
     assert [values[:2] for _, _, values in table.lines] == [[(20 + d) / 40, 1 / (20 + d)] for d in (0.0, 0.1, 0.8)]

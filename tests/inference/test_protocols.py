@@ -220,7 +220,7 @@ def test_ablate_compares_methods_by_a_protocol(tmp_path, small):
     assert {(row["method"], row["views"]) for row in rows} == {(m, k) for m in ("sirt", "tv") for k in (2, 3)}
     assert {row["grid"] for row in rows} == {"24x24x24"} and all(row["ssim_uniform"] <= 1 for row in rows)
     page = (tmp_path / "out" / "tables.md").read_text()
-    assert "data range 2024 HU" in page and "SSIM 7^3" in page
+    assert "data range 2024 HU" in page and "SSIM 7^3" in page and "Protocol small (a test): scored on 24^3" in page
 
 
 def test_a_protocol_against_another_number_of_views_is_refused_by_ablate(tmp_path, small, capsys):

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 
 import nibabel as nib
 import numpy as np
@@ -18,11 +21,13 @@ from phydict.page import CASE_FILES, Contents, PageCase, check_own_page, write_c
 from phydict.runtime.warning import warn
 
 
-def results_page(folder: Path) -> Path:
+def results_page(folder: Path, further: Sequence[Table] = (),
+                 empty: Mapping[str, str] = MappingProxyType({})) -> Path:
     """Writes the page of a folder's finished cases, one method's or several methods' in a folder each; returns its
     path. What the page needs of a case and older results lack is made of their NIfTI files.
 
-    Raises ValueError where there is no finished case, or where a page of someone else's is in its place.
+    further: tables behind that of the means; empty: scores that may stay empty -> why. Raises ValueError where there is
+    no finished case, or where a page of someone else's is in its place.
     """
     check_own_page(folder, "folder")
     cases = [case for path in _case_folders(folder) if (case := _case(folder, path))]
@@ -37,8 +42,8 @@ def results_page(folder: Path) -> Path:
               for case in cases]
     tables = sorted({path.relative_to(folder).as_posix() for depth in ("", "*/") for name in (TABLE, "results.md")
                      for path in folder.glob(depth + name)})
-    return write_page(folder, Contents(f"Results in {folder.resolve().name}", _mean_tables(scored), cases, points,
-                                       error, links=tables))
+    return write_page(folder, Contents(f"Results in {folder.resolve().name}",
+                                       [*_mean_tables(scored, empty), *further], cases, points, error, links=tables))
 
 
 def _case_folders(folder: Path) -> list[Path]:
@@ -70,10 +75,12 @@ def _make_case_files(path: Path, missing: list[str]) -> None:
     write_case_files(path, Grid(volumes["reconstruction"].shape, affine=image.affine), volumes, names=missing)
 
 
-def _mean_tables(scored: list) -> list[Table]:
+def _mean_tables(scored: list, empty: Mapping[str, str]) -> list[Table]:
     """The means over scored cases by method, where there are any."""
     if not scored:
         return []
     names = {record["settings"].get("data", {}).get("protocol") for record in scored}
-    window = protocol_of(*names).window if len(names) == 1 and None not in names else RANGE
-    return [mean_table([score_row(record["case"], record) for record in scored], window=window)]
+    protocol = protocol_of(*names) if len(names) == 1 and None not in names else None
+    table = mean_table([score_row(record["case"], record) for record in scored],
+                       window=protocol.window if protocol else RANGE, empty=empty)
+    return [replace(table, notes=[*table.notes, protocol.note]) if protocol else table]

@@ -20,11 +20,12 @@ def summarise(results: CaseResults, cases: list[str], name: str, scoring: Scorin
     finished = [case for case in cases if case not in missing]
     console = Console()
     console.width = max(console.width, 80 if console.is_terminal else 120)
-    for table in results.summarise(finished, _distances(results, finished, name, scoring), protocol, scoring.empty):
+    distances = _distances(results, finished, name, scoring)
+    for table in results.summarise(finished, distances, protocol, scoring.empty):
         console.print(table)
     print(f"results in {results.folder}")
     if finished:
-        print(f"page: {results_page(results.folder.parent)}")
+        print(f"page: {results_page(results.folder.parent, distances, scoring.empty)}")
     if missing:
         raise ValueError(f"{len(missing)} of {len(cases)} cases were not reconstructed "
                          f"({', '.join(missing)}): see the messages above, and {results.to_resume}")

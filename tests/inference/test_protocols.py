@@ -129,6 +129,7 @@ def test_a_protocols_scores_are_those_of_its_grid_and_range(tmp_path, small, mon
     page = (tmp_path / "sirt" / "results.md").read_text()
     assert "[-1000, 1024], data range 2024" in page and "Protocol small (a test): scored on 24^3 voxels" in page
     assert record(tmp_path / "sirt" / "phantom-1000000")["settings"]["data"]["protocol"] == "small"
+    assert "Protocol small (a test): scored on 24^3 voxels" in (tmp_path / "index.html").read_text()
 
 
 def test_lpips_is_taken_in_a_protocols_range(tmp_path, small, monkeypatch):

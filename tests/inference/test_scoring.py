@@ -46,6 +46,13 @@ def test_test_measures_them_all_and_a_repeated_command_tables_the_same(tmp_path,
     assert (folder / "results.md").read_text() == page and read_csv(folder / "results.csv") == rows
 
 
+def test_the_page_shows_the_frechet_distances_and_why_scores_are_empty(tmp_path, untrained):
+    main(phantoms(tmp_path, 2, "--model.grid=34", "--metrics=[fid,clip]", "--fid.replicates=0"))
+    page = (tmp_path / "index.html").read_text()
+    assert "Frechet distance of slices (FID)" in page and "Backbone squeezenet" in page
+    assert "CLIP T2I (%): empty, since CT-CLIP's checkpoint was not given" in page
+
+
 def test_other_metrics_do_not_pass_for_those_of_a_finished_case(tmp_path, capsys, untrained):
     main(phantoms(tmp_path, 1, "--model.grid=34"))
     other = phantoms(tmp_path, 1, "--model.grid=34", "--metrics=[lpips]")

@@ -31,14 +31,14 @@ STAGES = {"seconds_network": "network", "seconds_projector": "projector", "rest"
 
 
 def write_plots(folder: Path, entries: Sequence[Entry]) -> list[Path]:
-    """Every plot that the entries allow, as PNG in a folder; returns the files."""
+    """Every plot that the entries with all of their cases allow, as PNG in a folder; returns the files."""
     written, style = [], styles(entries)
+    entries = [entry for entry in entries if entry.complete]
     for condition, group in conditions(entries):
-        complete = [entry for entry in group if entry.complete]
         where = format_settings(condition)
-        if len(complete) > 1 and "geometry" not in condition:
-            written.append(_draw(folder, f"pareto {where}", 2, lambda axes: _pareto(axes, complete, where, style)))
-            written.append(_draw(folder, f"stages {where}", 1, lambda axes: _stages(axes[0], complete, where)))
+        if len(group) > 1 and "geometry" not in condition:
+            written.append(_draw(folder, f"pareto {where}", 2, lambda axes: _pareto(axes, group, where, style)))
+            written.append(_draw(folder, f"stages {where}", 1, lambda axes: _stages(axes[0], group, where)))
     for rest, group in compared_views(entries):
         written.append(_draw(folder, f"views {format_settings(rest)}", 2, lambda axes: _views(axes, group, style)))
     for rest, group in compared_geometries(entries):
@@ -100,7 +100,7 @@ def _views(axes: Sequence[Axes], group: Sequence[Entry], style: dict) -> None:
     for ax, name in zip(axes, ("psnr", "ssim")):
         labels = {e.name: e.method for e in group}
         for label, method in labels.items():
-            points = sorted((e.condition["views"], e.means[name]) for e in group if e.complete and e.name == label)
+            points = sorted((e.condition["views"], e.means[name]) for e in group if e.name == label)
             ax.plot(*zip(*points), **style[method], markersize=5, label=literal(label))
         views = sorted({e.condition["views"] for e in group})
         ax.set_xscale("log", base=2)
@@ -115,7 +115,7 @@ def _geometries(axes: Sequence[Axes], group: Sequence[Entry], style: dict) -> No
         labels = {entry.name: entry.method for entry in group}
         for label, method in labels.items():
             points = [(entry.means[name], places.index(entry.condition["geometry"])) for entry in group
-                      if entry.complete and entry.name == label]
+                      if entry.name == label]
             ax.plot(*zip(*points), **style[method], linestyle="", markersize=6, label=literal(label))
         ax.set_yticks(range(len(places)), [literal(Path(place).stem) for place in places])
         ax.invert_yaxis()
@@ -126,7 +126,7 @@ def _deltas(axes: Sequence[Axes], curves: Sequence[tuple[str, list[Entry]]]) -> 
     """SSIM and, beside it, the misfit of the X-rays."""
     for ax, name in zip(axes, ("ssim", "misfit")):
         for i, (label, group) in enumerate(curves):
-            points = [(e.settings["delta"], e.means[name]) for e in group if e.complete]
+            points = [(e.settings["delta"], e.means[name]) for e in group]
             ax.plot(*zip(*points), color=COLOURS[i % len(COLOURS)], marker="o", markersize=5, label=literal(label))
         _dress(ax, "delta of Extra Compute (0: none)", SHOWN_MEASURES[name].heading)
     axes[-1].set_yscale("log")

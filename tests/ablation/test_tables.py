@@ -81,6 +81,11 @@ def test_every_plot_that_the_rows_allow_is_drawn(tmp_path):
     assert {file.stem for file in files} == {"pareto_K_1", "pareto_K_8", "stages_K_1", "stages_K_8", "views", "delta"}
 
 
+def test_rows_that_are_all_refused_give_no_plot(tmp_path):
+    rows = [row("a", "x", None, views=views, **more) for views in (1, 8) for more in ({"delta": 0.0}, {"delta": 0.8})]
+    assert plots.write_plots(tmp_path, summarise(rows)) == [] == list(tmp_path.iterdir())
+
+
 def test_dollars_in_the_name_of_a_method_are_no_formula_of_its_plots(tmp_path):
     names = ["a$\\frac$", "$x|[/b]"]
     rows = ablate(tmp_path, methods={name: {"of": "sirt", "method.iterations": 2} for name in names})

@@ -120,9 +120,11 @@ def _load_own(part: nn.Module, file: str, option: str) -> None:
     if not Path(file).is_file():
         raise ValueError(f"there is no file {file}: give another {option}, a .safetensors file of weights")
     with refusing(file, f"give another {option}"):
-        try:
-            part.load_state_dict(load_file(file))
-        except RuntimeError as error:
-            raise ValueError(f"{file} does not hold the weights of this {type(part).__name__} "
-                             f"({str(error).splitlines()[-1].strip()}): give another {option}, or the network's "
-                             "settings that it was trained with") from error
+        given, own = load_file(file), part.state_dict()
+        unlike = [key for key in given.keys() | own.keys() if key not in given or key not in own
+                  or given[key].shape != own[key].shape]
+        if unlike:
+            raise ValueError(f"{file} does not hold the weights of this {type(part).__name__} ({len(unlike)} are "
+                             f"missing, unexpected or of another shape, such as {min(unlike)}): give another "
+                             f"{option}, or the network's settings that it was trained with")
+        part.load_state_dict(given)

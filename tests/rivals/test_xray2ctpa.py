@@ -84,8 +84,10 @@ def test_ones_own_weights_are_taken_and_others_are_refused(tmp_path):
     taken = XrayToCTPATraining(other, latent=LatentSettings(0, autoencoder=file), **settings)
     for name, weight in own.prior.network.autoencoder.state_dict().items():
         assert torch.equal(weight, taken.prior.network.autoencoder.state_dict()[name])
-    with pytest.raises(ValueError, match="does not hold the weights of this XrayEmbedding"):
+    with pytest.raises(ValueError, match="does not hold the weights of this XrayEmbedding") as refused:
         XrayToCTPATraining(other, latent=LatentSettings(encoder=file), **settings)
+    assert len(str(refused.value)) < 500 and "such as blocks.0" in str(refused.value)
+    assert "give another model.latent.encoder, or the network's settings" in str(refused.value)
     with pytest.raises(ValueError, match=r"model\.initial brings all of its weights"):
         XrayToCTPATraining(other, latent=LatentSettings(encoder=file), initial=file, **settings)
     with pytest.raises(ValueError, match=r"nowhere\.safetensors"):

@@ -15,7 +15,7 @@ from phydict.prior.files import (
     save_super_resolution,
 )
 from phydict.prior.inspection import inspect_prior
-from phydict.prior.stage_file import is_saved_prior
+from phydict.prior.stage_file import STAGES, is_saved_prior
 from phydict.prior.text_file import build_text, has_text
 from phydict.rivals import NETWORKS, build_rival, save_rival
 from phydict.runtime.console import check_writable
@@ -61,7 +61,7 @@ def export_prior(checkpoint: str, out: str, overwrite: bool = False) -> None:
             save_refiner(refiner, out, training)
         else:
             save_prior(prior, out, training)
-    print(f"prior in {out}")
+    print(f"{STAGES.get(stage, 'a prior').removeprefix('a ')} in {out}")
 
 
 def print_prior(path: str) -> None:

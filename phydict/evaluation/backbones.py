@@ -50,7 +50,8 @@ class SliceFeatures(nn.Module):
                 f"fid.weights {weights} was given: leave it out")
         self.name, self.dimensions = name, DIMENSIONS[name]
         if weights is None:
-            self.network = load_lpips("squeeze", False, "leave fid out of the metrics").get_submodule("net")
+            otherwise = "leave fid out of the metrics"
+            self.network = load_lpips("squeeze", False, otherwise, "FID by squeezenet").get_submodule("net")
         else:
             self.network = _radimagenet() if name == "radimagenet" else _inception()
             _load(self.network, Path(weights), name)

@@ -17,11 +17,11 @@ OF_A_REWARD = ("set the reward's lpips weight to 0 (--model.method.init_args.lik
 
 
 @lru_cache(maxsize=4)
-def load_lpips(backbone: str, random_backbone: bool, otherwise: str = OF_A_REWARD) -> nn.Module:
+def load_lpips(backbone: str, random_backbone: bool, otherwise: str = OF_A_REWARD, needing: str = "LPIPS") -> nn.Module:
     """LPIPS, frozen and in evaluation mode.
 
-    Raises FileNotFoundError naming the file and what can be done `otherwise` when the trained backbone is not there and
-    cannot be downloaded, and ValueError for an unknown backbone.
+    Raises FileNotFoundError naming the file, what is `needing` it and what can be done `otherwise` when the trained
+    backbone is not there and cannot be downloaded, and ValueError for an unknown backbone.
     """
     if backbone not in FILES:
         raise ValueError(f"LPIPS backbones are {', '.join(FILES)}, but '{backbone}' was given")
@@ -34,8 +34,8 @@ def load_lpips(backbone: str, random_backbone: bool, otherwise: str = OF_A_REWAR
             network = lpips.LPIPS(net=backbone, pnet_rand=random_backbone, verbose=False)
     except OSError as error:
         raise FileNotFoundError(
-            f"LPIPS needs the trained backbone {FILES[backbone]} in {torch.hub.get_dir()}/checkpoints and could not "
-            f"download it: put the file there, or {otherwise}") from error
+            f"{needing} needs the trained backbone {FILES[backbone]} in {torch.hub.get_dir()}/checkpoints and could "
+            f"not download it: put the file there, or {otherwise}") from error
     return network.eval().requires_grad_(False)
 
 

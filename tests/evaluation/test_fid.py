@@ -135,6 +135,16 @@ def test_a_backbone_is_read_from_its_file_and_is_blind_to_a_scale_and_an_offset_
     assert not network.training and not any(weight.requires_grad for weight in network.parameters())
 
 
+def test_squeezenet_that_is_not_there_is_missed_for_fid_and_not_for_lpips(tmp_path, monkeypatch):
+    def offline(*_, **__):
+        raise OSError("no network")
+
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    monkeypatch.setattr(torch.hub, "download_url_to_file", offline)
+    with pytest.raises(FileNotFoundError, match=r"^FID by squeezenet needs .* or leave fid out of the metrics$"):
+        SliceFeatures("squeezenet")
+
+
 def test_a_backbone_without_its_weights_or_with_anothers_is_refused(radimagenet, tmp_path):
     torch.save({"conv1.weight": torch.zeros(3)}, tmp_path / "other.pth")
     for name, weights, sentence in (

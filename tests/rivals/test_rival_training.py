@@ -50,11 +50,11 @@ def arguments(name: str, folder: Path, cache: Path, *more: str) -> list[str]:
 
 
 @pytest.mark.parametrize("name", TINY)
-def test_a_resumed_run_is_the_uninterrupted_one_and_its_file_is_compared(name, tmp_path, cache):
+def test_a_resumed_run_is_the_uninterrupted_one_and_its_file_is_compared(name, tmp_path, cache, capsys):
     last = resumed_as_uninterrupted(main, lambda run, *more: arguments(name, run, cache, *more), tmp_path)
     file = tmp_path / "rival.safetensors"
     main(["export", "--checkpoint", str(last), "--out", str(file)])
-    assert load_rival(file).network.stage == name
+    assert load_rival(file).network.stage == name and f"rival in {file}" in capsys.readouterr().out
     comparison = tmp_path / "comparison.yaml"
     comparison.write_text(f"methods: {{{name}: {{of: phydict.rivals.TrainedRival, method.file: {file}}}}}\n"
                           "base: {voxels: 16, views: 2, detector: 28}\n"

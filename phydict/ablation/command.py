@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from jsonargparse import ArgumentParser
 
-from phydict.ablation.fid import fid_tables
+from phydict.ablation.fid import comparison_tables
 from phydict.ablation.page import comparison_page
 from phydict.ablation.plots import write_plots
 from phydict.ablation.run import RESULTS, run
@@ -50,7 +50,7 @@ def main(args: list[str] | None = None) -> None:
             rows = run(specification, torch.device(device), progress, scoring)
         print(f"{len(rows)} rows in {specification.out / RESULTS}")
         entries = summarise(rows)
-        tables = all_tables(entries, scoring.empty) + fid_tables(specification.out, entries, scoring)
+        tables = all_tables(entries, scoring.empty) + comparison_tables(specification.out, entries, scoring)
         written = write_tables(specification.out, tables) + write_plots(specification.out, entries)
         print(f"tables and plots in {specification.out}: {', '.join(path.name for path in written)}")
         print(f"page: {comparison_page(specification.out, entries, tables)}")

@@ -10,39 +10,41 @@ from phydict.ablation.run import features_file
 from phydict.ablation.summary import Entry, conditions, format_settings
 from phydict.datasets import patient_of
 from phydict.evaluation import write_csv
-from phydict.evaluation.fid import NAMES, load_features
-from phydict.evaluation.tables import Table, fid_table
+from phydict.evaluation.bootstrap import Estimate
+from phydict.evaluation.fid import StoredFeatures, distances
+from phydict.evaluation.tables import Table, fid_tables
 from phydict.inference.scoring import Scoring
 
 FID = "fid.csv"
 """The distances in a folder of results."""
 
 
-def fid_tables(out: Path, entries: Sequence[Entry], scoring: Scoring) -> list[Table]:
-    """A table for each condition, with a line per entry, and FID with the same numbers; none where the distance is not
-    measured.
+def comparison_tables(out: Path, entries: Sequence[Entry], scoring: Scoring) -> list[Table]:
+    """The tables of each condition, with a line per entry, and FID with the same numbers; none where the distance is
+    not measured.
 
     Of several seeds of a case each counts as a case of the same patient.
     """
     if scoring.network is None:
         return []
-    rows, tables, backbone = [], [], scoring.fid.backbone
+    rows, tables, backbone, replicates = [], [], scoring.fid.backbone, scoring.fid.replicates
     for condition, group in conditions(entries):
-        features = {entry.label: {name: load_features(features_file(out, key), backbone)
+        features = {entry.label: {name: StoredFeatures(features_file(out, key), backbone)
                                   for name, key in _named(entry.counted)} for entry in group if entry.counted}
         if features:
-            tables.append(fid_table(features, backbone, scoring.fid.replicates,
-                                    format_settings("Frechet distance of slices (FID)", condition)))
-            rows += [{"method": label} | condition | {"fid_backbone": backbone, "cases": len(features[label])}
-                     | _numbers(values) for label, _, values in tables[-1].lines]
+            found = distances(features, replicates)
+            title = format_settings("Frechet distance of slices (FID)", condition)
+            tables += fid_tables(found, backbone, replicates, title)
+            rows += [{"method": label} | condition | {"fid_backbone": backbone, "cases": len(one.cases)}
+                     | _numbers(one.estimates()) for label, one in found.items()]
     write_csv(out / FID, rows)
     return tables
 
 
-def _numbers(values: Sequence) -> dict[str, float]:
+def _numbers(estimates: Mapping[str, Estimate]) -> dict[str, float]:
     """Each distance, and the ends of its interval where it has one."""
-    return {f"{name}{end}": number for name, value in zip(NAMES, values)
-            for end, number in zip(("", "_low", "_high"), value) if not math.isnan(number)}
+    return {f"{name}{end}": number for name, estimate in estimates.items()
+            for end, number in zip(("", "_low", "_high"), estimate) if not math.isnan(number)}
 
 
 def _named(rows: Sequence[Mapping]) -> list[tuple[str, str]]:

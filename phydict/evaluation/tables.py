@@ -17,9 +17,8 @@ from rich.measure import Measurement
 from rich.table import Table as ConsoleTable
 
 from phydict.evaluation.bootstrap import Estimate
-from phydict.evaluation.fid import NAMES, Features, fid
+from phydict.evaluation.fid import NAMES, Distances
 from phydict.evaluation.metrics import MEASURES, RANGE, SIGMA, TAPS, Measure, Summary, summarise
-from phydict.evaluation.planes import PLANES
 from phydict.units import HUWindow
 
 Value = float | Summary | Estimate
@@ -139,24 +138,34 @@ def mean_table(rows: Iterable[Mapping], by: str = "method", metrics: Sequence[st
                   *empty_notes(empty, measured), *warning_notes(rows, by)])
 
 
-def fid_table(methods: Mapping[str, Mapping[str, Features]], backbone: str, replicates: int,
-              title: str = "Frechet distance of slices (FID)") -> Table:
-    """The Frechet distances of some methods, label -> the features of its cases, a line each, and what they rest on."""
+def fid_tables(methods: Mapping[str, Distances], backbone: str, replicates: int,
+               title: str = "Frechet distance of slices (FID)") -> list[Table]:
+    """The Frechet distances of some methods by label, a line each, with what they rest on; where they have intervals, a
+    second table has their differences from the least distance of most cases."""
     lines: list[tuple[str, bool, list[Value | None]]] = []
-    for label, cases in methods.items():
-        distances = fid(cases, replicates)
-        lines.append((label, all(cases.keys() == other.keys() for other in methods.values()),
-                      [distances[name] for name in NAMES]))
-    counts = dict.fromkeys(f"{len(cases)} cases with " + ", ".join(
-        f"{plane.upper()} {sum(one[plane].shape[1] for one in cases.values())}" for plane in PLANES) + " slices"
-        for cases in methods.values())
+    for label, found in methods.items():
+        alike = all(set(found.cases) == set(other.cases) for other in methods.values())
+        estimates = found.estimates()
+        lines.append((label, alike, [estimates[name] for name in NAMES]))
+    counts = dict.fromkeys(f"{len(found.cases)} cases with " + ", ".join(
+        f"{plane.upper()} {count}" for plane, count in found.slices.items()) + " slices" for found in methods.values())
     note = (f"Backbone {backbone}, a scale of its own: {'; '.join(counts)}, all of each volume, against the truth's of "
             f"the same cases. HU clipped to [{RANGE.low:g}, {RANGE.high:g}], each volume's least and largest value "
             "mapped to 0 and 1, so that a wrong HU scale is not seen. FID: mean of the planes.")
     measures = [Measure(f"FID-{name[4:].upper()}" if "_" in name else "FID", False, 3) for name in NAMES]
+    header = ["method", *(measure.heading for measure in measures)]
+    if not interval_note(lines):
+        return [Table(title, header, measures, lines, [note])]
     intervals = f"{IN_BRACKETS}, {replicates} draws of patients; repeated slices make it too high."
-    return Table(title, ["method", *(measure.heading for measure in measures)], measures, lines,
-                 [note, *([intervals] if interval_note(lines) else [])])
+    best = min(methods, key=lambda label: (-len(methods[label].cases), float(methods[label].values["fid"][0])))
+    less: list[tuple[str, bool, list[Value | None]]] = []
+    for label, found in methods.items():
+        if label != best and found.cases == methods[best].cases:
+            estimates = found.estimates(methods[best])
+            less.append((label, False, [estimates[name] for name in NAMES]))
+    paired = f"{IN_BRACKETS} of the difference: each of the {replicates} draws has the same patients for both."
+    return [Table(title, header, measures, lines, [note, intervals]),
+            *([Table(f"{title}: less {best}, draw by draw", header, measures, less, [note, paired])] if less else [])]
 
 
 def caption(statistic: str, rows: Sequence[Mapping], columns: Mapping[str, str], window: HUWindow = RANGE) -> str:

@@ -15,7 +15,7 @@ from phydict.datasets.cts.segmentations import organs_beside
 from phydict.evaluation import RANGE, volume_metrics
 from phydict.evaluation.backbones import SliceFeatures
 from phydict.evaluation.ct_clip import clip_scores, load_ct_clip
-from phydict.evaluation.fid import Features, case_features
+from phydict.evaluation.fid import case_features
 from phydict.evaluation.organs import fine_grid, organ_scores
 from phydict.evaluation.perceptual import load_networks, lpips_scores
 from phydict.evaluation.published import PUBLISHED
@@ -125,7 +125,7 @@ class Scoring:
             scores |= clip_scores(self.clip.to(device), volume, truth, grid, case.get("ct_report", case["report"]))
         return scores
 
-    def features(self, volume: Tensor, case: Case, window: HUWindow, device: torch.device) -> Features | None:
+    def features(self, volume: Tensor, case: Case, window: HUWindow, device: torch.device) -> dict[str, Tensor] | None:
         """The features of the slices of volume and truth, where FID is measured; the truth's are kept in the case."""
         if self.network is None:
             return None

@@ -5,8 +5,8 @@ from __future__ import annotations
 from rich.console import Console
 
 from phydict.evaluation import Table
-from phydict.evaluation.fid import load_features
-from phydict.evaluation.tables import fid_table
+from phydict.evaluation.fid import StoredFeatures, distances
+from phydict.evaluation.tables import fid_tables
 from phydict.inference.page import results_page
 from phydict.inference.protocols import Protocol
 from phydict.inference.results import FEATURES, CaseResults
@@ -20,12 +20,12 @@ def summarise(results: CaseResults, cases: list[str], name: str, scoring: Scorin
     finished = [case for case in cases if case not in missing]
     console = Console()
     console.width = max(console.width, 80 if console.is_terminal else 120)
-    distances = _distances(results, finished, name, scoring)
-    for table in results.summarise(finished, distances, protocol, scoring.empty):
+    further = _distances(results, finished, name, scoring)
+    for table in results.summarise(finished, further, protocol, scoring.empty):
         console.print(table)
     print(f"results in {results.folder}")
     if finished:
-        print(f"page: {results_page(results.folder.parent, distances, scoring.empty)}")
+        print(f"page: {results_page(results.folder.parent, further, scoring.empty)}")
     if missing:
         raise ValueError(f"{len(missing)} of {len(cases)} cases were not reconstructed "
                          f"({', '.join(missing)}): see the messages above, and {results.to_resume}")
@@ -36,5 +36,6 @@ def _distances(results: CaseResults, cases: list[str], name: str, scoring: Scori
     if scoring.network is None or not cases:
         return []
     backbone = scoring.fid.backbone
-    features = {case: load_features(results.folder / case / FEATURES, backbone) for case in cases}
-    return [fid_table({name: features}, backbone, scoring.fid.replicates)]
+    features = {case: StoredFeatures(results.folder / case / FEATURES, backbone) for case in cases}
+    found = distances({name: features}, scoring.fid.replicates)
+    return fid_tables(found, backbone, scoring.fid.replicates)

@@ -10,9 +10,20 @@ from monai.metrics import FIDMetric
 from torch.nn.functional import conv2d, interpolate
 
 from phydict.evaluation import backbones
+from phydict.evaluation import fid as fid_module
 from phydict.evaluation.backbones import SliceFeatures
-from phydict.evaluation.fid import PlaneFID, case_features, fid, frechet_distance, load_features, save_features
+from phydict.evaluation.fid import (
+    NAMES,
+    PlaneFID,
+    StoredFeatures,
+    case_features,
+    distances,
+    fid,
+    frechet_distance,
+    save_features,
+)
 from phydict.evaluation.planes import PLANES, slices
+from phydict.evaluation.tables import fid_tables
 
 
 def normal(count: int, dimensions: int, seed: int = 0) -> torch.Tensor:
@@ -62,6 +73,40 @@ def test_a_slice_that_counts_twice_is_one_that_is_there_twice():
     assert frechet_distance(a, b, repeats) == pytest.approx(wanted, rel=1e-6)
 
 
+@pytest.mark.parametrize("count, dimensions", [(40, 8), (12, 30), (60, 60)])
+def test_it_is_the_singular_values_sum_for_weighted_slices_of_falling_variance(count, dimensions):
+    scale = torch.exp(-0.05 * torch.arange(dimensions))
+    a, b = normal(count, dimensions, 1) * scale, (1.2 * normal(count, dimensions, 2) + 0.1) * scale
+    repeats = torch.arange(count) % 4
+    x, y = (part.repeat_interleave(repeats, 0).double() for part in (a, b))
+    roots = [(part - part.mean(0)) / (len(part) - 1) ** 0.5 for part in (x, y)]
+    wanted = (x.mean(0) - y.mean(0)).square().sum() + sum(root.square().sum() for root in roots) - (
+        2 * torch.linalg.svdvals(roots[0] @ roots[1].T).sum())
+    assert frechet_distance(a, b, repeats) == pytest.approx(float(wanted), rel=1e-4)
+
+
+def test_methods_are_paired_draw_by_draw_and_each_is_as_it_is_alone(monkeypatch):
+    methods = {f"blur {n}": of_volumes(lambda hu, n=n: blurred(hu, n)) for n in (1, 2)}
+    methods["three"] = {case: features for case, features in methods["blur 2"].items() if case != "p3"}
+    summed = []
+    plain = fid_module._reduced
+    monkeypatch.setattr(fid_module, "_reduced", lambda moments: summed.append(1) or plain(moments))
+    found = distances(methods, replicates=20)
+    assert len(summed) == 3 * 21 * 2  # planes, draws, and sets of cases: two methods share a truth
+    for label, cases in methods.items():
+        alone = fid(cases, replicates=20)
+        for name in NAMES:
+            assert tuple(found[label].estimates()[name]) == pytest.approx(tuple(alone[name]))
+    less = found["blur 2"].estimates(found["blur 1"])["fid"]
+    drawn = found["blur 2"].values["fid"] - found["blur 1"].values["fid"]
+    assert less.mean == pytest.approx(drawn[0]) and drawn[1:].min() <= less.low <= less.high <= drawn[1:].max()
+    table, differences = fid_tables(found, "squeezenet", 20)
+    assert [label for label, _, _ in table.lines] == ["blur 1", "blur 2", "three"]
+    assert differences.title.endswith("less blur 1, draw by draw")
+    assert [(label, values[-1]) for label, _, values in differences.lines] == [("blur 2", less)]
+    assert len(fid_tables(distances(methods), "squeezenet", 0)) == 1
+
+
 def test_a_volume_that_is_not_finite_shows():
     spoiled = of_volumes(lambda hu: hu.clone().fill_(math.nan))
     found = fid(spoiled, replicates=5)["fid"]
@@ -108,12 +153,12 @@ def test_features_come_back_from_their_file_and_others_are_refused(tmp_path, mon
     features = of_volumes(lambda hu: hu)["p0"]
     save_features(tmp_path / "f.safetensors", features)
     assert all(torch.equal(features[plane], found) for plane, found in
-               load_features(tmp_path / "f.safetensors", "squeezenet").items())
+               StoredFeatures(tmp_path / "f.safetensors", "squeezenet").items())
     with pytest.raises(ValueError, match="not hold features of the FID backbone radimagenet"):
-        load_features(tmp_path / "f.safetensors", "radimagenet")
+        StoredFeatures(tmp_path / "f.safetensors", "radimagenet")
     (tmp_path / "f.safetensors").write_bytes(b"none")
     with pytest.raises(ValueError, match="missing or damaged"):
-        load_features(tmp_path / "f.safetensors", "squeezenet")
+        StoredFeatures(tmp_path / "f.safetensors", "squeezenet")
 
 
 @pytest.fixture(scope="module")

@@ -10,11 +10,19 @@ from phydict.methods import reconstruct
 from phydict.rivals import Rival, RivalAnswer, X2CTNetwork, load_rival, save_rival
 from phydict.rivals.planes import on_planes, plane_places, turned, turns
 from phydict.rivals.rival import bound_orbit
+from phydict.runtime.shipped import configuration
 from phydict.training.rivals import OrbitScenes
 from phydict.training.x2ct import Adversary, X2CTTraining
-from phydict.units import MU_WATER
-from phydict.xray import ConeBeam, Projector
+from phydict.units import MU_WATER, HUWindow
+from phydict.xray import ConeBeam, Projector, binning
+from phydict.xray.geometry_files import read_beam
 from rivals.tiny_rivals import GRID, body, lively, tiny_x2ct
+
+
+def test_two_views_at_right_angles_are_those_of_the_shipped_biplanar_geometry():
+    beam = read_beam(configuration("biplanar", ("geometry",)))
+    rival = Rival(tiny_x2ct().network, GRID, HUWindow(), bound_orbit(GRID, 2, 180.0))
+    rival.check(GRID, beam.binned(binning(GRID, beam)))
 
 
 def test_views_at_right_angles_are_turned_by_permuting_axes():

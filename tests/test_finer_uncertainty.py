@@ -19,6 +19,7 @@ from phydict.prior.correction import CorrectionNetwork
 from phydict.prior.finer_uncertainty import SEEN, FinerUncertainty, tissue_of_seen
 from phydict.prior.uncertainty import LEVELS, TISSUES
 from phydict.training.finer_uncertainty import FinerUncertaintyTraining
+from phydict.training.refinement import RefinementTraining
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 from phydict.xray.boxes import interpolated
@@ -178,3 +179,9 @@ def test_steps_on_one_crop_bring_the_scale_to_the_errors(files):
     (1, [], "made of a refiner's own, but"), (0, ["--model.window=[-1000,1000]"], "has another grid or HU window")])
 def test_what_cannot_be_learnt_from_is_refused(tmp_path, cache, files, capsys, refiner, more, words):
     assert words in refusal(capsys, main, arguments(tmp_path / "run", cache, files[refiner], files[2], *more))
+
+
+def test_a_correction_that_is_trained_on_loses_what_was_known_of_its_errors(tmp_path):
+    save_correction(knowing(), tmp_path / "knows.safetensors", dtype=torch.float32)
+    trained = RefinementTraining(cube=Cube(32), window=(-1000, 600), initial=str(tmp_path / "knows.safetensors"))
+    assert trained.prior.uncertainty is None and all(w.requires_grad for w in trained.parameters())

@@ -17,6 +17,9 @@ from phydict.units import HUWindow
 
 OUTSIDE = TISSUES.index("air")
 
+EVERY = 7
+"""Of how many voxels of a reconstruction one calibrates."""
+
 
 class FinerUncertaintyTraining(StageTraining):
     """Learns the FinerUncertainty of a CorrectionNetwork, whose own weights stay as they are, from crops of its
@@ -67,7 +70,7 @@ class FinerUncertaintyTraining(StageTraining):
         body = tissue != OUTSIDE
         self.log("val/rank", spearman_corrcoef(log_scale[body].float(), error[body]), batch_size=1, sync_dist=True,
                  prog_bar=True)
-        self.held_out.append(((error / log_scale.exp()).flatten(), tissue.flatten()))
+        self.held_out.append(((error / log_scale.exp()).flatten()[::EVERY], tissue.flatten()[::EVERY]))
         self.log("samples", float(self.samples), rank_zero_only=True, batch_size=1)
 
     def on_validation_epoch_end(self) -> None:

@@ -15,7 +15,7 @@ from phydict.units import HUWindow
 class RefinementTraining(StageTraining):
     """Learns a CorrectionNetwork from crops of stored reconstructions: the squared and the absolute error of its
     estimate, over those of the whole reconstruction, which weighs a dB alike at all numbers of views. No likelihood
-    step follows in training.
+    step follows in training. What was known of its errors is forgotten.
 
     Args:
         channels: width of each level of the network, the first at half the resolution
@@ -36,6 +36,7 @@ class RefinementTraining(StageTraining):
         if not network.grid.same_as(cube.grid()) or network.window != hu:
             raise ValueError(f"the network {initial} has another grid or HU window than this training: "
                              "set model.cube and model.window to its own")
+        network.uncertainty = None  # of the errors of other weights
         super().__init__(network.train().requires_grad_(True), optimisation, 0)
         self.body_weight = body_weight
 

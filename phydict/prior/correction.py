@@ -7,13 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import pad, silu
+from torch.nn.functional import silu
 
 from phydict.grid import Grid
 from phydict.prior.convolution import lay_out, silence, speed_up
 from phydict.prior.evidence_channels import EVIDENCE_CHANNELS
 from phydict.prior.finer_uncertainty import FinerUncertainty
-from phydict.prior.local_unet import PositionNorm
+from phydict.prior.local_unet import PositionNorm, prolonged
 from phydict.runtime.precision import network_precision
 from phydict.units import HUWindow
 
@@ -82,12 +82,9 @@ class CorrectionNetwork(nn.Module):
     def forward(self, seen: Tensor) -> Tensor:
         """The corrected estimate (B, 1, X, Y, Z) of an estimate and its evidence (B, INPUTS, X, Y, Z), in the prior's
         range, for any sizes."""
-        sizes = seen.shape[2:]
-        missing = [n for size in reversed(sizes) for n in (0, -size % self.divisor)]
-        padded = pad(seen, missing, mode="replicate") if any(missing) else seen
-        padded = padded.contiguous(memory_format=torch.channels_last_3d)
+        padded = prolonged(seen, self.divisor).contiguous(memory_format=torch.channels_last_3d)
         down, below, up = self.unet.model.children()
-        x, y, z = sizes
+        x, y, z = seen.shape[2:]
         lacking = self._lacking(up, below(down(padded)), padded)
         return seen[:, :1] + lacking[..., :x, :y, :z].to(seen.dtype)
 

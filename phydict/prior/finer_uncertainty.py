@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import pad, silu
+from torch.nn.functional import silu
 
 from phydict.prior.convolution import lay_out, speed_up
+from phydict.prior.local_unet import prolonged
 from phydict.prior.uncertainty import LEVELS, LOG_SCALE, TISSUES, quantiles_of, steepness, tissue_of
 
 SEEN = 4
@@ -47,8 +48,7 @@ class FinerUncertainty(nn.Module):
 
     def forward(self, seen: Tensor) -> Tensor:
         """log b (B, 1, X, Y, Z) of what is seen (B, SEEN, X, Y, Z), all in the prior's range, for any sizes."""
-        missing = [n for size in reversed(seen.shape[2:]) for n in (0, -size % self.divisor)]
-        z, before, width, lung = (pad(seen, missing, mode="replicate") if any(missing) else seen).split(1, 1)
+        z, before, width, lung = prolonged(seen, self.divisor).split(1, 1)
         log_width = width.clamp(min=LEAST_WIDTH).log()
         given = torch.cat([z, 2 * (z - before).abs(), 2 * steepness(z), log_width / 2 + 1.5, lung], 1)
         ratio = self.leave(silu(self.join(torch.cat([self.unet(given), given], 1))))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from einops import rearrange
 from torch import Tensor, nn
-from torch.nn.functional import layer_norm
+from torch.nn.functional import layer_norm, pad
 
 from phydict.prior.convolution import lay_out, silence, speed_up
 from phydict.prior.unet import check_sizes
@@ -87,3 +87,9 @@ class LocalUNet(nn.Module):
         h = self.fold(h.contiguous(memory_format=torch.channels_last_3d))
         h = self.unfold(self.unet(h, 1000 * t))
         return rearrange(h, "b (c i j k) x y z -> b c (x i) (y j) (z k)", i=n, j=n, k=n)
+
+
+def prolonged(x: Tensor, divisor: int) -> Tensor:
+    """x (B, C, X, Y, Z) with its last voxels repeated at the end of each axis, up to the next multiple of `divisor`."""
+    missing = [n for size in reversed(x.shape[2:]) for n in (0, -size % divisor)]
+    return pad(x, missing, mode="replicate") if any(missing) else x

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import reprlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -91,18 +91,21 @@ def built_network(made: Callable[[], Network], weights: dict[str, Tensor], heade
             if name in header:
                 check_sizes(name, header[name], weights)
         with torch.device("meta"):
-            shapes = {k: w.shape for k, w in made().state_dict().items()}
-        unlike = [k for k in shapes.keys() | weights.keys() if k not in shapes or k not in weights
-                  or shapes[k] != weights[k].shape]
-        if unlike:
-            raise ValueError(f"{len(unlike)} of them are missing, unexpected or of another shape, such as "
-                             f"{min(unlike)}")
+            wrong = unlike(weights, made().state_dict())
+        if wrong:
+            raise ValueError(f"{len(wrong)} of them are missing, unexpected or of another shape, such as {min(wrong)}")
         stage = made()
         stage.load_state_dict(weights)
     except Exception as error:  # of whatever kind: it is the header that leads to it
         lacks = f"the header lacks {error}" if isinstance(error, KeyError) else reason(error)
         raise ValueError(f"the weights are not those of the network that the header describes ({lacks})") from error
     return stage
+
+
+def unlike(given: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> list[str]:
+    """The names of the weights that are given to a network and are not its own, or of another shape, or missing."""
+    return [name for name in given.keys() | own.keys()
+            if name not in given or name not in own or given[name].shape != own[name].shape]
 
 
 def check_sizes(name: str, settings: dict, weights: dict[str, Tensor]) -> None:

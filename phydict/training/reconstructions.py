@@ -92,12 +92,13 @@ class Reconstructions(Dataset):
     precision, in the prior's range.
 
     name: of its folders. channels: of what is seen at a call. default_network: the file that stands for None.
+    of_intervals: whether the refiner needs to know them.
 
     Item n shows volume n modulo their number, deformed unless `strength` is that of none, in a scene of its own. It is
     made when missing and kept in `folder`.
     """
 
-    name, channels, default_network = "reconstructions", INPUTS, cast(str | None, None)
+    name, channels, default_network, of_intervals = "reconstructions", INPUTS, cast(str | None, None), False
 
     def __init__(self, volumes: Items, grid: Grid, base: str, network: str | None, scenes: Scenes,
                  strength: Augmentation, folder: Path, length: int, seed: int):
@@ -133,7 +134,7 @@ class Reconstructions(Dataset):
 class RefinedResults(Reconstructions):
     """What a FinerUncertainty sees of the results of `network`, and last the truth: (SEEN + 1, X, Y, Z)."""
 
-    name, channels, default_network = "results", SEEN, str(DEFAULT_CORRECTION)
+    name, channels, default_network, of_intervals = "results", SEEN, str(DEFAULT_CORRECTION), True
 
     def _seen(self, base: Posterior, xrays: Tensor, projector: Projector) -> Tensor:
         network = load_correction(cast(str, self.network))
@@ -218,6 +219,9 @@ class RefinementData(PriorData):
         if not isinstance(refiner, Refiner) or refiner.window != self.window:
             raise ValueError(f"reconstructions are made by a refiner in the HU window {window}, but {initial} is none: "
                              "give a refiner's file as data.initial, and model.window as its own")
+        if self.kind.of_intervals and refiner.uncertainty is None:
+            raise ValueError(f"intervals on finer voxels are made of a refiner's own, but {initial} has none: "
+                             "train them first, with configs/prior/uncertainty.yaml")
         if not refinements(refiner.grid, self.grid):
             raise ValueError(f"reconstructions are refined to voxels finer than the refiner's, but model.cube has "
                              f"{cube.voxels} as it has: give more")
@@ -254,13 +258,3 @@ class RefinedResultsData(RefinementData):
     `made.network`, the shipped one if left out, and a refiner with intervals."""
 
     kind = RefinedResults
-
-    def __init__(self, made: RefinementCases = RefinementCases(), scenes: Scenes = Scenes(most_views=16),
-                 cts: str | None = None, holdout: HoldOut = HoldOut(phantoms=0), phantoms: int = 0,
-                 loading: Loading = Loading(), cache: str = "runs/cache", initial: str = str(DEFAULT_REFINER),
-                 cube: Cube = Cube(128), window: tuple[float, float] = (-1000.0, 1000.0)):
-        refiner = load_prior(initial)
-        if isinstance(refiner, Refiner) and refiner.uncertainty is None:
-            raise ValueError(f"intervals on finer voxels are made of a refiner's own, but {initial} has none: "
-                             "train them first, with configs/prior/uncertainty.yaml")
-        super().__init__(made, scenes, cts, holdout, phantoms, loading, cache, initial, cube, window)

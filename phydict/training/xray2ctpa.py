@@ -13,6 +13,7 @@ from torch.nn.functional import l1_loss
 
 from phydict.diffusion.steps import noise_like
 from phydict.grid import Cube
+from phydict.prior.stage_file import unlike
 from phydict.rivals import Rival, XrayToCTPANetwork
 from phydict.rivals.rival import WATER_MM, bound_orbit
 from phydict.runtime.reading import refusing
@@ -120,11 +121,9 @@ def _load_own(part: nn.Module, file: str, option: str) -> None:
     if not Path(file).is_file():
         raise ValueError(f"there is no file {file}: give another {option}, a .safetensors file of weights")
     with refusing(file, f"give another {option}"):
-        given, own = load_file(file), part.state_dict()
-        unlike = [key for key in given.keys() | own.keys() if key not in given or key not in own
-                  or given[key].shape != own[key].shape]
-        if unlike:
-            raise ValueError(f"{file} does not hold the weights of this {type(part).__name__} ({len(unlike)} are "
-                             f"missing, unexpected or of another shape, such as {min(unlike)}): give another "
+        given = load_file(file)
+        if wrong := unlike(given, part.state_dict()):
+            raise ValueError(f"{file} does not hold the weights of this {type(part).__name__} ({len(wrong)} are "
+                             f"missing, unexpected or of another shape, such as {min(wrong)}): give another "
                              f"{option}, or the network's settings that it was trained with")
         part.load_state_dict(given)

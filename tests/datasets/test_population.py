@@ -304,6 +304,8 @@ def test_fewer_than_two_patients_are_refused(folder, tmp_path):
         DrawnPatients(CTCases(files[:1], None, GRID))
     with pytest.raises(ValueError, match="; 3 CTs in the subfolder scans count as one patient's, give that folder"):
         DrawnPatients(CTCases([replace(ct, id=f"scans__{ct.id}") for ct in files], None, GRID))
+    with pytest.raises(ValueError, match=r"1 to train on \(train_1_a_0\): give more CTs"):
+        DrawnPatients(CTCases([replace(ct, id=f"train_1_a_{n}") for n, ct in enumerate(files)], None, GRID))
     water(tmp_path)
     drawn = DrawnPatients(CTCases([files[0], *find_cts(tmp_path)], None, Grid.cube(16)))
     with pytest.warns(UserWarning, match="water"), pytest.raises(ValueError, match="1 of 2 could be registered"):

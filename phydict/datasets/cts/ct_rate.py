@@ -53,10 +53,12 @@ def patient_of(id: str) -> str:
 
 def as_one_patient(ids: Iterable[str]) -> str:
     """What to tell where several CTs are the scans of a single patient, since all lie in one subfolder; else ""."""
-    patients = [patient_of(id) for id in ids]
-    if len(patients) < 2 or len(set(patients)) > 1:
+    ids = list(ids)
+    folders = {id.partition("__")[0] for id in ids if "__" in id and not NAME.fullmatch(id)}
+    if len(ids) < 2 or {patient_of(id) for id in ids} != folders or len(folders) > 1:
         return ""
-    return f"; {len(patients)} CTs in the subfolder {patients[0]} count as one patient's, give that folder"
+    return (f"; {len(ids)} CTs in the subfolder {folders.pop()} count as one patient's, give that folder if they are "
+            "several patients'")
 
 
 def scan_of(id: str) -> str:

@@ -1,0 +1,82 @@
+"""Weights of one method beside each other on CTs that were held out, as they are and as other scans would show them.
+
+    python tests/benchmark/held_out.py <folder of CTs> <name>=<weights> <name>=<weights> ... [--method phydict_fast]
+        [--views 2 4 8 16] [--changed 3]
+
+For choosing among weights, by CTs that neither trained them nor evaluate the result. Ideal X-rays of each CT, and of
+`--changed` draws of it: turned, shifted and bent, on another couch, at times with covers, leads and arms or a scan that
+is cut. Writes held_out.csv beside this file; rows of other names are kept. Prints the mean differences of PSNR from the
+first weights, over all voxels and in the body, with their standard errors over CTs and draws.
+"""
+
+import argparse
+from itertools import product
+from pathlib import Path
+from statistics import mean, stdev
+
+import torch
+
+from phydict import Projector, load_prior, reconstruct
+from phydict.datasets import Augmentation, Surroundings, augment, body_mask, find_cts, prepare_ct
+from phydict.evaluation import read_csv, volume_metrics, write_csv
+from phydict.xray import Ideal
+from phydict.xray.binning import benchmark_orbit
+
+FILE = Path(__file__).with_suffix(".csv")
+CHANGES = Augmentation(girth=0.0, surroundings=Surroundings(table=1.0, couch=1.0))
+"""Of each changed CT: its couch is always another."""
+
+
+def rows_of(ct, weights: dict, method: str, views: list[int], changed: int) -> list[dict]:
+    first = next(iter(weights.values()))
+    grid, window, rows = first.grid, first.window, []
+    plain = prepare_ct(ct.path, grid, window, id=ct.id)
+    for draw, k in product(range(changed + 1), views):
+        case = augment(plain, draw, grid, window, CHANGES) if draw else plain
+        truth, beam = window.to_hu(case["volume"])[None], benchmark_orbit(grid, k)
+        body = torch.from_numpy(body_mask(truth[0, 0].numpy(), grid.spacing))[None, None].float()
+        xrays = Ideal()(Projector(grid, beam, full_detector=True), window.to_mu(case["volume"])[None], draw)[0]
+        for name, prior in weights.items():
+            found = reconstruct(xrays, beam, prior, method)
+            scores = volume_metrics(found.volume[None, None], truth, body=body)
+            rows.append({"weights": name, "case": ct.id, "method": method, "views": k, "draw": draw,
+                         **{key: scores[key] for key in ("psnr", "ssim", "psnr_body", "ssim_body")}})
+            print(*rows[-1].values(), flush=True)
+    return rows
+
+
+def table(rows: list[dict]) -> str:
+    """Differences from the first weights, a row for each of the others, of the CTs as they are and of changed ones."""
+    score = {(row["weights"], row["case"], row["views"], row["draw"]): row for row in rows}
+    names, views = (list(dict.fromkeys(row[key] for row in rows)) for key in ("weights", "views"))
+    lines = ["| weights | CTs | " + " | ".join(f"K = {k}" for k in views) + " |", "|---|---|" + "---|" * len(views)]
+    for name, changed in product(names[1:], (False, True)):
+        cells = []
+        for k in views:
+            pairs = [(row, score[names[0], *place]) for (own, *place), row in score.items()
+                     if own == name and place[1] == k and bool(place[2]) == changed]
+            cells.append(", body ".join(of_differences([own[key] - other[key] for own, other in pairs])
+                                        for key in ("psnr", "psnr_body")))
+        lines.append(f"| {name} | {'changed' if changed else 'as they are'} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def of_differences(values: list[float]) -> str:
+    if len(values) < 2:
+        return "".join(f"{value:+.2f}" for value in values)
+    return f"{mean(values):+.2f} ({stdev(values) / len(values) ** 0.5:.2f})"
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("cts", type=Path)
+    parser.add_argument("weights", nargs="+", metavar="name=file")
+    parser.add_argument("--method", default="phydict_fast")
+    parser.add_argument("--views", type=int, nargs="+", default=[2, 4, 8, 16])
+    parser.add_argument("--changed", type=int, default=3)
+    given = parser.parse_args()
+    weights = {name: load_prior(file) for name, _, file in (each.partition("=") for each in given.weights)}
+    kept = [row for row in read_csv(FILE) if row["weights"] not in weights] if FILE.exists() else []
+    rows = [row for ct in find_cts(given.cts) for row in rows_of(ct, weights, given.method, given.views, given.changed)]
+    write_csv(FILE, kept + rows)
+    print(table(rows))

@@ -136,6 +136,7 @@ def test_a_method_gives_its_golden_figures_in_single_precision(golden, name, sce
     assert_same(on_the_tiny_grid(name, torch.float32, scene), golden[f"{name}, {scene}"], 1e-3, hu)
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")  # of reports that are not heard, of what a few steps do not explain
 @pytest.mark.parametrize("name", [
     pytest.param(name, marks=[] if name == "cgls" else [pytest.mark.slow])
     for name in METHODS])

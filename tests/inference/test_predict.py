@@ -121,6 +121,7 @@ def test_a_sample_of_the_prior_depends_on_the_seed_alone_and_is_that_of_python(p
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("default")
 def test_x_rays_or_cts_alone_are_enough(tmp_path, monkeypatch):
     example = ROOT / "data" / "example"
     monkeypatch.chdir(tmp_path)

@@ -5,8 +5,8 @@
 
 For choosing among weights, by CTs that neither trained them nor evaluate the result. Ideal X-rays of each CT, and of
 `--changed` draws of it: turned, shifted and bent, on another couch, at times with covers, leads and arms or a scan that
-is cut. Writes held_out.csv beside this file; rows of other names are kept. Prints the mean differences of PSNR from the
-first weights, over all voxels and in the body, with their standard errors over CTs and draws.
+is cut. Writes held_out.csv beside this file, where rows of other names and methods stay. Prints the mean differences of
+PSNR from the first weights, over all voxels and in the body, with their standard errors over CTs and draws.
 """
 
 import argparse
@@ -76,7 +76,7 @@ if __name__ == "__main__":
     parser.add_argument("--changed", type=int, default=3)
     given = parser.parse_args()
     weights = {name: load_prior(file) for name, _, file in (each.partition("=") for each in given.weights)}
-    kept = [row for row in read_csv(FILE) if row["weights"] not in weights] if FILE.exists() else []
+    kept = [row for row in read_csv(FILE) if row["weights"] not in weights or row["method"] != given.method]
     rows = [row for ct in find_cts(given.cts) for row in rows_of(ct, weights, given.method, given.views, given.changed)]
     write_csv(FILE, kept + rows)
     print(table(rows))

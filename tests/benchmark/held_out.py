@@ -31,17 +31,19 @@ def rows_of(ct, weights: dict, method: str, views: list[int], changed: int) -> l
     first = next(iter(weights.values()))
     grid, window, rows = first.grid, first.window, []
     plain = prepare_ct(ct.path, grid, window, id=ct.id)
-    for draw, k in product(range(changed + 1), views):
+    for draw in range(changed + 1):
         case = augment(plain, draw, grid, window, CHANGES) if draw else plain
-        truth, beam = window.to_hu(case["volume"])[None], benchmark_orbit(grid, k)
+        truth = window.to_hu(case["volume"])[None]
         body = torch.from_numpy(body_mask(truth[0, 0].numpy(), grid.spacing))[None, None].float()
-        xrays = Ideal()(Projector(grid, beam, full_detector=True), window.to_mu(case["volume"])[None], draw)[0]
-        for name, prior in weights.items():
-            found = reconstruct(xrays, beam, prior, method)
-            scores = volume_metrics(found.volume[None, None], truth, body=body)
-            rows.append({"weights": name, "case": ct.id, "method": method, "views": k, "draw": draw,
-                         **{key: scores[key] for key in ("psnr", "ssim", "psnr_body", "ssim_body")}})
-            print(*rows[-1].values(), flush=True)
+        for k in views:
+            beam = benchmark_orbit(grid, k)
+            xrays = Ideal()(Projector(grid, beam, full_detector=True), window.to_mu(case["volume"])[None], draw)[0]
+            for name, prior in weights.items():
+                found = reconstruct(xrays, beam, prior, method)
+                scores = volume_metrics(found.volume[None, None], truth, body=body)
+                rows.append({"weights": name, "case": ct.id, "method": method, "views": k, "draw": draw,
+                             **{key: scores[key] for key in ("psnr", "ssim", "psnr_body", "ssim_body")}})
+                print(*rows[-1].values(), flush=True)
     return rows
 
 
@@ -50,7 +52,7 @@ def table(rows: list[dict]) -> str:
     score = {(row["weights"], row["case"], row["views"], row["draw"]): row for row in rows}
     names, views = (list(dict.fromkeys(row[key] for row in rows)) for key in ("weights", "views"))
     lines = ["| weights | CTs | " + " | ".join(f"K = {k}" for k in views) + " |", "|---|---|" + "---|" * len(views)]
-    for name, changed in product(names[1:], (False, True)):
+    for name, changed in product(names[1:], sorted({bool(row["draw"]) for row in rows})):
         cells = []
         for k in views:
             pairs = [(row, score[names[0], *place]) for (own, *place), row in score.items()
@@ -76,7 +78,7 @@ if __name__ == "__main__":
     parser.add_argument("--changed", type=int, default=3)
     given = parser.parse_args()
     weights = {name: load_prior(file) for name, _, file in (each.partition("=") for each in given.weights)}
-    kept = [row for row in read_csv(FILE) if row["weights"] not in weights or row["method"] != given.method]
+    kept = [row for row in read_csv(FILE) if str(row["weights"]) not in weights or row["method"] != given.method]
     rows = [row for ct in find_cts(given.cts) for row in rows_of(ct, weights, given.method, given.views, given.changed)]
     write_csv(FILE, kept + rows)
     print(table(rows))

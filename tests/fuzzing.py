@@ -95,9 +95,11 @@ def _described() -> list[bytes]:
     blocks = ({"kind": "line_integrals", "scale": 1e-4, "offset": 0.0},
               {"kind": "counts", "flat": ["a.png", "b.png"], "dark": 10.0, "floor": 1.0},
               {"kind": "display", "bright_is_dense": True})
+    uncertain = {"detector_shift_mm": 5, "rotation_degrees": 2.0, "gain": 0.1}
     turn = {"rotate_degrees": 90, "flip_rows": True, "flip_columns": False}
-    return [yaml.safe_dump({"beam": {"orbit": ORBIT}, "intensity": block, "orientation": turn}).encode()
-            for block in blocks] + [b"beam: {dicom: {pixel: [1, 1], source_to_isocentre: [765, 765]}}\n"]
+    described = [{"beam": {"orbit": ORBIT}, "intensity": block, "orientation": turn, "uncertain": uncertain}
+                 for block in blocks] + [{"beam": {"dicom": {"pixel": [1, 1], "source_to_isocentre": [765, 765]}}}]
+    return [yaml.safe_dump(content).encode() for content in described]
 
 
 def _beam_samples(ending: str) -> Callable[[], list[bytes]]:

@@ -3,8 +3,10 @@
 import json
 from itertools import pairwise
 from pathlib import Path
+from unittest.mock import Mock
 
 import nibabel
+import numpy as np
 import pytest
 import torch
 from command_lines import refiner_arguments, refusal, resumed_as_uninterrupted
@@ -13,6 +15,7 @@ from prior.tiny import tiny_prior, tiny_refiner
 from phydict.cli.infer import main as infer
 from phydict.cli.train import main
 from phydict.grid import Cube, Grid
+from phydict.inference import case_files
 from phydict.methods import reconstruct
 from phydict.posterior import Measurement, Unrolled
 from phydict.posterior.refined import ON_FINER
@@ -179,6 +182,8 @@ def test_predict_writes_the_interval_beside_the_volume(tmp_path, refiner_file, m
     BEAM.save(folder / "geometry.yaml")
     for n, view in enumerate(views()):
         nibabel.save(nibabel.Nifti1Image(view.numpy(), torch.eye(4).numpy()), folder / f"view_{n}.nii.gz")
+    panel = Mock(wraps=case_files.panel)
+    monkeypatch.setattr(case_files, "panel", panel)
     infer(["predict", f"--data.xrays={folder}", f"--model.prior={refiner_file}", "--model.out=out",
            "--trainer.accelerator=cpu"])
     [case] = Path("out/phydict_learned").glob("*/")
@@ -188,6 +193,9 @@ def test_predict_writes_the_interval_beside_the_volume(tmp_path, refiner_file, m
     assert (widening := record["interval_widening"]) >= (2 if record["scatter"] else 1)
     assert (f"intervals {widening:.1f} times as wide as calibrated" in capsys.readouterr().err) == (widening >= 1.05)
     assert 0 < record["interval_90_hu"] <= interval.get_fdata().max()
+    shown = panel.call_args.kwargs
+    assert shown["deviation_label"] == "half of the 90% interval"
+    np.testing.assert_allclose(shown["deviation_hu"], interval.get_fdata(), atol=1)
 
 
 def test_a_resumed_run_is_the_uninterrupted_one_and_leaves_the_refiner_as_it_was(tmp_path, cache, refiner_file):

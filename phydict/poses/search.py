@@ -17,7 +17,7 @@ chosen: at the end the beam is carried to where its shadows are most like the no
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -98,16 +98,16 @@ def find_poses(xrays: Tensor, beam: ConeBeam, uncertain: Uncertain, grid: Grid, 
     """
     check_xrays(xrays, beam)
     beam.check(grid)
-    uncertain.check(beam.views, xrays[0].numel())
     if display:
         uncertain.check_scale(beam)
+        uncertain = replace(uncertain, gain=max(uncertain.gain, DISPLAY), offset=max(uncertain.offset, DISPLAY))
+    uncertain.check(beam.views, xrays[0].numel())
     while max(grid.shape) > MOST_VOXELS:
         grid = halved(grid)
     watch, deviations, coarse = Stopwatch(), uncertain.deviations, halved(grid)
     with watch.stage("calibrate"):
         xrays = xrays.float().cpu()
         if display:
-            deviations[8:] = np.maximum(deviations[8:], DISPLAY)
             chest = Projector(coarse, beam.binned(binning(coarse, beam)), full_detector=True)
             xrays = match_views(xrays[None], mu_water * chest(typical_chest(chest)))[0]
         state = State(torch.zeros(beam.views, 10), torch.zeros(beam.views, 10))

@@ -114,6 +114,13 @@ def geometries():
             ("polarity 1", {"kind": "display", "bright_is_dense": 1}, "bright_is_dense"),
             ("polarity of counts", {"kind": "counts", "bright_is_dense": True, "air": "1"}, "air")):
         yield f"intensity {name}", no, word, lambda p, block=block: p.predict(p.case(intensity=block))
+    for name, block, word in (
+            ("-5", {"detector_shift_mm": -5}, "detector_shift_mm"), ("nan", {"gain": float("nan")}, "gain"),
+            ("5 mm", {"source_shift_mm": "5 mm"}, "source_shift_mm"), ("1e30", {"offset": 1e30}, "offset"),
+            ("a list", ["gain"], "mapping"), ("an unknown key", {"shift": 5}, "shift"), ("empty", {}, "uncertain"),
+            ("all zero", {"gain": 0}, "uncertain"), ("1 as a key", {1: 5}, "uncertain")):
+        yield f"uncertain {name}", no, ("geometry.yaml", word), lambda p, block=block: p.predict(
+            p.case(uncertain=block), "--calibrate")
     vectors = BEAM.to_dict()
     for name, change, word in (
             ("of text", {"sources": "here"}, "sources"), ("one short", {"sources": vectors["sources"][:2]}, ""),

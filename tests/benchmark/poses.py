@@ -15,7 +15,8 @@ The true scene is carried as a whole to where the nominal beam sees it (phydict.
 where it was. psnr_aligned is of the found beam carried to the true one before the reconstruction, psnr_calibrated of
 the found beam as it is, and inside_90 the share of the body's voxels in the intervals of 90 %, if there are any;
 reprojection_mm is after that carrying, the root mean square over views of 125 points' errors
-on the detector. regained: the share of the lost PSNR. Rows that poses.csv beside this file holds already are kept.
+on the detector. regained: the share of the lost PSNR. warnings: of the calibration; warnings_plain: of the run without.
+Rows that poses.csv beside this file holds already are kept.
 """
 
 from __future__ import annotations
@@ -88,10 +89,14 @@ def row(case: dict, views: int, errors: str, method: str) -> dict:
     truth = WINDOW.to_hu(case["volume"])[None]
 
     inside, body = {}, torch.from_numpy(body_mask(truth[0, 0].numpy(), GRID.spacing)) | (case["masks"][0] > 0.5)
+    warned = {}
 
     def psnr(name: str, y: torch.Tensor, beam: ConeBeam) -> float:
         began = time.process_time()
-        result = ready.reconstruct(*fit_to_grid(ready, GRID, y, beam))
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            result = ready.reconstruct(*fit_to_grid(ready, GRID, y, beam))
+        warned[name] = "; ".join(str(warning.message) for warning in caught) or None
         seconds[name] = time.process_time() - began
         if name == "calibrated" and result.intervals:
             result = poses.added_to(result)
@@ -115,7 +120,7 @@ def row(case: dict, views: int, errors: str, method: str) -> dict:
             **inside, "misfit_before": poses.misfits[0], "misfit_after": poses.misfits[1],
             "seconds_plain": seconds["wrong"], "seconds_calibrated": seconds["calibrate"] + seconds["calibrated"],
             "ratio": (seconds["calibrate"] + seconds["calibrated"]) / seconds["wrong"],
-            "warnings": "; ".join(said) or None}
+            "warnings": "; ".join(said) or None, "warnings_plain": warned["wrong"]}
 
 
 def rms(values: np.ndarray) -> float:

@@ -43,6 +43,9 @@ def scenes(grid: Grid) -> Iterator[tuple[str, ConeBeam, Simulator, Grid, Grid]]:
         yield "polychromatic", benchmark_orbit(grid, views), Polychromatic(), grid, fine
     for name in ("arc_60", "truncated"):
         yield name, ConeBeam.load(shipped(f"configs/geometry/{name}.yaml")), Ideal(), grid, grid
+    for degrees in (25, 15):
+        yield f"arc_{degrees}", benchmark_orbit(grid, 8, degrees), Ideal(), grid, grid
+    yield "many", benchmark_orbit(grid, 64), Ideal(), grid, grid
     for views in (1, 2, 4, 8, 16):
         yield f"{BEYOND}{fine.shape[0]}", benchmark_orbit(finest, views), Ideal(), fine, finest
 
@@ -94,7 +97,7 @@ def draw_reliability(rows: list[dict], path: Path) -> None:
                           for level in levels]
                 axes.plot(levels, shares, "o-", color=f"C{color}", markersize=2 + views**0.5, linewidth=0.8,
                           label=scene.replace("_", " ") if views == of_scene[0]["views"] else None)
-        axes.set(title=part, xlabel="promised (%)", xlim=(45, 100), ylim=(35, 102))
+        axes.set(title=part, xlabel="promised (%)", xlim=(45, 100), ylim=(25, 102))
     figure.axes[0].set_ylabel("voxels inside (%), mean over the CTs")
     figure.axes[0].legend(fontsize="small", title="larger: more views", title_fontsize="small")
     figure.savefig(path, dpi=100)

@@ -101,3 +101,11 @@ def test_what_cannot_be_calibrated_is_refused(case, tmp_path, capsys, uncertain,
     said = refusal(capsys, main, predict(case, tmp_path / "out", "--calibrate"))
     assert words in said and "geometry.yaml" in said
     assert not (tmp_path / "out" / "sirt" / "anna").exists()
+
+
+def test_one_view_alone_is_refused_with_the_number_of_its_unknowns(xrays, tmp_path, capsys):
+    save_xrays(tmp_path / "anna", xrays[:1], BEAM.select([0]))
+    describe(tmp_path / "anna", UNCERTAIN)
+    said = refusal(capsys, main, predict(tmp_path / "anna", tmp_path / "out", "--calibrate"))
+    assert "one view leaves its 2 unknowns of pose undecided" in said
+    assert not (tmp_path / "out" / "sirt" / "anna").exists()

@@ -1,5 +1,7 @@
 """Poses found with the volume: what is marginalised, the true poses stay, and wrong ones are found."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,7 @@ from phydict.datasets import Thorax, build
 from phydict.grid import Grid
 from phydict.poses import find_poses
 from phydict.poses.blind import BlindMeasurement
-from phydict.poses.search import PoseSearch, halved, middle_points
+from phydict.poses.search import PoseSearch, Views, halved, middle_points
 from phydict.posterior import Measurement
 from phydict.units import HUWindow, hu_to_mu
 from phydict.xray import ConeBeam, Projector
@@ -111,3 +113,30 @@ def test_gains_are_found_and_taken_out(thorax):
     found = find_poses(drifted, BEAM, Uncertain(gain=0.1), GRID, search=SEARCH)
     assert found.beam.same_as(BEAM) and set(found.record()["corrections"]) == {"gain"}
     assert (found.corrected(drifted) - clean).norm() < 0.3 * (drifted - clean).norm()
+
+
+def test_dead_pixels_pull_the_poses_along_less_than_least_squares_would_let_them(thorax):
+    """Residuals far beyond a view's own count less (Huber)."""
+    true = moved(BEAM, np.random.default_rng(0).normal(0, 1, (8, 8)) * UNCERTAIN.poses)
+    y = xrays(thorax, true)
+    y[torch.rand(y.shape, generator=torch.Generator().manual_seed(1)) < 0.003] = 0
+    huber, squares = (error(find_poses(y, BEAM, UNCERTAIN, GRID, search=search).beam, true)
+                      for search in (SEARCH, replace(SEARCH, huber=1e9)))
+    assert huber < 0.95 * squares and huber < 0.5 * error(BEAM, true)
+
+
+def test_a_step_that_would_put_the_source_into_the_volume_is_shortened(thorax):
+    views = Views(xrays(thorax, BEAM), BEAM, GRID, torch.ones(10), 0.02, SEARCH)
+    small, large = torch.zeros(8, 10), torch.zeros(8, 10)
+    small[:, 0], large[:, 4] = 5.0, -900.0  # towards the source, past the isocentre
+    assert torch.equal(views.clear(torch.zeros(8, 10), small), small)
+    step = views.clear(torch.zeros(8, 10), large)
+    assert (step[:, 4] / large[:, 4]).unique().numel() == 1 and -900 < step[0, 4] < 0
+    moved(BEAM, step[:, :8].double().numpy()).check(GRID)
+
+
+@pytest.mark.parametrize("display, unknowns", [(False, 16), (True, 32)])
+def test_more_unknowns_than_the_pixels_hold_are_refused_gains_of_display_values_included(display, unknowns):
+    beam = ConeBeam.orbit(8, 1150, 740, (2, 2), 300.0)
+    with pytest.raises(ValueError, match=f"{unknowns} unknowns of 8 views cannot be found from 32 pixels"):
+        find_poses(torch.rand(8, 2, 2), beam, Uncertain(detector_shift_mm=5), GRID, display)

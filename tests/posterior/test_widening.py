@@ -9,7 +9,7 @@ from prior.tiny import tiny_refiner
 
 from phydict.methods import reconstruct
 from phydict.posterior import posterior
-from phydict.posterior.widening import angular_spread, limited_angle_factor
+from phydict.posterior.widening import angular_spread, limited_angle_factor, narrow_arc_widening
 from phydict.xray import ConeBeam, Projector
 from posterior.hollow import GRID, ORBIT, measured
 
@@ -51,3 +51,21 @@ def test_a_limited_angle_belongs_to_the_calibration_so_that_nothing_counts_as_wi
     assert wider.interval_widening == usual.interval_widening
     for level, half_width in usual.intervals.items():
         torch.testing.assert_close(wider.intervals[level], (1.5 * half_width).clamp(max=2 * refiner.window.half_width))
+
+
+def test_a_narrower_arc_than_in_the_calibration_widens_and_is_said():
+    wider = []
+    for degrees in (30.0, 20.0, 10.0, 0.1):
+        with pytest.warns(UserWarning, match="8 views come from a narrower arc .* 40 degrees: they are 1.. times"):
+            wider.append(narrow_arc_widening(seen(8, degrees)))
+    assert wider[0] > 1 and wider == sorted(set(wider)) and wider[-1] < 2
+    with pytest.warns(UserWarning, match="narrower arc"):
+        found = reconstruct(measured().y[0][[0] * 4], ORBIT.select([0] * 4), tiny_refiner(uncertain=True),
+                            "phydict_learned", precision="float32")
+    assert found.interval_widening >= wider[-1]
+
+
+@pytest.mark.filterwarnings("error")
+def test_arcs_of_the_calibration_few_views_and_full_orbits_do_not():
+    scenes = *(seen(views, 40.0) for views in (4, 8, 32)), *(seen(views) for views in (1, 2, 3, 4, 200)), seen(3, 10.0)
+    assert all(narrow_arc_widening(scene) == 1 for scene in scenes)

@@ -9,11 +9,11 @@ from pathlib import Path
 from phydict.ablation.run import features_file
 from phydict.ablation.summary import Entry, conditions, format_settings
 from phydict.datasets import patient_of
-from phydict.evaluation import write_csv
+from phydict.evaluation import read_csv, write_csv
 from phydict.evaluation.bootstrap import Estimate
 from phydict.evaluation.fid import StoredFeatures, distances
 from phydict.evaluation.tables import Table, fid_tables
-from phydict.inference.scoring import Scoring
+from phydict.inference.scoring import FIDSettings, Scoring
 
 FID = "fid.csv"
 """The distances in a folder of results."""
@@ -21,13 +21,29 @@ FID = "fid.csv"
 
 def comparison_tables(out: Path, entries: Sequence[Entry], scoring: Scoring) -> list[Table]:
     """The tables of each condition, with a line per entry, and FID with the same numbers; none where the distance is
-    not measured.
-
-    Of several seeds of a case each counts as a case of the same patient.
-    """
+    not measured."""
     if scoring.network is None:
         return []
-    rows, tables, backbone, replicates = [], [], scoring.fid.backbone, scoring.fid.replicates
+    tables, rows = _tables(out, entries, scoring.fid.backbone, scoring.fid.replicates)
+    write_csv(out / FID, rows)
+    return tables
+
+
+def kept_tables(out: Path, entries: Sequence[Entry]) -> list[Table]:
+    """The same tables, of a comparison that measured the distance and whose features lie there still; otherwise
+    none."""
+    measured = read_csv(out / FID)
+    rows = [row for entry in entries for row in entry.counted]
+    if not measured or not all(features_file(out, row["key"]).is_file() for row in rows):
+        return []
+    return _tables(out, entries, measured[0]["fid_backbone"],
+                   int(measured[0].get("replicates", FIDSettings().replicates)))[0]
+
+
+def _tables(out: Path, entries: Sequence[Entry], backbone: str, replicates: int) -> tuple[list[Table], list[dict]]:
+    """Of several seeds of a case each counts as a case of the same patient."""
+    tables: list[Table] = []
+    rows: list[dict] = []
     for condition, group in conditions(entries):
         features = {entry.label: {name: StoredFeatures(features_file(out, key), backbone)
                                   for name, key in _named(entry.counted)} for entry in group if entry.counted}
@@ -35,10 +51,10 @@ def comparison_tables(out: Path, entries: Sequence[Entry], scoring: Scoring) -> 
             found = distances(features, replicates)
             title = format_settings("Frechet distance of slices (FID)", condition)
             tables += fid_tables(found, backbone, replicates, title)
-            rows += [{"method": label} | condition | {"fid_backbone": backbone, "cases": len(one.cases)}
-                     | _numbers(one.estimates()) for label, one in found.items()]
-    write_csv(out / FID, rows)
-    return tables
+            rows += [{"method": label} | condition | {"fid_backbone": backbone, "replicates": replicates,
+                                                      "cases": len(one.cases)} | _numbers(one.estimates())
+                     for label, one in found.items()]
+    return tables, rows
 
 
 def _numbers(estimates: Mapping[str, Estimate]) -> dict[str, float]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from phydict.ablation.fid import kept_tables
 from phydict.ablation.run import RESULTS
 from phydict.ablation.summary import Entry, format_settings, summarise
 from phydict.ablation.tables import all_tables
@@ -20,10 +21,9 @@ def is_comparison(folder: Path) -> bool:
 
 
 def page_anew(folder: Path) -> Path:
-    """Writes the page of a folder's table; returns its path. Tables of Frechet distances, which ablate
-    makes of features, are in tables.md alone."""
+    """Writes the page of a folder's table; returns its path."""
     entries = summarise(read_csv(folder / RESULTS))
-    return comparison_page(folder, entries, all_tables(entries))
+    return comparison_page(folder, entries, all_tables(entries) + kept_tables(folder, entries))
 
 
 def comparison_page(folder: Path, entries: Sequence[Entry], tables: Sequence[Table]) -> Path:

@@ -13,27 +13,32 @@ import nibabel as nib
 import numpy as np
 
 from phydict.evaluation import RANGE, mean_table
-from phydict.evaluation.tables import Table
+from phydict.evaluation.fid import StoredFeatures, distances
+from phydict.evaluation.tables import Table, fid_tables
 from phydict.grid import Grid
 from phydict.inference.protocols import protocol_of
-from phydict.inference.results import RECORD, TABLE, score_row
+from phydict.inference.results import FEATURES, RECORD, TABLE, score_row
+from phydict.inference.scoring import FIDSettings
 from phydict.page import CASE_FILES, Contents, PageCase, check_own_page, write_case_files, write_page
 from phydict.runtime.warning import warn
 
 
-def results_page(folder: Path, further: Sequence[Table] = (),
+def results_page(folder: Path, further: Sequence[Table] | None = None,
                  empty: Mapping[str, str] = MappingProxyType({})) -> Path:
     """Writes the page of a folder's finished cases, one method's or several methods' in a folder each; returns its
     path. What the page needs of a case and older results lack is made of their NIfTI files.
 
-    further: tables behind that of the means; empty: scores that may stay empty -> why. Raises ValueError where there is
-    no finished case, or where a page of someone else's is in its place.
+    further: tables behind that of the means; if left out, those of the Frechet distances of slices whose features lie
+    in the cases' folders. empty: scores that may stay empty -> why. Raises ValueError where there is no finished case,
+    or where a page of someone else's is in its place.
     """
     check_own_page(folder, "folder")
     cases = [case for path in _case_folders(folder) if (case := _case(folder, path))]
     if not cases:
         raise ValueError(f"{folder} holds no results: give the folder that predict, test or ablate wrote to, which "
                          f"holds <case>/{RECORD}, <method>/<case>/{RECORD} or ablate's {TABLE}")
+    if further is None:
+        further = _kept_distances(folder, cases)
     scored = [case.record for case in cases if case.record["scores"]]
     error = "mae_hu" if any("mae_hu" in record["scores"] for record in scored) else "misfit"
     points = [{"name": f"{case.record['case']}, {case.record['method']}", "series": case.record["method"],
@@ -84,3 +89,20 @@ def _mean_tables(scored: list, empty: Mapping[str, str]) -> list[Table]:
     table = mean_table([score_row(record["case"], record) for record in scored],
                        window=protocol.window if protocol else RANGE, empty=empty)
     return [replace(table, notes=[*table.notes, protocol.note]) if protocol else table]
+
+
+def _kept_distances(folder: Path, cases: Sequence[PageCase]) -> list[Table]:
+    """The tables of Frechet distances that features in the cases' folders give, a line per method."""
+    methods: dict[str, dict[str, dict[str, StoredFeatures]]] = {}
+    for case in cases:
+        backbone, file = case.record.get("settings", {}).get("fid_backbone"), folder / case.folder / FEATURES
+        if backbone and file.is_file():
+            try:
+                features = StoredFeatures(file, backbone)
+            except ValueError as error:
+                warn(f"a case is left out of the Frechet distances: {error}")
+                continue
+            methods.setdefault(backbone, {}).setdefault(case.record["method"], {})[case.record["case"]] = features
+    replicates = FIDSettings().replicates
+    return [table for backbone, features in methods.items()
+            for table in fid_tables(distances(features, replicates), backbone, replicates)]

@@ -16,6 +16,8 @@ from phydict.evaluation.fid import NAMES
 from phydict.evaluation.organs import dice
 from phydict.grid import Grid
 from phydict.inference import scoring
+from phydict.inference.page import results_page
+from phydict.inference.results import FEATURES
 from phydict.inference.scoring import FIDSettings, Scoring
 from phydict.runtime.lpips_networks import load_lpips
 
@@ -53,6 +55,17 @@ def test_the_page_shows_the_frechet_distances_and_why_scores_are_empty(tmp_path,
     assert "CLIP T2I (%): empty, since CT-CLIP's checkpoint was not given" in page
 
 
+def test_a_page_made_anew_has_the_frechet_distances_whose_features_are_kept(tmp_path, untrained):
+    main(phantoms(tmp_path, 2, "--model.grid=34", "--metrics=[fid]"))
+    made = (tmp_path / "index.html").read_text()
+    main(["page", str(tmp_path)])
+    assert "Frechet distance of slices (FID)" in made and (tmp_path / "index.html").read_text() == made
+    (tmp_path / "sirt" / "phantom-1000000" / FEATURES).write_bytes(b"no features")
+    with pytest.warns(UserWarning, match="left out of the Frechet distances: .*are missing or damaged"):
+        results_page(tmp_path)
+    assert "1 cases with XY 34" in (tmp_path / "index.html").read_text()
+
+
 def test_other_metrics_do_not_pass_for_those_of_a_finished_case(tmp_path, capsys, untrained):
     main(phantoms(tmp_path, 1, "--model.grid=34"))
     other = phantoms(tmp_path, 1, "--model.grid=34", "--metrics=[lpips]")
@@ -73,6 +86,9 @@ def test_ablate_has_a_line_of_fid_for_each_method_and_resumes(tmp_path, untraine
     for row in read_csv(tmp_path / "out" / "fid.csv"):
         (line,) = (line for line in fid.splitlines() if line.startswith(f"| {row['method']} |"))
         assert all(f"{row[name]:.3f}" in line for name in NAMES) and row["cases"] == 2
+    made = (tmp_path / "out" / "index.html").read_text()
+    main(["page", str(tmp_path / "out")])
+    assert "Frechet distance of slices" in made and (tmp_path / "out" / "index.html").read_text() == made
     next((tmp_path / "out" / "features").iterdir()).unlink()
     capsys.readouterr()
     main(args)

@@ -265,11 +265,11 @@ def _attempt(work: Callable[[], object]):
     a failure instead."""
     try:
         return work()
-    except ValueError as error:
-        return {"status": "refused", "error": sentence(error)}
     except Exception as error:  # of whatever kind: one method's failure must not end the others' runs
         if os.environ.get(TRACEBACK):
             raise
+        if isinstance(error, ValueError):
+            return {"status": "refused", "error": sentence(error)}
         return {"status": "failed", "error": f"{type(error).__name__}: {sentence(error)}"}
 
 

@@ -98,14 +98,14 @@ class InferenceCLI(TellingCLI):
         """Reconstruct X-rays, or draw their geometry."""
         if self.dry_run:
             check_apart(model.pages, "model.out", datamodule.inputs("predict"))
-            self._draw(datamodule.xray_cases(), model, datamodule.geometry)
+            self._draw(datamodule.xray_cases(), model, datamodule.geometry_file)
             return
         model.profile, model.calibrate = self.flag("profile"), self.flag("calibrate")
         with _resumable(model):
             self.trainer.predict(model, datamodule=datamodule, return_predictions=False)
 
     @staticmethod
-    def _draw(folders: dict[str, Path], model: ReconstructionTask, geometry: str | None) -> None:
+    def _draw(folders: dict[str, Path], model: ReconstructionTask, geometry: Path | None) -> None:
         """The page of every case, id -> folder. Raises ValueError, naming them, where some cannot be drawn."""
         bad = []
         for name, folder in folders.items():

@@ -112,9 +112,8 @@ class CascadePosterior(Reconstructor):
             state = torch.cat([stage.window.to_range(base.within)[None], 2 * masks - 1])[None].to(xrays)
             state = state[:, :stage.coarse_channels]
             measurement = Measurement(projector, xrays, stage.window, display, self.mu_water)
-            measurement.carry(base.carried)
+            measurement.adopt(base)
             if base.scatter:
-                measurement.reset_scatter(True)
                 measurement.refit(stage.upsample(state)[:, :1])
                 measurement.scatter_enabled = False  # the base stage's is kept
             guard = Guard(measurement, on_step, self.second.steps())
@@ -126,7 +125,8 @@ class CascadePosterior(Reconstructor):
             ct = state[:, :1]
             measurement.match_gain_offset(ct)
             fit = guard.score(state, measurement.project(ct), measurement.y)
-            masks = interpolate(masks[None], stage.grid.shape, mode="trilinear")[0]
+            masks = interpolate(masks[None], stage.grid.shape, mode="trilinear")[0] if len(masks) else (
+                masks.new_zeros(0, *stage.grid.shape))
             masks[:stage.state_channels - 1] = ((state[0, 1:] + 1) / 2).cpu()
             volume = stage.window.to_hu(ct[0, 0]).cpu()
             if base.carried:
@@ -136,7 +136,7 @@ class CascadePosterior(Reconstructor):
             **fit | {"diverged_at": base.diverged_at or guard.diverged_at}, seconds=watch.seconds,
             network_calls=base.network_calls + denoiser.calls,
             projector_calls=base.projector_calls + measurement.calls, masks=masks,
-            scatter=base.scatter, precision=base.precision)
+            hardened=base.hardened, scatter=base.scatter, model_variance=base.model_variance, precision=base.precision)
 
     def _base(self, xrays: Tensor, projector: Projector, report: str, display: bool, seed: int,
               on_step: Callable[[], None]) -> Reconstruction:

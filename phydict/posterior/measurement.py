@@ -59,6 +59,7 @@ class Measurement:
         self.window, self.mu_water = window, mu_water
         self.scales = finest_to_own(projector.grid.spacing)
         self.y = xrays[None]
+        self._noise_of: tuple[Tensor | None, Tensor] = None, xrays  # the y that it was last estimated from, and it
         self.hardened = self.scatter_enabled = False
         self.calls = 1
         self.last_projection: Tensor | None = None
@@ -87,7 +88,7 @@ class Measurement:
         """Holds of the X-rays what a reconstruction from them found beside the CT, on other voxels: what is carried,
         what counts as noise of a view, hardening, and whether there is scatter."""
         self.carry(found.carried)
-        self.model_variance = found.model_variance
+        self.model_variance = torch.as_tensor(found.model_variance).to(self.y)
         if found.hardened:
             self.straighten()
         self.reset_scatter(found.scatter > 0)
@@ -121,7 +122,9 @@ class Measurement:
     def noise_variance(self) -> Tensor:
         """Variance (K, V, U) of the noise of each pixel of y."""
         if self.noise is None:
-            return noise_level(self.y[0]).square()
+            if self._noise_of[0] is not self.y:
+                self._noise_of = self.y, noise_level(self.y[0]).square()
+            return self._noise_of[1]
         level = self.noise if isinstance(self.noise, Tensor) else self.noise * self.y.max()
         return level.square().expand(self.y.shape[1:])
 

@@ -97,7 +97,7 @@ def with_metal(measurement: Measurement, metal: Metal | None, first: Callable[[]
     states = z
     for _ in range(metal.rounds):
         carried = beside(measurement, states[:1, :1], where, metal)
-        if carried.density < PROMISING * metal.least:
+        if not carried.density >= PROMISING * metal.least:  # not a number where nothing is left
             break
         measurement.carry(carried)
         states = again()

@@ -199,7 +199,7 @@ class Posterior(Reconstructor):
             network_calls=denoiser.calls * (2 if report and self.guidance != 1 else 1),
             projector_calls=measurement.calls, masks=((state[1:] + 1) / 2).cpu(), deviation=deviation,
             intervals=intervals, interval_widening=widening, hardened=measurement.hardened,
-            scatter=measurement.scatter, model_variance=measurement.model_variance,
+            scatter=measurement.scatter, model_variance=torch.as_tensor(measurement.model_variance).cpu(),
             precision=precision_name(self.precision, xrays), carried=carried)
 
     def _volume(self, measurement: Measurement, x: Tensor) -> tuple[Tensor, Carried | None]:

@@ -156,4 +156,5 @@ class Stopwatch:
             with stage(name):
                 yield
         finally:
+            _wait()
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began

@@ -116,6 +116,17 @@ def test_the_untimed_call_ends_no_run_that_is_to_show_where_it_fails(tmp_path, m
     assert {row["status"] for row in ablate(tmp_path, axes={"method": ["trace"]})} == {"ok"}
 
 
+@pytest.mark.parametrize("error", [ValueError("No view."), RuntimeError("no memory")])
+def test_every_error_of_a_method_shows_where_it_is_asked_to(tmp_path, monkeypatch, trace, error):
+    def give_up(calls):
+        raise error
+
+    monkeypatch.setenv("PHYDICT_TRACEBACK", "1")
+    monkeypatch.setattr(trace, "behave", staticmethod(give_up))
+    with pytest.raises(type(error), match=str(error)):
+        ablate(tmp_path, axes={"method": ["trace"]})
+
+
 @pytest.mark.parametrize("error, status, again", [(ValueError("Two\nlines."), "refused", 0),
                                                   (RuntimeError("no memory"), "failed", 1)])
 def test_a_method_that_gives_up_is_a_row_with_its_sentence(tmp_path, monkeypatch, trace, error, status, again):

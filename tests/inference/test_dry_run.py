@@ -13,6 +13,7 @@ from inference.runs import contents, names, phantoms, sirt
 from phydict.cli.infer import main
 from phydict.datasets import load_xrays, phantom_case, save_xrays
 from phydict.grid import Grid
+from phydict.runtime.shipped import shipped
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 
@@ -28,6 +29,16 @@ def test_a_dry_run_draws_every_case_and_reconstructs_nothing(measured, tmp_path,
     assert pose == "anna view 0: source posterior, columns to left, rows to inferior; agreement"
     assert float(agreement) > 0.7
     assert not any("better" in line for line in lines)
+
+
+@pytest.mark.filterwarnings("ignore:case. view")
+def test_a_dry_run_takes_a_geometry_by_its_name(measured, tmp_path, capsys):
+    orbit = ConeBeam.load(shipped("configs/geometry/paper_orbit.yaml"))
+    save_xrays(tmp_path / "case", torch.rand(orbit.views, *orbit.shape), orbit)
+    (tmp_path / "case" / "geometry.yaml").unlink()
+    main(sirt("predict", tmp_path / "out", f"--data.xrays={tmp_path / 'case'}", "--data.geometry=paper_orbit",
+              "--dry_run"))
+    assert names(tmp_path / "out" / "dry_run") == ["case.png"]
 
 
 def test_a_dry_run_sees_images_that_lie_upside_down(measured, tmp_path, capsys):

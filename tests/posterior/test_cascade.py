@@ -12,9 +12,10 @@ from torch.nn.functional import interpolate
 from phydict.diffusion import CosineSchedule, GaussianDenoiser
 from phydict.grid import Grid
 from phydict.posterior import CascadePosterior, Posterior, PriorOnly, ProximalCG, SplitGibbs
-from phydict.prior import Cascade, MedSynSuperResolution
-from phydict.units import HUWindow
+from phydict.prior import Cascade, MedSynSuperResolution, PriorContract
+from phydict.units import MU_WATER, HUWindow
 from phydict.xray import ConeBeam, Projector, binned
+from phydict.xray.calibration import without_hardening
 
 BEAM = ConeBeam.orbit(4, 1020, 740, (56, 56), 10.0)
 FINE = Grid.cube(32)
@@ -119,6 +120,39 @@ def test_scatter_that_the_base_stage_finds_is_subtracted_at_both_stages(xrays, s
         assert (found.xrays - xrays).norm() < 0.5 * (measured - xrays).norm()
     else:
         assert found.scatter == 0 and found.xrays.equal(measured)
+
+
+class Finding(CascadePosterior):
+    """One whose base stage finds what `found` says, beside what it finds."""
+
+    found = {}
+
+    def _base(self, *args):
+        return replace(super()._base(*args), **self.found)
+
+
+def test_what_the_base_stage_straightened_or_took_for_noise_is_so_at_the_second_stage(xrays):
+    doubted = torch.tensor([0.0, 1.0, 0.0, 0.0])[:, None, None]
+    plain, straight, doubting = (type("Found", (Finding,), {"found": found})(
+        Cascade(tiny_prior(False), GaussianStage(1e-2)), SAMPLER, precision="float32").reconstruct(
+            xrays, PROJECTOR, seed=3) for found in ({}, {"hardened": True}, {"model_variance": doubted}))
+    torch.testing.assert_close(straight.xrays, without_hardening(plain.xrays, MU_WATER))
+    assert straight.hardened and not plain.hardened and torch.equal(doubting.model_variance, doubted)
+    assert doubting.misfit_per_view[1] > 1.2 * plain.misfit_per_view[1]
+
+
+class CTAlone(PriorContract):
+    """A prior without masks."""
+
+    grid, window = Grid.cube(16), HUWindow(-1000, 600)
+
+    def bind(self, report="", guidance=1.0, precision="auto"):
+        return GaussianDenoiser(torch.full((1, 1, *self.grid.shape), -0.5), torch.tensor(0.1), GaussianStage.schedule)
+
+
+def test_a_prior_without_masks_has_a_second_stage(xrays):
+    found = CascadePosterior(Cascade(CTAlone(), GaussianStage(1e-2)), SAMPLER).reconstruct(xrays, PROJECTOR, seed=3)
+    assert found.volume.shape == FINE.shape and found.masks.shape == (0, *FINE.shape)
 
 
 def medsyn_stage():

@@ -11,6 +11,7 @@ from phydict.posterior.scatter import with_scatter
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 from phydict.xray.calibration import UNBENT_PATH, without_hardening
+from posterior.hollow import measured
 
 GRID = Grid.cube(6)
 BEAM = ConeBeam.orbit(3, 1020, 740, (7, 9), 60.0)
@@ -162,3 +163,11 @@ def test_the_truth_is_missed_by_the_noise_and_each_state_of_a_batch_by_its_own()
     missed = m.normalised_residual(torch.cat([truth, truth + 0.1]))
     assert float(missed[0]) == pytest.approx(1, abs=0.15) and float(missed[1]) > 3
     torch.testing.assert_close(missed, torch.cat([m.normalised_residual(truth), m.normalised_residual(truth + 0.1)]))
+
+
+def test_the_noise_is_that_of_the_xrays_as_they_are_now():
+    m = measured(noise=0.01)
+    before = m.noise_variance
+    assert m.noise_variance is before
+    m.y = 2 * m.y
+    torch.testing.assert_close(m.noise_variance, 4 * before)

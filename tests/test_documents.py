@@ -1,5 +1,6 @@
 """What the documents say is so: links lead somewhere, figures are those of the CSVs, names and versions are today's."""
 
+import ast
 import re
 import runpy
 import statistics
@@ -37,6 +38,13 @@ def test_a_link_leads_to_a_file_and_a_heading_that_are_there(file):
         target = (file.parent / place).resolve() if place else file
         assert target.exists(), link
         assert not anchor or anchor in anchors(target), link
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "phydict/posterior/samplers").glob("*.py")), ids=lambda f: f.stem)
+def test_the_table_of_a_samplers_docstring_is_in_line(file):
+    table = [line for line in (ast.get_docstring(ast.parse(file.read_text())) or "").splitlines() if line[:1] == "|"]
+    edges = [at for at, mark in enumerate(table[0]) if mark == "|"] if table else []
+    assert all(len(line) == len(table[0]) and {line[at] for at in edges} == {"|"} for line in table)
 
 
 def test_the_readme_is_short_and_names_every_method():

@@ -14,7 +14,7 @@ from phydict.grid import Cube, Grid
 from phydict.methods import fit_to_grid, reconstructor
 from phydict.posterior import Refined, Unrolled
 from phydict.posterior.refined import ON_FINER
-from phydict.prior import load_correction, save_correction, save_refiner
+from phydict.prior import describe_correction, load_correction, save_correction, save_refiner
 from phydict.prior.correction import CorrectionNetwork
 from phydict.prior.finer_uncertainty import SEEN, FinerUncertainty, tissue_of_seen
 from phydict.prior.uncertainty import LEVELS, TISSUES
@@ -155,6 +155,16 @@ def test_a_resumed_run_is_the_uninterrupted_one_and_leaves_the_correction_as_it_
     assert all(torch.equal(before[name].half(), trained[name].half()) for name in before)
     assert all(name.startswith("uncertainty.") for name in trained.keys() - before.keys())
     assert not torch.equal(trained["uncertainty.quantiles"], FinerUncertainty((4, 8)).quantiles.half().float())
+
+
+def test_a_training_of_intervals_and_one_of_the_correction_are_not_resumed_as_each_other(files):
+    settings = {"cube": Cube(32), "window": (-1000, 600), "initial": files[2]}
+    for task, other in ((FinerUncertaintyTraining(FinerUncertainty((4, 8)), **settings), knowing(uncertain=False)),
+                        (RefinementTraining(**settings), knowing())):
+        with pytest.raises(ValueError, match="differ in 'uncertainty': give the settings"):
+            task.on_load_checkpoint({"phydict": describe_correction(other) | {"training": {"samples": 8}}})
+        task.on_load_checkpoint({"phydict": task._describe() | {"training": {"samples": 8}}})
+        assert task.samples == 8
 
 
 def test_steps_on_one_crop_bring_the_scale_to_the_errors(files):

@@ -7,10 +7,13 @@ import nibabel
 import numpy as np
 import pytest
 import torch
+from ct_files import save_ct, thorax_hu
 
-from phydict.datasets import phantom_case
+from phydict.datasets import find_cts, load_case, phantom_case, prepare_ct
+from phydict.datasets.cts.preparation import prepare_folder
+from phydict.datasets.cts.spaces import Settings
 from phydict.grid import Cube, Grid
-from phydict.training.crops import CropDataset, PhantomVolumes, SuperResolutionData, mapped_volume
+from phydict.training.crops import CropDataset, CTVolumes, PhantomVolumes, SuperResolutionData, mapped_volume
 from phydict.training.settings import Crops, HoldOut, Loading
 from phydict.units import HUWindow
 
@@ -102,6 +105,22 @@ def test_phantoms_are_those_of_the_base_stage(tmp_path):
     np.testing.assert_array_equal(volume, expected)
 
 
+def test_prepared_cases_are_read_as_they_were_prepared_and_never_made_finer(tmp_path):
+    save_ct(tmp_path / "in/a.nii.gz", thorax_hu())
+    prepare_folder(tmp_path / "in", tmp_path / "out", Settings(voxels=32))
+    cts, grid = find_cts(tmp_path / "out"), Grid.cube(32)
+    volumes = CTVolumes(cts, tmp_path / "cache", grid, HUWindow())
+    anew = prepare_ct(cts[0].path, grid, HUWindow())["volume"][0].numpy().astype(np.float16)
+    np.save(tmp_path / "cache" / f"a-{volumes.key(cts[0])}.npy", anew)  # where a volume prepared once more was kept
+    expected = load_case(cts[0], grid, HUWindow())["volume"][0].numpy().astype(np.float16)
+    assert not np.array_equal(volumes[0], anew) and np.array_equal(volumes[0], expected)
+    data = SuperResolutionData(Crops(8, 2), str(tmp_path / "out"), holdout=HoldOut(phantoms=0), phantoms=0,
+                               loading=Loading(epoch_size=1, ct_fraction=1.0), cache=str(tmp_path / "cache"),
+                               cube=Cube(64))
+    with pytest.raises(ValueError, match="a was prepared with voxels of 12 mm, but 6 mm are needed; .* --voxels 64"):
+        data.draws(0)[0]
+
+
 def test_held_out_cts_alone_validate_on_fixed_crops(tmp_path):
     for n in range(2):
         hu = np.full((20, 20, 20), -1000, np.int16)
@@ -125,6 +144,13 @@ def test_held_out_cts_alone_validate_on_fixed_crops(tmp_path):
 def test_a_crop_that_cannot_be_is_refused(crop, factor, tmp_path):
     with pytest.raises(ValueError, match="data.crops.size is a multiple"):
         SuperResolutionData(Crops(crop, factor), phantoms=1, cube=Cube(16), cache=str(tmp_path))
+
+
+@pytest.mark.parametrize("wrong", [{"factor": 0}, {"factor": -4}, {"validation": -1}])
+def test_settings_of_crops_that_cannot_be_are_refused(wrong):
+    [(name, value)] = wrong.items()
+    with pytest.raises(ValueError, match=rf"^data\.crops\.{name} .*, but {value} was given$"):
+        Crops(**wrong)
 
 
 def test_crops_are_drawn_from_volumes_of_one_size_alone(tmp_path):

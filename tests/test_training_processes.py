@@ -6,11 +6,12 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 from command_lines import CONFIG, arguments, checkpoint, losses
-from torch.utils.data import default_collate
+from torch.utils.data import DistributedSampler, default_collate
 
 from phydict.cli.train import main
 from phydict.grid import Cube
@@ -115,3 +116,12 @@ def test_a_batch_is_one_loss_however_many_processes_share_it(cache):
         halves = [task.batch_loss(share, key, rank, 2) for rank, share in enumerate(shares)]
         torch.testing.assert_close(sum(halves) / 2, task.batch_loss(batch, key))
     assert task.batch_loss(batch, (0, 0)) != task.batch_loss(batch, (0, 1))
+
+
+@pytest.mark.parametrize("processes", [1, 3])
+def test_what_is_drawn_for_a_held_out_case_does_not_depend_on_the_process_that_sees_it(monkeypatch, processes):
+    task = PriorTraining(VolumeUNet(4, 2, (8, 8), (False, True), 1, 8), TextSettings("none"), cube=Cube(16))
+    for rank in range(processes):
+        monkeypatch.setattr(PriorTraining, "trainer", SimpleNamespace(world_size=processes, global_rank=rank))
+        dealt = list(DistributedSampler(range(6), processes, rank, shuffle=False))
+        assert [task.validation_number(i) for i in range(len(dealt))] == dealt

@@ -23,6 +23,7 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
 from phydict.grid import Grid
+from phydict.runtime.files import atomic_write
 from phydict.xray.residuals import misfits
 
 DISPLAY = (-1000.0, 400.0)
@@ -239,5 +240,5 @@ def _array(values, dimensions: int, noun: str) -> np.ndarray:
 
 
 def _save(figure: Figure, path: str | Path) -> None:
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, format="png")
+    with atomic_write(Path(path)) as part:
+        figure.savefig(part, format="png")

@@ -88,7 +88,8 @@ class Measurement:
         """Holds of the X-rays what a reconstruction from them found beside the CT, on other voxels: what is carried,
         what counts as noise of a view, hardening, and whether there is scatter."""
         self.carry(found.carried)
-        self.model_variance = torch.as_tensor(found.model_variance).to(self.y)
+        variance = found.model_variance
+        self.model_variance = variance.to(self.y) if isinstance(variance, Tensor) else variance
         if found.hardened:
             self.straighten()
         self.reset_scatter(found.scatter > 0)

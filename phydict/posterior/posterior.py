@@ -194,12 +194,13 @@ class Posterior(Reconstructor):
             volume, carried = self._volume(measurement, ct[0, 0])
             intervals, widening = self._intervals(denoiser, measurement, reprojection)
             warn_of_contradictions(measurement, widening if intervals else None)
+            variance = measurement.model_variance
         return Reconstruction(
             volume=volume, grid=prior.grid, method=self.name, seed=seed, **fit, seconds=watch.seconds,
             network_calls=denoiser.calls * (2 if report and self.guidance != 1 else 1),
             projector_calls=measurement.calls, masks=((state[1:] + 1) / 2).cpu(), deviation=deviation,
             intervals=intervals, interval_widening=widening, hardened=measurement.hardened,
-            scatter=measurement.scatter, model_variance=torch.as_tensor(measurement.model_variance).cpu(),
+            scatter=measurement.scatter, model_variance=variance.cpu() if isinstance(variance, Tensor) else variance,
             precision=precision_name(self.precision, xrays), carried=carried)
 
     def _volume(self, measurement: Measurement, x: Tensor) -> tuple[Tensor, Carried | None]:

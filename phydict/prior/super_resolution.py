@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -43,6 +44,7 @@ class SuperResolution(nn.Module):
                  schedule: CosineSchedule = CosineSchedule(), detail_std: float = 0.08, skip_std: float = 0.1,
                  memory: int = 2**32, overlap: int = 48):
         super().__init__()
+        check_between("the factor of a super-resolution stage", factor, 1, math.inf)
         if any(n % network.divisor or n % factor for n in grid.shape):
             raise ValueError(f"this network needs sizes divisible by {network.divisor} and by the factor {factor}, but "
                              f"the grid is {grid.shape}")

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import ConcatDataset, Dataset
 
-from phydict.datasets import CTCases, CTSource, Deformation, phantom_case, prepare_ct
+from phydict.datasets import CTCases, CTSource, Deformation, load_case, phantom_case
 from phydict.datasets.cts.cache import write_array
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM, CachedPhantoms
 from phydict.grid import Cube
@@ -19,6 +19,9 @@ from phydict.training.data import PriorData
 from phydict.training.draws import Draws, Items
 from phydict.training.settings import Crops, HoldOut, Loading
 from phydict.units import AIR, HUWindow
+
+VOLUME_ENDING = ".volume2.npy"
+"""Of cached CTs. Its number is raised when CTVolumes changes its result, so that older caches are not read."""
 
 
 def mapped_volume(file: Path, make: Callable[[], Tensor]) -> np.ndarray:
@@ -42,14 +45,14 @@ class PhantomVolumes(CachedPhantoms):
 
 
 class CTVolumes(CTCases):
-    """The CTs alone of CTCases, as `mapped_volume`s."""
+    """The CTs alone of CTCases, as `mapped_volume`s. Raises what `load_case` raises."""
 
     cache: Path
 
     def __getitem__(self, index: int):
         ct = self.cts[index]
-        return mapped_volume(self.cache / f"{ct.id}-{self.key(ct)}.npy", lambda: prepare_ct(
-            ct.path, self.grid, self.window, id=ct.id, calibration=ct.calibration)["volume"][0])
+        return mapped_volume(self.cache / f"{ct.id}-{self.key(ct)}{VOLUME_ENDING}",
+                             lambda: load_case(ct, self.grid, self.window)["volume"][0])
 
 
 class CropDataset(Draws):

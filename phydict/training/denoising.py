@@ -61,7 +61,7 @@ class DenoisingTraining(StageTraining):
 
     def validation_step(self, batch: dict, index: int) -> None:
         x0, _ = self._clean_state(batch)
-        generator = torch.Generator().manual_seed(index)
+        generator = torch.Generator().manual_seed(self.validation_number(index))
         noise = torch.randn(x0.shape, generator=generator).to(self.device)
         denoiser = self._denoiser(batch, x0)
         errors = denoising_errors(denoiser, x0, noise, self.prior.window)

@@ -117,7 +117,8 @@ class PriorTraining(DenoisingTraining):
         if not self.validation_views or self.device_mesh is not None:
             return
         with torch.autocast(self.device.type, enabled=False):
-            scores = reconstruction_scores(self.prior, batch["volume"], self.validation_views, index)
+            scores = reconstruction_scores(self.prior, batch["volume"], self.validation_views,
+                                           self.validation_number(index))
         for name in ("psnr", "ssim"):
             self.log(f"val/{name}", scores[name], prog_bar=name == "psnr", sync_dist=True, batch_size=1)
 

@@ -81,6 +81,7 @@ class RefinerTraining(StageTraining):
 
     @property
     def calls(self) -> int:  # type: ignore[override]
+        """Those of every scene; the further ones of many views (`Unrolled.more_times`) are not counted."""
         return len(self.method.times)
 
     def batch_loss(self, batch: dict, key: tuple[int, ...] = (0,), rank: int = 0, processes: int = 1) -> Tensor:
@@ -129,10 +130,10 @@ def log_scores(module: StageTraining, batch: dict, index: int, views: Sequence[i
                method: Sampler | Reconstructor, beam: ConeBeam | None = None) -> None:
     """Logs how well a training's network reconstructs a held-out case from each of these numbers of X-rays, or from
     those of `beam`."""
-    scores = []
+    scores, seed = [], module.validation_number(index)
     with torch.autocast(module.device.type, enabled=False):
         for count in views:
-            view_scores = reconstruction_scores(module.prior, batch["volume"], count, index, method, beam)
+            view_scores = reconstruction_scores(module.prior, batch["volume"], count, seed, method, beam)
             module.log(f"val/psnr_{count}", view_scores["psnr"], sync_dist=True, batch_size=1)
             scores.append(view_scores)
     for name in ("psnr", "ssim"):

@@ -215,11 +215,14 @@ class Crops:
     """The cubes that a super-resolution stage learns from.
 
     Args:
-        size: voxels along each side
+        size: voxels along each side, a multiple of the factor
         factor: tied to model.factor
-        validation: fixed crops of each held-out volume that validate
+        validation: fixed crops of each held-out volume that validate; 0: none
     """
 
     size: int = 96
     factor: int = 4
     validation: int = 4
+
+    def __post_init__(self):
+        check_fields(self, "data.crops", factor=(1, math.inf), validation=(0, MOST_DRAWS))

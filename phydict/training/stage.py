@@ -66,6 +66,11 @@ class StageTraining(lightning.LightningModule, ABC):
         self.log("loss", mean, prog_bar=True, batch_size=len(batch["volume"]))
         return loss
 
+    def validation_number(self, index: int) -> int:
+        """The number, among the validation batches of all processes, of this one's `index`-th, which decides what is
+        drawn for it."""
+        return index * self.trainer.world_size + self.trainer.global_rank
+
     def on_train_batch_end(self, outputs: object, batch: object, index: int) -> None:
         if self.global_step == self.trainer.max_steps:  # Lightning then validates, whichever epoch it is
             self.trainer.should_stop = True
@@ -108,8 +113,8 @@ class StageTraining(lightning.LightningModule, ABC):
     def on_load_checkpoint(self, checkpoint: dict) -> None:
         resumed, current = {"stage": "base"} | checkpoint["phydict"], self._describe()
         check_stage(resumed, (current["stage"],), "the checkpoint")
-        for key, value in current.items():
-            if resumed[key] != value:
+        for key in resumed | current:
+            if key != "training" and resumed.get(key) != current.get(key):
                 raise ValueError(f"the checkpoint's prior and this training's differ in '{key}': give the settings and "
                                  "data that the checkpoint was trained with, or start anew with model.initial")
         self.samples = checkpoint["phydict"].get("training", {}).get("samples", 0)

@@ -99,7 +99,7 @@ class UncertaintyTraining(StageTraining):
     def validation_step(self, batch: dict, index: int) -> None:
         ct = batch["volume"]
         for scene in range(self.validation.scenes):
-            rng = np.random.default_rng((self.seed, index, scene))
+            rng = np.random.default_rng((self.seed, self.validation_number(index), scene))
             z, evidence, measurement = self._reconstruct(batch, rng)
             error, log_scale = (z[:, :1] - ct).abs(), self._log_scale(z, evidence, measurement)
             body = _body(ct, z)

@@ -13,7 +13,8 @@ from pathlib import Path
 import nibabel
 import numpy as np
 import pytest
-from ct_files import save_ct
+from ct_files import AFFINE, save_ct
+from dicom_files import write_ct_series
 from processes import Python
 
 from phydict.datasets.cts import cache, preparation
@@ -21,7 +22,9 @@ from phydict.datasets.cts.ct_rate import CTCases, find_cts
 from phydict.datasets.cts.ct_rate_tables import read_calibrations, read_reports
 from phydict.datasets.cts.preparation import SUMMARY, prepare_folder
 from phydict.datasets.cts.prepared import RECORD
+from phydict.datasets.cts.sources import Source
 from phydict.datasets.cts.spaces import Settings
+from phydict.datasets.cts.transforms import Calibration
 from phydict.grid import Grid
 
 SMALL = Settings(voxels=32)
@@ -79,6 +82,84 @@ def test_a_changed_input_is_prepared_again_and_other_settings_are_refused(tmp_pa
     (tmp_path / "out/a" / RECORD).write_text("{")
     with pytest.raises(ValueError, match="case.json cannot be read .* prepare that CT again"):
         find_cts(tmp_path / "out")
+
+
+STORED = Calibration(1.0, 0.0, (6.0, 6.0, 6.0)).affine()
+REPORTS = "VolumeName,Findings_EN,Impressions_EN\na.nii,{},\n"
+METADATA = 'VolumeName,RescaleSlope,RescaleIntercept,XYSpacing,ZSpacing\na.nii,1,{},"[6, 6]",6\n'
+
+
+def other_voxels(at, hu):
+    save_ct(at / "in/a.nii", hu + np.int16(100), STORED)
+
+
+def other_report(at, _hu):
+    (at / "reports.csv").write_text(REPORTS.format("Nodule."))
+
+
+def other_calibration(at, _hu):
+    (at / "metadata.csv").write_text(METADATA.format(-10))
+
+
+def masks_exchanged(at, _hu):
+    vessels, airway, aside = (at / f"in/a_totalsegmentator/{name}" for name in ("lung_vessels.nii.gz", "trachea.nii.gz",
+                                                                                "aside"))
+    vessels.rename(aside)
+    airway.rename(vessels)
+    aside.rename(airway)
+
+
+def one_other_slice(at, _hu):
+    file = sorted((at / "in/s").iterdir())[20]
+    file.write_bytes(file.read_bytes()[:-400] + bytes(400))
+
+
+def record_of_an_older_version(at, _hu):
+    file = at / "out/a" / RECORD
+    record = json.loads(file.read_text())
+    record["fingerprint"] = {name: record["fingerprint"][name] for name in ("files", "bytes")}
+    file.write_text(json.dumps(record))
+
+
+def test_a_case_of_another_input_of_the_same_size_is_prepared_anew_and_told_and_no_other(tmp_path, thorax, capsys):
+    save_ct(tmp_path / "in/a.nii", thorax, STORED)
+    for name, mask in (("lung_vessels", thorax > 500), ("trachea", thorax < -845)):
+        save_ct(tmp_path / f"in/a_totalsegmentator/{name}.nii.gz", mask.astype(np.uint8), STORED)
+    write_ct_series(tmp_path / "in/s", thorax, AFFINE)
+    (tmp_path / "reports.csv").write_text(REPORTS.format("No nodule."))
+    (tmp_path / "metadata.csv").write_text(METADATA.format(0))
+
+    def prepared(out):
+        rows = prepare_folder(tmp_path / "in", tmp_path / out, SMALL, fixed=False, reports=tmp_path / "reports.csv",
+                              metadata=tmp_path / "metadata.csv")
+        assert [(row["id"], row["status"]) for row in rows] == [("a", "prepared"), ("s", "prepared")]
+        return {name: (tmp_path / out / name).stat().st_ino for name in "as"}, capsys.readouterr().err
+
+    before, said = prepared("out")
+    assert "prepared again" not in said
+    for change in (other_voxels, other_report, other_calibration, masks_exchanged, one_other_slice,
+                   record_of_an_older_version):
+        change(tmp_path, thorax)
+        changed, other = "sa" if change is one_other_slice else "as"
+        after, said = prepared("out")
+        assert after[changed] != before[changed] and after[other] == before[other], change
+        assert f"1 case in {tmp_path / 'out'} will be prepared again and replaced ({changed}): a CT, segment" in said
+        before = after
+    after, said = prepared("out")
+    assert after == before and "prepared again" not in said
+    prepared("whole")
+    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
+
+
+def test_a_ct_that_changes_while_it_is_prepared_is_prepared_again(tmp_path, thorax, monkeypatch):
+    save_ct(tmp_path / "in/a.nii", thorax)
+    load = Source.load
+    with monkeypatch.context() as meanwhile:
+        meanwhile.setattr(Source, "load", lambda self: (load(self), save_ct(self.ct.path, thorax + np.int16(100)))[0])
+        prepare_folder(tmp_path / "in", tmp_path / "out", SMALL)
+    for out in ("out", "whole"):
+        prepare_folder(tmp_path / "in", tmp_path / out, SMALL)
+    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
 
 
 def notes_inside(case):

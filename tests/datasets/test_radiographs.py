@@ -14,9 +14,12 @@ import yaml
 from PIL import Image
 
 from phydict.datasets.intensity import Intensity
+from phydict.datasets.radiographs import xray_description
 from phydict.datasets.radiographs.radiographs import find_xrays, load_xrays, save_xrays
+from phydict.datasets.radiographs.xray_description import Orientation, read_description
 from phydict.xray.geometry import ConeBeam
 from phydict.xray.geometry_files import write_beam
+from phydict.xray.poses.uncertain import Uncertain
 
 SHAPE = (6, 5)
 ORBIT = {"views": 2, "source_to_detector": 1020.0, "source_to_isocentre": 740.0, "shape": list(SHAPE),
@@ -45,6 +48,21 @@ def fails(sentence, folder, error=ValueError, **arguments):
     with pytest.raises(error, match=sentence) as caught:
         load_xrays(folder, **arguments)
     assert "\n" not in str(caught.value)
+
+
+def test_the_example_of_a_geometry_file_is_one_with_each_of_its_beams(tmp_path):
+    lines = [line[4:] for line in xray_description.__doc__.splitlines() if line.startswith("    ")]
+    file = tmp_path / "geometry.yaml"
+    file.write_text("\n".join(lines))
+    found = read_description(file)
+    assert found.views == 8 and found.beam_of((448, 448), []).shape == (448, 448)
+    assert (found.intensity, found.orientation) == (Intensity("counts", air=50000), Orientation())
+    assert found.uncertain == Uncertain(detector_shift_mm=5, rotation_degrees=2)
+    others = [line.removeprefix("# ") for line in lines if line.startswith("# beam:")]
+    assert len(others) == 2
+    for other, key in zip(others, ("file", "dicom"), strict=True):
+        file.write_text(other)
+        assert key in read_description(file).beam
 
 
 def test_saved_npy_is_read_back_exactly(tmp_path):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import resource
+
 import matplotlib.image
 import numpy as np
 import pytest
@@ -127,6 +129,26 @@ def test_bad_input_is_named(tmp_path):
         method_panel(tmp_path / "m.png", {"a": volume}, None, GRID, {"b": ""})
     with pytest.raises(ValueError, match="no volumes"):
         method_panel(tmp_path / "m.png", {}, volume, GRID)
+
+
+def test_a_page_that_the_disk_cannot_hold_leaves_the_one_before(tmp_path):
+    page = tmp_path / "p.png"
+    panel(page, air_with_block(HIGH, HIGH, MIDDLE), GRID)
+    before, limits = page.read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))  # no file may grow beyond 1000 bytes
+    try:
+        with pytest.raises(OSError):
+            panel(page, air_with_block(MIDDLE, MIDDLE, MIDDLE), GRID)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert page.read_bytes() == before and [*tmp_path.iterdir()] == [page]
+
+
+def test_a_page_is_a_png_under_any_name(tmp_path):
+    for name in ("p", "p.jpg"):
+        panel(tmp_path / name, air_with_block(HIGH, HIGH, MIDDLE), GRID)
+        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
+    assert len([*tmp_path.iterdir()]) == 2
 
 
 def test_dollars_in_a_title_are_no_formula(tmp_path):

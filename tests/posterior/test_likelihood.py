@@ -1,6 +1,7 @@
 """The likelihood steps: one solves its normal equations, the other descends the paper's objective."""
 
 import itertools
+import math
 
 import numpy as np
 import pytest
@@ -194,10 +195,25 @@ def test_much_total_variation_leaves_a_constant():
     assert z.max() - z.min() < 1e-3
 
 
-@pytest.mark.parametrize("wrong, message", [({"tv_weight": -1.0}, "tv_weight"), ({"tv_eps": 0.0}, "tv_eps")])
-def test_impossible_total_variation_is_refused(wrong, message):
-    with pytest.raises(ValueError, match=message):
-        ProximalCG(**wrong)
+@pytest.mark.parametrize("step, wrong", [
+    (ProximalCG, {"iterations": -1}), (ProximalCG, {"restarts": -1}), (ProximalCG, {"noise": -0.02}),
+    (ProximalCG, {"noise": math.nan}), (ProximalCG, {"tolerance": -1e-6}), (ProximalCG, {"tolerance": 2.0}),
+    (ProximalCG, {"tv_weight": -1.0}), (ProximalCG, {"tv_eps": 0.0}), (GradientSteps, {"steps": 0}),
+    (GradientSteps, {"learning_rate": 0.0}), (GradientSteps, {"rho": 0.0}), (GradientSteps, {"rho": -1.0})])
+def test_impossible_settings_are_refused_by_name(step, wrong):
+    [(name, value)] = wrong.items()
+    with pytest.raises(ValueError, match=rf"^{step.__name__}\.{name} .*, but {value} was given$"):
+        step(**wrong)
+
+
+def test_without_noise_nothing_can_be_weighed_against_the_data():
+    for beside in ({"tv_weight": 1.0}, {"weighted_least_squares": True}):
+        with pytest.raises(ValueError, match="a noise of 0 was given: give one above 0"):
+            ProximalCG(noise=0.0, **beside)
+    m = measurement(4)
+    m.model_variance = torch.tensor([0.0, 0, 1, 0]).double()
+    with pytest.raises(ValueError, match="a noise of 0 was given: give one above 0"):
+        ProximalCG(noise=0.0)(m, X0, 0.5)
 
 
 def test_refitting_the_scatter_comes_nearer_to_the_truth_and_without_scatter_goes_little_astray():

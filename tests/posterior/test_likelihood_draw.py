@@ -107,6 +107,13 @@ def test_no_noise_and_no_view_are_refused():
         NormalisedMeasurement(DenseMeasurement(torch.zeros(2, N).double(), torch.zeros(2).double()), 0.1)
 
 
+@pytest.mark.parametrize("wrong", [{"iterations": -1}, {"tolerance": -1e-4}, {"tolerance": 2.0}])
+def test_impossible_exact_draws_are_refused(wrong):
+    [(name, value)] = wrong.items()
+    with pytest.raises(ValueError, match=rf"^ExactDraw\.{name} .*, but {value} was given$"):
+        ExactDraw(**wrong)
+
+
 @pytest.mark.parametrize("settings", [{"iterations": 0}, {"step": 0.0}, {"last_share": 2.0}])
 def test_impossible_langevin_dynamics_are_refused(settings):
     with pytest.raises(ValueError, match=str(next(iter(settings.values())))):

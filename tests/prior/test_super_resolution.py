@@ -161,6 +161,7 @@ def test_a_noise_level_outside_its_range_is_refused(noise):
 
 @pytest.mark.parametrize("settings, words", [
     ({"voxels": 34}, "divisible by 4"), ({"voxels": 40, "factor": 3}, "factor 3"),
+    ({"factor": 0}, "the factor .* 1 or more, but 0"), ({"factor": -2}, "the factor .* 1 or more, but -2"),
     ({"coarse_channels": 4}, "has 5 inputs"), ({"coarse_channels": 0}, "coarse state must have")])
 def test_stages_that_cannot_be_are_refused(settings, words):
     with pytest.raises(ValueError, match=words):

@@ -1,6 +1,7 @@
 """Training of rivals: the loss falls, a resumed run is the uninterrupted one, and its file can be compared."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -90,6 +91,7 @@ def test_validation_takes_the_x_rays_that_a_bound_rival_holds_for(monkeypatch):
     task, found = X2CTTraining(X2CTNetwork(8, 4, (2, 2), (4, 8, 8)), OrbitScenes(views=2, arc_degrees=180.0), Cube(16),
                                (-1000, 600)).eval(), {}
     monkeypatch.setattr(task, "log", lambda name, value, **how: found.update({name: value}))
+    monkeypatch.setattr(X2CTTraining, "trainer", SimpleNamespace(world_size=1, global_rank=0))
     task.validation_step(default_collate([phantom_case(3, GRID, HUWindow(-1000, 600))]), 0)
     assert found["val/psnr"] == found["val/psnr_2"] > 5
 

@@ -9,8 +9,8 @@ import os
 import signal
 import threading
 import warnings
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from dataclasses import asdict
@@ -19,7 +19,6 @@ from pathlib import Path
 import numpy as np
 
 from phydict.datasets.cts.anatomy import MASKS, body_mask, lung_box_centre, lung_box_size, segment
-from phydict.datasets.cts.ct_rate import CTFile
 from phydict.datasets.cts.prepared import RECORD, VOLUME, read_record, write_prepared
 from phydict.datasets.cts.segmentations import lungs_by_lungmask, read_segmentation, segmentations_beside
 from phydict.datasets.cts.sources import Source, find_sources
@@ -29,6 +28,7 @@ from phydict.grid import Grid
 from phydict.runtime.files import atomic_directory, atomic_write, check_replaceable, remove_leftovers
 from phydict.runtime.progress import CaseProgress
 from phydict.runtime.reading import not_written
+from phydict.runtime.telling import tell
 
 SUMMARY = "summary.csv"
 COLUMNS = ("id", "status", "reason", "remark", "source", "kind", "slices", "spacing_x_mm", "spacing_y_mm",
@@ -40,8 +40,9 @@ def prepare_folder(cts: str | Path, out: str | Path, settings: Settings = Settin
                    **tables) -> list[dict]:
     """Prepares every CT below `cts` into `out`, one folder each, and writes out/summary.csv.
 
-    Finished cases are kept where their input is the same; a case appears only when it is complete, and takes the place
-    of nothing but a case that was prepared here. workers: processes.
+    Finished cases are kept where their input is the same: the bytes of its files, its report and its calibration. Where
+    it is another, or the case says nothing of it, a line tells so, and the CT is prepared again. A case appears only
+    when it is complete, and takes the place of nothing but a case that was prepared here. workers: processes.
     tables: reports, metadata, fixed, first_reconstruction and exclude, as for `find_cts`.
     Returns the summary's rows, by COLUMNS, status being prepared or rejected.
     Raises ValueError for folders inside each other, for an `out` of other settings and for what no preparation wrote in
@@ -57,7 +58,7 @@ def prepare_folder(cts: str | Path, out: str | Path, settings: Settings = Settin
     sources = find_sources(root, **tables)
     _check_summary(out / SUMMARY)
     remove_leftovers(out)
-    rows = {source.id: row for source in sources if (row := _finished(source, out, settings)) is not None}
+    rows = _kept(sources, out, settings, workers)
     left = [source for source in sources if source.id not in rows]
     with CaseProgress() as progress:
         progress.begin("CTs", len(left), verb="prepare", out=out)
@@ -70,12 +71,35 @@ def prepare_folder(cts: str | Path, out: str | Path, settings: Settings = Settin
     return summary
 
 
-def _finished(source: Source, out: Path, settings: Settings) -> dict | None:
-    """The row of a case that is already there and of this input, else None, where a new one may take its place.
+def _kept(sources: list[Source], out: Path, settings: Settings, workers: int) -> dict[str, dict]:
+    """The rows by id of the cases that are already there and of these inputs; tells which others are prepared again.
+
+    Every file of an input whose case is there is read once, by as many threads as there are workers.
+    """
+    there = [source for source in sources if os.path.lexists(out / source.id)]
+    if there:
+        tell(f"{out} holds {_cases(there)}, whose inputs are compared with what they were", event="compare",
+             cases=len(there), out=str(out))
+    with ThreadPoolExecutor(workers) as threads:
+        found = list(threads.map(lambda s: _finished(out / s.id, settings, s.fingerprint), there))
+    again = [source for source, row in zip(there, found) if row is None]
+    if again:
+        names = ", ".join(source.id for source in again[:3]) + ", ..." * (len(again) > 3)
+        tell(f"{_cases(again)} in {out} will be prepared again and replaced ({names}): a CT, segmentation, report or "
+             "calibration is another than it was, or was not recorded then",
+             event="again", cases=[source.id for source in again], out=str(out))
+    return {source.id: row for source, row in zip(there, found) if row is not None}
+
+
+def _cases(sources: list[Source]) -> str:
+    return f"{len(sources)} case{'' if len(sources) == 1 else 's'}"
+
+
+def _finished(folder: Path, settings: Settings, fingerprint: Callable[[], dict]) -> dict | None:
+    """The row of a case that is already in its folder and of this input, else None, where a new one may take its place.
 
     Raises ValueError where what is there must stay: what no preparation wrote, and a case of other settings.
     """
-    folder = out / source.id
     if not os.path.lexists(folder):
         return None
     if not (folder / RECORD).is_file():
@@ -86,7 +110,7 @@ def _finished(source: Source, out: Path, settings: Settings) -> dict | None:
         raise ValueError(f"{folder} was prepared with other settings; give another output folder, or remove that one")
     row = record["row"]
     with suppress(ValueError, OSError):
-        if record.get("fingerprint") == source.fingerprint():
+        if record.get("fingerprint") == fingerprint():
             return row
     masks = str(row.get("masks", "")).split()
     check_replaceable(folder, {RECORD, VOLUME, *(f"{mask}.nii.gz" for mask in masks)}, "output folder")
@@ -130,8 +154,8 @@ def prepare_source(source: Source, out: Path, settings: Settings) -> dict:
     with warnings.catch_warnings(record=True) as remarks:
         warnings.simplefilter("always", UserWarning)
         try:
+            fingerprint = source.fingerprint()  # before the voxels: what changes meanwhile is seen by the next run
             grid, images, facts = _place(*source.load(), segmentations_beside(source.beside), settings)
-            fingerprint = source.fingerprint()
         except (ValueError, OSError) as error:
             facts = {"status": "rejected", "reason": " ".join(str(error).split())}
         row["remark"] = "; ".join(str(w.message) for w in remarks if w.category is UserWarning)
@@ -139,13 +163,13 @@ def prepare_source(source: Source, out: Path, settings: Settings) -> dict:
         return row | facts
     row |= facts | {"status": "prepared", "window_low": settings.window[0], "window_high": settings.window[1]}
     record = {"id": source.id, "space": settings.space, "extent": settings.extent, "window": settings.window,
-              "report": source.ct.report if isinstance(source.ct, CTFile) else "", "settings": asdict(settings),
-              "fingerprint": fingerprint, "row": row}
+              "report": source.report, "settings": asdict(settings), "fingerprint": fingerprint, "row": row}
+    folder = out / source.id
     try:
-        with atomic_directory(out / source.id, lambda: _finished(source, out, settings) is None) as partial:
+        with atomic_directory(folder, lambda: _finished(folder, settings, lambda: fingerprint) is None) as partial:
             write_prepared(partial, grid, images, record)
     except OSError as error:
-        raise not_written(f"the case {out / source.id}", error, "give another output folder, and run the same command "
+        raise not_written(f"the case {folder}", error, "give another output folder, and run the same command "
                           "again, finished cases are kept") from error
     return row
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
+from zlib import crc32
 
 import numpy as np
 
@@ -12,6 +13,8 @@ from phydict.datasets.cts.ct_rate import CTFile, find_cts
 from phydict.datasets.cts.ct_series import Series, find_series, load_series
 from phydict.datasets.cts.segmentations import segmentations_beside
 from phydict.datasets.cts.transforms import case_id, load_ct
+from phydict.runtime.files import file_crc32
+from phydict.runtime.reading import reading
 
 
 @dataclass(frozen=True)
@@ -34,11 +37,25 @@ class Source:
         """HU (X, Y, Z) in RAS+ and the affine. Raises ValueError and OSError."""
         return load_series(self.ct) if isinstance(self.ct, Series) else load_ct(self.ct.path, self.ct.calibration)
 
+    @property
+    def report(self) -> str:
+        return "" if isinstance(self.ct, Series) else self.ct.report
+
     def fingerprint(self) -> dict:
-        """What identifies this input: its files' number and bytes, those of its segmentations included."""
-        files = [*(self.ct.files if isinstance(self.ct, Series) else (self.ct.path,)),
-                 *(file for files in segmentations_beside(self.beside).values() for file in files)]
-        return {"files": len(files), "bytes": sum(file.stat().st_size for file in files)}
+        """What identifies this input, as plain JSON values: the number, bytes and contents of its files, those of its
+        segmentations included, its report and its calibration. Reads every file once. Raises ValueError and OSError."""
+        parts = {"ct": self.ct.files if isinstance(self.ct, Series) else (self.ct.path,)}
+        parts |= segmentations_beside(self.beside)
+        files = [file for part in parts.values() for file in part]
+        calibration = None if isinstance(self.ct, Series) else self.ct.calibration
+        crc = 0
+        for name, part in parts.items():
+            crc = crc32(name.encode(), crc)
+            for file in part:
+                with reading(file, "see that it is there and may be read"):
+                    crc = file_crc32(file, crc)
+        return {"files": len(files), "bytes": sum(file.stat().st_size for file in files), "crc32": crc,
+                "report_crc32": crc32(self.report.encode()), "calibration": str(calibration)}
 
 
 def find_sources(root: Path, **tables) -> list[Source]:

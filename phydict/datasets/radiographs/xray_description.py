@@ -1,13 +1,15 @@
 """geometry.yaml: where the X-rays of a folder were taken, what their pixels mean and what way their images are turned.
 
-    beam: {orbit: {...}}                               ConeBeam's YAML, which may also stand at the top level
-    beam: {file: geometry.xml, pixel: [1.25, 1.25]}    a file that phydict.xray.geometry_files reads, beside this one;
-                                                       pixel is for RTK's XML alone
-    beam: {dicom: {source_to_isocentre: 765.0}}        values used instead of tags; see
-    phydict.datasets.radiographs.dicom_beam intensity: {kind: counts, air: 50000}              see
-    phydict.datasets.intensity orientation: {rotate_degrees: 0, flip_rows: false, flip_columns: false}
-    uncertain: {detector_shift_mm: 5, rotation_degrees: 2}    what is not exactly known, for a calibration; see
-    phydict.xray.poses.uncertain
+    beam:                                                # ConeBeam's YAML, which may also stand at the top level
+      orbit: {views: 8, source_to_detector: 1020.0, source_to_isocentre: 740.0, shape: [448, 448], pixel: [1.25, 1.25]}
+    # beam: {file: geometry.xml, pixel: [1.25, 1.25]}    # a file that phydict.xray.geometry_files reads, beside this
+    #                                                    # one; pixel is for RTK's XML alone
+    # beam: {dicom: {source_to_isocentre: 765.0}}        # values used instead of tags; see
+    #                                                    # phydict.datasets.radiographs.dicom_beam
+    intensity: {kind: counts, air: 50000}                # see phydict.datasets.intensity
+    orientation: {rotate_degrees: 0, flip_rows: false, flip_columns: false}
+    uncertain: {detector_shift_mm: 5, rotation_degrees: 2}    # what is not exactly known, for --calibrate; see
+    #                                                         # phydict.xray.poses.uncertain
 
 Without `beam:` the tags of DICOM images decide. Rotation is clockwise, in quarters, and comes before the flips. The
 beam, wherever it comes from, is that of the images once they are turned.

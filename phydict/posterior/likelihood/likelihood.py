@@ -7,6 +7,7 @@ They act on the CT channel; the other channels of the state pass through.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 
@@ -17,6 +18,10 @@ from phydict.linalg.conjugate_gradients import conjugate_gradients
 from phydict.linalg.total_variation import TVQuadraticMajorizer
 from phydict.posterior.likelihood.reward import Reward
 from phydict.posterior.measurement import Measurement
+from phydict.runtime.ranges import check_fields
+
+LEAST, MOST = 1e-9, 1_000_000
+"""Of settings that are divided by or squared, so that neither overflows."""
 
 
 class LikelihoodStep(ABC):
@@ -46,10 +51,11 @@ class ProximalCG(LikelihoodStep):
     consistency in diffusion sampling, Chung et al. 2024, arXiv:2303.05754.
 
     Args:
-        iterations: of conjugate gradients per restart, at most
-        restarts: how often conjugate gradients begin again
-        noise: standard deviation of the line integrals' error (noise and model)
-        tolerance: a restart ends once its residual has shrunk by this factor
+        iterations: of conjugate gradients per restart, at most; 0: z is x0, clipped
+        restarts: how often conjugate gradients begin again; 0: z is x0, clipped
+        noise: standard deviation of the line integrals' error (noise and model); 0: they are exact, beside which
+            nothing else has a weight
+        tolerance: a restart ends once its residual has shrunk by this factor, in [0, 1]
         refit_scatter: whether each restart refits the scatter of a measurement in which it is sought
         weighted_least_squares: whether the variance of each pixel's own noise is added to noise^2, so that pixels which
             few photons reach count less (Thibault et al. 2007, doi:10.1118/1.2789499)
@@ -67,14 +73,19 @@ class ProximalCG(LikelihoodStep):
     tv_eps: float = 0.01
 
     def __post_init__(self):
-        if not self.tv_weight >= 0 or not self.tv_eps > 0:
-            raise ValueError("total variation needs a tv_weight >= 0, 0 for none, and a tv_eps > 0, but "
-                             f"{self.tv_weight} and {self.tv_eps} were given")
+        check_fields(self, "ProximalCG", iterations=(0, math.inf), restarts=(0, math.inf), noise=(0, MOST),
+                     tolerance=(0, 1), tv_weight=(0, MOST), tv_eps=(LEAST, MOST))
+        if not self.noise and (self.tv_weight or self.weighted_least_squares):
+            raise ValueError("ProximalCG weighs total variation and the pixels' own noise by its noise, but a noise of "
+                             "0 was given: give one above 0, or leave out tv_weight and weighted_least_squares")
 
     def __call__(self, measurement: Measurement, x0: Tensor, x0_std: float) -> Tensor:
         weight = (self.noise / x0_std) ** 2
         z = x0.clamp(-1, 1)
         variance = measurement.model_variance + (measurement.noise_variance if self.weighted_least_squares else 0.0)
+        if not self.noise and isinstance(variance, Tensor):
+            raise ValueError("ProximalCG weighs what no volume explains by its noise, but a noise of 0 was given: give "
+                             "one above 0")
         weights = 1 / (1 + variance / self.noise**2) if isinstance(variance, Tensor) else 1.0
         tv_scale = self.noise**2 * self.tv_weight
         for _ in range(self.restarts):
@@ -105,9 +116,9 @@ class GradientSteps(LikelihoodStep):
     at every time. x0_std is not used.
 
     Args:
-        steps: how many
-        learning_rate: length of a step
-        rho: the larger, the less the prior's estimate weighs
+        steps: how many, 1 or more
+        learning_rate: length of a step, above 0
+        rho: the larger, the less the prior's estimate weighs; above 0
         reward: what the X-rays are compared by
         adam: Adam; else plain gradient descent, which diverges unless learning_rate (1 / rho + |A|^2 / K) < 1, with |A|
             the operator's norm and K the number of views
@@ -120,6 +131,9 @@ class GradientSteps(LikelihoodStep):
     reward: Reward = field(default_factory=Reward)
     adam: bool = True
     prior_mean: bool = False
+
+    def __post_init__(self):
+        check_fields(self, "GradientSteps", steps=(1, math.inf), learning_rate=(LEAST, MOST), rho=(LEAST, MOST))
 
     def __call__(self, measurement: Measurement, x0: Tensor, x0_std: float) -> Tensor:
         with torch.enable_grad():

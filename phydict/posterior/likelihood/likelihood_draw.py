@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
@@ -9,6 +10,7 @@ from torch import Tensor
 
 from phydict.diffusion.steps import Generators, noise_like
 from phydict.posterior.normalised import NormalisedMeasurement, nearest_fit
+from phydict.runtime.ranges import check_fields
 
 
 class LikelihoodDraw(ABC):
@@ -31,12 +33,16 @@ class ExactDraw(LikelihoodDraw):
     arXiv:1409.0606.
 
     Args:
-        iterations: of conjugate gradients; exact with as many as the operator has singular values
-        tolerance: factor by which the residual shrinks, after which they end
+        iterations: of conjugate gradients; exact with as many as the operator has singular values; 0: the perturbed
+            estimate alone
+        tolerance: factor by which the residual shrinks, after which they end, in [0, 1]
     """
 
     iterations: int = 30
     tolerance: float = 1e-4
+
+    def __post_init__(self):
+        check_fields(self, "ExactDraw", iterations=(0, math.inf), tolerance=(0, 1))
 
     def __call__(self, measurement: NormalisedMeasurement, x0: Tensor, x0_std: float, generator: Generators,
                  progress: float) -> Tensor:

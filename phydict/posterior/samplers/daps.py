@@ -1,10 +1,10 @@
 """DAPS: at every noise level a clean estimate, a draw near it that fits the X-rays, and wholly new noise.
 
-| here                             | publication                                                    |
-|----------------------------------|----------------------------------------------------------------|
-| denoise_along(denoiser, x, times)         | x0hat(x_t) by the probability flow                             |
-| likelihood(m, x0, x0_std, generator) | x_0 ~ p(x_0 | x_t, y), p(x_0 | x_t) as N(x0hat, x0_std^2)      |
-| renoise(z, s, noise)             | x_s ~ N(x_0, sigma_s^2)                                        |
+| here                                 | publication                                               |
+|--------------------------------------|-----------------------------------------------------------|
+| denoise_along(denoiser, x, times)    | x0hat(x_t) by the probability flow                        |
+| likelihood(m, x0, x0_std, generator) | x_0 ~ p(x_0 | x_t, y), p(x_0 | x_t) as N(x0hat, x0_std^2) |
+| renoise(z, s, noise)                 | x_s ~ N(x_0, sigma_s^2)                                   |
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 | here                           | publication                                                     |
 |--------------------------------|-----------------------------------------------------------------|
-| noise_in, stochastic_ddim_step       | Algorithm 1, lines 4 to 6: the ancestral step                   |
+| noise_in, stochastic_ddim_step | Algorithm 1, lines 4 to 6: the ancestral step                   |
 | scale * gradient               | line 7, x <- x' - scale grad_x |y - A x0hat(x)|, norm unsquared |
 """
 

@@ -1,9 +1,9 @@
 """PnP-DM: Gibbs sampling of a clean state and its copy near it, one under the prior, one under the X-rays.
 
-| here                            | publication                                                          |
-|---------------------------------|----------------------------------------------------------------------|
-| likelihood(m, x, rho, generator) | z ~ exp(-|P(z) - y|^2 / (2 sigma_y^2) - |z - x|^2 / (2 rho^2))       |
-| denoise_along(denoiser, z, times, generator) | x ~ p(x) exp(-|x - z|^2 / (2 rho^2)), by diffusion from level rho    |
+| here                                         | publication                                                       |
+|----------------------------------------------|-------------------------------------------------------------------|
+| likelihood(m, x, rho, generator)             | z ~ exp(-|P(z) - y|^2 / (2 sigma_y^2) - |z - x|^2 / (2 rho^2))    |
+| denoise_along(denoiser, z, times, generator) | x ~ p(x) exp(-|x - z|^2 / (2 rho^2)), by diffusion from level rho |
 """
 
 from __future__ import annotations

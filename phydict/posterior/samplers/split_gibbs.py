@@ -18,7 +18,7 @@ from torch import Tensor
 
 from phydict.diffusion import Denoiser, ddim, renoise
 from phydict.diffusion.steps import Generators, noise_like
-from phydict.posterior.likelihood.likelihood import LikelihoodStep, ProximalCG
+from phydict.posterior.likelihood.likelihood import LEAST, MOST, LikelihoodStep, ProximalCG
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.metal import Metal, with_metal
 from phydict.posterior.samplers.sampler import Sampler, ddim_sample
@@ -44,7 +44,7 @@ class SplitGibbs(Sampler):
             doi:10.1016/0041-5553(64)90137-5)
         sampling_noise: the noise_fraction that takes its place, without momentum, where several samples are to show how
             far they differ; None: the same
-        prior_std: standard deviation of the state, which sets the spread of x0 at each time
+        prior_std: standard deviation of the state, above 0, which sets the spread of x0 at each time
         ec_delta: EC's delta in [0, 1), 0 for none
         ec_steps: EC's noise levels
         ec_guided: meet the X-rays at each of EC's levels too, as in the first pass, instead of following the prior
@@ -92,6 +92,7 @@ class SplitGibbs(Sampler):
         if not 0 <= self.momentum <= 1 or (self.momentum and self.noise_fraction is None):
             raise ValueError("momentum is a share in [0, 1], and above 0 only where noise_fraction is given, but "
                              f"{self.momentum} was given, with a noise_fraction of {self.noise_fraction}")
+        check_between("prior_std", self.prior_std, LEAST, MOST)
         for name in ("noise_fraction", "sampling_noise"):
             if getattr(self, name) is not None:
                 check_between(name, getattr(self, name))

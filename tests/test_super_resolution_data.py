@@ -146,10 +146,10 @@ def test_a_crop_that_cannot_be_is_refused(crop, factor, tmp_path):
         SuperResolutionData(Crops(crop, factor), phantoms=1, cube=Cube(16), cache=str(tmp_path))
 
 
-@pytest.mark.parametrize("wrong", [{"factor": 0}, {"factor": -4}, {"validation": -1}])
-def test_settings_of_crops_that_cannot_be_are_refused(wrong):
-    [(name, value)] = wrong.items()
-    with pytest.raises(ValueError, match=rf"^data\.crops\.{name} .*, but {value} was given$"):
+@pytest.mark.parametrize("wrong, option", [({"factor": 0}, "model.factor"), ({"factor": -4}, "model.factor"),
+                                           ({"validation": -1}, "data.crops.validation")])
+def test_settings_of_crops_that_cannot_be_are_refused_by_their_option(wrong, option):
+    with pytest.raises(ValueError, match=f"^{option} .*, but {next(iter(wrong.values()))} was given$"):
         Crops(**wrong)
 
 

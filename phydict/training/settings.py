@@ -225,4 +225,5 @@ class Crops:
     validation: int = 4
 
     def __post_init__(self):
-        check_fields(self, "data.crops", factor=(1, math.inf), validation=(0, MOST_DRAWS))
+        check_between("model.factor", self.factor, 1, math.inf)
+        check_between("data.crops.validation", self.validation, 0, MOST_DRAWS)

@@ -41,7 +41,7 @@ def kept_tables(out: Path, entries: Sequence[Entry]) -> list[Table]:
 
 
 def _tables(out: Path, entries: Sequence[Entry], backbone: str, replicates: int) -> tuple[list[Table], list[dict]]:
-    """Of several seeds of a case each counts as a case of the same patient."""
+    """The tables, and the rows of FID. Of several seeds of a case each counts as a case of the same patient."""
     tables: list[Table] = []
     rows: list[dict] = []
     for condition, group in conditions(entries):

@@ -38,10 +38,10 @@ two held-out CTs, from 3 to 32 views, what is left of the differences between sc
 otherwise 16 %; with 16 to 32 views from less than 60 degrees errors are 1.6 to 1.9 times as large as it says."""
 
 FEW_VIEWS, LEAST_SPREAD, NARROW_POWER = 3, 0.037, 0.15
-"""Views up to which an arc's width changes nothing; `angular_spread` of the narrowest arc of the calibration, 40
-degrees; and the power of what that is larger by, by which the intervals of more views from a narrower one widen: of two held-out CTs 79 to 88 % of the body are otherwise in the 90 %
-interval from 8 and 16 views within 15 and 25 degrees. From 64 and 128 views, and tilted by 30 and 45 degrees, it holds
-88 to 94 % as it is."""
+"""Views up to which the width of an arc changes nothing; `angular_spread` of the narrowest arc of the calibration, 40
+degrees; and the power of how far that of more views is below it, by which intervals widen: of two held-out CTs 79 to
+88 % of the body are otherwise in the 90 % interval from 8 and 16 views within 15 and 25 degrees. From 64 and 128 views,
+and tilted by 30 and 45 degrees, it holds 88 to 94 % as it is."""
 
 
 def widening_of(measurement: Measurement, reprojection: Tensor, most_residual: float) -> float:

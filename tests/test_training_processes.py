@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from command_lines import CONFIG, arguments, checkpoint, losses
-from torch.utils.data import DistributedSampler, default_collate
+from torch.utils.data import DataLoader, DistributedSampler, default_collate
 
 from phydict.cli.train import main
 from phydict.grid import Cube
@@ -122,6 +122,7 @@ def test_a_batch_is_one_loss_however_many_processes_share_it(cache):
 def test_what_is_drawn_for_a_held_out_case_does_not_depend_on_the_process_that_sees_it(monkeypatch, processes):
     task = PriorTraining(VolumeUNet(4, 2, (8, 8), (False, True), 1, 8), TextSettings("none"), cube=Cube(16))
     for rank in range(processes):
-        monkeypatch.setattr(PriorTraining, "trainer", SimpleNamespace(world_size=processes, global_rank=rank))
-        dealt = list(DistributedSampler(range(6), processes, rank, shuffle=False))
+        monkeypatch.setattr(PriorTraining, "trainer", SimpleNamespace(
+            world_size=processes, global_rank=rank, val_dataloaders=DataLoader(range(5))))
+        dealt = list(DistributedSampler(range(5), processes, rank, shuffle=False))
         assert [task.validation_number(i) for i in range(len(dealt))] == dealt

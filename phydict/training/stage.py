@@ -67,9 +67,10 @@ class StageTraining(lightning.LightningModule, ABC):
         return loss
 
     def validation_number(self, index: int) -> int:
-        """The number, among the validation batches of all processes, of this one's `index`-th, which decides what is
-        drawn for it."""
-        return index * self.trainer.world_size + self.trainer.global_rank
+        """The number of the held-out case that is this process's `index`-th, which decides what is drawn for it:
+        processes take turns, and begin anew until each has as many."""
+        cases = len(self.trainer.val_dataloaders.dataset)  # type: ignore[union-attr, arg-type]  # one loader
+        return (index * self.trainer.world_size + self.trainer.global_rank) % cases
 
     def on_train_batch_end(self, outputs: object, batch: object, index: int) -> None:
         if self.global_step == self.trainer.max_steps:  # Lightning then validates, whichever epoch it is

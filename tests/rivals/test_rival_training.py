@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from command_lines import refusal, resumed_as_uninterrupted
-from torch.utils.data import default_collate
+from torch.utils.data import DataLoader, default_collate
 
 from phydict.cli.infer import main as infer
 from phydict.cli.train import main
@@ -91,7 +91,8 @@ def test_validation_takes_the_x_rays_that_a_bound_rival_holds_for(monkeypatch):
     task, found = X2CTTraining(X2CTNetwork(8, 4, (2, 2), (4, 8, 8)), OrbitScenes(views=2, arc_degrees=180.0), Cube(16),
                                (-1000, 600)).eval(), {}
     monkeypatch.setattr(task, "log", lambda name, value, **how: found.update({name: value}))
-    monkeypatch.setattr(X2CTTraining, "trainer", SimpleNamespace(world_size=1, global_rank=0))
+    monkeypatch.setattr(X2CTTraining, "trainer", SimpleNamespace(
+        world_size=1, global_rank=0, val_dataloaders=DataLoader([0])))
     task.validation_step(default_collate([phantom_case(3, GRID, HUWindow(-1000, 600))]), 0)
     assert found["val/psnr"] == found["val/psnr_2"] > 5
 

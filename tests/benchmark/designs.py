@@ -146,7 +146,7 @@ def learnt(design: Design, data: PriorData, seconds: float, folder: Path) -> tup
     return training.prior.eval(), training.samples
 
 
-def scores(prior: Prior, cases: list[dict], views: int = VIEWS) -> list[dict]:
+def scores(prior: Prior, cases: list[dict]) -> list[dict]:
     """For each held-out case, denoising errors and the scores of a reconstruction."""
     denoiser, rows = prior.bind(), []
     for i, case in enumerate(cases):
@@ -154,7 +154,7 @@ def scores(prior: Prior, cases: list[dict], views: int = VIEWS) -> list[dict]:
         noise = torch.randn(x0.shape, generator=torch.Generator().manual_seed(i))
         errors = denoising_errors(denoiser, x0, noise, prior.window)
         row = {"case": case["id"]} | {f"rmse_hu_t{t}": float(error) for t, error in errors.items()}
-        rows.append(row | reconstruction_scores(prior, x0[:, :1], views, i))
+        rows.append(row | reconstruction_scores(prior, x0[:, :1], VIEWS, i))
     return rows
 
 

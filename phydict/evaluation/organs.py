@@ -23,18 +23,14 @@ from torch.nn.functional import interpolate
 
 from phydict.datasets.cts.anatomy import segment
 from phydict.grid import Grid
+from phydict.xray.boxes import divided
 
 FINEST_MM, SKELETON_STEPS = 3.0, 10
 
 
 def fine_grid(grid: Grid) -> Grid:
     """The voxels of FINEST_MM or less, whole parts of the grid's, on which organs are compared."""
-    parts = max(1, math.ceil(max(grid.spacing) / FINEST_MM - 1e-6))
-    affine = grid.affine.copy()
-    affine[:3, :3] /= parts
-    affine[:3, 3] -= affine[:3, :3].sum(1) * (parts - 1) / 2
-    x, y, z = grid.shape
-    return Grid((parts * x, parts * y, parts * z), affine=affine)
+    return divided(grid, max(1, math.ceil(max(grid.spacing) / FINEST_MM - 1e-6)))
 
 
 def organ_scores(hu: Tensor, true_hu: Tensor, grid: Grid, given: Mapping[str, np.ndarray] | None = None

@@ -28,7 +28,7 @@ from phydict.runtime.reading import name_of, read_ids
 from phydict.runtime.shipped import configuration
 from phydict.units import HUWindow
 from phydict.xray import Ideal, Projector, Simulator
-from phydict.xray.boxes import in_other_voxels
+from phydict.xray.boxes import divided, in_other_voxels
 from phydict.xray.geometry_files import read_beam
 
 MOST_PHANTOMS = 100_000
@@ -196,7 +196,7 @@ class ReconstructionData(lightning.LightningDataModule):
         if voxels != factor * grid.shape[0]:
             raise ValueError(f"data.simulation_voxels must be a multiple of the reconstruction's {grid.shape[0]} "
                              f"voxels, but {voxels} was given")
-        fine = make(in_other_voxels(grid, [factor * n for n in grid.shape]))["volume"]
+        fine = make(divided(grid, factor))["volume"]
         return make(grid) | {"fine": fine, "volume": torch.nn.functional.avg_pool3d(fine, factor)}
 
     def transfer_batch_to_device(self, batch: Case, device: torch.device, dataloader_idx: int) -> Case:

@@ -33,6 +33,7 @@ from phydict.posterior.measurement import Measurement
 from phydict.runtime.profiling import Stopwatch
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import ConeBeam, Projector, binned, binning
+from phydict.xray.boxes import in_other_voxels
 from phydict.xray.calibration import match_views
 from phydict.xray.checks import check_xrays
 from phydict.xray.poses.gauge import aligned, reprojection_errors
@@ -141,11 +142,7 @@ def stated_shift(beam: ConeBeam, uncertain: Uncertain, points: np.ndarray) -> np
 
 def halved(grid: Grid) -> Grid:
     """The same box in half as many voxels along each side."""
-    shape = tuple(max(1, n // 2) for n in grid.shape)
-    affine = np.array(grid.affine)
-    affine[:3, :3] *= np.array(grid.shape) / shape
-    affine[:3, 3] = grid.centre - affine[:3, :3] @ ((np.array(shape) - 1) / 2)
-    return Grid(shape, affine=affine)  # type: ignore[arg-type]
+    return in_other_voxels(grid, [max(1, n // 2) for n in grid.shape])
 
 
 def middle_points(grid: Grid) -> np.ndarray:

@@ -15,7 +15,7 @@ from phydict.prior import BoundRefiner, Refiner
 from phydict.reconstruction import Reconstruction
 from phydict.runtime.profiling import stage
 from phydict.xray import Projector
-from phydict.xray.boxes import in_other_voxels
+from phydict.xray.boxes import divided
 from phydict.xray.finer import FinerProjector
 
 TIME = 0.15
@@ -69,7 +69,7 @@ def knows(base: object, level: Grid) -> bool:
 def _factor(grid: Grid, level: Grid) -> int:
     """How many of a level's voxels make one of the grid's along each axis; 0 where they do not."""
     factor = round(level.shape[0] / grid.shape[0])
-    fits = factor > 0 and level.same_as(in_other_voxels(grid, [factor * n for n in grid.shape]))
+    fits = factor > 0 and level.same_as(divided(grid, factor))
     return factor if fits else 0
 
 

@@ -56,8 +56,12 @@ class DenoisingTraining(StageTraining):
         conditioning = self._condition(batch, x0, generators)
         a, s = (w.float().view(-1, 1, 1, 1, 1) for w in self.prior.schedule.scales(t.double()))
         error = (self.prior(a * x0 + s * noise, t, *conditioning) - x0).square()
-        unit = self.prior.preconditioning(t)[1].clamp(min=self.typical_std / 2) ** -2
-        return (unit * weight * error).mean() * x0.shape[1] / (1 + self.mask_weight * (x0.shape[1] - 1))
+        weight = self.time_weight(t) * weight
+        return (weight * error).mean() * x0.shape[1] / (1 + self.mask_weight * (x0.shape[1] - 1))
+
+    def time_weight(self, t: Tensor) -> Tensor:
+        """The weight (B, 1, 1, 1, 1) of the squared error of x0 at times t (B,)."""
+        return self.prior.preconditioning(t)[1].clamp(min=self.typical_std / 2) ** -2
 
     def validation_step(self, batch: dict, index: int) -> None:
         x0, _ = self._clean_state(batch)

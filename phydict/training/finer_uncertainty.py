@@ -12,7 +12,7 @@ from phydict.prior.correction import CorrectionNetwork
 from phydict.prior.finer_uncertainty import SEEN, FinerUncertainty, tissue_of_seen
 from phydict.prior.uncertainty import TISSUES
 from phydict.training.settings import Optimisation
-from phydict.training.stage import StageTraining
+from phydict.training.stage import StageTraining, check_continues
 from phydict.units import HUWindow
 
 OUTSIDE = TISSUES.index("air")
@@ -40,9 +40,7 @@ class FinerUncertaintyTraining(StageTraining):
                  window: tuple[float, float] = (-1000.0, 1000.0), optimisation: Optimisation = Optimisation(),
                  body_weight: float = 9.0, initial: str = str(DEFAULT_CORRECTION)):
         corrects = load_correction(initial)
-        if not corrects.grid.same_as(cube.grid()) or corrects.window != HUWindow(*window):
-            raise ValueError(f"the network {initial} has another grid or HU window than this training: "
-                             "set model.cube and model.window to its own")
+        check_continues("network", initial, corrects, cube.grid(), HUWindow(*window))
         corrects.uncertainty = network or corrects.uncertainty or FinerUncertainty()
         super().__init__(corrects, optimisation, 0)
         corrects.uncertainty.train().requires_grad_(True)

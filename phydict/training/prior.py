@@ -26,6 +26,7 @@ from phydict.training.denoising import DenoisingTraining
 from phydict.training.reports import BATCH, learn_sentences
 from phydict.training.settings import Execution, PriorOptimisation, PriorValidation, TextSettings
 from phydict.training.sharding import shard
+from phydict.training.stage import check_continues
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Ideal, Projector
 from phydict.xray.binning import benchmark_orbit
@@ -157,9 +158,7 @@ def _loaded(path: str, requested: Prior) -> Prior:
     if not isinstance(prior, Prior):
         raise ValueError(f"training starts from priors of phydict's own, but {path} is MedSyn's: leave out "
                          "model.initial")
-    if not prior.grid.same_as(requested.grid) or prior.window != requested.window:
-        raise ValueError(f"the prior {path} has another grid or HU window than this training: "
-                         "set model.cube and model.window to its own")
+    check_continues("prior", path, prior, requested.grid, requested.window)
     if prior.load_text is not None:
         prior.text, prior.load_text = prior.load_text(), None
         prior.text.trainable = prior.text.source is None

@@ -8,7 +8,7 @@ from phydict.grid import Cube
 from phydict.prior import describe_correction, load_correction
 from phydict.prior.correction import CorrectionNetwork
 from phydict.training.settings import Optimisation
-from phydict.training.stage import StageTraining
+from phydict.training.stage import StageTraining, check_continues
 from phydict.units import HUWindow
 
 
@@ -33,9 +33,7 @@ class RefinementTraining(StageTraining):
                  body_weight: float = 2.0, initial: str | None = None):
         hu = HUWindow(*window)
         network = load_correction(initial) if initial else CorrectionNetwork(channels, 16, cube.grid(), hu)
-        if not network.grid.same_as(cube.grid()) or network.window != hu:
-            raise ValueError(f"the network {initial} has another grid or HU window than this training: "
-                             "set model.cube and model.window to its own")
+        check_continues("network", str(initial), network, cube.grid(), hu)
         network.uncertainty = None  # of the errors of other weights
         super().__init__(network.train().requires_grad_(True), optimisation, 0)
         self.body_weight = body_weight

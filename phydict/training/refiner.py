@@ -16,7 +16,7 @@ from phydict.reconstruction import Reconstructor
 from phydict.training.prior import reconstruction_scores
 from phydict.training.scenes import Scenes
 from phydict.training.settings import Optimisation, RefinerValidation
-from phydict.training.stage import StageTraining
+from phydict.training.stage import StageTraining, check_continues
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam
 
@@ -65,9 +65,7 @@ class RefinerTraining(StageTraining):
         if not isinstance(loaded, Prior | Refiner):
             raise ValueError(f"a refiner begins with a prior of phydict's own, but {initial} is MedSyn's: give another "
                              "model.initial")
-        if not loaded.grid.same_as(cube.grid()) or loaded.window != HUWindow(*window):
-            raise ValueError(f"the prior {initial} has another grid or HU window than this training: "
-                             "set model.cube and model.window to its own")
+        check_continues("prior", initial, loaded, cube.grid(), HUWindow(*window))
         refiner = loaded if isinstance(loaded, Refiner) else Refiner(
             loaded, _mean(loaded), first=deepcopy(loaded) if loaded.reads_text else None)
         refiner.uncertainty = None  # of what it was

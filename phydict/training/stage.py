@@ -12,14 +12,25 @@ import torch
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 
+from phydict.grid import Grid
 from phydict.prior import CorrectionNetwork, Prior, Refiner, SuperResolution
 from phydict.prior.finite import not_finite
 from phydict.prior.stage_file import check_stage
 from phydict.rivals import Rival
 from phydict.training.settings import Optimisation
+from phydict.units import HUWindow
 
 CHECKPOINT = "last.ckpt"
 """The file of a training's folder that it can be resumed from."""
+
+
+def check_continues(kind: str, file: str, stage: Prior | Refiner | CorrectionNetwork, grid: Grid,
+                    window: HUWindow) -> None:
+    """Raises ValueError unless the stage that a training goes on from, a `kind` in `file`, is of the training's own
+    grid and HU window."""
+    if not stage.grid.same_as(grid) or stage.window != window:
+        raise ValueError(f"the {kind} {file} has another grid or HU window than this training: set model.cube and "
+                         "model.window to its own")
 
 
 class StageTraining(lightning.LightningModule, ABC):

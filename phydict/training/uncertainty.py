@@ -17,7 +17,7 @@ from phydict.prior import DEFAULT_REFINER, Refiner, describe_refiner, load_prior
 from phydict.prior.uncertainty import AIR_BELOW, Uncertainty, coverage_of, tissue_of
 from phydict.training.scenes import Scenes
 from phydict.training.settings import CalibrationScenes, Optimisation
-from phydict.training.stage import StageTraining
+from phydict.training.stage import StageTraining, check_continues
 from phydict.units import HUWindow
 
 VOXELS = 20_000
@@ -53,9 +53,7 @@ class UncertaintyTraining(StageTraining):
         if not isinstance(refiner, Refiner):
             raise ValueError(f"uncertainty is learnt of a refiner, but {initial} is none: give a refiner's file as "
                              "model.initial")
-        if not refiner.grid.same_as(cube.grid()) or refiner.window != HUWindow(*window):
-            raise ValueError(f"the refiner {initial} has another grid or HU window than this training: "
-                             "set model.cube and model.window to its own")
+        check_continues("refiner", initial, refiner, cube.grid(), HUWindow(*window))
         refiner.uncertainty = network or refiner.uncertainty or Uncertainty(refiner.state_channels)
         super().__init__(refiner, optimisation, seed)
         reader = refiner.reader

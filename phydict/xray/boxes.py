@@ -102,6 +102,11 @@ def in_other_voxels(grid: Grid, shape: Sequence[int]) -> Grid:
     return Grid((x, y, z), affine=affine)
 
 
+def divided(grid: Grid, factor: int) -> Grid:
+    """The same box, factor^3 voxels in the place of each."""
+    return in_other_voxels(grid, [factor * n for n in grid.shape])
+
+
 def part(grid: Grid, box: Sequence[slice]) -> Grid:
     """The voxels of a grid in a box of indices."""
     affine = grid.affine.copy()

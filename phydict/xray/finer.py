@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from phydict.linalg.power_iteration import operator_norm
-from phydict.xray.boxes import in_other_voxels
+from phydict.xray.boxes import divided
 from phydict.xray.projectors.projector import Projector
 
 
@@ -20,7 +20,7 @@ class FinerProjector(Projector):
 
     def __init__(self, projector: Projector, factor: int = 2):
         self.beam, self.factor = projector.beam, factor
-        self.grid = in_other_voxels(projector.grid, [factor * n for n in projector.grid.shape])
+        self.grid = divided(projector.grid, factor)
         self._rays = Projector(self.grid, projector.beam.divided(factor), full_detector=True)
         self.method, self.reason = self._rays.method, self._rays.reason
 

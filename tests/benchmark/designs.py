@@ -1,11 +1,12 @@
-"""Designs of the prior's network, compared after equal training effort.
+"""Designs of the prior's network and of its training, compared after equal training effort.
 
     python tests/benchmark/designs.py <folder of training CTs> [--out runs/designs] [--seconds 360] [--designs ...]
 
-Each design learns from the same draws, noise and times, for the same CPU time of one thread, which other work on the
-machine does not change. The learning rate rises over 30 steps and falls to zero over the second half of the time;
-the weights are averaged. LIDC-IDRI-0004 and the phantoms from seed 1,000,000 on are held out. A training that was
-stopped resumes from its last checkpoint in --out; a design that designs.csv holds already is not run again.
+Each design learns from the same draws, for the same CPU time of one thread, which other work on the machine does not
+change; noise and times are the same too where the batches are. The learning rate rises over 30 steps and falls to zero
+over the second half of the time; the weights are averaged. LIDC-IDRI-0004 and the phantoms from seed 1,000,000 on are
+held out. A training that was stopped resumes from its last checkpoint in --out; a design that designs.csv holds already
+is not run again.
 
 Writes designs.csv beside this file, one row per design and held-out case: denoising error (RMSE of the CT in HU) at
 each noise level, and SSIM, PSNR and MAE of phydict_fast's reconstruction from four ideal views; CPU seconds of one
@@ -14,7 +15,8 @@ call of the denoiser relative to the default VolumeUNet's, measured in turns on 
 
 import argparse
 import time
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import mean
 
@@ -23,6 +25,7 @@ import numpy as np
 import torch
 from lightning.pytorch.callbacks import EMAWeightAveraging, ModelCheckpoint
 from torch import nn
+from torch.nn.functional import avg_pool3d
 from torch.utils.data import Dataset
 
 from phydict.datasets.cts.cache import read_arrays, write_arrays
@@ -39,22 +42,26 @@ from phydict.training.stage import CHECKPOINT
 FILE = Path(__file__).with_suffix(".csv")
 HELD_OUT_CT = "LIDC-IDRI-0004"
 VIEWS = 4
-WARMUP, DECAY = 30, 0.99
+WARMUP = 30
 
 
 @dataclass(frozen=True)
 class Design:
     """What differs from VolumeUNet's defaults, and how Prior and StageTraining use the network.
 
-    middle_attention: attention between encoder and decoder. typical_std: errors are weighted by
-    1 / max(c_out, typical_std / 2)^2; from 1 on, all noise levels weigh the same. seed: of initial weights, times and
-    noise.
+    middle_attention: attention between encoder and decoder. weighting: of the error of x0 against noise, one of
+    WEIGHTINGS. seed: of initial weights, times and noise. batch: draws at a step. learning_rate: its largest. average:
+    decay of the averaged weights. coarse: share of the time in which it learns from voxels of twice the side.
     """
 
     network: dict = field(default_factory=dict)
     middle_attention: bool = True
-    typical_std: float = 0.5
+    weighting: str = "clamped"
     seed: int = 0
+    batch: int = 2
+    learning_rate: float = 1e-3
+    average: float = 0.99
+    coarse: float = 0.0
 
 
 DESIGNS = {
@@ -63,8 +70,43 @@ DESIGNS = {
     "block 4, 128-192": Design({"block": 4, "channels": (128, 192), "attention": (False, True)}),
     "without attention": Design({"attention": (False,) * 3}, middle_attention=False),
     "narrow, 24-48-96": Design({"channels": (24, 48, 96), "head_channels": 24}),
-    "even weights": Design(typical_std=1.0),
+    "even weights": Design(weighting="even"),
+    "weights of v": Design(weighting="v"),
+    "min-SNR 5": Design(weighting="min-SNR 5"),
+    "batch 1": Design(batch=1),
+    "batch 4": Design(batch=4),
+    "rate 5e-4": Design(learning_rate=5e-4),
+    "rate 2e-3": Design(learning_rate=2e-3),
+    "averaged by 0.9": Design(average=0.9),
+    "coarse first": Design(coarse=0.4),
 }
+
+WEIGHTINGS: dict[str, Callable[[torch.Tensor, torch.Tensor], torch.Tensor]] = {
+    "clamped": lambda snr, scale: scale.clamp(min=0.25) ** -2,
+    "even": lambda snr, scale: torch.ones_like(snr),
+    "v": lambda snr, scale: 1 + snr,
+    "min-SNR 5": lambda snr, scale: snr.clamp(max=5),
+}
+"""Of the squared error of x0, by the signal-to-noise ratio and the size of what the network adds (`preconditioning`):
+the training's own; one weight for all; that of an error of v (Salimans and Ho, arXiv:2202.00512); min-SNR (Hang et al.,
+arXiv:2303.09556)."""
+
+
+class Weighted(PriorTraining):
+    """PriorTraining by one of WEIGHTINGS, scaled so that an error of the network's own size costs as much on average:
+    the clipped gradient and the learning rate then mean the same for each."""
+
+    def __init__(self, design: Design):
+        super().__init__(VolumeUNet(**design.network), TextSettings("none"), seed=design.seed,
+                         optimisation=PriorOptimisation(learning_rate=design.learning_rate, warmup=0))
+        self.weighting, self.scale = WEIGHTINGS[design.weighting], 1.0
+        times = torch.linspace(0.0005, 0.9995, 1000)
+        size = self.prior.preconditioning(times)[1].square()
+        self.scale = float((super().time_weight(times) * size).mean() / (self.time_weight(times) * size).mean())
+
+    def time_weight(self, t: torch.Tensor) -> torch.Tensor:
+        sigma = self.prior.schedule.sigma(t.double()).float().view(-1, 1, 1, 1, 1)
+        return self.scale * self.weighting(sigma**-2, self.prior.preconditioning(t)[1])
 
 
 class NoAttention(nn.Module):
@@ -105,12 +147,14 @@ class Draws(PriorData):
 
 class Effort(lightning.Callback):
     """Ends a training after `seconds` of CPU time in its steps, and sets the learning rate by the share that is
-    spent."""
+    spent; over the first `coarse` of them, batches are means over blocks of 2^3 voxels."""
 
-    def __init__(self, seconds: float):
-        self.seconds, self.spent = seconds, 0.0
+    def __init__(self, seconds: float, coarse: float):
+        self.seconds, self.coarse, self.spent = seconds, coarse, 0.0
 
     def on_train_batch_start(self, trainer, module, batch, index) -> None:
+        if self.spent < self.coarse * self.seconds:
+            batch |= {key: avg_pool3d(batch[key], 2) for key in ("volume", "masks")}
         rate = min(1.0, (trainer.global_step + 1) / WARMUP) * min(1.0, max(0.0, 2 - 2 * self.spent / self.seconds))
         for group in trainer.optimizers[0].param_groups:
             group["lr"] = rate * module.optimisation.learning_rate
@@ -130,13 +174,11 @@ class Effort(lightning.Callback):
 def learnt(design: Design, data: PriorData, seconds: float, folder: Path) -> tuple[Prior, int]:
     """The prior that a design becomes, and the samples that it saw."""
     torch.manual_seed(design.seed)
-    training = PriorTraining(VolumeUNet(**design.network), TextSettings("none"),
-                             optimisation=PriorOptimisation(learning_rate=1e-3, warmup=0), seed=design.seed)
-    training.typical_std = design.typical_std
+    training = Weighted(design)
     if not design.middle_attention:
         training.prior.network.unet.middle_block.attention = NoAttention()
     last = folder / CHECKPOINT
-    callbacks = [Effort(seconds), EMAWeightAveraging(decay=DECAY), ModelCheckpoint(
+    callbacks = [Effort(seconds, design.coarse), EMAWeightAveraging(decay=design.average), ModelCheckpoint(
         folder, "last", every_n_epochs=1, save_on_train_epoch_end=True, enable_version_counter=False)]
     trainer = lightning.Trainer(
         accelerator="cpu", devices=1, precision=trainer_precision("auto", torch.device("cpu")), gradient_clip_val=1.0,
@@ -194,6 +236,7 @@ if __name__ == "__main__":
         for name in given.designs:
             if any(row["design"] == name and row["budget_s"] == given.seconds for row in read_csv(FILE)):
                 continue
+            data.loading = replace(data.loading, batch_size=DESIGNS[name].batch)
             prior, samples = learnt(DESIGNS[name], data, given.seconds, given.out / f"{name}, {given.seconds:g} s")
             own, least = call_seconds([prior, today])
             told = {"design": name, "budget_s": given.seconds, "samples": samples,

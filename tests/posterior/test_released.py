@@ -9,7 +9,6 @@ from phydict.diffusion import GaussianDenoiser
 from phydict.grid import Grid
 from phydict.methods import METHODS
 from phydict.posterior import GradientSteps, Measurement, Posterior, Reward, SplitGibbs
-from phydict.posterior.likelihood.reward import finer
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 from posterior.dense import FINE, SHAPE, denoiser, measurement
@@ -55,13 +54,6 @@ def test_nearest_upsampling_changes_nothing_under_siddon_and_linear_upsampling_l
     smooth = torch.einsum("x, y, z -> xyz", bell, bell, bell)[None, None]
     fine, plain = (Reward(raw_range=True, upsampling=n).project(data(), smooth) for n in (4, 1))
     assert 0 < (fine - plain).norm() < 0.1 * plain.norm()
-
-
-@pytest.mark.parametrize("n", [2, 3])
-def test_a_finer_grid_fills_the_same_place(n):
-    grid = Grid((4, 5, 6), (3.0, 2.0, 1.0))
-    fine = finer(grid, n)
-    assert fine.same_as(Grid((4 * n, 5 * n, 6 * n), (3 / n, 2 / n, 1 / n)))
 
 
 def test_dropout_makes_each_call_another_and_every_run_the_same_and_disturbs_no_other_draw():

@@ -7,7 +7,7 @@ from laws import random_like
 
 from phydict.grid import Box, Grid
 from phydict.xray import ConeBeam, Projector
-from phydict.xray.boxes import covers, interpolated, outside_projection, refinements, share_inside
+from phydict.xray.boxes import covers, divided, interpolated, outside_projection, refinements, share_inside
 
 BASE = Grid.cube(16)
 BEAM = ConeBeam.orbit(3, 1020, 740, (28, 28), 20.0)
@@ -88,3 +88,9 @@ def test_turned_axes_are_refused():
     turned = Grid((4, 4, 4), affine=np.array([[0.0, -9, 0, 0], [9, 0, 0, 0], [0, 0, 9, 0], [0, 0, 0, 1]]))
     with pytest.raises(ValueError, match="give a box along the same axes"):
         refinements(BASE, turned)
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_a_finer_grid_fills_the_same_place(n):
+    grid = Grid((4, 5, 6), (3.0, 2.0, 1.0))
+    assert divided(grid, n).same_as(Grid((4 * n, 5 * n, 6 * n), (3 / n, 2 / n, 1 / n)))

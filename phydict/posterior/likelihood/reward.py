@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from phydict.grid import Grid
 from phydict.posterior.measurement import Measurement
 from phydict.runtime.lpips_networks import load_lpips, lpips_distances
 from phydict.xray import Projector
+from phydict.xray.boxes import divided
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Reward:
         if n > 1:
             field = interpolate(field, scale_factor=n, mode="nearest" if self.nearest else "trilinear")
         if self.renderer or n > 1:
-            projector = Projector(finer(projector.grid, n), projector.beam, self.renderer or "auto", device=x.device,
+            projector = Projector(divided(projector.grid, n), projector.beam, self.renderer or "auto", device=x.device,
                                   full_detector=True)
         measurement.calls += 1
         return projector(field)
@@ -99,15 +99,6 @@ class Reward:
             distances = lpips_distances(network, images[0].flatten(0, 1), images[1].flatten(0, 1),
                                     "give a finer detector, or set the reward's lpips weight to 0")
         return distances.view(projected.shape[:2])
-
-
-def finer(grid: Grid, n: int) -> Grid:
-    """The grid of n^3 voxels in the place of each one."""
-    affine = grid.affine.copy()
-    affine[:3, :3] /= n
-    affine[:3, 3] -= affine[:3, :3].sum(1) * (n - 1) / 2
-    x, y, z = grid.shape
-    return Grid((n * x, n * y, n * z), affine=affine)
 
 
 def _standardised(views: Tensor) -> Tensor:

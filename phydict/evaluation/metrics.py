@@ -27,6 +27,7 @@ from torchmetrics import Metric
 from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 from torchmetrics.utilities.data import dim_zero_cat
 
+from phydict.datasets import body_mask
 from phydict.evaluation.bootstrap import bounds, estimate
 from phydict.units import HUWindow
 
@@ -90,6 +91,11 @@ def ssim_window(shape: Sequence[int]) -> tuple[list[int], list[float]]:
     """
     taps = [min(TAPS, n - 1 + n % 2) for n in shape]
     return taps, [SIGMA * n / TAPS for n in taps]
+
+
+def body_weights(true_hu: Tensor, spacing: Sequence[float]) -> Tensor:
+    """The body of a CT (1, 1, X, Y, Z) in HU at `spacing` mm, without couch and air, as `volume_metrics` takes it."""
+    return torch.from_numpy(body_mask(true_hu[0, 0].cpu().numpy(), spacing))[None, None].float()
 
 
 def volume_metrics(hu: Tensor, true_hu: Tensor, lung: Tensor | None = None, body: Tensor | None = None,

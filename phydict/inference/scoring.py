@@ -9,10 +9,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from phydict.datasets import body_mask
 from phydict.datasets.case import Case
 from phydict.datasets.cts.segmentations import organs_beside
-from phydict.evaluation import RANGE, volume_metrics
+from phydict.evaluation import RANGE, body_weights, volume_metrics
 from phydict.evaluation.backbones import SliceFeatures
 from phydict.evaluation.ct_clip import clip_scores, load_ct_clip
 from phydict.evaluation.fid import case_features
@@ -137,13 +136,13 @@ class Scoring:
 def case_scores(volume: Tensor, misfit: float, case: Case, grid: Grid, window: HUWindow,
                 scored: HUWindow = RANGE) -> dict[str, float]:
     """Scores of a reconstructed volume (X, Y, Z) in HU on `grid` against the CT case that its X-rays were made of, in
-    the HU range `scored`: over the whole volume, in the body, which leaves out couch and air (`body_mask` of the CT),
-    and in the lungs if known."""
+    the HU range `scored`: over the whole volume, in the body, which leaves out couch and air (`body_weights` of the
+    CT), and in the lungs if known."""
     truth = window.to_hu(case["volume"])[None].cpu()
     lung = case["masks"][None, :1].cpu() if bool(case["has_masks"][0]) else None
-    body = torch.from_numpy(body_mask(truth[0, 0].numpy(), grid.spacing))[None, None]
+    body = body_weights(truth, grid.spacing)
     if lung is not None:  # a lung that the field of view cuts open is not filled in the body
-        body |= lung > 0.5
+        body = torch.maximum(body, (lung > 0.5).float())
     return volume_metrics(volume[None, None], truth, lung, body, scored.low, scored.high) | {"misfit": misfit}
 
 

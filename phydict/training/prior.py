@@ -13,7 +13,7 @@ from phydict.datasets.phantoms.teaching import teaching_sentences
 from phydict.datasets.prose import written_words
 from phydict.datasets.reports import read_texts
 from phydict.diffusion import Denoiser
-from phydict.evaluation import method_panel, volume_metrics
+from phydict.evaluation import body_weights, method_panel, volume_metrics
 from phydict.grid import Cube
 from phydict.methods import reconstruct
 from phydict.posterior import Sampler
@@ -195,10 +195,12 @@ def _text_encoder(text: TextSettings, network: VolumeUNet) -> TextEncoder | None
 def reconstruction_scores(prior, ct: Tensor, views: int, seed: int,
                           method: str | Sampler | Reconstructor | None = None,
                           beam: ConeBeam | None = None) -> dict[str, float]:
-    """SSIM, PSNR (dB) and MAE (HU) of a method's reconstruction, without a report, from ideal X-rays of a CT
-    (1, 1, X, Y, Z) in the range of `prior`, a Prior, Refiner or Rival, on `beam` or `benchmark_orbit`."""
+    """SSIM, PSNR (dB) and MAE (HU), whole and in the body, of a method's reconstruction, without a report, from
+    ideal X-rays of a CT (1, 1, X, Y, Z) in the range of `prior`, a Prior, Refiner or Rival, on `beam` or
+    `benchmark_orbit`."""
     beam = beam or benchmark_orbit(prior.grid, views)
     exact = Projector(prior.grid, beam, device=ct.device, full_detector=True)
     result = reconstruct(Ideal()(exact, prior.window.to_mu(ct), seed)[0], beam, prior, method, seed=seed,
                         grid=prior.grid)
-    return volume_metrics(result.volume[None, None], prior.window.to_hu(ct))
+    truth = prior.window.to_hu(ct)
+    return volume_metrics(result.volume[None, None], truth, body=body_weights(truth, prior.grid.spacing))

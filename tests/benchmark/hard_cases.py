@@ -36,7 +36,7 @@ from torch.nn.functional import interpolate
 
 from phydict import METHODS, ConeBeam, Grid, HUWindow, Projector, load_prior, reconstruct
 from phydict.datasets import prepare_ct
-from phydict.evaluation import read_csv, volume_metrics, write_csv
+from phydict.evaluation import body_weights, read_csv, volume_metrics, write_csv
 from phydict.guard import worst_view
 from phydict.methods import fit_to_grid
 from phydict.posterior import Posterior
@@ -48,9 +48,9 @@ from phydict.xray import Ideal
 from phydict.xray.poses.uncertain import USUAL, Uncertain
 
 OUT = Path(__file__).with_suffix(".csv")
-COLUMNS = ("case", "method", "ssim", "psnr", "mae_hu", "misfit", "worst_view_misfit", "worst_view", "finite",
-           "diverged_at", "error_rank_correlation", "body_rank_correlation",
-           "difference_hu", "inside_90", "interval_widening", "said")
+COLUMNS = ("case", "method", "ssim", "psnr", "mae_hu", "ssim_body", "psnr_body", "mae_hu_body", "misfit",
+           "worst_view_misfit", "worst_view", "finite", "diverged_at", "error_rank_correlation",
+           "body_rank_correlation", "difference_hu", "inside_90", "interval_widening", "said")
 GRID, WINDOW, BEAM = Grid.cube(64), HUWindow(), ConeBeam.orbit(8, 1020, 740, (448, 448), 1.25)
 FAR = ConeBeam.orbit(8, 1100, 740, (224, 224), 2.7)
 """With room for detectors that stand a little closer."""
@@ -288,9 +288,10 @@ def row(name: str, method: str, case: Case, prior: Prior) -> dict:
     settings = {"method": FAST if method == "phydict_fast" else method} | case.settings
     own = None if method == "phydict_learned" else prior
     result: Reconstruction = case.run() if case.run else reconstruct(case.xrays, case.beam, own, **settings)
-    scores = volume_metrics(result.volume[None, None], case.truth[None, None])
+    truth = case.truth[None, None]
+    scores = volume_metrics(result.volume[None, None], truth, body=body_weights(truth, GRID.spacing))
     worst, _ = worst_view(result.misfit_per_view)
-    found = {"case": name, "method": method} | {key: scores[key] for key in ("ssim", "psnr", "mae_hu")} | {
+    found = {"case": name, "method": method} | scores | {
         "misfit": result.misfit, "worst_view_misfit": result.misfit_per_view[worst], "worst_view": worst,
         "finite": bool(result.volume.isfinite().all()), "diverged_at": result.diverged_at or ""}
     if result.deviation is not None:

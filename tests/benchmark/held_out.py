@@ -14,11 +14,9 @@ from itertools import product
 from pathlib import Path
 from statistics import mean, stdev
 
-import torch
-
 from phydict import Projector, load_prior, reconstruct
-from phydict.datasets import Augmentation, Surroundings, augment, body_mask, find_cts, prepare_ct
-from phydict.evaluation import read_csv, volume_metrics, write_csv
+from phydict.datasets import Augmentation, Surroundings, augment, find_cts, prepare_ct
+from phydict.evaluation import body_weights, read_csv, volume_metrics, write_csv
 from phydict.xray import Ideal
 from phydict.xray.binning import benchmark_orbit
 
@@ -34,15 +32,14 @@ def rows_of(ct, weights: dict, method: str, views: list[int], changed: int) -> l
     for draw in range(changed + 1):
         case = augment(plain, draw, grid, window, CHANGES) if draw else plain
         truth = window.to_hu(case["volume"])[None]
-        body = torch.from_numpy(body_mask(truth[0, 0].numpy(), grid.spacing))[None, None].float()
+        body = body_weights(truth, grid.spacing)
         for k in views:
             beam = benchmark_orbit(grid, k)
             xrays = Ideal()(Projector(grid, beam, full_detector=True), window.to_mu(case["volume"])[None], draw)[0]
             for name, prior in weights.items():
                 found = reconstruct(xrays, beam, prior, method)
-                scores = volume_metrics(found.volume[None, None], truth, body=body)
-                rows.append({"weights": name, "case": ct.id, "method": method, "views": k, "draw": draw,
-                             **{key: scores[key] for key in ("psnr", "ssim", "psnr_body", "ssim_body")}})
+                rows.append({"weights": name, "case": ct.id, "method": method, "views": k, "draw": draw}
+                            | volume_metrics(found.volume[None, None], truth, body=body))
                 print(*rows[-1].values(), flush=True)
     return rows
 

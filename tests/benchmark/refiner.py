@@ -22,7 +22,7 @@ from torch import Tensor
 from torch.utils.data import default_collate
 
 from phydict import reconstruct
-from phydict.evaluation import volume_metrics, write_csv
+from phydict.evaluation import body_weights, volume_metrics, write_csv
 from phydict.grid import Cube
 from phydict.posterior import Measurement, ProximalCG, Unrolled
 from phydict.prior import save_prior
@@ -112,7 +112,8 @@ if __name__ == "__main__":
                 for views in VIEWS:
                     beam = benchmark_orbit(data.grid, views)
                     y = Ideal()(Projector(data.grid, beam, full_detector=True), data.window.to_mu(ct), 0)[0]
-                    scores = volume_metrics(volume(y, beam)[None, None], data.window.to_hu(ct))
+                    scores = volume_metrics(volume(y, beam)[None, None], data.window.to_hu(ct),
+                                            body=body_weights(data.window.to_hu(ct), data.grid.spacing))
                     rows.append({"case": case["id"], "method": name, "views": views, "samples": samples,
                                  "seconds_of_training": given.seconds * (samples > 0)} | scores)
             write_csv(Path(__file__).with_suffix(".csv"), rows)

@@ -16,7 +16,7 @@ from statistics import mean
 
 import phydict
 from phydict.datasets import find_cts, prepare_ct
-from phydict.evaluation import read_csv, volume_metrics, write_csv
+from phydict.evaluation import body_weights, read_csv, volume_metrics, write_csv
 from phydict.methods import METHODS
 from phydict.prior import DEFAULT_REFINER
 from phydict.xray import Ideal, Projector
@@ -31,12 +31,14 @@ def scored(refiner: phydict.prior.Refiner, core_hours: float, folder: Path, view
     rows = []
     for ct in find_cts(folder):
         volume = prepare_ct(ct.path, refiner.grid, refiner.window, id=ct.id)["volume"][None]
+        truth = refiner.window.to_hu(volume)
         for number in views:
             projector = Projector(refiner.grid, benchmark_orbit(refiner.grid, number), full_detector=True)
             xrays = Ideal()(projector, refiner.window.to_mu(volume), 0)[0]
             found = phydict.reconstruct(xrays, projector.beam, refiner, METHOD, grid=refiner.grid)
             rows.append({"case": ct.id, "core_hours": core_hours, "views": number}
-                        | volume_metrics(found.volume[None, None], refiner.window.to_hu(volume)))
+                        | volume_metrics(found.volume[None, None], truth,
+                                         body=body_weights(truth, refiner.grid.spacing)))
     return rows
 
 

@@ -1,17 +1,17 @@
 """Does the report matter? Held-out phantoms from few X-rays with the right report, none, and a wrong-side one.
 
     python tests/benchmark/text.py [prior.safetensors ...] [--phantoms 48] [--views 1 2 4] [--guidance 1]
-                                   [--first_views N]
+                                   [--first_views N] [--first_seed 1001000] [--out FILE]
     python tests/benchmark/text.py [prior.safetensors ...] --cts <folder of CTs> [--views 1 2 4]
 
 The second: what a report that all is normal does to CTs, in text_cts.csv beside this file.
 
 Without a prior, the shipped one. The error is the mean absolute HU error over the voxels that the phantom's findings
 changed; where the method knows intervals, inside_90 is the share of these voxels, and of the body's, in the 90 % one.
-Writes text.csv beside this file, where rows of other priors and numbers of views stay, and prints means and paired
-differences to the same case without a report, each with its standard error. With --first_views the refiner hears
-reports with up to N views, and its rows say so. Only phantoms with a one-sided finding of at least 50 ml count: others
-have no wrong side.
+Writes text.csv beside this file, where rows of other priors, numbers of views and guidance scales stay, and prints
+means and paired differences to the same case without a report, each with its standard error. With --first_views the
+refiner hears reports with up to N views, and its rows say so. Only phantoms with a one-sided finding of at least 50 ml
+count: others have no wrong side.
 """
 
 import argparse
@@ -22,9 +22,9 @@ import numpy as np
 import torch
 
 import phydict
-from phydict.datasets import Thorax, body_mask, find_cts, pathology_region, phantom_case, prepare_ct, report, wrong_side
+from phydict.datasets import Thorax, find_cts, pathology_region, phantom_case, prepare_ct, report, wrong_side
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM
-from phydict.evaluation import read_csv, volume_metrics, write_csv
+from phydict.evaluation import body_weights, read_csv, volume_metrics, write_csv
 from phydict.methods import METHODS
 from phydict.prior import DEFAULT_PRIOR, Prior
 from phydict.xray import Ideal
@@ -35,9 +35,9 @@ REPORTS = ("right report", "none", "wrong side")
 NORMAL = "The lungs are clear. No pleural effusion or pneumothorax. Heart size is normal. No nodules or masses."
 
 
-def one_sided(count: int, grid: phydict.Grid) -> list[tuple[int, torch.Tensor]]:
-    """The first `count` held-out seeds with a sizeable one-sided finding, and where it is."""
-    voxel_ml, found, seed = np.prod(grid.spacing) / 1000, [], HELD_OUT_PHANTOM + 1000
+def one_sided(count: int, grid: phydict.Grid, seed: int) -> list[tuple[int, torch.Tensor]]:
+    """The first `count` phantoms from a seed on with a sizeable one-sided finding, and where it is."""
+    voxel_ml, found = np.prod(grid.spacing) / 1000, []
     while len(found) < count:
         thorax = Thorax.draw(seed)
         if len(thorax.findings) == 1 and thorax.findings[0].side in ("left", "right"):
@@ -58,7 +58,7 @@ def compared(name: str, prior: Prior, cases: list[tuple[int, torch.Tensor]], vie
         case, thorax = phantom_case(seed, prior.grid, prior.window), Thorax.draw(seed)
         xrays = Ideal()(projector, prior.window.to_mu(case["volume"])[None], seed)[0]
         truth = prior.window.to_hu(case["volume"])[None]
-        body = torch.from_numpy(body_mask(truth[0, 0].numpy(), prior.grid.spacing))[None, None]
+        body = body_weights(truth, prior.grid.spacing)
         for kind, text in zip(REPORTS, (report(thorax), "", report(wrong_side(thorax)))):
             result = phydict.reconstruct(xrays, beam, prior, method, text, seed=seed, guidance=guidance)
             error = (result.volume - truth[0, 0]).abs()
@@ -66,7 +66,7 @@ def compared(name: str, prior: Prior, cases: list[tuple[int, torch.Tensor]], vie
                          "views": views, "guidance": guidance, "region_mae_hu": float(error[region].mean())}
                         | volume_metrics(result.volume[None, None], truth, body=body)
                         | {f"inside_90_{part}": float((error <= result.intervals[0.9])[where].double().mean())
-                           for part, where in (("region", region), ("body", body[0, 0])) if result.intervals})
+                           for part, where in (("region", region), ("body", body[0, 0] > 0)) if result.intervals})
     return rows
 
 
@@ -79,8 +79,10 @@ def spared(name: str, prior: Prior, folder: Path, views: int) -> list[dict]:
         xrays = Ideal()(projector, prior.window.to_mu(case), 0)[0]
         for kind, text in (("none", ""), ("normal", NORMAL)):
             result = phydict.reconstruct(xrays, beam, prior, report=text, seed=0, grid=prior.grid)
+            truth = prior.window.to_hu(case)
             rows.append({"prior": name, "case": ct.id, "method": kind, "views": views}
-                        | volume_metrics(result.volume[None, None], prior.window.to_hu(case)))
+                        | volume_metrics(result.volume[None, None], truth,
+                                         body=body_weights(truth, prior.grid.spacing)))
             print(f"{ct.id}, K = {views}, {kind}: {rows[-1]['psnr']:.2f} dB", flush=True)
     return rows
 
@@ -110,6 +112,7 @@ if __name__ == "__main__":
     parser.add_argument("--views", type=int, nargs="+", default=[1, 2, 4])
     parser.add_argument("--guidance", type=float, default=1.0)
     parser.add_argument("--first_views", type=int)
+    parser.add_argument("--first_seed", type=int, default=HELD_OUT_PHANTOM + 1000, help="of the phantoms")
     parser.add_argument("--cts", type=Path)
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
@@ -120,11 +123,14 @@ if __name__ == "__main__":
         suffix = f" (first_views {given.first_views})"
     for file in given.priors:
         prior, name = phydict.load_prior(file), file.stem + suffix
-        cases = [] if given.cts else one_sided(given.phantoms, prior.grid)
+        cases = [] if given.cts else one_sided(given.phantoms, prior.grid, given.first_seed)
         for views in given.views:
+            guidance = 1.0 if given.cts else given.guidance
             if given.cts:
                 found = spared(name, prior, given.cts, views)
             else:
-                found = compared(name, prior, cases, views, given.guidance, method)
+                found = compared(name, prior, cases, views, guidance, method)
                 print(f"{name}:\n{summary(found)}", flush=True)
-            write_csv(out, [row for row in read_csv(out) if (row["prior"], row["views"]) != (name, views)] + found)
+            own = name, views, guidance
+            write_csv(out, [row for row in read_csv(out)
+                            if (row["prior"], row["views"], row.get("guidance", 1.0)) != own] + found)

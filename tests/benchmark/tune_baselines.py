@@ -17,7 +17,7 @@ import numpy as np
 from phydict import HUWindow
 from phydict.baselines import CGLS, FDK, FISTATV, SIRT, DiffVox
 from phydict.datasets import CTFile, find_cts, prepare_ct
-from phydict.evaluation import read_csv, volume_metrics, write_csv
+from phydict.evaluation import body_weights, read_csv, volume_metrics, write_csv
 from phydict.grid import Grid
 from phydict.methods import fit_to_grid
 from phydict.reconstruction import Reconstructor, describe
@@ -64,7 +64,8 @@ def tune(ct: CTFile, rows: list[dict]) -> None:
                 if (ct.id, views, text(method)) in done:
                     continue
                 result = method.reconstruct(*fit_to_grid(method, GRID, xrays, beam))
-                scores = volume_metrics(result.volume[None, None], WINDOW.to_hu(truth))
+                scores = volume_metrics(result.volume[None, None], WINDOW.to_hu(truth),
+                                        body=body_weights(WINDOW.to_hu(truth), GRID.spacing))
                 rows.append({"case": ct.id, "method": name, "views": views, "settings": text(method), **scores,
                              "misfit": result.misfit, "projector_calls": result.projector_calls})
                 print(ct.id, views, name, text(method), f"{scores['psnr']:.2f} dB", flush=True)

@@ -17,7 +17,7 @@ from torch.nn.functional import avg_pool3d
 
 from phydict.baselines import CGLS, FISTATV, SIRT, DiffVox
 from phydict.datasets import find_cts, prepare_ct
-from phydict.evaluation import read_csv, volume_metrics, write_csv
+from phydict.evaluation import body_weights, read_csv, volume_metrics, write_csv
 from phydict.grid import Grid
 from phydict.methods import fit_to_grid, onto_grid, reconstructor
 from phydict.posterior import Posterior, ProximalCG, Refinement
@@ -65,9 +65,11 @@ def main(ct: str, voxels: int, views: int, names: list[str]) -> None:
             ready = onto_grid(base, grid, settings) if name == "refinement" else settings
             began = time.process_time()
             found = ready.reconstruct(*fit_to_grid(ready, grid, xrays, beam))
+            spent = time.process_time() - began
+            scores = volume_metrics(found.volume[None, None], truth, body=body_weights(truth, grid.spacing))
             row = {"case": case.id, "method": name, "voxels": voxels, "views": views,
-                   "settings": json.dumps(describe(settings)), **volume_metrics(found.volume[None, None], truth),
-                   "misfit": found.misfit, "cpu_seconds": round(time.process_time() - began, 1)}
+                   "settings": json.dumps(describe(settings)), **scores, "misfit": found.misfit,
+                   "cpu_seconds": round(spent, 1)}
             rows = [old for old in rows if any(old[k] != row[k] for k in SAME)]
             write_csv(FILE, rows := [*rows, row])
             print(voxels, views, name, row["settings"], f"{row['psnr']:.2f} dB, {row['cpu_seconds']} s", flush=True)

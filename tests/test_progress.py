@@ -6,7 +6,7 @@ import pytest
 
 from phydict.runtime import progress as module
 from phydict.runtime.progress import CaseProgress, duration
-from phydict.runtime.telling import telling
+from phydict.runtime.telling import tell, telling
 
 
 @pytest.fixture
@@ -55,6 +55,13 @@ def test_machines_read_the_same_as_json(told):
     cases = [event for event in events if event["event"] == "case"]
     assert [(e["case"], e["done"], e["cases"], e["seconds_to_go"]) for e in cases] == [
         ("a", 1, 3, 80.0), ("b", 2, 3, 40.0), ("c", 3, 3, 0.0)]
+
+
+def test_machines_read_null_for_what_is_no_finite_number(capsys):
+    with telling(False, True):
+        tell("scored", psnr=float("inf"), scores={"ssim": float("nan"), "views": [1, 0.5]})
+    line = json.loads(capsys.readouterr().err, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+    assert line == {"psnr": None, "scores": {"ssim": None, "views": [1, 0.5]}}
 
 
 def test_quiet_tells_nothing(told):

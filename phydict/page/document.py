@@ -16,6 +16,7 @@ from urllib.parse import quote
 from phydict.evaluation.metrics import MEASURES
 from phydict.evaluation.tables import Table, ranks
 from phydict.runtime.files import atomic_write
+from phydict.runtime.strict_json import strict_json
 
 PAGE = "index.html"
 SIGNED = '<meta name="generator" content="phydict">'
@@ -68,7 +69,7 @@ def write_page(folder: Path, contents: Contents) -> Path:
     """Writes index.html into a folder in one step; returns its path."""
     text, style, *scripts = ((files("phydict.page") / name).read_text("utf-8") for name in (
         "page.html", "page.css", "volume.js", "viewer.js", "page.js"))
-    data = json.dumps(_plain(_content(contents)), allow_nan=False).replace("<", "\\u003c")
+    data = strict_json(_content(contents)).replace("<", "\\u003c")
     for mark, value in (("TITLE", html.escape(contents.title)), ("STYLE", style), ("SIGNED", SIGNED),
                         ("SCRIPT", "".join(scripts)), ("CONTENT", data)):
         text = text.replace(f"<!--{mark}-->", value)
@@ -129,12 +130,3 @@ def _file(name: str) -> dict:
 def _quoted(path: str) -> str:
     """A path as part of an address, whatever bytes it is made of."""
     return quote(os.fsencode(path))
-
-
-def _plain(value):
-    """Nested values with None for what is no finite number, which JSON cannot say."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(one) for key, one in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(one) for one in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -42,7 +42,7 @@ SWAY_WIDENING = 1.25
 """Factor by which intervals widen where views are said to sway: with breathing by 10 mm between eight views of two CTs
 kept from training, 83 and 86 % of the body are otherwise in the 90 % one, which holds 90 % at 1.17 and 1.27 times."""
 
-WIDEST = 2 * HUWindow().half_width
+WIDEST_HU = 2 * HUWindow().half_width
 """HU of half the widest interval, which leaves out nothing."""
 
 
@@ -103,7 +103,7 @@ class FoundPoses:
         factor = factor if result.intervals else 1.0
         return replace(result, beam=self.beam, poses=self.record(),
                        seconds={"calibrate": self.seconds} | result.seconds,
-                       intervals={level: (factor * half_width).clamp(max=WIDEST)
+                       intervals={level: (factor * half_width).clamp(max=WIDEST_HU)
                                   for level, half_width in result.intervals.items()},
                        interval_widening=factor * result.interval_widening)
 

@@ -43,7 +43,7 @@ from phydict.xray.poses.unknowns import moved
 from phydict.xray.residuals import misfits
 
 WINDOW = HUWindow()
-DISPLAY = 0.3
+DISPLAY_STD = 0.3
 """Standard deviation of gain and offset of display values, once they are matched to a typical chest."""
 X0_STD = 5.0
 """Standard deviation, in the window's range, of the error of a round's volume: the next one is free to leave it."""
@@ -101,7 +101,7 @@ def find_poses(xrays: Tensor, beam: ConeBeam, uncertain: Uncertain, grid: Grid, 
     beam.check(grid)
     if display:
         uncertain.check_scale(beam)
-        uncertain = replace(uncertain, gain=max(uncertain.gain, DISPLAY), offset=max(uncertain.offset, DISPLAY))
+        uncertain = replace(uncertain, gain=max(uncertain.gain, DISPLAY_STD), offset=max(uncertain.offset, DISPLAY_STD))
     uncertain.check(beam.views, xrays[0].numel())
     while max(grid.shape) > MOST_VOXELS:
         grid = halved(grid)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -19,6 +18,8 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+
+from phydict.runtime.strict_json import strict_json
 
 WORDS, JSON, SILENCE = "words", "json", "silence"
 
@@ -44,13 +45,13 @@ def add_telling(parser: ArgumentParser) -> None:
 def tell(text: str, /, **event: object) -> None:
     """A line on standard error: the text or, as `telling` has it, the event as JSON, or nothing."""
     if _MANNER.get() != SILENCE:
-        print(text if _MANNER.get() == WORDS else json.dumps(event), file=sys.stderr, flush=True)
+        print(text if _MANNER.get() == WORDS else strict_json(event), file=sys.stderr, flush=True)
 
 
 def exclaim(kind: str, text: str) -> None:
     """A warning, or an error that does not end the run, on standard error: as JSON where progress is, and never
     silenced."""
-    print(json.dumps({"event": kind, "text": text}) if _MANNER.get() == JSON else f"{kind}: {text}", file=sys.stderr,
+    print(strict_json({"event": kind, "text": text}) if _MANNER.get() == JSON else f"{kind}: {text}", file=sys.stderr,
           flush=True)
 
 

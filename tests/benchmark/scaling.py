@@ -2,8 +2,8 @@
 
     python tests/benchmark/scaling.py <name>=<the training's metrics.csv>[+<samples seen before it>] ...
 
-Writes scaling.csv and scaling.png beside this file: RMSE of the CT in HU as validation logged it, on logarithmic axes,
-where a power law is a straight line.
+Writes scaling.csv and scaling.png beside this file, where other trainings' rows stay: RMSE of the CT in HU and the PSNR
+of phydict_fast as validation logged them, on logarithmic axes, where a power law is a straight line.
 """
 
 import argparse
@@ -22,7 +22,7 @@ def curve(name: str, log: Path, before: int) -> list[dict]:
     """One row for each validation of a training and each noise level."""
     rows = [row for row in read_csv(log) if row.get("val/rmse_hu") is not None]
     return [{"training": name, "samples": before + row["samples"], "t": t,
-             "rmse_hu": row[f"val/rmse_hu_t{t}"]}
+             "rmse_hu": row[f"val/rmse_hu_t{t}"], "psnr": row.get("val/psnr")}
             for row in rows for t in NOISE_LEVELS]
 
 
@@ -48,10 +48,10 @@ if __name__ == "__main__":
     given = parser.parse_args()
     if not all("=" in training for training in given.trainings):
         parser.error("a training is given as <name>=<its metrics.csv>")
-    rows = []
+    rows = read_csv(FILE.with_suffix(".csv"))
     for told in given.trainings:
         name, _, log = told.partition("=")
         log, _, before = log.partition("+")
-        rows += curve(name, Path(log), int(before or 0))
+        rows = [row for row in rows if row["training"] != name] + curve(name, Path(log), int(before or 0))
     write_csv(FILE.with_suffix(".csv"), rows)
     plot(rows, FILE.with_suffix(".png"))

@@ -175,7 +175,8 @@ class MeasuredCase:
         with noted(self.warnings, case):
             self.xrays = data.simulate(made, case_seed(trial.seed, case), self.grid, self.window, device)
         if not (scored := trial.scored()).same_as(self.grid):
-            self.truth, self.grid = lacking(made, "features") | cut_out(made, self.grid, scored, self.window), scored
+            cut = cut_out(made, self.grid, scored, self.window)
+            self.truth, self.grid = lacking(made, "features", "clip_latent") | cut, scored
 
     def report(self, trial: Trial) -> str:
         """The report, where the trial uses it and its prior reads text."""

@@ -39,6 +39,7 @@ class Case(TypedDict, total=False):
     mu_water: float  # 1/mm, in the X-rays
     ct_report: str  # the report, where `report` is what is used of it
     features: dict[str, Tensor]  # of the volume's slices
+    clip_latent: Tensor  # of the volume
 
 
 def lacking(case: Case, *keys: str) -> Case:

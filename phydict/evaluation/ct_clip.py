@@ -265,11 +265,15 @@ def prepared(hu: Tensor, grid: Grid, towers: Towers = Towers()) -> Tensor:
     return pad(volume, margins, value=-1.0).permute(0, 1, 4, 2, 3)
 
 
-def clip_scores(model: CTCLIP, hu: Tensor, true_hu: Tensor, grid: Grid, report: str = "") -> dict[str, float]:
+def image_latent(model: CTCLIP, hu: Tensor, grid: Grid) -> Tensor:
+    """The unit latent (1, latent) of a volume (X, Y, Z) in HU."""
+    return model.image(prepared(hu, grid, model.towers).to(model.to_text_latent.weight.device))
+
+
+def clip_scores(model: CTCLIP, hu: Tensor, truth: Tensor, grid: Grid, report: str = "") -> dict[str, float]:
     """{"clip_i2i": and, with a report and a text tower, "clip_t2i"} in percent: 100 max(cos, 0) of the latents of the
-    volume (X, Y, Z) in HU and of the truth, and of the report."""
-    device = model.to_text_latent.weight.device
-    image, truth = (model.image(prepared(volume, grid, model.towers).to(device)) for volume in (hu, true_hu))
+    volume (X, Y, Z) in HU and of the truth, `truth` being that latent, and of the report."""
+    image = image_latent(model, hu, grid)
     scores = {"clip_i2i": 100 * max(float((image * truth).sum()), 0.0)}
     if report and model.text_transformer is not None:
         scores["clip_t2i"] = 100 * max(float((image * model.text(report)).sum()), 0.0)

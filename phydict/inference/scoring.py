@@ -13,7 +13,7 @@ from phydict.datasets.case import Case
 from phydict.datasets.cts.segmentations import organs_beside
 from phydict.evaluation import RANGE, body_weights, volume_metrics
 from phydict.evaluation.backbones import SliceFeatures
-from phydict.evaluation.ct_clip import clip_scores, load_ct_clip
+from phydict.evaluation.ct_clip import clip_scores, image_latent, load_ct_clip
 from phydict.evaluation.fid import case_features
 from phydict.evaluation.organs import fine_grid, organ_scores
 from phydict.evaluation.perceptual import load_networks, lpips_scores
@@ -121,7 +121,10 @@ class Scoring:
         if "sharpness" in self.metrics and bool(case["has_masks"][0]):
             scores |= sharpness_scores(volume, truth, case["masks"][0].cpu(), grid)
         if self.clip:
-            scores |= clip_scores(self.clip.to(device), volume, truth, grid, case.get("ct_report", case["report"]))
+            model = self.clip.to(device)
+            if "clip_latent" not in case:
+                case["clip_latent"] = image_latent(model, truth, grid)
+            scores |= clip_scores(model, volume, case["clip_latent"], grid, case.get("ct_report", case["report"]))
         return scores
 
     def features(self, volume: Tensor, case: Case, window: HUWindow, device: torch.device) -> dict[str, Tensor] | None:

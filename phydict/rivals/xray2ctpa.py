@@ -51,7 +51,9 @@ class XrayToCTPANetwork(RivalNetwork):
 
     Not as published: an autoencoder trained on the same CTs in place of Stable Diffusion's, a small convolutional
     network in place of BiomedCLIP's image encoder, the mean over the views of their embeddings with their directions,
-    DDIM in place of 1000 ancestral steps, the prior's HU window, and no perceptual loss.
+    DDIM in place of 1000 ancestral steps, the prior's HU window, no perceptual loss, no linear attention within slices,
+    sinusoids in place of rotary positions, latents that their largest value scales in place of the least and largest of
+    all CTs, and one case at a step.
 
     image_channels, embedding: widths of the X-rays' network and of its vector; slice_channels: of the autoencoder, one
     halving less than their number; channels: of the UNet; ddim_steps: of the sampler.
@@ -117,6 +119,9 @@ class XrayToCTPANetwork(RivalNetwork):
 
     def reconstruct(self, y: Tensor, geometry: Geometry, generator: torch.Generator,
                     on_step: Callable[[], None] = lambda: None) -> Tensor:
+        if not bool(self.denoiser.leave.weight.any()):
+            raise ValueError("this X-ray2CTPA network has learnt its autoencoder alone, nothing of X-rays: train it on "
+                             "with model.initial, its file, and model.latent.autoencoder_steps 0")
         directions, latent = geometry
         condition = self.encoder(y, directions)
         x = noise_like(latent.expand(len(y), -1, -1, -1, -1), generator)

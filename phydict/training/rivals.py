@@ -91,7 +91,7 @@ class LiftedTraining(RivalTraining):
 
 @dataclass(frozen=True)
 class OrbitScenes(Scenes):
-    """Scenes of one geometry, the benchmarks' orbit from angle 0; of the other settings, noise and model_error count.
+    """Scenes of one geometry, the benchmarks' orbit from angle 0; the settings of its geometry mean nothing.
 
     Args:
         views: X-rays

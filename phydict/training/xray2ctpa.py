@@ -25,6 +25,9 @@ from phydict.xray import ConeBeam
 FORGOTTEN = 0.01
 """By which share a new case moves the size of the latents."""
 
+SETTLING = 100
+"""Steps of the diffusion, from its first on, in which larger latents still raise their size."""
+
 
 @dataclass(frozen=True)
 class LatentSettings:
@@ -72,6 +75,9 @@ class XrayToCTPATraining(RivalTraining):
         if initial and (given := [part for part in ("autoencoder", "encoder") if getattr(latent, part)]):
             raise ValueError(f"model.initial brings all of its weights, but model.latent.{given[0]} was given beside "
                              "it: leave one of the two out")
+        if not (initial or latent.autoencoder or latent.autoencoder_steps):
+            raise ValueError("model.latent.autoencoder_steps is 0, but no autoencoder that has learnt was given: give "
+                             "model.latent.autoencoder or model.initial, or some steps")
         network, grid = network or XrayToCTPANetwork(), cube.grid()
         for part in ("autoencoder", "encoder"):
             if file := getattr(latent, part):
@@ -91,8 +97,8 @@ class XrayToCTPATraining(RivalTraining):
         network, y = cast(XrayToCTPANetwork, self.prior.network), water / WATER_MM
         with torch.no_grad():
             latent = network.latent(ct).float()
-            if not network.largest:  # the autoencoder came with weights of its own
-                network.largest.copy_(latent.abs().max())
+            if self.global_step - self.latent.autoencoder_steps < SETTLING:
+                network.largest.copy_(torch.maximum(network.largest, latent.abs().max()))
             x0 = (latent / network.largest).clamp(-1, 1)
         noise, t = noise_like(x0, generator), torch.rand(1, generator=generator).to(x0)
         signal, sigma = (scale.view(-1, 1, 1, 1, 1) for scale in network.schedule.scales(t))
@@ -112,7 +118,7 @@ class XrayToCTPATraining(RivalTraining):
         return l1_loss(again.float(), slices) + self.latent.kl_weight * divergence
 
     def validation_step(self, batch: dict, index: int) -> None:
-        if not self.learns_slices:
+        if self.global_step > self.latent.autoencoder_steps:  # the diffusion has learnt something
             super().validation_step(batch, index)
 
 

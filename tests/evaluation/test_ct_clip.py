@@ -6,21 +6,12 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from evaluation.tiny_ct_clip import TINY, tiny
 
-from phydict.evaluation.ct_clip import CTCLIP, Towers, clip_scores, load_ct_clip, prepared
+from phydict.evaluation.ct_clip import CTCLIP, clip_scores, image_latent, load_ct_clip, prepared
 from phydict.grid import Grid
 
-TINY = Towers(side=24, frames=12, patch=6, frame_patch=3, width=16, heads=2, head_width=4, depth=2, codes=32,
-              text_width=6, latent=8)
 GRID = Grid((32, 32, 24), (0.75, 0.75, 1.5))
-
-
-def tiny() -> CTCLIP:
-    torch.manual_seed(0)
-    model = CTCLIP(TINY)
-    for weight in [*model.parameters(), model.visual_transformer.vq._codebook.embed]:
-        torch.nn.init.normal_(weight, std=0.5)
-    return model.eval().requires_grad_(False)
 
 
 def hu(seed: int) -> torch.Tensor:
@@ -45,8 +36,9 @@ def test_names_and_shapes_are_the_checkpoints():
 
 def test_the_truth_scores_100_and_noise_less():
     model, truth = tiny(), hu(0)
-    assert clip_scores(model, truth, truth, GRID) == {"clip_i2i": pytest.approx(100)}
-    assert clip_scores(model, hu(1), truth, GRID)["clip_i2i"] < 99.9
+    latent = image_latent(model, truth, GRID)
+    assert clip_scores(model, truth, latent, GRID) == {"clip_i2i": pytest.approx(100)}
+    assert clip_scores(model, hu(1), latent, GRID)["clip_i2i"] < 99.9
 
 
 def test_a_report_is_scored_by_its_latent_and_a_negative_cosine_counts_as_none():
@@ -61,10 +53,10 @@ def test_a_report_is_scored_by_its_latent_and_a_negative_cosine_counts_as_none()
             return SimpleNamespace(last_hidden_state=sign * wanted[None, None])
 
     model.text_transformer = Bert()
-    scores = [clip_scores(model, hu(0), hu(0), GRID, report) for report in ("so", "not so")]
+    scores = [clip_scores(model, hu(0), image, GRID, report) for report in ("so", "not so")]
     assert scores[0]["clip_t2i"] == pytest.approx(100 * float(nearest @ image[0]), rel=1e-3)
     assert scores[0]["clip_t2i"] > 10
-    assert scores[1]["clip_t2i"] == 0 and "clip_t2i" not in clip_scores(model, hu(0), hu(0), GRID)
+    assert scores[1]["clip_t2i"] == 0 and "clip_t2i" not in clip_scores(model, hu(0), image, GRID)
 
 
 def test_a_checkpoint_comes_back_with_its_further_entries_left_out(tmp_path):

@@ -16,7 +16,7 @@ from torch import Tensor
 from transformers import BertConfig, BertModel
 
 from phydict.datasets import join_report
-from phydict.evaluation.ct_clip import CTCLIP, Towers, clip_scores, load_ct_clip, plain, prepared
+from phydict.evaluation.ct_clip import CTCLIP, Towers, clip_scores, image_latent, load_ct_clip, plain, prepared
 from phydict.grid import Grid
 
 TOWERS = Towers(side=24, frames=12, patch=6, frame_patch=3, width=16, heads=2, head_width=4, depth=2, codes=32,
@@ -64,7 +64,7 @@ def test_latents_and_scores_are_the_authors(model):
     text = [0.153641, 0.06557, -0.74431, 0.280333, 0.32203, -0.060431, 0.383532, -0.291647]
     assert model.image(prepared(hu("made"), GRID, TOWERS))[0].tolist() == pytest.approx(image, abs=1e-4)
     assert model.text(report)[0].tolist() == pytest.approx(text, abs=1e-4)
-    assert clip_scores(model, hu("made"), hu("true"), GRID, report) == {
+    assert clip_scores(model, hu("made"), image_latent(model, hu("true"), GRID), GRID, report) == {
         "clip_i2i": pytest.approx(62.5258, abs=0.01), "clip_t2i": pytest.approx(68.3133, abs=0.01)}
 
 

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 import yaml
 from command_lines import refusal
+from evaluation.tiny_ct_clip import tiny
+from torch.nn import Identity
 
-from inference.runs import phantoms, record
+from inference.runs import ORBIT, phantoms, record, sirt
 from phydict.cli.infer import main
 from phydict.datasets.cts.segmentations import organs_beside
 from phydict.evaluation import backbones, perceptual, read_csv
@@ -53,6 +55,24 @@ def test_the_page_shows_the_frechet_distances_and_why_scores_are_empty(tmp_path,
     page = (tmp_path / "index.html").read_text()
     assert "Frechet distance of slices (FID)" in page and "Backbone squeezenet" in page
     assert "CLIP T2I (%): empty, since CT-CLIP's checkpoint was not given" in page
+
+
+@pytest.mark.parametrize("text, why", [(None, "CXR-BERT was not given"), (Identity(), "no case has a report")])
+def test_volumes_are_scored_by_ct_clip_and_the_table_says_why_reports_are_not(text, why, cts, tmp_path, monkeypatch):
+    model = tiny()
+    model.text_transformer = text
+    monkeypatch.setattr(scoring, "load_ct_clip", lambda *_: model)
+    (tmp_path / "clip.pt").write_bytes(b"")
+    main(sirt("test", tmp_path / "out", f"--data.cts={cts}", *ORBIT, "--metrics=[clip]",
+              f"--clip.weights={tmp_path / 'clip.pt'}"))
+    folder = tmp_path / "out" / "sirt"
+    assert f"CLIP T2I (%): empty, since {why}" in (folder / "results.md").read_text()
+    assert all(0 <= row["clip_i2i"] <= 100 and "clip_t2i" not in row for row in read_csv(folder / "results.csv"))
+
+
+def test_a_text_tower_without_ct_clip_is_refused(tmp_path, capsys):
+    given = phantoms(tmp_path, 1, "--metrics=[clip]", "--clip.text=there")
+    assert "give clip.weights" in refusal(capsys, main, given)
 
 
 def test_a_page_made_anew_has_the_frechet_distances_whose_features_are_kept(tmp_path, untrained):

@@ -33,7 +33,8 @@ TINY = {"lifted": ["--model.network.class_path=phydict.rivals.LiftedNetwork",
                       "--model.network.init_args.image_channels=[4,4]", "--model.network.init_args.embedding=8",
                       "--model.network.init_args.slice_channels=[4,8]", "--model.network.init_args.channels=[4,8]",
                       "--model.network.init_args.ddim_steps=4", "--model.scenes.views=2",
-                      "--model.latent.autoencoder_steps=3", "--trainer.check_val_every_n_epoch=1"]}
+                      "--model.latent.autoencoder_steps=2", "--model.optimisation.warmup=0",
+                      "--trainer.check_val_every_n_epoch=1"]}
 TASKS = {"lifted": lambda: LiftedTraining(lively(lambda: LiftedNetwork((4, 6), 2, 4, (4, 6, 8))),
                                           cube=Cube(16), window=(-1000, 600)),
          "x2ct": lambda: X2CTTraining(lively(lambda: X2CTNetwork(8, 4, (2, 2), (4, 8, 8))), OrbitScenes(views=2),

@@ -6,12 +6,12 @@ from safetensors.torch import save_file
 
 from phydict.grid import Cube, Grid
 from phydict.methods import reconstruct
-from phydict.rivals import RivalAnswer, XrayToCTPANetwork
+from phydict.rivals import Rival, RivalAnswer, XrayToCTPANetwork
 from phydict.rivals.rival import WATER_MM, bound_orbit
 from phydict.rivals.slice_unet import StackAttention, waves
 from phydict.training.rivals import OrbitScenes
 from phydict.training.xray2ctpa import LatentSettings, XrayToCTPATraining
-from phydict.units import MU_WATER
+from phydict.units import MU_WATER, HUWindow
 from phydict.xray import Projector
 from rivals.tiny_rivals import GRID, body, lively, tiny_xray2ctpa
 
@@ -25,6 +25,13 @@ def water(beam=BEAM) -> torch.Tensor:
 def task(**latent) -> XrayToCTPATraining:
     return XrayToCTPATraining(lively(lambda: XrayToCTPANetwork((4, 4), 8, (4, 8), (4, 8), 4)), OrbitScenes(views=2),
                               Cube(16), (-1000, 600), latent=LatentSettings(**latent))
+
+
+@pytest.fixture
+def autoencoder(tmp_path) -> str:
+    """A file of an autoencoder's weights."""
+    save_file(task().prior.network.autoencoder.state_dict(), tmp_path / "autoencoder.safetensors")
+    return str(tmp_path / "autoencoder.safetensors")
 
 
 @torch.no_grad()
@@ -66,8 +73,8 @@ def test_the_code_of_a_slice_is_its_own_in_the_networks_precision():
     torch.testing.assert_close(codes[0][0].float(), waves(torch.arange(256.0), 8), atol=0.01, rtol=0)
 
 
-def test_each_part_learns_in_its_own_time():
-    first, then = task(autoencoder_steps=1), task(autoencoder_steps=0)
+def test_each_part_learns_in_its_own_time(autoencoder):
+    first, then = task(autoencoder_steps=1), task(autoencoder_steps=0, autoencoder=autoencoder)
     for training, learnt in ((first, "autoencoder"), (then, "denoiser"), (then, "encoder")):
         training.zero_grad()
         training.case_loss(body(), water(), BEAM, torch.Generator().manual_seed(0)).backward()
@@ -76,9 +83,27 @@ def test_each_part_learns_in_its_own_time():
     assert first.prior.network.largest > 0 and then.prior.network.largest > 0
 
 
-def test_ones_own_weights_are_taken_and_others_are_refused(tmp_path):
-    own, file = task(), str(tmp_path / "own.safetensors")
-    save_file(own.prior.network.autoencoder.state_dict(), file)
+def test_the_size_of_latents_is_that_of_the_largest_of_the_first_cases(autoencoder):
+    training = task(autoencoder_steps=0, autoencoder=autoencoder)
+    network, sizes = training.prior.network, []
+    for ct in (-torch.ones(body().shape), body(), -torch.ones(body().shape)):
+        training.case_loss(ct, water(), BEAM, torch.Generator().manual_seed(0))
+        sizes.append(float(network.largest))
+    with torch.no_grad():
+        assert sizes[0] < sizes[1] == sizes[2] == pytest.approx(float(network.latent(body()).abs().max()), rel=1e-5)
+
+
+def test_what_has_learnt_nothing_of_xrays_or_of_slices_is_refused(tmp_path):
+    network = XrayToCTPANetwork((4, 4), 8, (4, 8), (4, 8), 4)
+    method = RivalAnswer(Rival(network, GRID, HUWindow(), BEAM))
+    with pytest.raises(ValueError, match="has learnt its autoencoder alone"):
+        reconstruct(water()[0] * MU_WATER, BEAM, method=method, grid=GRID)
+    with pytest.raises(ValueError, match="no autoencoder that has learnt was given"):
+        task(autoencoder_steps=0)
+
+
+def test_ones_own_weights_are_taken_and_others_are_refused(tmp_path, autoencoder):
+    own, file = task(), autoencoder
     other = XrayToCTPANetwork((4, 4), 8, (4, 8), (4, 8), 4)
     settings = {"scenes": OrbitScenes(views=2), "cube": Cube(16), "window": (-1000, 600)}
     taken = XrayToCTPATraining(other, latent=LatentSettings(0, autoencoder=file), **settings)

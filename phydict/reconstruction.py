@@ -170,6 +170,10 @@ class Delegating(Reconstructor):
         return self.target
 
     @property
+    def volumes(self) -> int:
+        return max(super().volumes, self.base.volumes)
+
+    @property
     def full_detector(self) -> bool:  # type: ignore[override]
         return self.base.full_detector
 

@@ -53,6 +53,9 @@ class Bound(Protocol):
     @property
     def window(self) -> HUWindow: ...
 
+    @property
+    def precision(self) -> str: ...
+
     def steps(self) -> int: ...
 
     def with_mu_water(self, mu_water: float) -> Reconstructor: ...
@@ -68,11 +71,11 @@ class Correction(Protocol):
         """Whether it was trained for these voxels and HU."""
         ...
 
-    def corrected(self, z: Tensor, evidence: Tensor) -> Tensor:
+    def corrected(self, z: Tensor, evidence: Tensor, precision: str) -> Tensor:
         """An estimate z (1, 1, X, Y, Z) of the CT without what it lacks, given the evidence there."""
         ...
 
-    def half_widths(self, grid: Grid, seen: Tensor) -> Tensor | None:
+    def half_widths(self, grid: Grid, seen: Tensor, precision: str) -> Tensor | None:
         """Half-widths (1, levels, X, Y, Z) of intervals around the result, given SEEN (1, 4, X, Y, Z); None where it
         knows none on these voxels."""
         ...
@@ -129,9 +132,9 @@ class Refinement:
         return fine_calls, max(coarse_calls, 0)
 
     def __call__(self, measurement: Measurement, x: Tensor, network: Correction | None,
-                 coarse: CoarseCorrection | None = None, refined: bool = False) -> Tensor:
+                 coarse: CoarseCorrection | None = None, refined: bool = False, precision: str = "auto") -> Tensor:
         """The refined estimate of an interpolated one x (1, 1, X, Y, Z), by a network on these voxels and one on coarse
-        ones. refined: whether what was interpolated had been refined."""
+        ones. refined: whether what was interpolated had been refined; precision: of the former network."""
         if self.step is None:
             return x
         first = (self.call_step, self.call_std) if refined and self.call_step else (self.step, self.x0_std)
@@ -142,7 +145,7 @@ class Refinement:
                 evidence.measure_noise()
                 channels = evidence(z, before, start)
                 with stage("network"):
-                    z = network.corrected(z, channels)
+                    z = network.corrected(z, channels, precision)
             if coarse is not None and (left or network is None):
                 z = coarse(z)
             before = z
@@ -234,7 +237,7 @@ class Refined(Delegating):
                 fine_calls, coarse_calls = (refinement.corrections(network is not None)
                                             if coarse.masks is not None else (0, 0))
                 correction = coarse_correction(base, level, binned, coarse, report, display) if coarse_calls else None
-                x = refinement(measurement, start, network, correction, grid is not base.grid)
+                x = refinement(measurement, start, network, correction, grid is not base.grid, base.precision)
                 guard = Guard(measurement, on_step, 1)
                 guard()
                 if network is not None and coarse.intervals and coarse.masks is not None and len(coarse.masks):
@@ -265,7 +268,7 @@ class Refined(Delegating):
                          ) -> tuple[dict[float, Tensor], Grid] | None:
         """The half-widths in HU that a network knows on a level's voxels, and these; None where it knows none."""
         window = self.base.window
-        widths = network.half_widths(level, seen_of(x, start, coarse, window, level))
+        widths = network.half_widths(level, seen_of(x, start, coarse, window, level), self.base.precision)
         if widths is None:
             return None
         return dict(zip(coarse.intervals, window.half_width * widths[0].clamp(max=WIDEST).cpu())), level

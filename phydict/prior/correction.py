@@ -102,16 +102,17 @@ class CorrectionNetwork(nn.Module):
         return torch.cat(slabs, 2)
 
     @torch.no_grad()
-    def corrected(self, z: Tensor, evidence: Tensor) -> Tensor:
-        """As `forward`, of the estimate z (B, 1, X, Y, Z), held inside the range, in the device's best precision."""
-        with network_precision("auto", z):
+    def corrected(self, z: Tensor, evidence: Tensor, precision: str = "auto") -> Tensor:
+        """As `forward`, of the estimate z (B, 1, X, Y, Z), held inside the range, in a precision of
+        phydict.runtime.precision."""
+        with network_precision(precision, z):
             return self.to(z.device)(torch.cat([z, evidence], 1)).clamp(-1, 1)
 
     @torch.no_grad()
-    def half_widths(self, grid: Grid, seen: Tensor) -> Tensor | None:
+    def half_widths(self, grid: Grid, seen: Tensor, precision: str = "auto") -> Tensor | None:
         """As FinerUncertainty's, where there is one and voxels are those it learnt on, and else None."""
         if self.uncertainty is None or not self._has_voxels(grid, 1):
             return None
         self.to(seen.device)
-        with network_precision("auto", seen):
+        with network_precision(precision, seen):
             return self.uncertainty.half_widths(seen)

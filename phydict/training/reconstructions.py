@@ -79,11 +79,11 @@ class _Recording:
     def suits(self, grid: Grid, window: HUWindow) -> bool:
         return True
 
-    def corrected(self, z: Tensor, evidence: Tensor) -> Tensor:
+    def corrected(self, z: Tensor, evidence: Tensor, precision: str) -> Tensor:
         self.inputs.append(torch.cat([z, evidence], 1))
-        return self.network.corrected(z, evidence) if self.network else z
+        return self.network.corrected(z, evidence, precision) if self.network else z
 
-    def half_widths(self, grid: Grid, seen: Tensor) -> None:
+    def half_widths(self, grid: Grid, seen: Tensor, precision: str) -> None:
         return None
 
 

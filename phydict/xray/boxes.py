@@ -84,12 +84,14 @@ def outside_projection(mu: Tensor, grid: Grid, projector: Projector) -> Tensor:
 
 def refinements(start: Grid, target: Grid) -> list[Grid]:
     """Grids over the target's box, each of voxels about half as long as those before it, `start`'s first, up to the
-    target; none where that is `start`."""
+    target, along each axis none longer than `start`'s unless the target's are; none where that is `start`."""
     check_axes(start, target)
     if start.same_as(target):
         return []
     halvings = max(1, round(math.log2(max(np.divide(start.spacing, target.spacing)))))
-    shapes = [[math.ceil(n / 2**k) for n in target.shape] for k in range(halvings - 1, 0, -1)]
+    most = [math.ceil(side - SLACK) for side in np.multiply(target.shape, target.spacing) / start.spacing]
+    shapes = [[min(n, max(math.ceil(n / 2**k), m)) for n, m in zip(target.shape, most)]
+              for k in range(halvings - 1, 0, -1)]
     return [in_other_voxels(target, shape) for shape in shapes] + [target]
 
 

@@ -90,7 +90,8 @@ def draw(rows: list[dict]) -> None:
             print("", views, f"{contrast:.0f}", method, *(f"{value:.2f}" for value in means), "", sep=" | ")
         ax.set_title(f"K = {views}, {contrast:.0f} HU denser")
         ax.grid(True, linewidth=0.3)
-    axes[0, 0].legend(fontsize=8)
+    named = {line.get_label(): line for ax in axes.flat for line in ax.get_lines()}
+    axes[0, 0].legend(named.values(), named.keys(), fontsize=8)
     figure.supxlabel("diameter (mm)")
     figure.supylabel("share of the contrast that is shown")
     figure.tight_layout()

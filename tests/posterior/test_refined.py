@@ -40,6 +40,7 @@ class Known:
     """A method that is bound to voxels and knows the chest there by its means."""
 
     full_detector, citation, mu_water, name, window, survey = False, "known", 0.02, "known", WINDOW, None
+    precision, volumes = "float32", 20
 
     def __init__(self, voxels: int = 16):
         self.grid = Grid.cube(voxels)
@@ -66,6 +67,27 @@ def refined(grid: Grid, xrays: torch.Tensor, refinement: Refinement = Refinement
 
 def error(volume: torch.Tensor, truth: torch.Tensor) -> float:
     return float((volume - truth).square().mean().sqrt())
+
+
+def test_a_network_on_finer_voxels_computes_as_the_base_does(xrays):
+    asked = []
+
+    class Asked(Watched):
+        def __init__(self):
+            pass
+
+        def corrected(self, z, evidence, precision):
+            asked.append(precision)
+            return z
+
+    ready = Refined(Known(), Grid.cube(32), network=Asked())
+    ready.reconstruct(*fit_to_grid(ready, ready.grid, xrays, BEAM))
+    assert asked == ["float32"] * 2
+
+
+def test_a_method_in_a_box_holds_as_many_volumes_as_without():
+    region = Grid.box(24, 144.0, (48.0, 0.0, 0.0))
+    assert onto_grid(FISTATV(), region).volumes == FISTATV().volumes > Refined(Known(), region).volumes
 
 
 def test_the_own_grid_is_no_refinement_and_changes_nothing(xrays):
@@ -110,7 +132,7 @@ class Watched:
     def suits(self, grid, window):
         return True
 
-    def corrected(self, z, evidence):
+    def corrected(self, z, evidence, precision):
         noise = self.measurement.noise_variance.mean().sqrt() / self.measurement.y.max()
         self.told.append((10 ** (float(evidence[0, 4].mean()) - 2), float(noise)))
         return z

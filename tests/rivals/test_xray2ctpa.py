@@ -44,7 +44,6 @@ def test_sampling_ends_at_the_latent_whose_noise_is_found(monkeypatch):
         signal, sigma = network.schedule.scales(t)
         return (x - signal * wanted) / sigma
 
-    monkeypatch.setattr(network, "denoiser", torch.nn.Identity())
     monkeypatch.setattr(network.denoiser, "forward", knows)
     found = network.reconstruct(y, geometry, torch.Generator().manual_seed(1))
     torch.testing.assert_close(found, network.decoded(wanted), atol=1e-4, rtol=0)

@@ -84,6 +84,13 @@ def test_voxels_halve_from_level_to_level_up_to_the_target():
     assert [level.shape[0] for level in refinements(Grid.cube(64), Grid.cube(256))] == [128, 256]
 
 
+def test_no_level_is_coarser_than_where_it_starts_unless_the_target_is():
+    for target, shapes in ((Grid.box((256, 256, 64), 384.0), [(128, 128, 64), (256, 256, 64)]),
+                           (Grid.box((64, 16, 8), 384.0), [(32, 16, 8), (64, 16, 8)])):
+        start = Grid.cube(target.shape[1] // 4 if target.shape[1] > 16 else 16)
+        assert [level.shape for level in refinements(start, target)] == shapes
+
+
 def test_turned_axes_are_refused():
     turned = Grid((4, 4, 4), affine=np.array([[0.0, -9, 0, 0], [9, 0, 0, 0], [0, 0, 9, 0], [0, 0, 0, 1]]))
     with pytest.raises(ValueError, match="give a box along the same axes"):

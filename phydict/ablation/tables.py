@@ -53,7 +53,7 @@ def all_tables(entries: Sequence[Entry], empty: Mapping[str, str] = MappingProxy
                                         ["The settings were chosen by these cases' own PSNR."]))
             title += ": all settings"
         tables.append(_method_table(title, group, empty))
-        tables += _difference_tables(title.removesuffix(": all settings"), best)
+        tables += _difference_tables(title.removesuffix(": all settings"), best if len(best) > 1 else group)
     for rest, group in compared_views(entries):
         columns = {k: f"K = {k}" for k in sorted({entry.condition["views"] for entry in group})}
         tables += _axis_tables("against the number of views", rest, group, columns, "views")
@@ -80,7 +80,8 @@ def _method_table(title: str, entries: Sequence[Entry], empty: Mapping[str, str]
 
 
 def _difference_tables(title: str, entries: Sequence[Entry]) -> list[Table]:
-    """What each method has more than the one of highest mean PSNR on the same cases; none without a second one."""
+    """What each method, or setting of the only one, has more than that of highest mean PSNR on the same cases; none
+    without a second one."""
     compared = [entry for entry in entries if entry.cases]
     if len(compared) < 2:
         return []

@@ -36,6 +36,14 @@ def test_each_condition_has_its_table_and_the_best_setting_stands_for_a_method()
     assert tables["PSNR (dB) ↑ against the number of views"].lines[1] == ("x, iterations 3", True, [23.2, 23.8])
 
 
+def test_settings_of_the_only_method_are_compared_case_by_case():
+    rows = [row(case, "x", psnr + n, **{"method.iterations": n}) for n in (1, 3)
+            for case, psnr in (("a", 20.0), ("b", 30.0))]
+    *_, differences = all_tables(summarise(rows))
+    assert differences.title == "Methods, K = 8, ideal: less x, iterations 3, case by case"
+    assert "| x, iterations 1 |" in differences.markdown() and "-2.00 [-2.00, -2.00]" in differences.markdown()
+
+
 def test_a_table_says_what_its_own_rows_rest_on_alone():
     rows = [row("a", "x", 20.0, views=2, protocol="x2ct", warning="odd", threads=1),
             row("a", "y", 21.0, views=2, protocol="x2ct", threads=1),

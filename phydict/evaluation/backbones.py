@@ -6,9 +6,9 @@
                  weights are torchvision's inception_v3_google-0cc3c7bd.pth, not those of the original FID
     squeezenet   SqueezeNet 1.1 as in LPIPS, 512 features, found where torch.hub keeps its files
 
-The features are spatial means of the last map. Slices are normalised as in MAISI's script (compute_fid_2-5d_ct.py), which
-pads them to 512 x 512 as well: HU clipped to [-1000, 1000], the volume's own least and largest value mapped to 0 and 1, so that a wrong HU scale or offset
-is not seen, then less RadImageNet's means of blue, green and red.
+The features are spatial means of the last map. Slices are normalised as in MAISI's script (compute_fid_2-5d_ct.py),
+which pads them to 512 x 512 as well: HU clipped to [-1000, 1000], the volume's own least and largest value mapped to 0
+and 1, so that a wrong HU scale or offset is not seen, then less RadImageNet's means of blue, green and red.
 """
 
 from __future__ import annotations

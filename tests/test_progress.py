@@ -1,12 +1,15 @@
 """What a long run tells: what is done, what remains and for how long, in words or for machines, or nothing."""
 
 import json
+from types import SimpleNamespace
 
 import pytest
 
 from phydict.runtime import progress as module
 from phydict.runtime.progress import CaseProgress, duration
 from phydict.runtime.telling import tell, telling
+from phydict.training import progress as training_progress
+from phydict.training.progress import TrainingProgress
 
 
 @pytest.fixture
@@ -66,6 +69,19 @@ def test_machines_read_null_for_what_is_no_finite_number(capsys):
 
 def test_quiet_tells_nothing(told):
     assert told(quiet=True) == [] == told(quiet=True, json_lines=True)
+
+
+def test_a_long_validation_of_a_training_tells_its_cases(capsys, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(training_progress.time, "monotonic", lambda: now[0])
+    trainer = SimpleNamespace(state=SimpleNamespace(fn="fit"), sanity_checking=False, num_val_batches=[4],
+                              is_global_zero=True)
+    progress = TrainingProgress(interval=10)
+    progress.spoke = 0.0
+    for index in range(4):
+        now[0] += 6
+        progress.on_validation_batch_end(trainer, None, None, None, index)
+    assert capsys.readouterr().err.splitlines() == ["validation: 2 of 4 cases", "validation: 4 of 4 cases"]
 
 
 @pytest.mark.parametrize("seconds, words", [(0.4, "0 s"), (99, "99 s"), (100, "2 min"), (5900, "98 min"),

@@ -17,7 +17,7 @@ BAR_METRICS = ("loss", "val/psnr")
 
 
 class TrainingProgress(lightning.Callback):
-    """Tells the steps that are done and what they log, and of `validate` the cases.
+    """Tells the steps that are done and what they log, and the cases of a validation that takes long.
 
     Args:
         interval: seconds between two lines where the output is no terminal
@@ -57,9 +57,13 @@ class TrainingProgress(lightning.Callback):
         if self.cases:
             self.cases.case(f"case {index + 1}")
             self.cases.finished("measured")
+        elif self._fits(trainer) and time.monotonic() - self.spoke > self.interval:
+            self.spoke, cases = time.monotonic(), sum(trainer.num_val_batches)
+            self._tell(trainer, f"validation: {index + 1} of {cases} cases", event="validation", done=index + 1,
+                       cases=cases)
 
     def on_validation_end(self, trainer, module) -> None:
-        if trainer.state.fn == "fit" and not trainer.sanity_checking:
+        if self._fits(trainer):
             self._line(trainer)
         self._close()
 
@@ -89,6 +93,11 @@ class TrainingProgress(lightning.Callback):
         logged = _logged(trainer)
         self._tell(trainer, f"step {step}{of}{to_go(left or 0)}: {_in_words(logged)}", event="step", step=step,
                    steps=self.total, seconds_to_go=left, **logged)
+
+    @staticmethod
+    def _fits(trainer) -> bool:
+        """Whether a training has begun."""
+        return trainer.state.fn == "fit" and not trainer.sanity_checking
 
     @staticmethod
     def _tell(trainer, text: str, **event) -> None:

@@ -101,7 +101,9 @@ def test_what_is_not_a_number_leaves_the_page_readable(tmp_path):
 def test_the_page_is_made_anew_of_what_older_runs_left(tmp_path, capsys):
     folder = finish(tmp_path, "anna", "sirt", with_page=False)
     main(["page", str(tmp_path)])
-    assert str(tmp_path / PAGE) in capsys.readouterr().out and all((folder / name).is_file() for name in CASE_FILES)
+    told = capsys.readouterr()
+    assert str(tmp_path / PAGE) in told.out and all((folder / name).is_file() for name in CASE_FILES)
+    assert told.err == f"{folder}: making what the page shows of it\n"
     image = nibabel.as_closest_canonical(nibabel.load(folder / "volume.nii.gz"))
     assert (volume_in(folder) == np.rint(image.get_fdata())).all()
     results = CaseResults(folder.parent, overwrite=True)  # the case is still this project's alone

@@ -1,5 +1,5 @@
-"""Whether 256^3 voxels show more than 128^3 ones, and what shows it: phydict_learned from X-rays of 256^3 voxels, scored
-on these.
+"""Whether 256^3 voxels show more than 128^3 ones, and by what: phydict_learned from X-rays of 256^3 voxels, scored on
+these.
 
     python tests/benchmark/finest.py <folder of CTs> [--views 8]
 

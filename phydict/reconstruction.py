@@ -101,11 +101,13 @@ class Reconstructor(ABC):
     full_detector: whether the method wants every pixel, instead of a detector binned to what the grid can hold.
     mu_water: attenuation in 1/mm that water has in the X-rays; between it and HU lies this factor.
     citation: authors, title, venue and DOI or arXiv number of the method's publication.
+    precision: of its networks, where it has some; see phydict.runtime.precision.
     """
 
     name: str = ""
     full_detector = False
     citation = ""
+    precision: str = "auto"
     mu_water: float = MU_WATER
 
     def __post_init__(self):

@@ -76,12 +76,13 @@ def test_a_long_validation_of_a_training_tells_its_cases(capsys, monkeypatch):
     monkeypatch.setattr(training_progress.time, "monotonic", lambda: now[0])
     trainer = SimpleNamespace(state=SimpleNamespace(fn="fit"), sanity_checking=False, num_val_batches=[4],
                               is_global_zero=True)
-    progress = TrainingProgress(interval=10)
-    progress.spoke = 0.0
-    for index in range(4):
-        now[0] += 6
-        progress.on_validation_batch_end(trainer, None, None, None, index)
-    assert capsys.readouterr().err.splitlines() == ["validation: 2 of 4 cases", "validation: 4 of 4 cases"]
+    for bar_is_shown, lines in ((False, ["validation: 2 of 4 cases", "validation: 4 of 4 cases"]), (True, [])):
+        progress = TrainingProgress(interval=10)
+        progress.spoke, progress.bar = now[0], SimpleNamespace(disable=not bar_is_shown)
+        for index in range(4):
+            now[0] += 6
+            progress.on_validation_batch_end(trainer, None, None, None, index)
+        assert capsys.readouterr().err.splitlines() == lines
 
 
 @pytest.mark.parametrize("seconds, words", [(0.4, "0 s"), (99, "99 s"), (100, "2 min"), (5900, "98 min"),

@@ -17,6 +17,7 @@ from phydict.cli.train import main
 from phydict.datasets import CTSource, phantom_case
 from phydict.datasets.phantoms.cached import CachedPhantoms
 from phydict.grid import Cube, Grid
+from phydict.prior import load_prior, save_prior
 from phydict.training import PriorTraining
 from phydict.training.data import PriorData
 from phydict.training.prior import reconstruction_scores
@@ -111,6 +112,17 @@ def test_without_validation_views_nothing_is_reconstructed_or_kept(tmp_path, cac
     main(arguments(tmp_path, cache, "--trainer.max_epochs=1", "--model.validation.views=0"))
     assert "val/psnr" not in next(tmp_path.glob("logs/**/metrics.csv")).read_text()
     assert not (tmp_path / "best.ckpt").exists() and (tmp_path / "last.ckpt").exists()
+
+
+def test_a_prior_of_coarser_voxels_goes_on_at_finer_ones_of_its_box_alone(tmp_path):
+    save_prior(tiny_prior(detail=True), file := str(tmp_path / "coarse.safetensors"))
+    finer = PriorTraining(cube=Cube(24), window=(-1000, 600), initial=file).prior
+    assert finer.grid.same_as(Grid.cube(24)) and finer.bind().denoise(torch.zeros(1, 4, 24, 24, 24), 0.5).any()
+    for name, weight in load_prior(file).state_dict().items():
+        torch.testing.assert_close(finer.state_dict()[name], weight, msg=name)
+    for cube, words in ((Cube(24, 300.0), "has another grid or HU window"), (Cube(22), "sizes divisible by 4")):
+        with pytest.raises(ValueError, match=words):
+            PriorTraining(cube=cube, window=(-1000, 600), initial=file)
 
 
 def test_more_views_reconstruct_a_held_out_case_better():

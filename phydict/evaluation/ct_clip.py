@@ -270,11 +270,11 @@ def image_latent(model: CTCLIP, hu: Tensor, grid: Grid) -> Tensor:
     return model.image(prepared(hu, grid, model.towers).to(model.to_text_latent.weight.device))
 
 
-def clip_scores(model: CTCLIP, hu: Tensor, truth: Tensor, grid: Grid, report: str = "") -> dict[str, float]:
+def clip_scores(model: CTCLIP, hu: Tensor, true_latent: Tensor, grid: Grid, report: str = "") -> dict[str, float]:
     """{"clip_i2i": and, with a report and a text tower, "clip_t2i"} in percent: 100 max(cos, 0) of the latents of the
-    volume (X, Y, Z) in HU and of the truth, `truth` being that latent, and of the report."""
+    volume (X, Y, Z) in HU and of the truth, which is given, and of the report."""
     image = image_latent(model, hu, grid)
-    scores = {"clip_i2i": 100 * max(float((image * truth).sum()), 0.0)}
+    scores = {"clip_i2i": 100 * max(float((image * true_latent).sum()), 0.0)}
     if report and model.text_transformer is not None:
         scores["clip_t2i"] = 100 * max(float((image * model.text(report)).sum()), 0.0)
     return scores

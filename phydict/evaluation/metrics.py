@@ -95,7 +95,7 @@ def ssim_window(shape: Sequence[int]) -> tuple[list[int], list[float]]:
 
 def body_weights(true_hu: Tensor, spacing: Sequence[float]) -> Tensor:
     """The body of a CT (1, 1, X, Y, Z) in HU at `spacing` mm, without couch and air, as `volume_metrics` takes it."""
-    return torch.from_numpy(body_mask(true_hu[0, 0].cpu().numpy(), spacing))[None, None].float()
+    return torch.from_numpy(body_mask(true_hu[0, 0].float().cpu().numpy(), spacing))[None, None].float()
 
 
 def volume_metrics(hu: Tensor, true_hu: Tensor, lung: Tensor | None = None, body: Tensor | None = None,

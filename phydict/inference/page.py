@@ -65,7 +65,8 @@ def _case(folder: Path, path: Path) -> PageCase | None:
         score_row(record["case"], record | {"scores": record["scores"] or {}})
         float(record["misfit"]), list(record["misfit_per_view"])
         if missing := [name for name in CASE_FILES if not (path / name).is_file()]:
-            tell(f"{path}: making what the page shows of it", event="case", case=record["case"], folder=str(path))
+            tell(f"{path}: making what the page shows of it", event="page",
+                 case=record["case"], folder=str(path))
             _make_case_files(path, missing)
     except Exception as error:  # whatever a damaged record or volume leads to
         warn(f"{path} is left out of the page, since its files are damaged ({type(error).__name__}: {error})")

@@ -54,15 +54,22 @@ class Prior(nn.Module):
                  schedule: CosineSchedule = CosineSchedule(), sigma_data: float = 0.5, skip_std: float = 0.1,
                  load_text: Callable[[], TextEncoder] | None = None, detail: DetailNetwork | None = None):
         super().__init__()
-        if any(n % network.divisor for n in grid.shape):
-            raise ValueError(f"this network needs sizes divisible by {network.divisor}, but the grid is {grid.shape}")
         if text is not None and text.width != network.context_dim:
             raise ValueError(f"this text encoder's tokens have width {text.width}, but the network's context_dim is "
                              f"{network.context_dim}: build the network with context_dim {text.width}")
         self.network, self.detail, self.text, self.load_text = network, detail, text, load_text
-        self.grid, self.window, self.schedule, self.sigma_data = grid, window, schedule, sigma_data
+        self.work_on(grid)
+        self.window, self.schedule, self.sigma_data = window, schedule, sigma_data
         self.skip_std, self.unheard = skip_std, ""
         self.null = nn.Parameter(0.02 * torch.randn(1, 1, network.context_dim))
+
+    def work_on(self, grid: Grid) -> None:
+        """Takes the voxels of `grid`, none of which its weights are bound to. Raises ValueError for sizes that the
+        network cannot halve."""
+        if any(n % self.network.divisor for n in grid.shape):
+            raise ValueError(f"this network needs sizes divisible by {self.network.divisor}, but the grid is "
+                             f"{grid.shape}")
+        self.grid = grid
 
     def context(self, reports: Sequence[str]) -> Tensor:
         """Reports -> contexts (B, L, D); the learned null token stands for padding and for a report left empty.

@@ -110,6 +110,11 @@ class XrayToCTPANetwork(RivalNetwork):
         slices = (latent * self.largest).permute(0, 4, 1, 2, 3)
         return self.autoencoder.decode(slices.flatten(0, 1)).unflatten(0, slices.shape[:2]).permute(0, 2, 3, 4, 1)
 
+    @property
+    def knows_xrays(self) -> bool:
+        """Whether the diffusion has learnt anything: its last layer begins at zero."""
+        return bool(self.denoiser.leave.weight.any())
+
     def forward(self, x: Tensor, t: Tensor, y: Tensor, directions: Tensor) -> Tensor:
         """The noise in scaled latents x (B, 4, X', Y', Z) at times t (B,), given the X-rays y."""
         return self.denoiser(x, t, self.encoder(y, directions))
@@ -119,7 +124,7 @@ class XrayToCTPANetwork(RivalNetwork):
 
     def reconstruct(self, y: Tensor, geometry: Geometry, generator: torch.Generator,
                     on_step: Callable[[], None] = lambda: None) -> Tensor:
-        if not bool(self.denoiser.leave.weight.any()):
+        if not self.knows_xrays:
             raise ValueError("this X-ray2CTPA network has learnt its autoencoder alone, nothing of X-rays: train it on "
                              "with model.initial, its file, and model.latent.autoencoder_steps 0")
         directions, latent = geometry

@@ -30,6 +30,7 @@ from phydict.training.stage import check_continues
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Ideal, Projector
 from phydict.xray.binning import benchmark_orbit
+from phydict.xray.boxes import in_other_voxels
 
 SENTENCES, VOCABULARY_SIZE = 20_000, 5000
 SENTENCE_LENGTH, MOST_SENTENCES = 64, 64
@@ -48,8 +49,9 @@ class PriorTraining(DenoisingTraining):
         optimisation: how the weights are learnt
         validation: what validation shows and measures
         execution: how the network is run
-        initial: a prior's file to start from, which then decides the networks and the text; one without a detail
-            network is given this training's
+        initial: a prior's file to start from, which then decides the networks and the text, and may be of other voxels
+            over the same box, such as coarser ones that it learnt from first; one without a detail network is given
+            this training's
         seed: of times, noise and text dropout
     """
 
@@ -153,11 +155,14 @@ class PriorTraining(DenoisingTraining):
 
 
 def _loaded(path: str, requested: Prior) -> Prior:
-    """The prior in a file, to be trained; one without a detail network is given that of `requested`."""
+    """The prior in a file, to be trained on the voxels of `requested`, whose detail network it is given where it has
+    none."""
     prior = load_prior(path)
     if not isinstance(prior, Prior):
         raise ValueError(f"training starts from priors of phydict's own, but {path} is MedSyn's: leave out "
                          "model.initial")
+    if prior.grid.same_as(in_other_voxels(requested.grid, prior.grid.shape)):
+        prior.work_on(requested.grid)
     check_continues("prior", path, prior, requested.grid, requested.window)
     if prior.load_text is not None:
         prior.text, prior.load_text = prior.load_text(), None

@@ -57,7 +57,7 @@ class TrainingProgress(lightning.Callback):
         if self.cases:
             self.cases.case(f"case {index + 1}")
             self.cases.finished("measured")
-        elif self._fits(trainer) and time.monotonic() - self.spoke > self.interval:
+        elif self._fits(trainer) and self.bar.disable and time.monotonic() - self.spoke > self.interval:
             self.spoke, cases = time.monotonic(), sum(trainer.num_val_batches)
             self._tell(trainer, f"validation: {index + 1} of {cases} cases", event="validation", done=index + 1,
                        cases=cases)

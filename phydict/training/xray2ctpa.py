@@ -26,7 +26,7 @@ FORGOTTEN = 0.01
 """By which share a new case moves the size of the latents."""
 
 SETTLING = 100
-"""Steps of the diffusion, from its first on, in which larger latents still raise their size."""
+"""Steps of a new diffusion, from its first on, in which larger latents still raise their size."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,11 @@ class XrayToCTPATraining(RivalTraining):
                 _load_own(getattr(network, part), file, f"model.latent.{part}")
         made = Rival(network, grid, HUWindow(*window), bound_orbit(grid, scenes.views, scenes.arc_degrees))
         super().__init__(made, scenes, (scenes.views,), optimisation, initial, seed)
-        self.latent = latent
+        self.latent, self.settles = latent, not (self.network.knows_xrays and self.network.largest)
+
+    @property
+    def network(self) -> XrayToCTPANetwork:
+        return cast(XrayToCTPANetwork, self.prior.network)
 
     @property
     def learns_slices(self) -> bool:
@@ -94,10 +98,10 @@ class XrayToCTPATraining(RivalTraining):
     def case_loss(self, ct: Tensor, water: Tensor, beam: ConeBeam, generator: torch.Generator) -> Tensor:
         if self.learns_slices:
             return self._slices_loss(ct, generator)
-        network, y = cast(XrayToCTPANetwork, self.prior.network), water / WATER_MM
+        network, y = self.network, water / WATER_MM
         with torch.no_grad():
             latent = network.latent(ct).float()
-            if self.global_step - self.latent.autoencoder_steps < SETTLING:
+            if self.settles and self.global_step - self.latent.autoencoder_steps < SETTLING:
                 network.largest.copy_(torch.maximum(network.largest, latent.abs().max()))
             x0 = (latent / network.largest).clamp(-1, 1)
         noise, t = noise_like(x0, generator), torch.rand(1, generator=generator).to(x0)
@@ -106,7 +110,7 @@ class XrayToCTPATraining(RivalTraining):
         return l1_loss(network(signal * x0 + sigma * noise, t, y, directions).float(), noise)
 
     def _slices_loss(self, ct: Tensor, generator: torch.Generator) -> Tensor:
-        network = cast(XrayToCTPANetwork, self.prior.network)
+        network = self.network
         chosen = torch.randperm(ct.shape[-1], generator=generator)[:self.latent.slices]
         slices = ct[0, :, :, :, chosen.to(ct.device)].permute(3, 0, 1, 2)
         mean, std = (part.float() for part in network.autoencoder.encode(slices))
@@ -118,7 +122,7 @@ class XrayToCTPATraining(RivalTraining):
         return l1_loss(again.float(), slices) + self.latent.kl_weight * divergence
 
     def validation_step(self, batch: dict, index: int) -> None:
-        if self.global_step > self.latent.autoencoder_steps:  # the diffusion has learnt something
+        if self.network.knows_xrays:
             super().validation_step(batch, index)
 
 

@@ -92,7 +92,7 @@ def refinements(start: Grid, target: Grid) -> list[Grid]:
     most = [math.ceil(side - SLACK) for side in np.multiply(target.shape, target.spacing) / start.spacing]
     shapes = [[min(n, max(math.ceil(n / 2**k), m)) for n, m in zip(target.shape, most)]
               for k in range(halvings - 1, 0, -1)]
-    return [in_other_voxels(target, shape) for shape in shapes] + [target]
+    return [in_other_voxels(target, shape) for shape in shapes if shape != [*target.shape]] + [target]
 
 
 def in_other_voxels(grid: Grid, shape: Sequence[int]) -> Grid:

@@ -36,7 +36,7 @@ def rows_of(ct, views: int) -> list[dict]:
     refiner = load_prior(DEFAULT_REFINER)
     coarse, window = reconstructor("phydict_learned", refiner), refiner.window
     finest = onto_grid(coarse, FINEST)
-    methods = onto_grid(coarse, Grid.cube(128)), replace(finest, refinement=Refinement(calls=0)), finest
+    methods = onto_grid(coarse, Grid.cube(128)), replace(finest, network=None, refinement=Refinement(calls=0)), finest
     volume, beam = prepare_ct(ct.path, FINEST, window, id=ct.id)["volume"][None], benchmark_orbit(FINEST, views)
     truth, rows = window.to_hu(volume), []
     body = body_weights(truth, FINEST.spacing)

@@ -16,7 +16,7 @@ from torch.nn.functional import avg_pool3d
 
 from phydict import Projector, load_prior
 from phydict.datasets import find_cts, prepare_ct
-from phydict.evaluation import read_csv, volume_metrics, write_csv
+from phydict.evaluation import body_weights, read_csv, volume_metrics, write_csv
 from phydict.grid import Grid
 from phydict.methods import fit_to_grid, onto_grid, reconstructor
 from phydict.prior import DEFAULT_REFINER
@@ -35,6 +35,8 @@ def rows_of(ct, views: int) -> list[dict]:
     window, beam = refiner.window, benchmark_orbit(SCENE, views)
     volume, rows = prepare_ct(ct.path, SCENE, window, id=ct.id)["volume"][None], []
     truth = interpolated(window.to_hu(avg_pool3d(volume, 2))[0, 0], WHOLE, BOX, AIR)[None, None]
+    body = body_weights(window.to_hu(avg_pool3d(volume, 2)), WHOLE.spacing)[0, 0]
+    body = interpolated(body, WHOLE, BOX, 0.0)[None, None]
     xrays = Ideal()(Projector(SCENE, beam, full_detector=True), window.to_mu(volume), case_seed(0, ct.id))[0]
     for name in ("phydict_learned", "tv"):
         for where, grid in (("box", BOX), ("whole", WHOLE)):
@@ -44,7 +46,7 @@ def rows_of(ct, views: int) -> list[dict]:
             spent = time.process_time() - began
             shown = interpolated(found.volume, grid, BOX, AIR)[None, None]
             rows.append({"case": ct.id, "views": views, "method": name, "reconstructed": where, "cpu_seconds": spent}
-                        | volume_metrics(shown, truth))
+                        | volume_metrics(shown, truth, body=body))
             print(*rows[-1].values(), flush=True)
     return rows
 

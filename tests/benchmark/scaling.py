@@ -2,8 +2,8 @@
 
     python tests/benchmark/scaling.py <name>=<the training's metrics.csv>[+<samples seen before it>] ...
 
-Writes scaling.csv and scaling.png beside this file, where other trainings' rows stay: RMSE of the CT in HU and the PSNR
-of phydict_fast as validation logged them, on logarithmic axes, where a power law is a straight line.
+Writes scaling.csv beside this file, where other trainings' rows stay: RMSE of the CT in HU and the PSNR of phydict_fast
+as validation logged them; and of the former scaling.png, on logarithmic axes, where a power law is a straight line.
 """
 
 import argparse

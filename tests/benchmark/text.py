@@ -30,6 +30,9 @@ from phydict.prior import DEFAULT_PRIOR, Prior
 from phydict.xray import Ideal
 from phydict.xray.binning import benchmark_orbit
 
+HELD_OUT = HELD_OUT_PHANTOM + 1000
+"""The first seed of the phantoms that are compared."""
+
 REPORTS = ("right report", "none", "wrong side")
 
 NORMAL = "The lungs are clear. No pleural effusion or pneumothorax. Heart size is normal. No nodules or masses."
@@ -112,10 +115,12 @@ if __name__ == "__main__":
     parser.add_argument("--views", type=int, nargs="+", default=[1, 2, 4])
     parser.add_argument("--guidance", type=float, default=1.0)
     parser.add_argument("--first_views", type=int)
-    parser.add_argument("--first_seed", type=int, default=HELD_OUT_PHANTOM + 1000, help="of the phantoms")
+    parser.add_argument("--first_seed", type=int, default=HELD_OUT, help="of the phantoms")
     parser.add_argument("--cts", type=Path)
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
+    if given.first_seed != HELD_OUT and not given.out:
+        parser.error("rows of other phantoms do not belong into text.csv: give --out")
     out = given.out or Path(__file__).with_name("text_cts.csv" if given.cts else "text.csv")
     method, suffix = None, ""
     if given.first_views is not None:

@@ -6,14 +6,14 @@ from safetensors.torch import save_file
 
 from phydict.grid import Cube, Grid
 from phydict.methods import reconstruct
-from phydict.rivals import Rival, RivalAnswer, XrayToCTPANetwork
+from phydict.rivals import Rival, RivalAnswer, XrayToCTPANetwork, save_rival
 from phydict.rivals.rival import WATER_MM, bound_orbit
 from phydict.rivals.slice_unet import StackAttention, waves
 from phydict.training.rivals import OrbitScenes
 from phydict.training.xray2ctpa import LatentSettings, XrayToCTPATraining
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import Projector
-from rivals.tiny_rivals import GRID, body, lively, tiny_xray2ctpa
+from rivals.tiny_rivals import GRID, WINDOW, body, lively, tiny_xray2ctpa
 
 BEAM = bound_orbit(GRID, 2)
 
@@ -90,6 +90,19 @@ def test_the_size_of_latents_is_that_of_the_largest_of_the_first_cases(autoencod
         sizes.append(float(network.largest))
     with torch.no_grad():
         assert sizes[0] < sizes[1] == sizes[2] == pytest.approx(float(network.latent(body()).abs().max()), rel=1e-5)
+
+
+def test_a_trained_diffusion_keeps_the_size_of_its_latents_and_is_validated_from_its_file(tmp_path):
+    save_rival(tiny_xray2ctpa(), file := str(tmp_path / "rival.safetensors"))
+    scenes, window = OrbitScenes(views=2), (WINDOW.low, WINDOW.high)
+    went_on = XrayToCTPATraining(scenes=scenes, cube=Cube(16), window=window, latent=LatentSettings(0), initial=file)
+    went_on.case_loss(body(), water(), BEAM, torch.Generator().manual_seed(0))
+    assert float(went_on.prior.network.largest) == 1.0
+    logged = []
+    went_on.log = lambda name, *_, **__: logged.append(name)
+    went_on.validation_number = lambda index: index
+    went_on.validation_step({"volume": body()}, 0)
+    assert "val/psnr" in logged
 
 
 def test_what_has_learnt_nothing_of_xrays_or_of_slices_is_refused(tmp_path):

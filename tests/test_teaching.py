@@ -40,7 +40,7 @@ def test_training_goes_on_from_a_prior_and_refuses_one_of_another_grid(tmp_path)
     task = PriorTraining(initial=str(path), cube=Cube(16), window=(-1000, 600), text=TextSettings(frozen=False))
     assert all(w.requires_grad for w in task.prior.parameters())
     with pytest.raises(ValueError, match="another grid"):
-        PriorTraining(initial=str(path), cube=Cube(32), window=(-1000, 600), text=TextSettings("none"))
+        PriorTraining(initial=str(path), cube=Cube(32, 300.0), window=(-1000, 600), text=TextSettings("none"))
 
 
 def test_text_that_is_kept_is_taught_first_and_not_moved_by_denoising(cache):

@@ -43,7 +43,7 @@ def test_a_log_file_tells_steps_in_whole_lines_and_nothing_of_lightnings(tmp_pat
     said = (done.out + done.err).splitlines()
     for last in ("step 3 of 3: loss ", "step 6 of 6: loss "):
         assert any(line.startswith(last) and "samples_per_s" in line for line in said), said
-    known = ("step ", "training", "report ", "sentences: ", "Seed")
+    known = ("step ", "training", "validation: ", "report ", "sentences: ", "Seed")
     assert all(line.startswith(known) for line in said), said
 
 

@@ -33,7 +33,7 @@ from phydict.posterior.measurement import Measurement
 from phydict.runtime.profiling import Stopwatch
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import ConeBeam, Projector, binned, binning
-from phydict.xray.boxes import in_other_voxels
+from phydict.xray.boxes import halved
 from phydict.xray.calibration import match_views
 from phydict.xray.checks import check_xrays
 from phydict.xray.poses.gauge import aligned, reprojection_errors
@@ -138,11 +138,6 @@ def stated_shift(beam: ConeBeam, uncertain: Uncertain, points: np.ndarray) -> np
     each = [reprojection_errors(moved(beam, np.tile(unknown, (beam.views, 1))), beam, points)
             for unknown in np.diag(uncertain.poses)]
     return np.sqrt(np.square(each).sum(0))
-
-
-def halved(grid: Grid) -> Grid:
-    """The same box in half as many voxels along each side."""
-    return in_other_voxels(grid, [max(1, n // 2) for n in grid.shape])
 
 
 def middle_points(grid: Grid) -> np.ndarray:

@@ -12,8 +12,9 @@ from phydict.grid import Grid
 from phydict.prior.convolution import silence, speed_up
 from phydict.prior.unet import check_sizes
 from phydict.rivals.network import Geometry, RivalNetwork
-from phydict.rivals.sampling import all_places, halved, pooled, seen
+from phydict.rivals.sampling import all_places, pooled, seen
 from phydict.xray import ConeBeam
+from phydict.xray.boxes import halved
 
 
 class ResidualBlock(nn.Module):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
@@ -13,15 +12,6 @@ from phydict.xray.places import detector_places
 
 HIDDEN = -1e4
 """What the maximum over views starts from, below any feature."""
-
-
-def halved(grid: Grid) -> Grid:
-    """The box in blocks of two voxels a side, each where its block's centre is."""
-    affine = grid.affine.copy()
-    affine[:3, 3] += grid.affine[:3, :3] @ np.full(3, 0.5)
-    affine[:3, :3] *= 2
-    x, y, z = (n // 2 for n in grid.shape)
-    return Grid((x, y, z), affine=affine)
 
 
 def all_places(grid: Grid, beam: ConeBeam, like: Tensor) -> Tensor:

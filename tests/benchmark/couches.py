@@ -4,7 +4,7 @@
                                       [--methods tv phydict_fast phydict_learned]
 
 Ideal X-rays of draws of each CT: turned, shifted and bent, on another couch, at times with covers, leads and arms or a
-scan that is cut (`held_out.CHANGES`). Writes couches.csv beside this file, where rows of other methods and numbers of
+scan that is cut (`held_out.scenes`). Writes couches.csv beside this file, where rows of other methods and numbers of
 views stay, and prints each method's means and its least lead over the first one.
 """
 
@@ -13,34 +13,23 @@ from itertools import product
 from pathlib import Path
 from statistics import mean
 
-from held_out import CHANGES
+from held_out import scenes
 
-from phydict import Projector, load_prior, reconstruct
-from phydict.datasets import augment, find_cts, prepare_ct
-from phydict.evaluation import body_weights, read_csv, volume_metrics, write_csv
+from phydict import load_prior, reconstruct
+from phydict.datasets import find_cts
+from phydict.evaluation import read_csv, write_csv
 from phydict.prior import DEFAULT_PRIOR
-from phydict.xray import Ideal
-from phydict.xray.binning import benchmark_orbit
 
 FILE = Path(__file__).with_suffix(".csv")
 
 
 def rows_of(ct, methods: list[str], views: list[int], draws: int) -> list[dict]:
-    prior, rows = load_prior(DEFAULT_PRIOR), []
-    grid, window = prior.grid, prior.window
-    plain = prepare_ct(ct.path, grid, window, id=ct.id)
-    for draw in range(1, draws + 1):
-        volume = augment(plain, draw, grid, window, CHANGES)["volume"][None]
-        truth = window.to_hu(volume)
-        body = body_weights(truth, grid.spacing)
-        for k in views:
-            beam = benchmark_orbit(grid, k)
-            xrays = Ideal()(Projector(grid, beam, full_detector=True), window.to_mu(volume), draw)[0]
-            for method in methods:
-                found = reconstruct(xrays, beam, method=method, grid=grid)
-                rows.append({"case": ct.id, "draw": draw, "views": k, "method": method}
-                            | volume_metrics(found.volume[None, None], truth, body=body))
-                print(*rows[-1].values(), flush=True)
+    prior, rows = load_prior(DEFAULT_PRIOR), list[dict]()
+    for scene, xrays, beam, scores in scenes(ct, prior, views, range(1, draws + 1)):
+        for method in methods:
+            found = reconstruct(xrays, beam, method=method, grid=prior.grid)
+            rows.append(scene | {"method": method} | scores(found.volume))
+            print(*rows[-1].values(), flush=True)
     return rows
 
 

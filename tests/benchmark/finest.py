@@ -10,17 +10,19 @@ numbers of views stay, and prints means and the least lead of the last over the 
 
 import argparse
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from statistics import mean
 
-from phydict import Projector, load_prior
-from phydict.datasets import find_cts, prepare_ct
+from torch import Tensor
+
+from phydict import ConeBeam, HUWindow, Projector
+from phydict.datasets import CTFile, find_cts, prepare_ct
 from phydict.evaluation import body_weights, read_csv, volume_metrics, write_csv
 from phydict.grid import Grid
 from phydict.methods import fit_to_grid, onto_grid, reconstructor
 from phydict.posterior import Refinement
-from phydict.prior import DEFAULT_REFINER
 from phydict.runtime.seeds import case_seed
 from phydict.units import AIR
 from phydict.xray import Ideal
@@ -28,27 +30,51 @@ from phydict.xray.binning import benchmark_orbit
 from phydict.xray.boxes import interpolated
 
 FILE = Path(__file__).with_suffix(".csv")
-FINEST = Grid.cube(256)
+FINEST, WINDOW = Grid.cube(256), HUWindow()
 WAYS = ("128^3, interpolated", "64^3, X-rays and total variation", "256^3")
 
 
 def rows_of(ct, views: int) -> list[dict]:
-    refiner = load_prior(DEFAULT_REFINER)
-    coarse, window = reconstructor("phydict_learned", refiner), refiner.window
+    coarse = reconstructor("phydict_learned")
     finest = onto_grid(coarse, FINEST)
-    methods = onto_grid(coarse, Grid.cube(128)), replace(finest, network=None, refinement=Refinement(calls=0)), finest
-    volume, beam = prepare_ct(ct.path, FINEST, window, id=ct.id)["volume"][None], benchmark_orbit(FINEST, views)
-    truth, rows = window.to_hu(volume), []
+    methods = (onto_grid(coarse, Grid.cube(128)),
+               replace(finest, network=None, refinement=Refinement(calls=0)), finest)
+    volume, xrays, beam = scene(ct, views)
+    truth, rows = WINDOW.to_hu(volume), []
     body = body_weights(truth, FINEST.spacing)
-    xrays = Ideal()(Projector(FINEST, beam, full_detector=True), window.to_mu(volume), case_seed(0, ct.id))[0]
     for way, method in zip(WAYS, methods):
-        began = time.process_time()
-        found = method.reconstruct(*fit_to_grid(method, method.grid, xrays, beam))
-        spent = time.process_time() - began
-        shown = interpolated(found.volume, found.grid, FINEST, AIR)[None, None]
-        rows.append({"case": ct.id, "views": views, "way": way, "cpu_seconds": spent}
+        shown, seconds = timed(method, method.grid, FINEST, xrays, beam)
+        rows.append({"case": ct.id, "views": views, "way": way, "cpu_seconds": seconds}
                     | volume_metrics(shown, truth, body=body))
         print(*rows[-1].values(), flush=True)
+    return rows
+
+
+def scene(ct, views: int) -> tuple[Tensor, Tensor, ConeBeam]:
+    """A CT (1, 1, X, Y, Z) in [-1, 1] on FINEST, its X-rays, and their beam."""
+    volume, beam = prepare_ct(ct.path, FINEST, WINDOW, id=ct.id)["volume"][None], benchmark_orbit(FINEST, views)
+    projector = Projector(FINEST, beam, full_detector=True)
+    return volume, Ideal()(projector, WINDOW.to_mu(volume), case_seed(0, ct.id))[0], beam
+
+
+def timed(method, grid: Grid, onto: Grid, xrays: Tensor, beam: ConeBeam) -> tuple[Tensor, float]:
+    """What a method reconstructs on `grid`, shown on the voxels of `onto` (1, 1, X, Y, Z), and its CPU seconds."""
+    began = time.process_time()
+    found = method.reconstruct(*fit_to_grid(method, grid, xrays, beam))
+    spent = time.process_time() - began
+    return interpolated(found.volume, grid, onto, AIR)[None, None], spent
+
+
+def main(doc: str, file: Path, rows_of: Callable[[CTFile, int], list[dict]]) -> list[dict]:
+    """The rows of each CT of a folder, from the number of views that is asked for; writes them into a CSV beside those
+    of others."""
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("cts", type=Path)
+    parser.add_argument("--views", type=int, default=8)
+    given = parser.parse_args()
+    kept = [row for row in read_csv(file) if row["views"] != given.views]
+    rows = [row for ct in find_cts(given.cts) for row in rows_of(ct, given.views)]
+    write_csv(file, kept + rows)
     return rows
 
 
@@ -63,11 +89,4 @@ def table(rows: list[dict]) -> str:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("cts", type=Path)
-    parser.add_argument("--views", type=int, default=8)
-    given = parser.parse_args()
-    kept = [row for row in read_csv(FILE) if row["views"] != given.views]
-    rows = [row for ct in find_cts(given.cts) for row in rows_of(ct, given.views)]
-    write_csv(FILE, kept + rows)
-    print(table(rows))
+    print(table(main(__doc__, FILE, rows_of)))

@@ -10,11 +10,15 @@ PSNR from the first weights, over all voxels and in the body, with their standar
 """
 
 import argparse
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from itertools import product
 from pathlib import Path
 from statistics import mean, stdev
 
-from phydict import Projector, load_prior, reconstruct
+from torch import Tensor
+
+from phydict import ConeBeam, Projector, load_prior, reconstruct
 from phydict.datasets import Augmentation, Surroundings, augment, find_cts, prepare_ct
 from phydict.evaluation import body_weights, read_csv, volume_metrics, write_csv
 from phydict.xray import Ideal
@@ -25,22 +29,28 @@ CHANGES = Augmentation(girth=0.0, surroundings=Surroundings(table=1.0, couch=1.0
 """Of each changed CT: its couch is always another."""
 
 
-def rows_of(ct, weights: dict, method: str, views: list[int], changed: int) -> list[dict]:
-    first = next(iter(weights.values()))
-    grid, window, rows = first.grid, first.window, []
+def scenes(ct, prior, views: list[int], draws: Iterable[int]) -> Iterator[tuple[dict, Tensor, ConeBeam, Callable]]:
+    """Of each draw of a CT, 0 as it is, and each number of views: these, the X-rays, their beam, and what scores a
+    volume (X, Y, Z) in HU."""
+    grid, window = prior.grid, prior.window
     plain = prepare_ct(ct.path, grid, window, id=ct.id)
-    for draw in range(changed + 1):
-        case = augment(plain, draw, grid, window, CHANGES) if draw else plain
-        truth = window.to_hu(case["volume"])[None]
-        body = body_weights(truth, grid.spacing)
+    for draw in draws:
+        volume = (augment(plain, draw, grid, window, CHANGES) if draw else plain)["volume"][None]
+        truth = window.to_hu(volume)
+        scores = partial(volume_metrics, true_hu=truth, body=body_weights(truth, grid.spacing))
         for k in views:
             beam = benchmark_orbit(grid, k)
-            xrays = Ideal()(Projector(grid, beam, full_detector=True), window.to_mu(case["volume"])[None], draw)[0]
-            for name, prior in weights.items():
-                found = reconstruct(xrays, beam, prior, method)
-                rows.append({"weights": name, "case": ct.id, "method": method, "views": k, "draw": draw}
-                            | volume_metrics(found.volume[None, None], truth, body=body))
-                print(*rows[-1].values(), flush=True)
+            xrays = Ideal()(Projector(grid, beam, full_detector=True), window.to_mu(volume), draw)[0]
+            yield {"case": ct.id, "views": k, "draw": draw}, xrays, beam, lambda hu: scores(hu[None, None])
+
+
+def rows_of(ct, weights: dict, method: str, views: list[int], changed: int) -> list[dict]:
+    rows: list[dict] = []
+    for scene, xrays, beam, scores in scenes(ct, next(iter(weights.values())), views, range(changed + 1)):
+        for name, prior in weights.items():
+            found = reconstruct(xrays, beam, prior, method)
+            rows.append({"weights": name, "method": method} | scene | scores(found.volume))
+            print(*rows[-1].values(), flush=True)
     return rows
 
 

@@ -108,12 +108,12 @@ if __name__ == "__main__":
         held_out = list(data.validation)
         for name, samples, volume in ways(data, given.seconds):
             for case in held_out:
-                ct = case["volume"][None]
+                ct, truth = case["volume"][None], data.window.to_hu(case["volume"][None])
+                body = body_weights(truth, data.grid.spacing)
                 for views in VIEWS:
                     beam = benchmark_orbit(data.grid, views)
                     y = Ideal()(Projector(data.grid, beam, full_detector=True), data.window.to_mu(ct), 0)[0]
-                    scores = volume_metrics(volume(y, beam)[None, None], data.window.to_hu(ct),
-                                            body=body_weights(data.window.to_hu(ct), data.grid.spacing))
+                    scores = volume_metrics(volume(y, beam)[None, None], truth, body=body)
                     rows.append({"case": case["id"], "method": name, "views": views, "samples": samples,
                                  "seconds_of_training": given.seconds * (samples > 0)} | scores)
             write_csv(Path(__file__).with_suffix(".csv"), rows)

@@ -32,13 +32,13 @@ def scored(refiner: phydict.prior.Refiner, core_hours: float, folder: Path, view
     for ct in find_cts(folder):
         volume = prepare_ct(ct.path, refiner.grid, refiner.window, id=ct.id)["volume"][None]
         truth = refiner.window.to_hu(volume)
+        body = body_weights(truth, refiner.grid.spacing)
         for number in views:
             projector = Projector(refiner.grid, benchmark_orbit(refiner.grid, number), full_detector=True)
             xrays = Ideal()(projector, refiner.window.to_mu(volume), 0)[0]
             found = phydict.reconstruct(xrays, projector.beam, refiner, METHOD, grid=refiner.grid)
             rows.append({"case": ct.id, "core_hours": core_hours, "views": number}
-                        | volume_metrics(found.volume[None, None], truth,
-                                         body=body_weights(truth, refiner.grid.spacing)))
+                        | volume_metrics(found.volume[None, None], truth, body=body))
     return rows
 
 

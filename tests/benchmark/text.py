@@ -79,13 +79,12 @@ def spared(name: str, prior: Prior, folder: Path, views: int) -> list[dict]:
     projector = phydict.Projector(prior.grid, beam, full_detector=True)
     for ct in find_cts(folder):
         case = prepare_ct(ct.path, prior.grid, prior.window, id=ct.id)["volume"][None]
-        xrays = Ideal()(projector, prior.window.to_mu(case), 0)[0]
+        xrays, truth = Ideal()(projector, prior.window.to_mu(case), 0)[0], prior.window.to_hu(case)
+        body = body_weights(truth, prior.grid.spacing)
         for kind, text in (("none", ""), ("normal", NORMAL)):
             result = phydict.reconstruct(xrays, beam, prior, report=text, seed=0, grid=prior.grid)
-            truth = prior.window.to_hu(case)
             rows.append({"prior": name, "case": ct.id, "method": kind, "views": views}
-                        | volume_metrics(result.volume[None, None], truth,
-                                         body=body_weights(truth, prior.grid.spacing)))
+                        | volume_metrics(result.volume[None, None], truth, body=body))
             print(f"{ct.id}, K = {views}, {kind}: {rows[-1]['psnr']:.2f} dB", flush=True)
     return rows
 
@@ -129,8 +128,8 @@ if __name__ == "__main__":
     for file in given.priors:
         prior, name = phydict.load_prior(file), file.stem + suffix
         cases = [] if given.cts else one_sided(given.phantoms, prior.grid, given.first_seed)
+        guidance = 1.0 if given.cts else given.guidance
         for views in given.views:
-            guidance = 1.0 if given.cts else given.guidance
             if given.cts:
                 found = spared(name, prior, given.cts, views)
             else:

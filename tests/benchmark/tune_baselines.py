@@ -54,18 +54,19 @@ def best(rows: list[dict]) -> dict[str, str]:
 def tune(ct: CTFile, rows: list[dict]) -> None:
     """Adds to `rows` what is missing of one CT."""
     done = {(row["case"], row["views"], row["settings"]) for row in rows}
-    truth = prepare_ct(ct.path, GRID, WINDOW, id=ct.id)["volume"][None]
+    volume = prepare_ct(ct.path, GRID, WINDOW, id=ct.id)["volume"][None]
+    truth = WINDOW.to_hu(volume)
+    body = body_weights(truth, GRID.spacing)
     for views in VIEWS:
         beam = ConeBeam.orbit(views, 1020, 740, (448, 448), 1.25)
         exact = Projector(GRID, beam, full_detector=True)
-        xrays = Ideal()(exact, WINDOW.to_mu(truth), zlib.crc32(f"0/{ct.id}".encode()))[0]
+        xrays = Ideal()(exact, WINDOW.to_mu(volume), zlib.crc32(f"0/{ct.id}".encode()))[0]
         for name, methods in SETTINGS.items():
             for method in methods:
                 if (ct.id, views, text(method)) in done:
                     continue
                 result = method.reconstruct(*fit_to_grid(method, GRID, xrays, beam))
-                scores = volume_metrics(result.volume[None, None], WINDOW.to_hu(truth),
-                                        body=body_weights(WINDOW.to_hu(truth), GRID.spacing))
+                scores = volume_metrics(result.volume[None, None], truth, body=body)
                 rows.append({"case": ct.id, "method": name, "views": views, "settings": text(method), **scores,
                              "misfit": result.misfit, "projector_calls": result.projector_calls})
                 print(ct.id, views, name, text(method), f"{scores['psnr']:.2f} dB", flush=True)

@@ -11,7 +11,7 @@ from phydict.datasets import Thorax, build
 from phydict.grid import Grid
 from phydict.poses import find_poses
 from phydict.poses.blind import BlindMeasurement
-from phydict.poses.search import PoseSearch, Views, halved, middle_points
+from phydict.poses.search import PoseSearch, Views, middle_points
 from phydict.posterior import Measurement
 from phydict.units import HUWindow, hu_to_mu
 from phydict.xray import ConeBeam, Projector
@@ -64,12 +64,6 @@ def test_a_blind_measurement_has_an_exact_adjoint_and_does_not_see_large_unknown
     assert_adjoint(marginal.linear, marginal.adjoint, (1, 1, 6, 6, 6))
     assert marginal.filtered(changes[:, 1][None]).norm() < 1e-3 * changes[:, 1].norm()
     torch.testing.assert_close(blind(0.0)[2].y, plain.y)
-
-
-def test_half_as_many_voxels_fill_the_same_box():
-    grid = Grid((8, 6, 5), affine=Grid.cube(8).affine)
-    np.testing.assert_allclose(halved(grid).corners(), grid.corners())
-    assert halved(grid).shape == (4, 3, 2)
 
 
 def test_random_errors_of_every_view_are_found(thorax):

@@ -7,9 +7,10 @@ from torch.nn.functional import avg_pool2d
 
 from phydict.grid import Grid
 from phydict.rivals import LiftedNetwork
-from phydict.rivals.sampling import all_places, halved, pooled
+from phydict.rivals.sampling import all_places, pooled
 from phydict.units import MU_WATER
 from phydict.xray import ConeBeam, Projector
+from phydict.xray.boxes import halved
 from rivals.tiny_rivals import GRID, body, tilted, tiny_lifted
 
 ORBIT = ConeBeam.orbit(3, 1020, 740, (28, 28), 20.0)

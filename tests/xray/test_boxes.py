@@ -7,7 +7,7 @@ from laws import random_like
 
 from phydict.grid import Box, Grid
 from phydict.xray import ConeBeam, Projector
-from phydict.xray.boxes import covers, divided, interpolated, outside_projection, refinements, share_inside
+from phydict.xray.boxes import covers, divided, halved, interpolated, outside_projection, refinements, share_inside
 
 BASE = Grid.cube(16)
 BEAM = ConeBeam.orbit(3, 1020, 740, (28, 28), 20.0)
@@ -101,3 +101,9 @@ def test_turned_axes_are_refused():
 def test_a_finer_grid_fills_the_same_place(n):
     grid = Grid((4, 5, 6), (3.0, 2.0, 1.0))
     assert divided(grid, n).same_as(Grid((4 * n, 5 * n, 6 * n), (3 / n, 2 / n, 1 / n)))
+
+
+def test_half_as_many_voxels_fill_the_same_box():
+    grid = Grid((8, 6, 5), affine=Grid.cube(8).affine)
+    np.testing.assert_allclose(halved(grid).corners(), grid.corners())
+    assert halved(grid).shape == (4, 3, 2)

@@ -11,6 +11,33 @@ from phydict.xray.finer import FinerProjector
 
 FACTOR = 2
 
+UNLIKE_FINER = 2.5
+"""By how many times a view may miss the volume at hand more with what finer voxels add to it: 1.3 to 2.0 times of
+X-rays made on finer voxels; of those made on the grid, in a tomosynthesis, 1.8 to 3.0 times, since sharp edges along
+its rays look like finer voxels. Of two CTs that evaluate nothing."""
+
+
+def find_subgrid(measurement: Measurement, x: Tensor, step: LikelihoodStep | None, x0_std: float) -> bool:
+    """Sets the `subgrid` of a measurement: what finer voxels add to the projections of a CT x (1, 1, X, Y, Z). Whether
+    that is anything.
+
+    Of views that miss x by at most UNLIKE_FINER times more with it. Nothing where the X-rays hold no more than their
+    noise beyond x, without a `step` on the finer voxels, of a projector of one's own, and where detectors are tilted,
+    for which they cost too much.
+    """
+    measurement.subgrid = 0.0
+    if step is None or getattr(measurement.projector, "method", None) != "separable":
+        return False
+    projection = measurement.project(x)
+    if not (measurement.normalised_error(projection, modelled=True) > 1).any():
+        return False
+    finer = subgrid_projection(measurement, x, step, x0_std)
+    without, with_it = ((projected - measurement.y)[0].flatten(1).norm(dim=1)
+                        for projected in (projection, projection + finer))
+    like = with_it <= UNLIKE_FINER * without
+    measurement.subgrid = finer * like[:, None, None]
+    return bool(like.any())
+
 
 def subgrid_projection(measurement: Measurement, x: Tensor, step: LikelihoodStep, x0_std: float) -> Tensor:
     """Line integrals (1, K, V, U) that voxels half as long have beyond those of their means over the grid's.

@@ -26,13 +26,13 @@ def with_hardening(measurement: Measurement, first: Callable[[], Tensor], again:
     if measurement.hardened or not measurement.can_estimate_scatter:
         return z
     reprojection = measurement.project(z[:, :1])
-    residual = float(measurement.normalised_error(reprojection))
-    if residual <= RESIDUAL or bend(measurement.y[0], reprojection[0], measurement.mu_water) <= BENT:
+    residual = float(measurement.normalised_error(reprojection).max())
+    if residual <= RESIDUAL or bend(measurement.y[0], reprojection.mean(0), measurement.mu_water) <= BENT:
         return z
     plain = measurement.fitted
     measurement.straighten()
     straight = again()
-    if float(measurement.normalised_residual(straight[:, :1])) < LEFT * residual:
+    if float(measurement.normalised_residual(straight[:, :1]).max()) < LEFT * residual:
         return straight
     measurement.fitted = plain
     return z

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,9 +14,11 @@ from phydict.datasets import phantom_case
 from phydict.grid import Grid
 from phydict.linalg.total_variation import TVQuadraticMajorizer, total_variation
 from phydict.posterior import GradientSteps, Measurement, ProximalCG, Reward
+from phydict.posterior.likelihood.likelihood import MOST_SMOOTHING
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 from posterior.dense import SHAPE, DenseMeasurement, N, measurement
+from posterior.hollow import block, measured
 
 X0 = 0.3 * random_like((1, *SHAPE), seed=20)
 
@@ -43,6 +46,18 @@ def test_what_no_volume_explains_counts_as_noise():
     m.model_variance = torch.tensor([0.0, 0, 1e9, 0]).double()
     without = DenseMeasurement(m.matrix[[0, 1, 3]], m.y[0, [0, 1, 3]], m.background)
     torch.testing.assert_close(step(m, X0, 0.2), step(without, X0, 0.2), atol=1e-8, rtol=0)
+
+
+@pytest.mark.parametrize("bend, raised", [(0.0, False), (0.1, True), (0.3, True)])
+def test_model_error_raises_the_total_variation_and_noise_does_not(bend, raised):
+    """Of X-rays of a spectrum's curvature, by the squared normalised residual, up to a bound."""
+    m, x0, plain = measured(noise=0.01), 0.9 * block(), ProximalCG(10, 6, tv_weight=0.2)
+    m.y = m.y - bend * m.y * (m.y.max() - m.y)
+    excess = float(m.normalised_residual(plain(m, x0, 0.3))) ** 2
+    found = replace(plain, discrepancy=True)(m, x0, 0.3)
+    smoother = replace(plain, tv_weight=0.2 * min(excess, MOST_SMOOTHING))(m, x0, 0.3)
+    assert (excess > 1) == raised and torch.equal(found, smoother if raised else plain(m, x0, 0.3))
+    assert (total_variation(found) < total_variation(plain(m, x0, 0.3))) == raised
 
 
 def test_each_iteration_lowers_the_objective_and_as_many_as_unknowns_suffice():

@@ -13,6 +13,7 @@ from phydict.posterior import LikelihoodStep, Measurement, PriorOnly, ProximalCG
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 from posterior.dense import FINE, SHAPE, DenseMeasurement, condition, denoiser, measurement, propagate
+from posterior.hollow import block, fine_scene, measured
 
 V, NOISE = 0.04, 0.3
 EXACT = ProximalCG(50, noise=NOISE, tolerance=1e-12)
@@ -222,3 +223,19 @@ def test_scatter_is_looked_for_where_the_xrays_are_missed_and_otherwise_costs_an
     else:
         torch.testing.assert_close(found[True][0], found[False][0], atol=0, rtol=0)
         assert found[True][2] == found[False][2] + 2  # to see what is missed
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("wrong", ["nothing", "finer voxels", "a tube's bend"])
+def test_what_the_model_lacks_is_looked_for_where_the_xrays_are_missed_and_otherwise_changes_nothing(wrong):
+    m, truth = fine_scene(noise=1e-3) if wrong == "finer voxels" else (measured(noise=1e-3), block())
+    if wrong == "a tube's bend":
+        m.measured = m.y = m.y - 0.03 * m.y * (m.y - 4)
+    prior, parts = GaussianDenoiser(0.9 * truth, torch.tensor(0.04)), {"hardening": True, "subgrid": ProximalCG(10, 2)}
+    plain = SplitGibbs(4, ProximalCG(), ProximalCG(10, 5, noise=0.01), t_start=0.9, t_end=0.2, noise_fraction=0.0)
+    x = random_like((2, *truth.shape[1:]), torch.float32)
+    errors = []
+    for settings in (plain, replace(plain, **parts)):
+        errors.append(float((settings.sample(prior, m, x, torch.Generator()) - truth).norm()))
+    assert m.hardened == (wrong == "a tube's bend") and isinstance(m.subgrid, torch.Tensor) == (wrong != "nothing")
+    assert errors[1] == errors[0] if wrong == "nothing" else errors[1] < 0.97 * errors[0]

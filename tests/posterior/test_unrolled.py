@@ -14,16 +14,14 @@ from phydict.diffusion import CosineSchedule, renoise
 from phydict.grid import Grid
 from phydict.guard import one_material
 from phydict.methods import METHODS, reconstruct, reconstructor
-from phydict.posterior import Measurement, Posterior, PriorOnly, ProximalCG, SplitGibbs, Unrolled
+from phydict.posterior import Measurement, Posterior, PriorOnly, ProximalCG, SplitGibbs, Unrolled, discretisation
 from phydict.posterior.discretisation import subgrid_projection
 from phydict.posterior.hardening import with_hardening
-from phydict.posterior.samplers import unrolled
 from phydict.prior import BoundRefiner, Prior, Refiner, load_prior, save_prior, save_refiner
 from phydict.runtime.precision import computes_bfloat16
 from phydict.units import HUWindow, hu_to_mu
 from phydict.xray import ConeBeam, Ideal, Polychromatic, Projector
-from phydict.xray.finer import FinerProjector
-from posterior.hollow import GRID, ORBIT, WINDOW, block, measured
+from posterior.hollow import GRID, ORBIT, WINDOW, block, fine_scene, measured
 
 OTHERS = {
     "one view": ConeBeam.orbit(1, 1020, 740, (28, 28), 20.0),
@@ -72,30 +70,6 @@ def test_an_untrained_refiner_reconstructs_as_split_gibbs_without_noise_does():
 
 
 @torch.no_grad()
-def test_model_error_raises_the_total_variation_at_the_end_and_noise_does_not():
-    """X-rays of a spectrum's curvature are met less closely, by a smoother volume, than they could be."""
-    refiner, step = tiny_refiner(untrained=True), ProximalCG(10, 6, tv_weight=0.2)
-    method, seen = Unrolled((0.4,), (0.5, 0.3), step, step, step), []
-    for bend in (0.0, 0.2):
-        m = measured(noise=0.01)
-        m.y = m.y - bend * m.y * (m.y.max() - m.y)
-        x0, z = (x[:, :1].clamp(-1, 1) for x in method.estimates(refiner.bind(precision="float32"), m))
-        seen.append(torch.equal(z, step(m, x0, 0.3).clamp(-1, 1)))
-    assert seen == [True, False]
-
-
-def fine_scene(noise: float) -> tuple[Measurement, torch.Tensor]:
-    """X-rays of voxels half as long as the grid's, each drawn on its own within the block, and the grid's means."""
-    fine = torch.nn.functional.interpolate(block(), scale_factor=2)
-    grain = 0.6 * torch.randn(fine.shape, generator=torch.Generator().manual_seed(1)) * (fine > -0.5)
-    fine = (fine + grain).clamp(-1, 1)
-    projector = Projector(GRID, ORBIT, full_detector=True)
-    y = FinerProjector(projector)(WINDOW.to_mu(fine))
-    y = y + noise * y.max() * torch.randn(y.shape, generator=torch.Generator().manual_seed(0))
-    return Measurement(projector, y[0], WINDOW, noise=noise), torch.nn.functional.avg_pool3d(fine, 2)
-
-
-@torch.no_grad()
 def test_finer_voxels_explain_what_the_means_of_the_truth_do_not():
     m, truth = fine_scene(noise=1e-3)
     without = m.normalised_residual(truth)
@@ -123,7 +97,7 @@ def test_what_finer_voxels_add_is_left_out_of_a_view_that_misses_more_with_it(mo
     m, m_spoilt = (fine_scene(noise=1e-3)[0] for _ in range(2))
     refiner = tiny_refiner().bind(precision="float32")
     for measurement, step in ((m, subgrid_projection), (m_spoilt, spoilt)):
-        monkeypatch.setattr(unrolled, "subgrid_projection", step)
+        monkeypatch.setattr(discretisation, "subgrid_projection", step)
         list(Unrolled().estimates(refiner, measurement))
     assert m.subgrid.abs().amax((2, 3)).min() > 0 and not m_spoilt.subgrid[:, 1].any()
     assert torch.equal(m_spoilt.subgrid[:, ::2], m.subgrid[:, ::2])

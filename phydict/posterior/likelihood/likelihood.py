@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -22,6 +22,9 @@ from phydict.runtime.ranges import check_fields
 
 LEAST, MOST = 1e-9, 1_000_000
 """Of settings that are divided by or squared, so that neither overflows."""
+
+MOST_SMOOTHING = 10.0
+"""Most by which model error raises the weight of total variation."""
 
 
 class LikelihoodStep(ABC):
@@ -61,6 +64,9 @@ class ProximalCG(LikelihoodStep):
             few photons reach count less (Thibault et al. 2007, doi:10.1118/1.2789499)
         tv_weight: weight of the total variation TV, 0 for none
         tv_eps: differences between neighbours, in the prior's range, below which TV is smooth
+        discrepancy: whether what a result misses of the X-rays beyond their noise, as in wrong poses, counts as noise
+            (Morozov 1966): once more from x0, with tv_weight times the squared normalised residual,
+            at most MOST_SMOOTHING
     """
 
     iterations: int = 5
@@ -71,6 +77,7 @@ class ProximalCG(LikelihoodStep):
     weighted_least_squares: bool = False
     tv_weight: float = 0.0
     tv_eps: float = 0.01
+    discrepancy: bool = False
 
     def __post_init__(self):
         check_fields(self, "ProximalCG", iterations=(0, math.inf), restarts=(0, math.inf), noise=(0, MOST),
@@ -105,7 +112,13 @@ class ProximalCG(LikelihoodStep):
             scale = 1 / (weight + tv_scale * tv.diagonal()) if tv else torch.ones_like(z)
             z = (z + conjugate_gradients(normal, negative_gradient * inactive_mask, self.iterations, self.tolerance,
                                          scale * inactive_mask)).clamp(-1, 1)
-        return z
+        if not (self.discrepancy and tv_scale):
+            return z
+        excess = float(measurement.normalised_residual(z, modelled=True).max()) ** 2
+        if excess <= 1:
+            return z
+        smoother = replace(self, tv_weight=self.tv_weight * min(excess, MOST_SMOOTHING), discrepancy=False)
+        return smoother(measurement, x0, x0_std)
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,8 @@ from torch import Tensor
 
 from phydict.diffusion import Denoiser, ddim, renoise
 from phydict.diffusion.steps import Generators, noise_like
+from phydict.posterior.discretisation import find_subgrid
+from phydict.posterior.hardening import with_hardening
 from phydict.posterior.likelihood.likelihood import LEAST, MOST, LikelihoodStep, ProximalCG
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.metal import Metal, with_metal
@@ -55,6 +57,9 @@ class SplitGibbs(Sampler):
             release
         scatter: where the result misses the X-rays by more than SCATTER_THRESHOLD times their noise, sample once more,
             subtracting the scatter that each estimate implies, and keep what that gives if it misses less
+        hardening: where line integrals bend as a tube's do, sample once more from straight ones (`with_hardening`)
+        subgrid: the step on finer voxels that seeks what the grid cannot hold of the X-rays (`find_subgrid`), after
+            which the last likelihood step is done again; none: it is left in them
         metal: how what is denser than the prior's window is sought; none: it is not
     """
 
@@ -77,6 +82,8 @@ class SplitGibbs(Sampler):
     clip: bool = True
     final_denoise: bool = False
     scatter: bool = False
+    hardening: bool = False
+    subgrid: LikelihoodStep | None = None
     metal: Metal | None = None
     batches = True
 
@@ -123,7 +130,10 @@ class SplitGibbs(Sampler):
             return self.one_pass(denoiser, measurement, x, generator, on_step)
 
         def explained(on_step: Callable[[], None] = lambda: None) -> Tensor:
-            return with_scatter(measurement, lambda: run(on_step), run) if self.scatter else run(on_step)
+            def straight() -> Tensor:
+                return with_hardening(measurement, lambda: run(on_step), run) if self.hardening else run(on_step)
+
+            return with_scatter(measurement, straight, run) if self.scatter else straight()
 
         return with_metal(measurement, self.metal, lambda: explained(on_step), explained)
 
@@ -145,7 +155,7 @@ class SplitGibbs(Sampler):
                      on_step: Callable[[], None]) -> Tensor:
         """The estimate after the noise levels of `times`, at each of which it meets the X-rays."""
         schedule = denoiser.schedule
-        previous = None
+        previous, measurement.subgrid = None, 0.0
         for t, s in times:
             x0 = denoiser.denoise(x, t)
             if self.clip:
@@ -153,8 +163,10 @@ class SplitGibbs(Sampler):
             (measurement.refit if t < 1 else measurement.match_gain_offset)(x0[:, :1])
             z, step = x0.clamp(-1, 1), self.likelihood if s > 0 else self.final_likelihood
             if step:
-                ct = step(measurement, x0[:, :1], self.x0_std(denoiser, t)).clamp(-1, 1)
-                z = torch.cat([ct, z[:, 1:]], 1)
+                ct = step(measurement, x0[:, :1], self.x0_std(denoiser, t))
+                if s == 0 and find_subgrid(measurement, ct.mean(0, keepdim=True), self.subgrid, self.prior_std):
+                    ct = step(measurement, x0[:, :1], self.x0_std(denoiser, t))
+                z = torch.cat([ct.clamp(-1, 1), z[:, 1:]], 1)
             if self.noise_fraction is None:
                 x = ddim(schedule, z, x, t, s)
             elif s > 0 or self.final_denoise:

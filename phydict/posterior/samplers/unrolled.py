@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from phydict.diffusion.steps import Generators, noise_like
-from phydict.posterior.discretisation import subgrid_projection
+from phydict.posterior.discretisation import find_subgrid
 from phydict.posterior.evidence import Evidence
 from phydict.posterior.hardening import with_hardening
 from phydict.posterior.likelihood.likelihood import LikelihoodStep, ProximalCG
@@ -21,9 +21,6 @@ from phydict.posterior.scatter import with_scatter
 from phydict.prior import DEFAULT_REFINER, BoundRefiner
 from phydict.runtime.warning import warn
 
-MOST_SMOOTHING = 10.0
-"""Most by which model error raises the weight of total variation."""
-
 CAUTION = 3.0
 """Standard deviation that a view's contradiction counts as, over its root mean square: neighbouring pixels share it."""
 
@@ -31,11 +28,6 @@ OUTLIER, SHARED = 2.2, 0.45
 """A view whose error is OUTLIER times the median's is doubted from half of the usual limit on: of one that was shifted
 it is 2.8 to 3.2 times, of right ones 2.05 at most. Of the worst view's error, SHARED may be seen in others because of
 it, and does not count against them: with one view flipped 0.25 to 0.5. Both of CTs that evaluate nothing."""
-
-UNLIKE_FINER = 2.5
-"""By how many times a view may miss the volume at hand more with what finer voxels add to it: 1.3 to 2.0 times of
-X-rays made on finer voxels; of those made on the grid, in a tomosynthesis, 1.8 to 3.0 times, since sharp edges along
-its rays look like finer voxels. Of two CTs that evaluate nothing."""
 
 FIRST_STEP_VIEWS = 8
 """Views beyond which the first step, of bounded length, leaves more of each, as the root of their number: on five
@@ -61,10 +53,6 @@ class Unrolled(Sampler):
     flipped view, a gain that drifts or a patient who moves, no volume explains it: the excess counts from then on as
     noise of that view (`Measurement.model_variance`), so that volumes follow it less and the prior and the other views
     more. Where scatter is sought, of which the first step knows little, the second tells that.
-
-    Where a ProximalCG at the end misses the X-rays by more than their noise, as it does in wrong poses, the excess
-    is model error, which counts as noise (Morozov 1966): the step is repeated with its total variation weighted by the
-    squared normalised residual.
 
     Args:
         times: labels in (0, 1) under which the refiner's network takes each z, as if it were a noisy state of that time
@@ -93,7 +81,7 @@ class Unrolled(Sampler):
     start: LikelihoodStep = ProximalCG(10, 3, refit_scatter=True, tv_weight=10.0, tv_eps=0.003)
     likelihood: LikelihoodStep = ProximalCG(10, 3, refit_scatter=True, tv_weight=5.0, tv_eps=0.003)
     final_likelihood: LikelihoodStep = ProximalCG(10, 4, refit_scatter=True, weighted_least_squares=True,
-                                                  tv_weight=2.0, tv_eps=0.003)
+                                                  tv_weight=2.0, tv_eps=0.003, discrepancy=True)
     subgrid: LikelihoodStep | None = ProximalCG(5, 1, tv_weight=10.0, tv_eps=0.003)
     contradiction: float | None = 0.4
     chests_only: bool = False
@@ -153,12 +141,7 @@ class Unrolled(Sampler):
             step = self.final_likelihood if last else self.likelihood
             z = self._likelihood_step(step, measurement, before, x0_std)
             if n + 1 == len(self.times) // 2:
-                measurement.subgrid = self._subgrid_of(measurement, z[:, :1])
-            if last and isinstance(step, ProximalCG):
-                excess = float(measurement.normalised_residual(z[:, :1], modelled=True).max()) ** 2
-                if excess > 1:
-                    smoother = replace(step, tv_weight=step.tv_weight * min(excess, MOST_SMOOTHING))
-                    z = self._likelihood_step(smoother, measurement, before, x0_std)
+                find_subgrid(measurement, z[:, :1], self.subgrid, self.x0_stds[0])
             if last or n + 1 < len(self.times):
                 on_step()
         on_result(z, lambda: evidence(z[:, :1], before[:, :1], start[:, :1]))
@@ -183,19 +166,6 @@ class Unrolled(Sampler):
             return mean
         generator = torch.Generator().manual_seed(0)
         return self.first.one_pass(refiner, measurement, noise_like(mean, generator), generator)
-
-    def _subgrid_of(self, measurement: Measurement, x: Tensor) -> Tensor | float:
-        """What finer voxels add to the projections of the CT x: of views that it does not make much worse, and nothing
-        where the X-rays hold no more than their noise beyond x."""
-        if self.subgrid is None or measurement.projector.method != "separable":
-            return 0.0
-        projection = measurement.project(x)
-        if not (measurement.normalised_error(projection, modelled=True) > 1).any():
-            return 0.0
-        finer = subgrid_projection(measurement, x, self.subgrid, self.x0_stds[0])
-        without, with_it = ((projected - measurement.y)[0].flatten(1).norm(dim=1)
-                            for projected in (projection, projection + finer))
-        return finer * (with_it <= UNLIKE_FINER * without)[:, None, None]
 
     @staticmethod
     def _likelihood_step(step: LikelihoodStep, measurement: Measurement, x0: Tensor, x0_std: float) -> Tensor:

@@ -65,8 +65,8 @@ class ProximalCG(LikelihoodStep):
         tv_weight: weight of the total variation TV, 0 for none
         tv_eps: differences between neighbours, in the prior's range, below which TV is smooth
         discrepancy: whether what a result misses of the X-rays beyond their noise, as in wrong poses, counts as noise
-            (Morozov 1966): once more from x0, with tv_weight times the squared normalised residual,
-            at most MOST_SMOOTHING
+            (Morozov 1966): once more from x0, with tv_weight times the squared normalised residual, at most
+            MOST_SMOOTHING
     """
 
     iterations: int = 5

@@ -163,9 +163,10 @@ class SplitGibbs(Sampler):
             (measurement.refit if t < 1 else measurement.match_gain_offset)(x0[:, :1])
             z, step = x0.clamp(-1, 1), self.likelihood if s > 0 else self.final_likelihood
             if step:
-                ct = step(measurement, x0[:, :1], self.x0_std(denoiser, t))
+                x0_std = self.x0_std(denoiser, t)
+                ct = step(measurement, x0[:, :1], x0_std)
                 if s == 0 and find_subgrid(measurement, ct.mean(0, keepdim=True), self.subgrid, self.prior_std):
-                    ct = step(measurement, x0[:, :1], self.x0_std(denoiser, t))
+                    ct = step(measurement, x0[:, :1], x0_std)
                 z = torch.cat([ct.clamp(-1, 1), z[:, 1:]], 1)
             if self.noise_fraction is None:
                 x = ddim(schedule, z, x, t, s)

@@ -38,6 +38,7 @@ from phydict.posterior import (
 )
 from phydict.prior import (
     DEFAULT_CORRECTION,
+    FINEST_CORRECTION,
     AnyPrior,
     Cascade,
     MedSynCheckpoint,
@@ -49,6 +50,7 @@ from phydict.prior import (
     load_correction,
     load_super_resolution,
 )
+from phydict.prior.correction import TOLERANCE
 from phydict.reconstruction import Reconstruction, Reconstructor
 from phydict.runtime.precision import check_precision
 from phydict.runtime.reading import check_memory, reason
@@ -177,25 +179,32 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: AnyPrior | str |
     return replace(ready, sr_sampler=sr_sampler) if sr_sampler else ready
 
 
-def correction_of(method: Sampler | Reconstructor) -> Path | None:
-    """The file of the network that corrects a method's estimates on finer voxels, where it has learnt from these."""
-    learnt = isinstance(method, Sampler) and method.needs_refiner
-    return DEFAULT_CORRECTION if learnt and DEFAULT_CORRECTION.is_file() else None
+CORRECTIONS = {3.0: DEFAULT_CORRECTION, 1.5: FINEST_CORRECTION}
+"""Length in mm of the voxels that they learnt on -> files of networks that correct estimates on these."""
+
+
+def corrections_of(method: Sampler | Reconstructor, grid: Grid) -> list[Path]:
+    """The files of the networks that correct a method's estimates on the way to a grid, of long voxels first, where
+    they have learnt from these."""
+    if not (isinstance(method, Sampler) and method.needs_refiner):
+        return []
+    return [file for length, file in CORRECTIONS.items()
+            if file.is_file() and min(grid.spacing) < (1 + TOLERANCE) * length]
 
 
 def onto_grid(method: Reconstructor, grid: Grid | None, refinement: Refinement = Refinement()) -> Reconstructor:
     """The method on the voxels of `grid`; None leaves it as it is.
 
     What is bound to voxels of its own, as a prior is, works there first and is then refined (`Refined`), with a step
-    also by the network of `correction_of`. A method without a prior works on `grid` itself, on a box that leaves out a
-    part of the chest after a coarse reconstruction of the whole (`Region`). Raises ValueError where there is no way or
-    not enough memory.
+    also by the networks of `corrections_of`. A method without a prior works on `grid` itself, on a box that leaves out
+    a part of the chest after a coarse reconstruction of the whole (`Region`). Raises ValueError where there is no way
+    or not enough memory.
     """
     if grid is None or (method.grid is not None and method.grid.same_as(grid)):
         return method
     if method.grid is not None:
-        file = correction_of(method.sampler) if isinstance(method, Posterior) and refinement.step else None
-        method = Refined(cast(Any, method), grid, refinement, load_correction(file) if file else None)
+        files = corrections_of(method.sampler, grid) if isinstance(method, Posterior) and refinement.step else []
+        method = Refined(cast(Any, method), grid, refinement, tuple(map(load_correction, files)))
     elif isinstance(method, Baseline) and along(grid, DEFAULT_GRID) and not covers(grid, DEFAULT_GRID):
         method = Region(method, grid, DEFAULT_GRID)
     check_memory(4 * method.volumes * math.prod(grid.shape), f"a reconstruction on "

@@ -47,7 +47,7 @@ def seen(*shape: int) -> torch.Tensor:
 def reconstructed(network: CorrectionNetwork, target: Grid = FINE):
     xrays = Projector(target, BEAM, full_detector=True)(0.02 * torch.ones(1, 1, *target.shape))[0]
     base = reconstructor(Unrolled((0.2,), (0.5, 0.3)), tiny_refiner(uncertain=True))
-    ready = Refined(base, target, network=network)
+    ready = Refined(base, target, networks=(network,))
     return ready.reconstruct(*fit_to_grid(ready, target, xrays, BEAM))
 
 

@@ -1,5 +1,6 @@
 """The network that corrects reconstructions on fine voxels: what it keeps to, its training and its file."""
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -44,7 +45,7 @@ def reconstructed(network: CorrectionNetwork | None, refinement: Refinement = Re
                   precision: str = "auto"):
     xrays = Projector(FINE, BEAM, full_detector=True)(0.02 * torch.ones(1, 1, *FINE.shape))[0]
     base = reconstructor(Unrolled((0.2,), (0.5, 0.3)), tiny_refiner(), precision=precision)
-    ready = Refined(base, FINE, refinement, network)
+    ready = Refined(base, FINE, refinement, (network,) if network else ())
     return ready.reconstruct(*fit_to_grid(ready, FINE, xrays[list(order)], BEAM.select(list(order))))
 
 
@@ -95,20 +96,29 @@ def test_a_refinement_prepares_what_it_uses_and_counts_what_happens(monkeypatch,
 @pytest.mark.parametrize("factor, refinement, alone", [
     (2, Refinement(), False), (3, Refinement(), False), (2.5, Refinement(), True),
     (2, Refinement(coarse=False), True), (2, Refinement(calls=0), True), (2, Refinement(None), False)])
-def test_voxels_that_the_xrays_alone_refine_to_are_told(factor, refinement, alone):
+def test_voxels_that_the_xrays_alone_refine_to_are_known(factor, refinement, alone):
     base = reconstructor(Unrolled((0.2,), (0.5, 0.3)), tiny_refiner())
     target = Grid.cube(round(factor * base.grid.shape[0]))
     assert any(level.same_as(target) for level in Refined(base, target, refinement).uncorrected) == alone
-    assert not Refined(base, FINE, refinement, network()).uncorrected
+    assert not Refined(base, FINE, refinement, (network(),)).uncorrected
+
+
+@pytest.mark.parametrize("corrects", [True, False])
+def test_a_reconstruction_says_where_the_xrays_alone_refine(corrects):
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        reconstructed(network() if corrects else None, Refinement(coarse=False))
+    told = [str(warning.message) for warning in warned if "no trained stage" in str(warning.message)]
+    assert ["32 x 32 x 32 voxels" in words for words in told] == [True] * (not corrects)
 
 
 def test_a_refinement_by_a_network_takes_the_memory_that_is_asked_for():
     cost = Path(__file__).parent / "benchmark" / "grid_cost.csv"
     measured = [row["own_mib"] for row in read_csv(cost) if row["voxels"] == 256]
     base = reconstructor(Unrolled((0.2,), (0.5, 0.3)), tiny_refiner())
-    asked = Refined(base, FINE, network=network()).volumes * 256**3 * 4 / 2**20
+    asked = Refined(base, FINE, networks=(network(),)).volumes * 256**3 * 4 / 2**20
     assert measured and max(measured) <= asked < 1.5 * min(measured)
-    assert Refined(base, FINE).volumes < Refined(base, FINE, network=network()).volumes
+    assert Refined(base, FINE).volumes < Refined(base, FINE, networks=(network(),)).volumes
 
 
 @pytest.mark.parametrize("corrects", [True, False])
@@ -229,6 +239,30 @@ def test_with_a_network_a_reconstruction_is_learnt_from_at_both_calls(tmp_path, 
     errors = {float(np.square(seen[0, ::4, ::4, ::4].astype(np.float32) - truth).mean()) for seen in (before, after)}
     assert sorted(crops) == pytest.approx(sorted(errors), rel=1e-4)
     assert np.array_equal(both.validation[0]["volume"][0], both.validation.made[0][INPUTS].astype(np.float32))
+
+
+def test_finer_voxels_are_learnt_of_as_they_are_seen_after_the_coarser_ones(tmp_path, refiner_file):
+    file, seen = tmp_path / "fine.safetensors", []
+    save_correction(network(), file, dtype=torch.float32)
+    for name in (None, str(file)):
+        data = RefinementData(
+            RefinementCases(1, 1, 16, name), Scenes(most_views=20), phantoms=1, cache=str(tmp_path / "cache"),
+            holdout=HoldOut(phantoms=1), initial=refiner_file, cube=Cube(64), window=(-1000, 600))
+        seen.append(np.array(data.made[0], np.float32))
+    without, corrected = seen
+    assert without.shape[1:] == corrected.shape[1:] == (64, 64, 64) and len(corrected) == 2 * INPUTS + 1
+    assert np.array_equal(without[-1], corrected[-1])
+    assert not np.allclose(without[0], corrected[0], atol=0.01)
+
+
+def test_a_network_goes_on_on_its_own_voxels_or_half_as_long_ones(tmp_path):
+    file = tmp_path / "fine.safetensors"
+    save_correction(network(), file, dtype=torch.float32)
+    for voxels in (32, 64):
+        learns = RefinementTraining(cube=Cube(voxels), window=(-1000, 600), initial=str(file))
+        assert learns.prior.grid.same_as(Grid.cube(voxels)) and learns.prior.leave.weight.equal(network().leave.weight)
+    with pytest.raises(ValueError, match="another grid"):
+        RefinementTraining(cube=Cube(128), window=(-1000, 600), initial=str(file))
 
 
 @pytest.mark.parametrize("given, words", [

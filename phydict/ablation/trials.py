@@ -18,7 +18,7 @@ from phydict.grid import Box, Grid
 from phydict.inference.data import ReconstructionData
 from phydict.inference.protocols import whole
 from phydict.inference.settings import Orbit
-from phydict.methods import DEFAULT_GRID, METHODS, correction_of
+from phydict.methods import DEFAULT_GRID, METHODS, corrections_of
 from phydict.posterior import Refinement, Sampler
 from phydict.prior import find_prior, fingerprint, load_super_resolution, own_identity
 from phydict.reconstruction import Reconstructor, describe
@@ -147,8 +147,9 @@ class Trial:
             identity["super_resolution_crc32"] = _crc(self.super_resolution)
         if self.prior is not None and self.box and not self.first().same_as(self.box.grid()):
             identity["refinement"] = describe(self.refinement)
-            if self.refine and (file := correction_of(self.method)):
-                identity["correction_crc32"] = _crc(str(file))
+            files = corrections_of(self.method, self.box.grid()) if self.refine else []
+            identity |= {key: _crc(str(file))
+                         for key, file in zip(("correction_crc32", "finer_correction_crc32"), files)}
         if self.box and not self.box.grid().same_as(grid):
             identity["region"] = self.box.grid().to_dict()
         if self.projector != "auto":

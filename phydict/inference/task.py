@@ -33,7 +33,7 @@ from phydict.inference.summary import summarise
 from phydict.methods import DEFAULT_GRID, METHODS, calibrated, default_method, fit_to_grid, onto_grid, reconstructor
 from phydict.page import check_own_page
 from phydict.poses import FoundPoses, PoseSearch
-from phydict.posterior import CascadePosterior, Refined, Sampler
+from phydict.posterior import CascadePosterior, Sampler
 from phydict.prior import MedSynCheckpoint, PriorContract, find_prior, load_super_resolution
 from phydict.reconstruction import Reconstruction, Reconstructor
 from phydict.runtime.console import TRACEBACK, check_apart, check_writable, noted, sentence
@@ -249,10 +249,6 @@ class ReconstructionTask(lightning.LightningModule):
     def _start(self, cases: int) -> None:
         if isinstance(self.plain, CascadePosterior):
             self.plain.check_memory(self.device)
-        if left := self.reconstructor.uncorrected if isinstance(self.reconstructor, Refined) else []:
-            sizes = " and ".join(" x ".join(map(str, level.shape)) for level in left)
-            note = f"no trained stage was given for {sizes} voxels: the X-rays and total variation alone refine to them"
-            tell(note, event="note", text=note)
         steps = self.reconstructor.steps() + (PoseSearch().rounds if self.calibrate else 0)
         self.progress.begin(self.method_name, cases, steps, out=self.results.folder)
 

@@ -19,6 +19,7 @@ from phydict.posterior.posterior import WIDEST
 from phydict.prior.finer_uncertainty import SEEN_LEVEL
 from phydict.reconstruction import Delegating, Reconstruction, Reconstructor
 from phydict.runtime.profiling import Stopwatch, stage
+from phydict.runtime.warning import warn
 from phydict.units import AIR, HUWindow, hu_to_mu
 from phydict.xray import Projector
 from phydict.xray.boxes import covers, interpolated, outside_projection, refinements, seen_by
@@ -171,19 +172,19 @@ class Refined(Delegating):
 
     Masks and deviations of the result are the base's, interpolated. Its intervals are the network's where it knows
     them, on still finer voxels interpolated, and else made of the base's and of what the refinement changed of the
-    interpolated volume, as ON_FINER says.
+    interpolated volume, as ON_FINER says. Warns where no network corrects.
 
     Args:
         base: the method, bound to voxels of its own
         target: the voxels of the result, along the same axes
         refinement: how
-        network: what corrects the estimates on voxels that it suits; none: nothing
+        networks: what corrects the estimates on voxels, the last of those that suit them; none: nothing
     """
 
     base: Bound
     target: Grid
     refinement: Refinement = Refinement()
-    network: Correction | None = None
+    networks: tuple[Correction, ...] = ()
 
     def __post_init__(self):
         super().__post_init__()
@@ -212,7 +213,8 @@ class Refined(Delegating):
                 if not self._network(level) and not (coarse_calls and knows(self.base, level))]
 
     def _network(self, level: Grid) -> Correction | None:
-        return self.network if self.network and self.network.suits(level, self.base.window) else None
+        suiting = [network for network in self.networks if network.suits(level, self.base.window)]
+        return suiting[-1] if suiting else None
 
     def steps(self) -> int:
         return self.base.steps() + len(self.levels)
@@ -224,6 +226,9 @@ class Refined(Delegating):
             raise ValueError(
                 f"the target is {self.target.shape} voxels of {self.target.spacing} mm, but the X-rays are projected "
                 f"from {projector.grid.shape} voxels of {projector.grid.spacing} mm: use the target's grid")
+        if self.uncorrected:
+            sizes = " and ".join(" x ".join(map(str, level.shape)) for level in self.uncorrected)
+            warn(f"no trained stage was given for {sizes} voxels: the X-rays and total variation alone refine to them")
         watch, base, refinement = Stopwatch(), self.base, self.refinement.of_views(projector.beam.views)
         with watch.stage("base"):
             binned = self._binned(xrays, projector, base.grid)

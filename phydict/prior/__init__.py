@@ -8,6 +8,7 @@ from phydict.prior.files import (
     DEFAULT_CORRECTION,
     DEFAULT_PRIOR,
     DEFAULT_REFINER,
+    FINEST_CORRECTION,
     describe_correction,
     describe_prior,
     describe_refiner,
@@ -34,10 +35,10 @@ from phydict.prior.super_resolution import SuperResolution
 from phydict.prior.text import TextEncoder, learn_vocabulary
 from phydict.prior.unet import VolumeUNet
 
-__all__ = ["DEFAULT_CORRECTION", "DEFAULT_PRIOR", "DEFAULT_REFINER", "STATE", "AnyPrior", "BoundPrior", "BoundRefiner",
-           "Cascade", "CorrectionNetwork", "DetailNetwork", "LocalUNet", "MedSynCheckpoint", "MedSynPrior",
-           "MedSynSuperResolution", "Prior", "PriorContract", "Refiner", "SuperResolution", "TextEncoder", "VolumeUNet",
-           "check_prior", "describe_correction", "describe_prior", "describe_refiner", "describe_super_resolution",
-           "file_read", "find_prior", "fingerprint", "inspect_prior", "is_refiner", "learn_vocabulary",
-           "load_correction", "load_prior", "load_super_resolution", "own_identity", "save_correction", "save_prior",
-           "save_refiner", "save_super_resolution"]
+__all__ = ["DEFAULT_CORRECTION", "DEFAULT_PRIOR", "DEFAULT_REFINER", "FINEST_CORRECTION", "STATE", "AnyPrior",
+           "BoundPrior", "BoundRefiner", "Cascade", "CorrectionNetwork", "DetailNetwork", "LocalUNet",
+           "MedSynCheckpoint", "MedSynPrior", "MedSynSuperResolution", "Prior", "PriorContract", "Refiner",
+           "SuperResolution", "TextEncoder", "VolumeUNet", "check_prior", "describe_correction", "describe_prior",
+           "describe_refiner", "describe_super_resolution", "file_read", "find_prior", "fingerprint", "inspect_prior",
+           "is_refiner", "learn_vocabulary", "load_correction", "load_prior", "load_super_resolution", "own_identity",
+           "save_correction", "save_prior", "save_refiner", "save_super_resolution"]

@@ -71,16 +71,17 @@ class RefinementCases:
 
 
 class _Recording:
-    """Keeps what a network sees at each call; without one nothing is corrected."""
+    """Keeps what a network sees at each call on a `grid`'s voxels; without one nothing is corrected."""
 
-    def __init__(self, network: CorrectionNetwork | None):
-        self.network, self.inputs = network, list[Tensor]()
+    def __init__(self, network: CorrectionNetwork | None, grid: Grid):
+        self.network, self.grid, self.inputs = network, grid, list[Tensor]()
 
     def suits(self, grid: Grid, window: HUWindow) -> bool:
-        return True
+        return self.grid.same_as(grid) or (self.network is not None and self.network.suits(grid, window))
 
     def corrected(self, z: Tensor, evidence: Tensor, precision: str) -> Tensor:
-        self.inputs.append(torch.cat([z, evidence], 1))
+        if z.shape[2:] == self.grid.shape:
+            self.inputs.append(torch.cat([z, evidence], 1))
         return self.network.corrected(z, evidence, precision) if self.network else z
 
     def half_widths(self, grid: Grid, seen: Tensor, precision: str) -> None:
@@ -125,9 +126,9 @@ class Reconstructions(Dataset):
 
     def _seen(self, base: Posterior, xrays: Tensor, projector: Projector) -> Tensor:
         """What is seen (1, calls INPUTS, X, Y, Z) of a reconstruction by `base`."""
-        record = _Recording(load_correction(self.network) if self.network else None)
+        record = _Recording(load_correction(self.network) if self.network else None, self.grid)
         refinement = Refinement(calls=2 if self.network else 1)
-        Refined(base, self.grid, refinement, record).reconstruct(xrays, projector)
+        Refined(base, self.grid, refinement, (record,)).reconstruct(xrays, projector)
         return torch.cat(record.inputs, 1)
 
 
@@ -138,7 +139,7 @@ class RefinedResults(Reconstructions):
 
     def _seen(self, base: Posterior, xrays: Tensor, projector: Projector) -> Tensor:
         network = load_correction(cast(str, self.network))
-        found = Refined(base, self.grid, Refinement(), network).reconstruct(xrays, projector)
+        found = Refined(base, self.grid, Refinement(), (network,)).reconstruct(xrays, projector)
         assert found.coarse is not None
         start = interpolated(found.coarse.within, found.coarse.grid, self.grid, AIR)
         x, start = (base.window.to_range(hu)[None, None] for hu in (found.within, start))

@@ -23,7 +23,7 @@ class RefinementTraining(StageTraining):
         window: HU that the prior's range [-1, 1] stands for
         optimisation: how the weights are learnt
         body_weight: how many times more a voxel of the body counts than one of air, plus 1
-        initial: a network's file to go on from, which then decides its size
+        initial: a network's file to go on from, of these voxels or of twice as long ones, which then decides its size
     """
 
     prior: CorrectionNetwork
@@ -33,7 +33,9 @@ class RefinementTraining(StageTraining):
                  body_weight: float = 2.0, initial: str | None = None):
         hu = HUWindow(*window)
         network = load_correction(initial) if initial else CorrectionNetwork(channels, 16, cube.grid(), hu)
-        check_continues("network", str(initial), network, cube.grid(), hu)
+        if not network.suits(cube.grid(), hu):
+            check_continues("network", str(initial), network, cube.grid(), hu)
+        network.grid = cube.grid()
         network.uncertainty = None  # of the errors of other weights
         super().__init__(network.train().requires_grad_(True), optimisation, 0)
         self.body_weight = body_weight

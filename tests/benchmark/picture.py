@@ -3,7 +3,8 @@
     python tests/benchmark/picture.py <CT> [128 or 256]
 
 X-rays are made of 256^3 voxels, 0.5 % noise. Writes data/pictures/grid_<voxels>.jpg: the CT, phydict_learned on these
-voxels and on 64^3, and, for 128, total variation; and, for 128, the README's real_ct.jpg, without 64^3.
+voxels and on 64^3, and total variation, whose weight grows with their number along an axis; and, for 128, the README's
+real_ct.jpg, without 64^3.
 """
 
 from __future__ import annotations
@@ -48,9 +49,8 @@ def main() -> None:
     source = prepare_ct(find_cts(given.ct)[0].path, FINEST, WINDOW)["volume"]
     truth = WINDOW.to_hu(avg_pool3d(source, FINEST.shape[0] // given.voxels))[0]
     tried = {"phydict_learned": ("phydict_learned", given.voxels),
-             f"phydict_learned, {COARSE}": ("phydict_learned", 64)}
-    if given.voxels == 128:
-        tried["tv"] = (FISTATV(iterations=200, weight=2 * METHODS["tv"].weight), given.voxels)
+             f"phydict_learned, {COARSE}": ("phydict_learned", 64),
+             "tv": (FISTATV(iterations=200, weight=given.voxels / 64 * METHODS["tv"].weight), given.voxels)}
     volumes, captions = {}, {}
     for views in (8, 2):
         xrays, beam = seen(source, views), benchmark_orbit(FINEST, views)

@@ -12,6 +12,7 @@ from phydict.baselines import CGLS, FDK, FISTATV, SIRT, Region
 from phydict.grid import Grid
 from phydict.methods import fit_to_grid, onto_grid, reconstruct, reconstructor
 from phydict.posterior import Measurement, PriorOnly, ProximalCG, Refined, Refinement
+from phydict.prior import CorrectionNetwork
 from phydict.runtime.reading import check_memory
 from phydict.units import HUWindow, hu_to_mu
 from phydict.xray import ConeBeam, Projector
@@ -80,9 +81,25 @@ def test_a_network_on_finer_voxels_computes_as_the_base_does(xrays):
             asked.append(precision)
             return z
 
-    ready = Refined(Known(), Grid.cube(32), network=Asked())
+    ready = Refined(Known(), Grid.cube(32), networks=(Asked(),))
     ready.reconstruct(*fit_to_grid(ready, ready.grid, xrays, BEAM))
     assert asked == ["float32"] * 2
+
+
+@pytest.mark.parametrize("learnt, correcting", [
+    ([32, 64], [32, 32, 64, 64]), ([32], [32, 32, 32, 32]), ([64], [64, 64])])
+def test_voxels_are_corrected_by_the_network_that_learnt_on_them_or_on_twice_as_long_ones(xrays, learnt, correcting):
+    asked = []
+
+    class Noted(CorrectionNetwork):
+        def corrected(self, z, evidence, precision="auto"):
+            asked.append(self.grid.shape[0])
+            return z
+
+    networks = tuple(Noted((4, 8), 4, Grid.cube(voxels), WINDOW) for voxels in learnt)
+    ready = Refined(Known(), FINE, networks=networks)
+    ready.reconstruct(*fit_to_grid(ready, FINE, xrays, BEAM))
+    assert asked == correcting
 
 
 def test_a_method_in_a_box_holds_as_many_volumes_as_without():

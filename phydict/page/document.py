@@ -68,7 +68,7 @@ def check_own_page(folder: Path, option: str) -> None:
 def write_page(folder: Path, contents: Contents) -> Path:
     """Writes index.html into a folder in one step; returns its path."""
     text, style, *scripts = ((files("phydict.page") / name).read_text("utf-8") for name in (
-        "page.html", "page.css", "volume.js", "viewer.js", "page.js"))
+        "page.html", "page.css", "volume.js", "viewer.js", "xrays.js", "page.js"))
     data = strict_json(_content(contents)).replace("<", "\\u003c")
     for mark, value in (("TITLE", html.escape(contents.title)), ("STYLE", style), ("SIGNED", SIGNED),
                         ("SCRIPT", "".join(scripts)), ("CONTENT", data)):

@@ -3,7 +3,7 @@ const content = JSON.parse(byId("content").textContent);
 const keyOf = case_ => `${case_.record.method}/${case_.record.case}`;
 const places = new Map(content.cases.map(case_ => [keyOf(case_), case_]));
 const loaded = new Map();  // key -> {volumes, xrays}, the last ones opened
-let viewer = null, opened = "";
+let viewer = null, xrayViewer = null, opened = "";
 
 /* The rows of a table in the order of a column: numbers by size, text by its letters, what is missing last. */
 function inOrder(rows, column, down) {
@@ -162,7 +162,9 @@ async function showCase(key) {
     if (opened !== key) return;
     byId("viewer").hidden = false;
     viewer ??= new Viewer();
-    viewer.show(volumes, xrays, record.misfit_per_view ?? []);
+    viewer.show(volumes);
+    xrayViewer ??= new XrayViewer();
+    xrayViewer.show(xrays, record.misfit_per_view ?? []);
     await offerOthers(case_, volumes);
   } catch (error) {
     if (opened === key) byId("state").textContent = `The volume is not shown: ${folder}/view.js cannot be used, ` +

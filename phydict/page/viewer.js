@@ -53,7 +53,6 @@ class Viewer {
       });
     byId("way").addEventListener("change", () => this.draw());
     byId("overlay").addEventListener("change", () => this.draw());
-    byId("wipe").addEventListener("input", () => this.drawXrays());
     this.setWindow(...this.window);
   }
 
@@ -103,26 +102,16 @@ class Viewer {
     return canvas;
   }
 
-  /* Shows a case's volumes and X-rays; misfits: of each view. */
-  show(volumes, xrays, misfits) {
+  /* Shows a case's volumes. */
+  show(volumes) {
     const {reconstruction, truth, ...further} = volumes;
-    [this.volume, this.uncertainty, this.xrays] = [reconstruction, Object.values(further)[0] ?? null, xrays];
+    [this.volume, this.uncertainty] = [reconstruction, Object.values(further)[0] ?? null];
     this.at = this.volume.shape.map(size => Math.floor(size / 2));
     this.indices = this.volume.indices(this.volume);
     this.other = null;
     byId("overlay-label").hidden = !this.uncertainty;
     byId("overlay-name").textContent = `${this.uncertainty?.name} as overlay`;
-    for (const id of ["xray", "residual"]) byId(id).parentNode.hidden = !xrays;
-    byId("xrays").hidden = !xrays && !misfits.length;
-    this.view = 0;
-    const most = Math.max(...misfits.map(value => value ?? 0), 1e-9);
-    byId("bars").replaceChildren(...misfits.map((value, view) => element("button", {
-      type: "button", "aria-label": `view ${view}: misfit ${value?.toPrecision(3) ?? "unknown"}`,
-      onclick: () => { this.view = view; this.drawXrays(); }},
-      element("span", {style: `height: ${100 * (value ?? 0) / most}%`}))));
-    this.misfits = misfits;
     this.draw();
-    this.drawXrays();
   }
 
   /* Takes another volume for the second row, null for none; returns whether it can be shown there. */
@@ -216,21 +205,5 @@ class Viewer {
       const low = this.mean ? -1024 : -200, top = values.reduce((a, b) => Math.max(a, b), low + 1);
       paint(canvas, values, wide, high, ratio, hu => Array(3).fill(255 * share(hu, low, top)));
     }
-  }
-
-  drawXrays() {
-    for (const [n, bar] of [...byId("bars").children].entries()) bar.setAttribute("aria-pressed", n === this.view);
-    byId("view-name").textContent = `view ${this.view} of ${this.misfits.length}, misfit ` +
-      `${this.misfits[this.view]?.toPrecision(3) ?? "unknown"}`;
-    if (!this.xrays) return;
-    const {shape: [, tall, wide], low, step, measured, rendered} = this.xrays, size = wide * tall;
-    const [y, p] = [measured, rendered].map(all => all.subarray(this.view * size, (this.view + 1) * size));
-    const edge = wide * byId("wipe").value / 100, residual = Float32Array.from(p, (code, n) => step * (code - y[n]));
-    const top = 65535 * step || 1, most = residual.reduce((a, b) => Math.max(a, Math.abs(b)), step);
-    paint(byId("xray"), y, wide, tall, tall / wide,
-          (code, n) => Array(3).fill(255 * step * (n % wide < edge ? code : p[n]) / top));
-    paint(byId("residual"), residual, wide, tall, tall / wide, value => signed(value / most));
-    byId("residual-scale").textContent = `residual, ±${most.toPrecision(2)} in line integrals from ` +
-      `${low.toPrecision(2)} to ${(low + top).toPrecision(2)}; red: re-projected too high`;
   }
 }

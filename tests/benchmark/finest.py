@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from statistics import mean
 
+import torch
 from torch import Tensor
 
 from phydict import ConeBeam, HUWindow, Projector
@@ -23,6 +24,7 @@ from phydict.evaluation import body_weights, read_csv, volume_metrics, write_csv
 from phydict.grid import Grid
 from phydict.methods import fit_to_grid, onto_grid, reconstructor
 from phydict.posterior import Refinement
+from phydict.runtime.precision import instruction_set
 from phydict.runtime.seeds import case_seed
 from phydict.units import AIR
 from phydict.xray import Ideal
@@ -38,14 +40,14 @@ def rows_of(ct, views: int) -> list[dict]:
     coarse = reconstructor("phydict_learned")
     finest = onto_grid(coarse, FINEST)
     methods = (onto_grid(coarse, Grid.cube(128)),
-               replace(finest, network=None, refinement=Refinement(calls=0)), finest)
+               replace(finest, networks=(), refinement=Refinement(calls=0)), finest)
     volume, xrays, beam = scene(ct, views)
     truth, rows = WINDOW.to_hu(volume), []
     body = body_weights(truth, FINEST.spacing)
     for way, method in zip(WAYS, methods):
         shown, seconds = timed(method, method.grid, FINEST, xrays, beam)
-        rows.append({"case": ct.id, "views": views, "way": way, "cpu_seconds": seconds}
-                    | volume_metrics(shown, truth, body=body))
+        rows.append({"case": ct.id, "views": views, "way": way, "cpu_seconds": seconds,
+                     "instruction_set": instruction_set(torch.device("cpu"))} | volume_metrics(shown, truth, body=body))
         print(*rows[-1].values(), flush=True)
     return rows
 

@@ -34,6 +34,7 @@ from phydict.evaluation import read_csv, volume_metrics, write_csv
 from phydict.grid import Grid
 from phydict.methods import calibrated, fit_to_grid, reconstructor
 from phydict.poses.search import middle_points
+from phydict.runtime.precision import instruction_set
 from phydict.runtime.seeds import case_seed
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Ideal, Projector
@@ -119,6 +120,7 @@ def row(case: dict, views: int, errors: str, method: str) -> dict:
             "reprojection_mm": rms(reprojection_errors(moved_back, true, POINTS)),
             **inside, "misfit_before": poses.misfits[0], "misfit_after": poses.misfits[1],
             "seconds_plain": seconds["wrong"], "seconds_calibrated": seconds["calibrate"] + seconds["calibrated"],
+            "instruction_set": instruction_set(torch.device("cpu")),
             "ratio": (seconds["calibrate"] + seconds["calibrated"]) / seconds["wrong"],
             "warnings": "; ".join(said) or None, "warnings_plain": warned["wrong"]}
 

@@ -10,12 +10,14 @@ Writes region.csv beside this file, where rows of other numbers of views stay, a
 from pathlib import Path
 from statistics import mean
 
+import torch
 from finest import WINDOW, main, scene, timed
 from torch.nn.functional import avg_pool3d
 
 from phydict.evaluation import body_weights, volume_metrics
 from phydict.grid import Grid
 from phydict.methods import onto_grid, reconstructor
+from phydict.runtime.precision import instruction_set
 from phydict.units import AIR
 from phydict.xray.boxes import interpolated
 
@@ -31,7 +33,8 @@ def rows_of(ct, views: int) -> list[dict]:
     for name in ("phydict_learned", "tv"):
         for where, grid in (("box", BOX), ("whole", WHOLE)):
             shown, seconds = timed(onto_grid(reconstructor(name), grid), grid, BOX, xrays, beam)
-            rows.append({"case": ct.id, "views": views, "method": name, "reconstructed": where, "cpu_seconds": seconds}
+            rows.append({"case": ct.id, "views": views, "method": name, "reconstructed": where, "cpu_seconds": seconds,
+                         "instruction_set": instruction_set(torch.device("cpu"))}
                         | volume_metrics(shown, truth, body=body))
             print(*rows[-1].values(), flush=True)
     return rows

@@ -28,6 +28,7 @@ from phydict.grid import Cube
 from phydict.prior import VolumeUNet, load_prior
 from phydict.prior.files import DEFAULT_PRIOR
 from phydict.runtime.console import quiet
+from phydict.runtime.precision import instruction_set
 from phydict.training import PriorTraining
 from phydict.training.settings import Execution, PriorValidation, TextSettings
 from phydict.training.throughput import matmul_peak, sample_flop
@@ -126,7 +127,8 @@ def measure(name: str, cases: list[dict]) -> dict:
     with quiet():
         clock = monai_steps(loader) if name == MONAI else our_steps(loader, **OURS[name])
     seconds = median(clock.seconds[WARM_UP:])
-    return {"step": name, "threads": torch.get_num_threads(), "batch": BATCH, "seconds": seconds,
+    return {"step": name, "instruction_set": instruction_set(torch.device("cpu")),
+            "threads": torch.get_num_threads(), "batch": BATCH, "seconds": seconds,
             "samples_per_s": BATCH / seconds,
             "tflop_per_s": BATCH * flop / seconds / 1e12, "matmul_peak_tflop_per_s": peak / 1e12,
             "share_of_peak": BATCH * flop / seconds / peak, "memory_mib": peak_mib() - before, "losses": clock.losses}

@@ -13,6 +13,7 @@ import zlib
 from dataclasses import replace
 from pathlib import Path
 
+import torch
 from torch.nn.functional import avg_pool3d
 
 from phydict.baselines import CGLS, FISTATV, SIRT, DiffVox
@@ -22,6 +23,7 @@ from phydict.grid import Grid
 from phydict.methods import fit_to_grid, onto_grid, reconstructor
 from phydict.posterior import Posterior, ProximalCG, Refinement
 from phydict.reconstruction import describe
+from phydict.runtime.precision import instruction_set
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Ideal, Projector
 
@@ -69,7 +71,8 @@ def main(ct: str, voxels: int, views: int, names: list[str]) -> None:
             scores = volume_metrics(found.volume[None, None], truth, body=body_weights(truth, grid.spacing))
             row = {"case": case.id, "method": name, "voxels": voxels, "views": views,
                    "settings": json.dumps(describe(settings)), **scores, "misfit": found.misfit,
-                   "cpu_seconds": round(spent, 1)}
+                   "cpu_seconds": round(spent, 1),
+                   "instruction_set": instruction_set(torch.device("cpu"))}
             rows = [old for old in rows if any(old[k] != row[k] for k in SAME)]
             write_csv(FILE, rows := [*rows, row])
             print(voxels, views, name, row["settings"], f"{row['psnr']:.2f} dB, {row['cpu_seconds']} s", flush=True)

@@ -179,6 +179,9 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: AnyPrior | str |
     return replace(ready, sr_sampler=sr_sampler) if sr_sampler else ready
 
 
+PROCESS = 1250 * 2**20
+"""Bytes that a process holds beside the volumes of a reconstruction (tests/benchmark/grid_cost.csv)."""
+
 CORRECTIONS = {3.0: DEFAULT_CORRECTION, 1.5: FINEST_CORRECTION}
 """Length in mm of the voxels that they learnt on -> files of networks that correct estimates on these."""
 
@@ -207,7 +210,7 @@ def onto_grid(method: Reconstructor, grid: Grid | None, refinement: Refinement =
         method = Refined(cast(Any, method), grid, refinement, tuple(map(load_correction, files)))
     elif isinstance(method, Baseline) and along(grid, DEFAULT_GRID) and not covers(grid, DEFAULT_GRID):
         method = Region(method, grid, DEFAULT_GRID)
-    check_memory(4 * method.volumes * math.prod(grid.shape), f"a reconstruction on "
+    check_memory(PROCESS + 4 * method.volumes * math.prod(grid.shape), f"a reconstruction on "
                  f"{' x '.join(map(str, grid.shape))} voxels, {method.volumes} volumes of them at once,",
                  "give fewer voxels, or a smaller box of them")
     return method

@@ -1,5 +1,6 @@
 """The network that corrects reconstructions on fine voxels: what it keeps to, its training and its file."""
 
+import re
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from prior.tiny import tiny_prior, tiny_refiner
 from torch.nn.functional import pad
 
 from phydict.cli.train import main
+from phydict.datasets import phantom_case
 from phydict.evaluation import read_csv
 from phydict.grid import Cube, Grid
 from phydict.methods import fit_to_grid, reconstructor
@@ -20,6 +22,7 @@ from phydict.posterior.coarse_correction import coarse_correction
 from phydict.prior import correction, load_correction, save_correction, save_prior, save_refiner
 from phydict.prior.correction import INPUTS, CorrectionNetwork
 from phydict.runtime.profiling import profiled
+from phydict.runtime.warning import Remark
 from phydict.training.reconstructions import RefinementCases, RefinementData
 from phydict.training.refinement import RefinementTraining
 from phydict.training.scenes import Scenes
@@ -93,23 +96,40 @@ def test_a_refinement_prepares_what_it_uses_and_counts_what_happens(monkeypatch,
         profile.uses[name].calls for name in ("refine / projector", "score / projector"))
 
 
-@pytest.mark.parametrize("factor, refinement, alone", [
-    (2, Refinement(), False), (3, Refinement(), False), (2.5, Refinement(), True),
-    (2, Refinement(coarse=False), True), (2, Refinement(calls=0), True), (2, Refinement(None), False)])
-def test_voxels_that_the_xrays_alone_refine_to_are_known(factor, refinement, alone):
+@pytest.mark.parametrize("voxels, refinement, corrects, alone", [
+    (32, Refinement(), False, []), (48, Refinement(), False, ["24"]), (40, Refinement(), False, ["40"]),
+    (32, Refinement(coarse=False), False, ["32"]), (32, Refinement(calls=0), False, ["32"]),
+    (32, Refinement(calls=0), True, ["32"]), (32, Refinement(None), False, []),
+    (32, Refinement(coarse=False), True, []), (64, Refinement(coarse=False), False, ["32", "64"])])
+def test_a_reconstruction_says_where_the_xrays_alone_refine(voxels, refinement, corrects, alone):
+    assert remarks(voxels, refinement, corrects) == alone
+
+
+def test_a_box_of_odd_numbers_of_unequal_voxels_meets_the_xrays_too():
+    target = Grid.box((30, 21, 17), (360.0, 252.0, 170.0), (5.0, -10.0, 20.0))
+    case = phantom_case(1, FINE, WINDOW)
+    xrays = Projector(FINE, BEAM, full_detector=True)(WINDOW.to_mu(case["volume"])[None])[0]
+    ready = Refined(reconstructor(Unrolled((0.2,), (0.5, 0.3)), tiny_refiner()), target, networks=(network(),))
+    found = ready.reconstruct(*fit_to_grid(ready, target, xrays, BEAM))
+    assert found.volume.shape == target.shape and found.grid.same_as(target) and found.misfit < 0.05
+
+
+def test_of_one_view_and_tilted_detectors_it_says_so_too():
+    for beam in (BEAM.select([0]), BEAM.tilted(1)):
+        assert remarks(48, Refinement(), beam=beam) == ["24", "48"]
+
+
+def remarks(voxels: int, refinement: Refinement, corrects: bool = False, beam: ConeBeam = BEAM) -> list[str]:
+    """Sizes of what it is said of that no network refines to it, along an axis."""
+    target = Grid.cube(voxels)
+    xrays = Projector(target, beam, full_detector=True)(0.02 * torch.ones(1, 1, *target.shape))[0]
     base = reconstructor(Unrolled((0.2,), (0.5, 0.3)), tiny_refiner())
-    target = Grid.cube(round(factor * base.grid.shape[0]))
-    assert any(level.same_as(target) for level in Refined(base, target, refinement).uncorrected) == alone
-    assert not Refined(base, FINE, refinement, (network(),)).uncorrected
-
-
-@pytest.mark.parametrize("corrects", [True, False])
-def test_a_reconstruction_says_where_the_xrays_alone_refine(corrects):
+    ready = Refined(base, target, refinement, (network(),) if corrects else ())
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
-        reconstructed(network() if corrects else None, Refinement(coarse=False))
-    told = [str(warning.message) for warning in warned if "no trained stage" in str(warning.message)]
-    assert ["32 x 32 x 32 voxels" in words for words in told] == [True] * (not corrects)
+        ready.reconstruct(*fit_to_grid(ready, target, xrays, beam))
+    said = " ".join(str(warning.message) for warning in warned if warning.category is Remark)
+    return re.findall(r"(\d+) x \1 x \1", said)
 
 
 def test_a_refinement_by_a_network_takes_the_memory_that_is_asked_for():

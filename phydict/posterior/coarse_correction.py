@@ -60,12 +60,6 @@ class CoarseCorrection:
         return (z + change).clamp(-1, 1)
 
 
-def knows(base: object, level: Grid) -> bool:
-    """Whether the network of `base` corrects estimates on a level's voxels: that of a refiner, where a whole number of
-    them, two or more, makes one of its own along each axis."""
-    return isinstance(base, Posterior) and isinstance(base.prior, Refiner) and _factor(base.grid, level) >= 2
-
-
 def _factor(grid: Grid, level: Grid) -> int:
     """How many of a level's voxels make one of the grid's along each axis; 0 where they do not."""
     factor = round(level.shape[0] / grid.shape[0])
@@ -76,12 +70,14 @@ def _factor(grid: Grid, level: Grid) -> int:
 def coarse_correction(base: object, level: Grid, seen: tuple[Tensor, Projector], found: Reconstruction,
                       report: str, display: bool) -> CoarseCorrection | None:
     """The correction of estimates on a level's voxels by the network of `base`, which found a reconstruction of the
-    X-rays and the projector that it has `seen`; None where it `knows` no such voxels or left the X-rays to another
-    method, and where detectors are tilted, for which finer voxels cost too much."""
+    X-rays and the projector that it has `seen`; None where that is no refiner's or left the X-rays to another method,
+    where a whole number of the voxels, two or more, does not make one of its own along each axis, and where detectors
+    are tilted, for which finer voxels cost too much."""
     xrays, projector = seen
-    if not knows(base, level) or projector.method != "separable":
+    if not (isinstance(base, Posterior) and isinstance(base.prior, Refiner)) or _factor(base.grid, level) < 2:
         return None
-    assert isinstance(base, Posterior) and isinstance(base.prior, Refiner)
+    if projector.method != "separable":
+        return None
     if found.masks is None or len(found.masks) + 1 != base.prior.state_channels:
         return None
     measurement = Measurement(projector, xrays, base.window, display, base.mu_water)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from phydict.grid import Grid
 from phydict.guard import Guard
-from phydict.posterior.coarse_correction import CoarseCorrection, coarse_correction, knows
+from phydict.posterior.coarse_correction import CoarseCorrection, coarse_correction
 from phydict.posterior.evidence import Evidence
 from phydict.posterior.likelihood.likelihood import LikelihoodStep, ProximalCG
 from phydict.posterior.measurement import Measurement
@@ -19,7 +19,7 @@ from phydict.posterior.posterior import WIDEST
 from phydict.prior.finer_uncertainty import SEEN_LEVEL
 from phydict.reconstruction import Delegating, Reconstruction, Reconstructor
 from phydict.runtime.profiling import Stopwatch, stage
-from phydict.runtime.warning import warn
+from phydict.runtime.warning import Remark, warn
 from phydict.units import AIR, HUWindow, hu_to_mu
 from phydict.xray import Projector
 from phydict.xray.boxes import covers, interpolated, outside_projection, refinements, seen_by
@@ -172,7 +172,7 @@ class Refined(Delegating):
 
     Masks and deviations of the result are the base's, interpolated. Its intervals are the network's where it knows
     them, on still finer voxels interpolated, and else made of the base's and of what the refinement changed of the
-    interpolated volume, as ON_FINER says. Warns where no network corrects.
+    interpolated volume, as ON_FINER says. Remarks on voxels on which no network corrects.
 
     Args:
         base: the method, bound to voxels of its own
@@ -203,15 +203,6 @@ class Refined(Delegating):
     def volumes(self) -> int:
         return CORRECTED_VOLUMES if any(map(self._network, self.levels)) else super().volumes
 
-    @property
-    def uncorrected(self) -> list[Grid]:
-        """Those that the X-rays are met on and no network corrects on."""
-        if self.refinement.step is None:
-            return []
-        _, coarse_calls = self.refinement.corrections(network=False)
-        return [level for level in self.levels
-                if not self._network(level) and not (coarse_calls and knows(self.base, level))]
-
     def _network(self, level: Grid) -> Correction | None:
         suiting = [network for network in self.networks if network.suits(level, self.base.window)]
         return suiting[-1] if suiting else None
@@ -226,15 +217,12 @@ class Refined(Delegating):
             raise ValueError(
                 f"the target is {self.target.shape} voxels of {self.target.spacing} mm, but the X-rays are projected "
                 f"from {projector.grid.shape} voxels of {projector.grid.spacing} mm: use the target's grid")
-        if self.uncorrected:
-            sizes = " and ".join(" x ".join(map(str, level.shape)) for level in self.uncorrected)
-            warn(f"no trained stage was given for {sizes} voxels: the X-rays and total variation alone refine to them")
         watch, base, refinement = Stopwatch(), self.base, self.refinement.of_views(projector.beam.views)
         with watch.stage("base"):
             binned = self._binned(xrays, projector, base.grid)
             coarse = base.reconstruct(*binned, report, display, seed, on_step)
         volume, grid, calls, scores = coarse.within.to(xrays), base.grid, coarse.projector_calls, {}
-        network_calls, known = coarse.network_calls, None
+        network_calls, known, alone = coarse.network_calls, None, list[str]()
         for level in self.levels:
             with watch.stage("refine"):
                 y, A = self._binned(xrays, projector, level)
@@ -259,6 +247,11 @@ class Refined(Delegating):
             if correction is not None:
                 calls += correction.projector_calls
                 network_calls += correction.calls
+            if refinement.step and not fine_calls and correction is None:
+                alone.append(" x ".join(map(str, level.shape)))
+        if alone:
+            warn(f"no network has learnt to refine to {' and '.join(alone)} voxels here: the X-rays and total "
+                 "variation alone do", Remark)
         deviation, volume = coarse.deviation, volume.cpu()
         intervals = self._intervals(coarse, volume, known)
         if coarse.carried:

@@ -21,7 +21,8 @@ from phydict.runtime.parser_message import plain
 from phydict.runtime.reading import one_line
 from phydict.runtime.renamed import CONFIGURATION, check_options, check_setting
 from phydict.runtime.shipped import configuration
-from phydict.runtime.telling import exclaim
+from phydict.runtime.telling import exclaim, tell
+from phydict.runtime.warning import Remark
 from phydict.runtime.yaml_file import parse_yaml, read_yaml
 
 NOISE = (".*does not have many workers", ".*LeafSpec.*is deprecated", ".*is smaller than the logging interval",
@@ -211,11 +212,22 @@ def sentence(error: Exception) -> str:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Lightning's hints and the warnings of NOISE are silent inside, and other warnings take one line."""
+    """Lightning's hints and the warnings of NOISE are silent inside, and other warnings take one line, a Remark once.
+    """
+    remarks = set()
+
+    def show(message: Warning | str, category: type[Warning], *_) -> None:
+        text = " ".join(str(message).split())
+        if category is not Remark:
+            exclaim("warning", text)
+        elif text not in remarks:
+            remarks.add(text)
+            tell(text, event="note", text=text)
+
     loggers = [logging.getLogger(name) for name in ("lightning.pytorch", "lightning.fabric")]
     levels = [logger.level for logger in loggers]
     with warnings.catch_warnings():
-        warnings.showwarning = _show  # type: ignore[assignment]
+        warnings.showwarning = show  # type: ignore[assignment]
         for message in NOISE:
             warnings.filterwarnings("ignore", message)
         for logger in loggers:
@@ -239,11 +251,7 @@ def noted(texts: list[str], name: str) -> Iterator[None]:
             text = " ".join(str(message).split())
             if category is UserWarning and text not in texts:
                 texts.append(text)
-            show(message if name in text else f"{name}: {text}", category, *where)
+            show(message if name in text or category is Remark else f"{name}: {text}", category, *where)
 
         warnings.showwarning = keep  # type: ignore[assignment]
         yield
-
-
-def _show(message: Warning | str, *_) -> None:
-    exclaim("warning", " ".join(str(message).split()))

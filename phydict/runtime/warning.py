@@ -12,6 +12,10 @@ INSIDE = str(Path(__file__).parents[1]), str(Path(torch.__file__).parent)
 """Where the user's line is not: in this package, and in torch, whose decorators stand between."""
 
 
+class Remark(UserWarning):
+    """What a user should know, though no result is doubtful for it."""
+
+
 def warn(message: str, category: type[Warning] = UserWarning) -> None:
     """Warns at the innermost caller outside of this package and torch."""
     frame, level = sys._getframe(), 1

@@ -2,9 +2,9 @@
 
     python tests/benchmark/picture.py <CT> [128 or 256]
 
-X-rays are made of 256^3 voxels, 0.5 % noise. Writes data/pictures/grid_<voxels>.jpg: the CT, phydict_learned on these
+X-rays are made of 256^3 voxels, 0.5 % noise. Writes data/pictures/grid_<voxels>.png: the CT, phydict_learned on these
 voxels and on 64^3, and total variation, whose weight grows with their number along an axis; and, for 128, the README's
-real_ct.jpg, without 64^3.
+real_ct.png, without 64^3.
 """
 
 from __future__ import annotations
@@ -61,10 +61,10 @@ def main() -> None:
             scores = volume_metrics(volumes[label][None, None], truth[None, None])
             captions[label] = f"{scores['psnr']:.1f} dB, SSIM {scores['ssim']:.2f}"
             print(label, captions[label], flush=True)
-    method_panel(PICTURES / f"grid_{given.voxels}.jpg", volumes, truth, grid, captions)
+    method_panel(PICTURES / f"grid_{given.voxels}.png", volumes, truth, grid, captions)
     if given.voxels == 128:
         shown = [label for label in volumes if COARSE not in label]
-        method_panel(PICTURES / "real_ct.jpg", {label: volumes[label] for label in shown}, truth, grid,
+        method_panel(PICTURES / "real_ct.png", {label: volumes[label] for label in shown}, truth, grid,
                      {label: captions[label] for label in shown})
 
 

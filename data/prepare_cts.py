@@ -1,12 +1,13 @@
 """Prepares CTs for training a prior: python data/prepare_cts.py <folder of DICOM series or NIfTI> <output folder>"""
 
+import sys
 from collections import Counter
 from pathlib import Path
 
 from phydict.datasets.cts.preparation import SUMMARY, prepare_folder
 from phydict.datasets.cts.spaces import Settings, atlas_lungs
 from phydict.runtime.console import check_writable, cli_errors, quiet
-from phydict.runtime.telling import run_command
+from phydict.runtime.telling import run_command, told_of
 
 
 def prepare(cts: str, out: str, voxels: int = 256, side: float = 384.0, space: str = "patient",
@@ -44,8 +45,9 @@ def prepare(cts: str, out: str, voxels: int = 256, side: float = 384.0, space: s
 
 def main(args: list[str] | None = None) -> None:
     """Command line; a bad input ends in one sentence and exit code 2."""
-    with cli_errors(), quiet():
-        run_command(prepare, args, positional=True)
+    given = sys.argv[1:] if args is None else args
+    with told_of(given), cli_errors(), quiet():
+        run_command(prepare, given, positional=True)
 
 
 if __name__ == "__main__":

@@ -160,6 +160,22 @@ def test_machines_read_a_json_object_on_each_line_and_quiet_tells_nothing(comman
     assert run(command, "--quiet", out="silent") == ""
 
 
+@pytest.mark.parametrize("command, args", [
+    (infer, ["predict", "--data.xrays=absent"]), (infer, ["predict", "--no_such_option=1"]),
+    (infer, ["ablate", "-c", "absent.yaml"]), (infer, ["page", "absent"]), (train, ["export", "--checkpoint=absent"])])
+def test_machines_read_what_was_wrong_as_json_too(command, args, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for option in ("--json_lines", "--quiet"):
+        with pytest.raises(SystemExit, match="2"):
+            command([*args, option])
+        said = capsys.readouterr().err.splitlines()
+        if option == "--json_lines":
+            last = json.loads(said[-1])
+            assert last["event"] == "error" and all(json.loads(line) for line in said)
+        else:
+            assert said[-1] == f"error: {last['text']}"
+
+
 def test_a_run_that_overwrites_says_that_it_begins_anew(run, handlers, monkeypatch, capfd):
     run("predict")
     stop_once(monkeypatch)

@@ -25,13 +25,13 @@ from phydict.runtime.files import alone_in
 from phydict.runtime.help import HelpFormatter, show_settings
 from phydict.runtime.progress import CaseProgress
 from phydict.runtime.reading import reason
-from phydict.runtime.telling import add_telling, telling
+from phydict.runtime.telling import add_telling, told_of
 
 
 def main(args: list[str] | None = None) -> None:
     """infer.py ablate -c <file>. A bad input ends in one sentence and exit code 2; a stopped run resumes."""
-    with cli_errors(), quiet():
-        args = sys.argv[1:] if args is None else args
+    args = sys.argv[1:] if args is None else args
+    with told_of(args), cli_errors(), quiet():
         check_configured(args, (), "configs/ablate/pareto.yaml")
         given = _parser(args).parse_args(args).as_dict()
         device = given.pop("device") or ("cuda" if torch.cuda.is_available() else "cpu")
@@ -40,13 +40,13 @@ def main(args: list[str] | None = None) -> None:
         except Exception as error:  # torch has a kind for each reason
             raise ValueError(f"--device {device} cannot be used ({reason(error)[:100]}): give cpu, or leave it "
                              "out") from error
-        manner = given.pop("quiet"), given.pop("json_lines")
+        del given["quiet"], given["json_lines"]
         specification = read_specification(given.pop("config"), given.pop("set"), **given)
         check_writable(specification.out, "out")
         check_own_page(specification.out, "out")
         check_apart(specification.out, "out", [Path(cts)] if (cts := specification.cases.cts) else [])
         scoring = Scoring(specification.metrics, specification.fid, specification.clip)
-        with alone_in(specification.out, "out"), telling(*manner), CaseProgress() as progress:
+        with alone_in(specification.out, "out"), CaseProgress() as progress:
             rows = run(specification, torch.device(device), progress, scoring)
         print(f"{len(rows)} rows in {specification.out / RESULTS}")
         entries = summarise(rows)

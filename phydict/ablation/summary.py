@@ -162,7 +162,7 @@ def _entry(rows: Sequence[Mapping], changed: Sequence[str], varying: Sequence[st
     cases = len({row["case"] for row in good})
     stages = {name for row in good for name in row if name.startswith("seconds_")}
     values = {name: scores for name in [*SHOWN_MEASURES, *stages]
-              if len(scores := case_values(good, name)) == cases > 0}
+              if (scores := case_values(good, name)) and (name in SCORES or len(scores) == cases)}
     error = next((f"{row['status']}: {row['error']}" for row in rows if row["status"] != "ok"), None)
     return Entry(first["method"], {n: first[n] for n in changed if n in first},
                  {n: first[n] for n in varying if n in first}, values, cases, len({row["case"] for row in rows}), rows,

@@ -20,7 +20,16 @@ from phydict.ablation.summary import (
 )
 from phydict.evaluation.bootstrap import difference
 from phydict.evaluation.metrics import MEASURES, RANGE
-from phydict.evaluation.tables import INTERVAL, Table, caption, empty_notes, interval_note, listed, warning_notes
+from phydict.evaluation.tables import (
+    INTERVAL,
+    Table,
+    caption,
+    empty_notes,
+    interval_note,
+    listed,
+    partial_notes,
+    warning_notes,
+)
 from phydict.inference.protocols import Protocol, protocol_of
 from phydict.runtime.files import atomic_write
 
@@ -110,7 +119,8 @@ def _entry_table(title: str, first: str, names: Sequence[str], lines: Sequence[t
     names = _measured(names, entries, empty)
     measures = [SHOWN_MEASURES[name] for name in names]
     printed = [(label, entry.complete, [entry.estimate(name) for name in names]) for label, entry in lines]
-    why = empty_notes(empty, {name for entry in entries for name in entry.values})
+    why = empty_notes(empty, {name for entry in entries for name in entry.values}) + partial_notes(
+        (label, entry.cases, {name: len(entry.values.get(name, ())) for name in names}) for label, entry in lines)
     return Table(title, [first, *(measure.heading for measure in measures)], measures, printed,
                  [_caption(entries), *why, *_origins(entries), *notes, *interval_note(printed), *_reasons(entries)])
 
@@ -130,7 +140,9 @@ def _axis_tables(title: str, rest: dict, group: Sequence[Entry], columns: Mappin
         tables.append(Table(
             format_settings(f"{measure.heading} {title}", rest), ["method", *columns.values()],
             [measure] * len(columns), printed,
-            [_caption(group), *_origins(group), *interval_note(printed), *_reasons(group)]))
+            [_caption(group), *_origins(group), *interval_note(printed), *_reasons(group), *partial_notes(
+                (f"{label}, {columns[k]}", entry.cases, {name: len(entry.values.get(name, ()))})
+                for label, line in lines.items() for k, entry in line.items())]))
     return tables
 
 

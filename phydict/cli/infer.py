@@ -36,7 +36,7 @@ from phydict.runtime.help import HelpFormatter
 from phydict.runtime.reading import reading
 from phydict.runtime.renamed import CONFIGURATION
 from phydict.runtime.shipped import configuration
-from phydict.runtime.telling import exclaim
+from phydict.runtime.telling import exclaim, told_of
 
 COMMANDS = {"predict": "X-rays -> volumes", "test": "CTs -> X-rays -> volumes and scores",
             "ablate": "methods compared on the same X-rays", "page": "results -> a page for the browser"}
@@ -222,7 +222,7 @@ def main(args: list[str] | None = None) -> None:
         return ablate(args[1:])
     if args[:1] == ["page"]:
         return page(args[1:])
-    with cli_errors(MisconfigurationException), quiet():
+    with told_of(args), cli_errors(MisconfigurationException), quiet():
         check_command(args, COMMANDS, InferenceCLI.subcommands(), "predict --data.xrays data/example/xrays")
         cli = InferenceCLI(
             ReconstructionTask, ReconstructionData, args=args, seed_everything_default=0, save_config_callback=None,

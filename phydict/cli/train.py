@@ -34,7 +34,7 @@ from phydict.runtime.files import alone_in, atomic_write
 from phydict.runtime.help import HelpFormatter
 from phydict.runtime.precision import PRECISIONS, resolve_precision, trainer_precision
 from phydict.runtime.reading import reading
-from phydict.runtime.telling import run_command, tell, telling
+from phydict.runtime.telling import run_command, tell, telling, told_of
 from phydict.training.checkpoints import BEST, HELD_OUT, RESUMED, BestCheckpoint, WholeCheckpoints, read_checkpoint
 from phydict.training.crops import SuperResolutionData
 from phydict.training.data import PriorData
@@ -200,7 +200,8 @@ class PriorCLI(TellingCLI):
 def main(args: list[str] | None = None) -> None:
     """Command line of training: fit, validate, export, inspect-prior. A bad input ends in one sentence and code 2."""
     given = sys.argv[1:] if args is None else args
-    with cli_errors(MisconfigurationException, to_resume="add --ckpt_path and the run's last.ckpt"), quiet():
+    resuming = "add --ckpt_path and the run's last.ckpt"
+    with told_of(given), cli_errors(MisconfigurationException, to_resume=resuming), quiet():
         if given[:1] == ["export"]:
             run_command(export_prior, given[1:], f"{Path(sys.argv[0]).name} export")
         elif given[:1] == ["inspect-prior"]:

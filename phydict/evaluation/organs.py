@@ -38,7 +38,7 @@ def organ_scores(hu: Tensor, true_hu: Tensor, grid: Grid, given: Mapping[str, np
     """{"dice_lung", "hd95_lung", "cldice_vessel"} of volumes (X, Y, Z) in HU on `grid`.
 
     given: masks (lung, vessel) of the truth on `fine_grid(grid)`, bool, by another segmenter. What is not found in the
-    truth has no score; lungs that are not found in the reconstruction have Dice 0 and an infinite HD95.
+    truth has no score; lungs that are not found in the reconstruction have Dice 0 and no HD95.
     """
     fine = fine_grid(grid)
     organs, known = _organs(hu, fine)
@@ -47,7 +47,8 @@ def organ_scores(hu: Tensor, true_hu: Tensor, grid: Grid, given: Mapping[str, np
     scores = {}
     if has.get("lung"):
         scores["dice_lung"] = dice(organs["lung"], truth["lung"]) if known["lung"] else 0.0
-        scores["hd95_lung"] = hd95(organs["lung"], truth["lung"], fine.spacing) if known["lung"] else math.inf
+        if known["lung"]:
+            scores["hd95_lung"] = hd95(organs["lung"], truth["lung"], fine.spacing)
     if has.get("vessel"):
         scores["cldice_vessel"] = cl_dice(organs["vessel"], truth["vessel"]) if known["vessel"] else 0.0
     return scores
@@ -71,13 +72,14 @@ def hd95(a: np.ndarray, b: np.ndarray, spacing) -> float:
 
 
 def cl_dice(a: np.ndarray, b: np.ndarray) -> float:
-    """clDice of two trees of vessels, masks (X, Y, Z); 0 where one of them is empty."""
+    """clDice of two trees of vessels, masks (X, Y, Z); 0 where one of them is empty or too thick for its lines to be
+    found."""
     if not (a.any() and b.any()):
         return 0.0
     shares = []
     for mask, other in ((a, b), (b, a)):
         lines = skeleton(mask)
-        shares.append(float(lines[other].sum() / lines.sum()))
+        shares.append(float(lines[other].sum() / lines.sum().clip(1e-6)))
     precision, sensitivity = shares
     return 2 * precision * sensitivity / (precision + sensitivity) if precision + sensitivity else 0.0
 

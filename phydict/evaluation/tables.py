@@ -128,13 +128,16 @@ def mean_table(rows: Iterable[Mapping], by: str = "method", metrics: Sequence[st
     if warned := warned_cases(rows, by):
         measures.append(Measure("warned", None, 0))
         lines = [(label, ranked, [*values, len(warned.get(label, ()))]) for label, ranked, values in lines]
-    cases = {frozenset(row.get("case", f"row {n}") for n, row in enumerate(rows) if str(row[by]) == group)
-             for group in groups}
+    of_group = {group: frozenset(row.get("case", f"row {n}") for n, row in enumerate(rows) if str(row[by]) == group)
+                for group in groups}
+    cases = set(of_group.values())
     counts = sorted({min(map(len, cases)), max(map(len, cases))})
     unequal = " (not the same cases in every line)" if len(cases) > 1 else ""
+    parts = partial_notes((label, len(of_group[label]), {name: summary.cases for name, summary in group.items()
+                                                         if name in MEASURES}) for label, group in groups.items())
     over = f"Mean ± standard deviation over n = {' to '.join(map(str, counts))} cases{unequal}"
     return Table(f"Scores by {by}", [by, *(measure.heading for measure in measures)], measures, lines,
-                 [caption(over, rows, {"Grid": "grid", "Views": "views"}, window), *interval_note(lines),
+                 [caption(over, rows, {"Grid": "grid", "Views": "views"}, window), *interval_note(lines), *parts,
                   *empty_notes(empty, measured), *warning_notes(rows, by)])
 
 
@@ -187,6 +190,17 @@ def interval_note(lines: Iterable[tuple[str, bool, Sequence[Value | None]]]) -> 
 def empty_notes(empty: Mapping[str, str], measured: Iterable[str]) -> list[str]:
     """Why columns are empty: metric -> reason, of those that were not measured."""
     return [f"{MEASURES[name].label}: empty, since {reason}." for name, reason in empty.items() if name not in measured]
+
+
+def partial_notes(lines: Iterable[tuple[str, int, Mapping[str, int]]]) -> list[str]:
+    """Of how many cases a score is the mean, where that is not all of a line's; lines: (label, its cases, score ->
+    cases that have it)."""
+    parts: dict[str, list[str]] = {}
+    for label, cases, counts in lines:
+        for name, count in counts.items():
+            if 0 < count < cases:
+                parts.setdefault(f"{MEASURES[name].label}: of {count} of {cases} cases", []).append(label)
+    return [f"{part} ({', '.join(labels)})." for part, labels in parts.items()]
 
 
 def listed(rows: Sequence[Mapping], column: str) -> str:

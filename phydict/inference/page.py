@@ -71,7 +71,8 @@ def _case(folder: Path, path: Path) -> PageCase | None:
     except Exception as error:  # whatever a damaged record or volume leads to
         warn(f"{path} is left out of the page, since its files are damaged ({type(error).__name__}: {error})")
         return None
-    return PageCase(path.relative_to(folder).as_posix(), sorted(os.listdir(path)), record)
+    return PageCase(path.relative_to(folder).as_posix(), sorted(os.listdir(path)), record,
+                    f"{record['case']}, {record.get('views')}")
 
 
 def _make_case_files(path: Path, missing: list[str]) -> None:

@@ -39,7 +39,8 @@ function line(cells) {
 }
 
 function caseRow(case_) {
-  const {record, scores} = case_, key = keyOf(case_), open = () => { location.hash = encodeURIComponent(key); };
+  const {record, scores} = case_, key = keyOf(case_);
+  const open = () => opened === key ? showCase(key) : (location.hash = encodeURIComponent(key));
   const picture = case_.files.find(file => file.name === "thumbnail.png");
   const row = [
     {text: record.case, value: null, label: true,
@@ -100,9 +101,9 @@ function showRun() {
   if (cases.length) {
     const header = ["case", "picture", "method", "views", ...measures.map(measure => measure.label), "warnings"];
     const rows = cases.map(caseRow), caseTable = table("Cases", header, rows, [
-      "Best of each case in bold, second underlined. A name opens the case."]);
+      "Best of each case and number of views in bold, second underlined. A name opens the case."]);
     const filter = element("input", {type: "search", oninput: () => {
-      for (const row of caseTable.querySelectorAll("tbody tr")) row.hidden = !row.dataset.key.includes(filter.value);
+      for (const row of caseTable.querySelectorAll("tbody tr")) row.hidden = !row.dataset.key.toLowerCase().includes(filter.value.toLowerCase());
     }});
     run.append(element("p", {}, element("label", {}, "show cases and methods with ", filter)), caseTable);
   }
@@ -168,7 +169,7 @@ async function showCase(key) {
     await offerOthers(case_, volumes);
   } catch (error) {
     if (opened === key) byId("state").textContent = `The volume is not shown: ${folder}/view.js cannot be used, ` +
-      `since ${error.message}. Make the page anew: infer.py page <folder>.`;
+      `since ${error.message}. Delete it and make the page anew, without truth and X-rays: infer.py page <folder>.`;
   } finally {
     if (opened === key) {
       byId("case-name").focus({preventScroll: true});

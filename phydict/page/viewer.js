@@ -68,12 +68,14 @@ class Viewer {
     canvas.addEventListener("pointerdown", event => { canvas.setPointerCapture(event.pointerId); pick(event); });
     canvas.addEventListener("pointermove", event => { if (event.buttons) pick(event); });
     canvas.addEventListener("wheel", event => {
+      if (event.ctrlKey) return;  // the browser's zoom
       event.preventDefault();
       this.move({[across]: this.at[across] - Math.sign(event.deltaY)});
     }, {passive: false});
     canvas.addEventListener("keydown", event => {
       const [axis, step] = {ArrowLeft: [x, 1], ArrowRight: [x, -1], ArrowUp: [y, 1], ArrowDown: [y, -1],
-                            PageUp: [across, 1], PageDown: [across, -1]}[event.key] ?? [];
+                            PageUp: [across, 1], PageDown: [across, -1], Home: [across, -this.volume.shape[across]],
+                            End: [across, this.volume.shape[across]]}[event.key] ?? [];
       if (step) {
         event.preventDefault();
         this.move({[axis]: this.at[axis] + step});
@@ -95,7 +97,7 @@ class Viewer {
     }}, "mean");
     canvas.addEventListener("pointermove", event => {
       if (!event.buttons) return;
-      this.angle = (this.angle + event.movementX + 540) % 360 - 180;
+      turn.value = this.angle = (this.angle + event.movementX + 540) % 360 - 180;
       this.drawTurning();
     });
     element("figure", {}, canvas, element("figcaption", {}, ...row ? [] : ["turn ", turn, " ", kind]));

@@ -21,7 +21,7 @@ from phydict.runtime.parser_message import plain
 from phydict.runtime.reading import one_line
 from phydict.runtime.renamed import CONFIGURATION, check_options, check_setting
 from phydict.runtime.shipped import configuration
-from phydict.runtime.telling import exclaim, tell
+from phydict.runtime.telling import exclaim, proclaim, tell
 from phydict.runtime.warning import Remark
 from phydict.runtime.yaml_file import parse_yaml, read_yaml
 
@@ -64,19 +64,21 @@ def cli_errors(*also: type[Exception], to_resume: str = "run the same command ag
         interrupted = isinstance(stop, KeyboardInterrupt) or isinstance(stop.__context__, KeyboardInterrupt)
         if not interrupted and isinstance(stop, SystemExit) and stop.code is not None:
             raise
-        print(f"stopped by a signal; to resume, {_advice(stop, to_resume)}", file=sys.stderr)
+        text = f"stopped by a signal; to resume, {_advice(stop, to_resume)}"
+        proclaim(text, event="stopped", text=text)
         raise SystemExit(130 if interrupted else 143) from None
     except (ValueError, OSError, FloatingPointError, ArgumentError, *also) as error:  # type: ignore[misc]
         if os.environ.get(TRACEBACK):
             raise
         full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
         advice = f": free some space; to resume, {_advice(error, to_resume)}" if full else ""
-        print(f"error: {sentence(error)}{advice}", file=sys.stderr)
+        exclaim("error", f"{sentence(error)}{advice}")
         raise SystemExit(2) from None
     except RuntimeError as error:
         if os.environ.get(TRACEBACK) or not re.search("Connection (closed|reset) by peer", str(error)):
             raise
-        print("stopped, because another process of this run ended; its message says why", file=sys.stderr)
+        text = "stopped, because another process of this run ended; its message says why"
+        proclaim(text, event="stopped", text=text)
         raise SystemExit(2) from None
 
 

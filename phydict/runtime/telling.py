@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 
 from jsonargparse import ArgumentParser
@@ -36,6 +36,11 @@ def telling(quiet: bool, json_lines: bool) -> Iterator[None]:
         _MANNER.reset(before)
 
 
+def told_of(args: Sequence[str]) -> AbstractContextManager[None]:
+    """`telling` as the options of a whole command line have it, errors in that line included."""
+    return telling("--quiet" in args, "--json_lines" in args)
+
+
 def add_telling(parser: ArgumentParser) -> None:
     """The options of a command line that `telling` takes."""
     parser.add_argument("--quiet", action="store_true", help="tell no progress, only results, warnings and errors")
@@ -45,14 +50,17 @@ def add_telling(parser: ArgumentParser) -> None:
 def tell(text: str, /, **event: object) -> None:
     """A line on standard error: the text or, as `telling` has it, the event as JSON, or nothing."""
     if _MANNER.get() != SILENCE:
-        print(text if _MANNER.get() == WORDS else strict_json(event), file=sys.stderr, flush=True)
+        proclaim(text, **event)
+
+
+def proclaim(text: str, /, **event: object) -> None:
+    """As `tell`, but never silenced."""
+    print(strict_json(event) if _MANNER.get() == JSON else text, file=sys.stderr, flush=True)
 
 
 def exclaim(kind: str, text: str) -> None:
-    """A warning, or an error that does not end the run, on standard error: as JSON where progress is, and never
-    silenced."""
-    print(strict_json({"event": kind, "text": text}) if _MANNER.get() == JSON else f"{kind}: {text}", file=sys.stderr,
-          flush=True)
+    """A warning or an error on standard error: as JSON where progress is, and never silenced."""
+    proclaim(f"{kind}: {text}", event=kind, text=text)
 
 
 def bars_on(console: Console, *columns: ProgressColumn) -> Progress:

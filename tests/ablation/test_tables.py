@@ -62,6 +62,15 @@ def test_columns_that_stay_empty_are_kept_with_the_reason():
     assert "CLIP T2I" not in all_tables(entries)[0].markdown()
 
 
+def test_a_score_of_some_cases_is_their_mean_and_says_of_how_many():
+    rows = [row("a", "x", 20.0, dice_lung=0.9), row("b", "x", 22.0), row("a", "y", 21.0, dice_lung=0.7),
+            row("b", "y", 23.0, dice_lung=0.8)]
+    table = all_tables(summarise(rows))[0].markdown()
+    line = next(line for line in table.splitlines() if line.startswith("| x"))
+    assert "0.900" in line and "Dice lungs: of 1 of 2 cases (x)." in table
+    assert "cases (y)" not in table
+
+
 def test_the_table_of_delta_has_the_misfit_beside_ssim():
     rows = [row("a", "x", 20.0 + d, delta=d) for d in (0.0, 0.8, 0.1)] + [row("a", "x", 21.0, delta=None)]
     table = next(t for t in all_tables(summarise(rows)) if "delta" in t.header)

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 import torch
 from ct_files import AFFINE, save_ct
+from dicom_files import write_ct_series
 
 from phydict.datasets.cts.ct_rate import CTCases, find_cts, patient_of, split_by_patient
 from phydict.datasets.cts.ct_rate_tables import read_reports
+from phydict.datasets.cts.sources import find_sources
 from phydict.datasets.cts.transforms import Calibration, load_ct, prepare_ct
 from phydict.grid import Grid
 
@@ -124,6 +126,30 @@ def test_a_table_of_reports_of_other_cts_is_refused_and_one_found_by_itself_warn
     table.parent.rename(tmp_path / "radiology_text_reports")
     with pytest.warns(UserWarning, match=said):
         assert find_cts(tmp_path / "cts")[0].report == ""
+
+
+def test_a_table_without_a_row_is_refused_as_one_of_others_is(tmp_path, chest):
+    save_ct(tmp_path / "cts" / "mine.nii.gz", chest[:4, :4, :4])
+    empty = write_csv(tmp_path / "empty.csv", REPORT_COLUMNS)
+    with pytest.raises(ValueError, match="none of the 0 reports in .*the first CT is mine"):
+        find_cts(tmp_path / "cts", reports=empty)
+
+
+def test_dicom_series_have_their_reports_by_name_and_a_table_of_others_is_refused(tmp_path):
+    write_ct_series(tmp_path / "cts" / "anna", np.zeros((8, 8, 4)), AFFINE)
+    rows = [("bob.nii.gz", "", "", "Nodule, 4 mm.", "Nodule."), ("anna.nii.gz", "", "", "Effusion.", "Effusion.")]
+    found, = find_sources(tmp_path / "cts", reports=write_csv(tmp_path / "both.csv", REPORT_COLUMNS, *rows))
+    assert "Effusion" in found.report and find_sources(tmp_path / "cts")[0].report == ""
+    with pytest.raises(ValueError, match="none of the 1 reports in .*the first is anna"):
+        find_sources(tmp_path / "cts", reports=write_csv(tmp_path / "others.csv", REPORT_COLUMNS, rows[0]))
+
+
+def test_nifti_files_beside_dicom_series_are_not_lost_with_a_wrong_table(tmp_path, chest):
+    save_ct(tmp_path / "cts" / "mine.nii.gz", chest[:4, :4, :4])
+    write_ct_series(tmp_path / "cts" / "anna", np.zeros((8, 8, 4)), AFFINE)
+    assert {source.id for source in find_sources(tmp_path / "cts")} == {"mine", "anna"}
+    with pytest.raises(FileNotFoundError, match="there is no CSV table"):
+        find_sources(tmp_path / "cts", reports=tmp_path / "absent.csv")
 
 
 def test_a_patient_never_straddles_the_split():

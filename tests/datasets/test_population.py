@@ -226,6 +226,14 @@ def test_a_cached_draw_is_the_draw_and_other_variations_are_other_files(drawn, m
     assert other[1]["volume"].sub(patient["volume"]).abs().max() < 1e-3
 
 
+def test_further_scans_of_a_patient_are_left_out_and_it_is_said(drawn, capsys):
+    first, second, *_ = drawn.cts.cts
+    ids = ["a__1", "a__2", "b__1"]
+    named = CTCases([replace(ct, id=id) for ct, id in zip((first, first, second), ids)], None, GRID)
+    assert [ct.id for ct in DrawnPatients(named, drawn.settings).cts.cts] == ["a__1", "b__1"]
+    assert "one scan of each of 2 patients, of 3 CTs" in capsys.readouterr().err
+
+
 def test_a_stored_draw_is_not_that_of_the_same_patients_with_other_reports(drawn):
     told = CTCases([replace(ct, report="Findings: mine.") for ct in drawn.cts.cts], drawn.cts.cache, GRID)
     with_reports = DrawnPatients(told, drawn.settings)

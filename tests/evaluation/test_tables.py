@@ -181,6 +181,12 @@ def test_a_metric_that_a_method_lacks_is_a_dash():
     assert table["tv"]["SSIM"] == "–" and table["tv"]["PSNR (dB)"] == "1.00"
 
 
+def test_a_metric_of_some_cases_says_of_how_many():
+    rows = [{"case": case, "method": "m", "psnr": 20.0} | more for case, more in (("a", {"clip_t2i": 0.5}), ("b", {}))]
+    said = mean_table(rows, empty={"clip_t2i": "no case has a report"}).markdown()
+    assert "CLIP T2I (%): of 1 of 2 cases (m)." in said and "empty" not in said
+
+
 def test_the_tables_for_console_and_latex_say_the_same():
     console = Console(width=200, record=True, file=open(os.devnull, "w"))
     console.print(mean_table(STATED))

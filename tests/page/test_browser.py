@@ -115,6 +115,15 @@ def test_wheel_and_keys_change_the_slice_that_a_screen_reader_is_told(shown):
     assert int(canvas.get_attribute("aria-valuenow")) == before[1]
     assert look(page, "[data-plane=coronal][data-row='0']") == before[0]
     assert re.fullmatch(r"slice \d of 6, -?\d+\.\d mm", canvas.get_attribute("aria-valuetext"))
+    for key, end in (("End", "6"), ("Home", "1")):
+        page.keyboard.press(key)
+        assert canvas.get_attribute("aria-valuenow") == end
+
+
+def test_the_open_case_can_be_gone_back_to(shown):
+    page = shown("#sirt%2Fanna")
+    page.locator("[data-key='sirt/anna'] button.name").click()
+    page.wait_for_function("document.activeElement.id === 'case-name'")
 
 
 def test_windows_overlay_and_difference_change_what_is_shown(shown):

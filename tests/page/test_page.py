@@ -83,6 +83,13 @@ def test_hostile_text_is_data_and_nothing_else(tmp_path):
     assert page.read_text().count("<script") == before and content(page)["title"] == HOSTILE
 
 
+def test_of_unequal_numbers_of_views_none_is_the_better(tmp_path):
+    for method, views, psnr in (("sirt", 2, 9.0), ("tv", 8, 21.0), ("fdk", 8, 10.0)):
+        finish(tmp_path, "anna", method, views=views, scores={"psnr": psnr})
+    places = {c["record"]["method"]: c["places"]["psnr"] for c in content(results_page(tmp_path))["cases"]}
+    assert places == {"sirt": 0, "tv": 1, "fdk": 2}
+
+
 def test_the_best_of_each_case_is_marked_among_the_methods(tmp_path):
     for case, better in (("anna", "sirt"), ("bert", "tv")):
         for method in ("sirt", "tv"):

@@ -90,6 +90,11 @@ class CTSource:
         return find_cts(cts, **vars(self))
 
 
+class NoNIfTI(FileNotFoundError):
+    """There is no NIfTI file where CTs are looked for."""
+
+
+
 def find_cts(root: str | Path, reports: str | Path | None = None, metadata: str | Path | None = None,
              fixed: bool = True, first_reconstruction: bool = False,
              exclude: str | Path | None = None) -> list[CTFile]:
@@ -127,9 +132,10 @@ def find_cts(root: str | Path, reports: str | Path | None = None, metadata: str 
     texts = read_reports(reports) if reports else {}
     by_scan = {scan_of(id): text for id, text in texts.items()}
     reports_of = {id: texts.get(id, by_scan.get(scan_of(id))) for id in ids}
-    if texts and all(text is None for text in reports_of.values()):
-        message = (f"none of the {len(texts)} reports in {reports} is of one of the {len(ids)} CTs in {root} (the "
-                   f"first report is of {next(iter(texts))}, the first CT is {ids[0]})")
+    if (table_given or texts) and all(text is None for text in reports_of.values()):
+        first = f"the first report is of {next(iter(texts))}, " if texts else ""
+        message = (f"none of the {len(texts)} reports in {reports} is of one of the {len(ids)} CTs in {root} ({first}"
+                   f"the first CT is {ids[0]})")
         if table_given:
             raise ValueError(f"{message}: give the table of these CTs, or leave out data.source.reports")
         warn(message)
@@ -152,18 +158,18 @@ def _calibrated(cts: list[CTFile], metadata: str | Path | None) -> list[CTFile]:
 def _nifti_files(root: Path) -> list[Path]:
     if root.is_file():
         if not root.name.lower().endswith((".nii", ".nii.gz")):
-            raise FileNotFoundError(f"{root} is not a NIfTI file; give a .nii or .nii.gz file, or a folder of them")
+            raise NoNIfTI(f"{root} is not a NIfTI file; give a .nii or .nii.gz file, or a folder of them")
         return [root]
     if not root.is_dir():
-        raise FileNotFoundError(f"there is no folder or file {root}; give the folder that holds the CTs")
+        raise NoNIfTI(f"there is no folder or file {root}; give the folder that holds the CTs")
     every = [p for p in root.rglob("*") if p.is_file()
              and not any(part.startswith(".") for part in p.relative_to(root).parts)]
     files = sorted(p for p in every if p.name.lower().endswith((".nii", ".nii.gz")) and not is_segmentation(p)
                    and (p.name == VOLUME or not is_prepared(p)))
     if not files:
         held = f"its {len(every)} files are of other kinds" if every else "it is empty"
-        raise FileNotFoundError(f"there is no .nii or .nii.gz file in {root} ({held}); give a folder of NIfTI CTs, or "
-                                "prepare DICOM series with data/prepare_cts.py first")
+        raise NoNIfTI(f"there is no .nii or .nii.gz file in {root} ({held}); give a folder of NIfTI CTs, or "
+                      "prepare DICOM series with data/prepare_cts.py first")
     return files
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from zlib import crc32
 
 import numpy as np
 
-from phydict.datasets.cts.ct_rate import CTFile, find_cts
+from phydict.datasets.cts.ct_rate import CTFile, NoNIfTI, find_cts
+from phydict.datasets.cts.ct_rate_tables import read_reports
 from phydict.datasets.cts.ct_series import Series, find_series, load_series
 from phydict.datasets.cts.segmentations import segmentations_beside
 from phydict.datasets.cts.transforms import case_id, load_ct
@@ -19,11 +20,12 @@ from phydict.runtime.reading import reading
 
 @dataclass(frozen=True)
 class Source:
-    """A CT to prepare. beside: its path without ending, beside which segmentations lie."""
+    """A CT to prepare. beside: its path without ending, beside which segmentations lie. report: radiology text."""
 
     id: str
     ct: CTFile | Series
     beside: Path
+    report: str = ""
 
     @property
     def is_dicom(self) -> bool:
@@ -36,10 +38,6 @@ class Source:
     def load(self) -> tuple[np.ndarray, np.ndarray]:
         """HU (X, Y, Z) in RAS+ and the affine. Raises ValueError and OSError."""
         return load_series(self.ct) if isinstance(self.ct, Series) else load_ct(self.ct.path, self.ct.calibration)
-
-    @property
-    def report(self) -> str:
-        return "" if isinstance(self.ct, Series) else self.ct.report
 
     def fingerprint(self) -> dict:
         """What identifies this input, as plain JSON values: the number, bytes and contents of its files, those of its
@@ -62,19 +60,29 @@ def find_sources(root: Path, **tables) -> list[Source]:
     """Every DICOM series and NIfTI CT below `root`; tables: as for `find_cts`.
 
     A series is named as a NIfTI file in its folder's place would be, `<first subfolder>__<folder>`; where that is not
-    enough, by all its folders, then with its SeriesNumber, then with a count.
-    Raises FileNotFoundError where there is none, and what `find_cts` raises.
+    enough, by all its folders, then with its SeriesNumber, then with a count. Where there are series alone, a given
+    table of reports has theirs by these names.
+    Raises FileNotFoundError where there is none, what `find_cts` raises, and ValueError for a given table of reports
+    without any of the CTs.
     """
     series = find_series(root) if root.is_dir() else []
     try:
         cts = find_cts(root, **tables)
-    except FileNotFoundError:
+    except NoNIfTI:
         if not series:
             raise FileNotFoundError(f"there is no CT in {root}; give a NIfTI file, or a folder that holds NIfTI files "
                                     "or DICOM series") from None
-        cts = []
-    sources = [Source(ct.id, ct, ct.path.with_name(case_id(ct.path))) for ct in cts]
+        return _reported(_named(series, root, set()), tables.get("reports"))
+    sources = [Source(ct.id, ct, ct.path.with_name(case_id(ct.path)), ct.report) for ct in cts]
     return sources + _named(series, root, {ct.id for ct in cts})
+
+
+def _reported(sources: list[Source], reports: str | Path | None) -> list[Source]:
+    texts = read_reports(reports) if reports is not None else {}
+    if reports is not None and not any(source.id in texts for source in sources):
+        raise ValueError(f"none of the {len(texts)} reports in {reports} is of one of the {len(sources)} DICOM series "
+                         f"(the first is {sources[0].id}): name them so in the table, or leave it out")
+    return [replace(source, report=texts.get(source.id, "")) for source in sources]
 
 
 def _named(series: list[Series], root: Path, taken: set[str]) -> list[Source]:

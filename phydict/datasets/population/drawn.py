@@ -19,6 +19,7 @@ from phydict.datasets.population.population import Population
 from phydict.datasets.population.registration import Registered, features, medoid, register
 from phydict.runtime.progress import CaseProgress
 from phydict.runtime.ranges import check_fields
+from phydict.runtime.telling import tell
 from phydict.runtime.warning import warn
 
 POPULATION_VERSION = 2
@@ -66,6 +67,9 @@ class DrawnPatients(Dataset):
                              + (f" ({cts.cts[picked[0]].id})" if picked else "")
                              + as_one_patient(ct.id for ct in cts.cts)
                              + ": give more CTs, or set data.loading.population.share to 0")
+        if len(firsts) < len(cts.cts):
+            tell(f"the population is of one scan of each of {len(firsts)} patients, of {len(cts.cts)} CTs; those in "
+                 "one subfolder count as one patient's", event="population", patients=len(firsts), cts=len(cts.cts))
         self.cts = CTCases([cts.cts[i] for i in picked], cts.cache, cts.grid, cts.window)
         self.folder = cts.cache and cts.cache / f"population{POPULATION_VERSION}"
         self.population: Population | None = None
@@ -111,7 +115,8 @@ class DrawnPatients(Dataset):
             raise ValueError(f"a population is drawn from at least 2 CTs, but {len(left)} of {len(cases)} could be "
                              "registered: give other CTs, or set data.loading.population.share to 0")
         self.drawn = self.folder and self.folder / self._key(
-            [[self.cts.key(self.cts.cts[i]), cases[i]["report"]] for i in left], asdict(self.settings.variation))
+            [[self.cts.key(self.cts.cts[i]), cases[i]["report"]] for i in left], left.index(template),
+            asdict(self.settings.variation))
         self.overlaps = [registered[i].overlap for i in left if i != template]
         self.population = Population([cases[i] for i in left], torch.stack([registered[i].velocity for i in left]),
                                      left.index(template), self.cts.grid, self.cts.window)

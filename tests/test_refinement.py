@@ -16,7 +16,7 @@ from phydict.cli.train import main
 from phydict.datasets import phantom_case
 from phydict.evaluation import read_csv
 from phydict.grid import Cube, Grid
-from phydict.methods import fit_to_grid, reconstructor
+from phydict.methods import METHODS, corrections_of, fit_to_grid, reconstructor
 from phydict.posterior import ProximalCG, Refined, Refinement, Unrolled, refined
 from phydict.posterior.coarse_correction import coarse_correction
 from phydict.prior import correction, load_correction, save_correction, save_prior, save_refiner
@@ -130,6 +130,13 @@ def remarks(voxels: int, refinement: Refinement, corrects: bool = False, beam: C
         ready.reconstruct(*fit_to_grid(ready, target, xrays, beam))
     said = " ".join(str(warning.message) for warning in warned if warning.category is Remark)
     return re.findall(r"(\d+) x \1 x \1", said)
+
+
+def test_the_shipped_networks_correct_on_their_own_voxels():
+    for grid, lengths in ((Grid.cube(64), []), (Grid.box(64, 192.0), [3]), (Grid.cube(256), [3, 1.5])):
+        files = corrections_of(Unrolled(), grid)
+        assert [load_correction(file).grid.spacing[0] for file in files] == lengths
+        assert corrections_of(METHODS["phydict_fast"], grid) == []
 
 
 def test_a_refinement_by_a_network_takes_the_memory_that_is_asked_for():

@@ -88,8 +88,9 @@ class X2CTNetwork(RivalNetwork):
     their own, whose end is a convolution of 7^3. As in the paper, the rays of a view are taken as parallel.
 
     Not as published: any number of views at any angle, one encoder and decoder for all of them, doublings in place of
-    transposed convolutions, the mean is not fed back to the views; it learns from one case at a step, against a smaller
-    PatchGAN (two layers, 16 channels).
+    transposed convolutions, the mean is not fed back to the views; HU are those of the training's window in
+    place of 0 to 2500 over -1000; it learns from one case at a step, against a smaller PatchGAN (two layers, 16
+    channels).
 
     stem: channels of the first convolution; growth, blocks: maps that a dense
     layer adds, and layers of each stage; channels: of the volumes, from the full size to that of 4^3, one more than

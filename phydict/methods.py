@@ -73,11 +73,12 @@ RELEASED_STEPS = GradientSteps(learning_rate=0.01, prior_mean=True, reward=Rewar
 METHODS: dict[str, Sampler | Reconstructor] = {
     # Conjugate gradients onto the X-rays at ten noise levels, the last counting each pixel by its noise.
     "phydict_fast": SplitGibbs(
-        iterations=10, t_start=0.97, t_end=0.15, noise_fraction=0.4, momentum=0.5, sampling_noise=1.0, scatter=True,
+        iterations=10, t_start=0.97, t_end=0.15, noise_fraction=0.7, momentum=0.5, sampling_noise=1.0, scatter=True,
         hardening=True, subgrid=ProximalCG(5, 1, tv_weight=10.0, tv_eps=0.003), metal=Metal(),
-        likelihood=ProximalCG(iterations=7, restarts=1, tv_weight=10.0, tv_eps=0.003),
-        final_likelihood=ProximalCG(iterations=10, restarts=15, noise=0.01, refit_scatter=True,
-                                    weighted_least_squares=True, tv_weight=10.0, tv_eps=0.003, discrepancy=True)),
+        likelihood=ProximalCG(iterations=12, restarts=1, tv_weight=10.0, tv_eps=0.003),
+        final_likelihood=ProximalCG(iterations=25, restarts=3, noise=0.01, refit_scatter=True,
+                                    weighted_least_squares=True, tv_weight=10.0, tv_eps=0.003, precondition_data=True,
+                                    discrepancy=True)),
     # The default: a network trained on scenes of X-rays, four or six calls, each followed by conjugate gradients.
     "phydict_learned": Unrolled(chests_only=True),
     # The paper's text: two gradient steps of 0.1 per timestep with LPIPS, then Extra Compute from delta = 0.8.

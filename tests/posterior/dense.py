@@ -34,6 +34,9 @@ class DenseMeasurement:
         self.calls += 1
         return (r @ self.matrix.to(r)).view(len(r), *SHAPE)
 
+    def mean_diagonal(self, weights: Tensor | float = 1.0) -> float:
+        return float((weights * self.matrix.square().T).sum()) / N
+
     def norm(self) -> float:
         return float(torch.linalg.matrix_norm(self.matrix, 2))
 

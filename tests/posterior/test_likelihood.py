@@ -205,6 +205,23 @@ def test_with_total_variation_every_restart_lowers_the_objective_and_they_end_wh
     assert gradient.abs().max() < 1e-6
 
 
+def test_preconditioned_by_the_x_rays_too_it_ends_at_the_same_minimum_and_nearer_to_it_after_as_many_iterations():
+    m, level, truth = chest_measurement(0.005)
+    x0, step = 0.8 * truth, ProximalCG(10, 4, level, tv_weight=10.0, tv_eps=0.003)
+
+    def objective(z):
+        return float((m.project(z) - m.y).square().sum() / level**2 + (z - x0).square().sum() / 0.2**2
+                     + 2 * step.tv_weight * total_variation(z, m.scales, step.tv_eps))
+
+    plain, both = step(m, x0, 0.2), replace(step, precondition_data=True)(m, x0, 0.2)
+    assert objective(both) < objective(plain)
+    dense = replace(step, iterations=20, restarts=300, noise=0.3, tolerance=1e-13, tv_weight=2.0, tv_eps=0.05)
+    torch.testing.assert_close(replace(dense, precondition_data=True)(measurement(4), X0, 0.5),
+                               dense(measurement(4), X0, 0.5), atol=1e-6, rtol=0)
+    without = replace(step, tv_weight=0.0)
+    assert replace(without, precondition_data=True)(m, x0, 0.2).equal(without(m, x0, 0.2))
+
+
 def test_much_total_variation_leaves_a_constant():
     z = ProximalCG(20, 50, 0.3, 1e-13, tv_weight=1e4, tv_eps=0.01)(measurement(4), X0, 0.5)
     assert z.max() - z.min() < 1e-3

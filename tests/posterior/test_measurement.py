@@ -36,6 +36,16 @@ def test_the_linear_part_is_linear_and_its_adjoint_exact():
     torch.testing.assert_close(m.project(x + d) - m.project(x), m.linear(d))
 
 
+@pytest.mark.parametrize("weights", [1.0, torch.linspace(0, 2, 3).double()[:, None, None]])
+def test_the_mean_diagonal_is_that_of_the_operators_matrix(weights):
+    m = Measurement(PROJECTOR, Y, HUWindow())
+    columns = m.linear(torch.eye(6**3).double().view(6**3, *SHAPE[1:]))
+    exact = float((weights * columns.square()).sum()) / 6**3
+    assert m.mean_diagonal(weights) == pytest.approx(exact, rel=0.3)  # a few voxels share each ray
+    flipped = Measurement(PROJECTOR, Y, HUWindow(-1000, 3000))  # twice the attenuation per unit of the range
+    assert flipped.mean_diagonal(weights) == pytest.approx(4 * m.mean_diagonal(weights))
+
+
 def test_air_projects_to_nothing():
     m = Measurement(PROJECTOR, Y, HUWindow())
     assert m.project(torch.full(SHAPE, -1.0).double()).abs().max() < 1e-12

@@ -64,6 +64,8 @@ class ProximalCG(LikelihoodStep):
             few photons reach count less (Thibault et al. 2007, doi:10.1118/1.2789499)
         tv_weight: weight of the total variation TV, 0 for none
         tv_eps: differences between neighbours, in the prior's range, below which TV is smooth
+        precondition_data: whether the preconditioner of total variation holds the mean diagonal of the X-rays' term as
+            well, with which fewer iterations come as near to the minimum; without total variation it changes nothing
         discrepancy: whether what a result misses of the X-rays beyond their noise, as in wrong poses, counts as noise
             (Morozov 1966): once more from x0, with tv_weight times the squared normalised residual, at most
             MOST_SMOOTHING
@@ -77,6 +79,7 @@ class ProximalCG(LikelihoodStep):
     weighted_least_squares: bool = False
     tv_weight: float = 0.0
     tv_eps: float = 0.01
+    precondition_data: bool = False
     discrepancy: bool = False
 
     def __post_init__(self):
@@ -95,6 +98,7 @@ class ProximalCG(LikelihoodStep):
                              "one above 0")
         weights = 1 / (1 + variance / self.noise**2) if isinstance(variance, Tensor) else 1.0
         tv_scale = self.noise**2 * self.tv_weight
+        diagonal = weight + (measurement.mean_diagonal(weights) if self.precondition_data and tv_scale else 0.0)
         for _ in range(self.restarts):
             reprojection = measurement.project(z)
             if self.refit_scatter:
@@ -109,7 +113,7 @@ class ProximalCG(LikelihoodStep):
                 return fitted.add_(tv.gradient(d), alpha=tv_scale) if tv else fitted
 
             inactive_mask = ~((z <= -1) & (negative_gradient < 0) | (z >= 1) & (negative_gradient > 0))
-            scale = 1 / (weight + tv_scale * tv.diagonal()) if tv else torch.ones_like(z)
+            scale = 1 / (diagonal + tv_scale * tv.diagonal()) if tv else torch.ones_like(z)
             z = (z + conjugate_gradients(normal, negative_gradient * inactive_mask, self.iterations, self.tolerance,
                                          scale * inactive_mask)).clamp(-1, 1)
         if not (self.discrepancy and tv_scale):

@@ -51,8 +51,8 @@ from phydict.runtime.shipped import own_or_shipped, shipped
 DEFAULT_PRIOR = shipped("data/prior/phydict_64.safetensors")
 """The prior that comes with the project."""
 
-UNHEARD = ("phydict_64 has unlearnt what reports state, and a report costs phydict_fast 2 dB from one X-ray: leave "
-           "reports out, or give data/prior/phydict_64_reports.safetensors")
+UNHEARD = ("phydict_64 hears of a report that there is a finding, not on which side: for reports give "
+           "data/prior/phydict_64_reports.safetensors")
 """What is warned of when the first report is given to DEFAULT_PRIOR."""
 
 DEFAULT_REFINER = shipped("data/prior/refiner_64.safetensors")

@@ -300,7 +300,7 @@ def test_a_thousand_noise_levels_change_little_beside_a_hundred():
 
 
 def test_denoisers_in_bf16_fp32_and_fp64_agree(prior):
-    """But for voxels at the bounds, which a restart frees or not by a last digit: here some HU on the root mean square."""
+    """But for voxels at the bounds, which a restart frees or not by a last digit: here some HU."""
     projector, sampler = Projector(GRID, BEAM, full_detector=True), replace(FAST, iterations=4)
 
     def volume(kind: torch.dtype, precision: str) -> torch.Tensor:

@@ -222,4 +222,5 @@ def test_the_shipped_prior_that_hears_no_sides_says_so_at_the_first_and_the_one_
     for loaded in (prior, hears):
         loaded.context([""])
         loaded.context(["a nodule in the left lung"])
-    assert ["phydict_64 hears of a report that there is a finding, not on which side" in str(w.message) for w in recwarn] == [True]
+    said = [str(w.message) for w in recwarn]
+    assert len(said) == 1 and "phydict_64 hears of a report that there is a finding, not on which side" in said[0]

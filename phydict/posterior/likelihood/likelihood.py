@@ -23,6 +23,9 @@ from phydict.runtime.ranges import check_fields
 LEAST, MOST = 1e-9, 1_000_000
 """Of settings that are divided by or squared, so that neither overflows."""
 
+LONG = 12
+"""Iterations of one restart beyond which residuals are kept orthogonal."""
+
 MOST_SMOOTHING = 10.0
 """Most by which model error raises the weight of total variation."""
 
@@ -115,7 +118,7 @@ class ProximalCG(LikelihoodStep):
             inactive_mask = ~((z <= -1) & (negative_gradient < 0) | (z >= 1) & (negative_gradient > 0))
             scale = 1 / (diagonal + tv_scale * tv.diagonal()) if tv else torch.ones_like(z)
             z = (z + conjugate_gradients(normal, negative_gradient * inactive_mask, self.iterations, self.tolerance,
-                                         scale * inactive_mask)).clamp(-1, 1)
+                                         scale * inactive_mask, reorthogonalise=self.iterations > LONG)).clamp(-1, 1)
         if not (self.discrepancy and tv_scale):
             return z
         excess = float(measurement.normalised_residual(z, modelled=True).max()) ** 2

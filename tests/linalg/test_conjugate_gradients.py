@@ -1,0 +1,39 @@
+"""Conjugate gradients whose residuals are kept orthogonal."""
+
+import pytest
+import torch
+from laws import random_like
+
+from phydict.linalg.conjugate_gradients import conjugate_gradients
+
+SIZE = 200
+EIGENVALUES = torch.logspace(0, 5, SIZE).double()
+RIGHT = random_like((2, 1, 4, 5, 10), seed=1)
+SCALE = 1 / (EIGENVALUES.sqrt() * (1 + random_like((SIZE,), seed=2).abs())).view(1, 1, 4, 5, 10)
+
+
+def solved(dtype: torch.dtype, iterations: int, reorthogonalise: bool, right=RIGHT) -> torch.Tensor:
+    turn = torch.linalg.qr(random_like((SIZE, SIZE), seed=3))[0]
+    matrix = (turn * EIGENVALUES) @ turn.T
+
+    def operator(d):
+        return (d.flatten(1) @ matrix.to(dtype)).view_as(d)
+
+    return conjugate_gradients(operator, right.to(dtype), iterations, 0.0, SCALE.to(dtype),
+                               reorthogonalise=reorthogonalise)
+
+
+@pytest.mark.parametrize("iterations", [30, 60])
+def test_kept_orthogonal_single_precision_goes_where_double_goes(iterations):
+    exact = solved(torch.float64, iterations, True)
+    kept, lost = ((solved(torch.float32, iterations, keep).double() - exact).norm() / exact.norm()
+                  for keep in (True, False))
+    assert kept < 1e-3 and lost > 10 * kept
+
+
+def test_in_double_precision_few_iterations_are_the_same_and_a_solved_case_stays():
+    torch.testing.assert_close(solved(torch.float64, 8, True), solved(torch.float64, 8, False), rtol=1e-8, atol=0)
+    half = torch.cat([RIGHT[:1], torch.zeros_like(RIGHT[:1])])
+    found = solved(torch.float64, 20, True, half)
+    torch.testing.assert_close(found[:1], solved(torch.float64, 20, True)[:1])
+    assert not found[1].any()

@@ -57,7 +57,7 @@ class ProximalCG(LikelihoodStep):
     consistency in diffusion sampling, Chung et al. 2024, arXiv:2303.05754.
 
     Args:
-        iterations: of conjugate gradients per restart, at most; 0: z is x0, clipped
+        iterations: of conjugate gradients per restart, at most; 0: z is x0, clipped. More than LONG keep a volume each
         restarts: how often conjugate gradients begin again; 0: z is x0, clipped
         noise: standard deviation of the line integrals' error (noise and model); 0: they are exact, beside which
             nothing else has a weight

@@ -104,6 +104,8 @@ class CascadePosterior(Reconstructor):
                 f"the super-resolution stage makes {stage.grid.shape} voxels of {stage.grid.spacing} mm, but the "
                 f"X-rays are projected from {projector.grid.shape} voxels of {projector.grid.spacing} mm: use its grid")
         self.check_memory(xrays.device, xrays.dtype)
+        if isinstance(stage, torch.nn.Module):
+            stage.to(xrays.device)
         with watch.stage("base"):
             base = self._base(xrays, projector, report, display, seed, on_step)
         with watch.stage("prepare"):

@@ -151,6 +151,8 @@ class Posterior(Reconstructor):
     def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,
                     seed: int = 0, on_step: Callable[[], None] = lambda: None) -> Reconstruction:
         prior, watch = self.prior, Stopwatch()
+        if isinstance(prior, torch.nn.Module):
+            prior.to(xrays.device)
         if not prior.grid.same_as(projector.grid):
             raise ValueError(
                 f"the prior was trained on {prior.grid.shape} voxels of {prior.grid.spacing} mm, but the X-rays are "

@@ -15,7 +15,7 @@ from phydict.datasets.cts.cache import write_array
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM, CachedPhantoms
 from phydict.grid import Cube
 from phydict.runtime.warning import warn
-from phydict.training.data import PriorData
+from phydict.training.data import PriorData, check_plain
 from phydict.training.draws import Draws, Items
 from phydict.training.settings import Crops, HoldOut, Loading
 from phydict.units import AIR, HUWindow
@@ -112,6 +112,7 @@ class SuperResolutionData(PriorData):
         if loading.population.share:
             raise ValueError(f"a super-resolution stage learns from CTs and phantoms alone, but "
                              f"data.loading.population.share is {loading.population.share}: set it to 0")
+        check_plain(loading)
         super().__init__(cts, source, holdout, phantoms, loading, cache, seed=seed, cube=cube, window=window)
         if self.factor != 1:
             raise ValueError(f"a super-resolution stage learns from volumes of {cube.voxels} voxels alone, but "

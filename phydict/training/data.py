@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from dataclasses import asdict
 from pathlib import Path
 
 import lightning
 import torch
-from torch.nn.functional import avg_pool3d
 from torch.utils.data import ConcatDataset, DataLoader, Dataset, DistributedSampler
 
 from phydict.datasets import (
@@ -27,7 +28,7 @@ from phydict.grid import Cube, Grid
 from phydict.runtime.console import check_writable
 from phydict.runtime.seeds import check_seed
 from phydict.runtime.warning import warn
-from phydict.training.draws import MixedCases, training_parts
+from phydict.training.draws import Averaged, KeptDraws, MixedCases, averaged, training_parts
 from phydict.training.settings import HoldOut, Loading
 from phydict.units import HUWindow
 
@@ -56,10 +57,9 @@ class PriorData(lightning.LightningDataModule):
                  window: tuple[float, float] = (-1000.0, 1000.0)):
         super().__init__()
         check_seed(seed)
-        self.factor, rest = divmod(loading.simulation_voxels or cube.voxels, cube.voxels)
-        if rest or self.factor < 1:
-            raise ValueError(f"data.loading.simulation_voxels is a multiple of model.cube.voxels, {cube.voxels}, but "
-                             f"{loading.simulation_voxels} was given")
+        self.factor = _multiple("simulation_voxels", loading.simulation_voxels, "model.cube.voxels", cube.voxels)
+        trained = self.factor * cube.voxels
+        self.block = _multiple("draw_voxels", loading.draw_voxels, "the voxels that are trained on", trained)
         if not cts and not phantoms:
             raise ValueError("there is nothing to train on: give data.cts, or data.phantoms above 0")
         if phantoms < 0:
@@ -68,8 +68,9 @@ class PriorData(lightning.LightningDataModule):
             raise ValueError(f"data.cache {cache} lies inside data.cts {cts}: give a folder elsewhere")
         check_writable(Path(cache), "data.cache")
         hu = HUWindow(*window)
-        self.grid, self.window = Grid.cube(self.factor * cube.voxels, cube.side), hu
-        self.phantoms = CachedPhantoms(0, phantoms, self.grid, hu, Path(cache))
+        self.grid, self.window = Grid.cube(trained, cube.side), hu
+        self.draw_grid = Grid.cube(self.block * trained, cube.side)
+        self.phantoms = CachedPhantoms(0, phantoms, self.draw_grid, hu, Path(cache))
         files = source.find(cts) if cts else []
         for word in holdout.ids or []:
             if not any(word in f.id for f in files):
@@ -85,7 +86,7 @@ class PriorData(lightning.LightningDataModule):
                  f"{as_one_patient(f.id for f in files)}: give more CTs, or name some by data.holdout.ids")
         self.held_out = [f.id for f in held_out]
         validating = set(self.held_out)
-        self.cts = CTCases([f for f in files if f.id not in validating], cache, self.grid, hu)
+        self.cts = CTCases([f for f in files if f.id not in validating], cache, self.draw_grid, hu)
         self.population = DrawnPatients(self.cts, loading.population) if loading.population.share else None
         self.held_out_cts = CTCases(held_out, cache, self.grid, hu)
         self.validation: Dataset = ConcatDataset([
@@ -93,7 +94,7 @@ class PriorData(lightning.LightningDataModule):
         self.reports = [f.report for f in files if f.report and f.id not in validating]
         self.reports += [report(Thorax.draw(s)) for s in range(min(phantoms, 1000))]
         self.reports += self.population.reports(1000) if self.population else []
-        self.loading, self.seed, self.augmentation = loading, seed, augmentation
+        self.loading, self.seed, self.augmentation, self.cache = loading, seed, augmentation, Path(cache)
 
     def origin(self) -> list:
         """Of which files and of which versions of phantoms and new patients the cases to train on are, as plain JSON
@@ -127,8 +128,17 @@ class PriorData(lightning.LightningDataModule):
         """What is trained on in an epoch."""
         if self.population:
             self.population.prepare()  # here, before loader processes are forked
-        return MixedCases(self.cts, self.phantoms, self.loading.ct_fraction, self.grid, self.window,
-                          self.loading.epoch_size, epoch, self.seed, self.augmentation, self.population)
+        length, kept = self.loading.epoch_size, self.loading.reuse > 1
+        mixed = MixedCases(self.cts, self.phantoms, self.loading.ct_fraction, self.draw_grid, self.window, length,
+                           0 if kept else epoch, self.seed, self.augmentation, self.population)
+        drawn = Averaged(mixed, self.block) if self.block > 1 else mixed
+        return KeptDraws(drawn, self._kept_in(), self.loading.reuse, length, epoch, self.seed) if kept else drawn
+
+    def _kept_in(self) -> Path:
+        """The folder of kept draws, another for whatever else decides what they are."""
+        parts = [self.origin(), asdict(self.augmentation), self.loading.ct_fraction, self.seed, asdict(self.window),
+                 self.draw_grid.to_dict(), self.block]
+        return self.cache / f"draws-{hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]}"
 
     def val_dataloader(self) -> DataLoader:
         return DataLoader(self.validation, 1, num_workers=self.loading.workers, collate_fn=self.collate)
@@ -137,7 +147,20 @@ class PriorData(lightning.LightningDataModule):
         """A batch of cases in the model's voxels; drawn in finer ones, these are the batch's "fine" volumes, and their
         means over blocks are what is learnt."""
         batch = torch.utils.data.default_collate([training_parts(case) for case in cases])
-        if self.factor == 1:
-            return batch
-        means = {key: avg_pool3d(batch[key], self.factor) for key in ("volume", "masks")}
-        return batch | means | {"fine": batch["volume"]}
+        return batch if self.factor == 1 else averaged(batch, self.factor) | {"fine": batch["volume"]}
+
+
+def check_plain(loading: Loading) -> None:
+    """Raises ValueError where draws are asked for as only stages that learn from whole cases have them."""
+    for name, unlike in (("draw_voxels", loading.draw_voxels is not None), ("reuse", loading.reuse > 1)):
+        if unlike:
+            raise ValueError(f"this stage makes its draws in its own way, but data.loading.{name} is "
+                             f"{getattr(loading, name)}: leave it out")
+
+
+def _multiple(name: str, voxels: int | None, of: str, base: int) -> int:
+    """How many times `base` voxels a setting of data.loading has; 1 where it is not given."""
+    factor, rest = divmod(voxels or base, base)
+    if rest or factor < 1:
+        raise ValueError(f"data.loading.{name} is a multiple of {of}, {base}, but {voxels} was given")
+    return factor

@@ -52,7 +52,7 @@ class DenoisingTraining(StageTraining):
         generators = [torch.Generator().manual_seed(hash((*key, place)) % 2**31) for place in places]
         u = torch.cat([torch.rand(1, generator=generator) for generator in generators])
         t = ((torch.tensor(places) + u) / (len(x0) * processes)).to(self.device)
-        noise = torch.stack([torch.randn(x0.shape[1:], generator=g) for g in generators]).to(self.device)
+        noise = torch.stack([_noise(x0[0], generator) for generator in generators])
         conditioning = self._condition(batch, x0, generators)
         a, s = (w.float().view(-1, 1, 1, 1, 1) for w in self.prior.schedule.scales(t.double()))
         error = (self.prior(a * x0 + s * noise, t, *conditioning) - x0).square()
@@ -84,6 +84,14 @@ class DenoisingTraining(StageTraining):
     @abstractmethod
     def _write_preview(self, file: Path, batch: dict, x0: Tensor, sample: Tensor) -> None:
         """Writes a picture of a held-out case and a sample."""
+
+
+def _noise(like: Tensor, generator: torch.Generator) -> Tensor:
+    """Normal noise of a tensor's shape, drawn where the tensor is: a CPU would take longer than a GPU for a step."""
+    if like.device.type != "cpu":
+        seed = int(torch.randint(2**62, (1,), generator=generator))
+        generator = torch.Generator(like.device).manual_seed(seed)
+    return torch.randn(like.shape, device=like.device, generator=generator)
 
 
 def denoising_errors(denoiser: Denoiser, x0: Tensor, noise: Tensor, window: HUWindow) -> dict[float, Tensor]:

@@ -4,19 +4,26 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+import torch
+from torch.nn.functional import avg_pool3d
 from torch.utils.data import Dataset
 
 from phydict.datasets.case import Case
 from phydict.datasets.cts.augment import Augmentation, augment
+from phydict.datasets.cts.cache import read_arrays, write_arrays
 from phydict.datasets.population import DrawnPatients
 from phydict.grid import Grid
 from phydict.units import HUWindow
 
 KEYS = ("volume", "masks", "has_masks", "report")
 """The parts of a Case that training needs."""
+
+ALL_NEW = 500
+"""Draws before any is given again, so that the first steps do not see the same few."""
 
 
 class Items(Protocol):
@@ -69,6 +76,61 @@ class MixedCases(Draws):
 
     def item(self, drawn: Case, rng: np.random.Generator) -> dict:
         return training_parts(augment(drawn, int(rng.integers(2**31)), self.grid, self.window, self.augmentation))
+
+
+class Averaged(Dataset):
+    """Draws with the means of their volumes and masks over blocks of `block`^3 voxels."""
+
+    def __init__(self, drawn: Items, block: int):
+        self.drawn, self.block = drawn, block
+
+    def __len__(self) -> int:
+        return len(self.drawn)
+
+    def __getitem__(self, i: int) -> dict:
+        return averaged(self.drawn[i], self.block)
+
+
+class KeptDraws(Dataset):
+    """Draws that are each made once, kept as a file in `folder`, and given `reuse` times on average: when they are new,
+    and then at random between later ones. Item n of epoch e is the same on every machine."""
+
+    def __init__(self, drawn: Items, folder: Path, reuse: int, length: int, epoch: int, seed: int):
+        self.drawn, self.folder, self.reuse = drawn, folder, reuse
+        self.length, self.epoch, self.seed = length, epoch, seed
+
+    def __len__(self) -> int:
+        return self.length
+
+    def __getitem__(self, i: int) -> dict:
+        return self.draw(self.number(self.epoch * self.length + i))
+
+    def draw(self, number: int) -> dict:
+        """Draw `number`, counted from the training's first."""
+        file = self.folder / f"{number:08d}.npz"
+        kept = read_arrays(file)
+        if kept is None:
+            case = self.drawn[number]
+            kept = {"volume": case["volume"].numpy().astype(np.float16),
+                    "masks": (255 * case["masks"].numpy()).round().astype(np.uint8),
+                    "has_masks": case["has_masks"].numpy(), "report": np.array(case["report"])}
+            write_arrays(file, kept)
+        return {"volume": torch.from_numpy(kept["volume"].astype(np.float32)),
+                "masks": torch.from_numpy(kept["masks"].astype(np.float32) / 255),
+                "has_masks": torch.from_numpy(kept["has_masks"]), "report": str(kept["report"])}
+
+    def number(self, item: int) -> int:
+        """Which draw the item of this number, over all epochs, is."""
+        later = max(item - ALL_NEW, 0)
+        newest = min(item, ALL_NEW) + later // self.reuse
+        if later % self.reuse == 0:
+            return newest
+        return int(np.random.default_rng((self.seed, 17, item)).integers(newest + 1))
+
+
+def averaged(case: Mapping, block: int) -> dict:
+    """A Case or a batch of them with the means of volume and masks over blocks of `block`^3 voxels."""
+    return dict(case) | {key: avg_pool3d(case[key], block) for key in ("volume", "masks") if block > 1}
 
 
 def training_parts(case: Mapping) -> dict:

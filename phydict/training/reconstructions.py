@@ -28,7 +28,7 @@ from phydict.prior.finer_uncertainty import SEEN
 from phydict.runtime.ranges import check_fields
 from phydict.runtime.seeds import check_seed
 from phydict.training.crops import CTVolumes, PhantomVolumes, mapped_volume
-from phydict.training.data import PriorData
+from phydict.training.data import PriorData, check_plain
 from phydict.training.draws import Draws, Items
 from phydict.training.scenes import Scenes
 from phydict.training.settings import HoldOut, Loading
@@ -212,6 +212,7 @@ class RefinementData(PriorData):
         if loading.population.share:
             raise ValueError(f"a refinement learns from reconstructions of CTs and phantoms alone, but "
                              f"data.loading.population.share is {loading.population.share}: set it to 0")
+        check_plain(loading)
         super().__init__(cts, CTSource(), holdout, phantoms, loading, cache, cube=cube, window=window)
         if self.factor != 1:
             raise ValueError(f"X-rays of reconstructions are made of {FINER * cube.voxels} voxels anyway, but "

@@ -22,7 +22,7 @@ from phydict.prior import DEFAULT_REFINER, BoundRefiner, Refiner, fingerprint, l
 from phydict.prior.evidence_channels import EVIDENCE_CHANNELS
 from phydict.runtime.ranges import check_fields
 from phydict.training.crops import mapped_volume
-from phydict.training.data import PriorData
+from phydict.training.data import PriorData, check_plain
 from phydict.training.draws import Draws, Items
 from phydict.training.refiner import RefinerTraining
 from phydict.training.scenes import Scenes
@@ -131,6 +131,7 @@ class RollOutData(PriorData):
                  holdout: HoldOut = HoldOut(), phantoms: int = 2000, loading: Loading = Loading(),
                  cache: str = "runs/cache", augmentation: Augmentation = Augmentation(), seed: int = 0,
                  cube: Cube = Cube(), window: tuple[float, float] = (-1000.0, 1000.0)):
+        check_plain(loading)
         super().__init__(cts, CTSource(), holdout, phantoms, loading, cache, augmentation, seed, cube, window)
         refiner = load_prior(rollouts.initial)
         if not isinstance(refiner, Refiner) or not refiner.grid.same_as(cube.grid()) or refiner.window != self.window:

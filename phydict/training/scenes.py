@@ -133,9 +133,9 @@ class Scenes:
     def measure(self, ct: Tensor, rng: np.random.Generator, grid: Grid, window: HUWindow,
                 fine: Tensor | None = None) -> Measurement:
         """The same as a measurement; of what was drawn into it nobody is warned."""
-        y, projector = self.xrays(ct, rng, grid, window, fine)
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), torch.autocast(ct.device.type, enabled=False):
             warnings.simplefilter("ignore")
+            y, projector = self.xrays(ct, rng, grid, window, fine)
             return Measurement(projector, y, window)
 
 

@@ -196,6 +196,9 @@ class Loading:
         population: new patients drawn from the CTs, which a share of these draws is taken from
         simulation_voxels: for stages that learn from X-rays, voxels per side of the volumes that these are made of, a
             multiple of model.cube.voxels; none given: the model's own
+        draw_voxels: voxels per side on which cases are changed before they are averaged to those that are trained on,
+            a multiple of these: more keep grain and edges that the changes' interpolation smooths; none given: the same
+        reuse: times that a draw is trained on, on average; above 1, each is made once and kept in data.cache
     """
 
     epoch_size: int = 400
@@ -204,10 +207,12 @@ class Loading:
     ct_fraction: float = 0.5
     population: PopulationSettings = PopulationSettings()
     simulation_voxels: int | None = None
+    draw_voxels: int | None = None
+    reuse: int = 1
 
     def __post_init__(self):
         check_fields(self, "data.loading", epoch_size=(1, MOST_DRAWS), batch_size=(1, MOST_DRAWS),
-                     workers=(0, MOST_WORKERS), ct_fraction=(0, 1))
+                     workers=(0, MOST_WORKERS), ct_fraction=(0, 1), reuse=(1, MOST_DRAWS))
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from pathlib import Path
 import lightning
 import numpy as np
 import torch
+from lightning.pytorch.callbacks import WeightAveraging
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 
@@ -67,6 +68,11 @@ class StageTraining(lightning.LightningModule, ABC):
 
     def learn_reports(self) -> None:
         """Teaches the text part, where there is one, before the first denoising step."""
+
+    def on_fit_start(self) -> None:
+        for callback in self.trainer.callbacks:  # type: ignore[attr-defined]
+            if isinstance(callback, WeightAveraging) and callback._average_model is not None:
+                callback._average_model.to(self.device)  # made before the weights came there; each step would copy them
 
     def training_step(self, batch: dict, index: int) -> Tensor:
         loss = self.batch_loss(batch, (self.seed, self.global_step, index), self.global_rank, self.trainer.world_size)

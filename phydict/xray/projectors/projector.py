@@ -145,7 +145,7 @@ class _Linear(torch.autograd.Function):
     @staticmethod
     def forward(ctx, x, operator, transposed):
         ctx.operator, ctx.transposed = operator, transposed
-        with stage("projector"):
+        with stage("projector"), torch.autocast(x.device.type, enabled=False):  # which would round sparse products
             return operator.adjoint(x) if transposed else operator.forward(x)
 
     @staticmethod

@@ -12,8 +12,8 @@ from scipy.sparse import csr_array
 
 from phydict.xray.projectors.csr import csr_tensor
 
-BLOCK_VALUES = 2**20
-"""Intermediate values per block of columns (4 MiB in float32)."""
+BLOCK_VALUES = 2**24
+"""Intermediate values per block of columns (64 MiB in float32)."""
 
 
 class SparseFactors:

@@ -38,7 +38,7 @@ def edge_profile(volume: Tensor, lung: Tensor, edge: str, reach: int = 5) -> Ten
     crossing = []
     for values, inside in both:
         first = inside.int().argmax(-1)
-        places = first[:, None] + torch.arange(reach - 1, -reach - 1, -1)
+        places = first[:, None] + torch.arange(reach - 1, -reach - 1, -1, device=first.device)
         kept = inside.any(-1) & (places.amin(-1) >= 0) & (places.amax(-1) < values.shape[-1])
         kept[kept.clone()] &= inside[kept].gather(-1, places[kept])[:, :reach].all(-1)
         crossing.append(values[kept].gather(-1, places[kept]))
@@ -51,7 +51,7 @@ def edge_profile(volume: Tensor, lung: Tensor, edge: str, reach: int = 5) -> Ten
 
 def edge_width(profile: Tensor, spacing: float) -> float:
     """mm over which a profile rises from 10 to 90 % of the way between its ends; of `spacing` mm between samples."""
-    share = ((profile - profile[0]) / (profile[-1] - profile[0])).double().numpy()
+    share = ((profile - profile[0]) / (profile[-1] - profile[0])).double().numpy(force=True)
     share = np.maximum.accumulate(share)
     places = np.arange(len(share))
     low, high = (float(np.interp(level, share + 1e-9 * places, places)) for level in (0.1, 0.9))

@@ -108,9 +108,9 @@ class Scenes:
         """X-rays (K, V, U) of a CT (1, 1, X, Y, Z) in the prior's range, of a drawn scene, and their projector from its
         grid; `fine`, if given, is the same CT in finer voxels."""
         scale = grid.extent[0] / 384
-        projector = true = Projector(grid, self.beam(rng, grid), full_detector=True)
+        projector = true = Projector(grid, self.beam(rng, grid), device=ct.device, full_detector=True)
         if _happens(self.misplaced, rng):
-            true = Projector(grid, _moved(projector.beam, rng, scale), full_detector=True)
+            true = Projector(grid, _moved(projector.beam, rng, scale), device=ct.device, full_detector=True)
         if fine is not None and rng.random() < self.fine:
             y = FinerProjector(true, fine.shape[-1] // ct.shape[-1])(window.to_mu(fine))
         else:

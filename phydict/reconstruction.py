@@ -76,17 +76,19 @@ class Reconstruction:
         save_nifti(path, self.volume.numpy(), self.grid)
 
 
-def save_nifti(path: str | Path, volume: np.ndarray, grid: Grid) -> None:
+def save_nifti(path: str | Path, volume: np.ndarray, grid: Grid, dtype: type[np.number] = np.float32) -> None:
     """Writes `volume` (X, Y, Z) on `grid` as NIfTI (.nii or .nii.gz), replacing the file only when complete.
 
-    Raises ValueError for another ending.
+    dtype: of the file; of whole numbers, the nearest that it holds are written. Raises ValueError for another ending.
     """
     import nibabel
 
     if not str(path).lower().endswith((".nii", ".nii.gz")):
         raise ValueError(f"a volume is written as NIfTI, but '{path}' was given: end the name in .nii or .nii.gz")
 
-    image = nibabel.Nifti1Image(np.asarray(volume, np.float32), grid.affine)
+    if issubclass(dtype, np.integer):
+        volume = np.rint(volume).clip(np.iinfo(dtype).min, np.iinfo(dtype).max)
+    image = nibabel.Nifti1Image(np.asarray(volume, dtype), grid.affine)
     image.header.set_xyzt_units("mm", "sec")
     image.set_sform(grid.affine, code="scanner")
     image.set_qform(grid.affine, code="scanner")

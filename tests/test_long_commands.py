@@ -93,6 +93,12 @@ def terminal() -> Iterator[list[bytes]]:
     os.close(ours)
 
 
+def shown_in(page: Path) -> set[str]:
+    """The ids of the cases on a page."""
+    content = re.search(r'id="content">(.*)</script>\n<script>', page.read_text()).group(1)
+    return {case["record"]["case"] for case in json.loads(content)["cases"]}
+
+
 def stop_once(monkeypatch) -> None:
     """Presses Ctrl-C after the first case and, in training, in the second epoch."""
     finished, step = CaseProgress.finished, PriorTraining.training_step
@@ -145,10 +151,20 @@ def test_ctrl_c_on_a_terminal_says_how_to_resume_and_a_log_file_tells_the_rest(c
     else:
         assert advice.endswith("run the same command again")
         more = []
+    if command in ("predict", "test", "ablate"):
+        assert len(shown_in(tmp_path / "out" / "index.html")) == 1
     log = run(command, *more)
     assert f"results in {tmp_path / 'out'}" in log and "\x1b" not in log
     wanted = r"step 5 of 8, about \d+ s to go: loss" if command == "fit" else r"\(1 of 1\)$"
     assert re.search(wanted, log, flags=re.MULTILINE), log
+
+
+@pytest.mark.parametrize("command", ["predict", "test", "ablate"])
+def test_a_run_that_is_stopped_before_a_case_is_finished_writes_no_page(command, run, handlers, tmp_path, monkeypatch):
+    monkeypatch.setattr(CaseProgress, "case", lambda *_: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(SystemExit) as stopped:
+        run(command)
+    assert stopped.value.code == 130 and not (tmp_path / "out" / "index.html").exists()
 
 
 @pytest.mark.parametrize("command", sorted({*COMMANDS} - {"test"}))  # which is as predict

@@ -1,10 +1,16 @@
 """What a long run tells: what is done, what remains and for how long, in words or for machines, or nothing."""
 
 import json
+import re
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
+import torch
 
+from phydict.evaluation.fid import NAMES, distances
+from phydict.evaluation.planes import PLANES
+from phydict.inference.distances import told_distances
 from phydict.runtime import progress as module
 from phydict.runtime.progress import CaseProgress, duration
 from phydict.runtime.telling import tell, telling
@@ -83,6 +89,19 @@ def test_a_long_validation_of_a_training_tells_its_cases(capsys, monkeypatch):
             now[0] += 6
             progress.on_validation_batch_end(trainer, None, None, None, index)
         assert capsys.readouterr().err.splitlines() == lines
+
+
+def test_frechet_distances_tell_plane_after_plane_and_are_the_same(capsys):
+    some = np.random.default_rng(0)
+    methods = {method: {case: {plane: torch.from_numpy(some.normal(size=(2, 5, 3))) for plane in PLANES}
+                        for case in cases} for method, cases in (("sirt", "ab"), ("tv", "ab"), ("fdk", "a"))}
+    found, wanted = told_distances(methods, 7), distances(methods, 7)
+    for method in methods:
+        assert all(np.array_equal(found[method].values[name], wanted[method].values[name]) for name in NAMES)
+    begin, *lines = capsys.readouterr().err.splitlines()
+    assert begin == "Frechet distances of slices: 6 planes to measure"  # of two groups of methods with the same cases
+    assert [re.sub(", about .* to go", "", line) for line in lines] == [
+        f"plane {plane}: measured ({n} of 6)" for n, plane in enumerate([*PLANES, *PLANES], 1)]
 
 
 @pytest.mark.parametrize("seconds, words", [(0.4, "0 s"), (99, "99 s"), (100, "2 min"), (5900, "98 min"),

@@ -237,6 +237,17 @@ def test_another_seed_makes_other_reconstructions_and_the_same_held_out_ones(tmp
     assert first.validation.made.folder == second.validation.made.folder
 
 
+def test_an_epoch_says_how_many_reconstructions_are_still_to_be_made(tmp_path, refiner_file, capsys):
+    data = RefinementData(
+        RefinementCases(2, 1, 16), Scenes(most_views=3), phantoms=2, cache=str(tmp_path / "cache"),
+        initial=refiner_file, cube=Cube(32), window=(-1000, 600))
+    data.made.folder.mkdir(parents=True)
+    for made, says in enumerate(("0 of 2 reconstructions are made", "1 of 2 reconstructions are made", "")):
+        data.draws(made)
+        assert capsys.readouterr().err.partition(",")[0] == says
+        (data.made.folder / f"{made:05d}.npy").touch()
+
+
 def test_held_out_reconstructions_are_those_of_their_own_volumes(tmp_path, refiner_file):
     def validated(phantoms: int) -> Path:
         data = RefinementData(

@@ -45,6 +45,16 @@ def test_single_calls_are_learnt_from_as_a_whole_reconstruction_is(refiner_file,
     torch.testing.assert_close(torch.stack([found[n] for n in range(whole.calls)]).mean(), live, rtol=2e-3, atol=2e-3)
 
 
+def test_an_epoch_says_how_many_roll_outs_are_still_to_be_made(tmp_path, refiner_file, capsys):
+    data, said = rollouts(refiner_file, tmp_path, count=2), []
+    for epoch in range(3):
+        data.draws(epoch)
+        said.append(capsys.readouterr().err)
+        data.rollouts[min(epoch, 1)]
+    assert [text.partition(",")[0] for text in said] == ["0 of 2 roll-outs are made", "1 of 2 roll-outs are made", ""]
+    assert said[0].endswith(f"in {data.rollouts.folder}\n")
+
+
 def test_calls_of_finer_volumes_and_masks_that_are_not_known_are_kept_as_such(refiner_file, cache, monkeypatch):
     data = rollouts(refiner_file, cache, loading=Loading(simulation_voxels=32))
     case, kinds = data._case(0), load_prior(refiner_file).state_channels - 1

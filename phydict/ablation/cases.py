@@ -11,12 +11,12 @@ from phydict.inference.data import ReconstructionData
 
 @dataclass(frozen=True)
 class Cases:
-    """Where the cases come from: a folder of CTs, or a number of phantoms; `only` and `reports` as in infer.py."""
+    """Where the cases come from: a folder of CTs, or a number of phantoms; `only` and `source` as in infer.py."""
 
     cts: str | None = None
     phantoms: int | None = None
     only: str | None = None
-    reports: str | None = None
+    source: CTSource = CTSource()
 
     def __post_init__(self):
         if (self.cts is None) == (self.phantoms is None):
@@ -24,14 +24,14 @@ class Cases:
                              "two, in the file or on the command line")
         if self.phantoms is not None and type(self.phantoms) is not int:
             raise ValueError(f"phantoms is a whole number without quotes, but {self.phantoms!r} was given")
-        for name in ("cts", "only", "reports"):
+        for name in ("cts", "only"):
             check_path(getattr(self, name), name)
 
     def data(self, **settings) -> ReconstructionData:
         """The simulated X-rays of these cases."""
         if self.phantoms is not None:
             return ReconstructionData(cts="phantom", phantoms=self.phantoms, **settings)
-        return ReconstructionData(cts=self.cts, only=self.only, source=CTSource(self.reports), **settings)
+        return ReconstructionData(cts=self.cts, only=self.only, source=self.source, **settings)
 
 
 def check_path(value, name: str) -> None:

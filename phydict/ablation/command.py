@@ -6,6 +6,7 @@ import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import get_type_hints
 
 import torch
 from jsonargparse import ArgumentParser
@@ -13,10 +14,11 @@ from jsonargparse import ArgumentParser
 from phydict.ablation.fid import comparison_tables
 from phydict.ablation.page import comparison_page
 from phydict.ablation.plots import write_plots
-from phydict.ablation.run import RESULTS, run
-from phydict.ablation.spec import read_specification
+from phydict.ablation.run import RESULTS, planned, run
+from phydict.ablation.spec import Specification, read_specification
 from phydict.ablation.summary import summarise
 from phydict.ablation.tables import all_tables, write_tables
+from phydict.datasets import CTSource
 from phydict.inference.scoring import METRICS, Scoring
 from phydict.methods import METHODS
 from phydict.page import check_own_page
@@ -41,19 +43,34 @@ def main(args: list[str] | None = None) -> None:
             raise ValueError(f"--device {device} cannot be used ({reason(error)[:100]}): give cpu, or leave it "
                              "out") from error
         del given["quiet"], given["json_lines"]
+        keep_volumes = given.pop("keep_volumes")
+        source = {name: value for name, value in given.pop("source").items() if value is not None}
+        given["source"] = source or None
         specification = read_specification(given.pop("config"), given.pop("set"), **given)
         check_writable(specification.out, "out")
         check_own_page(specification.out, "out")
         check_apart(specification.out, "out", [Path(cts)] if (cts := specification.cases.cts) else [])
         scoring = Scoring(specification.metrics, specification.fid, specification.clip)
-        with alone_in(specification.out, "out"), CaseProgress() as progress:
-            rows = run(specification, torch.device(device), progress, scoring)
+        try:
+            with alone_in(specification.out, "out"), CaseProgress() as progress:
+                rows = run(specification, torch.device(device), progress, scoring, keep_volumes)
+        except KeyboardInterrupt:
+            _page_so_far(specification, scoring)
+            raise
         print(f"{len(rows)} rows in {specification.out / RESULTS}")
         entries = summarise(rows)
         tables = all_tables(entries, scoring.empty) + comparison_tables(specification.out, entries, scoring)
         written = write_tables(specification.out, tables) + write_plots(specification.out, entries)
         print(f"tables and plots in {specification.out}: {', '.join(path.name for path in written)}")
         print(f"page: {comparison_page(specification.out, entries, tables)}")
+
+
+def _page_so_far(specification: Specification, scoring: Scoring) -> None:
+    """Writes the page of the rows that a stopped run has finished, where there are any, without the Frechet distances
+    of slices, which take long."""
+    entries = summarise(planned(specification, scoring)[0].rows)
+    if any(entry.counted for entry in entries):
+        print(f"page: {comparison_page(specification.out, entries, all_tables(entries, scoring.empty))}")
 
 
 def _parser(args: Sequence[str]) -> ArgumentParser:
@@ -70,6 +87,8 @@ def _parser(args: Sequence[str]) -> ArgumentParser:
     parser.add_argument("--phantoms", type=int, help="a number of phantoms, instead of the file's cases")
     parser.add_argument("--only", type=str, help="a text file of the case ids to take")
     parser.add_argument("--reports", type=str, help="CT-RATE's table of reports, or the folder it is in")
+    for name, hint in get_type_hints(CTSource).items():
+        parser.add_argument(f"--source.{name}", type=hint | None, help="as --data.source of test")
     parser.add_argument("--set", nargs="+", metavar="NAME=VALUE",
                         help="settings instead of the file's; a list is an axis: --set "
                              "method=[sirt,my_module.MySampler] views=4 projector=siddon; of one of the file's changed "
@@ -77,6 +96,8 @@ def _parser(args: Sequence[str]) -> ArgumentParser:
     parser.add_argument("--metrics", type=list[str],
                         help=f"what is measured, instead of the file's: a list of {', '.join(METRICS)}")
     parser.add_argument("--out", type=str, help="folder of the results, instead of the file's")
+    parser.add_argument("--keep_volumes", action="store_true",
+                        help="keep each row's volume, in volumes/<key>, and show it on the page")
     parser.add_argument("--device", type=str, help="cpu or cuda; left out: cuda where there is one")
     add_telling(parser)
     words = {word for arg in args for word in re.findall(r"\w+", arg)}

@@ -10,9 +10,11 @@ from phydict.ablation.run import features_file
 from phydict.ablation.summary import Entry, conditions, format_settings
 from phydict.datasets import patient_of
 from phydict.evaluation import read_csv, write_csv
+from phydict.evaluation.backbones import NORMALISATION
 from phydict.evaluation.bootstrap import Estimate
-from phydict.evaluation.fid import StoredFeatures, distances
+from phydict.evaluation.fid import Distances, StoredFeatures
 from phydict.evaluation.tables import Table, fid_tables
+from phydict.inference.distances import told_distances
 from phydict.inference.scoring import FIDSettings, Scoring
 
 FID = "fid.csv"
@@ -48,13 +50,19 @@ def _tables(out: Path, entries: Sequence[Entry], backbone: str, replicates: int)
         features = {entry.label: {name: StoredFeatures(features_file(out, key), backbone)
                                   for name, key in _named(entry.counted)} for entry in group if entry.counted}
         if features:
-            found = distances(features, replicates)
+            found = told_distances(features, replicates)
             title = format_settings("Frechet distance of slices (FID)", condition)
             tables += fid_tables(found, backbone, replicates, title)
-            rows += [{"method": label} | condition | {"fid_backbone": backbone, "replicates": replicates,
-                                                      "cases": len(one.cases)} | _numbers(one.estimates())
+            rows += [{"method": label} | condition | _origin(one, backbone, replicates) | _numbers(one.estimates())
                      for label, one in found.items()]
     return tables, rows
+
+
+def _origin(found: Distances, backbone: str, replicates: int) -> dict:
+    """What distances rest on; the truth has as many slices as the reconstructions, of the same cases."""
+    return {"fid_backbone": backbone, "fid_normalisation": NORMALISATION, "replicates": replicates,
+            "cases": len(found.cases)} | {f"{of}slices_{plane}": count for of in ("", "truth_")
+                                          for plane, count in found.slices.items()}
 
 
 def _numbers(estimates: Mapping[str, Estimate]) -> dict[str, float]:

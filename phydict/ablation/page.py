@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from phydict.ablation.fid import kept_tables
-from phydict.ablation.run import RESULTS
+from phydict.ablation.run import RESULTS, volume_folder
 from phydict.ablation.summary import Entry, format_settings, summarise
 from phydict.ablation.tables import all_tables
 from phydict.evaluation import read_csv
@@ -30,7 +31,7 @@ def comparison_page(folder: Path, entries: Sequence[Entry], tables: Sequence[Tab
     """Writes the page of entries, with their rows, and tables, with the plots in the folder; returns its path. Raises
     ValueError where a page of someone else's is in its place."""
     check_own_page(folder, "out")
-    cases = [_case(entry, row) for entry in entries for row in entry.counted]
+    cases = [_case(folder, entry, row) for entry in entries for row in entry.counted]
     points = [{"name": format_settings(entry.label, entry.condition), "series": entry.method,
                "seconds": entry.means["seconds"], "error": entry.means.get("mae_hu")}
               for entry in entries if "seconds" in entry.means]
@@ -39,12 +40,14 @@ def comparison_page(folder: Path, entries: Sequence[Entry], tables: Sequence[Tab
                                        plots=sorted(path.name for path in folder.glob("*.png")), links=kept))
 
 
-def _case(entry: Entry, row: Mapping) -> PageCase:
-    """A row as a case, known by its method, settings and seed."""
+def _case(folder: Path, entry: Entry, row: Mapping) -> PageCase:
+    """A row as a case, known by its method, settings and seed, with its volume where that was kept."""
     scores = {name: row[name] for name in MEASURES if row.get(name) is not None}
     record = {name: value for name, value in row.items() if name not in scores and value is not None}
     group = format_settings(str(row["case"]), entry.condition)
-    return PageCase("", (), record | {
+    kept = volume_folder(folder, str(row.get("key")))
+    place, files = (kept.relative_to(folder).as_posix(), sorted(os.listdir(kept))) if kept.is_dir() else ("", ())
+    return PageCase(place, files, record | {
         "method": format_settings(entry.name, entry.condition, {"seed": row.get("seed", 0)}),
         "scores": scores, "misfit": row.get("misfit"), "seconds": {"all": row["seconds"]} if "seconds" in row else {},
         "warnings": [row["warning"]] if row.get("warning") else []}, group)

@@ -7,9 +7,11 @@ import reprlib
 import warnings
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from phydict.ablation.spec import Specification
@@ -18,12 +20,14 @@ from phydict.datasets.case import Case, lacking
 from phydict.evaluation import read_csv, write_csv
 from phydict.evaluation.fid import save_features
 from phydict.evaluation.metrics import MEASURES
-from phydict.inference.protocols import cut_out, resampled
+from phydict.inference.case_files import VOLUME, write_page_files
+from phydict.inference.protocols import cut_out, placed, resampled
 from phydict.inference.scoring import Scoring
 from phydict.methods import fit_to_grid, onto_grid, reconstructor
 from phydict.posterior import Sampler
-from phydict.reconstruction import Reconstruction
+from phydict.reconstruction import Reconstruction, save_nifti
 from phydict.runtime.console import TRACEBACK, noted, sentence
+from phydict.runtime.files import atomic_directory
 from phydict.runtime.precision import instruction_set
 from phydict.runtime.profiling import peak_memory, profiled, reset_peak_memory
 from phydict.runtime.progress import CaseProgress
@@ -100,36 +104,49 @@ class Results:
         write_csv(self.file, [{k: row.get(k) for k in order} | row for row in self.rows + self.others])
 
 
-def run(specification: Specification, device: torch.device, progress: CaseProgress,
-        scoring: Scoring | None = None) -> list[dict]:
-    """The rows of a specification: those that its table holds already, and those that are run now, with the metrics of
-    `scoring`.
+Work = list[tuple[Trial, str, Callable[[], Case]]]
+"""Trials of a case, the keys of their rows, and the functions that make the case."""
 
-    Case by case; the X-rays of a case are simulated once for all trials that share an acquisition.
-    """
-    scoring = scoring or Scoring()
-    cases_of, planned = {}, {}  # by acquisition; key -> columns
-    cases: dict[str, list] = {}  # id -> trials, their rows' keys, and the functions that make the case
+
+def planned(specification: Specification, scoring: Scoring) -> tuple[Results, dict[str, Work]]:
+    """The table of a specification's rows, with those that its file holds already, and the work of each case, by its
+    id."""
+    cases_of, rows = {}, {}  # by acquisition; key -> columns
+    cases: dict[str, Work] = {}
     for trial in specification.trials:
         if (acquisition := trial.acquisition()) not in cases_of:
             cases_of[acquisition] = trial.data.test_cases(*trial.scene())
         for case, source, make in cases_of[acquisition]:
             name = key(trial, case, source, scoring.settings())
-            planned[name] = {"case": case} | trial.columns | {"grid": "x".join(map(str, trial.scored().shape))}
+            rows[name] = {"case": case} | trial.columns | {"grid": "x".join(map(str, trial.scored().shape))} | (
+                {"training": trial.training} if trial.training else {})
             cases.setdefault(case, []).append((trial, name, make))
-    results = Results(specification.out, planned)
+    return Results(specification.out, rows), cases
+
+
+def run(specification: Specification, device: torch.device, progress: CaseProgress,
+        scoring: Scoring | None = None, keep_volumes: bool = False) -> list[dict]:
+    """The rows of a specification: those that its table holds already, and those that are run now, with the metrics of
+    `scoring`; keep_volumes: each row's volume in a folder beside the table, of rows that lack theirs too.
+
+    Case by case; the X-rays of a case are simulated once for all trials that share an acquisition.
+    """
+    scoring = scoring or Scoring()
+    results, cases = planned(specification, scoring)
     if scoring.network:
         results.forget(lambda name: not features_file(specification.out, name).is_file())
-    left = sum(name not in results.done for name in planned)
-    tell(f"{len(planned) - left} of {len(planned)} rows are there already, {left} are to be run",
-         event="kept", cases=len(planned) - left, of=len(planned))
+    if keep_volumes:
+        results.forget(lambda name: not volume_folder(specification.out, name).is_dir())
+    of = len(results.planned)
+    left = sum(name not in results.done for name in results.planned)
+    tell(f"{of - left} of {of} rows are there already, {left} are to be run", event="kept", cases=of - left, of=of)
     if others := len(results.others):
         tell(f"{others} rows of other settings or data are kept in {results.file} and left out of tables",
              event="others", cases=others, out=str(results.file))
-    runner = Runner(device, scoring, specification.out, progress)
+    runner = Runner(device, scoring, specification.out, progress, keep_volumes)
     progress.begin("ablate", left, verb="run", out=specification.out, noun="row")
     for case, work in cases.items():
-        groups: dict[str, list] = {}
+        groups: dict[str, Work] = {}
         made = CaseCache()
         for trial, name, make in work:
             if name not in results.done:
@@ -187,10 +204,12 @@ class MeasuredCase:
 class Runner:
     """Runs trials and measures them; what only a first call costs is spent before the clock runs.
 
-    out: where the features of slices are kept, where the Frechet distance is measured."""
+    out: where the features of slices are kept, where the Frechet distance is measured, and volumes if these are."""
 
-    def __init__(self, device: torch.device, scoring: Scoring, out: Path, progress: CaseProgress):
+    def __init__(self, device: torch.device, scoring: Scoring, out: Path, progress: CaseProgress,
+                 keep_volumes: bool = False):
         self.device, self.scoring, self.out, self.progress, self.warm = device, scoring, out, progress, set[str]()
+        self.keep_volumes = keep_volumes
 
     def measure(self, trial: Trial, scene: MeasuredCase, key: str) -> dict:
         """The measured columns of one trial on one case, the row of `key`."""
@@ -222,6 +241,8 @@ class Runner:
                                          trial.data.protocol)
             if features := self.scoring.features(volume, scene.truth, scene.window, self.device):
                 save_features(features_file(self.out, key), features)
+            if self.keep_volumes:
+                _keep(volume_folder(self.out, key), result, scene)
         return scores | {
             "status": "ok" if finite else "diverged",
             "error": None if finite else "the volume holds NaN or infinite voxels", "misfit": result.misfit,
@@ -248,6 +269,21 @@ class Runner:
 def features_file(out: Path, key: str) -> Path:
     """Where the features of the slices of a row's volume are kept."""
     return out / "features" / f"{key}.safetensors"
+
+
+def volume_folder(out: Path, key: str) -> Path:
+    """Where a row's volume is kept, with what the page shows of it, if it is."""
+    return out / "volumes" / key
+
+
+def _keep(folder: Path, result: Reconstruction, scene: MeasuredCase) -> None:
+    """Writes a volume, in its place in the CT that it came from, and what the page shows of it."""
+    truth = resampled(scene.window.to_hu(scene.truth["volume"])[0].cpu(), scene.grid, result.grid)
+    if "affine" in scene.truth:
+        result = replace(result, grid=placed(result.grid, scene.grid, scene.truth["affine"].numpy()))
+    with atomic_directory(folder) as partial:
+        save_nifti(partial / VOLUME, result.volume.numpy(), result.grid, np.int16)
+        write_page_files(partial, result, truth)
 
 
 @cache

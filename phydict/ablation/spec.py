@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import reprlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from phydict.ablation.cases import Cases, check_path
 from phydict.ablation.nested import changed as changed_settings
 from phydict.ablation.nested import has_field, parsed
 from phydict.ablation.trials import Trial, check_used, dotted, method_of, trials_of
+from phydict.datasets import CTSource
 from phydict.inference.scoring import CLIPSettings, FIDSettings
 from phydict.runtime.reading import refusing
 from phydict.runtime.shipped import configuration
@@ -32,15 +33,16 @@ class Specification:
 
 def read_specification(file: str | Path, changes: Sequence[str] | None = None, **given) -> Specification:
     """The specification in a YAML file, or in a shipped one by its name; `given` (out, cts, phantoms, only, reports,
-    metrics), where not None, takes the place of what the file says, and so do `changes`: settings as "name=value", of
-    which a list of values is an axis, or as "method.setting=value" of one of the file's changed methods.
+    source, metrics), where not None, takes the place of what the file says, and so do `changes`: settings as
+    "name=value", of which a list of values is an axis, or as "method.setting=value" of one of the file's changed
+    methods.
 
-    Its keys: out; cts or phantoms, only, reports; metrics, fid, clip: what is measured, as in infer.py test; methods:
-    names for changed methods, each a mapping of settings and `of`, the method that is changed, by its name or the path
-    of its class; base: settings of all trials; axes: setting -> list of values, of which every combination is a trial;
-    or products: a list of such bases and axes. A setting that
-    means nothing to a method is left out for it, and what then is the same is run once. Raises ValueError, in one
-    sentence, on what cannot be meant.
+    Its keys: out; cts or phantoms, only, source: which CTs of the folder are taken, as data.source in infer.py test,
+    and reports, short for source.reports; metrics, fid, clip: what is measured, as there; methods: names for changed
+    methods, each a mapping of settings and `of`, the method that is changed, by its name or the path of its class;
+    base: settings of all trials; axes: setting -> list of values, of which every combination is a trial; or products: a
+    list of such bases and axes. A setting that means nothing to a method is left out for it, and what then is the same
+    is run once. Raises ValueError, in one sentence, on what cannot be meant.
     """
     content = read_yaml(configuration(file, ("ablate",)))
     changed = {}
@@ -54,14 +56,15 @@ def read_specification(file: str | Path, changes: Sequence[str] | None = None, *
 
 
 def _specification(content, given: Mapping, changed: dict) -> Specification:
-    keys = ("out", "cts", "phantoms", "only", "reports", "metrics", "fid", "clip", "methods", "base", "axes",
+    keys = ("out", "cts", "phantoms", "only", "reports", "source", "metrics", "fid", "clip", "methods", "base", "axes",
             "products")
     _check_keys(content, keys, "a specification")
     if "products" in content and "axes" in content:
         raise ValueError("give axes, or products, each with axes of its own, but not both")
     if "cts" in given or "phantoms" in given:
-        content = {k: v for k, v in content.items() if k not in ("cts", "phantoms", "only", "reports")}
-    content = content | given
+        content = {k: v for k, v in content.items() if k not in ("cts", "phantoms", "only", "reports", "source")}
+    source = {**_mapping(content.get("source"), "source"), **given.get("source", {})}
+    content = content | given | {"source": source}
     methods = dict(_mapping(content.get("methods"), "methods"))
     for name in [name for name in changed if name.partition(".")[0] in methods]:
         method, _, setting = name.partition(".")
@@ -72,7 +75,7 @@ def _specification(content, given: Mapping, changed: dict) -> Specification:
             method_of(of)
         except ValueError as error:
             raise ValueError(f"methods.{name}.of: {error}") from error
-    cases = Cases(*(content.get(name) for name in ("cts", "phantoms", "only", "reports")))
+    cases = Cases(content.get("cts"), content.get("phantoms"), content.get("only"), _source(content))
     if content.get("out") is None:
         raise ValueError("there is no folder for the results: give out, in the file or as --out")
     check_path(content["out"], "out")
@@ -98,6 +101,15 @@ def _specification(content, given: Mapping, changed: dict) -> Specification:
     fid, clip = (_settings(kind(), content.get(name), name) for kind, name in ((FIDSettings, "fid"),
                                                                               (CLIPSettings, "clip")))
     return Specification(Path(content["out"]), cases, list(trials.values()), tuple(metrics), fid, clip)
+
+
+def _source(content: Mapping) -> CTSource:
+    """Which CTs of the folder are taken."""
+    source, reports = _settings(CTSource(), content.get("source"), "source"), content.get("reports")
+    check_path(reports, "reports")
+    if reports is not None and source.reports is not None:
+        raise ValueError("the table of reports is given as reports and as source.reports: leave one of the two out")
+    return replace(source, reports=reports or source.reports)
 
 
 def _settings(default, value, name: str):

@@ -22,7 +22,7 @@ SHOWN_MEASURES = MEASURES | {"network_calls": Measure("network calls", None, 0),
 SCORES = MEASURES.keys() - {"seconds"}
 """The measures of how good a volume is, whose means have intervals."""
 
-NON_SETTING_COLUMNS = (*MEASURED, "case", "key", "seed", "grid")
+NON_SETTING_COLUMNS = (*MEASURED, "case", "key", "seed", "grid", "training")
 
 
 @dataclass(frozen=True)

@@ -43,8 +43,8 @@ OF_METHODS = ("ssim", "psnr", "mae_hu", *FURTHER, "misfit", "seconds", "network_
 OF_VIEWS = ("ssim", "psnr", *FURTHER, "seconds")
 """Measures that are tabled against the number of views and by geometry."""
 
-OF_DIFFERENCES = ("ssim", "psnr", "mae_hu", *FURTHER, "misfit")
-"""Measures whose differences between methods are tabled."""
+OF_DIFFERENCES = ("ssim", "psnr", "mae_hu", *(name for name in FURTHER if name != "dice_lung_ct"), "misfit")
+"""Measures whose differences between methods are tabled; one that is of the CT alone has none."""
 
 OF_DELTA = ("ssim", "misfit", "psnr", "mae_hu", *FURTHER, "seconds")
 """Columns of the table of Extra Compute, the misfit beside SSIM: what looks better may fit the X-rays worse."""
@@ -165,9 +165,12 @@ def _caption(entries: Sequence[Entry]) -> str:
 
 
 def _origins(entries: Sequence[Entry]) -> list[str]:
-    """The protocol that the rows of a table's entries were taken by, and the cases that are doubtful."""
+    """The protocol that the rows of a table's entries were taken by, how long trained rivals among them have learnt,
+    and the cases that are doubtful."""
     rows = [row for entry in entries for row in entry.rows]
-    return [*(protocol.note for protocol in _protocols(rows)), *warning_notes(rows)]
+    trained = dict.fromkeys(f"{row['method']} {row['training']}" for row in rows if row.get("training"))
+    return [*(protocol.note for protocol in _protocols(rows)), *warning_notes(rows),
+            *([f"Trained rivals, as their files tell: {'; '.join(trained)}."] if trained else [])]
 
 
 def _protocols(rows: Sequence[Mapping]) -> list[Protocol]:

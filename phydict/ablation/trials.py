@@ -6,6 +6,7 @@ import json
 import math
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cache
 from importlib import import_module
@@ -22,6 +23,7 @@ from phydict.methods import DEFAULT_GRID, METHODS, corrections_of
 from phydict.posterior import Refinement, Sampler
 from phydict.prior import find_prior, fingerprint, load_super_resolution, own_identity
 from phydict.reconstruction import Reconstructor, describe
+from phydict.rivals import TrainedRival
 from phydict.runtime.reading import reason
 from phydict.runtime.renamed import check_setting
 from phydict.runtime.seeds import check_seed
@@ -133,6 +135,14 @@ class Trial:
     @property
     def refinement(self) -> Refinement:
         return Refinement() if self.refine else Refinement(None)
+
+    @property
+    def training(self) -> str | None:
+        """What a trained rival's file tells of its training; None for other methods, and where its row will say why the
+        file cannot be read."""
+        with suppress(ValueError):
+            return self.method.training if isinstance(self.method, TrainedRival) else None
+        return None
 
     def identity(self) -> dict:
         """All that decides the numbers of a trial beside the case, as plain JSON values."""

@@ -134,13 +134,15 @@ class InferenceCLI(TellingCLI):
 
 @contextmanager
 def _resumable(model: ReconstructionTask) -> Iterator[None]:
-    """The progress of a run, which says how it is resumed if it is stopped."""
-    with model.progress:
-        try:
+    """The progress of a run, which shows what is finished and says how it is resumed if it is stopped."""
+    try:
+        with model.progress:
             yield
-        except BaseException as stop:
-            stop.add_note(model.results.to_resume)
-            raise
+    except BaseException as stop:
+        if isinstance(stop, KeyboardInterrupt | SystemExit):
+            model.show_finished()
+        stop.add_note(model.results.to_resume)
+        raise
 
 
 def with_methods(args: list[str]) -> list[str]:

@@ -28,6 +28,9 @@ from phydict.runtime.lpips_networks import load_lpips
 DIMENSIONS = {"squeezenet": 512, "radimagenet": 2048, "inception": 2048}
 FILES = {"radimagenet": "RadImageNet-ResNet50_notop.pth", "inception": "inception_v3_google-0cc3c7bd.pth"}
 MEANS = (0.406, 0.456, 0.485)
+NORMALISATION = (f"HU clipped to [{RANGE.low:g}, {RANGE.high:g}], each volume's least and largest value mapped to 0 "
+                 "and 1")
+"""Of the slices, before the means are taken off."""
 BATCH = 16
 
 

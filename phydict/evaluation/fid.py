@@ -6,12 +6,17 @@ Heusel et al. 2017, arXiv:1706.08500; Dowson & Landau 1982, doi:10.1016/0047-259
 trace is the sum of the roots of the eigenvalues of B S B', also where the slices are fewer than the features. The
 number depends on the backbone, on the number of slices and on their size: compare at equal ones alone. Few slices make
 it too large, and so do the bootstrap's repeated ones: its interval may lie above the number.
+
+Means and covariances are streamed in float64, case by case (Chan, Golub & LeVeque 1983, doi:10.1080/00031305.1983.
+10483115), so that memory does not grow with the cases. A covariance of each patient would be 2 MB for 512 features and
+34 MB for 2048, many times the patient's slices; so the bootstrap keeps one for each of as many draws as BLOCK_BYTES
+hold, and reads the features again for the next ones: 256 draws in one go for 512 features, 16 for 2048.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,8 +40,43 @@ NAMES = (*(f"fid_{plane}" for plane in PLANES), "fid")
 Features = Mapping[str, Tensor]
 """Plane -> features (2, N, d) of a case's slices: of the reconstruction and of the truth."""
 
-Moments = tuple[Tensor, Tensor]
-"""A mean (d,) of features, and a root (n, d), A, such that A'A is their covariance."""
+Reference = tuple[Tensor, Tensor]
+"""A mean (d,) of features, and a root (r, d), B, such that B'B is their covariance."""
+
+BLOCK_BYTES = 2**29
+"""What the covariances of the draws that are summed up at once may take; twice as much is in memory at most."""
+
+
+class Moments:
+    """Of features, slice upon slice, in float64: their count, mean (d,), and scatter (d, d), the sum of
+    (x - mean)(x - mean)'."""
+
+    def __init__(self, dimensions: int):
+        self.count, self.mean = 0.0, torch.zeros(dimensions, dtype=torch.float64)
+        self.scatter = torch.zeros(dimensions, dimensions, dtype=torch.float64)
+
+    @classmethod
+    def of(cls, x: Tensor, repeats: Tensor | None = None) -> Moments:
+        """Those of features (N, d), each of which counts as often as `repeats` (N,) says."""
+        moments, x = cls(x.shape[1]), x.double().cpu()
+        weight = (torch.ones(len(x)) if repeats is None else repeats).double()[:, None]
+        moments.count = float(weight.sum())
+        moments.mean = (weight * x).sum(0) / weight.sum()
+        moments.scatter = (weight * (x - moments.mean)).T @ (x - moments.mean)
+        return moments
+
+    def add(self, other: Moments, times: float = 1.0) -> None:
+        """Adds other features, each of which counts `times` times."""
+        if not (added := times * other.count):
+            return
+        apart, total = other.mean - self.mean, self.count + added
+        self.scatter.add_(other.scatter, alpha=times).addr_(apart, apart, alpha=self.count * added / total)
+        self.mean = self.mean + apart * (added / total)
+        self.count = total
+
+    @property
+    def covariance(self) -> Tensor:
+        return self.scatter / (self.count - 1)
 
 
 class StoredFeatures(Mapping[str, Tensor]):
@@ -100,36 +140,26 @@ def save_features(file: Path, features: Features) -> None:
 def frechet_distance(a: Tensor, b: Tensor, repeats: Tensor | None = None) -> float:
     """The Frechet distance of features a (N, d) and b (M, d); repeats: how often each slice counts, of both (N = M).
     NaN where a feature is not finite."""
-    return _distance(_moments(a, repeats), _reduced(_moments(b, repeats)))
+    return _distance(Moments.of(a, repeats), _reduced(Moments.of(b, repeats)))
 
 
-def _moments(x: Tensor, repeats: Tensor | None) -> Moments:
-    """Those of features (N, d), each of which counts as often as `repeats` (N,) says."""
-    weight = (torch.ones(len(x)) if repeats is None else repeats).double()[:, None]
-    x, weight = x[weight[:, 0] > 0].double(), weight[weight[:, 0] > 0]
-    mean = (weight * x).sum(0) / weight.sum()
-    return mean, (weight / (weight.sum() - 1)).sqrt() * (x - mean)
+def _reduced(moments: Moments) -> Reference:
+    """The mean and a root of the covariance, with as many rows as that has eigenvalues above what rounding leaves."""
+    covariance = moments.covariance
+    if not covariance.isfinite().all():
+        return moments.mean, covariance
+    values, vectors = torch.linalg.eigh(covariance)
+    there = values > len(values) * torch.finfo(values.dtype).eps * values[-1]
+    return moments.mean, values[there].sqrt()[:, None] * vectors.T[there]
 
 
-def _reduced(moments: Moments) -> Moments:
-    """The same with a root of d rows at most."""
-    mean, root = moments
-    tall = len(root) > root.shape[1] and bool(root.isfinite().all())
-    return mean, torch.linalg.qr(root, mode="r").R if tall else root
-
-
-def _distance(of: Moments, to: Moments) -> float:
-    """The distance of moments to others, whose root has few rows. NaN where one is not finite."""
-    (m, first), (n, second) = of, to
-    if not (first.isfinite().all() and second.isfinite().all()):
+def _distance(of: Moments, to: Reference) -> float:
+    """The distance of moments to others. NaN where one is not finite."""
+    covariance, (mean, root) = of.covariance, to
+    if not (covariance.isfinite().all() and root.isfinite().all()):
         return math.nan
-    if len(first) > first.shape[1]:
-        product = second @ (first.T @ first) @ second.T
-    else:
-        mixed = first @ second.T
-        product = mixed @ mixed.T if len(first) < len(second) else mixed.T @ mixed
-    trace = torch.linalg.eigvalsh(product).clamp(min=0).sqrt().sum()
-    return float((m - n).square().sum() + first.square().sum() + second.square().sum() - 2 * trace)
+    trace = torch.linalg.eigvalsh(root @ covariance @ root.T).clamp(min=0).sqrt().sum()
+    return float((of.mean - mean).square().sum() + covariance.trace() + root.square().sum() - 2 * trace)
 
 
 def fid(cases: Mapping[str, Features], replicates: int = 0) -> dict[str, Estimate]:
@@ -137,11 +167,13 @@ def fid(cases: Mapping[str, Features], replicates: int = 0) -> dict[str, Estimat
     return distances({"": cases}, replicates)[""].estimates()
 
 
-def distances(methods: Mapping[str, Mapping[str, Features]], replicates: int = 0) -> dict[str, Distances]:
+def distances(methods: Mapping[str, Mapping[str, Features]], replicates: int = 0,
+              on_plane: Callable[[str], None] = lambda plane: None) -> dict[str, Distances]:
     """Those of all slices of some methods' cases, label -> case id -> features.
 
     replicates: draws of patients, each with its slices of reconstruction and truth, of which the 95 % intervals are
-    taken; 0: none. Raises ValueError without a case.
+    taken; 0: none. on_plane: called with each plane before it is measured, for each group of methods with the same
+    cases. Raises ValueError without a case.
     """
     if not all(methods.values()):
         raise ValueError("there are no cases to take a Frechet distance of: score at least one")
@@ -150,7 +182,10 @@ def distances(methods: Mapping[str, Mapping[str, Features]], replicates: int = 0
         groups.setdefault(tuple(cases), []).append(label)
     found = {}
     for names, labels in groups.items():
-        planes = {plane: _plane([methods[label] for label in labels], plane, replicates) for plane in PLANES}
+        planes = {}
+        for plane in PLANES:
+            on_plane(plane)
+            planes[plane] = _plane([methods[label] for label in labels], plane, replicates)
         for place, label in enumerate(labels):
             values = {f"fid_{plane}": drawn[place] for plane, (_, drawn) in planes.items()}
             found[label] = Distances(names, {plane: count for plane, (count, _) in planes.items()},
@@ -160,64 +195,123 @@ def distances(methods: Mapping[str, Mapping[str, Features]], replicates: int = 0
 
 def _plane(methods: Sequence[Mapping[str, Features]], plane: str, replicates: int) -> tuple[int, np.ndarray]:
     """The number of slices of each of some methods with the same cases in one plane, and their distances (methods,
-    1 + R). A truth that methods share is summed up once for each draw; no other plane is in memory."""
-    patients = list(dict.fromkeys(map(patient_of, methods[0])))
-    fakes, truths, places = [], list[Tensor](), []
-    for cases in methods:
-        parts = [features[plane] for features in cases.values()]
-        truth = torch.cat([part[1] for part in parts])
-        place = next((n for n, other in enumerate(truths) if torch.equal(truth, other)), len(truths))
-        truths += [truth] * (place == len(truths))
-        fakes.append(torch.cat([part[0] for part in parts]))
-        places.append(place)
-        owners = torch.tensor([patients.index(patient_of(case)) for case, part in zip(cases, parts)
-                               for _ in range(part.shape[1])])
-    drawn = draws(len(patients), replicates) if replicates > 0 and len(patients) > 1 else ()
-    values = []
-    for repeats in (None, *(torch.from_numpy(counts)[owners] for counts in drawn)):
-        references = [_reduced(_moments(truth, repeats)) for truth in truths]
-        values.append([_distance(_moments(fake, repeats), references[place]) for fake, place in zip(fakes, places)])
-    return len(owners), np.array(values).T
+    1 + R). A truth that methods share is summed up once for each draw; draws that are alike are one."""
+    patients: dict[str, list[str]] = {}
+    for case in methods[0]:
+        patients.setdefault(patient_of(case), []).append(case)
+    alone = replicates < 1 or len(patients) < 2
+    drawn = np.vstack([np.ones((1, len(patients)), int), *([] if alone else [draws(len(patients), replicates)])])
+    distinct, place = np.unique(drawn, axis=0, return_inverse=True)
+    shared = [next(k for k, other in enumerate(methods) if _same_truth(cases, other, plane)) for cases in methods]
+    shapes = [features[plane].shape for features in methods[0].values()]
+    size, values = max(1, BLOCK_BYTES // (8 * shapes[0][2] ** 2)), np.empty((len(methods), len(distinct)))
+    for start in range(0, len(distinct), size):
+        block = slice(start, start + size)
+        for first in dict.fromkeys(shared):
+            truths = [_reduced(moments) for moments in _drawn(methods[first], 1, plane, patients, distinct[block])]
+            for k in (k for k, other in enumerate(shared) if other == first):
+                fakes = _drawn(methods[k], 0, plane, patients, distinct[block])
+                values[k, block] = [_distance(fake, truth) for fake, truth in zip(fakes, truths)]
+    return sum(shape[1] for shape in shapes), values[:, place.ravel()]
+
+
+def _same_truth(cases: Mapping[str, Features], others: Mapping[str, Features], plane: str) -> bool:
+    return cases is others or all(torch.equal(features[plane][1], others[case][plane][1])
+                                  for case, features in cases.items())
+
+
+def _drawn(cases: Mapping[str, Features], of: int, plane: str, patients: Mapping[str, Sequence[str]],
+           counts: np.ndarray) -> list[Moments]:
+    """The moments of cases' reconstructions (of 0) or truths (1) in draws of their patients, by counts (draws,
+    patients); the features of one case alone are in memory."""
+    sums: list[Moments] = []
+    for names, repeats in zip(patients.values(), counts.T):
+        patient = Moments.of(cases[names[0]][plane][of])
+        for case in names[1:]:
+            patient.add(Moments.of(cases[case][plane][of]))
+        sums = sums or [Moments(len(patient.mean)) for _ in counts]
+        for moments, times in zip(sums, repeats):
+            moments.add(patient, float(times))
+    return sums
 
 
 class PlaneFID(Metric):
-    """`fid` of the cases that all processes have seen; a case seen twice counts once.
+    """`fid` of the cases that all processes have seen; a case seen twice counts once, in another process where it is
+    the last one there, as where a distributed sampler repeats cases to fill the last batch.
 
-    dimensions: of the features. State: the cases' features as they are, so that the distance is over all slices.
+    dimensions: of the features. State: in float64 the sums of (1, x)(1, x)' over all slices but those of the last case,
+    whose features are kept until the next one.
     """
 
     full_state_update = False
     higher_is_better = False
     is_differentiable = False
+    sums: Tensor
+    summed: list[Tensor]
 
     def __init__(self, dimensions: int):
         super().__init__()
-        self.dimensions = dimensions
-        # Flat float32 rows [case, slice, reconstruction's features, truth's]: torchmetrics gathers an empty process as
-        # a flat tensor.
-        for plane in PLANES:
-            self.add_state(plane, default=[], dist_reduce_fx="cat")
+        self.dimensions, self.seen = dimensions, set[int]()
+        shape = (len(PLANES), 2, dimensions + 1, dimensions + 1)
+        self.add_state("sums", default=torch.zeros(shape, dtype=torch.float64), dist_reduce_fx="sum")
+        # Flat float32 rows: torchmetrics gathers an empty process as a flat tensor. Cases that are summed up; and of
+        # the last one [case, slice, reconstruction's features, truth's].
+        for name in ("summed", *PLANES):
+            self.add_state(name, default=[], dist_reduce_fx="cat")
+
+    def reset(self) -> None:
+        super().reset()
+        self.seen = set()
 
     def update(self, case: int, features: Features) -> None:
         """Add one case, by its index in the dataset, the same in every process."""
+        if case in self.seen:
+            return
+        self.seen.add(case)
+        for last, kept in self._last().items():
+            self.sums += self._products(kept)
+            self.summed.append(torch.tensor([float(last)], device=self.device))
         for plane, values in features.items():
             fake, real = values.float().to(self.device)
             place = torch.stack([torch.full((len(fake),), float(case)), torch.arange(float(len(fake)))], 1)
-            getattr(self, plane).append(torch.cat([place.to(self.device), fake, real], 1).flatten())
+            setattr(self, plane, [torch.cat([place.to(self.device), fake, real], 1).flatten()])
 
     def compute(self) -> dict[str, Tensor]:
         """The distances, and the numbers of cases and of slices in each plane, as a flat dict of scalars."""
-        cases: dict[str, dict[str, Tensor]] = {}
+        known = set(dim_zero_cat(self.summed).int().tolist()) if len(self.summed) else set()
+        last = {case: kept for case, kept in self._last().items() if case not in known}
+        sums = self.sums.cpu() + sum(self._products(kept).cpu() for kept in last.values())
+        if not float(sums[0, 0, 0, 0]):
+            return {}
+        values = {f"fid_{plane}": _distance(_unpacked(fake), _reduced(_unpacked(real)))
+                  for plane, (fake, real) in zip(PLANES, sums)}
+        values["fid"] = sum(values.values()) / len(PLANES)
+        counts = {f"slices_{plane}": float(of[0, 0, 0]) for plane, of in zip(PLANES, sums)}
+        return {name: torch.tensor(value) for name, value in (
+            values | counts | {"fid_cases": float(len(known) + len(last))}).items()}
+
+    def _last(self) -> dict[int, dict[str, Tensor]]:
+        """Case -> plane -> features (2, N, d) of the last case of each process that is known here."""
+        cases: dict[int, dict[str, Tensor]] = {}
         for plane in PLANES:
             state: list[Tensor] | Tensor = getattr(self, plane)
-            if not len(state):
-                return {}
-            rows = dim_zero_cat(state).reshape(-1, 2 + 2 * self.dimensions).cpu()
+            rows = dim_zero_cat(state).reshape(-1, 2 + 2 * self.dimensions) if len(state) else torch.empty(0, 2)
             for case in rows[:, 0].unique().tolist():
                 slices = rows[rows[:, 0] == case]
                 slices = slices[: int(slices[:, 1].max()) + 1, 2:]
-                cases.setdefault(str(case), {})[plane] = slices.view(-1, 2, self.dimensions).movedim(1, 0)
-        values = {name: torch.tensor(float(value)) for name, value in fid(cases).items()}
-        counts = {f"slices_{plane}": sum(case[plane].shape[1] for case in cases.values()) for plane in PLANES}
-        counts["fid_cases"] = len(cases)
-        return values | {name: torch.tensor(float(count)) for name, count in counts.items()}
+                cases.setdefault(int(case), {})[plane] = slices.view(-1, 2, self.dimensions).movedim(1, 0)
+        return cases
+
+    @staticmethod
+    def _products(features: Features) -> Tensor:
+        """The sums (planes, 2, 1 + d, 1 + d) of (1, x)(1, x)' over a case's slices."""
+        ones = [torch.nn.functional.pad(features[plane].double(), (1, 0), value=1.0) for plane in PLANES]
+        return torch.stack([x.mT @ x for x in ones])
+
+
+def _unpacked(sums: Tensor) -> Moments:
+    """The moments whose sums of (1, x)(1, x)' are given."""
+    moments = Moments(len(sums) - 1)
+    moments.count, moments.mean = float(sums[0, 0]), sums[0, 1:] / sums[0, 0]
+    moments.scatter = sums[1:, 1:] - sums[0, 0] * torch.outer(moments.mean, moments.mean)
+    return moments

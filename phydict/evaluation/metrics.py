@@ -67,6 +67,7 @@ MEASURES = {
     "lpips_alex": Measure("LPIPS alex", False, 4),
     "lpips_squeeze": Measure("LPIPS squeeze", False, 4),
     "dice_lung": Measure("Dice lungs", True, 3),
+    "dice_lung_ct": Measure("Dice lungs, of the CT itself", None, 3),
     "hd95_lung": Measure("HD95 lungs (mm)", False, 1),
     "cldice_vessel": Measure("clDice vessels", True, 3),
     "edge_diaphragm": Measure("diaphragm's width", False, 2),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from phydict.evaluation.metrics import RANGE
 from phydict.evaluation.planes import PLANES, slices
@@ -15,10 +15,9 @@ OTHERWISE = "leave lpips out of the metrics"
 BATCH = 32
 
 
-def load_networks() -> None:
-    """Reads the backbones. Raises FileNotFoundError, in one sentence, where one is not there."""
-    for backbone in BACKBONES:
-        load_lpips(backbone, False, OTHERWISE)
+def load_networks() -> nn.ModuleDict:
+    """LPIPS by each of the backbones. Raises FileNotFoundError, in one sentence, where one is not there."""
+    return nn.ModuleDict({backbone: load_lpips(backbone, False, OTHERWISE) for backbone in BACKBONES})
 
 
 @torch.no_grad()

@@ -16,6 +16,7 @@ from rich.markup import escape
 from rich.measure import Measurement
 from rich.table import Table as ConsoleTable
 
+from phydict.evaluation.backbones import NORMALISATION
 from phydict.evaluation.bootstrap import Estimate
 from phydict.evaluation.fid import NAMES, Distances
 from phydict.evaluation.metrics import MEASURES, RANGE, SIGMA, TAPS, Measure, Summary, summarise
@@ -153,8 +154,7 @@ def fid_tables(methods: Mapping[str, Distances], backbone: str, replicates: int,
     counts = dict.fromkeys(f"{len(found.cases)} cases with " + ", ".join(
         f"{plane.upper()} {count}" for plane, count in found.slices.items()) + " slices" for found in methods.values())
     note = (f"Backbone {backbone}, a scale of its own: {'; '.join(counts)}, all of each volume, against the truth's of "
-            f"the same cases. HU clipped to [{RANGE.low:g}, {RANGE.high:g}], each volume's least and largest value "
-            "mapped to 0 and 1, so that a wrong HU scale is not seen. FID: mean of the planes.")
+            f"the same cases. {NORMALISATION}, so that a wrong HU scale is not seen. FID: mean of the planes.")
     measures = [Measure(f"FID-{name[4:].upper()}" if "_" in name else "FID", False, 3) for name in NAMES]
     header = ["method", *(measure.heading for measure in measures)]
     if not interval_note(lines):

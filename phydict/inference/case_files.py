@@ -14,6 +14,8 @@ from phydict.inference.results import FEATURES
 from phydict.page import write_case_files
 from phydict.reconstruction import Reconstruction, save_nifti
 
+VOLUME = "volume.nii.gz"
+
 SHOWN_LEVEL = 0.9
 """The level of the intervals that are written and shown."""
 
@@ -25,24 +27,37 @@ def write_result(folder: Path, case: Case, result: Reconstruction, method: str, 
                  keep_coarse: bool, features: Features | None = None) -> None:
     """Writes volumes, panel, what the page shows of a case and the features of its slices; truth: HU (X, Y, Z) on the
     result's voxels."""
-    result.save_nifti(folder / "volume.nii.gz")
+    result.save_nifti(folder / VOLUME)
     if result.beam is not None:
         save_geometry(folder / "geometry_found.yaml", result.beam, case.get("description"))
     if result.deviation is not None:
         save_nifti(folder / "deviation.nii.gz", result.deviation.numpy(), result.grid)
     if keep_coarse and result.coarse is not None:
         result.coarse.save_nifti(folder / "coarse.nii.gz")
-    uncertain, label = result.deviation, "standard deviation"
     if result.intervals:
-        uncertain, label = result.intervals[SHOWN_LEVEL], f"half of the {SHOWN_LEVEL:.0%} interval"
-        save_nifti(folder / f"interval_{SHOWN_LEVEL * 100:.0f}.nii.gz", uncertain.numpy(), result.grid)
+        save_nifti(folder / f"interval_{SHOWN_LEVEL * 100:.0f}.nii.gz", result.intervals[SHOWN_LEVEL].numpy(),
+                   result.grid)
+    label, uncertain = _uncertain(result)
     panel(folder / "panel.png", result.volume, result.grid, result.xrays, result.reprojection, truth,
           title=f"{case['id']}: {method}", deviation_hu=uncertain, deviation_label=label)
+    write_page_files(folder, result, truth)
+    if features:
+        save_features(folder / FEATURES, features)
+
+
+def write_page_files(folder: Path, result: Reconstruction, truth: Tensor | None) -> None:
+    """Writes what the page shows of a result; truth: HU (X, Y, Z) on the result's voxels."""
+    label, uncertain = _uncertain(result)
     volumes = {"reconstruction": result.volume, "truth": truth, label: uncertain}
     write_case_files(folder, result.grid, {k: v for k, v in volumes.items() if v is not None}, result.xrays,
                      result.reprojection)
-    if features:
-        save_features(folder / FEATURES, features)
+
+
+def _uncertain(result: Reconstruction) -> tuple[str, Tensor | None]:
+    """How uncertain each voxel is, HU (X, Y, Z), and what that is called; None where it is not known."""
+    if result.intervals:
+        return f"half of the {SHOWN_LEVEL:.0%} interval", result.intervals[SHOWN_LEVEL]
+    return "standard deviation", result.deviation
 
 
 def body_interval(result: Reconstruction) -> float | None:

@@ -13,14 +13,15 @@ import nibabel as nib
 import numpy as np
 
 from phydict.evaluation import RANGE, mean_table
-from phydict.evaluation.fid import StoredFeatures, distances
+from phydict.evaluation.fid import StoredFeatures
 from phydict.evaluation.tables import Table, fid_tables
 from phydict.grid import Grid
+from phydict.inference.distances import told_distances
 from phydict.inference.protocols import protocol_of
 from phydict.inference.results import FEATURES, RECORD, TABLE, score_row
 from phydict.inference.scoring import FIDSettings
 from phydict.page import CASE_FILES, Contents, PageCase, check_own_page, write_case_files, write_page
-from phydict.runtime.telling import tell
+from phydict.runtime.progress import CaseProgress
 from phydict.runtime.warning import warn
 
 
@@ -34,7 +35,7 @@ def results_page(folder: Path, further: Sequence[Table] | None = None,
     or where a page of someone else's is in its place.
     """
     check_own_page(folder, "folder")
-    cases = [case for path in _case_folders(folder) if (case := _case(folder, path))]
+    cases = _cases(folder)
     if not cases:
         raise ValueError(f"{folder} holds no results: give the folder that predict, test or ablate wrote to, which "
                          f"holds <case>/{RECORD}, <method>/<case>/{RECORD} or ablate's {TABLE}")
@@ -58,15 +59,35 @@ def _case_folders(folder: Path) -> list[Path]:
     return sorted(path for path in folders if not any(part[:1] == "." for part in path.relative_to(folder).parts))
 
 
+def _cases(folder: Path) -> list[PageCase]:
+    """The finished cases; what the page shows of them and older results lack is made, and told as cases are."""
+    paths, cases = _case_folders(folder), []
+    lacking = {path for path in paths if _missing(path)}
+    with CaseProgress() as progress:
+        if lacking:
+            progress.begin("page", len(lacking), verb="prepare", out=folder)
+        for path in paths:
+            if path in lacking:
+                progress.case(path.relative_to(folder).as_posix())
+            if case := _case(folder, path):
+                cases.append(case)
+            if path in lacking:
+                progress.finished("prepared" if case else "left out")
+    return cases
+
+
+def _missing(path: Path) -> list[str]:
+    """What the page shows of a case and is not there."""
+    return [name for name in CASE_FILES if not (path / name).is_file()]
+
+
 def _case(folder: Path, path: Path) -> PageCase | None:
     """A finished case, None, with a warning, where its files are damaged."""
     try:
         record = json.loads((path / RECORD).read_text())
         score_row(record["case"], record | {"scores": record["scores"] or {}})
         float(record["misfit"]), list(record["misfit_per_view"])
-        if missing := [name for name in CASE_FILES if not (path / name).is_file()]:
-            tell(f"{path}: making what the page shows of it", event="page",
-                 case=record["case"], folder=str(path))
+        if missing := _missing(path):
             _make_case_files(path, missing)
     except Exception as error:  # whatever a damaged record or volume leads to
         warn(f"{path} is left out of the page, since its files are damaged ({type(error).__name__}: {error})")
@@ -109,4 +130,4 @@ def _kept_distances(folder: Path, cases: Sequence[PageCase]) -> list[Table]:
             methods.setdefault(backbone, {}).setdefault(case.record["method"], {})[case.record["case"]] = features
     replicates = FIDSettings().replicates
     return [table for backbone, features in methods.items()
-            for table in fid_tables(distances(features, replicates), backbone, replicates)]
+            for table in fid_tables(told_distances(features, replicates), backbone, replicates)]

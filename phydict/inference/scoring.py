@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from phydict.datasets.case import Case
 from phydict.datasets.cts.segmentations import organs_beside
@@ -15,7 +16,7 @@ from phydict.evaluation import RANGE, body_weights, volume_metrics
 from phydict.evaluation.backbones import SliceFeatures
 from phydict.evaluation.ct_clip import clip_scores, image_latent, load_ct_clip
 from phydict.evaluation.fid import case_features
-from phydict.evaluation.organs import fine_grid, organ_scores
+from phydict.evaluation.organs import ORGANS_VERSION, fine_grid, organ_scores
 from phydict.evaluation.perceptual import load_networks, lpips_scores
 from phydict.evaluation.published import PUBLISHED
 from phydict.evaluation.sharpness import sharpness_scores
@@ -81,18 +82,21 @@ class Scoring:
         for name, given, default in (("fid", fid, FIDSettings()), ("clip", clip, CLIPSettings())):
             if given != default and name not in self.metrics:
                 raise ValueError(f"settings of {name} mean nothing without that metric: add {name} to the metrics")
-        if "lpips" in self.metrics:
-            load_networks()
         self.network = SliceFeatures(fid.backbone, fid.weights) if "fid" in self.metrics else None
         self.clip = load_ct_clip(clip.weights, clip.text) if clip.weights else None
+        networks = {"lpips": load_networks() if "lpips" in self.metrics else None,
+                    "fid": None if fid.weights else self.network}  # of these torch.hub finds the files
         self.checksums = {f"{name}_weights_crc32": file_crc32(Path(file)) for name, file in (
-            ("fid", fid.weights), ("clip", clip.weights)) if file}
+            ("fid", fid.weights), ("clip", clip.weights)) if file} | {
+                f"{name}_weights_crc32": weights_crc32(network)
+                for name, network in networks.items() if network is not None}
 
     def settings(self) -> dict:
         """What decides the scores beyond those that are always taken; empty where there is nothing."""
         further = [name for name in self.metrics if name != "volume"]
         return ({"metrics": further} if further else {}) | (
             {"fid_backbone": self.fid.backbone} if self.network else {}) | (
+            {"organs_version": ORGANS_VERSION} if "organs" in self.metrics else {}) | (
             {"clip_text": self.clip.text_transformer is not None} if self.clip else {}) | self.checksums
 
     @property
@@ -134,6 +138,14 @@ class Scoring:
         truth = case.get("features") or window.to_hu(case["volume"])[0].to(device)
         case["features"] = case_features(self.network.to(device), volume.to(device), truth)
         return case["features"]
+
+
+def weights_crc32(network: nn.Module) -> int:
+    """A checksum of a network's weights, by their names, wherever their files came from."""
+    crc = 0
+    for name, weight in network.state_dict().items():
+        crc = zlib.crc32(weight.detach().cpu().contiguous().numpy(), zlib.crc32(name.encode(), crc))
+    return crc
 
 
 def case_scores(volume: Tensor, misfit: float, case: Case, grid: Grid, window: HUWindow,

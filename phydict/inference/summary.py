@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+from contextlib import suppress
+
 from rich.console import Console
 
 from phydict.evaluation import Table
-from phydict.evaluation.fid import StoredFeatures, distances
+from phydict.evaluation.fid import StoredFeatures
 from phydict.evaluation.tables import fid_tables
+from phydict.inference.distances import told_distances
 from phydict.inference.page import results_page
 from phydict.inference.protocols import Protocol
 from phydict.inference.results import FEATURES, CaseResults
@@ -31,11 +35,19 @@ def summarise(results: CaseResults, cases: list[str], name: str, scoring: Scorin
                          f"({', '.join(missing)}): see the messages above, and {results.to_resume}")
 
 
+def show_finished(results: CaseResults, cases: Collection[str], scoring: Scoring) -> None:
+    """Writes the page where some of a stopped run's cases are finished, without the Frechet distances of slices, which
+    take long, and prints where it is."""
+    with suppress(ValueError, OSError):  # what stopped the run is what is to be told
+        if len(results.missing()) < len(cases):
+            print(f"page: {results_page(results.folder.parent, (), scoring.empty)}")
+
+
 def _distances(results: CaseResults, cases: list[str], name: str, scoring: Scoring) -> list[Table]:
     """The table of Frechet distances over finished cases, where they are measured."""
     if scoring.network is None or not cases:
         return []
     backbone = scoring.fid.backbone
     features = {case: StoredFeatures(results.folder / case / FEATURES, backbone) for case in cases}
-    found = distances({name: features}, scoring.fid.replicates)
+    found = told_distances({name: features}, scoring.fid.replicates)
     return fid_tables(found, backbone, scoring.fid.replicates)

@@ -29,7 +29,7 @@ from phydict.inference.record import cascade_settings, case_record, grid_setting
 from phydict.inference.results import CaseResults
 from phydict.inference.scoring import Scoring
 from phydict.inference.settings import CascadeSettings, Sampling
-from phydict.inference.summary import summarise
+from phydict.inference.summary import show_finished, summarise
 from phydict.methods import DEFAULT_GRID, METHODS, calibrated, default_method, fit_to_grid, onto_grid, reconstructor
 from phydict.page import check_own_page
 from phydict.poses import FoundPoses, PoseSearch
@@ -281,6 +281,11 @@ class ReconstructionTask(lightning.LightningModule):
             self.results.write(case["id"], record, lambda folder: write_result(
                 folder, case, result, self.method_name, truth, self.keep_coarse, features))
         self.progress.finished(_said_of(result))
+
+    def show_finished(self) -> None:
+        """Writes the page of what a stopped run has finished, if that is anything."""
+        if self.trainer.is_global_zero:
+            show_finished(self.results, self.cases, self.scoring)
 
     def summarise(self) -> None:
         """Prints and writes the scores of this run's cases. Raises ValueError, naming them, where some have failed."""

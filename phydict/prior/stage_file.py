@@ -118,9 +118,7 @@ def check_sizes(name: str, settings: dict, weights: dict[str, Tensor]) -> None:
     for key, value in settings.items():
         if key in ("res_blocks", "layers") and type(value) is int:
             layers *= value
-        elif key == "res_blocks" and isinstance(value, list) and all(type(count) is int for count in value):
-            layers = max(layers, sum(value))
-        elif isinstance(value, list) and not value:
+        elif isinstance(value, list) and (key == "res_blocks" or not value):
             raise ValueError(f"{name}.{key} is {reprlib.repr(value)}")
     if layers > MOST_LAYERS:
         raise ValueError(f"{name} has {layers:,} layers, more than {MOST_LAYERS}")

@@ -57,7 +57,6 @@ class VolumeUNet(nn.Module):
 
     state_channels: channels of the state (CT and masks).
     channels, attention: width of each level, and whether it attends to itself and to the text.
-    res_blocks: residual blocks of each level, or of all.
     context_dim: width D of the text context (B, L, D).
     kinds: of findings, each with a map of its own.
     Spatial sizes must be divisible by block * 2^(levels - 1).
@@ -69,7 +68,7 @@ class VolumeUNet(nn.Module):
         block: int = 2,
         channels: tuple[int, ...] = (32, 64, 128),
         attention: tuple[bool, ...] = (False, False, True),
-        res_blocks: int | tuple[int, ...] = 1,
+        res_blocks: int = 1,
         head_channels: int = 32,
         context_dim: int = 64,
         kinds: tuple[str, ...] = (),
@@ -80,8 +79,7 @@ class VolumeUNet(nn.Module):
         check_sizes(block=block, channels=channels, res_blocks=res_blocks, head_channels=head_channels)
         self.settings: dict = {
             "state_channels": state_channels, "block": block, "channels": list(channels),
-            "attention": list(attention), "res_blocks": res_blocks if isinstance(res_blocks, int) else list(res_blocks),
-            "head_channels": head_channels,
+            "attention": list(attention), "res_blocks": res_blocks, "head_channels": head_channels,
             "context_dim": context_dim}
         self.block, self.context_dim, self.state_channels = block, context_dim, state_channels
         self.divisor = block * 2 ** (len(channels) - 1)
@@ -113,33 +111,6 @@ class VolumeUNet(nn.Module):
         speed_up(self.hint)
         if kinds:  # which older files do not name
             self.settings["kinds"] = list(kinds)
-
-    def levels(self) -> tuple[int, ...]:
-        """The residual blocks of each level."""
-        blocks = self.settings["res_blocks"]
-        return (blocks,) * len(self.settings["channels"]) if isinstance(blocks, int) else tuple(blocks)
-
-    def deepened(self, res_blocks: tuple[int, ...]) -> VolumeUNet:
-        """A network with more residual blocks in each level that computes the same: new ones add nothing until they
-        learn, and follow a level's own on the way down and its first on the way up.
-
-        Raises ValueError for less blocks than a level has, or for another number of levels.
-        """
-        own = self.levels()
-        if len(res_blocks) != len(own) or any(more < less for more, less in zip(res_blocks, own)):
-            raise ValueError(f"a network with {list(own)} residual blocks in its levels is deepened to as many or more "
-                             f"in each, but {list(res_blocks)} was given")
-        settings = self.settings | {name: tuple(self.settings[name]) for name in ("channels", "attention")}
-        deeper = VolumeUNet(**settings | {"res_blocks": res_blocks})
-        old, new = self.unet, deeper.unet
-        deeper.load_state_dict({name: w for name, w in self.state_dict().items() if not name.startswith(
-            ("unet.down_blocks", "unet.up_blocks"))}, strict=False)
-        added = [more - less for more, less in zip(res_blocks, own)]
-        for ours, theirs in zip(old.down_blocks, new.down_blocks):
-            _copy_level(ours, theirs)
-        for ours, theirs, shift in zip(old.up_blocks, new.up_blocks, added[::-1]):
-            _copy_level(ours, theirs, shift)
-        return deeper
 
     def blocks(self) -> list[nn.Module]:
         """The residual and attention blocks of the UNet, which hold nearly all of its weights and activations."""
@@ -183,19 +154,3 @@ class VolumeUNet(nn.Module):
         h = h + interpolate(self.hint(self.text_map(context)), h.shape[2:], mode="trilinear")
         h = self.unfold(self.unet(h, 1000 * t, context=context))
         return rearrange(h, "b (c i j k) x y z -> b c (x i) (y j) (z k)", i=n, j=n, k=n)
-
-
-def _copy_level(old: nn.Module, new: nn.Module, shift: int = 0) -> None:
-    """Gives a UNet's level the weights of one with fewer residual blocks. On the way up all but its first come `shift`
-    later, and those between pass on what they are given."""
-    weights = {}
-    for name, weight in old.state_dict().items():
-        part, *rest = name.split(".")
-        if part in ("resnets", "attentions") and rest[0] != "0":
-            rest[0] = str(int(rest[0]) + shift)
-        weights[".".join([part, *rest])] = weight
-    new.load_state_dict(weights, strict=False)
-    for block in list(new.resnets)[1:1 + shift]:  # type: ignore[arg-type]
-        silence(block.skip_connection)
-        layer = block.skip_connection.conv
-        layer.weight.data[:, :layer.out_channels, 0, 0, 0] = torch.eye(layer.out_channels)

@@ -41,6 +41,9 @@ def load_rival(path: str | Path, device: str = "cpu") -> Rival:
             rival = build_rival(header, weights)
         except ValueError as error:
             raise ValueError(f"'{path}' contradicts itself: {error}") from error
+    training = header.get("training")
+    told = training if isinstance(training, dict) else {}
+    rival.budget = {name: told[name] for name in ("steps", "samples") if type(told.get(name)) is int}
     return rival.to(device).eval().requires_grad_(False)
 
 

@@ -84,6 +84,15 @@ class TrainedRival(Reconstructor):
         return RivalAnswer(_loaded(self.file, self.weights_crc32), 0, self.precision, self.mu_water, self.name)
 
     @property
+    def training(self) -> str:
+        """In words, how many views the weights are for and how long they learnt, as their file tells. Raises ValueError
+        where there is none, or no rival in it."""
+        rival = self.answer.rival
+        views = f"K = {rival.beam.views}" if rival.beam else "any K"
+        return ", ".join([views, *(f"{count:,} {name}" for name, count in rival.budget.items())]
+                         if rival.budget else [views, "steps not stated"])
+
+    @property
     def grid(self) -> Grid | None:
         return None if self.file is None else self.answer.rival.grid
 

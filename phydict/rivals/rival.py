@@ -30,7 +30,8 @@ def bound_orbit(grid: Grid, views: int, arc_degrees: float = 360.0) -> ConeBeam:
 class Rival(nn.Module):
     """A network, and what it holds for.
 
-    beam: the geometry of a bound network, its detector binned to what the grid can hold; None for others.
+    beam: the geometry of a bound network, its detector binned to what the grid can hold; None for others. budget: the
+    steps and samples of its training, as its file tells; empty where nothing does.
     Raises ValueError where the grid does not suit the network, or where one of beam and network is bound alone.
     """
 
@@ -41,6 +42,7 @@ class Rival(nn.Module):
             raise ValueError(f"{type(network).__name__} is {'' if network.bound else 'not '}bound to one geometry, "
                              f"but {'none' if beam is None else 'one'} was given")
         self.network, self.grid, self.window, self.beam = network, grid, window, beam
+        self.budget: dict[str, int] = {}
 
     def describe(self) -> dict:
         """What the rival is, as plain JSON values; `phydict.rivals.build_rival` builds it again."""

@@ -51,8 +51,7 @@ class PriorTraining(DenoisingTraining):
         execution: how the network is run
         initial: a prior's file to start from, which then decides the networks and the text, and may be of other voxels
             over the same box, such as coarser ones that it learnt from first; one without a detail network is given
-            this training's, and where a network is given, residual blocks up to its numbers of them (res_blocks), which
-            change nothing until they have learnt
+            this training's
         seed: of times, noise and text dropout
     """
 
@@ -66,15 +65,12 @@ class PriorTraining(DenoisingTraining):
         if text.renew and not initial:
             raise ValueError("model.text.renew gives a prior a new text side, but none was given to start from: give "
                              "model.initial, or leave it out")
-        deeper = network.levels() if initial and network else None
         network = network or VolumeUNet()
         encoder = None if initial else _text_encoder(text, network)
         prior = Prior(network, cube.grid(), HUWindow(*window), encoder, sigma_data=optimisation.sigma_data,
                       detail=detail or DetailNetwork(network.state_channels))
         if initial:
             prior = _loaded(initial, prior)
-        if deeper:
-            prior.network = prior.network.deepened(deeper)
         if text.renew:
             prior = _renewed(prior, _text_encoder(text, prior.network))
         new_text = text.renew or not initial

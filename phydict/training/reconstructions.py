@@ -27,7 +27,7 @@ from phydict.prior.correction import INPUTS, CorrectionNetwork
 from phydict.prior.finer_uncertainty import SEEN
 from phydict.runtime.ranges import check_fields
 from phydict.runtime.seeds import check_seed
-from phydict.training.crops import CTVolumes, PhantomVolumes, mapped_volume
+from phydict.training.crops import CTVolumes, PhantomVolumes, mapped_volume, tell_made
 from phydict.training.data import PriorData, check_plain
 from phydict.training.draws import Draws, Items
 from phydict.training.scenes import Scenes
@@ -249,6 +249,8 @@ class RefinementData(PriorData):
             made.validation * len(validated), 1))
 
     def draws(self, epoch: int) -> Dataset:
+        if not self.trainer or self.trainer.is_global_zero:
+            tell_made(self.made.name, self.made.folder, len(self.made))
         return ReconstructionCrops(self.made, self.crop, self.loading.epoch_size, epoch, self.seed)
 
     def collate(self, cases: list[dict]) -> dict:

@@ -49,9 +49,9 @@ def write(folder: Path, **content) -> Path:
     return file
 
 
-def ablate(folder: Path, **content) -> list[dict]:
-    """The rows after a run."""
-    main(["ablate", "-c", str(write(folder, **content)), "--device", "cpu"])
+def ablate(folder: Path, *more: str, **content) -> list[dict]:
+    """The rows after a run with more options."""
+    main(["ablate", "-c", str(write(folder, **content)), "--device", "cpu", *more])
     return read_csv(folder / "out" / "results.csv")
 
 

@@ -236,6 +236,33 @@ def test_a_profile_counts_a_projector_whoever_runs_it():
     assert profile.seconds("projector", "network") == {"projector": profile.uses["sample / projector"].seconds}
 
 
+def test_volumes_are_kept_where_that_is_asked_for_and_the_page_shows_them_in_their_place(tmp_path, trace):
+    (tmp_path / "cts").mkdir()
+    hu, affine = np.full((20, 20, 20), -1000, np.float32), np.diag([-10.0, 10, 10, 1])
+    hu[4:16, 6:15], affine[:3, 3] = 40, (300, -90, 40)
+    image = nibabel.Nifti1Image(hu, affine)
+    image.set_sform(affine, code=1)
+    nibabel.save(image, tmp_path / "cts" / "anna.nii.gz")
+    content = {"cts": str(tmp_path / "cts"), "phantoms": None, "base": TINY, "axes": {"method": ["trace", "sirt"]}}
+    out = tmp_path / "out"
+    ablate(tmp_path, **content)
+    assert not (out / "volumes").exists() and len(trace.given) == 2
+    rows = ablate(tmp_path, "--keep_volumes", **content)
+    assert len(trace.given) == 4  # a row without its volume is run again
+    for row in rows:
+        folder = out / "volumes" / row["key"]
+        kept = nibabel.load(folder / "volume.nii.gz")
+        assert kept.get_data_dtype() == np.int16 and kept.shape == (16, 16, 16)
+        centre = kept.affine @ [7.5, 7.5, 7.5, 1]
+        np.testing.assert_allclose(centre, affine @ [9.5, 9.5, 9.5, 1], atol=1e-3)
+        assert {"view.js", "thumbnail.png", "volume.nii.gz"} == {path.name for path in folder.iterdir()}
+        assert '"truth"' in (folder / "view.js").read_text()
+    page = (out / "index.html").read_text()
+    assert all(f'"folder": "volumes/{row["key"]}"' in page for row in rows)
+    assert ablate(tmp_path, "--keep_volumes", **content) == rows == ablate(tmp_path, **content)
+    assert len(trace.given) == 4
+
+
 def test_results_are_never_written_among_the_cts(tmp_path, capsys):
     cts = tmp_path / "cts"
     cts.mkdir()

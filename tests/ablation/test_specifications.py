@@ -11,11 +11,16 @@ from command_lines import refusal
 from ablation.runs import TINY, write
 from phydict.ablation import read_specification
 from phydict.ablation.nested import changed
-from phydict.ablation.trials import refined_from
+from phydict.ablation.trials import prior_of, refined_from
 from phydict.cli.infer import main
+from phydict.datasets import CTSource
+from phydict.evaluation import read_csv
+from phydict.grid import Grid
+from phydict.inference import ReconstructionData
 from phydict.methods import METHODS
 from phydict.posterior import DAPS, SplitGibbs
 from phydict.runtime.files import alone_in
+from phydict.units import HUWindow
 
 ROOT = Path(__file__).parents[2]
 
@@ -56,6 +61,35 @@ def test_every_shipped_comparison_is_one(file):
 def test_an_orbits_setting_means_nothing_beside_a_geometry_file(tmp_path):
     with pytest.raises(ValueError, match="the setting views means nothing"):
         read_specification(write(tmp_path, base={"method": "sirt", "voxels": 16, "geometry": "arc_90", "views": 3}))
+
+
+def test_the_cts_of_a_folder_are_chosen_as_in_a_test_of_their_own(tmp_path, cts, capsys):
+    def ids(data: ReconstructionData) -> list[str]:
+        return [case for case, *_ in data.test_cases(Grid.cube(16), HUWindow())]
+
+    (tmp_path / "none.txt").write_text("patient0.nii.gz\n")
+    source, content = {"exclude": str(tmp_path / "none.txt")}, {"axes": {"method": ["trace"]}, "phantoms": None}
+    wanted = ids(ReconstructionData(cts=str(cts), source=CTSource(**source)))
+    assert wanted == ["patient1"]
+    whole = write(tmp_path, cts=str(cts), **content)
+    assert len(ids(read_specification(whole).trials[0].data)) == 2
+    given = read_specification(whole, source=source), read_specification(whole, cts=str(cts), source=source)
+    told = read_specification(write(tmp_path, cts=str(cts), source=source, **content))
+    for specification in (*given, told):
+        assert [ids(trial.data) for trial in specification.trials] == [wanted]
+    main(["ablate", "-c", str(write(tmp_path, cts=str(cts), **content)), "--device", "cpu",
+          f"--source.exclude={source['exclude']}"])
+    assert [row["case"] for row in read_csv(tmp_path / "out" / "results.csv")] == wanted
+
+
+@pytest.mark.parametrize("content, words", [
+    ({"source": {"fix": True}}, "source has no setting 'fix': use reports, metadata, fixed"),
+    ({"source": {"fixed": "perhaps"}}, "source.fixed takes a value of type bool"), ({"source": [1]}, "source is a map"),
+    ({"source": {"reports": "a"}, "reports": "b"}, "as reports and as source.reports: leave one")],
+    ids=["name", "type", "list", "twice"])
+def test_cts_that_cannot_be_meant_are_one_sentence(tmp_path, content, words):
+    with pytest.raises(ValueError, match=words):
+        read_specification(write(tmp_path, axes={"method": ["sirt"]}, **content))
 
 
 def test_set_takes_the_place_of_a_files_axis_base_and_product(tmp_path):
@@ -147,6 +181,16 @@ def test_every_committed_specification_can_be_run(config):
             names = {trial.name for trial in specification.trials if trial.data.beam.views == views}
             of = {told.get(name, {}).get("of", name) for name in names}
             assert of >= set(METHODS) - {"trace", "phydict_released"}
+
+
+def test_the_papers_methods_share_the_prior_that_hears_reports(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    trials = read_specification(ROOT / "configs" / "ablate" / "table1.yaml", phantoms=1).trials
+    own = {"phydict_fast", "phydict_learned"}
+    priors = {trial.name: Path(trial.prior).name for trial in trials if trial.prior}
+    assert {file for name, file in priors.items() if name not in own} == {"phydict_64_reports.safetensors"}
+    assert len(priors) == 9 and len({priors[name] for name in own} | {"phydict_64_reports.safetensors"}) == 3
+    assert prior_of("data/prior/phydict_64_reports.safetensors").reads_text
 
 
 @pytest.mark.parametrize("content, words", [

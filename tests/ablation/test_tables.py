@@ -55,6 +55,24 @@ def test_a_table_says_what_its_own_rows_rest_on_alone():
     assert "sparc" not in of_x2ct and "Mean over 1 case;" in of_x2ct and "Mean over 2 cases;" in of_sparc
 
 
+def test_the_ceiling_of_dice_stands_beside_it_and_has_no_differences_between_methods():
+    rows = [row(case, method, 20.0 + n, dice_lung=0.8 - n / 10, dice_lung_ct=0.97)
+            for n, method in enumerate("xy") for case in "ab"]
+    table, differences = all_tables(summarise(rows))
+    assert "Dice lungs, of the CT itself" in table.header and "0.970" in table.markdown()
+    assert "Dice lungs ↑" in differences.header and "Dice lungs, of the CT itself" not in differences.header
+
+
+def test_every_table_says_how_long_its_rivals_have_learnt_and_that_is_no_setting():
+    rows = [row(case, "rival", 20.0, training="K = 2, 790 steps") for case in "ab"] + [
+        row(case, method, 21.0) for method in ("rival", "tv") for case in "cd"]
+    entries = summarise(rows)
+    assert [entry.method for entry in entries] == ["rival", "tv"] and not any(entry.settings for entry in entries)
+    for table in all_tables(entries):
+        assert "Trained rivals, as their files tell: rival K = 2, 790 steps." in table.notes
+    assert "Trained rivals" not in all_tables(summarise(rows[2:]))[0].markdown()
+
+
 def test_columns_that_stay_empty_are_kept_with_the_reason():
     entries = summarise([row("a", "x", 20.0), row("a", "y", 21.0)])
     (table,) = all_tables(entries, {"clip_t2i": "no weights were given"})

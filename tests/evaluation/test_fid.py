@@ -7,11 +7,13 @@ import math
 import pytest
 import torch
 from monai.metrics import FIDMetric
+from torch.multiprocessing.reductions import StorageWeakRef
 from torch.nn.functional import conv2d, interpolate
 
 from phydict.evaluation import backbones
 from phydict.evaluation import fid as fid_module
 from phydict.evaluation.backbones import SliceFeatures
+from phydict.evaluation.bootstrap import draws
 from phydict.evaluation.fid import (
     NAMES,
     PlaneFID,
@@ -92,7 +94,8 @@ def test_methods_are_paired_draw_by_draw_and_each_is_as_it_is_alone(monkeypatch)
     plain = fid_module._reduced
     monkeypatch.setattr(fid_module, "_reduced", lambda moments: summed.append(1) or plain(moments))
     found = distances(methods, replicates=20)
-    assert len(summed) == 3 * 21 * 2  # planes, draws, and sets of cases: two methods share a truth
+    unlike = [len({(1,) * n, *map(tuple, draws(n, 20).tolist())}) for n in (4, 3)]
+    assert len(summed) == 3 * sum(unlike)  # planes, draws, and sets of cases: two methods share a truth
     for label, cases in methods.items():
         alone = fid(cases, replicates=20)
         for name in NAMES:
@@ -105,6 +108,34 @@ def test_methods_are_paired_draw_by_draw_and_each_is_as_it_is_alone(monkeypatch)
     assert differences.title.endswith("less blur 1, draw by draw")
     assert [(label, values[-1]) for label, _, values in differences.lines] == [("blur 2", less)]
     assert len(fid_tables(distances(methods), "squeezenet", 0)) == 1
+
+
+def test_moments_of_parts_are_those_of_the_whole_whatever_their_order_and_how_often_they_count():
+    x, repeats = 5 + normal(40, 6), torch.arange(40) // 10 % 3
+    whole, streamed = fid_module.Moments.of(x, repeats), fid_module.Moments(6)
+    for n in (2, 0, 3, 1):
+        streamed.add(fid_module.Moments.of(x[10 * n:10 * n + 10]), n % 3)
+    assert streamed.count == whole.count == 30
+    torch.testing.assert_close(streamed.mean, whole.mean)
+    torch.testing.assert_close(streamed.covariance, x.repeat_interleave(repeats, 0).double().T.cov())
+    torch.testing.assert_close(streamed.covariance, whole.covariance)
+
+
+def test_how_many_draws_are_summed_up_at_once_changes_nothing_and_one_case_alone_is_in_memory(monkeypatch):
+    class Watched(dict):
+        def __getitem__(self, plane):
+            assert all(earlier.expired() for earlier in read), "the features of another case are still in memory"
+            values = super().__getitem__(plane).clone()
+            read.append(StorageWeakRef(values.untyped_storage()))
+            return values
+
+    read: list = []
+    cases = of_volumes(lambda hu: blurred(hu, 2))
+    wanted = distances({"": cases}, replicates=30)[""].values
+    for at_once in (1, 3):
+        monkeypatch.setattr(fid_module, "BLOCK_BYTES", at_once * 8 * 8**2)
+        found = distances({"": {case: Watched(features) for case, features in cases.items()}}, 30)[""].values
+        assert read and all(found[name] == pytest.approx(wanted[name], rel=1e-9) for name in NAMES)
 
 
 def test_a_volume_that_is_not_finite_shows():
@@ -146,6 +177,25 @@ def test_a_repeated_case_counts_once_and_compute_is_fid():
     for name, value in wanted.items():
         assert float(got[name]) == pytest.approx(value.mean, rel=1e-4)
     assert (got["fid_cases"], got["slices_xy"], got["slices_yz"]) == (4, 64, 96)
+
+
+def test_processes_agree_on_a_case_that_fills_the_last_batch_and_keep_no_other_features():
+    cases = of_volumes(lambda hu: blurred(hu, 1))
+    parts = [PlaneFID(8) for _ in range(3)]
+    for part, seen in zip(parts, ((0, 3), (1, 0), (2, 0))):  # as of four cases for three processes
+        for index in seen:
+            part.update(index, cases[f"p{index}"])
+        assert len(part.xy) == 1 and part.xy[0].numel() == 16 * (2 + 2 * 8)
+    gathered = {name: [state for part in parts for state in getattr(part, name)] for name in ("summed", *PLANES)}
+    whole, gathered["sums"] = parts[0], torch.stack([part.sums for part in parts]).sum(0)
+    for name, state in gathered.items():
+        setattr(whole, name, state)
+    got, wanted = whole.compute(), fid(cases)
+    assert (got["fid_cases"], got["slices_xy"], got["slices_yz"]) == (4, 64, 96)
+    assert all(float(got[name]) == pytest.approx(wanted[name].mean, rel=1e-4) for name in NAMES)
+    whole.reset()
+    whole.update(0, cases["p0"])
+    assert whole.compute()["fid_cases"] == 1
 
 
 def test_features_come_back_from_their_file_and_others_are_refused(tmp_path, monkeypatch):

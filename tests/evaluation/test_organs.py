@@ -80,3 +80,15 @@ def test_given_masks_take_the_place_of_the_truths_thresholds(coarse):
     lung[:20] = True
     plain, given = (organ_scores(chest(), chest(), GRID, masks) for masks in (None, {"lung": lung}))
     assert given["dice_lung"] < 0.6 < plain["dice_lung"] and given["cldice_vessel"] == plain["cldice_vessel"]
+
+
+def test_the_ceiling_of_dice_is_what_a_perfect_reconstruction_has_whatever_the_reconstruction(coarse):
+    lung = np.zeros(GRID.shape, bool)
+    lung[:20] = True
+    for masks in ({"lung": lung}, {"lung": lung, "vessel": lung}):
+        perfect, small, none = (organ_scores(hu, chest(), GRID, masks)
+                                for hu in (chest(), chest(50.0), torch.full(GRID.shape, 40.0)))
+        assert perfect["dice_lung_ct"] == perfect["dice_lung"] < 1
+        assert small["dice_lung_ct"] == none["dice_lung_ct"] == perfect["dice_lung_ct"] and none["dice_lung"] == 0
+    assert organ_scores(chest(), torch.full(GRID.shape, 40.0), GRID, {"lung": lung})["dice_lung_ct"] == 0
+    assert "dice_lung_ct" not in organ_scores(chest(), chest(), GRID)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import nibabel
 import numpy as np
 import pytest
+import torch
 import yaml
 from command_lines import refusal
 from evaluation.tiny_ct_clip import tiny
@@ -12,10 +13,12 @@ from torch.nn import Identity
 
 from inference.runs import ORBIT, phantoms, record, sirt
 from phydict.cli.infer import main
+from phydict.datasets.cts.prepared import write_prepared
 from phydict.datasets.cts.segmentations import organs_beside
 from phydict.evaluation import backbones, perceptual, read_csv
 from phydict.evaluation.fid import NAMES
 from phydict.evaluation.organs import dice
+from phydict.evaluation.planes import PLANES
 from phydict.grid import Grid
 from phydict.inference import scoring
 from phydict.inference.page import results_page
@@ -106,6 +109,8 @@ def test_ablate_has_a_line_of_fid_for_each_method_and_resumes(tmp_path, untraine
     for row in read_csv(tmp_path / "out" / "fid.csv"):
         (line,) = (line for line in fid.splitlines() if line.startswith(f"| {row['method']} |"))
         assert all(f"{row[name]:.3f}" in line for name in NAMES) and row["cases"] == 2
+        assert all(row[f"{of}slices_{plane}"] == 68 for of in ("", "truth_") for plane in PLANES)
+        assert row["fid_backbone"] == "squeezenet" and row["fid_normalisation"] in page
     made = (tmp_path / "out" / "index.html").read_text()
     main(["page", str(tmp_path / "out")])
     assert "Frechet distance of slices" in made and (tmp_path / "out" / "index.html").read_text() == made
@@ -148,6 +153,21 @@ def test_lungs_that_are_segmented_beside_a_ct_are_those_of_the_truth(tmp_path):
     assert organs_beside(tmp_path / "bert.nii.gz", grid) == {}
 
 
+def test_the_prepared_lungs_are_those_of_the_truth_and_its_vessels_are_found_in_the_ct(tmp_path):
+    grid = Grid.cube(24, 240.0)
+    lung = np.zeros(grid.shape, np.float32)
+    lung[4:20, 6:18, 5:15] = 1
+    for space in ("patient", "medsyn"):
+        folder = tmp_path / space / "anna"
+        folder.mkdir(parents=True)
+        record = {"id": "anna", "space": space, "extent": [240.0] * 3, "window": [-1000, 1000], "report": "", "row": {}}
+        write_prepared(folder, grid, {"ct": 1000 * lung, "lung": lung, "vessel": lung}, record)
+        found = organs_beside(folder / "ct.nii.gz", grid)
+        assert found.keys() == {"lung"} and np.array_equal(found["lung"], lung > 0)
+        (folder / "lung.nii.gz").unlink()
+        assert organs_beside(folder / "ct.nii.gz", grid) == {}
+
+
 def test_the_distance_of_a_region_is_that_of_its_own_slices(tmp_path, untrained):
     """Also after that of the whole of the same case."""
     def distances(name: str, products: list) -> dict:
@@ -172,7 +192,20 @@ def test_other_weights_of_a_network_are_another_score(tmp_path, monkeypatch):
     assert found[0] != found[1]
 
 
+@pytest.mark.parametrize("metric", ["fid", "lpips"])
+def test_other_weights_that_torch_hub_finds_are_another_score(metric, untrained):
+    networks = [load_lpips(backbone, True) for backbone in perceptual.BACKBONES]
+    before = Scoring([metric]).settings()
+    weight = next(networks[-1].net.parameters())  # SqueezeNet's, which both metrics take
+    with torch.no_grad():
+        weight += 1
+        other = Scoring([metric]).settings()
+        weight -= 1
+    assert before != other and before | {f"{metric}_weights_crc32": 0} == other | {f"{metric}_weights_crc32": 0}
+
+
 def test_settings_name_what_decides_the_scores_and_nothing_by_default(untrained):
     assert Scoring().settings() == {} == Scoring(["volume"]).settings()
-    assert Scoring(["fid", "volume"], FIDSettings(replicates=5)).settings() == {
-        "metrics": ["fid"], "fid_backbone": "squeezenet"}
+    one, again = (Scoring(["fid", "volume"], FIDSettings(replicates=n)).settings() for n in (5, 6))
+    assert one == again and one.keys() == {"metrics", "fid_backbone", "fid_weights_crc32"}
+    assert Scoring(["organs"]).settings() == {"metrics": ["organs"], "organs_version": 2}

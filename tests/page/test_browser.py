@@ -3,12 +3,16 @@
 import re
 import shutil
 from itertools import product
+from urllib.parse import quote
 
 import nibabel
 import numpy as np
 import pytest
+import yaml
 
 from page.made import finish
+from phydict.cli.infer import main
+from phydict.evaluation import read_csv
 from phydict.grid import Grid
 from phydict.inference.page import results_page
 
@@ -90,6 +94,20 @@ def test_the_hu_under_the_crosshair_is_the_files_wherever_it_is_moved(shown, res
         assert hu["reconstruction"] == round(float(image.dataobj[tuple(index)]))
         seen.add(tuple(mm))
     assert len(seen) == 5
+
+
+def test_kept_volumes_of_a_comparison_are_seen_beside_those_of_other_settings(shown, tmp_path):
+    (tmp_path / "spec.yaml").write_text(yaml.safe_dump({
+        "phantoms": 1, "base": {"voxels": 16, "detector": 24, "views": 3}, "axes": {
+            "method": ["sirt"], "method.iterations": [2, 5]}}))
+    main(["ablate", "-c", str(tmp_path / "spec.yaml"), "--out", str(tmp_path / "out"), "--keep_volumes"])
+    names = [f"sirt, iterations {n}, seed 0" for n in (2, 5)]
+    [case] = {row["case"] for row in read_csv(tmp_path / "out" / "results.csv")}
+    page = shown("#" + quote(f"{names[0]}/{case}", safe=""), folder=tmp_path / "out")
+    assert page.locator("#other option").all_inner_texts() == ["nothing", "truth", names[1]]
+    page.select_option("#other", label=names[1])
+    page.wait_for_function(f"document.getElementById('readout').textContent.includes('{names[1]}')")
+    assert page.locator("[data-plane=axial][data-row='1']").is_visible()
 
 
 def test_a_click_points_to_what_the_radiological_display_shows_there(shown):

@@ -4,6 +4,7 @@ import base64
 import gzip
 import json
 import re
+import shutil
 
 import nibabel
 import numpy as np
@@ -110,11 +111,30 @@ def test_the_page_is_made_anew_of_what_older_runs_left(tmp_path, capsys):
     main(["page", str(tmp_path)])
     told = capsys.readouterr()
     assert str(tmp_path / PAGE) in told.out and all((folder / name).is_file() for name in CASE_FILES)
-    assert told.err == f"{folder}: making what the page shows of it\n"
+    assert told.err.splitlines() == [f"page: 1 case to prepare, results in {tmp_path}",
+                                     "sirt/anna: prepared (1 of 1)"]
     image = nibabel.as_closest_canonical(nibabel.load(folder / "volume.nii.gz"))
     assert (volume_in(folder) == np.rint(image.get_fdata())).all()
     results = CaseResults(folder.parent, overwrite=True)  # the case is still this project's alone
     assert results.unfinished({"anna": "crc32 1"}, {"seed": 0}) == ["anna"]
+
+
+@pytest.mark.filterwarnings("ignore:.* is left out of the page")
+def test_many_older_cases_are_told_one_by_one_to_people_and_machines_and_those_that_are_whole_are_not(tmp_path, capsys):
+    for case in ("anna", "bert", "carl", "dora"):
+        finish(tmp_path, case, "sirt", with_page=case == "dora")
+    (tmp_path / "sirt" / "bert" / "volume.nii.gz").write_bytes(b"no volume")
+    main(["page", str(tmp_path), "--json_lines"])
+    begin, *told = map(json.loads, capsys.readouterr().err.splitlines())
+    assert (begin["event"], begin["cases"], begin["out"]) == ("begin", 3, str(tmp_path))
+    assert [(e["case"], e["summary"], e["done"]) for e in told if e["event"] == "case"] == [
+        ("sirt/anna", "prepared", 1), ("sirt/bert", "left out", 2), ("sirt/carl", "prepared", 3)]
+    (tmp_path / "sirt" / "anna" / "view.js").unlink()
+    shutil.rmtree(tmp_path / "sirt" / "bert")
+    main(["page", str(tmp_path), "--quiet"])
+    assert capsys.readouterr().err == ""
+    main(["page", str(tmp_path)])
+    assert capsys.readouterr().err == ""
 
 
 def test_a_missing_thumbnail_is_made_and_what_else_the_page_shows_stays(tmp_path):

@@ -189,7 +189,7 @@ def with_header(file, weights=None, **changes):
 
 @pytest.mark.parametrize("network, words", [
     ({"res_blocks": 100_000}, "network has 200,000 layers, more than 256"), ({"res_blocks": [100_000, 1]},
-    "network has 100,001 layers"), ({"res_blocks": [1.5, 1]}, "res_blocks is"),
+    "res_blocks is"),
     ({"channels": []}, "channels is"), ([], "network is"), ("x", "network is"), (3, "network is")])
 def test_a_header_of_more_layers_than_can_be_meant_is_refused_before_they_are_made(file, network, words):
     whole = tiny_prior().network.settings | network if isinstance(network, dict) else network

@@ -103,29 +103,3 @@ def test_a_checkpointed_copy_computes_with_its_own_weights():
         net.blocks()[0].conv1.conv.weight.zero_()
     arguments = random_like((1, 2, 8, 8, 8)), torch.tensor([0.5]), random_like((1, 3, 16))
     assert torch.equal(copy(*arguments), awake()(*arguments)) and not torch.equal(net(*arguments), copy(*arguments))
-
-
-@pytest.mark.parametrize("own, more", [(1, (1, 3)), (2, (4, 2)), ((1, 2), (3, 3))])
-def test_a_deepened_network_computes_the_same_until_it_learns(own, more):
-    net = network(res_blocks=own)
-    for weight in net.parameters():
-        torch.nn.init.normal_(weight, std=0.1)  # no layer of its own is silent
-    deeper = net.deepened(more)
-    arguments = random_like((1, 2, 8, 8, 8), torch.float32), torch.tensor([0.3]), random_like((1, 3, 16), torch.float32)
-    torch.testing.assert_close(deeper(*arguments), net(*arguments), rtol=1e-5, atol=1e-5)
-    before = deeper(*arguments).detach()
-    optimizer = torch.optim.SGD(deeper.parameters(), 0.1)
-    kept = {name: weight.detach().clone() for name, weight in deeper.named_parameters()}
-    (deeper(*arguments) - 1).square().mean().backward()
-    optimizer.step()
-    new = [name for name in kept if name not in net.state_dict() and name.endswith("conv2.conv.weight")]
-    assert new and all(not torch.equal(deeper.get_parameter(name), kept[name]) for name in new)
-    assert not torch.equal(deeper(*arguments), before)
-    again = VolumeUNet(**deeper.settings)
-    again.load_state_dict(deeper.state_dict())
-
-
-@pytest.mark.parametrize("more", [(1, 1), (2,), (2, 2, 2), (2, 0)])
-def test_a_network_is_not_deepened_to_less_or_to_other_levels(more):
-    with pytest.raises(ValueError, match=r"\[2, 2\] residual blocks .* but \[.*\] was given"):
-        network(res_blocks=2).deepened(more)

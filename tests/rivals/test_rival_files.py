@@ -1,9 +1,11 @@
 """Rivals as methods: their file gives them back, and what they were not trained for is refused in a sentence."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
+import yaml
 from prior.tiny import tiny_prior
 
 from phydict.cli.infer import main as infer
@@ -16,7 +18,7 @@ from phydict.prior import load_prior, save_prior
 from phydict.rivals import LiftedNetwork, Rival, RivalAnswer, TrainedRival, load_rival, save_rival
 from phydict.units import MU_WATER, HUWindow, hu_to_mu
 from phydict.xray import ConeBeam, Projector
-from rivals.tiny_rivals import GRID, WINDOW, body, tiny_lifted
+from rivals.tiny_rivals import GRID, WINDOW, body, tiny_lifted, tiny_x2ct
 
 ORBIT = ConeBeam.orbit(3, 1020, 740, (28, 28), 20.0)
 
@@ -116,3 +118,27 @@ def test_a_prior_is_no_rival_and_a_rival_no_prior(file, tmp_path):
     (tmp_path / "cut.safetensors").write_bytes(open(file, "rb").read()[:-100])
     with pytest.raises(ValueError, match="truncated"):
         load_rival(tmp_path / "cut.safetensors")
+
+
+@pytest.mark.parametrize("training, words", [
+    ({"steps": 790, "samples": 1580}, "790 steps, 1,580 samples"), ({}, "steps not stated"), (None, "steps not stated"),
+    ({"steps": "many"}, "steps not stated")])
+def test_a_file_tells_for_which_views_and_how_long_it_was_trained(tmp_path, training, words):
+    for made, views in ((tiny_lifted(), "any K"), (tiny_x2ct(views=2), "K = 2")):
+        save_rival(made, tmp_path / f"{views}.safetensors", training)
+        assert TrainedRival(str(tmp_path / f"{views}.safetensors")).training == f"{views}, {words}"
+
+
+def test_the_table_of_a_comparison_says_so_and_that_of_a_damaged_file_is_made_too(file, tmp_path):
+    def table(training: dict, damage: bool) -> str:
+        save_rival(tiny_lifted(), file, training)
+        if damage:
+            Path(file).write_bytes(b"no rival")
+        (tmp_path / "spec.yaml").write_text(yaml.safe_dump({
+            "out": str(tmp_path / f"out{damage}"), "phantoms": 1, "base": {"detector": 24, "views": 3, "voxels": 16},
+            "methods": {"mine": {"of": "phydict.rivals.TrainedRival", "method.file": file}}}))
+        infer(["ablate", "-c", str(tmp_path / "spec.yaml"), "--device", "cpu"])
+        return (tmp_path / f"out{damage}" / "tables.md").read_text()
+
+    assert "Trained rivals, as their files tell: mine any K, 7 steps." in table({"steps": 7}, False)
+    assert "mine: refused: " in table({"steps": 7}, True)

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from phydict.datasets.cts.prepared import is_prepared
 from phydict.datasets.cts.transforms import case_id, load_ct, to_grid
 from phydict.grid import Grid
 
@@ -68,8 +69,12 @@ def read_segmentation(files: tuple[Path, ...], shape, affine: np.ndarray) -> np.
 def organs_beside(ct: Path, grid: Grid) -> dict[str, np.ndarray]:
     """Masks (X, Y, Z) bool of what is segmented beside a NIfTI CT, lung and vessel, on `grid` in the CT's own world.
 
-    Raises ValueError where a file cannot be read or some of the lungs' lobes are missing.
+    Of a prepared CT the lung alone, since its voxels' shares of vessels lose the thin ones. Raises ValueError where a
+    file cannot be read or some of the lungs' lobes are missing.
     """
+    if is_prepared(ct):
+        file = ct.with_name("lung.nii.gz")
+        return {"lung": to_grid(*load_ct(file), grid, 0.0) > 0.5} if file.is_file() else {}
     masks = {}
     for name, files in segmentations_beside(ct.with_name(case_id(ct))).items():
         if name in ("lung", "vessel"):

@@ -11,7 +11,7 @@ from command_lines import refusal
 from ablation.runs import TINY, write
 from phydict.ablation import read_specification
 from phydict.ablation.nested import changed
-from phydict.ablation.trials import prior_of, refined_from
+from phydict.ablation.trials import refined_from
 from phydict.cli.infer import main
 from phydict.datasets import CTSource
 from phydict.evaluation import read_csv
@@ -181,16 +181,6 @@ def test_every_committed_specification_can_be_run(config):
             names = {trial.name for trial in specification.trials if trial.data.beam.views == views}
             of = {told.get(name, {}).get("of", name) for name in names}
             assert of >= set(METHODS) - {"trace", "phydict_released"}
-
-
-def test_the_papers_methods_share_the_prior_that_hears_reports(monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    trials = read_specification(ROOT / "configs" / "ablate" / "table1.yaml", phantoms=1).trials
-    own = {"phydict_fast", "phydict_learned"}
-    priors = {trial.name: Path(trial.prior).name for trial in trials if trial.prior}
-    assert {file for name, file in priors.items() if name not in own} == {"phydict_64_reports.safetensors"}
-    assert len(priors) == 9 and len({priors[name] for name in own} | {"phydict_64_reports.safetensors"}) == 3
-    assert prior_of("data/prior/phydict_64_reports.safetensors").reads_text
 
 
 @pytest.mark.parametrize("content, words", [

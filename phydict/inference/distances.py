@@ -11,14 +11,14 @@ from phydict.runtime.progress import CaseProgress
 
 def told_distances(methods: Mapping[str, Mapping[str, Features]], replicates: int) -> dict[str, Distances]:
     """`distances`, label -> case id -> features, that tells which planes are done. Raises ValueError without a case."""
-    begun = 0
+    begun = False
 
     def on_plane(plane: str) -> None:
         nonlocal begun
         if begun:
             progress.finished("measured")
         progress.case(f"plane {plane}")
-        begun += 1
+        begun = True
 
     with CaseProgress() as progress:
         progress.begin("Frechet distances of slices", len({tuple(cases) for cases in methods.values()}) * len(PLANES),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from dataclasses import asdict
 from pathlib import Path
 
@@ -21,6 +19,7 @@ from phydict.datasets import (
     report,
     split_by_patient,
 )
+from phydict.datasets.cts.cache import key_of
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM, CachedPhantoms
 from phydict.datasets.population import DrawnPatients
 from phydict.datasets.population.drawn import POPULATION_VERSION
@@ -138,7 +137,7 @@ class PriorData(lightning.LightningDataModule):
         """The folder of kept draws, another for whatever else decides what they are."""
         parts = [self.origin(), asdict(self.augmentation), self.loading.ct_fraction, self.seed, asdict(self.window),
                  self.draw_grid.to_dict(), self.block]
-        return self.cache / f"draws-{hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]}"
+        return self.cache / f"draws-{key_of(parts)}"
 
     def val_dataloader(self) -> DataLoader:
         return DataLoader(self.validation, 1, num_workers=self.loading.workers, collate_fn=self.collate)

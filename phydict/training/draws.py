@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-import torch
 from torch.nn.functional import avg_pool3d
 from torch.utils.data import Dataset
 
 from phydict.datasets.case import Case
 from phydict.datasets.cts.augment import Augmentation, augment
-from phydict.datasets.cts.cache import read_arrays, write_arrays
+from phydict.datasets.cts.cache import pack_case, read_arrays, unpack_case, write_arrays
 from phydict.datasets.population import DrawnPatients
 from phydict.grid import Grid
 from phydict.units import HUWindow
@@ -110,14 +109,9 @@ class KeptDraws(Dataset):
         file = self.folder / f"{number:08d}.npz"
         kept = read_arrays(file)
         if kept is None:
-            case = self.drawn[number]
-            kept = {"volume": case["volume"].numpy().astype(np.float16),
-                    "masks": (255 * case["masks"].numpy()).round().astype(np.uint8),
-                    "has_masks": case["has_masks"].numpy(), "report": np.array(case["report"])}
+            kept = pack_case(self.drawn[number], KEYS)
             write_arrays(file, kept)
-        return {"volume": torch.from_numpy(kept["volume"].astype(np.float32)),
-                "masks": torch.from_numpy(kept["masks"].astype(np.float32) / 255),
-                "has_masks": torch.from_numpy(kept["has_masks"]), "report": str(kept["report"])}
+        return dict(unpack_case(kept))
 
     def number(self, item: int) -> int:
         """Which draw the item of this number, over all epochs, is."""
@@ -130,7 +124,7 @@ class KeptDraws(Dataset):
 
 def averaged(case: Mapping, block: int) -> dict:
     """A Case or a batch of them with the means of volume and masks over blocks of `block`^3 voxels."""
-    return dict(case) | {key: avg_pool3d(case[key], block) for key in ("volume", "masks") if block > 1}
+    return dict(case) | {key: avg_pool3d(case[key], block) for key in ("volume", "masks")}
 
 
 def training_parts(case: Mapping) -> dict:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import cast
@@ -17,6 +15,7 @@ from torch.utils.data import ConcatDataset, Dataset
 from phydict.datasets import Augmentation, CTSource
 from phydict.datasets.case import Case
 from phydict.datasets.cts.augment import augment
+from phydict.datasets.cts.cache import key_of
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM
 from phydict.datasets.surroundings.surroundings import Surroundings
 from phydict.grid import Cube, Grid
@@ -240,7 +239,7 @@ class RefinementData(PriorData):
         network = made.network or self.kind.default_network
         parts = [asdict(scenes), fingerprint(initial), network and fingerprint(network), scene.to_dict(),
                  self.origin(), holdout.phantoms, [[ct.id, self.held_out_cts.key(ct)] for ct in self.held_out_cts.cts]]
-        folder = folder / f"{self.kind.name}-{hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]}"
+        folder = folder / f"{self.kind.name}-{key_of(parts)}"
         self.crop, self.made = made.crop, self.kind(
             trained, self.grid, initial, network, scenes, STRENGTH, folder / f"trained-{made.seed}",
             made.reconstructions, made.seed)

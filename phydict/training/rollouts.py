@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
@@ -16,6 +14,7 @@ from torch import Tensor
 from torch.utils.data import Dataset, default_collate
 
 from phydict.datasets import Augmentation, CTSource
+from phydict.datasets.cts.cache import key_of
 from phydict.grid import Cube
 from phydict.posterior import Unrolled
 from phydict.prior import DEFAULT_REFINER, BoundRefiner, Refiner, fingerprint, load_prior
@@ -141,7 +140,7 @@ class RollOutData(PriorData):
         self.channels, method = refiner.state_channels, Unrolled()
         parts = [asdict(rollouts.scenes), fingerprint(rollouts.initial), str(method), seed, asdict(augmentation),
                  loading.ct_fraction, self.factor, self.origin()]
-        folder = Path(cache) / f"rollouts-{hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]}"
+        folder = Path(cache) / f"rollouts-{key_of(parts)}"
         self.rollouts = RollOuts(self._case, rollouts, method, folder, seed)
 
     @cached_property

@@ -21,14 +21,13 @@ from pathlib import Path
 from statistics import mean
 
 import lightning
-import numpy as np
 import torch
 from lightning.pytorch.callbacks import EMAWeightAveraging, ModelCheckpoint
 from torch import nn
 from torch.nn.functional import avg_pool3d
 from torch.utils.data import Dataset
 
-from phydict.datasets.cts.cache import read_arrays, write_arrays
+from phydict.datasets.cts.cache import pack_case, read_arrays, unpack_case, write_arrays
 from phydict.evaluation import read_csv, write_csv
 from phydict.prior import Prior, VolumeUNet
 from phydict.runtime.console import quiet
@@ -129,13 +128,9 @@ class CachedDraws(Dataset):
         file = self.folder / f"{i:04d}.npz"
         stored = read_arrays(file)
         if stored is None:
-            case = self.draws[i]
-            stored = {"volume": case["volume"].numpy().astype(np.float16), "has_masks": case["has_masks"].numpy(),
-                      "masks": (255 * case["masks"].numpy()).round().astype(np.uint8)}
+            stored = pack_case(self.draws[i], ("volume", "masks", "has_masks"))
             write_arrays(file, stored)
-        return {"volume": torch.from_numpy(stored["volume"].astype(np.float32)),
-                "masks": torch.from_numpy(stored["masks"].astype(np.float32) / 255),
-                "has_masks": torch.from_numpy(stored["has_masks"]), "report": ""}
+        return unpack_case(stored) | {"report": ""}
 
 
 class Draws(PriorData):

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import hashlib
+import json
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO, cast
 
 import numpy as np
+import torch
 
+from phydict.datasets.case import Case
 from phydict.runtime.files import atomic_write
 from phydict.runtime.reading import not_written, reason
 from phydict.runtime.warning import warn
+
+
+def key_of(parts: object) -> str:
+    """A name for plain JSON values: other values have another."""
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]
 
 
 def write_arrays(file: Path, arrays: dict[str, np.ndarray]) -> None:
@@ -30,6 +39,21 @@ def write_array(file: Path, array: np.ndarray) -> None:
         header = np.lib.format.header_data_from_array_1_0(array)
         np.lib.format.write_array_header_1_0(stream, header)
         stream.write(array.data)  # np.save would not notice that a full disk takes no more of an array's end
+
+
+def pack_case(case: Mapping, names: Iterable[str]) -> dict[str, np.ndarray]:
+    """Those parts of a Case as small arrays: the volume in half precision, masks in steps of 1 / 255, texts and other
+    parts as they are."""
+    arrays = {name: np.array(part) if isinstance(part := case[name], str) else part.numpy() for name in names}
+    return arrays | {"volume": arrays["volume"].astype(np.float16),
+                     "masks": (255 * arrays["masks"]).round().astype(np.uint8)}
+
+
+def unpack_case(packed: Mapping[str, np.ndarray]) -> Case:
+    """The parts of a Case that `pack_case` made small."""
+    parts: dict[str, Any] = {name: str(array) if array.dtype.kind == "U" else torch.from_numpy(array)
+                             for name, array in packed.items()}
+    return cast(Case, parts | {"volume": parts["volume"].float(), "masks": parts["masks"].float() / 255})
 
 
 @contextmanager

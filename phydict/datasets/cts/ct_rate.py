@@ -7,19 +7,16 @@ CT-RATE (arXiv 2403.17834) names its volumes (train|valid)_<patient>_<scan>_<rec
 
 from __future__ import annotations
 
-import hashlib
-import json
 import re
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import torch
 from torch.utils.data import Dataset
 
 from phydict.datasets.case import Case
-from phydict.datasets.cts.cache import read_arrays, write_arrays
+from phydict.datasets.cts.cache import key_of, pack_case, read_arrays, unpack_case, write_arrays
 from phydict.datasets.cts.ct_rate_tables import read_calibrations, read_reports
 from phydict.datasets.cts.prepared import VOLUME, is_prepared, read_prepared, read_record
 from phydict.datasets.cts.segmentations import is_segmentation
@@ -31,6 +28,9 @@ from phydict.runtime.warning import warn
 from phydict.units import HUWindow
 
 NAME = re.compile(r"(?P<patient>(?:train|valid)_\d+)_(?P<scan>[a-z]+)_(?P<reconstruction>\d+)", re.IGNORECASE)
+PACKED = ("volume", "masks", "has_masks", "affine", "centred_on")
+"""The parts of a prepared CT that the cache holds."""
+
 CACHE_VERSION = 1
 """Raise it when `prepare_ct` changes its result, so that older caches are not read."""
 
@@ -240,27 +240,14 @@ class CTCases(Dataset):
         file = self.cache and self.cache / f"{ct.id}-{self.key(ct)}.npz"
         packed = read_arrays(file) if file else None
         if packed is None:
-            packed = _pack(load_case(ct, self.grid, self.window))
+            packed = pack_case(load_case(ct, self.grid, self.window), PACKED)
             if file:
                 write_arrays(file, packed)
-        return _unpack(packed) | {"id": ct.id, "report": ct.report}
+        return unpack_case(packed) | {"id": ct.id, "report": ct.report}
 
     def key(self, ct: CTFile) -> str:
         """Of a CT as it is prepared here: another file, grid, window or calibration has another."""
         stat = ct.path.stat()
         parts = [CACHE_VERSION, str(ct.path.resolve()), stat.st_mtime_ns, stat.st_size, self.grid.to_dict(),
                  asdict(self.window), asdict(ct.calibration) if ct.calibration else None]
-        return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]
-
-
-def _pack(case: Case) -> dict[str, np.ndarray]:
-    return {"volume": case["volume"].numpy().astype(np.float16),
-            "masks": (case["masks"].numpy() * 255).round().astype(np.uint8), "has_masks": case["has_masks"].numpy(),
-            "affine": case["affine"].numpy(), "centred_on": np.array(case["centred_on"])}
-
-
-def _unpack(packed: dict[str, np.ndarray]) -> Case:
-    return {"volume": torch.from_numpy(packed["volume"].astype(np.float32)),
-            "masks": torch.from_numpy(packed["masks"].astype(np.float32) / 255),
-            "has_masks": torch.from_numpy(packed["has_masks"]), "affine": torch.from_numpy(packed["affine"]),
-            "centred_on": str(packed["centred_on"])}
+        return key_of(parts)

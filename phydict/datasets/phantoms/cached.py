@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch.utils.data import Dataset
 
 from phydict.datasets.case import Case
-from phydict.datasets.cts.cache import read_arrays, write_arrays
+from phydict.datasets.cts.cache import pack_case, read_arrays, unpack_case, write_arrays
 from phydict.datasets.phantoms.phantom import phantom_case
 from phydict.datasets.phantoms.thorax import Thorax, report
 from phydict.grid import Grid
@@ -38,10 +37,8 @@ class CachedPhantoms(Dataset):
         file = self.folder / f"{seed:07d}.npz"
         stored = read_arrays(file)
         if stored is None:
-            case = phantom_case(seed, self.grid, self.window)
-            stored = {"volume": case["volume"].numpy().astype(np.float16),
-                      "masks": (255 * case["masks"].numpy()).round().astype(np.uint8)}
+            stored = pack_case(phantom_case(seed, self.grid, self.window), ("volume", "masks"))
             write_arrays(file, stored)
-        masks = torch.from_numpy(stored["masks"].astype(np.float32) / 255)
-        return {"volume": torch.from_numpy(stored["volume"].astype(np.float32)), "masks": masks,
-                "has_masks": torch.ones(len(masks), dtype=torch.bool), "report": report(Thorax.draw(seed))}
+        case = unpack_case(stored)
+        return case | {"has_masks": torch.ones(len(case["masks"]), dtype=torch.bool),
+                       "report": report(Thorax.draw(seed))}

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -11,7 +9,7 @@ import torch
 from torch.utils.data import Dataset
 
 from phydict.datasets.case import Case
-from phydict.datasets.cts.cache import read_arrays, write_arrays
+from phydict.datasets.cts.cache import key_of, pack_case, read_arrays, unpack_case, write_arrays
 from phydict.datasets.cts.ct_rate import CTCases, as_one_patient, patient_of
 from phydict.datasets.phantoms.findings import write_report
 from phydict.datasets.population.anatomy import Variation, findings_of
@@ -83,14 +81,10 @@ class DrawnPatients(Dataset):
         packed = read_arrays(file) if file else None
         if packed is None:
             case = population.case(population.draw(seed, self.settings.variation), seed)
-            packed = {"volume": case["volume"].numpy().astype(np.float16),
-                      "masks": (255 * case["masks"].numpy()).round().astype(np.uint8),
-                      "has_masks": case["has_masks"].numpy(), "report": np.array(case["report"])}
+            packed = pack_case(case, ("volume", "masks", "has_masks", "report"))
             if file:
                 write_arrays(file, packed)
-        return {"id": f"population-{seed:06d}", "volume": torch.from_numpy(packed["volume"].astype(np.float32)),
-                "masks": torch.from_numpy(packed["masks"].astype(np.float32) / 255),
-                "has_masks": torch.from_numpy(packed["has_masks"]), "report": str(packed["report"])}
+        return unpack_case(packed) | {"id": f"population-{seed:06d}"}
 
     def reports(self, most: int) -> list[str]:
         """Reports such as draws have, for learning their words; nothing is registered for them."""
@@ -114,9 +108,9 @@ class DrawnPatients(Dataset):
         if len(left) < 2:
             raise ValueError(f"a population is drawn from at least 2 CTs, but {len(left)} of {len(cases)} could be "
                              "registered: give other CTs, or set data.loading.population.share to 0")
-        self.drawn = self.folder and self.folder / self._key(
+        self.drawn = self.folder and self.folder / key_of([
             [[self.cts.key(self.cts.cts[i]), cases[i]["report"]] for i in left], left.index(template),
-            asdict(self.settings.variation))
+            asdict(self.settings.variation)])
         self.overlaps = [registered[i].overlap for i in left if i != template]
         self.population = Population([cases[i] for i in left], torch.stack([registered[i].velocity for i in left]),
                                      left.index(template), self.cts.grid, self.cts.window)
@@ -124,7 +118,7 @@ class DrawnPatients(Dataset):
 
     def _registered(self, images: dict[int, torch.Tensor], template: int) -> dict[int, Registered]:
         keys = {i: self.cts.key(self.cts.cts[i]) for i in images}
-        files = {i: self.folder and self.folder / f"{self.cts.cts[i].id}-{self._key(keys[i], keys[template])}.npz"
+        files = {i: self.folder and self.folder / f"{self.cts.cts[i].id}-{key_of([keys[i], keys[template]])}.npz"
                  for i in images}
         stored = {i: read_arrays(file) if file else None for i, file in files.items()}
         registered = {i: Registered(torch.from_numpy(one["velocity"]), float(one["overlap"]), float(one["least"]))
@@ -141,7 +135,3 @@ class DrawnPatients(Dataset):
                     write_arrays(file, {name: np.asarray(value) for name, value in vars(registered[i]).items()})
                 progress.finished(f"lungs overlap by {registered[i].overlap:.2f}")
         return dict(sorted(registered.items()))
-
-    @staticmethod
-    def _key(*parts) -> str:
-        return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]

@@ -159,6 +159,21 @@ def test_ctrl_c_on_a_terminal_says_how_to_resume_and_a_log_file_tells_the_rest(c
     assert re.search(wanted, log, flags=re.MULTILINE), log
 
 
+def test_a_scheduler_ends_a_comparison_as_ctrl_c_does(run, handlers, tmp_path, monkeypatch):
+    before, finished = signal.getsignal(signal.SIGTERM), CaseProgress.finished
+
+    def ending(progress: CaseProgress, summary: str) -> None:
+        finished(progress, summary)
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(CaseProgress, "finished", ending)
+    with pytest.raises(SystemExit) as stopped:
+        run("ablate")
+    assert stopped.value.code == 143
+    assert len(shown_in(tmp_path / "out" / "index.html")) == 1
+    assert signal.getsignal(signal.SIGTERM) == before
+
+
 @pytest.mark.parametrize("command", ["predict", "test", "ablate"])
 def test_a_run_that_is_stopped_before_a_case_is_finished_writes_no_page(command, run, handlers, tmp_path, monkeypatch):
     monkeypatch.setattr(CaseProgress, "case", lambda *_: signal.raise_signal(signal.SIGINT))

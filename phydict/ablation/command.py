@@ -22,7 +22,7 @@ from phydict.datasets import CTSource
 from phydict.inference.scoring import METRICS, Scoring
 from phydict.methods import METHODS
 from phydict.page import check_own_page
-from phydict.runtime.console import check_apart, check_configured, check_writable, cli_errors, quiet
+from phydict.runtime.console import check_apart, check_configured, check_writable, cli_errors, ended_by_sigterm, quiet
 from phydict.runtime.files import alone_in
 from phydict.runtime.help import HelpFormatter, show_settings
 from phydict.runtime.progress import CaseProgress
@@ -52,9 +52,9 @@ def main(args: list[str] | None = None) -> None:
         check_apart(specification.out, "out", [Path(cts)] if (cts := specification.cases.cts) else [])
         scoring = Scoring(specification.metrics, specification.fid, specification.clip)
         try:
-            with alone_in(specification.out, "out"), CaseProgress() as progress:
+            with ended_by_sigterm(), alone_in(specification.out, "out"), CaseProgress() as progress:
                 rows = run(specification, torch.device(device), progress, scoring, keep_volumes)
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, SystemExit):
             _page_so_far(specification, scoring)
             raise
         print(f"{len(rows)} rows in {specification.out / RESULTS}")

@@ -7,6 +7,7 @@ import logging
 import os
 import re
 import reprlib
+import signal
 import sys
 import tempfile
 import warnings
@@ -80,6 +81,20 @@ def cli_errors(*also: type[Exception], to_resume: str = "run the same command ag
         text = "stopped, because another process of this run ended; its message says why"
         proclaim(text, event="stopped", text=text)
         raise SystemExit(2) from None
+
+
+@contextmanager
+def ended_by_sigterm() -> Iterator[None]:
+    """SIGTERM, as a cluster's scheduler sends it, ends what runs inside as Ctrl-C does: by an exception, a SystemExit
+    that `cli_errors` knows, in place of at once."""
+    def end(*_: object) -> None:
+        raise SystemExit
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _advice(stop: BaseException, to_resume: str) -> str:

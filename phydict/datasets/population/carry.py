@@ -21,17 +21,20 @@ LEAST_SCANNED = 0.9
 """Share of a slice's middle that must come from slices that were scanned, or the scan ends before it."""
 
 
+def fine_flow(velocity: Tensor, voxels) -> Tensor:
+    """The flow of a velocity (3, x, y, z) on voxels half as wide as its own, no finer than the image's `voxels`."""
+    return flow(resize(velocity, [min(2 * n, m) for n, m in zip(velocity.shape[1:], voxels)]))
+
+
 def sources(shape: Tensor, patient: Tensor, voxels) -> Tensor:
     """Where a new anatomy takes its values in the patient's CT: exp(patient) after exp(-shape), (3, *voxels).
 
-    shape, patient: velocities (3, x, y, z) of the new shape and of the patient, from the template. The result is in
-    half-widths of the box.
+    shape: velocity (3, x, y, z) of the new shape, from the template; patient: `fine_flow` of the patient's. The result
+    is in half-widths of the box.
     """
-    fine = [min(2 * n, m) for n, m in zip(shape.shape[1:], voxels)]
-    start = places(fine)
-    back = start + flow(-resize(shape, fine))
-    moved = back + sample(flow(resize(patient, fine)), back) - start
-    return places(voxels) + resize(moved, voxels)
+    start = places(patient.shape[1:])
+    back = start + fine_flow(-shape, voxels)
+    return places(voxels) + resize(back + sample(patient, back) - start, voxels)
 
 
 def carry(case: Case, points: Tensor, grid: Grid, window: HUWindow, lungs: float = 0.0) -> Case:

@@ -17,7 +17,7 @@ from torch import Tensor
 from phydict.datasets.case import Case
 from phydict.datasets.phantoms.findings import write_report
 from phydict.datasets.population.anatomy import Anatomy, Variation, principal_modes
-from phydict.datasets.population.carry import carry, sources
+from phydict.datasets.population.carry import carry, fine_flow, sources
 from phydict.datasets.population.findings import put_findings
 from phydict.datasets.population.organs import ORGANS, PULL, expansion, organs
 from phydict.datasets.population.velocity import jacobian, resize
@@ -41,6 +41,8 @@ class Population:
     def __init__(self, cases: Sequence[Case], velocities: Tensor, template: int, grid: Grid, window: HUWindow):
         self.cases, self.velocities, self.template = cases, velocities, template
         self.grid, self.window = grid, window
+        self.flows = [fine_flow(velocity, grid.shape) for velocity in velocities]
+        self._last: tuple[Anatomy, Tensor] | None = None
 
     @cached_property
     def modes(self):
@@ -73,8 +75,11 @@ class Population:
         return anatomy.towards_patient(1.0)
 
     def sources(self, anatomy: Anatomy) -> Tensor:
-        """Where an anatomy's voxels take their values in its patient's CT, (3, X, Y, Z) in half-widths of the box."""
-        return sources(self.velocity(anatomy), self.velocities[anatomy.patient], self.grid.shape)
+        """Where an anatomy's voxels take their values in its patient's CT, (3, X, Y, Z) in half-widths of the box. Those
+        of the last anatomy are kept, which drawing has looked at before its case is made."""
+        if self._last is None or self._last[0] != anatomy:
+            self._last = anatomy, sources(self.velocity(anatomy), self.flows[anatomy.patient], self.grid.shape)
+        return self._last[1]
 
     def case(self, anatomy: Anatomy, seed: int = 0) -> Case:
         """The Case of an anatomy. seed: of its findings' looks and of its report's words.

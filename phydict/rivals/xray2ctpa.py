@@ -46,14 +46,15 @@ class XrayToCTPANetwork(RivalNetwork):
     """X-ray2CTPA (Cahan et al. 2025, arXiv:2406.16109), from its paper, for K views.
 
     The CT's slices go through a variational autoencoder that shrinks them by four or so; a UNet over the stack of their
-    latents learns the noise in it, at all times of a cosine schedule, beside an embedding of the X-rays, and DDIM
-    draws a stack, which is decoded.
+    latents tells its noise, at all times of a cosine schedule, beside an embedding of the X-rays, and DDIM draws a
+    stack, which is decoded.
 
     Not as published: an autoencoder trained on the same CTs in place of Stable Diffusion's, a small convolutional
     network in place of BiomedCLIP's image encoder, the mean over the views of their embeddings with their directions,
     DDIM in place of 1000 ancestral steps, the prior's HU window, no perceptual loss, no linear attention within slices,
     sinusoids in place of rotary positions, latents that their largest value scales in place of the least and largest of
-    all CTs, and one case at a step.
+    all CTs, one case at a step, and the velocity in place of the noise (Salimans and Ho 2022, arXiv:2202.00512): where
+    next to nothing but noise is seen, the least error in it would be a stack of another CT.
 
     image_channels, embedding: widths of the X-rays' network and of its vector; slice_channels: of the autoencoder, one
     halving less than their number; channels: of the UNet; ddim_steps: of the sampler.
@@ -61,7 +62,7 @@ class XrayToCTPANetwork(RivalNetwork):
 
     stage = "xray2ctpa"
     bound = True
-    largest: Tensor
+    latent_size: Tensor
 
     def __init__(self, image_channels: tuple[int, ...] = (16, 32, 64, 64), embedding: int = 256,
                  slice_channels: tuple[int, ...] = (32, 64, 64), channels: tuple[int, ...] = (32, 64, 128),
@@ -85,7 +86,7 @@ class XrayToCTPANetwork(RivalNetwork):
             with_encoder_nonlocal_attn=False, with_decoder_nonlocal_attn=False)
         self.encoder = XrayEmbedding(tuple(image_channels), embedding)
         self.denoiser = SliceUNet(LATENT, embedding, tuple(channels))
-        self.register_buffer("largest", torch.zeros(()))  # of the latents, which brings them to [-1, 1]; 0: not known
+        self.register_buffer("latent_size", torch.zeros(()))  # brings latents to [-1, 1]; 0: not known
         speed_up(self)
 
     def geometry(self, grid: Grid, beam: ConeBeam, like: Tensor) -> Geometry:
@@ -107,7 +108,7 @@ class XrayToCTPANetwork(RivalNetwork):
 
     def decoded(self, latent: Tensor) -> Tensor:
         """The CT of scaled latents."""
-        slices = (latent * self.largest).permute(0, 4, 1, 2, 3)
+        slices = (latent * self.latent_size).permute(0, 4, 1, 2, 3)
         return self.autoencoder.decode(slices.flatten(0, 1)).unflatten(0, slices.shape[:2]).permute(0, 2, 3, 4, 1)
 
     @property
@@ -116,7 +117,8 @@ class XrayToCTPANetwork(RivalNetwork):
         return bool(self.denoiser.leave.weight.any())
 
     def forward(self, x: Tensor, t: Tensor, y: Tensor, directions: Tensor) -> Tensor:
-        """The noise in scaled latents x (B, 4, X', Y', Z) at times t (B,), given the X-rays y."""
+        """The velocity of scaled latents x (B, 4, X', Y', Z) at times t (B,), given the X-rays y: signal times their
+        noise less sigma times what they are without it."""
         return self.denoiser(x, t, self.encoder(y, directions))
 
     def steps(self) -> int:
@@ -131,9 +133,9 @@ class XrayToCTPANetwork(RivalNetwork):
         condition = self.encoder(y, directions)
         x = noise_like(latent.expand(len(y), -1, -1, -1, -1), generator)
         for t, s in self.schedule.steps(self.ddim_steps):
-            noise = self.denoiser(x, torch.full((len(x),), t).to(y), condition).to(x)
+            velocity = self.denoiser(x, torch.full((len(x),), t).to(y), condition).to(x)
             signal, sigma = (float(scale) for scale in self.schedule.scales(t))
-            x0 = ((x - sigma * noise) / signal).clamp(-1, 1)
+            x0 = (signal * x - sigma * velocity).clamp(-1, 1)
             x = ddim(self.schedule, x0, x, t, s)
             on_step()
         return self.decoded(x0)

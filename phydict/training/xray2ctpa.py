@@ -55,7 +55,7 @@ class LatentSettings:
 
 
 class XrayToCTPATraining(RivalTraining):
-    """Learns an XrayToCTPANetwork: mean absolute error of slices, then of the noise in their latents.
+    """Learns an XrayToCTPANetwork: mean absolute error of slices, then of the velocity of their latents.
 
     Args:
         network: the network; none given: the default XrayToCTPANetwork
@@ -84,7 +84,7 @@ class XrayToCTPATraining(RivalTraining):
                 _load_own(getattr(network, part), file, f"model.latent.{part}")
         made = Rival(network, grid, HUWindow(*window), bound_orbit(grid, scenes.views, scenes.arc_degrees))
         super().__init__(made, scenes, (scenes.views,), optimisation, initial, seed)
-        self.latent, self.settles = latent, not (self.network.knows_xrays and self.network.largest)
+        self.latent, self.settles = latent, not (self.network.knows_xrays and self.network.latent_size)
 
     @property
     def network(self) -> XrayToCTPANetwork:
@@ -102,12 +102,13 @@ class XrayToCTPATraining(RivalTraining):
         with torch.no_grad():
             latent = network.latent(ct).float()
             if self.settles and self.global_step - self.latent.autoencoder_steps < SETTLING:
-                network.largest.copy_(torch.maximum(network.largest, latent.abs().max()))
-            x0 = (latent / network.largest).clamp(-1, 1)
+                network.latent_size.copy_(torch.maximum(network.latent_size, latent.abs().max()))
+            x0 = (latent / network.latent_size).clamp(-1, 1)
         noise, t = noise_like(x0, generator), torch.rand(1, generator=generator).to(x0)
         signal, sigma = (scale.view(-1, 1, 1, 1, 1) for scale in network.schedule.scales(t))
         directions, _ = network.geometry(self.prior.grid, beam, y)
-        return l1_loss(network(signal * x0 + sigma * noise, t, y, directions).float(), noise)
+        velocity = network(signal * x0 + sigma * noise, t, y, directions).float()
+        return l1_loss(velocity, signal * noise - sigma * x0)
 
     def _slices_loss(self, ct: Tensor, generator: torch.Generator) -> Tensor:
         network = self.network
@@ -115,8 +116,8 @@ class XrayToCTPATraining(RivalTraining):
         slices = ct[0, :, :, :, chosen.to(ct.device)].permute(3, 0, 1, 2)
         mean, std = (part.float() for part in network.autoencoder.encode(slices))
         with torch.no_grad():
-            share = FORGOTTEN if network.largest else 1.0
-            network.largest.lerp_(mean.abs().max(), share)
+            share = FORGOTTEN if network.latent_size else 1.0
+            network.latent_size.lerp_(mean.abs().max(), share)
         divergence = (mean.square() + std.square() - 1 - 2 * std.clamp(min=1e-12).log()).mean() / 2
         again = network.autoencoder.decode(mean + std * noise_like(mean, generator))
         return l1_loss(again.float(), slices) + self.latent.kl_weight * divergence

@@ -39,7 +39,7 @@ def tiny_x2ct(grid: Grid = GRID, views: int = 2) -> Rival:
 
 def tiny_xray2ctpa(grid: Grid = GRID, views: int = 2) -> Rival:
     network = lively(lambda: XrayToCTPANetwork((4, 4), 8, (4, 8), (4, 8), 4))
-    network.largest.fill_(1.0)
+    network.latent_size.fill_(1.0)
     return Rival(network, grid, WINDOW, bound_orbit(grid, views)).eval().requires_grad_(False)
 
 

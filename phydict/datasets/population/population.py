@@ -75,8 +75,8 @@ class Population:
         return anatomy.towards_patient(1.0)
 
     def sources(self, anatomy: Anatomy) -> Tensor:
-        """Where an anatomy's voxels take their values in its patient's CT, (3, X, Y, Z) in half-widths of the box. Those
-        of the last anatomy are kept, which drawing has looked at before its case is made."""
+        """Where an anatomy's voxels take their values in its patient's CT, (3, X, Y, Z) in half-widths of the box. The
+        last anatomy's are kept, which drawing has looked at before its case is made."""
         if self._last is None or self._last[0] != anatomy:
             self._last = anatomy, sources(self.velocity(anatomy), self.flows[anatomy.patient], self.grid.shape)
         return self._last[1]

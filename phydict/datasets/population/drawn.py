@@ -33,7 +33,7 @@ class PopulationSettings:
     Args:
         share: share of the CT draws that are taken from the population, in [0, 1]
         draws: number of different new patients
-        patients: most patients that are registered, 10 s each; of more, so many are picked
+        patients: most patients that are registered, 6 to 10 s each; of more, so many are picked
         variation: how far new patients go from those that are there
     """
 

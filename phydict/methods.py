@@ -228,6 +228,9 @@ def fit_to_grid(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam
     check_air(xrays)
     beam.check(grid)
     beam.check_scale(method.survey or grid)
+    if beam.continued and not covers(grid, DEFAULT_GRID):
+        raise ValueError("a patient goes on above and below the whole chest's voxels alone, but a smaller box was "
+                         "given beside a geometry that is continued: leave one of the two out")
     return seen_by(grid, xrays.float(), beam, method.full_detector, projector)
 
 

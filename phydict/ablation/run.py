@@ -31,6 +31,7 @@ from phydict.runtime.files import atomic_directory
 from phydict.runtime.precision import instruction_set
 from phydict.runtime.profiling import peak_memory, profiled, reset_peak_memory
 from phydict.runtime.progress import CaseProgress
+from phydict.runtime.reading import TooLittleMemory
 from phydict.runtime.seeds import case_seed
 from phydict.runtime.telling import tell
 
@@ -80,6 +81,7 @@ class Results:
         self.others = [row for name, row in stored.items() if name not in planned]
         self.done = {name: self._row(name, row) for name, row in stored.items()
                      if name in planned and row.get("status") in FINISHED}
+        self.again: set[str] = set()
 
     def _row(self, name: str, measured: Mapping) -> dict:
         return self.planned[name] | {k: measured[k] for k in MEASURED if measured.get(k) is not None} | {"key": name}
@@ -91,12 +93,17 @@ class Results:
 
     def add(self, name: str, measured: Mapping) -> None:
         """Adds a row and writes the table, in one step."""
-        self.done[name] = self._row(name, measured)
+        if measured["status"] == "ok" or name not in self.again:
+            self.done[name] = self._row(name, measured)
+        self.again.discard(name)
         self.write()
 
     def forget(self, lacking: Callable[[str], bool]) -> None:
-        """Take rows for not done whose volume was scored, but which lack something, by their keys."""
-        self.done = {name: row for name, row in self.done.items() if row["status"] != "ok" or not lacking(name)}
+        """Have rows run again, by their keys, whose volume was scored but lacks something; they stay until then."""
+        self.again |= {name for name, row in self.done.items() if row["status"] == "ok" and lacking(name)}
+
+    def finished(self, name: str) -> bool:
+        return name in self.done and name not in self.again
 
     def write(self) -> None:
         """The table with the columns in one order, whatever order its rows came in."""
@@ -138,7 +145,7 @@ def run(specification: Specification, device: torch.device, progress: CaseProgre
     if keep_volumes:
         results.forget(lambda name: not volume_folder(specification.out, name).is_dir())
     of = len(results.planned)
-    left = sum(name not in results.done for name in results.planned)
+    left = sum(not results.finished(name) for name in results.planned)
     tell(f"{of - left} of {of} rows are there already, {left} are to be run", event="kept", cases=of - left, of=of)
     if others := len(results.others):
         tell(f"{others} rows of other settings or data are kept in {results.file} and left out of tables",
@@ -149,7 +156,7 @@ def run(specification: Specification, device: torch.device, progress: CaseProgre
         groups: dict[str, Work] = {}
         made = CaseCache()
         for trial, name, make in work:
-            if name not in results.done:
+            if not results.finished(name):
                 groups.setdefault(trial.acquisition(), []).append((trial, name, make))
         for group in groups.values():
             first, _, make = group[0]
@@ -306,7 +313,8 @@ def _attempt(work: Callable[[], object]):
         if os.environ.get(TRACEBACK):
             raise
         if isinstance(error, ValueError):
-            return {"status": "refused", "error": sentence(error)}
+            status = "failed" if isinstance(error, TooLittleMemory) else "refused"  # which is not tried again
+            return {"status": status, "error": sentence(error)}
         return {"status": "failed", "error": f"{type(error).__name__}: {sentence(error)}"}
 
 

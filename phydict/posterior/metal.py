@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -117,7 +117,8 @@ def beside(measurement: Measurement, x: Tensor, where: Tensor, metal: Metal) -> 
     measurement.subgrid = 0.0
     box = tuple(slice(int(i.min()), int(i.max()) + 1) for i in where[0, 0].nonzero(as_tuple=True))
     projector = measurement.projector
-    B = FinerProjector(Projector(part(projector.grid, box), projector.beam, device=x.device, full_detector=True), RAYS)
+    B = FinerProjector(Projector(part(projector.grid, box), replace(projector.beam, continued=False), device=x.device,
+                                 full_detector=True), RAYS)
     allowed = interpolate(where[:, :, *box].to(x), scale_factor=RAYS) > 0
     x = torch.where(where, float(measurement.window.to_range(torch.tensor(SOFT))), x)
     z, e, slope = x, torch.zeros_like(allowed, dtype=x.dtype), measurement.slope

@@ -135,13 +135,17 @@ def check_held(promised: int, path: Path, what: str, times: int = MOST_SQUEEZED)
                          "damaged")
 
 
+class TooLittleMemory(ValueError):
+    """What another machine could do."""
+
+
 def check_memory(needed: int, what: str, advice: str) -> None:
-    """Raises ValueError, with both numbers, where `what` takes more bytes than this machine, or the container that this
-    runs in, has memory."""
+    """Raises TooLittleMemory, with both numbers, where `what` takes more bytes than this machine, or the container
+    that this runs in, has memory."""
     there = min([os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"), *container_limits()])
     if needed > there:
-        raise ValueError(f"{what} would take {needed / 2**30:,.1f} GiB of memory, but this machine has "
-                         f"{there / 2**30:,.1f}; {advice}")
+        raise TooLittleMemory(f"{what} would take {needed / 2**30:,.1f} GiB of memory, but this machine has "
+                              f"{there / 2**30:,.1f}; {advice}")
 
 
 def container_limits() -> list[int]:

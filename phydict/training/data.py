@@ -135,8 +135,8 @@ class PriorData(lightning.LightningDataModule):
 
     def _kept_in(self) -> Path:
         """The folder of kept draws, another for whatever else decides what they are."""
-        parts = [self.origin(), asdict(self.augmentation), self.loading.ct_fraction, self.seed, asdict(self.window),
-                 self.draw_grid.to_dict(), self.block]
+        parts = [self.origin(), [ct.report for ct in self.cts.cts], asdict(self.augmentation), self.loading.ct_fraction,
+                 self.seed, asdict(self.window), self.draw_grid.to_dict(), self.block]
         return self.cache / f"draws-{key_of(parts)}"
 
     def val_dataloader(self) -> DataLoader:

@@ -33,6 +33,7 @@ class RivalTraining(StageTraining):
     def __init__(self, made: Rival, scenes: Scenes, views: tuple[int, ...], optimisation: Optimisation,
                  initial: str | None, seed: int):
         rival = made if initial is None else load_rival(initial)
+        before = rival.budget
         bound = ("grid", "beam") if made.network.bound else ()
         for part in ("stage", "hu_window", *bound):
             if rival.describe()[part] != made.describe()[part]:
@@ -40,6 +41,7 @@ class RivalTraining(StageTraining):
                                  "model.initial, or the settings that it was trained with")
         rival = Rival(rival.network, made.grid, made.window, made.beam)
         super().__init__(rival.train().requires_grad_(True), optimisation, seed)
+        self.before = before
         self.scenes, self.validation_views = scenes, views
 
     @abstractmethod

@@ -46,6 +46,8 @@ class StageTraining(lightning.LightningModule, ABC):
                  optimisation: Optimisation, seed: int):
         super().__init__()
         self.prior, self.optimisation, self.seed, self.samples = prior, optimisation, seed, 0
+        self.before: dict[str, int] = {}
+        """Steps and samples that the weights had learnt from when this training was given them, where they say so."""
 
     @abstractmethod
     def batch_loss(self, batch: dict, key: tuple[int, ...] = (0,), rank: int = 0, processes: int = 1) -> Tensor:
@@ -126,6 +128,7 @@ class StageTraining(lightning.LightningModule, ABC):
     def on_save_checkpoint(self, checkpoint: dict) -> None:
         self._check_weights(checkpoint["state_dict"], checkpoint.get("current_model_state", {}))
         progress = {"steps": self.trainer.global_step, "samples": self.samples}
+        progress = {name: count + self.before.get(name, 0) for name, count in progress.items()}
         checkpoint["phydict"] = self._describe() | {"training": progress}
 
     def on_load_checkpoint(self, checkpoint: dict) -> None:
@@ -135,4 +138,4 @@ class StageTraining(lightning.LightningModule, ABC):
             if key != "training" and resumed.get(key) != current.get(key):
                 raise ValueError(f"the checkpoint's prior and this training's differ in '{key}': give the settings and "
                                  "data that the checkpoint was trained with, or start anew with model.initial")
-        self.samples = checkpoint["phydict"].get("training", {}).get("samples", 0)
+        self.samples = checkpoint["phydict"].get("training", {}).get("samples", 0) - self.before.get("samples", 0)

@@ -49,16 +49,6 @@ def covers(grid: Grid, box: Grid) -> bool:
     return bool((low >= -0.5 - SLACK).all() and (high <= np.asarray(grid.shape) - 0.5 + SLACK).all())
 
 
-def share_inside(grid: Grid, box: Grid) -> Tensor:
-    """The share (X, Y, Z) of each of the grid's voxels that lies in a box along the same axes."""
-    check_axes(grid, box)
-    shares = []
-    for n, low, high in zip(grid.shape, *_faces(grid, box)):
-        places = np.arange(n)
-        shares.append(torch.as_tensor((np.minimum(places + 0.5, high) - np.maximum(places - 0.5, low)).clip(0, 1)))
-    return shares[0][:, None, None] * shares[1][:, None] * shares[2]
-
-
 def interpolated(volume: Tensor, grid: Grid, onto: Grid, fill: float) -> Tensor:
     """A volume (X, Y, Z) on `grid`, trilinearly on the voxels of another grid along the same axes; `fill` lies outside
     its box."""
@@ -77,9 +67,8 @@ def interpolated(volume: Tensor, grid: Grid, onto: Grid, fill: float) -> Tensor:
 def outside_projection(mu: Tensor, grid: Grid, projector: Projector) -> Tensor:
     """Line integrals (K, V, U), along the projector's rays, of what of mu (X, Y, Z) in 1/mm on `grid` lies outside the
     projector's own box."""
-    outside = mu * (1 - share_inside(grid, projector.grid)).to(mu)
-    return Projector(grid, projector.beam, projector.method, device=mu.device, full_detector=True)(
-        outside[None, None])[0]
+    whole = Projector(grid, projector.beam, projector.method, device=mu.device, full_detector=True)(mu[None, None])
+    return (whole - projector(interpolated(mu, grid, projector.grid, 0.0)[None, None]))[0]
 
 
 def refinements(start: Grid, target: Grid) -> list[Grid]:

@@ -46,7 +46,7 @@ def subtract_scatter(xrays: Tensor, reference: Tensor, order: int = 3) -> Tensor
     signal = torch.exp(-xrays.double())
     down, along = (torch.linspace(0, math.pi, n, dtype=torch.float64, device=xrays.device) for n in xrays.shape[-2:])
     smooth = torch.stack([torch.cos(i * down)[:, None] * torch.cos(j * along)
-                          for i in range(order) for j in range(order - i)])
+                          for i in range(min(order, len(down))) for j in range(min(order - i, len(along)))])
     design = (smooth / signal[..., None, :, :]).flatten(-2)
     excess = (1 - torch.exp(-reference.double()) / signal).flatten(-2)
     normal, right = design @ design.transpose(-1, -2), design @ excess[..., None]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from torch import Tensor
@@ -28,7 +28,8 @@ class Carried:
 
     def projection(self, projector: Projector) -> Tensor:
         """Its line integrals (K, V, U) along a projector's rays."""
-        rays = Projector(self.grid, projector.beam.divided(RAYS), device=self.extra.device, full_detector=True)
+        beam = replace(projector.beam.divided(RAYS), continued=False)
+        rays = Projector(self.grid, beam, device=self.extra.device, full_detector=True)
         return self.mu_water / 1000 * avg_pool2d(rays(self.extra[None, None]), RAYS)[0]
 
     def on(self, grid: Grid) -> Tensor:

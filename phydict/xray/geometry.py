@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import reprlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ FORMS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "orbit": (ORBIT_KEYS, ORBIT_OPTIONS), "angles": (("angles_degrees", *ORBIT_KEYS[1:]), ()),
     "sweep": ((*ORBIT_KEYS, "sweep_degrees"), ())}
 """Required and optional keys of the mappings that a YAML file may hold in place of vectors."""
+CONTINUED = ("continued",)
 PLACE_OPTIONS = ("detector_shift", "tilt_degrees")
 LISTS = ("shape", "pixel", "angles_degrees", "detector_shift")
 MOST_RADIANS = 4 * math.pi
@@ -43,6 +44,8 @@ class ConeBeam:
     sources, detectors: (K, 3) the focal spots and the detectors' centres.
     u, v: (K, 3) the step from one column to the next and from one row to the next, perpendicular to each other.
     shape: (V, U) pixels. Pixel (r, c) is centred on detector + (c - (U-1)/2) u + (r - (V-1)/2) v.
+    continued: whether what a volume holds goes on above and below it where rays meet it, each column as its last voxel
+        does, as a patient is taller than a scan; else there is nothing beyond.
     Raises ValueError for wrong shapes, non-finite numbers, degenerate detectors and a source in a detector's plane.
     """
 
@@ -51,6 +54,7 @@ class ConeBeam:
     u: np.ndarray
     v: np.ndarray
     shape: tuple[int, int]
+    continued: bool = False
 
     def __post_init__(self):
         shape = whole_sizes(self.shape)
@@ -59,6 +63,8 @@ class ConeBeam:
                              "was given")
         _check_room(len(np.atleast_1d(self.sources)), shape)
         object.__setattr__(self, "shape", shape)
+        if not isinstance(self.continued, bool):
+            raise ValueError(f"a beam's continued is true or false, but {reprlib.repr(self.continued)} was given")
         for name in ("sources", "detectors", "u", "v"):
             value = np.array(getattr(self, name), float) + 0.0  # no negative zeros
             if value.ndim != 2 or value.shape[1] != 3 or len(value) < 1:
@@ -143,14 +149,18 @@ class ConeBeam:
         column, as for a half-fan acquisition."""
         height, width = np.linalg.norm(self.v, axis=1), np.linalg.norm(self.u, axis=1)
         move = rows * self.v / height[:, None] + columns * self.u / width[:, None]
-        return ConeBeam(self.sources, self.detectors + move, self.u, self.v, self.shape)
+        return replace(self, detectors=self.detectors + move)
+
+    def at(self, sources: np.ndarray, detectors: np.ndarray, u: np.ndarray, v: np.ndarray) -> ConeBeam:
+        """The beam in other poses."""
+        return replace(self, sources=sources, detectors=detectors, u=u, v=v)
 
     def tilted(self, degrees: float) -> ConeBeam:
         """The beam with each view turned about the line through the isocentre that its rows run along, so that the
         source rises by `degrees`: the angulation of a C-arm."""
         if not abs(degrees) < 90:
             raise ValueError(f"tilt_degrees lies between -90 and 90, but {degrees} was given")
-        return ConeBeam(*turned((self.sources, self.detectors, self.u, self.v), math.radians(degrees)), self.shape)
+        return self.at(*turned((self.sources, self.detectors, self.u, self.v), math.radians(degrees)))
 
     @property
     def views(self) -> int:
@@ -177,7 +187,7 @@ class ConeBeam:
     def select(self, views) -> ConeBeam:
         """The beam with only `views` (indices, slice or mask), in the order given."""
         index = np.atleast_1d(np.arange(self.views)[views])
-        return ConeBeam(self.sources[index], self.detectors[index], self.u[index], self.v[index], self.shape)
+        return self.at(self.sources[index], self.detectors[index], self.u[index], self.v[index])
 
     def binned(self, factor: int) -> ConeBeam:
         """The beam whose pixels are blocks of factor x factor pixels; the field of view stays the same."""
@@ -185,13 +195,27 @@ class ConeBeam:
             raise ValueError(f"a detector of {self.shape[0]} x {self.shape[1]} pixels cannot be binned by {factor}; "
                              "give a positive whole number that divides both sizes")
         factor = int(factor)
-        return ConeBeam(self.sources, self.detectors, factor * self.u, factor * self.v,
-                        (self.shape[0] // factor, self.shape[1] // factor))
+        return replace(self, u=factor * self.u, v=factor * self.v,
+                       shape=(self.shape[0] // factor, self.shape[1] // factor))
 
     def divided(self, factor: int) -> ConeBeam:
         """The beam each of whose pixels is divided into factor x factor; `binned` undoes it."""
-        return ConeBeam(self.sources, self.detectors, self.u / factor, self.v / factor,
-                        (self.shape[0] * factor, self.shape[1] * factor))
+        return replace(self, u=self.u / factor, v=self.v / factor,
+                       shape=(self.shape[0] * factor, self.shape[1] * factor))
+
+    def reach_beyond(self, grid: Grid) -> int:
+        """How many slices above or below a grid rays of the detector meet before they leave its columns, at most."""
+        corners = np.stack([self.detectors + row * (self.shape[0] - 1) / 2 * self.v
+                            + column * (self.shape[1] - 1) / 2 * self.u for row in (-1, 1) for column in (-1, 1)])
+        radius = float(np.hypot(*(grid.extent[:2] / 2)))
+        towards = self.normals - (self.normals @ (grid.affine[:3, 2] / grid.spacing[2]))[:, None] * (
+            grid.affine[:3, 2] / grid.spacing[2])
+        towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), LEAST_MM)
+        far = ((grid.centre + radius * towards - self.sources) * self.normals).sum(1) / self.distances
+        ends = self.sources + np.minimum(far, 1.0)[:, None] * (corners - self.sources)
+        places = np.stack([grid.index(end)[:, 2] for end in ends])
+        beyond = max(-places.min(), places.max() - (grid.shape[2] - 1))
+        return max(0, math.ceil(beyond))
 
     def check(self, grid: Grid) -> None:
         """Raise ValueError unless the whole box of voxels lies between every source and its detector's plane."""
@@ -261,7 +285,8 @@ class ConeBeam:
 
     def to_dict(self) -> dict:
         """Plain lists, from which `ConeBeam(**d)` builds the same beam."""
-        return {name: np.asarray(getattr(self, name)).tolist() for name in VECTOR_KEYS}
+        return {name: np.asarray(getattr(self, name)).tolist() for name in VECTOR_KEYS} | (
+            {"continued": True} if self.continued else {})
 
     def save(self, path: str | Path) -> None:
         """Write the beam as YAML in the vector form (keys sources, detectors, u, v in mm, shape)."""
@@ -277,6 +302,7 @@ class ConeBeam:
         and optionally start_degrees (0) and arc_degrees (360), or start and arc in radians; angles_degrees: [...] in
         place of views, start and arc; or one mapping `sweep:` with sweep_degrees beside the orbit's five keys. Both
         take detector_shift (mm from column to column, or [from row to row, from column to column]) and tilt_degrees.
+        Beside any of these forms `continued: true` says that the patient goes on above and below the volume.
         Raises FileNotFoundError, and ValueError naming the file for unknown or missing keys and impossible geometry.
         """
         path = Path(path)
@@ -294,10 +320,12 @@ class ConeBeam:
         """The beam of a mapping in one of the forms that `load` reads. Raises ValueError naming the key."""
         form = next((name for name in ("orbit", "sweep") if isinstance(content, dict) and name in content), None)
         if form is None:
-            content = _check_keys(content, VECTOR_KEYS, ())
+            content = dict(_check_keys(content, VECTOR_KEYS, CONTINUED))
+            continued = content.pop("continued", False)
             numbers: dict[str, Any] = {key: _numbers(key, value) for key, value in content.items()}
-            return cls(**numbers)
-        given: Any = _check_keys(content, (form,), ())[form]
+            return cls(**numbers, continued=continued)
+        content = _check_keys(content, (form,), CONTINUED)
+        given: Any = content[form]
         if form == "orbit" and isinstance(given, dict) and "angles_degrees" in given:
             form = "angles"
         required, optional = FORMS[form]
@@ -313,7 +341,8 @@ class ConeBeam:
         beam = make[form](**given)
         if np.any(shift):
             beam = beam.shifted(*((0.0, shift) if np.ndim(shift) == 0 else shift))
-        return beam.tilted(tilt) if tilt else beam
+        beam = beam.tilted(tilt) if tilt else beam
+        return replace(beam, continued=content.get("continued", False))
 
 
 def _radians(name: str, radians: float | None, degrees: float | None, otherwise: float) -> float:

@@ -7,7 +7,7 @@ from laws import random_like
 
 from phydict.grid import Box, Grid
 from phydict.xray import ConeBeam, Projector
-from phydict.xray.boxes import covers, divided, halved, interpolated, outside_projection, refinements, share_inside
+from phydict.xray.boxes import covers, divided, halved, interpolated, outside_projection, refinements
 
 BASE = Grid.cube(16)
 BEAM = ConeBeam.orbit(3, 1020, 740, (28, 28), 20.0)
@@ -48,14 +48,6 @@ def test_interpolation_keeps_what_is_linear_and_fills_what_lies_outside(onto):
     torch.testing.assert_close(found[inner], linear(onto)[inner])
     beyond = interpolated(linear(BASE), BASE, Grid.box(4, 40.0, (400.0, 0.0, 0.0)), -5.0)
     assert (beyond == -5).all()
-
-
-def test_shares_of_a_box_sum_to_its_volume_and_are_whole_inside():
-    box = Grid.box((5, 7, 9), (101.0, 200.0, 93.0), (11.0, -20.0, 30.0))
-    share = share_inside(BASE, box)
-    assert float(share.sum()) * np.prod(BASE.spacing) == pytest.approx(101 * 200 * 93)
-    assert share.max() == 1 and share.min() == 0
-    assert (share_inside(BASE, BASE) == 1).all()
 
 
 def test_what_lies_inside_and_outside_a_box_projects_to_the_whole():

@@ -85,8 +85,10 @@ def load_xrays(folder: str | Path, geometry: str | Path | None = None, intensity
     for name, image in zip(views.names, views.images):
         rows, columns = upright(image.shape)
         if (rows, columns) != beam.shape:
-            raise ValueError(f"{name} has {rows} x {columns} pixels (rows x columns), but {source} "
-                             f"describes a detector of {beam.shape[0]} x {beam.shape[1]}; correct `shape` and `pixel`")
+            other = (f"{views.names[0]} has {beam.shape[0]} x {beam.shape[1]}; crop or pad them to one size"
+                     if upright(views.images[0].shape) == beam.shape else
+                     f"{source} describes a detector of {beam.shape[0]} x {beam.shape[1]}; correct `shape` and `pixel`")
+            raise ValueError(f"{name} has {rows} x {columns} pixels (rows x columns), but {other}")
     if views.tags:
         intensity = shown(intensity or tags_intensity(views.tags), views.tags)
     intensity = intensity or _assumed(views, folder, source)

@@ -10,6 +10,7 @@
     orientation: {rotate_degrees: 0, flip_rows: false, flip_columns: false}
     uncertain: {detector_shift_mm: 5, rotation_degrees: 2}    # what is not exactly known, for --calibrate; see
     #                                                         # phydict.xray.poses.uncertain
+    continued: true                                      # the patient goes on above and below the volume
 
 Without `beam:` the tags of DICOM images decide. Rotation is clockwise, in quarters, and comes before the flips. The
 beam, wherever it comes from, is that of the images once they are turned.
@@ -18,7 +19,7 @@ beam, wherever it comes from, is that of the images once they are turned.
 from __future__ import annotations
 
 import reprlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -69,13 +70,15 @@ class Orientation:
 
 @dataclass(frozen=True)
 class Description:
-    """What one geometry file says. source: the file; beam: its mapping, None where the tags of DICOM images decide."""
+    """What one geometry file says. source: the file; beam: its mapping, None where the tags of DICOM images decide;
+    continued: as ConeBeam's, whatever states the beam."""
 
     source: Path
     beam: dict | None = None
     intensity: Intensity | None = None
     orientation: Orientation = Orientation()
     uncertain: Uncertain | None = None
+    continued: bool = False
 
     @property
     def views(self) -> int | None:
@@ -87,6 +90,10 @@ class Description:
 
     def beam_of(self, shape: tuple[int, int], tags: list[DicomTags]) -> ConeBeam:
         """The beam for images of `shape` (V, U), turned, and their DICOM tags, if any. Raises ValueError."""
+        beam = self._stated_beam(shape, tags)
+        return replace(beam, continued=True) if self.continued else beam
+
+    def _stated_beam(self, shape: tuple[int, int], tags: list[DicomTags]) -> ConeBeam:
         beam = self.beam or {}
         if self._left_to_tags:
             if not tags:
@@ -131,13 +138,16 @@ def read_description(path: Path, needed: bool = True) -> Description:
         return Description(path, {"file": path.name})
     content = read_yaml(path)
     if not isinstance(content, dict):
-        raise ValueError(f"{path} must hold `beam:`, and may hold `intensity:`, `orientation:` and `uncertain:`")
+        raise ValueError(f"{path} must hold `beam:`, and may hold `intensity:`, `orientation:`, `uncertain:` and "
+                         "`continued:`")
     intensity, orientation = content.pop("intensity", None) or {}, content.pop("orientation", None) or {}
-    uncertain = content.pop("uncertain", None)
+    uncertain, continued = content.pop("uncertain", None), content.pop("continued", False)
+    if not isinstance(continued, bool):
+        raise ValueError(f"{path}: `continued:` is true or false, but {reprlib.repr(continued)} was found")
     if "beam" in content and len(content) > 1:
         unknown = [reprlib.repr(key) for key in content if key != "beam"]
         raise ValueError(f"{path}: unknown key {', '.join(unknown)}; the keys are beam, intensity, orientation, "
-                         "uncertain")
+                         "uncertain, continued")
     beam = content.get("beam", content or None)
     _check_beam(path, beam)
     for block, value, kind in (("intensity", intensity, Intensity), ("orientation", orientation, Orientation)):
@@ -150,7 +160,7 @@ def read_description(path: Path, needed: bool = True) -> Description:
         raise ValueError(f"{path}: `intensity:` needs `kind`, one of {', '.join(KINDS)}")
     try:
         return Description(path, beam, Intensity(**intensity) if intensity else None, Orientation(**orientation),
-                           None if uncertain is None else Uncertain.from_dict(uncertain))
+                           None if uncertain is None else Uncertain.from_dict(uncertain), continued)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 

@@ -23,8 +23,7 @@ def carried(beam: ConeBeam, motion: np.ndarray) -> ConeBeam:
     """The beam moved as a whole: turned about the origin by the vector motion[3:] in degrees, then shifted by
     motion[:3] in mm."""
     turn = Rotation.from_rotvec(np.radians(motion[3:])).as_matrix().T
-    return ConeBeam(beam.sources @ turn + motion[:3], beam.detectors @ turn + motion[:3], beam.u @ turn, beam.v @ turn,
-                    beam.shape)
+    return beam.at(beam.sources @ turn + motion[:3], beam.detectors @ turn + motion[:3], beam.u @ turn, beam.v @ turn)
 
 
 def shadows(beam: ConeBeam, points: np.ndarray) -> np.ndarray:

@@ -23,7 +23,7 @@ def moved(beam: ConeBeam, values: np.ndarray) -> ConeBeam:
     """The beam with its views moved by `values` (K, 8), in mm and degrees, as POSE lists them."""
     vectors = torch.stack([_moved(unknowns, vectors) for unknowns, vectors in _views(beam, values)])
     sources, detectors, u, v = np.moveaxis(vectors.numpy(), 1, 0)
-    return ConeBeam(sources, detectors, u, v, beam.shape)
+    return beam.at(sources, detectors, u, v)
 
 
 def derivative(beam: ConeBeam, values: np.ndarray) -> Tensor:

@@ -14,6 +14,7 @@ from phydict.runtime.profiling import stage
 from phydict.runtime.warning import warn
 from phydict.xray.binning import binning
 from phydict.xray.geometry import VECTOR_KEYS, ConeBeam
+from phydict.xray.projectors.continued import Continued, with_slices
 
 if TYPE_CHECKING:  # they bring a compiler, so that each is imported where it is first needed
     from phydict.xray.projectors.eq4 import Eq4
@@ -35,7 +36,8 @@ class Projector:
     """A: attenuation mu (B, 1, X, Y, Z) in 1/mm on `grid` -> line integrals (B, K, V, U) along the rays of `beam`.
 
     `A(mu)` and the exact adjoint `A.T(xrays)` are differentiable (to any order) in float32 and float64; geometry is
-    computed once, in float64, and shared by projectors of the same grid and beam. mu is 0 outside the grid.
+    computed once, in float64, and shared by projectors of the same grid and beam. mu is 0 outside the grid, or, where
+    the beam says that it is continued, above and below it what it is in the last slice.
     method:
         "separable": trilinear volumes, upright detectors, any device; the fast one (phydict.xray.projectors.separable);
         "siddon": piecewise-constant voxels exactly, any pose, computed on the CPU (phydict.xray.projectors.siddon);
@@ -89,7 +91,7 @@ class Projector:
 class _Engine:
     """What projectors of the same grid and beam share: the operator, why it was chosen, and its norm once known."""
 
-    operator: Eq4 | Joseph | Separable | Siddon | SystemMatrix
+    operator: Eq4 | Joseph | Separable | Siddon | SystemMatrix | Continued
     method: str
     reason: str
     norm: float | None = None
@@ -100,11 +102,14 @@ _engines: OrderedDict[tuple, _Engine] = OrderedDict()
 
 def _engine(grid: Grid, beam: ConeBeam, method: str, memory: int, device: str) -> _Engine:
     """The engine for a geometry, from among those last used if it is there."""
-    key = (method, memory, device, grid.shape, grid.affine.tobytes(), beam.shape,
+    key = (method, memory, device, grid.shape, grid.affine.tobytes(), beam.shape, beam.continued,
            *(getattr(beam, name).tobytes() for name in VECTOR_KEYS[:4]))
     if key not in _engines:
-        chosen, reason = _choose(grid, beam, memory, device) if method == "auto" else (method, "it was requested")
-        _engines[key] = _Engine(_operator(grid, beam, chosen, memory), chosen, reason)
+        slices = beam.reach_beyond(grid) if beam.continued else 0
+        tall = with_slices(grid, slices)
+        chosen, reason = _choose(tall, beam, memory, device) if method == "auto" else (method, "it was requested")
+        operator = _operator(tall, beam, chosen, memory)
+        _engines[key] = _Engine(Continued(operator, slices) if slices else operator, chosen, reason)
     _engines.move_to_end(key)
     while len(_engines) > CACHE_SIZE:
         _engines.popitem(last=False)

@@ -204,18 +204,18 @@ class ConeBeam:
                        shape=(self.shape[0] * factor, self.shape[1] * factor))
 
     def reach_beyond(self, grid: Grid) -> int:
-        """How many slices above or below a grid rays of the detector meet before they leave its columns, at most."""
-        corners = np.stack([self.detectors + row * (self.shape[0] - 1) / 2 * self.v
-                            + column * (self.shape[1] - 1) / 2 * self.u for row in (-1, 1) for column in (-1, 1)])
-        radius = float(np.hypot(*(grid.extent[:2] / 2)))
-        towards = self.normals - (self.normals @ (grid.affine[:3, 2] / grid.spacing[2]))[:, None] * (
-            grid.affine[:3, 2] / grid.spacing[2])
-        towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), LEAST_MM)
-        far = ((grid.centre + radius * towards - self.sources) * self.normals).sum(1) / self.distances
-        ends = self.sources + np.minimum(far, 1.0)[:, None] * (corners - self.sources)
-        places = np.stack([grid.index(end)[:, 2] for end in ends])
-        beyond = max(-places.min(), places.max() - (grid.shape[2] - 1))
-        return max(0, math.ceil(beyond))
+        """How many slices above or below a grid the detector's rays meet, at most, while they are over its columns."""
+        up = grid.affine[:3, 2] / grid.spacing[2]
+        across = self.normals - np.outer(self.normals @ up, up)
+        across *= np.hypot(*(grid.extent[:2] / 2)) / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), LEAST_MM)
+        rows, columns = ((n - 1) / 2 * step for n, step in zip(self.shape, (self.v, self.u)))
+        places = []
+        for side in (-across, across):  # where rays come over the columns, and where they leave them
+            depth = ((grid.centre + side - self.sources) * self.normals).sum(1) / self.distances
+            for pixel in (rows + columns, rows - columns, columns - rows, -rows - columns):
+                ray = self.detectors + pixel - self.sources
+                places.append(grid.index(self.sources + depth.clip(0, 1)[:, None] * ray)[:, 2])
+        return max(0, math.ceil(max(-np.min(places), np.max(places) - (grid.shape[2] - 1))))
 
     def check(self, grid: Grid) -> None:
         """Raise ValueError unless the whole box of voxels lies between every source and its detector's plane."""

@@ -22,6 +22,7 @@ from phydict.methods import METHODS
 from phydict.prior import save_prior
 from phydict.runtime import profiling
 from phydict.runtime.profiling import profiled
+from phydict.runtime.reading import TooLittleMemory
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 
@@ -128,6 +129,7 @@ def test_every_error_of_a_method_shows_where_it_is_asked_to(tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize("error, status, again", [(ValueError("Two\nlines."), "refused", 0),
+                                                  (TooLittleMemory("It would take 9 GiB"), "failed", 1),
                                                   (RuntimeError("no memory"), "failed", 1)])
 def test_a_method_that_gives_up_is_a_row_with_its_sentence(tmp_path, monkeypatch, trace, error, status, again):
     def give_up(calls):
@@ -261,6 +263,19 @@ def test_volumes_are_kept_where_that_is_asked_for_and_the_page_shows_them_in_the
     assert all(f'"folder": "volumes/{row["key"]}"' in page for row in rows)
     assert ablate(tmp_path, "--keep_volumes", **content) == rows == ablate(tmp_path, **content)
     assert len(trace.given) == 4
+
+
+def test_rows_that_lack_their_volume_stay_until_they_are_replaced(tmp_path, monkeypatch, trace):
+    content = {"phantoms": 1, "base": TINY, "axes": {"method": ["trace", "sirt"]}}
+    rows = ablate(tmp_path, **content)
+
+    def give_up(calls):
+        raise ValueError("no")
+
+    monkeypatch.setattr(trace, "behave", staticmethod(give_up))
+    again = ablate(tmp_path, "--keep_volumes", **content)
+    assert again[0] == rows[0] and again[1]["psnr"] == rows[1]["psnr"]
+    assert not (tmp_path / "out" / "volumes" / rows[0]["key"]).exists()
 
 
 def test_results_are_never_written_among_the_cts(tmp_path, capsys):

@@ -198,7 +198,7 @@ def test_line_integrals_that_the_base_straightened_are_straight_on_finer_voxels(
 
 
 def test_every_level_is_one_step_and_figures_belong_to_the_volume(xrays):
-    steps, target = [], Grid.box((31, 40, 27), (384, 360, 390))
+    steps, target = [], Grid.box((31, 40, 27), (384, 390, 390))
     ready = Refined(Known(), target)
     y, projector = fit_to_grid(ready, target, xrays, BEAM)
     found = ready.reconstruct(y, projector, on_step=lambda: steps.append(1))

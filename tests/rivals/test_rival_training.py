@@ -111,6 +111,19 @@ def test_what_is_bound_to_no_geometry_goes_on_with_other_voxels_and_what_is_boun
                      initial=str(file))
 
 
+def test_a_rival_counts_the_steps_that_it_went_on_from(tmp_path, monkeypatch):
+    file = tmp_path / "rival.safetensors"
+    save_rival(tiny_lifted(), file, {"steps": 6, "samples": 12})
+    task = LiftedTraining(cube=Cube(16), window=(-1000, 600), initial=str(file))
+    monkeypatch.setattr(LiftedTraining, "trainer", SimpleNamespace(global_step=2))
+    task.samples, checkpoint = 4, {"state_dict": {}}
+    task.on_save_checkpoint(checkpoint)
+    assert checkpoint["phydict"]["training"] == {"steps": 8, "samples": 16}
+    task.samples = 0
+    task.on_load_checkpoint(checkpoint)
+    assert task.samples == 4
+
+
 def test_training_that_cannot_be_is_refused(tmp_path, cache, capsys):
     args = arguments("lifted", tmp_path, cache, "--model.cube.voxels=18")
     assert "divisible by 4" in refusal(capsys, main, args)

@@ -60,6 +60,15 @@ def test_what_lies_inside_and_outside_a_box_projects_to_the_whole():
     torch.testing.assert_close(found, whole)
 
 
+def test_faces_that_cut_voxels_leave_no_part_of_them_twice_or_out():
+    box = Grid.box((16, 2, 16), (192.0, 24.0, 192.0), (0.0, 6.0, 0.0))  # a slab of half a coarse voxel to each side
+    mu = random_like(BASE.shape).abs()
+    projector = Projector(box, BEAM, "siddon", full_detector=True)
+    whole = Projector(BASE, BEAM, "siddon", full_detector=True)(mu[None, None])[0]
+    inner = interpolated(mu, BASE, box, 0.0)
+    torch.testing.assert_close(outside_projection(mu, BASE, projector) + projector(inner[None, None])[0], whole)
+
+
 def test_a_box_covers_itself_and_what_lies_inside_alone():
     assert covers(BASE, BASE) and covers(BASE, Grid.box(3, 100.0)) and covers(Grid.cube(7, 400.0), BASE)
     assert not covers(BASE, Grid.box(3, 100.0, (150.0, 0.0, 0.0))) and not covers(Grid.cube(64, 300.0), BASE)

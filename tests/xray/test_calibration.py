@@ -23,6 +23,12 @@ def test_smooth_scatter_is_subtracted_exactly_where_the_reference_is_right():
     torch.testing.assert_close(subtract_scatter(scattered(CLEAN, SMOOTH), CLEAN), CLEAN, atol=1e-6, rtol=0)
 
 
+@pytest.mark.parametrize("rows, columns", [(1, 40), (40, 1), (2, 2), (1, 1)])
+def test_detectors_of_few_rows_have_their_scatter_subtracted_too(rows, columns):
+    clean = CLEAN[..., :rows, :columns].contiguous()
+    torch.testing.assert_close(subtract_scatter(clean, clean), clean, atol=1e-5, rtol=0)
+
+
 def test_a_reference_that_is_wrong_in_detail_spoils_little():
     measured = scattered(CLEAN, SMOOTH)
     reference = CLEAN + 0.1 * random_like(CLEAN.shape, seed=1)

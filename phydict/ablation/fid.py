@@ -43,12 +43,15 @@ def kept_tables(out: Path, entries: Sequence[Entry]) -> list[Table]:
 
 
 def _tables(out: Path, entries: Sequence[Entry], backbone: str, replicates: int) -> tuple[list[Table], list[dict]]:
-    """The tables, and the rows of FID. Of several seeds of a case each counts as a case of the same patient."""
+    """The tables, and the rows of FID, of what has its features there. Of several seeds of a case each counts as a case
+    of the same patient."""
     tables: list[Table] = []
     rows: list[dict] = []
     for condition, group in conditions(entries):
-        features = {entry.label: {name: StoredFeatures(features_file(out, key), backbone)
-                                  for name, key in _named(entry.counted)} for entry in group if entry.counted}
+        there = {entry.label: [row for row in entry.counted if features_file(out, row["key"]).is_file()]
+                 for entry in group}
+        features = {label: {name: StoredFeatures(features_file(out, key), backbone) for name, key in _named(kept)}
+                    for label, kept in there.items() if kept}
         if features:
             found = told_distances(features, replicates)
             title = format_settings("Frechet distance of slices (FID)", condition)

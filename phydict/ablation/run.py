@@ -103,6 +103,7 @@ class Results:
         self.again |= {name for name, row in self.done.items() if row["status"] == "ok" and lacking(name)}
 
     def finished(self, name: str) -> bool:
+        """Whether nothing is to be run for a row."""
         return name in self.done and name not in self.again
 
     def write(self) -> None:

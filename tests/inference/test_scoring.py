@@ -12,6 +12,7 @@ from evaluation.tiny_ct_clip import tiny
 from torch.nn import Identity
 
 from inference.runs import ORBIT, phantoms, record, sirt
+from phydict.baselines import SIRT
 from phydict.cli.infer import main
 from phydict.datasets.cts.prepared import write_prepared
 from phydict.datasets.cts.segmentations import organs_beside
@@ -119,6 +120,24 @@ def test_ablate_has_a_line_of_fid_for_each_method_and_resumes(tmp_path, untraine
     main(args)
     assert "3 of 4 rows are there already" in capsys.readouterr().err
     assert (tmp_path / "out" / "tables.md").read_text()[page.index("Frechet"):] == fid
+
+
+def test_a_row_whose_features_cannot_be_made_again_is_left_out_of_the_distances(tmp_path, untrained, monkeypatch):
+    file, out = tmp_path / "spec.yaml", tmp_path / "out"
+    file.write_text(yaml.safe_dump({
+        "out": str(out), "phantoms": 2, "metrics": ["fid"], "fid": {"replicates": 0},
+        "base": {"voxels": 34, "detector": 24, "views": 3, "method.iterations": 2}, "axes": {"method": ["sirt"]}}))
+    args = ["ablate", "-c", str(file), "--device", "cpu"]
+    main(args)
+    rows = read_csv(out / "results.csv")
+    (out / "features" / f"{rows[0]['key']}.safetensors").unlink()
+
+    def give_up(*_):
+        raise RuntimeError("no")
+
+    monkeypatch.setattr(SIRT, "solve", give_up)
+    main(args)
+    assert read_csv(out / "results.csv") == rows and [row["cases"] for row in read_csv(out / "fid.csv")] == [1]
 
 
 @pytest.mark.parametrize("given, sentence", [

@@ -203,20 +203,6 @@ class ConeBeam:
         return replace(self, u=self.u / factor, v=self.v / factor,
                        shape=(self.shape[0] * factor, self.shape[1] * factor))
 
-    def reach_beyond(self, grid: Grid) -> int:
-        """How many slices above or below a grid the detector's rays meet, at most, while they are over its columns."""
-        up = grid.affine[:3, 2] / grid.spacing[2]
-        across = self.normals - np.outer(self.normals @ up, up)
-        across *= np.hypot(*(grid.extent[:2] / 2)) / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), LEAST_MM)
-        rows, columns = ((n - 1) / 2 * step for n, step in zip(self.shape, (self.v, self.u)))
-        places = []
-        for side in (-across, across):  # where rays come over the columns, and where they leave them
-            depth = ((grid.centre + side - self.sources) * self.normals).sum(1) / self.distances
-            for pixel in (rows + columns, rows - columns, columns - rows, -rows - columns):
-                ray = self.detectors + pixel - self.sources
-                places.append(grid.index(self.sources + depth.clip(0, 1)[:, None] * ray)[:, 2])
-        return max(0, math.ceil(max(-np.min(places), np.max(places) - (grid.shape[2] - 1))))
-
     def check(self, grid: Grid) -> None:
         """Raise ValueError unless the whole box of voxels lies between every source and its detector's plane."""
         depth = (grid.corners() @ self.normals.T) - (self.sources * self.normals).sum(1)  # (8, K) from source plane

@@ -15,13 +15,11 @@ from phydict.evaluation import volume_metrics
 from phydict.grid import Grid
 from phydict.units import HUWindow
 from phydict.xray import Ideal
-from phydict.xray.projectors.continued import with_slices
+from phydict.xray.projectors.continued import reach_beyond, with_slices
 
 GRID = Grid.cube(16)
 ORBIT = ConeBeam.orbit(3, 1020, 740, (40, 40), 14.0, start=0.2)
 TILTED = ConeBeam.orbit(3, 1020, 600, (40, 40), 14.0, start=0.2).tilted(7)
-
-
 SWEEP = ConeBeam.sweep(3, 1020, 740, (40, 40), 14.0, 40)
 
 
@@ -31,7 +29,7 @@ SWEEP = ConeBeam.sweep(3, 1020, 740, (40, 40), 14.0, 40)
 def test_rays_meet_the_last_slices_as_far_as_they_meet_anything(beam, method):
     mu = random_like((1, 1, *GRID.shape), torch.float64).abs()
     continued = Projector(GRID, replace(beam, continued=True), method, full_detector=True)
-    slices = beam.reach_beyond(GRID)
+    slices = reach_beyond(beam, GRID)
     for more in (slices, slices + 3):
         tall = Projector(with_slices(GRID, more), beam, method, full_detector=True)
         torch.testing.assert_close(continued(mu), tall(pad(mu, (more, more, 0, 0, 0, 0), mode="replicate")))
@@ -49,7 +47,7 @@ def test_the_adjoint_is_exact(method):
 def test_a_small_detector_meets_nothing_beyond():
     beam = replace(ConeBeam.orbit(2, 1020, 740, (20, 40), 5.0), continued=True)
     mu = random_like((1, 1, *GRID.shape), torch.float64)
-    assert beam.reach_beyond(GRID) == 0
+    assert reach_beyond(beam, GRID) == 0
     plain = Projector(GRID, replace(beam, continued=False), full_detector=True)
     assert torch.equal(Projector(GRID, beam, full_detector=True)(mu), plain(mu))
 

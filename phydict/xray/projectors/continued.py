@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
+import numpy as np
 from torch import Tensor
 from torch.nn.functional import pad
 
 from phydict.grid import Grid
+from phydict.xray.geometry import LEAST_MM, ConeBeam
 
 
 class Continued:
@@ -34,3 +37,18 @@ def with_slices(grid: Grid, slices: int) -> Grid:
     affine = grid.affine.copy()
     affine[:3, 3] -= slices * affine[:3, 2]
     return Grid((x, y, z + 2 * slices), affine=affine)
+
+
+def reach_beyond(beam: ConeBeam, grid: Grid) -> int:
+    """How many slices above or below a grid the detector's rays meet, at most, while they are over its columns."""
+    up = grid.affine[:3, 2] / grid.spacing[2]
+    across = beam.normals - np.outer(beam.normals @ up, up)
+    across *= np.hypot(*(grid.extent[:2] / 2)) / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), LEAST_MM)
+    rows, columns = ((n - 1) / 2 * step for n, step in zip(beam.shape, (beam.v, beam.u)))
+    places = []
+    for side in (-across, across):  # where rays come over the columns, and where they leave them
+        depth = ((grid.centre + side - beam.sources) * beam.normals).sum(1) / beam.distances
+        for pixel in (rows + columns, rows - columns, columns - rows, -rows - columns):
+            ray = beam.detectors + pixel - beam.sources
+            places.append(grid.index(beam.sources + depth.clip(0, 1)[:, None] * ray)[:, 2])
+    return max(0, math.ceil(max(-np.min(places), np.max(places) - (grid.shape[2] - 1))))

@@ -14,7 +14,7 @@ from phydict.runtime.profiling import stage
 from phydict.runtime.warning import warn
 from phydict.xray.binning import binning
 from phydict.xray.geometry import VECTOR_KEYS, ConeBeam
-from phydict.xray.projectors.continued import Continued, with_slices
+from phydict.xray.projectors.continued import Continued, reach_beyond, with_slices
 
 if TYPE_CHECKING:  # they bring a compiler, so that each is imported where it is first needed
     from phydict.xray.projectors.eq4 import Eq4
@@ -105,7 +105,7 @@ def _engine(grid: Grid, beam: ConeBeam, method: str, memory: int, device: str) -
     key = (method, memory, device, grid.shape, grid.affine.tobytes(), beam.shape, beam.continued,
            *(getattr(beam, name).tobytes() for name in VECTOR_KEYS[:4]))
     if key not in _engines:
-        slices = beam.reach_beyond(grid) if beam.continued else 0
+        slices = reach_beyond(beam, grid) if beam.continued else 0
         tall = with_slices(grid, slices)
         chosen, reason = _choose(tall, beam, memory, device) if method == "auto" else (method, "it was requested")
         operator = _operator(tall, beam, chosen, memory)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from phydict.baselines import CGLS, FDK, FISTATV, SIRT, DiffVox, Region
 from phydict.baselines.baseline import Baseline
+from phydict.baselines.beside import with_surroundings
 from phydict.datasets import format_report
 from phydict.grid import Grid
 from phydict.posterior import (
@@ -58,6 +59,7 @@ from phydict.runtime.seeds import check_seed
 from phydict.runtime.warning import warn
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
+from phydict.xray.beyond import asked
 from phydict.xray.boxes import along, covers, seen_by
 from phydict.xray.checks import check_air, check_xrays, with_air_at_zero
 from phydict.xray.poses.uncertain import Uncertain
@@ -218,9 +220,10 @@ def onto_grid(method: Reconstructor, grid: Grid | None, refinement: Refinement =
 
 
 def fit_to_grid(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam,
-                projector: str = "auto") -> tuple[Tensor, Projector]:
+                projector: str = "auto", display: bool = False) -> tuple[Tensor, Projector]:
     """X-rays (K, V, U), binned unless the method wants the full detector, and the projector that goes with them on the
-    X-rays' device; `projector` is its kind, as Projector's `method`.
+    X-rays' device; `projector` is its kind, as Projector's `method`. Whether the patient goes on beyond the grid is
+    asked of the X-rays where the beam does not say.
 
     Raises ValueError where X-rays, geometry and grid do not fit, and warns where the X-rays look inverted.
     """
@@ -228,9 +231,7 @@ def fit_to_grid(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam
     check_air(xrays)
     beam.check(grid)
     beam.check_scale(method.survey or grid)
-    if beam.continued and not covers(grid, DEFAULT_GRID):
-        raise ValueError("a patient goes on above and below the whole chest's voxels alone, but a smaller box was "
-                         "given beside a geometry that is continued: leave one of the two out")
+    beam = asked(xrays, beam, method.survey or grid, display)
     return seen_by(grid, xrays.float(), beam, method.full_detector, projector)
 
 
@@ -246,6 +247,7 @@ def calibrated(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam,
 
     if not display:
         xrays = with_air_at_zero(xrays)  # which the reconstruction would see no more once offsets are found
+    beam = asked(xrays, beam, grid, display)
     poses = find_poses(xrays, beam, uncertain, grid, display, method.mu_water, on_round=on_round)
     for words in poses.warnings():
         warn(words)
@@ -289,7 +291,8 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: AnyPrior | str | Path | No
     poses: FoundPoses | None = None
     if uncertain is not None:
         xrays, poses = calibrated(ready, ready.survey or grid, xrays, beam, uncertain, display)
-    xrays, A = fit_to_grid(ready, grid, xrays, poses.beam if poses else beam, projector)
+    xrays, A = fit_to_grid(ready, grid, xrays, poses.beam if poses else beam, projector, display)
+    ready = with_surroundings(ready, xrays, A, display)
     result = ready.reconstruct(xrays, A, format_report(report), display, seed, on_step)
     return poses.added_to(result) if poses else result
 

@@ -16,6 +16,7 @@ import torch
 
 from phydict.ablation.spec import Specification
 from phydict.ablation.trials import Trial, key, prior_of, stage_of
+from phydict.baselines.beside import with_surroundings
 from phydict.datasets.case import Case, lacking
 from phydict.evaluation import read_csv, write_csv
 from phydict.evaluation.fid import save_features
@@ -269,9 +270,10 @@ class Runner:
         ready = reconstructor(trial.method, prior, trial.guidance, trial.name, stage, samples=trial.samples)
         ready = onto_grid(ready, trial.box.grid() if trial.box else None, trial.refinement)
         self.progress.follow(ready.steps())
+        ready = ready.with_mu_water(scene.mu_water)
         xrays, projector = fit_to_grid(ready, trial.result_scene()[0], scene.xrays.clone(), scene.beam, trial.projector)
-        return ready.with_mu_water(scene.mu_water).reconstruct(
-            xrays, projector, scene.report(trial), False, seed, on_step)
+        ready = with_surroundings(ready, xrays, projector, False)
+        return ready.reconstruct(xrays, projector, scene.report(trial), False, seed, on_step)
 
 
 def features_file(out: Path, key: str) -> Path:

@@ -55,7 +55,10 @@ class Region(Delegating):
             if display:
                 whole = Projector(self.outer, projector.beam, projector.method, device=xrays.device, full_detector=True)
                 xrays = match_views(xrays[None], whole(mu[None, None]))[0]
-            outside = outside_projection(mu, self.outer, projector)
+            continued = bool(projector.beam.continued)
+            projector = Projector(self.target, replace(projector.beam, continued=False), projector.method,
+                                  device=xrays.device, full_detector=True)
+            outside = outside_projection(mu, self.outer, projector, continued)
         result = self.base.reconstruct(xrays, projector, report, False, seed, on_step, outside)
         return replace(result, coarse=coarse, seconds=watch.seconds | result.seconds,
                        projector_calls=coarse.projector_calls + result.projector_calls)

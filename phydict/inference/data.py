@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import zlib
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -105,6 +106,8 @@ class ReconstructionData(lightning.LightningDataModule):
             self.beam = read_beam(self.geometry_file)
             crc = file_crc32(self.geometry_file)
             self._beam_settings = {"geometry": f"{self.geometry_file.name}, crc32 {crc:08x}"}
+        if self.beam.continued is None and not (self.protocol and self.protocol.grid):
+            self.beam = replace(self.beam, continued=False)  # X-rays are made of what the method's volume holds
 
     def settings(self, stage: str) -> dict:
         """What, beside the cases themselves, decides the X-rays that a stage (predict, test) reconstructs from."""

@@ -17,6 +17,7 @@ import lightning
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 from torch import Tensor
 
+from phydict.baselines.beside import with_surroundings
 from phydict.datasets.case import Case
 from phydict.evaluation import CaseMetrics
 from phydict.evaluation.fid import Features, PlaneFID
@@ -270,7 +271,8 @@ class ReconstructionTask(lightning.LightningModule):
                                       self.progress.advance)
             beam = poses.beam
         with stage("fit to grid"):
-            xrays, projector = fit_to_grid(ready, self.grid, xrays, beam, self.projector)
+            xrays, projector = fit_to_grid(ready, self.grid, xrays, beam, self.projector, display)
+            ready = with_surroundings(ready, xrays, projector, display)
         result = ready.reconstruct(xrays, projector, case["report"], display, seed, self.progress.advance)
         return poses.added_to(result) if poses else result
 

@@ -227,7 +227,7 @@ class Refined(Delegating):
             with watch.stage("refine"):
                 y, A = self._binned(xrays, projector, level)
                 start = base.window.to_range(interpolated(volume, grid, level, AIR))[None, None]
-                measurement = self._measurement(y, A, coarse, display)
+                measurement = self._measurement(y, A, coarse, display, bool(projector.beam.continued))
                 measurement.refit(start)
                 network = self._network(level) if coarse.masks is not None else None
                 fine_calls, coarse_calls = (refinement.corrections(network is not None)
@@ -286,16 +286,20 @@ class Refined(Delegating):
 
     def _binned(self, xrays: Tensor, projector: Projector, grid: Grid) -> tuple[Tensor, Projector]:
         """The X-rays as a level sees them, binned to what its voxels can hold, and the projector to them."""
-        if grid.same_as(projector.grid):
+        beam = projector.beam
+        if beam.continued and not covers(grid, self.base.grid):  # what lies beyond is then outside
+            beam = replace(beam, continued=False)
+        elif grid.same_as(projector.grid):
             return xrays, projector
-        return seen_by(grid, xrays, projector.beam, self.full_detector, projector.method)
+        return seen_by(grid, xrays, beam, self.full_detector, projector.method)
 
-    def _measurement(self, y: Tensor, A: Projector, coarse: Reconstruction, display: bool) -> Measurement:
-        """The X-rays as a problem on a level's voxels alone."""
+    def _measurement(self, y: Tensor, A: Projector, coarse: Reconstruction, display: bool, continued: bool
+                     ) -> Measurement:
+        """The X-rays as a problem on a level's voxels alone; continued: whether the coarse volume goes on."""
         outside = None
         if not covers(self.target, coarse.grid):
             mu = hu_to_mu(coarse.within.to(y), self.mu_water)
-            outside = outside_projection(mu, coarse.grid, A)
+            outside = outside_projection(mu, coarse.grid, A, continued)
         measurement = Measurement(A, y, self.base.window, display, self.mu_water, outside=outside)
         measurement.adopt(coarse)
         return measurement

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -64,10 +65,11 @@ def interpolated(volume: Tensor, grid: Grid, onto: Grid, fill: float) -> Tensor:
     return result.contiguous() + fill
 
 
-def outside_projection(mu: Tensor, grid: Grid, projector: Projector) -> Tensor:
+def outside_projection(mu: Tensor, grid: Grid, projector: Projector, continued: bool = False) -> Tensor:
     """Line integrals (K, V, U), along the projector's rays, of what of mu (X, Y, Z) in 1/mm on `grid` lies outside the
-    projector's own box."""
-    whole = Projector(grid, projector.beam, projector.method, device=mu.device, full_detector=True)(mu[None, None])
+    projector's own box, and, where it is continued, above and below `grid`."""
+    beam = replace(projector.beam, continued=continued)
+    whole = Projector(grid, beam, projector.method, device=mu.device, full_detector=True)(mu[None, None])
     return (whole - projector(interpolated(mu, grid, projector.grid, 0.0)[None, None]))[0]
 
 

@@ -45,7 +45,8 @@ class ConeBeam:
     u, v: (K, 3) the step from one column to the next and from one row to the next, perpendicular to each other.
     shape: (V, U) pixels. Pixel (r, c) is centred on detector + (c - (U-1)/2) u + (r - (V-1)/2) v.
     continued: whether what a volume holds goes on above and below it where rays meet it, each column as its last voxel
-        does, as a patient is taller than a scan; else there is nothing beyond.
+        does, as a patient is taller than a scan; False: there is nothing beyond. None: a reconstruction asks the X-rays
+        (phydict.xray.beyond), and a projector sees nothing beyond.
     Raises ValueError for wrong shapes, non-finite numbers, degenerate detectors and a source in a detector's plane.
     """
 
@@ -54,7 +55,7 @@ class ConeBeam:
     u: np.ndarray
     v: np.ndarray
     shape: tuple[int, int]
-    continued: bool = False
+    continued: bool | None = None
 
     def __post_init__(self):
         shape = whole_sizes(self.shape)
@@ -63,8 +64,9 @@ class ConeBeam:
                              "was given")
         _check_room(len(np.atleast_1d(self.sources)), shape)
         object.__setattr__(self, "shape", shape)
-        if not isinstance(self.continued, bool):
-            raise ValueError(f"a beam's continued is true or false, but {reprlib.repr(self.continued)} was given")
+        if not isinstance(self.continued, bool | None):
+            raise ValueError("a beam's continued is true or false, or None, but "
+                             f"{reprlib.repr(self.continued)} was given")
         for name in ("sources", "detectors", "u", "v"):
             value = np.array(getattr(self, name), float) + 0.0  # no negative zeros
             if value.ndim != 2 or value.shape[1] != 3 or len(value) < 1:
@@ -205,7 +207,7 @@ class ConeBeam:
 
     def check(self, grid: Grid) -> None:
         """Raise ValueError unless the whole box of voxels lies between every source and its detector's plane."""
-        depth = (grid.corners() @ self.normals.T) - (self.sources * self.normals).sum(1)  # (8, K) from source plane
+        depth = self._depths(grid)
         centre = ((grid.centre - self.sources) * self.normals).sum(1)
         for k, distance in enumerate(self.distances):
             near, far = depth[:, k].min(), depth[:, k].max()
@@ -223,6 +225,15 @@ class ConeBeam:
                 f"{distance - centre[k]:.1f} mm along the view, but the volume reaches {centre[k] - near:.1f} mm from "
                 f"its centre; {room} this source_to_detector of {distance:g} mm; move the source or the detector, or "
                 f"give a smaller volume{units}")
+
+    def has_room_for(self, grid: Grid) -> bool:
+        """Whether the whole box of voxels lies between every source and its detector's plane."""
+        depth = self._depths(grid)
+        return bool((depth > 0).all() and (depth < self.distances).all())
+
+    def _depths(self, grid: Grid) -> np.ndarray:
+        """How far (8, K) in mm the box's corners lie from the sources' planes, towards the detectors."""
+        return (grid.corners() @ self.normals.T) - (self.sources * self.normals).sum(1)
 
     def is_upright(self, grid: Grid) -> bool:
         """Whether every detector's columns of pixels run along the grid's third axis."""
@@ -272,7 +283,7 @@ class ConeBeam:
     def to_dict(self) -> dict:
         """Plain lists, from which `ConeBeam(**d)` builds the same beam."""
         return {name: np.asarray(getattr(self, name)).tolist() for name in VECTOR_KEYS} | (
-            {"continued": True} if self.continued else {})
+            {} if self.continued is None else {"continued": self.continued})
 
     def save(self, path: str | Path) -> None:
         """Write the beam as YAML in the vector form (keys sources, detectors, u, v in mm, shape)."""
@@ -288,7 +299,7 @@ class ConeBeam:
         and optionally start_degrees (0) and arc_degrees (360), or start and arc in radians; angles_degrees: [...] in
         place of views, start and arc; or one mapping `sweep:` with sweep_degrees beside the orbit's five keys. Both
         take detector_shift (mm from column to column, or [from row to row, from column to column]) and tilt_degrees.
-        Beside any of these forms `continued: true` says that the patient goes on above and below the volume.
+        Beside any of these forms `continued` says whether the patient goes on above and below the volume.
         Raises FileNotFoundError, and ValueError naming the file for unknown or missing keys and impossible geometry.
         """
         path = Path(path)
@@ -307,7 +318,7 @@ class ConeBeam:
         form = next((name for name in ("orbit", "sweep") if isinstance(content, dict) and name in content), None)
         if form is None:
             content = dict(_check_keys(content, VECTOR_KEYS, CONTINUED))
-            continued = content.pop("continued", False)
+            continued = content.pop("continued", None)
             numbers: dict[str, Any] = {key: _numbers(key, value) for key, value in content.items()}
             return cls(**numbers, continued=continued)
         content = _check_keys(content, (form,), CONTINUED)
@@ -328,7 +339,7 @@ class ConeBeam:
         if np.any(shift):
             beam = beam.shifted(*((0.0, shift) if np.ndim(shift) == 0 else shift))
         beam = beam.tilted(tilt) if tilt else beam
-        return replace(beam, continued=content.get("continued", False))
+        return replace(beam, continued=content.get("continued"))
 
 
 def _radians(name: str, radians: float | None, degrees: float | None, otherwise: float) -> float:

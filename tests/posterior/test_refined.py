@@ -18,7 +18,7 @@ from phydict.units import HUWindow, hu_to_mu
 from phydict.xray import ConeBeam, Projector
 from phydict.xray.calibration import without_hardening
 
-BEAM = ConeBeam.orbit(6, 1020, 740, (56, 56), 10.0)
+BEAM = replace(ConeBeam.orbit(6, 1020, 740, (56, 56), 10.0), continued=False)
 COARSE, FINE, WINDOW = Grid.cube(16), Grid.cube(64), HUWindow(-1000, 600)
 
 

@@ -3,6 +3,7 @@
 import csv
 import hashlib
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -225,7 +226,7 @@ def test_a_network_can_be_differentiated():
     assert (moved[1] - moved[0]) / (2 * step) == pytest.approx(float(slope.square().sum()), rel=0.02)
 
 
-BEAM = ConeBeam.orbit(2, 1020.0, 740.0, (12, 12), 48.0)
+BEAM = replace(ConeBeam.orbit(2, 1020.0, 740.0, (12, 12), 48.0), continued=False)
 XRAYS = torch.linspace(1.5, 2.5, 288).view(2, 12, 12)
 
 

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 import yaml
@@ -10,11 +9,14 @@ from laws import random_like
 from torch.nn.functional import pad
 
 from phydict import ConeBeam, Projector, reconstruct
+from phydict.baselines import FISTATV
 from phydict.datasets import load_xrays, phantom_case, save_xrays
 from phydict.evaluation import volume_metrics
 from phydict.grid import Grid
+from phydict.runtime.warning import Remark
 from phydict.units import HUWindow
-from phydict.xray import Ideal
+from phydict.xray import Ideal, Polychromatic, Simulator
+from phydict.xray.beyond import asked
 from phydict.xray.projectors.continued import reach_beyond, with_slices
 
 GRID = Grid.cube(16)
@@ -64,31 +66,75 @@ def test_other_poses_pixels_and_views_stay_continued_and_a_file_keeps_it(tmp_pat
         ConeBeam.from_dict({"orbit": orbit, "continued": "yes"})
 
 
-@pytest.mark.filterwarnings("ignore:no volume explains")
-@pytest.mark.parametrize("method", ["phydict_learned", "phydict_fast", "cgls"])
-def test_a_patient_who_goes_on_is_found_better_where_the_geometry_says_so(method):
-    grid, window = Grid.cube(64), HUWindow()
-    case = phantom_case(3, grid, window)["volume"][None]
-    tall = pad(case[..., 12:52], (28, 28, 0, 0, 0, 0), mode="replicate")
-    truth = tall[..., 16:80].contiguous()
+CHEST, ROWS, WINDOW = Grid.cube(64), 16, HUWindow()
+WIDE = ConeBeam.at_angles([90, 0], 1800, 1500, (112, 112), 5.0)
+
+
+@pytest.fixture(scope="module")
+def patients() -> dict[str, torch.Tensor]:
+    """A phantom on 96 slices: as it is, and with its 13th last slices repeated, at both ends or below."""
+    case = phantom_case(3, CHEST, WINDOW)["volume"][None]
+    ends = pad(case, (ROWS, ROWS, 0, 0, 0, 0), value=-1.0)
+    goes_on = pad(case[..., 12:52], (28, 28, 0, 0, 0, 0), mode="replicate")
+    return {"ends": ends, "goes on": goes_on, "goes on below": torch.where(torch.arange(96) < 68, goes_on, -1.0)}
+
+
+def xrays_of(mu: torch.Tensor, beam: ConeBeam, simulator: Simulator = Ideal()) -> torch.Tensor:
+    return simulator(Projector(with_slices(CHEST, ROWS), beam, full_detector=True), mu, 0)[0]
+
+
+@pytest.mark.filterwarnings("ignore:the X-rays show")
+@pytest.mark.parametrize("simulator", [Ideal(), Polychromatic()])
+@pytest.mark.parametrize("beam", [ConeBeam.orbit(k, 1020, 740, (112, 112), 5.0) for k in (1, 2, 8)] + [WIDE])
+def test_x_rays_tell_whether_a_patient_goes_on(patients, beam, simulator):
+    for scene, volume in patients.items():
+        y = xrays_of(WINDOW.to_mu(volume), beam, simulator)
+        gains = torch.linspace(0.3, 3, beam.views)[:, None, None]
+        for xrays, display in ((y, False), (gains * y - 2 + gains, True)):
+            found = asked(xrays, beam, CHEST, display)
+            assert found.continued == scene.startswith("goes on") and found.same_as(beam)
+
+
+def test_what_is_stated_is_not_asked(patients):
+    beam = ConeBeam.orbit(2, 1020, 740, (112, 112), 5.0)
+    y = xrays_of(WINDOW.to_mu(patients["goes on"]), beam)
+    for stated in (True, False):
+        assert asked(y, replace(beam, continued=stated), CHEST, False).continued is stated
+    with pytest.warns(Remark, match="the patient goes on above or below the volume"):
+        asked(y, beam, CHEST, False)
+    assert asked(torch.zeros_like(y), beam, CHEST, False).continued is False
+    assert asked(torch.zeros_like(y), beam, CHEST, True).continued is False
+
+
+@pytest.mark.filterwarnings("ignore:no volume explains", "ignore:the X-rays show")
+@pytest.mark.parametrize("method", ["phydict_learned", "cgls"])
+def test_a_patient_who_goes_on_is_found_better_where_the_rays_do(patients, method):
     beam = ConeBeam.orbit(8, 1020, 740, (112, 112), 5.0)
-    y = Ideal()(Projector(with_slices(grid, 16), beam, full_detector=True), window.to_mu(tall), 0)[0]
-    plain, continued = (volume_metrics(reconstruct(y, given, method=method, grid=grid).volume[None, None],
-                                       window.to_hu(truth))["psnr"]
-                        for given in (beam, replace(beam, continued=True)))
-    assert continued > plain + 3
+    y = xrays_of(WINDOW.to_mu(patients["goes on"]), beam)
+    truth = WINDOW.to_hu(patients["goes on"][..., ROWS:-ROWS].contiguous())
+    of_box, told, found = (reconstruct(y, replace(beam, continued=given), method=method, grid=CHEST).volume
+                           for given in (False, True, None))
+    assert torch.equal(found, told)
+    assert volume_metrics(told[None, None], truth)["psnr"] > volume_metrics(of_box[None, None], truth)["psnr"] + 3
 
 
-def test_a_smaller_box_is_refused():
-    beam = replace(ConeBeam.orbit(2, 1020, 740, (112, 112), 5.0), continued=True)
-    with pytest.raises(ValueError, match="a smaller box was given"):
-        reconstruct(np.random.default_rng(0).random((2, 112, 112)), beam, method="tv", grid=Grid.box(16, 100.0))
+@pytest.mark.filterwarnings("ignore:no volume explains", "ignore:the X-rays show")
+@pytest.mark.parametrize("method", ["phydict_learned", FISTATV(iterations=80)])
+def test_a_box_in_a_patient_who_goes_on_is_as_the_whole_volume_shows_it(patients, method):
+    beam, box = ConeBeam.orbit(8, 1020, 740, (112, 112), 5.0), Grid.box(32, 192.0, (0.0, 0.0, 96.0))
+    y = xrays_of(WINDOW.to_mu(patients["goes on"]), beam)
+    truth = WINDOW.to_hu(patients["goes on"][0, 0, 16:48, 16:48, ROWS + 32:-ROWS])
+    whole = reconstruct(y, beam, method=method, grid=CHEST).volume[16:48, 16:48, 32:]
+    of_box, ending = (reconstruct(y, replace(beam, continued=given), method=method, grid=box).volume
+                      for given in (None, False))
+    rms = [float((volume - truth).square().mean().sqrt()) for volume in (whole, of_box, ending)]
+    assert rms[1] < 1.1 * rms[0] and rms[1] < 0.5 * rms[2]
 
 
 @pytest.mark.parametrize("beam", [{"beam": ORBIT.to_dict()}, ORBIT.to_dict()])
 def test_a_folder_of_xrays_says_that_the_patient_goes_on(beam, tmp_path):
     save_xrays(tmp_path / "scan", torch.rand(3, 40, 40), ORBIT)
-    for said in (True, False):
+    for said in (True, False, None):
         (tmp_path / "scan" / "geometry.yaml").write_text(yaml.safe_dump(beam | {"continued": said}))
         assert load_xrays(tmp_path / "scan")["beam"].continued == said
     (tmp_path / "scan" / "geometry.yaml").write_text(yaml.safe_dump(beam | {"continued": 1}))

@@ -71,14 +71,14 @@ class Orientation:
 @dataclass(frozen=True)
 class Description:
     """What one geometry file says. source: the file; beam: its mapping, None where the tags of DICOM images decide;
-    continued: as ConeBeam's, whatever states the beam."""
+    continued: as ConeBeam's, whatever states the beam; None: as the beam says."""
 
     source: Path
     beam: dict | None = None
     intensity: Intensity | None = None
     orientation: Orientation = Orientation()
     uncertain: Uncertain | None = None
-    continued: bool = False
+    continued: bool | None = None
 
     @property
     def views(self) -> int | None:
@@ -91,7 +91,7 @@ class Description:
     def beam_of(self, shape: tuple[int, int], tags: list[DicomTags]) -> ConeBeam:
         """The beam for images of `shape` (V, U), turned, and their DICOM tags, if any. Raises ValueError."""
         beam = self._stated_beam(shape, tags)
-        return replace(beam, continued=True) if self.continued else beam
+        return beam if self.continued is None else replace(beam, continued=self.continued)
 
     def _stated_beam(self, shape: tuple[int, int], tags: list[DicomTags]) -> ConeBeam:
         beam = self.beam or {}
@@ -141,8 +141,8 @@ def read_description(path: Path, needed: bool = True) -> Description:
         raise ValueError(f"{path} must hold `beam:`, and may hold `intensity:`, `orientation:`, `uncertain:` and "
                          "`continued:`")
     intensity, orientation = content.pop("intensity", None) or {}, content.pop("orientation", None) or {}
-    uncertain, continued = content.pop("uncertain", None), content.pop("continued", False)
-    if not isinstance(continued, bool):
+    uncertain, continued = content.pop("uncertain", None), content.pop("continued", None)
+    if not isinstance(continued, bool | None):
         raise ValueError(f"{path}: `continued:` is true or false, but {reprlib.repr(continued)} was found")
     if "beam" in content and len(content) > 1:
         unknown = [reprlib.repr(key) for key in content if key != "beam"]

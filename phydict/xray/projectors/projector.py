@@ -102,7 +102,7 @@ _engines: OrderedDict[tuple, _Engine] = OrderedDict()
 
 def _engine(grid: Grid, beam: ConeBeam, method: str, memory: int, device: str) -> _Engine:
     """The engine for a geometry, from among those last used if it is there."""
-    key = (method, memory, device, grid.shape, grid.affine.tobytes(), beam.shape, beam.continued,
+    key = (method, memory, device, grid.shape, grid.affine.tobytes(), beam.shape, bool(beam.continued),
            *(getattr(beam, name).tobytes() for name in VECTOR_KEYS[:4]))
     if key not in _engines:
         slices = reach_beyond(beam, grid) if beam.continued else 0

@@ -231,6 +231,7 @@ def fit_to_grid(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam
     check_air(xrays)
     beam.check(grid)
     beam.check_scale(method.survey or grid)
+    beam.check_meets(grid)
     beam = asked(xrays, beam, method.survey or grid, display)
     return seen_by(grid, xrays.float(), beam, method.full_detector, projector)
 

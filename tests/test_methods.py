@@ -42,6 +42,16 @@ def test_sirt_in_one_call_finds_the_ball_in_its_exact_line_integrals():
     assert result.volume[26:38, 26:38, 26:38].mean() == pytest.approx(0, abs=100)
 
 
+@pytest.mark.parametrize("method, prior", [("sirt", None), (PriorOnly(2), tiny_prior(False))])
+def test_a_box_that_no_view_sees_is_refused_and_one_that_is_seen_in_part_is_not(method, prior):
+    beam = ConeBeam.orbit(2, 1020, 740, (28, 28), 20.0, arc_degrees=180)
+    xrays = ball(beam, 90.0)
+    with pytest.raises(ValueError, match=r"no ray of any view meets the box .*centre at \(0, 0, 900\) mm: give a cent"):
+        reconstruct(xrays, beam, prior, method, grid=Grid.box(8, 96.0, (0, 0, 900.0)))
+    part = reconstruct(xrays, beam, prior, method, grid=Grid.box(8, 96.0, (0, 0, 190.0)))
+    assert part.volume.shape == (8, 8, 8)
+
+
 def test_a_strangers_method_is_named_and_scaled_though_it_declares_neither():
     @dataclass(frozen=True)
     class Water(Reconstructor):

@@ -8,12 +8,13 @@ from pathlib import Path
 
 from phydict.ablation.fid import kept_tables
 from phydict.ablation.run import RESULTS, volume_folder
-from phydict.ablation.summary import Entry, format_settings, summarise
+from phydict.ablation.summary import Entry, format_settings, summarise, without_repeats
 from phydict.ablation.tables import all_tables
 from phydict.evaluation import read_csv
 from phydict.evaluation.metrics import MEASURES
 from phydict.evaluation.tables import Table
 from phydict.page import Contents, PageCase, check_own_page, write_page
+from phydict.runtime.telling import tell
 
 
 def is_comparison(folder: Path) -> bool:
@@ -22,8 +23,15 @@ def is_comparison(folder: Path) -> bool:
 
 
 def page_anew(folder: Path) -> Path:
-    """Writes the page of a folder's table; returns its path."""
-    entries = summarise(read_csv(folder / RESULTS))
+    """Writes the page of a folder's table; returns its path. Of rows that differ in no setting the first counts, and
+    how many others there are is told."""
+    stored = read_csv(folder / RESULTS)
+    rows = without_repeats(stored)
+    if repeats := len(stored) - len(rows):
+        tell(f"{repeats} of the {len(stored)} rows in {folder / RESULTS} are left out, each of the case, method, "
+             "settings and seed of an earlier row but of other weights or data: give methods that are to be compared "
+             "names of their own", event="others", cases=repeats, out=str(folder / RESULTS))
+    entries = summarise(rows)
     return comparison_page(folder, entries, all_tables(entries) + kept_tables(folder, entries))
 
 

@@ -109,6 +109,16 @@ def summarise(rows: Iterable[Mapping]) -> list[Entry]:
     return [_entry(group, changed[group[0]["method"]], varying) for group in groups.values()]
 
 
+def without_repeats(rows: Iterable[Mapping]) -> list[Mapping]:
+    """The first of those rows of a case that have the same method, settings and seed: `ablate` writes the rows of other
+    weights or data, which it keeps, behind its own."""
+    kept: dict[frozenset, Mapping] = {}
+    for row in rows:
+        kept.setdefault(frozenset((name, value) for name, value in row.items()
+                                  if name not in (*MEASURED, "key", "training")), row)
+    return list(kept.values())
+
+
 def conditions(entries: Sequence[Entry], without: Sequence[str] = ()) -> list[tuple[dict, list[Entry]]]:
     """The entries under each condition, or under what is left of it `without` some of its parts."""
     groups: dict[tuple, list] = {}

@@ -52,8 +52,7 @@ def widening_of(measurement: Measurement, reprojection: Tensor, most_residual: f
     if residual > FAR_OUTSIDE * most_residual:
         warn(f"the residual of the X-rays is {residual:.3g} times their noise, and usually at most {most_residual:.3g} "
              "in the scenes that the intervals were calibrated on: they are widened, and may still be too narrow; "
-             "check the geometry and the scale, and whether the patient moved or goes on beyond the volume "
-             "(`continued: true` in geometry.yaml)")
+             "check the geometry and the scale, and whether the patient moved or is wider than the volume")
     widening = max(1.0, residual / most_residual) ** WIDENING * contradiction_widening(measurement)
     widening *= narrow_arc_widening(measurement.projector)
     return widening * (SCATTER_WIDENING if measurement.scatter else 1.0)
@@ -91,7 +90,7 @@ def warn_of_contradictions(measurement: Measurement, widening: float | None) -> 
         wider = "" if widening is None else f", and intervals are {widening:.1f} times as wide as calibrated"
         warn(f"no volume explains {which}: as much of it as contradicts the rest counted as noise, so that the volume "
              f"follows it less and the prior more{wider}; check geometry and scale, and whether the patient moved or "
-             "goes on beyond the volume (`continued: true` in geometry.yaml)")
+             "is wider than the volume")
 
 
 def angular_spread(projector: Projector) -> float:

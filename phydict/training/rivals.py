@@ -25,13 +25,13 @@ class RivalTraining(StageTraining):
 
     made: the rival to train; scenes: its X-rays; views: numbers of X-rays from which validation reconstructs; initial:
     a rival's file to continue from, one that is not bound to a geometry also of another grid; seed: of scenes, noise
-    and whatever else is drawn.
+    and whatever else is drawn; given: whether made's network was asked for, which that in `initial` must then equal.
     """
 
     prior: Rival
 
     def __init__(self, made: Rival, scenes: Scenes, views: tuple[int, ...], optimisation: Optimisation,
-                 initial: str | None, seed: int):
+                 initial: str | None, seed: int, given: bool):
         rival = made if initial is None else load_rival(initial)
         before = rival.budget
         bound = ("grid", "beam") if made.network.bound else ()
@@ -39,6 +39,11 @@ class RivalTraining(StageTraining):
             if rival.describe()[part] != made.describe()[part]:
                 raise ValueError(f"the rival {initial} and this training differ in '{part}': give another "
                                  "model.initial, or the settings that it was trained with")
+        own, asked = rival.network.settings, made.network.settings
+        if given and (name := next((name for name in asked if asked[name] != own[name]), None)):
+            raise ValueError(f"model.network has {name} {asked[name]}, but the rival {initial} that training continues "
+                             f"from has {own[name]}: leave model.network out, give it all of that rival's settings, or "
+                             "leave model.initial out")
         rival = Rival(rival.network, made.grid, made.window, made.beam)
         super().__init__(rival.train().requires_grad_(True), optimisation, seed)
         self.before = before
@@ -68,7 +73,7 @@ class LiftedTraining(RivalTraining):
     """Learns a LiftedNetwork by the refiner's loss of the CT.
 
     Args:
-        network: the network; none given: the default LiftedNetwork
+        network: the network; none given: that of initial, else the default LiftedNetwork
         scenes: the X-rays that are drawn for it
         cube: of voxels
         window: HU that the range [-1, 1] stands for
@@ -84,7 +89,7 @@ class LiftedTraining(RivalTraining):
                  validation: RefinerValidation = RefinerValidation(), body_weight: float = 2.0,
                  initial: str | None = None, seed: int = 0):
         made = Rival(network or LiftedNetwork(), cube.grid(), HUWindow(*window))
-        super().__init__(made, scenes, validation.views, optimisation, initial, seed)
+        super().__init__(made, scenes, validation.views, optimisation, initial, seed, network is not None)
         self.body_weight = body_weight
 
     def case_loss(self, ct: Tensor, water: Tensor, beam: ConeBeam, generator: torch.Generator) -> Tensor:

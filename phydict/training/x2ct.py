@@ -54,7 +54,7 @@ class X2CTTraining(RivalTraining):
     Generator and discriminator take their step at once, each against the other's weights before it.
 
     Args:
-        network: the generator; none given: the default X2CTNetwork
+        network: the generator; none given: that of initial, else the default X2CTNetwork
         scenes: the X-rays, of one geometry
         cube: of voxels
         window: HU that the range [-1, 1] stands for, whose volumes the losses see in [0, 1]
@@ -71,7 +71,7 @@ class X2CTTraining(RivalTraining):
         grid = cube.grid()
         beam = bound_orbit(grid, scenes.views, scenes.arc_degrees)
         made = Rival(network or X2CTNetwork(), grid, HUWindow(*window), beam)
-        super().__init__(made, scenes, (scenes.views,), optimisation, initial, seed)
+        super().__init__(made, scenes, (scenes.views,), optimisation, initial, seed, network is not None)
         self.discriminator = PatchDiscriminator(scenes.views, adversary.width, adversary.layers)
         self.adversary = adversary
 

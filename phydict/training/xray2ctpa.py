@@ -58,7 +58,7 @@ class XrayToCTPATraining(RivalTraining):
     """Learns an XrayToCTPANetwork: mean absolute error of slices, then of the velocity of their latents.
 
     Args:
-        network: the network; none given: the default XrayToCTPANetwork
+        network: the network; none given: that of initial, else the default XrayToCTPANetwork
         scenes: the X-rays, of one geometry
         cube: of voxels
         window: HU that the range [-1, 1] stands for
@@ -72,18 +72,18 @@ class XrayToCTPATraining(RivalTraining):
                  cube: Cube = Cube(), window: tuple[float, float] = (-1000.0, 1000.0),
                  optimisation: Optimisation = Optimisation(1e-4), latent: LatentSettings = LatentSettings(),
                  initial: str | None = None, seed: int = 0):
-        if initial and (given := [part for part in ("autoencoder", "encoder") if getattr(latent, part)]):
-            raise ValueError(f"model.initial brings all of its weights, but model.latent.{given[0]} was given beside "
+        if initial and (files := [part for part in ("autoencoder", "encoder") if getattr(latent, part)]):
+            raise ValueError(f"model.initial brings all of its weights, but model.latent.{files[0]} was given beside "
                              "it: leave one of the two out")
         if not (initial or latent.autoencoder or latent.autoencoder_steps):
             raise ValueError("model.latent.autoencoder_steps is 0, but no autoencoder that has learnt was given: give "
                              "model.latent.autoencoder or model.initial, or some steps")
-        network, grid = network or XrayToCTPANetwork(), cube.grid()
+        given, network, grid = network is not None, network or XrayToCTPANetwork(), cube.grid()
         for part in ("autoencoder", "encoder"):
             if file := getattr(latent, part):
                 _load_own(getattr(network, part), file, f"model.latent.{part}")
         made = Rival(network, grid, HUWindow(*window), bound_orbit(grid, scenes.views, scenes.arc_degrees))
-        super().__init__(made, scenes, (scenes.views,), optimisation, initial, seed)
+        super().__init__(made, scenes, (scenes.views,), optimisation, initial, seed, given)
         self.latent, self.settles = latent, not (self.network.knows_xrays and self.network.latent_size)
 
     @property

@@ -31,6 +31,8 @@ PLACE_OPTIONS = ("detector_shift", "tilt_degrees")
 LISTS = ("shape", "pixel", "angles_degrees", "detector_shift")
 MOST_RADIANS = 4 * math.pi
 """An angle in radians beyond two turns was meant in degrees."""
+LEAST_ARC_DEGREES = 1e-3
+"""Several views over less of an arc would all come from one angle."""
 LEAST_MM, MOST_MM = 1e-6, 1e9
 """No pixel's side is shorter, and no length as long: they would be those of a mistake, and underflow or overflow."""
 SHORT_MM = 200
@@ -102,8 +104,8 @@ class ConeBeam:
         start (0) and arc (a full turn) are in radians, start_degrees and arc_degrees the same in degrees.
         Angle 0 is the PA view (source posterior, patient's right at the image's left, row 0 superior); at 90 degrees
         the source is at the patient's left. Distances and pixel = (row height, column width) in mm.
-        Raises ValueError unless views >= 1 and 0 < source_to_isocentre < source_to_detector and pixel > 0, and for an
-        angle given twice or in radians beyond two turns.
+        Raises ValueError unless views >= 1 and 0 < source_to_isocentre < source_to_detector and pixel > 0, for an
+        angle given twice or in radians beyond two turns, and for several views on an arc of less than 0.001 degrees.
         """
         count, sizes = whole_sizes(views), whole_sizes(shape)
         if count is None or len(count) != 1:
@@ -113,6 +115,11 @@ class ConeBeam:
             _check_room(count[0], sizes)
         _check_isocentre(source_to_detector, source_to_isocentre)
         first, turn = _radians("start", start, start_degrees, 0.0), _radians("arc", arc, arc_degrees, 2 * math.pi)
+        if count[0] > 1 and abs(turn) < math.radians(LEAST_ARC_DEGREES):
+            raise ValueError(f"an orbit of {count[0]} views has an arc that they are spread over, but one of "
+                             f"{math.degrees(turn):g} degrees, at which all come from one angle, was given: give "
+                             f"{LEAST_ARC_DEGREES:g} degrees or more, leave the arc out for a full turn, or give one "
+                             "view")
         angles = first + turn * np.arange(int(views)) / int(views)
         return cls(*on_circle(angles, source_to_detector, source_to_isocentre, pixel_sizes(pixel)), shape)
 
@@ -226,6 +233,16 @@ class ConeBeam:
                 f"its centre; {room} this source_to_detector of {distance:g} mm; move the source or the detector, or "
                 f"give a smaller volume{units}")
 
+    def check_meets(self, grid: Grid) -> None:
+        """Raise ValueError unless a ray of some view meets the box of voxels, which must lie between source and
+        detector."""
+        if not self._meets(grid).any():
+            size, centre = (", ".join(f"{mm:g}" for mm in np.round(place, 3) + 0.0)
+                            for place in (grid.extent, grid.centre))
+            raise ValueError(f"no ray of any view meets the box of voxels, which has sides of ({size}) mm and its "
+                             f"centre at ({centre}) mm: give a centre, in mm towards right, anterior and superior, and "
+                             "sides of a box that is seen in the X-rays")
+
     def has_room_for(self, grid: Grid) -> bool:
         """Whether the whole box of voxels lies between every source and its detector's plane."""
         depth = self._depths(grid)
@@ -247,9 +264,9 @@ class ConeBeam:
         Raises ValueError for a view of which no ray meets the box, and where both sides of a shadow differ from the
         detector's by a factor of 6 or more; warns from a factor of 3. The box must lie between source and detector.
         """
-        sides = np.stack([np.linalg.norm(self.v, axis=1), np.linalg.norm(self.u, axis=1)], 1) * self.shape  # (K, 2)
+        sides, met = self._sides, self._meets(grid)
         for k, (low, high) in enumerate(zip(*self._shadow(grid))):
-            if (low > sides[k] / 2).any() or (high < -sides[k] / 2).any():
+            if not met[k]:
                 raise ValueError(f"view {k}: no ray from the source to the detector meets the volume; check the view's "
                                  "source, detector centre, u and v, and that the volume's centre is the isocentre")
             ratio = (high - low) / sides[k]
@@ -264,6 +281,16 @@ class ConeBeam:
                 raise ValueError(message)
             warn(message)
             return
+
+    @property
+    def _sides(self) -> np.ndarray:
+        """The detectors' sides (K, 2) in mm, along their columns and their rows."""
+        return np.stack([np.linalg.norm(self.v, axis=1), np.linalg.norm(self.u, axis=1)], 1) * self.shape
+
+    def _meets(self, grid: Grid) -> np.ndarray:
+        """Whether (K,) the box's shadow, as far as it reaches along rows and columns, meets each detector."""
+        (low, high), half = self._shadow(grid), self._sides / 2
+        return np.all((low <= half) & (high >= -half), axis=1)
 
     def _shadow(self, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
         """The ends (K, 2) in mm, along rows' and columns' direction from the detector's centre, of the box's shadow."""

@@ -265,6 +265,25 @@ def test_volumes_are_kept_where_that_is_asked_for_and_the_page_shows_them_in_the
     assert len(trace.given) == 4
 
 
+def test_a_page_made_anew_shows_of_each_case_the_row_of_the_last_run(tmp_path, capsys):
+    files = [tmp_path / f"{name}.yaml" for name in "ab"]
+    content = {"base": {"voxels": 16}, "axes": {"method": ["trace", "sirt"], "method.iterations": [2],
+                                                "geometry": [str(file) for file in files]}}
+    out, orbit = tmp_path / "out", {"views": 2, "source_to_detector": 1020, "source_to_isocentre": 740,
+                                    "shape": [24, 24], "pixel": 24}
+    for tilt in (0, 8):
+        for file, degrees in zip(files, (0, tilt)):
+            file.write_text(yaml.safe_dump({"orbit": orbit | {"tilt_degrees": degrees}}))
+        rows = ablate(tmp_path, **content)
+    assert len(rows) == 12 and len({row["key"] for row in rows}) == 12
+    capsys.readouterr()
+    for remake in (lambda: None, lambda: main(["page", str(out)])):
+        remake()
+        page = (out / "index.html").read_text()
+        assert [row["key"] in page for row in rows] == [True] * 8 + [False] * 4
+    assert "4 of the 12 rows in" in "".join(capsys.readouterr())
+
+
 def test_rows_that_lack_their_volume_stay_until_they_are_replaced(tmp_path, monkeypatch, trace):
     content = {"phantoms": 1, "base": TINY, "axes": {"method": ["trace", "sirt"]}}
     rows = ablate(tmp_path, **content)

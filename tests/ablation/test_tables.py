@@ -6,7 +6,7 @@ import random
 
 from ablation.runs import ablate, row
 from phydict.ablation import plots
-from phydict.ablation.summary import summarise
+from phydict.ablation.summary import summarise, without_repeats
 from phydict.ablation.tables import all_tables
 
 
@@ -23,6 +23,13 @@ def test_a_case_counts_once_whatever_its_seeds_and_a_missing_case_takes_a_method
     assert differences.title == "Methods, K = 8, ideal: less x, case by case"  # y lacks a case
     assert "| y (1 of 2 cases) | 0.600 | 24.00 |" in differences.markdown()
     assert "| z | -0.500 [-0.750, -0.250] | -20.00 [-30.00, -10.00] |" in differences.markdown()
+
+
+def test_of_rows_that_differ_in_what_was_measured_alone_the_first_counts():
+    first = [row("a", "x", 10.0, key="1", training="2 steps"), row("a", "x", 20.0, seed=1, key="2"),
+             row("a", "y", 30.0, key="3"), row("a", "x", 40.0, key="4", delta=0.1), row("b", "x", None, key="5")]
+    again = [row("a", "x", 99.0, key="6", training="3 steps"), row("b", "x", 99.0, key="7", warning="odd")]
+    assert without_repeats(first + again) == first == without_repeats(first)
 
 
 def test_each_condition_has_its_table_and_the_best_setting_stands_for_a_method():

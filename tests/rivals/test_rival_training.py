@@ -18,7 +18,7 @@ from phydict.training.rivals import LiftedTraining, OrbitScenes
 from phydict.training.x2ct import Adversary, X2CTTraining
 from phydict.training.xray2ctpa import XrayToCTPATraining
 from phydict.units import HUWindow
-from rivals.tiny_rivals import GRID, lively, tiny_lifted, tiny_x2ct
+from rivals.tiny_rivals import GRID, lively, tiny_lifted, tiny_x2ct, tiny_xray2ctpa
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "rivals"
 TINY = {"lifted": ["--model.network.class_path=phydict.rivals.LiftedNetwork",
@@ -111,6 +111,23 @@ def test_what_is_bound_to_no_geometry_goes_on_with_other_voxels_and_what_is_boun
                      initial=str(file))
 
 
+@pytest.mark.parametrize("name, made, other, sentence", [
+    ("lifted", tiny_lifted, lambda: LiftedNetwork((4, 6), 3, 4, (4, 6, 8)), "fine 3, .* 2:"),
+    ("x2ct", tiny_x2ct, lambda: X2CTNetwork(8, 6, (2, 2), (4, 8, 8)), "growth 6, .* 4:"),
+    ("xray2ctpa", tiny_xray2ctpa, lambda: XrayToCTPANetwork((4, 4), 8, (4, 8), (4, 8), 5),
+     "ddim_steps 5, .* 4:")])
+def test_a_network_beside_a_rival_to_continue_from_is_the_rivals_own(tmp_path, name, made, other, sentence):
+    file, training = tmp_path / "rival.safetensors", type(TASKS[name]())
+    save_rival(made(), file)
+    more = {"cube": Cube(16), "window": (-1000, 600), "initial": str(file)}
+    if name != "lifted":
+        more["scenes"] = OrbitScenes(views=2)
+    for network in [made().network] + [None] * (name != "x2ct"):  # whose default is for other voxels
+        assert training(network, **more).prior.network.settings == made().network.settings
+    with pytest.raises(ValueError, match=f"model.network has {sentence} leave model.network out"):
+        training(other(), **more)
+
+
 def test_a_rival_counts_the_steps_that_it_went_on_from(tmp_path, monkeypatch):
     file = tmp_path / "rival.safetensors"
     save_rival(tiny_lifted(), file, {"steps": 6, "samples": 12})
@@ -128,3 +145,7 @@ def test_a_rival_counts_the_steps_that_it_went_on_from(tmp_path, monkeypatch):
 def test_training_that_cannot_be_is_refused(tmp_path, cache, capsys):
     args = arguments("lifted", tmp_path, cache, "--model.cube.voxels=18")
     assert "divisible by 4" in refusal(capsys, main, args)
+    save_rival(tiny_lifted(), tmp_path / "rival.safetensors")
+    args = arguments("lifted", tmp_path, cache, f"--model.initial={tmp_path / 'rival.safetensors'}",
+                     "--model.network.init_args.fine=3")
+    assert "model.network has fine 3" in refusal(capsys, main, args)

@@ -50,6 +50,10 @@ def test_degrees_given_as_radians_are_refused_with_the_name_of_degrees(angle):
         orbit(4, **{angle: 90})
 
 
+def test_a_view_alone_needs_no_arc():
+    assert orbit(1, arc_degrees=0).same_as(orbit(1)) and orbit(2, arc_degrees=-0.01).views == 2
+
+
 def pixel_of(beam, point):
     """Row and column (K, 2) in pixels from the detectors' centres at which a world point is seen."""
     ray = np.asarray(point, float) - beam.sources
@@ -122,6 +126,8 @@ def test_bad_vectors_are_refused_with_a_reason(changes, sentence):
     ((0, 1020, 740, (4, 4), 1), "at least one view"),
     ((2, 740, 1020, (4, 4), 1), "must lie between source and detector"),
     ((2, 1020, 740, (4, 4), (1, 0)), "row height, column width"),
+    ((2, 1020, 740, (4, 4), 1, 0.0, 0.0), "an orbit of 2 views .* one of 0 degrees, .* leave the arc out"),
+    ((3, 1020, 740, (4, 4), 1, 0.0, -1e-5), "an orbit of 3 views .* one of -0.000572958 degrees"),
 ])
 def test_bad_orbits_are_refused_with_a_reason(arguments, sentence):
     with pytest.raises(ValueError, match=sentence):
@@ -210,6 +216,7 @@ def test_yaml_holds_angles_sweeps_shifts_and_tilts(tmp_path):
     (ORBIT.replace("orbit", "sweep").replace("views: 4", "views: 1") + "  sweep_degrees: 17\n", "two views or more"),
     (ORBIT + "  angle: 3\n", "unknown key 'angle'; .* start_degrees, arc_degrees"),
     (ORBIT + "  start: 90\n", "give start_degrees"),
+    (ORBIT + "  arc_degrees: 0\n", "an orbit of 4 views has an arc"),
     (ORBIT.replace("  views: 4\n", ""), "missing key 'views'"),
     (ORBIT + "shape: [1, 1]\n", "unknown key 'shape'"),
     (ORBIT.replace("740", "2000"), "must lie between"),
@@ -264,3 +271,16 @@ def test_a_view_that_misses_the_volume_is_refused():
                       beam.shape)
     with pytest.raises(ValueError, match="view 1: no ray .* meets the volume"):
         beside.check_scale(Grid.cube(64))
+
+
+@pytest.mark.parametrize("axis, half", [(0, 192 * 836 / 1020), (2, 280 * 836 / 1020)])  # seen 96 mm behind its centre
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_a_box_is_met_where_a_view_sees_a_part_of_it(axis, half, sign):
+    def box(beyond: float) -> Grid:
+        return Grid.box(8, 192.0, np.eye(3)[axis] * sign * (half + 96 + beyond))
+
+    beam = orbit(1)
+    beam.check_meets(box(-0.1))
+    with pytest.raises(ValueError, match=r"no ray of any view meets the box .* \(192, 192, 192\) mm"):
+        beam.check_meets(box(0.1))
+    orbit(2, arc_degrees=180).check_meets(box(0.1) if axis == 0 else box(-0.1))  # the second view sees it

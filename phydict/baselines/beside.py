@@ -52,13 +52,14 @@ class Beside(Delegating):
         base: the method
         target: its voxels
         outside: line integrals (K, V, U) of what stands beside them
-        seconds: that it took to find
+        seconds, calls: that it took to find, and applications of the wider box's operator or its adjoint
     """
 
     base: Reconstructor
     target: Grid
     outside: Tensor
     seconds: float = 0.0
+    calls: int = 0
 
     @property
     def survey(self) -> Grid | None:
@@ -73,7 +74,8 @@ class Beside(Delegating):
         outside = self.outside.cpu()
         y, reprojection = found.xrays + outside, found.reprojection + outside
         return replace(found, xrays=y, reprojection=reprojection, **misfits(reprojection, y),
-                       seconds={"beside": self.seconds} | found.seconds)
+                       seconds={"beside": self.seconds} | found.seconds,
+                       projector_calls=self.calls + found.projector_calls)
 
 
 @torch.no_grad()
@@ -109,7 +111,7 @@ def with_surroundings(method: Reconstructor, xrays: Tensor, projector: Projector
     width = " x ".join(f"{side:.0f}" for side in wide.extent[:2])
     warn("the X-rays show that something stands beside the volume, such as a wider patient, arms or a couch: what a "
          f"coarse reconstruction of {width} mm shows of it is subtracted from them", Remark)
-    return Beside(method, projector.grid, outside, sum(watch.seconds.values()))
+    return Beside(method, projector.grid, outside, sum(watch.seconds.values()), found.projector_calls)
 
 
 def _wider(grid: Grid, beam: ConeBeam) -> Grid | None:

@@ -101,6 +101,12 @@ class Grid:
         """World position (3,) in mm of the grid's centre."""
         return self.affine[:3, :3] @ ((np.asarray(self.shape) - 1) / 2) + self.affine[:3, 3]
 
+    def grown(self, x: int, y: int, z: int) -> Grid:
+        """The grid with so many voxels more at both ends of each axis."""
+        affine = self.affine.copy()
+        affine[:3, 3] -= affine[:3, :3] @ (x, y, z)
+        return Grid((self.shape[0] + 2 * x, self.shape[1] + 2 * y, self.shape[2] + 2 * z), affine=affine)
+
     @property
     def extent(self) -> np.ndarray:
         """Edge lengths (3,) in mm of the box of voxels, from face to face."""

@@ -30,7 +30,7 @@ def asked(xrays: Tensor, beam: ConeBeam, grid: Grid, display: bool) -> ConeBeam:
     """
     if beam.continued is not None:
         return beam
-    coarse = in_other_voxels(grid, [min(n, SIDE) for n in grid.shape])
+    coarse = coarsened(grid)
     xrays = _levelled(xrays) if display else xrays
     ends, goes_on = (unexplained(xrays, replace(beam, continued=answer), coarse) for answer in (False, True))
     continued = CLEARLY * goes_on < ends
@@ -39,6 +39,11 @@ def asked(xrays: Tensor, beam: ConeBeam, grid: Grid, display: bool) -> ConeBeam:
              "as its last voxel does (`continued: false` in geometry.yaml, in Python of the ConeBeam, if it ends)",
              Remark)
     return replace(beam, continued=continued)
+
+
+def coarsened(grid: Grid) -> Grid:
+    """The same box in at most SIDE voxels along each side."""
+    return in_other_voxels(grid, [min(n, SIDE) for n in grid.shape])
 
 
 def unexplained(xrays: Tensor, beam: ConeBeam, grid: Grid) -> float:

@@ -25,7 +25,7 @@ ORBIT = replace(ConeBeam.orbit(6, 1300, 800, (112, 112), 6.4, start=0.1), contin
 
 @pytest.fixture(scope="module")
 def patients() -> dict[str, torch.Tensor]:
-    """A phantom of 384 mm with air beside it, and with arms and a wide couch."""
+    """A phantom of 384 mm with air beside it, and with arms."""
     alone = pad(phantom_case(3, CHEST, WINDOW)["volume"][None], (0, 0, 8, 8, 8, 8), value=-1.0)
     x, y = torch.meshgrid(torch.arange(80) - 39.5, torch.arange(80) - 39.5, indexing="ij")
     arms = (((x.abs() - 36) / 3.5) ** 2 + (y / 6) ** 2 < 1)[..., None].expand(80, 80, 64)

@@ -33,10 +33,7 @@ class Continued:
 
 def with_slices(grid: Grid, slices: int) -> Grid:
     """A grid with `slices` more above and below it."""
-    x, y, z = grid.shape
-    affine = grid.affine.copy()
-    affine[:3, 3] -= slices * affine[:3, 2]
-    return Grid((x, y, z + 2 * slices), affine=affine)
+    return grid.grown(0, 0, slices)
 
 
 def reach_beyond(beam: ConeBeam, grid: Grid) -> int:

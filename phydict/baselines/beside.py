@@ -41,9 +41,9 @@ something to be looked for that is not seen: 2.6 or more where arms stand there,
 TRIES, EXPLAINED, GROSS, MUCH = 50, 1.45, 0.055, 2.5
 """Iterations of total variation that look for it; how many times its misfit in the volume must be that in the wider one
 for what is seen: of the wide CTs 1.39 to 1.6 from four views and 2.1 or more from eight, of patients who fill the
-volume 1.02 at most, of a tube's X-rays 1.38 from four views and 1.13 from eight; and, for what is not, how large it must be
-and how many times that in the wider one: with arms 0.05 to 0.14 and 2.9 or more, of X-rays that hold half as much
-scatter as signal or whose detector stands 8 mm elsewhere 0.053 and 3.3 at most."""
+volume 1.02 at most, of a tube's X-rays 1.38 from four views and 1.13 from eight; and, for what is not, how large it
+must be and how many times that in the wider one: with arms 0.05 to 0.14 and 2.9 or more, of X-rays that hold half as
+much scatter as signal or whose detector stands 8 mm elsewhere 0.053 and 3.3 at most."""
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import reprlib
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,7 +13,7 @@ from torch import Tensor
 
 from phydict.baselines import CGLS, FDK, FISTATV, SIRT, DiffVox, Region
 from phydict.baselines.baseline import Baseline
-from phydict.baselines.beside import with_surroundings
+from phydict.baselines.extended import covering, extended
 from phydict.datasets import format_report
 from phydict.grid import Grid
 from phydict.posterior import (
@@ -54,7 +53,7 @@ from phydict.prior import (
 from phydict.prior.correction import TOLERANCE
 from phydict.reconstruction import Reconstruction, Reconstructor
 from phydict.runtime.precision import check_precision
-from phydict.runtime.reading import check_memory, reason
+from phydict.runtime.reading import reason
 from phydict.runtime.seeds import check_seed
 from phydict.runtime.warning import warn
 from phydict.units import HUWindow
@@ -182,9 +181,6 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: AnyPrior | str |
     return replace(ready, sr_sampler=sr_sampler) if sr_sampler else ready
 
 
-PROCESS = 1250 * 2**20
-"""Bytes that a process holds beside the volumes of a reconstruction (tests/benchmark/grid_cost.csv)."""
-
 CORRECTIONS = {3.0: DEFAULT_CORRECTION, 1.5: FINEST_CORRECTION}
 """Length in mm of the voxels that they learnt on -> files of networks that correct estimates on these."""
 
@@ -201,21 +197,19 @@ def corrections_of(method: Sampler | Reconstructor, grid: Grid) -> list[Path]:
 def onto_grid(method: Reconstructor, grid: Grid | None, refinement: Refinement = Refinement()) -> Reconstructor:
     """The method on the voxels of `grid`; None leaves it as it is.
 
-    What is bound to voxels of its own, as a prior is, works there first and is then refined (`Refined`), with a step
-    also by the networks of `corrections_of`. A method without a prior works on `grid` itself, on a box that leaves out
-    a part of the chest after a coarse reconstruction of the whole (`Region`). Raises ValueError where there is no way
-    or not enough memory.
+    What is bound to voxels of its own, as a prior is, works there first, on more of them where the grid reaches beyond
+    these, and is then refined (`Refined`), with a step also by the networks of `corrections_of`. A method without a
+    prior works on `grid` itself, on a box that leaves out a part of the chest after a coarse reconstruction of the
+    whole (`Region`). Raises ValueError where there is no way or not enough memory.
     """
     if grid is None or (method.grid is not None and method.grid.same_as(grid)):
         return method
     if method.grid is not None:
         files = corrections_of(method.sampler, grid) if isinstance(method, Posterior) and refinement.step else []
-        method = Refined(cast(Any, method), grid, refinement, tuple(map(load_correction, files)))
+        method = Refined(cast(Any, covering(method, grid)), grid, refinement, tuple(map(load_correction, files)))
     elif isinstance(method, Baseline) and along(grid, DEFAULT_GRID) and not covers(grid, DEFAULT_GRID):
         method = Region(method, grid, DEFAULT_GRID)
-    check_memory(PROCESS + 4 * method.volumes * math.prod(grid.shape), f"a reconstruction on "
-                 f"{' x '.join(map(str, grid.shape))} voxels, {method.volumes} volumes of them at once,",
-                 "give fewer voxels, or a smaller box of them")
+    method.check_voxels(grid)
     return method
 
 
@@ -227,13 +221,26 @@ def fit_to_grid(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam
 
     Raises ValueError where X-rays, geometry and grid do not fit, and warns where the X-rays look inverted.
     """
+    _check_fit(method, grid, xrays, beam)
+    beam = asked(xrays, beam, method.survey or grid, display)
+    return seen_by(grid, xrays.float(), beam, method.full_detector, projector)
+
+
+def with_room(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, projector: str = "auto",
+              display: bool = False) -> tuple[Reconstructor, Tensor, Projector]:
+    """What reconstructs the voxels of `grid`, if need be by way of more of them (`extended`), and X-rays and projector
+    to be given to it, as `fit_to_grid` makes them."""
+    _check_fit(method, grid, xrays, beam)
+    method, grid, beam = extended(method, grid, xrays, beam, display)
+    return method, *seen_by(grid, xrays.float(), beam, method.full_detector, projector)
+
+
+def _check_fit(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam) -> None:
     check_xrays(xrays, beam)
     check_air(xrays)
     beam.check(grid)
     beam.check_scale(method.survey or grid)
     beam.check_meets(grid)
-    beam = asked(xrays, beam, method.survey or grid, display)
-    return seen_by(grid, xrays.float(), beam, method.full_detector, projector)
 
 
 def calibrated(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, uncertain: Uncertain,
@@ -248,8 +255,9 @@ def calibrated(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam,
 
     if not display:
         xrays = with_air_at_zero(xrays)  # which the reconstruction would see no more once offsets are found
-    beam = asked(xrays, beam, grid, display)
+    stated, beam = beam.continued, asked(xrays, beam, grid, display)
     poses = find_poses(xrays, beam, uncertain, grid, display, method.mu_water, on_round=on_round)
+    poses = replace(poses, beam=replace(poses.beam, continued=stated))
     for words in poses.warnings():
         warn(words)
     return xrays if display else poses.corrected(xrays), poses
@@ -292,8 +300,7 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: AnyPrior | str | Path | No
     poses: FoundPoses | None = None
     if uncertain is not None:
         xrays, poses = calibrated(ready, ready.survey or grid, xrays, beam, uncertain, display)
-    xrays, A = fit_to_grid(ready, grid, xrays, poses.beam if poses else beam, projector, display)
-    ready = with_surroundings(ready, xrays, A, display)
+    ready, xrays, A = with_room(ready, grid, xrays, poses.beam if poses else beam, projector, display)
     result = ready.reconstruct(xrays, A, format_report(report), display, seed, on_step)
     return poses.added_to(result) if poses else result
 

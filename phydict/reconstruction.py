@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from phydict.grid import Grid
 from phydict.runtime.files import atomic_write
+from phydict.runtime.reading import TooLittleMemory, check_memory
 from phydict.units import MU_WATER
 from phydict.xray import ConeBeam, Projector
 from phydict.xray.carried import Carried
@@ -38,7 +40,8 @@ class Reconstruction:
     model_variance: variance (K, 1, 1) of what counted as noise of each view because no volume explains it;
     beam, poses: where poses were searched, the beam found, and what was corrected in it (phydict.poses);
     coarse: the reconstruction on coarser voxels that was refined, or that says what lies outside a region of interest;
-    carried: what of the volume is denser than the prior's window, such as metal, where it was found.
+    carried: what of the volume is denser than the prior's window, such as metal, where it was found;
+    extended_mm: how much more was reconstructed at both ends of each axis, where the patient goes on, and cut off.
     """
 
     volume: Tensor
@@ -65,6 +68,7 @@ class Reconstruction:
     poses: dict | None = None
     coarse: Reconstruction | None = None
     carried: Carried | None = None
+    extended_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def within(self) -> Tensor:
@@ -94,6 +98,10 @@ def save_nifti(path: str | Path, volume: np.ndarray, grid: Grid, dtype: type[np.
     image.set_qform(grid.affine, code="scanner")
     with atomic_write(Path(path)) as part:
         nibabel.save(image, part)
+
+
+PROCESS = 1250 * 2**20
+"""Bytes that a process holds beside the volumes of a reconstruction (tests/benchmark/grid_cost.csv)."""
 
 
 class Reconstructor(ABC):
@@ -146,6 +154,24 @@ class Reconstructor(ABC):
     def survey(self) -> Grid | None:
         """The coarse voxels over all that the rays meet, of a method that looks at these first; None for others."""
         return None
+
+    def with_room(self, x: int, y: int, z: int) -> Reconstructor | None:
+        """The method on so many voxels more at both ends of each axis, of its survey's or else of its own; None where
+        it is bound to those it has."""
+        return self if self.grid is None else None
+
+    def check_voxels(self, grid: Grid) -> None:
+        """Raises TooLittleMemory where a reconstruction on a grid's voxels takes more memory than there is."""
+        check_memory(PROCESS + 4 * self.volumes * math.prod(grid.shape), f"a reconstruction on "
+                     f"{' x '.join(map(str, grid.shape))} voxels, {self.volumes} volumes of them at once,",
+                     "give fewer voxels, or a smaller box of them")
+
+    def has_memory_for(self, grid: Grid) -> bool:
+        """Whether there is memory for a reconstruction on a grid's voxels."""
+        with suppress(TooLittleMemory):
+            self.check_voxels(grid)
+            return True
+        return False
 
     @abstractmethod
     def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,

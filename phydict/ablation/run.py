@@ -16,7 +16,7 @@ import torch
 
 from phydict.ablation.spec import Specification
 from phydict.ablation.trials import Trial, key, prior_of, stage_of
-from phydict.baselines.beside import with_surroundings
+from phydict.baselines.extended import covering
 from phydict.datasets.case import Case, lacking
 from phydict.evaluation import read_csv, write_csv
 from phydict.evaluation.fid import save_features
@@ -24,7 +24,7 @@ from phydict.evaluation.metrics import MEASURES
 from phydict.inference.case_files import VOLUME, write_page_files
 from phydict.inference.protocols import cut_out, placed, resampled
 from phydict.inference.scoring import Scoring
-from phydict.methods import fit_to_grid, onto_grid, reconstructor
+from phydict.methods import onto_grid, reconstructor, with_room
 from phydict.posterior import Sampler
 from phydict.reconstruction import Reconstruction, save_nifti
 from phydict.runtime.console import TRACEBACK, noted, sentence
@@ -245,7 +245,7 @@ class Runner:
         finite = bool(result.volume.isfinite().all())
         scores = {}
         if finite:
-            volume = resampled(result.volume, trial.result_scene()[0], scene.grid)
+            volume = resampled(result.volume, result.grid, scene.grid)
             scores = self.scoring.scores(volume, result.misfit, scene.truth, scene.grid, scene.window, self.device,
                                          trial.data.protocol)
             if features := self.scoring.features(volume, scene.truth, scene.window, self.device):
@@ -269,10 +269,11 @@ class Runner:
         stage = _stage_on(trial.super_resolution, self.device) if trial.super_resolution else None
         ready = reconstructor(trial.method, prior, trial.guidance, trial.name, stage, samples=trial.samples)
         ready = onto_grid(ready, trial.box.grid() if trial.box else None, trial.refinement)
+        ready = covering(ready, trial.fixed) if trial.fixed else ready
         self.progress.follow(ready.steps())
         ready = ready.with_mu_water(scene.mu_water)
-        xrays, projector = fit_to_grid(ready, trial.result_scene()[0], scene.xrays.clone(), scene.beam, trial.projector)
-        ready = with_surroundings(ready, xrays, projector, False)
+        grid = ready.grid or trial.result_scene()[0]
+        ready, xrays, projector = with_room(ready, grid, scene.xrays.clone(), scene.beam, trial.projector)
         return ready.reconstruct(xrays, projector, scene.report(trial), False, seed, on_step)
 
 

@@ -40,6 +40,9 @@ class Region(Delegating):
     def survey(self) -> Grid:
         return self.outer
 
+    def with_room(self, x: int, y: int, z: int) -> Region:
+        return replace(self, outer=self.outer.grown(x, y, z))
+
     def steps(self) -> int:
         return 2 * self.base.steps()
 

@@ -60,7 +60,8 @@ def case_record(case: Case, result: Reconstruction, name: str, method: Reconstru
             "network_calls": result.network_calls, "projector_calls": result.projector_calls,
             "process_peak_memory_mb": peak_memory(CPU), "mu_water": case.get("mu_water", method.mu_water),
             "views": len(result.xrays), "precision": result.precision, "instruction_set": instruction_set(device),
-            "grid": result.grid.to_dict(), "seed": result.seed, **({"poses": result.poses} if result.poses else {}),
+            "grid": result.grid.to_dict(), "extended_mm": list(result.extended_mm), "seed": result.seed,
+            **({"poses": result.poses} if result.poses else {}),
             **({"carried": result.carried.record()} if result.carried else {}), "warnings": case["warnings"],
             "report": case["report"], "source": case["source"], "settings": settings, "versions": versions()}
 

@@ -17,7 +17,7 @@ import lightning
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 from torch import Tensor
 
-from phydict.baselines.beside import with_surroundings
+from phydict.baselines.extended import covering
 from phydict.datasets.case import Case
 from phydict.evaluation import CaseMetrics
 from phydict.evaluation.fid import Features, PlaneFID
@@ -31,7 +31,7 @@ from phydict.inference.results import CaseResults
 from phydict.inference.scoring import Scoring
 from phydict.inference.settings import CascadeSettings, Sampling
 from phydict.inference.summary import show_finished, summarise
-from phydict.methods import DEFAULT_GRID, METHODS, calibrated, default_method, fit_to_grid, onto_grid, reconstructor
+from phydict.methods import DEFAULT_GRID, METHODS, calibrated, default_method, onto_grid, reconstructor, with_room
 from phydict.page import check_own_page
 from phydict.poses import FoundPoses, PoseSearch
 from phydict.posterior import CascadePosterior, Sampler
@@ -156,8 +156,8 @@ class ReconstructionTask(lightning.LightningModule):
             self.settings |= self.scoring.settings()
             if data.protocol and data.protocol.grid:
                 data.protocol.check_voxels(self.chosen, self.plain.grid is not None)
-                if self.plain.grid is None:
-                    self.grid, self.reconstructor = data.protocol.grid, self.plain
+                held = self.plain if self.plain.grid is None else covering(self.reconstructor, data.protocol.grid)
+                self.reconstructor, self.grid = held, held.grid or data.protocol.grid
                 self.around = self.grid
         check_apart(self.results.folder, "model.out", data.inputs(stage))
         check_own_page(self.results.folder.parent, "model.out")
@@ -271,8 +271,7 @@ class ReconstructionTask(lightning.LightningModule):
                                       self.progress.advance)
             beam = poses.beam
         with stage("fit to grid"):
-            xrays, projector = fit_to_grid(ready, self.grid, xrays, beam, self.projector, display)
-            ready = with_surroundings(ready, xrays, projector, display)
+            ready, xrays, projector = with_room(ready, self.grid, xrays, beam, self.projector, display)
         result = ready.reconstruct(xrays, projector, case["report"], display, seed, self.progress.advance)
         return poses.added_to(result) if poses else result
 

@@ -95,6 +95,7 @@ class Posterior(Reconstructor):
     but for rounding, on batch.
     otherwise: what reconstructs instead, from the same X-rays, where the volume is one material in air and no chest;
     None: nothing does.
+    room: voxels beyond the prior's at both ends of each axis, of a prior that takes them.
     """
 
     prior: AnyPrior
@@ -106,6 +107,7 @@ class Posterior(Reconstructor):
     samples: int = 1
     batch: int = 4
     otherwise: Reconstructor | None = None
+    room: tuple[int, int, int] = (0, 0, 0)
 
     def __post_init__(self):
         super().__post_init__()
@@ -123,13 +125,17 @@ class Posterior(Reconstructor):
                 raise ValueError(f"{name} is a number of reconstructions, 1 or more, but {getattr(self, name)} was "
                                  "given")
 
-        size = self.prior.state_channels * math.prod(self.prior.grid.shape)
+        size = self.prior.state_channels * math.prod(self.grid.shape)
         check_memory(4 * self.samples * size, f"samples={self.samples} states of {size:,} numbers", "draw fewer")
 
     @property
     def grid(self) -> Grid:
         """Where the reconstructed volumes live."""
-        return self.prior.grid
+        return self.prior.grid.grown(*self.room)
+
+    def with_room(self, x: int, y: int, z: int) -> Posterior | None:
+        takes, room = getattr(self.prior, "takes", None), (self.room[0] + x, self.room[1] + y, self.room[2] + z)
+        return replace(self, room=room) if takes and takes(self.prior.grid.grown(*room).shape) else None
 
     @property
     def window(self) -> HUWindow:
@@ -150,12 +156,12 @@ class Posterior(Reconstructor):
     @torch.no_grad()
     def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,
                     seed: int = 0, on_step: Callable[[], None] = lambda: None) -> Reconstruction:
-        prior, watch = self.prior, Stopwatch()
+        prior, grid, watch = self.prior, self.grid, Stopwatch()
         if isinstance(prior, torch.nn.Module):
             prior.to(xrays.device)
-        if not prior.grid.same_as(projector.grid):
+        if not grid.same_as(projector.grid):
             raise ValueError(
-                f"the prior was trained on {prior.grid.shape} voxels of {prior.grid.spacing} mm, but the X-rays are "
+                f"the prior was trained on {grid.shape} voxels of {grid.spacing} mm, but the X-rays are "
                 f"projected from {projector.grid.shape} voxels of {projector.grid.spacing} mm: use the prior's grid")
         seeds = [sample_seed(seed, i) for i in range(self.samples)]
         together = self.batch if self.sampler.batches else 1
@@ -166,7 +172,7 @@ class Posterior(Reconstructor):
             guard = Guard(measurement, on_step, sampler.steps())
             counting = CountingRefiner if sampler.needs_refiner else CountingDenoiser
             denoiser = counting(prior.bind(report, self.guidance, self.precision), guard)
-            state = torch.empty(1, prior.state_channels, *prior.grid.shape, device=xrays.device)
+            state = torch.empty(1, prior.state_channels, *grid.shape, device=xrays.device)
         with watch.stage("sample"):
             drawn = []
             for first in range(0, self.samples, together):
@@ -198,7 +204,7 @@ class Posterior(Reconstructor):
             warn_of_contradictions(measurement, widening if intervals else None)
             variance = measurement.model_variance
         return Reconstruction(
-            volume=volume, grid=prior.grid, method=self.name, seed=seed, **fit, seconds=watch.seconds,
+            volume=volume, grid=grid, method=self.name, seed=seed, **fit, seconds=watch.seconds,
             network_calls=denoiser.calls * (2 if report and self.guidance != 1 else 1),
             projector_calls=measurement.calls, masks=((state[1:] + 1) / 2).cpu(), deviation=deviation,
             intervals=intervals, interval_widening=widening, hardened=measurement.hardened,
@@ -210,11 +216,11 @@ class Posterior(Reconstructor):
         as the prior knows, or denser."""
         volume, carried = self.prior.window.to_hu(x).cpu(), measurement.carried
         if carried is None:
-            check_ceiling(x, self.prior.grid, self.prior.window)
+            check_ceiling(x, self.grid, self.prior.window)
             return volume, None
         warn(carried_note(carried, self.prior.window))
         carried = replace(carried, extra=carried.extra.cpu())
-        return volume + carried.on(self.prior.grid), carried
+        return volume + carried.on(self.grid), carried
 
     def _intervals(self, denoiser: CountingDenoiser, measurement: Measurement, reprojection: Tensor
                    ) -> tuple[dict[float, Tensor], float]:

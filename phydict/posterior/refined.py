@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Any, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,7 +24,7 @@ from phydict.runtime.profiling import Stopwatch, stage
 from phydict.runtime.warning import Remark, warn
 from phydict.units import AIR, HUWindow, hu_to_mu
 from phydict.xray import Projector
-from phydict.xray.boxes import covers, interpolated, outside_projection, refinements, seen_by
+from phydict.xray.boxes import SLACK, covers, interpolated, outside_projection, refinements, seen_by
 
 ON_FINER = {0.5: (0.85, 0.0), 0.8: (1.0, 0.0), 0.9: (1.0, 0.1), 0.95: (1.0, 0.2)}
 """Level -> the shares of a coarse interval and of the refinement's change of which one on finer voxels is the sum: of
@@ -63,6 +65,8 @@ class Bound(Protocol):
     def steps(self) -> int: ...
 
     def with_mu_water(self, mu_water: float) -> Reconstructor: ...
+
+    def with_room(self, x: int, y: int, z: int) -> Any: ...
 
     def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False, seed: int = 0,
                     on_step: Callable[[], None] = lambda: None) -> Reconstruction: ...
@@ -111,7 +115,7 @@ class Refinement:
     call_step: LikelihoodStep | None = ProximalCG(iterations=10, restarts=1, tv_weight=5.0, tv_eps=0.003)
     call_std: float = 0.3
     coarse: bool = True
-    few_views: int = 2
+    few_views: int = 3
 
     def __post_init__(self):
         for name in ("x0_std", "call_std"):
@@ -193,6 +197,16 @@ class Refined(Delegating):
     @property
     def survey(self) -> Grid:
         return self.base.grid
+
+    def with_room(self, x: int, y: int, z: int) -> Refined | None:
+        """As a Reconstructor; the target has as much more room where it holds all of the base's box."""
+        base, target = self.base.with_room(x, y, z), self.target
+        if base is None:
+            return None
+        if covers(target, self.base.grid):
+            more = np.multiply((x, y, z), self.base.grid.spacing) / target.spacing
+            target = target.grown(*(math.ceil(n - SLACK) for n in more))
+        return replace(self, base=base, target=target)
 
     @property
     def levels(self) -> list[Grid]:

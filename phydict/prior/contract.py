@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Protocol
@@ -34,6 +35,11 @@ class PriorContract(ABC):
     state_channels: int = 1
     reads_text: bool = False
     ends_at_zero: bool = False
+
+    def takes(self, shape: Sequence[int]) -> bool:
+        """Whether its denoisers take states of this shape as well, as voxels of the same size: where the X-rays show
+        that the patient goes on beyond `grid`, more of them are reconstructed then."""
+        return tuple(shape) == self.grid.shape
 
     @abstractmethod
     def bind(self, report: str, guidance: float, precision: str) -> Denoiser:

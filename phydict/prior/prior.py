@@ -66,10 +66,14 @@ class Prior(nn.Module):
     def work_on(self, grid: Grid) -> None:
         """Takes the voxels of `grid`, none of which its weights are bound to. Raises ValueError for sizes that the
         network cannot halve."""
-        if any(n % self.network.divisor for n in grid.shape):
+        if not self.takes(grid.shape):
             raise ValueError(f"this network needs sizes divisible by {self.network.divisor}, but the grid is "
                              f"{grid.shape}")
         self.grid = grid
+
+    def takes(self, shape: Sequence[int]) -> bool:
+        """Whether the network can halve a state of so many voxels along each axis."""
+        return not any(n % self.network.divisor for n in shape)
 
     def context(self, reports: Sequence[str]) -> Tensor:
         """Reports -> contexts (B, L, D); the learned null token stands for padding and for a report left empty.

@@ -103,6 +103,10 @@ class Refiner(nn.Module):
     def network(self) -> VolumeUNet:
         return self.prior.network
 
+    def takes(self, shape: Sequence[int]) -> bool:
+        """As for a Prior."""
+        return self.prior.takes(shape)
+
     def network_inputs(self, shape: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
         """As for a Prior."""
         return self.prior.network_inputs(shape)

@@ -50,6 +50,13 @@ def covers(grid: Grid, box: Grid) -> bool:
     return bool((low >= -0.5 - SLACK).all() and (high <= np.asarray(grid.shape) - 0.5 + SLACK).all())
 
 
+def lacking(grid: Grid, box: Grid) -> list[float]:
+    """How many voxels a grid lacks at one end of each axis, that of which it lacks more, to hold a box along the same
+    axes."""
+    low, high = _faces(grid, box)
+    return [max(0.0, -0.5 - SLACK - first, last - n + 0.5 - SLACK) for n, first, last in zip(grid.shape, low, high)]
+
+
 def interpolated(volume: Tensor, grid: Grid, onto: Grid, fill: float) -> Tensor:
     """A volume (X, Y, Z) on `grid`, trilinearly on the voxels of another grid along the same axes; `fill` lies outside
     its box."""

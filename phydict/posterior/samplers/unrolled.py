@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from phydict.diffusion.steps import Generators, noise_like
 from phydict.posterior.discretisation import find_subgrid
@@ -160,8 +161,11 @@ class Unrolled(Sampler):
 
     def start_state(self, refiner: BoundRefiner, measurement: Measurement) -> Tensor:
         """The state (1, C, X, Y, Z) before the first step: of few views with a report what the refiner's prior to begin
-        with makes of both, in one pass from noise that is always the same."""
+        with makes of both, in one pass from noise that is always the same. Beyond the refiner's own voxels the mean is
+        as it is at their ends."""
         mean = refiner.mean.to(measurement.y)
+        more = [(n - own) // 2 for n, own in zip(measurement.projector.grid.shape, mean.shape[2:])]
+        mean = pad(mean, [n for n in reversed(more) for _ in range(2)], mode="replicate")
         if self.first is None or not refiner.begins or measurement.projector.beam.views > self.first_views:
             return mean
         generator = torch.Generator().manual_seed(0)

@@ -1,0 +1,173 @@
+"""More voxels than are wanted where the X-rays show that the patient does not end with these."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from phydict.baselines.tv import FISTATV
+from phydict.grid import Grid
+from phydict.reconstruction import Delegating, Reconstruction, Reconstructor
+from phydict.runtime.warning import Remark, warn
+from phydict.xray.beyond import asked, coarsened, reaches_beyond, unexplained
+from phydict.xray.boxes import along, in_other_voxels, lacking, seen_by
+from phydict.xray.geometry import ConeBeam
+from phydict.xray.projectors.continued import reach_beyond
+from phydict.xray.projectors.projector import Projector
+
+UP, STEP = 48.0, 4
+"""Millimetres that are reconstructed above and below the volume, at most; voxels are added in so many at a time at each
+end, which the shipped networks can halve."""
+
+LEAST_VIEWS = 4
+"""Views from which on total variation tells what stands beside the volume from what is in it."""
+
+MORE, LEAST = 0.25, 0.06
+"""Shares of the volume's width that are looked at beside it, at each side: at most, and at least where the geometry
+leaves so much room."""
+
+FULL, LEAST_PIXELS = 0.3, 4
+"""The line integral beyond that of a volume full of water, and how many pixels, of a detector binned to the coarse
+voxels, must read as much for something to be seen beside it: of three CTs of 420 to 460 mm, from four views, 6 or more
+do, of CTs that end inside 2 at most, whose X-rays scatter, wrong poses and drift do not raise."""
+
+SUSPECT = 2.0
+"""How many times what conjugate gradients leave of the X-rays in the volume is what they leave in the wider one for
+something to be looked for that is not seen: 2.6 or more where arms stand there, 1.3 at most where nothing does."""
+
+TRIES, EXPLAINED, GROSS, MUCH = 50, 1.45, 0.055, 2.5
+"""Iterations of total variation that look for it; how many times its misfit in the volume must be that in the wider one
+for what is seen: of the wide CTs 1.39 to 1.6 from four views and 2.1 or more from eight, of patients who fill the
+volume 1.02 at most, of a tube's X-rays 1.38 from four views and 1.13 from eight; and, for what is not, how large it
+must be and how many times that in the wider one: with arms 0.05 to 0.14 and 2.9 or more, of X-rays that hold half as
+much scatter as signal or whose detector stands 8 mm elsewhere 0.053 and 3.3 at most."""
+
+
+REST = 0.15
+"""What a box may leave of what the widest one explains and the volume does not: of four CTs with arms of 42 mm beside
+it, 48 mm more leave 0.03 to 0.13, 24 mm 0.16 to 0.37."""
+
+
+GOES_ON = "the X-rays show that the patient goes on above or below the volume"
+OVERRULED = "`continued: false` in geometry.yaml, in Python of the ConeBeam, if he ends"
+
+
+@dataclass(frozen=True)
+class Extended(Delegating):
+    """`base` on voxels that reach beyond those that are wanted (extended field of view), and its volumes cut to these.
+
+    Args:
+        base: the method
+        target: the voxels on which it works
+        kept: those that are wanted, which are the same or in their middle
+        room_mm: how far at both ends of each axis the base reaches beyond the box that it would else have
+    """
+
+    base: Reconstructor
+    target: Grid
+    kept: Grid
+    room_mm: tuple[float, float, float]
+
+    @property
+    def survey(self) -> Grid | None:
+        return self.base.survey
+
+    def steps(self) -> int:
+        return self.base.steps()
+
+    def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,
+                    seed: int = 0, on_step: Callable[[], None] = lambda: None) -> Reconstruction:
+        found = self.base.reconstruct(xrays, projector, report, display, seed, on_step)
+        return replace(found, grid=self.kept, extended_mm=self.room_mm, volume=self._cut(found.volume),
+                       masks=None if found.masks is None else self._cut(found.masks),
+                       deviation=None if found.deviation is None else self._cut(found.deviation),
+                       intervals={level: self._cut(width) for level, width in found.intervals.items()})
+
+    def _cut(self, volume: Tensor) -> Tensor:
+        x, y, z = (slice((n - kept) // 2, (n + kept) // 2) for n, kept in zip(self.target.shape, self.kept.shape))
+        return volume[..., x, y, z].clone()
+
+
+def covering(method: Reconstructor, box: Grid) -> Reconstructor:
+    """The method, of which the voxels of its survey, or else its own, hold a box along the same axes, if it takes as
+    many more as that needs, in whole steps."""
+    volume = method.survey or method.grid
+    if volume is None or not along(volume, box):
+        return method
+    x, y, z = (STEP * math.ceil(n / STEP) for n in lacking(volume, box))
+    return (method.with_room(x, y, z) if x or y or z else None) or method
+
+
+@torch.no_grad()
+def extended(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, display: bool
+             ) -> tuple[Reconstructor, Grid, ConeBeam]:
+    """The method, its voxels and the beam, or, where the X-rays (K, V, U) show that the patient goes on beyond the
+    volume, which is said in a remark, what reconstructs on more voxels and cuts the result to `grid`; the beam then
+    says whether he goes on even beyond these. A method that takes no more voxels, or has no memory for them, is left
+    as it is.
+
+    Above and below, that is asked as `reaches_beyond` does. Beside the volume, of LEAST_VIEWS views or more, of line
+    integrals, where source and detectors leave room: it is seen where rays that hardly meet the volume show more than
+    water that fills it, and else has to explain much.
+    """
+    volume = method.survey or grid
+    room = _room(method, volume, xrays, beam, display) if method.with_room(0, 0, 0) else (0, 0, 0)
+    wider = method.with_room(*room) if any(room) else None
+    whole = grid if wider is None else wider.grid or grid.grown(*room)
+    if wider is None or not wider.has_memory_for(whole):
+        answered = asked(xrays, beam, volume, display)
+        if answered.continued and beam.continued is None:
+            warn(f"{GOES_ON}: each column is taken to go on there as its last voxel does ({OVERRULED})", Remark)
+        return method, grid, answered
+    x, y, z = (n * float(length) for n, length in zip(room, volume.spacing))
+    if z and beam.continued is None:
+        warn(f"{GOES_ON}: {z:g} mm more are reconstructed at both ends and cut off ({OVERRULED})", Remark)
+    if x:
+        warn("the X-rays show that something stands beside the volume, such as a wider patient, arms or a couch: "
+             f"{x:g} mm more are reconstructed at each side and cut off", Remark)
+    beam = asked(xrays, beam, volume.grown(*room), display)
+    return Extended(wider, whole, grid, (x, y, z)), whole, beam
+
+
+def _room(method: Reconstructor, volume: Grid, xrays: Tensor, beam: ConeBeam, display: bool) -> tuple[int, int, int]:
+    """How many voxels more the volume needs at both ends of each axis."""
+    aside = 0 if display else _columns(volume, xrays, asked(xrays, beam, volume, display), method.mu_water)
+    wide = volume.grown(aside, aside, 0)
+    slices = reach_beyond(beam, wide) if reaches_beyond(xrays, beam, wide, display) else 0
+    return aside, aside, STEP * math.ceil(min(slices, UP / volume.spacing[2]) / STEP)
+
+
+def _columns(volume: Grid, xrays: Tensor, beam: ConeBeam, mu_water: float) -> int:
+    """How many voxels more the volume needs at each of its four sides to hold what stands there; 0 where nothing does
+    that the X-rays show."""
+    across = max(volume.shape[:2])
+    room = [n for n in range(STEP, int(MORE * across) + 1, STEP) if beam.has_room_for(volume.grown(n, n, 0))]
+    if beam.views < LEAST_VIEWS or not room or room[-1] < LEAST * across:
+        return 0
+    coarse, wide = _coarse(volume, 0), _coarse(volume, room[-1])
+    y, A = seen_by(coarse, xrays, replace(beam, continued=True), False)
+    full = mu_water * A(torch.ones(1, 1, *coarse.shape).to(y))[0]
+    seen = int((y > full + FULL).sum()) >= LEAST_PIXELS
+    most, least = (unexplained(xrays, beam, grid) for grid in (coarse, wide))
+    if not seen and most < SUSPECT * least:
+        return 0
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the method will say itself what is doubtful of the X-rays
+        tv = FISTATV(iterations=TRIES, mu_water=mu_water)
+        alone, together = (tv.reconstruct(*seen_by(grid, xrays, beam, False)).misfit for grid in (coarse, wide))
+    if not ((seen and alone > EXPLAINED * together) or alone > max(GROSS, MUCH * together)):
+        return 0
+    enough = least + REST * (most - least)
+    return next(n for n in room if n == room[-1] or unexplained(xrays, beam, _coarse(volume, n)) < enough)
+
+
+def _coarse(volume: Grid, columns: int) -> Grid:
+    """The box of a volume with so many columns of its voxels more at its sides, in voxels of `coarsened`'s size."""
+    wide = volume.grown(columns, columns, 0)
+    return in_other_voxels(wide, [math.ceil(n * few / of) for n, few, of in zip(
+        wide.shape, coarsened(volume).shape, volume.shape)])

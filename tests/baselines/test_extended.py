@@ -1,0 +1,131 @@
+"""Patients who are larger than the volume."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch.nn.functional import pad
+
+from phydict import ConeBeam, Projector, reconstruct
+from phydict.baselines import FISTATV
+from phydict.baselines.extended import Extended, covering, extended
+from phydict.datasets import phantom_case
+from phydict.evaluation import volume_metrics
+from phydict.grid import Grid
+from phydict.methods import fit_to_grid, onto_grid, reconstructor, with_room
+from phydict.posterior import Posterior, Refined, SplitGibbs
+from phydict.runtime.warning import Remark
+from phydict.units import HUWindow
+from phydict.xray import Ideal
+from phydict.xray.boxes import covers, lacking
+
+TV = FISTATV(iterations=80)
+CHEST, WIDE, WINDOW = Grid.cube(64), Grid.box([80, 80, 64], [480.0, 480.0, 384.0]), HUWindow()
+ORBIT = replace(ConeBeam.orbit(6, 1300, 800, (112, 112), 6.4, start=0.1), continued=False)
+
+
+@pytest.fixture(scope="module")
+def patients() -> dict[str, torch.Tensor]:
+    """A phantom of 384 mm with air beside it, and with arms."""
+    alone = pad(phantom_case(3, CHEST, WINDOW)["volume"][None], (0, 0, 8, 8, 8, 8), value=-1.0)
+    x, y = torch.meshgrid(torch.arange(80) - 39.5, torch.arange(80) - 39.5, indexing="ij")
+    arms = (((x.abs() - 36) / 3.5) ** 2 + (y / 6) ** 2 < 1)[..., None].expand(80, 80, 64)
+    return {"alone": alone, "with arms": torch.where(arms, WINDOW.to_range(torch.tensor(40.0)), alone)}
+
+
+def xrays_of(volume: torch.Tensor, beam: ConeBeam = ORBIT) -> torch.Tensor:
+    return Ideal()(Projector(WIDE, beam, full_detector=True), WINDOW.to_mu(volume), 0)[0]
+
+
+def inside(volume: torch.Tensor) -> torch.Tensor:
+    return WINDOW.to_hu(volume[..., 8:72, 8:72, :].contiguous())
+
+
+@pytest.mark.filterwarnings("ignore:no volume explains")
+@pytest.mark.parametrize("method", ["phydict_learned", TV])
+def test_what_stands_beside_the_volume_does_not_spoil_it(patients, method, monkeypatch):
+    y, truth = xrays_of(patients["with arms"]), inside(patients["with arms"])
+    with pytest.warns(Remark, match="something stands beside the volume"):
+        found = reconstruct(y, ORBIT, method=method, grid=CHEST)
+    monkeypatch.setattr("phydict.methods.extended", lambda method, grid, xrays, beam, display: (method, grid, beam))
+    spoilt = reconstruct(y, ORBIT, method=method, grid=CHEST)
+    scores = [volume_metrics(each.volume[None, None], truth)["psnr"] for each in (found, spoilt)]
+    assert scores[0] > scores[1] + 2
+    torch.testing.assert_close(found.xrays, spoilt.xrays)
+    assert found.misfit == pytest.approx(float((found.reprojection - found.xrays).norm() / found.xrays.norm()),
+                                         rel=1e-4)
+    assert found.misfit < spoilt.misfit and found.method == spoilt.method
+
+
+def test_nothing_is_sought_where_nothing_stands_or_can_be_told(patients):
+    method = reconstructor("tv")
+    for beam, patient, display in (
+            (ORBIT, "alone", False), (ORBIT.select([0, 1, 2]), "with arms", False), (ORBIT, "with arms", True)):
+        assert extended(method, CHEST, xrays_of(patients[patient], beam), beam, display) == (method, CHEST, beam)
+    with pytest.warns(Remark, match="48 mm more are reconstructed at each side"):
+        found, whole, _ = extended(method, CHEST, xrays_of(patients["with arms"]), ORBIT, False)
+    assert whole.same_as(WIDE) and found == Extended(method, whole, CHEST, (48.0, 48.0, 0.0))
+    narrow = replace(ConeBeam.orbit(6, 1020, 740, (112, 112), 5.0), continued=False)
+    assert not narrow.has_room_for(WIDE)
+    y = Ideal()(Projector(CHEST, narrow, full_detector=True), WINDOW.to_mu(patients["alone"][..., 8:72, 8:72, :]), 0)[0]
+    assert extended(method, CHEST, y, narrow, False) == (method, CHEST, narrow)
+
+
+@pytest.mark.filterwarnings("ignore:the X-rays show that something")
+def test_a_method_bound_to_its_voxels_is_left_as_it_is(patients):
+    y, learned = xrays_of(patients["with arms"]), reconstructor("phydict_learned")
+    wider, whole, _ = extended(learned, CHEST, y, ORBIT, False)
+    assert whole.same_as(WIDE) and wider.base.grid.same_as(WIDE) and wider.kept is CHEST
+
+    class Bound:
+        """A prior that says of no other shape that it takes it."""
+
+        grid, window, state_channels = CHEST, WINDOW, 4
+
+    bound = Posterior(Bound(), SplitGibbs())
+    assert extended(bound, CHEST, y, ORBIT, False) == (bound, CHEST, ORBIT)
+    assert learned.with_room(1, 0, 0) is None and learned.with_room(0, 0, 4).grid.shape == (64, 64, 72)
+
+
+@pytest.mark.filterwarnings("ignore:the X-rays show that something", "ignore:no volume explains")
+def test_the_result_is_cut_out_of_what_more_voxels_give(patients):
+    ready, xrays, A = with_room(reconstructor("phydict_learned"), CHEST, xrays_of(patients["with arms"]), ORBIT)
+    found, whole = ready.reconstruct(xrays, A), ready.base.reconstruct(xrays, A)
+    for part, of in ((found.volume, whole.volume), (found.masks, whole.masks), *zip(
+            found.intervals.values(), whole.intervals.values())):
+        assert torch.equal(part, of[..., 8:72, 8:72, :])
+    assert found.grid is CHEST and found.extended_mm == (48, 48, 0) and found.misfit == whole.misfit
+    assert ready.steps() == ready.base.steps()
+
+
+@pytest.mark.parametrize("box", [Grid.cube(256, 409.6), Grid.box([40, 90, 64], [380.0, 400.0, 384.0]),
+                                 Grid.box(16, 96.0, (0.0, 0.0, -170.0)), Grid.box([72, 64, 65], [432.0, 384.0, 390.0])])
+@pytest.mark.parametrize("target", [None, Grid.cube(128), Grid.cube(100)])
+def test_a_method_takes_as_many_voxels_as_hold_a_box_and_no_more(box, target):
+    method = onto_grid(reconstructor("phydict_learned"), target)
+    held = covering(method, box)
+    own, more = method.survey or method.grid, held.survey or held.grid
+    assert covers(more, box) and covers(held.grid, more)
+    assert all(n == 0 or n - 4 < lacks for n, lacks in zip(
+        np.subtract(more.shape, own.shape) // 2, lacking(own, box)))
+    assert covering(method, CHEST) is method and covering(TV, box) is TV
+
+
+@pytest.mark.filterwarnings("ignore:no volume explains", "ignore:no network has learnt")
+def test_a_volume_wider_than_the_priors_holds_what_stands_there(patients):
+    y, truth = xrays_of(patients["with arms"]), WINDOW.to_hu(patients["with arms"])
+    found = reconstruct(y, ORBIT, grid=WIDE).volume
+    narrow = Refined(reconstructor("phydict_learned"), WIDE)
+    spoilt = narrow.reconstruct(*fit_to_grid(narrow, WIDE, y, ORBIT)).volume
+    assert found.shape == WIDE.shape
+    assert volume_metrics(found[None, None], truth)["psnr"] > volume_metrics(spoilt[None, None], truth)["psnr"] + 2
+
+
+@pytest.mark.filterwarnings("ignore:the X-rays show that something")
+def test_a_finer_box_of_a_wider_patient_is_found_as_well(patients):
+    y, box = xrays_of(patients["with arms"]), Grid.box(32, 192.0)
+    truth = inside(patients["with arms"])[0, 0, 16:48, 16:48, 16:48]
+    hu = reconstruct(y, ORBIT, method=TV, grid=box).volume
+    whole = reconstruct(y, ORBIT, method=TV, grid=CHEST).volume[16:48, 16:48, 16:48]
+    assert (hu - truth).square().mean().sqrt() < 1.1 * (whole - truth).square().mean().sqrt()

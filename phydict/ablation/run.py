@@ -269,10 +269,12 @@ class Runner:
         stage = _stage_on(trial.super_resolution, self.device) if trial.super_resolution else None
         ready = reconstructor(trial.method, prior, trial.guidance, trial.name, stage, samples=trial.samples)
         ready = onto_grid(ready, trial.box.grid() if trial.box else None, trial.refinement)
-        ready = covering(ready, trial.fixed) if trial.fixed else ready
         self.progress.follow(ready.steps())
         ready = ready.with_mu_water(scene.mu_water)
-        grid = ready.grid or trial.result_scene()[0]
+        grid = trial.result_scene()[0]
+        if trial.fixed:
+            ready = covering(ready, trial.fixed)
+            grid = ready.grid or grid
         ready, xrays, projector = with_room(ready, grid, scene.xrays.clone(), scene.beam, trial.projector)
         return ready.reconstruct(xrays, projector, scene.report(trial), False, seed, on_step)
 

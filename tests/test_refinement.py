@@ -283,6 +283,7 @@ def test_with_a_network_a_reconstruction_is_learnt_from_at_both_calls(tmp_path, 
     assert np.array_equal(both.validation[0]["volume"][0], both.validation.made[0][INPUTS].astype(np.float32))
 
 
+@pytest.mark.filterwarnings("ignore:no volume explains")
 def test_finer_voxels_are_learnt_of_as_they_are_seen_after_the_coarser_ones(tmp_path, refiner_file):
     file, seen = tmp_path / "fine.safetensors", []
     save_correction(network(), file, dtype=torch.float32)

@@ -226,8 +226,8 @@ def fit_to_grid(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam
     return seen_by(grid, xrays.float(), beam, method.full_detector, projector)
 
 
-def with_room(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, projector: str = "auto",
-              display: bool = False) -> tuple[Reconstructor, Tensor, Projector]:
+def fitted(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, projector: str = "auto",
+           display: bool = False) -> tuple[Reconstructor, Tensor, Projector]:
     """What reconstructs the voxels of `grid`, if need be by way of more of them (`extended`), and X-rays and projector
     to be given to it, as `fit_to_grid` makes them."""
     _check_fit(method, grid, xrays, beam)
@@ -300,7 +300,7 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: AnyPrior | str | Path | No
     poses: FoundPoses | None = None
     if uncertain is not None:
         xrays, poses = calibrated(ready, ready.survey or grid, xrays, beam, uncertain, display)
-    ready, xrays, A = with_room(ready, grid, xrays, poses.beam if poses else beam, projector, display)
+    ready, xrays, A = fitted(ready, grid, xrays, poses.beam if poses else beam, projector, display)
     result = ready.reconstruct(xrays, A, format_report(report), display, seed, on_step)
     return poses.added_to(result) if poses else result
 

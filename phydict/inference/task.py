@@ -31,7 +31,7 @@ from phydict.inference.results import CaseResults
 from phydict.inference.scoring import Scoring
 from phydict.inference.settings import CascadeSettings, Sampling
 from phydict.inference.summary import show_finished, summarise
-from phydict.methods import DEFAULT_GRID, METHODS, calibrated, default_method, onto_grid, reconstructor, with_room
+from phydict.methods import DEFAULT_GRID, METHODS, calibrated, default_method, fitted, onto_grid, reconstructor
 from phydict.page import check_own_page
 from phydict.poses import FoundPoses, PoseSearch
 from phydict.posterior import CascadePosterior, Sampler
@@ -271,7 +271,7 @@ class ReconstructionTask(lightning.LightningModule):
                                       self.progress.advance)
             beam = poses.beam
         with stage("fit to grid"):
-            ready, xrays, projector = with_room(ready, self.grid, xrays, beam, self.projector, display)
+            ready, xrays, projector = fitted(ready, self.grid, xrays, beam, self.projector, display)
         result = ready.reconstruct(xrays, projector, case["report"], display, seed, self.progress.advance)
         return poses.added_to(result) if poses else result
 

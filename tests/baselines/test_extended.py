@@ -13,7 +13,7 @@ from phydict.baselines.extended import Extended, covering, extended
 from phydict.datasets import phantom_case
 from phydict.evaluation import volume_metrics
 from phydict.grid import Grid
-from phydict.methods import fit_to_grid, onto_grid, reconstructor, with_room
+from phydict.methods import fit_to_grid, fitted, onto_grid, reconstructor
 from phydict.posterior import Posterior, Refined, SplitGibbs
 from phydict.runtime.warning import Remark
 from phydict.units import HUWindow
@@ -90,7 +90,7 @@ def test_a_method_bound_to_its_voxels_is_left_as_it_is(patients):
 
 @pytest.mark.filterwarnings("ignore:the X-rays show that something", "ignore:no volume explains")
 def test_the_result_is_cut_out_of_what_more_voxels_give(patients):
-    ready, xrays, A = with_room(reconstructor("phydict_learned"), CHEST, xrays_of(patients["with arms"]), ORBIT)
+    ready, xrays, A = fitted(reconstructor("phydict_learned"), CHEST, xrays_of(patients["with arms"]), ORBIT)
     found, whole = ready.reconstruct(xrays, A), ready.base.reconstruct(xrays, A)
     for part, of in ((found.volume, whole.volume), (found.masks, whole.masks), *zip(
             found.intervals.values(), whole.intervals.values())):

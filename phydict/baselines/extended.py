@@ -47,11 +47,9 @@ volume 1.02 at most, of a tube's X-rays 1.38 from four views and 1.13 from eight
 must be and how many times that in the wider one: with arms 0.05 to 0.14 and 2.9 or more, of X-rays that hold half as
 much scatter as signal or whose detector stands 8 mm elsewhere 0.053 and 3.3 at most."""
 
-
 REST = 0.15
 """What a box may leave of what the widest one explains and the volume does not: of four CTs with arms of 42 mm beside
 it, 48 mm more leave 0.03 to 0.13, 24 mm 0.16 to 0.37."""
-
 
 GOES_ON = "the X-rays show that the patient goes on above or below the volume"
 OVERRULED = "`continued: false` in geometry.yaml, in Python of the ConeBeam, if he ends"
@@ -116,11 +114,11 @@ def extended(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, d
     water that fills it, and else has to explain much.
     """
     volume = method.survey or grid
-    room = _room(method, volume, xrays, beam, display) if method.with_room(0, 0, 0) else (0, 0, 0)
+    answered = asked(xrays, beam, volume, display)
+    room = _room(volume, xrays, beam, answered, method.mu_water, display) if method.with_room(0, 0, 0) else (0, 0, 0)
     wider = method.with_room(*room) if any(room) else None
     whole = grid if wider is None else wider.grid or grid.grown(*room)
     if wider is None or not wider.has_memory_for(whole):
-        answered = asked(xrays, beam, volume, display)
         if answered.continued and beam.continued is None:
             warn(f"{GOES_ON}: each column is taken to go on there as its last voxel does ({OVERRULED})", Remark)
         return method, grid, answered
@@ -134,9 +132,10 @@ def extended(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, d
     return Extended(wider, whole, grid, (x, y, z)), whole, beam
 
 
-def _room(method: Reconstructor, volume: Grid, xrays: Tensor, beam: ConeBeam, display: bool) -> tuple[int, int, int]:
-    """How many voxels more the volume needs at both ends of each axis."""
-    aside = 0 if display else _columns(volume, xrays, asked(xrays, beam, volume, display), method.mu_water)
+def _room(volume: Grid, xrays: Tensor, beam: ConeBeam, answered: ConeBeam, mu_water: float, display: bool
+          ) -> tuple[int, int, int]:
+    """How many voxels more the volume needs at both ends of each axis; answered: the beam as `asked` of the volume."""
+    aside = 0 if display else _columns(volume, xrays, answered, mu_water)
     wide = volume.grown(aside, aside, 0)
     slices = reach_beyond(beam, wide) if reaches_beyond(xrays, beam, wide, display) else 0
     return aside, aside, STEP * math.ceil(min(slices, UP / volume.spacing[2]) / STEP)

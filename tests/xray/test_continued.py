@@ -16,7 +16,7 @@ from phydict.grid import Grid
 from phydict.units import HUWindow
 from phydict.xray import Ideal, Polychromatic, Simulator
 from phydict.xray.beyond import asked, reaches_beyond
-from phydict.xray.projectors.continued import reach_beyond, with_slices
+from phydict.xray.projectors.continued import reach_beyond
 
 GRID = Grid.cube(16)
 ORBIT = ConeBeam.orbit(3, 1020, 740, (40, 40), 14.0, start=0.2)
@@ -32,7 +32,7 @@ def test_rays_meet_the_last_slices_as_far_as_they_meet_anything(beam, method):
     continued = Projector(GRID, replace(beam, continued=True), method, full_detector=True)
     slices = reach_beyond(beam, GRID)
     for more in (slices, slices + 3):
-        tall = Projector(with_slices(GRID, more), beam, method, full_detector=True)
+        tall = Projector(GRID.grown(0, 0, more), beam, method, full_detector=True)
         torch.testing.assert_close(continued(mu), tall(pad(mu, (more, more, 0, 0, 0, 0), mode="replicate")))
     assert 0 < slices < 16 and not torch.allclose(continued(mu), Projector(GRID, beam, method, full_detector=True)(mu))
 
@@ -80,7 +80,7 @@ def patients() -> dict[str, torch.Tensor]:
 
 
 def xrays_of(mu: torch.Tensor, beam: ConeBeam, simulator: Simulator = Ideal()) -> torch.Tensor:
-    return simulator(Projector(with_slices(CHEST, ROWS), beam, full_detector=True), mu, 0)[0]
+    return simulator(Projector(CHEST.grown(0, 0, ROWS), beam, full_detector=True), mu, 0)[0]
 
 
 @pytest.mark.filterwarnings("ignore:the X-rays show")

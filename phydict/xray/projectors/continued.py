@@ -31,11 +31,6 @@ class Continued:
         return back
 
 
-def with_slices(grid: Grid, slices: int) -> Grid:
-    """A grid with `slices` more above and below it."""
-    return grid.grown(0, 0, slices)
-
-
 def reach_beyond(beam: ConeBeam, grid: Grid) -> int:
     """How many slices above or below a grid the detector's rays meet, at most, while they are over its columns."""
     up = grid.affine[:3, 2] / grid.spacing[2]

@@ -14,7 +14,7 @@ from phydict.runtime.profiling import stage
 from phydict.runtime.warning import warn
 from phydict.xray.binning import binning
 from phydict.xray.geometry import VECTOR_KEYS, ConeBeam
-from phydict.xray.projectors.continued import Continued, reach_beyond, with_slices
+from phydict.xray.projectors.continued import Continued, reach_beyond
 
 if TYPE_CHECKING:  # they bring a compiler, so that each is imported where it is first needed
     from phydict.xray.projectors.eq4 import Eq4
@@ -106,7 +106,7 @@ def _engine(grid: Grid, beam: ConeBeam, method: str, memory: int, device: str) -
            *(getattr(beam, name).tobytes() for name in VECTOR_KEYS[:4]))
     if key not in _engines:
         slices = reach_beyond(beam, grid) if beam.continued else 0
-        tall = with_slices(grid, slices)
+        tall = grid.grown(0, 0, slices)
         chosen, reason = _choose(tall, beam, memory, device) if method == "auto" else (method, "it was requested")
         operator = _operator(tall, beam, chosen, memory)
         _engines[key] = _Engine(Continued(operator, slices) if slices else operator, chosen, reason)

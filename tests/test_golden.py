@@ -16,20 +16,25 @@ from tempfile import TemporaryDirectory
 
 import pytest
 import torch
+import yaml
 from command_lines import arguments, losses
 from prior.tiny import tiny_prior, tiny_refiner, tiny_super_resolution
 
+from phydict.ablation.fid import distance_tables
+from phydict.ablation.run import TABLES
 from phydict.ablation.summary import summarise
-from phydict.ablation.tables import all_tables
+from phydict.ablation.tables import all_tables, write_tables
 from phydict.cli.train import main
 from phydict.evaluation import read_csv
 from phydict.grid import Grid
+from phydict.inference.scoring import Scoring
 from phydict.methods import METHODS, RELEASED_STEPS, reconstruct
 from phydict.posterior import CascadePosterior, GradientSteps, Posterior, Reward, Sampler
 from phydict.prior import Cascade
 from phydict.xray import ConeBeam, Projector
 
 HERE = Path(__file__).parent
+CONFIGS = HERE.parent / "configs" / "ablate"
 GOLDEN = HERE / "golden.json"
 BEAM = ConeBeam.orbit(3, 1020, 740, (28, 28), 20.0)
 FINE = Grid.cube(32)
@@ -152,10 +157,15 @@ def test_training_gives_its_golden_losses(golden, tmp_path):
 
 
 @pytest.mark.parametrize("results", sorted(HERE.glob("benchmark/*/results.csv")), ids=lambda file: file.parent.name)
-def test_committed_results_give_their_committed_tables_byte_for_byte(results):
-    rows = read_csv(results)
-    tables = "\n".join(table.markdown() for table in all_tables(summarise(rows)))
-    assert tables == (results.parent / "tables.md").read_text()
+def test_committed_results_give_their_committed_tables_byte_for_byte(results, tmp_path):
+    folder, entries = results.parent, summarise(read_csv(results))
+    config = CONFIGS / f"{folder.name}.yaml"
+    clip = config.is_file() and "clip" in yaml.safe_load(config.read_text()).get("metrics", ())
+    tables = all_tables(entries, Scoring(("clip",)).empty if clip else {}) + distance_tables(folder, entries)
+    write_tables(tmp_path, tables)
+    for name in TABLES:
+        assert not (folder / name).is_file() or (tmp_path / name).read_text() == (folder / name).read_text()
+    assert (folder / "tables.md").is_file()
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from typing import get_type_hints
 import torch
 from jsonargparse import ArgumentParser
 
-from phydict.ablation.fid import comparison_tables
+from phydict.ablation.fid import distance_tables, write_distances
 from phydict.ablation.page import comparison_page
 from phydict.ablation.plots import write_plots
 from phydict.ablation.run import RESULTS, planned, run
@@ -59,7 +59,8 @@ def main(args: list[str] | None = None) -> None:
             raise
         print(f"{len(rows)} rows in {specification.out / RESULTS}")
         entries = summarise(rows)
-        tables = all_tables(entries, scoring.empty) + comparison_tables(specification.out, entries, scoring)
+        write_distances(specification.out, entries, scoring)
+        tables = all_tables(entries, scoring.empty) + distance_tables(specification.out, entries)
         written = write_tables(specification.out, tables) + write_plots(specification.out, entries)
         print(f"tables and plots in {specification.out}: {', '.join(path.name for path in written)}")
         print(f"page: {comparison_page(specification.out, entries, tables)}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -10,68 +9,42 @@ from phydict.ablation.run import features_file
 from phydict.ablation.summary import Entry, conditions, format_settings
 from phydict.datasets import patient_of
 from phydict.evaluation import read_csv, write_csv
-from phydict.evaluation.backbones import NORMALISATION
-from phydict.evaluation.bootstrap import Estimate
-from phydict.evaluation.fid import Distances, StoredFeatures
+from phydict.evaluation.fid import StoredFeatures, fid_rows
 from phydict.evaluation.tables import Table, fid_tables
 from phydict.inference.distances import told_distances
-from phydict.inference.scoring import FIDSettings, Scoring
+from phydict.inference.scoring import Scoring
 
 FID = "fid.csv"
 """The distances in a folder of results."""
 
 
-def comparison_tables(out: Path, entries: Sequence[Entry], scoring: Scoring) -> list[Table]:
-    """The tables of each condition, with a line per entry, and FID with the same numbers; none where the distance is
-    not measured."""
+def write_distances(out: Path, entries: Sequence[Entry], scoring: Scoring) -> None:
+    """Writes FID, the distances of each condition's entries, of those that have their features there, where the
+    distance is measured. Of several seeds of a case each counts as a case of the same patient."""
     if scoring.network is None:
-        return []
-    tables, rows = _tables(out, entries, scoring.fid.backbone, scoring.fid.replicates)
-    write_csv(out / FID, rows)
-    return tables
-
-
-def kept_tables(out: Path, entries: Sequence[Entry]) -> list[Table]:
-    """The same tables, of a comparison that measured the distance and whose features lie there still; otherwise
-    none."""
-    measured = read_csv(out / FID)
-    rows = [row for entry in entries for row in entry.counted]
-    if not measured or not all(features_file(out, row["key"]).is_file() for row in rows):
-        return []
-    return _tables(out, entries, measured[0]["fid_backbone"],
-                   int(measured[0].get("replicates", FIDSettings().replicates)))[0]
-
-
-def _tables(out: Path, entries: Sequence[Entry], backbone: str, replicates: int) -> tuple[list[Table], list[dict]]:
-    """The tables, and the rows of FID, of what has its features there. Of several seeds of a case each counts as a case
-    of the same patient."""
-    tables: list[Table] = []
-    rows: list[dict] = []
+        return
+    backbone, replicates, rows = scoring.fid.backbone, scoring.fid.replicates, []
     for condition, group in conditions(entries):
         there = {entry.label: [row for row in entry.counted if features_file(out, row["key"]).is_file()]
                  for entry in group}
         features = {label: {name: StoredFeatures(features_file(out, key), backbone) for name, key in _named(kept)}
                     for label, kept in there.items() if kept}
         if features:
-            found = told_distances(features, replicates)
-            title = format_settings("Frechet distance of slices (FID)", condition)
-            tables += fid_tables(found, backbone, replicates, title)
-            rows += [{"method": label} | condition | _origin(one, backbone, replicates) | _numbers(one.estimates())
-                     for label, one in found.items()]
-    return tables, rows
+            found = fid_rows(told_distances(features, replicates), backbone, replicates)
+            rows += [{"method": row["method"]} | condition | row for row in found]
+    write_csv(out / FID, rows)
 
 
-def _origin(found: Distances, backbone: str, replicates: int) -> dict:
-    """What distances rest on; the truth has as many slices as the reconstructions, of the same cases."""
-    return {"fid_backbone": backbone, "fid_normalisation": NORMALISATION, "replicates": replicates,
-            "cases": len(found.cases)} | {f"{of}slices_{plane}": count for of in ("", "truth_")
-                                          for plane, count in found.slices.items()}
-
-
-def _numbers(estimates: Mapping[str, Estimate]) -> dict[str, float]:
-    """Each distance, and the ends of its interval where it has one."""
-    return {f"{name}{end}": number for name, estimate in estimates.items()
-            for end, number in zip(("", "_low", "_high"), estimate) if not math.isnan(number)}
+def distance_tables(out: Path, entries: Sequence[Entry]) -> list[Table]:
+    """The tables that FID in a folder gives, for each condition of the entries; none where there is no such file."""
+    rows = read_csv(out / FID)
+    tables: list[Table] = []
+    for condition, group in conditions(entries):
+        labels = {entry.label for entry in group}
+        of = [row for row in rows if row["method"] in labels and condition.items() <= row.items()]
+        if of:
+            tables += fid_tables(of, format_settings("Frechet distance of slices (FID)", condition))
+    return tables
 
 
 def _named(rows: Sequence[Mapping]) -> list[tuple[str, str]]:

@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from phydict.ablation.fid import kept_tables
+from phydict.ablation.fid import distance_tables
 from phydict.ablation.run import RESULTS, volume_folder
 from phydict.ablation.summary import Entry, format_settings, summarise, without_repeats
 from phydict.ablation.tables import all_tables
@@ -32,7 +32,7 @@ def page_anew(folder: Path) -> Path:
              "settings and seed of an earlier row but of other weights or data: give methods that are to be compared "
              "names of their own", event="others", cases=repeats, out=str(folder / RESULTS))
     entries = summarise(rows)
-    return comparison_page(folder, entries, all_tables(entries) + kept_tables(folder, entries))
+    return comparison_page(folder, entries, all_tables(entries) + distance_tables(folder, entries))
 
 
 def comparison_page(folder: Path, entries: Sequence[Entry], tables: Sequence[Table]) -> Path:

@@ -29,7 +29,7 @@ from torchmetrics import Metric
 from torchmetrics.utilities.data import dim_zero_cat
 
 from phydict.datasets.cts.ct_rate import patient_of
-from phydict.evaluation.backbones import DIMENSIONS, SliceFeatures
+from phydict.evaluation.backbones import DIMENSIONS, NORMALISATION, SliceFeatures
 from phydict.evaluation.bootstrap import Estimate, draws, percentiles
 from phydict.evaluation.planes import PLANES
 from phydict.runtime.files import atomic_write
@@ -165,6 +165,32 @@ def _distance(of: Moments, to: Reference) -> float:
 def fid(cases: Mapping[str, Features], replicates: int = 0) -> dict[str, Estimate]:
     """{"fid_xy", "fid_yz", "fid_zx", "fid" (their mean)} over all slices of cases, as `distances` has them."""
     return distances({"": cases}, replicates)[""].estimates()
+
+
+def fid_rows(methods: Mapping[str, Distances], backbone: str, replicates: int) -> list[dict]:
+    """The distances of methods by label, a row each, with what they rest on and, in columns that begin with "less_", by
+    how much they are above those of `less`, the method of most cases and of these the nearest, where their cases are
+    the same. A distance's interval is in columns that end in "_low" and "_high".
+
+    backbone: whose features they were; replicates: the draws of patients that they were found with.
+    """
+    best = min(methods, key=lambda label: (-len(methods[label].cases), float(methods[label].values["fid"][0])))
+    rows = []
+    for label, found in methods.items():
+        row: dict = {"method": label, "fid_backbone": backbone, "fid_normalisation": NORMALISATION,
+                     "replicates": replicates, "cases": len(found.cases)}
+        row |= {f"{of}slices_{plane}": n for of in ("", "truth_") for plane, n in found.slices.items()}
+        row |= _numbers("", found.estimates())
+        if label != best and found.cases == methods[best].cases:
+            row["less"] = best
+            row |= _numbers("less_", found.estimates(methods[best]))
+        rows.append(row)
+    return rows
+
+
+def _numbers(of: str, estimates: Mapping[str, Estimate]) -> dict[str, float]:
+    return {f"{of}{name}{end}": number for name, estimate in estimates.items()
+            for end, number in zip(("", "_low", "_high"), estimate) if not math.isnan(number)}
 
 
 def distances(methods: Mapping[str, Mapping[str, Features]], replicates: int = 0,

@@ -16,10 +16,10 @@ from rich.markup import escape
 from rich.measure import Measurement
 from rich.table import Table as ConsoleTable
 
-from phydict.evaluation.backbones import NORMALISATION
 from phydict.evaluation.bootstrap import Estimate
-from phydict.evaluation.fid import NAMES, Distances
+from phydict.evaluation.fid import NAMES
 from phydict.evaluation.metrics import MEASURES, RANGE, SIGMA, TAPS, Measure, Summary, summarise
+from phydict.evaluation.planes import PLANES
 from phydict.units import HUWindow
 
 Value = float | Summary | Estimate
@@ -142,33 +142,34 @@ def mean_table(rows: Iterable[Mapping], by: str = "method", metrics: Sequence[st
                   *empty_notes(empty, measured), *warning_notes(rows, by)])
 
 
-def fid_tables(methods: Mapping[str, Distances], backbone: str, replicates: int,
-               title: str = "Frechet distance of slices (FID)") -> list[Table]:
-    """The Frechet distances of some methods by label, a line each, with what they rest on; where they have intervals, a
-    second table has their differences from the least distance of most cases."""
-    lines: list[tuple[str, bool, list[Value | None]]] = []
-    for label, found in methods.items():
-        alike = all(set(found.cases) == set(other.cases) for other in methods.values())
-        estimates = found.estimates()
-        lines.append((label, alike, [estimates[name] for name in NAMES]))
-    counts = dict.fromkeys(f"{len(found.cases)} cases with " + ", ".join(
-        f"{plane.upper()} {count}" for plane, count in found.slices.items()) + " slices" for found in methods.values())
-    note = (f"Backbone {backbone}, a scale of its own: {'; '.join(counts)}, all of each volume, against the truth's of "
-            f"the same cases. {NORMALISATION}, so that a wrong HU scale is not seen. FID: mean of the planes.")
+def fid_tables(rows: Sequence[Mapping], title: str = "Frechet distance of slices (FID)") -> list[Table]:
+    """The Frechet distances of `fid_rows`, a line each, with what they rest on; where they have intervals, a second
+    table has their differences from the least distance of most cases."""
+    paired = [row for row in rows if row.get("less")]
+    alike = len(paired) == len(rows) - 1
+    counts = dict.fromkeys(f"{row['cases']} cases with " + ", ".join(
+        f"{plane.upper()} {row[f'slices_{plane}']}" for plane in PLANES) + " slices" for row in rows)
+    note = (f"Backbone {rows[0]['fid_backbone']}, a scale of its own: {'; '.join(counts)}, all of each volume, against "
+            f"the truth's of the same cases. {rows[0]['fid_normalisation']}, so that a wrong HU scale is not seen. "
+            "FID: mean of the planes.")
     measures = [Measure(f"FID-{name[4:].upper()}" if "_" in name else "FID", False, 3) for name in NAMES]
     header = ["method", *(measure.heading for measure in measures)]
+    lines = [(row["method"], alike, _estimates(row, "")) for row in rows]
     if not interval_note(lines):
         return [Table(title, header, measures, lines, [note])]
-    intervals = f"{IN_BRACKETS}, {replicates} draws of patients; repeated slices make it too high."
-    best = min(methods, key=lambda label: (-len(methods[label].cases), float(methods[label].values["fid"][0])))
-    less: list[tuple[str, bool, list[Value | None]]] = []
-    for label, found in methods.items():
-        if label != best and found.cases == methods[best].cases:
-            estimates = found.estimates(methods[best])
-            less.append((label, False, [estimates[name] for name in NAMES]))
-    paired = f"{IN_BRACKETS} of the difference: each of the {replicates} draws has the same patients for both."
-    return [Table(title, header, measures, lines, [note, intervals]),
-            *([Table(f"{title}: less {best}, draw by draw", header, measures, less, [note, paired])] if less else [])]
+    replicates = rows[0]["replicates"]
+    tables = [Table(title, header, measures, lines, [
+        note, f"{IN_BRACKETS}, {replicates} draws of patients; repeated slices make it too high."])]
+    if paired:
+        less = [(row["method"], False, _estimates(row, "less_")) for row in paired]
+        tables.append(Table(f"{title}: less {paired[0]['less']}, draw by draw", header, measures, less, [
+            note, f"{IN_BRACKETS} of the difference: each of the {replicates} draws has the same patients for both."]))
+    return tables
+
+
+def _estimates(row: Mapping, of: str) -> list[Value | None]:
+    """The distances of a row, or, `of` "less_", their differences."""
+    return [Estimate(*(row.get(f"{of}{name}{end}", math.nan) for end in ("", "_low", "_high"))) for name in NAMES]
 
 
 def caption(statistic: str, rows: Sequence[Mapping], columns: Mapping[str, str], window: HUWindow = RANGE) -> str:

@@ -13,7 +13,7 @@ import nibabel as nib
 import numpy as np
 
 from phydict.evaluation import RANGE, mean_table
-from phydict.evaluation.fid import StoredFeatures
+from phydict.evaluation.fid import StoredFeatures, fid_rows
 from phydict.evaluation.tables import Table, fid_tables
 from phydict.grid import Grid
 from phydict.inference.distances import told_distances
@@ -130,4 +130,4 @@ def _kept_distances(folder: Path, cases: Sequence[PageCase]) -> list[Table]:
             methods.setdefault(backbone, {}).setdefault(case.record["method"], {})[case.record["case"]] = features
     replicates = FIDSettings().replicates
     return [table for backbone, features in methods.items()
-            for table in fid_tables(told_distances(features, replicates), backbone, replicates)]
+            for table in fid_tables(fid_rows(told_distances(features, replicates), backbone, replicates))]

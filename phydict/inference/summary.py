@@ -8,7 +8,7 @@ from contextlib import suppress
 from rich.console import Console
 
 from phydict.evaluation import Table
-from phydict.evaluation.fid import StoredFeatures
+from phydict.evaluation.fid import StoredFeatures, fid_rows
 from phydict.evaluation.tables import fid_tables
 from phydict.inference.distances import told_distances
 from phydict.inference.page import results_page
@@ -50,4 +50,4 @@ def _distances(results: CaseResults, cases: list[str], name: str, scoring: Scori
     backbone = scoring.fid.backbone
     features = {case: StoredFeatures(results.folder / case / FEATURES, backbone) for case in cases}
     found = told_distances({name: features}, scoring.fid.replicates)
-    return fid_tables(found, backbone, scoring.fid.replicates)
+    return fid_tables(fid_rows(found, backbone, scoring.fid.replicates))

@@ -108,6 +108,18 @@ class Grid:
         return Grid((self.shape[0] + 2 * x, self.shape[1] + 2 * y, self.shape[2] + 2 * z), affine=affine)
 
     @property
+    def is_upright(self) -> bool:
+        """Whether the third axis runs up or down the patient, within 45 degrees."""
+        return bool(2 * self.affine[2, 2] ** 2 > self.spacing[2] ** 2)
+
+    def turned_as(self, other: Grid) -> Grid:
+        """The same voxels about the same centre, stacked in the directions of another grid's axes."""
+        affine = self.affine.copy()
+        affine[:3, :3] = other.affine[:3, :3] / other.spacing * self.spacing
+        affine[:3, 3] = self.centre - affine[:3, :3] @ ((np.asarray(self.shape) - 1) / 2)
+        return Grid(self.shape, affine=affine)
+
+    @property
     def extent(self) -> np.ndarray:
         """Edge lengths (3,) in mm of the box of voxels, from face to face."""
         return np.asarray(self.shape) * self.spacing
@@ -124,7 +136,7 @@ class Grid:
     def same_as(self, other: Grid) -> bool:
         """Whether both grids have the same voxels, to a thousandth of a voxel."""
         return self.shape == other.shape and np.allclose(
-            self.affine, other.affine, atol=1e-3 * min(self.spacing))
+            self.corners(), other.corners(), rtol=0, atol=1e-3 * min(self.spacing))
 
     def to_dict(self) -> dict:
         """Plain lists, from which `Grid(**d)` builds the same grid."""

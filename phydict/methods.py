@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -53,13 +54,14 @@ from phydict.prior import (
 from phydict.prior.correction import TOLERANCE
 from phydict.reconstruction import Reconstruction, Reconstructor
 from phydict.runtime.precision import check_precision
+from phydict.runtime.profiling import Stopwatch
 from phydict.runtime.reading import reason
 from phydict.runtime.seeds import check_seed
 from phydict.runtime.warning import warn
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 from phydict.xray.beyond import asked
-from phydict.xray.boxes import along, covers, seen_by
+from phydict.xray.boxes import covers, seen_by
 from phydict.xray.checks import check_air, check_xrays, with_air_at_zero
 from phydict.xray.poses.uncertain import Uncertain
 
@@ -207,8 +209,8 @@ def onto_grid(method: Reconstructor, grid: Grid | None, refinement: Refinement =
     if method.grid is not None:
         files = corrections_of(method.sampler, grid) if isinstance(method, Posterior) and refinement.step else []
         method = Refined(cast(Any, covering(method, grid)), grid, refinement, tuple(map(load_correction, files)))
-    elif isinstance(method, Baseline) and along(grid, DEFAULT_GRID) and not covers(grid, DEFAULT_GRID):
-        method = Region(method, grid, DEFAULT_GRID)
+    elif isinstance(method, Baseline) and not covers(grid, outer := DEFAULT_GRID.turned_as(grid)):
+        method = Region(method, grid, outer)
     method.check_voxels(grid)
     return method
 
@@ -222,17 +224,34 @@ def fit_to_grid(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam
     Raises ValueError where X-rays, geometry and grid do not fit, and warns where the X-rays look inverted.
     """
     _check_fit(method, grid, xrays, beam)
+    xrays = xrays.float()
     beam = asked(xrays, beam, method.survey or grid, display)
-    return seen_by(grid, xrays.float(), beam, method.full_detector, projector)
+    return seen_by(grid, xrays, beam, method.full_detector, projector)
 
 
-def fitted(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, projector: str = "auto",
-           display: bool = False) -> tuple[Reconstructor, Tensor, Projector]:
-    """What reconstructs the voxels of `grid`, if need be by way of more of them (`extended`), and X-rays and projector
-    to be given to it, as `fit_to_grid` makes them."""
+def reconstruct_by(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, report: str = "",
+                   display: bool = False, seed: int = 0, on_step: Callable[[], None] = lambda: None,
+                   projector: str = "auto", uncertain: Uncertain | None = None) -> Reconstruction:
+    """What a method makes of X-rays (K, V, U) on `grid`, its own if it has one, or the voxels it refines to.
+
+    First the poses are searched, where they are `uncertain`; then the X-rays are asked whether the patient
+    goes on beyond the voxels (`extended`) and binned; other arguments as those of `reconstruct`. Raises ValueError
+    where X-rays, geometry and grid do not fit, and warns where the X-rays look inverted.
+    """
     _check_fit(method, grid, xrays, beam)
-    method, grid, beam = extended(method, grid, xrays, beam, display)
-    return method, *seen_by(grid, xrays.float(), beam, method.full_detector, projector)
+    poses: FoundPoses | None = None
+    if uncertain is not None:
+        xrays, poses = calibrated(method, method.survey or grid, xrays, beam, uncertain, display, on_step)
+        beam = poses.beam
+    watch = Stopwatch()
+    with watch.stage("fit to grid"):
+        xrays = xrays.float()
+        method, grid, beam = extended(method, grid, xrays, beam, display)
+        xrays, A = seen_by(grid, xrays, beam, method.full_detector, projector)
+    result = method.reconstruct(xrays, A, report, display, seed, on_step)
+    prepared = sum(watch.seconds.values()) + result.seconds.get("prepare", 0.0)
+    result = replace(result, seconds=result.seconds | {"prepare": prepared})
+    return poses.added_to(result) if poses else result
 
 
 def _check_fit(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam) -> None:
@@ -241,6 +260,10 @@ def _check_fit(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam)
     beam.check(grid)
     beam.check_scale(method.survey or grid)
     beam.check_meets(grid)
+    if beam.continued and not grid.is_upright:
+        raise ValueError("a patient who goes on above and below is continued along the third axis of the voxels, which "
+                         f"is to run upwards, but {np.round(grid.affine[:3, 2] / grid.spacing[2], 2).tolist()} was "
+                         "given: give voxels whose third axis is superior, or leave out `continued`")
 
 
 def calibrated(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, uncertain: Uncertain,
@@ -255,7 +278,7 @@ def calibrated(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam,
 
     if not display:
         xrays = with_air_at_zero(xrays)  # which the reconstruction would see no more once offsets are found
-    stated, beam = beam.continued, asked(xrays, beam, grid, display)
+    stated, beam = beam.continued, asked(xrays.float(), beam, grid, display)
     poses = find_poses(xrays, beam, uncertain, grid, display, method.mu_water, on_round=on_round)
     poses = replace(poses, beam=replace(poses.beam, continued=stated))
     for words in poses.warnings():
@@ -297,12 +320,7 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: AnyPrior | str | Path | No
                           samples=samples, precision=precision)
     ready = onto_grid(ready if mu_water is None else ready.with_mu_water(mu_water), grid)
     grid, xrays = ready.grid or grid or DEFAULT_GRID, _real(xrays)
-    poses: FoundPoses | None = None
-    if uncertain is not None:
-        xrays, poses = calibrated(ready, ready.survey or grid, xrays, beam, uncertain, display)
-    ready, xrays, A = fitted(ready, grid, xrays, poses.beam if poses else beam, projector, display)
-    result = ready.reconstruct(xrays, A, format_report(report), display, seed, on_step)
-    return poses.added_to(result) if poses else result
+    return reconstruct_by(ready, grid, xrays, beam, format_report(report), display, seed, on_step, projector, uncertain)
 
 
 def _real(xrays) -> Tensor:

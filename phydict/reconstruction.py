@@ -222,6 +222,9 @@ class Delegating(Reconstructor):
     def with_mu_water(self, mu_water: float) -> Self:
         return replace(self, base=self.base.with_mu_water(mu_water))  # type: ignore[type-var]
 
+    def with_name(self, name: str) -> Self:
+        return replace(self, base=self.base.with_name(name))  # type: ignore[type-var]
+
 
 def describe(settings) -> dict:
     """A method's settings as plain JSON values: class name and fields, nested."""

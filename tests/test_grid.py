@@ -98,6 +98,13 @@ def test_same_as_sees_a_shift_a_turn_and_a_size():
     assert not grid.same_as(Grid((4, 5, 7), affine=TURNED))
 
 
+@pytest.mark.parametrize("stretch, same", [(1e-6, True), (1e-5, False), (1e-3, False)])
+def test_same_as_holds_to_a_thousandth_of_a_voxel_at_the_far_corner_too(stretch, same):
+    one, other = (Grid((512,) * 3, affine=np.diag([length, length, length, 1.0]))
+                  for length in (0.75, 0.75 * (1 + stretch)))
+    assert one.same_as(other) == other.same_as(one) == same
+
+
 def test_a_grid_cannot_be_changed_afterwards_nor_through_the_array_it_was_made_of():
     given = TURNED.copy()
     grid = Grid((4, 5, 6), affine=given)

@@ -24,7 +24,7 @@ from phydict.evaluation.metrics import MEASURES
 from phydict.inference.case_files import VOLUME, write_page_files
 from phydict.inference.protocols import cut_out, placed, resampled
 from phydict.inference.scoring import Scoring
-from phydict.methods import fitted, onto_grid, reconstructor
+from phydict.methods import onto_grid, reconstruct_by, reconstructor
 from phydict.posterior import Sampler
 from phydict.reconstruction import Reconstruction, save_nifti
 from phydict.runtime.console import TRACEBACK, noted, sentence
@@ -275,8 +275,8 @@ class Runner:
         if trial.fixed:
             ready = covering(ready, trial.fixed)
             grid = ready.grid or grid
-        ready, xrays, projector = fitted(ready, grid, scene.xrays.clone(), scene.beam, trial.projector)
-        return ready.reconstruct(xrays, projector, scene.report(trial), False, seed, on_step)
+        return reconstruct_by(ready, grid, scene.xrays.clone(), scene.beam, scene.report(trial), False, seed, on_step,
+                              trial.projector)
 
 
 def features_file(out: Path, key: str) -> Path:

@@ -14,7 +14,8 @@ from phydict.baselines.tv import FISTATV
 from phydict.grid import Grid
 from phydict.reconstruction import Delegating, Reconstruction, Reconstructor
 from phydict.runtime.warning import Remark, warn
-from phydict.xray.beyond import asked, coarsened, reaches_beyond, unexplained
+from phydict.xray.beyond import asked, asks_for_taller, coarsened, unexplained
+from phydict.xray.binning import binned, binning
 from phydict.xray.boxes import along, in_other_voxels, lacking, seen_by
 from phydict.xray.geometry import ConeBeam
 from phydict.xray.projectors.continued import reach_beyond
@@ -109,36 +110,45 @@ def extended(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, d
     says whether he goes on even beyond these. A method that takes no more voxels, or has no memory for them, is left
     as it is.
 
-    Above and below, that is asked as `reaches_beyond` does. Beside the volume, of LEAST_VIEWS views or more, of line
-    integrals, where source and detectors leave room: it is seen where rays that hardly meet the volume show more than
-    water that fills it, and else has to explain much.
+    Above and below, he goes on where the beam says so, or else where the X-rays are `asked`. Beside the volume, of
+    LEAST_VIEWS views or more, of line integrals, where source and detectors leave room: it is seen where rays that
+    hardly meet the volume show more than water that fills it, and else has to explain much.
     """
     volume = method.survey or grid
-    answered = asked(xrays, beam, volume, display)
-    room = _room(volume, xrays, beam, answered, method.mu_water, display) if method.with_room(0, 0, 0) else (0, 0, 0)
+    factor = binning(coarsened(volume), beam)
+    few, pixels = binned(xrays, factor), beam.binned(factor)
+    answered = asked(few, pixels, volume, display).continued
+    takes_more = method.with_room(STEP, STEP, 0) or method.with_room(0, 0, STEP)
+    room = _room(volume, few, pixels, answered, method.mu_water, display) if takes_more else (0, 0, 0)
     wider = method.with_room(*room) if any(room) else None
     whole = grid if wider is None else wider.grid or grid.grown(*room)
     if wider is None or not wider.has_memory_for(whole):
-        if answered.continued and beam.continued is None:
+        if answered and beam.continued is None:
             warn(f"{GOES_ON}: each column is taken to go on there as its last voxel does ({OVERRULED})", Remark)
-        return method, grid, answered
+        return method, grid, beam.saying(answered)
     x, y, z = (n * float(length) for n, length in zip(room, volume.spacing))
     if z and beam.continued is None:
         warn(f"{GOES_ON}: {z:g} mm more are reconstructed at both ends and cut off ({OVERRULED})", Remark)
     if x:
         warn("the X-rays show that something stands beside the volume, such as a wider patient, arms or a couch: "
              f"{x:g} mm more are reconstructed at each side and cut off", Remark)
-    beam = asked(xrays, beam, volume.grown(*room), display)
-    return Extended(wider, whole, grid, (x, y, z)), whole, beam
+    answered = asked(few, pixels, volume.grown(*room), display).continued
+    return Extended(wider, whole, grid, (x, y, z)), whole, beam.saying(answered)
 
 
-def _room(volume: Grid, xrays: Tensor, beam: ConeBeam, answered: ConeBeam, mu_water: float, display: bool
+def _room(volume: Grid, xrays: Tensor, beam: ConeBeam, answered: bool | None, mu_water: float, display: bool
           ) -> tuple[int, int, int]:
-    """How many voxels more the volume needs at both ends of each axis; answered: the beam as `asked` of the volume."""
-    aside = 0 if display else _columns(volume, xrays, answered, mu_water)
+    """How many voxels more the volume needs at both ends of each axis; answered: whether the patient goes on above and
+    below, `asked` of the volume."""
+    aside = 0 if display else _columns(volume, xrays, replace(beam, continued=answered), mu_water)
     wide = volume.grown(aside, aside, 0)
-    slices = reach_beyond(beam, wide) if reaches_beyond(xrays, beam, wide, display) else 0
-    return aside, aside, STEP * math.ceil(min(slices, UP / volume.spacing[2]) / STEP)
+    goes_on = asked(xrays, beam, wide, display).continued if aside else answered
+    if not (goes_on or (beam.continued is None and asks_for_taller(xrays, beam, wide, display))):
+        return aside, aside, 0
+    slices = STEP * math.ceil(min(reach_beyond(beam, wide), UP / volume.spacing[2]) / STEP)
+    while slices and not beam.has_room_for(wide.grown(0, 0, slices)):
+        slices -= STEP
+    return aside, aside, slices
 
 
 def _columns(volume: Grid, xrays: Tensor, beam: ConeBeam, mu_water: float) -> int:

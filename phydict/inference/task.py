@@ -31,9 +31,9 @@ from phydict.inference.results import CaseResults
 from phydict.inference.scoring import Scoring
 from phydict.inference.settings import CascadeSettings, Sampling
 from phydict.inference.summary import show_finished, summarise
-from phydict.methods import DEFAULT_GRID, METHODS, calibrated, default_method, fitted, onto_grid, reconstructor
+from phydict.methods import DEFAULT_GRID, METHODS, default_method, onto_grid, reconstruct_by, reconstructor
 from phydict.page import check_own_page
-from phydict.poses import FoundPoses, PoseSearch
+from phydict.poses import PoseSearch
 from phydict.posterior import CascadePosterior, Sampler
 from phydict.prior import MedSynCheckpoint, PriorContract, find_prior, load_super_resolution
 from phydict.reconstruction import Reconstruction, Reconstructor
@@ -265,15 +265,9 @@ class ReconstructionTask(lightning.LightningModule):
     def _reconstruct(self, case: Case, seed: int) -> Reconstruction:
         ready = self.reconstructor.with_mu_water(case["mu_water"]) if "mu_water" in case else self.reconstructor
         xrays, beam, display = case["xrays"].to(self.device), case["beam"], case.get("display", False)
-        poses: FoundPoses | None = None
-        if self.calibrate:
-            xrays, poses = calibrated(ready, ready.survey or self.grid, xrays, beam, uncertain_of(case), display,
-                                      self.progress.advance)
-            beam = poses.beam
-        with stage("fit to grid"):
-            ready, xrays, projector = fitted(ready, self.grid, xrays, beam, self.projector, display)
-        result = ready.reconstruct(xrays, projector, case["report"], display, seed, self.progress.advance)
-        return poses.added_to(result) if poses else result
+        uncertain = uncertain_of(case) if self.calibrate else None
+        return reconstruct_by(ready, self.grid, xrays, beam, case["report"], display, seed, self.progress.advance,
+                              self.projector, uncertain)
 
     def _finish(self, case: Case, result: Reconstruction, scores: dict | None = None,
                 truth: Tensor | None = None, features: Features | None = None) -> None:

@@ -23,7 +23,8 @@ from phydict.reconstruction import Reconstruction, Reconstructor
 from phydict.runtime.precision import check_precision, resolve_precision
 from phydict.runtime.profiling import Stopwatch
 from phydict.units import MU_WATER, HUWindow
-from phydict.xray import Projector, binned, binning
+from phydict.xray import Projector
+from phydict.xray.boxes import seen_by
 
 
 @dataclass(frozen=True)
@@ -142,9 +143,8 @@ class CascadePosterior(Reconstructor):
 
     def _base(self, xrays: Tensor, projector: Projector, report: str, display: bool, seed: int,
               on_step: Callable[[], None]) -> Reconstruction:
-        """The base stage's reconstruction, from X-rays binned to what its grid can hold."""
-        prior, beam = self.cascade.base, projector.beam
-        factor = 1 if self.sampler.full_detector else binning(prior.grid, beam)
-        coarse = Projector(prior.grid, beam.binned(factor), device=xrays.device, full_detector=True)
+        """The base stage's reconstruction, by the same kind of projector, from X-rays binned to what its grid holds."""
+        prior, kind = self.cascade.base, getattr(projector, "method", "auto")  # none of a projector of one's own
+        binned = seen_by(prior.grid, xrays, projector.beam, self.sampler.full_detector, kind)
         posterior = Posterior(prior, self.sampler, self.guidance, self.mu_water, self.name, self.precision)
-        return posterior.reconstruct(binned(xrays, factor), coarse, report, display, seed, on_step)
+        return posterior.reconstruct(*binned, report, display, seed, on_step)

@@ -34,6 +34,14 @@ class RivalAnswer(Baseline):
     mu_water: float = MU_WATER
     name: str = "rival"
 
+    @property
+    def grid(self) -> Grid:
+        return self.rival.grid
+
+    @property
+    def window(self) -> HUWindow:
+        return self.rival.window
+
     def steps(self) -> int:
         return self.rival.network.steps()
 

@@ -27,30 +27,31 @@ LOW = 0.01
 """The share of a display image's pixels at or below what stands for air."""
 
 
-def reaches_beyond(xrays: Tensor, beam: ConeBeam, grid: Grid, display: bool) -> bool:
-    """Whether the patient in the box of `grid` is found above or below it too: as the beam says of `continued`, or else
-    where a taller volume, or one whose last slices are repeated beyond it, clearly explains the X-rays (K, V, U)
-    better. Other arguments as those of `asked`."""
-    if beam.continued is not None:
-        return beam.continued
-    coarse = coarsened(grid)
-    xrays, taller = _levelled(xrays) if display else xrays, coarse.grown(0, 0, round(TALLER * coarse.shape[2]))
-    alone, repeated, more = (unexplained(xrays, replace(beam, continued=continued), voxels) for voxels, continued in (
-        (coarse, False), (coarse, True), (taller, False)))
-    return CLEARLY * repeated < alone or MORE_CLEARLY * more < alone
-
-
 def asked(xrays: Tensor, beam: ConeBeam, grid: Grid, display: bool) -> ConeBeam:
     """The beam, `continued`, where it is None, as the X-rays (K, V, U) of a patient in the box of `grid` show it: true
-    where a volume whose last slices are repeated beyond it clearly explains them better.
+    where a volume whose last slices are repeated beyond it clearly explains them better. Of voxels that are not stacked
+    upwards nothing is repeated.
 
     display: whether the X-rays are values whose gain and offset per view are unknown.
     """
     if beam.continued is not None:
         return beam
-    xrays = _levelled(xrays) if display else xrays
-    alone, repeated = (unexplained(xrays, replace(beam, continued=answer), coarsened(grid)) for answer in (False, True))
+    if not grid.is_upright:
+        return replace(beam, continued=False)
+    xrays, coarse = _levelled(xrays) if display else xrays, coarsened(grid)
+    alone, repeated = (unexplained(xrays, replace(beam, continued=answer), coarse) for answer in (False, True))
     return replace(beam, continued=CLEARLY * repeated < alone)
+
+
+def asks_for_taller(xrays: Tensor, beam: ConeBeam, grid: Grid, display: bool) -> bool:
+    """Whether a taller volume, if source and detectors leave room for it, clearly explains the X-rays better, of a
+    patient who ends in it. Arguments as those of `asked`."""
+    coarse, beam = coarsened(grid), replace(beam, continued=False)
+    taller = coarse.grown(0, 0, round(TALLER * coarse.shape[2]))
+    if not (grid.is_upright and beam.has_room_for(taller)):
+        return False
+    xrays = _levelled(xrays) if display else xrays
+    return MORE_CLEARLY * unexplained(xrays, beam, taller) < unexplained(xrays, beam, coarse)
 
 
 def coarsened(grid: Grid) -> Grid:
@@ -60,7 +61,7 @@ def coarsened(grid: Grid) -> Grid:
 
 def unexplained(xrays: Tensor, beam: ConeBeam, grid: Grid) -> float:
     """The norm of what ITERATIONS steps leave of the X-rays."""
-    y, A = seen_by(grid, xrays.float(), beam, False)
+    y, A = seen_by(grid, xrays, beam, False)
     x = conjugate_gradients(lambda mu: A.T(A(mu)), A.T(y[None]), ITERATIONS)
     return float((y - A(x)[0]).norm())
 

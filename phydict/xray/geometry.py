@@ -302,8 +302,10 @@ class ConeBeam:
         return places.min(1), places.max(1)
 
     def same_as(self, other: ConeBeam, tolerance: float = 1e-6) -> bool:
-        """Whether both beams have the same poses to `tolerance` mm and the same detector shape."""
-        return self.shape == other.shape and self.views == other.views and all(
+        """Whether both beams have the same poses to `tolerance` mm, the same detector shape and, where both state it,
+        the same `continued`."""
+        contradict = {self.continued, other.continued} == {True, False}
+        return self.shape == other.shape and self.views == other.views and not contradict and all(
             np.allclose(getattr(self, name), getattr(other, name), rtol=0, atol=tolerance)
             for name in ("sources", "detectors", "u", "v"))
 
@@ -317,6 +319,15 @@ class ConeBeam:
         with atomic_write(Path(path)) as part:
             part.write_text(yaml.safe_dump(self.to_dict(), sort_keys=False, default_flow_style=None))
 
+    def saying(self, continued: bool | None) -> ConeBeam:
+        """The same beam, which says so of `continued`; None leaves it. Raises ValueError where it says otherwise."""
+        if continued is None or continued is self.continued:
+            return self
+        if self.continued is not None:
+            raise ValueError(f"`continued` is {self.continued} in `beam:`, but {continued} beside it: leave one of the "
+                             "two out")
+        return replace(self, continued=continued)
+
     @classmethod
     def load(cls, path: str | Path) -> ConeBeam:
         """Read a beam from YAML: the vector form that `save` writes, or one mapping `orbit:`, at the top
@@ -326,7 +337,8 @@ class ConeBeam:
         and optionally start_degrees (0) and arc_degrees (360), or start and arc in radians; angles_degrees: [...] in
         place of views, start and arc; or one mapping `sweep:` with sweep_degrees beside the orbit's five keys. Both
         take detector_shift (mm from column to column, or [from row to row, from column to column]) and tilt_degrees.
-        Beside any of these forms `continued` says whether the patient goes on above and below the volume.
+        Beside any of these forms, or beside `beam:`, `continued` says whether the patient goes on above and below the
+        volume.
         Raises FileNotFoundError, and ValueError naming the file for unknown or missing keys and impossible geometry.
         """
         path = Path(path)
@@ -334,8 +346,9 @@ class ConeBeam:
             raise FileNotFoundError(f"there is no geometry file {path}; write one with ConeBeam.save or by hand")
         content = read_yaml(path)
         try:
-            beam = content.get("beam", content) if isinstance(content, dict) else content
-            return cls.from_dict(beam)
+            if not isinstance(content, dict) or "beam" not in content:
+                return cls.from_dict(content)
+            return cls.from_dict(content["beam"]).saying(content.get("continued"))
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
 

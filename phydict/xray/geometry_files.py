@@ -18,6 +18,7 @@ import numpy as np
 
 from phydict.runtime.files import atomic_write
 from phydict.runtime.reading import read_npy, read_text, reading, reason
+from phydict.runtime.warning import warn
 from phydict.xray.geometry import ConeBeam
 from phydict.xray.rtk import check_beam, read_rtk, write_rtk
 
@@ -60,14 +61,16 @@ def read_beam(path: str | Path, shape: tuple[int, int] | None = None,
 def write_beam(path: str | Path, beam: ConeBeam) -> None:
     """Write a beam as the kind of file that its ending names; `read_beam` reads it back.
 
-    Raises ValueError for other endings, where RTK's XML cannot hold the beam, and for what is no beam.
+    Warns where a beam states `continued`, which YAML alone can hold. Raises ValueError for other endings, where RTK's
+    XML cannot hold the beam, and for what is no beam.
     """
     check_beam("write_beam", path, beam)
     ending = _ending(Path(path))
     vectors = np.concatenate([beam.sources, beam.detectors, beam.u, beam.v], axis=1)
     if ending in (".yaml", ".yml"):
         beam.save(path)
-    elif ending == ".xml":
+        return
+    if ending == ".xml":
         write_rtk(path, beam)
     elif ending == ".npy":
         with atomic_write(Path(path)) as part, part.open("wb") as file:
@@ -76,6 +79,9 @@ def write_beam(path: str | Path, beam: ConeBeam) -> None:
         lines = [",".join(COLUMNS), *(",".join(repr(float(value)) for value in row) for row in vectors)]
         with atomic_write(Path(path)) as part:
             part.write_text("\n".join(lines) + "\n")
+    if beam.continued is not None:
+        warn(f"{path} cannot say whether the patient goes on: state `continued: {str(beam.continued).lower()}` in the "
+             "geometry.yaml that names it")
 
 
 def _ending(path: Path) -> str:

@@ -13,12 +13,12 @@ from phydict.baselines.extended import Extended, covering, extended
 from phydict.datasets import phantom_case
 from phydict.evaluation import volume_metrics
 from phydict.grid import Grid
-from phydict.methods import fit_to_grid, fitted, onto_grid, reconstructor
+from phydict.methods import fit_to_grid, onto_grid, reconstructor
 from phydict.posterior import Posterior, Refined, SplitGibbs
 from phydict.runtime.warning import Remark
 from phydict.units import HUWindow
 from phydict.xray import Ideal
-from phydict.xray.boxes import covers, lacking
+from phydict.xray.boxes import covers, lacking, seen_by
 
 TV = FISTATV(iterations=80)
 CHEST, WIDE, WINDOW = Grid.cube(64), Grid.box([80, 80, 64], [480.0, 480.0, 384.0]), HUWindow()
@@ -72,6 +72,18 @@ def test_nothing_is_sought_where_nothing_stands_or_can_be_told(patients):
     assert extended(method, CHEST, y, narrow, False) == (method, CHEST, narrow)
 
 
+@pytest.mark.filterwarnings("ignore:the X-rays show that the patient")
+@pytest.mark.parametrize("continued", [None, True])
+def test_no_more_is_reconstructed_than_source_and_detectors_leave_room_for(patients, continued):
+    beam = replace(ConeBeam.orbit(4, 1020, 740, (56, 56), 10.0).tilted(30), continued=continued)
+    assert beam.has_room_for(CHEST) and not beam.has_room_for(CHEST.grown(0, 0, 8))
+    y = Projector(CHEST, beam, full_detector=True)(WINDOW.to_mu(patients["alone"][..., 8:72, 8:72, :].contiguous()))[0]
+    found = reconstruct(y, beam, method=TV, grid=CHEST)
+    assert found.extended_mm[2] < 48 and found.misfit < 0.1
+    half = reconstruct(y.half(), beam, method=TV, grid=CHEST)
+    assert (half.volume - found.volume).square().mean().sqrt() < 5
+
+
 @pytest.mark.filterwarnings("ignore:the X-rays show that something")
 def test_a_method_bound_to_its_voxels_is_left_as_it_is(patients):
     y, learned = xrays_of(patients["with arms"]), reconstructor("phydict_learned")
@@ -84,13 +96,15 @@ def test_a_method_bound_to_its_voxels_is_left_as_it_is(patients):
         grid, window, state_channels = CHEST, WINDOW, 4
 
     bound = Posterior(Bound(), SplitGibbs())
-    assert extended(bound, CHEST, y, ORBIT, False) == (bound, CHEST, ORBIT)
+    assert extended(bound, CHEST, y, ORBIT, False)[:2] == (bound, CHEST)
     assert learned.with_room(1, 0, 0) is None and learned.with_room(0, 0, 4).grid.shape == (64, 64, 72)
 
 
 @pytest.mark.filterwarnings("ignore:the X-rays show that something", "ignore:no volume explains")
 def test_the_result_is_cut_out_of_what_more_voxels_give(patients):
-    ready, xrays, A = fitted(reconstructor("phydict_learned"), CHEST, xrays_of(patients["with arms"]), ORBIT)
+    xrays = xrays_of(patients["with arms"])
+    ready, grid, beam = extended(reconstructor("phydict_learned"), CHEST, xrays, ORBIT, False)
+    xrays, A = seen_by(grid, xrays, beam, False)
     found, whole = ready.reconstruct(xrays, A), ready.base.reconstruct(xrays, A)
     for part, of in ((found.volume, whole.volume), (found.masks, whole.masks), *zip(
             found.intervals.values(), whole.intervals.values())):

@@ -63,19 +63,20 @@ def gaussian(variance=1e-2, **settings):
     return CascadePosterior(stages, SAMPLER, precision="float32", **settings)
 
 
-def base_alone(xrays, seed=3):
+def base_alone(xrays, seed=3, kind="auto"):
     """The base stage's reconstruction by itself, in the prior's range, upsampled."""
     half = BEAM.binned(2)
     result = Posterior(tiny_prior(False), SAMPLER, precision="float32").reconstruct(
-        binned(xrays, 2), Projector(Grid.cube(16), half, full_detector=True), seed=seed)
+        binned(xrays, 2), Projector(Grid.cube(16), half, kind, full_detector=True), seed=seed)
     coarse = HUWindow(-1000, 600).to_range(result.volume)[None, None]
     return interpolate(coarse, scale_factor=2, mode="trilinear")
 
 
-def test_unguided_and_without_detail_it_is_the_base_stages_result_upsampled(xrays):
+@pytest.mark.parametrize("kind", ["auto", "siddon"])
+def test_unguided_and_without_detail_it_is_the_base_stages_result_upsampled(xrays, kind):
     method = gaussian(1e-12, sr_guided=False, noise=0.0)
-    found = method.reconstruct(xrays, PROJECTOR, seed=3)
-    expected = HUWindow(-1000, 600).to_hu(base_alone(xrays))[0, 0]
+    found = method.reconstruct(xrays, Projector(FINE, BEAM, kind, full_detector=True), seed=3)
+    expected = HUWindow(-1000, 600).to_hu(base_alone(xrays, kind=kind))[0, 0]
     torch.testing.assert_close(found.volume, expected, atol=0.1, rtol=0)
     assert found.grid.same_as(FINE)
 

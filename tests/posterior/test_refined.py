@@ -247,6 +247,22 @@ def test_a_method_without_a_prior_accounts_for_what_lies_outside_its_box(xrays, 
     assert part.coarse.grid.shape == (64, 64, 64) and part.grid is region
 
 
+@pytest.mark.parametrize("method", [SIRT(40), FISTATV(30)], ids=lambda method: method.name)
+def test_a_box_means_the_same_in_whatever_directions_its_voxels_are_stacked(xrays, method):
+    box = Grid.box((24, 32, 20), (144.0, 192.0, 120.0), (48.0, 0.0, 0.0))
+    flipped, permuted = box.affine.copy(), box.affine[:, [2, 0, 1, 3]]
+    flipped[:3, :2] *= -1
+    flipped[:3, 3] += box.affine[:3, :3] @ (23, 31, 0)
+    usual, lps, turned = (reconstruct(xrays, BEAM, method=method, grid=grid)
+                          for grid in (box, Grid(box.shape, affine=flipped), Grid((20, 24, 32), affine=permuted)))
+    assert error(lps.volume.flip(0, 1), usual.volume) < 15
+    truth = chest()[28:52, 16:48, 22:42]  # another projector suits the last one
+    assert error(turned.volume.permute(1, 2, 0), truth) < 1.25 * error(usual.volume, truth)
+    assert lps.misfit == pytest.approx(usual.misfit, rel=1e-3)
+    with pytest.raises(ValueError, match="give voxels whose third axis is superior, or leave out `continued`"):
+        reconstruct(xrays, replace(BEAM, continued=True), method=method, grid=turned.grid)
+
+
 def test_a_local_method_gives_in_a_box_what_it_gives_there_in_the_whole(xrays):
     region = Grid.box((24, 32, 24), (144.0, 192.0, 144.0), (48.0, 0.0, 0.0))
     whole, part = (reconstruct(xrays, BEAM, method="fdk", grid=grid) for grid in (None, region))
@@ -279,6 +295,8 @@ def test_a_method_that_works_by_another_one_is_asked_what_that_is_asked(ready):
     assert told == replace(ready, base=base.with_mu_water(0.016)) and told.mu_water == 0.016 != ready.mu_water
     assert (told.name, told.citation, told.full_detector) == (base.name, base.citation, base.full_detector)
     assert told.grid is ready.target and base.citation
+    assert ready.with_name("other") == replace(ready, base=base.with_name("other"))
+    assert ready.with_name("other").name == "other" != ready.name
 
 
 def test_the_attenuation_of_water_reaches_every_level(xrays):

@@ -6,13 +6,16 @@ import pytest
 import torch
 from laws import random_like
 from prior.tiny import tiny_prior
+from torch.nn.functional import pad
 
 from phydict import reconstruct
 from phydict.diffusion.steps import noise_like
-from phydict.posterior import Measurement, Posterior, PriorOnly, ProximalCG, SplitGibbs
+from phydict.methods import METHODS
+from phydict.posterior import GradientSteps, Measurement, Posterior, PriorOnly, ProximalCG, Reward, SplitGibbs
 from phydict.posterior.posterior import sample_seed
+from phydict.xray import ConeBeam, Projector
 from posterior.dense import SHAPE, N, measurement
-from posterior.scene import BEAM, PROJECTOR, views
+from posterior.scene import BEAM, GRID, PROJECTOR, views
 
 SAMPLER = SplitGibbs(4, ProximalCG(3), ProximalCG(3), t_start=0.7, noise_fraction=0.0, sampling_noise=0.6)
 
@@ -37,6 +40,21 @@ def test_mean_and_deviation_are_those_of_samples_that_do_not_depend_on_their_num
         torch.testing.assert_close(several.volume, single[:n].mean(0), atol=0.05, rtol=0)
         torch.testing.assert_close(several.deviation, single[:n].std(0), atol=0.05, rtol=0)
     assert single.std(0).mean() > 5
+
+
+@pytest.mark.parametrize("display", [False, True])
+@pytest.mark.parametrize("sampler", [
+    METHODS["phydict_fast"], replace(SAMPLER, subgrid=ProximalCG(3)),
+    replace(SAMPLER, final_likelihood=ProximalCG(10, tv_weight=10.0, discrepancy=True)),
+    replace(SAMPLER, final_likelihood=ProximalCG(3, weighted_least_squares=True)),
+    replace(SAMPLER, likelihood=GradientSteps(1, reward=Reward(1.0, random_backbone=True, dropout=True, squared=0)))],
+    ids=["phydict_fast", "subgrid", "discrepancy", "own noise", "dropout"])
+def test_what_is_sought_beside_a_sample_does_not_depend_on_those_drawn_with_it(method, sampler, display):
+    wide = Projector(GRID, ConeBeam.orbit(4, 1020, 740, (16, 16), 40.0))  # the fewest pixels that LPIPS takes
+    alone, together = (replace(method, sampler=sampler, samples=3, batch=batch).reconstruct(
+        pad(views(), (1, 1, 1, 1)), wide, display=display, seed=5) for batch in (1, 3))
+    torch.testing.assert_close(together.volume, alone.volume, atol=0.05, rtol=0)
+    torch.testing.assert_close(together.deviation, alone.deviation, atol=0.05, rtol=0)
 
 
 def test_one_sample_is_the_samplers_own_result_without_a_deviation(method):

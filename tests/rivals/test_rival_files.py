@@ -104,9 +104,18 @@ def test_what_a_rival_is_not_for_is_refused(file, tmp_path):
 
 
 def test_other_voxels_are_refined_from_the_rivals_own(file):
-    found = reconstruct(xrays(), ORBIT, method=TrainedRival(file), grid=Grid.cube(32))
-    assert found.volume.shape == (32, 32, 32) and found.coarse.grid.same_as(GRID)
-    assert found.misfit < found.coarse.misfit
+    for method in (TrainedRival(file), RivalAnswer(tiny_lifted())):
+        found = reconstruct(xrays(), ORBIT, method=method, grid=Grid.cube(32))
+        assert found.volume.shape == (32, 32, 32) and found.coarse.grid.same_as(GRID)
+        assert found.misfit < found.coarse.misfit
+
+
+@pytest.mark.filterwarnings("ignore:no volume")
+def test_a_patient_who_goes_on_gives_a_rival_no_more_voxels_than_its_own(file):
+    beam = replace(ORBIT, continued=True)
+    read, made = (reconstruct(xrays(beam), beam, method=method, grid=GRID)
+                  for method in (TrainedRival(file, "float32"), RivalAnswer(tiny_lifted(), precision="float32")))
+    assert made.grid.same_as(GRID) and torch.equal(read.volume, made.volume)
 
 
 def test_a_prior_is_no_rival_and_a_rival_no_prior(file, tmp_path):

@@ -1,7 +1,10 @@
 """Where sources, detectors and pixels are, and what impossible geometry is told."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import yaml
 
 from phydict.xray import ConeBeam, Grid
 
@@ -203,6 +206,29 @@ def test_yaml_holds_angles_sweeps_shifts_and_tilts(tmp_path):
     assert ConeBeam.load(path).same_as(ConeBeam.at_angles([3, 50], 1020, 740, (112, 96), (5, 4)).shifted(5, -30))
     path.write_text(ORBIT.replace("orbit", "sweep") + "  sweep_degrees: 40\n")
     assert ConeBeam.load(path).same_as(ConeBeam.sweep(4, 1020, 740, (112, 96), (5, 4), 40))
+
+
+@pytest.mark.parametrize("within, beside", [(None, None), (None, True), (None, False), (True, None), (False, False)])
+def test_yaml_says_in_the_beam_or_beside_it_whether_the_patient_goes_on(tmp_path, within, beside):
+    path = tmp_path / "geometry.yaml"
+    path.write_text(yaml.safe_dump({"beam": vectors(continued=within), "continued": beside}))
+    assert ConeBeam.load(path).continued is (beside if within is None else within)
+
+
+@pytest.mark.parametrize("within, beside, sentence", [
+    (True, False, "`continued` is True in `beam:`, but False beside it"),
+    (False, True, "`continued` is False in `beam:`, but True beside it"), (None, 1, "continued is true or false")])
+def test_yaml_that_contradicts_itself_on_whether_the_patient_goes_on_is_refused(tmp_path, within, beside, sentence):
+    path = tmp_path / "geometry.yaml"
+    path.write_text(yaml.safe_dump({"beam": vectors(continued=within), "continued": beside}))
+    with pytest.raises(ValueError, match=rf"geometry\.yaml: .*{sentence}"):
+        ConeBeam.load(path)
+
+
+def test_a_patient_who_goes_on_and_one_who_ends_are_not_seen_alike():
+    goes_on, ends = (replace(orbit(), continued=said) for said in (True, False))
+    assert not goes_on.same_as(ends) and not ends.same_as(goes_on)
+    assert goes_on.same_as(goes_on) and goes_on.same_as(orbit()) and orbit().same_as(ends)
 
 
 @pytest.mark.parametrize("text, sentence", [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -47,6 +48,17 @@ def rtk(tmp_path, views, head="<SourceToIsocenterDistance>740</SourceToIsocenter
 def test_what_is_written_is_read_back(tmp_path, make, ending):
     write_beam(tmp_path / f"beam.{ending}", make())
     assert read_beam(tmp_path / f"beam.{ending}", SHAPE, PIXEL).same_as(make(), tolerance=1e-9)
+
+
+@pytest.mark.parametrize("continued", [True, False])
+def test_yaml_holds_whether_the_patient_goes_on_and_other_files_warn_that_they_do_not(tmp_path, continued):
+    beam = replace(orbit(), continued=continued)
+    write_beam(tmp_path / "beam.yaml", beam)
+    assert read_beam(tmp_path / "beam.yaml").continued is continued
+    for ending in ENDINGS[1:]:
+        with pytest.warns(UserWarning, match=f"beam.{ending} cannot say .*`continued: {str(continued).lower()}`"):
+            write_beam(tmp_path / f"beam.{ending}", beam)
+        assert read_beam(tmp_path / f"beam.{ending}", SHAPE, PIXEL).continued is None
 
 
 @pytest.mark.parametrize("ending", ENDINGS)

@@ -1,10 +1,13 @@
 """Uncertain poses: their unknowns, what they change in a projection, and what no X-ray shows."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from laws import random_like
 from scipy.spatial.transform import Rotation
+from torch.nn.functional import pad
 
 from phydict.grid import Grid
 from phydict.xray import ConeBeam, Projector
@@ -12,6 +15,7 @@ from phydict.xray.poses.gauge import aligned, carried, reprojection_errors, shad
 from phydict.xray.poses.sensitivity import pose_derivatives
 from phydict.xray.poses.uncertain import Uncertain
 from phydict.xray.poses.unknowns import POSE, moved
+from phydict.xray.projectors.continued import reach_beyond
 
 GRID = Grid.cube(10, 100.0)
 BEAM = ConeBeam.orbit(3, 1100, 740, (9, 11), 18.0)
@@ -36,6 +40,16 @@ def test_the_sampled_integrals_are_those_of_a_projector_of_trilinear_volumes():
     sampled = pose_derivatives(mu, GRID, BEAM, VALUES)[0]
     swept = Projector(GRID, moved(BEAM, VALUES), "joseph")(mu[None, None])[0]
     assert (sampled - swept).norm() < 0.02 * swept.norm()
+
+
+def test_the_derivatives_of_a_volume_that_goes_on_are_those_of_a_taller_one():
+    mu, more = random_like(GRID.shape, seed=2).abs(), reach_beyond(moved(BEAM, VALUES), GRID) + 3
+    tall = pad(mu[None, None], (more, more, 0, 0, 0, 0), mode="replicate")[0, 0]
+    going_on = pose_derivatives(mu, GRID, replace(BEAM, continued=True), VALUES)
+    taller = pose_derivatives(tall, GRID.grown(0, 0, more), BEAM, VALUES)
+    for found, expected, ending in zip(going_on, taller, pose_derivatives(mu, GRID, BEAM, VALUES)):
+        torch.testing.assert_close(found, expected)
+        assert (found - ending).norm() > 0.01 * ending.norm()
 
 
 def test_a_volume_of_nothing_has_no_derivatives():

@@ -19,7 +19,7 @@ beam, wherever it comes from, is that of the images once they are turned.
 from __future__ import annotations
 
 import reprlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -91,7 +91,10 @@ class Description:
     def beam_of(self, shape: tuple[int, int], tags: list[DicomTags]) -> ConeBeam:
         """The beam for images of `shape` (V, U), turned, and their DICOM tags, if any. Raises ValueError."""
         beam = self._stated_beam(shape, tags)
-        return beam if self.continued is None else replace(beam, continued=self.continued)
+        try:
+            return beam.saying(self.continued)
+        except ValueError as error:
+            raise ValueError(f"{self.source}: {error}") from error
 
     def _stated_beam(self, shape: tuple[int, int], tags: list[DicomTags]) -> ConeBeam:
         beam = self.beam or {}

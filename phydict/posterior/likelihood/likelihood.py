@@ -31,7 +31,12 @@ MOST_SMOOTHING = 10.0
 
 
 class LikelihoodStep(ABC):
-    """z = step(measurement, x0, x0_std): x0 and z (B, 1, X, Y, Z); x0_std is the standard deviation of x0's error."""
+    """z = step(measurement, x0, x0_std): x0 and z (B, 1, X, Y, Z); x0_std is the standard deviation of x0's error.
+
+    batches: whether the states of a batch do not influence each other.
+    """
+
+    batches = True
 
     @abstractmethod
     def __call__(self, measurement: Measurement, x0: Tensor, x0_std: float) -> Tensor: ...
@@ -91,6 +96,11 @@ class ProximalCG(LikelihoodStep):
         if not self.noise and (self.tv_weight or self.weighted_least_squares):
             raise ValueError("ProximalCG weighs total variation and the pixels' own noise by its noise, but a noise of "
                              "0 was given: give one above 0, or leave out tv_weight and weighted_least_squares")
+
+    @property
+    def batches(self) -> bool:  # type: ignore[override]
+        """Not with a noise, of pixels or of the model, that is one for all states."""
+        return not (self.weighted_least_squares or self.discrepancy)
 
     def __call__(self, measurement: Measurement, x0: Tensor, x0_std: float) -> Tensor:
         weight = (self.noise / x0_std) ** 2
@@ -154,6 +164,11 @@ class GradientSteps(LikelihoodStep):
 
     def __post_init__(self):
         check_fields(self, "GradientSteps", steps=(1, math.inf), learning_rate=(LEAST, MOST), rho=(LEAST, MOST))
+
+    @property
+    def batches(self) -> bool:  # type: ignore[override]
+        """Not with dropout, which is drawn for all states at once."""
+        return not self.reward.dropout
 
     def __call__(self, measurement: Measurement, x0: Tensor, x0_std: float) -> Tensor:
         with torch.enable_grad():

@@ -85,7 +85,6 @@ class SplitGibbs(Sampler):
     hardening: bool = False
     subgrid: LikelihoodStep | None = None
     metal: Metal | None = None
-    batches = True
 
     def __post_init__(self):
         if self.iterations < 1:
@@ -108,6 +107,12 @@ class SplitGibbs(Sampler):
         if self.ec_delta and self.ec_steps < 1:
             raise ValueError(f"refining from {self.ec_delta} needs ec_steps of at least 1, but "
                              f"{self.ec_steps} was given")
+
+    @property
+    def batches(self) -> bool:  # type: ignore[override]
+        """Not where something is sought beside the CT, of which a measurement holds one for all states."""
+        steps = [step for step in (self.likelihood, self.final_likelihood) if step]
+        return not (self.scatter or self.hardening or self.subgrid or self.metal) and all(s.batches for s in steps)
 
     def steps(self) -> int:
         passes = [self.iterations] + ([self.ec_steps] if self.ec_delta else [])
@@ -165,7 +170,7 @@ class SplitGibbs(Sampler):
             if step:
                 x0_std = self.x0_std(denoiser, t)
                 ct = step(measurement, x0[:, :1], x0_std)
-                if s == 0 and find_subgrid(measurement, ct.mean(0, keepdim=True), self.subgrid, self.prior_std):
+                if s == 0 and find_subgrid(measurement, ct, self.subgrid, self.prior_std):
                     ct = step(measurement, x0[:, :1], x0_std)
                 z = torch.cat([ct.clamp(-1, 1), z[:, 1:]], 1)
             if self.noise_fraction is None:

@@ -5,7 +5,8 @@ A ray from the source s to its pixel p is sampled at s + t (p - s), at the same 
     L = |p - s| dt * sum over t of mu(s + t (p - s))
     dL/ds = -(p - s) / |p - s|^2 L + |p - s| dt * sum over t of (1 - t) grad mu,    dL/dp likewise with t
 
-mu is trilinear between voxel centres and falls to 0 one voxel beyond the outermost ones.
+mu is trilinear between voxel centres and falls to 0 one voxel beyond the outermost ones. Where a beam is continued, its
+last slices are repeated above and below as far as rays meet them.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from phydict.grid import Grid
 from phydict.xray.geometry import ConeBeam
 from phydict.xray.poses.unknowns import derivative, moved
 from phydict.xray.projectors.compiled import compiled
+from phydict.xray.projectors.continued import reach_beyond
 from phydict.xray.projectors.tracer import aim, ray_lengths, rays_in_voxels, run
 
 PACE = 1.0
@@ -31,7 +33,9 @@ def pose_derivatives(mu: Tensor, grid: Grid, beam: ConeBeam, values: np.ndarray)
     In the type of mu, float32 or float64; on the CPU.
     """
     there = moved(beam, values)
-    volume = np.pad(mu.detach().numpy(), 1)
+    slices = reach_beyond(there, grid) if beam.continued else 0
+    grid = grid.grown(0, 0, slices)
+    volume = np.pad(np.pad(mu.detach().numpy(), ((0, 0), (0, 0), (slices, slices)), "edge"), 1)
     images = np.zeros((beam.views, *beam.shape), volume.dtype)
     ends = np.zeros((beam.views, *beam.shape, 2, 3), volume.dtype)
     rays = rays_in_voxels(grid, beam)  # the nominal beam's: the samples stay where they are in t

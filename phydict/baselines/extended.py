@@ -72,10 +72,6 @@ class Extended(Delegating):
     kept: Grid
     room_mm: tuple[float, float, float]
 
-    @property
-    def survey(self) -> Grid | None:
-        return self.base.survey
-
     def steps(self) -> int:
         return self.base.steps()
 

@@ -2,8 +2,8 @@
 
     python tests/benchmark/prior.py [prior.safetensors ...] [--cts folder of held-out CTs ...]
 
-Without a prior, the shipped one. Writes prior.csv beside this file: RMSE of the CT in HU, one noise draw per case and
-level, the same for all priors.
+Without a prior, the shipped one. Writes prior.csv beside this file, where rows of other priors stay: RMSE of the CT in
+HU, one noise draw per case and level, the same for all priors.
 """
 
 import argparse
@@ -15,7 +15,7 @@ import torch
 from phydict import load_prior
 from phydict.datasets import find_cts, phantom_case, prepare_ct
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM
-from phydict.evaluation import write_csv
+from phydict.evaluation import read_csv, write_csv
 from phydict.prior import Prior
 from phydict.prior.files import DEFAULT_PRIOR
 from phydict.training.denoising import NOISE_LEVELS, denoising_errors
@@ -56,5 +56,6 @@ if __name__ == "__main__":
     given = parser.parse_args()
     held_out = [ct for folder in given.cts for ct in find_cts(folder)]
     rows = [row for file in given.priors for row in errors(file.stem, load_prior(file), held_out)]
-    write_csv(Path(__file__).with_suffix(".csv"), rows)
+    file = Path(__file__).with_suffix(".csv")
+    write_csv(file, [row for row in read_csv(file) if row["prior"] not in {own["prior"] for own in rows}] + rows)
     print(table(rows))

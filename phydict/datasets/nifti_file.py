@@ -11,6 +11,8 @@ from phydict.runtime.reading import MOST_SQUEEZED, check_held, check_memory
 if TYPE_CHECKING:
     from nibabel.spatialimages import SpatialImage
 
+NIFTI = (".nii", ".nii.gz")
+
 
 def open_nifti(path: Path) -> SpatialImage:
     """A NIfTI image whose voxels are not read yet. For use inside `reading`.

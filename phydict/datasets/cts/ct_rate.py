@@ -21,7 +21,9 @@ from phydict.datasets.cts.ct_rate_tables import read_calibrations, read_reports
 from phydict.datasets.cts.prepared import VOLUME, is_prepared, read_prepared, read_record
 from phydict.datasets.cts.segmentations import is_segmentation
 from phydict.datasets.cts.transforms import Calibration, case_id, prepare_ct
+from phydict.datasets.itk_file import ENDINGS
 from phydict.datasets.natural_order import natural_order
+from phydict.datasets.nifti_file import NIFTI
 from phydict.grid import Grid
 from phydict.runtime.reading import name_of, read_ids
 from phydict.runtime.warning import warn
@@ -98,7 +100,8 @@ class NoNIfTI(FileNotFoundError):
 def find_cts(root: str | Path, reports: str | Path | None = None, metadata: str | Path | None = None,
              fixed: bool = True, first_reconstruction: bool = False,
              exclude: str | Path | None = None) -> list[CTFile]:
-    """The CTs under `root`, a .nii or .nii.gz file or a folder of any depth, in natural order.
+    """The CTs under `root`, a NIfTI file or a folder of any depth, in natural order; a MetaImage or NRRD file is read as
+    well, and so is a folder of these without a NIfTI file.
 
     reports, metadata: CT-RATE's CSV tables or folders of them; left out, radiology_text_reports/ (and, for
     fixed=False, metadata/) is looked for in `root` and the three folders above it. No reports at all is fine.
@@ -113,7 +116,7 @@ def find_cts(root: str | Path, reports: str | Path | None = None, metadata: str 
     """
     root = Path(root)
     files: dict[str, Path] = {}
-    for path in _nifti_files(root):
+    for path in _ct_files(root):
         id = _id(path, root)
         if id in files and NAME.fullmatch(id) and _is_fixed(path) != _is_fixed(files[id]):
             path = path if _is_fixed(path) == fixed else files[id]
@@ -155,17 +158,18 @@ def _calibrated(cts: list[CTFile], metadata: str | Path | None) -> list[CTFile]:
     return [replace(ct, calibration=table[ct.id]) for ct in cts]
 
 
-def _nifti_files(root: Path) -> list[Path]:
+def _ct_files(root: Path) -> list[Path]:
     if root.is_file():
-        if not root.name.lower().endswith((".nii", ".nii.gz")):
+        if not root.name.lower().endswith((*NIFTI, *ENDINGS)):
             raise NoNIfTI(f"{root} is not a NIfTI file; give a .nii or .nii.gz file, or a folder of them")
         return [root]
     if not root.is_dir():
         raise NoNIfTI(f"there is no folder or file {root}; give the folder that holds the CTs")
     every = [p for p in root.rglob("*") if p.is_file()
              and not any(part.startswith(".") for part in p.relative_to(root).parts)]
-    files = sorted(p for p in every if p.name.lower().endswith((".nii", ".nii.gz")) and not is_segmentation(p)
+    files = sorted(p for p in every if p.name.lower().endswith(NIFTI) and not is_segmentation(p)
                    and (p.name == VOLUME or not is_prepared(p)))
+    files = files or sorted(p for p in every if p.name.lower().endswith(ENDINGS))
     if not files:
         held = f"its {len(every)} files are of other kinds" if every else "it is empty"
         raise NoNIfTI(f"there is no .nii or .nii.gz file in {root} ({held}); give a folder of NIfTI CTs, or "

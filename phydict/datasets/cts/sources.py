@@ -14,6 +14,7 @@ from phydict.datasets.cts.ct_rate_tables import read_reports
 from phydict.datasets.cts.ct_series import Series, find_series, load_series
 from phydict.datasets.cts.segmentations import segmentations_beside
 from phydict.datasets.cts.transforms import case_id, load_ct
+from phydict.datasets.itk_file import ENDINGS
 from phydict.runtime.files import file_crc32
 from phydict.runtime.reading import reading
 
@@ -57,7 +58,7 @@ class Source:
 
 
 def find_sources(root: Path, **tables) -> list[Source]:
-    """Every DICOM series and NIfTI CT below `root`; tables: as for `find_cts`.
+    """Every DICOM series and CT of `find_cts` below `root`, beside series NIfTI alone; tables: as for `find_cts`.
 
     A series is named as a NIfTI file in its folder's place would be, `<first subfolder>__<folder>`; where that is not
     enough, by all its folders, then with its SeriesNumber, then with a count. Where there are series alone, a given
@@ -68,6 +69,8 @@ def find_sources(root: Path, **tables) -> list[Source]:
     series = find_series(root) if root.is_dir() else []
     try:
         cts = find_cts(root, **tables)
+        if series and cts[0].path.name.lower().endswith(ENDINGS):
+            raise NoNIfTI
     except NoNIfTI:
         if not series:
             raise FileNotFoundError(f"there is no CT in {root}; give a NIfTI file, or a folder that holds NIfTI files "

@@ -15,6 +15,7 @@ import torch
 
 from phydict.datasets.case import Case
 from phydict.datasets.cts.anatomy import lung_box_centre, segment
+from phydict.datasets.itk_file import ENDINGS, read_itk
 from phydict.datasets.nifti_file import open_nifti
 from phydict.grid import Grid
 from phydict.runtime.reading import name_of, reading
@@ -51,25 +52,17 @@ class Calibration:
 
 
 def load_ct(path: str | Path, calibration: Calibration | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Read a NIfTI CT and turn its axes to RAS+.
+    """Read a CT, NIfTI or a MetaImage or NRRD file (phydict.datasets.itk_file), and turn its axes to RAS+.
 
     calibration: for files without a usable header (CT-RATE v1) HU scale and spacing come from it instead.
     Returns HU (X, Y, Z) float32 and the 4x4 index -> world mm affine.
     Raises FileNotFoundError, and ValueError naming the file where it cannot be read, is not one 3D volume, has
     fewer than LEAST_SLICES slices, no orientation, or holds NaN or infinite values.
     """
-    from monai.data import NibabelReader
-
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no CT file {path}; give a .nii or .nii.gz file that exists")
-    with reading(path, "convert it to NIfTI, or download it, again"):
-        header = open_nifti(path).header
-    _check_header(path, header, calibration)
-    reader = NibabelReader(squeeze_non_spatial_dims=True)
-    with reading(f"the voxels of {path}", "the file seems truncated or damaged: download or convert it again"):
-        stored, meta = reader.get_data(reader.read(path))
-        hu, affine = np.array(stored, np.float32), meta["affine"]
+    hu, affine = _load_itk(path) if path.suffix.lower() in ENDINGS else _load_nifti(path, calibration)
     if calibration is not None:
         hu, affine = hu * np.float32(calibration.slope) + np.float32(calibration.intercept), calibration.affine()
     hu, affine = to_ras(hu, affine)
@@ -77,6 +70,26 @@ def load_ct(path: str | Path, calibration: Calibration | None = None) -> tuple[n
     if bad:
         raise ValueError(f"{path} holds {bad} NaN or infinite voxels; replace them, by -1000 HU where there is no data")
     return hu, affine
+
+
+def _load_nifti(path: Path, calibration: Calibration | None) -> tuple[np.ndarray, np.ndarray]:
+    from monai.data import NibabelReader
+
+    with reading(path, "convert it to NIfTI, or download it, again"):
+        header = open_nifti(path).header
+    _check_header(path, header, calibration)
+    reader = NibabelReader(squeeze_non_spatial_dims=True)
+    with reading(f"the voxels of {path}", "the file seems truncated or damaged: download or convert it again"):
+        stored, meta = reader.get_data(reader.read(path))
+        return np.array(stored, np.float32), meta["affine"]
+
+
+def _load_itk(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    with reading(path, "convert it to NIfTI, or download it, again"):
+        stored, affine = read_itk(path)
+    _check_shape(path, stored.shape)
+    _check_affine(path, affine, "convert it from DICOM again")
+    return np.array(stored, np.float32), affine
 
 
 def to_ras(volume: np.ndarray, affine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -95,11 +108,7 @@ def _check_header(path: Path, header, calibration: Calibration | None) -> None:
         shape = shape[:-1]
     if len(shape) != 3:
         raise ValueError(f"{path} is {len(shape)}D with shape {tuple(shape)}; give one 3D volume per file")
-    if min(shape) < 2:
-        raise ValueError(f"{path} is a single 2D slice with shape {tuple(shape)}; give a 3D volume")
-    if min(shape) < LEAST_SLICES:
-        raise ValueError(f"{path} has {min(shape)} slices (its shape is {tuple(shape)}), but a chest CT has at least "
-                         f"{LEAST_SLICES}; give the whole series")
+    _check_shape(path, shape)
     if calibration is not None:
         return _check_affine(path, calibration.affine(), "correct it in the metadata table")
     codes = [int(header[name]) for name in ("sform_code", "qform_code") if name in header]
@@ -112,6 +121,14 @@ def _check_header(path: Path, header, calibration: Calibration | None) -> None:
     if np.allclose(axes, np.eye(3)) and shape[0] >= 512:
         warn(f"{path} has the blank header of CT-RATE v1 (1 mm voxels, identity axes); "
              "read such files with data.source.fixed false and their metadata table")
+
+
+def _check_shape(path: Path, shape: tuple[int, ...]) -> None:
+    if min(shape) < 2:
+        raise ValueError(f"{path} is a single 2D slice with shape {tuple(shape)}; give a 3D volume")
+    if min(shape) < LEAST_SLICES:
+        raise ValueError(f"{path} has {min(shape)} slices (its shape is {tuple(shape)}), but a chest CT has at least "
+                         f"{LEAST_SLICES}; give the whole series")
 
 
 def _check_affine(path: Path, affine: np.ndarray, advice: str) -> None:
@@ -211,9 +228,9 @@ def centred(grid: Grid, centre: np.ndarray) -> Grid:
 
 
 def case_id(path: str | Path) -> str:
-    """A file's name without .nii or .nii.gz."""
+    """A file's name without .nii, .nii.gz or one of the ENDINGS of MetaImage and NRRD."""
     name = name_of(path)
-    for ending in (".nii.gz", ".nii"):
+    for ending in (".nii.gz", ".nii", *ENDINGS):
         if name.lower().endswith(ending):
             return name[: -len(ending)]
     return name

@@ -1,0 +1,41 @@
+"""CTs in MetaImage and NRRD files, as LUNA16's and 3D Slicer's are, read by SimpleITK."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from phydict.runtime.reading import check_memory
+
+ENDINGS = (".mhd", ".mha", ".nrrd")
+
+
+def read_itk(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """The numbers (X, Y, Z) of a file with one of ENDINGS, and its 4x4 index -> RAS+ world mm affine. For use inside
+    `reading`.
+
+    Raises ValueError where SimpleITK is not installed, for voxels that are not one number each, for another number of
+    dimensions than three, and for more of them than this machine can hold.
+    """
+    try:
+        import SimpleITK
+    except ImportError:
+        raise ValueError("SimpleITK, which reads it, is not installed: pip install 'phydict[itk]'") from None
+    reader = SimpleITK.ImageFileReader()
+    reader.SetFileName(str(path))
+    try:
+        reader.ReadImageInformation()
+        shape = reader.GetSize()
+        if len(shape) != 3 or reader.GetNumberOfComponents() != 1:
+            raise ValueError(f"it is {len(shape)}D with shape {shape} and {reader.GetNumberOfComponents()} numbers per "
+                             "voxel; one 3D volume of one number each is needed")
+        check_memory(16 * math.prod(shape), f"its shape {shape}", "give a smaller one")
+        volume = SimpleITK.GetArrayFromImage(reader.Execute()).T
+    except RuntimeError as error:  # whose last line says what is wrong, after those of ITK's source
+        raise ValueError(str(error).strip().splitlines()[-1].strip()) from error
+    affine = np.eye(4)
+    affine[:3, :3] = np.reshape(reader.GetDirection(), (3, 3)) * reader.GetSpacing()
+    affine[:3, 3] = reader.GetOrigin()
+    return volume, np.diag([-1.0, -1.0, 1.0, 1.0]) @ affine  # ITK's world is LPS

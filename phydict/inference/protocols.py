@@ -79,10 +79,12 @@ class Protocol:
         return fixed
 
     def check_simulation(self, voxels: int | None) -> None:
-        """Raises ValueError where X-rays are to be made of other voxels, along each side, than the protocol's."""
-        if self.cube and voxels not in (None, self.cube[0]):
-            raise ValueError(f"data.protocol {self.name} makes X-rays of {self.cube[0]} voxels along each side, but "
-                             f"data.simulation_voxels {voxels} was given: leave one of the two out")
+        """Raises ValueError where X-rays are to be made of other voxels, along each side, than as many as the protocol
+        has, or a multiple."""
+        if self.cube and voxels and voxels % self.cube[0]:
+            raise ValueError(f"data.protocol {self.name} makes X-rays of {self.cube[0]} voxels along each side, or a "
+                             f"multiple, but data.simulation_voxels {voxels} was given: give such a one, or leave one "
+                             "of the two out")
 
     def check_voxels(self, given: Grid | None, bound: bool) -> None:
         """Raises ValueError where a method is given voxels for its result that contradict the protocol's: others than

@@ -100,8 +100,8 @@ class NoNIfTI(FileNotFoundError):
 def find_cts(root: str | Path, reports: str | Path | None = None, metadata: str | Path | None = None,
              fixed: bool = True, first_reconstruction: bool = False,
              exclude: str | Path | None = None) -> list[CTFile]:
-    """The CTs under `root`, a NIfTI file or a folder of any depth, in natural order; a MetaImage or NRRD file is read as
-    well, and so is a folder of these without a NIfTI file.
+    """The CTs under `root`, a NIfTI file or a folder of any depth, in natural order; a MetaImage or NRRD file is read
+    as well, and so is a folder of these without a NIfTI file.
 
     reports, metadata: CT-RATE's CSV tables or folders of them; left out, radiology_text_reports/ (and, for
     fixed=False, metadata/) is looked for in `root` and the three folders above it. No reports at all is fine.

@@ -28,7 +28,8 @@ class Reconstruction:
 
     volume: HU (X, Y, Z) on `grid`; misfit: relative residual |A mu - y| / |y| over all views, and misfit_per_view;
     seconds: per stage; network_calls, projector_calls: denoiser evaluations and applications of A or A.T to all
-    views, but for those that ask on coarse voxels where the patient ends; xrays, reprojection: line integrals (K, V, U), measured (calibrated where they were display values) and
+    views, but for those that ask on coarse voxels where the patient ends; xrays, reprojection: line integrals
+    (K, V, U), measured (calibrated where they were display values) and
     of the volume; masks: soft anatomy masks (M, X, Y, Z) in [0, 1] where the method gives them; deviation: HU
     (X, Y, Z), the standard deviation of the samples of which the volume is the mean, where there are several;
     intervals: level -> HU (X, Y, Z), half the width of the interval around the volume that is to hold that share of

@@ -12,7 +12,7 @@ from phydict.evaluation import read_csv, write_csv
 from phydict.evaluation.fid import StoredFeatures, fid_rows
 from phydict.evaluation.tables import Table, fid_tables
 from phydict.inference.distances import told_distances
-from phydict.inference.scoring import Scoring
+from phydict.inference.scoring import FIDSettings, Scoring
 
 FID = "fid.csv"
 """The distances in a folder of results."""
@@ -41,7 +41,8 @@ def distance_tables(out: Path, entries: Sequence[Entry]) -> list[Table]:
     tables: list[Table] = []
     for condition, group in conditions(entries):
         labels = {entry.label for entry in group}
-        of = [row for row in rows if row["method"] in labels and condition.items() <= row.items()]
+        of = [{"replicates": FIDSettings().replicates} | row for row in rows
+              if row["method"] in labels and condition.items() <= row.items()]
         if of:
             tables += fid_tables(of, format_settings("Frechet distance of slices (FID)", condition))
     return tables

@@ -16,7 +16,7 @@ import torch
 from phydict.datasets.case import Case
 from phydict.datasets.cts.anatomy import lung_box_centre, segment
 from phydict.datasets.itk_file import ENDINGS, read_itk
-from phydict.datasets.nifti_file import open_nifti
+from phydict.datasets.nifti_file import NIFTI, open_nifti
 from phydict.grid import Grid
 from phydict.runtime.reading import name_of, reading
 from phydict.runtime.warning import warn
@@ -230,7 +230,7 @@ def centred(grid: Grid, centre: np.ndarray) -> Grid:
 def case_id(path: str | Path) -> str:
     """A file's name without .nii, .nii.gz or one of the ENDINGS of MetaImage and NRRD."""
     name = name_of(path)
-    for ending in (".nii.gz", ".nii", *ENDINGS):
+    for ending in (*NIFTI, *ENDINGS):
         if name.lower().endswith(ending):
             return name[: -len(ending)]
     return name

@@ -10,11 +10,11 @@ import numpy as np
 from PIL import Image
 
 from phydict.datasets.natural_order import natural_order
-from phydict.datasets.nifti_file import open_nifti
+from phydict.datasets.nifti_file import NIFTI, open_nifti
 from phydict.runtime.reading import MOST_SQUEEZED, check_held, read_npy, reading, refusing
 
 DICOM = (".dcm", ".dicom", ".ima")
-ENDINGS = (".png", ".tif", ".tiff", ".npy", ".nii", ".nii.gz", *DICOM)
+ENDINGS = (".png", ".tif", ".tiff", ".npy", *NIFTI, *DICOM)
 GREY = ("L", "I;16", "I;16B", "I;16L", "I", "F")
 
 
@@ -50,7 +50,7 @@ def _read_image(path: Path) -> np.ndarray:
     with reading(f"the image {path}", "export it again"):
         if name.endswith(".npy"):
             return read_npy(path)
-        if name.endswith((".nii", ".nii.gz")):
+        if name.endswith(NIFTI):
             return _read_nifti(path)
         return _read_picture(path)
 

@@ -19,6 +19,14 @@ def whole_sizes(values) -> tuple[int, ...] | None:
     return tuple(map(int, sizes)) if (sizes >= 1).all() and (sizes == np.floor(sizes)).all() else None
 
 
+def centred(axes: np.ndarray, shape: tuple[int, int, int], centre=(0.0, 0.0, 0.0)) -> np.ndarray:
+    """The affine (4, 4) of voxels whose steps are the columns of `axes` (3, 3), in mm, about a `centre` in mm."""
+    affine = np.eye(4)
+    affine[:3, :3] = axes
+    affine[:3, 3] = centre - axes @ ((np.asarray(shape) - 1) / 2)
+    return affine
+
+
 @dataclass(frozen=True, eq=False)
 class Grid:
     """A regular voxel grid in RAS+ world millimetres, voxel centres at integer indices.
@@ -43,8 +51,7 @@ class Grid:
             if self.spacing is None:
                 raise ValueError("a grid needs either its spacing in mm or its index-to-world affine")
             spacing = np.broadcast_to(np.asarray(self.spacing, float), 3)
-            affine = np.diag([*spacing, 1.0])
-            affine[:3, 3] = -spacing * (np.asarray(shape) - 1) / 2
+            affine = centred(np.diag(spacing), shape)
         else:
             affine = np.array(self.affine, float)
             if affine.shape != (4, 4):
@@ -91,10 +98,7 @@ class Grid:
             raise ValueError("the centre of a box of voxels is three numbers in mm from the isocentre, but "
                              f"{reprlib.repr(centre)} was given")
         x, y, z = shape * 3 if len(shape) == 1 else shape
-        spacing = np.broadcast_to(lengths, 3) / (x, y, z)
-        affine = np.diag([*spacing, 1.0])
-        affine[:3, 3] = place - spacing * (np.array([x, y, z]) - 1) / 2
-        return cls((x, y, z), affine=affine)
+        return cls((x, y, z), affine=centred(np.diag(np.broadcast_to(lengths, 3) / (x, y, z)), (x, y, z), place))
 
     @property
     def centre(self) -> np.ndarray:
@@ -114,10 +118,8 @@ class Grid:
 
     def turned_as(self, other: Grid) -> Grid:
         """The same voxels about the same centre, stacked in the directions of another grid's axes."""
-        affine = self.affine.copy()
-        affine[:3, :3] = other.affine[:3, :3] / other.spacing * self.spacing
-        affine[:3, 3] = self.centre - affine[:3, :3] @ ((np.asarray(self.shape) - 1) / 2)
-        return Grid(self.shape, affine=affine)
+        axes = other.affine[:3, :3] / other.spacing * self.spacing
+        return Grid(self.shape, affine=centred(axes, self.shape, self.centre))
 
     @property
     def extent(self) -> np.ndarray:

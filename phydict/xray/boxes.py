@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from phydict.grid import Grid
+from phydict.grid import Grid, centred
 from phydict.xray.binning import binned, binning
 from phydict.xray.geometry import ConeBeam
 from phydict.xray.projectors.projector import Projector
@@ -96,10 +96,8 @@ def refinements(start: Grid, target: Grid) -> list[Grid]:
 def in_other_voxels(grid: Grid, shape: Sequence[int]) -> Grid:
     """The same box in other voxels."""
     x, y, z = shape
-    affine = grid.affine.copy()
-    affine[:3, :3] *= np.divide(grid.shape, shape)
-    affine[:3, 3] = grid.centre - affine[:3, :3] @ ((np.asarray(shape) - 1) / 2)
-    return Grid((x, y, z), affine=affine)
+    axes = grid.affine[:3, :3] * np.divide(grid.shape, shape)
+    return Grid((x, y, z), affine=centred(axes, (x, y, z), grid.centre))
 
 
 def divided(grid: Grid, factor: int) -> Grid:

@@ -68,12 +68,13 @@ def row_of(volume: Tensor, beam: ConeBeam, columns: int, method: str, ends: bool
     seen = volume[..., middle, middle, :].contiguous()
     truth = WINDOW.to_hu(volume[..., SIDE:-SIDE, SIDE:-SIDE, MORE:-MORE].contiguous())
     xrays = Ideal()(Projector(GRID.grown(columns, columns, MORE), beam, full_detector=True), WINDOW.to_mu(seen), 0)[0]
-    body = body_weights(truth, GRID.spacing)[0, 0] > 0.5
+    body = body_weights(truth, GRID.spacing)
 
     def scored(name: str, found: Reconstruction) -> dict:
-        inside = ((found.volume - truth[0, 0]).abs() <= found.intervals[0.9])[body] if found.intervals else None
-        return {f"psnr{name}": volume_metrics(found.volume[None, None], truth)["psnr"], f"misfit{name}": found.misfit,
-                f"within_90{name}": None if inside is None else float(inside.float().mean())}
+        scores = volume_metrics(found.volume[None, None], truth, body=body)
+        inside = (found.volume - truth[0, 0]).abs() <= found.intervals[0.9] if found.intervals else None
+        return {f"psnr{name}": scores["psnr"], f"psnr_body{name}": scores["psnr_body"], f"misfit{name}": found.misfit,
+                f"within_90{name}": None if inside is None else float(inside[body[0, 0] > 0.5].float().mean())}
 
     began = time.perf_counter()
     extended(reconstructor(method), GRID, xrays, beam, False)
@@ -114,7 +115,8 @@ if __name__ == "__main__":
     rows = [row for row in read_csv(FILE) if row["method"] in given.methods and row["geometry"] in given.geometries]
     for key in dict.fromkeys((row["method"], row["geometry"], row["scene"]) for row in rows):
         of = [row for row in rows if (row["method"], row["geometry"], row["scene"]) == key]
-        means = {name: mean(row[name] for row in of) for name in ("psnr_unasked", "psnr", "psnr_told", "within_90")
+        means = {name: mean(row[name] for row in of)
+                 for name in ("psnr_unasked", "psnr", "psnr_body_unasked", "psnr_body", "psnr_told", "within_90")
                  if all(row.get(name) is not None for row in of)}
         print(*key, *(f"{name} {value:.2f}" for name, value in means.items()),
               *(f"{name} {sum(row[name] > 0 for row in of)}" for name in ("extended_above_mm", "extended_beside_mm")))

@@ -30,7 +30,7 @@ import numpy as np
 import torch
 
 from phydict.datasets import CTSource, body_mask, load_case
-from phydict.evaluation import read_csv, volume_metrics, write_csv
+from phydict.evaluation import body_weights, read_csv, volume_metrics, write_csv
 from phydict.grid import Grid
 from phydict.methods import calibrated, fit_to_grid, reconstructor
 from phydict.poses.search import middle_points
@@ -90,7 +90,7 @@ def row(case: dict, views: int, errors: str, method: str) -> dict:
     truth = WINDOW.to_hu(case["volume"])[None]
 
     inside, body = {}, torch.from_numpy(body_mask(truth[0, 0].numpy(), GRID.spacing)) | (case["masks"][0] > 0.5)
-    warned = {}
+    warned, weights, psnr_body = {}, body_weights(truth, GRID.spacing), {}
 
     def psnr(name: str, y: torch.Tensor, beam: ConeBeam) -> float:
         began = time.process_time()
@@ -103,7 +103,9 @@ def row(case: dict, views: int, errors: str, method: str) -> dict:
             result = poses.added_to(result)
             held = ((result.volume - truth[0, 0]).abs() <= result.intervals[0.9])[body]
             inside["inside_90"], inside["interval_widening"] = float(held.float().mean()), result.interval_widening
-        return volume_metrics(result.volume[None, None], truth)["psnr"]
+        found = volume_metrics(result.volume[None, None], truth, body=weights)
+        psnr_body[f"psnr_body_{name}"] = found["psnr_body"]
+        return found["psnr"]
 
     began = time.process_time()
     y, poses = calibrated(ready, GRID, xrays, nominal, USUAL, False)
@@ -115,7 +117,7 @@ def row(case: dict, views: int, errors: str, method: str) -> dict:
     lost = scores["psnr_correct"] - scores["psnr_wrong"]
     gained = {f"regained{end}": (scores[f"psnr_{name}"] - scores["psnr_wrong"]) / lost if lost > 0.1 else None
               for name, end in (("calibrated", ""), ("aligned", "_aligned"))}
-    return {"case": case["id"], "views": views, "errors": errors, "method": method, **scores, **gained,
+    return {"case": case["id"], "views": views, "errors": errors, "method": method, **scores, **psnr_body, **gained,
             "reprojection_mm_before": rms(reprojection_errors(nominal, true, POINTS)),
             "reprojection_mm": rms(reprojection_errors(moved_back, true, POINTS)),
             **inside, "misfit_before": poses.misfits[0], "misfit_after": poses.misfits[1],

@@ -30,7 +30,7 @@ def write_distances(out: Path, entries: Sequence[Entry], scoring: Scoring) -> No
         features = {label: {name: StoredFeatures(features_file(out, key), backbone) for name, key in _named(kept)}
                     for label, kept in there.items() if kept}
         if features:
-            found = fid_rows(told_distances(features, replicates), backbone, replicates)
+            found = fid_rows(told_distances(features, replicates), backbone, replicates, scoring.fid.normalisation)
             rows += [{"method": row["method"]} | condition | row for row in found]
     write_csv(out / FID, rows)
 

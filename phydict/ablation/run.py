@@ -248,7 +248,7 @@ class Runner:
             volume = resampled(result.volume, result.grid, scene.grid)
             scores = self.scoring.scores(volume, result.misfit, scene.truth, scene.grid, scene.window, self.device,
                                          trial.data.protocol)
-            if features := self.scoring.features(volume, scene.truth, scene.window, self.device):
+            if features := self.scoring.features(volume, scene.truth, scene.grid, scene.window, self.device):
                 save_features(features_file(self.out, key), features)
             if self.keep_volumes:
                 _keep(volume_folder(self.out, key), result, scene)

@@ -6,9 +6,10 @@
                  weights are torchvision's inception_v3_google-0cc3c7bd.pth, not those of the original FID
     squeezenet   SqueezeNet 1.1 as in LPIPS, 512 features, found where torch.hub keeps its files
 
-The features are spatial means of the last map. Slices are normalised as in MAISI's script (compute_fid_2-5d_ct.py),
-which pads them to 512 x 512 as well: HU clipped to [-1000, 1000], the volume's own least and largest value mapped to 0
-and 1, so that a wrong HU scale or offset is not seen, then less RadImageNet's means of blue, green and red.
+The features are spatial means of the last map. Slices are normalised as in MAISI's script (compute_fid_2-5d_ct.py):
+HU clipped to [-1000, 1000], the volume's own least and largest value mapped to 0 and 1, so that a wrong HU scale or
+offset is not seen, then less RadImageNet's means of blue, green and red. Its voxels, on which alone a figure may stand
+beside the script's, are `maisi_voxels`.
 """
 
 from __future__ import annotations
@@ -21,9 +22,11 @@ from torch.nn.functional import interpolate
 
 from phydict.evaluation.metrics import RANGE
 from phydict.evaluation.planes import slices
+from phydict.grid import Grid, centred
 from phydict.prior.finite import check_finite
 from phydict.prior.tensors import read_torch
 from phydict.runtime.lpips_networks import load_lpips
+from phydict.xray.boxes import interpolated
 
 DIMENSIONS = {"squeezenet": 512, "radimagenet": 2048, "inception": 2048}
 FILES = {"radimagenet": "RadImageNet-ResNet50_notop.pth", "inception": "inception_v3_google-0cc3c7bd.pth"}
@@ -31,7 +34,17 @@ MEANS = (0.406, 0.456, 0.485)
 NORMALISATION = (f"HU clipped to [{RANGE.low:g}, {RANGE.high:g}], each volume's least and largest value mapped to 0 "
                  "and 1")
 """Of the slices, before the means are taken off."""
+MAISI_SIDE = 512
+"""Voxels of 1 mm along each side of MAISI's volumes."""
 BATCH = 16
+
+
+def maisi_voxels(hu: Tensor, grid: Grid) -> Tensor:
+    """A volume (X, Y, Z) in HU on `grid` as MAISI's script takes it, where it is asked for 1 mm and 512^3 voxels: on
+    (512, 512, 512) voxels of 1 mm about its centre, what does not fit cut off and air around the rest."""
+    shape = (MAISI_SIDE,) * 3
+    onto = Grid(shape, affine=centred(grid.affine[:3, :3] / grid.spacing, shape, grid.centre))
+    return interpolated(hu, grid, onto, RANGE.low)
 
 
 class SliceFeatures(nn.Module):

@@ -167,17 +167,19 @@ def fid(cases: Mapping[str, Features], replicates: int = 0) -> dict[str, Estimat
     return distances({"": cases}, replicates)[""].estimates()
 
 
-def fid_rows(methods: Mapping[str, Distances], backbone: str, replicates: int) -> list[dict]:
+def fid_rows(methods: Mapping[str, Distances], backbone: str, replicates: int,
+             normalisation: str = NORMALISATION) -> list[dict]:
     """The distances of methods by label, a row each, with what they rest on and, in columns that begin with "less_", by
     how much they are above those of `less`, the method of most cases and of these the nearest, where their cases are
     the same. A distance's interval is in columns that end in "_low" and "_high".
 
-    backbone: whose features they were; replicates: the draws of patients that they were found with.
+    backbone: whose features they were; replicates: the draws of patients that they were found with; normalisation: of
+    the slices, in words.
     """
     best = min(methods, key=lambda label: (-len(methods[label].cases), float(methods[label].values["fid"][0])))
     rows = []
     for label, found in methods.items():
-        row: dict = {"method": label, "fid_backbone": backbone, "fid_normalisation": NORMALISATION,
+        row: dict = {"method": label, "fid_backbone": backbone, "fid_normalisation": normalisation,
                      "replicates": replicates, "cases": len(found.cases)}
         row |= {f"{of}slices_{plane}": n for of in ("", "truth_") for plane, n in found.slices.items()}
         row |= _numbers("", found.estimates())

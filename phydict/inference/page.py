@@ -118,16 +118,17 @@ def _mean_tables(scored: list, empty: Mapping[str, str]) -> list[Table]:
 
 def _kept_distances(folder: Path, cases: Sequence[PageCase]) -> list[Table]:
     """The tables of Frechet distances that features in the cases' folders give, a line per method."""
-    methods: dict[str, dict[str, dict[str, StoredFeatures]]] = {}
+    methods: dict[FIDSettings, dict[str, dict[str, StoredFeatures]]] = {}
     for case in cases:
-        backbone, file = case.record.get("settings", {}).get("fid_backbone"), folder / case.folder / FEATURES
-        if backbone and file.is_file():
+        settings, file = case.record.get("settings", {}), folder / case.folder / FEATURES
+        if (backbone := settings.get("fid_backbone")) and file.is_file():
             try:
                 features = StoredFeatures(file, backbone)
             except ValueError as error:
                 warn(f"a case is left out of the Frechet distances: {error}")
                 continue
-            methods.setdefault(backbone, {}).setdefault(case.record["method"], {})[case.record["case"]] = features
-    replicates = FIDSettings().replicates
-    return [table for backbone, features in methods.items()
-            for table in fid_tables(fid_rows(told_distances(features, replicates), backbone, replicates))]
+            measured = FIDSettings(backbone, maisi_voxels=settings.get("fid_maisi_voxels", False))
+            methods.setdefault(measured, {}).setdefault(case.record["method"], {})[case.record["case"]] = features
+    return [table for fid, features in methods.items()
+            for table in fid_tables(fid_rows(told_distances(features, fid.replicates), fid.backbone, fid.replicates,
+                                             fid.normalisation))]

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from phydict.datasets.case import Case
 from phydict.datasets.cts.segmentations import organs_beside
 from phydict.evaluation import RANGE, body_weights, volume_metrics
-from phydict.evaluation.backbones import SliceFeatures
+from phydict.evaluation.backbones import MAISI_SIDE, NORMALISATION, SliceFeatures, maisi_voxels
 from phydict.evaluation.ct_clip import clip_scores, image_latent, load_ct_clip
 from phydict.evaluation.fid import case_features
 from phydict.evaluation.organs import ORGANS_VERSION, fine_grid, organ_scores
@@ -36,16 +36,24 @@ class FIDSettings:
         backbone: squeezenet, radimagenet or inception; each has a scale of its own
         weights: the file of its weights; squeezenet takes LPIPS' own
         replicates: draws of patients for the 95 % intervals; 0: no intervals
+        maisi_voxels: whether volumes are put on MAISI's 512 x 512 x 512 voxels of 1 mm first, for figures beside its
+            own; 512 times the pixels of 64 x 64 x 64 voxels
     """
 
     backbone: str = "squeezenet"
     weights: str | None = None
     replicates: int = 200
+    maisi_voxels: bool = False
 
     def __post_init__(self):
         if self.replicates < 0:
             raise ValueError(f"fid.replicates is a number of draws, 0 for no intervals, but "
                              f"{self.replicates} was given")
+
+    @property
+    def normalisation(self) -> str:
+        """Of the slices, in words."""
+        return f"{MAISI_SIDE}^3 voxels of 1 mm. {NORMALISATION}" if self.maisi_voxels else NORMALISATION
 
 
 @dataclass(frozen=True)
@@ -96,6 +104,7 @@ class Scoring:
         further = [name for name in self.metrics if name != "volume"]
         return ({"metrics": further} if further else {}) | (
             {"fid_backbone": self.fid.backbone} if self.network else {}) | (
+            {"fid_maisi_voxels": True} if self.network and self.fid.maisi_voxels else {}) | (
             {"organs_version": ORGANS_VERSION} if "organs" in self.metrics else {}) | (
             {"clip_text": self.clip.text_transformer is not None} if self.clip else {}) | self.checksums
 
@@ -131,12 +140,18 @@ class Scoring:
             scores |= clip_scores(model, volume, case["clip_latent"], grid, case.get("ct_report", case["report"]))
         return scores
 
-    def features(self, volume: Tensor, case: Case, window: HUWindow, device: torch.device) -> dict[str, Tensor] | None:
-        """The features of the slices of volume and truth, where FID is measured; the truth's are kept in the case."""
+    def features(self, volume: Tensor, case: Case, grid: Grid, window: HUWindow,
+                 device: torch.device) -> dict[str, Tensor] | None:
+        """The features of the slices of a volume on `grid` and of the truth, where FID is measured; the case keeps the
+        truth's."""
         if self.network is None:
             return None
-        truth = case.get("features") or window.to_hu(case["volume"])[0].to(device)
-        case["features"] = case_features(self.network.to(device), volume.to(device), truth)
+
+        def shown(hu: Tensor) -> Tensor:
+            return maisi_voxels(hu.to(device), grid) if self.fid.maisi_voxels else hu.to(device)
+
+        truth = case.get("features") or shown(window.to_hu(case["volume"])[0])
+        case["features"] = case_features(self.network.to(device), shown(volume), truth)
         return case["features"]
 
 

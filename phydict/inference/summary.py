@@ -50,4 +50,4 @@ def _distances(results: CaseResults, cases: list[str], name: str, scoring: Scori
     backbone = scoring.fid.backbone
     features = {case: StoredFeatures(results.folder / case / FEATURES, backbone) for case in cases}
     found = told_distances({name: features}, scoring.fid.replicates)
-    return fid_tables(fid_rows(found, backbone, scoring.fid.replicates))
+    return fid_tables(fid_rows(found, backbone, scoring.fid.replicates, scoring.fid.normalisation))

@@ -203,7 +203,7 @@ class ReconstructionTask(lightning.LightningModule):
                 coarse, grid=placed(coarse.grid, grid, affine)))
         with stage("metrics"):
             scores = self.scoring.scores(volume, result.misfit, case, grid, window, self.device, data.protocol)
-            features = self.scoring.features(volume, case, window, self.device)
+            features = self.scoring.features(volume, case, grid, window, self.device)
         self.metrics.update(case["index"], self.method_name, scores, seconds=sum(result.seconds.values()))
         if self.slices is not None and features:
             self.slices.update(case["index"], features)

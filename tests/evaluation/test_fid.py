@@ -12,7 +12,7 @@ from torch.nn.functional import conv2d, interpolate
 
 from phydict.evaluation import backbones
 from phydict.evaluation import fid as fid_module
-from phydict.evaluation.backbones import SliceFeatures
+from phydict.evaluation.backbones import SliceFeatures, maisi_voxels
 from phydict.evaluation.bootstrap import draws
 from phydict.evaluation.fid import (
     NAMES,
@@ -27,6 +27,7 @@ from phydict.evaluation.fid import (
 )
 from phydict.evaluation.planes import PLANES, slices
 from phydict.evaluation.tables import fid_tables
+from phydict.grid import Grid
 
 
 def normal(count: int, dimensions: int, seed: int = 0) -> torch.Tensor:
@@ -48,6 +49,24 @@ def blurred(hu: torch.Tensor, times: int) -> torch.Tensor:
     for _ in range(times):
         hu = torch.nn.functional.avg_pool3d(hu[None, None], 3, 1, 1, count_include_pad=False)[0, 0]
     return hu
+
+
+def test_on_maisis_voxels_each_place_keeps_its_hu_with_air_around_and_what_does_not_fit_cut_off(monkeypatch):
+    monkeypatch.setattr(backbones, "MAISI_SIDE", 16)
+    affine = torch.diag(torch.tensor([-2.0, 3.0, 1.5, 1.0])).double()  # towards left, anterior and superior
+    affine[:3, 3] = torch.tensor([50.0, -20.0, 7.0])
+    grid = Grid((5, 4, 20), affine=affine.numpy())
+    at = torch.stack(torch.meshgrid(*map(torch.arange, grid.shape), indexing="ij"), -1).double() @ affine[:3, :3].T
+    ramp = (at + affine[:3, 3]) @ torch.tensor([3.0, -5.0, 7.0]).double()
+    shown = maisi_voxels(ramp, grid)
+    steps = torch.arange(16) - 7.5
+    mm = torch.stack(torch.meshgrid(steps, steps, steps, indexing="ij"), -1).double()  # from the middle, along the axes
+    world = mm * torch.tensor([-1.0, 1.0, 1.0]) + torch.tensor(grid.centre)
+    between = (mm[..., 0].abs() <= 4) & (mm[..., 1].abs() <= 4.5)  # voxels' centres; the third axis is cut
+    outside = (mm[..., 0].abs() > 5) | (mm[..., 1].abs() > 6)
+    assert shown.shape == (16, 16, 16) and between.any() and outside.any()
+    torch.testing.assert_close(shown[between], (world @ torch.tensor([3.0, -5.0, 7.0]).double())[between])
+    assert (shown[outside] == -1000).all()
 
 
 def of_volumes(change) -> dict:

@@ -202,6 +202,17 @@ def test_the_distance_of_a_region_is_that_of_its_own_slices(tmp_path, untrained)
     assert distances("both", [whole, region])["sirt"] == distances("alone", [region])["sirt"]
 
 
+def test_fid_on_maisis_voxels_has_their_slices_says_so_and_its_page_is_made_anew(tmp_path, untrained, monkeypatch):
+    monkeypatch.setattr(backbones, "MAISI_SIDE", 40)
+    main(phantoms(tmp_path, 1, "--model.grid=34", "--metrics=[fid]", "--fid.maisi_voxels=true"))
+    table, page = (tmp_path / "sirt" / "results.md").read_text(), tmp_path / "index.html"
+    made = page.read_text()
+    assert all(text in told for told in (table, made)
+               for text in ("512^3 voxels of 1 mm", "XY 40, YZ 40, ZX 40 slices"))
+    main(["page", str(tmp_path)])
+    assert page.read_text() == made
+
+
 def test_other_weights_of_a_network_are_another_score(tmp_path, monkeypatch):
     monkeypatch.setattr(scoring, "SliceFeatures", lambda *_: object())
     file, found = tmp_path / "inception.pth", []
@@ -227,4 +238,6 @@ def test_settings_name_what_decides_the_scores_and_nothing_by_default(untrained)
     assert Scoring().settings() == {} == Scoring(["volume"]).settings()
     one, again = (Scoring(["fid", "volume"], FIDSettings(replicates=n)).settings() for n in (5, 6))
     assert one == again and one.keys() == {"metrics", "fid_backbone", "fid_weights_crc32"}
+    resampled = Scoring(["fid"], FIDSettings(maisi_voxels=True))
+    assert resampled.settings() == Scoring(["fid"]).settings() | {"fid_maisi_voxels": True}
     assert Scoring(["organs"]).settings() == {"metrics": ["organs"], "organs_version": 2}

@@ -66,6 +66,7 @@ class Design:
 DESIGNS = {
     "block 2, 32-64-128": Design(),
     "the same, another seed": Design(seed=1),
+    "the same, again": Design(),
     "block 4, 128-192": Design({"block": 4, "channels": (128, 192), "attention": (False, True)}),
     "without attention": Design({"attention": (False,) * 3}, middle_attention=False),
     "narrow, 24-48-96": Design({"channels": (24, 48, 96), "head_channels": 24}),

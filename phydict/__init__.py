@@ -29,7 +29,7 @@ from phydict.runtime.seeds import case_seed
 from phydict.units import HUWindow, hu_to_mu, mu_to_hu
 from phydict.xray import ConeBeam, Projector
 
-__version__ = "0.5.2"
+__version__ = "0.5.3"
 
 __all__ = ["METHODS", "ConeBeam", "Grid", "HUWindow", "Projector", "case_seed", "hu_to_mu", "load_prior", "load_xrays",
            "mu_to_hu", "reconstruct", "save_prior"]

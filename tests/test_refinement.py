@@ -174,6 +174,21 @@ def test_from_many_views_the_fits_after_the_networks_take_twice_as_many_iteratio
     assert not found.volume.equal(reconstructed(correction, replace(usual, many_views=4)).volume)
 
 
+def test_the_first_level_is_met_by_step_and_further_ones_by_call_step():
+    class Noted(ProximalCG):
+        def __call__(self, measurement, x, *given):
+            noted.append((self.tv_weight, x.shape[-1]))
+            return super().__call__(measurement, x, *given)
+
+    noted: list[tuple[float, int]] = []
+    target, refinement = Grid.cube(64), Refinement(Noted(tv_weight=10.0), call_step=Noted(tv_weight=5.0))
+    xrays = Projector(target, BEAM, full_detector=True)(0.02 * torch.ones(1, 1, *target.shape))[0]
+    ready = Refined(reconstructor(Unrolled((0.2,), (0.5, 0.3)), tiny_refiner()), target, refinement)
+    ready.reconstruct(*fit_to_grid(ready, target, xrays, BEAM))
+    first = {size: weight for weight, size in reversed(noted)}
+    assert first == {32: 10.0, 64: 5.0}
+
+
 def test_the_order_of_the_views_changes_nothing():
     one, other = (reconstructed(network(), Refinement(calls=1), order, "float32") for order in ((0, 1, 2), (2, 0, 1)))
     torch.testing.assert_close(one.volume, other.volume, atol=4.0, rtol=0)  # HU; CG carries rounding far

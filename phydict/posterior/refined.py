@@ -241,7 +241,7 @@ class Refined(Delegating):
             coarse = base.reconstruct(*binned, report, display, seed, on_step)
         volume, grid, calls, scores = coarse.within.to(xrays), base.grid, coarse.projector_calls, {}
         network_calls, known, alone = coarse.network_calls, None, list[str]()
-        for level in self.levels:
+        for number, level in enumerate(self.levels):
             with watch.stage("refine"):
                 y, A = self._binned(xrays, projector, level)
                 start = base.window.to_range(interpolated(volume, grid, level, AIR))[None, None]
@@ -251,7 +251,7 @@ class Refined(Delegating):
                 fine_calls, coarse_calls = (refinement.corrections(network is not None)
                                             if coarse.masks is not None else (0, 0))
                 correction = coarse_correction(base, level, binned, coarse, report, display) if coarse_calls else None
-                x = refinement(measurement, start, network, correction, grid is not base.grid, base.precision)
+                x = refinement(measurement, start, network, correction, number > 0, base.precision)
                 guard = Guard(measurement, on_step, 1)
                 guard()
                 if network is not None and coarse.intervals and coarse.masks is not None and len(coarse.masks):

@@ -166,14 +166,6 @@ def test_from_few_views_total_variation_weighs_less_and_no_coarse_network_correc
     assert found.network_calls - found.coarse.network_calls == corrects
 
 
-def test_from_many_views_the_fits_after_the_networks_take_twice_as_many_iterations():
-    usual, correction = Refinement(many_views=3), network()
-    stated = replace(usual, call_step=replace(usual.call_step, iterations=2 * usual.call_step.iterations), many_views=4)
-    found = reconstructed(correction, usual)
-    assert found.volume.equal(reconstructed(correction, stated).volume)
-    assert not found.volume.equal(reconstructed(correction, replace(usual, many_views=4)).volume)
-
-
 def test_the_first_level_is_met_by_step_and_further_ones_by_call_step():
     class Noted(ProximalCG):
         def __call__(self, measurement, x, *given):

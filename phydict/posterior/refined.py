@@ -107,7 +107,6 @@ class Refinement:
         coarse: whether a network that knows coarse voxels corrects the estimate as well
         few_views: with fewer views the total variation of both steps weighs as many times less, the estimate is
             corrected at most once, and by no network on coarse voxels
-        many_views: from so many views call_step takes twice its iterations
     """
 
     step: LikelihoodStep | None = ProximalCG(iterations=10, restarts=3, tv_weight=10.0, tv_eps=0.003)
@@ -117,7 +116,6 @@ class Refinement:
     call_std: float = 0.3
     coarse: bool = True
     few_views: int = 3
-    many_views: int = 12
 
     def __post_init__(self):
         for name in ("x0_std", "call_std"):
@@ -128,8 +126,6 @@ class Refinement:
 
     def of_views(self, views: int) -> Refinement:
         """How it is done from so many X-rays."""
-        if views >= self.many_views and isinstance(self.call_step, ProximalCG):
-            return replace(self, call_step=replace(self.call_step, iterations=2 * self.call_step.iterations))
         if views >= self.few_views:
             return self
         step, call_step = (replace(step, tv_weight=step.tv_weight * views / self.few_views)

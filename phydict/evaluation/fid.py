@@ -29,7 +29,7 @@ from torchmetrics import Metric
 from torchmetrics.utilities.data import dim_zero_cat
 
 from phydict.datasets.cts.ct_rate import patient_of
-from phydict.evaluation.backbones import DIMENSIONS, NORMALISATION, SliceFeatures
+from phydict.evaluation.backbones import DIMENSIONS, SliceFeatures
 from phydict.evaluation.bootstrap import Estimate, draws, percentiles
 from phydict.evaluation.planes import PLANES
 from phydict.runtime.files import atomic_write
@@ -167,8 +167,7 @@ def fid(cases: Mapping[str, Features], replicates: int = 0) -> dict[str, Estimat
     return distances({"": cases}, replicates)[""].estimates()
 
 
-def fid_rows(methods: Mapping[str, Distances], backbone: str, replicates: int,
-             normalisation: str = NORMALISATION) -> list[dict]:
+def fid_rows(methods: Mapping[str, Distances], backbone: str, replicates: int, normalisation: str) -> list[dict]:
     """The distances of methods by label, a row each, with what they rest on and, in columns that begin with "less_", by
     how much they are above those of `less`, the method of most cases and of these the nearest, where their cases are
     the same. A distance's interval is in columns that end in "_low" and "_high".

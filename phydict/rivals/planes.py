@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import affine_grid, grid_sample
 
-from phydict.grid import Grid
+from phydict.grid import Grid, centred
 from phydict.xray import ConeBeam
 from phydict.xray.places import detector_places
 
@@ -25,9 +25,7 @@ def plane_places(grid: Grid, beam: ConeBeam, like: Tensor) -> Tensor:
     places = []
     for k in range(beam.views):
         column, row, depth = step * view_axes(beam, k)
-        affine = np.eye(4)
-        affine[:3, :3] = np.stack([row, column, depth], 1)
-        affine[:3, 3] = grid.centre - (n - 1) / 2 * (row + column)
+        affine = centred(np.stack([row, column, depth], 1), (n, n, 1), grid.centre)
         places.append(detector_places(Grid((n, n, 1), affine=affine), beam, k, like)[1][:, :, 0])
     return torch.stack(places)
 

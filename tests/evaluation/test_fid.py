@@ -12,7 +12,7 @@ from torch.nn.functional import conv2d, interpolate
 
 from phydict.evaluation import backbones
 from phydict.evaluation import fid as fid_module
-from phydict.evaluation.backbones import SliceFeatures, maisi_voxels
+from phydict.evaluation.backbones import NORMALISATION, SliceFeatures, maisi_voxels
 from phydict.evaluation.bootstrap import draws
 from phydict.evaluation.fid import (
     NAMES,
@@ -123,11 +123,11 @@ def test_methods_are_paired_draw_by_draw_and_each_is_as_it_is_alone(monkeypatch)
     less = found["blur 2"].estimates(found["blur 1"])["fid"]
     drawn = found["blur 2"].values["fid"] - found["blur 1"].values["fid"]
     assert less.mean == pytest.approx(drawn[0]) and drawn[1:].min() <= less.low <= less.high <= drawn[1:].max()
-    table, differences = fid_tables(fid_rows(found, "squeezenet", 20))
+    table, differences = fid_tables(fid_rows(found, "squeezenet", 20, NORMALISATION))
     assert [label for label, _, _ in table.lines] == ["blur 1", "blur 2", "three"]
     assert differences.title.endswith("less blur 1, draw by draw")
     assert [(label, values[-1]) for label, _, values in differences.lines] == [("blur 2", less)]
-    assert len(fid_tables(fid_rows(distances(methods), "squeezenet", 0))) == 1
+    assert len(fid_tables(fid_rows(distances(methods), "squeezenet", 0, NORMALISATION))) == 1
 
 
 def test_moments_of_parts_are_those_of_the_whole_whatever_their_order_and_how_often_they_count():

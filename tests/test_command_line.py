@@ -6,17 +6,14 @@ import re
 import subprocess
 import sys
 import warnings
-from importlib import import_module
 from pathlib import Path
 
 import pytest
-import yaml
 from command_lines import refusal
 
 from phydict.cli.infer import main as infer
 from phydict.cli.train import main as train
 from phydict.runtime.console import check_writable, cli_errors, noted, quiet, with_configurations
-from phydict.runtime.renamed import MODULES
 from phydict.runtime.shipped import shipped
 
 ROOT = Path(__file__).parents[1]
@@ -65,48 +62,6 @@ def test_an_unknown_configuration_is_one_sentence_that_lists_what_there_is(empty
     said = capsys.readouterr().err
     assert stopped.value.code == 2 and said.count("\n") == 1 and f"no configuration {given}:" in said
     assert all(name in said for name in names)
-
-
-@pytest.mark.parametrize("main, command", [(infer, "predict"), (train, "fit")], ids=["infer", "train"])
-@pytest.mark.parametrize("path, new", [
-    ("model.method.init_args.warm_start", "t_start"), ("model.method.init_args.renewed", "eta"),
-    ("model.method.init_args.trust", "prior_weight"),
-    ("model.method.init_args.final_likelihood.init_args.variation", "tv_weight"),
-    ("model.fine_noise", "noise_augmentation"), ("model.text_steps", "pretrain_steps"),
-    ("data.augmentation.waves", "elastic_mm"),
-    ("data.augmentation.table", "surroundings.table"), ("model.fine_sampler", "model.super_resolution.sampler"),
-    ("model.voxels", "model.grid (of infer.py) or model.cube.voxels (of train.py)"),
-    ("model.text", "model.text.encoder"), ("data.views", "data.orbit.views"), ("data.holdout", "data.holdout.ids"),
-    ("model.super_resolution", "model.super_resolution.file")])
-def test_an_old_setting_is_refused_with_its_new_name(empty, capsys, main, command, path, new):
-    settings = 1
-    for name in reversed(path.split(".")):
-        settings = {name: settings}
-    (empty / "old.yaml").write_text(yaml.safe_dump(settings))
-    inline = yaml.safe_dump(settings, default_flow_style=True)
-    outer, nested = path.partition(".")[0], yaml.safe_dump(next(iter(settings.values())), default_flow_style=True)
-    for args in ([f"--{path}=1"], [f"--{path}", "1"], ["-c", "old.yaml"], ["-c", inline], [f"--{outer}={nested}"]):
-        with pytest.raises(SystemExit) as stopped:
-            main([command, *args])
-        said = capsys.readouterr().err
-        assert stopped.value.code == 2 and said.count("\n") == 1
-        assert f"{path} is now " in said and f"{new}" in said and "rename it" in said
-
-
-@pytest.mark.parametrize("given", [
-    "phydict.posterior.split_gibbs.SplitGibbs", "phydict.posterior.likelihood.ProximalCG"])
-def test_a_class_that_was_moved_is_refused_with_its_new_place(empty, capsys, given):
-    (empty / "old.yaml").write_text(yaml.safe_dump({"model": {"method": {"class_path": given}}}))
-    for args in (["--model.method.class_path", given], ["-c", "old.yaml"]):
-        with pytest.raises(SystemExit) as stopped:
-            infer(["predict", *args])
-        said = capsys.readouterr().err
-        assert stopped.value.code == 2 and f"is now phydict.posterior.{given.rpartition('.')[2]}: rename" in said
-
-
-@pytest.mark.parametrize("module", MODULES.values())
-def test_a_module_that_classes_were_moved_to_is_there(module):
-    assert import_module(module)
 
 
 def test_a_configuration_of_another_command_is_none_of_its_names(empty, capsys):
@@ -161,7 +116,7 @@ def test_a_setting_of_the_wrong_kind_is_one_sentence_that_names_it(empty, capsys
     ("--model.overwrite=maybe", "model.overwrite is true or false, but maybe was given"),
     ("--model.sampling={samples: x}", "model.sampling.samples is a whole number, but x was given"),
     ("--model.grid=big", "model.grid is a whole number or a mapping of settings, but big was given"),
-    ("--model.cube.voxels=32", "model.cube is now model.grid: rename it"),
+    ("--model.cube.voxels=32", "model.cube is a setting of train.py: give model.grid"),
     ("--model.grid.side=200", "give model.grid.voxels"),
     ("--model.grid.voxels=[8,8]", "model.grid.voxels is a whole number or a list of 3, but [8, 8] was"),
     ("--data.orbit.pixel=[1]", "data.orbit.pixel is a list of 2, but [1] was given"),

@@ -72,4 +72,4 @@ def test_a_loader_process_sends_the_message_too(cts, tmp_path, cache, capsys):
                                     "--model.network.init_args.channels=[]", "--model.network.init_args.block=0"])
 def test_data_that_cannot_be_are_refused_by_their_option(tmp_path, capsys, cache, option):
     said = refusal(capsys, main, arguments(tmp_path, cache, option))
-    assert option.partition("=")[0].rpartition(".")[2] in said and "is now" not in said
+    assert option.partition("=")[0].rpartition(".")[2] in said

@@ -25,7 +25,6 @@ from phydict.prior import find_prior, fingerprint, load_super_resolution, own_id
 from phydict.reconstruction import Reconstructor, describe
 from phydict.rivals import TrainedRival
 from phydict.runtime.reading import reason
-from phydict.runtime.renamed import check_setting
 from phydict.runtime.seeds import check_seed
 from phydict.units import HUWindow
 from phydict.xray import Ideal, Polychromatic, Simulator
@@ -336,9 +335,7 @@ def key(trial: Trial, case: str, source: str, measured: Mapping = MappingProxyTy
 
 
 def dotted(settings: Mapping) -> dict:
-    """Settings, their names without the init_args of infer.py's configuration files. Raises ValueError for old
-    names."""
-    check_setting("", settings)
+    """Settings, their names without the init_args of infer.py's configuration files."""
     return {".".join(part for part in str(name).split(".") if part != "init_args"): value
             for name, value in settings.items()}
 

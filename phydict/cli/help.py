@@ -11,9 +11,8 @@ from phydict.ablation.nested import parsed
 from phydict.methods import DEFAULT_METHOD, METHODS
 from phydict.posterior import Sampler
 from phydict.reconstruction import Reconstructor
-from phydict.runtime.console import read_configuration
+from phydict.runtime.console import CONFIGURATION, read_configuration
 from phydict.runtime.help import arrange_help, show_settings
-from phydict.runtime.renamed import CONFIGURATION
 from phydict.runtime.yaml_file import parse_yaml
 
 LIGHTNING = {name: "Lightning's options; more are accepted, as its documentation describes them" for name in (

@@ -23,6 +23,7 @@ from phydict.inference.scoring import METRICS, CLIPSettings, FIDSettings, Scorin
 from phydict.inference.task import ReconstructionTask
 from phydict.methods import METHODS
 from phydict.runtime.console import (
+    CONFIGURATION,
     check_apart,
     check_command,
     check_processes,
@@ -34,7 +35,6 @@ from phydict.runtime.console import (
 )
 from phydict.runtime.help import HelpFormatter
 from phydict.runtime.reading import reading
-from phydict.runtime.renamed import CONFIGURATION
 from phydict.runtime.shipped import configuration
 from phydict.runtime.telling import exclaim, told_of
 
@@ -153,7 +153,7 @@ def with_methods(args: list[str]) -> list[str]:
     """
     given = [arg.partition("=")[0] for arg in args]
     if any(option.startswith("--model.cube") for option in given):
-        raise ValueError("model.cube is now model.grid: rename it")
+        raise ValueError("model.cube is a setting of train.py: give model.grid")
     chosen = any(option in ("--model", "--model.method", "--model.method.class_path") for option in given)
     out, rest = [], iter(args)
     for arg in rest:

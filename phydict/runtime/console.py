@@ -20,7 +20,6 @@ from jsonargparse import set_loader
 
 from phydict.runtime.parser_message import plain
 from phydict.runtime.reading import one_line
-from phydict.runtime.renamed import CONFIGURATION, check_options, check_setting
 from phydict.runtime.shipped import configuration
 from phydict.runtime.telling import exclaim, proclaim, tell
 from phydict.runtime.warning import Remark
@@ -36,6 +35,9 @@ NOISE = (".*does not have many workers", ".*LeafSpec.*is deprecated", ".*is smal
          "The dirpath has changed from",
          r"Found \d+ module\(s\) in eval mode at the start of training")
 """Warnings that tell a user of the command lines nothing to act on."""
+
+CONFIGURATION = ("-c", "--config")
+"""Options that name a configuration file, or hold settings themselves."""
 
 
 def _bounded(text: str) -> object:
@@ -120,12 +122,11 @@ def with_configurations(args: list[str], kinds: tuple[str, ...]) -> list[str]:
 
 def check_command(args: Sequence[str], commands: Mapping[str, str], anywhere: Collection[str], example: str) -> None:
     """Raises ValueError, in one sentence that names `commands`, name -> what it does, and an example, where no argument
-    is one of those that may stand `anywhere`, and none asks for help, or where an option has an old name."""
+    is one of those that may stand `anywhere`, and none asks for help."""
     if not any(arg in anywhere or arg in ("-h", "--help") or arg.startswith("--print_config") for arg in args):
         listed = ", ".join(f"{name} ({what})" for name, what in commands.items())
         raise ValueError(f"the first word says what to do, but {repr(args[0]) if args else 'none'} was given: use one "
                          f"of {listed}; such as: {example}")
-    check_options(args)
 
 
 def check_configured(args: Sequence[str], options: Collection[str], example: str) -> None:
@@ -200,10 +201,6 @@ def read_configuration(file: str) -> dict:
         if not isinstance(settings.get(name, {}), dict):
             raise ValueError(f"{file}: `{name}` is a mapping of settings, but {reprlib.repr(settings[name])} was given")
     _check_classes(settings, str(file), "")
-    try:
-        check_setting("", settings)
-    except ValueError as error:
-        raise ValueError(f"{file}: {error}") from error
     return settings
 
 

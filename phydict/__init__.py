@@ -26,10 +26,11 @@ from phydict.grid import Grid
 from phydict.methods import METHODS, reconstruct
 from phydict.prior import load_prior, save_prior
 from phydict.runtime.seeds import case_seed
+from phydict.runtime.version import VERSION
 from phydict.units import HUWindow, hu_to_mu, mu_to_hu
 from phydict.xray import ConeBeam, Projector
 
-__version__ = "0.5.3"
+__version__ = VERSION
 
 __all__ = ["METHODS", "ConeBeam", "Grid", "HUWindow", "Projector", "case_seed", "hu_to_mu", "load_prior", "load_xrays",
            "mu_to_hu", "reconstruct", "save_prior"]

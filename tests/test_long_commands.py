@@ -159,7 +159,8 @@ def test_ctrl_c_on_a_terminal_says_how_to_resume_and_a_log_file_tells_the_rest(c
     assert re.search(wanted, log, flags=re.MULTILINE), log
 
 
-def test_a_scheduler_ends_a_comparison_as_ctrl_c_does(run, handlers, tmp_path, monkeypatch):
+@pytest.mark.parametrize("command", ["predict", "test", "ablate"])
+def test_a_scheduler_ends_a_command_as_ctrl_c_does(command, run, handlers, tmp_path, monkeypatch):
     before, finished = signal.getsignal(signal.SIGTERM), CaseProgress.finished
 
     def ending(progress: CaseProgress, summary: str) -> None:
@@ -168,7 +169,7 @@ def test_a_scheduler_ends_a_comparison_as_ctrl_c_does(run, handlers, tmp_path, m
 
     monkeypatch.setattr(CaseProgress, "finished", ending)
     with pytest.raises(SystemExit) as stopped:
-        run("ablate")
+        run(command)
     assert stopped.value.code == 143
     assert len(shown_in(tmp_path / "out" / "index.html")) == 1
     assert signal.getsignal(signal.SIGTERM) == before

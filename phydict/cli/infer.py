@@ -28,6 +28,7 @@ from phydict.runtime.console import (
     check_command,
     check_processes,
     cli_errors,
+    ended_by_sigterm,
     noted,
     quiet,
     read_configuration,
@@ -136,7 +137,7 @@ class InferenceCLI(TellingCLI):
 def _resumable(model: ReconstructionTask) -> Iterator[None]:
     """The progress of a run, which shows what is finished and says how it is resumed if it is stopped."""
     try:
-        with model.progress:
+        with ended_by_sigterm(), model.progress:
             yield
     except BaseException as stop:
         if isinstance(stop, KeyboardInterrupt | SystemExit):

@@ -25,7 +25,7 @@ the median was 0.72 to 0.86 on five chest CTs and 0.50 on a sixth whose lungs ar
 
 def dry_run(path: str | Path, case: Case, grid: Grid) -> list[str]:
     """Write the geometry page of an X-ray Case as PNG; returns one line per view that says what is seen in it, and
-    warns of views that look mirrored or unlike a thorax in this geometry.
+    warns of views that look upside down, mirrored or unlike a thorax in this geometry.
 
     grid: where a reconstruction would put its voxels. Raises ValueError where X-rays, geometry and grid do not fit.
     """
@@ -41,6 +41,10 @@ def dry_run(path: str | Path, case: Case, grid: Grid) -> list[str]:
     xrays = binned(case["xrays"].float(), factor).numpy()
     geometry_page(path, coarse, grid, xrays, thorax, hu, title=case["id"])
     agreements = [agreement(*pair) for pair in zip(xrays, thorax)]
+    upside_down = [str(k) for k, words in enumerate(agreements) if "with flip_rows" in words]
+    if upside_down:
+        warn(f"{case['id']}: view {', '.join(upside_down)} agrees better with a standard thorax when upside down: row "
+             "0 is superior, change flip_rows")
     mirrored = [str(k) for k, words in enumerate(agreements) if words.endswith("with flip_columns changed")]
     if mirrored:
         warn(f"{case['id']}: view {', '.join(mirrored)} agrees better with a standard thorax when mirrored: "

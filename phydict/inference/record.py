@@ -18,6 +18,7 @@ from phydict.prior import AnyPrior, MedSynCheckpoint, file_read, fingerprint, ow
 from phydict.reconstruction import Reconstruction, Reconstructor, describe
 from phydict.runtime.precision import instruction_set
 from phydict.runtime.profiling import CPU, peak_memory
+from phydict.runtime.version import VERSION
 
 
 def method_settings(name: str, seed: int, method: Sampler | Reconstructor, projector: str) -> dict:
@@ -68,8 +69,8 @@ def case_record(case: Case, result: Reconstruction, name: str, method: Reconstru
 
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that a result depends on."""
-    return {"python": platform.python_version()} | {
-        name: version(name) for name in ("phydict", "torch", "lightning", "monai", "torchmetrics", "numpy")}
+    return {"python": platform.python_version(), "phydict": VERSION} | {
+        name: version(name) for name in ("torch", "lightning", "monai", "torchmetrics", "numpy")}
 
 
 def _identity(role: str, file: str | MedSynCheckpoint) -> dict:

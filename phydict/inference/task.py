@@ -14,7 +14,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import lightning
-from lightning.pytorch.utilities.exceptions import SIGTERMException
 from torch import Tensor
 
 from phydict.baselines.extended import covering
@@ -210,9 +209,7 @@ class ReconstructionTask(lightning.LightningModule):
         self._finish(case, result, scores, resampled(truth, grid, self.grid), features)
 
     def _attempt(self, case: Case, work: Callable[[Case], None]) -> None:
-        """Bad input ends the run, or, where there are more cases, this one alone; a signal ends it between cases."""
-        if self.trainer.received_sigterm:
-            raise SIGTERMException
+        """Bad input ends the run, or, where there are more cases, this one alone."""
         self.progress.case(case["id"])
         try:
             if "error" in case:

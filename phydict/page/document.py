@@ -8,7 +8,6 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
 from urllib.parse import quote
@@ -17,6 +16,7 @@ from phydict.evaluation.metrics import MEASURES
 from phydict.evaluation.tables import Table, ranks
 from phydict.runtime.files import atomic_write
 from phydict.runtime.strict_json import strict_json
+from phydict.runtime.version import VERSION
 
 PAGE = "index.html"
 SIGNED = '<meta name="generator" content="phydict">'
@@ -86,7 +86,7 @@ def _content(contents: Contents) -> dict:
     measures = [{"name": name, "label": measure.label, "decimals": measure.decimals}
                 for name, measure in MEASURES.items() if name in scored]
     error = MEASURES[contents.error].label
-    return {"title": contents.title, "version": version("phydict"), "tables": [_table(t) for t in contents.tables],
+    return {"title": contents.title, "version": VERSION, "tables": [_table(t) for t in contents.tables],
             "cases": cases, "shared": [json.loads(text) for text in shared], "measures": measures,
             "points": contents.points, "error": error, "plots": [_file(name) for name in contents.plots],
             "links": [_file(name) for name in contents.links]}

@@ -41,12 +41,15 @@ def test_a_dry_run_takes_a_geometry_by_its_name(measured, tmp_path, capsys):
     assert names(tmp_path / "out" / "dry_run") == ["case.png"]
 
 
+@pytest.mark.filterwarnings("default")
 def test_a_dry_run_sees_images_that_lie_upside_down(measured, tmp_path, capsys):
     case = load_xrays(measured / "anna")
     save_xrays(tmp_path / "case", case["xrays"].flip(1), case["beam"])
     main(sirt("predict", tmp_path / "out", f"--data.xrays={tmp_path / 'case'}", "--dry_run"))
-    lines = capsys.readouterr().out.splitlines()[:3]
-    assert all("with flip_rows changed" in line for line in lines), lines
+    out, err = capsys.readouterr()
+    assert all("with flip_rows changed" in line for line in out.splitlines()[:3]) and "upside down" in err
+    main(sirt("predict", tmp_path / "out", f"--data.xrays={measured / 'anna'}", "--dry_run"))
+    assert "upside down" not in capsys.readouterr().err
 
 
 @pytest.mark.filterwarnings("default")

@@ -30,7 +30,7 @@ def prepare(cts: str, out: str, voxels: int = 256, side: float = 384.0, space: s
         metadata: CT-RATE's metadata table, needed where headers are not fixed
         fixed: whether the NIfTI headers are right (CT-RATE's *_fixed folders and ordinary archives)
         first_reconstruction: keep one volume per scan
-        exclude: a text file of case ids to leave out
+        exclude: a text file of case ids or files to leave out, one a line
     """
     window = window or ((-1024.0, 600.0) if space == "medsyn" else (-1000.0, 1000.0))
     settings = Settings(voxels, side, window, space, segmenter, **(atlas_lungs(Path(atlas)) if atlas else {}))

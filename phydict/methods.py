@@ -6,7 +6,7 @@ import reprlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -59,7 +59,7 @@ from phydict.runtime.reading import reason
 from phydict.runtime.seeds import check_seed
 from phydict.runtime.warning import warn
 from phydict.units import HUWindow
-from phydict.xray import ConeBeam, Projector
+from phydict.xray import ConeBeam
 from phydict.xray.beyond import asked
 from phydict.xray.boxes import covers, seen_by
 from phydict.xray.checks import check_air, check_xrays, with_air_at_zero
@@ -208,25 +208,11 @@ def onto_grid(method: Reconstructor, grid: Grid | None, refinement: Refinement =
         return method
     if method.grid is not None:
         files = corrections_of(method.sampler, grid) if isinstance(method, Posterior) and refinement.step else []
-        method = Refined(cast(Any, covering(method, grid)), grid, refinement, tuple(map(load_correction, files)))
+        method = Refined(covering(method, grid), grid, refinement, tuple(map(load_correction, files)))
     elif isinstance(method, Baseline) and not covers(grid, outer := DEFAULT_GRID.turned_as(grid)):
         method = Region(method, grid, outer)
     method.check_voxels(grid)
     return method
-
-
-def fit_to_grid(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam,
-                projector: str = "auto", display: bool = False) -> tuple[Tensor, Projector]:
-    """X-rays (K, V, U), binned unless the method wants the full detector, and the projector that goes with them on the
-    X-rays' device; `projector` is its kind, as Projector's `method`. Whether the patient goes on beyond the grid is
-    asked of the X-rays where the beam does not say.
-
-    Raises ValueError where X-rays, geometry and grid do not fit, and warns where the X-rays look inverted.
-    """
-    _check_fit(method, grid, xrays, beam)
-    xrays = xrays.float()
-    beam = asked(xrays, beam, method.survey or grid, display)
-    return seen_by(grid, xrays, beam, method.full_detector, projector)
 
 
 def reconstruct_by(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, report: str = "",

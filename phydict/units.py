@@ -68,8 +68,3 @@ class HUWindow:
         """The prior's range -> linear attenuation in 1/mm, without clipping."""
         a, b = self.mu_affine(mu_water)
         return a * x + b
-
-    def from_mu(self, mu, mu_water: float = MU_WATER):
-        """Linear attenuation in 1/mm -> the prior's range, without clipping."""
-        a, b = self.mu_affine(mu_water)
-        return (mu - b) / a

@@ -1,11 +1,15 @@
-"""Laws that any linear operator must keep, as reusable assertions.
+"""Laws that any linear operator must keep, as reusable assertions, and the total variation.
 
 An operator here is a function of one tensor, with its adjoint given as a second function.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
+
+from phydict.linalg.total_variation import UNIT, differences
 
 
 def random_like(shape, dtype=torch.float64, seed: int = 0) -> torch.Tensor:
@@ -46,3 +50,8 @@ def assert_gradient_is_adjoint(forward, adjoint, shape_in, dtype=torch.float64, 
     (curvature,) = torch.autograd.grad((gradient * direction).sum(), x)
     expected = adjoint(forward(direction))
     assert (curvature - expected).norm() <= tolerance * expected.norm()
+
+
+def total_variation(x: torch.Tensor, scales: Sequence[float] = UNIT, eps: float = 0.0) -> torch.Tensor:
+    """The sum over voxels of sqrt(|forward differences|^2 + eps^2)."""
+    return (eps**2 + differences(x, scales).square().sum(0)).sqrt().sum()

@@ -6,12 +6,13 @@ from pathlib import Path
 import pytest
 import torch
 from command_lines import refusal, resumed_as_uninterrupted
+from fitting import fit_to_grid
 from prior.tiny import tiny_refiner
 from torch.nn.functional import pad
 
 from phydict.cli.train import main
 from phydict.grid import Cube, Grid
-from phydict.methods import fit_to_grid, reconstructor
+from phydict.methods import reconstructor
 from phydict.posterior import Refined, Unrolled
 from phydict.posterior.refined import ON_FINER
 from phydict.prior import describe_correction, load_correction, save_correction, save_refiner

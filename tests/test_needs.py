@@ -11,11 +11,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from fitting import fit_to_grid
 from posterior.scene import BEAM, views
 from prior.tiny import REPORTS, tiny_for, tiny_prior
 
 from phydict import METHODS, ConeBeam, Grid, reconstruct
-from phydict.methods import fit_to_grid, reconstructor
+from phydict.methods import reconstructor
 from phydict.posterior import DPS, GradientSteps, Posterior, Reward, Sampler
 from phydict.prior import save_prior
 from phydict.runtime.profiling import CPU, CUDA, peak_memory, profiled, stage

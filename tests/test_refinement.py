@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from command_lines import refusal, resumed_as_uninterrupted
+from fitting import fit_to_grid
 from prior.tiny import tiny_prior, tiny_refiner
 from torch.nn.functional import pad
 
@@ -16,7 +17,7 @@ from phydict.cli.train import main
 from phydict.datasets import phantom_case
 from phydict.evaluation import read_csv
 from phydict.grid import Cube, Grid
-from phydict.methods import METHODS, corrections_of, fit_to_grid, reconstructor
+from phydict.methods import METHODS, corrections_of, reconstructor
 from phydict.posterior import ProximalCG, Refined, Refinement, Unrolled, refined
 from phydict.posterior.coarse_correction import coarse_correction
 from phydict.prior import correction, load_correction, save_correction, save_prior, save_refiner

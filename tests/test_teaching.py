@@ -84,8 +84,8 @@ def test_a_prior_gets_a_new_text_side_and_is_the_same_without_a_report(tmp_path)
     export = tmp_path / "renewed.safetensors"
     save_prior(renewed.prior, export, dtype=torch.float32)
     again = load_prior(export)
-    assert torch.equal(again.network.text_map.scores(again.context(REPORTS[:1])),
-                       renewed.prior.network.text_map.scores(renewed.prior.context(REPORTS[:1])))
+    assert torch.equal(again.network.text_map(again.context(REPORTS[:1])),
+                       renewed.prior.network.text_map(renewed.prior.context(REPORTS[:1])))
     with pytest.raises(ValueError, match="model.initial"):
         PriorTraining(text=replace(text, renew=True), cube=Cube(16))
 

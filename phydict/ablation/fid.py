@@ -9,9 +9,9 @@ from phydict.ablation.run import features_file
 from phydict.ablation.summary import Entry, conditions, format_settings
 from phydict.datasets import patient_of
 from phydict.evaluation import read_csv, write_csv
-from phydict.evaluation.fid import StoredFeatures, fid_rows
+from phydict.evaluation.fid import StoredFeatures
 from phydict.evaluation.tables import Table, fid_tables
-from phydict.inference.distances import told_distances
+from phydict.inference.distances import told_rows
 from phydict.inference.scoring import FIDSettings, Scoring
 
 FID = "fid.csv"
@@ -23,15 +23,14 @@ def write_distances(out: Path, entries: Sequence[Entry], scoring: Scoring) -> No
     distance is measured. Of several seeds of a case each counts as a case of the same patient."""
     if scoring.network is None:
         return
-    backbone, replicates, rows = scoring.fid.backbone, scoring.fid.replicates, []
+    backbone, rows = scoring.fid.backbone, []
     for condition, group in conditions(entries):
         there = {entry.label: [row for row in entry.counted if features_file(out, row["key"]).is_file()]
                  for entry in group}
         features = {label: {name: StoredFeatures(features_file(out, key), backbone) for name, key in _named(kept)}
                     for label, kept in there.items() if kept}
         if features:
-            found = fid_rows(told_distances(features, replicates), backbone, replicates, scoring.fid.normalisation)
-            rows += [{"method": row["method"]} | condition | row for row in found]
+            rows += [{"method": row["method"]} | condition | row for row in told_rows(features, scoring.fid)]
     write_csv(out / FID, rows)
 
 
@@ -39,13 +38,19 @@ def distance_tables(out: Path, entries: Sequence[Entry]) -> list[Table]:
     """The tables that FID in a folder gives, for each condition of the entries; none where there is no such file."""
     rows = read_csv(out / FID)
     tables: list[Table] = []
+    names = {name for entry in entries for name in entry.condition}
     for condition, group in conditions(entries):
         labels = {entry.label for entry in group}
         of = [{"replicates": FIDSettings().replicates} | row for row in rows
-              if row["method"] in labels and condition.items() <= row.items()]
+              if row["method"] in labels and all(_text(row, name) == _text(condition, name) for name in names)]
         if of:
             tables += fid_tables(of, format_settings("Frechet distance of slices (FID)", condition))
     return tables
+
+
+def _text(row: Mapping, name: str) -> str:
+    """A setting as FID has it, empty where there is none."""
+    return "" if row.get(name) is None else str(row[name])
 
 
 def _named(rows: Sequence[Mapping]) -> list[tuple[str, str]]:

@@ -74,7 +74,7 @@ def _draw(folder: Path, name: str, panels: int, draw: Callable[[Sequence[Axes]],
     draw(axes)
     if not axes[-1].get_legend():
         axes[-1].legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
-    path = folder / (re.sub(r"[^\w.]+", "_", name.strip()) + ".png")
+    path = folder / (re.sub(r"[^\w.-]+", "_", name.strip()) + ".png")
     with atomic_write(path) as part:
         figure.savefig(part, format="png")
     return path

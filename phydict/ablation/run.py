@@ -40,7 +40,8 @@ RESULTS, TABLES = "results.csv", ("tables.md", "tables.tex")
 """The results of a folder, and the tables that are made of them."""
 
 FINISHED = ("ok", "refused", "diverged")
-"""What a row's status may be that is not tried again; "failed" is, since its reason may lie outside."""
+"""What a row's status may be that is not tried again; "failed" is, since its reason may lie outside: "refused" is what
+the method itself raises a ValueError for."""
 
 MEASURED = ("status", "error", "warning", *MEASURES, "seconds_prepare", "seconds_sample", "seconds_score",
             "seconds_network", "seconds_projector", "network_calls", "projector_calls", "peak_memory_mb", "device",
@@ -239,7 +240,9 @@ class Runner:
     def _measured(self, trial: Trial, scene: MeasuredCase, key: str) -> dict:
         known = reset_peak_memory(self.device)
         with profiled(memory=False) as profile:
-            result = self._reconstruct(trial, scene, self.progress.advance)
+            result = _attempt(lambda: self._reconstruct(trial, scene, self.progress.advance), "refused")
+        if isinstance(result, dict):
+            return result
         peak = peak_memory(self.device) if known else None
         seconds = result.seconds | profile.seconds("network", "projector")
         finite = bool(result.volume.isfinite().all())
@@ -310,17 +313,16 @@ def _stage_on(file: str, device: torch.device):
     return stage_of(file).to(device)
 
 
-def _attempt(work: Callable[[], object]):
+def _attempt(work: Callable[[], object], unwilling: str = "failed"):
     """What `work` gives, or the columns of a row that says why there is nothing; with PHYDICT_TRACEBACK=1 the trace of
-    a failure instead."""
+    a failure instead. unwilling: the status after a ValueError, unless another machine could do it."""
     try:
         return work()
     except Exception as error:  # of whatever kind: one method's failure must not end the others' runs
         if os.environ.get(TRACEBACK):
             raise
         if isinstance(error, ValueError):
-            status = "failed" if isinstance(error, TooLittleMemory) else "refused"  # which is not tried again
-            return {"status": status, "error": sentence(error)}
+            return {"status": "failed" if isinstance(error, TooLittleMemory) else unwilling, "error": sentence(error)}
         return {"status": "failed", "error": f"{type(error).__name__}: {sentence(error)}"}
 
 

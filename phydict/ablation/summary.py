@@ -142,19 +142,19 @@ def _along(entries: Sequence[Entry], axis: str, without: Sequence[str]) -> list[
     return [(rest, group) for rest, group in groups if len({entry.condition[axis] for entry in group}) > 1]
 
 
-def best_settings(entries: Sequence[Entry], measure: str = "psnr") -> list[Entry]:
-    """Of each method the entry with the highest mean of `measure`, complete ones first."""
+def best_settings(entries: Sequence[Entry]) -> list[Entry]:
+    """Of each method the entry with the highest mean PSNR, complete ones first."""
     best: dict[str, Entry] = {}
     for entry in entries:
         other = best.get(entry.method)
-        if other is None or rank(entry, measure) > rank(other, measure):
+        if other is None or rank(entry) > rank(other):
             best[entry.method] = entry
     return list(best.values())
 
 
-def rank(entry: Entry, measure: str = "psnr") -> tuple[bool, float]:
-    """What orders entries by the mean of `measure`, those of all cases above others."""
-    return entry.complete, entry.means.get(measure, -math.inf)
+def rank(entry: Entry) -> tuple[bool, float]:
+    """What orders entries by their mean PSNR, those of all cases above others."""
+    return entry.complete, entry.means.get("psnr", -math.inf)
 
 
 def deltas(entries: Sequence[Entry]) -> list[tuple[str, list[Entry]]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -9,6 +10,7 @@ from torch import Tensor
 
 from phydict.baselines.baseline import Baseline, CountingProjector, bounds, clip, empty
 from phydict.linalg.conjugate_gradients import conjugate_gradients
+from phydict.runtime.ranges import check_fields
 from phydict.units import MU_WATER, HUWindow
 
 
@@ -39,9 +41,7 @@ class CGLS(Baseline):
 
     def __post_init__(self):
         super().__post_init__()
-        for what in ("iterations", "restarts"):
-            if getattr(self, what) < 1:
-                raise ValueError(f"CGLS needs {what} of at least 1, but {getattr(self, what)} was given")
+        check_fields(self, "CGLS", iterations=(1, math.inf), restarts=(1, math.inf))
 
     def steps(self) -> int:
         return self.iterations * self.restarts

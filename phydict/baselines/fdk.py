@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from phydict.baselines.baseline import Baseline, CountingProjector, clip, empty
-from phydict.baselines.orbit import Orbit
+from phydict.baselines.orbit import CircularOrbit
 from phydict.grid import Grid
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray.places import detector_places
@@ -26,8 +26,8 @@ class FDK(Baseline):
 
     p_k are view k's line integrals at (a, b), mm on the detector scaled to the axis at distance R from the source; cos
     is R / sqrt(R^2 + a^2 + b^2); share_k is the angle that the view stands for and w counts lines seen twice once: both
-    are `Orbit`'s, which says how they are on full circles, short scans and limited arcs. The ramp is Kak & Slaney's
-    band-limited one (1988, ch. 3), between zeros; detector edges that cut the patient are not extrapolated.
+    are `CircularOrbit`'s, which says how they are on full circles, short scans and limited arcs. The ramp is Kak &
+    Slaney's band-limited one (1988, ch. 3), between zeros; detector edges that cut the patient are not extrapolated.
 
     Few views give streaks. Raises ValueError for views that are no such orbit.
 
@@ -52,7 +52,7 @@ class FDK(Baseline):
 
     def solve(self, A: CountingProjector, y: Tensor, on_step: Callable[[], None]) -> Tensor:
         beam, grid = A.beam, A.grid
-        orbit = Orbit.of(beam, grid)
+        orbit = CircularOrbit.of(beam, grid)
         density = empty(A, y)
         for k, filtered in enumerate(self._filtered(orbit, y)):
             density += _smeared(orbit, k, filtered, grid)
@@ -60,7 +60,7 @@ class FDK(Baseline):
         on_step()
         return clip(density, self.window)
 
-    def _filtered(self, orbit: Orbit, y: Tensor) -> Tensor:
+    def _filtered(self, orbit: CircularOrbit, y: Tensor) -> Tensor:
         """Weighted and filtered views (K, V, U), times the angles that they stand for."""
         beam, (rows, columns) = orbit.beam, (torch.arange(n) - (n - 1) / 2 for n in y.shape[2:])
         foot = beam.detectors - beam.sources
@@ -90,7 +90,7 @@ def ramp(n: int, hann: bool = False) -> Tensor:
     return response * torch.cos(torch.linspace(0, math.pi / 2, len(response)).double()) ** 2 if hann else response
 
 
-def _smeared(orbit: Orbit, k: int, filtered: Tensor, grid: Grid) -> Tensor:
+def _smeared(orbit: CircularOrbit, k: int, filtered: Tensor, grid: Grid) -> Tensor:
     """View k's part in the volume (1, 1, X, Y, Z): its filtered pixels (V, U) along their rays, by distance."""
     depth, places = detector_places(grid, orbit.beam, k, filtered)
     smeared = grid_sample(filtered[None, None], places.flatten(0, 1)[None], align_corners=False).view(depth.shape)

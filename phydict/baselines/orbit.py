@@ -18,7 +18,7 @@ TAPER = math.radians(10)
 
 
 @dataclass(frozen=True, eq=False)
-class Orbit:
+class CircularOrbit:
     """Views of upright detectors on a circle.
 
     axis (3,): unit vector along the detectors' columns. centre (3,): the point on it level with the sources. radius: mm
@@ -34,7 +34,7 @@ class Orbit:
     turns: np.ndarray
 
     @staticmethod
-    def of(beam: ConeBeam, grid: Grid) -> Orbit:
+    def of(beam: ConeBeam, grid: Grid) -> CircularOrbit:
         """The orbit of a beam. Where the views leave the axis open, as one view does, it is the one nearest to the
         grid's centre. Raises ValueError unless every detector is upright and faces one axis at one distance."""
         across, axis = beam.u / np.linalg.norm(beam.u, axis=1, keepdims=True), beam.v[0] / np.linalg.norm(beam.v[0])
@@ -52,7 +52,7 @@ class Orbit:
         first = arm[0] / distance[0]
         angles = np.arctan2(arm @ np.cross(axis, first), arm @ first) % (2 * math.pi)
         turns = np.sign((np.cross(axis, beam.normals) * across).sum(1))
-        return Orbit(beam, axis, centre + height.mean() * axis, radius, angles, turns)
+        return CircularOrbit(beam, axis, centre + height.mean() * axis, radius, angles, turns)
 
     def shares(self) -> np.ndarray:
         """The angle (K,) in radians that each view stands for: half the way to both neighbours, and at the ends of an

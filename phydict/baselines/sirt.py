@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -9,6 +10,7 @@ import torch
 from torch import Tensor
 
 from phydict.baselines.baseline import Baseline, CountingProjector, empty
+from phydict.runtime.ranges import check_fields
 from phydict.units import MU_WATER
 
 
@@ -32,8 +34,7 @@ class SIRT(Baseline):
 
     def __post_init__(self):
         super().__post_init__()
-        if self.iterations < 1:
-            raise ValueError(f"SIRT needs at least 1 iteration, but {self.iterations} was given")
+        check_fields(self, "SIRT", iterations=(1, math.inf))
 
     def steps(self) -> int:
         return self.iterations

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -10,6 +11,7 @@ from torch import Tensor
 from phydict.baselines.baseline import Baseline, CountingProjector, clip, empty
 from phydict.linalg.power_iteration import operator_norm
 from phydict.linalg.total_variation import finest_to_own, tv_proximal
+from phydict.runtime.ranges import check_fields
 from phydict.units import MU_WATER, HUWindow
 
 
@@ -43,11 +45,7 @@ class FISTATV(Baseline):
 
     def __post_init__(self):
         super().__post_init__()
-        for what in ("iterations", "inner"):
-            if getattr(self, what) < 1:
-                raise ValueError(f"FISTA-TV needs {what} of at least 1, but {getattr(self, what)} was given")
-        if not self.weight >= 0:
-            raise ValueError(f"the weight of total variation must not be negative, but {self.weight} was given")
+        check_fields(self, "FISTATV", iterations=(1, math.inf), inner=(1, math.inf), weight=(0, math.inf))
 
     @property
     def volumes(self) -> int:

@@ -56,13 +56,12 @@ class Moments:
         self.scatter = torch.zeros(dimensions, dimensions, dtype=torch.float64)
 
     @classmethod
-    def of(cls, x: Tensor, repeats: Tensor | None = None) -> Moments:
-        """Those of features (N, d), each of which counts as often as `repeats` (N,) says."""
+    def of(cls, x: Tensor) -> Moments:
+        """Those of features (N, d)."""
         moments, x = cls(x.shape[1]), x.double().cpu()
-        weight = (torch.ones(len(x)) if repeats is None else repeats).double()[:, None]
-        moments.count = float(weight.sum())
-        moments.mean = (weight * x).sum(0) / weight.sum()
-        moments.scatter = (weight * (x - moments.mean)).T @ (x - moments.mean)
+        moments.count, moments.mean = float(len(x)), x.sum(0) / len(x)
+        apart = x - moments.mean
+        moments.scatter = apart.T @ apart
         return moments
 
     def add(self, other: Moments, times: float = 1.0) -> None:
@@ -137,12 +136,6 @@ def save_features(file: Path, features: Features) -> None:
         save_file({plane: values.contiguous() for plane, values in features.items()}, part)
 
 
-def frechet_distance(a: Tensor, b: Tensor, repeats: Tensor | None = None) -> float:
-    """The Frechet distance of features a (N, d) and b (M, d); repeats: how often each slice counts, of both (N = M).
-    NaN where a feature is not finite."""
-    return _distance(Moments.of(a, repeats), _reduced(Moments.of(b, repeats)))
-
-
 def _reduced(moments: Moments) -> Reference:
     """The mean and a root of the covariance, with as many rows as that has eigenvalues above what rounding leaves."""
     covariance = moments.covariance
@@ -160,11 +153,6 @@ def _distance(of: Moments, to: Reference) -> float:
         return math.nan
     trace = torch.linalg.eigvalsh(root @ covariance @ root.T).clamp(min=0).sqrt().sum()
     return float((of.mean - mean).square().sum() + covariance.trace() + root.square().sum() - 2 * trace)
-
-
-def fid(cases: Mapping[str, Features], replicates: int = 0) -> dict[str, Estimate]:
-    """{"fid_xy", "fid_yz", "fid_zx", "fid" (their mean)} over all slices of cases, as `distances` has them."""
-    return distances({"": cases}, replicates)[""].estimates()
 
 
 def fid_rows(methods: Mapping[str, Distances], backbone: str, replicates: int, normalisation: str) -> list[dict]:
@@ -263,8 +251,8 @@ def _drawn(cases: Mapping[str, Features], of: int, plane: str, patients: Mapping
 
 
 class PlaneFID(Metric):
-    """`fid` of the cases that all processes have seen; a case seen twice counts once, in another process where it is
-    the last one there, as where a distributed sampler repeats cases to fill the last batch.
+    """`distances` of the cases that all processes have seen; a case seen twice counts once, in another process where it
+    is the last one there, as where a distributed sampler repeats cases to fill the last batch.
 
     dimensions: of the features. State: in float64 the sums of (1, x)(1, x)' over all slices but those of the last case,
     whose features are kept until the next one.

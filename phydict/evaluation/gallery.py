@@ -18,7 +18,7 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
+from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
@@ -88,10 +88,12 @@ def panel(path: str | Path, reconstruction_hu, grid: Grid, xrays=None, reproject
             ax = upper.add_subplot(cells[n, column] if beside else cells[0, n])
             _show_plane(ax, volume, grid, name, f"{label}, {name}")
         if deviation_hu is not None:
-            _show_deviation(upper.add_subplot(cells[n, columns - 1]), deviation_hu, grid, name, deviation_label)
+            _show_image(upper.add_subplot(cells[n, columns - 1]), deviation_hu, grid, name,
+                        f"{deviation_label}, up to {DIFFERENCE:g} HU", SPREAD, 0, DIFFERENCE)
         if truth_hu is not None:
             difference = _array(reconstruction_hu, 3, "a volume") - _array(truth_hu, 3, "a volume")
-            _show_difference(upper.add_subplot(cells[n, 2]), difference, grid, name)
+            _show_image(upper.add_subplot(cells[n, 2]), difference, grid, name,
+                        f"difference, ±{DIFFERENCE:g} HU", SIGNED, -DIFFERENCE, DIFFERENCE)
     if xrays is not None:
         _show_xrays(lower, xrays_height, xrays, reprojection)
     _save(figure, path)
@@ -141,11 +143,17 @@ def _margins(height: float, heading: float) -> dict[str, float]:
     return {"left": 0.02, "right": 0.98, "bottom": 0.1 / height, "top": 1 - heading / height}
 
 
-def _show_plane(ax: Axes, volume, grid: Grid, name: str, heading: str) -> None:
+def _show_image(ax: Axes, volume, grid: Grid, name: str, heading: str, colours: Colormap, low: float,
+                high: float) -> np.ndarray:
+    """Shows the plane `name` of a volume in colours from low to high; returns its pixels."""
     image, aspect = plane(volume, grid, name)
-    ax.imshow(np.ma.masked_invalid(image), GREY, aspect=aspect, vmin=DISPLAY[0], vmax=DISPLAY[1],
-              interpolation="nearest")
+    ax.imshow(np.ma.masked_invalid(image), colours, aspect=aspect, vmin=low, vmax=high, interpolation="nearest")
     _finish(ax, heading)
+    return image
+
+
+def _show_plane(ax: Axes, volume, grid: Grid, name: str, heading: str) -> None:
+    image = _show_image(ax, volume, grid, name, heading, GREY, *DISPLAY)
     for (x, y), letter in zip(((0.03, 0.5), (0.97, 0.5), (0.5, 0.96), (0.5, 0.04)), PLANES[name][1]):
         _write(ax, x, y, letter, "center")
     if broken := int((~np.isfinite(image)).sum()):
@@ -155,19 +163,6 @@ def _show_plane(ax: Axes, volume, grid: Grid, name: str, heading: str) -> None:
 def _write(ax: Axes, x: float, y: float, text: str, align: str) -> None:
     outline = [withStroke(linewidth=2, foreground="black")]
     ax.text(x, y, text, transform=ax.transAxes, color="gold", fontsize=8, ha=align, va="center", path_effects=outline)
-
-
-def _show_deviation(ax: Axes, deviation, grid: Grid, name: str, label: str) -> None:
-    image, aspect = plane(deviation, grid, name)
-    ax.imshow(np.ma.masked_invalid(image), SPREAD, aspect=aspect, vmin=0, vmax=DIFFERENCE, interpolation="nearest")
-    _finish(ax, f"{label}, up to {DIFFERENCE:g} HU")
-
-
-def _show_difference(ax: Axes, difference: np.ndarray, grid: Grid, name: str) -> None:
-    image, aspect = plane(difference, grid, name)
-    ax.imshow(np.ma.masked_invalid(image), SIGNED, aspect=aspect, vmin=-DIFFERENCE, vmax=DIFFERENCE,
-              interpolation="nearest")
-    _finish(ax, f"difference, ±{DIFFERENCE:g} HU")
 
 
 def _show_xrays(figure, height: float, xrays, reprojection) -> None:

@@ -17,6 +17,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from phydict.datasets import CTFile, CTSource, find_xrays, load_case, load_xrays, phantom_case
 from phydict.datasets.case import Case
+from phydict.datasets.cts.segmentations import mask_files
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM, PHANTOM_VERSION
 from phydict.grid import Grid
 from phydict.inference.protocols import protocol_of
@@ -63,7 +64,7 @@ class ReconstructionData(lightning.LightningDataModule):
             simulated X-rays in place of orbit
         cts: for test, a NIfTI file or a folder of CTs, or the word phantom
         source: which CTs of a folder are taken, and what belongs to them
-        only: a text file of the case ids to test, such as the held_out.txt of a training; none given: all
+        only: a text file of the case ids to test, one a line, such as a training's held_out.txt; none given: all
         phantoms: how many phantoms where cts is the word phantom
         orbit: the simulated X-rays' geometry where no file gives it
         simulator: how X-rays are made of a CT (configs/simulate)
@@ -213,10 +214,18 @@ class ReconstructionData(lightning.LightningDataModule):
 
 
 def _ct_source(ct: CTFile) -> str:
-    """What identifies a CT and its report, wherever the file lies."""
-    stat, report = ct.path.stat(), zlib.crc32(ct.report.encode())
-    contents = _crc32_of(ct.path, stat.st_size, stat.st_mtime_ns)
-    return f"{ct.path.name}, crc32 {contents:08x}, {ct.calibration}, report crc32 {report:08x}"
+    """What identifies a CT, its report and the masks of it, wherever the file lies."""
+    report, masks = zlib.crc32(ct.report.encode()), 0
+    for file in mask_files(ct.path):
+        masks = zlib.crc32(f"{file.name} {_contents(file)}".encode(), masks)
+    return f"{ct.path.name}, crc32 {_contents(ct.path)}, {ct.calibration}, report crc32 {report:08x}" + (
+        f", masks crc32 {masks:08x}" if masks else "")
+
+
+def _contents(file: Path) -> str:
+    """A file's checksum in words."""
+    stat = file.stat()
+    return f"{_crc32_of(file, stat.st_size, stat.st_mtime_ns):08x}"
 
 
 @cache

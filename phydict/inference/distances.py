@@ -4,9 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from phydict.evaluation.fid import Distances, Features, distances
+from phydict.evaluation.fid import Distances, Features, distances, fid_rows
 from phydict.evaluation.planes import PLANES
+from phydict.inference.scoring import FIDSettings
 from phydict.runtime.progress import CaseProgress
+
+
+def told_rows(methods: Mapping[str, Mapping[str, Features]], fid: FIDSettings) -> list[dict]:
+    """The `fid_rows` of `told_distances`, label -> case id -> features. Raises ValueError without a case."""
+    return fid_rows(told_distances(methods, fid.replicates), fid.backbone, fid.replicates, fid.normalisation)
 
 
 def told_distances(methods: Mapping[str, Mapping[str, Features]], replicates: int) -> dict[str, Distances]:

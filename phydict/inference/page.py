@@ -12,13 +12,12 @@ from types import MappingProxyType
 import nibabel as nib
 import numpy as np
 
-from phydict.evaluation import RANGE, mean_table
-from phydict.evaluation.fid import StoredFeatures, fid_rows
+from phydict.evaluation.fid import StoredFeatures
 from phydict.evaluation.tables import Table, fid_tables
 from phydict.grid import Grid
-from phydict.inference.distances import told_distances
+from phydict.inference.distances import told_rows
 from phydict.inference.protocols import protocol_of
-from phydict.inference.results import FEATURES, RECORD, TABLE, score_row
+from phydict.inference.results import FEATURES, RECORD, TABLE, score_row, score_table
 from phydict.inference.scoring import FIDSettings
 from phydict.page import CASE_FILES, Contents, PageCase, check_own_page, write_case_files, write_page
 from phydict.runtime.progress import CaseProgress
@@ -111,14 +110,24 @@ def _mean_tables(scored: list, empty: Mapping[str, str]) -> list[Table]:
         return []
     names = {record["settings"].get("data", {}).get("protocol") for record in scored}
     protocol = protocol_of(*names) if len(names) == 1 and None not in names else None
-    table = mean_table([score_row(record["case"], record) for record in scored],
-                       window=protocol.window if protocol else RANGE, empty=empty)
-    return [replace(table, notes=[*table.notes, protocol.note]) if protocol else table]
+    return _noted([score_table(scored, protocol, empty)], scored)
+
+
+def _noted(tables: Sequence[Table], records: Sequence[Mapping]) -> list[Table]:
+    """Tables of some cases, the last note naming methods whose cases are of several settings, but for the seed."""
+    settings: dict[str, set[str]] = {}
+    for record in records:
+        kind = json.dumps(record.get("settings", {}) | {"seed": None}, sort_keys=True)
+        settings.setdefault(record["method"], set()).add(kind)
+    several = ", ".join(method for method, kinds in settings.items() if len(kinds) > 1)
+    note = [f"Cases of several settings, as their records tell, in one line: {several}."] if several else []
+    return [replace(table, notes=[*table.notes, *note]) for table in tables]
 
 
 def _kept_distances(folder: Path, cases: Sequence[PageCase]) -> list[Table]:
     """The tables of Frechet distances that features in the cases' folders give, a line per method."""
     methods: dict[FIDSettings, dict[str, dict[str, StoredFeatures]]] = {}
+    records: dict[FIDSettings, list[Mapping]] = {}
     for case in cases:
         settings, file = case.record.get("settings", {}), folder / case.folder / FEATURES
         if (backbone := settings.get("fid_backbone")) and file.is_file():
@@ -129,6 +138,6 @@ def _kept_distances(folder: Path, cases: Sequence[PageCase]) -> list[Table]:
                 continue
             measured = FIDSettings(backbone, maisi_voxels=settings.get("fid_maisi_voxels", False))
             methods.setdefault(measured, {}).setdefault(case.record["method"], {})[case.record["case"]] = features
+            records.setdefault(measured, []).append(case.record)
     return [table for fid, features in methods.items()
-            for table in fid_tables(fid_rows(told_distances(features, fid.replicates), fid.backbone, fid.replicates,
-                                             fid.normalisation))]
+            for table in _noted(fid_tables(told_rows(features, fid)), records[fid])]

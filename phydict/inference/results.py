@@ -97,16 +97,15 @@ class CaseResults:
         """The tables of the finished cases that were scored, and further ones behind them; written as results.csv, with
         one row per case, and results.md. None where no case was scored. protocol: what the scores were taken by;
         empty: scores that may stay empty -> why."""
-        rows = []
+        records = []
         for case in cases:
             there = self._there(case)
             if there and there.record["scores"]:
-                rows.append(score_row(case, there.record))
-        if not rows:
+                records.append(there.record)
+        if not records:
             return []
-        table = mean_table(rows, window=protocol.window if protocol else RANGE, empty=empty)
-        tables = [replace(table, notes=[*table.notes, *([protocol.note] if protocol else [])]), *further]
-        write_csv(self.folder / TABLE, rows)
+        tables = [score_table(records, protocol, empty), *further]
+        write_csv(self.folder / TABLE, [score_row(record["case"], record) for record in records])
         with atomic_write(self.folder / "results.md") as part:
             part.write_text("\n".join(table.markdown() for table in tables))
         return tables
@@ -167,6 +166,29 @@ class CaseResults:
         if not replaceable:
             raise ValueError(f"{table if table.is_file() else page} is no table of this command, and is not replaced: "
                              "move it away, or give another model.out")
+
+
+def score_table(records: Sequence[dict], protocol: Protocol | None, empty: Mapping[str, str]) -> Table:
+    """The means of records' scores by method, with notes on how their X-rays were made and on the protocol, if any,
+    that they were taken by; empty: scores that may stay empty -> why."""
+    rows = [score_row(record["case"], record) for record in records]
+    table = mean_table(rows, window=protocol.window if protocol else RANGE, empty=empty)
+    made = dict.fromkeys(_xrays(record["settings"]) for record in records
+                         if "simulator" in record["settings"].get("data", {}))
+    return replace(table, notes=[*table.notes, *made, *([protocol.note] if protocol else [])])
+
+
+def _xrays(settings: Mapping) -> str:
+    """How the X-rays of a scored case were made."""
+    data = settings["data"]
+    stated = {name: value for name, value in (data["simulator"] | data).items()
+              if name not in ("class", "protocol", "simulation_voxels") and isinstance(value, str | int | float | list)
+              and not isinstance(value, bool)}
+    voxels = data.get("simulation_voxels")
+    places = (f"{voxels}^3 voxels" if voxels else "the protocol's voxels" if "protocol" in data else
+              "the voxels that are reconstructed, which is optimistic")
+    return (f"X-rays: {data['simulator']['class']}, {', '.join(f'{name} {value}' for name, value in stated.items())}; "
+            f"made on {places}; seed {settings['seed']}.")
 
 
 def score_row(case: str, record: dict) -> dict:

@@ -8,9 +8,9 @@ from contextlib import suppress
 from rich.console import Console
 
 from phydict.evaluation import Table
-from phydict.evaluation.fid import StoredFeatures, fid_rows
+from phydict.evaluation.fid import StoredFeatures
 from phydict.evaluation.tables import fid_tables
-from phydict.inference.distances import told_distances
+from phydict.inference.distances import told_rows
 from phydict.inference.page import results_page
 from phydict.inference.protocols import Protocol
 from phydict.inference.results import FEATURES, CaseResults
@@ -47,7 +47,5 @@ def _distances(results: CaseResults, cases: list[str], name: str, scoring: Scori
     """The table of Frechet distances over finished cases, where they are measured."""
     if scoring.network is None or not cases:
         return []
-    backbone = scoring.fid.backbone
-    features = {case: StoredFeatures(results.folder / case / FEATURES, backbone) for case in cases}
-    found = told_distances({name: features}, scoring.fid.replicates)
-    return fid_tables(fid_rows(found, backbone, scoring.fid.replicates, scoring.fid.normalisation))
+    features = {case: StoredFeatures(results.folder / case / FEATURES, scoring.fid.backbone) for case in cases}
+    return fid_tables(told_rows({name: features}, scoring.fid))

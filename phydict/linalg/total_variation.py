@@ -46,11 +46,6 @@ def finest_to_own(spacing: Sequence[float]) -> list[float]:
     return [min(spacing) / s for s in spacing]
 
 
-def total_variation(x: Tensor, scales: Sequence[float] = UNIT, eps: float = 0.0) -> Tensor:
-    """The sum over voxels of sqrt(|forward differences|^2 + eps^2)."""
-    return (eps**2 + differences(x, scales).square().sum(0)).sqrt().sum()
-
-
 def tv_proximal(v: Tensor, weight: float, scales: Sequence[float], clip: Callable[[Tensor], Tensor], iterations: int,
                 dual: Tensor) -> tuple[Tensor, Tensor]:
     """argmin over x of |x - v|^2 / 2 + weight TV(x) where clip(x) = x, and its dual field (Beck & Teboulle 2009,

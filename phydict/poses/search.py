@@ -36,6 +36,7 @@ from phydict.xray import ConeBeam, Projector, binned, binning
 from phydict.xray.boxes import halved
 from phydict.xray.calibration import match_views
 from phydict.xray.checks import check_xrays
+from phydict.xray.noise_level import MEDIAN
 from phydict.xray.poses.gauge import aligned, reprojection_errors
 from phydict.xray.poses.sensitivity import pose_derivatives
 from phydict.xray.poses.uncertain import Uncertain
@@ -55,8 +56,6 @@ no less than LEAST_FIT and no more than MOST_FIT times: fewer views are the easi
 training CTs have 1.08 at most from eight views and 1.38 from four, those off by 5 mm and 2 degrees 2.9 or more."""
 HALVINGS = 6
 """Of a step that would put a source or a detector into the volume."""
-MAD = 0.6745
-"""Median of the absolute value of a standard normal number."""
 
 
 @dataclass(frozen=True)
@@ -201,7 +200,7 @@ class Views:
         reprojection = plain.project(state.x)[0]
         state.misfits.append(misfits(reprojection, plain.y[0])["misfit"])
         residual = plain.y[0] - reprojection
-        level = (residual.abs().flatten(1).median(1).values / MAD).clamp(min=1e-6)[:, None, None]
+        level = (residual.abs().flatten(1).median(1).values / MEDIAN).clamp(min=1e-6)[:, None, None]
         weights = (self.search.huber * level / residual.abs().clamp(min=1e-12)).clamp(max=1)
         data = torch.einsum("kmvu,kvu,knvu->kmn", changes, weights, changes)
         right = torch.einsum("kmvu,kvu->km", changes, weights * residual) / noise**2 - before

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -13,6 +14,7 @@ from phydict.guard import BONE, CEILING, CEILING_ML, millilitres
 from phydict.linalg.conjugate_gradients import conjugate_gradients
 from phydict.linalg.total_variation import TVQuadraticMajorizer
 from phydict.posterior.measurement import Measurement
+from phydict.runtime.ranges import check_fields
 from phydict.units import HUWindow
 from phydict.xray import Projector
 from phydict.xray.boxes import part
@@ -59,9 +61,8 @@ class Metal:
         if not 0 < self.least_ml <= self.most_ml:
             raise ValueError("metal is sought where the window's upper end holds between least_ml and most_ml, 0 < "
                              f"least_ml <= most_ml, but {self.least_ml} and {self.most_ml} were given")
-        for name in ("least_views", "rounds", "restarts", "iterations"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is a number of 1 or more, but {getattr(self, name)} was given")
+        check_fields(self, "Metal", least_views=(1, math.inf), rounds=(1, math.inf), restarts=(1, math.inf),
+                     iterations=(1, math.inf))
 
 
 NOISE, X0_STD, TV_WEIGHT, TV_EPS = 0.02, 0.3, 5.0, 0.003

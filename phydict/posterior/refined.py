@@ -19,7 +19,7 @@ from phydict.posterior.likelihood.likelihood import LikelihoodStep, ProximalCG
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.posterior import WIDEST
 from phydict.prior.finer_uncertainty import SEEN_LEVEL
-from phydict.reconstruction import Delegating, Reconstruction, Reconstructor
+from phydict.reconstruction import Delegating, Reconstruction
 from phydict.runtime.profiling import Stopwatch, stage
 from phydict.runtime.warning import Remark, warn
 from phydict.units import AIR, HUWindow, hu_to_mu
@@ -33,43 +33,6 @@ two CTs kept from training these hold 43 to 52, 75 to 86, 85 to 95 and 92 to 99 
 CORRECTED_VOLUMES = 55
 """Volumes of the finest voxels that a refinement by a network on them holds at most, in float32
 (tests/benchmark/grid_cost.csv)."""
-
-
-class Bound(Protocol):
-    """A Reconstructor that is bound to voxels and an HU range of its own: a prior's, a cascade's or a rival's."""
-
-    @property
-    def full_detector(self) -> bool: ...
-
-    @property
-    def citation(self) -> str: ...
-
-    @property
-    def mu_water(self) -> float: ...
-
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def grid(self) -> Grid: ...
-
-    @property
-    def window(self) -> HUWindow: ...
-
-    @property
-    def precision(self) -> str: ...
-
-    @property
-    def volumes(self) -> int: ...
-
-    def steps(self) -> int: ...
-
-    def with_mu_water(self, mu_water: float) -> Reconstructor: ...
-
-    def with_room(self, x: int, y: int, z: int) -> Any: ...
-
-    def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False, seed: int = 0,
-                    on_step: Callable[[], None] = lambda: None) -> Reconstruction: ...
 
 
 class Correction(Protocol):
@@ -179,13 +142,13 @@ class Refined(Delegating):
     interpolated volume, as ON_FINER says. Remarks on voxels on which no network corrects.
 
     Args:
-        base: the method, bound to voxels of its own
+        base: the method, bound to voxels and an HU `window` of its own: a prior's, a cascade's or a rival's
         target: the voxels of the result, along the same axes
         refinement: how
         networks: what corrects the estimates on voxels, the last of those that suit them; none: nothing
     """
 
-    base: Bound
+    base: Any
     target: Grid
     refinement: Refinement = Refinement()
     networks: tuple[Correction, ...] = ()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -30,12 +29,10 @@ from phydict.prior.medsyn.super_resolution import MedSynSuperResolution
 from phydict.prior.prior import STATE, Prior
 from phydict.prior.refiner import Refiner
 from phydict.prior.stage_file import (
-    ADVICE,
     FORMAT,
-    Network,
     built_network,
+    loaded_stage,
     number_of,
-    read_stage,
     whole_of,
     window_of,
     write_stage,
@@ -45,7 +42,6 @@ from phydict.prior.text_file import has_text, load_text
 from phydict.prior.uncertainty import Uncertainty
 from phydict.prior.unet import VolumeUNet
 from phydict.runtime.files import file_crc32
-from phydict.runtime.reading import refusing
 from phydict.runtime.shipped import own_or_shipped, shipped
 
 DEFAULT_PRIOR = shipped("data/prior/phydict_64.safetensors")
@@ -167,7 +163,7 @@ def load_prior(path: str | Path | MedSynCheckpoint = DEFAULT_PRIOR,
             reader.unheard = UNHEARD if path == DEFAULT_PRIOR else ""
         return loaded
 
-    return _loaded(path, ("base", "refiner"), build, device)
+    return loaded_stage(path, ("base", "refiner"), build, device)
 
 
 def load_super_resolution(path: str | Path | MedSynCheckpoint,
@@ -176,24 +172,12 @@ def load_super_resolution(path: str | Path | MedSynCheckpoint,
     path = _resolved(path)
     if isinstance(path, MedSynCheckpoint) or is_medsyn(path):
         return load_medsyn_super_resolution(path, device)
-    return _loaded(path, ("super_resolution",), build_super_resolution, device)
+    return loaded_stage(path, ("super_resolution",), build_super_resolution, device)
 
 
 def load_correction(path: str | Path = DEFAULT_CORRECTION, device: str = "cpu") -> CorrectionNetwork:
     """The network in a file written by `save_correction`; as `load_prior`."""
-    return _loaded(own_or_shipped(path), ("refinement",), build_correction, device)
-
-
-def _loaded(path: Path, stages: tuple[str, ...], build: Callable[[dict, dict[str, Tensor]], Network],
-            device: str) -> Network:
-    """What `build` makes of a file of one of these stages, ready to be used. Raises as `load_prior` says."""
-    with refusing(path, ADVICE):
-        header, weights = read_stage(path, stages, device)
-        try:
-            loaded = build(header, weights)
-        except ValueError as error:
-            raise ValueError(f"'{path}' contradicts itself: {error}") from error
-    return loaded.to(device).eval().requires_grad_(False)
+    return loaded_stage(own_or_shipped(path), ("refinement",), build_correction, device)
 
 
 def is_refiner(given: object) -> bool:

@@ -41,7 +41,3 @@ class KindMap(nn.Module):
     def stated(self, context: Tensor) -> Tensor:
         """Context (B, L, D) -> the probability of each kind that some state states it (B, kinds)."""
         return self.answers(context)[0].sigmoid().amax(1)
-
-    def scores(self, context: Tensor) -> Tensor:
-        """Context (B, L, D) -> how much of each kind is drawn (B, kinds): the mean of its map."""
-        return self(context).mean((2, 3, 4))

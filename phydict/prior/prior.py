@@ -43,21 +43,23 @@ class Prior(nn.Module):
     sigma > DETAIL_REACH skip_std and the noise hides all detail.
 
     ends_at_zero: whether its own inference ends with a call at time 0 (see PriorOnly).
-    network: F; detail: D, None for a prior without; text: the report encoder, None for a prior without text, or a
-    function that loads it when the first report arrives; grid, window: where and in which HU range the volumes live;
-    sigma_data: standard deviation of the state; skip_std: see above. unheard: what is warned of at the first report.
+    network: F; detail: D, None for a prior without; text: the report encoder, None for a prior without text or until
+    `load_text`, if there is one, returns it when the first report arrives; grid, window: where and in which HU range
+    the volumes live; sigma_data: standard deviation of the state; skip_std: see above. unheard: what is warned of at
+    the first report.
     """
 
     ends_at_zero = False
 
     def __init__(self, network: VolumeUNet, grid: Grid, window: HUWindow, text: TextEncoder | None = None,
                  schedule: CosineSchedule = CosineSchedule(), sigma_data: float = 0.5, skip_std: float = 0.1,
-                 load_text: Callable[[], TextEncoder] | None = None, detail: DetailNetwork | None = None):
+                 detail: DetailNetwork | None = None):
         super().__init__()
         if text is not None and text.width != network.context_dim:
             raise ValueError(f"this text encoder's tokens have width {text.width}, but the network's context_dim is "
                              f"{network.context_dim}: build the network with context_dim {text.width}")
-        self.network, self.detail, self.text, self.load_text = network, detail, text, load_text
+        self.network, self.detail, self.text = network, detail, text
+        self.load_text: Callable[[], TextEncoder] | None = None
         self.work_on(grid)
         self.window, self.schedule, self.sigma_data = window, schedule, sigma_data
         self.skip_std, self.unheard = skip_std, ""
@@ -175,10 +177,6 @@ class BoundPrior:
     @property
     def schedule(self) -> CosineSchedule:
         return self.prior.schedule
-
-    @property
-    def ends_at_zero(self) -> bool:
-        return self.prior.ends_at_zero
 
     def denoise(self, x: Tensor, t: float) -> Tensor:
         """E[x_0 | x_t = x, report]. Differentiable where x requires a gradient; otherwise nothing is kept for one."""

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from phydict.prior.finite import check_finite, not_finite
 from phydict.runtime.files import atomic_write
-from phydict.runtime.reading import not_written, reason
+from phydict.runtime.reading import not_written, reason, refusing
 from phydict.units import HUWindow
 
 Network = TypeVar("Network", bound=nn.Module)
@@ -62,8 +62,24 @@ def read_stage(path: Path, stages: Sequence[str], device: str) -> tuple[dict, di
     return header, weights
 
 
+def loaded_stage(path: Path, stages: Sequence[str], build: Callable[[dict, dict[str, Tensor]], Network],
+                 device: str) -> Network:
+    """What `build` makes of a file of one of these stages, ready to be used (evaluation mode, no gradients).
+
+    Raises FileNotFoundError where there is no file, ValueError where it is truncated, is of another stage, contradicts
+    itself or holds weights that are not finite.
+    """
+    with refusing(path, ADVICE):
+        header, weights = read_stage(path, stages, device)
+        try:
+            loaded = build(header, weights)
+        except ValueError as error:
+            raise ValueError(f"'{path}' contradicts itself: {error}") from error
+    return loaded.to(device).eval().requires_grad_(False)
+
+
 def is_saved_prior(path: str | Path) -> bool:
-    """Whether `save_prior` or `save_super_resolution` wrote a file."""
+    """Whether `write_stage` wrote a file."""
     try:
         with safe_open(path, "pt") as file:
             return "phydict" in (file.metadata() or {})

@@ -9,13 +9,12 @@ import torch
 from torch import Tensor
 
 from phydict.grid import Grid
-from phydict.prior.stage_file import ADVICE, built_network, read_stage, window_of, write_stage
+from phydict.prior.stage_file import built_network, loaded_stage, window_of, write_stage
 from phydict.rivals.lifted import LiftedNetwork
 from phydict.rivals.network import RivalNetwork
 from phydict.rivals.rival import Rival
 from phydict.rivals.x2ct import X2CTNetwork
 from phydict.rivals.xray2ctpa import XrayToCTPANetwork
-from phydict.runtime.reading import refusing
 from phydict.xray import ConeBeam
 
 NETWORKS: dict[str, type[RivalNetwork]] = {
@@ -34,17 +33,13 @@ def load_rival(path: str | Path, device: str = "cpu") -> Rival:
     Raises FileNotFoundError when there is no file, ValueError when it is truncated, is no rival, or holds weights that
     are not finite.
     """
-    path = Path(path)
-    with refusing(path, ADVICE):
-        header, weights = read_stage(path, tuple(NETWORKS), device)
-        try:
-            rival = build_rival(header, weights)
-        except ValueError as error:
-            raise ValueError(f"'{path}' contradicts itself: {error}") from error
-    training = header.get("training")
-    told = training if isinstance(training, dict) else {}
-    rival.budget = {name: told[name] for name in ("steps", "samples") if type(told.get(name)) is int}
-    return rival.to(device).eval().requires_grad_(False)
+    def build(header: dict, weights: dict[str, Tensor]) -> Rival:
+        rival, training = build_rival(header, weights), header.get("training")
+        told = training if isinstance(training, dict) else {}
+        rival.budget = {name: told[name] for name in ("steps", "samples") if type(told.get(name)) is int}
+        return rival
+
+    return loaded_stage(Path(path), tuple(NETWORKS), build, device)
 
 
 def build_rival(header: dict, weights: dict[str, Tensor]) -> Rival:

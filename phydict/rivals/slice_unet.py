@@ -58,7 +58,7 @@ class StackAttention(nn.Module):
 
 
 class SliceUNet(nn.Module):
-    """Noisy stacks (B, C, X, Y, slices) at times, beside a condition (B, D) -> the noise in them.
+    """Noisy stacks (B, C, X, Y, slices) at times, beside a condition (B, D) -> their velocity.
 
     After the 3D UNet of video diffusion (Ho et al. 2022, arXiv:2204.03458) that X-ray2CTPA uses. Slices are halved from
     level to level, their number stays. channels: of the stack; condition: its width D; widths: of each level.
@@ -79,7 +79,7 @@ class SliceUNet(nn.Module):
         silence(self.leave)
 
     def forward(self, x: Tensor, t: Tensor, condition: Tensor) -> Tensor:
-        """x (B, C, X, Y, slices), times t (B,) in [0, 1], condition (B, D) -> noise of x's shape."""
+        """x (B, C, X, Y, slices), times t (B,) in [0, 1], condition (B, D) -> velocity of x's shape."""
         known = torch.cat([condition, self.time(waves(1000 * t, self.wave).to(condition))], 1)
         h, levels = self.enter(x), []
         start = h

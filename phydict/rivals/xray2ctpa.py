@@ -46,7 +46,7 @@ class XrayToCTPANetwork(RivalNetwork):
     """X-ray2CTPA (Cahan et al. 2025, arXiv:2406.16109), from its paper, for K views.
 
     The CT's slices go through a variational autoencoder that shrinks them by four or so; a UNet over the stack of their
-    latents tells its noise, at all times of a cosine schedule, beside an embedding of the X-rays, and DDIM draws a
+    latents tells its velocity, at all times of a cosine schedule, beside an embedding of the X-rays, and DDIM draws a
     stack, which is decoded.
 
     Not as published: an autoencoder trained on the same CTs in place of Stable Diffusion's, a small convolutional

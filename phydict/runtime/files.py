@@ -94,6 +94,13 @@ def alone_in(folder: Path, option: str) -> Iterator[None]:
         yield
 
 
+def atomic_removal(folder: Path, wanted: Callable[[], bool]) -> None:
+    """Removes a folder, whole until it is gone; wanted: as for `atomic_directory`."""
+    with undisturbed(folder.parent):
+        if os.path.lexists(folder) and wanted():
+            shutil.rmtree(folder.rename(_partial(folder)), ignore_errors=True)
+
+
 def check_replaceable(folder: Path, written: Collection[str], option: str) -> None:
     """Raises ValueError where `folder` is a link or holds more than the files `written`, so that it must stay; `option`
     is what the user may change instead."""
@@ -171,6 +178,22 @@ def _runs(process: int) -> bool:
     except PermissionError:
         pass
     return True
+
+
+def files_below(root: Path) -> list[Path]:
+    """The files in a folder, at any depth and in linked folders too, each folder once, in order; hidden ones are passed
+    over."""
+    found, links = [], [root]
+    seen = {str(folder) for folder in root.resolve().parents}
+    while links:
+        for folder, inner, names in os.walk(links.pop(0)):
+            real = os.path.realpath(folder)
+            inner[:] = [name for name in inner if not name.startswith(".") and real not in seen]
+            links += [Path(folder, name) for name in inner if Path(folder, name).is_symlink()]
+            if real not in seen:
+                found += [Path(folder, name) for name in names if not name.startswith(".")]
+            seen.add(real)
+    return sorted(path for path in found if path.is_file())
 
 
 def file_crc32(path: Path, start: int = 0) -> int:

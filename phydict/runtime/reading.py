@@ -109,10 +109,10 @@ def name_of(path: str | Path) -> str:
 
 
 def read_ids(path: str | Path, option: str) -> list[str]:
-    """The ids in a text file, apart by white space; `option` is what names the file. Raises as `read_text` does."""
+    """The ids in a text file, one a line; `option` is what names the file. Raises as `read_text` does."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"there is no file {path}: give another {option}, a text file of case ids")
-    return read_text(path).split()
+    return [line.strip() for line in read_text(path).splitlines() if line.strip()]
 
 
 def read_npy(path: str | Path) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Training a prior or a super-resolution stage with Lightning."""
+"""Training with Lightning: priors, super-resolution, refiners, refinement on finer voxels, uncertainty and rivals."""
 
 from phydict.training.crops import SuperResolutionData
 from phydict.training.data import PriorData

@@ -14,6 +14,9 @@ from torch import Tensor
 LARGEST_SHARE = 0.9
 """The share of a pixel's signal that may at most be scatter."""
 
+ORDER = 3
+"""The cosines that a view's scatter is made of have total orders below it."""
+
 HARDENING = 0.011
 """By how much a tube's line integrals m of water bend: m + HARDENING m (m - m_0) is straight in the water's thickness,
 within 0.07 over 450 mm, where m itself errs by 0.4 to 0.65. The best value is 0.0105 to 0.0121 for tubes of 70 to 120
@@ -36,17 +39,17 @@ def match_views(display: Tensor, reference: Tensor) -> Tensor:
     return gain * centred + reference.mean(axes, keepdim=True)
 
 
-def subtract_scatter(xrays: Tensor, reference: Tensor, order: int = 3) -> Tensor:
+def subtract_scatter(xrays: Tensor, reference: Tensor) -> Tensor:
     """Line integrals (B, K, V, U) without the scatter that makes their signal exceed that of `reference`.
 
-    exp(-xrays) = exp(-reference) + S, with S per view a sum of the cosines of a total order below `order` along rows
+    exp(-xrays) = exp(-reference) + S, with S per view a sum of the cosines of a total order below ORDER along rows
     and columns, fitted by least squares relative to the signal, so that what is thick counts as much as what is thin.
     S is kept above zero and below LARGEST_SHARE of the signal.
     """
     signal = torch.exp(-xrays.double())
     down, along = (torch.linspace(0, math.pi, n, dtype=torch.float64, device=xrays.device) for n in xrays.shape[-2:])
     smooth = torch.stack([torch.cos(i * down)[:, None] * torch.cos(j * along)
-                          for i in range(min(order, len(down))) for j in range(min(order - i, len(along)))])
+                          for i in range(min(ORDER, len(down))) for j in range(min(ORDER - i, len(along)))])
     design = (smooth / signal[..., None, :, :]).flatten(-2)
     excess = (1 - torch.exp(-reference.double()) / signal).flatten(-2)
     normal, right = design @ design.transpose(-1, -2), design @ excess[..., None]

@@ -193,6 +193,15 @@ class ConeBeam:
         return (self.detectors[:, None, None] + columns[None, None, :, None] * self.u[:, None, None]
                 + rows[None, :, None, None] * self.v[:, None, None])
 
+    def shadows(self, points: np.ndarray) -> np.ndarray:
+        """Where points (N, 3) appear on each detector: (K, N, 2) mm from its centre, from column to column and from row
+        to row."""
+        rays = points - self.sources[:, None]
+        depth = (rays * self.normals[:, None]).sum(2, keepdims=True)
+        hits = self.sources[:, None] + rays * self.distances[:, None, None] / depth - self.detectors[:, None]
+        return np.stack([(hits * (step / np.linalg.norm(step, axis=1, keepdims=True))[:, None]).sum(2)
+                         for step in (self.u, self.v)], 2)
+
     def select(self, views) -> ConeBeam:
         """The beam with only `views` (indices, slice or mask), in the order given."""
         index = np.atleast_1d(np.arange(self.views)[views])
@@ -294,11 +303,7 @@ class ConeBeam:
 
     def _shadow(self, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
         """The ends (K, 2) in mm, along rows' and columns' direction from the detector's centre, of the box's shadow."""
-        rays = grid.corners() - self.sources[:, None]  # (K, 8, 3)
-        depth = (rays * self.normals[:, None]).sum(2, keepdims=True)
-        hits = self.sources[:, None] + rays * self.distances[:, None, None] / depth - self.detectors[:, None]
-        units = (step / np.linalg.norm(step, axis=1, keepdims=True) for step in (self.v, self.u))
-        places = np.stack([(hits * unit[:, None]).sum(2) for unit in units], 2)
+        places = self.shadows(grid.corners())[..., ::-1]
         return places.min(1), places.max(1)
 
     def same_as(self, other: ConeBeam, tolerance: float = 1e-6) -> bool:

@@ -46,7 +46,7 @@ class Ideal(Simulator):
     """Monoenergetic X-rays without scatter: the projector's line integrals, with noise.
 
     Reconstructing with the projector that made the X-rays is an inverse crime: the model error of a real
-    measurement is missing. To lessen it, simulate on a finer grid or with the other method, or use Polychromatic.
+    measurement is missing. To lessen it, simulate on a finer grid or with another method, or use Polychromatic.
 
     Args:
         noise: standard deviation of added Gaussian noise, as a fraction of the case's largest line integral; 0 = none

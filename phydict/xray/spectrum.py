@@ -1,4 +1,4 @@
-"""X-ray spectra and what matter does to them: tube spectra, mass attenuation, half-value layers, photons per dose.
+"""X-ray spectra of tubes, and the attenuation of matter by energy.
 
 The tables lie in data/spectra, with their provenance; everything between their energies is interpolated.
 """
@@ -15,9 +15,6 @@ from phydict.runtime.shipped import shipped
 DENSITIES = {"water": 1.0, "soft_tissue": 1.06, "bone": 1.92, "titanium": 4.54, "aluminium": 2.699,
              "caesium_iodide": 4.51, "air": 1.205e-3}
 """g/cm^3, as NIST tabulates them with the compositions in data/spectra/make.py; bone is cortical (ICRU-44)."""
-
-GRAY_PER_KEV = 1.602176634e-13
-"""Gy of 1 keV absorbed in 1 g."""
 
 
 @cache
@@ -81,34 +78,3 @@ class Spectrum:
             raise ValueError(f"there is no tube spectrum of {kvp} kVp; use one of {tubes}, or give a Spectrum")
         there = table[f"{kvp}kvp"] > 1e-7
         return cls(tuple(table["energy_kev"][there]), tuple(table[f"{kvp}kvp"][there]))
-
-    @classmethod
-    def monoenergetic(cls, energy: float) -> Spectrum:
-        """All photons of one energy in keV."""
-        return cls((energy,), (1.0,))
-
-    def behind(self, material: str, mm: float) -> Spectrum:
-        """The spectrum after `mm` of a material, by Beer-Lambert."""
-        passed = np.exp(-mm * attenuation(material, self.energies))
-        return Spectrum(self.energies, tuple(np.asarray(self.weights) * passed))
-
-    @property
-    def mean_energy(self) -> float:
-        """keV, averaged over photons."""
-        return float(np.dot(self.energies, self.weights))
-
-    def kerma(self, material: str = "aluminium", mm: float = 0.0) -> float:
-        """Air kerma in uGy of a fluence of one photon per mm^2 before `mm` of a material, measured behind it."""
-        absorbed = mass_attenuation("air_energy_absorption", self.energies) * np.asarray(self.energies)
-        passed = np.exp(-mm * attenuation(material, self.energies))
-        return 1e6 * 100 * GRAY_PER_KEV * float(np.dot(absorbed * passed, self.weights))
-
-    def half_value_layer(self, material: str = "aluminium") -> float:
-        """mm of a material that halve the air kerma, by bisection."""
-        half, thin, thick = self.kerma() / 2, 0.0, 1.0
-        while self.kerma(material, thick) > half:
-            thick *= 2
-        for _ in range(50):
-            middle = (thin + thick) / 2
-            thin, thick = (middle, thick) if self.kerma(material, middle) > half else (thin, middle)
-        return thick

@@ -18,6 +18,8 @@ from phydict.ablation import read_specification
 from phydict.cli.infer import main
 from phydict.evaluation import read_csv
 from phydict.grid import Grid
+from phydict.inference.data import ReconstructionData
+from phydict.inference.scoring import Scoring
 from phydict.methods import METHODS
 from phydict.prior import save_prior
 from phydict.runtime import profiling
@@ -145,6 +147,19 @@ def test_a_method_that_gives_up_is_a_row_with_its_sentence(tmp_path, monkeypatch
     calls = len(trace.given)
     ablate(tmp_path, **content)
     assert (len(trace.given) > calls) == bool(again)
+
+
+@pytest.mark.parametrize("owner, name", [(ReconstructionData, "simulate"), (Scoring, "scores")])
+def test_what_goes_wrong_outside_the_method_is_tried_again(tmp_path, monkeypatch, trace, owner, name):
+    def give_up(*_):
+        raise ValueError("The case is damaged.")
+
+    content = {"phantoms": 1, "axes": {"method": ["trace"]}}
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, name, give_up)
+        assert [(row["status"], row["error"]) for row in ablate(tmp_path, **content)] == [
+            ("failed", "The case is damaged.")]
+    assert [row["status"] for row in ablate(tmp_path, **content)] == ["ok"]
 
 
 def test_methods_without_a_prior_take_the_grid_and_window_of_those_with_one(tmp_path):

@@ -6,8 +6,12 @@ import random
 
 from ablation.runs import ablate, row
 from phydict.ablation import plots
+from phydict.ablation.fid import FID, distance_tables
 from phydict.ablation.summary import summarise, without_repeats
 from phydict.ablation.tables import all_tables
+from phydict.evaluation import write_csv
+from phydict.evaluation.fid import NAMES
+from phydict.evaluation.planes import PLANES
 
 
 def test_a_case_counts_once_whatever_its_seeds_and_a_missing_case_takes_a_method_out():
@@ -123,6 +127,12 @@ def test_every_plot_that_the_rows_allow_is_drawn(tmp_path):
     assert {file.stem for file in files} == {"pareto_K_1", "pareto_K_8", "stages_K_1", "stages_K_8", "views", "delta"}
 
 
+def test_plots_of_boxes_on_either_side_are_two(tmp_path):
+    rows = [row("a", method, 20.0, centre=(x, 0.0, 20.0)) for x in (-60.0, 60.0) for method in "xy"]
+    files = plots.write_plots(tmp_path, summarise(rows))
+    assert len(set(files)) == len(files) == 4
+
+
 def test_rows_that_are_all_refused_give_no_plot(tmp_path):
     rows = [row("a", "x", None, views=views, **more) for views in (1, 8) for more in ({"delta": 0.0}, {"delta": 0.8})]
     assert plots.write_plots(tmp_path, summarise(rows)) == [] == list(tmp_path.iterdir())
@@ -132,3 +142,14 @@ def test_dollars_in_the_name_of_a_method_are_no_formula_of_its_plots(tmp_path):
     names = ["a$\\frac$", "$x|[/b]"]
     rows = ablate(tmp_path, methods={name: {"of": "sirt", "method.iterations": 2} for name in names})
     assert {row["method"] for row in rows} == set(names) and list((tmp_path / "out").glob("*.png"))
+
+
+def test_distances_are_told_of_their_own_condition_alone(tmp_path):
+    boxes = [{}, {"simulation_voxels": 128}, {"simulation_voxels": None, "voxels": (16, 16, 8)}]
+    entries = summarise(row("a", "x", 20.0, **box) for box in boxes)
+    slices = {f"slices_{plane}": 16 for plane in PLANES}
+    write_csv(tmp_path / FID, [{"method": "x"} | box | slices | {
+        "fid_backbone": "b", "fid_normalisation": "n", "cases": 1} | dict.fromkeys(NAMES, float(n))
+        for n, box in enumerate(boxes)])
+    tables = distance_tables(tmp_path, entries)
+    assert [[values[-1].mean for _, _, values in table.lines] for table in tables] == [[0.0], [1.0], [2.0]]

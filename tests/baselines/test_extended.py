@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from fitting import fit_to_grid
 from torch.nn.functional import pad
 
 from phydict import ConeBeam, Projector, reconstruct
@@ -13,7 +14,7 @@ from phydict.baselines.extended import Extended, covering, extended
 from phydict.datasets import phantom_case
 from phydict.evaluation import volume_metrics
 from phydict.grid import Grid
-from phydict.methods import fit_to_grid, onto_grid, reconstructor
+from phydict.methods import onto_grid, reconstructor
 from phydict.posterior import Posterior, Refined, SplitGibbs
 from phydict.runtime.warning import Remark
 from phydict.units import HUWindow

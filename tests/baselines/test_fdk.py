@@ -9,7 +9,7 @@ from laws import assert_linear
 
 from phydict.baselines import FDK
 from phydict.baselines.fdk import ramp
-from phydict.baselines.orbit import Orbit
+from phydict.baselines.orbit import CircularOrbit
 from phydict.grid import Grid
 from phydict.units import MU_WATER
 from phydict.xray import ConeBeam, Projector
@@ -106,14 +106,14 @@ def test_a_view_given_twice_counts_once():
 
 @pytest.mark.parametrize("arc", [60, 180, 230, 300, 345])
 def test_the_angles_of_an_open_arc_add_up_to_it(arc):
-    assert Orbit.of(orbit(15, arc=arc), GRID).shares().sum() == pytest.approx(math.radians(arc))
+    assert CircularOrbit.of(orbit(15, arc=arc), GRID).shares().sum() == pytest.approx(math.radians(arc))
 
 
 def test_the_angles_of_a_circle_add_up_to_it_and_a_missing_view_opens_it():
-    full = Orbit.of(orbit(8), GRID)
+    full = CircularOrbit.of(orbit(8), GRID)
     assert full.shares() == pytest.approx(np.full(8, math.pi / 4))
     assert (full.redundancy(np.zeros((8, 3))) == 0.5).all()
-    missing = Orbit.of(orbit(8).select([0, 1, 2, 4, 5, 6, 7]), GRID)
+    missing = CircularOrbit.of(orbit(8).select([0, 1, 2, 4, 5, 6, 7]), GRID)
     assert missing.shares().sum() == pytest.approx(math.radians(315))
 
 
@@ -122,7 +122,7 @@ def test_lines_seen_from_both_sides_count_once_in_all_and_lines_seen_once_too(ar
     """Between whole views the weight is a function of the angle: compare it at the conjugate angle."""
     views = 3600
     beam = ConeBeam.orbit(views, 1020, 740, (2, 2), 12.0, 0.3, math.radians(arc))
-    scan, step = Orbit.of(beam, GRID), math.radians(arc) / views
+    scan, step = CircularOrbit.of(beam, GRID), math.radians(arc) / views
     tangents = np.tan(np.linspace(-0.25, 0.25, 11))
     weights = scan.redundancy(np.tile(tangents, (views, 1)))
     seen_twice = 0
@@ -139,7 +139,7 @@ def test_lines_seen_from_both_sides_count_once_in_all_and_lines_seen_once_too(ar
 
 
 def test_a_limited_arc_weighs_every_line_fully():
-    assert (Orbit.of(orbit(8, arc=60), GRID).redundancy(np.tile(np.linspace(-0.3, 0.3, 9), (8, 1))) == 1).all()
+    assert (CircularOrbit.of(orbit(8, arc=60), GRID).redundancy(np.tile(np.linspace(-0.3, 0.3, 9), (8, 1))) == 1).all()
 
 
 @pytest.mark.parametrize("beam", [orbit(1), orbit(2), orbit(2, arc=180), orbit(6, arc=60), orbit(1).select([0, 0])])

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 import torch
-from laws import random_like
+from laws import random_like, total_variation
 
 from phydict.baselines import CGLS, FISTATV
 from phydict.baselines.tv import finest_to_own
 from phydict.grid import Grid
-from phydict.linalg.total_variation import differences, total_variation, tv_proximal
+from phydict.linalg.total_variation import differences, tv_proximal
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import ConeBeam, Projector
 

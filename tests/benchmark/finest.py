@@ -11,6 +11,7 @@ of views and ways stay, and prints means and the least lead of 256^3 over each.
 """
 
 import argparse
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -27,7 +28,7 @@ from phydict.baselines import CGLS, FISTATV, SIRT, DiffVox
 from phydict.datasets import CTFile, find_cts, prepare_ct
 from phydict.evaluation import body_weights, read_csv, volume_metrics, write_csv
 from phydict.grid import Grid
-from phydict.methods import fit_to_grid, onto_grid, reconstructor
+from phydict.methods import onto_grid, reconstructor
 from phydict.posterior import Refinement
 from phydict.prior import DEFAULT_CORRECTION, load_correction
 from phydict.runtime.precision import instruction_set
@@ -36,6 +37,9 @@ from phydict.units import AIR
 from phydict.xray import Ideal
 from phydict.xray.binning import benchmark_orbit
 from phydict.xray.boxes import interpolated
+
+sys.path.append(str(Path(__file__).parents[1]))
+from fitting import fit_to_grid
 
 FILE = Path(__file__).with_suffix(".csv")
 FINEST, WINDOW = Grid.cube(256), HUWindow()

@@ -38,14 +38,17 @@ from phydict import METHODS, ConeBeam, Grid, HUWindow, Projector, load_prior, re
 from phydict.datasets import prepare_ct
 from phydict.evaluation import body_weights, read_csv, volume_metrics, write_csv
 from phydict.guard import worst_view
-from phydict.methods import fit_to_grid
 from phydict.posterior import Posterior
 from phydict.prior import Prior
 from phydict.prior.files import DEFAULT_PRIOR
 from phydict.reconstruction import Reconstruction
 from phydict.runtime.console import sentence
+from phydict.units import mu_to_hu
 from phydict.xray import Ideal
 from phydict.xray.poses.uncertain import USUAL, Uncertain
+
+sys.path.append(str(Path(__file__).parents[1]))
+from fitting import fit_to_grid
 
 OUT = Path(__file__).with_suffix(".csv")
 COLUMNS = ("case", "method", "ssim", "psnr", "mae_hu", "ssim_body", "psnr_body", "mae_hu_body", "misfit",
@@ -138,7 +141,7 @@ class HardCases:
 
     def _bad_data(self):
         def of(mu: Tensor, **more) -> Case:
-            return Case(self.simulated(mu, **more), WINDOW.to_hu(WINDOW.from_mu(mu).clamp(-1, 1))[0, 0])
+            return Case(self.simulated(mu, **more), mu_to_hu(mu)[0, 0].clamp(WINDOW.low, WINDOW.high))
 
         mu = WINDOW.to_mu(self.x)
         for name, simulator in (("no noise", Ideal(0)), ("1e4 photons per pixel", Ideal(0, 1e4)),

@@ -18,6 +18,7 @@ from pathlib import Path
 from statistics import mean
 
 import numpy as np
+from balls import SHELL, nodule
 from scipy.ndimage import binary_erosion, maximum_filter
 from torch import Tensor
 from torch.nn.functional import conv3d
@@ -25,7 +26,6 @@ from torch.nn.functional import conv3d
 from phydict import Grid, HUWindow, Projector, load_prior, reconstruct
 from phydict.datasets import find_cts, prepare_ct
 from phydict.evaluation import write_csv
-from phydict.evaluation.sharpness import SHELL, nodule
 from phydict.prior import DEFAULT_REFINER
 from phydict.runtime.seeds import case_seed
 from phydict.xray import Ideal

@@ -11,6 +11,7 @@ first step has the length of the learning rate and depends on the gradient's sig
 from __future__ import annotations
 
 import argparse
+import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -20,12 +21,15 @@ from torch import Tensor
 from phydict.datasets import CTFile, load_case
 from phydict.evaluation import write_csv
 from phydict.inference.scoring import case_scores
-from phydict.methods import METHODS, fit_to_grid, reconstructor
+from phydict.methods import METHODS, reconstructor
 from phydict.posterior import GradientSteps, Reward, Sampler
 from phydict.posterior.measurement import Measurement
 from phydict.prior import load_prior
 from phydict.runtime.seeds import case_seed
 from phydict.xray import ConeBeam, Ideal, Projector
+
+sys.path.append(str(Path(__file__).parents[1]))
+from fitting import fit_to_grid
 
 WEIGHTS = (0, 1, 1e3, 1e4, 1e5, 1e6)
 WITH_EC = (0, 1, 1e5)

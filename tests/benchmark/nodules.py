@@ -17,6 +17,7 @@ from statistics import mean
 
 import numpy as np
 import torch
+from balls import nodule, recovered_contrast
 from lesions import GRID, places
 from matplotlib.figure import Figure
 from torch import Tensor
@@ -25,7 +26,6 @@ from phydict import Grid, HUWindow, Projector, reconstruct
 from phydict.baselines import FISTATV
 from phydict.datasets import find_cts, prepare_ct
 from phydict.evaluation import read_csv, write_csv
-from phydict.evaluation.sharpness import nodule, recovered_contrast
 from phydict.runtime.seeds import case_seed
 from phydict.xray import Ideal
 from phydict.xray.binning import benchmark_orbit

@@ -22,6 +22,7 @@ Rows that poses.csv beside this file holds already are kept.
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 import warnings
 from pathlib import Path
@@ -32,7 +33,7 @@ import torch
 from phydict.datasets import CTSource, body_mask, load_case
 from phydict.evaluation import body_weights, read_csv, volume_metrics, write_csv
 from phydict.grid import Grid
-from phydict.methods import calibrated, fit_to_grid, reconstructor
+from phydict.methods import calibrated, reconstructor
 from phydict.poses.search import middle_points
 from phydict.runtime.precision import instruction_set
 from phydict.runtime.seeds import case_seed
@@ -41,6 +42,9 @@ from phydict.xray import ConeBeam, Ideal, Projector
 from phydict.xray.poses.gauge import aligned, reprojection_errors
 from phydict.xray.poses.uncertain import USUAL
 from phydict.xray.poses.unknowns import moved
+
+sys.path.append(str(Path(__file__).parents[1]))
+from fitting import fit_to_grid
 
 FILE = Path(__file__).with_suffix(".csv")
 GRID, WINDOW = Grid.cube(64), HUWindow()

@@ -61,7 +61,7 @@ def read_reports(table: Path) -> tuple[list[str], dict[str, np.ndarray]]:
 def drawn(prior: Prior, reports: list[str]) -> np.ndarray:
     """How much of each kind a prior draws for reports (N, kinds)."""
     kinds = prior.network.text_map
-    return torch.cat([kinds.scores(prior.context([report])) for report in reports]).numpy()
+    return torch.cat([kinds(prior.context([report])).mean((2, 3, 4)) for report in reports]).numpy()
 
 
 def measured(file: Path, table: Path) -> list[dict]:

@@ -19,9 +19,11 @@ from phydict.baselines import CGLS, FDK, FISTATV, SIRT, DiffVox
 from phydict.datasets import CTFile, find_cts, prepare_ct
 from phydict.evaluation import body_weights, read_csv, volume_metrics, write_csv
 from phydict.grid import Grid
-from phydict.methods import fit_to_grid
 from phydict.reconstruction import Reconstructor, describe
 from phydict.xray import ConeBeam, Ideal, Projector
+
+sys.path.append(str(Path(__file__).parents[1]))
+from fitting import fit_to_grid
 
 FILE = Path(__file__).with_name("tune_baselines.csv")
 VIEWS = (4, 8)

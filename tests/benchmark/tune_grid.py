@@ -20,12 +20,15 @@ from phydict.baselines import CGLS, FISTATV, SIRT, DiffVox
 from phydict.datasets import find_cts, prepare_ct
 from phydict.evaluation import body_weights, read_csv, volume_metrics, write_csv
 from phydict.grid import Grid
-from phydict.methods import fit_to_grid, onto_grid, reconstructor
+from phydict.methods import onto_grid, reconstructor
 from phydict.posterior import Posterior, ProximalCG, Refinement
 from phydict.reconstruction import describe
 from phydict.runtime.precision import instruction_set
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Ideal, Projector
+
+sys.path.append(str(Path(__file__).parents[1]))
+from fitting import fit_to_grid
 
 FILE = Path(__file__).with_suffix(".csv")
 SCENE, WINDOW = Grid.cube(256), HUWindow()

@@ -12,6 +12,7 @@ from dicom_files import write_ct_series
 
 from phydict.datasets.cts.ct_rate import CTCases, find_cts, patient_of, split_by_patient
 from phydict.datasets.cts.ct_rate_tables import read_reports
+from phydict.datasets.cts.ct_series import find_series
 from phydict.datasets.cts.sources import find_sources
 from phydict.datasets.cts.transforms import Calibration, load_ct, prepare_ct
 from phydict.grid import Grid
@@ -51,6 +52,27 @@ def test_ct_rate_is_found_with_its_reports(tmp_path, chest):
     assert [ct.id for ct in firsts] == ["train_1_a_1", "train_1_b_1", "train_2_a_1", "train_10_a_1"]
     (tmp_path / "no_chest.txt").write_text("train/train_2/train_2_a_1.nii.gz\n\n train_10_a_1.nii.gz\n")
     assert len(find_cts(root, exclude=tmp_path / "no_chest.txt")) == 3
+
+
+@pytest.mark.parametrize("lines, left", [("x__a b", ["a b", "y__c"]), ("./x/a b.nii\nnobody", ["a b", "y__c"]),
+                                         ("a b.nii\nelsewhere/y__c", ["x__a b"]), ("\n", ["a b", "x__a b", "y__c"])])
+def test_a_list_leaves_out_the_cts_of_its_lines_and_no_others(tmp_path, chest, lines, left):
+    for name in ("a b.nii", "x/a b.nii", "y/c.nii"):
+        save_ct(tmp_path / "cts" / name, chest[:4, :4, :4])
+    (tmp_path / "list.txt").write_text(lines)
+    assert [ct.id for ct in find_cts(tmp_path / "cts", exclude=tmp_path / "list.txt")] == left
+
+
+def test_a_list_to_exclude_of_other_cts_is_warned_of(tmp_path, chest):
+    save_ct(tmp_path / "nifti" / "anna.nii", chest[:4, :4, :4])
+    write_ct_series(tmp_path / "dicom" / "anna", np.zeros((8, 8, 4)), AFFINE)
+    write_ct_series(tmp_path / "dicom" / "bob", np.zeros((8, 8, 4)), AFFINE)
+    (tmp_path / "list.txt").write_text("anna, bob\n")
+    for root in (tmp_path / "nifti", tmp_path / "dicom"):
+        with pytest.warns(UserWarning, match="none of the 1 lines of .* CTs in .*first line is anna, bob.*CT is anna"):
+            find_sources(root, exclude=tmp_path / "list.txt")
+    (tmp_path / "list.txt").write_text("bob\n")
+    assert [source.id for source in find_sources(tmp_path / "dicom", exclude=tmp_path / "list.txt")] == ["anna"]
 
 
 def test_v1_takes_hu_and_spacing_from_the_metadata(tmp_path, chest):
@@ -95,6 +117,19 @@ def test_files_of_the_same_name_in_patient_folders_are_told_apart(tmp_path, ches
     save_ct(tmp_path / "x" / "again" / "ct.nii", chest[:4, :4, :4])
     with pytest.raises(ValueError, match="would both become case x__ct"):
         find_cts(tmp_path)
+
+
+def test_linked_folders_are_entered_once_and_hidden_ones_never(tmp_path, chest):
+    root = tmp_path / "cts"
+    for name in ("cts/ben/a.nii", "cts/.Trash-1000/old/a.nii", "elsewhere/a.nii"):
+        save_ct(tmp_path / name, chest[:4, :4, :4])
+    for name in ("cts/ben/s", "cts/.Trash-1000/s", "elsewhere/t"):
+        write_ct_series(tmp_path / name, np.zeros((8, 8, 4)), AFFINE)
+    links = {"anna": "../elsewhere", "ada": "ben", "again": "../elsewhere", "up": "..", "elsewhere/loop": "."}
+    for name, place in links.items():
+        (root / name if "/" not in name else tmp_path / name).symlink_to(place)
+    assert [ct.id for ct in find_cts(root)] == ["again__a", "ben__a"]
+    assert [series.folder for series in find_series(root)] == [root / "again" / "t", root / "ben" / "s"]
 
 
 def test_folders_without_cts_are_explained(tmp_path):

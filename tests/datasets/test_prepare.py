@@ -122,6 +122,15 @@ def test_segmentations_beside_a_ct_are_used_and_are_no_cts(tmp_path, thorax):
     assert "holds 1 of the 5 lobes" in prepare_folder(tmp_path / "in", tmp_path / "o3", SMALL)[0]["reason"]
 
 
+def test_a_prepared_case_whose_masks_have_changed_is_cached_anew(tmp_path, thorax):
+    save_ct(tmp_path / "in/a.nii.gz", thorax)
+    prepare_folder(tmp_path / "in", tmp_path / "out", SMALL)
+    cases = CTCases(find_cts(tmp_path / "out"), tmp_path / "cache", Grid.cube(32), WINDOW)
+    assert cases[0]["has_masks"].tolist()[0] and len([*(tmp_path / "cache").iterdir()]) == 1
+    (tmp_path / "out/a/lung.nii.gz").unlink()
+    assert not cases[0]["has_masks"].tolist()[0]
+
+
 def test_lungmask_sees_slices_as_it_was_trained(tmp_path, thorax, monkeypatch):
     class LMInferer:
         """Air in the first columns, which are the patient's right in LPS order, from slice 20 upwards."""

@@ -84,6 +84,18 @@ def test_a_changed_input_is_prepared_again_and_other_settings_are_refused(tmp_pa
         find_cts(tmp_path / "out")
 
 
+def test_a_case_goes_when_its_ct_is_rejected_and_is_named_when_its_ct_is_gone(tmp_path, thorax):
+    for name in ("a", "b", "c"):
+        save_ct(tmp_path / f"in/{name}.nii", thorax)
+    prepare_folder(tmp_path / "in", tmp_path / "out", SMALL)
+    save_ct(tmp_path / "in/a.nii", thorax[:, :, :2])
+    (tmp_path / "in/b.nii").unlink()
+    with pytest.warns(UserWarning, match="out holds 1 case of no CT that is taken from .*: remove b if"):
+        rows = prepare_folder(tmp_path / "in", tmp_path / "out", SMALL)
+    assert [(row["id"], row["status"]) for row in rows] == [("a", "rejected"), ("c", "prepared")]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["b", "c", SUMMARY]
+
+
 STORED = Calibration(1.0, 0.0, (6.0, 6.0, 6.0)).affine()
 REPORTS = "VolumeName,Findings_EN,Impressions_EN\na.nii,{},\n"
 METADATA = 'VolumeName,RescaleSlope,RescaleIntercept,XYSpacing,ZSpacing\na.nii,1,{},"[6, 6]",6\n'
@@ -251,8 +263,9 @@ def test_settings_and_places_that_cannot_be_are_refused(tmp_path, thorax):
     (tmp_path / "empty").mkdir()
     with pytest.raises(FileNotFoundError, match="there is no CT in .*empty; give a NIfTI file, or a folder"):
         prepare_folder(tmp_path / "empty", tmp_path / "out")
-    for wrong, sentence in (({"voxels": 4}, "at least 8 voxels"), ({"side": 0}, "a side above 0"),
-                            ({"window": (5, 5)}, "low < high"), ({"space": "atlas"}, "space is patient or medsyn"),
+    for wrong, sentence in (({"voxels": 4}, "at least 8 voxels"), ({"side": 1e-9}, "side of 10 to 2000 mm"),
+                            ({"side": 1e9}, "side of 10 to 2000 mm"), ({"window": (5, 5)}, "low < high"),
+                            ({"space": "atlas"}, "space is patient or medsyn"),
                             ({"segmenter": "x"}, "segmenter is threshold or lungmask")):
         with pytest.raises(ValueError, match=sentence):
             Settings(**wrong)

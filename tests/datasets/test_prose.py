@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from phydict.datasets import Thorax, format_report, report
-from phydict.datasets.phantoms.findings import FOCAL, KINDS, LOBES, MIDLINE, PLEURAL, Finding, write_report
+from phydict.datasets.phantoms.findings import FOCAL, KINDS, LOBES, MIDLINE, PLEURAL, Finding
 from phydict.datasets.phantoms.phantom import change_by_findings
 from phydict.datasets.phantoms.places import examples, extents
 from phydict.datasets.phantoms.teaching import teaching_sentences
 from phydict.datasets.phantoms.thorax import wrong_side
-from phydict.datasets.prose import phrases, written_words
+from phydict.datasets.prose import phrases, write_report, written_words
 from phydict.datasets.reports import read_texts
 from phydict.grid import Grid
 

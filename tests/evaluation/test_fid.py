@@ -16,18 +16,36 @@ from phydict.evaluation.backbones import NORMALISATION, SliceFeatures, maisi_vox
 from phydict.evaluation.bootstrap import draws
 from phydict.evaluation.fid import (
     NAMES,
+    Moments,
     PlaneFID,
     StoredFeatures,
     case_features,
     distances,
-    fid,
     fid_rows,
-    frechet_distance,
     save_features,
 )
 from phydict.evaluation.planes import PLANES, slices
 from phydict.evaluation.tables import fid_tables
 from phydict.grid import Grid
+
+
+def moments_of(x: torch.Tensor, repeats: torch.Tensor) -> Moments:
+    """Those of features (N, d), each of which counts as often as `repeats` (N,) says."""
+    moments = Moments(x.shape[1])
+    for one, times in zip(x, repeats.tolist()):
+        moments.add(Moments.of(one[None]), times)
+    return moments
+
+
+def frechet_distance(a: torch.Tensor, b: torch.Tensor, repeats: torch.Tensor | None = None) -> float:
+    """The Frechet distance of features a (N, d) and b (M, d); repeats: how often each slice counts, of both (N = M)."""
+    of, to = (Moments.of(x) if repeats is None else moments_of(x, repeats) for x in (a, b))
+    return fid_module._distance(of, fid_module._reduced(to))
+
+
+def fid(cases: dict, replicates: int = 0) -> dict:
+    """{"fid_xy", "fid_yz", "fid_zx", "fid" (their mean)} over all slices of cases, as `distances` has them."""
+    return distances({"": cases}, replicates)[""].estimates()
 
 
 def normal(count: int, dimensions: int, seed: int = 0) -> torch.Tensor:
@@ -132,9 +150,9 @@ def test_methods_are_paired_draw_by_draw_and_each_is_as_it_is_alone(monkeypatch)
 
 def test_moments_of_parts_are_those_of_the_whole_whatever_their_order_and_how_often_they_count():
     x, repeats = 5 + normal(40, 6), torch.arange(40) // 10 % 3
-    whole, streamed = fid_module.Moments.of(x, repeats), fid_module.Moments(6)
+    whole, streamed = Moments.of(x.repeat_interleave(repeats, 0)), Moments(6)
     for n in (2, 0, 3, 1):
-        streamed.add(fid_module.Moments.of(x[10 * n:10 * n + 10]), n % 3)
+        streamed.add(Moments.of(x[10 * n:10 * n + 10]), n % 3)
     assert streamed.count == whole.count == 30
     torch.testing.assert_close(streamed.mean, whole.mean)
     torch.testing.assert_close(streamed.covariance, x.repeat_interleave(repeats, 0).double().T.cov())

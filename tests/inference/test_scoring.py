@@ -22,10 +22,13 @@ from phydict.evaluation.organs import dice
 from phydict.evaluation.planes import PLANES
 from phydict.grid import Grid
 from phydict.inference import scoring
+from phydict.inference.data import ReconstructionData
 from phydict.inference.page import results_page
 from phydict.inference.results import FEATURES
 from phydict.inference.scoring import FIDSettings, Scoring
+from phydict.runtime.files import file_crc32
 from phydict.runtime.lpips_networks import load_lpips
+from phydict.units import HUWindow
 
 METRICS = "--metrics=[lpips,fid,organs]"
 COLUMNS = ("lpips_alex", "lpips_squeeze", "dice_lung", "hd95_lung", "cldice_vessel")
@@ -170,6 +173,23 @@ def test_lungs_that_are_segmented_beside_a_ct_are_those_of_the_truth(tmp_path):
     assert found.keys() == {"lung"}
     assert dice(found["lung"], lung.repeat(2, 0).repeat(2, 1).repeat(2, 2) > 0) > 0.999  # but for its corners
     assert organs_beside(tmp_path / "bert.nii.gz", grid) == {}
+
+
+def test_cases_of_other_masks_are_other_data_and_those_without_are_known_by_the_ct_alone(tmp_path):
+    def source() -> str:
+        (_, source, _), = ReconstructionData(cts=str(ct)).test_cases(Grid.cube(16), HUWindow())
+        return source
+
+    ct, mask = tmp_path / "anna.nii.gz", tmp_path / "anna_lungmask.nii.gz"
+    ct.write_bytes(b"ct")
+    alone = source()
+    assert alone == f"anna.nii.gz, crc32 {file_crc32(ct):08x}, None, report crc32 00000000"
+    found = []
+    for content in (b"one", b"other"):
+        mask.write_bytes(content)
+        found.append(source())
+    mask.unlink()
+    assert len({alone, *found}) == 3 and source() == alone
 
 
 def test_the_prepared_lungs_are_those_of_the_truth_and_its_vessels_are_found_in_the_ct(tmp_path):

@@ -4,14 +4,13 @@ from functools import partial
 
 import pytest
 import torch
-from laws import assert_adjoint, random_like
+from laws import assert_adjoint, random_like, total_variation
 
 from phydict.linalg.total_variation import (
     UNIT,
     TVQuadraticMajorizer,
     differences,
     differences_adjoint,
-    total_variation,
     tv_proximal,
 )
 

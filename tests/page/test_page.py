@@ -151,6 +151,12 @@ def test_the_page_of_one_method_is_that_of_its_folder(tmp_path):
     assert [case["folder"] for case in content(results_page(tmp_path))["cases"]] == ["sirt/anna", "tv/anna"]
 
 
+def test_a_line_of_several_settings_is_named_beneath_the_means_and_one_of_several_seeds_is_not(tmp_path):
+    for method, change in (("sirt", {"noise": 0.1}), ("tv", {"seed": 1})):
+        finish(tmp_path, "anna", method), finish(tmp_path, "bert", method, settings={"seed": 0} | change)
+    assert "Cases of several settings, as their records tell, in one line: sirt." in results_page(tmp_path).read_text()
+
+
 def test_a_damaged_case_is_left_out_with_a_word(tmp_path):
     finish(tmp_path, "anna", "sirt")
     (finish(tmp_path, "bert", "sirt") / RECORD).write_text("{")

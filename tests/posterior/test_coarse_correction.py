@@ -6,11 +6,12 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from fitting import fit_to_grid
 from laws import random_like
 from prior.tiny import tiny_prior, tiny_refiner
 
 from phydict.grid import Grid
-from phydict.methods import fit_to_grid, reconstructor
+from phydict.methods import reconstructor
 from phydict.posterior import Measurement, PriorOnly, Refined, Refinement, Unrolled
 from phydict.posterior.coarse_correction import CoarseCorrection, coarse_correction
 from phydict.runtime.profiling import profiled

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from laws import random_like
+from laws import random_like, total_variation
 from scipy.optimize import lsq_linear
 
 from phydict.datasets import phantom_case
 from phydict.grid import Grid
-from phydict.linalg.total_variation import TVQuadraticMajorizer, total_variation
+from phydict.linalg.total_variation import TVQuadraticMajorizer
 from phydict.posterior import GradientSteps, Measurement, ProximalCG, Reward
 from phydict.posterior.likelihood.likelihood import MOST_SMOOTHING
 from phydict.units import HUWindow

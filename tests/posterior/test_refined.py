@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from fitting import fit_to_grid
 from laws import random_like
 from prior.tiny import tiny_prior, tiny_super_resolution
 
 from phydict.baselines import CGLS, FDK, FISTATV, SIRT, Region
 from phydict.grid import Grid
-from phydict.methods import fit_to_grid, onto_grid, reconstruct, reconstructor
+from phydict.methods import onto_grid, reconstruct, reconstructor
 from phydict.posterior import Measurement, PriorOnly, ProximalCG, Refined, Refinement
 from phydict.prior import CorrectionNetwork
 from phydict.runtime.reading import check_memory

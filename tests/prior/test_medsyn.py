@@ -255,7 +255,7 @@ def test_sampled_alone_it_ends_as_medsyns_inference_does():
     found = reconstruct(XRAYS, BEAM, one, PriorOnly(50), on_step=lambda: steps.append(1))
     assert times == pytest.approx([(50 - i) / 50 for i in range(51)])
     assert found.network_calls == len(steps) == reconstructor(PriorOnly(50), one).steps() == 51
-    PriorOnly(20).sample(fine.bind(X[:, :, :2, :1, :2]), None, torch.zeros(1, 4, 8, 4, 8), None)
+    PriorOnly(20).suited(fine).sample(fine.bind(X[:, :, :2, :1, :2]), None, torch.zeros(1, 4, 8, 4, 8), None)
     assert fine_times == pytest.approx([(20 - i) / 20 for i in range(21)])
 
 

@@ -11,7 +11,7 @@ from torch.nn.functional import pad
 
 from phydict.grid import Grid
 from phydict.xray import ConeBeam, Projector
-from phydict.xray.poses.gauge import aligned, carried, reprojection_errors, shadows
+from phydict.xray.poses.gauge import aligned, moved_as_a_whole, reprojection_errors
 from phydict.xray.poses.sensitivity import pose_derivatives
 from phydict.xray.poses.uncertain import Uncertain
 from phydict.xray.poses.unknowns import POSE, moved
@@ -67,7 +67,7 @@ def test_what_does_not_move_stays_and_a_shifted_detector_is_a_shifted_detector()
 def test_a_farther_detector_magnifies_and_a_rotation_keeps_all_distances():
     farther, turn = np.zeros((3, 8)), np.zeros((3, 8))
     farther[:, 4], turn[:, 5:] = 110.0, (3.0, -20.0, 8.0)
-    np.testing.assert_allclose(shadows(moved(BEAM, farther), POINTS), 1.1 * shadows(BEAM, POINTS), atol=1e-9)
+    np.testing.assert_allclose(moved(BEAM, farther).shadows(POINTS), 1.1 * BEAM.shadows(POINTS), atol=1e-9)
     turned = moved(BEAM, turn)
     np.testing.assert_allclose(np.linalg.norm(turned.sources, axis=1), np.linalg.norm(BEAM.sources, axis=1))
     np.testing.assert_allclose(np.linalg.norm(turned.sources - turned.detectors, axis=1), 1100.0)
@@ -80,11 +80,12 @@ def test_the_whole_scene_moved_changes_no_projection(method):
     world[:3, :3], world[:3, 3] = Rotation.from_rotvec(np.radians(MOTION[3:])).as_matrix(), MOTION[:3]
     there = Grid(GRID.shape, affine=world @ GRID.affine)
     before = Projector(GRID, beam, method)(mu)
-    torch.testing.assert_close(Projector(there, carried(beam, MOTION), method)(mu), before, rtol=1e-6, atol=1e-9)
+    after = Projector(there, moved_as_a_whole(beam, MOTION), method)(mu)
+    torch.testing.assert_close(after, before, rtol=1e-6, atol=1e-9)
 
 
 def test_a_beam_that_was_carried_away_is_carried_back():
-    away = carried(BEAM, MOTION)
+    away = moved_as_a_whole(BEAM, MOTION)
     assert reprojection_errors(away, BEAM, POINTS).min() > 1
     assert aligned(away, BEAM, POINTS).same_as(BEAM, 1e-3)
 

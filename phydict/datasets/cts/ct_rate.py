@@ -19,12 +19,13 @@ from phydict.datasets.case import Case
 from phydict.datasets.cts.cache import key_of, pack_case, read_arrays, unpack_case, write_arrays
 from phydict.datasets.cts.ct_rate_tables import read_calibrations, read_reports
 from phydict.datasets.cts.prepared import VOLUME, is_prepared, read_prepared, read_record
-from phydict.datasets.cts.segmentations import is_segmentation
+from phydict.datasets.cts.segmentations import is_segmentation, mask_files
 from phydict.datasets.cts.transforms import Calibration, case_id, prepare_ct
 from phydict.datasets.itk_file import ENDINGS
 from phydict.datasets.natural_order import natural_order
 from phydict.datasets.nifti_file import NIFTI
 from phydict.grid import Grid
+from phydict.runtime.files import files_below
 from phydict.runtime.reading import name_of, read_ids
 from phydict.runtime.warning import warn
 from phydict.units import HUWindow
@@ -78,7 +79,7 @@ class CTSource:
         metadata: CT-RATE's metadata table, needed where headers are not fixed
         fixed: whether the NIfTI headers are right (CT-RATE's *_fixed folders and ordinary archives)
         first_reconstruction: keep one volume per scan
-        exclude: a text file of case ids to leave out
+        exclude: a text file of case ids or files to leave out, one a line
     """
 
     reports: str | None = None
@@ -100,14 +101,14 @@ class NoNIfTI(FileNotFoundError):
 def find_cts(root: str | Path, reports: str | Path | None = None, metadata: str | Path | None = None,
              fixed: bool = True, first_reconstruction: bool = False,
              exclude: str | Path | None = None) -> list[CTFile]:
-    """The CTs under `root`, a NIfTI file or a folder of any depth, in natural order; a MetaImage or NRRD file is read
-    as well, and so is a folder of these without a NIfTI file.
+    """The CTs under `root`, a NIfTI file or a folder of any depth, linked folders included, in natural order; a
+    MetaImage or NRRD file is read as well, and so is a folder of these without a NIfTI file.
 
     reports, metadata: CT-RATE's CSV tables or folders of them; left out, radiology_text_reports/ (and, for
     fixed=False, metadata/) is looked for in `root` and the three folders above it. No reports at all is fine.
     fixed: trust the headers; False reads CT-RATE v1 by its metadata. Where the folder holds both versions of a volume,
-    the one of `fixed` is read. first_reconstruction: keep one volume per scan. exclude: a text file of volume
-    names to leave out (CT-RATE's no_chest_*.txt).
+    the one of `fixed` is read. first_reconstruction: keep one volume per scan. exclude: a text file of ids or
+    files to leave out, one a line (CT-RATE's no_chest_*.txt).
     Segmentations beside CTs are passed over. Of cases prepared by data/prepare_cts.py the volume alone is taken, with
     their own ids, and with their own reports where no table has one.
     Ids are file names without ending; outside CT-RATE's names, a file in a subfolder gets `<first subfolder>__<name>`.
@@ -123,13 +124,11 @@ def find_cts(root: str | Path, reports: str | Path | None = None, metadata: str 
         elif id in files:
             raise ValueError(f"{files[id]} and {path} would both become case {id}; rename one of them")
         files[id] = path
-    for line in read_ids(exclude, "data.source.exclude") if exclude else ():
-        files.pop(case_id(line), None)
     ids = sorted(files, key=natural_order)
+    if exclude:
+        ids = without_excluded(ids, exclude, root)
     if first_reconstruction:
         ids = [id for n, id in enumerate(ids) if n == 0 or scan_of(ids[n - 1]) != scan_of(id)]
-    if not ids:
-        raise FileNotFoundError(f"every CT in {root} is excluded by {exclude}; give another list or folder")
     table_given = reports is not None
     reports = reports or _beside(root, "radiology_text_reports")
     texts = read_reports(reports) if reports else {}
@@ -144,6 +143,25 @@ def find_cts(root: str | Path, reports: str | Path | None = None, metadata: str 
         warn(message)
     cts = [CTFile(files[id], id, _own_report(files[id]) if text is None else text) for id, text in reports_of.items()]
     return cts if fixed else _calibrated(cts, metadata or _beside(root, "metadata"))
+
+
+def without_excluded(ids: list[str], exclude: str | Path, root: Path) -> list[str]:
+    """The ids that a text file does not list; in it sub/x.nii.gz means the case sub__x or, where there is none, x.
+
+    Warns where it lists other ids alone. Raises FileNotFoundError where it lists all.
+    """
+    lines, known, listed = read_ids(exclude, "data.source.exclude"), set(ids), set()
+    for line in lines:
+        name = case_id(line)
+        inner = "__".join((*Path(line).parts[:1], name))
+        listed.add(inner if inner in known else name)
+    left = [id for id in ids if id not in listed]
+    if lines and len(left) == len(ids):
+        warn(f"none of the {len(lines)} lines of {exclude} is one of the {len(ids)} CTs in {root}, so that nothing is "
+             f"excluded (the first line is {lines[0]}, the first CT is {ids[0]}): one id a line is read")
+    if not left:
+        raise FileNotFoundError(f"every CT in {root} is excluded by {exclude}; give another list or folder")
+    return left
 
 
 def _calibrated(cts: list[CTFile], metadata: str | Path | None) -> list[CTFile]:
@@ -165,11 +183,9 @@ def _ct_files(root: Path) -> list[Path]:
         return [root]
     if not root.is_dir():
         raise NoNIfTI(f"there is no folder or file {root}; give the folder that holds the CTs")
-    every = [p for p in root.rglob("*") if p.is_file()
-             and not any(part.startswith(".") for part in p.relative_to(root).parts)]
-    files = sorted(p for p in every if p.name.lower().endswith(NIFTI) and not is_segmentation(p)
-                   and (p.name == VOLUME or not is_prepared(p)))
-    files = files or sorted(p for p in every if p.name.lower().endswith(ENDINGS))
+    every = files_below(root)
+    files = [p for p in every if p.name.lower().endswith(NIFTI) and not is_segmentation(p)
+             and (p.name == VOLUME or not is_prepared(p))] or [p for p in every if p.name.lower().endswith(ENDINGS)]
     if not files:
         held = f"its {len(every)} files are of other kinds" if every else "it is empty"
         raise NoNIfTI(f"there is no .nii or .nii.gz file in {root} ({held}); give a folder of NIfTI CTs, or "
@@ -225,8 +241,9 @@ class CTCases(Dataset):
     """Cases prepared from CT files, one by one when first needed, then read from a cache folder.
 
     cts: what `find_cts` returns. cache: a folder for the prepared cases, made when missing; None keeps nothing. A case
-    is prepared anew when its file, grid, window or calibration changes. Volumes are stored to half precision (0.5 HU),
-    masks to 1/255; a case is the same before and after caching. The folder of the CTs is never written to.
+    is prepared anew when its file, grid, window or calibration changes, or a mask of one that was prepared before.
+    Volumes are stored to half precision (0.5 HU), masks to 1/255; a case is the same before and after caching. The
+    folder of the CTs is never written to.
     """
 
     def __init__(self, cts: list[CTFile], cache: str | Path | None, grid: Grid = Grid.cube(64),
@@ -250,8 +267,11 @@ class CTCases(Dataset):
         return unpack_case(packed) | {"id": ct.id, "report": ct.report}
 
     def key(self, ct: CTFile) -> str:
-        """Of a CT as it is prepared here: another file, grid, window or calibration has another."""
+        """Of a CT as it is prepared here: another file, grid, window or calibration has another, and of one that was
+        prepared before so have other masks."""
         stat = ct.path.stat()
+        masks = [[file.name, file.stat().st_mtime_ns, file.stat().st_size]
+                 for file in (mask_files(ct.path) if is_prepared(ct.path) else ())]
         parts = [CACHE_VERSION, str(ct.path.resolve()), stat.st_mtime_ns, stat.st_size, self.grid.to_dict(),
                  asdict(self.window), asdict(ct.calibration) if ct.calibration else None]
-        return key_of(parts)
+        return key_of([*parts, *masks])

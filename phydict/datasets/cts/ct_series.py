@@ -19,6 +19,7 @@ from phydict.datasets.cts.transforms import LEAST_SLICES, to_ras
 from phydict.datasets.dicom import open_dicom, read_dicom, tag_numbers
 from phydict.datasets.natural_order import natural_order
 from phydict.datasets.nifti_file import NIFTI
+from phydict.runtime.files import files_below
 from phydict.runtime.reading import reading
 
 NEEDED = {"Rows": 1, "Columns": 1, "ImagePositionPatient": 3, "ImageOrientationPatient": 6, "PixelSpacing": 2,
@@ -40,7 +41,7 @@ class Series:
 def find_series(root: Path) -> list[Series]:
     """Every DICOM series below the folder `root`, of any modality, in natural order; other files are passed over."""
     groups = defaultdict(list)
-    for path in sorted(p for p in root.rglob("*") if p.is_file()):
+    for path in files_below(root):
         if path.name.lower().endswith(NIFTI) or path.name.upper() == "DICOMDIR":
             continue
         try:

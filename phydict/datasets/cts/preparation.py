@@ -25,10 +25,11 @@ from phydict.datasets.cts.sources import Source, find_sources
 from phydict.datasets.cts.spaces import Settings
 from phydict.datasets.cts.transforms import SEGMENTATION_MM, check_hu, covering_grid, to_grid
 from phydict.grid import Grid
-from phydict.runtime.files import atomic_directory, atomic_write, check_replaceable, remove_leftovers
+from phydict.runtime.files import atomic_directory, atomic_removal, atomic_write, check_replaceable, remove_leftovers
 from phydict.runtime.progress import CaseProgress
-from phydict.runtime.reading import not_written
+from phydict.runtime.reading import Unreadable, not_written
 from phydict.runtime.telling import tell
+from phydict.runtime.warning import warn
 
 SUMMARY = "summary.csv"
 COLUMNS = ("id", "status", "reason", "remark", "source", "kind", "slices", "spacing_x_mm", "spacing_y_mm",
@@ -42,7 +43,8 @@ def prepare_folder(cts: str | Path, out: str | Path, settings: Settings = Settin
 
     Finished cases are kept where their input is the same: the bytes of its files, its report and its calibration. Where
     it is another, or the case says nothing of it, a line tells so, and the CT is prepared again. A case appears only
-    when it is complete, and takes the place of nothing but a case that was prepared here. workers: processes.
+    when it is complete, and takes the place of nothing but a case that was prepared here, which also goes where its CT
+    is rejected now; cases whose CT is not below `cts` are warned of. workers: processes.
     tables: reports, metadata, fixed, first_reconstruction and exclude, as for `find_cts`.
     Returns the summary's rows, by COLUMNS, status being prepared or rejected.
     Raises ValueError for folders inside each other, for an `out` of other settings and for what no preparation wrote in
@@ -60,6 +62,10 @@ def prepare_folder(cts: str | Path, out: str | Path, settings: Settings = Settin
     remove_leftovers(out)
     rows = _kept(sources, out, settings, workers)
     left = [source for source in sources if source.id not in rows]
+    others = sorted({path.parent.name for path in out.glob(f"[!.]*/{RECORD}")} - {source.id for source in sources})
+    if others:
+        warn(f"{out} holds {_cases(others)} of no CT that is taken from {root}, to be trained on with the rest: remove "
+             f"{', '.join(others[:3])}{', ...' * (len(others) > 3)} if that is not meant")
     with CaseProgress() as progress:
         progress.begin("CTs", len(left), verb="prepare", out=out)
         for row in _prepared(left, out, settings, workers):
@@ -91,7 +97,7 @@ def _kept(sources: list[Source], out: Path, settings: Settings, workers: int) ->
     return {source.id: row for source, row in zip(there, found) if row is not None}
 
 
-def _cases(sources: list[Source]) -> str:
+def _cases(sources: list) -> str:
     return f"{len(sources)} case{'' if len(sources) == 1 else 's'}"
 
 
@@ -145,12 +151,14 @@ def _end_with_parent() -> None:
 
 
 def prepare_source(source: Source, out: Path, settings: Settings) -> dict:
-    """Prepares one CT into out/<id>; returns its row of the summary, in which it may be rejected.
+    """Prepares one CT into out/<id>; returns its row of the summary, in which it may be rejected. An earlier
+    case of a CT that is read and rejected is removed.
 
     Raises OSError, in one sentence, where the case cannot be written; nothing of it is left then.
     """
     row = dict.fromkeys(COLUMNS, "") | {"id": source.id, "source": str(source.place),
                                         "kind": "DICOM" if source.is_dicom else "NIfTI"}
+    folder = out / source.id
     with warnings.catch_warnings(record=True) as remarks:
         warnings.simplefilter("always", UserWarning)
         try:
@@ -158,13 +166,14 @@ def prepare_source(source: Source, out: Path, settings: Settings) -> dict:
             grid, images, facts = _place(*source.load(), segmentations_beside(source.beside), settings)
         except (ValueError, OSError) as error:
             facts = {"status": "rejected", "reason": " ".join(str(error).split())}
+            if not isinstance(error, OSError | Unreadable):  # what cannot be read may be read by the next run
+                atomic_removal(folder, lambda: _finished(folder, settings, dict) is None)
         row["remark"] = "; ".join(str(w.message) for w in remarks if w.category is UserWarning)
     if "reason" in facts:
         return row | facts
     row |= facts | {"status": "prepared", "window_low": settings.window[0], "window_high": settings.window[1]}
     record = {"id": source.id, "space": settings.space, "extent": settings.extent, "window": settings.window,
               "report": source.report, "settings": asdict(settings), "fingerprint": fingerprint, "row": row}
-    folder = out / source.id
     try:
         with atomic_directory(folder, lambda: _finished(folder, settings, lambda: fingerprint) is None) as partial:
             write_prepared(partial, grid, images, record)

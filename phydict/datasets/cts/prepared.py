@@ -20,7 +20,7 @@ import torch
 
 from phydict.datasets.case import Case
 from phydict.datasets.cts.anatomy import MASKS
-from phydict.datasets.cts.transforms import centred, load_ct, to_grid
+from phydict.datasets.cts.transforms import load_ct, moved_to, to_grid
 from phydict.grid import Grid
 from phydict.runtime.reading import read_text, reading
 from phydict.runtime.warning import warn
@@ -117,7 +117,7 @@ def read_prepared(path: Path, grid: Grid, window: HUWindow) -> Case:
     else:
         stored = Grid(hu.shape, affine=affine)
         _check_room(record, stored, grid)
-        target = centred(grid, stored.centre)
+        target = moved_to(grid, stored.centre)
         placed = target.affine.copy()
 
         def sampled(image, pad):

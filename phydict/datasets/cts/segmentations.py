@@ -13,10 +13,12 @@ series, `name__<SeriesNumber>`); they must lie on the CT's own voxels:
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
+from phydict.datasets.cts.anatomy import MASKS
 from phydict.datasets.cts.prepared import is_prepared
 from phydict.datasets.cts.transforms import case_id, load_ct, to_grid
 from phydict.grid import Grid
@@ -49,6 +51,16 @@ def segmentations_beside(ct: Path) -> dict[str, tuple[Path, ...]]:
                         ("body", ("body",))):
         beside[name] = tuple(path for path in (folder / f"{file}.nii.gz" for file in files) if path.is_file())[:1]
     return {name: files for name, files in beside.items() if files}
+
+
+def mask_files(ct: Path) -> list[Path]:
+    """The files that masks of a NIfTI CT are read from, those beside it or a prepared one's own; often none, and none
+    where some of the lungs' lobes are missing."""
+    if is_prepared(ct):
+        return [file for name in MASKS if (file := ct.with_name(f"{name}.nii.gz")).is_file()]
+    with suppress(ValueError):
+        return [file for files in segmentations_beside(ct.with_name(case_id(ct))).values() for file in files]
+    return []
 
 
 def read_segmentation(files: tuple[Path, ...], shape, affine: np.ndarray) -> np.ndarray:

@@ -13,11 +13,13 @@ from pathlib import Path
 import numpy as np
 
 from phydict.datasets.cts.anatomy import lung_box_centre, lung_box_size
-from phydict.datasets.cts.transforms import centred, load_ct
+from phydict.datasets.cts.transforms import load_ct, moved_to
 from phydict.grid import Grid
 from phydict.units import AIR
 
 SPACES, SEGMENTERS = ("patient", "medsyn"), ("threshold", "lungmask")
+LEAST_SIDE, MOST_SIDE = 10.0, 2000.0
+"""mm along a cube around lungs that can be meant."""
 ATLAS_MM = (316.0, 316.0, 292.0)
 """MedSyn's atlas volume, right-left, posterior-anterior and inferior-superior."""
 ATLAS_LUNGS_MM = (275.0, 193.0, 256.0)
@@ -44,9 +46,9 @@ class Settings:
     atlas_offset_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self):
-        if self.voxels < 8 or self.side <= 0:
-            raise ValueError(f"a case needs at least 8 voxels and a side above 0 mm, but {self.voxels} voxels and "
-                             f"{self.side} mm were given")
+        if self.voxels < 8 or not LEAST_SIDE <= self.side <= MOST_SIDE:
+            raise ValueError(f"a case needs at least 8 voxels and a side of {LEAST_SIDE:g} to {MOST_SIDE:g} mm, but "
+                             f"{self.voxels} voxels and {self.side} mm were given")
         if not self.window[0] < self.window[1]:
             raise ValueError(f"an HU window needs low < high, but {list(self.window)} was given")
         for name, value, values in (("space", self.space, SPACES), ("segmenter", self.segmenter, SEGMENTERS)):
@@ -67,9 +69,9 @@ class Settings:
         """The voxels in the patient's world, for lungs in a box of `lung_mm` (3,) around `lung_centre` (3,)."""
         shape, extent = (self.voxels,) * 3, np.asarray(self.extent)
         if self.space == "patient":
-            return centred(Grid(shape, tuple(extent / shape)), lung_centre)
+            return moved_to(Grid(shape, tuple(extent / shape)), lung_centre)
         shrink = lung_mm / self.atlas_lungs_mm
-        return centred(Grid(shape, tuple(extent * shrink / shape)), lung_centre - shrink * self.atlas_offset_mm)
+        return moved_to(Grid(shape, tuple(extent * shrink / shape)), lung_centre - shrink * self.atlas_offset_mm)
 
 
 def atlas_lungs(mask: Path) -> dict:

@@ -220,7 +220,7 @@ def covering_grid(shape, affine: np.ndarray, spacing: float) -> Grid:
     return Grid(tuple(voxels), affine=cover)
 
 
-def centred(grid: Grid, centre: np.ndarray) -> Grid:
+def moved_to(grid: Grid, centre: np.ndarray) -> Grid:
     """`grid` moved so that its centre lies at the world position `centre` (3,) in mm."""
     affine = grid.affine.copy()
     affine[:3, 3] += centre - grid.centre
@@ -260,7 +260,7 @@ def prepare_ct(ct: str | Path | tuple[np.ndarray, np.ndarray], grid: Grid = Grid
         size = " x ".join(f"{length:.0f}" for length in np.linalg.norm(affine[:3, :3], axis=0) * hu.shape)
         warn(f"no lungs were found in {name}, a scan of {size} mm; its volume is centred on the scan and its "
              "masks are unknown")
-    target = centred(grid, centre)
+    target = moved_to(grid, centre)
     volume = window.to_range(to_grid(hu, affine, target, AIR))
     masks = np.stack([to_grid(m, work.affine, target, 0.0) for m in masks]).clip(0, 1)
     return {"id": name, "volume": torch.from_numpy(volume.astype(np.float32))[None],

@@ -1,4 +1,4 @@
-"""Findings of a procedural thorax: what can be wrong, where and how large, and the report that says so.
+"""Findings of a procedural thorax: what can be wrong, where and how large.
 
     Finding.size by kind
     nodule, mass                 diameter in mm (a mass is larger than 30 mm)
@@ -15,10 +15,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-
-from phydict.datasets.prose import write_report
-
-__all__ = ["FOCAL", "FREQUENCY", "GRADES", "KINDS", "LOBES", "PLEURAL", "Finding", "draw_findings", "write_report"]
 
 KINDS = ("nodule", "mass", "effusion", "consolidation", "opacity", "atelectasis", "emphysema", "cardiomegaly",
          "pericardial effusion", "pneumothorax")

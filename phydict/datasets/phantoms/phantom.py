@@ -15,23 +15,11 @@ import torch
 
 from phydict.datasets.case import Case
 from phydict.datasets.phantoms.canvas import Canvas, Texture
-from phydict.datasets.phantoms.findings import Finding
 from phydict.datasets.phantoms.lungs import airways, focal_findings, lung_tissue, pleural_space, vessels
 from phydict.datasets.phantoms.skeleton import arm_end, bones
-from phydict.datasets.phantoms.thorax import (
-    SIDES,
-    Thorax,
-    ellipsoid,
-    report,
-    smooth_max,
-    superellipse,
-    without,
-    wrong_side,
-)
+from phydict.datasets.phantoms.thorax import SIDES, Thorax, ellipsoid, report, smooth_max, superellipse, without
 from phydict.grid import Grid
 from phydict.units import AIR, HUWindow
-
-__all__ = ["Finding", "Thorax", "build", "pathology_region", "phantom_case", "report", "without", "wrong_side"]
 
 NOISE_MM = 1.5
 """Voxels to which `Thorax.noise` refers; larger ones average it, as noise that neighbours share in part."""

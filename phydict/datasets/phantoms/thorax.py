@@ -13,7 +13,8 @@ from functools import cached_property, lru_cache
 import numpy as np
 import scipy
 
-from phydict.datasets.phantoms.findings import Finding, draw_findings, write_report
+from phydict.datasets.phantoms.findings import Finding, draw_findings
+from phydict.datasets.prose import write_report
 from phydict.datasets.surroundings.couches import Couch
 
 
@@ -43,6 +44,10 @@ ARMS = ((False, False), (False, False), (False, True), (True, False))
 
 LEAST_SCAN = 120.0
 """mm that a short scan shows at least."""
+
+
+LUNG_POINTS = 9000
+"""How many are drawn in the box around a lung; those inside the lung stand for it."""
 
 
 @dataclass(frozen=True)
@@ -255,15 +260,15 @@ class Thorax:
         return np.maximum(-above, shelf if lobe == "middle" else -shelf) + 0 * x
 
     @lru_cache(maxsize=8)  # noqa: B019
-    def lung_points(self, side: str, count: int = 9000) -> tuple[np.ndarray, float]:
+    def lung_points(self, side: str) -> tuple[np.ndarray, float]:
         """Points (N, 3) spread evenly inside one lung, at least 2 mm deep, and that region's volume in mm^3."""
         rng = np.random.default_rng([self.seed, 3, int(SIDES[side] > 0)])
         box = np.array([self.width, 2 * self.depth, self.height])
-        points = rng.random((count, 3)) * box - [0, self.depth, self.height / 2]
+        points = rng.random((LUNG_POINTS, 3)) * box - [0, self.depth, self.height / 2]
         points[:, 0] *= SIDES[side]
         inside = points[self.lung(side, *points.T) < -2]
         inside.setflags(write=False)
-        return inside, float(box.prod() * len(inside) / count)
+        return inside, float(box.prod() * len(inside) / LUNG_POINTS)
 
 
 def superellipse(x, y, a, b, power: float):

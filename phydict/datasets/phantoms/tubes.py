@@ -12,6 +12,9 @@ import numpy as np
 
 GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 
+MURRAY = 2.5
+"""The power m of Murray's law: r^m of a tube is the sum of those that it forks into."""
+
 
 @dataclass(frozen=True)
 class Tubes:
@@ -79,10 +82,10 @@ class Tubes:
         return self.start[t] + place[ring][:, None] * line[t] + spread, volume, hu
 
 
-def tree(root, targets: np.ndarray, leaf_radius: float, hu: float, pull: float = 0.4, murray: float = 2.5) -> Tubes:
+def tree(root, targets: np.ndarray, leaf_radius: float, hu: float, pull: float = 0.4) -> Tubes:
     """A tree that forks from `root` (3,) until it reaches every target (N, 3); N is a power of two.
 
-    Each fork halves the targets along their widest direction; the radius follows Murray's law with exponent `murray`.
+    Each fork halves the targets along their widest direction; the radius follows Murray's law.
     """
     count = len(targets)
     if count < 1 or count & (count - 1):
@@ -95,6 +98,6 @@ def tree(root, targets: np.ndarray, leaf_radius: float, hu: float, pull: float =
         groups = np.take_along_axis(groups, order[..., None], 1).reshape(-1, half, 3)
         parents = np.repeat(nodes, 2, axis=0)
         nodes = parents + (1.0 if half == 1 else pull) * (groups.mean(1) - parents)
-        radius = leaf_radius * half ** (1 / murray)
+        radius = leaf_radius * half ** (1 / MURRAY)
         bundles.append(Tubes.of(parents, nodes, radius * 1.08, radius * 0.92, hu=hu))
     return Tubes.join(bundles)

@@ -11,10 +11,10 @@ from torch.utils.data import Dataset
 from phydict.datasets.case import Case
 from phydict.datasets.cts.cache import key_of, pack_case, read_arrays, unpack_case, write_arrays
 from phydict.datasets.cts.ct_rate import CTCases, as_one_patient, patient_of
-from phydict.datasets.phantoms.findings import write_report
 from phydict.datasets.population.anatomy import Variation, findings_of
 from phydict.datasets.population.population import Population
 from phydict.datasets.population.registration import Registered, features, medoid, register
+from phydict.datasets.prose import write_report
 from phydict.runtime.progress import CaseProgress
 from phydict.runtime.ranges import check_fields
 from phydict.runtime.telling import tell

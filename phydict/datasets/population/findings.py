@@ -49,7 +49,7 @@ class CTThorax(Thorax):
         return scipy.ndimage.map_coordinates(self.depths[side], np.moveaxis(self.grid.index(points), -1, 0), order=1,
                                              mode="nearest")
 
-    def lung_points(self, side: str, count: int = 9000) -> tuple[np.ndarray, float]:  # type: ignore[override]
+    def lung_points(self, side: str) -> tuple[np.ndarray, float]:  # type: ignore[override]
         index = np.argwhere(self.depths[side] < -2)
         points = index @ self.grid.affine[:3, :3].T + self.grid.affine[:3, 3] - self.offset
         return points, float(len(index) * np.prod(self.grid.spacing))

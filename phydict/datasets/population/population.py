@@ -15,12 +15,12 @@ import torch
 from torch import Tensor
 
 from phydict.datasets.case import Case
-from phydict.datasets.phantoms.findings import write_report
 from phydict.datasets.population.anatomy import Anatomy, Variation, principal_modes
 from phydict.datasets.population.carry import carry, fine_flow, sources
 from phydict.datasets.population.findings import put_findings
 from phydict.datasets.population.organs import ORGANS, PULL, expansion, organs
 from phydict.datasets.population.velocity import jacobian, resize
+from phydict.datasets.prose import write_report
 from phydict.grid import Grid
 from phydict.units import HUWindow
 

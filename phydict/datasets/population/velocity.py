@@ -38,10 +38,10 @@ def resize(image: Tensor, shape) -> Tensor:
     return F.interpolate(image[None], tuple(shape), mode="trilinear", align_corners=False)[0]
 
 
-def flow(velocity: Tensor, steps: int = STEPS) -> Tensor:
+def flow(velocity: Tensor) -> Tensor:
     """exp(v) - identity: the displacement (3, X, Y, Z) of each voxel's centre."""
-    start, moved = places(velocity.shape[1:]), velocity / 2**steps
-    for _ in range(steps):
+    start, moved = places(velocity.shape[1:]), velocity / 2**STEPS
+    for _ in range(STEPS):
         moved = moved + sample(moved, start + moved)
     return moved
 

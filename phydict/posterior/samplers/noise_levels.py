@@ -9,12 +9,15 @@ from torch import Tensor
 from phydict.diffusion import CosineSchedule, Denoiser, ddim, noise_in, renoise
 from phydict.diffusion.steps import Generators, noise_like
 
+POWER = 7.0
+"""Of the polynomial that noise levels follow."""
 
-def polynomial_levels(high: float, low: float, n: int, power: float = 7.0) -> list[float]:
-    """n noise levels sigma from `high` down to `low`, evenly spaced in sigma^(1/power) (Karras et al. 2022,
+
+def polynomial_levels(high: float, low: float, n: int) -> list[float]:
+    """n noise levels sigma from `high` down to `low`, evenly spaced in sigma^(1/POWER) (Karras et al. 2022,
     arXiv:2206.00364, Eq. 5); one level is `high`."""
-    ends = high ** (1 / power), low ** (1 / power)
-    return [(ends[0] + (ends[1] - ends[0]) * i / max(n - 1, 1)) ** power for i in range(n)]
+    ends = high ** (1 / POWER), low ** (1 / POWER)
+    return [(ends[0] + (ends[1] - ends[0]) * i / max(n - 1, 1)) ** POWER for i in range(n)]
 
 
 def times_of(schedule: CosineSchedule, levels: Sequence[float]) -> list[float]:

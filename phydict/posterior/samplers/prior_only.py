@@ -39,5 +39,4 @@ class PriorOnly(Sampler):
 
     def sample(self, denoiser: Denoiser, measurement: Measurement | None, x: Tensor, generator: Generators | None,
                on_step: Callable[[], None] = lambda: None) -> Tensor:
-        final_denoise = bool(self.suited(denoiser).final_denoise)
-        return ddim_sample(denoiser, x, self.iterations, on_step=on_step, final_denoise=final_denoise)
+        return ddim_sample(denoiser, x, self.iterations, on_step=on_step, final_denoise=bool(self.final_denoise))

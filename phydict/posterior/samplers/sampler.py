@@ -41,7 +41,7 @@ class Sampler(ABC):
         """How often `sample` calls on_step."""
 
     def suited(self, prior: object) -> Sampler:
-        """These settings, with what they leave to `prior`, a prior or a denoiser, decided; these, unless overridden."""
+        """These settings, with what they leave to a prior decided; these, unless overridden."""
         return self
 
     def for_sampling(self) -> Sampler:

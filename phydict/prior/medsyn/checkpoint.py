@@ -1,4 +1,4 @@
-"""Weights that others trained: MedSyn's checkpoints, read strictly and never run; and what a prior's file is.
+"""Weights that others trained: MedSyn's checkpoints, read strictly and never run.
 
 A pickle may hold code. Only tensors are read from one, and a file that asks for anything else is refused.
 """

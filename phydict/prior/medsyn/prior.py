@@ -1,4 +1,4 @@
-"""MedSyn's two networks, and the priors made of them (Xu et al. 2024, doi:10.1109/TMI.2024.3415032).
+"""MedSyn's stage 1 as a prior, and both stages' networks in short (Xu et al. 2024, doi:10.1109/TMI.2024.3415032).
 
 | here                | resolution | condition           | parameters  |
 |---------------------|------------|---------------------|-------------|
@@ -43,7 +43,8 @@ class MedSynPrior(nn.Module):
     """MedSyn's stage 1 as a prior: denoises states (B, 4, X, Y, Z), in RAS+, of CT, lobe, airway and vessel masks.
 
     network: predicts the clean state; text: reports -> contexts (B, L, D), with or without a mask, such as a
-    TextEncoder; load_text: a function that returns it when the first report arrives; grid: where the voxels are.
+    TextEncoder; None: `load_text`, if there is one, returns it when the first report arrives; grid: where the voxels
+    are.
     The attenuation of the window's low end, -1024 HU, is slightly negative. ends_at_zero: MedSyn's inference descends
     in 50 steps from time 1 to 0 and denoises there once more.
     """
@@ -51,11 +52,11 @@ class MedSynPrior(nn.Module):
     window, schedule, state_channels = WINDOW, CosineSchedule(), STATE_CHANNELS
     ends_at_zero = True
 
-    def __init__(self, network: TextUNet, text: Callable | None = None,
-                 load_text: Callable[[], Callable] | None = None, grid: Grid = atlas_grid(64)):
+    def __init__(self, network: TextUNet, text: Callable | None = None, grid: Grid = atlas_grid(64)):
         super().__init__()
         _check_divisible(network, grid)
-        self.network, self.text, self.load_text, self.grid = network, text, load_text, grid
+        self.network, self.text, self.grid = network, text, grid
+        self.load_text: Callable[[], Callable] | None = None
 
     @property
     def reads_text(self) -> bool:

@@ -59,7 +59,7 @@ class MedSynSuperResolution(nn.Module):
                              "else leave the super-resolution stage out")
 
     def bind(self, coarse: Tensor, noise: float = 0.0, precision: str = "auto",
-             generator: torch.Generator | None = None) -> BoundSuperResolution:
+             generator: torch.Generator | None = None) -> BoundMedSynSuperResolution:
         """The denoiser of the fine states of a coarse one (B, 4, X/4, Y/4, Z/4), which may be a part of the grid's.
 
         noise: share in [0, 1] of normal noise in the coarse state (MedSyn trained with up to 0.4), no input of the
@@ -73,11 +73,11 @@ class MedSynSuperResolution(nn.Module):
         upsampled = self.upsample(coarse)
         if noise and generator is not None:
             upsampled = torch.lerp(upsampled, torch.randn(upsampled.shape, generator=generator).to(upsampled), noise)
-        return BoundSuperResolution(self, upsampled, precision)
+        return BoundMedSynSuperResolution(self, upsampled, precision)
 
 
 @dataclass(frozen=True)
-class BoundSuperResolution:
+class BoundMedSynSuperResolution:
     """A Denoiser: stage 2 with its coarse state, repeated to the fine size, fixed."""
 
     stage: MedSynSuperResolution
@@ -87,10 +87,6 @@ class BoundSuperResolution:
     @property
     def schedule(self) -> CosineSchedule:
         return self.stage.schedule
-
-    @property
-    def ends_at_zero(self) -> bool:
-        return self.stage.ends_at_zero
 
     @torch.no_grad()
     def denoise(self, x: Tensor, t: float) -> Tensor:

@@ -19,26 +19,16 @@ STEP = 1e-4
 """mm and degrees of the differences that stand for derivatives."""
 
 
-def carried(beam: ConeBeam, motion: np.ndarray) -> ConeBeam:
+def moved_as_a_whole(beam: ConeBeam, motion: np.ndarray) -> ConeBeam:
     """The beam moved as a whole: turned about the origin by the vector motion[3:] in degrees, then shifted by
     motion[:3] in mm."""
     turn = Rotation.from_rotvec(np.radians(motion[3:])).as_matrix().T
     return beam.at(beam.sources @ turn + motion[:3], beam.detectors @ turn + motion[:3], beam.u @ turn, beam.v @ turn)
 
 
-def shadows(beam: ConeBeam, points: np.ndarray) -> np.ndarray:
-    """Where points (N, 3) appear on each detector: (K, N, 2) mm from its centre, from column to column and from row to
-    row."""
-    rays = points - beam.sources[:, None]
-    depth = (rays * beam.normals[:, None]).sum(2, keepdims=True)
-    hits = beam.sources[:, None] + rays * beam.distances[:, None, None] / depth - beam.detectors[:, None]
-    return np.stack([(hits * (step / np.linalg.norm(step, axis=1, keepdims=True))[:, None]).sum(2)
-                     for step in (beam.u, beam.v)], 2)
-
-
 def reprojection_errors(beam: ConeBeam, other: ConeBeam, points: np.ndarray) -> np.ndarray:
     """Root mean square distance (K,) in mm on the detector between points' shadows in two beams."""
-    return np.sqrt(((shadows(beam, points) - shadows(other, points)) ** 2).sum(2).mean(1))
+    return np.sqrt(((beam.shadows(points) - other.shadows(points)) ** 2).sum(2).mean(1))
 
 
 def aligned(beam: ConeBeam, to: ConeBeam, points: np.ndarray) -> ConeBeam:
@@ -48,14 +38,14 @@ def aligned(beam: ConeBeam, to: ConeBeam, points: np.ndarray) -> ConeBeam:
     do not carry the others away.
     """
     for _ in range(STEPS):
-        here, wanted = shadows(beam, points), shadows(to, points)
-        jacobian = np.stack([(shadows(carried(beam, STEP * unit), points) - here).ravel() / STEP for unit in np.eye(6)],
-                            1)
+        here, wanted = beam.shadows(points), to.shadows(points)
+        jacobian = np.stack([(moved_as_a_whole(beam, STEP * unit).shadows(points) - here).ravel() / STEP
+                             for unit in np.eye(6)], 1)
         apart = wanted - here
         weights = 1 / (np.sqrt((apart**2).sum(2).mean(1)) + 0.05)
         root = np.sqrt(np.broadcast_to(weights[:, None, None], apart.shape)).ravel()
         motion = np.linalg.lstsq(jacobian * root[:, None], apart.ravel() * root, rcond=1e-9)[0]
-        beam = carried(beam, motion)
+        beam = moved_as_a_whole(beam, motion)
         if np.abs(motion).max() < 1e-6:
             break
     return beam

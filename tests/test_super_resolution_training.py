@@ -108,6 +108,7 @@ def test_a_checkpoint_of_the_other_stage_is_one_sentence(straight, cache, tmp_pa
     (["--model.factor=0"], ["model.factor", "1 or more", "0"]),
     (["--data.crops.validation=-1"], ["crops.validation", "-1"]),
     (["--model.cube.voxels=34"], ["34", "divisible"]), (["--model.most_noise=2"], ["most_noise"]),
+    (["--model.detail_std=0"], ["detail_std", "0.001"]),
     (["--stage=fine"], ["fine"]), (["--model.text.encoder=none"], ["model.text.encoder"]),
     (["--model.initial={base}"], ["base prior"])],
     ids=lambda value: value[0].split("=")[0].strip("-") if value[0].startswith("-") else "")

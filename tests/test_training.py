@@ -17,9 +17,11 @@ from phydict.cli.train import main
 from phydict.datasets import CTSource, phantom_case
 from phydict.datasets.phantoms.cached import CachedPhantoms
 from phydict.grid import Cube, Grid
+from phydict.inference.data import ReconstructionData
 from phydict.prior import load_prior, save_prior
 from phydict.training import PriorTraining
 from phydict.training.data import PriorData
+from phydict.training.draws import MixedCases
 from phydict.training.prior import reconstruction_scores
 from phydict.training.settings import HoldOut
 from phydict.units import HUWindow
@@ -176,6 +178,47 @@ def test_the_held_out_cts_are_written_down_and_told(cts, cache, tmp_path, capsys
     assert "1 of 2 CTs are held out" in capsys.readouterr().err
     main([*args, f"--out={tmp_path / 'all'}"])
     assert "no CT is held out, so that none tells which weights are best" in capsys.readouterr().err
+
+
+def test_a_training_resumes_with_the_same_cts_held_out(cts, cache, tmp_path, capsys):
+    args = arguments(tmp_path / "run", cache, "--trainer.limit_train_batches=1", "--trainer.limit_val_batches=0",
+                     f"--data.cts={cts}", "--model.text.encoder=none", "--trainer.max_epochs=1")
+    main([*args, "--data.holdout.ids=[patient1]"])
+    more = ["--trainer.max_epochs=2", f"--ckpt_path={tmp_path / 'run' / 'last.ckpt'}", f"--out={tmp_path / 'on'}"]
+    assert "patient0 is held out now" in refusal(capsys, main, [*args, *more, "--data.holdout.ids=[patient]"])
+    assert "patient1 is not held out now" in refusal(capsys, main, [*args, *more])
+    assert not (tmp_path / "on" / "held_out.txt").exists()
+    main([*args, *more, "--data.holdout.ids=[patient1]"])
+    assert (tmp_path / "on" / "held_out.txt").read_text() == "patient1\n"
+
+
+def test_a_resumed_run_learns_at_the_rate_and_decay_that_are_given(trained, cache, tmp_path):
+    main(arguments(tmp_path, cache, "--trainer.max_epochs=3", "--trainer.limit_val_batches=0",
+                   f"--ckpt_path={trained / 'last.ckpt'}", "--model.optimisation.learning_rate=1e-3",
+                   "--model.optimisation.weight_decay=0.5"))
+    resumed = checkpoint(tmp_path)
+    for group in resumed["optimizer_states"][0]["param_groups"]:
+        assert group["lr"] == group["initial_lr"] == 1e-3 and group["weight_decay"] == 0.5
+    assert resumed["lr_schedulers"][0]["base_lrs"] == [1e-3]
+
+
+def test_a_run_that_stopped_within_an_epoch_goes_on_with_the_draws_after_it(tmp_path, cache, monkeypatch):
+    drawn, item = [], MixedCases.__getitem__
+    monkeypatch.setattr(MixedCases, "__getitem__", lambda draws, i: (
+        drawn.append((draws.epoch, i)), item(draws, i))[1])
+    args = arguments(tmp_path, cache, "--trainer.limit_val_batches=0", "--model.text.encoder=none")
+    main([*args, "--trainer.max_steps=3"])
+    main([*args, "--trainer.max_steps=6", f"--ckpt_path={tmp_path / 'last.ckpt'}"])
+    assert drawn[:12] == [(0, i) for i in range(8)] + [(1, i) for i in range(4)]
+
+
+def test_no_phantom_both_tests_and_validates_or_is_trained_on(tmp_path):
+    data = PriorData(holdout=HoldOut(phantoms=2), phantoms=2, cache=str(tmp_path), cube=Cube(16))
+    tested = ReconstructionData(cts="phantom", phantoms=1000).test_cases(data.grid, data.window)
+    seeds = [range(part.first_seed, part.first_seed + len(part)) for part in (
+        data.phantoms, data.validation.datasets[0])]
+    tested = {int(case[0].removeprefix("phantom-")) for case in tested}
+    assert not tested & {*seeds[0], *seeds[1]} and not {*seeds[0]} & {*seeds[1]}
 
 
 def test_it_is_said_that_no_ct_is_held_out(cts, tmp_path):

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from command_lines import CONFIG, arguments, checkpoint, losses
@@ -18,9 +19,12 @@ from phydict.grid import Cube
 from phydict.prior import VolumeUNet, load_prior
 from phydict.runtime.precision import computes_bfloat16
 from phydict.runtime.profiling import CPU
-from phydict.training import PriorTraining
+from phydict.training import PriorTraining, SuperResolutionTraining
 from phydict.training.data import PriorData
+from phydict.training.refinement import RefinementTraining
+from phydict.training.refiner import RefinerTraining
 from phydict.training.settings import TextSettings
+from phydict.training.stage import StageTraining
 
 
 def two_processes(folder: Path, cache: Path, config: str, *more: str) -> subprocess.CompletedProcess:
@@ -126,3 +130,21 @@ def test_what_is_drawn_for_a_held_out_case_does_not_depend_on_the_process_that_s
             world_size=processes, global_rank=rank, val_dataloaders=DataLoader(range(5))))
         dealt = list(DistributedSampler(range(5), processes, rank, shuffle=False))
         assert [task.validation_number(i) for i in range(len(dealt))] == dealt
+
+
+def test_every_held_out_case_counts_once_however_many_processes_share_them(monkeypatch):
+    task, weights = RefinementTraining((8, 8)), np.zeros(5)
+    for rank in range(3):
+        monkeypatch.setattr(StageTraining, "trainer", SimpleNamespace(
+            world_size=3, global_rank=rank, val_dataloaders=DataLoader(range(5))))
+        for i, case in enumerate(DistributedSampler(range(5), 3, rank, shuffle=False)):
+            with monkeypatch.context() as patch:
+                patch.setattr(task, "log", lambda *_, batch_size, case=case, **__: np.add.at(weights, case, batch_size))
+                task.log_case(i, "val/psnr", 1.0)
+    assert weights.min() == weights.max() > 0 and weights.sum() % 3 == 0
+
+
+@pytest.mark.parametrize("stage", [StageTraining, SuperResolutionTraining, RefinerTraining, RefinementTraining])
+def test_only_a_prior_is_sharded(stage):
+    with pytest.raises(ValueError, match="too small to be sharded over devices: train it with configs/prior/ddp.yaml"):
+        stage.configure_model(SimpleNamespace(device_mesh=object()))

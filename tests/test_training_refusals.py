@@ -69,7 +69,11 @@ def test_a_loader_process_sends_the_message_too(cts, tmp_path, cache, capsys):
                                     "--data.loading.workers=1000000", "--model.validation.preview_steps=-1",
                                     "--model.validation.views=-1",
                                     "--model.optimisation.learning_rate=1e38", "--trainer.devices=99",
-                                    "--model.network.init_args.channels=[]", "--model.network.init_args.block=0"])
+                                    "--model.network.init_args.channels=[]", "--model.network.init_args.block=0",
+                                    "--model.network.init_args.state_channels=6", "--data.phantoms=1000001",
+                                    "--model.optimisation.sigma_data=0", "--model.seed=-1",
+                                    "--trainer.check_val_every_n_epoch=0", "--trainer.accumulate_grad_batches=0",
+                                    "--trainer.precision=16-true"])
 def test_data_that_cannot_be_are_refused_by_their_option(tmp_path, capsys, cache, option):
     said = refusal(capsys, main, arguments(tmp_path, cache, option))
     assert option.partition("=")[0].rpartition(".")[2] in said

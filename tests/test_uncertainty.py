@@ -212,6 +212,13 @@ def test_a_prior_in_place_of_a_refiner_is_refused(tmp_path, cache, capsys):
     assert "uncertainty is learnt of a refiner" in said and "model.initial" in said
 
 
+def test_weights_that_validation_calibrates_are_not_averaged(tmp_path, cache, refiner_file, capsys):
+    said = refusal(capsys, main, arguments(tmp_path, cache, refiner_file, "--trainer.max_epochs=1",
+                                           "--trainer.callbacks=lightning.pytorch.callbacks.EMAWeightAveraging"))
+    assert "train without EMAWeightAveraging (trainer.callbacks: null)" in said
+    assert not (tmp_path / "last.ckpt").exists()
+
+
 def test_a_refiner_that_is_trained_on_loses_what_was_known_of_its_errors(refiner_file):
     assert load_prior(refiner_file).uncertainty is not None
     assert RefinerTraining(cube=Cube(16), window=(-1000, 600), initial=refiner_file).prior.uncertainty is None

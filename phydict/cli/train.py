@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import reprlib
 import sys
 from pathlib import Path
@@ -10,7 +11,7 @@ from pathlib import Path
 import lightning
 import torch
 from jsonargparse import auto_cli
-from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.callbacks import LambdaCallback, ModelCheckpoint
 from lightning.pytorch.cli import LightningCLI
 from lightning.pytorch.loggers import CSVLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
@@ -33,6 +34,7 @@ from phydict.runtime.console import (
 from phydict.runtime.files import alone_in, atomic_write
 from phydict.runtime.help import HelpFormatter
 from phydict.runtime.precision import PRECISIONS, resolve_precision, trainer_precision
+from phydict.runtime.ranges import check_between
 from phydict.runtime.reading import reading
 from phydict.runtime.telling import run_command, tell, telling, told_of
 from phydict.training.checkpoints import BEST, HELD_OUT, RESUMED, BestCheckpoint, WholeCheckpoints, read_checkpoint
@@ -128,6 +130,12 @@ class PriorCLI(TellingCLI):
         plugins = [*(given if isinstance(given, list) else [given]), WholeCheckpoints()]
         logger = CSVLogger(self._get(self.config, "out"), name="logs")
         trainer = self._get(self.config_init, "trainer")
+        if str(trainer.precision) in ("16-true", "bf16-true", "64-true", "64"):
+            raise ValueError(f"weights are learnt in float32, but trainer.precision is {trainer.precision}: leave it "
+                             "out, and give --precision bfloat16 for networks that compute in that")
+        for name in ("accumulate_grad_batches", "check_val_every_n_epoch"):
+            check_between(f"trainer.{name}", 1 if getattr(trainer, name) is None else getattr(trainer, name), 1,
+                          math.inf)
         gpu = None if trainer.accelerator == "cpu" else torch.accelerator.current_accelerator(check_available=True)
         device = gpu or torch.device("cpu")
         if trainer.precision is None:
@@ -167,8 +175,15 @@ class PriorCLI(TellingCLI):
             if (out / name).exists():
                 raise ValueError(f"{out} holds a training already: resume it with --ckpt_path {out / name}, or give "
                                  "another folder with --out")
-        if resumed:
+        if resumed:  # the checkpoint may yet refuse what is held out
+            listing = LambdaCallback(on_train_start=lambda *_: self._write_held_out(out))
+            self.trainer.callbacks.append(listing)  # type: ignore[attr-defined]
             return
+        self._write_held_out(out)
+        self.model.learn_reports()
+
+    def _write_held_out(self, out: Path) -> None:
+        """Lists the CTs that are held out. Raises ValueError where another list is there."""
         if self.trainer.is_global_zero and self.datamodule.held_out:
             held_out = "".join(f"{case}\n" for case in self.datamodule.held_out)
             file = out / HELD_OUT
@@ -177,7 +192,6 @@ class PriorCLI(TellingCLI):
                                  "it away, or give another folder with --out")
             with atomic_write(file) as part:
                 part.write_text(held_out)
-        self.model.learn_reports()
 
     def before_validate(self) -> None:
         if not (self.config.validate.ckpt_path or self.config.validate.model.initial):

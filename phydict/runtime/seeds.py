@@ -12,7 +12,7 @@ def case_seed(seed: int, case: str) -> int:
     return zlib.crc32(f"{seed}/{case}".encode())
 
 
-def check_seed(seed: int) -> None:
-    """Raises ValueError unless a seed is a whole number that random generators take."""
+def check_seed(seed: int, name: str = "a seed") -> None:
+    """Raises ValueError, with the name of the setting, unless a seed is a whole number that random generators take."""
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**63:
-        raise ValueError(f"a seed is a whole number from 0 to 2^63 - 1, but {seed} was given")
+        raise ValueError(f"{name} is a whole number from 0 to 2^63 - 1, but {seed} was given")

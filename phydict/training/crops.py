@@ -12,7 +12,7 @@ from torch.utils.data import ConcatDataset, Dataset
 
 from phydict.datasets import CTCases, CTSource, Deformation, load_case, phantom_case
 from phydict.datasets.cts.cache import write_array
-from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM, CachedPhantoms
+from phydict.datasets.phantoms.cached import VALIDATION_PHANTOM, CachedPhantoms
 from phydict.grid import Cube
 from phydict.runtime.telling import tell
 from phydict.runtime.warning import warn
@@ -133,7 +133,7 @@ class SuperResolutionData(PriorData):
         self.phantoms = PhantomVolumes(0, phantoms, self.grid, self.window, folder)
         self.cts = CTVolumes(self.cts.cts, folder, self.grid, self.window)
         self.validation = ConcatDataset([self._fixed([], [], 0)] + [
-            self._fixed([], PhantomVolumes(HELD_OUT_PHANTOM + i, 1, self.grid, self.window, folder), crops.validation)
+            self._fixed([], PhantomVolumes(VALIDATION_PHANTOM + i, 1, self.grid, self.window, folder), crops.validation)
             for i in range(holdout.phantoms)] + [
             self._fixed(CTVolumes([ct], folder, self.grid, self.window), [], crops.validation)
             for ct in self.held_out_cts.cts])

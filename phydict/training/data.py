@@ -7,7 +7,7 @@ from pathlib import Path
 
 import lightning
 import torch
-from torch.utils.data import ConcatDataset, DataLoader, Dataset, DistributedSampler
+from torch.utils.data import ConcatDataset, DataLoader, Dataset, DistributedSampler, Subset
 
 from phydict.datasets import (
     Augmentation,
@@ -20,11 +20,12 @@ from phydict.datasets import (
     split_by_patient,
 )
 from phydict.datasets.cts.cache import key_of
-from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM, CachedPhantoms
+from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM, VALIDATION_PHANTOM, CachedPhantoms
 from phydict.datasets.population import DrawnPatients
 from phydict.datasets.population.drawn import POPULATION_VERSION
 from phydict.grid import Cube, Grid
 from phydict.runtime.console import check_writable
+from phydict.runtime.ranges import check_between
 from phydict.runtime.seeds import check_seed
 from phydict.runtime.warning import warn
 from phydict.training.draws import Averaged, KeptDraws, MixedCases, averaged, training_parts
@@ -61,8 +62,7 @@ class PriorData(lightning.LightningDataModule):
         self.block = _multiple("draw_voxels", loading.draw_voxels, "the voxels that are trained on", trained)
         if not cts and not phantoms:
             raise ValueError("there is nothing to train on: give data.cts, or data.phantoms above 0")
-        if phantoms < 0:
-            raise ValueError(f"data.phantoms must not be negative, but {phantoms} was given")
+        check_between("data.phantoms", phantoms, 0, HELD_OUT_PHANTOM)  # those from there on are kept for tests
         if cts and Path(cache).resolve().is_relative_to(Path(cts).resolve()):
             raise ValueError(f"data.cache {cache} lies inside data.cts {cts}: give a folder elsewhere")
         check_writable(Path(cache), "data.cache")
@@ -89,7 +89,7 @@ class PriorData(lightning.LightningDataModule):
         self.population = DrawnPatients(self.cts, loading.population) if loading.population.share else None
         self.held_out_cts = CTCases(held_out, cache, self.grid, hu)
         self.validation: Dataset = ConcatDataset([
-            CachedPhantoms(HELD_OUT_PHANTOM, holdout.phantoms, self.grid, hu, Path(cache)), self.held_out_cts])
+            CachedPhantoms(VALIDATION_PHANTOM, holdout.phantoms, self.grid, hu, Path(cache)), self.held_out_cts])
         self.reports = [f.report for f in files if f.report and f.id not in validating]
         self.reports += [report(Thorax.draw(s)) for s in range(min(phantoms, 1000))]
         self.reports += self.population.reports(1000) if self.population else []
@@ -102,6 +102,19 @@ class PriorData(lightning.LightningDataModule):
         if self.population:
             drawn += [POPULATION_VERSION, asdict(self.loading.population)]
         return [drawn, *([ct.id, self.cts.key(ct)] for ct in self.cts.cts)]
+
+    def state_dict(self) -> dict:
+        return {"held_out": self.held_out}
+
+    def load_state_dict(self, state_dict: dict) -> None:
+        """Raises ValueError where a training that resumes holds out other CTs than it did."""
+        changed = sorted(set(state_dict["held_out"]) ^ set(self.held_out))
+        if self.trainer.state.fn == "fit" and changed:
+            is_now = "held out" if changed[0] in self.held_out else "not held out"
+            raise ValueError(f"a training resumes with the CTs held out that were before, but {changed[0]} is {is_now} "
+                             "now: give the same data.cts, data.holdout and data.seed, or the ids of the training's "
+                             "held_out.txt as data.holdout.ids with data.holdout.fraction 0, or start anew with "
+                             "model.initial")
 
     def prepare_data(self) -> None:
         if self.population and self.trainer.state.fn == "fit":
@@ -117,7 +130,10 @@ class PriorData(lightning.LightningDataModule):
             raise ValueError(f"data.loading.epoch_size is {self.loading.epoch_size}, less than one batch on every "
                              f"device ({least}): raise it, or lower data.loading.batch_size")
         # Lightning's own sampler would shuffle: several processes take turns, so that each step sees what one would.
-        draws = self.draws(self.trainer.current_epoch)
+        draws, fit = self.draws(self.trainer.current_epoch), self.trainer.fit_loop
+        if fit.restarting:  # perhaps within an epoch, whose first batches are done
+            done, length = least * fit.epoch_loop.batch_progress.current.ready, self.loading.epoch_size
+            draws = Subset(draws, [n % length for n in range(done, done + length)])
         turns: DistributedSampler = DistributedSampler(draws, self.trainer.world_size, self.trainer.global_rank,
                                                        shuffle=False)
         return DataLoader(draws, self.loading.batch_size, sampler=turns, num_workers=self.loading.workers,

@@ -70,9 +70,9 @@ class DenoisingTraining(StageTraining):
         denoiser = self._denoiser(batch, x0)
         errors = denoising_errors(denoiser, x0, noise, self.prior.window)
         for t, error in errors.items():
-            self.log(f"val/rmse_hu_t{t}", error, sync_dist=True, batch_size=len(x0))
+            self.log_case(index, f"val/rmse_hu_t{t}", error)
         mean = torch.stack([*errors.values()]).mean()
-        self.log("val/rmse_hu", mean, prog_bar=True, sync_dist=True, batch_size=len(x0))
+        self.log_case(index, "val/rmse_hu", mean, prog_bar=True)
         self.log("samples", float(self.samples), rank_zero_only=True, batch_size=len(x0))
         folder = Path(self.trainer.log_dir or self.trainer.default_root_dir) / "samples"  # asks every process
         painted = index < 2 and self.preview_steps

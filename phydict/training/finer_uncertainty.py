@@ -35,6 +35,7 @@ class FinerUncertaintyTraining(StageTraining):
     """
 
     prior: CorrectionNetwork
+    calibrates = True
 
     def __init__(self, network: FinerUncertainty | None = None, cube: Cube = Cube(128),
                  window: tuple[float, float] = (-1000.0, 1000.0), optimisation: Optimisation = Optimisation(),
@@ -66,8 +67,7 @@ class FinerUncertaintyTraining(StageTraining):
     def validation_step(self, batch: dict, index: int) -> None:
         log_scale, error, tissue = self._compared(batch["volume"])
         body = tissue != OUTSIDE
-        self.log("val/rank", spearman_corrcoef(log_scale[body].float(), error[body]), batch_size=1, sync_dist=True,
-                 prog_bar=True)
+        self.log_case(index, "val/rank", spearman_corrcoef(log_scale[body].float(), error[body]), prog_bar=True)
         self.held_out.append(((error / log_scale.exp()).flatten()[::EVERY], tissue.flatten()[::EVERY]))
         self.log("samples", float(self.samples), rank_zero_only=True, batch_size=1)
 

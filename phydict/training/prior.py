@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import torch
-from lightning.pytorch.callbacks import WeightAveraging
 from torch import Tensor
 
+from phydict.datasets import MASKS
 from phydict.datasets.phantoms.findings import KINDS
 from phydict.datasets.phantoms.teaching import teaching_sentences
 from phydict.datasets.prose import written_words
@@ -66,6 +66,9 @@ class PriorTraining(DenoisingTraining):
             raise ValueError("model.text.renew gives a prior a new text side, but none was given to start from: give "
                              "model.initial, or leave it out")
         network = network or VolumeUNet()
+        if network.state_channels > 1 + len(MASKS):
+            raise ValueError(f"model.network has state_channels for a CT and up to {len(MASKS)} masks, at most "
+                             f"{1 + len(MASKS)}, but {network.state_channels} was given")
         encoder = None if initial else _text_encoder(text, network)
         prior = Prior(network, cube.grid(), HUWindow(*window), encoder, sigma_data=optimisation.sigma_data,
                       detail=detail or DetailNetwork(network.state_channels))
@@ -96,7 +99,7 @@ class PriorTraining(DenoisingTraining):
         mesh = self.device_mesh  # only of a strategy that shards the weights
         if mesh is None:
             return
-        if any(isinstance(one, WeightAveraging) for one in self.trainer.callbacks):  # type: ignore[attr-defined]
+        if self.averaging():
             raise ValueError("sharded weights cannot be averaged: train without EMAWeightAveraging "
                              "(trainer.callbacks: null), as configs/prior/fsdp.yaml does")
         # A sharded optimizer resumes only if it has moved each of its weights: those that denoising leaves alone rest.
@@ -123,7 +126,7 @@ class PriorTraining(DenoisingTraining):
             scores = reconstruction_scores(self.prior, batch["volume"], self.validation_views,
                                            self.validation_number(index))
         for name in ("psnr", "ssim"):
-            self.log(f"val/{name}", scores[name], prog_bar=name == "psnr", sync_dist=True, batch_size=1)
+            self.log_case(index, f"val/{name}", scores[name], prog_bar=name == "psnr")
 
     def _write_preview(self, file: Path, batch: dict, x0: Tensor, sample: Tensor) -> None:
         window = self.prior.window

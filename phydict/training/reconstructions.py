@@ -16,7 +16,7 @@ from phydict.datasets import Augmentation, CTSource
 from phydict.datasets.case import Case
 from phydict.datasets.cts.augment import augment
 from phydict.datasets.cts.cache import key_of
-from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM
+from phydict.datasets.phantoms.cached import VALIDATION_PHANTOM
 from phydict.datasets.surroundings.surroundings import Surroundings
 from phydict.grid import Cube, Grid
 from phydict.posterior import Posterior, Refined, Refinement, Unrolled
@@ -234,11 +234,12 @@ class RefinementData(PriorData):
             ConcatDataset([CTVolumes(cts, folder, scene, self.window),
                            PhantomVolumes(first, count, scene, self.window, folder)])
             for cts, first, count in ((self.cts.cts, 0, phantoms),
-                                      (self.held_out_cts.cts, HELD_OUT_PHANTOM, holdout.phantoms))]
+                                      (self.held_out_cts.cts, VALIDATION_PHANTOM, holdout.phantoms))]
         trained, validated = volumes
         network = made.network or self.kind.default_network
+        validating = holdout.phantoms and [VALIDATION_PHANTOM, holdout.phantoms]
         parts = [asdict(scenes), fingerprint(initial), network and fingerprint(network), scene.to_dict(),
-                 self.origin(), holdout.phantoms, [[ct.id, self.held_out_cts.key(ct)] for ct in self.held_out_cts.cts]]
+                 self.origin(), validating, [[ct.id, self.held_out_cts.key(ct)] for ct in self.held_out_cts.cts]]
         folder = folder / f"{self.kind.name}-{key_of(parts)}"
         self.crop, self.made = made.crop, self.kind(
             trained, self.grid, initial, network, scenes, STRENGTH, folder / f"trained-{made.seed}",

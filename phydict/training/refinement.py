@@ -51,7 +51,7 @@ class RefinementTraining(StageTraining):
         truth, inputs = batch["volume"][:, -1:], batch["volume"][:, :-1]
         for name, x0 in (("psnr", self.prior(inputs).clamp(-1, 1)), ("psnr_before", inputs[:, :1])):
             psnr = 10 * (4 / (x0.float() - truth).square().mean()).log10()  # the range is 2 wide
-            self.log(f"val/{name}", psnr, prog_bar=name == "psnr", sync_dist=True, batch_size=1)
+            self.log_case(index, f"val/{name}", psnr, prog_bar=name == "psnr")
         self.log("samples", float(self.samples), rank_zero_only=True, batch_size=1)
 
     def _describe(self) -> dict:

@@ -132,11 +132,11 @@ def log_scores(module: StageTraining, batch: dict, index: int, views: Sequence[i
     with torch.autocast(module.device.type, enabled=False):
         for count in views:
             view_scores = reconstruction_scores(module.prior, batch["volume"], count, seed, method, beam)
-            module.log(f"val/psnr_{count}", view_scores["psnr"], sync_dist=True, batch_size=1)
+            module.log_case(index, f"val/psnr_{count}", view_scores["psnr"])
             scores.append(view_scores)
     for name in ("psnr", "ssim"):
         mean = float(np.mean([view_scores[name] for view_scores in scores]))
-        module.log(f"val/{name}", mean, prog_bar=name == "psnr", sync_dist=True, batch_size=1)
+        module.log_case(index, f"val/{name}", mean, prog_bar=name == "psnr")
     module.log("samples", float(module.samples), rank_zero_only=True, batch_size=1)
 
 

@@ -89,6 +89,10 @@ class PriorOptimisation(Optimisation):
     sigma_data: float = 0.5
     mask_weight: float = 0.1
 
+    def __post_init__(self):
+        super().__post_init__()
+        check_between("model.optimisation.sigma_data", self.sigma_data, 1e-3, 1000)
+
 
 @dataclass(frozen=True)
 class Previews:

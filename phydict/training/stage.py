@@ -18,6 +18,7 @@ from phydict.prior import CorrectionNetwork, Prior, Refiner, SuperResolution
 from phydict.prior.finite import not_finite
 from phydict.prior.stage_file import check_stage
 from phydict.rivals import Rival
+from phydict.runtime.seeds import check_seed
 from phydict.training.settings import Optimisation
 from phydict.units import HUWindow
 
@@ -37,14 +38,16 @@ def check_continues(kind: str, file: str, stage: Prior | Refiner | CorrectionNet
 class StageTraining(lightning.LightningModule, ABC):
     """Learns one stage, its network `self.prior`, by the loss of a batch (`batch_loss`).
 
-    calls: of the network, forward and backward, that a sample costs.
+    calls: of the network, forward and backward, that a sample costs. calibrates: whether validation changes the
+    weights.
     """
 
-    calls = 1
+    calls, calibrates = 1, False
 
     def __init__(self, prior: Prior | SuperResolution | Refiner | CorrectionNetwork | Rival,
                  optimisation: Optimisation, seed: int):
         super().__init__()
+        check_seed(seed, "model.seed")
         self.prior, self.optimisation, self.seed, self.samples = prior, optimisation, seed, 0
         self.before: dict[str, int] = {}
         """Steps and samples that the weights had learnt from when this training was given them, where they say so."""
@@ -71,10 +74,30 @@ class StageTraining(lightning.LightningModule, ABC):
     def learn_reports(self) -> None:
         """Teaches the text part, where there is one, before the first denoising step."""
 
+    def averaging(self) -> list[WeightAveraging]:
+        """The trainer's callbacks that average weights."""
+        return [one for one in self.trainer.callbacks if isinstance(one, WeightAveraging)]  # type: ignore[attr-defined]
+
+    def configure_model(self) -> None:
+        if self.device_mesh is not None:  # only of a strategy that shards the weights
+            raise ValueError("this stage is too small to be sharded over devices: train it with "
+                             "configs/prior/ddp.yaml instead of fsdp.yaml")
+
     def on_fit_start(self) -> None:
-        for callback in self.trainer.callbacks:  # type: ignore[attr-defined]
-            if isinstance(callback, WeightAveraging) and callback._average_model is not None:
+        for callback in self.averaging():
+            if self.calibrates:
+                raise ValueError("weights that validation calibrates cannot be averaged: train without "
+                                 f"{type(callback).__name__} (trainer.callbacks: null)")
+            if callback._average_model is not None:
                 callback._average_model.to(self.device)  # made before the weights came there; each step would copy them
+
+    def on_train_start(self) -> None:
+        for schedule in (config.scheduler for config in self.trainer.lr_scheduler_configs):  # type: ignore[attr-defined]
+            settings, groups = self.optimisation, schedule.optimizer.param_groups  # perhaps a checkpoint's
+            schedule.base_lrs = [settings.learning_rate] * len(groups)
+            for group in groups:
+                group.update(initial_lr=settings.learning_rate, weight_decay=settings.weight_decay,
+                             lr=settings.learning_rate * settings.factor(schedule.last_epoch))
 
     def training_step(self, batch: dict, index: int) -> Tensor:
         loss = self.batch_loss(batch, (self.seed, self.global_step, index), self.global_rank, self.trainer.world_size)
@@ -88,8 +111,18 @@ class StageTraining(lightning.LightningModule, ABC):
     def validation_number(self, index: int) -> int:
         """The number of the held-out case that is this process's `index`-th, which decides what is drawn for it:
         processes take turns, and begin anew until each has as many."""
-        cases = len(self.trainer.val_dataloaders.dataset)  # type: ignore[union-attr, arg-type]  # one loader
-        return (index * self.trainer.world_size + self.trainer.global_rank) % cases
+        return (index * self.trainer.world_size + self.trainer.global_rank) % self._held_out_cases()
+
+    def log_case(self, index: int, name: str, value: Tensor | float, prog_bar: bool = False) -> None:
+        """Logs a number of this process's `index`-th held-out case for the mean over cases; one that is begun anew
+        counts nothing."""
+        cases, processes = self._held_out_cases(), self.trainer.world_size
+        counts = index * processes + self.trainer.global_rank < cases
+        # Lightning takes the mean of these whole numbers over processes, rounded: multiples of their number stay right.
+        self.log(name, value, prog_bar=prog_bar, sync_dist=True, batch_size=processes * counts)
+
+    def _held_out_cases(self) -> int:
+        return len(self.trainer.val_dataloaders.dataset)  # type: ignore[union-attr, arg-type]  # one loader
 
     def on_train_batch_end(self, outputs: object, batch: object, index: int) -> None:
         if self.global_step == self.trainer.max_steps:  # Lightning then validates, whichever epoch it is

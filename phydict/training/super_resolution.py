@@ -41,6 +41,7 @@ class SuperResolutionTraining(DenoisingTraining):
                  optimisation: Optimisation = Optimisation(), validation: Previews = Previews(),
                  initial: str | None = None, seed: int = 0):
         check_between("model.most_noise", most_noise)
+        check_between("model.detail_std", detail_std, 1e-3, 1000)
         stage = SuperResolution(network or LocalUNet(), cube.grid(), HUWindow(*window), factor,
                                detail_std=detail_std)
         if initial:
@@ -52,11 +53,6 @@ class SuperResolutionTraining(DenoisingTraining):
             stage = first.train().requires_grad_(True)
         super().__init__(stage, stage.detail_std, optimisation, validation.preview_steps, seed)
         self.most_noise = most_noise
-
-    def configure_model(self) -> None:
-        if self.device_mesh is not None:
-            raise ValueError("a super-resolution stage is too small to be sharded over devices: train it with "
-                             "configs/prior/ddp.yaml instead of fsdp.yaml")
 
     def _clean_state(self, batch: dict) -> tuple[Tensor, Tensor]:
         return batch["volume"], torch.ones(len(batch["volume"]), 1, 1, 1, 1, device=self.device)
@@ -77,7 +73,7 @@ class SuperResolutionTraining(DenoisingTraining):
         super().validation_step(batch, index)
         x0 = batch["volume"]
         lacking = (self.prior.upsample(avg_pool3d(x0, self.prior.factor)) - x0).square().mean().sqrt()
-        self.log("val/rmse_hu_upsampled", lacking * self.prior.window.half_width, sync_dist=True, batch_size=len(x0))
+        self.log_case(index, "val/rmse_hu_upsampled", lacking * self.prior.window.half_width)
 
     def _write_preview(self, file: Path, batch: dict, x0: Tensor, sample: Tensor) -> None:
         upsampled = self.prior.upsample(avg_pool3d(x0, self.prior.factor))

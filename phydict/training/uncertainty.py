@@ -44,6 +44,7 @@ class UncertaintyTraining(StageTraining):
     """
 
     prior: Any  # a Refiner with uncertainty
+    calibrates = True
 
     def __init__(self, network: Uncertainty | None = None, method: Unrolled = Unrolled(), scenes: Scenes = Scenes(),
                  cube: Cube = Cube(), window: tuple[float, float] = (-1000.0, 1000.0),
@@ -101,8 +102,7 @@ class UncertaintyTraining(StageTraining):
             z, evidence, measurement = self._reconstruct(batch, rng)
             error, log_scale = (z[:, :1] - ct).abs(), self._log_scale(z, evidence, measurement)
             body = _body(ct, z)
-            self.log("val/rank", spearman_corrcoef(log_scale[body], error[body]), batch_size=1, sync_dist=True,
-                     prog_bar=True)
+            self.log_case(index, "val/rank", spearman_corrcoef(log_scale[body], error[body]), prog_bar=True)
             chosen = torch.from_numpy(rng.integers(error.numel(), size=VOXELS)).to(ct.device)
             self.held_out.append((
                 (error / log_scale.exp()).flatten()[chosen], tissue_of(z).flatten()[chosen],

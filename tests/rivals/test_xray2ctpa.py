@@ -101,6 +101,7 @@ def test_a_trained_diffusion_keeps_the_size_of_its_latents_and_is_validated_from
     assert float(went_on.prior.network.latent_size) == 1.0
     logged = []
     went_on.log = lambda name, *_, **__: logged.append(name)
+    went_on.log_case = lambda index, name, *_, **__: logged.append(name)
     went_on.validation_number = lambda index: index
     went_on.validation_step({"volume": body()}, 0)
     assert "val/psnr" in logged

@@ -18,7 +18,10 @@ PHANTOM_VERSION = 4
 """Raised whenever a phantom of the same seed comes out differently, so that cached ones are made anew."""
 
 HELD_OUT_PHANTOM = 1_000_000
-"""Phantoms with this seed and above are never trained on."""
+"""Phantoms with this seed and above are never trained on: the first of them are for tests."""
+
+VALIDATION_PHANTOM = 2_000_000
+"""Phantoms with this seed and above validate trainings."""
 
 
 class CachedPhantoms(Dataset):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, field, fields, is_dataclass, replace
@@ -229,6 +229,14 @@ class Delegating(Reconstructor):
 
 def describe(settings) -> dict:
     """A method's settings as plain JSON values: class name and fields, nested."""
-    return {"class": type(settings).__name__} | {
-        f.name: describe(value) if is_dataclass(value := getattr(settings, f.name)) else value
-        for f in fields(settings)}
+    return {"class": type(settings).__name__} | {f.name: _plain(getattr(settings, f.name)) for f in fields(settings)}
+
+
+def _plain(value):
+    if is_dataclass(value):
+        return describe(value)
+    if isinstance(value, Mapping):
+        return {str(name): _plain(inner) for name, inner in value.items()}
+    if isinstance(value, tuple | list):
+        return [_plain(inner) for inner in value]
+    return str(value) if isinstance(value, Path) else value

@@ -1,8 +1,13 @@
 """Laws of what a reconstruction reports."""
 
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+
 import pytest
 import torch
 
+from phydict.reconstruction import describe
 from phydict.xray.residuals import misfits
 
 Y = torch.rand(3, 5, 4, generator=torch.Generator().manual_seed(0)) + 0.1
@@ -21,3 +26,14 @@ def test_misfits_of_views_combine_to_the_whole():
     sizes = scaled.flatten(1).norm(dim=1)
     residuals = torch.tensor(said["misfit_per_view"]) * sizes
     assert said["misfit"] == pytest.approx(float(residuals.norm() / sizes.norm()), rel=1e-5)
+
+
+def test_settings_of_any_kind_are_plain_json():
+    @dataclass(frozen=True)
+    class Mine:
+        weights: Path = Path("a.safetensors")
+        levels: tuple = (1, (Path("b"), 2.0))
+        named: dict = field(default_factory=lambda: {"c": Path("d")})
+
+    assert json.loads(json.dumps(describe(Mine()))) == {
+        "class": "Mine", "weights": "a.safetensors", "levels": [1, ["b", 2.0]], "named": {"c": "d"}}

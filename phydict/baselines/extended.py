@@ -150,6 +150,8 @@ def _room(volume: Grid, xrays: Tensor, beam: ConeBeam, answered: bool | None, mu
 def _columns(volume: Grid, xrays: Tensor, beam: ConeBeam, mu_water: float) -> int:
     """How many voxels more the volume needs at each of its four sides to hold what stands there; 0 where nothing does
     that the X-rays show."""
+    if not volume.is_upright:
+        return 0
     across = max(volume.shape[:2])
     room = [n for n in range(STEP, int(MORE * across) + 1, STEP) if beam.has_room_for(volume.grown(n, n, 0))]
     if beam.views < LEAST_VIEWS or not room or room[-1] < LEAST * across:

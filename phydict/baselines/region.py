@@ -14,7 +14,7 @@ from phydict.reconstruction import Delegating, Reconstruction
 from phydict.runtime.profiling import Stopwatch
 from phydict.units import hu_to_mu
 from phydict.xray import Projector
-from phydict.xray.boxes import outside_projection, seen_by
+from phydict.xray.boxes import elsewhere, outside_projection, seen_by
 from phydict.xray.calibration import match_views
 
 
@@ -51,15 +51,16 @@ class Region(Delegating):
                     seed: int = 0, on_step: Callable[[], None] = lambda: None) -> Reconstruction:
         watch = Stopwatch()
         with watch.stage("base"):
-            binned = seen_by(self.outer, xrays, projector.beam, self.full_detector, projector.method)
+            method = elsewhere(projector)
+            binned = seen_by(self.outer, xrays, projector.beam, self.full_detector, method)
             coarse = self.base.reconstruct(*binned, report, display, seed, on_step)
         with watch.stage("outside"):
             mu = hu_to_mu(coarse.volume.to(xrays), self.mu_water)
             if display:
-                whole = Projector(self.outer, projector.beam, projector.method, device=xrays.device, full_detector=True)
+                whole = Projector(self.outer, projector.beam, method, device=xrays.device, full_detector=True)
                 xrays = match_views(xrays[None], whole(mu[None, None]))[0]
             continued = bool(projector.beam.continued)
-            projector = Projector(self.target, replace(projector.beam, continued=False), projector.method,
+            projector = Projector(self.target, replace(projector.beam, continued=False), method,
                                   device=xrays.device, full_detector=True)
             outside = outside_projection(mu, self.outer, projector, continued)
         result = self.base.reconstruct(xrays, projector, report, False, seed, on_step, outside)

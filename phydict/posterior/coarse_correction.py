@@ -76,7 +76,7 @@ def coarse_correction(base: object, level: Grid, seen: tuple[Tensor, Projector],
     xrays, projector = seen
     if not (isinstance(base, Posterior) and isinstance(base.prior, Refiner)) or _factor(base.grid, level) < 2:
         return None
-    if projector.method != "separable":
+    if getattr(projector, "method", None) != "separable":
         return None
     if found.masks is None or len(found.masks) + 1 != base.prior.state_channels:
         return None

@@ -24,7 +24,17 @@ from phydict.runtime.profiling import Stopwatch, stage
 from phydict.runtime.warning import Remark, warn
 from phydict.units import AIR, HUWindow, hu_to_mu
 from phydict.xray import Projector
-from phydict.xray.boxes import SLACK, covers, interpolated, outside_projection, refinements, seen_by
+from phydict.xray.boxes import (
+    SLACK,
+    averaged,
+    covers,
+    elsewhere,
+    interpolated,
+    no_finer,
+    outside_projection,
+    refinements,
+    seen_by,
+)
 
 ON_FINER = {0.5: (0.85, 0.0), 0.8: (1.0, 0.0), 0.9: (1.0, 0.1), 0.95: (1.0, 0.2)}
 """Level -> the shares of a coarse interval and of the refinement's change of which one on finer voxels is the sum: of
@@ -141,6 +151,9 @@ class Refined(Delegating):
     them, on still finer voxels interpolated, and else made of the base's and of what the refinement changed of the
     interpolated volume, as ON_FINER says. Remarks on voxels on which no network corrects.
 
+    A target in the base's box whose voxels are along no axis shorter than the base's is not refined: its volume, masks,
+    deviation and intervals are the base's, averaged over its voxels, and its misfit that of the base's volume.
+
     Args:
         base: the method, bound to voxels and an HU `window` of its own: a prior's, a cascade's or a rival's
         target: the voxels of the result, along the same axes
@@ -174,7 +187,7 @@ class Refined(Delegating):
     @property
     def levels(self) -> list[Grid]:
         """The voxels of each refinement."""
-        return refinements(self.base.grid, self.target)
+        return [] if no_finer(self.target, self.base.grid) else refinements(self.base.grid, self.target)
 
     @property
     def volumes(self) -> int:
@@ -198,6 +211,8 @@ class Refined(Delegating):
         with watch.stage("base"):
             binned = self._binned(xrays, projector, base.grid)
             coarse = base.reconstruct(*binned, report, display, seed, on_step)
+        if not self.levels:
+            return self._averaged(coarse, watch.seconds)
         volume, grid, calls, scores = coarse.within.to(xrays), base.grid, coarse.projector_calls, {}
         network_calls, known, alone = coarse.network_calls, None, list[str]()
         for number, level in enumerate(self.levels):
@@ -242,6 +257,15 @@ class Refined(Delegating):
                 *(interpolated(mask, base.grid, self.target, 0.0)[None] for mask in coarse.masks)]),
             deviation=None if deviation is None else interpolated(deviation, base.grid, self.target, 0.0))
 
+    def _averaged(self, coarse: Reconstruction, seconds: dict[str, float]) -> Reconstruction:
+        def onto(volume: Tensor) -> Tensor:
+            return averaged(volume, coarse.grid, self.target)
+
+        return replace(coarse, volume=onto(coarse.volume), grid=self.target, coarse=coarse, seconds=seconds,
+                       masks=None if coarse.masks is None else onto(coarse.masks),
+                       deviation=None if coarse.deviation is None else onto(coarse.deviation),
+                       intervals={level: onto(half_width) for level, half_width in coarse.intervals.items()})
+
     def _known_intervals(self, network: Correction, level: Grid, x: Tensor, start: Tensor, coarse: Reconstruction
                          ) -> tuple[dict[float, Tensor], Grid] | None:
         """The half-widths in HU that a network knows on a level's voxels, and these; None where it knows none."""
@@ -268,7 +292,7 @@ class Refined(Delegating):
             beam = replace(beam, continued=False)
         elif grid.same_as(projector.grid):
             return xrays, projector
-        return seen_by(grid, xrays, beam, self.full_detector, projector.method)
+        return seen_by(grid, xrays, beam, self.full_detector, elsewhere(projector))
 
     def _measurement(self, y: Tensor, A: Projector, coarse: Reconstruction, display: bool, continued: bool
                      ) -> Measurement:

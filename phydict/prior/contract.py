@@ -50,10 +50,12 @@ class PriorContract(ABC):
         """
 
     def identity(self) -> dict:
-        """What decides its answers, as plain JSON values: its class and those of its attributes that are plain. A prior
-        with weights adds their checksum, so that results of others are not taken for its own."""
+        """What decides its answers, as plain JSON values: its class, voxels, HU window and channels, and those of its
+        attributes that are plain. A prior with weights adds their checksum, so that results of others are not taken
+        for its own."""
         plain = {name: value for name, value in vars(self).items() if isinstance(value, str | int | float | None)}
-        return {"class": f"{type(self).__module__}.{type(self).__qualname__}"} | plain
+        return {"class": f"{type(self).__module__}.{type(self).__qualname__}", "grid": self.grid.to_dict(),
+                "window": [self.window.low, self.window.high], "state_channels": self.state_channels} | plain
 
 
 class AnyPrior(Protocol):

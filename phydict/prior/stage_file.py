@@ -110,7 +110,8 @@ def built_network(made: Callable[[], Network], weights: dict[str, Tensor], heade
             wrong = unlike(weights, made().state_dict())
         if wrong:
             raise ValueError(f"{len(wrong)} of them are missing, unexpected or of another shape, such as {min(wrong)}")
-        stage = made()
+        with torch.random.fork_rng(devices=[]):  # what it begins with is random
+            stage = made()
         stage.load_state_dict(weights)
     except Exception as error:  # of whatever kind: it is the header that leads to it
         lacks = f"the header lacks {error}" if isinstance(error, KeyError) else reason(error)

@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 
 from phydict.grid import Grid, centred
+from phydict.runtime.warning import warn
 from phydict.xray.binning import binned, binning
 from phydict.xray.geometry import ConeBeam
-from phydict.xray.projectors.projector import Projector
+from phydict.xray.projectors.projector import METHODS, Projector
 
 ALONG = 1e-4
 """Sine of the angle below which axes of two grids run along each other."""
@@ -28,6 +29,16 @@ def seen_by(grid: Grid, xrays: Tensor, beam: ConeBeam, full_detector: bool, meth
     with them on their device; `method` as Projector's."""
     factor = 1 if full_detector else binning(grid, beam)
     return binned(xrays, factor), Projector(grid, beam.binned(factor), method, device=xrays.device, full_detector=True)
+
+
+def elsewhere(projector: Projector) -> str:
+    """The method by which X-rays are projected on other voxels than a projector's own; a projector that is not
+    phydict's gives its place to it there, and a warning says so."""
+    method = getattr(projector, "method", None)
+    if method in METHODS:
+        return method
+    warn(f"{type(projector).__name__} projects its own voxels alone: on others phydict's projector takes its place")
+    return "auto"
 
 
 def along(grid: Grid, other: Grid) -> bool:
@@ -70,6 +81,29 @@ def interpolated(volume: Tensor, grid: Grid, onto: Grid, fill: float) -> Tensor:
         weights = ((1 - distance).clamp(min=0) * inside[:, None]).to(volume)
         result = torch.tensordot(weights, result.movedim(axis, 0), 1).movedim(0, axis)
     return result.contiguous() + fill
+
+
+def averaged(volume: Tensor, grid: Grid, onto: Grid) -> Tensor:
+    """Volumes (..., X, Y, Z) on `grid`, averaged over the voxels of another grid along the same axes, of which each
+    shares a part with its box; what is beyond that does not count."""
+    if grid.same_as(onto):
+        return volume
+    check_axes(grid, onto)
+    first, step = grid.index(onto.affine[:3, 3]), np.divide(onto.spacing, grid.spacing)
+    for axis, n in enumerate(grid.shape):
+        centres, places = first[axis] + step[axis] * np.arange(onto.shape[axis])[:, None], np.arange(n)
+        shared = (np.minimum(centres + step[axis] / 2, places + 0.5)
+                  - np.maximum(centres - step[axis] / 2, places - 0.5)).clip(0)
+        weights = torch.as_tensor(shared / shared.sum(1, keepdims=True)).to(volume)
+        volume = torch.tensordot(weights, volume.movedim(axis - 3, 0), 1).movedim(0, axis - 3)
+    return volume.contiguous()
+
+
+def no_finer(grid: Grid, than: Grid) -> bool:
+    """Whether a grid's voxels are along no axis shorter than those of another grid along the same axes, and each lies
+    at least half in its box."""
+    beyond = np.multiply(lacking(than, grid), than.spacing) / grid.spacing
+    return bool((np.divide(grid.spacing, than.spacing) > 1 - SLACK).all() and (beyond < 0.5).all())
 
 
 def outside_projection(mu: Tensor, grid: Grid, projector: Projector, continued: bool = False) -> Tensor:

@@ -100,8 +100,9 @@ def _read_npy(path: Path) -> np.ndarray:
 
 
 def _read_table(path: Path) -> np.ndarray:
-    rows = [re.split(r"[,;\s]+", line.strip(" ,;\t")) for line in read_text(path).splitlines()
-            if line.strip() and not line.startswith("#")]
+    lines = [line.strip(" ,;\t") for line in read_text(path).splitlines()]
+    lines = [line.lstrip("# ") if _names_columns(line) else line for line in lines]  # numpy.savetxt's header
+    rows = [re.split(r"[,;\s]+", line) for line in lines if line and not line.startswith("#")]
     columns = list(COLUMNS)
     if rows and rows[0][0][:1].isalpha():
         columns = [name.lower() for name in rows.pop(0)]
@@ -116,3 +117,7 @@ def _read_table(path: Path) -> np.ndarray:
     except ValueError as error:
         raise ValueError(f"{path}: {reason(error)[:100]}; give numbers in mm") from error
     return table[:, [columns.index(name) for name in COLUMNS]]
+
+
+def _names_columns(line: str) -> bool:
+    return line.startswith("#") and re.split(r"[,;\s]+", line.lstrip("# ").lower())[0] in COLUMNS

@@ -1,5 +1,6 @@
 """Patients who are larger than the volume."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -71,6 +72,13 @@ def test_nothing_is_sought_where_nothing_stands_or_can_be_told(patients):
     assert not narrow.has_room_for(WIDE)
     y = Ideal()(Projector(CHEST, narrow, full_detector=True), WINDOW.to_mu(patients["alone"][..., 8:72, 8:72, :]), 0)[0]
     assert extended(method, CHEST, y, narrow, False) == (method, CHEST, narrow)
+
+
+def test_voxels_that_lie_get_no_more_at_their_sides(patients):
+    lying = Grid(CHEST.shape, affine=CHEST.affine[:, [0, 2, 1, 3]])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", Remark)
+        assert extended(reconstructor("tv"), lying, xrays_of(patients["with arms"]), ORBIT, False)[1] == lying
 
 
 @pytest.mark.filterwarnings("ignore:the X-rays show that the patient")

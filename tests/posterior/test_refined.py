@@ -114,6 +114,17 @@ def test_the_own_grid_is_no_refinement_and_changes_nothing(xrays):
     assert own.volume.equal(same.volume) and same.coarse is None
 
 
+@pytest.mark.parametrize("grid, factor", [(Grid.cube(8), 2), (Grid((16, 16, 4), (24.0, 24.0, 96.0)), (1, 1, 4))])
+def test_on_voxels_no_finer_than_the_base_s_the_result_is_its_averages_with_its_misfit(xrays, grid, factor):
+    found, base = refined(grid, xrays), Known()
+    coarse = found.coarse
+    assert found.grid is grid and found.misfit == coarse.misfit and Refined(base, grid).steps() == base.steps()
+    for of_target, of_base in ((found.volume, coarse.volume), (found.deviation, coarse.deviation),
+                               (found.masks, coarse.masks)):
+        torch.testing.assert_close(of_target, torch.nn.functional.avg_pool3d(
+            of_base.view(-1, 1, *COARSE.shape), factor).view_as(of_target))
+
+
 def test_refining_leaves_what_explains_the_xrays_to_the_solvers_tolerance():
     x = WINDOW.to_range(chest())[None, None].double()
     projector = Projector(FINE, BEAM, full_detector=True)

@@ -43,6 +43,16 @@ def test_the_reward_is_minus_the_mean_over_views_of_the_squared_error():
     assert Reward()(Measurement(PROJECTOR, Y, WINDOW), X).tolist() == pytest.approx(expected)
 
 
+@pytest.mark.parametrize("reward", [Reward(renderer="separable"), Reward(upsampling=1, renderer="auto")])
+def test_another_renderer_sees_what_lies_outside_as_well(reward):
+    outside = 0.1 * random_like(Y.shape, seed=4).abs()
+    m = Measurement(PROJECTOR, Y + outside, WINDOW, outside=outside)
+    assert reward(m, X).tolist() == pytest.approx(Reward()(m, X).tolist())
+    before = m.calls
+    reward(m, X)
+    assert m.calls == before + len(X)
+
+
 def test_the_truth_has_the_highest_reward_and_its_gradient_vanishes():
     m, x = Measurement(PROJECTOR, Y, WINDOW), TRUTH.clone().requires_grad_()
     reward = Reward()(m, x)

@@ -4,10 +4,20 @@ import numpy as np
 import pytest
 import torch
 from laws import random_like
+from torch.nn.functional import avg_pool3d
 
 from phydict.grid import Box, Grid
 from phydict.xray import ConeBeam, Projector
-from phydict.xray.boxes import covers, divided, halved, interpolated, outside_projection, refinements
+from phydict.xray.boxes import (
+    averaged,
+    covers,
+    divided,
+    halved,
+    interpolated,
+    no_finer,
+    outside_projection,
+    refinements,
+)
 
 BASE = Grid.cube(16)
 BEAM = ConeBeam.orbit(3, 1020, 740, (28, 28), 20.0)
@@ -48,6 +58,23 @@ def test_interpolation_keeps_what_is_linear_and_fills_what_lies_outside(onto):
     torch.testing.assert_close(found[inner], linear(onto)[inner])
     beyond = interpolated(linear(BASE), BASE, Grid.box(4, 40.0, (400.0, 0.0, 0.0)), -5.0)
     assert (beyond == -5).all()
+
+
+def test_averages_over_voxels_keep_the_mean_and_over_whole_ones_what_is_linear():
+    x = random_like((2, *BASE.shape))
+    torch.testing.assert_close(averaged(x, BASE, Grid((8, 4, 16), (48.0, 96.0, 24.0))), avg_pool3d(x, (2, 4, 1)))
+    assert averaged(x, BASE, Grid.box(8, 192.0)).equal(x[:, 4:12, 4:12, 4:12])
+    torch.testing.assert_close(averaged(x, BASE, Grid.cube(7)).mean(), x.mean())
+    onto = Grid.box((5, 4, 3), (240.0, 192.0, 216.0), (24.0, 0.0, -12.0))  # whose faces are those of voxels
+    torch.testing.assert_close(averaged(linear(BASE), BASE, onto), linear(onto))
+
+
+@pytest.mark.parametrize("grid, expected", [
+    (Grid.cube(8), True), (Grid.box(8, 192.0), True), (Grid((16, 16, 8), (24.0, 24.0, 48.0)), True),
+    (Grid((32, 8, 8), (12.0, 48.0, 48.0)), False), (Grid.cube(16, 383.0), False),
+    (Grid((18, 16, 16), 24.0), False), (Grid.box(8, 192.0, (120.0, 0, 0)), False)])
+def test_no_finer_are_voxels_that_are_along_no_axis_shorter_and_lie_in_the_box(grid, expected):
+    assert no_finer(grid, BASE) is expected
 
 
 def test_what_lies_inside_and_outside_a_box_projects_to_the_whole():

@@ -50,6 +50,15 @@ def test_what_is_written_is_read_back(tmp_path, make, ending):
     assert read_beam(tmp_path / f"beam.{ending}", SHAPE, PIXEL).same_as(make(), tolerance=1e-9)
 
 
+def test_a_table_of_numpys_has_its_columns_by_the_names_in_its_header(tmp_path):
+    write_beam(tmp_path / "beam.csv", random_poses())
+    lines = (tmp_path / "beam.csv").read_text().splitlines()
+    columns = np.array([line.split(",") for line in lines if not line.startswith("#")]).T[::-1]
+    assert columns[0, 0] == COLUMNS[-1]
+    np.savetxt(tmp_path / "numpy.csv", columns[:, 1:].T.astype(float), delimiter=",", header=",".join(columns[:, 0]))
+    assert read_beam(tmp_path / "numpy.csv", SHAPE, PIXEL).same_as(random_poses(), tolerance=1e-9)
+
+
 @pytest.mark.parametrize("continued", [True, False])
 def test_yaml_holds_whether_the_patient_goes_on_and_other_files_warn_that_they_do_not(tmp_path, continued):
     beam = replace(orbit(), continued=continued)

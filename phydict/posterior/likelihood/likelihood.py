@@ -180,6 +180,6 @@ class GradientSteps(LikelihoodStep):
                 apart = apart.mean(1) if self.prior_mean else apart.sum(1)
                 loss = (apart / self.rho - self.reward(measurement, z)).sum()
                 loss.backward()
-                measurement.calls += 1  # autograd's use of the adjoint
+                measurement.calls += len(z)  # autograd's use of the adjoint
                 optimiser.step()
         return z.detach()

@@ -17,7 +17,8 @@ def compiled(fastmath: bool | set[str] = False, parallel: bool = False) -> Calla
     and its prange loops on several threads where `parallel` says so.
 
     The machine code is kept for other processes in NUMBA_CACHE_DIR, beside the source or in the user's cache folder,
-    the first of them that can be written to; where none can, every process compiles anew.
+    the first of them that can be written to; where none can, every process compiles anew. It is made anew when the
+    function's own file changes, not when that of a compiled function it calls does: such a change needs both.
     """
     threads: Any = LOOPS_ALONE if parallel else False
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from phydict.xray.projectors.compiled import compiled
-from phydict.xray.projectors.tracer import Tracer, aim, enter, nearest
+from phydict.xray.projectors.tracer import Tracer, aim, clip, nearest
 
 
 @compiled()
@@ -20,7 +20,7 @@ def _project(volume, image, ray, lengths, low, high):
     for r in range(image.shape[0]):
         for c in range(image.shape[1]):
             aim(ray, r, c, step)
-            t, last = enter(start, step, low, high, voxel, sign, cross, delta)
+            t, last = clip(start, step, low, high, voxel, sign, cross, delta)
             total = 0.0
             while t < last:
                 a = nearest(cross)
@@ -46,7 +46,7 @@ def _backproject(volume, images, rays, lengths, bottom, top):
         for r in range(images.shape[1]):
             for c in range(images.shape[2]):
                 aim(rays[k], r, c, step)
-                t, last = enter(start, step, low, high, voxel, sign, cross, delta)
+                t, last = clip(start, step, low, high, voxel, sign, cross, delta)
                 value = images[k, r, c] * lengths[k, r, c]
                 while t < last:
                     a = nearest(cross)

@@ -17,7 +17,7 @@ from phydict.grid import Grid
 from phydict.xray.geometry import ConeBeam
 from phydict.xray.projectors.compiled import compiled
 from phydict.xray.projectors.csr import csr_tensor, index_type
-from phydict.xray.projectors.tracer import aim, enter, nearest, ray_lengths, rays_in_voxels, run
+from phydict.xray.projectors.tracer import aim, clip, nearest, ray_lengths, rays_in_voxels, run
 
 
 class SystemMatrix:
@@ -105,7 +105,7 @@ def _count(shape, ray, crossed):
     for r in range(crossed.shape[0]):
         for c in range(crossed.shape[1]):
             aim(ray, r, c, step)
-            t, last = enter(start, step, (0, 0, 0), shape, voxel, sign, cross, delta)
+            t, last = clip(start, step, (0, 0, 0), shape, voxel, sign, cross, delta)
             while t < last:
                 crossed[r, c] += 1
                 a = nearest(cross)
@@ -125,7 +125,7 @@ def _fill(shape, ray, lengths, offsets, voxels, values):
     for r in range(lengths.shape[0]):
         for c in range(lengths.shape[1]):
             aim(ray, r, c, step)
-            t, last = enter(start, step, (0, 0, 0), shape, voxel, sign, cross, delta)
+            t, last = clip(start, step, (0, 0, 0), shape, voxel, sign, cross, delta)
             entry = offsets[r, c]
             while t < last:
                 a = nearest(cross)

@@ -110,7 +110,7 @@ def aim(ray, row, column, step):
 
 
 @compiled()
-def enter(start, step, low, high, voxel, sign, cross, delta):
+def clip(start, step, low, high, voxel, sign, cross, delta):
     """Set up one ray, start + t step in voxel indices, and return its interval of t inside the box.
 
     The box holds the voxels low <= index < high. Fills per axis the first voxel, the direction of travel, the t of
@@ -128,8 +128,10 @@ def enter(start, step, low, high, voxel, sign, cross, delta):
     if first >= last:
         return 1.0, 0.0
     for a in range(3):
-        voxel[a] = min(max(int(np.floor(start[a] + first * step[a] + 0.5)), low[a]), high[a] - 1)
-        if abs(step[a]) < 1e-12:
+        still = abs(step[a]) < 1e-12
+        way = 0.0 if still else first * step[a]
+        voxel[a] = min(max(int(np.floor(start[a] + way + 0.5)), low[a]), high[a] - 1)
+        if still:
             sign[a], cross[a], delta[a] = 0, np.inf, np.inf
         else:
             sign[a] = 1 if step[a] > 0 else -1

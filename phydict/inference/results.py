@@ -101,7 +101,7 @@ class CaseResults:
         for case in cases:
             there = self._there(case)
             if there and there.record["scores"]:
-                records.append(there.record)
+                records.append(there.record | {"case": case})
         if not records:
             return []
         tables = [score_table(records, protocol, empty), *further]

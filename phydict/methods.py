@@ -153,6 +153,11 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: AnyPrior | str |
             raise ValueError(f"there is no method '{method}': use one of {', '.join(METHODS)}")
         name, method = name or method, METHODS[method]
     if isinstance(method, Reconstructor):
+        beside = [setting for setting, given in (("samples", samples != 1), ("guidance", guidance != 1), (
+            "super_resolution", super_resolution is not None)) if given]
+        if isinstance(method, Posterior | CascadePosterior) and beside:
+            raise ValueError(f"a ready {type(method).__name__} has its own settings, but {' and '.join(beside)} came "
+                             "beside it: leave that out, or give its sampler and its prior in its place")
         if super_resolution is not None:
             raise ValueError(f"super_resolution refines what a prior gives, but {type(method).__name__} has none: "
                              "leave it out, or use a method with a prior")
@@ -224,6 +229,8 @@ def reconstruct_by(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeB
     goes on beyond the voxels (`extended`) and binned; other arguments as those of `reconstruct`. Raises ValueError
     where X-rays, geometry and grid do not fit, and warns where the X-rays look inverted.
     """
+    if isinstance(method, Region) and beam.stands_in(method.outer):
+        method = method.base  # of a scene that is smaller than a chest
     _check_fit(method, grid, xrays, beam)
     poses: FoundPoses | None = None
     if uncertain is not None:
@@ -306,12 +313,15 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: AnyPrior | str | Path | No
                           samples=samples, precision=precision)
     ready = onto_grid(ready if mu_water is None else ready.with_mu_water(mu_water), grid)
     grid, xrays = ready.grid or grid or DEFAULT_GRID, _real(xrays)
-    return reconstruct_by(ready, grid, xrays, beam, format_report(report), display, seed, on_step, projector, uncertain)
+    return reconstruct_by(ready, grid, xrays, beam, format_report(report), display, int(seed), on_step, projector,
+                          uncertain)
 
 
 def _real(xrays) -> Tensor:
     """X-rays as a dense tensor of numbers. Raises ValueError where they are none."""
     try:
+        if isinstance(xrays, np.ndarray):  # torch takes neither reversed axes nor another machine's order of bytes
+            xrays = np.ascontiguousarray(xrays, xrays.dtype.newbyteorder("="))
         values = torch.as_tensor(xrays)
     except Exception as error:  # NumPy and torch each have their own for what is no array of numbers
         raise ValueError(f"the X-rays must be an array of numbers, but {type(xrays).__name__} was given "

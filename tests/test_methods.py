@@ -8,10 +8,10 @@ import pytest
 import torch
 from prior.tiny import tiny_for, tiny_prior, tiny_refiner, tiny_super_resolution
 
-from phydict.baselines import SIRT
+from phydict.baselines import CGLS, SIRT, Region
 from phydict.diffusion import GaussianDenoiser
 from phydict.grid import Grid
-from phydict.methods import METHODS, default_method, reconstruct, reconstructor
+from phydict.methods import METHODS, default_method, onto_grid, reconstruct, reconstructor
 from phydict.posterior import CascadePosterior, Posterior, PriorOnly, ProximalCG, Sampler, SplitGibbs
 from phydict.prior import MedSynCheckpoint, save_prior, save_refiner, save_super_resolution
 from phydict.reconstruction import Reconstruction, Reconstructor
@@ -141,8 +141,8 @@ def test_priors_samplers_and_projectors_of_ones_own_fit_in():
             return denoiser.denoise(x, 1.0)
 
     class Doubled:
-        def __init__(self):
-            self.grid, self.beam, self._A = grid, beam, Projector(grid, beam)
+        def __init__(self, grid=grid):
+            self.grid, self.beam, self._A = grid, beam, Projector(grid, beam, full_detector=True)
 
         def __call__(self, mu):
             return 2 * self._A(mu)
@@ -155,6 +155,10 @@ def test_priors_samplers_and_projectors_of_ones_own_fit_in():
     assert mean.volume.mean() == pytest.approx(-500, abs=20) and mean.misfit < 0.1 and mean.method == "Mean"
     doubled = Posterior(OwnPrior(), METHODS["phydict_fast"]).reconstruct(2 * y, Doubled())
     assert doubled.misfit < 0.02 and doubled.volume.mean() == pytest.approx(-500, abs=20)
+    for elsewhere in (onto_grid(Posterior(OwnPrior(), METHODS["dds"]), Grid.cube(32)),
+                      Region(CGLS(2), Grid.box(8, 90.0), grid)):
+        with pytest.warns(UserWarning, match="Doubled projects its own voxels alone"):
+            assert elsewhere.reconstruct(2 * y, Doubled(elsewhere.target)).volume.isfinite().all()
 
 
 @pytest.mark.parametrize("change, sentence", [
@@ -236,6 +240,22 @@ def test_a_super_resolution_stage_makes_it_a_cascade_on_the_fine_grid(tmp_path):
     assert ready.name == "two" and ready.with_mu_water(0.018).mu_water == 0.018
 
 
+@pytest.mark.parametrize("beside", [{"samples": 3}, {"guidance": 2.0}, {"super_resolution": tiny_super_resolution()}])
+def test_a_method_that_is_made_takes_no_settings_of_its_making(beside):
+    with pytest.raises(ValueError, match=f"a ready Posterior has its own settings, but {next(iter(beside))} came"):
+        reconstructor(Posterior(tiny_prior(), PriorOnly(2)), **beside)
+
+
+@pytest.mark.filterwarnings("ignore:the largest line integral is")
+@pytest.mark.parametrize("method", ["cgls", "tv"])
+def test_what_is_far_smaller_than_a_chest_is_reconstructed_alone(method):
+    grid, beam = Grid.cube(16, 60.0), ConeBeam.orbit(4, 300, 200, (24, 24), 5.0)
+    mu = torch.zeros(1, 1, *grid.shape)
+    mu[..., 4:12, 4:12, 4:12] = 0.02
+    found = reconstruct(Projector(grid, beam, full_detector=True)(mu)[0], beam, method=method, grid=grid)
+    assert found.coarse is None and found.misfit < 0.01 and found.grid.same_as(grid)
+
+
 def test_a_method_without_a_prior_takes_no_second_stage():
     with pytest.raises(ValueError, match="SIRT has none"):
         reconstructor("sirt", super_resolution=tiny_super_resolution())
@@ -266,6 +286,14 @@ def test_xrays_of_unsigned_integers_are_what_their_numbers_say():
     counts = (100 * ball(beam, 90.0).numpy()).astype(np.uint16)
     pair = [reconstruct(xrays, beam, method=SIRT(2)).volume for xrays in (counts, counts.astype(np.float32))]
     assert torch.equal(*pair)
+
+
+def test_xrays_and_seeds_of_numpy_are_what_their_numbers_say():
+    beam = ConeBeam.orbit(6, 1020, 740, (56, 56), 8.0)
+    y = ball(beam, 90.0).numpy()
+    plain, other, turned = (reconstruct(xrays, beam, method=SIRT(2), seed=np.int64(3))
+                            for xrays in (y, y.astype(">f4"), y[:, ::-1].copy()[:, ::-1]))
+    assert torch.equal(plain.volume, other.volume) and torch.equal(plain.volume, turned.volume) and plain.seed == 3
 
 
 @pytest.mark.parametrize("guidance", [-1.0, float("nan"), 1e7, 1e308])

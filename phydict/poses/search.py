@@ -97,6 +97,9 @@ def find_poses(xrays: Tensor, beam: ConeBeam, uncertain: Uncertain, grid: Grid, 
     ValueError where the data cannot hold the unknowns, and where neither density nor size has a scale.
     """
     check_xrays(xrays, beam)
+    if not xrays.any():
+        raise ValueError("poses are found by what X-rays show, but these are 0 in every pixel: give others, or leave "
+                         "out `uncertain`")
     beam.check(grid)
     if display:
         uncertain.check_scale(beam)
@@ -231,8 +234,10 @@ class Views:
         derivatives = pose_derivatives(WINDOW.to_mu(state.x[0, 0], self.mu_water), self.grid, self.beam,
                                        state.theta[:, :8].double().numpy())[1]
         ramp = torch.linspace(-0.5, 0.5, residual.shape[1])[:, None]
-        columns = torch.cat([self.changes(state), (derivatives[:, 1] * ramp)[:, None]], 1).flatten(2)
-        columns = columns[:, columns.abs().amax((0, 2)) > 0]
+        changes, swayed = self.changes(state), derivatives[:, 1:2] * ramp
+        if not swayed.any():  # a volume of air
+            return torch.zeros(2, len(residual))
+        columns = torch.cat([changes[:, changes.abs().amax((0, 2, 3)) > 0], swayed], 1).flatten(2)
         covariance = torch.linalg.inv(columns @ columns.transpose(1, 2))
         fitted = (covariance @ (columns @ residual.flatten(1)[..., None]))[..., 0]
         left = residual.flatten(1) - torch.einsum("km,kmp->kp", fitted, columns)

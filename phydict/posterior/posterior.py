@@ -29,7 +29,7 @@ from phydict.runtime.reading import check_memory
 from phydict.runtime.warning import warn
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import Projector
-from phydict.xray.carried import Carried
+from phydict.xray.carried import Carried, mean_carried
 
 MOST_GUIDANCE = 1_000_000
 """No scale of guidance is as large: it would overflow."""
@@ -92,7 +92,8 @@ class Posterior(Reconstructor):
     samples: how many are drawn. One is the sampler's own result; of several, drawn by its `for_sampling` settings, the
     volume is the mean, and their standard deviation shows where it is uncertain. batch: how many of them go through
     the denoiser at once, where the sampler allows it; fewer need less memory. Sample i depends neither on samples nor,
-    but for rounding, on batch.
+    but for rounding, on batch. What is sought of the X-rays beside the CT is each sample's own: the result carries the
+    mean of what they carry, and its X-rays and misfit are as the last one leaves the X-rays.
     otherwise: what reconstructs instead, from the same X-rays, where the volume is one material in air and no chest;
     None: nothing does.
     room: voxels beyond the prior's at both ends of each axis, of a prior that takes them.
@@ -174,13 +175,16 @@ class Posterior(Reconstructor):
             denoiser = counting(prior.bind(report, self.guidance, self.precision), guard)
             state = torch.empty(1, prior.state_channels, *grid.shape, device=xrays.device)
         with watch.stage("sample"):
-            drawn = []
+            drawn, carried, plain = [], list[Carried | None](), measurement.fitted
             for first in range(0, self.samples, together):
+                measurement.carry(None)
+                measurement.fitted = plain
                 guard.reset()
                 generators = [torch.Generator().manual_seed(s) for s in seeds[first:first + together]]
                 x = noise_like(state.expand(len(generators), -1, -1, -1, -1), generators).to(xrays.dtype)
                 generator = generators if len(generators) > 1 else generators[0]
                 drawn.append(sampler.sample(denoiser, measurement, x, generator, guard))
+                carried += len(generators) * [measurement.carried]
                 if self.samples > 1:
                     guard.finish(drawn[-1])
             states = torch.cat(drawn)
@@ -194,12 +198,14 @@ class Posterior(Reconstructor):
                            projector_calls=measurement.calls + result.projector_calls)
         with watch.stage("score"):
             state, ct = states.mean(0), states[:, :1].mean(0, keepdim=True)
+            if len(drawn) > 1 and any(carried):
+                measurement.carry(mean_carried(carried, grid))
             measurement.match_gain_offset(ct)
             reprojection = measurement.project(ct)
             measurement.subtract_scatter(reprojection)
             fit = guard.score(states if self.samples == 1 else None, reprojection, measurement.y)
-            deviation = (prior.window.half_width * states[:, 0].std(0)).cpu() if self.samples > 1 else None
-            volume, carried = self._volume(measurement, ct[0, 0])
+            deviation = self._deviation(states[:, 0], carried) if self.samples > 1 else None
+            volume, mean = self._volume(measurement, ct[0, 0])
             intervals, widening = self._intervals(denoiser, measurement, reprojection)
             warn_of_contradictions(measurement, widening if intervals else None)
             variance = measurement.model_variance
@@ -209,7 +215,7 @@ class Posterior(Reconstructor):
             projector_calls=measurement.calls, masks=((state[1:] + 1) / 2).cpu(), deviation=deviation,
             intervals=intervals, interval_widening=widening, hardened=measurement.hardened,
             scatter=measurement.scatter, model_variance=variance.cpu() if isinstance(variance, Tensor) else variance,
-            precision=precision_name(self.precision, xrays), carried=carried)
+            precision=precision_name(self.precision, xrays), carried=mean)
 
     def _volume(self, measurement: Measurement, x: Tensor) -> tuple[Tensor, Carried | None]:
         """HU (X, Y, Z) of a result x in the prior's range, and what of them is carried beside it. Says what is as dense
@@ -221,6 +227,13 @@ class Posterior(Reconstructor):
         warn(carried_note(carried, self.prior.window))
         carried = replace(carried, extra=carried.extra.cpu())
         return volume + carried.on(self.grid), carried
+
+    def _deviation(self, x: Tensor, carried: list[Carried | None]) -> Tensor:
+        """Standard deviation in HU (X, Y, Z) of samples x (N, X, Y, Z) in the prior's range with what each carries."""
+        if any(carried):
+            beside = [each.on(self.grid) if each else torch.zeros_like(x[0]) for each in carried]
+            x = x + torch.stack(beside) / self.prior.window.half_width
+        return (self.prior.window.half_width * x.std(0)).cpu()
 
     def _intervals(self, denoiser: CountingDenoiser, measurement: Measurement, reprojection: Tensor
                    ) -> tuple[dict[float, Tensor], float]:

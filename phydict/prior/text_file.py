@@ -5,6 +5,7 @@ from __future__ import annotations
 import reprlib
 from pathlib import Path
 
+import torch
 from safetensors import safe_open
 from torch import Tensor
 
@@ -59,6 +60,7 @@ def load_text(path: Path, text: dict) -> TextEncoder:
             weights = {k: file.get_tensor(k) for k in file.keys() if k.startswith("text.")}
         check_finite(weights, path)
         try:
-            return build_text(text, weights)
+            with torch.random.fork_rng(devices=[]):  # what it begins with is random
+                return build_text(text, weights)
         except ValueError as error:
             raise ValueError(f"'{path}' contradicts itself: {error}") from error

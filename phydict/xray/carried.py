@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from torch.nn.functional import avg_pool2d
 
 from phydict.grid import Grid
 from phydict.units import MU_WATER
-from phydict.xray.boxes import interpolated
+from phydict.xray.boxes import divided, interpolated, part
 from phydict.xray.projectors.projector import Projector
 
 RAYS = 2
@@ -57,3 +58,16 @@ class Carried:
     def record(self) -> dict:
         """As plain JSON values."""
         return {"millilitres": self.millilitres, "density_hu": self.density, "centre_mm": self.centre.tolist()}
+
+
+def mean_carried(found: Sequence[Carried | None], grid: Grid) -> Carried:
+    """The mean of what is carried, by one at least, beside each of several volumes on `grid`, on parts of the voxels of
+    which RAYS^3 make one of the grid's."""
+    whole = divided(grid, RAYS)
+    placed = [(carried, np.rint(whole.index(carried.grid.affine[:3, 3])).astype(int)) for carried in found if carried]
+    low = np.min([first for _, first in placed], 0)
+    high = np.max([first + carried.grid.shape for carried, first in placed], 0)
+    extra = placed[0][0].extra.new_zeros(*(high - low))
+    for carried, first in placed:
+        extra[tuple(slice(i, i + n) for i, n in zip(first - low, carried.grid.shape))] += carried.extra / len(found)
+    return replace(placed[0][0], extra=extra, grid=part(whole, [slice(i, j) for i, j in zip(low, high)]))

@@ -257,6 +257,11 @@ class ConeBeam:
         depth = self._depths(grid)
         return bool((depth > 0).all() and (depth < self.distances).all())
 
+    def stands_in(self, grid: Grid) -> bool:
+        """Whether a source lies in the sphere about the box of voxels."""
+        distances = np.linalg.norm(self.sources - grid.centre, axis=1)
+        return bool((distances < np.linalg.norm(grid.extent) / 2).any())
+
     def _depths(self, grid: Grid) -> np.ndarray:
         """How far (8, K) in mm the box's corners lie from the sources' planes, towards the detectors."""
         return (grid.corners() @ self.normals.T) - (self.sources * self.normals).sum(1)

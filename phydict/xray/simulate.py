@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -24,7 +24,7 @@ class Simulator(ABC):
         seed: one per case, or a single int for a single case. A case's noise depends on its own seed alone, not on
         the rest of the batch or the device. Raises ValueError when their number is wrong.
         """
-        seeds = list(seed) if isinstance(seed, Sequence) else [seed]
+        seeds = list(seed) if isinstance(seed, Iterable) else [seed]
         if len(seeds) != len(mu):
             raise ValueError(f"{len(mu)} cases need one seed each, but {len(seeds)} were given; pass a list of ints")
         with torch.no_grad():

@@ -11,7 +11,7 @@ from phydict.datasets import Thorax, build
 from phydict.grid import Grid
 from phydict.poses import find_poses
 from phydict.poses.blind import BlindMeasurement
-from phydict.poses.search import PoseSearch, Views, middle_points
+from phydict.poses.search import PoseSearch, State, Views, middle_points
 from phydict.posterior import Measurement
 from phydict.units import HUWindow, hu_to_mu
 from phydict.xray import ConeBeam, Projector
@@ -127,6 +127,14 @@ def test_a_step_that_would_put_the_source_into_the_volume_is_shortened(thorax):
     step = views.clear(torch.zeros(8, 10), large)
     assert (step[:, 4] / large[:, 4]).unique().numel() == 1 and -900 < step[0, 4] < 0
     moved(BEAM, step[:, :8].double().numpy()).check(GRID)
+
+
+def test_x_rays_of_nothing_have_no_poses_and_a_volume_of_air_sways_by_nothing():
+    with pytest.raises(ValueError, match="are 0 in every pixel"):
+        find_poses(torch.zeros(8, 48, 48), BEAM, UNCERTAIN, GRID)
+    views = Views(torch.zeros(8, 48, 48), BEAM, GRID, torch.ones(10), 0.02, SEARCH)
+    state = State(torch.zeros(8, 10), torch.zeros(8, 10), torch.full((1, 1, *GRID.shape), -1.0))
+    assert not views.sway(state).any()
 
 
 @pytest.mark.parametrize("display, unknowns", [(False, 16), (True, 32)])

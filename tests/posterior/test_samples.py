@@ -14,6 +14,8 @@ from phydict.methods import METHODS
 from phydict.posterior import GradientSteps, Measurement, Posterior, PriorOnly, ProximalCG, Reward, SplitGibbs
 from phydict.posterior.posterior import sample_seed
 from phydict.xray import ConeBeam, Projector
+from phydict.xray.boxes import divided, part
+from phydict.xray.carried import RAYS, Carried
 from posterior.dense import SHAPE, N, measurement
 from posterior.scene import BEAM, GRID, PROJECTOR, views
 
@@ -76,6 +78,30 @@ def test_misfit_and_reprojection_belong_to_the_mean_and_calls_are_counted_per_sa
     ready = replace(method, samples=3, batch=2)
     ready.reconstruct(views(), PROJECTOR, on_step=lambda: calls.append(1))
     assert len(calls) == ready.steps() == 2 * SAMPLER.steps()
+
+
+def test_what_a_sample_finds_beside_the_ct_is_its_own_and_in_the_mean_and_the_deviation(method):
+    alone, window = [], method.prior.window
+
+    class Finding(PriorOnly):
+        def sample(self, denoiser, measurement, x, generator, on_step=lambda: None):
+            assert measurement.carried is None and not measurement.hardened
+            z, n = (0.1 * x).clamp(-1, 1), len(alone)
+            if n != 1:
+                box = part(divided(GRID, RAYS), [slice(8 + 2 * n, 14 + 2 * n), slice(10, 14), slice(6, 10)])
+                measurement.carry(Carried(torch.full(box.shape, 1000.0 + 500 * n), box))
+                measurement.straighten()
+            alone.append(window.to_hu(z[0, 0]) + (measurement.carried.on(GRID) if measurement.carried else 0.0))
+            return z
+
+    finding = replace(method, sampler=Finding(1), samples=3, batch=1)
+    with pytest.warns(UserWarning, match="as dense as metal"):
+        found = finding.reconstruct(views(), PROJECTOR)
+    each = torch.stack(alone)
+    torch.testing.assert_close(found.volume, each.mean(0), atol=1e-2, rtol=0)
+    torch.testing.assert_close(found.deviation, each.std(0), atol=1e-2, rtol=0)
+    within = PROJECTOR(window.to_mu(window.to_range(found.within))[None, None])[0]
+    torch.testing.assert_close(found.reprojection, within + found.carried.projection(PROJECTOR), atol=1e-4, rtol=1e-4)
 
 
 def test_the_x_rays_narrow_the_samples(method):

@@ -141,5 +141,5 @@ def test_what_identifies_a_prior_of_ones_own_names_its_voxels_and_its_hu(module)
 
 def test_reading_a_network_leaves_the_random_numbers_of_others_alone():
     state = torch.get_rng_state()
-    phydict.load_prior()
+    phydict.load_prior().load_text()
     assert torch.equal(torch.get_rng_state(), state)

@@ -1,5 +1,6 @@
 """Simulated X-rays: the requested noise, and the same noise for the same seed."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -26,6 +27,9 @@ def test_a_case_depends_on_its_seed_alone(simulate):
     assert torch.equal(both, simulate(A, MU, [5, 6]))
     assert torch.equal(both[1:], simulate(A, MU[1:], 6))
     assert not torch.equal(both[1:], simulate(A, MU[1:], 7))
+    for seeds in (np.array([5, 6]), torch.tensor([5, 6]), range(5, 7)):
+        assert torch.equal(both, simulate(A, MU, seeds))
+    assert torch.equal(both[1:], simulate(A, MU[1:], np.int64(6)))
 
 
 def test_counting_noise_follows_the_photons():

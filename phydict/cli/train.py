@@ -134,8 +134,8 @@ class PriorCLI(TellingCLI):
             raise ValueError(f"weights are learnt in float32, but trainer.precision is {trainer.precision}: leave it "
                              "out, and give --precision bfloat16 for networks that compute in that")
         for name in ("accumulate_grad_batches", "check_val_every_n_epoch"):
-            check_between(f"trainer.{name}", 1 if getattr(trainer, name) is None else getattr(trainer, name), 1,
-                          math.inf)
+            if (number := getattr(trainer, name)) is not None:
+                check_between(f"trainer.{name}", number, 1, math.inf)
         gpu = None if trainer.accelerator == "cpu" else torch.accelerator.current_accelerator(check_available=True)
         device = gpu or torch.device("cpu")
         if trainer.precision is None:

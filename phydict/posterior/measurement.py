@@ -67,7 +67,7 @@ class Measurement:
     def project(self, x: Tensor) -> Tensor:
         """P(x): line integrals (B, K, V, U) of the CT x."""
         self.calls += len(x)
-        projected = self.slope * self.projector(x) + self.background + self.outside + self.beside + self.subgrid
+        projected = self.slope * self.projector(x) + self.background + self.added
         self.last_projection = projected.detach()
         return projected
 
@@ -104,6 +104,12 @@ class Measurement:
     @fitted.setter
     def fitted(self, values: tuple[Tensor, Tensor, bool, bool, Tensor | float, Tensor | float]) -> None:
         self.y, self.measured, self.hardened, self.scatter_enabled, self.subgrid, self.model_variance = values
+
+    @property
+    def added(self) -> Tensor | float:
+        """Line integrals that P adds to those of the voxels: of what lies outside or is carried, and of what the voxels
+        cannot hold."""
+        return self.outside + self.beside + self.subgrid
 
     def linear(self, d: Tensor) -> Tensor:
         """The linear part of P, for differences d of CTs."""

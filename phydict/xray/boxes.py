@@ -72,15 +72,13 @@ def interpolated(volume: Tensor, grid: Grid, onto: Grid, fill: float) -> Tensor:
     """A volume (X, Y, Z) on `grid`, trilinearly on the voxels of another grid along the same axes; `fill` lies outside
     its box."""
     check_axes(grid, onto)
-    first, step = grid.index(onto.affine[:3, 3]), np.divide(onto.spacing, grid.spacing)
-    result = volume - fill
+    first, step, weights = grid.index(onto.affine[:3, 3]), np.divide(onto.spacing, grid.spacing), []
     for axis, n in enumerate(grid.shape):
         places = torch.as_tensor(first[axis] + step[axis] * np.arange(onto.shape[axis]))
         inside = (places >= -0.5 - SLACK) & (places <= n - 0.5 + SLACK)
         distance = (places.clamp(0, n - 1)[:, None] - torch.arange(n)).abs()
-        weights = ((1 - distance).clamp(min=0) * inside[:, None]).to(volume)
-        result = torch.tensordot(weights, result.movedim(axis, 0), 1).movedim(0, axis)
-    return result.contiguous() + fill
+        weights.append((1 - distance).clamp(min=0) * inside[:, None])
+    return _weighted(volume - fill, weights) + fill
 
 
 def averaged(volume: Tensor, grid: Grid, onto: Grid) -> Tensor:
@@ -89,13 +87,19 @@ def averaged(volume: Tensor, grid: Grid, onto: Grid) -> Tensor:
     if grid.same_as(onto):
         return volume
     check_axes(grid, onto)
-    first, step = grid.index(onto.affine[:3, 3]), np.divide(onto.spacing, grid.spacing)
+    first, step, weights = grid.index(onto.affine[:3, 3]), np.divide(onto.spacing, grid.spacing), []
     for axis, n in enumerate(grid.shape):
         centres, places = first[axis] + step[axis] * np.arange(onto.shape[axis])[:, None], np.arange(n)
         shared = (np.minimum(centres + step[axis] / 2, places + 0.5)
                   - np.maximum(centres - step[axis] / 2, places - 0.5)).clip(0)
-        weights = torch.as_tensor(shared / shared.sum(1, keepdims=True)).to(volume)
-        volume = torch.tensordot(weights, volume.movedim(axis - 3, 0), 1).movedim(0, axis - 3)
+        weights.append(torch.as_tensor(shared / shared.sum(1, keepdims=True)))
+    return _weighted(volume, weights)
+
+
+def _weighted(volume: Tensor, weights: Sequence[Tensor]) -> Tensor:
+    """Volumes (..., X, Y, Z) whose voxels are, axis by axis, sums of those given, by weights (new, given)."""
+    for axis, of_axis in enumerate(weights, -3):
+        volume = torch.tensordot(of_axis.to(volume), volume.movedim(axis, 0), 1).movedim(0, axis)
     return volume.contiguous()
 
 

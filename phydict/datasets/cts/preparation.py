@@ -151,8 +151,8 @@ def _end_with_parent() -> None:
 
 
 def prepare_source(source: Source, out: Path, settings: Settings) -> dict:
-    """Prepares one CT into out/<id>; returns its row of the summary, in which it may be rejected. An earlier
-    case of a CT that is read and rejected is removed.
+    """Prepares one CT into out/<id>; returns its row of the summary, in which it may be rejected. An earlier case
+    of a CT that is read and rejected is removed.
 
     Raises OSError, in one sentence, where the case cannot be written; nothing of it is left then.
     """

@@ -82,8 +82,7 @@ class Reward:
             projector = Projector(divided(projector.grid, n), projector.beam, self.renderer or "auto", device=x.device,
                                   full_detector=True)
         measurement.calls += len(x)
-        return projector(field) + (0.0 if self.raw_range else measurement.outside + measurement.beside
-                                   + measurement.subgrid)
+        return projector(field) + (0.0 if self.raw_range else measurement.added)
 
     def _lpips(self, projected: Tensor, measured: Tensor, seed: int) -> Tensor:
         """LPIPS per view (B, K). The measured views' range is mapped to the [-1, 1] that LPIPS expects, unless both

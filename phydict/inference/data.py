@@ -19,6 +19,7 @@ from phydict.datasets import CTFile, CTSource, find_xrays, load_case, load_xrays
 from phydict.datasets.case import Case
 from phydict.datasets.cts.segmentations import mask_files
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM, PHANTOM_VERSION
+from phydict.datasets.radiographs.radiographs import case_files
 from phydict.grid import Grid
 from phydict.inference.protocols import protocol_of
 from phydict.inference.settings import Orbit
@@ -113,7 +114,7 @@ class ReconstructionData(lightning.LightningDataModule):
     def settings(self, stage: str) -> dict:
         """What, beside the cases themselves, decides the X-rays that a stage (predict, test) reconstructs from."""
         if stage == "predict":
-            return {"geometry": self.geometry}
+            return {"geometry": self.geometry_file and self.geometry_file.name}
         return self._beam_settings | {
             "simulator": describe(self.simulator), "simulation_voxels": self.simulation_voxels} | (
                 {"protocol": self.protocol.name} if self.protocol else {})
@@ -178,10 +179,9 @@ class ReconstructionData(lightning.LightningDataModule):
         return [ct for ct in cts if ct.id in wanted]
 
     def _xrays_source(self, folder: Path) -> str:
-        """What identifies a folder's X-rays: a checksum of its files and of the geometry used instead of its own."""
+        """What identifies a folder's X-rays: a checksum of its files and of those that its geometry names."""
         crc = 0
-        files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
-        for file in [*files, self.geometry_file] if self.geometry_file else files:
+        for file in case_files(folder, self.geometry_file):
             named = zlib.crc32(os.fsencode(file.name), crc)
             crc = file_crc32(file, named) if file.is_file() else named
         return f"files crc32 {crc:08x}"

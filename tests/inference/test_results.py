@@ -11,7 +11,9 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import numpy as np
 import pytest
+import yaml
 from command_lines import refusal
 from processes import INFER, Python
 
@@ -186,6 +188,28 @@ def test_a_finished_case_is_never_taken_for_that_of_other_data(measured, cts, tm
             shutil.copyfile(cts / "a.nii.gz", tmp_path / "ct.nii.gz")  # later, but the same
             main(ct)
     assert "other data" in refusal(capsys, main, ct)
+
+
+def test_what_a_geometry_file_names_elsewhere_is_data_too(measured, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(measured / "anna", tmp_path / "case")
+    (tmp_path / "case" / "geometry.yaml").rename(tmp_path / "beam.yaml")
+    content = yaml.safe_load((tmp_path / "beam.yaml").read_text())
+    (tmp_path / "beam.yaml").write_text(yaml.safe_dump({"beam": content["beam"]}))
+    shape = load_xrays(measured / "anna")["xrays"].shape[1:]
+    np.save(tmp_path / "flat.npy", np.full(shape, 100.0, np.float32))
+    (tmp_path / "g.yaml").write_text("beam: {file: beam.yaml}\nintensity: {kind: counts, flat: flat.npy}\n")
+    for view in (tmp_path / "case").glob("*.npy"):
+        np.save(view, 100 * np.exp(-np.load(view)))
+    xrays = sirt("predict", tmp_path / "out", "--data.xrays=case", "--data.geometry=g.yaml")
+    main(xrays)
+    main([*xrays[:-1], "--data.geometry=./g.yaml"])
+    assert "kept" in capsys.readouterr().err
+    for file in ("beam.yaml", "flat.npy", "g.yaml"):
+        whole = (tmp_path / file).read_bytes()
+        (tmp_path / file).write_bytes(whole + b"\n")
+        assert "other data" in refusal(capsys, main, xrays), file
+        (tmp_path / file).write_bytes(whole)
 
 
 def test_one_bad_case_spoils_no_other(measured, tmp_path, capsys):

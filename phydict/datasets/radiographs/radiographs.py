@@ -8,7 +8,7 @@ DICOM with one or more frames, in the natural order of their names: view_2 comes
 from __future__ import annotations
 
 import os
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -106,6 +106,16 @@ def load_xrays(folder: str | Path, geometry: str | Path | None = None, intensity
             "xrays": torch.from_numpy(described.orientation.apply(xrays).astype(np.float32)),
             "display": intensity.kind == "display", "uncertain": described.uncertain_of(beam, views.tags),
             "description": described}
+
+
+def case_files(folder: Path, geometry: Path | None = None) -> list[Path]:
+    """The files that decide what `load_xrays` makes of a folder: all that lie there, the geometry file used instead of
+    its own, and those that a geometry file names elsewhere, whether they are there or not."""
+    files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+    source = folder / GEOMETRY if geometry is None else geometry
+    with suppress(ValueError, OSError):  # what is wrong with it is told where the case is read
+        files += read_description(source).named_files()
+    return list(dict.fromkeys([*files, geometry] if geometry else files))
 
 
 def save_xrays(folder: str | Path, xrays: torch.Tensor | np.ndarray, beam: ConeBeam, report: str = "",

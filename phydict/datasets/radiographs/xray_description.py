@@ -125,6 +125,11 @@ class Description:
         names = intensity.references if intensity else {}
         return {name: [self.source.parent / file for file in files] for name, files in names.items()}
 
+    def named_files(self) -> list[Path]:
+        """The files that it names: of the beam, of flat and of dark images."""
+        beam = [self.source.parent / self.beam["file"]] if self.beam and "file" in self.beam else []
+        return beam + [file for files in self.reference_files(self.intensity).values() for file in files]
+
 
 def read_description(path: Path, needed: bool = True) -> Description:
     """Read geometry.yaml, or a file of another program's geometry, whose name becomes the beam's `file`.

@@ -135,7 +135,11 @@ def test_a_setting_of_the_wrong_kind_is_one_sentence_that_names_it(empty, capsys
     ('--model.method={"class_path": "phydict.baselines.SIRT", "init_args": {"speed": 3}}', "SIRT has no setting speed"),
     ("--trainer.callbacks=3", "trainer.callbacks is a list"), ("--dry_run=7", "--dry_run takes no value, but 7 was"),
     ("--trainer.precision=12", "32-true, 64-true, bf16, but 12 was given"),
-    ("--trainer.speed=3", "there is no option --trainer.speed=3")])
+    ("--model.method.iteratons=3", "SIRT has no setting iteratons: did you mean iterations?"),
+    ("--trainer.speed=3", "there is no option --trainer.speed=3: --help"),
+    ("--model.metod=tv", "there is no option --model.metod=tv: did you mean --model.method?"),
+    ("--config={model: {samples: 3}}", "there is no option --model.samples: did you mean --model.sampling.samples?"),
+    ("--out=x", "there is no option --out=x: did you mean --model.out?")])
 def test_an_option_of_the_wrong_kind_is_told_in_words_of_the_settings(empty, capsys, option, words):
     with pytest.raises(SystemExit) as stopped:
         infer(["predict", "-c", "sirt", "--data.xrays", str(shipped("data/example/xrays")), option])

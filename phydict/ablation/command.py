@@ -25,6 +25,7 @@ from phydict.page import check_own_page
 from phydict.runtime.console import check_apart, check_configured, check_writable, cli_errors, ended_by_sigterm, quiet
 from phydict.runtime.files import alone_in
 from phydict.runtime.help import HelpFormatter, show_settings
+from phydict.runtime.parser_message import unknown_told
 from phydict.runtime.progress import CaseProgress
 from phydict.runtime.reading import reason
 from phydict.runtime.telling import add_telling, told_of
@@ -35,7 +36,9 @@ def main(args: list[str] | None = None) -> None:
     args = sys.argv[1:] if args is None else args
     with told_of(args), cli_errors(), quiet():
         check_configured(args, (), "configs/ablate/pareto.yaml")
-        given = _parser(args).parse_args(args).as_dict()
+        parser = _parser(args)
+        with unknown_told(parser):
+            given = parser.parse_args(args).as_dict()
         device = given.pop("device") or ("cuda" if torch.cuda.is_available() else "cpu")
         try:
             torch.empty(0, device=device)

@@ -6,6 +6,7 @@ from typing import Any
 
 from lightning.pytorch.cli import LightningCLI
 
+from phydict.runtime.parser_message import unknown_told
 from phydict.runtime.telling import add_telling, telling
 
 
@@ -22,6 +23,10 @@ class TellingCLI(LightningCLI):
         parser = super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
         add_telling(parser)
         return parser
+
+    def parse_arguments(self, parser, args) -> None:
+        with unknown_told(*self._subcommand_parsers.values()):
+            super().parse_arguments(parser, args)
 
     def flag(self, name: str) -> bool:
         """An option that is on or off, in a configuration too."""

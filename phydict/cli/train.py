@@ -10,7 +10,6 @@ from pathlib import Path
 
 import lightning
 import torch
-from jsonargparse import auto_cli
 from lightning.pytorch.callbacks import LambdaCallback, ModelCheckpoint
 from lightning.pytorch.cli import LightningCLI
 from lightning.pytorch.loggers import CSVLogger
@@ -219,7 +218,7 @@ def main(args: list[str] | None = None) -> None:
         if given[:1] == ["export"]:
             run_command(export_prior, given[1:], f"{Path(sys.argv[0]).name} export")
         elif given[:1] == ["inspect-prior"]:
-            auto_cli(print_prior, args=given[1:], exit_on_error=False, allow_abbrev=False)
+            run_command(print_prior, given[1:], f"{Path(sys.argv[0]).name} inspect-prior", positional=True)
         else:
             check_command(given, COMMANDS, PriorCLI.subcommands(), "fit -c configs/prior/phantom.yaml")
             check_configured(given, ("--print_config",), "configs/prior/phantom.yaml")

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import inspect
 import re
+from argparse import ArgumentError, ArgumentParser
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from difflib import get_close_matches
+from pydoc import locate
 
 KINDS = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "a text", "list": "a list",
          "tuple": "a list", "dict": "a mapping of settings"}
@@ -19,14 +25,41 @@ GIVEN = re.compile(r"(?:Got|Given) value: (.*?)(?= Given value type: | Subclass 
                    r"Expected a path but (.*?) either not ")
 
 
+UNKNOWN = re.compile(r"unrecognized arguments: (\S+)|Subcommand '\w+' does not accept option '(.*)'")
+"""What the parser says of an option, on the command line or in a configuration, that it does not know."""
+
+
+@contextmanager
+def unknown_told(*parsers: ArgumentParser) -> Iterator[None]:
+    """An option that parsers refuse inside as unknown is raised as a ValueError that names the nearest of theirs."""
+    try:
+        yield
+    except ArgumentError as error:
+        unknown = UNKNOWN.search(str(error))
+        if unknown is None:
+            raise
+        given = unknown[1] or f"--{unknown[2]}"
+        known = [option for parser in parsers for option in parser._option_string_actions]
+        meant = _meant(given.partition("=")[0], known)
+        raise ValueError(f"there is no option {_short(given)}: {meant}--help lists what there is") from error
+
+
+def _meant(given: str, known: Collection[str]) -> str:
+    """A question for the known name that ends as the given one, or else is as deep and spelled nearly like it, if
+    there is one."""
+    last = given.lstrip("-").split(".")[-1]
+    named = [name for name in known if len(last) > 1 and name.lstrip("-").split(".")[-1] == last]
+    deep = [name for name in known if name.count(".") == given.count(".")]
+    near = get_close_matches(given, named, 1, 0) or get_close_matches(given, deep, 1, 0.75)
+    return f"did you mean {near[0]}? " if near else ""
+
+
 def plain(message: str) -> str:
     """A message of jsonargparse on one setting as one sentence: its name, what it holds and what was given. Empty where
     it is another message."""
     text = " ".join(message.split())
     if flag := re.fullmatch(r"argument (--\S+): ignored explicit argument '(.*)'", text):
         return f"{flag[1]} takes no value, but {_short(flag[2])} was given"
-    if unknown := re.fullmatch(r"unrecognized arguments: (.*)", text):
-        return f"there is no option {_short(unknown[1].split()[0])}: --help lists what there is"
     if unloaded := UNLOADED.match(text):
         return (f"{unloaded[1]} is a mapping of settings, but {_short(unloaded[3])} was given"
                 if ": Unable to load config " in unloaded[4] else plain(unloaded[4]))
@@ -51,7 +84,8 @@ def plain(message: str) -> str:
 
 def _of_class(key: str, path: str, reason: str) -> str:
     if option := re.fullmatch(r"Option '(.*)' is not accepted", reason):
-        return f"{key}: {path} has no setting {option[1]}; the same command with --help lists what it has"
+        known = inspect.signature(kind).parameters if callable(kind := locate(path)) else ()
+        return f"{key}: {path} has no setting {option[1]}: {_meant(option[1], known)}--help lists what it has"
     if reason.endswith("has no attribute 'keys'"):
         return f"{key}.init_args is a mapping of the settings of {path}, but something else was given"
     reason = re.sub(r"^module '([^']*)' has no attribute '([^']*)'", r"\1 has no \2", reason)

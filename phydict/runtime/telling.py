@@ -19,6 +19,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from phydict.runtime.parser_message import unknown_told
 from phydict.runtime.strict_json import strict_json
 
 WORDS, JSON, SILENCE = "words", "json", "silence"
@@ -78,6 +79,7 @@ def run_command(function: Callable[..., object], args: Sequence[str] | None, pro
     parser = ArgumentParser(prog=program, description=description, exit_on_error=False, allow_abbrev=False)
     parser.add_function_arguments(function, as_positional=positional, as_group=False)
     add_telling(parser)
-    given = parser.instantiate(parser.parse_args(args)).as_dict()
+    with unknown_told(parser):
+        given = parser.instantiate(parser.parse_args(args)).as_dict()
     with telling(given.pop("quiet"), given.pop("json_lines")):
         function(**given)

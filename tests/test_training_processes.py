@@ -132,6 +132,18 @@ def test_what_is_drawn_for_a_held_out_case_does_not_depend_on_the_process_that_s
         assert [task.validation_number(i) for i in range(len(dealt))] == dealt
 
 
+@pytest.mark.parametrize("processes", [1, 3])
+def test_what_held_out_cases_give_is_gathered_once_and_in_order(monkeypatch, processes):
+    task = RefinementTraining((8, 8))
+    dealt = [list(DistributedSampler(range(5), processes, rank, shuffle=False)) for rank in range(processes)]
+    given = [[torch.tensor([case, case + 0.5]) for case in mine] for mine in dealt]
+    monkeypatch.setattr(StageTraining, "trainer", SimpleNamespace(
+        world_size=processes, val_dataloaders=DataLoader(range(5))))
+    monkeypatch.setattr(StageTraining, "all_gather", lambda self, own: own if processes == 1 else torch.stack(
+        [torch.stack(values) for values in given]))
+    assert task.of_all_processes(given[-1]).tolist() == [0, 0.5, 1, 1.5, 2, 2.5, 3, 3.5, 4, 4.5]
+
+
 def test_every_held_out_case_counts_once_however_many_processes_share_them(monkeypatch):
     task, weights = RefinementTraining((8, 8)), np.zeros(5)
     for rank in range(3):

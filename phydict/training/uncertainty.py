@@ -96,7 +96,7 @@ class UncertaintyTraining(StageTraining):
         self.held_out = []
 
     def validation_step(self, batch: dict, index: int) -> None:
-        ct = batch["volume"]
+        ct, scenes = batch["volume"], []
         for scene in range(self.validation.scenes):
             rng = np.random.default_rng((self.seed, self.validation_number(index), scene))
             z, evidence, measurement = self._reconstruct(batch, rng)
@@ -104,16 +104,15 @@ class UncertaintyTraining(StageTraining):
             body = _body(ct, z)
             self.log_case(index, "val/rank", spearman_corrcoef(log_scale[body], error[body]), prog_bar=True)
             chosen = torch.from_numpy(rng.integers(error.numel(), size=VOXELS)).to(ct.device)
-            self.held_out.append((
+            scenes.append((
                 (error / log_scale.exp()).flatten()[chosen], tissue_of(z).flatten()[chosen],
                 coverage_of(evidence).flatten()[chosen], measurement.normalised_residual(z[:, :1]).flatten()))
+        self.held_out.append(tuple(map(torch.cat, zip(*scenes))))
         self.log("samples", float(self.samples), rank_zero_only=True, batch_size=1)
 
     def on_validation_epoch_end(self) -> None:
         if self.held_out:
-            columns = [torch.cat(parts) for parts in zip(*self.held_out)]
-            everywhere = [self.all_gather(part).flatten() for part in columns]  # type: ignore[union-attr]
-            self.prior.uncertainty.calibrate(*everywhere)
+            self.prior.uncertainty.calibrate(*(self.of_all_processes(list(part)) for part in zip(*self.held_out)))
 
     def _describe(self) -> dict:
         return describe_refiner(self.prior)

@@ -76,9 +76,14 @@ class Reconstruction:
         """The volume without what is carried beside it."""
         return self.volume - self.carried.on(self.grid) if self.carried else self.volume
 
-    def save_nifti(self, path: str | Path) -> None:
-        """Writes the volume as float32 HU with the grid's affine (RAS+ mm), replacing the file only when complete."""
-        save_nifti(path, self.volume.numpy(), self.grid)
+    def save_nifti(self, path: str | Path, values: Tensor | None = None) -> None:
+        """Writes the volume, or other values (X, Y, Z) on its voxels such as the intervals' half-widths, as float32 HU
+        with the grid's affine (RAS+ mm), replacing the file only when complete. Raises ValueError for another shape."""
+        values = self.volume if values is None else values
+        if values.shape != self.volume.shape:
+            raise ValueError(f"values of shape {tuple(values.shape)} were given, but the volume's voxels are "
+                             f"{tuple(self.volume.shape)}: give one value for each")
+        save_nifti(path, values.numpy(), self.grid)
 
 
 def save_nifti(path: str | Path, volume: np.ndarray, grid: Grid, dtype: type[np.number] = np.float32) -> None:

@@ -12,7 +12,7 @@ from phydict.evaluation import panel
 from phydict.evaluation.fid import Features, save_features
 from phydict.inference.results import FEATURES
 from phydict.page import write_case_files
-from phydict.reconstruction import Reconstruction, save_nifti
+from phydict.reconstruction import Reconstruction
 
 VOLUME = "volume.nii.gz"
 
@@ -31,12 +31,11 @@ def write_result(folder: Path, case: Case, result: Reconstruction, method: str, 
     if result.beam is not None:
         save_geometry(folder / "geometry_found.yaml", result.beam, case.get("description"))
     if result.deviation is not None:
-        save_nifti(folder / "deviation.nii.gz", result.deviation.numpy(), result.grid)
+        result.save_nifti(folder / "deviation.nii.gz", result.deviation)
     if keep_coarse and result.coarse is not None:
         result.coarse.save_nifti(folder / "coarse.nii.gz")
     if result.intervals:
-        save_nifti(folder / f"interval_{SHOWN_LEVEL * 100:.0f}.nii.gz", result.intervals[SHOWN_LEVEL].numpy(),
-                   result.grid)
+        result.save_nifti(folder / f"interval_{SHOWN_LEVEL * 100:.0f}.nii.gz", result.intervals[SHOWN_LEVEL])
     label, uncertain = _uncertain(result)
     panel(folder / "panel.png", result.volume, result.grid, result.xrays, result.reprojection, truth,
           title=f"{case['id']}: {method}", deviation_hu=uncertain, deviation_label=label)

@@ -149,6 +149,10 @@ def test_the_written_file_is_the_volume_in_its_place(prior, tmp_path):
     np.testing.assert_allclose(image.affine, GRID.affine)
     assert nibabel.aff2axcodes(image.affine) == ("R", "A", "S") and image.header.get_xyzt_units()[0] == "mm"
     assert [f.name for f in tmp_path.iterdir()] == ["v.nii.gz"]
+    result.save_nifti(tmp_path / "v.nii.gz", -result.volume)
+    np.testing.assert_array_equal(np.asarray(nibabel.load(tmp_path / "v.nii.gz").dataobj), -result.volume.numpy())
+    with pytest.raises(ValueError, match="give one value for each"):
+        result.save_nifti(tmp_path / "v.nii.gz", result.volume[1:])
 
 
 @pytest.mark.parametrize("name", SAMPLERS)

@@ -153,9 +153,10 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: AnyPrior | str |
             raise ValueError(f"there is no method '{method}': use one of {', '.join(METHODS)}")
         name, method = name or method, METHODS[method]
     if isinstance(method, Reconstructor):
-        beside = [setting for setting, given in (("samples", samples != 1), ("guidance", guidance != 1), (
-            "super_resolution", super_resolution is not None)) if given]
-        if isinstance(method, Posterior | CascadePosterior) and beside:
+        beside = [setting for setting, given in (
+            ("prior", prior is not None), ("samples", samples != 1), ("guidance", guidance != 1),
+            ("super_resolution", super_resolution is not None), ("precision", precision != "auto")) if given]
+        if isinstance(method, Posterior | CascadePosterior | Refined) and beside:
             raise ValueError(f"a ready {type(method).__name__} has its own settings, but {' and '.join(beside)} came "
                              "beside it: leave that out, or give its sampler and its prior in its place")
         if super_resolution is not None:
@@ -229,7 +230,7 @@ def reconstruct_by(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeB
     goes on beyond the voxels (`extended`) and binned; other arguments as those of `reconstruct`. Raises ValueError
     where X-rays, geometry and grid do not fit, and warns where the X-rays look inverted.
     """
-    if isinstance(method, Region) and beam.stands_in(method.outer):
+    if isinstance(method, Region) and beam.has_behind(method.outer):
         method = method.base  # of a scene that is smaller than a chest
     _check_fit(method, grid, xrays, beam)
     poses: FoundPoses | None = None

@@ -1,7 +1,7 @@
 """The named methods, and a reconstruction in one call."""
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -155,7 +155,8 @@ def test_priors_samplers_and_projectors_of_ones_own_fit_in():
     assert mean.volume.mean() == pytest.approx(-500, abs=20) and mean.misfit < 0.1 and mean.method == "Mean"
     doubled = Posterior(OwnPrior(), METHODS["phydict_fast"]).reconstruct(2 * y, Doubled())
     assert doubled.misfit < 0.02 and doubled.volume.mean() == pytest.approx(-500, abs=20)
-    for elsewhere in (onto_grid(Posterior(OwnPrior(), METHODS["dds"]), Grid.cube(32)),
+    own = Posterior(OwnPrior(), METHODS["dds"])
+    for elsewhere in (onto_grid(own, Grid.cube(32)), onto_grid(own, Grid.box(24, 180.0)),
                       Region(CGLS(2), Grid.box(8, 90.0), grid)):
         with pytest.warns(UserWarning, match="Doubled projects its own voxels alone"):
             assert elsewhere.reconstruct(2 * y, Doubled(elsewhere.target)).volume.isfinite().all()
@@ -240,10 +241,21 @@ def test_a_super_resolution_stage_makes_it_a_cascade_on_the_fine_grid(tmp_path):
     assert ready.name == "two" and ready.with_mu_water(0.018).mu_water == 0.018
 
 
-@pytest.mark.parametrize("beside", [{"samples": 3}, {"guidance": 2.0}, {"super_resolution": tiny_super_resolution()}])
+@pytest.mark.parametrize("beside", [{"samples": 3}, {"guidance": 2.0}, {"super_resolution": tiny_super_resolution()},
+                                    {"prior": tiny_prior()}, {"precision": "float32"}])
 def test_a_method_that_is_made_takes_no_settings_of_its_making(beside):
-    with pytest.raises(ValueError, match=f"a ready Posterior has its own settings, but {next(iter(beside))} came"):
-        reconstructor(Posterior(tiny_prior(), PriorOnly(2)), **beside)
+    ready = Posterior(tiny_prior(), PriorOnly(2))
+    for method, kind in ((ready, "Posterior"), (onto_grid(ready, Grid.cube(24)), "Refined")):
+        with pytest.raises(ValueError, match=f"a ready {kind} has its own settings, but {next(iter(beside))} came"):
+            reconstructor(method, **beside)
+
+
+def test_what_lies_beside_a_small_box_is_accounted_for_wherever_the_sources_clear_the_chest():
+    beam = replace(ConeBeam.orbit(4, 700, 320, (48, 48), 16.0), continued=False)
+    chest = hu_to_mu(torch.full((1, 1, 16, 16, 16), -700.0))
+    views = Projector(Grid.cube(16), beam, full_detector=True)(chest)[0]
+    result = reconstruct(views, beam, method=CGLS(5), grid=Grid.box(16, 150.0))
+    assert result.misfit < 0.1 and result.volume.mean() == pytest.approx(-700, abs=60)
 
 
 @pytest.mark.filterwarnings("ignore:the largest line integral is")

@@ -212,6 +212,19 @@ def test_a_run_that_stopped_within_an_epoch_goes_on_with_the_draws_after_it(tmp_
     assert drawn[:12] == [(0, i) for i in range(8)] + [(1, i) for i in range(4)]
 
 
+def test_a_run_that_stopped_at_an_epochs_last_batch_goes_on_with_the_next_ones_first(tmp_path, cache, monkeypatch):
+    drawn, item = [], MixedCases.__getitem__
+    monkeypatch.setattr(MixedCases, "__getitem__", lambda draws, i: (
+        drawn.append((draws.epoch, i)), item(draws, i))[1])
+    args = arguments(tmp_path, cache, "--trainer.limit_val_batches=0", "--model.text.encoder=none",
+                     "--data.loading.epoch_size=7", "--checkpoint.every_n_train_steps=3",
+                     "--checkpoint.every_n_epochs=null", "--checkpoint.save_on_train_epoch_end=false")
+    main([*args, "--trainer.max_steps=3"])
+    before = len(drawn)
+    main([*args, "--trainer.max_steps=5", f"--ckpt_path={tmp_path / 'last.ckpt'}"])
+    assert drawn[before:before + 4] == [(1, i) for i in range(4)]
+
+
 def test_no_phantom_both_tests_and_validates_or_is_trained_on(tmp_path):
     data = PriorData(holdout=HoldOut(phantoms=2), phantoms=2, cache=str(tmp_path), cube=Cube(16))
     tested = ReconstructionData(cts="phantom", phantoms=1000).test_cases(data.grid, data.window)

@@ -25,7 +25,7 @@ class TellingCLI(LightningCLI):
         return parser
 
     def parse_arguments(self, parser, args) -> None:
-        with unknown_told(*self._subcommand_parsers.values()):
+        with unknown_told(parser, *getattr(self, "_subcommand_parsers", {}).values()):  # none where nothing is run
             super().parse_arguments(parser, args)
 
     def flag(self, name: str) -> bool:

@@ -167,29 +167,28 @@ class PriorCLI(TellingCLI):
                 raise
 
     def _begin(self, out: Path, resumed: str | None) -> None:
-        """What comes before the first step. Raises ValueError where another training's files would be replaced."""
+        """What comes before the first step, such as the list of the CTs that are held out. Raises ValueError where
+        another training's files would be replaced."""
         if resumed and (resumed in ("last", "best") or Path(resumed).resolve().parent == out.resolve()):
             return
         for name in (CHECKPOINT, BEST):
             if (out / name).exists():
                 raise ValueError(f"{out} holds a training already: resume it with --ckpt_path {out / name}, or give "
                                  "another folder with --out")
+        held_out = "".join(f"{case}\n" for case in self.datamodule.held_out)
+        if held_out and (file := out / HELD_OUT).exists() and file.read_bytes() != held_out.encode():
+            raise ValueError(f"{file} is there already and names other cases than this training holds out: move it "
+                             "away, or give another folder with --out")
         if resumed:  # the checkpoint may yet refuse what is held out
-            listing = LambdaCallback(on_train_start=lambda *_: self._write_held_out(out))
+            listing = LambdaCallback(on_train_start=lambda *_: self._write_held_out(out, held_out))
             self.trainer.callbacks.append(listing)  # type: ignore[attr-defined]
             return
-        self._write_held_out(out)
+        self._write_held_out(out, held_out)
         self.model.learn_reports()
 
-    def _write_held_out(self, out: Path) -> None:
-        """Lists the CTs that are held out. Raises ValueError where another list is there."""
-        if self.trainer.is_global_zero and self.datamodule.held_out:
-            held_out = "".join(f"{case}\n" for case in self.datamodule.held_out)
-            file = out / HELD_OUT
-            if file.exists() and file.read_bytes() != held_out.encode():
-                raise ValueError(f"{file} is there already and names other cases than this training holds out: move "
-                                 "it away, or give another folder with --out")
-            with atomic_write(file) as part:
+    def _write_held_out(self, out: Path, held_out: str) -> None:
+        if self.trainer.is_global_zero and held_out:
+            with atomic_write(out / HELD_OUT) as part:
                 part.write_text(held_out)
 
     def before_validate(self) -> None:

@@ -41,10 +41,11 @@ def dry_run(path: str | Path, case: Case, grid: Grid) -> list[str]:
     xrays = binned(case["xrays"].float(), factor).numpy()
     geometry_page(path, coarse, grid, xrays, thorax, hu, title=case["id"])
     agreements = [agreement(*pair) for pair in zip(xrays, thorax)]
-    upside_down = [str(k) for k, words in enumerate(agreements) if "with flip_rows" in words]
-    if upside_down:
-        warn(f"{case['id']}: view {', '.join(upside_down)} agrees better with a standard thorax when upside down: row "
-             "0 is superior, change flip_rows")
+    for flips, how in (("flip_rows", "upside down"), ("flip_rows and flip_columns", "turned by 180 degrees")):
+        turned = [str(k) for k, words in enumerate(agreements) if words.endswith(f"with {flips} changed")]
+        if turned:
+            warn(f"{case['id']}: view {', '.join(turned)} agrees better with a standard thorax when {how}: row 0 is "
+                 f"superior, change {flips}")
     mirrored = [str(k) for k, words in enumerate(agreements) if words.endswith("with flip_columns changed")]
     if mirrored:
         warn(f"{case['id']}: view {', '.join(mirrored)} agrees better with a standard thorax when mirrored: "

@@ -188,7 +188,7 @@ def files_below(root: Path) -> list[Path]:
     while links:
         for folder, inner, names in os.walk(links.pop(0)):
             real = os.path.realpath(folder)
-            inner[:] = [name for name in inner if not name.startswith(".") and real not in seen]
+            inner[:] = sorted(name for name in inner if not name.startswith(".") and real not in seen)
             links += [Path(folder, name) for name in inner if Path(folder, name).is_symlink()]
             if real not in seen:
                 found += [Path(folder, name) for name in names if not name.startswith(".")]

@@ -132,7 +132,8 @@ class PriorData(lightning.LightningDataModule):
         # Lightning's own sampler would shuffle: several processes take turns, so that each step sees what one would.
         draws, fit = self.draws(self.trainer.current_epoch), self.trainer.fit_loop
         if fit.restarting:  # perhaps within an epoch, whose first batches are done
-            done, length = least * fit.epoch_loop.batch_progress.current.ready, self.loading.epoch_size
+            length = self.loading.epoch_size
+            done = least * (fit.epoch_loop.batch_progress.current.ready % (length // least))
             draws = Subset(draws, [n % length for n in range(done, done + length)])
         turns: DistributedSampler = DistributedSampler(draws, self.trainer.world_size, self.trainer.global_rank,
                                                        shuffle=False)

@@ -114,7 +114,7 @@ def outside_projection(mu: Tensor, grid: Grid, projector: Projector, continued: 
     """Line integrals (K, V, U), along the projector's rays, of what of mu (X, Y, Z) in 1/mm on `grid` lies outside the
     projector's own box, and, where it is continued, above and below `grid`."""
     beam = replace(projector.beam, continued=continued)
-    whole = Projector(grid, beam, projector.method, device=mu.device, full_detector=True)(mu[None, None])
+    whole = Projector(grid, beam, elsewhere(projector), device=mu.device, full_detector=True)(mu[None, None])
     return (whole - projector(interpolated(mu, grid, projector.grid, 0.0)[None, None]))[0]
 
 

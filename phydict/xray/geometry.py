@@ -257,10 +257,9 @@ class ConeBeam:
         depth = self._depths(grid)
         return bool((depth > 0).all() and (depth < self.distances).all())
 
-    def stands_in(self, grid: Grid) -> bool:
-        """Whether a source lies in the sphere about the box of voxels."""
-        distances = np.linalg.norm(self.sources - grid.centre, axis=1)
-        return bool((distances < np.linalg.norm(grid.extent) / 2).any())
+    def has_behind(self, grid: Grid) -> bool:
+        """Whether a part of the box of voxels lies beside a source or behind it."""
+        return bool((self._depths(grid) <= 0).any())
 
     def _depths(self, grid: Grid) -> np.ndarray:
         """How far (8, K) in mm the box's corners lie from the sources' planes, towards the detectors."""

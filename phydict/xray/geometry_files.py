@@ -12,6 +12,7 @@ Vectors are taken as world millimetres, RAS+: where another program's axes diffe
 from __future__ import annotations
 
 import re
+from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
@@ -100,9 +101,11 @@ def _read_npy(path: Path) -> np.ndarray:
 
 
 def _read_table(path: Path) -> np.ndarray:
-    lines = [line.strip(" ,;\t") for line in read_text(path).splitlines()]
-    lines = [line.lstrip("# ") if _names_columns(line) else line for line in lines]  # numpy.savetxt's header
-    rows = [re.split(r"[,;\s]+", line) for line in lines if line and not line.startswith("#")]
+    lines = [line for line in (line.strip(" ,;\t") for line in read_text(path).splitlines()) if line]
+    header = next((line for line in takewhile(lambda line: line.startswith("#"), lines) if _names_columns(line)), None)
+    rows = [re.split(r"[,;\s]+", line) for line in lines if not line.startswith("#")]
+    if header and rows and not rows[0][0][:1].isalpha():  # as numpy.savetxt writes it
+        rows.insert(0, re.split(r"[,;\s]+", header.lstrip("# ")))
     columns = list(COLUMNS)
     if rows and rows[0][0][:1].isalpha():
         columns = [name.lower() for name in rows.pop(0)]
@@ -120,4 +123,4 @@ def _read_table(path: Path) -> np.ndarray:
 
 
 def _names_columns(line: str) -> bool:
-    return line.startswith("#") and re.split(r"[,;\s]+", line.lstrip("# ").lower())[0] in COLUMNS
+    return set(COLUMNS) <= set(re.split(r"[,;\s]+", line.lstrip("# ").lower()))

@@ -75,6 +75,20 @@ def test_a_list_to_exclude_of_other_cts_is_warned_of(tmp_path, chest):
     assert [source.id for source in find_sources(tmp_path / "dicom", exclude=tmp_path / "list.txt")] == ["anna"]
 
 
+@pytest.mark.parametrize("lines, left", [
+    ("one\np1/a/s", ["two", "p1__b__s", "p2__s"]), ("p2/s\nnobody", ["one", "two", "p1__a__s", "p1__b__s"]),
+    ("one.nii\ntwo.nii", ["p1__a__s", "p1__b__s", "p2__s"]),
+    ("{root}/p1/b/s\n{root}/two.nii", ["one", "p1__a__s", "p2__s"])])
+def test_a_list_to_exclude_is_one_of_nifti_files_and_of_series_beside_them(tmp_path, chest, lines, left):
+    root = tmp_path / "cts"
+    for name in ("one", "two"):
+        save_ct(root / f"{name}.nii", chest[:4, :4, :4])
+    for name in ("p1/a/s", "p1/b/s", "p2/s"):
+        write_ct_series(root / name, np.zeros((8, 8, 4)), AFFINE)
+    (tmp_path / "list.txt").write_text(lines.format(root=root))
+    assert [source.id for source in find_sources(root, exclude=tmp_path / "list.txt")] == left
+
+
 def test_v1_takes_hu_and_spacing_from_the_metadata(tmp_path, chest):
     root = tmp_path / "dataset"
     stored = (chest[::-1, ::-1] + 8192).astype(np.int16)

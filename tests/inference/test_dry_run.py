@@ -48,6 +48,9 @@ def test_a_dry_run_sees_images_that_lie_upside_down(measured, tmp_path, capsys):
     main(sirt("predict", tmp_path / "out", f"--data.xrays={tmp_path / 'case'}", "--dry_run"))
     out, err = capsys.readouterr()
     assert all("with flip_rows changed" in line for line in out.splitlines()[:3]) and "upside down" in err
+    save_xrays(tmp_path / "case", case["xrays"].flip(1, 2), case["beam"], overwrite=True)
+    main(sirt("predict", tmp_path / "out", f"--data.xrays={tmp_path / 'case'}", "--dry_run"))
+    assert "turned by 180 degrees: row 0 is superior, change flip_rows and flip_columns" in capsys.readouterr().err
     main(sirt("predict", tmp_path / "out", f"--data.xrays={measured / 'anna'}", "--dry_run"))
     assert "upside down" not in capsys.readouterr().err
 

@@ -57,6 +57,11 @@ def test_a_table_of_numpys_has_its_columns_by_the_names_in_its_header(tmp_path):
     assert columns[0, 0] == COLUMNS[-1]
     np.savetxt(tmp_path / "numpy.csv", columns[:, 1:].T.astype(float), delimiter=",", header=",".join(columns[:, 0]))
     assert read_beam(tmp_path / "numpy.csv", SHAPE, PIXEL).same_as(random_poses(), tolerance=1e-9)
+    table, comment = "\n".join(",".join(row) for row in columns.T), "# source_x, source_y and source_z in mm"
+    named = "# " + table.partition("\n")[0]
+    for text in (f"{comment}\n{table}\n{comment}\n{named}", f"{named}\n{table}"):
+        (tmp_path / "commented.csv").write_text(text)
+        assert read_beam(tmp_path / "commented.csv", SHAPE, PIXEL).same_as(random_poses(), tolerance=1e-9)
 
 
 @pytest.mark.parametrize("continued", [True, False])

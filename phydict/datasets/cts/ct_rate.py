@@ -128,7 +128,7 @@ def find_cts(root: str | Path, reports: str | Path | None = None, metadata: str 
     if exclude:
         ids = without_excluded(ids, exclude, root)
     if first_reconstruction:
-        ids = [id for n, id in enumerate(ids) if n == 0 or scan_of(ids[n - 1]) != scan_of(id)]
+        ids = first_of_scans(ids)
     table_given = reports is not None
     reports = reports or _beside(root, "radiology_text_reports")
     texts = read_reports(reports) if reports else {}
@@ -145,16 +145,23 @@ def find_cts(root: str | Path, reports: str | Path | None = None, metadata: str 
     return cts if fixed else _calibrated(cts, metadata or _beside(root, "metadata"))
 
 
+def first_of_scans(ids: list[str]) -> list[str]:
+    """Of ids in natural order, one of each scan."""
+    return [id for n, id in enumerate(ids) if n == 0 or scan_of(ids[n - 1]) != scan_of(id)]
+
+
 def without_excluded(ids: list[str], exclude: str | Path, root: Path) -> list[str]:
-    """The ids that a text file does not list; in it sub/x.nii.gz means the case sub__x or, where there is none, x.
+    """The ids that a text file does not list; in it a/b/x.nii.gz, in `root` or absolute, means the case a__b__x or,
+    where there is none, a__x or x.
 
     Warns where it lists other ids alone. Raises FileNotFoundError where it lists all.
     """
     lines, known, listed = read_ids(exclude, "data.source.exclude"), set(ids), set()
     for line in lines:
-        name = case_id(line)
-        inner = "__".join((*Path(line).parts[:1], name))
-        listed.add(inner if inner in known else name)
+        path, name = Path(line), case_id(line)
+        folders = (path.relative_to(root.absolute()) if path.is_relative_to(root.absolute()) else path).parts[:-1]
+        forms = ["__".join((*outer, name)) for outer in (folders, folders[:1])]
+        listed.add(next((form for form in forms if form in known), name))
     left = [id for id in ids if id not in listed]
     if lines and len(left) == len(ids):
         warn(f"none of the {len(lines)} lines of {exclude} is one of the {len(ids)} CTs in {root}, so that nothing is "

@@ -9,7 +9,7 @@ from zlib import crc32
 
 import numpy as np
 
-from phydict.datasets.cts.ct_rate import CTFile, NoNIfTI, find_cts, without_excluded
+from phydict.datasets.cts.ct_rate import CTFile, NoNIfTI, find_cts, first_of_scans, without_excluded
 from phydict.datasets.cts.ct_rate_tables import read_reports
 from phydict.datasets.cts.ct_series import Series, find_series, load_series
 from phydict.datasets.cts.segmentations import segmentations_beside
@@ -57,15 +57,27 @@ class Source:
                 "report_crc32": crc32(self.report.encode()), "calibration": str(calibration)}
 
 
-def find_sources(root: Path, **tables) -> list[Source]:
-    """Every DICOM series and CT of `find_cts` below `root`, beside series NIfTI alone; tables: as for `find_cts`.
+def find_sources(root: Path, first_reconstruction: bool = False, exclude: str | Path | None = None,
+                 **tables) -> list[Source]:
+    """Every DICOM series and CT of `find_cts` below `root`, beside series NIfTI alone; options: as for `find_cts`.
 
     A series is named as a NIfTI file in its folder's place would be, `<first subfolder>__<folder>`; where that is not
-    enough, by all its folders, then with its SeriesNumber, then with a count. Where there are series alone, a given
-    table of reports has theirs by these names, and so has a list to exclude.
+    enough, by all its folders, then with its SeriesNumber, then with a count. A list to exclude has these
+    names, and so has, where there are series alone, a given table of reports.
     Raises FileNotFoundError where there is none, what `find_cts` raises, and ValueError for a given table of reports
     without any of the CTs.
     """
+    sources = _found(root, tables)
+    ids = [source.id for source in sources]
+    if exclude:
+        ids = without_excluded(ids, exclude, root)
+    if first_reconstruction:
+        ids = first_of_scans(ids)
+    left = set(ids)
+    return [source for source in sources if source.id in left]
+
+
+def _found(root: Path, tables: dict) -> list[Source]:
     series = find_series(root) if root.is_dir() else []
     try:
         cts = find_cts(root, **tables)
@@ -75,11 +87,7 @@ def find_sources(root: Path, **tables) -> list[Source]:
         if not series:
             raise FileNotFoundError(f"there is no CT in {root}; give a NIfTI file, or a folder that holds NIfTI files "
                                     "or DICOM series") from None
-        sources = _named(series, root, set())
-        if exclude := tables.get("exclude"):
-            left = without_excluded([source.id for source in sources], exclude, root)
-            sources = [source for source in sources if source.id in left]
-        return _reported(sources, tables.get("reports"))
+        return _reported(_named(series, root, set()), tables.get("reports"))
     sources = [Source(ct.id, ct, ct.path.with_name(case_id(ct.path)), ct.report) for ct in cts]
     return sources + _named(series, root, {ct.id for ct in cts})
 

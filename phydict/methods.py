@@ -230,7 +230,7 @@ def reconstruct_by(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeB
     goes on beyond the voxels (`extended`) and binned; other arguments as those of `reconstruct`. Raises ValueError
     where X-rays, geometry and grid do not fit, and warns where the X-rays look inverted.
     """
-    if isinstance(method, Region) and beam.has_behind(method.outer):
+    if isinstance(method, Region) and beam.is_smaller_than(method.outer):
         method = method.base  # of a scene that is smaller than a chest
     _check_fit(method, grid, xrays, beam)
     poses: FoundPoses | None = None

@@ -257,9 +257,15 @@ class ConeBeam:
         depth = self._depths(grid)
         return bool((depth > 0).all() and (depth < self.distances).all())
 
-    def has_behind(self, grid: Grid) -> bool:
-        """Whether a part of the box of voxels lies beside a source or behind it."""
-        return bool((self._depths(grid) <= 0).any())
+    def is_smaller_than(self, grid: Grid) -> bool:
+        """Whether the scene is that of something smaller than the box of voxels: a part of it lies beside or behind a
+        source, or a source stands in the sphere about it and sees, along both sides of the detector, less than a third.
+        """
+        if (self._depths(grid) <= 0).any():
+            return True
+        near = np.linalg.norm(self.sources - grid.centre, axis=1) < np.linalg.norm(grid.extent) / 2
+        low, high = self._shadow(grid)
+        return bool((near & ((high - low) > 3 * self._sides).all(1)).any())
 
     def _depths(self, grid: Grid) -> np.ndarray:
         """How far (8, K) in mm the box's corners lie from the sources' planes, towards the detectors."""

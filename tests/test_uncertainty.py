@@ -1,6 +1,9 @@
 """How far a refiner's reconstruction may be off: intervals that hold their share, their training and their files."""
 
 import json
+import os
+import subprocess
+import sys
 from itertools import pairwise
 from pathlib import Path
 from unittest.mock import Mock
@@ -9,7 +12,7 @@ import nibabel
 import numpy as np
 import pytest
 import torch
-from command_lines import refiner_arguments, refusal, resumed_as_uninterrupted
+from command_lines import checkpoint, refiner_arguments, refusal, resumed_as_uninterrupted
 from prior.tiny import tiny_prior, tiny_refiner
 
 from phydict.cli.infer import main as infer
@@ -204,6 +207,20 @@ def test_a_resumed_run_is_the_uninterrupted_one_and_leaves_the_refiner_as_it_was
     trained, before = load_prior(tmp_path / "refiner.safetensors").state_dict(), load_prior(refiner_file).state_dict()
     moved = {name for name in before if not torch.equal(before[name].half(), trained[name].half())}
     assert moved and all(name.startswith("uncertainty.") for name in moved) and "uncertainty.quantiles" in moved
+
+
+@pytest.mark.slow
+def test_two_processes_calibrate_on_the_held_out_cases_that_one_would(tmp_path, cache, refiner_file):
+    ddp = f"--config={CONFIG.with_name('ddp.yaml')}"
+    for run, more in (("one", ["--trainer.devices=1"]), ("two", [ddp, "--trainer.devices=2"])):
+        args = arguments(tmp_path / run, cache, refiner_file, *more, "--data.holdout.phantoms=3",
+                         f"--data.loading.batch_size={1 if run == 'two' else 2}", "--trainer.max_epochs=1")
+        done = subprocess.run([sys.executable, str(CONFIG.parents[2] / "train.py"), *args], capture_output=True,
+                              text=True, timeout=300, env=os.environ | {"OMP_NUM_THREADS": "1"})
+        assert done.returncode == 0, done.stderr[-2000:]
+    one, two = (checkpoint(tmp_path / run)["state_dict"] for run in ("one", "two"))
+    for name in ("prior.uncertainty.quantiles", "prior.uncertainty.most_residual"):
+        torch.testing.assert_close(two[name], one[name], rtol=1e-3, atol=0)
 
 
 def test_a_prior_in_place_of_a_refiner_is_refused(tmp_path, cache, capsys):

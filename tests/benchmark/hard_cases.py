@@ -214,6 +214,7 @@ class HardCases:
         yield "patient of 55 cm", stout
         yield "cube of water of 20 cm", lambda: of(water_cube(self.x, in_range(0.0)))
         yield "patient upside down", lambda: of(self.x.flip(-1))
+        yield "patient mirrored", lambda: of(self.x.flip(2))
         yield "left lung removed", lambda: of(without_left_lung(self.x, self.lung, in_range(20.0)))
 
     def _larger(self) -> Case:

@@ -19,7 +19,8 @@ NOTICED = (
     "view 2 in the place of view 3", "view 3 blank", "display values taken for line integrals",
     "line integrals 10 times too small", "truncated: 1.4 times the patient", "truncated by a narrow detector",
     "water of 0.025 / mm assumed", "arc of 60 degrees", "two views", "metal", "10 % noise", "all water",
-    "heel effect of 30 %", "detector blur of 3 mm", "detector lag of 5 %", "patient of 55 cm", "breathing by 10 mm")
+    "heel effect of 30 %", "detector blur of 3 mm", "detector lag of 5 %", "patient of 55 cm", "patient mirrored",
+    "breathing by 10 mm")
 """Cases of hard_cases.csv that stand in the page."""
 
 SAID_OF = {"true": "true, which no one knows", "tags": "as the tags say", "calibrated": "`--calibrate`"}

@@ -21,6 +21,11 @@
     cli              the command lines of train.py and infer.py                     Lightning
 """
 
+import os
+
+if "OMP_WAIT_POLICY" not in os.environ:  # torch's threads else spin so long for each other that one more program beside
+    os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # them makes a reconstruction take nine times its seconds
+
 from phydict.datasets import load_xrays
 from phydict.grid import Grid
 from phydict.methods import METHODS, reconstruct

@@ -176,7 +176,8 @@ def test_neither_picture_engine_nor_cache_that_cannot_be_keeps_a_command_from_st
     assert run.returncode == 0 and run.stdout.lower().strip() == "agg", run.stderr
 
 
-@pytest.mark.parametrize("own, spins", [({}, "3000"), ({"GOMP_SPINCOUNT": "7"}, "7"), ({"OMP_WAIT_POLICY": "active"}, "")])
+@pytest.mark.parametrize("own, spins", [
+    ({}, "3000"), ({"GOMP_SPINCOUNT": "7"}, "7"), ({"OMP_WAIT_POLICY": "active"}, "")])
 def test_threads_spin_shortly_for_each_other_unless_the_environment_says_how(own, spins):
     left = {name: value for name, value in os.environ.items() if name not in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY")}
     run = subprocess.run([sys.executable, "-c", "import os, phydict; print(os.environ.get('GOMP_SPINCOUNT', ''))"],

@@ -23,8 +23,8 @@
 
 import os
 
-if "OMP_WAIT_POLICY" not in os.environ:  # torch's threads else spin so long for each other that one more program beside
-    os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # them makes a reconstruction take nine times its seconds
+if "OMP_WAIT_POLICY" not in os.environ:  # threads that spin long for each other lose most beside another program
+    os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # (tests/benchmark/beside.csv); libgomp reads it as torch loads it
 
 from phydict.datasets import load_xrays
 from phydict.grid import Grid

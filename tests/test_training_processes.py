@@ -141,7 +141,8 @@ def test_what_held_out_cases_give_is_gathered_once_and_in_order(monkeypatch, pro
         world_size=processes, val_dataloaders=DataLoader(range(5))))
     monkeypatch.setattr(StageTraining, "all_gather", lambda self, own: own if processes == 1 else torch.stack(
         [torch.stack(values) for values in given]))
-    assert task.of_all_processes(given[-1]).tolist() == [0, 0.5, 1, 1.5, 2, 2.5, 3, 3.5, 4, 4.5]
+    [row] = task.of_all_processes([(value,) for value in given[-1]])
+    assert row.tolist() == [0, 0.5, 1, 1.5, 2, 2.5, 3, 3.5, 4, 4.5]
 
 
 def test_every_held_out_case_counts_once_however_many_processes_share_them(monkeypatch):

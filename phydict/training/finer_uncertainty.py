@@ -73,7 +73,7 @@ class FinerUncertaintyTraining(StageTraining):
     def on_validation_epoch_end(self) -> None:
         if self.held_out:
             assert self.prior.uncertainty is not None
-            self.prior.uncertainty.calibrate(*(self.of_all_processes(list(part)) for part in zip(*self.held_out)))
+            self.prior.uncertainty.calibrate(*self.of_all_processes(self.held_out))
 
     def _describe(self) -> dict:
         return describe_correction(self.prior)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import lightning
@@ -121,12 +121,15 @@ class StageTraining(lightning.LightningModule, ABC):
         # Lightning takes the mean of these whole numbers over processes, rounded: multiples of their number stay right.
         self.log(name, value, prog_bar=prog_bar, sync_dist=True, batch_size=processes * counts)
 
-    def of_all_processes(self, values: list[Tensor]) -> Tensor:
-        """What each of this process's held-out cases gave, (n,) each, and what those of the others gave, each case once
-        and in order, as one row."""
-        rows = self.all_gather(torch.stack(values))
-        rows = rows.reshape(self.trainer.world_size, len(values), -1)  # type: ignore[union-attr]
-        return rows.transpose(0, 1).flatten(0, 1)[:self._held_out_cases()].flatten()
+    def of_all_processes(self, given: Sequence[tuple[Tensor, ...]]) -> list[Tensor]:
+        """What each of this process's held-out cases gave, (n,) of each kind, and what those of the others gave: one
+        row of each kind, each case once and in order."""
+        rows = []
+        for values in zip(*given):
+            everywhere = self.all_gather(torch.stack(values))
+            shaped = everywhere.reshape(self.trainer.world_size, len(values), -1)  # type: ignore[union-attr]
+            rows.append(shaped.transpose(0, 1).flatten(0, 1)[:self._held_out_cases()].flatten())
+        return rows
 
     def _held_out_cases(self) -> int:
         return len(self.trainer.val_dataloaders.dataset)  # type: ignore[union-attr, arg-type]  # one loader

@@ -112,7 +112,7 @@ class UncertaintyTraining(StageTraining):
 
     def on_validation_epoch_end(self) -> None:
         if self.held_out:
-            self.prior.uncertainty.calibrate(*(self.of_all_processes(list(part)) for part in zip(*self.held_out)))
+            self.prior.uncertainty.calibrate(*self.of_all_processes(self.held_out))
 
     def _describe(self) -> dict:
         return describe_refiner(self.prior)

@@ -57,7 +57,7 @@ from phydict.runtime.precision import check_precision
 from phydict.runtime.profiling import Stopwatch
 from phydict.runtime.reading import reason
 from phydict.runtime.seeds import check_seed
-from phydict.runtime.warning import warn
+from phydict.runtime.warning import heard, warn
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam
 from phydict.xray.beyond import asked
@@ -230,22 +230,23 @@ def reconstruct_by(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeB
     goes on beyond the voxels (`extended`) and binned; other arguments as those of `reconstruct`. Raises ValueError
     where X-rays, geometry and grid do not fit, and warns where the X-rays look inverted.
     """
-    if isinstance(method, Region) and beam.is_smaller_than(method.outer):
-        method = method.base  # of a scene that is smaller than a chest
-    _check_fit(method, grid, xrays, beam)
-    poses: FoundPoses | None = None
-    if uncertain is not None:
-        xrays, poses = calibrated(method, method.survey or grid, xrays, beam, uncertain, display, on_step)
-        beam = poses.beam
-    watch = Stopwatch()
-    with watch.stage("fit to grid"):
-        xrays = xrays.float()
-        method, grid, beam = extended(method, grid, xrays, beam, display)
-        xrays, A = seen_by(grid, xrays, beam, method.full_detector, projector)
-    result = method.reconstruct(xrays, A, report, display, seed, on_step)
-    prepared = sum(watch.seconds.values()) + result.seconds.get("prepare", 0.0)
-    result = replace(result, seconds=result.seconds | {"prepare": prepared})
-    return poses.added_to(result) if poses else result
+    with heard() as warnings:
+        if isinstance(method, Region) and beam.is_smaller_than(method.outer):
+            method = method.base  # of a scene that is smaller than a chest
+        _check_fit(method, grid, xrays, beam)
+        poses: FoundPoses | None = None
+        if uncertain is not None:
+            xrays, poses = calibrated(method, method.survey or grid, xrays, beam, uncertain, display, on_step)
+            beam = poses.beam
+        watch = Stopwatch()
+        with watch.stage("fit to grid"):
+            xrays = xrays.float()
+            method, grid, beam = extended(method, grid, xrays, beam, display)
+            xrays, A = seen_by(grid, xrays, beam, method.full_detector, projector)
+        result = method.reconstruct(xrays, A, report, display, seed, on_step)
+        prepared = sum(watch.seconds.values()) + result.seconds.get("prepare", 0.0)
+        result = replace(result, seconds=result.seconds | {"prepare": prepared})
+    return replace(poses.added_to(result) if poses else result, warnings=warnings)
 
 
 def _check_fit(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam) -> None:

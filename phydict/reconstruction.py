@@ -42,7 +42,8 @@ class Reconstruction:
     beam, poses: where poses were searched, the beam found, and what was corrected in it (phydict.poses);
     coarse: the reconstruction on coarser voxels that was refined, or that says what lies outside a region of interest;
     carried: what of the volume is denser than the prior's window, such as metal, where it was found;
-    extended_mm: how much more was reconstructed at both ends of each axis, where the patient goes on, and cut off.
+    extended_mm: how much more was reconstructed at both ends of each axis, where the patient goes on, and cut off;
+    warnings: what makes the result doubtful, in words, even where Python's filters hide warnings.
     """
 
     volume: Tensor
@@ -70,6 +71,7 @@ class Reconstruction:
     coarse: Reconstruction | None = None
     carried: Carried | None = None
     extended_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    warnings: list[str] = field(default_factory=list)
 
     @property
     def within(self) -> Tensor:

@@ -167,6 +167,28 @@ def test_from_few_views_total_variation_weighs_less_and_no_coarse_network_correc
     assert found.network_calls - found.coarse.network_calls == corrects
 
 
+def test_from_many_views_the_xrays_are_met_more_often_and_a_mirrored_estimate_is_corrected_too():
+    usual, met = Refinement(many_views=BEAM.views), ProximalCG(iterations=8, restarts=2, tv_weight=5.0, tv_eps=0.003)
+    many = usual.of_views(BEAM.views)
+    assert many == replace(usual, call_std=many.call_std, call_step=met) and many.call_std == pytest.approx(0.2)
+    found = reconstructed(network(), usual)
+    assert found.network_calls - found.coarse.network_calls == 5
+    assert (found.volume - reconstructed(network(), replace(usual, mirrored=False)).volume).abs().max() > 0.1
+
+
+def test_mirrored_a_network_adds_nothing_to_one_side_that_it_takes_from_the_other():
+    class Leaning(CorrectionNetwork):
+        def corrected(self, z, evidence, precision="auto"):
+            return z + torch.linspace(-0.2, 0.2, z.shape[2])[:, None, None]
+
+    once = Refinement(calls=1, call_step=None, many_views=BEAM.views)
+    nothing, leaning = (reconstructed(made, once) for made in (
+        network(trained=False), Leaning((4, 8), 4, FINE, WINDOW)))
+    torch.testing.assert_close(leaning.volume, nothing.volume, atol=0.01, rtol=0)
+    one_way = reconstructed(Leaning((4, 8), 4, FINE, WINDOW), replace(once, mirrored=False))
+    assert (one_way.volume - nothing.volume).abs().max() > 100
+
+
 def test_the_first_level_is_met_by_step_and_further_ones_by_call_step():
     class Noted(ProximalCG):
         def __call__(self, measurement, x, *given):

@@ -80,6 +80,10 @@ class Refinement:
         coarse: whether a network that knows coarse voxels corrects the estimate as well
         few_views: with fewer views the total variation of both steps weighs as many times less, the estimate is
             corrected at most once, and by no network on coarse voxels
+        many_views: from so many views call_step takes twice the restarts, of four fifths of the iterations, call_std is
+            two thirds, and the estimate is corrected `mirrored`
+        mirrored: whether the network on the voxels then corrects the estimate mirrored left to right too, as half of
+            what it learnt from was, and the mean of both counts
     """
 
     step: LikelihoodStep | None = ProximalCG(iterations=10, restarts=3, tv_weight=10.0, tv_eps=0.003)
@@ -89,6 +93,8 @@ class Refinement:
     call_std: float = 0.3
     coarse: bool = True
     few_views: int = 3
+    many_views: int = 12
+    mirrored: bool = True
 
     def __post_init__(self):
         for name in ("x0_std", "call_std"):
@@ -99,16 +105,20 @@ class Refinement:
 
     def of_views(self, views: int) -> Refinement:
         """How it is done from so many X-rays."""
+        if views >= self.many_views:
+            return replace(self, call_std=self.call_std * 2 / 3, call_step=_changed(
+                self.call_step, lambda step: {"restarts": 2 * step.restarts,
+                                              "iterations": math.ceil(0.8 * step.iterations)}))
         if views >= self.few_views:
-            return self
-        step, call_step = (replace(step, tv_weight=step.tv_weight * views / self.few_views)
-                           if isinstance(step, ProximalCG) else step for step in (self.step, self.call_step))
-        return replace(self, step=step, call_step=call_step, calls=min(self.calls, 1), coarse=False)
+            return replace(self, mirrored=False)
+        step, call_step = (_changed(step, lambda step: {"tv_weight": step.tv_weight * views / self.few_views})
+                           for step in (self.step, self.call_step))
+        return replace(self, step=step, call_step=call_step, calls=min(self.calls, 1), coarse=False, mirrored=False)
 
     def corrections(self, network: bool) -> tuple[int, int]:
-        """How often a network on the voxels, if there is one, and one on coarse ones correct an estimate: what is
-        interpolated alone never."""
-        fine_calls = self.calls if self.step and network else 0
+        """How often a network on the voxels, if there is one, and one on coarse ones are called for an estimate: what
+        is interpolated alone never."""
+        fine_calls = self.calls * (1 + self.mirrored) if self.step and network else 0
         coarse_calls = self.calls - network if self.step and self.coarse else 0
         return fine_calls, max(coarse_calls, 0)
 
@@ -126,13 +136,24 @@ class Refinement:
                 evidence.measure_noise()
                 channels = evidence(z, before, start)
                 with stage("network"):
-                    z = network.corrected(z, channels, precision)
+                    z = self._corrected(network, z, channels, precision)
             if coarse is not None and (left or network is None):
                 z = coarse(z)
             before = z
             measurement.refit(z)
             z = z if self.call_step is None else self.call_step(measurement, z, self.call_std)
         return z
+
+    def _corrected(self, network: Correction, z: Tensor, channels: Tensor, precision: str) -> Tensor:
+        corrected = network.corrected(z, channels, precision)
+        if not self.mirrored:
+            return corrected
+        return (corrected + network.corrected(z.flip(2), channels.flip(2), precision).flip(2)) / 2
+
+
+def _changed(step: LikelihoodStep | None, settings: Callable[[ProximalCG], dict]) -> LikelihoodStep | None:
+    """Conjugate gradients with other settings; another step stays."""
+    return replace(step, **settings(step)) if isinstance(step, ProximalCG) else step
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ from phydict.posterior.refined import seen_of
 from phydict.prior import DEFAULT_CORRECTION, DEFAULT_REFINER, Refiner, fingerprint, load_correction, load_prior
 from phydict.prior.correction import INPUTS, CorrectionNetwork
 from phydict.prior.finer_uncertainty import SEEN
+from phydict.reconstruction import describe
 from phydict.runtime.ranges import check_fields
 from phydict.runtime.seeds import check_seed
 from phydict.training.crops import CTVolumes, PhantomVolumes, mapped_volume, tell_made
@@ -126,7 +127,7 @@ class Reconstructions(Dataset):
     def _seen(self, base: Posterior, xrays: Tensor, projector: Projector) -> Tensor:
         """What is seen (1, calls INPUTS, X, Y, Z) of a reconstruction by `base`."""
         record = _Recording(load_correction(self.network) if self.network else None, self.grid)
-        refinement = Refinement(calls=2 if self.network else 1)
+        refinement = Refinement(calls=2 if self.network else 1, mirrored=False)
         Refined(base, self.grid, refinement, (record,)).reconstruct(xrays, projector)
         return torch.cat(record.inputs, 1)
 
@@ -238,8 +239,9 @@ class RefinementData(PriorData):
         trained, validated = volumes
         network = made.network or self.kind.default_network
         validating = holdout.phantoms and [VALIDATION_PHANTOM, holdout.phantoms]
-        parts = [asdict(scenes), fingerprint(initial), network and fingerprint(network), scene.to_dict(),
-                 self.origin(), validating, [[ct.id, self.held_out_cts.key(ct)] for ct in self.held_out_cts.cts]]
+        parts = [asdict(scenes), describe(Refinement()), fingerprint(initial), network and fingerprint(network),
+                 scene.to_dict(), self.origin(), validating,
+                 [[ct.id, self.held_out_cts.key(ct)] for ct in self.held_out_cts.cts]]
         folder = folder / f"{self.kind.name}-{key_of(parts)}"
         self.crop, self.made = made.crop, self.kind(
             trained, self.grid, initial, network, scenes, STRENGTH, folder / f"trained-{made.seed}",

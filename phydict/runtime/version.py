@@ -1,3 +1,3 @@
 """Which version this is."""
 
-VERSION = "0.6.0"
+VERSION = "0.6.1"

@@ -17,7 +17,7 @@ from phydict.baselines import SIRT
 from phydict.cli.infer import main
 from phydict.datasets import phantom_case, save_xrays
 from phydict.evaluation import read_csv
-from phydict.grid import Grid
+from phydict.grid import Box, Grid
 from phydict.inference import ReconstructionTask
 from phydict.inference.protocols import cut_out, placed, whole
 from phydict.inference.settings import Sampling
@@ -74,6 +74,29 @@ def test_the_default_method_predicts_on_128_voxels_unless_a_grid_or_another_netw
     assert ReconstructionTask().grid.same_as(Grid.cube(64))  # what test scores
     for given in ({"grid": 64}, {"prior": str(prior)}, {"method": SIRT()}, {"sampling": Sampling(samples=2)}):
         assert ReconstructionTask(**given).predicted is None
+
+
+@pytest.mark.filterwarnings("always:no network has learnt")
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_number_of_voxels_goes_with_the_other_settings_of_a_box_in_any_order(measured, prior, tmp_path, order):
+    given = ["--model.grid=24", "--model.grid.keep_coarse=true", "--model.grid.side=288"][::order]
+    main(arguments("predict", tmp_path, prior, f"--data.xrays={measured}", *given))
+    fine, coarse = (nibabel.load(tmp_path / "prior_only" / "anna" / f"{name}.nii.gz") for name in ("volume", "coarse"))
+    np.testing.assert_allclose(fine.affine, Grid.cube(24, 288.0).affine)
+    assert fine.shape == (24,) * 3 and coarse.shape == (16,) * 3
+
+
+@pytest.mark.filterwarnings("always:there is no coarse volume")
+def test_the_coarse_volume_of_the_default_voxels_is_kept_on_request_where_there_is_one(measured, prior, tmp_path,
+                                                                                       capsys):
+    kept = ReconstructionTask(grid=Box(keep_coarse=True))
+    assert kept.predicted == Box(128, keep_coarse=True) and kept.grid.same_as(Grid.cube(64))
+    alone = "--model.grid.keep_coarse=true"
+    for more in [], [f"--model.prior={prior}"]:
+        assert "give model.grid.voxels" in refusal(capsys, main, [
+            "test", "--trainer.accelerator=cpu", "--data.cts=phantom", f"--model.out={tmp_path}", alone, *more])
+    main(arguments("predict", tmp_path, prior, f"--data.xrays={measured}", "--model.grid=16", alone, method="sirt"))
+    assert "there is no coarse volume to keep: sirt works on the given voxels" in capsys.readouterr().err
 
 
 def test_another_grid_is_another_setting(measured, prior, tmp_path, capsys):

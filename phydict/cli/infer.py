@@ -149,8 +149,9 @@ def _resumable(model: ReconstructionTask) -> Iterator[None]:
 def with_methods(args: list[str]) -> list[str]:
     """Arguments with a method's name and settings in the place of its name, in `--model.method` and in configurations.
 
-    `--model.name` calls it otherwise, and more arguments change the settings. Raises ValueError for names of no method
-    and of no configuration, and for settings without a method.
+    `--model.name` calls it otherwise, and more arguments change the settings. `--model.grid` with a number is the box's
+    `voxels`, which other settings of the box leave alone. Raises ValueError for names of no method and of no
+    configuration, and for settings without a method.
     """
     given = [arg.partition("=")[0] for arg in args]
     if any(option.startswith("--model.cube") for option in given):
@@ -170,6 +171,9 @@ def with_methods(args: list[str]) -> list[str]:
                 if "--model.name" in given:
                     del named["name"]
                 arg = "--config=" + json.dumps({"model": named})
+        elif option == "--model.grid":
+            value = value if equals else next(rest, "")
+            arg = f"{option}.voxels={value}" if value.isdecimal() else f"{option}={value}"
         out.append(arg)
     alone = [] if chosen else [option for option in given if option.startswith("--model.method.")
                                and option != "--model.method.help"]

@@ -16,6 +16,7 @@ from pathlib import Path
 import lightning
 from torch import Tensor
 
+from phydict.baselines import Region
 from phydict.baselines.extended import covering
 from phydict.datasets.case import Case
 from phydict.evaluation import CaseMetrics
@@ -33,7 +34,7 @@ from phydict.inference.summary import show_finished, summarise
 from phydict.methods import DEFAULT_GRID, METHODS, default_method, onto_grid, reconstruct_by, reconstructor
 from phydict.page import check_own_page
 from phydict.poses import PoseSearch
-from phydict.posterior import CascadePosterior, Sampler
+from phydict.posterior import CascadePosterior, Refined, Sampler
 from phydict.prior import MedSynCheckpoint, PriorContract, find_prior, load_super_resolution
 from phydict.reconstruction import Reconstruction, Reconstructor
 from phydict.runtime.console import TRACEBACK, check_apart, check_writable, noted, sentence
@@ -41,7 +42,7 @@ from phydict.runtime.profiling import profiled, stage
 from phydict.runtime.progress import CaseProgress
 from phydict.runtime.seeds import case_seed, check_seed
 from phydict.runtime.telling import exclaim, tell
-from phydict.runtime.warning import warn
+from phydict.runtime.warning import Remark, warn
 from phydict.units import HUWindow
 from phydict.xray.projectors.projector import METHODS as PROJECTORS
 
@@ -84,9 +85,10 @@ class ReconstructionTask(lightning.LightningModule):
         if method is None:
             chosen = default_method(prior, sampling.samples, sampling.guidance)
             method, name = METHODS[chosen], name or chosen
-        own_choice = prior is None and grid is None and not super_resolution.file
-        learnt = isinstance(method, Sampler) and method.needs_refiner
-        self.predicted = Box(PREDICTED_VOXELS) if own_choice and learnt else None
+        self.predicted, coarse_too = None, grid == Box(keep_coarse=True)
+        own_choice = prior is None and (grid is None or coarse_too) and not super_resolution.file
+        if own_choice and isinstance(method, Sampler) and method.needs_refiner:
+            self.predicted, grid = Box(PREDICTED_VOXELS, keep_coarse=coarse_too), None
         name = type(method).__name__ if name is None else name
         if name in ("", "..") or name != Path(name).name:
             raise ValueError(f"model.name is the name of one folder inside model.out, but '{name}' was given")
@@ -129,6 +131,8 @@ class ReconstructionTask(lightning.LightningModule):
         self.grid = self.chosen
         self.around = whole(self.grid)
         self.reconstructor = onto_grid(self.plain, self.grid)
+        if self.keep_coarse and not isinstance(self.reconstructor, Refined | Region):
+            warn(f"there is no coarse volume to keep: {self.method_name} works on the given voxels directly", Remark)
         self.settings |= grid_settings(self.grid, self.reconstructor)
 
     def measure(self, scoring: Scoring) -> None:
@@ -149,8 +153,10 @@ class ReconstructionTask(lightning.LightningModule):
         self.settings["data"] = {"with_report": self.with_report} | data.settings(stage)
         if self.calibrate:
             self.settings["calibrate"] = True
-        if stage == "predict" and self.predicted:
+        if self.predicted and stage == "predict":
             self._take(self.predicted)
+        elif self.predicted and self.predicted.keep_coarse:
+            self._take(Box(keep_coarse=True))  # which lacks its voxels
         if stage == "test":
             self.settings |= self.scoring.settings()
             if data.protocol and data.protocol.grid:

@@ -175,7 +175,8 @@ def test_a_correction_makes_the_back_projection_of_ones_once_and_is_told_of_the_
     def used(calls: int) -> tuple[int, list]:
         measurement = Measurement(projector, y, WINDOW, display=True)
         network = Watched(measurement)
-        Refinement(ProximalCG(1, 1), calls=calls, call_step=None, mirrored=False)(measurement, x.clamp(-1, 0.5), network)
+        refinement = Refinement(ProximalCG(1, 1), calls=calls, call_step=None, mirrored=False)
+        refinement(measurement, x.clamp(-1, 0.5), network)
         return measurement.calls, network.told
 
     (none, _), (once, _), (thrice, told) = (used(calls) for calls in (0, 1, 3))

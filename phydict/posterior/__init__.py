@@ -9,7 +9,8 @@ from phydict.posterior.likelihood.reward import Reward
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.metal import Metal
 from phydict.posterior.posterior import Posterior
-from phydict.posterior.refined import Refined, Refinement
+from phydict.posterior.refined import Refined
+from phydict.posterior.refinement import Refinement
 from phydict.posterior.samplers.daps import DAPS
 from phydict.posterior.samplers.dds import DDS
 from phydict.posterior.samplers.diffpir import DiffPIR

@@ -17,16 +17,21 @@ X-rays made on finer voxels; of those made on the grid, in a tomosynthesis, 1.8 
 its rays look like finer voxels. Of two CTs that evaluate nothing."""
 
 
+def has_finer(measurement: Measurement) -> bool:
+    """Whether finer voxels can be asked: not with a projector of one's own, nor where detectors are tilted, for which
+    they cost too much."""
+    return getattr(measurement.projector, "method", None) == "separable"
+
+
 def find_subgrid(measurement: Measurement, x: Tensor, step: LikelihoodStep | None, x0_std: float) -> bool:
     """Sets the `subgrid` of a measurement: what finer voxels add to the projections of a CT x (1, 1, X, Y, Z). Whether
     that is anything.
 
     Of views that miss x by at most UNLIKE_FINER times more with it. Nothing where the X-rays hold no more than their
-    noise beyond x, without a `step` on the finer voxels, of a projector of one's own, and where detectors are tilted,
-    for which they cost too much.
+    noise beyond x, without a `step` on the finer voxels, and where it `has_finer` none.
     """
     measurement.subgrid = 0.0
-    if step is None or getattr(measurement.projector, "method", None) != "separable":
+    if step is None or not has_finer(measurement):
         return False
     projection = measurement.project(x)
     if not (measurement.normalised_error(projection, modelled=True) > 1).any():

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from prior.tiny import tiny_prior, tiny_refiner, tiny_super_resolution
+from torch.nn.functional import interpolate
 
 from phydict.datasets import Thorax, build, load_xrays
 from phydict.diffusion import CosineSchedule, renoise
@@ -21,6 +22,7 @@ from phydict.prior import BoundRefiner, Prior, Refiner, load_prior, save_prior, 
 from phydict.runtime.precision import computes_bfloat16
 from phydict.units import HUWindow, hu_to_mu
 from phydict.xray import ConeBeam, Ideal, Polychromatic, Projector
+from phydict.xray.finer import FinerProjector
 from posterior.hollow import GRID, ORBIT, WINDOW, block, fine_scene, measured
 
 OTHERS = {
@@ -138,6 +140,22 @@ def test_a_view_that_contradicts_the_others_counts_less_and_x_rays_that_agree_co
     assert error[0.0, Unrolled.contradiction] == error[0.0, None]
     for amount in (0.5, 2.0):
         assert error[amount, Unrolled.contradiction] < 0.5 * error[amount, None]
+
+
+@torch.no_grad()
+def test_a_thin_sheet_that_views_see_along_its_face_contradicts_nothing():
+    """A couch's, half a voxel thick, which only finer voxels can hold."""
+    fine = interpolate(block(), scale_factor=2)
+    fine[:, :, 4:28, 7, 4:28] = 1
+    projector = Projector(GRID, ConeBeam.orbit(32, 1020, 740, (28, 28), 20.0), full_detector=True)
+    y, refiner = FinerProjector(projector)(WINDOW.to_mu(fine)), Knowing()
+    y = y + 0.002 * y.max() * torch.randn(y.shape, generator=torch.Generator().manual_seed(0))
+    counted = {}
+    for asked, method in {True: Unrolled(), False: Unrolled(subgrid=None)}.items():
+        m = Measurement(projector, y[0], WINDOW, noise=0.002)
+        list(method.estimates(refiner, m))
+        counted[asked] = m.model_variance
+    assert counted[True] == 0.0 and set(counted[False].flatten().nonzero().flatten().tolist()) == {7, 25}
 
 
 def test_scatter_that_the_first_step_knows_little_of_contradicts_nothing():

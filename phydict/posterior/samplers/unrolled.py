@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from phydict.diffusion.steps import Generators, noise_like
-from phydict.posterior.discretisation import find_subgrid
+from phydict.posterior.discretisation import find_subgrid, has_finer, subgrid_projection
 from phydict.posterior.evidence import Evidence
 from phydict.posterior.hardening import with_hardening
 from phydict.posterior.likelihood.likelihood import LikelihoodStep, ProximalCG
@@ -50,10 +50,11 @@ class Unrolled(Sampler):
     which finer voxels cost too much.
 
     Where the first step misses a view, beyond its noise, by more than `contradiction`, or by more than half of it and
-    OUTLIER times as much as the median view, and by more than SHARED of the worst view's error, as with wrong poses, a
-    flipped view, a gain that drifts or a patient who moves, no volume explains it: the excess counts from then on as
-    noise of that view (`Measurement.model_variance`), so that volumes follow it less and the prior and the other views
-    more. Where scatter is sought, of which the first step knows little, the second tells that.
+    OUTLIER times as much as the median view, and by more than SHARED of the worst view's error, and finer voxels do not
+    explain that, such as a couch's sheets seen along their faces, then no volume does, as with wrong poses, a flipped
+    view, a gain that drifts or a patient who moves: the excess counts from then on as noise of that view
+    (`Measurement.model_variance`), so that volumes follow it less and the prior and the other views more. Where scatter
+    is sought, of which the first step knows little, the second tells that.
 
     Args:
         times: labels in (0, 1) under which the refiner's network takes each z, as if it were a noisy state of that time
@@ -132,7 +133,7 @@ class Unrolled(Sampler):
             channels = evidence(z[:, :1], before[:, :1], start[:, :1])
             projection = measurement.last_projection
             if n == int(measurement.scatter_enabled) and self.contradiction is not None and projection is not None:
-                self._check_views_fit(measurement, projection, self.contradiction)
+                self._check_views_fit(measurement, z[:, :1], projection, self.contradiction)
             signal = float(refiner.schedule.scales(t)[0])
             x0 = refiner.refine(signal * z, t, channels)
             yield x0
@@ -148,14 +149,20 @@ class Unrolled(Sampler):
         on_result(z, lambda: evidence(z[:, :1], before[:, :1], start[:, :1]))
         yield z
 
-    @staticmethod
-    def _check_views_fit(measurement: Measurement, projection: Tensor, contradiction: float) -> None:
-        """Counts as noise of each view what a `projection` (1, K, V, U) misses of it too much to be explained."""
+    def _check_views_fit(self, measurement: Measurement, z: Tensor, projection: Tensor, contradiction: float) -> None:
+        """Counts as noise of each view what the `projection` (1, K, V, U) of a CT z misses of it too much to be
+        explained, on finer voxels either."""
         voxel = measurement.mu_water * max(measurement.projector.grid.spacing)
         usual = contradiction * voxel * max(1.0, measurement.projector.beam.views / FIRST_STEP_VIEWS) ** 0.5
-        errors = measurement.view_errors(projection)
-        like_others = (OUTLIER * errors.median()).clamp(usual / 2, usual)
-        excess = errors.square() - torch.maximum(like_others, SHARED * errors.max()).square()
+
+        def excess_of(errors: Tensor) -> Tensor:
+            like_others = (OUTLIER * errors.median()).clamp(usual / 2, usual)
+            return errors.square() - torch.maximum(like_others, SHARED * errors.max()).square()
+
+        excess = excess_of(errors := measurement.view_errors(projection))
+        if (excess > 0).any() and self.subgrid is not None and has_finer(measurement):
+            finer = subgrid_projection(measurement, z, self.subgrid, self.x0_stds[0])
+            excess = excess_of(torch.minimum(errors, measurement.view_errors(projection + finer)))
         if (excess > 0).any():
             measurement.model_variance = CAUTION**2 * excess.clamp(min=0)[:, None, None]
 

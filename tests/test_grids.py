@@ -77,9 +77,12 @@ def test_the_default_method_predicts_on_128_voxels_unless_a_grid_or_another_netw
 
 
 @pytest.mark.filterwarnings("always:no network has learnt")
+@pytest.mark.parametrize("number", ["--model.grid=24", "-c={}/own.yaml"])
 @pytest.mark.parametrize("order", [1, -1])
-def test_a_number_of_voxels_goes_with_the_other_settings_of_a_box_in_any_order(measured, prior, tmp_path, order):
-    given = ["--model.grid=24", "--model.grid.keep_coarse=true", "--model.grid.side=288"][::order]
+def test_a_number_of_voxels_goes_with_the_other_settings_of_a_box_in_any_order(measured, prior, tmp_path, number,
+                                                                               order):
+    (tmp_path / "own.yaml").write_text("model: {grid: 24}")
+    given = [number.format(tmp_path), "--model.grid.keep_coarse=true", "--model.grid.side=288"][::order]
     main(arguments("predict", tmp_path, prior, f"--data.xrays={measured}", *given))
     fine, coarse = (nibabel.load(tmp_path / "prior_only" / "anna" / f"{name}.nii.gz") for name in ("volume", "coarse"))
     np.testing.assert_allclose(fine.affine, Grid.cube(24, 288.0).affine)

@@ -17,16 +17,18 @@ from phydict.units import MU_WATER, HUWindow
 
 @dataclass(frozen=True)
 class FISTATV(Baseline):
-    """argmin |A x - y|^2 / (2 |A|^2) + weight TV(x) over densities x inside the window, from zero.
+    """argmin K |A x - y|^2 / (2 |A|^2) + weight TV(x) over densities x inside the window, from zero.
 
-    x is relative to water, |A| the operator's norm (power iteration), TV the isotropic total variation: the sum over
-    voxels of the length of the forward differences, those along coarser axes scaled down to the finest spacing. Beck
-    & Teboulle 2009, doi:10.1137/080716542 (FISTA, with the adaptive restart of O'Donoghue & Candes 2015,
+    x is relative to water, K the number of views, |A| the operator's norm (power iteration), so that each view counts
+    as much as it does among others. TV is the isotropic total variation: the sum over voxels of the length of the
+    forward differences, those along coarser axes scaled down to the finest spacing. Beck & Teboulle 2009,
+    doi:10.1137/080716542 (FISTA, with the adaptive restart of O'Donoghue & Candes 2015,
     doi:10.1007/s10208-013-9150-3) and doi:10.1109/TIP.2009.2028250 (the proximal step, by its dual).
 
     Args:
         iterations: of FISTA
-        weight: of the total variation; more is smoother
+        weight: of the total variation; more is smoother. Voxels half as long want about twice of it, X-rays that were
+            simulated on the voxels themselves a third, others up to three times
         inner: dual iterations per proximal step, each starting where the last one ended
         window: HU bounds, whose low end of -1000 HU is non-negativity, or None for none
         mu_water: attenuation of water in 1/mm in the X-rays
@@ -37,7 +39,7 @@ class FISTATV(Baseline):
                 "Deblurring Problems, IEEE Transactions on Image Processing 18(11), 2009, doi:10.1109/TIP.2009.2028250")
 
     iterations: int = 400
-    weight: float = 3e-4
+    weight: float = 2.4e-3
     inner: int = 5
     window: HUWindow | None = HUWindow()
     mu_water: float = MU_WATER
@@ -55,7 +57,7 @@ class FISTATV(Baseline):
         return self.iterations
 
     def solve(self, A: CountingProjector, y: Tensor, on_step: Callable[[], None]) -> Tensor:
-        lipschitz = max(1.02 * operator_norm(A.linear, A.T, empty(A, y) + 1, 1e-4, 50) ** 2, 1e-30)  # from below
+        squared_norm = max(1.02 * operator_norm(A.linear, A.T, empty(A, y) + 1, 1e-4, 50) ** 2, 1e-30)  # from below
         scales = finest_to_own(A.grid.spacing)
         def bounded(density: Tensor) -> Tensor:
             return clip(density, self.window)
@@ -63,8 +65,8 @@ class FISTATV(Baseline):
         x = ahead = bounded(empty(A, y))
         dual, momentum = x.new_zeros(3, *x.shape), 1.0
         for _ in range(self.iterations):
-            descended = ahead + A.T(y - A(ahead)) / lipschitz
-            new, dual = tv_proximal(descended, self.weight, scales, bounded, self.inner, dual)
+            descended = ahead + A.T(y - A(ahead)) / squared_norm
+            new, dual = tv_proximal(descended, self.weight / A.beam.views, scales, bounded, self.inner, dual)
             if ((ahead - new) * (new - x)).sum() > 0:
                 momentum = 1.0
             following = (1 + (1 + 4 * momentum**2) ** 0.5) / 2

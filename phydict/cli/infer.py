@@ -184,7 +184,8 @@ def with_methods(args: list[str]) -> list[str]:
 
 
 def _configuration(given: str) -> tuple[str, bool]:
-    """A configuration, its file or what it holds where it names a method, and whether it gives one at all."""
+    """A configuration, its file or what it holds where it names a method or gives a number of voxels, and whether it
+    gives a method at all."""
     if ":" in given:  # YAML itself
         return given, "method" in given
     try:
@@ -195,10 +196,15 @@ def _configuration(given: str) -> tuple[str, bool]:
         return json.dumps({"model": _named(name)}), True
     settings = read_configuration(file)
     model = settings.get("model", {})
-    if not _is_name(model.get("method")):
+    own: dict = {}
+    if _is_name(model.get("method")):
+        own = _named(model["method"])
+    if type(model.get("grid")) is int:
+        own["grid"] = {"voxels": model["grid"]}
+    if not own:
         return file, "method" in model
-    named = _named(model["method"])
-    return json.dumps(settings | {"model": named | model | {"method": named["method"]}}), True
+    written = own | model | {key: own[key] for key in own if key != "name"}  # a name in the file stays
+    return json.dumps(settings | {"model": written}), "method" in model
 
 
 def _is_name(method: object) -> bool:

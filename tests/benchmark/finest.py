@@ -55,7 +55,7 @@ WAYS: dict[str, Callable[[], Any]] = {
     "64^3, X-rays and total variation": lambda: replace(learned(), networks=(), refinement=Refinement(calls=0)),
     "256^3, network of 3 mm": lambda: replace(learned(), networks=(load_correction(DEFAULT_CORRECTION),)),
     "256^3": learned,
-    "tv": lambda: FISTATV(200, 1.2e-3), "cgls": lambda: CGLS(10, 10, WINDOW), "sirt": SIRT, "diffvox": DiffVox}
+    "tv": lambda: FISTATV(200, 9.6e-3), "cgls": lambda: CGLS(10, 10, WINDOW), "sirt": SIRT, "diffvox": DiffVox}
 
 
 def rows_of(ct, views: int, ways: list[str]) -> list[dict]:

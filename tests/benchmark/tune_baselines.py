@@ -2,17 +2,20 @@
 
     python tests/benchmark/tune_baselines.py <folder of training CTs> [how many of them]
 
-Ideal X-rays as `infer.py test` makes them, from 4 and from 8 views, onto 64^3 voxels, and total variation from 16 and
-32 as well. Writes tune_baselines.csv beside this file; settings that it holds already are not run again. The setting
-with the highest mean PSNR from 4 and 8 views is the method's default, which tests/baselines/test_tuned.py checks.
+Ideal X-rays as `infer.py test` makes them, from 4 and from 8 views, onto 64^3 voxels; total variation from 2, 16 and 32
+as well, and from polychromatic ones of 128^3 voxels. Writes tune_baselines.csv beside this file; settings that it holds
+already are not run again. The setting with the highest mean PSNR is the method's default, which
+tests/baselines/test_tuned.py checks.
 """
 
 import json
 import sys
 import zlib
+from itertools import product
 from pathlib import Path
 
 import numpy as np
+from torch.nn.functional import avg_pool3d
 
 from phydict import HUWindow
 from phydict.baselines import CGLS, FDK, FISTATV, SIRT, DiffVox
@@ -20,26 +23,28 @@ from phydict.datasets import CTFile, find_cts, prepare_ct
 from phydict.evaluation import body_weights, read_csv, volume_metrics, write_csv
 from phydict.grid import Grid
 from phydict.reconstruction import Reconstructor, describe
-from phydict.xray import ConeBeam, Ideal, Projector
+from phydict.xray import ConeBeam, Ideal, Polychromatic, Projector
 
 sys.path.append(str(Path(__file__).parents[1]))
 from fitting import fit_to_grid
 
 FILE = Path(__file__).with_name("tune_baselines.csv")
-VIEWS, MANY = (4, 8), (16, 32)
+XRAYS = {"ideal": (Ideal(), 64), "polychromatic": (Polychromatic(), 128)}
+"""Simulators, and the voxels along each side of what they see."""
+SCENES: list[tuple[str, int]] = [("ideal", 4), ("ideal", 8)]
+SCENES_OF: dict[str, list[tuple[str, int]]] = {"tv": list(product(XRAYS, (2, 4, 8, 16, 32)))}
+"""The X-rays and numbers of views that each method is tried from, and those of single methods."""
 CASES = 3
 GRID, WINDOW = Grid.cube(64), HUWindow()
 SETTINGS = {
     "fdk": [FDK(hann) for hann in (False, True)],
     "cgls": [*(CGLS(n) for n in (5, 10, 20, 40)),
              *(CGLS(n, restarts, WINDOW) for n, restarts in ((5, 10), (10, 5), (10, 10), (10, 20)))],
-    "tv": [FISTATV(n, w) for n, w in ((200, 1e-4), (200, 3e-4), (200, 1e-3), (200, 3e-3), (100, 3e-4), (400, 3e-4))],
+    "tv": [FISTATV(n, w) for n, w in ((400, 8e-4), (400, 2.4e-3), (400, 8e-3), (200, 2.4e-3), (100, 2.4e-3))],
     "diffvox": [DiffVox(n, s) for n, s in ((300, 1.5), (300, 5.0), (300, 15.0), (300, 50.0), (500, 15.0), (500, 50.0),
                                            (1000, 15.0), (1000, 50.0))],
     "sirt": [SIRT(n) for n in (100, 300, 1000)],
 }
-OF_MANY = {"tv": [FISTATV(200, w) for w in (3e-5, 1e-4, 3e-4)]}
-"""What is tried from MANY views."""
 
 
 def text(method: Reconstructor) -> str:
@@ -48,32 +53,34 @@ def text(method: Reconstructor) -> str:
 
 
 def best(rows: list[dict]) -> dict[str, str]:
-    """Method -> the settings with the highest PSNR, averaged over cases and VIEWS."""
+    """Method -> the settings with the highest PSNR, averaged over cases and numbers of views."""
     psnr: dict[str, dict[str, list[float]]] = {}
-    for row in (row for row in rows if row["views"] in VIEWS):
+    for row in rows:
         psnr.setdefault(row["method"], {}).setdefault(row["settings"], []).append(row["psnr"])
     return {name: max(found, key=lambda s: np.mean(found[s])) for name, found in psnr.items()}
 
 
 def tune(ct: CTFile, rows: list[dict]) -> None:
     """Adds to `rows` what is missing of one CT."""
-    done = {(row["case"], row["views"], row["settings"]) for row in rows}
-    volume = prepare_ct(ct.path, GRID, WINDOW, id=ct.id)["volume"][None]
-    truth = WINDOW.to_hu(volume)
-    body = body_weights(truth, GRID.spacing)
-    for views in VIEWS + MANY:
+    done = {(row["case"], row["xrays"], row["views"], row["settings"]) for row in rows}
+    for kind, views in sorted({*SCENES, *(scene for own in SCENES_OF.values() for scene in own)}):
+        simulator, voxels = XRAYS[kind]
+        volume = prepare_ct(ct.path, Grid.cube(voxels), WINDOW, id=ct.id)["volume"][None]
+        truth = WINDOW.to_hu(avg_pool3d(volume, voxels // GRID.shape[0]))
+        body = body_weights(truth, GRID.spacing)
         beam = ConeBeam.orbit(views, 1020, 740, (448, 448), 1.25)
-        exact = Projector(GRID, beam, full_detector=True)
-        xrays = Ideal()(exact, WINDOW.to_mu(volume), zlib.crc32(f"0/{ct.id}".encode()))[0]
-        for name, methods in (SETTINGS if views in VIEWS else OF_MANY).items():
-            for method in methods:
-                if (ct.id, views, text(method)) in done:
+        exact = Projector(Grid.cube(voxels), beam, full_detector=True)
+        xrays = simulator(exact, WINDOW.to_mu(volume), zlib.crc32(f"0/{ct.id}".encode()))[0]
+        for name, methods in SETTINGS.items():
+            for method in methods if (kind, views) in SCENES_OF.get(name, SCENES) else ():
+                if (ct.id, kind, views, text(method)) in done:
                     continue
-                result = method.reconstruct(*fit_to_grid(method, GRID, xrays, beam))
+                result = method.with_mu_water(simulator.effective_mu_water).reconstruct(
+                    *fit_to_grid(method, GRID, xrays, beam))
                 scores = volume_metrics(result.volume[None, None], truth, body=body)
-                rows.append({"case": ct.id, "method": name, "views": views, "settings": text(method), **scores,
-                             "misfit": result.misfit, "projector_calls": result.projector_calls})
-                print(ct.id, views, name, text(method), f"{scores['psnr']:.2f} dB", flush=True)
+                rows.append({"case": ct.id, "method": name, "xrays": kind, "views": views, "settings": text(method),
+                             **scores, "misfit": result.misfit, "projector_calls": result.projector_calls})
+                print(ct.id, kind, views, name, text(method), f"{scores['psnr']:.2f} dB", flush=True)
                 write_csv(FILE, rows)
 
 

@@ -37,7 +37,7 @@ SETTINGS = {
     "refinement": [Refinement(None), Refinement(STEP, 0.1), Refinement(STEP, 0.2), Refinement(STEP, 0.5),
                    Refinement(replace(STEP, tv_weight=5.0), 0.2), Refinement(replace(STEP, tv_weight=20.0), 0.2),
                    Refinement(replace(STEP, restarts=2), 0.5), Refinement(STEP, 1.0)],
-    "tv": [FISTATV(200, weight) for weight in (3e-4, 6e-4, 1.2e-3, 2.4e-3)],
+    "tv": [FISTATV(200, weight) for weight in (2.4e-3, 4.8e-3, 9.6e-3, 1.92e-2)],
     "cgls": [CGLS(10, restarts, WINDOW) for restarts in (20, 10, 5, 3)],
     "sirt": [SIRT(300), SIRT()],
     "diffvox": [DiffVox(), *(DiffVox(300, smoothness) for smoothness in (50.0, 100.0))]}

@@ -25,12 +25,12 @@ def test_every_setting_has_a_sentence(settings):
 
 
 @pytest.mark.parametrize("args, shown", [
-    (["predict", "--model.method", "tv", "--help"], "--model.method.weight 0.0003"),
+    (["predict", "--model.method", "tv", "--help"], "--model.method.weight 0.0024"),
     (["test", "--help", "--model.method=phydict_fast"], "--model.method.likelihood.iterations 12"),
     (["predict", "-c", "configs/reconstruct/sirt.yaml", "--help"], "--model.method.iterations 1000"),
     (["predict", "--model.method", "phydict.posterior.DDS", "--help"], "--model.method.eta 0.85"),
     (["ablate", "--set", "method=[tv,dds]", "--help"], "method.eta 0.85"),
-    (["ablate", "--model.method", "tv", "--help"], "method.weight 0.0003")])
+    (["ablate", "--model.method", "tv", "--help"], "method.weight 0.0024")])
 def test_help_shows_the_settings_of_the_method(capsys, args, shown):
     assert f"  {shown}" in help_of(infer, capsys, *args)
 

@@ -19,8 +19,8 @@ from phydict.units import MU_WATER, HUWindow
 class FISTATV(Baseline):
     """argmin K |A x - y|^2 / (2 |A|^2) + weight TV(x) over densities x inside the window, from zero.
 
-    x is relative to water, K the number of views, |A| the operator's norm (power iteration), so that each view counts
-    as much as it does among others. TV is the isotropic total variation: the sum over voxels of the length of the
+    x is relative to water, K the number of views and |A| the operator's norm (power iteration), so that each view adds
+    about as much to the first term. TV is the isotropic total variation: the sum over voxels of the length of the
     forward differences, those along coarser axes scaled down to the finest spacing. Beck & Teboulle 2009,
     doi:10.1137/080716542 (FISTA, with the adaptive restart of O'Donoghue & Candes 2015,
     doi:10.1007/s10208-013-9150-3) and doi:10.1109/TIP.2009.2028250 (the proximal step, by its dual).

@@ -84,3 +84,10 @@ def test_more_weight_is_smoother_and_fits_less():
 
 def test_coarser_axes_count_by_their_slope():
     assert finest_to_own((2.0, 4.0, 3.0)) == [1.0, 0.5, 2 / 3]
+
+
+def test_views_that_are_all_given_twice_count_twice():
+    twice = Projector(SMALL.grid, SMALL.beam.select([0, 1, 2, 0, 1, 2]), full_detector=True)
+    once, again = (FISTATV(300, weight, 20).reconstruct(MU_WATER * Y.view(3, 6, 6)[views], projector).volume
+                   for weight, views, projector in ((0.01, [0, 1, 2], SMALL), (0.02, [0, 1, 2, 0, 1, 2], twice)))
+    torch.testing.assert_close(again, once, atol=0.5, rtol=0)

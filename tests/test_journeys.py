@@ -82,7 +82,10 @@ def test_what_is_made_can_be_made():
 
 def test_the_demo_compares_three_methods(checkout):
     runpy.run_path(str(ROOT / "data" / "example" / "demo.py"), run_name="__main__")
-    assert (checkout / "runs" / "demo" / "comparison.png").is_file()
+    made = checkout / "runs" / "demo"
+    assert (made / "comparison.png").is_file()
+    page = (made / "index.html").read_text()
+    assert all(f'"folder": "{method}"' in page for method in ("phydict_learned", "phydict_fast", "sirt"))
 
 
 def test_the_example_is_reconstructed_and_shown(checkout, capsys):

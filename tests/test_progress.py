@@ -2,18 +2,20 @@
 
 import json
 import re
+from io import StringIO
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from rich.console import Console
 
 from phydict.evaluation.fid import NAMES, distances
 from phydict.evaluation.planes import PLANES
 from phydict.inference.distances import told_distances
 from phydict.runtime import progress as module
 from phydict.runtime.progress import CaseProgress, duration
-from phydict.runtime.telling import tell, telling
+from phydict.runtime.telling import bars_on, tell, telling
 from phydict.training import progress as training_progress
 from phydict.training.progress import TrainingProgress
 
@@ -43,6 +45,17 @@ def test_a_log_says_what_is_done_what_remains_for_how_long_and_where(told):
                       "b: step 1 of 2, about 60 s to go", "b: step 2 of 2, about 40 s to go",
                       "b: good (2 of 3, about 40 s to go)",
                       "c: step 1 of 2, about 20 s to go", "c: step 2 of 2", "c: good (3 of 3)"]
+
+
+def test_on_a_narrow_terminal_a_long_name_is_cut_and_counts_and_times_are_whole():
+    console = Console(width=80, file=StringIO())
+    bars = bars_on(console)
+    for name, done in (("phantom 100000, phydict_learned, views 16, [/b] simulator polychromatic", 17), ("sirt", 3)):
+        bars.add_task(name, total=1234, completed=done)
+    console.print(bars.make_tasks_table(bars.tasks))
+    lines = console.file.getvalue().splitlines()
+    assert len(lines) == 2 and "…" in lines[0] and lines[1].startswith("sirt ")
+    assert all(f" {done:>4}/1234 0:00:00 so far, -:--:-- to go" in line for done, line in zip((17, 3), lines))
 
 
 def test_a_case_may_have_steps_of_its_own(capsys, monkeypatch):

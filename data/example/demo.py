@@ -13,6 +13,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 import phydict
 from phydict.datasets import body_mask, load_xrays
 from phydict.evaluation import mean_table, method_panel, panel, volume_metrics, write_csv
+from phydict.inference.case_files import write_page_files
+from phydict.page import Contents, PageCase, write_page
 
 METHODS = ("phydict_learned", "phydict_fast", "sirt")
 
@@ -23,7 +25,7 @@ if __name__ == "__main__":
     grid = phydict.Grid.cube(truth.shape[0])
     body = torch.from_numpy(body_mask(truth.numpy(), grid.spacing))[None, None]
     out.mkdir(parents=True, exist_ok=True)
-    rows, volumes = [], {}
+    rows, volumes, shown = [], {}, []
     with Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()) as bar:
         for method in METHODS:
             steps = bar.add_task(method, total=phydict.METHODS[method].steps())
@@ -33,10 +35,17 @@ if __name__ == "__main__":
                         | {"misfit": result.misfit, "seconds": sum(result.seconds.values())})
             volumes[method] = result.volume
             result.save_nifti(out / f"{method}.nii.gz")
+            (out / method).mkdir(exist_ok=True)
+            write_page_files(out / method, result, truth)
+            shown.append(PageCase(method, (), rows[-1] | {
+                "scores": scores, "seconds": result.seconds, "misfit_per_view": result.misfit_per_view,
+                "warnings": result.warnings, "report": case["report"]}))
             panel(out / f"{method}.png", result.volume, result.grid, result.xrays, result.reprojection, truth,
                   title=f"{method}, {len(case['xrays'])} X-rays")
     captions = {row["method"]: f"{row['psnr']:.1f} dB, SSIM {row['ssim']:.2f}" for row in rows}
     method_panel(out / "comparison.png", volumes, truth, grid, captions)
     write_csv(out / "results.csv", rows)
-    Console().print(mean_table(rows))
-    print(f"picture: {out / 'comparison.png'}\nvolumes, X-ray fits and results.csv: {out}")
+    table = mean_table(rows)
+    Console().print(table)
+    page = write_page(out, Contents("The embedded example", [table], shown, plots=["comparison.png"]))
+    print(f"page, for a browser: {page}\npicture: {out / 'comparison.png'}\nvolumes, X-ray fits and results.csv: {out}")

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from phydict.ablation.fid import distance_tables
-from phydict.ablation.run import RESULTS, volume_folder
+from phydict.ablation.run import DETAILS, RESULTS, volume_folder
 from phydict.ablation.summary import Entry, format_settings, summarise, without_repeats
 from phydict.ablation.tables import all_tables
 from phydict.evaluation import read_csv
@@ -49,13 +50,14 @@ def comparison_page(folder: Path, entries: Sequence[Entry], tables: Sequence[Tab
 
 
 def _case(folder: Path, entry: Entry, row: Mapping) -> PageCase:
-    """A row as a case, known by its method, settings and seed, with its volume where that was kept."""
+    """A row as a case, known by its method, settings and seed, with its volume and details where these were kept."""
     scores = {name: row[name] for name in MEASURES if row.get(name) is not None}
     record = {name: value for name, value in row.items() if name not in scores and value is not None}
     group = format_settings(str(row["case"]), entry.condition)
     kept = volume_folder(folder, str(row.get("key")))
     place, files = (kept.relative_to(folder).as_posix(), sorted(os.listdir(kept))) if kept.is_dir() else ("", ())
-    return PageCase(place, files, record | {
+    details = json.loads((kept / DETAILS).read_text()) if DETAILS in files else {}
+    return PageCase(place, files, record | details | {
         "method": format_settings(entry.name, entry.condition, {"seed": row.get("seed", 0)}),
         "scores": scores, "misfit": row.get("misfit"), "seconds": {"all": row["seconds"]} if "seconds" in row else {},
         "warnings": [row["warning"]] if row.get("warning") else []}, group)

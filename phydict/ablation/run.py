@@ -23,6 +23,7 @@ from phydict.evaluation.fid import save_features
 from phydict.evaluation.metrics import MEASURES
 from phydict.inference.case_files import VOLUME, write_page_files
 from phydict.inference.protocols import cut_out, placed, resampled
+from phydict.inference.record import versions
 from phydict.inference.scoring import Scoring
 from phydict.methods import onto_grid, reconstruct_by, reconstructor
 from phydict.posterior import Sampler
@@ -34,10 +35,14 @@ from phydict.runtime.profiling import peak_memory, profiled, reset_peak_memory
 from phydict.runtime.progress import CaseProgress
 from phydict.runtime.reading import TooLittleMemory
 from phydict.runtime.seeds import case_seed
+from phydict.runtime.strict_json import strict_json
 from phydict.runtime.telling import tell
 
 RESULTS, TABLES = "results.csv", ("tables.md", "tables.tex")
 """The results of a folder, and the tables that are made of them."""
+
+DETAILS = "details.json"
+"""What is known of a row whose volume is kept and the table does not hold, beside that volume."""
 
 FINISHED = ("ok", "refused", "diverged")
 """What a row's status may be that is not tried again; "failed" is, since its reason may lie outside: "refused" is what
@@ -254,7 +259,7 @@ class Runner:
             if features := self.scoring.features(volume, scene.truth, scene.grid, scene.window, self.device):
                 save_features(features_file(self.out, key), features)
             if self.keep_volumes:
-                _keep(volume_folder(self.out, key), result, scene)
+                _keep(volume_folder(self.out, key), result, scene, trial)
         return scores | {
             "status": "ok" if finite else "diverged",
             "error": None if finite else "the volume holds NaN or infinite voxels", "misfit": result.misfit,
@@ -292,14 +297,18 @@ def volume_folder(out: Path, key: str) -> Path:
     return out / "volumes" / key
 
 
-def _keep(folder: Path, result: Reconstruction, scene: MeasuredCase) -> None:
-    """Writes a volume, in its place in the CT that it came from, and what the page shows of it."""
+def _keep(folder: Path, result: Reconstruction, scene: MeasuredCase, trial: Trial) -> None:
+    """Writes a volume, in its place in the CT that it came from, what the page shows of it, and what the table's row
+    does not hold."""
     truth = resampled(scene.window.to_hu(scene.truth["volume"])[0].cpu(), scene.grid, result.grid)
     if "affine" in scene.truth:
         result = replace(result, grid=placed(result.grid, scene.grid, scene.truth["affine"].numpy()))
+    details = {"misfit_per_view": result.misfit_per_view, "grid": result.grid.to_dict(), "report": scene.report(trial),
+               "settings": trial.identity(), "versions": versions()}
     with atomic_directory(folder) as partial:
         save_nifti(partial / VOLUME, result.volume.numpy(), result.grid, np.int16)
         write_page_files(partial, result, truth)
+        (partial / DETAILS).write_text(strict_json(details))
 
 
 @cache

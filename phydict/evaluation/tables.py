@@ -15,6 +15,7 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.markup import escape
 from rich.measure import Measurement
 from rich.table import Table as ConsoleTable
+from rich.text import Text
 
 from phydict.evaluation.bootstrap import Estimate
 from phydict.evaluation.fid import NAMES
@@ -63,10 +64,10 @@ class Table:
         table, wide = self._console(), options.update(width=10_000)
         fits = Measurement.get(console, wide, table).maximum <= options.max_width
         yield table if fits else self._console(turned=True)
+        yield Text("\n".join(note for note in self.notes if not note.startswith(IN_BRACKETS)), "table.caption")
 
     def _console(self, turned: bool = False) -> ConsoleTable:
-        notes = [note for note in self.notes if not note.startswith(IN_BRACKETS)]
-        table = ConsoleTable(title=escape(self.title), caption=escape("\n".join(notes)))
+        table = ConsoleTable(title=escape(self.title))
         plain = replace(self, lines=[(label, ranked, [_without_interval(value) for value in values])
                                      for label, ranked, values in self.lines])
         lines = [[escape(name) for name in self.header],

@@ -18,11 +18,15 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.table import Column
 
 from phydict.runtime.parser_message import unknown_told
 from phydict.runtime.strict_json import strict_json
 
 WORDS, JSON, SILENCE = "words", "json", "silence"
+
+BESIDE_NAME = 60
+"""Columns of a terminal for what stands beside the name of a bar."""
 
 _MANNER: ContextVar[str] = ContextVar("manner", default=WORDS)
 
@@ -65,9 +69,12 @@ def exclaim(kind: str, text: str) -> None:
 
 
 def bars_on(console: Console, *columns: ProgressColumn) -> Progress:
-    """Bars with their count, the time so far and the time to go, that show on a terminal alone, and in words alone."""
-    return Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
-                    TimeRemainingColumn(), *columns, console=console,
+    """Bars with their count, the time so far and the time to go, that show on a terminal alone, and in words alone. A
+    name that is too long for the line is cut."""
+    name = Column(no_wrap=True, overflow="ellipsis", max_width=max(console.width - BESIDE_NAME, 8))
+    return Progress(TextColumn("{task.description}", markup=False, table_column=name), BarColumn(16),
+                    MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("so far,"), TimeRemainingColumn(),
+                    TextColumn("to go"), *columns, console=console,
                     disable=not console.is_terminal or _MANNER.get() != WORDS)
 
 

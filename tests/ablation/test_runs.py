@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 from pathlib import Path
 
 import nibabel
@@ -272,7 +273,10 @@ def test_volumes_are_kept_where_that_is_asked_for_and_the_page_shows_them_in_the
         assert kept.get_data_dtype() == np.int16 and kept.shape == (16, 16, 16)
         centre = kept.affine @ [7.5, 7.5, 7.5, 1]
         np.testing.assert_allclose(centre, affine @ [9.5, 9.5, 9.5, 1], atol=1e-3)
-        assert {"view.js", "thumbnail.png", "volume.nii.gz"} == {path.name for path in folder.iterdir()}
+        assert {"view.js", "thumbnail.png", "volume.nii.gz", "details.json"} == {
+            path.name for path in folder.iterdir()}
+        details = json.loads((folder / "details.json").read_text())
+        assert len(details["misfit_per_view"]) == row["views"] and details["settings"]["name"] == row["method"]
         assert '"truth"' in (folder / "view.js").read_text()
     page = (out / "index.html").read_text()
     assert all(f'"folder": "volumes/{row["key"]}"' in page for row in rows)

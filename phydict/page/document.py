@@ -25,6 +25,9 @@ SIGNED = '<meta name="generator" content="phydict">'
 SHARED = ("settings", "versions")
 """Parts of records that are kept once for all cases of which they are the same."""
 
+FIRST = ("SSIM", "PSNR (dB)", "MAE (HU)", "misfit", "time (s)", "warned")
+"""Labels of measures whose columns stand before all others."""
+
 
 @dataclass(frozen=True)
 class PageCase:
@@ -83,8 +86,9 @@ def _content(contents: Contents) -> dict:
     cases = [_case(case, shared) for case in contents.cases]
     _mark_best([case.group or case.record["case"] for case in contents.cases], cases)
     scored = {name for case in cases for name in case["scores"]}
-    measures = [{"name": name, "label": measure.label, "decimals": measure.decimals}
-                for name, measure in MEASURES.items() if name in scored]
+    measures = [{"name": name, "label": measure.label, "heading": measure.heading, "decimals": measure.decimals}
+                for name, measure in sorted(MEASURES.items(), key=lambda item: item[1].label not in FIRST)
+                if name in scored]
     error = MEASURES[contents.error].label
     return {"title": contents.title, "version": VERSION, "tables": [_table(t) for t in contents.tables],
             "cases": cases, "shared": [json.loads(text) for text in shared], "measures": measures,
@@ -116,11 +120,14 @@ def _mark_best(names: Sequence[str], cases: Sequence[dict]) -> None:
 
 
 def _table(table: Table) -> dict:
+    others = [c for c, measure in enumerate(table.measures, 1) if measure.label not in FIRST]
+    order = [c for c in range(len(table.header)) if c not in others] + others
     rows = [[{"text": label, "value": None, "place": 0}] + [
         {"text": text, "value": None if value is None else float(value), "place": place}
         for (text, place), value in zip(cells, values)]
         for (label, _, values), cells in zip(table.lines, table.cells())]
-    return {"title": table.title, "header": table.header, "rows": rows, "notes": table.notes}
+    return {"title": table.title, "header": [table.header[c] for c in order],
+            "rows": [[row[c] for c in order] for row in rows], "notes": table.notes}
 
 
 def _file(name: str) -> dict:

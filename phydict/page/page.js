@@ -4,6 +4,27 @@ const keyOf = case_ => `${case_.record.method}/${case_.record.case}`;
 const places = new Map(content.cases.map(case_ => [keyOf(case_), case_]));
 const loaded = new Map();  // key -> {volumes, xrays}, the last ones opened
 let viewer = null, xrayViewer = null, opened = "";
+const KINDS = new Map(Object.entries({
+  "volume.nii.gz": "the reconstruction in HU", "coarse.nii.gz": "the reconstruction on coarser voxels, in HU",
+  "interval_90.nii.gz": "half of each voxel's 90% interval, in HU",
+  "deviation.nii.gz": "standard deviation of each voxel, in HU", "panel.png": "planes and X-rays as one picture",
+  "reconstruction.json": "scores, settings and versions", "details.json": "misfits, settings and versions", "geometry_found.yaml": "the geometry that was found",
+  "slice_features.safetensors": "features of slices, for Frechet distances", "results.csv": "a row per case",
+  "results.md": "the tables as Markdown", "tables.md": "the tables as Markdown", "tables.tex": "the tables as LaTeX"}));
+
+/* A value as it is read: numbers to four digits, parts that are not known left out. */
+function words(value, unit = "") {
+  if (typeof value === "number") return (Number.isInteger(value) ? value : Number(value.toPrecision(4))) + unit;
+  if (typeof value !== "object") return String(value);
+  return Object.entries(value).filter(([, part]) => part !== null).map(
+    ([name, part]) => (Array.isArray(value) ? "" : name.replaceAll("_", " ") + " ") + words(part, unit)).join(", ");
+}
+
+/* A list's line for a file in a folder, with a few words on what it is. */
+function fileLine({name, url}, folder = ".") {
+  const kind = KINDS.get(name.split("/").at(-1));
+  return element("li", {}, element("a", {href: `${folder}/${url}`}, name), kind ? `: ${kind}` : "");
+}
 
 /* The rows of a table in the order of a column: numbers by size, text by its letters, what is missing last. */
 function inOrder(rows, column, down) {
@@ -23,38 +44,40 @@ function table(title, header, rows, notes = []) {
         for (const other of heads) other.setAttribute("aria-sort", "none");
         head.setAttribute("aria-sort", down ? "descending" : "ascending");
         fill(inOrder(rows, column, down));
-      }}, name));
+      }}, name.replace(/ (?=[↑↓])/, "\u00a0")));
     return head;
   });
   fill(rows);
   return element("div", {},
-    element("div", {class: "scroll"}, element("table", {}, element("caption", {}, title),
-      element("thead", {}, element("tr", {}, ...heads)), body)),
+    element("div", {class: "scroll", tabindex: 0, role: "region", "aria-label": title}, element("table", {},
+      element("caption", {}, title), element("thead", {}, element("tr", {}, ...heads)), body)),
     ...notes.map(note => element("p", {class: "notes"}, note)));
 }
 
 function line(cells) {
-  return element("tr", {"data-key": cells.key}, ...cells.map(cell => element("td", {
-    class: ["", "best", "second"][cell.place ?? 0] + (cell.label ? " text" : "")}, cell.node ?? cell.text)));
+  return element("tr", {"data-key": cells.key}, ...cells.map((cell, column) => element(column ? "td" : "th", {
+    scope: column ? null : "row", class: ["", "best", "second"][cell.place ?? 0] + (cell.label ? " text" : "")},
+    cell.node ?? (cell.label ? cell.text : cell.text.replace(" [", "\n[")))));
 }
 
-function caseRow(case_) {
+const thumbnail = case_ => case_.files.find(file => file.name === "thumbnail.png");
+
+function caseRow(case_, pictured) {
   const {record, scores} = case_, key = keyOf(case_);
   const open = () => opened === key ? showCase(key) : (location.hash = encodeURIComponent(key));
-  const picture = case_.files.find(file => file.name === "thumbnail.png");
+  const picture = thumbnail(case_), warnings = (record.warnings ?? []).length;
   const row = [
     {text: record.case, value: null, label: true,
      node: element("button", {class: "name", type: "button", onclick: open}, record.case)},
-    {text: record.case, value: null, label: true, node: picture ? element("img", {
-      loading: "lazy", alt: "", src: `${case_.folder}/${picture.url}`, onclick: open}) : ""},
+    ...pictured ? [{text: "", value: null, node: picture ? element("img", {
+      loading: "lazy", alt: "", src: `${case_.folder}/${picture.url}`, onclick: open}) : ""}] : [],
     {text: record.method, value: null, label: true},
     {text: String(record.views ?? "–"), value: record.views ?? null}];
   for (const {name, decimals} of content.measures) {
     const value = scores[name] ?? null;
     row.push({text: value === null ? "–" : value.toFixed(decimals), value, place: case_.places[name]});
+    if (name === "seconds") row.push({text: String(warnings), value: warnings});
   }
-  const warnings = (record.warnings ?? []).length;
-  row.push({text: String(warnings), value: warnings});
   row.key = key;
   return row;
 }
@@ -72,22 +95,24 @@ function plot(points, error) {
   const range = values => [Math.min(...values), Math.max(...values)];
   const [first, last] = range(known.map(point => Math.log10(point.seconds)));
   const [low, high] = range(known.map(point => point.error));
-  const x = seconds => 60 + 340 * share(Math.log10(seconds), first, last === first ? first + 1 : last);
-  const y = value => 250 - 220 * share(value, low, high === low ? low + 1 : high);
+  const x = seconds => 80 + 320 * share(Math.log10(seconds), first, last === first ? first + 1 : last);
+  const y = value => 250 - 210 * share(value, low, high === low ? low + 1 : high);
   const series = [...new Set(known.map(point => point.series))];
   const colour = name => `hsl(${Math.round(360 * series.indexOf(name) / series.length)} 65% 50%)`;
-  const words = (text, at) => svg("text", at, text), number = value => Number(value.toPrecision(3)).toString();
+  const text = (words, x, y, anchor) => svg("text", {x, y, "text-anchor": anchor}, words);
+  const ticks = values => [...new Set(values.map(value => words(value)))];
   return element("figure", {}, element("figcaption", {}, `Seconds per case against ${error}; lower left is better`),
-    svg("svg", {viewBox: "0 0 620 300", role: "img", "aria-label": `Seconds per case against ${error}`},
-      svg("line", {x1: 50, y1: 260, x2: 410, y2: 260}), svg("line", {x1: 50, y1: 20, x2: 50, y2: 260}),
-      words(number(10 ** first) + " s", {x: 60, y: 278, "text-anchor": "middle"}),
-      words(number(10 ** last) + " s", {x: 400, y: 278, "text-anchor": "middle"}),
-      words(number(high), {x: 45, y: 34, "text-anchor": "end"}),
-      words(number(low), {x: 45, y: 254, "text-anchor": "end"}),
-      ...known.map(point => svg("circle", {cx: x(point.seconds), cy: y(point.error), r: 4, fill: colour(point.series)},
-        svg("title", {}, `${point.name}: ${number(point.seconds)} s, ${number(point.error)}`))),
-      ...series.slice(0, 18).map((name, n) => svg("g", {}, words(name, {x: 436, y: 34 + 15 * n}),
-        svg("circle", {cx: 426, cy: 30 + 15 * n, r: 4, fill: colour(name)})))));
+    svg("svg", {viewBox: "0 0 620 310", role: "group", "aria-label": `Seconds per case against ${error}`},
+      svg("line", {x1: 70, y1: 260, x2: 410, y2: 260}), svg("line", {x1: 70, y1: 30, x2: 70, y2: 260}),
+      text(error, 8, 18, "start"), text("seconds, logarithmic", 240, 296, "middle"),
+      ...ticks([10 ** first, 10 ** last]).map((tick, n) => text(tick, 80 + 320 * n, 278, "middle")),
+      ...ticks([low, high]).map((tick, n) => text(tick, 65, 254 - 210 * n, "end")),
+      ...known.map(point => svg("circle", {
+        cx: x(point.seconds), cy: y(point.error), r: 4, fill: colour(point.series), role: "img"},
+        svg("title", {}, `${point.name}: ${words(point.seconds)} s, ${words(point.error)}`))),
+      ...series.slice(0, 17).map((name, n) => svg("g", {}, text(name, 436, 34 + 15 * n, "start"),
+        svg("circle", {cx: 426, cy: 30 + 15 * n, r: 4, fill: colour(name)}))),
+      ...series.length > 17 ? [text(`and ${series.length - 17} more`, 436, 289, "start")] : []));
 }
 
 function showRun() {
@@ -99,18 +124,24 @@ function showRun() {
     return row;
   }), made.notes)), plot(points, error) ?? "");
   if (cases.length) {
-    const header = ["case", "picture", "method", "views", ...measures.map(measure => measure.label), "warnings"];
-    const rows = cases.map(caseRow), caseTable = table("Cases", header, rows, [
+    const pictured = cases.some(thumbnail);
+    const header = ["case", ...pictured ? ["picture"] : [], "method", "views", ...measures.flatMap(
+      ({name, heading}) => name === "seconds" ? [heading, "warnings"] : [heading])];
+    const rows = cases.map(case_ => caseRow(case_, pictured)), none = element("p", {role: "status"});
+    const caseTable = table("Cases", header, rows, [
       "Best of each case and number of views in bold, second underlined. A name opens the case."]);
     const filter = element("input", {type: "search", oninput: () => {
-      for (const row of caseTable.querySelectorAll("tbody tr")) row.hidden = !row.dataset.key.toLowerCase().includes(filter.value.toLowerCase());
+      const wanted = filter.value.toLowerCase(), lines = [...caseTable.querySelectorAll("tbody tr")];
+      for (const row of lines) row.hidden = !row.dataset.key.toLowerCase().includes(wanted);
+      none.textContent = lines.every(row => row.hidden) ? "none found" : "";
     }});
-    run.append(element("p", {}, element("label", {}, "show cases and methods with ", filter)), caseTable);
+    run.append(element("section", {id: "cases", "aria-label": "Cases"},
+      element("p", {}, element("label", {}, "show cases and methods with ", filter)), caseTable, none));
   }
   run.append(
     ...plots.map(({name, url}) => element("p", {},
       element("img", {class: "plot", loading: "lazy", alt: name, src: url}))),
-    element("ul", {}, ...links.map(({name, url}) => element("li", {}, element("a", {href: url}, name)))));
+    element("ul", {}, ...links.map(link => fileLine(link))));
 }
 
 /* A case's volumes and X-rays; the last few opened are kept. */
@@ -140,30 +171,47 @@ async function showCase(key) {
   opened = key;
   for (const row of document.querySelectorAll("tr[data-key]"))
     row.setAttribute("aria-current", row.dataset.key === key);
-  if (!case_) return;
+  if (!case_) {
+    if (key === "cases") byId("cases")?.scrollIntoView();
+    return;
+  }
+  const rows = [...document.querySelectorAll("tr[data-key]:not([hidden])")].map(row => row.dataset.key);
+  for (const [id, step] of [["previous", -1], ["next", 1]]) {
+    const to = rows[rows.indexOf(key) + step] ?? "";
+    byId(id).hidden = !to;
+    byId(id).title = to;
+    byId(id).href = `#${encodeURIComponent(to)}`;
+  }
   const {record, scores, folder, files} = case_;
   byId("case-name").textContent = `${record.case}: ${record.method}`;
   byId("case-scores").textContent = content.measures.filter(({name}) => (scores[name] ?? null) !== null)
     .map(({name, label, decimals}) => `${label} ${scores[name].toFixed(decimals)}`).join(", ");
   byId("warnings").replaceChildren(...(record.warnings ?? []).map(text => element("li", {}, text)));
-  byId("report").textContent = record.report || ("report" in record ? "none was given" : "not kept in this table");
-  byId("files").replaceChildren(...files.filter(({name}) => name !== "view.js").map(({name, url}) => element("li", {},
-    element("a", {href: `${folder}/${url}`}, name))));
+  byId("report").textContent = record.report || "none was given";
+  byId("report").parentNode.hidden = !("report" in record);
+  byId("files").replaceChildren(...files.filter(({name}) => !["view.js", "thumbnail.png"].includes(name)).map(
+    file => fileLine(file, folder)));
+  byId("files").parentNode.hidden = !files.length;
   const {settings, versions, grid, report, warnings, scores: _, files: __, ...facts} = record;
-  byId("facts").replaceChildren(...Object.entries({...facts, voxels: grid?.shape?.join(" x ")}).flatMap(
-    ([name, value]) => [element("dt", {}, name.replaceAll("_", " ")),
-                        element("dd", {}, typeof value === "object" ? JSON.stringify(value) : String(value))]));
-  byId("settings").textContent = JSON.stringify(
-    {settings: content.shared[settings], versions: content.shared[versions]}, null, 1);
+  byId("facts").replaceChildren(...Object.entries({voxels: grid?.shape?.join(" x "), ...facts})
+    .filter(([, value]) => (value ?? null) !== null).flatMap(([name, value]) => [
+      element("dt", {}, name.replaceAll("_", " ")),
+      element("dd", {}, words(value, name.startsWith("seconds") ? " s" : ""))]));
+  const kept = JSON.stringify({settings: content.shared[settings] ?? undefined,
+                               versions: content.shared[versions] ?? undefined}, null, 1);
+  byId("settings").textContent = kept.replace(/\[\n[^"[\]{}]*\]/g, list =>  // numbers on one line
+    list.replace(/,\n\s*/g, ", ").replace(/\n\s*/g, ""));
+  byId("settings").hidden = kept === "{}";
   byId("viewer").hidden = true;
-  byId("state").textContent = folder ? "loading the volume" : "";
+  byId("state").textContent = folder ? "loading the volume"
+    : "No volume of this run was kept: ablate --keep_volumes keeps them.";
   try {
     if (!folder) return;
     const {volumes, xrays} = await load(case_);
     if (opened !== key) return;
     byId("viewer").hidden = false;
     viewer ??= new Viewer();
-    viewer.show(volumes);
+    viewer.show(volumes, record.case);
     xrayViewer ??= new XrayViewer();
     xrayViewer.show(xrays, record.misfit_per_view ?? []);
     await offerOthers(case_, volumes);
@@ -202,7 +250,11 @@ async function offerOthers(case_, volumes) {
 }
 
 showRun();
-const follow = () => showCase(decodeURIComponent(location.hash.slice(1)));
+function follow() {
+  let key = "";  // of an address that is none
+  try { key = decodeURIComponent(location.hash.slice(1)); } catch {}
+  showCase(key);
+}
 window.addEventListener("hashchange", follow);
 if (!location.hash && content.cases.length === 1) location.hash = encodeURIComponent(keyOf(content.cases[0]));
 else follow();

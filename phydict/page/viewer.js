@@ -36,15 +36,33 @@ function paint(canvas, values, wide, high, ratio, colour) {
   return context;
 }
 
+/* A pale line in a dark one, to be seen on any picture. */
+function rule(context, x, y, wide, high) {
+  context.fillStyle = "rgba(0, 0, 0, 0.5)";
+  context.fillRect(x - 1, y - 1, wide + 2, high + 2);
+  context.fillStyle = "rgb(90, 200, 255)";
+  context.fillRect(x, y, wide, high);
+}
+
 class Viewer {
   constructor() {
     this.window = [...WINDOWS.all];
     this.angle = 0;
     this.mean = false;
+    this.rolled = 0;  // pixels of the wheel since the last slice
     this.rows = [0, 1].map(row => ({canvases: Object.fromEntries(Object.keys(PLANES).map(name =>
-      [name, this.canvas(name, row)])), turning: this.turning(row)}));
+      [name, this.canvas(name, row)])), turning: this.turning()}));
     for (const row of this.rows) for (const canvas of [...Object.values(row.canvases), row.turning])
       byId("planes").append(canvas.parentNode);
+    this.turn = element("input", {
+      type: "range", min: -180, max: 180, value: 0, "aria-label": "Angle of the projection",
+      oninput: () => { this.angle = +this.turn.value; this.drawTurning(); }});
+    const kind = element("button", {type: "button", "aria-pressed": "false", onclick: () => {
+      this.mean = !this.mean;
+      kind.setAttribute("aria-pressed", this.mean);
+      this.drawTurning();
+    }}, "mean");
+    this.rows[0].turning.parentNode.append(element("label", {}, "turn ", this.turn), " ", kind);
     for (const [name, window] of Object.entries(WINDOWS))
       byId("windows").append(element("button", {type: "button", onclick: () => this.setWindow(...window)}, name), " ");
     for (const id of ["level", "width"])
@@ -65,50 +83,55 @@ class Viewer {
       const i = wide - 1 - Math.floor((event.clientX - box.left) / box.width * wide);
       this.move({[x]: i, [y]: high - 1 - Math.floor((event.clientY - box.top) / box.height * high)});
     };
-    canvas.addEventListener("pointerdown", event => { canvas.setPointerCapture(event.pointerId); pick(event); });
+    let before;
+    canvas.addEventListener("pointerdown", event => {
+      before = {...this.at};
+      if (event.pointerType !== "mouse") return;  // a finger may be about to scroll
+      canvas.setPointerCapture(event.pointerId);
+      pick(event);
+    });
     canvas.addEventListener("pointermove", event => { if (event.buttons) pick(event); });
+    canvas.addEventListener("pointercancel", () => this.move(before));  // it scrolls
+    canvas.addEventListener("click", pick);
     canvas.addEventListener("wheel", event => {
       if (event.ctrlKey) return;  // the browser's zoom
       event.preventDefault();
-      this.move({[across]: this.at[across] - Math.sign(event.deltaY)});
+      this.rolled += event.deltaY * (event.deltaMode ? 40 : 1);
+      if (Math.abs(this.rolled) < 40) return;  // a trackpad sends many small steps
+      this.move({[across]: this.at[across] - Math.sign(this.rolled)});
+      this.rolled = 0;
     }, {passive: false});
     canvas.addEventListener("keydown", event => {
-      const [axis, step] = {ArrowLeft: [x, 1], ArrowRight: [x, -1], ArrowUp: [y, 1], ArrowDown: [y, -1],
-                            PageUp: [across, 1], PageDown: [across, -1], Home: [across, -this.volume.shape[across]],
-                            End: [across, this.volume.shape[across]]}[event.key] ?? [];
+      const size = this.volume.shape[across];
+      const step = {ArrowUp: 1, ArrowRight: 1, PageUp: 1, ArrowDown: -1, ArrowLeft: -1, PageDown: -1,
+                    Home: -size, End: size}[event.key];
       if (step) {
         event.preventDefault();
-        this.move({[axis]: this.at[axis] + step});
+        this.move({[across]: this.at[across] + step});
       }
     });
     element("figure", {}, canvas, element("figcaption"));
     return canvas;
   }
 
-  turning(row) {
+  turning() {
     const canvas = element("canvas", {role: "img", "aria-label": "Projection of the volume, turned by the slider"});
-    const turn = element("input", {
-      type: "range", min: -180, max: 180, value: 0, "aria-label": "Angle of the projection",
-      oninput: () => { this.angle = +turn.value; this.drawTurning(); }});
-    const kind = element("button", {type: "button", "aria-pressed": "false", onclick: () => {
-      this.mean = !this.mean;
-      kind.setAttribute("aria-pressed", this.mean);
-      this.drawTurning();
-    }}, "mean");
     canvas.addEventListener("pointermove", event => {
       if (!event.buttons) return;
-      turn.value = this.angle = (this.angle + event.movementX + 540) % 360 - 180;
+      this.turn.value = this.angle = (this.angle + event.movementX + 540) % 360 - 180;
       this.drawTurning();
     });
-    element("figure", {}, canvas, element("figcaption", {}, ...row ? [] : ["turn ", turn, " ", kind]));
+    element("figure", {}, canvas, element("figcaption"));
     return canvas;
   }
 
-  /* Shows a case's volumes. */
-  show(volumes) {
+  /* Shows volumes of a patient, at the place in mm where the last ones of the same patient were left. */
+  show(volumes, patient) {
     const {reconstruction, truth, ...further} = volumes;
-    [this.volume, this.uncertainty] = [reconstruction, Object.values(further)[0] ?? null];
-    this.at = this.volume.shape.map(size => Math.floor(size / 2));
+    const mm = patient === this.patient && world(this.volume.affine, this.at);
+    [this.volume, this.uncertainty, this.patient] = [reconstruction, Object.values(further)[0] ?? null, patient];
+    this.at = mm ? world(this.volume.inverse, mm).map((index, axis) => this.within(Math.round(index), axis))
+      : this.volume.shape.map(size => Math.floor(size / 2));
     this.indices = this.volume.indices(this.volume);
     this.other = null;
     byId("overlay-label").hidden = !this.uncertainty;
@@ -120,8 +143,14 @@ class Viewer {
   compare(other) {
     const indices = other?.indices(this.volume) ?? null;
     this.other = indices && {volume: other, indices};
+    byId("way").disabled = !indices;
     this.draw();
     return !other || Boolean(indices);
+  }
+
+  /* What the second row's difference is called; nothing where none is shown. */
+  difference() {
+    return this.other && byId("way").value === "difference" ? `difference from ${this.other.volume.name}` : "";
   }
 
   setWindow(level, width) {
@@ -133,9 +162,12 @@ class Viewer {
     if (this.volume) this.drawPlanes();
   }
 
+  within(index, axis) {
+    return Math.min(Math.max(index, 0), this.volume.shape[axis] - 1);
+  }
+
   move(changes) {
-    for (const [axis, index] of Object.entries(changes))
-      this.at[axis] = Math.min(Math.max(index, 0), this.volume.shape[axis] - 1);
+    for (const [axis, index] of Object.entries(changes)) this.at[axis] = this.within(index, axis);
     this.drawPlanes();
   }
 
@@ -145,14 +177,17 @@ class Viewer {
   }
 
   drawPlanes() {
-    const {volume, at, other} = this, difference = byId("way").value === "difference";
+    const {volume, at, other} = this, difference = this.difference();
+    const overlay = byId("overlay").checked ? this.uncertainty : null;
+    byId("difference-scale").hidden = !difference;
+    byId("overlay-scale").hidden = !overlay;
     const low = this.window[0] - this.window[1] / 2, high = low + this.window[1];
     const grey = hu => hu === EMPTY ? [255, 0, 255] : Array(3).fill(255 * share(hu, low, high));
     for (const [name, plane] of Object.entries(PLANES)) {
       const {across, x, y, edges} = plane, [wide, tall] = [volume.shape[x], volume.shape[y]];
       const ratio = tall * volume.spacing[y] / (wide * volume.spacing[x]);
       const hu = volume.plane(plane, at[across], this.indices);
-      const spread = byId("overlay").checked && this.uncertainty?.plane(plane, at[across], this.indices);
+      const spread = overlay?.plane(plane, at[across], this.indices);
       const beside = other?.volume.plane(plane, at[across], other.indices);
       const colours = [spread ? (value, n) => {
         const part = 0.8 * share(spread[n], 0, SPREAD), [base] = grey(value);
@@ -170,8 +205,8 @@ class Viewer {
         canvas.setAttribute("aria-valuenow", at[across] + 1);
         canvas.setAttribute("aria-valuemax", volume.shape[across]);
         canvas.setAttribute("aria-valuetext", `${place}, ${mm} mm`);
-        const what = !row ? volume.name : (difference ? `less ` : "") + other.volume.name;
-        figure.lastChild.textContent = `${what}, ${name}, ${place}`;
+        const what = !row ? volume.name : difference || other.volume.name;
+        figure.lastChild.textContent = `${name}, ${what}, ${place}`;
       }
     }
     this.readOut();
@@ -179,33 +214,42 @@ class Viewer {
 
   drawCrosshair(context, x, y, edges) {
     const {width, height} = context.canvas;
-    context.fillStyle = "rgba(90, 200, 255, 0.75)";
-    context.fillRect(Math.floor(x * width), 0, 1, height);
-    context.fillRect(0, Math.floor(y * height), width, 1);
+    rule(context, Math.floor(x * width), 0, 1, height);
+    rule(context, 0, Math.floor(y * height), width, 1);
     context.fillStyle = "gold";
+    context.lineWidth = 3;
     context.font = "13px sans-serif";
     context.textAlign = "center";
     const places = [[8, height / 2], [width - 8, height / 2], [width / 2, 14], [width / 2, height - 5]];
-    for (const [n, place] of places.entries()) context.fillText(edges[n], ...place);
+    for (const [n, place] of places.entries()) {
+      context.strokeText(edges[n], ...place);
+      context.fillText(edges[n], ...place);
+    }
   }
 
   readOut() {
     const {volume, at, other} = this, readings = [[volume.name, volume.at(at)]];
     if (other) readings.push([other.volume.name, other.volume.at(at.map((index, axis) => other.indices[axis][index]))]);
+    if (this.difference()) {
+      const [one, two] = readings.map(([, hu]) => hu);
+      readings.push([this.difference(), one === EMPTY || two === EMPTY ? EMPTY : one - two]);
+    }
     if (this.uncertainty) readings.push([this.uncertainty.name, this.uncertainty.at(at)]);
     byId("readout").textContent = `(${world(volume.affine, at).map(mm => mm.toFixed(1)).join(", ")}) mm RAS+: ` +
       readings.map(([name, hu]) => `${name} ${hu === EMPTY ? "no value" : hu + " HU"}`).join(", ");
   }
 
   drawTurning() {
-    const volumes = [this.volume, this.other && byId("way").value === "beside" ? this.other.volume : null];
-    for (const [row, volume] of volumes.entries()) {
-      const canvas = this.rows[row].turning;
-      canvas.parentNode.hidden = !volume;
-      if (!volume) continue;
-      const {values, wide, high, ratio} = volume.projection(this.angle, this.mean);
-      const low = this.mean ? -1024 : -200, top = values.reduce((a, b) => Math.max(a, b), low + 1);
-      paint(canvas, values, wide, high, ratio, hu => Array(3).fill(255 * share(hu, low, top)));
+    const volumes = [this.volume, ...this.other && !this.difference() ? [this.other.volume] : []];
+    const seen = volumes.map(volume => volume.projection(this.angle, this.mean)), low = this.mean ? -1024 : -200;
+    const top = seen.reduce((most, {values}) => values.reduce((a, b) => Math.max(a, b), most), low + 1);
+    for (const [row, {turning}] of this.rows.entries()) {
+      turning.parentNode.hidden = !seen[row];
+      if (!seen[row]) continue;
+      const {values, wide, high, ratio} = seen[row];
+      paint(turning, values, wide, high, ratio, hu => Array(3).fill(255 * share(hu, low, top)));
+      const kind = this.mean ? "mean" : "maximum";
+      turning.nextSibling.textContent = `${volumes[row].name}, ${kind} along rays, ${this.angle}°`;
     }
   }
 }

@@ -1,6 +1,6 @@
 "use strict";
 
-/* The measured X-rays, wiped over by the re-projected ones, their difference and the misfit of each view. */
+/* The measured X-rays left of an edge, the re-projected ones right of it, their difference, the misfit of each view. */
 class XrayViewer {
   constructor() {
     byId("wipe").addEventListener("input", () => this.draw());
@@ -10,26 +10,37 @@ class XrayViewer {
   show(xrays, misfits) {
     [this.xrays, this.misfits, this.view] = [xrays, misfits, 0];
     for (const id of ["xray", "residual"]) byId(id).parentNode.hidden = !xrays;
-    byId("xrays").hidden = !xrays && !misfits.length;
+    byId("xrays-part").hidden = !xrays && !misfits.length;
+    byId("bars-name").textContent = misfits.length ? "misfit of each view; choose a view" : "choose a view";
+    byId("bars").className = misfits.length ? "" : "plain";
     const most = Math.max(...misfits.map(value => value ?? 0), 1e-9);
-    byId("bars").replaceChildren(...misfits.map((value, view) => element("button", {
-      type: "button", "aria-label": `view ${view}: misfit ${value?.toPrecision(3) ?? "unknown"}`,
+    const views = Array.from({length: xrays?.shape[0] ?? misfits.length}, (_, view) => view);
+    byId("bars").replaceChildren(...views.map(view => element("button", {
+      type: "button", "aria-label": `view ${view}${this.misfit(view, ": ")}`,
       onclick: () => { this.view = view; this.draw(); }},
-      element("span", {style: `height: ${100 * (value ?? 0) / most}%`}))));
+      misfits.length ? element("span", {style: `height: ${100 * (misfits[view] ?? 0) / most}%`}) : view)));
     this.draw();
   }
 
+  /* A view's misfit in words, after `sign`; nothing where it is not known. */
+  misfit(view, sign) {
+    const value = this.misfits[view] ?? null;
+    return value === null ? "" : `${sign}misfit ${value.toPrecision(3)}`;
+  }
+
   draw() {
-    for (const [n, bar] of [...byId("bars").children].entries()) bar.setAttribute("aria-pressed", n === this.view);
-    byId("view-name").textContent = `view ${this.view} of ${this.misfits.length}, misfit ` +
-      `${this.misfits[this.view]?.toPrecision(3) ?? "unknown"}`;
+    const bars = [...byId("bars").children];
+    for (const [n, bar] of bars.entries()) bar.setAttribute("aria-pressed", n === this.view);
+    byId("view-name").textContent = `view ${this.view} (of 0 to ${bars.length - 1})${this.misfit(this.view, ", ")}`;
     if (!this.xrays) return;
     const {shape: [, tall, wide], low, step, measured, rendered} = this.xrays, size = wide * tall;
     const [y, p] = [measured, rendered].map(all => all.subarray(this.view * size, (this.view + 1) * size));
-    const edge = wide * byId("wipe").value / 100, residual = Float32Array.from(p, (code, n) => step * (code - y[n]));
+    const edge = Math.round(wide * byId("wipe").value / 100);
+    const residual = Float32Array.from(p, (code, n) => step * (code - y[n]));
     const top = 65535 * step || 1, most = residual.reduce((a, b) => Math.max(a, Math.abs(b)), step);
-    paint(byId("xray"), y, wide, tall, tall / wide,
-          (code, n) => Array(3).fill(255 * step * (n % wide < edge ? code : p[n]) / top));
+    const context = paint(byId("xray"), y, wide, tall, tall / wide,
+                          (code, n) => Array(3).fill(255 * step * (n % wide < edge ? code : p[n]) / top));
+    rule(context, Math.round(edge / wide * WIDE), 0, 1, context.canvas.height);
     paint(byId("residual"), residual, wide, tall, tall / wide, value => signed(value / most));
     byId("residual-scale").textContent = `residual, ±${most.toPrecision(2)} in line integrals from ` +
       `${low.toPrecision(2)} to ${(low + top).toPrecision(2)}; red: re-projected too high`;

@@ -1,5 +1,6 @@
 """The page of results in a real browser, from disk; skipped where no Chromium or no playwright is found."""
 
+import json
 import re
 import shutil
 from itertools import product
@@ -10,17 +11,19 @@ import numpy as np
 import pytest
 import yaml
 
-from page.made import finish
+from page.made import TURNED, finish
 from phydict.cli.infer import main
-from phydict.evaluation import read_csv
+from phydict.evaluation import read_csv, write_csv
 from phydict.grid import Grid
 from phydict.inference.page import results_page
+from phydict.page import Contents, write_case_files, write_page
 
 BROWSER = next(filter(None, map(shutil.which, (
     "chromium-headless-shell", "chromium", "chromium-browser", "google-chrome"))), None)
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 pytestmark = pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
 
+TURNING = "canvas[aria-label^='Projection']"
 HOSTILE = "<script>alert('1')<∕script>\"é😀 #?%41&amp;"
 
 
@@ -50,8 +53,8 @@ def shown(browser, results):
     """Opens the page, of a case where a hash names it; at the end nothing was said on its console."""
     said, pages = [], []
 
-    def show(place: str = "", folder=results, scheme: str = "light"):
-        page = browser.new_page(color_scheme=scheme)
+    def show(place: str = "", folder=results, **context):
+        page = browser.new_page(**context)
         pages.append(page)
         page.set_default_timeout(60_000)
         page.on("console", lambda message: message.type == "error" and said.append(message.text))
@@ -74,6 +77,13 @@ def readout(page) -> tuple[np.ndarray, dict[str, int]]:
     """The crosshair's place in mm and the HU there of each volume."""
     place, values = page.inner_text("#readout").split(" mm RAS+: ")
     return np.array(eval(place)), {name: int(hu) for name, hu in re.findall(r"([a-z][a-z ]*?) (-?\d+) HU", values)}
+
+
+def pixels(page, selector: str) -> np.ndarray:
+    """A canvas's picture (height, width, RGBA)."""
+    width, *values = page.eval_on_selector(selector, """canvas => [
+        canvas.width, ...canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data]""")
+    return np.array(values).reshape(-1, width, 4)
 
 
 def look(page, selector: str) -> str:
@@ -110,6 +120,19 @@ def test_kept_volumes_of_a_comparison_are_seen_beside_those_of_other_settings(sh
     assert page.locator("[data-plane=axial][data-row='1']").is_visible()
 
 
+def test_of_a_case_without_a_volume_what_is_known_is_shown_and_how_volumes_are_kept(shown, tmp_path):
+    write_csv(tmp_path / "results.csv", [{
+        "case": "anna", "method": "sirt", "views": 2, "seed": 0, "simulator": "ideal", "status": "ok", "psnr": 20.0,
+        "mae_hu": 50.0, "misfit": 0.1, "seconds": 1.23456, "network_calls": 0, "key": "k"}])
+    main(["page", str(tmp_path)])
+    page = shown(folder=tmp_path)
+    page.wait_for_function("document.getElementById('state').textContent.includes('ablate --keep_volumes keeps them')")
+    page.click("summary")
+    said = page.inner_text("body")
+    assert not re.search("undefined|null|None|Files|Report|picture", said) and "1.235 s" in said
+    assert [page.is_visible(name) for name in ("#viewer", "#settings", "td img")] == [False] * 3
+
+
 def test_a_click_points_to_what_the_radiological_display_shows_there(shown):
     page = shown("#sirt%2Fanna")
     box = page.locator("[data-plane=axial][data-row='0']").bounding_box()
@@ -133,9 +156,78 @@ def test_wheel_and_keys_change_the_slice_that_a_screen_reader_is_told(shown):
     assert int(canvas.get_attribute("aria-valuenow")) == before[1]
     assert look(page, "[data-plane=coronal][data-row='0']") == before[0]
     assert re.fullmatch(r"slice \d of 6, -?\d+\.\d mm", canvas.get_attribute("aria-valuetext"))
-    for key, end in (("End", "6"), ("Home", "1")):
+    for key, end in (("End", "6"), ("Home", "1"), ("ArrowUp", "2"), ("ArrowRight", "3"), ("ArrowLeft", "2"),
+                     ("ArrowDown", "1")):
         page.keyboard.press(key)
         assert canvas.get_attribute("aria-valuenow") == end
+
+
+def test_the_small_steps_of_a_trackpad_add_up_to_slices(shown):
+    page = shown("#sirt%2Fanna")
+    canvas = page.locator("[data-plane=coronal][data-row='0']")
+    slices = []
+    for delta in [10] * 8 + [-10] * 4:
+        canvas.dispatch_event("wheel", {"deltaY": delta})
+        slices.append(int(canvas.get_attribute("aria-valuenow")))
+    assert slices == [4, 4, 4, 3, 3, 3, 3, 2, 2, 2, 2, 3]
+
+
+def test_a_finger_scrolls_over_pictures_upwards_and_its_tap_or_drag_across_sets_the_crosshair(shown):
+    page = shown("#sirt%2Fanna", viewport={"width": 400, "height": 600}, has_touch=True, is_mobile=True)
+    touch, before = page.context.new_cdp_session(page), readout(page)[0]
+
+    def swipe(x: float, y: float, across: int, up: int):
+        for n, kind in enumerate(["Start", *["Move"] * 10]):
+            touch.send("Input.dispatchTouchEvent", {
+                "type": f"touch{kind}", "touchPoints": [{"x": x + n * across, "y": y - n * up}]})
+        touch.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+
+    for name in ("[data-plane=axial][data-row='0']", TURNING, "#xray", "#residual"):
+        page.eval_on_selector(name, "canvas => canvas.scrollIntoView({block: 'center'})")
+        box, top = page.locator(name).first.bounding_box(), page.evaluate("scrollY")
+        swipe(box["x"] + 20, box["y"] + 20, 0, 15)
+        page.wait_for_function("top => scrollY > top + 50", arg=top)
+        assert (readout(page)[0] == before).all()
+    plane = page.locator("[data-plane=axial][data-row='0']")
+    plane.tap(position={"x": 5, "y": 5})
+    assert (tapped := readout(page)[0])[0] > before[0]
+    box = plane.bounding_box()
+    swipe(box["x"] + 20, box["y"] + 20, 12, 0)
+    assert readout(page)[0][0] < tapped[0]  # dragged to the patient's left
+
+
+def test_another_method_of_the_same_case_opens_at_the_same_place(shown):
+    page = shown("#sirt%2Fanna")
+    page.click("[data-plane=axial][data-row='0']", position={"x": 20, "y": 30})
+    page.keyboard.press("PageUp")
+    before = readout(page)[0]
+    for method, wrong in (("tv", 0), ("fine", 1.3), ("sirt", 2.5)):  # half a voxel of each, and of the one before
+        page.click(f"[data-key='{method}/anna'] button.name")
+        page.wait_for_function("name => document.getElementById('case-name').textContent.endsWith(name) && "
+                               "document.getElementById('state').textContent === ''", arg=method)
+        assert np.abs(readout(page)[0] - before).max() <= wrong
+
+
+def test_from_an_open_case_links_lead_to_its_neighbours_and_to_all_cases(shown):
+    page = shown("#sirt%2Fanna")
+    names = [row.get_attribute("data-key") for row in page.locator("tr[data-key]").all()]
+    at = names.index("sirt/anna")
+    for name, place in (("next", at + 1), ("previous", at)):
+        page.focus(f"#{name}")
+        page.keyboard.press("Enter")
+        page.wait_for_selector(f"tr[data-key={json.dumps(names[place])}][aria-current=true]")
+    page.fill("[type=search]", "sirt/anna")
+    page.click("[data-key='sirt/anna'] button.name")
+    page.wait_for_selector("#next", state="hidden")
+    page.click("text=all cases")
+    page.wait_for_selector("#case", state="hidden")
+    assert page.locator("#cases caption").is_visible()
+
+
+def test_an_address_that_is_none_opens_no_case(shown):
+    page = shown()
+    page.goto(page.url + "#%E0%A4%A")
+    assert page.locator("tr[data-key]").count() == 4 and not page.is_visible("#case")
 
 
 def test_the_open_case_can_be_gone_back_to(shown):
@@ -161,6 +253,52 @@ def test_windows_overlay_and_difference_change_what_is_shown(shown):
     assert look(page, "[data-plane=axial][data-row='1']") != beside
 
 
+def test_the_difference_is_read_out_and_none_is_offered_beside_nothing(shown):
+    page = shown("#sirt%2Fanna")
+    scales = ["#difference-scale", "#overlay-scale"]
+    assert [page.is_visible(scale) for scale in scales] == [False, False]
+    page.select_option("#way", "difference")
+    page.check("#overlay")
+    assert [page.is_visible(scale) for scale in scales] == [True, True]
+    hu = readout(page)[1]
+    assert hu["difference from truth"] == hu["reconstruction"] - hu["truth"]
+    caption = page.locator("figure:has([data-plane=axial][data-row='1']) figcaption").inner_text()
+    assert caption == "axial, difference from truth, slice 4 of 7"
+    page.select_option("#other", label="nothing")
+    page.wait_for_selector("#way[disabled]")
+    assert "difference from truth" not in readout(page)[1] and not page.is_visible("#difference-scale")
+
+
+def test_letters_and_crosshair_have_a_dark_rim_on_white(shown, tmp_path):
+    folder = finish(tmp_path, "anna", "sirt")
+    same = np.zeros(TURNED.shape)
+    write_case_files(folder, TURNED, {"reconstruction": same, "truth": same})
+    results_page(tmp_path)
+    page = shown("#sirt%2Fanna", folder=tmp_path)
+    page.select_option("#way", "difference")
+    shades = pixels(page, "[data-plane=axial][data-row='1']")
+    middle = len(shades) // 2
+    for part in (shades[:20, 170:190], shades[-20:, 170:190], *np.split(shades[middle - 10:middle + 10], [20, 340], 1)):
+        assert part.max() == 255 and part[..., :3].max(-1).min() < 140
+
+
+def test_projections_side_by_side_share_one_window(shown, tmp_path):
+    folder = finish(tmp_path, "anna", "sirt")
+    same = np.full(TURNED.shape, 100.0)
+    brighter = same.copy()
+    brighter[3, 4, 3] = 3000
+    write_case_files(folder, TURNED, {"reconstruction": same, "truth": brighter})
+    results_page(tmp_path)
+    page = shown("#sirt%2Fanna", folder=tmp_path)
+    for kind in ("maximum", "mean"):
+        page.fill("[aria-label='Angle of the projection']", "30")
+        one, other = (pixels(page, f":nth-match({TURNING}, {n})")[..., 0] for n in (1, 2))
+        assert (one == other).mean() > 0.9 and other.max() == 255 > one.max() > 0
+        assert page.locator(f"figure:has({TURNING}) figcaption").all_inner_texts() == [
+            f"{name}, {kind} along rays, 30°" for name in ("reconstruction", "truth")]
+        page.click("button:text-is('mean')")
+
+
 def test_a_window_can_be_typed_anew(shown):
     page = shown("#sirt%2Fanna")
     page.click("#width")
@@ -177,7 +315,7 @@ def test_without_xrays_the_misfit_of_each_view_is_shown_alone(shown, tmp_path):
     page = shown("#sirt%2Fanna", folder=tmp_path)
     assert [page.is_visible(name) for name in ("#xray", "#residual", "#bars")] == [False, False, True]
     page.locator("#bars button").nth(1).click()
-    assert page.inner_text("#view-name") == "view 1 of 3, misfit 0.200"
+    assert page.inner_text("#view-name") == "view 1 (of 0 to 2), misfit 0.200"
 
 
 def test_another_methods_missing_volume_is_said_in_a_sentence(shown, tmp_path):
@@ -208,13 +346,35 @@ def test_xrays_follow_the_bars_and_the_slider(shown):
         "view 0: misfit 0.100", "view 1: misfit 0.200", "view 2: misfit 0.0500"]
     first = look(page, "#xray")
     page.locator("#bars button").nth(1).click()
-    assert page.inner_text("#view-name") == "view 1 of 3, misfit 0.200" and look(page, "#xray") != first
+    assert page.inner_text("#view-name") == "view 1 (of 0 to 2), misfit 0.200" and look(page, "#xray") != first
     second = look(page, "#xray")
     page.fill("#wipe", "100")
     assert look(page, "#xray") != second
     ends = [page.eval_on_selector("#residual", "(c, x) => [...c.getContext('2d').getImageData(x, 9, 1, 1).data]", x)
             for x in (0, 359)]
     assert ends == [[0, 0, 255, 255], [255, 0, 0, 255]]  # from -1 to 1 across
+
+
+def test_the_label_at_each_side_of_the_edge_says_what_is_shown_there(shown):
+    page = shown("#sirt%2Fanna")
+    measured = np.random.default_rng(0).uniform(0, 5, (3, 8, 10))  # as `finish` makes them
+    rendered = measured + np.linspace(-1, 1, 10)
+    low, high = min(measured.min(), rendered.min()), max(measured.max(), rendered.max())
+    shades = pixels(page, "#xray")[18::36, 18::36, 0]
+    sides = dict(zip(page.inner_text("label:has(#wipe)").split(), (np.s_[:, :5], np.s_[:, 5:])))
+    for name, values in (("measured", measured[0]), ("re-projected", rendered[0])):
+        wanted = 255 * (values - low) / (high - low)
+        assert np.abs(shades[sides[name]] - wanted[sides[name]]).max() < 1
+    assert (pixels(page, "#xray")[:, 180, :3] == [90, 200, 255]).all()
+
+
+def test_views_whose_misfit_was_not_kept_can_be_chosen(shown, tmp_path):
+    finish(tmp_path, "anna", "sirt", misfit_per_view=[])
+    results_page(tmp_path)
+    page = shown("#sirt%2Fanna", folder=tmp_path)
+    first = look(page, "#xray")
+    page.click("#bars button:text-is('2')")
+    assert look(page, "#xray") != first and page.inner_text("#view-name") == "view 2 (of 0 to 2)"
 
 
 def test_a_click_on_a_column_sorts_by_number_and_puts_what_is_missing_last(shown):
@@ -251,13 +411,10 @@ def test_a_missing_volume_is_said_in_a_sentence(shown, tmp_path):
 
 def test_a_projection_from_behind_is_the_mirrored_one_from_the_front_and_those_between_are_others(shown):
     page = shown("#sirt%2Fanna")
-    turning = "canvas[aria-label^='Projection']"
 
     def at(angle: int) -> np.ndarray:
         page.fill("[aria-label='Angle of the projection']", str(angle))
-        grey = page.eval_on_selector(turning, """canvas => [canvas.width, ...canvas.getContext('2d').getImageData(
-            0, 0, canvas.width, canvas.height).data.filter((_, place) => place % 4 === 0)]""")
-        return np.array(grey[1:]).reshape(-1, grey[0])
+        return pixels(page, TURNING)[..., 0]
 
     for pressed in ("false", "true"):
         front, side, back = at(0), at(90), at(180)
@@ -267,7 +424,7 @@ def test_a_projection_from_behind_is_the_mirrored_one_from_the_front_and_those_b
 
 
 def test_light_and_dark_follow_the_system(shown):
-    backs = [shown(scheme=scheme).eval_on_selector("body", "body => getComputedStyle(body).backgroundColor")
+    backs = [shown(color_scheme=scheme).eval_on_selector("body", "body => getComputedStyle(body).backgroundColor")
              for scheme in ("light", "dark")]
     assert backs == ["rgb(255, 255, 255)", "rgb(20, 23, 27)"]
 
@@ -283,3 +440,44 @@ def test_two_hundred_cases_are_one_small_page(shown, tmp_path):
     assert page.locator("tr[data-key]").count() == 200
     page.fill("[type=search]", "/17")
     assert page.locator("tr[data-key]:visible").count() == 11  # 17 and 170 to 179
+    page.fill("[type=search]", "nobody")
+    assert page.locator("tr[data-key]:visible").count() == 0 and page.is_visible("text=none found")
+
+
+def test_tables_are_told_to_a_screen_reader_and_scroll_with_their_names_in_sight(shown, tmp_path):
+    finish(tmp_path, "phantom-1000000", "sirt", scores={"psnr": 20.0, "ssim_lung": 0.5})
+    finish(tmp_path, "phantom-1000000", "tv", scores={"psnr": 21.0, "ssim_lung": 0.5})
+    results_page(tmp_path)
+    page = shown(folder=tmp_path, viewport={"width": 400, "height": 800})
+    assert page.get_by_role("rowheader").all_inner_texts() == ["sirt", "tv", *["phantom-1000000"] * 2]
+    assert page.locator("#cases thead th").all_inner_texts() == [
+        "case", "picture", "method", "views", "PSNR (dB)\xa0↑", "misfit\xa0↓", "time (s)\xa0↓", "warnings",
+        "SSIM lung\xa0↑"]
+    table, name = page.get_by_role("region", name="Cases").last, page.locator("#cases tbody th").first
+    table.focus()
+    page.keyboard.press("ArrowRight")
+    page.wait_for_function("document.querySelector('#cases .scroll').scrollLeft > 0")
+    assert name.bounding_box()["x"] == table.bounding_box()["x"] and name.bounding_box()["height"] < 60
+
+
+def test_the_plot_names_its_dots_and_axes_and_no_number_twice(shown, tmp_path):
+    points = [{"name": f"case {n}", "series": f"method {n}", "seconds": 14.0, "error": 180.0} for n in range(20)]
+    write_page(tmp_path, Contents("many", points=points))
+    page = shown(folder=tmp_path)
+    texts = page.locator("svg text").all_text_contents()
+    assert [text for text in texts if "method" not in text] == [
+        "MAE (HU)", "seconds, logarithmic", "14", "180", "and 3 more"]
+    assert page.get_by_role("img", name="case 7: 14 s, 180").count() == 1
+
+
+def test_facts_are_rounded_what_is_not_known_is_left_out_and_files_say_what_they_are(shown, tmp_path):
+    finish(tmp_path, "anna", "sirt", misfit=0.002272926038131118, diverged_at=None,
+           seconds={"sample": 10.141537, "score": 2.0}, settings={"detector": [448, 448], "names": ["a", "b"]})
+    results_page(tmp_path)
+    page = shown("#sirt%2Fanna", folder=tmp_path)
+    page.click("summary")
+    facts = page.inner_text("#facts").split("\n")
+    assert {"0.002273", "sample 10.14 s, score 2 s", "6 x 9 x 7", "0.1, 0.2, 0.05"} < set(facts)
+    assert "diverged at" not in facts and '"detector": [448, 448]' in page.inner_text("#settings")
+    files = page.locator("#files li").all_inner_texts()
+    assert "volume.nii.gz: the reconstruction in HU" in files and not re.search("thumbnail|view.js", str(files))

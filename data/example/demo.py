@@ -15,6 +15,7 @@ from phydict.datasets import body_mask, load_xrays
 from phydict.evaluation import mean_table, method_panel, panel, volume_metrics, write_csv
 from phydict.inference.case_files import write_page_files
 from phydict.page import Contents, PageCase, write_page
+from phydict.page.case_files import THUMBNAIL
 
 METHODS = ("phydict_learned", "phydict_fast", "sirt")
 
@@ -37,7 +38,7 @@ if __name__ == "__main__":
             result.save_nifti(out / f"{method}.nii.gz")
             (out / method).mkdir(exist_ok=True)
             write_page_files(out / method, result, truth)
-            shown.append(PageCase(method, (), rows[-1] | {
+            shown.append(PageCase(method, [THUMBNAIL], rows[-1] | {
                 "scores": scores, "seconds": result.seconds, "misfit_per_view": result.misfit_per_view,
                 "warnings": result.warnings, "report": case["report"]}))
             panel(out / f"{method}.png", result.volume, result.grid, result.xrays, result.reprojection, truth,
@@ -47,5 +48,6 @@ if __name__ == "__main__":
     write_csv(out / "results.csv", rows)
     table = mean_table(rows)
     Console().print(table)
-    page = write_page(out, Contents("The embedded example", [table], shown, plots=["comparison.png"]))
+    page = write_page(out, Contents("The embedded example", [table], shown, plots=["comparison.png"],
+                                    links=[*(f"{method}.nii.gz" for method in METHODS), "results.csv"]))
     print(f"page, for a browser: {page}\npicture: {out / 'comparison.png'}\nvolumes, X-ray fits and results.csv: {out}")

@@ -8,7 +8,8 @@ const KINDS = new Map(Object.entries({
   "volume.nii.gz": "the reconstruction in HU", "coarse.nii.gz": "the reconstruction on coarser voxels, in HU",
   "interval_90.nii.gz": "half of each voxel's 90% interval, in HU",
   "deviation.nii.gz": "standard deviation of each voxel, in HU", "panel.png": "planes and X-rays as one picture",
-  "reconstruction.json": "scores, settings and versions", "details.json": "misfits, settings and versions", "geometry_found.yaml": "the geometry that was found",
+  "reconstruction.json": "scores, settings and versions", "details.json": "misfits, settings and versions",
+  "geometry_found.yaml": "the geometry that was found",
   "slice_features.safetensors": "features of slices, for Frechet distances", "results.csv": "a row per case",
   "results.md": "the tables as Markdown", "tables.md": "the tables as Markdown", "tables.tex": "the tables as LaTeX"}));
 

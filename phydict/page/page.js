@@ -190,9 +190,9 @@ async function showCase(key) {
   byId("warnings").replaceChildren(...(record.warnings ?? []).map(text => element("li", {}, text)));
   byId("report").textContent = record.report || "none was given";
   byId("report").parentNode.hidden = !("report" in record);
-  byId("files").replaceChildren(...files.filter(({name}) => !["view.js", "thumbnail.png"].includes(name)).map(
-    file => fileLine(file, folder)));
-  byId("files").parentNode.hidden = !files.length;
+  const linked = files.filter(({name}) => !["view.js", "thumbnail.png"].includes(name));
+  byId("files").replaceChildren(...linked.map(file => fileLine(file, folder)));
+  byId("files").parentNode.hidden = !linked.length;
   const {settings, versions, grid, report, warnings, scores: _, files: __, ...facts} = record;
   byId("facts").replaceChildren(...Object.entries({voxels: grid?.shape?.join(" x "), ...facts})
     .filter(([, value]) => (value ?? null) !== null).flatMap(([name, value]) => [

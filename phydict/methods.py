@@ -37,6 +37,7 @@ from phydict.posterior import (
     SplitGibbs,
     Unrolled,
 )
+from phydict.posterior.discretisation import FINER_STEP
 from phydict.prior import (
     DEFAULT_CORRECTION,
     FINEST_CORRECTION,
@@ -77,7 +78,7 @@ METHODS: dict[str, Sampler | Reconstructor] = {
     # Conjugate gradients onto the X-rays at ten noise levels, the last counting each pixel by its noise.
     "phydict_fast": SplitGibbs(
         iterations=10, t_start=0.97, t_end=0.15, noise_fraction=0.7, momentum=0.5, sampling_noise=1.0, scatter=True,
-        hardening=True, subgrid=ProximalCG(10, 1, tv_weight=1.0, tv_eps=0.003), metal=Metal(),
+        hardening=True, subgrid=FINER_STEP, metal=Metal(),
         likelihood=ProximalCG(iterations=12, restarts=1, tv_weight=10.0, tv_eps=0.003),
         final_likelihood=ProximalCG(iterations=25, restarts=3, noise=0.01, refit_scatter=True,
                                     weighted_least_squares=True, tv_weight=10.0, tv_eps=0.003, precondition_data=True,

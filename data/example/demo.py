@@ -32,15 +32,17 @@ if __name__ == "__main__":
             steps = bar.add_task(method, total=phydict.METHODS[method].steps())
             result = phydict.reconstruct(case["xrays"], case["beam"], method=method, on_step=lambda: bar.advance(steps))
             scores = volume_metrics(result.volume[None, None], truth[None, None], body=body)
-            rows.append({"case": "example", "method": method, "views": len(case["xrays"]), "grid": "64x64x64"} | scores
+            known = {"case": "example", "method": method, "views": len(case["xrays"])}
+            rows.append(known | {"grid": "64x64x64"} | scores
                         | {"misfit": result.misfit, "seconds": sum(result.seconds.values())})
             volumes[method] = result.volume
             result.save_nifti(out / f"{method}.nii.gz")
             (out / method).mkdir(exist_ok=True)
             write_page_files(out / method, result, truth)
-            shown.append(PageCase(method, [THUMBNAIL], rows[-1] | {
-                "scores": scores, "seconds": result.seconds, "misfit_per_view": result.misfit_per_view,
-                "warnings": result.warnings, "report": case["report"]}))
+            shown.append(PageCase(method, [THUMBNAIL], known | {
+                "scores": scores, "misfit": result.misfit, "misfit_per_view": result.misfit_per_view,
+                "seconds": result.seconds, "grid": grid.to_dict(), "warnings": result.warnings,
+                "report": case["report"]}))
             panel(out / f"{method}.png", result.volume, result.grid, result.xrays, result.reprojection, truth,
                   title=f"{method}, {len(case['xrays'])} X-rays")
     captions = {row["method"]: f"{row['psnr']:.1f} dB, SSIM {row['ssim']:.2f}" for row in rows}

@@ -12,7 +12,7 @@ from importlib.resources import files
 from pathlib import Path
 from urllib.parse import quote
 
-from phydict.evaluation.metrics import MEASURES
+from phydict.evaluation.metrics import MEASURES, Measure
 from phydict.evaluation.tables import Table, ranks
 from phydict.runtime.files import atomic_write
 from phydict.runtime.strict_json import strict_json
@@ -87,7 +87,7 @@ def _content(contents: Contents) -> dict:
     _mark_best([case.group or case.record["case"] for case in contents.cases], cases)
     scored = {name for case in cases for name in case["scores"]}
     measures = [{"name": name, "label": measure.label, "heading": measure.heading, "decimals": measure.decimals}
-                for name, measure in sorted(MEASURES.items(), key=lambda item: item[1].label not in FIRST)
+                for name, measure in sorted(MEASURES.items(), key=lambda item: _stands_behind(item[1]))
                 if name in scored]
     error = MEASURES[contents.error].label
     return {"title": contents.title, "version": VERSION, "tables": [_table(t) for t in contents.tables],
@@ -119,9 +119,13 @@ def _mark_best(names: Sequence[str], cases: Sequence[dict]) -> None:
                 case.setdefault("places", {})[name] = place
 
 
+def _stands_behind(measure: Measure) -> bool:
+    """Whether a measure's column stands behind those of the first."""
+    return measure.label not in FIRST
+
+
 def _table(table: Table) -> dict:
-    others = [c for c, measure in enumerate(table.measures, 1) if measure.label not in FIRST]
-    order = [c for c in range(len(table.header)) if c not in others] + others
+    order = [0, *sorted(range(1, len(table.header)), key=lambda c: _stands_behind(table.measures[c - 1]))]
     rows = [[{"text": label, "value": None, "place": 0}] + [
         {"text": text, "value": None if value is None else float(value), "place": place}
         for (text, place), value in zip(cells, values)]

@@ -100,7 +100,7 @@ function plot(points, error) {
   const y = value => 250 - 210 * share(value, low, high === low ? low + 1 : high);
   const series = [...new Set(known.map(point => point.series))];
   const colour = name => `hsl(${Math.round(360 * series.indexOf(name) / series.length)} 65% 50%)`;
-  const text = (words, x, y, anchor) => svg("text", {x, y, "text-anchor": anchor}, words);
+  const text = (label, left, top, anchor) => svg("text", {x: left, y: top, "text-anchor": anchor}, label);
   const ticks = values => [...new Set(values.map(value => words(value)))];
   return element("figure", {}, element("figcaption", {}, `Seconds per case against ${error}; lower left is better`),
     svg("svg", {viewBox: "0 0 620 310", role: "group", "aria-label": `Seconds per case against ${error}`},

@@ -5,11 +5,15 @@ from __future__ import annotations
 from torch import Tensor
 from torch.nn.functional import avg_pool3d, interpolate
 
-from phydict.posterior.likelihood.likelihood import LikelihoodStep
+from phydict.posterior.likelihood.likelihood import LikelihoodStep, ProximalCG
 from phydict.posterior.measurement import Measurement
 from phydict.xray.finer import FinerProjector
 
 FACTOR = 2
+
+FINER_STEP = ProximalCG(10, 1, tv_weight=1.0, tv_eps=0.003)
+"""The named methods' step on finer voxels. With half of the iterations and ten times the total variation it has 0.3 to
+1.3 dB less from 8 to 32 ideal views of 256^3 voxels. Of two CTs that evaluate nothing."""
 
 UNLIKE_FINER = 2.5
 """By how many times a view may miss the volume at hand more with what finer voxels add to it: 1.3 to 2.0 times of

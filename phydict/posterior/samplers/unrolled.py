@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from phydict.diffusion.steps import Generators, noise_like
-from phydict.posterior.discretisation import find_subgrid, has_finer, subgrid_projection
+from phydict.posterior.discretisation import FINER_STEP, find_subgrid, has_finer, subgrid_projection
 from phydict.posterior.evidence import Evidence
 from phydict.posterior.hardening import with_hardening
 from phydict.posterior.likelihood.likelihood import LikelihoodStep, ProximalCG
@@ -84,7 +84,7 @@ class Unrolled(Sampler):
     likelihood: LikelihoodStep = ProximalCG(10, 3, refit_scatter=True, tv_weight=5.0, tv_eps=0.003)
     final_likelihood: LikelihoodStep = ProximalCG(10, 4, refit_scatter=True, weighted_least_squares=True,
                                                   tv_weight=2.0, tv_eps=0.003, discrepancy=True)
-    subgrid: LikelihoodStep | None = ProximalCG(10, 1, tv_weight=1.0, tv_eps=0.003)
+    subgrid: LikelihoodStep | None = FINER_STEP
     contradiction: float | None = 0.4
     chests_only: bool = False
     metal: Metal | None = Metal()

@@ -13,15 +13,15 @@ from torch import Tensor
 from phydict.grid import Grid
 from phydict.runtime.warning import warn
 from phydict.units import HUWindow
-from phydict.xray.residuals import misfits, view_norms, view_sizes
+from phydict.xray.residuals import misfits, shared_norms, view_norms, view_sizes
 
 EMPTY_MISFIT, RISE_FACTOR, RISE_MIN = 1.0, 2.0, 0.1
 """A misfit has risen where it is more than RISE_FACTOR times its smallest so far, that of an empty volume included, and
 more than RISE_MIN."""
 
-OUTLIER_RATIO, BAD_FIT = 2.0, 0.1
-"""Where a view's misfit is more than OUTLIER_RATIO times the median of all, that view is doubted; where the misfit is
-more than BAD_FIT, all of them are."""
+OUTLIER_RATIO, BAD_VIEW, BAD_FIT = 2.0, 0.01, 0.1
+"""A view is doubted where its misfit is more than OUTLIER_RATIO times the median of all and, noise left out, more than
+BAD_VIEW; all of them are where the misfit without noise is more than BAD_FIT."""
 
 BONE, CEILING, CEILING_ML = 1000, 0.98, (2.0, 300.0)
 """Where so many ml, from least to most, hold CEILING or more of a range that reaches BONE in HU, something denser is
@@ -101,15 +101,18 @@ class Guard:
         fit = misfits(reprojection, xrays)
         if volumes is not None:
             self.finish(volumes, fit["misfit"])
-        self.check_fit(**fit)
+        self.check_fit(fit["misfit_per_view"], **misfits(reprojection, xrays, shared_norms))
         return fit | {"xrays": xrays, "reprojection": reprojection, "diverged_at": self.diverged_at}
 
-    def check_fit(self, misfit: float, misfit_per_view: Sequence[float]) -> None:
-        """Warns where a method that looked at the X-rays and did not diverge fits one view, or all, badly."""
+    def check_fit(self, with_noise: Sequence[float], misfit: float, misfit_per_view: Sequence[float]) -> None:
+        """Warns where a method that looked at the X-rays and did not diverge fits one view, or all, badly.
+
+        with_noise: misfit of each view; misfit, misfit_per_view: without what is noise.
+        """
         if not self.misfits or self.diverged_at is not None:
             return
-        view, ratio = worst_view(misfit_per_view)
-        if ratio > OUTLIER_RATIO and misfit_per_view[view] > 0.01:
+        view, ratio = worst_view(with_noise)
+        if ratio > OUTLIER_RATIO and misfit_per_view[view] > BAD_VIEW:
             warn(f"view {view} (counted from 0) fits {ratio:.1f} times worse than the median view: check "
                  "whether it is flipped, shifted or another's, and its geometry")
         elif misfit > BAD_FIT:

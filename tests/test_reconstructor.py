@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from phydict.reconstruction import describe
-from phydict.xray.residuals import misfits
+from phydict.xray.residuals import misfits, shared_norms
 
 Y = torch.rand(3, 5, 4, generator=torch.Generator().manual_seed(0)) + 0.1
 
@@ -26,6 +26,14 @@ def test_misfits_of_views_combine_to_the_whole():
     sizes = scaled.flatten(1).norm(dim=1)
     residuals = torch.tensor(said["misfit_per_view"]) * sizes
     assert said["misfit"] == pytest.approx(float(residuals.norm() / sizes.norm()), rel=1e-5)
+
+
+def test_what_neighbours_share_is_all_of_smooth_views_and_nothing_of_noise():
+    smooth = torch.ones(2, 60, 50).cumsum(1) * torch.tensor([1.0, 3.0])[:, None, None]
+    noise = torch.randn(2, 60, 50, generator=torch.Generator().manual_seed(0)) * smooth.mean()
+    assert shared_norms(smooth) == pytest.approx(smooth.flatten(1).norm(dim=1), rel=0.02)
+    assert (shared_norms(noise) < 0.15 * noise.flatten(1).norm(dim=1)).all()
+    assert shared_norms(smooth + noise) == pytest.approx(shared_norms(smooth), rel=0.05)
 
 
 def test_settings_of_any_kind_are_plain_json():

@@ -3,21 +3,32 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
+import torch
 from torch import Tensor
 
 EPS_LINE_INTEGRAL = 1e-3
 """A line integral, 0.05 mm of water, below which misfits are not relative to what is measured, but to this."""
 
 
-def misfits(reprojection: Tensor, xrays: Tensor) -> dict:
-    """Relative residual |P - y| / |y| of line integrals (K, V, U): over all views and per view."""
-    residual, size = view_norms(reprojection - xrays), view_sizes(xrays)
-    return {"misfit": float(residual.norm() / size.norm()), "misfit_per_view": (residual / size).tolist()}
-
-
 def view_norms(views: Tensor) -> Tensor:
     return views.flatten(-2).norm(dim=-1)
+
+
+def shared_norms(views: Tensor) -> Tensor:
+    """Norms (..., K) of what pixels of views (..., K, V, U) share with their neighbours: those of views without noise
+    that changes little from pixel to pixel, and about 0 for white noise."""
+    products = torch.cat([(views[..., 1:, :] * views[..., :-1, :]).flatten(-2),
+                          (views[..., 1:] * views[..., :-1]).flatten(-2)], -1)
+    return (products.mean(-1).clamp(min=0) * (views.shape[-1] * views.shape[-2])).sqrt()
+
+
+def misfits(reprojection: Tensor, xrays: Tensor, norms: Callable[[Tensor], Tensor] = view_norms) -> dict:
+    """Relative residual |P - y| / |y| of line integrals (K, V, U): over all views and per view; by shared_norms,
+    without what is noise."""
+    residual, size = norms(reprojection - xrays), view_sizes(xrays)
+    return {"misfit": float(residual.norm() / size.norm()), "misfit_per_view": (residual / size).tolist()}
 
 
 def view_sizes(xrays: Tensor) -> Tensor:

@@ -5,8 +5,9 @@
 
 Beside the volume on 256^3 voxels that of 128^3, interpolated; what the X-rays and total variation alone make of its
 64^3 on 256^3, without the networks on finer voxels; what the network of 3 mm makes of them alone; and methods without a
-prior on 256^3, total variation at its weight of 64^3 times the ratio of the voxels' lengths, CGLS at ten restarts, the
-other two at their settings of 64^3. Writes finest.csv beside this file after each CT, where rows of other CTs, numbers
+prior on 256^3, total variation at its weight of 64^3 times the ratio of the voxels' lengths, CGLS at five restarts, the
+other two at their settings of 64^3. Scored by LPIPS too (TORCH_HOME: its backbones), and by how sharp edges are. Writes
+finest.csv beside this file after each CT, where rows of other CTs, numbers
 of views and ways stay, and prints means and the least lead of 256^3 over each.
 """
 
@@ -27,6 +28,8 @@ from phydict import ConeBeam, HUWindow, Projector
 from phydict.baselines import CGLS, FISTATV, SIRT, DiffVox
 from phydict.datasets import CTFile, find_cts, prepare_ct
 from phydict.evaluation import body_weights, read_csv, volume_metrics, write_csv
+from phydict.evaluation.perceptual import lpips_scores
+from phydict.evaluation.sharpness import sharpness_scores
 from phydict.grid import Grid
 from phydict.methods import onto_grid, reconstructor
 from phydict.posterior import Refinement
@@ -55,18 +58,19 @@ WAYS: dict[str, Callable[[], Any]] = {
     "64^3, X-rays and total variation": lambda: replace(learned(), networks=(), refinement=Refinement(calls=0)),
     "256^3, network of 3 mm": lambda: replace(learned(), networks=(load_correction(DEFAULT_CORRECTION),)),
     "256^3": learned,
-    "tv": lambda: FISTATV(200, 9.6e-3), "cgls": lambda: CGLS(10, 10, WINDOW), "sirt": SIRT, "diffvox": DiffVox}
+    "tv": lambda: FISTATV(200, 9.6e-3), "cgls": lambda: CGLS(10, 5, WINDOW), "sirt": SIRT, "diffvox": DiffVox}
 
 
 def rows_of(ct, views: int, ways: list[str]) -> list[dict]:
     volume, xrays, beam = scene(ct, views, SIMULATED)
     truth, rows = WINDOW.to_hu(avg_pool3d(volume, SIMULATED.shape[0] // FINEST.shape[0])), []
-    body = body_weights(truth, FINEST.spacing)
+    body, lung = body_weights(truth, FINEST.spacing), prepare_ct(ct.path, FINEST, WINDOW, id=ct.id)["masks"][0]
     for way in ways:
         method = WAYS[way]()
         shown, seconds = timed(method, method.grid or FINEST, FINEST, xrays, beam)
         rows.append({"case": ct.id, "views": views, "way": way, "cpu_seconds": seconds,
-                     "instruction_set": instruction_set(torch.device("cpu"))} | volume_metrics(shown, truth, body=body))
+                     "instruction_set": instruction_set(torch.device("cpu"))} | volume_metrics(shown, truth, body=body)
+                    | sharpness_scores(shown[0, 0], truth[0, 0], lung, FINEST) | lpips_scores(shown[0, 0], truth[0, 0]))
         print(*rows[-1].values(), flush=True)
     return rows
 

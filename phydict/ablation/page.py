@@ -15,7 +15,9 @@ from phydict.evaluation import read_csv
 from phydict.evaluation.metrics import MEASURES
 from phydict.evaluation.tables import Table
 from phydict.page import Contents, PageCase, check_own_page, write_page
+from phydict.runtime.reading import reason
 from phydict.runtime.telling import tell
+from phydict.runtime.warning import warn
 
 
 def is_comparison(folder: Path) -> bool:
@@ -56,8 +58,17 @@ def _case(folder: Path, entry: Entry, row: Mapping) -> PageCase:
     group = format_settings(str(row["case"]), entry.condition)
     kept = volume_folder(folder, str(row.get("key")))
     place, files = (kept.relative_to(folder).as_posix(), sorted(os.listdir(kept))) if kept.is_dir() else ("", ())
-    details = json.loads((kept / DETAILS).read_text()) if DETAILS in files else {}
+    details = _details(kept / DETAILS) if DETAILS in files else {}
     return PageCase(place, files, record | details | {
         "method": format_settings(entry.name, entry.condition, {"seed": row.get("seed", 0)}),
         "scores": scores, "misfit": row.get("misfit"), "seconds": {"all": row["seconds"]} if "seconds" in row else {},
         "warnings": [row["warning"]] if row.get("warning") else []}, group)
+
+
+def _details(file: Path) -> dict:
+    """What is known of a row beyond the table, nothing, with a warning, where its file is damaged."""
+    try:
+        return dict(json.loads(file.read_text()))
+    except (ValueError, TypeError) as error:
+        warn(f"{file} is left out of the page, since it is damaged ({reason(error)})")
+        return {}

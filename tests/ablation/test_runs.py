@@ -254,7 +254,8 @@ def test_a_profile_counts_a_projector_whoever_runs_it():
     assert profile.seconds("projector", "network") == {"projector": profile.uses["sample / projector"].seconds}
 
 
-def test_volumes_are_kept_where_that_is_asked_for_and_the_page_shows_them_in_their_place(tmp_path, trace):
+@pytest.mark.filterwarnings("always:.* is left out of the page")
+def test_volumes_are_kept_where_that_is_asked_for_and_the_page_shows_them_in_their_place(tmp_path, trace, capsys):
     (tmp_path / "cts").mkdir()
     hu, affine = np.full((20, 20, 20), -1000, np.float32), np.diag([-10.0, 10, 10, 1])
     hu[4:16, 6:15], affine[:3, 3] = 40, (300, -90, 40)
@@ -282,6 +283,11 @@ def test_volumes_are_kept_where_that_is_asked_for_and_the_page_shows_them_in_the
     assert all(f'"folder": "volumes/{row["key"]}"' in page for row in rows)
     assert ablate(tmp_path, "--keep_volumes", **content) == rows == ablate(tmp_path, **content)
     assert len(trace.given) == 4
+    for damage in ('{"misfit_per_view": [', "[1, 2]", ""):
+        (out / "volumes" / rows[0]["key"] / "details.json").write_text(damage)
+        main(["page", str(out)])
+        assert f"{rows[0]['key']}/details.json is left out of the page" in capsys.readouterr().err
+        assert all(row["key"] in (out / "index.html").read_text() for row in rows)
 
 
 def test_a_page_made_anew_shows_of_each_case_the_row_of_the_last_run(tmp_path, capsys):

@@ -102,18 +102,20 @@ function plot(points, error) {
   const colour = name => `hsl(${Math.round(360 * series.indexOf(name) / series.length)} 65% 50%)`;
   const text = (label, left, top, anchor) => svg("text", {x: left, y: top, "text-anchor": anchor}, label);
   const ticks = values => [...new Set(values.map(value => words(value)))];
-  return element("figure", {}, element("figcaption", {}, `Seconds per case against ${error}; lower left is better`),
-    svg("svg", {viewBox: "0 0 620 310", role: "group", "aria-label": `Seconds per case against ${error}`},
-      svg("line", {x1: 70, y1: 260, x2: 410, y2: 260}), svg("line", {x1: 70, y1: 30, x2: 70, y2: 260}),
-      text(error, 8, 18, "start"), text("seconds, logarithmic", 240, 296, "middle"),
-      ...ticks([10 ** first, 10 ** last]).map((tick, n) => text(tick, 80 + 320 * n, 278, "middle")),
-      ...ticks([low, high]).map((tick, n) => text(tick, 65, 254 - 210 * n, "end")),
-      ...known.map(point => svg("circle", {
-        cx: x(point.seconds), cy: y(point.error), r: 4, fill: colour(point.series), role: "img"},
-        svg("title", {}, `${point.name}: ${words(point.seconds)} s, ${words(point.error)}`))),
-      ...series.slice(0, 17).map((name, n) => svg("g", {}, text(name, 436, 34 + 15 * n, "start"),
-        svg("circle", {cx: 426, cy: 30 + 15 * n, r: 4, fill: colour(name)}))),
-      ...series.length > 17 ? [text(`and ${series.length - 17} more`, 436, 289, "start")] : []));
+  const label = `Seconds per case against ${error}`;
+  return element("figure", {}, element("figcaption", {}, `${label}; lower left is better`),
+    element("div", {class: "scroll", tabindex: 0, role: "region", "aria-label": label},
+      svg("svg", {viewBox: "0 0 620 310"},
+        svg("line", {x1: 70, y1: 260, x2: 410, y2: 260}), svg("line", {x1: 70, y1: 30, x2: 70, y2: 260}),
+        text(error, 8, 18, "start"), text("seconds, logarithmic", 240, 296, "middle"),
+        ...ticks([10 ** first, 10 ** last]).map((tick, n) => text(tick, 80 + 320 * n, 278, "middle")),
+        ...ticks([low, high]).map((tick, n) => text(tick, 65, 254 - 210 * n, "end")),
+        ...known.map(point => svg("circle", {
+          cx: x(point.seconds), cy: y(point.error), r: 4, fill: colour(point.series), role: "img"},
+          svg("title", {}, `${point.name}: ${words(point.seconds)} s, ${words(point.error)}`))),
+        ...series.slice(0, 17).map((name, n) => svg("g", {}, text(name, 436, 34 + 15 * n, "start"),
+          svg("circle", {cx: 426, cy: 30 + 15 * n, r: 4, fill: colour(name)}))),
+        ...series.length > 17 ? [text(`and ${series.length - 17} more`, 436, 289, "start")] : [])));
 }
 
 function showRun() {

@@ -470,6 +470,20 @@ def test_the_plot_names_its_dots_and_axes_and_no_number_twice(shown, tmp_path):
     assert page.get_by_role("img", name="case 7: 14 s, 180").count() == 1
 
 
+def test_on_a_phone_the_plot_s_letters_are_as_large_as_elsewhere_and_it_scrolls(shown, tmp_path):
+    write_page(tmp_path, Contents("two", points=[
+        {"name": name, "series": name, "seconds": seconds, "error": 100.0 / seconds}
+        for name, seconds in (("tv", 10.0), ("sirt", 20.0))]))
+    pages = [shown(folder=tmp_path, viewport={"width": width, "height": 800}) for width in (1200, 400)]
+    wide, narrow = (page.locator("svg text").first.bounding_box() for page in pages)
+    assert narrow["height"] == wide["height"]
+    page = pages[1]
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    page.get_by_role("region", name="Seconds per case against MAE (HU)").focus()
+    page.keyboard.press("ArrowRight")
+    page.wait_for_function("document.querySelector('figure .scroll').scrollLeft > 0")
+
+
 def test_facts_are_rounded_what_is_not_known_is_left_out_and_files_say_what_they_are(shown, tmp_path):
     finish(tmp_path, "anna", "sirt", misfit=0.002272926038131118, diverged_at=None,
            seconds={"sample": 10.141537, "score": 2.0}, settings={"detector": [448, 448], "names": ["a", "b"]})

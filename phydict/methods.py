@@ -169,6 +169,8 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: AnyPrior | str |
         if guidance != 1:
             raise ValueError(f"guidance strengthens what a report tells a prior, but {type(method).__name__} has none: "
                              f"leave guidance at 1 instead of {guidance}, or use a method with a prior")
+        if precision != "auto":
+            method = method.with_precision(precision)
         return method.with_name(name) if name else method
     if not isinstance(method, Sampler):
         given = f"the class {method.__name__}, not an object of it," if isinstance(method, type) else repr(method)

@@ -141,6 +141,10 @@ class Reconstructor(ABC):
         """The same method by another name."""
         return self._changed("name", name)
 
+    def with_precision(self, precision: str) -> Reconstructor:
+        """The same method with its networks computed in a precision of phydict.runtime.precision.PRECISIONS."""
+        return self._changed("precision", precision)
+
     def _changed(self, name: str, value: object) -> Reconstructor:
         if name in getattr(self, "__dataclass_fields__", {}):
             return replace(self, **{name: value})  # type: ignore[type-var]

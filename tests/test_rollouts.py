@@ -103,3 +103,11 @@ def test_a_prior_that_is_no_refiner_has_no_roll_outs(tmp_path, cache, capsys):
     args = refiner_arguments(CONFIG, tmp_path / "run", cache, str(tmp_path / "prior.safetensors"))
     args = [arg for arg in args if not arg.startswith("--model.scenes")]
     assert "give a refiner's file as model.initial" in refusal(capsys, main, args)
+
+
+def test_stored_calls_are_learnt_from_at_the_times_at_which_they_were_made(tmp_path, refiner_file, cache, capsys):
+    args = refiner_arguments(CONFIG, tmp_path / "run", cache, refiner_file, "--data.rollouts.count=1",
+                             "--model.method.times=[0.5,0.2]", "--model.method.x0_stds=[0.3,0.2,0.1]",
+                             "--trainer.max_epochs=1")
+    args = [arg.replace("--model.scenes", "--data.rollouts.scenes") for arg in args]
+    assert "leave model.method out" in refusal(capsys, main, args)

@@ -192,6 +192,18 @@ def test_a_training_resumes_with_the_same_cts_held_out(cts, cache, tmp_path, cap
     assert (tmp_path / "on" / "held_out.txt").read_text() == "patient1\n"
 
 
+def test_last_begins_a_training_as_if_it_were_left_out_and_then_goes_on_with_it(cts, cache, tmp_path, capsys):
+    args = arguments(tmp_path, cache, "--trainer.limit_train_batches=1", "--trainer.limit_val_batches=0",
+                     f"--data.cts={cts}", "--model.text.encoder=none", "--data.holdout.ids=[patient1]",
+                     "--ckpt_path=last")
+    for word, command in (("best", "fit"), ("best", "validate"), ("last", "validate")):
+        said = refusal(capsys, main, [command, *args[1:-1], f"--ckpt_path={word}"])
+        assert str(tmp_path / f"{word}.ckpt") in said
+    for epochs in (1, 2):
+        main([*args, f"--trainer.max_epochs={epochs}"])
+        assert (tmp_path / "held_out.txt").read_text() == "patient1\n" and checkpoint(tmp_path)["epoch"] == epochs - 1
+
+
 def test_a_resumed_run_learns_at_the_rate_and_decay_that_are_given(trained, cache, tmp_path):
     main(arguments(tmp_path, cache, "--trainer.max_epochs=3", "--trainer.limit_val_batches=0",
                    f"--ckpt_path={trained / 'last.ckpt'}", "--model.optimisation.learning_rate=1e-3",

@@ -65,6 +65,9 @@ STAGES = {"base": (PriorTraining, PriorData), "super_resolution": (SuperResoluti
           "xray2ctpa": (XrayToCTPATraining, PriorData)}
 """What trains a stage, and on which data."""
 
+NAMED_CHECKPOINTS = {"last": CHECKPOINT, "best": BEST}
+"""Words for --ckpt_path -> files in --out. `fit` begins where `last` is not there yet."""
+
 
 def stage_of(args: list[str]) -> str:
     """The stage that a command line trains: its --stage, or the `stage` of the last configuration file with one."""
@@ -169,7 +172,7 @@ class PriorCLI(TellingCLI):
     def _begin(self, out: Path, resumed: str | None) -> None:
         """What comes before the first step, such as the list of the CTs that are held out. Raises ValueError where
         another training's files would be replaced."""
-        if resumed and (resumed in ("last", "best") or Path(resumed).resolve().parent == out.resolve()):
+        if resumed and Path(resumed).resolve().parent == out.resolve():
             return
         for name in (CHECKPOINT, BEST):
             if (out / name).exists():
@@ -201,8 +204,12 @@ class PriorCLI(TellingCLI):
         if not command:
             return
         check_writable(Path(self.config[command].out), "--out")
-        checkpoint = self.config[command].ckpt_path
-        if checkpoint and checkpoint not in ("last", "best"):
+        settings = self.config[command]
+        if settings.ckpt_path in NAMED_CHECKPOINTS:
+            file = Path(settings.out) / NAMED_CHECKPOINTS[settings.ckpt_path]
+            begins = command == "fit" and settings.ckpt_path == "last" and not file.is_file()
+            settings.ckpt_path = None if begins else str(file)
+        if checkpoint := settings.ckpt_path:
             lacks = [part for part in RESUMED if part not in read_checkpoint(checkpoint)]
             if lacks:
                 raise ValueError(f"{checkpoint} lacks {', '.join(lacks)}, and cannot be resumed: give the "

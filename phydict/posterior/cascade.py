@@ -24,7 +24,7 @@ from phydict.runtime.precision import check_precision, resolve_precision
 from phydict.runtime.profiling import Stopwatch
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import Projector
-from phydict.xray.boxes import seen_by
+from phydict.xray.boxes import elsewhere, seen_by
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ class CascadePosterior(Reconstructor):
     def _base(self, xrays: Tensor, projector: Projector, report: str, display: bool, seed: int,
               on_step: Callable[[], None]) -> Reconstruction:
         """The base stage's reconstruction, by the same kind of projector, from X-rays binned to what its grid holds."""
-        prior, kind = self.cascade.base, getattr(projector, "method", "auto")  # none of a projector of one's own
-        binned = seen_by(prior.grid, xrays, projector.beam, self.sampler.full_detector, kind)
+        prior = self.cascade.base
+        binned = seen_by(prior.grid, xrays, projector.beam, self.sampler.full_detector, elsewhere(projector))
         posterior = Posterior(prior, self.sampler, self.guidance, self.mu_water, self.name, self.precision)
         return posterior.reconstruct(*binned, report, display, seed, on_step)

@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool3d, interpolate
 
 from phydict.grid import Grid
-from phydict.posterior.discretisation import beyond_means
+from phydict.posterior.discretisation import beyond_means, has_finer
 from phydict.posterior.evidence import Evidence
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.posterior import Posterior
@@ -76,9 +76,7 @@ def coarse_correction(base: object, level: Grid, seen: tuple[Tensor, Projector],
     xrays, projector = seen
     if not (isinstance(base, Posterior) and isinstance(base.prior, Refiner)) or _factor(base.grid, level) < 2:
         return None
-    if getattr(projector, "method", None) != "separable":
-        return None
-    if found.masks is None or len(found.masks) + 1 != base.prior.state_channels:
+    if not has_finer(projector) or found.masks is None or len(found.masks) + 1 != base.prior.state_channels:
         return None
     measurement = Measurement(projector, xrays, base.window, display, base.mu_water)
     measurement.adopt(found)

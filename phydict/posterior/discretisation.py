@@ -7,6 +7,7 @@ from torch.nn.functional import avg_pool3d, interpolate
 
 from phydict.posterior.likelihood.likelihood import LikelihoodStep, ProximalCG
 from phydict.posterior.measurement import Measurement
+from phydict.xray import Projector
 from phydict.xray.finer import FinerProjector
 
 FACTOR = 2
@@ -21,10 +22,10 @@ X-rays made on finer voxels; of those made on the grid, in a tomosynthesis, 1.8 
 its rays look like finer voxels. Of two CTs that evaluate nothing."""
 
 
-def has_finer(measurement: Measurement) -> bool:
+def has_finer(projector: Projector) -> bool:
     """Whether finer voxels can be asked: not with a projector of one's own, nor where detectors are tilted, for which
     they cost too much."""
-    return getattr(measurement.projector, "method", None) == "separable"
+    return getattr(projector, "method", None) == "separable"
 
 
 def find_subgrid(measurement: Measurement, x: Tensor, step: LikelihoodStep | None, x0_std: float) -> bool:
@@ -35,7 +36,7 @@ def find_subgrid(measurement: Measurement, x: Tensor, step: LikelihoodStep | Non
     noise beyond x, without a `step` on the finer voxels, and where it `has_finer` none.
     """
     measurement.subgrid = 0.0
-    if step is None or not has_finer(measurement):
+    if step is None or not has_finer(measurement.projector):
         return False
     projection = measurement.project(x)
     if not (measurement.normalised_error(projection, modelled=True) > 1).any():

@@ -131,8 +131,7 @@ class Refined(Delegating):
                 measurement = self._measurement(y, A, coarse, display, bool(projector.beam.continued))
                 measurement.refit(start)
                 network = self._network(level) if coarse.masks is not None else None
-                fine_calls, coarse_calls = (refinement.corrections(network is not None)
-                                            if coarse.masks is not None else (0, 0))
+                fine_calls, coarse_calls = refinement.corrections(network is not None)
                 correction = coarse_correction(base, level, binned, coarse, report, display) if coarse_calls else None
                 x = refinement(measurement, start, network, correction, number > 0, base.precision)
                 guard = Guard(measurement, on_step, 1)

@@ -217,7 +217,7 @@ def build_prior(header: dict, weights: dict[str, Tensor]) -> Prior:
 
     Raises ValueError where header and weights do not fit together.
     """
-    weights = {k: w.float() for k, w in weights.items() if not k.startswith("text.")}
+    weights = {k: w for k, w in weights.items() if not k.startswith("text.")}
     return built_network(lambda: _untrained(header), weights, header, ("network", "detail"))
 
 
@@ -240,7 +240,7 @@ def build_refiner(header: dict, weights: dict[str, Tensor]) -> Refiner:
     if not isinstance(first, dict):
         raise ValueError(f"first is {first}, where a mapping of settings is needed")
     described = header | {f"first.{name}": settings for name, settings in first.items()}
-    weights = {k: w.float() for k, w in weights.items() if not k.startswith(("text.", "prior.text.", "first.text."))}
+    weights = {k: w for k, w in weights.items() if not k.startswith(("text.", "prior.text.", "first.text."))}
     return built_network(made, weights, described, ("network", "detail", "uncertainty", "first.network",
                                                     "first.detail"))
 
@@ -256,7 +256,7 @@ def build_super_resolution(header: dict, weights: dict[str, Tensor]) -> SuperRes
             whole_of(header, "factor"), len(header["coarse_state"]), CosineSchedule(**header["schedule"]),
             number_of(header, "detail_std"), number_of(header, "skip_std"))
 
-    return built_network(made, {k: w.float() for k, w in weights.items()}, header, ("network",))
+    return built_network(made, weights, header, ("network",))
 
 
 def build_correction(header: dict, weights: dict[str, Tensor]) -> CorrectionNetwork:
@@ -266,4 +266,4 @@ def build_correction(header: dict, weights: dict[str, Tensor]) -> CorrectionNetw
         return CorrectionNetwork(**header["network"], grid=Grid(**header["grid"]), window=window_of(header),
                                  uncertainty=uncertainty)
 
-    return built_network(made, {k: w.float() for k, w in weights.items()}, header, ("network", "uncertainty"))
+    return built_network(made, weights, header, ("network", "uncertainty"))

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
 from phydict.diffusion import CosineSchedule
+from phydict.diffusion.steps import noise_like
 from phydict.grid import Grid
 from phydict.prior.local_unet import LocalUNet
 from phydict.prior.tiles import Tiles
@@ -57,7 +58,7 @@ class SuperResolution(nn.Module):
         self.network, self.grid, self.window, self.schedule = network, grid, window, schedule
         self.factor, self.coarse_channels, self.state_channels = factor, coarse_channels, network.out_channels
         self.detail_std, self.skip_std = detail_std, skip_std
-        self.memory, self.overlap = memory, overlap
+        self.memory, self.overlap = memory, math.ceil(overlap / network.divisor) * network.divisor
 
     def forward(self, x: Tensor, t: Tensor, upsampled: Tensor, level: Tensor) -> Tensor:
         """Clean estimate of the fine state x (B, C, X, Y, Z) at times t (B,), in x's dtype.
@@ -106,7 +107,7 @@ class SuperResolution(nn.Module):
             raise ValueError(f"this super-resolution stage needs {self.coarse_channels} coarse channels, but "
                              f"{coarse.shape[1]} were given")
         if generator is not None:
-            coarse = coarse + noise * torch.randn(coarse.shape, generator=generator).to(coarse)
+            coarse = coarse + noise * noise_like(coarse, generator)
         return BoundSuperResolution(self, self.upsample(coarse), noise, precision)
 
 

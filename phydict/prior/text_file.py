@@ -39,7 +39,7 @@ def build_text(text: dict, weights: dict[str, Tensor]) -> TextEncoder:
     """The text encoder of a header's "text", frozen; `weights` ("text.") are used unless it is a pretrained one."""
     if text["source"]:
         return TextEncoder.pretrained(text["source"], text["length"], text.get("padded_to"))
-    weights = {k.removeprefix("text."): w.float() for k, w in weights.items() if k.startswith("text.")}
+    weights = {k.removeprefix("text."): w for k, w in weights.items() if k.startswith("text.")}
     try:
         check_sizes("text", {key: text[key] for key in ("length", "width", "layers")}, weights)
         held = len(weights["bert.embeddings.word_embeddings.weight"])

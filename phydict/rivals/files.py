@@ -50,4 +50,4 @@ def build_rival(header: dict, weights: dict[str, Tensor]) -> Rival:
 
     if not isinstance(header.get("beam"), dict | None):
         raise ValueError(f"beam is {reprlib.repr(header['beam'])}, where a geometry is needed, or null")
-    return built_network(made, {k: w.float() for k, w in weights.items()}, header, ("network",))
+    return built_network(made, weights, header, ("network",))

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from phydict.diffusion import Denoiser, renoise
+from phydict.diffusion.steps import noise_like
 from phydict.posterior import ddim_sample
 from phydict.prior import Prior, SuperResolution
 from phydict.training.settings import Optimisation
@@ -65,8 +66,7 @@ class DenoisingTraining(StageTraining):
 
     def validation_step(self, batch: dict, index: int) -> None:
         x0, _ = self._clean_state(batch)
-        generator = torch.Generator().manual_seed(self.validation_number(index))
-        noise = torch.randn(x0.shape, generator=generator).to(self.device)
+        noise = noise_like(x0, torch.Generator().manual_seed(self.validation_number(index)))
         denoiser = self._denoiser(batch, x0)
         errors = denoising_errors(denoiser, x0, noise, self.prior.window)
         for t, error in errors.items():

@@ -169,6 +169,12 @@ class ReplayTraining(RefinerTraining):
 
     calls = 1
 
+    def on_fit_start(self) -> None:
+        super().on_fit_start()
+        if self.method != self.trainer.datamodule.rollouts.method:  # type: ignore[attr-defined]
+            raise ValueError("the stored calls were made by Unrolled at its defaults, but model.method has others: "
+                             "leave model.method out")
+
     def batch_loss(self, batch: dict, key: tuple[int, ...] = (0,), rank: int = 0, processes: int = 1) -> Tensor:
         times = torch.tensor(self.method.times + self.method.more_times, device=self.device)[batch["call"]]
         context = self.prior.prior.null.expand(len(times), -1, -1)

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool3d
 
 from phydict.diffusion import Denoiser
+from phydict.diffusion.steps import noise_like
 from phydict.evaluation import method_panel
 from phydict.grid import Cube, Grid
 from phydict.prior import LocalUNet, SuperResolution, describe_super_resolution, load_super_resolution
@@ -60,7 +61,7 @@ class SuperResolutionTraining(DenoisingTraining):
     def _condition(self, batch: dict, x0: Tensor, generators: list[torch.Generator]) -> tuple[Tensor, ...]:
         coarse = avg_pool3d(x0, self.prior.factor)
         level = self.most_noise * torch.cat([torch.rand(1, generator=g) for g in generators]).to(self.device)
-        noise = torch.stack([torch.randn(coarse.shape[1:], generator=g) for g in generators]).to(self.device)
+        noise = noise_like(coarse, generators)
         return self.prior.upsample(coarse + level.view(-1, 1, 1, 1, 1) * noise), level
 
     def _denoiser(self, batch: dict, x0: Tensor) -> Denoiser:

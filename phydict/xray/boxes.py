@@ -57,8 +57,7 @@ def check_axes(grid: Grid, other: Grid) -> None:
 
 def covers(grid: Grid, box: Grid) -> bool:
     """Whether the box of `grid` holds that of another grid along the same axes."""
-    low, high = _faces(grid, box)
-    return bool((low >= -0.5 - SLACK).all() and (high <= np.asarray(grid.shape) - 0.5 + SLACK).all())
+    return not any(lacking(grid, box))
 
 
 def lacking(grid: Grid, box: Grid) -> list[float]:

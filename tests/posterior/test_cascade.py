@@ -81,6 +81,17 @@ def test_unguided_and_without_detail_it_is_the_base_stages_result_upsampled(xray
     assert found.grid.same_as(FINE)
 
 
+def test_a_projector_of_one_s_own_leaves_the_base_stage_to_phydict_s(xrays):
+    class Own:
+        grid, beam, method = FINE, BEAM, "mine"
+        __call__, T, norm = PROJECTOR.__call__, PROJECTOR.T, PROJECTOR.norm
+
+    method = gaussian(1e-12, sr_guided=False, noise=0.0)
+    with pytest.warns(UserWarning, match="Own projects its own voxels alone"):
+        found = method.reconstruct(xrays, Own(), seed=3)
+    assert torch.equal(found.volume, method.reconstruct(xrays, PROJECTOR, seed=3).volume)
+
+
 def test_guided_it_is_the_posterior_mean_of_a_gaussian_stage(xrays):
     """At time 1 the state tells nothing: one likelihood step there ends at the mean of p(x | coarse, Y)."""
     solve = ProximalCG(iterations=300, restarts=20, noise=1.0, tolerance=1e-7)

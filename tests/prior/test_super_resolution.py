@@ -103,6 +103,12 @@ def test_a_sample_in_tiles_is_that_of_the_whole_and_the_same_bits_each_time():
     assert errors == sorted(errors, reverse=True) and errors[0] > errors[-1] and errors[-1] < 0.01
 
 
+def test_tiles_share_as_many_voxels_as_the_network_s_levels_divide():
+    network = LocalUNet(block=4, channels=(32, 32, 32, 32))
+    fine = SuperResolution(network, Grid.cube(2 * network.divisor), HUWindow(), 2)
+    assert fine.overlap == 64 and fine.tiles().overlap == 64
+
+
 def test_tiles_leave_no_seams():
     """Across the faces of the tiles, the estimate changes as much from voxel to voxel as the whole's."""
     coarse, noise = COARSE.repeat(1, 1, 2, 2, 2), X.repeat(1, 1, 2, 2, 2)

@@ -13,7 +13,7 @@ from phydict.datasets import phantom_case
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM
 from phydict.evaluation import read_csv
 from phydict.grid import Grid
-from phydict.methods import METHODS, reconstruct
+from phydict.methods import METHODS, reconstruct, reconstructor
 from phydict.prior import load_prior, save_prior
 from phydict.rivals import LiftedNetwork, Rival, RivalAnswer, TrainedRival, load_rival, save_rival
 from phydict.units import MU_WATER, HUWindow, hu_to_mu
@@ -116,6 +116,12 @@ def test_a_patient_who_goes_on_gives_a_rival_no_more_voxels_than_its_own(file):
     read, made = (reconstruct(xrays(beam), beam, method=method, grid=GRID)
                   for method in (TrainedRival(file, "float32"), RivalAnswer(tiny_lifted(), precision="float32")))
     assert made.grid.same_as(GRID) and torch.equal(read.volume, made.volume)
+
+
+def test_the_precision_that_is_asked_for_is_a_ready_rival_s(file):
+    for method in (TrainedRival(file), RivalAnswer(tiny_lifted())):
+        assert reconstructor(method, precision="float32") == replace(method, precision="float32")
+        assert reconstructor(method) == method
 
 
 def test_a_prior_is_no_rival_and_a_rival_no_prior(file, tmp_path):

@@ -160,7 +160,7 @@ class Unrolled(Sampler):
             return errors.square() - torch.maximum(like_others, SHARED * errors.max()).square()
 
         excess = excess_of(errors := measurement.view_errors(projection))
-        if (excess > 0).any() and self.subgrid is not None and has_finer(measurement):
+        if (excess > 0).any() and self.subgrid is not None and has_finer(measurement.projector):
             finer = subgrid_projection(measurement, z, self.subgrid, self.x0_stds[0])
             excess = excess_of(torch.minimum(errors, measurement.view_errors(projection + finer)))
         if (excess > 0).any():

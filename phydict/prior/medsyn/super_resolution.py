@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
 from phydict.diffusion.schedule import CosineSchedule
+from phydict.diffusion.steps import noise_like
 from phydict.grid import Grid
 from phydict.prior.medsyn.networks import FACTOR, STATE_CHANNELS, SuperResolutionUNet, from_slices, to_slices
 from phydict.prior.medsyn.prior import WINDOW, _check_divisible, atlas_grid
@@ -72,7 +73,7 @@ class MedSynSuperResolution(nn.Module):
         check_between("the noise level of the coarse state", noise)
         upsampled = self.upsample(coarse)
         if noise and generator is not None:
-            upsampled = torch.lerp(upsampled, torch.randn(upsampled.shape, generator=generator).to(upsampled), noise)
+            upsampled = torch.lerp(upsampled, noise_like(upsampled, generator), noise)
         return BoundMedSynSuperResolution(self, upsampled, precision)
 
 

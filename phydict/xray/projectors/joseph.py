@@ -20,7 +20,7 @@ import torch
 
 from phydict.grid import Grid
 from phydict.xray.geometry import ConeBeam
-from phydict.xray.projectors.tracer import rays_in_voxels
+from phydict.xray.projectors.tracer import ray_lengths, rays_in_voxels
 
 WORKING_BYTES = 2**26
 """Temporaries beyond which a larger chunk gains nothing: a smaller memory budget lowers it, a larger one does not."""
@@ -154,7 +154,7 @@ def _sweeps(grid: Grid, beam: ConeBeam, view: int, rays: np.ndarray) -> list[Swe
     source, first, column, row = rays
     ray = (first + np.arange(beam.shape[1])[:, None] * column + np.arange(beam.shape[0])[:, None, None] * row
            - source).reshape(-1, 3)
-    length = np.linalg.norm(beam.pixels()[view] - beam.sources[view], axis=-1).reshape(-1)
+    length = ray_lengths(beam.select([view])).reshape(-1)
     dominant = abs(ray).argmax(1)
     return [sweep for axis in range(3)
             if len((sweep := _sweep(grid, source, ray, length, np.flatnonzero(dominant == axis), axis)).pixels)]

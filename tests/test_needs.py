@@ -19,7 +19,7 @@ from phydict import METHODS, ConeBeam, Grid, reconstruct
 from phydict.methods import reconstructor
 from phydict.posterior import DPS, GradientSteps, Posterior, Reward, Sampler
 from phydict.prior import save_prior
-from phydict.runtime.profiling import CPU, CUDA, peak_memory, profiled, stage
+from phydict.runtime.profiling import CPU, CUDA, peak_memory, process_peak, profiled, reset_peak_memory, stage
 from phydict.xray import Projector
 
 ROOT = Path(__file__).parents[1]
@@ -161,6 +161,16 @@ def test_all_memory_is_in_mib(monkeypatch):
     assert peak_memory(CPU) == pytest.approx(resident, rel=0.02)
     monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda device: 3 * 2**20)
     assert peak_memory(CUDA) == 3
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
+def test_a_profile_sets_no_peak_of_the_whole_process_back():
+    reset_peak_memory(CPU)
+    torch.ones(2**26).sum()  # 256 MiB
+    before = process_peak()
+    with profiled(), stage("small"):
+        pass
+    assert peak_memory(CPU) < before - 200 and process_peak() >= before
 
 
 def test_a_profile_holds_the_calls_that_a_reconstruction_reports_and_its_table_every_stage():

@@ -29,9 +29,8 @@ class Cases:
 
     def data(self, **settings) -> ReconstructionData:
         """The simulated X-rays of these cases."""
-        if self.phantoms is not None:
-            return ReconstructionData(cts="phantom", phantoms=self.phantoms, **settings)
-        return ReconstructionData(cts=self.cts, only=self.only, source=self.source, **settings)
+        kind = {"cts": self.cts} if self.phantoms is None else {"cts": "phantom", "phantoms": self.phantoms}
+        return ReconstructionData(only=self.only, source=self.source, **kind, **settings)
 
 
 def check_path(value, name: str) -> None:

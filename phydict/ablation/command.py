@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import get_type_hints
 
@@ -15,7 +16,7 @@ from phydict.ablation.fid import distance_tables, write_distances
 from phydict.ablation.page import comparison_page
 from phydict.ablation.plots import write_plots
 from phydict.ablation.run import RESULTS, planned, run
-from phydict.ablation.spec import Specification, read_specification
+from phydict.ablation.spec import read_specification
 from phydict.ablation.summary import summarise
 from phydict.ablation.tables import all_tables, write_tables
 from phydict.datasets import CTSource
@@ -54,27 +55,32 @@ def main(args: list[str] | None = None) -> None:
         check_own_page(specification.out, "out")
         check_apart(specification.out, "out", [Path(cts)] if (cts := specification.cases.cts) else [])
         scoring = Scoring(specification.metrics, specification.fid, specification.clip)
+        results = None
         try:
             with ended_by_sigterm(), alone_in(specification.out, "out"), CaseProgress() as progress:
-                rows = run(specification, torch.device(device), progress, scoring, keep_volumes)
+                results, cases = planned(specification, scoring)
+                run(results, cases, torch.device(device), progress, scoring, keep_volumes)
         except (KeyboardInterrupt, SystemExit):
-            _page_so_far(specification, scoring)
+            if results:
+                _page_so_far(specification.out, results.rows, scoring)
             raise
-        print(f"{len(rows)} rows in {specification.out / RESULTS}")
-        entries = summarise(rows)
+        print(f"{len(results.rows)} rows in {specification.out / RESULTS}")
+        entries = summarise(results.rows)
         write_distances(specification.out, entries, scoring)
         tables = all_tables(entries, scoring.empty) + distance_tables(specification.out, entries)
-        written = write_tables(specification.out, tables) + write_plots(specification.out, entries)
+        plots = write_plots(specification.out, entries)
+        written = write_tables(specification.out, tables) + plots
         print(f"tables and plots in {specification.out}: {', '.join(path.name for path in written)}")
-        print(f"page: {comparison_page(specification.out, entries, tables)}")
+        print(f"page: {comparison_page(specification.out, entries, tables, plots)}")
 
 
-def _page_so_far(specification: Specification, scoring: Scoring) -> None:
+def _page_so_far(out: Path, rows: Sequence[dict], scoring: Scoring) -> None:
     """Writes the page of the rows that a stopped run has finished, where there are any, without the Frechet distances
     of slices, which take long."""
-    entries = summarise(planned(specification, scoring)[0].rows)
-    if any(entry.counted for entry in entries):
-        print(f"page: {comparison_page(specification.out, entries, all_tables(entries, scoring.empty))}")
+    entries = summarise(rows)
+    with suppress(ValueError, OSError):  # what stopped the run is what is to be told
+        if any(entry.counted for entry in entries):
+            print(f"page: {comparison_page(out, entries, all_tables(entries, scoring.empty))}")
 
 
 def _parser(args: Sequence[str]) -> ArgumentParser:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from phydict.ablation.run import features_file
+from phydict.ablation.run import FID, features_file
 from phydict.ablation.summary import Entry, conditions, format_settings
 from phydict.datasets import patient_of
 from phydict.evaluation import read_csv, write_csv
@@ -13,9 +13,6 @@ from phydict.evaluation.fid import StoredFeatures
 from phydict.evaluation.tables import Table, fid_tables
 from phydict.inference.distances import told_rows
 from phydict.inference.scoring import FIDSettings, Scoring
-
-FID = "fid.csv"
-"""The distances in a folder of results."""
 
 
 def write_distances(out: Path, entries: Sequence[Entry], scoring: Scoring) -> None:

@@ -14,6 +14,7 @@ from phydict.ablation.tables import all_tables
 from phydict.evaluation import read_csv
 from phydict.evaluation.metrics import MEASURES
 from phydict.evaluation.tables import Table
+from phydict.inference.case_files import remake_page_files
 from phydict.page import Contents, PageCase, check_own_page, write_page
 from phydict.runtime.reading import reason
 from phydict.runtime.telling import tell
@@ -38,17 +39,19 @@ def page_anew(folder: Path) -> Path:
     return comparison_page(folder, entries, all_tables(entries) + distance_tables(folder, entries))
 
 
-def comparison_page(folder: Path, entries: Sequence[Entry], tables: Sequence[Table]) -> Path:
-    """Writes the page of entries, with their rows, and tables, with the plots in the folder; returns its path. Raises
-    ValueError where a page of someone else's is in its place."""
+def comparison_page(folder: Path, entries: Sequence[Entry], tables: Sequence[Table],
+                    plots: Sequence[Path] | None = None) -> Path:
+    """Writes the page of entries, with their rows, tables and plots, None for all in the folder; returns its path.
+    Raises ValueError where a page of someone else's is in its place."""
     check_own_page(folder, "out")
     cases = [_case(folder, entry, row) for entry in entries for row in entry.counted]
     points = [{"name": format_settings(entry.label, entry.condition), "series": entry.method,
                "seconds": entry.means["seconds"], "error": entry.means.get("mae_hu")}
               for entry in entries if "seconds" in entry.means]
+    plots = [*folder.glob("*.png")] if plots is None else plots
     kept = sorted(path.name for path in folder.iterdir() if path.suffix in (".csv", ".md", ".tex"))
     return write_page(folder, Contents(f"Comparison in {folder.resolve().name}", tables, cases, points,
-                                       plots=sorted(path.name for path in folder.glob("*.png")), links=kept))
+                                       plots=sorted(path.name for path in plots), links=kept))
 
 
 def _case(folder: Path, entry: Entry, row: Mapping) -> PageCase:
@@ -57,12 +60,22 @@ def _case(folder: Path, entry: Entry, row: Mapping) -> PageCase:
     record = {name: value for name, value in row.items() if name not in scores and value is not None}
     group = format_settings(str(row["case"]), entry.condition)
     kept = volume_folder(folder, str(row.get("key")))
+    if kept.is_dir():
+        _complete(kept)
     place, files = (kept.relative_to(folder).as_posix(), sorted(os.listdir(kept))) if kept.is_dir() else ("", ())
     details = _details(kept / DETAILS) if DETAILS in files else {}
     return PageCase(place, files, record | details | {
         "method": format_settings(entry.name, entry.condition, {"seed": row.get("seed", 0)}),
         "scores": scores, "misfit": row.get("misfit"), "seconds": {"all": row["seconds"]} if "seconds" in row else {},
         "warnings": [row["warning"]] if row.get("warning") else []}, group)
+
+
+def _complete(folder: Path) -> None:
+    """Makes what the page shows of a volume and its folder lacks, with a warning where that cannot be."""
+    try:
+        remake_page_files(folder)
+    except Exception as error:  # whatever a damaged volume leads to
+        warn(f"the volume in {folder} is not shown, since it is damaged ({reason(error)})")
 
 
 def _details(file: Path) -> dict:

@@ -38,8 +38,8 @@ from phydict.runtime.seeds import case_seed
 from phydict.runtime.strict_json import strict_json
 from phydict.runtime.telling import tell
 
-RESULTS, TABLES = "results.csv", ("tables.md", "tables.tex")
-"""The results of a folder, and the tables that are made of them."""
+RESULTS, TABLES, FID = "results.csv", ("tables.md", "tables.tex"), "fid.csv"
+"""The results of a folder, the tables that are made of them, and the Frechet distances."""
 
 DETAILS = "details.json"
 """What is known of a row whose volume is kept and the table does not hold, beside that volume."""
@@ -69,7 +69,7 @@ class Results:
 
     def __init__(self, folder: Path, planned: Mapping[str, dict]):
         self.file, self.planned = folder / RESULTS, planned
-        others = [file.name for file in folder.glob("*") if file.suffix == ".png" or file.name in TABLES]
+        others = [file.name for file in folder.glob("*") if file.suffix == ".png" or file.name in (*TABLES, FID)]
         if others and not self.file.exists():
             raise ValueError(f"{folder} holds {others[0]}, but no {RESULTS} of this command, and is not written to: "
                              "give another out, or move that away")
@@ -139,27 +139,26 @@ def planned(specification: Specification, scoring: Scoring) -> tuple[Results, di
     return Results(specification.out, rows), cases
 
 
-def run(specification: Specification, device: torch.device, progress: CaseProgress,
-        scoring: Scoring | None = None, keep_volumes: bool = False) -> list[dict]:
-    """The rows of a specification: those that its table holds already, and those that are run now, with the metrics of
-    `scoring`; keep_volumes: each row's volume in a folder beside the table, of rows that lack theirs too.
+def run(results: Results, cases: dict[str, Work], device: torch.device, progress: CaseProgress, scoring: Scoring,
+        keep_volumes: bool = False) -> None:
+    """Runs what a table lacks of what is `planned`, with the metrics of `scoring`; keep_volumes: each row's volume in a
+    folder beside the table, of rows that lack theirs too.
 
     Case by case; the X-rays of a case are simulated once for all trials that share an acquisition.
     """
-    scoring = scoring or Scoring()
-    results, cases = planned(specification, scoring)
+    out = results.file.parent
     if scoring.network:
-        results.forget(lambda name: not features_file(specification.out, name).is_file())
+        results.forget(lambda name: not features_file(out, name).is_file())
     if keep_volumes:
-        results.forget(lambda name: not volume_folder(specification.out, name).is_dir())
+        results.forget(lambda name: not volume_folder(out, name).is_dir())
     of = len(results.planned)
     left = sum(not results.finished(name) for name in results.planned)
     tell(f"{of - left} of {of} rows are there already, {left} are to be run", event="kept", cases=of - left, of=of)
     if others := len(results.others):
         tell(f"{others} rows of other settings or data are kept in {results.file} and left out of tables",
              event="others", cases=others, out=str(results.file))
-    runner = Runner(device, scoring, specification.out, progress, keep_volumes)
-    progress.begin("ablate", left, verb="run", out=specification.out, noun="row")
+    runner = Runner(device, scoring, out, progress, keep_volumes)
+    progress.begin("ablate", left, verb="run", out=out, noun="row")
     for case, work in cases.items():
         groups: dict[str, Work] = {}
         made = CaseCache()
@@ -176,7 +175,6 @@ def run(specification: Specification, device: torch.device, progress: CaseProgre
                 progress.finished(f"{measured['seconds']:.2f} s, {measured['psnr']:.2f} dB"
                                   if measured["status"] == "ok" else f"{measured['status']}: {measured['error']}")
     results.write()
-    return results.rows
 
 
 class CaseCache:

@@ -61,7 +61,7 @@ def export_prior(checkpoint: str, out: str, overwrite: bool = False) -> None:
             save_refiner(refiner, out, training)
         else:
             save_prior(prior, out, training)
-    print(f"{STAGES.get(stage, 'a prior').removeprefix('a ')} in {out}")
+    print(f"{STAGES[stage].removeprefix('a ')} in {out}")
 
 
 def print_prior(path: str) -> None:

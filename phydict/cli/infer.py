@@ -126,7 +126,7 @@ class InferenceCLI(TellingCLI):
 
     def test(self, model: ReconstructionTask, datamodule: ReconstructionData) -> None:
         """Simulate the X-rays of CTs, reconstruct and score them."""
-        model.profile, model.calibrate = self.flag("profile"), self.flag("calibrate")
+        model.profile = self.flag("profile")
         model.measure(Scoring(self._get(self.config, "metrics"), self._get(self.config_init, "fid"),
                               self._get(self.config_init, "clip")))
         with _resumable(model):
@@ -135,13 +135,20 @@ class InferenceCLI(TellingCLI):
 
 @contextmanager
 def _resumable(model: ReconstructionTask) -> Iterator[None]:
-    """The progress of a run, which shows what is finished and says how it is resumed if it is stopped."""
+    """The progress of a run and what it ends with; where it is stopped, shows what is finished and says how it is
+    resumed."""
     try:
         with ended_by_sigterm(), model.progress:
             yield
     except BaseException as stop:
         if isinstance(stop, KeyboardInterrupt | SystemExit):
             model.show_finished()
+        stop.add_note(model.results.to_resume)
+        raise
+    try:
+        with ended_by_sigterm():
+            model.summarise()
+    except (KeyboardInterrupt, SystemExit) as stop:
         stop.add_note(model.results.to_resume)
         raise
 
@@ -237,7 +244,7 @@ def main(args: list[str] | None = None) -> None:
         return page(args[1:])
     with told_of(args), cli_errors(MisconfigurationException), quiet():
         check_command(args, COMMANDS, InferenceCLI.subcommands(), "predict --data.xrays data/example/xrays")
-        cli = InferenceCLI(
+        InferenceCLI(
             ReconstructionTask, ReconstructionData, args=args, seed_everything_default=0, save_config_callback=None,
             auto_configure_optimizers=False,
             parser_kwargs={"exit_on_error": False, "allow_abbrev": False, "formatter_class": HelpFormatter,
@@ -247,5 +254,3 @@ def main(args: list[str] | None = None) -> None:
             trainer_defaults={"inference_mode": False, "logger": False, "enable_progress_bar": False,
                               "enable_checkpointing": False, "enable_model_summary": False, "accelerator": "auto",
                               "devices": 1})
-        if cli.trainer.is_global_zero and not cli.dry_run:
-            cli.model.summarise()

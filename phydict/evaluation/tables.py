@@ -227,8 +227,9 @@ def warning_notes(rows: Sequence[Mapping], by: str = "method") -> list[str]:
 
 def escaped(text: str) -> str:
     """Text as LaTeX prints it."""
-    for plain, printed in (("\\", "\\textbackslash "), ("&", "\\&"), ("%", "\\%"), ("_", "\\_"), ("#", "\\#"),
-                           ("{", "\\{"), ("}", "\\}"), ("~", "\\textasciitilde "), ("^", "\\textasciicircum "),
-                           ("↑", "$\\uparrow$"), ("↓", "$\\downarrow$"), ("±", "$\\pm$"), ("–", "--")):
+    for plain, printed in (
+            ("\\", "\\textbackslash "), ("$", "\\$"), ("&", "\\&"), ("%", "\\%"), ("_", "\\_"), ("#", "\\#"),
+            ("{", "\\{"), ("}", "\\}"), ("~", "\\textasciitilde "), ("^", "\\textasciicircum "),
+            ("↑", "$\\uparrow$"), ("↓", "$\\downarrow$"), ("±", "$\\pm$"), ("–", "--")):
         text = text.replace(plain, printed)
     return text

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from phydict.datasets.case import Case
 from phydict.runtime.warning import warn
-from phydict.xray.poses.uncertain import USUAL, Uncertain
+from phydict.xray.poses.uncertain import Uncertain
 
 
 def uncertain_of(case: Case) -> Uncertain:
-    """What a case's geometry file says not to know exactly; of simulated X-rays and, with a warning, of radiographs
-    whose tags are their geometry, what is usual.
+    """What a case's geometry file says not to know exactly; with a warning, of radiographs whose tags are their
+    geometry, what is usual.
 
     Raises ValueError where a file of other measured ones does not say it.
     """
-    if "description" not in case:
-        return USUAL
     if case["uncertain"] is None:
         raise ValueError(f"--calibrate needs to know what {case['description'].source} is not sure of: state "
                          "`uncertain:` there, such as {detector_shift_mm: 5, rotation_degrees: 2}, or leave "

@@ -4,20 +4,28 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import nibabel
+import numpy as np
 from torch import Tensor
 
 from phydict.datasets.case import Case
 from phydict.datasets.radiographs.xray_description import save_geometry
 from phydict.evaluation import panel
 from phydict.evaluation.fid import Features, save_features
+from phydict.grid import Grid
 from phydict.inference.results import FEATURES
-from phydict.page import write_case_files
+from phydict.page import CASE_FILES, write_case_files
 from phydict.reconstruction import Reconstruction
 
 VOLUME = "volume.nii.gz"
 
 SHOWN_LEVEL = 0.9
 """The level of the intervals that are written and shown."""
+
+INTERVAL, DEVIATION = f"interval_{SHOWN_LEVEL * 100:.0f}.nii.gz", "deviation.nii.gz"
+
+UNCERTAIN = {INTERVAL: f"half of the {SHOWN_LEVEL:.0%} interval", DEVIATION: "standard deviation"}
+"""What says how uncertain each voxel is, the first that is there: its file, and what it is called."""
 
 TISSUE = -500.0
 """HU above which a voxel is no air."""
@@ -31,11 +39,11 @@ def write_result(folder: Path, case: Case, result: Reconstruction, method: str, 
     if result.beam is not None:
         save_geometry(folder / "geometry_found.yaml", result.beam, case.get("description"))
     if result.deviation is not None:
-        result.save_nifti(folder / "deviation.nii.gz", result.deviation)
+        result.save_nifti(folder / DEVIATION, result.deviation)
     if keep_coarse and result.coarse is not None:
         result.coarse.save_nifti(folder / "coarse.nii.gz")
     if result.intervals:
-        result.save_nifti(folder / f"interval_{SHOWN_LEVEL * 100:.0f}.nii.gz", result.intervals[SHOWN_LEVEL])
+        result.save_nifti(folder / INTERVAL, result.intervals[SHOWN_LEVEL])
     label, uncertain = _uncertain(result)
     panel(folder / "panel.png", result.volume, result.grid, result.xrays, result.reprojection, truth,
           title=f"{case['id']}: {method}", deviation_hu=uncertain, deviation_label=label)
@@ -52,11 +60,28 @@ def write_page_files(folder: Path, result: Reconstruction, truth: Tensor | None)
                      result.reprojection)
 
 
+def missing_page_files(folder: Path) -> list[str]:
+    """What the page shows of a case and is not in its folder."""
+    return [name for name in CASE_FILES if not (folder / name).is_file()]
+
+
+def remake_page_files(folder: Path) -> None:
+    """Writes what the page shows of a case and its folder lacks, of the NIfTI files there: without truth and X-rays."""
+    if not (missing := missing_page_files(folder)):
+        return
+    image: nibabel.Nifti1Image = nibabel.load(folder / VOLUME)  # type: ignore[assignment]
+    volumes = {"reconstruction": np.asarray(image.dataobj)}
+    if uncertain := next((name for name in UNCERTAIN if (folder / name).is_file()), None):
+        shown: nibabel.Nifti1Image = nibabel.load(folder / uncertain)  # type: ignore[assignment]
+        volumes[UNCERTAIN[uncertain]] = np.asarray(shown.dataobj)
+    write_case_files(folder, Grid(volumes["reconstruction"].shape, affine=image.affine), volumes, names=missing)
+
+
 def _uncertain(result: Reconstruction) -> tuple[str, Tensor | None]:
     """How uncertain each voxel is, HU (X, Y, Z), and what that is called; None where it is not known."""
     if result.intervals:
-        return f"half of the {SHOWN_LEVEL:.0%} interval", result.intervals[SHOWN_LEVEL]
-    return "standard deviation", result.deviation
+        return UNCERTAIN[INTERVAL], result.intervals[SHOWN_LEVEL]
+    return UNCERTAIN[DEVIATION], result.deviation
 
 
 def body_interval(result: Reconstruction) -> float | None:

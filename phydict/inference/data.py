@@ -88,6 +88,9 @@ class ReconstructionData(lightning.LightningDataModule):
                              "out for the reconstruction's own")
         self.xrays, self.geometry, self.cts, self.phantoms, self.only = xrays, geometry, cts, phantoms, only
         self.source, self.simulation_voxels = source, simulation_voxels
+        if cts == "phantom" and (only is not None or source != CTSource()):
+            raise ValueError("only, reports and source choose among the CTs of a folder, but the cases are phantoms: "
+                             "leave them out, or give a folder of CTs")
         if cts and geometry and orbit != Orbit():
             raise ValueError(f"the simulated X-rays are those of data.geometry ({geometry}), but data.orbit was "
                              "given as well: leave one out")

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from phydict.evaluation.fid import Distances, Features, distances, fid_rows
+from phydict.evaluation.fid import Features, distances, fid_rows
 from phydict.evaluation.planes import PLANES
 from phydict.inference.scoring import FIDSettings
 from phydict.runtime.progress import CaseProgress
 
 
 def told_rows(methods: Mapping[str, Mapping[str, Features]], fid: FIDSettings) -> list[dict]:
-    """The `fid_rows` of `told_distances`, label -> case id -> features. Raises ValueError without a case."""
-    return fid_rows(told_distances(methods, fid.replicates), fid.backbone, fid.replicates, fid.normalisation)
-
-
-def told_distances(methods: Mapping[str, Mapping[str, Features]], replicates: int) -> dict[str, Distances]:
-    """`distances`, label -> case id -> features, that tells which planes are done. Raises ValueError without a case."""
+    """The `fid_rows` of methods, label -> case id -> features, telling which planes are done. Raises ValueError without
+    a case."""
     begun = False
 
     def on_plane(plane: str) -> None:
@@ -29,6 +25,6 @@ def told_distances(methods: Mapping[str, Mapping[str, Features]], replicates: in
     with CaseProgress() as progress:
         progress.begin("Frechet distances of slices", len({tuple(cases) for cases in methods.values()}) * len(PLANES),
                        verb="measure", noun="plane")
-        found = distances(methods, replicates, on_plane)
+        found = distances(methods, fid.replicates, on_plane)
         progress.finished("measured")
-    return found
+    return fid_rows(found, fid.backbone, fid.replicates, fid.normalisation)

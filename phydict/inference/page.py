@@ -9,17 +9,14 @@ from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
-import nibabel as nib
-import numpy as np
-
 from phydict.evaluation.fid import StoredFeatures
 from phydict.evaluation.tables import Table, fid_tables
-from phydict.grid import Grid
+from phydict.inference.case_files import missing_page_files, remake_page_files
 from phydict.inference.distances import told_rows
 from phydict.inference.protocols import protocol_of
 from phydict.inference.results import FEATURES, RECORD, TABLE, score_row, score_table
 from phydict.inference.scoring import FIDSettings
-from phydict.page import CASE_FILES, Contents, PageCase, check_own_page, write_case_files, write_page
+from phydict.page import Contents, PageCase, check_own_page, write_page
 from phydict.runtime.progress import CaseProgress
 from phydict.runtime.warning import warn
 
@@ -61,7 +58,7 @@ def _case_folders(folder: Path) -> list[Path]:
 def _cases(folder: Path) -> list[PageCase]:
     """The finished cases; what the page shows of them and older results lack is made, and told as cases are."""
     paths, cases = _case_folders(folder), []
-    lacking = {path for path in paths if _missing(path)}
+    lacking = {path for path in paths if missing_page_files(path)}
     with CaseProgress() as progress:
         if lacking:
             progress.begin("page", len(lacking), verb="prepare", out=folder)
@@ -75,19 +72,13 @@ def _cases(folder: Path) -> list[PageCase]:
     return cases
 
 
-def _missing(path: Path) -> list[str]:
-    """What the page shows of a case and is not there."""
-    return [name for name in CASE_FILES if not (path / name).is_file()]
-
-
 def _case(folder: Path, path: Path) -> PageCase | None:
     """A finished case, None, with a warning, where its files are damaged."""
     try:
         record = json.loads((path / RECORD).read_text())
         score_row(record["case"], record | {"scores": record["scores"] or {}})
         float(record["misfit"]), list(record["misfit_per_view"])
-        if missing := _missing(path):
-            _make_case_files(path, missing)
+        remake_page_files(path)
     except Exception as error:  # whatever a damaged record or volume leads to
         warn(f"{path} is left out of the page, since its files are damaged ({type(error).__name__}: {error})")
         return None
@@ -95,22 +86,13 @@ def _case(folder: Path, path: Path) -> PageCase | None:
                     f"{record['case']}, {record.get('views')}")
 
 
-def _make_case_files(path: Path, missing: list[str]) -> None:
-    image: nib.Nifti1Image = nib.load(path / "volume.nii.gz")  # type: ignore[assignment]
-    volumes = {"reconstruction": np.asarray(image.dataobj)}
-    for name, label in (("interval_90", "half of the 90% interval"), ("deviation", "standard deviation")):
-        if len(volumes) == 1 and (path / f"{name}.nii.gz").is_file():
-            volumes[label] = np.asarray(nib.load(path / f"{name}.nii.gz").dataobj)  # type: ignore[attr-defined]
-    write_case_files(path, Grid(volumes["reconstruction"].shape, affine=image.affine), volumes, names=missing)
-
-
 def _mean_tables(scored: list, empty: Mapping[str, str]) -> list[Table]:
-    """The means over scored cases by method, where there are any."""
-    if not scored:
-        return []
-    names = {record["settings"].get("data", {}).get("protocol") for record in scored}
-    protocol = protocol_of(*names) if len(names) == 1 and None not in names else None
-    return _noted([score_table(scored, protocol, empty)], scored)
+    """The means over scored cases by method, a table for each protocol, since their HU ranges differ."""
+    protocols: dict[str | None, list] = {}
+    for record in scored:
+        protocols.setdefault(record["settings"].get("data", {}).get("protocol"), []).append(record)
+    return [table for name, records in protocols.items()
+            for table in _noted([score_table(records, protocol_of(name) if name else None, empty)], records)]
 
 
 def _noted(tables: Sequence[Table], records: Sequence[Mapping]) -> list[Table]:

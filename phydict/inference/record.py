@@ -17,7 +17,7 @@ from phydict.posterior import CascadePosterior, Refined, Sampler
 from phydict.prior import AnyPrior, MedSynCheckpoint, file_read, fingerprint, own_identity
 from phydict.reconstruction import Reconstruction, Reconstructor, describe
 from phydict.runtime.precision import instruction_set
-from phydict.runtime.profiling import CPU, peak_memory
+from phydict.runtime.profiling import process_peak
 from phydict.runtime.version import VERSION
 
 
@@ -59,7 +59,7 @@ def case_record(case: Case, result: Reconstruction, name: str, method: Reconstru
             "hardened": result.hardened, "scatter": result.scatter, "interval_90_hu": body_interval(result),
             "interval_widening": result.interval_widening, "seconds": result.seconds,
             "network_calls": result.network_calls, "projector_calls": result.projector_calls,
-            "process_peak_memory_mb": peak_memory(CPU), "mu_water": case.get("mu_water", method.mu_water),
+            "process_peak_memory_mb": process_peak(), "mu_water": case.get("mu_water", method.mu_water),
             "views": len(result.xrays), "precision": result.precision, "instruction_set": instruction_set(device),
             "grid": result.grid.to_dict(), "extended_mm": list(result.extended_mm), "seed": result.seed,
             **({"poses": result.poses} if result.poses else {}),

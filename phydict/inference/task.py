@@ -287,7 +287,8 @@ class ReconstructionTask(lightning.LightningModule):
 
     def summarise(self) -> None:
         """Prints and writes the scores of this run's cases. Raises ValueError, naming them, where some have failed."""
-        summarise(self.results, self.cases, self.method_name, self.scoring, self._data.protocol)
+        if self.trainer.is_global_zero:
+            summarise(self.results, self.cases, self.method_name, self.scoring, self._data.protocol)
 
 
 def _said_of(result: Reconstruction) -> str:

@@ -7,7 +7,7 @@ import json
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from urllib.parse import quote
@@ -52,7 +52,7 @@ class Contents:
     points: Sequence[Mapping] = ()
     error: str = "mae_hu"
     plots: Sequence[str] = ()
-    links: Sequence[str] = field(default=())
+    links: Sequence[str] = ()
 
 
 def check_own_page(folder: Path, option: str) -> None:

@@ -231,7 +231,8 @@ async function showCase(key) {
 
 /* Fills the choice of what stands beside a case's volume: its truth, and the same case by other methods. */
 async function offerOthers(case_, volumes) {
-  const same = content.cases.filter(other => other !== case_ && other.record.case === case_.record.case);
+  const same = content.cases.filter(
+    other => other !== case_ && other.folder && other.record.case === case_.record.case);
   const choices = [["nothing", null], ...volumes.truth ? [["truth", volumes.truth]] : [],
                    ...same.map(other => [other.record.method, other])];
   byId("other").replaceChildren(...choices.map(([name], n) => element("option", {value: n}, name)));

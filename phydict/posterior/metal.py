@@ -74,10 +74,10 @@ SOFT = 40.0
 
 FREE, SHARE = 2, 0.25
 
-LEFT, EXPLAINED = 0.95, 1e-3
+LEFT, EXPLAINED = 0.94, 1e-3
 """Shares of the X-rays' shared misfit without metal, and of the X-rays themselves. Of 10^4 photons per pixel of
-training CTs without metal, 5 to 30 ml of 2600 to 3400 HU leave 1.01 times the shared misfit, of a view turned over 0.96
-to 1.00; rods of 2 to 6 ml leave 0.6 to 0.93."""
+training CTs without metal, 5 to 30 ml of 2600 to 3400 HU leave 1.01 to 1.03 times the shared misfit, where a view is
+turned over or another's 0.95 to 1.00; rods of 2 to 15 ml leave 0.6 to 0.93."""
 
 PROMISING = 0.75
 """The share of the density to be reached at which the method runs again: of rods put into training CTs, of 3000 HU and

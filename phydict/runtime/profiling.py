@@ -23,6 +23,7 @@ MIB = 2**20
 CPU, CUDA = torch.device("cpu"), torch.device("cuda")
 
 _running: Profile | None = None
+_set_back = 0.0  # the process' highest peak before one that `reset_peak_memory` began anew
 
 
 @dataclass
@@ -122,6 +123,8 @@ def reset_peak_memory(device: torch.device) -> bool:
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
         return True
+    global _set_back
+    _set_back = max(_set_back, peak_memory(CPU))
     try:
         Path("/proc/self/clear_refs").write_text("5")
     except OSError:
@@ -141,6 +144,11 @@ def peak_memory(device: torch.device) -> float:
         unit = 1 if sys.platform == "darwin" else 1024
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / MIB
     return int(peak[1]) * 1024 / MIB
+
+
+def process_peak() -> float:
+    """The most memory in MiB that the process ever had, whatever `reset_peak_memory` began anew."""
+    return max(_set_back, peak_memory(CPU))
 
 
 class Stopwatch:

@@ -209,7 +209,7 @@ def test_the_table_of_another_comparison_is_left_alone(tmp_path, capsys, trace):
     assert {file: file.read_bytes() for file in (tmp_path / "out").iterdir()} == before
 
 
-@pytest.mark.parametrize("name", ["tables.md", "picture.png"])
+@pytest.mark.parametrize("name", ["tables.md", "picture.png", "fid.csv"])
 def test_what_other_programs_wrote_is_left_alone(tmp_path, capsys, trace, name):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / name).write_text("mine")
@@ -288,6 +288,10 @@ def test_volumes_are_kept_where_that_is_asked_for_and_the_page_shows_them_in_the
         main(["page", str(out)])
         assert f"{rows[0]['key']}/details.json is left out of the page" in capsys.readouterr().err
         assert all(row["key"] in (out / "index.html").read_text() for row in rows)
+    shown = out / "volumes" / rows[0]["key"] / "view.js"
+    shown.unlink()
+    main(["page", str(out)])  # of the volume alone
+    assert shown.is_file() and '"truth"' not in shown.read_text()
 
 
 def test_a_page_made_anew_shows_of_each_case_the_row_of_the_last_run(tmp_path, capsys):

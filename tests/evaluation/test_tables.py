@@ -118,7 +118,7 @@ def test_ranks_follow_the_direction_and_the_printed_values():
 
 
 def test_the_best_is_bold_and_the_second_underlined_by_what_is_printed():
-    table = Table("T_1", ["method", "PSNR", "MAE"], [MEASURES["psnr"], MEASURES["mae_hu"]],
+    table = Table("T_1 $", ["method", "PSNR", "MAE"], [MEASURES["psnr"], MEASURES["mae_hu"]],
                   [("a_b", True, [20.001, 9.0]), ("b", True, [30.0, 5.0]), ("c", False, [40.0, 1.0]),
                    ("d", True, [20.0, None])], ["100 %"])
     lines = table.markdown().splitlines()
@@ -126,7 +126,7 @@ def test_the_best_is_bold_and_the_second_underlined_by_what_is_printed():
                           "| d | <u>20.00</u> | – |"]
     tex = table.latex()
     assert "a\\_b & \\underline{20.00} & \\underline{9.0} \\\\" in tex and "b & \\textbf{30.00} & \\textbf{5.0}" in tex
-    assert "T\\_1. 100 \\%" in tex and "d & \\underline{20.00} & --" in tex
+    assert "T\\_1 \\$. 100 \\%" in tex and "d & \\underline{20.00} & --" in tex
 
 
 @pytest.mark.parametrize("name", [name for name in MEASURES if name != "dice_lung_ct"])  # no method makes it

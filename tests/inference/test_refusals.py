@@ -117,6 +117,15 @@ def test_what_simulates_x_rays_is_refused_where_they_were_measured(name, change,
     assert f"data.{name} is a setting of test" in said and not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("change", ["--data.only=ids.txt", "--data.source.reports=reports.csv"])
+def test_phantoms_are_not_chosen_among_as_a_folder_s_cts_are(change, tmp_path, capsys):
+    assert "the cases are phantoms" in refusal(capsys, main, phantoms(tmp_path / "out", 1, change))
+    (tmp_path / "spec.yaml").write_text("phantoms: 1\naxes: {method: [sirt]}")
+    option = change.replace("--data.", "--").replace("source.reports", "reports").split("=")
+    said = refusal(capsys, main, ["ablate", "-c", str(tmp_path / "spec.yaml"), "--out", str(tmp_path / "out"), *option])
+    assert "the cases are phantoms" in said and not (tmp_path / "out").exists()
+
+
 def test_measured_x_rays_and_their_calibration_are_refused_where_x_rays_are_simulated(measured, tmp_path, capsys):
     assert "leave one out" in refusal(capsys, main, phantoms(tmp_path / "out", 1, f"--data.xrays={measured}"))
     assert "--calibrate" in refusal(capsys, main, phantoms(tmp_path / "out", 1, "--calibrate"))

@@ -118,6 +118,11 @@ def test_kept_volumes_of_a_comparison_are_seen_beside_those_of_other_settings(sh
     page.select_option("#other", label=names[1])
     page.wait_for_function(f"document.getElementById('readout').textContent.includes('{names[1]}')")
     assert page.locator("[data-plane=axial][data-row='1']").is_visible()
+    shutil.rmtree(next(path for path in (tmp_path / "out" / "volumes").iterdir()
+                       if json.loads((path / "details.json").read_text())["settings"]["method"]["iterations"] == 5))
+    main(["page", str(tmp_path / "out")])
+    page = shown("#" + quote(f"{names[0]}/{case}", safe=""), folder=tmp_path / "out")
+    assert page.locator("#other option").all_inner_texts() == ["nothing", "truth"]
 
 
 def test_of_a_case_without_a_volume_what_is_known_is_shown_and_how_volumes_are_kept(shown, tmp_path):

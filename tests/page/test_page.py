@@ -157,6 +157,15 @@ def test_a_line_of_several_settings_is_named_beneath_the_means_and_one_of_severa
     assert "Cases of several settings, as their records tell, in one line: sirt." in results_page(tmp_path).read_text()
 
 
+def test_cases_of_several_protocols_have_a_table_each_of_its_own_range(tmp_path):
+    for method, data in (("sirt", {}), ("tv", {"protocol": "x2ct"}), ("fdk", {"protocol": "x2ct"})):
+        finish(tmp_path, "anna", method, settings={"seed": 0, "data": data})
+    tables = content(results_page(tmp_path))["tables"]
+    assert [[row[0]["text"] for row in table["rows"]] for table in tables] == [["fdk", "tv"], ["sirt"]]
+    for table, ends in zip(tables, ("[-1000, 1500]", "[-1000, 1000]")):
+        assert ends in " ".join([table["title"], *table["notes"]])
+
+
 def test_a_damaged_case_is_left_out_with_a_word(tmp_path):
     finish(tmp_path, "anna", "sirt")
     (finish(tmp_path, "bert", "sirt") / RECORD).write_text("{")

@@ -33,9 +33,7 @@ def with_scatter(measurement: Measurement, first: Callable[[], Tensor], again: C
         second = again()
         better = (residual > SCATTER_THRESHOLD) & (
             measurement.normalised_residual(second[:, :1]) < SCATTER_GAIN * residual)
-        if better.any():
-            measurement.reset_scatter(True)
-        else:
+        if not better.any():
             measurement.fitted = plain
         z = torch.where(better, second, z)
     return z

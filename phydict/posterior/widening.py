@@ -28,9 +28,6 @@ CONTRADICTION_WIDENING = 0.4
 CTs, 4 to 16 views in poses wrong by up to 5 mm and 2 degrees or with breathing by 10 mm, 88 to 92 % of the body is then
 in the 90 % interval, before 75 to 92 %. A gain that drifts by 20 %, which they see less of, is held to 70 % on one."""
 
-SCATTER_WIDENING = 2.0
-"""Factor by which they widen where scatter is subtracted, which shifts HU where a tube's spectrum was taken for it."""
-
 LIMITED_ANGLE_VIEWS, WIDE_SPREAD, LIMITED_POWER = 6, 0.35, 0.6
 """Views up to which, and `angular_spread` from which on, errors are as large as the network says that tells their size;
 and the power of the views over LIMITED_ANGLE_VIEWS by which more of them come from one line at most. Over 144 scenes of
@@ -46,16 +43,15 @@ and tilted by 30 and 45 degrees, it holds 88 to 94 % as it is."""
 
 def widening_of(measurement: Measurement, reprojection: Tensor, most_residual: float) -> float:
     """The factor, 1 or more, by which intervals are wider than calibrated: where the residual of the X-rays is larger
-    than was usual in the calibration, or they contradict each other, hold scatter or come from a narrower arc. Warns
-    where it is more than FAR_OUTSIDE times as large, less what counted as noise, and of a narrower arc."""
+    than was usual in the calibration, or they contradict each other or come from a narrower arc. Warns where it is more
+    than FAR_OUTSIDE times as large, less what counted as noise, and of a narrower arc."""
     residual = float(measurement.normalised_error(reprojection, modelled=True))
     if residual > FAR_OUTSIDE * most_residual:
         warn(f"the residual of the X-rays is {residual:.3g} times their noise, and usually at most {most_residual:.3g} "
              "in the scenes that the intervals were calibrated on: they are widened, and may still be too narrow; "
              "check the geometry and the scale, and whether the patient moved or is wider than the volume")
     widening = max(1.0, residual / most_residual) ** WIDENING * contradiction_widening(measurement)
-    widening *= narrow_arc_widening(measurement.projector)
-    return widening * (SCATTER_WIDENING if measurement.scatter else 1.0)
+    return widening * narrow_arc_widening(measurement.projector)
 
 
 def narrow_arc_widening(projector: Projector) -> float:

@@ -126,9 +126,11 @@ def test_scatter_is_believed_where_xrays_are_missed_and_it_explains_much_of_that
 
     def run(number: int) -> torch.Tensor:
         m.subgrid = m.model_variance = number  # what finer voxels add, and what contradicts, sought anew by each run
+        m.y = m.measured - 0.5 * number  # and what of the X-rays is scatter
         return torch.full((1, 1, 1, 1, 1), number)
 
     result = with_scatter(m, lambda: run(0), lambda: run(1))
+    assert torch.equal(m.y, m.measured - 0.5 * believed)
     assert bool(result) == believed == m.scatter_enabled == m.subgrid == m.model_variance
 
 

@@ -73,7 +73,8 @@ def _cases(folder: Path) -> list[PageCase]:
 
 
 def _case(folder: Path, path: Path) -> PageCase | None:
-    """A finished case, None, with a warning, where its files are damaged."""
+    """A finished case, None, with a warning, where its files are damaged. A method's folder that was given another name,
+    such as a copy, stands behind the method's."""
     try:
         record = json.loads((path / RECORD).read_text())
         score_row(record["case"], record | {"scores": record["scores"] or {}})
@@ -82,6 +83,8 @@ def _case(folder: Path, path: Path) -> PageCase | None:
     except Exception as error:  # whatever a damaged record or volume leads to
         warn(f"{path} is left out of the page, since its files are damaged ({type(error).__name__}: {error})")
         return None
+    if path.parent != folder and (given := path.parent.name) != record["method"]:
+        record["method"] += f" ({given})"
     return PageCase(path.relative_to(folder).as_posix(), sorted(os.listdir(path)), record,
                     f"{record['case']}, {record.get('views')}")
 

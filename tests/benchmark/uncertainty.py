@@ -41,6 +41,8 @@ def scenes(grid: Grid) -> Iterator[tuple[str, ConeBeam, Simulator, Grid, Grid]]:
         yield "ideal", benchmark_orbit(grid, views), Ideal(), grid, grid
     for views in (1, 2, 4, 8, 16):
         yield "polychromatic", benchmark_orbit(grid, views), Polychromatic(), grid, fine
+    for views in (2, 4, 8, 16):
+        yield "scatter", benchmark_orbit(grid, views), Polychromatic(scatter=0.06), grid, fine
     for name in ("arc_60", "truncated"):
         yield name, ConeBeam.load(shipped(f"configs/geometry/{name}.yaml")), Ideal(), grid, grid
     for degrees in (25, 15):

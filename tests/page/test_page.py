@@ -157,6 +157,15 @@ def test_a_line_of_several_settings_is_named_beneath_the_means_and_one_of_severa
     assert "Cases of several settings, as their records tell, in one line: sirt." in results_page(tmp_path).read_text()
 
 
+def test_a_method_s_folder_of_another_name_is_a_line_and_cases_of_its_own(tmp_path):
+    finish(tmp_path, "anna", "sirt")
+    shutil.copytree(tmp_path / "sirt", tmp_path / "sirt_old")
+    held = content(results_page(tmp_path))
+    assert [row[0]["text"] for row in held["tables"][0]["rows"]] == ["sirt", "sirt (sirt_old)"]
+    assert {case["record"]["method"]: case["folder"] for case in held["cases"]} == {
+        "sirt": "sirt/anna", "sirt (sirt_old)": "sirt_old/anna"}
+
+
 def test_cases_of_several_protocols_have_a_table_each_of_its_own_range(tmp_path):
     for method, data in (("sirt", {}), ("tv", {"protocol": "x2ct"}), ("fdk", {"protocol": "x2ct"})):
         finish(tmp_path, "anna", method, settings={"seed": 0, "data": data})

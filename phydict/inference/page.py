@@ -73,8 +73,8 @@ def _cases(folder: Path) -> list[PageCase]:
 
 
 def _case(folder: Path, path: Path) -> PageCase | None:
-    """A finished case, None, with a warning, where its files are damaged. A method's folder that was given another name,
-    such as a copy, stands behind the method's."""
+    """A finished case, None, with a warning, where its files are damaged. The name of a folder that is not its method's,
+    such as that of a copy, stands behind the method."""
     try:
         record = json.loads((path / RECORD).read_text())
         score_row(record["case"], record | {"scores": record["scores"] or {}})

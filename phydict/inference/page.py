@@ -73,8 +73,8 @@ def _cases(folder: Path) -> list[PageCase]:
 
 
 def _case(folder: Path, path: Path) -> PageCase | None:
-    """A finished case, None, with a warning, where its files are damaged. The name of a folder that is not its method's,
-    such as that of a copy, stands behind the method."""
+    """A finished case, None, with a warning, where its files are damaged. Behind the method stands the name of its
+    folder where that is another, as a copy's is."""
     try:
         record = json.loads((path / RECORD).read_text())
         score_row(record["case"], record | {"scores": record["scores"] or {}})

@@ -215,7 +215,9 @@ def onto_grid(method: Reconstructor, grid: Grid | None, refinement: Refinement =
     """
     if grid is None or (method.grid is not None and method.grid.same_as(grid)):
         return method
-    if method.grid is not None:
+    if isinstance(method, Refined):
+        method = replace(method, base=covering(method.base, grid), target=grid)
+    elif method.grid is not None:
         files = corrections_of(method.sampler, grid) if isinstance(method, Posterior) and refinement.step else []
         method = Refined(covering(method, grid), grid, refinement, tuple(map(load_correction, files)))
     elif isinstance(method, Baseline) and not covers(grid, outer := DEFAULT_GRID.turned_as(grid)):

@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import lightning
+import numpy as np
 from torch import Tensor
 
 from phydict.baselines import Region
@@ -203,9 +204,7 @@ class ReconstructionTask(lightning.LightningModule):
         result = self._reconstruct(case, seed)
         volume, truth = resampled(result.volume, self.grid, grid), window.to_hu(case["volume"])[0].cpu()
         if "affine" in case:  # back to its place in the CT it came from
-            affine, coarse = case["affine"].numpy(), result.coarse
-            result = replace(result, grid=placed(self.grid, grid, affine), coarse=coarse and replace(
-                coarse, grid=placed(coarse.grid, grid, affine)))
+            result = _moved(result, grid, case["affine"].numpy())
         with stage("metrics"):
             scores = self.scoring.scores(volume, result.misfit, case, grid, window, self.device, data.protocol)
             features = self.scoring.features(volume, case, grid, window, self.device)
@@ -289,6 +288,13 @@ class ReconstructionTask(lightning.LightningModule):
         """Prints and writes the scores of this run's cases. Raises ValueError, naming them, where some have failed."""
         if self.trainer.is_global_zero:
             summarise(self.results, self.cases, self.method_name, self.scoring, self._data.protocol)
+
+
+def _moved(result: Reconstruction, like: Grid, affine: np.ndarray) -> Reconstruction:
+    """A result, what it carries and its coarse one moved as the voxels `like` are that have this affine."""
+    carried = result.carried and replace(result.carried, grid=placed(result.carried.grid, like, affine))
+    return replace(result, grid=placed(result.grid, like, affine), carried=carried,
+                   coarse=result.coarse and _moved(result.coarse, like, affine))
 
 
 def _said_of(result: Reconstruction) -> str:

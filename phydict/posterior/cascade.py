@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -81,8 +81,11 @@ class CascadePosterior(Reconstructor):
 
     @property
     def second(self) -> Sampler:
-        """What samples the fine stage."""
-        return (self.sr_sampler if self.sr_guided else self.unguided).suited(self.cascade.super_resolution)
+        """What samples the fine stage; what the X-rays hold beside the CT is as the base stage found it."""
+        sampler = (self.sr_sampler if self.sr_guided else self.unguided).suited(self.cascade.super_resolution)
+        if isinstance(sampler, SplitGibbs):
+            return replace(sampler, scatter=False, hardening=False, metal=None)
+        return sampler
 
     @property
     def citation(self) -> str:  # type: ignore[override]

@@ -141,7 +141,9 @@ class Refined(Delegating):
             volume, grid = base.window.to_hu(x[0, 0]), level
             with watch.stage("score"):
                 measurement.match_gain_offset(x)
-                scores = guard.score(x, measurement.project(x), measurement.y)
+                reprojection = measurement.project(x)
+                measurement.subtract_scatter(reprojection)
+                scores = guard.score(x, reprojection, measurement.y) | {"scatter": measurement.scatter}
             calls += measurement.calls
             network_calls += fine_calls
             if correction is not None:

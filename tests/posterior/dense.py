@@ -18,7 +18,7 @@ FINE = CosineSchedule(offset=1e-3, floor=1e-6)
 class DenseMeasurement:
     """y = A x + background, on states (B, 1, 1, 2, 3); stands in for phydict.posterior.Measurement."""
 
-    scales, model_variance = UNIT, 0.0
+    scales, model_variance, display = UNIT, 0.0, None
 
     def __init__(self, matrix: Tensor, y: Tensor, background: float = 0.0):
         self.matrix, self.y, self.background, self.calls = matrix, y[None], background, 0

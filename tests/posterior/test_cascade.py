@@ -11,6 +11,7 @@ from torch.nn.functional import interpolate
 
 from phydict.diffusion import CosineSchedule, GaussianDenoiser
 from phydict.grid import Grid
+from phydict.methods import METHODS
 from phydict.posterior import CascadePosterior, Posterior, PriorOnly, ProximalCG, SplitGibbs
 from phydict.prior import Cascade, MedSynSuperResolution, PriorContract
 from phydict.units import MU_WATER, HUWindow
@@ -79,6 +80,13 @@ def test_unguided_and_without_detail_it_is_the_base_stages_result_upsampled(xray
     expected = HUWindow(-1000, 600).to_hu(base_alone(xrays, kind=kind))[0, 0]
     torch.testing.assert_close(found.volume, expected, atol=0.1, rtol=0)
     assert found.grid.same_as(FINE)
+
+
+def test_what_the_x_rays_hold_beside_the_ct_is_as_the_base_stage_found_it():
+    sampler = METHODS["phydict_fast"]
+    assert sampler.scatter and sampler.hardening and sampler.metal
+    second = CascadePosterior(Cascade(tiny_prior(False), tiny_super_resolution()), SAMPLER, sr_sampler=sampler).second
+    assert not (second.scatter or second.hardening or second.metal) and second.iterations == sampler.iterations
 
 
 def test_a_projector_of_one_s_own_leaves_the_base_stage_to_phydict_s(xrays):

@@ -210,6 +210,13 @@ def test_line_integrals_that_the_base_straightened_are_straight_on_finer_voxels(
     torch.testing.assert_close(straight.xrays, without_hardening(plain.xrays, Known.mu_water))
 
 
+def test_a_refined_method_is_refined_to_other_voxels_from_its_base(xrays):
+    ready = onto_grid(reconstructor("phydict_fast", tiny_prior(False)), Grid.cube(32))
+    again = onto_grid(ready, Grid.cube(48))
+    assert again.base == ready.base and again.target.same_as(Grid.cube(48)) and again.refinement == ready.refinement
+    assert onto_grid(ready, Grid.cube(32)) is ready
+
+
 def test_every_level_is_one_step_and_figures_belong_to_the_volume(xrays):
     steps, target = [], Grid.box((31, 40, 27), (384, 390, 390))
     ready = Refined(Known(), target)

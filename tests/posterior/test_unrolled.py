@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from prior.tiny import tiny_prior, tiny_refiner, tiny_super_resolution
-from torch.nn.functional import interpolate
+from torch.nn.functional import avg_pool3d, interpolate
 
 from phydict.datasets import Thorax, build, load_xrays
 from phydict.diffusion import CosineSchedule, renoise
@@ -156,6 +156,26 @@ def test_a_thin_sheet_that_views_see_along_its_face_contradicts_nothing():
         list(method.estimates(refiner, m))
         counted[asked] = m.model_variance
     assert counted[True] == 0.0 and set(counted[False].flatten().nonzero().flatten().tolist()) == {7, 25}
+
+
+@torch.no_grad()
+def test_what_is_known_of_finer_voxels_counts_once_where_views_are_compared():
+    fine = interpolate(block(), scale_factor=2)
+    fine[:, :, 4:28, 7, 4:28] = 1
+    projector = Projector(GRID, ConeBeam.orbit(8, 1020, 740, (28, 28), 20.0), full_detector=True)
+    y = FinerProjector(projector)(WINDOW.to_mu(fine))
+    y[:, 3] = y[:, 3].flip(-1)
+    z, found = avg_pool3d(fine, 2), []
+    for known in (False, True):
+        m = Measurement(projector, y[0], WINDOW, noise=0.002)
+        if known:
+            m.subgrid = subgrid_projection(m, z, Unrolled.subgrid, 0.5)
+        before = m.subgrid
+        Unrolled()._check_views_fit(m, z, m.project(z), Unrolled.contradiction)
+        assert m.subgrid is before
+        found.append(m.model_variance)
+    assert found[0].max() > 0
+    torch.testing.assert_close(found[1], found[0], rtol=0.35, atol=1e-4)
 
 
 def test_scatter_that_the_first_step_knows_little_of_contradicts_nothing():

@@ -82,6 +82,8 @@ class PnPDM(Sampler):
         m, schedule = NormalisedMeasurement(measurement, self.noise), denoiser.schedule
         grid = polynomial_levels(self.sigma_max, self.sigma_min, self.levels)
         total, kept = torch.zeros_like(x), 0
+        if measurement.display is not None:
+            measurement.match_gain_offset(denoiser.denoise(x, 1.0)[:, :1].clamp(-1, 1))
         for i in range(self.iterations):
             rho = max(self.rho_max * self.decay**i, self.rho_min)
             times = times_of(schedule, [rho, *(sigma for sigma in grid if sigma < rho)])

@@ -132,7 +132,8 @@ class Unrolled(Sampler):
         for n, t in enumerate(times):
             channels = evidence(z[:, :1], before[:, :1], start[:, :1])
             projection = measurement.last_projection
-            if n == int(measurement.scatter_enabled) and self.contradiction is not None and projection is not None:
+            checked = n == min(int(measurement.scatter_enabled), len(times) - 1)
+            if checked and self.contradiction is not None and projection is not None:
                 self._check_views_fit(measurement, z[:, :1], projection, self.contradiction)
             signal = float(refiner.schedule.scales(t)[0])
             x0 = refiner.refine(signal * z, t, channels)
@@ -161,7 +162,9 @@ class Unrolled(Sampler):
 
         excess = excess_of(errors := measurement.view_errors(projection))
         if (excess > 0).any() and self.subgrid is not None and has_finer(measurement.projector):
-            finer = subgrid_projection(measurement, z, self.subgrid, self.x0_stds[0])
+            known = measurement.subgrid
+            finer = subgrid_projection(measurement, z, self.subgrid, self.x0_stds[0]) - known
+            measurement.subgrid = known
             excess = excess_of(torch.minimum(errors, measurement.view_errors(projection + finer)))
         if (excess > 0).any():
             measurement.model_variance = CAUTION**2 * excess.clamp(min=0)[:, None, None]

@@ -158,6 +158,21 @@ def test_a_resumed_run_is_the_uninterrupted_one_and_leaves_the_correction_as_it_
     assert not torch.equal(trained["uncertainty.quantiles"], FinerUncertainty((4, 8)).quantiles.half().float())
 
 
+def test_intervals_are_those_of_the_network_whose_results_are_stored(tmp_path, cache, files, capsys):
+    refiner, _, fine = files
+    save_correction(knowing(uncertain=False), other := tmp_path / "other.safetensors", dtype=torch.float16)
+    said = refusal(capsys, main, arguments(tmp_path / "run", cache, refiner, fine, f"--model.initial={other}",
+                                           "--trainer.max_epochs=1"))
+    assert "give one file as model.initial and data.made.network" in said
+
+
+def test_intervals_are_not_calibrated_on_nothing(tmp_path, cache, files, capsys):
+    refiner, _, fine = files
+    said = refusal(capsys, main, arguments(tmp_path / "run", cache, refiner, fine, "--data.holdout.phantoms=0",
+                                           "--trainer.max_epochs=1"))
+    assert "nothing is held out" in said
+
+
 def test_a_training_of_intervals_and_one_of_the_correction_are_not_resumed_as_each_other(files):
     settings = {"cube": Cube(32), "window": (-1000, 600), "initial": files[2]}
     for task, other in ((FinerUncertaintyTraining(FinerUncertainty((4, 8)), **settings), knowing(uncertain=False)),

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from command_lines import CONFIG, arguments, checkpoint, losses, refusal
+from ct_files import save_ct, thorax_hu
 from prior.tiny import tiny_prior
 from processes import TRAIN, Python
 from torch.utils.data import default_collate
@@ -235,6 +236,26 @@ def test_a_run_that_stopped_at_an_epochs_last_batch_goes_on_with_the_next_ones_f
     before = len(drawn)
     main([*args, "--trainer.max_steps=5", f"--ckpt_path={tmp_path / 'last.ckpt'}"])
     assert drawn[before:before + 4] == [(1, i) for i in range(4)]
+
+
+@pytest.mark.parametrize("stop", [3, 4, 6, 8])
+def test_a_run_of_so_many_steps_that_validates_now_and_then_resumes_as_the_uninterrupted_one(tmp_path, cache, stop):
+    args = arguments(tmp_path, cache, "--model.text.encoder=none", "--data.loading.epoch_size=4",
+                     "--trainer.check_val_every_n_epoch=5", "--trainer.limit_val_batches=1")
+    main([*args, f"--out={tmp_path / 'straight'}", "--trainer.max_steps=10"])
+    main([*args, f"--out={tmp_path / 'halved'}", f"--trainer.max_steps={stop}"])
+    main([*args, f"--out={tmp_path / 'halved'}", "--trainer.max_steps=10", "--ckpt_path=last"])
+    one, other = (checkpoint(tmp_path / run) for run in ("straight", "halved"))
+    assert one["global_step"] == other["global_step"] == 10 and one["epoch"] == other["epoch"]
+    assert all(torch.equal(one["state_dict"][name], other["state_dict"][name]) for name in one["state_dict"])
+
+
+def test_an_id_that_is_held_out_is_no_word_for_longer_ones(tmp_path):
+    for name in ("1", "10", "21"):
+        save_ct(tmp_path / "cts" / f"{name}.nii.gz", thorax_hu())
+    held_out = [PriorData(str(tmp_path / "cts"), holdout=HoldOut([word], phantoms=1), cache=str(tmp_path / "cache"),
+                          cube=Cube(16)).held_out for word in ("1", "2", "0")]
+    assert held_out == [["1"], ["21"], ["10"]]
 
 
 def test_no_phantom_both_tests_and_validates_or_is_trained_on(tmp_path):

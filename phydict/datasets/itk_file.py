@@ -11,6 +11,21 @@ from phydict.runtime.reading import check_memory
 
 ENDINGS = (".mhd", ".mha", ".nrrd")
 
+MOST_HEADER = 2**20
+"""Bytes of a MetaImage header that are looked at."""
+
+
+def voxel_files(path: Path) -> list[Path]:
+    """The files that hold the voxels of a MetaImage header (.mhd), as far as they are there; none of other files."""
+    if path.suffix.lower() != ".mhd":
+        return []
+    with path.open("rb") as file:
+        lines = file.read(MOST_HEADER).decode("latin-1").splitlines()
+    values = [line.partition("=")[2].strip() for line in lines]
+    first = next((n for n, line in enumerate(lines) if line.partition("=")[0].strip() == "ElementDataFile"), len(lines))
+    names = [*values[first:first + 1], *(line.strip() for line in lines[first + 1:])]
+    return [path.parent / name for name in names if name and (path.parent / name).is_file()]
+
 
 def read_itk(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """The numbers (X, Y, Z) of a file with one of ENDINGS, and its 4x4 index -> RAS+ world mm affine. For use inside

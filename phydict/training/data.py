@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import lightning
 import torch
+from lightning.pytorch.loops.loop import _Loop
 from torch.utils.data import ConcatDataset, DataLoader, Dataset, DistributedSampler, Subset
 
 from phydict.datasets import (
@@ -71,12 +73,17 @@ class PriorData(lightning.LightningDataModule):
         self.draw_grid = Grid.cube(self.block * trained, cube.side)
         self.phantoms = CachedPhantoms(0, phantoms, self.draw_grid, hu, Path(cache))
         files = source.find(cts) if cts else []
+        names = {f.id for f in files}
+
+        def meant(word: str, id: str) -> bool:
+            return word == id if word in names else word in id
+
         for word in holdout.ids or []:
-            if not any(word in f.id for f in files):
+            if not any(meant(word, f.id) for f in files):
                 raise ValueError(f"data.holdout.ids names '{word}', but no CT has that in its id"
                                  + (f" (the first id is {files[0].id})" if files else "") + ": correct or remove it")
         validating = set(split_by_patient([f.id for f in files], holdout.fraction, seed)[1])
-        named = {patient_of(f.id) for f in files if any(word in f.id for word in holdout.ids or [])}
+        named = {patient_of(f.id) for f in files if any(meant(word, f.id) for word in holdout.ids or [])}
         held_out = [f for f in files if f.id in validating or patient_of(f.id) in named]
         if len(held_out) == len(files) and not phantoms:
             raise ValueError("there is nothing to train on: data.holdout holds out every CT, and data.phantoms is 0")
@@ -131,12 +138,16 @@ class PriorData(lightning.LightningDataModule):
                              f"device ({least}): raise it, or lower data.loading.batch_size")
         # Lightning's own sampler would shuffle: several processes take turns, so that each step sees what one would.
         draws, fit = self.draws(self.trainer.current_epoch), self.trainer.fit_loop
+        epoch: Any = fit.epoch_progress.current
+        if fit.restarting and fit.epoch_loop.batch_progress.is_last_batch and epoch.ready == epoch.processed:
+            # Where steps are counted, Lightning takes a finished epoch for a part of one, and would go on within it.
+            _Loop.restarting.fset(fit, False)  # type: ignore[attr-defined]
         if fit.restarting:  # perhaps within an epoch, whose first batches are done
             length = self.loading.epoch_size
             done = least * (fit.epoch_loop.batch_progress.current.ready % (length // least))
             draws = Subset(draws, [n % length for n in range(done, done + length)])
         turns: DistributedSampler = DistributedSampler(draws, self.trainer.world_size, self.trainer.global_rank,
-                                                       shuffle=False)
+                                                       shuffle=False, drop_last=True)
         return DataLoader(draws, self.loading.batch_size, sampler=turns, num_workers=self.loading.workers,
                           drop_last=True, collate_fn=self.collate)
 

@@ -6,7 +6,7 @@ from torch import Tensor
 from torchmetrics.functional import spearman_corrcoef
 
 from phydict.grid import Cube
-from phydict.prior import DEFAULT_CORRECTION, describe_correction, load_correction
+from phydict.prior import DEFAULT_CORRECTION, describe_correction, fingerprint, load_correction
 from phydict.prior.correction import CorrectionNetwork
 from phydict.prior.finer_uncertainty import SEEN, FinerUncertainty, tissue_of_seen
 from phydict.prior.uncertainty import TISSUES
@@ -44,8 +44,14 @@ class FinerUncertaintyTraining(StageTraining):
         corrects.uncertainty = network or corrects.uncertainty or FinerUncertainty()
         super().__init__(corrects, optimisation, 0)
         corrects.uncertainty.train().requires_grad_(True)
-        self.body_weight = body_weight
+        self.body_weight, self.initial = body_weight, initial
         self.held_out: list[tuple[Tensor, Tensor]] = []
+
+    def setup(self, stage: str) -> None:
+        made = self.trainer.datamodule.made.network  # type: ignore[attr-defined]
+        if fingerprint(made) != fingerprint(self.initial):
+            raise ValueError(f"the results are those of {made}, but the intervals are to be those of {self.initial}: "
+                             "give one file as model.initial and data.made.network")
 
     def batch_loss(self, batch: dict, key: tuple[int, ...] = (0,), rank: int = 0, processes: int = 1) -> Tensor:
         log_scale, error, tissue = self._compared(batch["volume"])

@@ -175,7 +175,7 @@ class HoldOut:
     """What validates instead of training.
 
     Args:
-        ids: CTs whose id contains one of these words
+        ids: CTs whose id is one of these words or, of a word that is no id, contains it
         fraction: share of the patients, in [0, 1]
         phantoms: a number of phantoms that are never trained on
     """

@@ -84,6 +84,9 @@ class StageTraining(lightning.LightningModule, ABC):
                              "configs/prior/ddp.yaml instead of fsdp.yaml")
 
     def on_fit_start(self) -> None:
+        if self.calibrates and not len(self.trainer.datamodule.validation):  # type: ignore[attr-defined]
+            raise ValueError("validation calibrates the intervals, but nothing is held out: name CTs by "
+                             "data.holdout.ids, or give a share of them as data.holdout.fraction")
         for callback in self.averaging():
             if self.calibrates:
                 raise ValueError("weights that validation calibrates cannot be averaged: train without "

@@ -154,6 +154,17 @@ def test_geometry_yaml_overrides_tags_one_by_one_or_all(tmp_path):
     assert load_xrays(folder)["beam"].same_as(beam)
 
 
+@pytest.mark.parametrize("orientation", [{"rotate_degrees": 90}, {"flip_columns": True}])
+def test_an_image_that_its_tag_turns_is_not_turned_again_without_a_word(tmp_path, orientation):
+    given = angled(0.0) | {"PatientOrientation": ["F", "R"]}
+    said = {"orientation": orientation, "intensity": {"kind": "line_integrals", "scale": 1e-4}}
+    folder = described(one(tmp_path, **given), **said)
+    with pytest.raises(ValueError, match=r"PatientOrientation of .* says already how its image is turned: leave"):
+        load_xrays(folder)
+    described(folder, beam={"dicom": {"patient_orientation": "L\\F"}}, **said)
+    assert load_xrays(folder)["beam"].u[0, 0] < 0
+
+
 def test_turned_images_turn_the_pixels_of_their_tags(tmp_path):
     folder = described(one(tmp_path, **angled(0.0)), orientation={"rotate_degrees": 90},
                        intensity={"kind": "line_integrals", "scale": 1e-3})

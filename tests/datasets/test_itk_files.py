@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 from ct_files import save_ct, thorax_hu
 
-from phydict.datasets.cts.ct_rate import find_cts
+from phydict.datasets.cts.ct_rate import CTCases, find_cts
 from phydict.datasets.cts.sources import find_sources
 from phydict.datasets.cts.transforms import load_ct
-from phydict.datasets.itk_file import ENDINGS
+from phydict.datasets.itk_file import ENDINGS, voxel_files
+from phydict.grid import Grid
+from phydict.units import HUWindow
 
 SimpleITK = pytest.importorskip("SimpleITK")
 TURNED = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -26,6 +28,18 @@ def save_itk(path: Path, volume: np.ndarray, vector: bool = False) -> Path:
     image.SetDirection((-TURNED).ravel().tolist() if volume.ndim == 3 else np.eye(3).ravel().tolist())
     SimpleITK.WriteImage(image, str(path))
     return path
+
+
+def test_other_voxels_beside_the_same_header_are_another_ct(tmp_path):
+    path, known = tmp_path / "ct.mhd", set()
+    for shift in (0, 100):
+        save_itk(path, thorax_hu().astype(np.int16) + np.int16(shift))
+        assert voxel_files(path) == [tmp_path / "ct.raw"]
+        [ct], [source] = find_cts(path), find_sources(path)
+        known.add((CTCases([ct], tmp_path, Grid.cube(16), HUWindow()).key(ct), str(source.fingerprint())))
+    assert len(known) == 2 and len({key for key, _ in known}) == 2
+    path.write_text(path.read_text().replace("ct.raw", "LOCAL"))
+    assert voxel_files(path) == [] == voxel_files(tmp_path / "ct.raw")
 
 
 @pytest.mark.parametrize("ending", ENDINGS)

@@ -21,7 +21,7 @@ from phydict.datasets.cts.ct_rate_tables import read_calibrations, read_reports
 from phydict.datasets.cts.prepared import VOLUME, is_prepared, read_prepared, read_record
 from phydict.datasets.cts.segmentations import is_segmentation, mask_files
 from phydict.datasets.cts.transforms import Calibration, case_id, prepare_ct
-from phydict.datasets.itk_file import ENDINGS
+from phydict.datasets.itk_file import ENDINGS, voxel_files
 from phydict.datasets.natural_order import natural_order
 from phydict.datasets.nifti_file import NIFTI
 from phydict.grid import Grid
@@ -277,8 +277,8 @@ class CTCases(Dataset):
         """Of a CT as it is prepared here: another file, grid, window or calibration has another, and of one that was
         prepared before so have other masks."""
         stat = ct.path.stat()
-        masks = [[file.name, file.stat().st_mtime_ns, file.stat().st_size]
-                 for file in (mask_files(ct.path) if is_prepared(ct.path) else ())]
+        beside = mask_files(ct.path) if is_prepared(ct.path) else voxel_files(ct.path)
+        others = [[file.name, file.stat().st_mtime_ns, file.stat().st_size] for file in beside]
         parts = [CACHE_VERSION, str(ct.path.resolve()), stat.st_mtime_ns, stat.st_size, self.grid.to_dict(),
                  asdict(self.window), asdict(ct.calibration) if ct.calibration else None]
-        return key_of([*parts, *masks])
+        return key_of([*parts, *others])

@@ -14,7 +14,7 @@ from phydict.datasets.cts.ct_rate_tables import read_reports
 from phydict.datasets.cts.ct_series import Series, find_series, load_series
 from phydict.datasets.cts.segmentations import segmentations_beside
 from phydict.datasets.cts.transforms import case_id, load_ct
-from phydict.datasets.itk_file import ENDINGS
+from phydict.datasets.itk_file import ENDINGS, voxel_files
 from phydict.runtime.files import file_crc32
 from phydict.runtime.reading import reading
 
@@ -43,7 +43,7 @@ class Source:
     def fingerprint(self) -> dict:
         """What identifies this input, as plain JSON values: the number, bytes and contents of its files, those of its
         segmentations included, its report and its calibration. Reads every file once. Raises ValueError and OSError."""
-        parts = {"ct": self.ct.files if isinstance(self.ct, Series) else (self.ct.path,)}
+        parts = {"ct": self.ct.files if isinstance(self.ct, Series) else (self.ct.path, *voxel_files(self.ct.path))}
         parts |= segmentations_beside(self.beside)
         files = [file for part in parts.values() for file in part]
         calibration = None if isinstance(self.ct, Series) else self.ct.calibration

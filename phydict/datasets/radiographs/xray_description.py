@@ -102,6 +102,12 @@ class Description:
             if not tags:
                 raise ValueError(f"{self.source} leaves the beam to DICOM's tags, but the images are not DICOM, so "
                                  "that they have no scale; state `beam:` with pixel size and distances in mm")
+            tagged = next((tag.name for tag in tags if tag.patient_orientation), None)
+            stated = "patient_orientation" in (beam.get("dicom") or {})
+            if tagged and not stated and self.orientation != Orientation():
+                raise ValueError(f"{self.source}: PatientOrientation of {tagged} says already how its image is turned: "
+                                 "leave `orientation:` out, or state that of the turned image as `beam: {dicom: "
+                                 "{patient_orientation: ...}}`")
             return tags_beam(tags, shape, beam.get("dicom"), self.orientation.turned,
                              f"`dicom:` of {self.source}")
         if "file" in beam:

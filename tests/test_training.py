@@ -238,7 +238,7 @@ def test_a_run_that_stopped_at_an_epochs_last_batch_goes_on_with_the_next_ones_f
     assert drawn[before:before + 4] == [(1, i) for i in range(4)]
 
 
-@pytest.mark.parametrize("stop", [3, 4, 6, 8])
+@pytest.mark.parametrize("stop", [4, 6])
 def test_a_run_of_so_many_steps_that_validates_now_and_then_resumes_as_the_uninterrupted_one(tmp_path, cache, stop):
     args = arguments(tmp_path, cache, "--model.text.encoder=none", "--data.loading.epoch_size=4",
                      "--trainer.check_val_every_n_epoch=5", "--trainer.limit_val_batches=1")

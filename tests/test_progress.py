@@ -10,9 +10,10 @@ import pytest
 import torch
 from rich.console import Console
 
-from phydict.evaluation.fid import NAMES, distances
+from phydict.evaluation.fid import distances, fid_rows
 from phydict.evaluation.planes import PLANES
-from phydict.inference.distances import told_distances
+from phydict.inference.distances import told_rows
+from phydict.inference.scoring import FIDSettings
 from phydict.runtime import progress as module
 from phydict.runtime.progress import CaseProgress, duration
 from phydict.runtime.telling import bars_on, tell, telling
@@ -108,9 +109,8 @@ def test_frechet_distances_tell_plane_after_plane_and_are_the_same(capsys):
     some = np.random.default_rng(0)
     methods = {method: {case: {plane: torch.from_numpy(some.normal(size=(2, 5, 3))) for plane in PLANES}
                         for case in cases} for method, cases in (("sirt", "ab"), ("tv", "ab"), ("fdk", "a"))}
-    found, wanted = told_distances(methods, 7), distances(methods, 7)
-    for method in methods:
-        assert all(np.array_equal(found[method].values[name], wanted[method].values[name]) for name in NAMES)
+    fid = FIDSettings(replicates=7)
+    assert told_rows(methods, fid) == fid_rows(distances(methods, 7), fid.backbone, 7, fid.normalisation)
     begin, *lines = capsys.readouterr().err.splitlines()
     assert begin == "Frechet distances of slices: 6 planes to measure"  # of two groups of methods with the same cases
     assert [re.sub(", about .* to go", "", line) for line in lines] == [

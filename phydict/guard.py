@@ -13,7 +13,7 @@ from torch import Tensor
 from phydict.grid import Grid
 from phydict.runtime.warning import warn
 from phydict.units import HUWindow
-from phydict.xray.residuals import misfits, shared_norms, view_norms, view_sizes
+from phydict.xray.residuals import misfits, shared_norms, worst_misfit
 
 EMPTY_MISFIT, RISE_FACTOR, RISE_MIN = 1.0, 2.0, 0.1
 """A misfit has risen where it is more than RISE_FACTOR times its smallest so far, that of an empty volume included, and
@@ -67,8 +67,7 @@ class Guard:
         if estimate is not None:
             self._check(estimate)
         if projection is not None:
-            y = self.operator.y
-            misfit = (view_norms(projection - y).norm(dim=-1) / view_sizes(y).norm(dim=-1)).max()
+            misfit = worst_misfit(projection, self.operator.y)
             self._check(misfit)
             self.misfits[self.step] = float(misfit)
         self.on_step()

@@ -59,11 +59,11 @@ def _case(folder: Path, entry: Entry, row: Mapping) -> PageCase:
     scores = {name: row[name] for name in MEASURES if row.get(name) is not None}
     record = {name: value for name, value in row.items() if name not in scores and value is not None}
     group = format_settings(str(row["case"]), entry.condition)
-    kept = volume_folder(folder, str(row.get("key")))
+    kept, place, files, details = volume_folder(folder, str(row.get("key"))), "", list[str](), dict()
     if kept.is_dir():
         _complete(kept)
-    place, files = (kept.relative_to(folder).as_posix(), sorted(os.listdir(kept))) if kept.is_dir() else ("", ())
-    details = _details(kept / DETAILS) if DETAILS in files else {}
+        place, files = kept.relative_to(folder).as_posix(), sorted(os.listdir(kept))
+        details = _details(kept / DETAILS) if DETAILS in files else {}
     return PageCase(place, files, record | details | {
         "method": format_settings(entry.name, entry.condition, {"seed": row.get("seed", 0)}),
         "scores": scores, "misfit": row.get("misfit"), "seconds": {"all": row["seconds"]} if "seconds" in row else {},

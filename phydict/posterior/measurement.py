@@ -19,7 +19,7 @@ from phydict.xray.calibration import match_views, subtract_scatter, without_hard
 from phydict.xray.carried import Carried
 from phydict.xray.checks import check_line_integrals, check_xrays, with_air_at_zero
 from phydict.xray.noise_level import noise_level
-from phydict.xray.residuals import shared_norms, view_sizes
+from phydict.xray.residuals import shared_norms, worst_misfit
 
 MAX_LINE_INTEGRAL = 30.0
 """Line integrals above which no photon comes through, so that they hold no scatter either."""
@@ -158,7 +158,7 @@ class Measurement:
 
     def shared_misfit(self, x: Tensor) -> float:
         """The relative residual of the CTs x, the largest of a batch, without what is noise (`shared_norms`)."""
-        return float((shared_norms(self.project(x) - self.y).norm(dim=-1) / view_sizes(self.y).norm(dim=-1)).max())
+        return float(worst_misfit(self.project(x), self.y, shared_norms))
 
     def view_errors(self, projection: Tensor) -> Tensor:
         """Root mean square (K,) by which projections (1, K, V, U) miss the line integrals of each view, beyond what its

@@ -31,6 +31,11 @@ def misfits(reprojection: Tensor, xrays: Tensor, norms: Callable[[Tensor], Tenso
     return {"misfit": float(residual.norm() / size.norm()), "misfit_per_view": (residual / size).tolist()}
 
 
+def worst_misfit(projections: Tensor, xrays: Tensor, norms: Callable[[Tensor], Tensor] = view_norms) -> Tensor:
+    """The largest relative residual over all views of projections (B, K, V, U) of X-rays (1, K, V, U), a scalar."""
+    return (norms(projections - xrays).norm(dim=-1) / view_sizes(xrays).norm(dim=-1)).max()
+
+
 def view_sizes(xrays: Tensor) -> Tensor:
     """Norms (..., K) of views (..., K, V, U), of which none counts as smaller than one of EPS_LINE_INTEGRAL in every
     pixel."""

@@ -7,8 +7,8 @@ Beside the volume on 256^3 voxels that of 128^3, interpolated; what the X-rays a
 64^3 on 256^3, without the networks on finer voxels; what the network of 3 mm makes of them alone; and methods without a
 prior on 256^3, total variation at its weight of 64^3 times the ratio of the voxels' lengths, CGLS at five restarts, the
 other two at their settings of 64^3. Scored by LPIPS too (TORCH_HOME: its backbones), and by how sharp edges are. Writes
-finest.csv beside this file after each CT, where rows of other CTs, numbers
-of views and ways stay, and prints means and the least lead of 256^3 over each.
+finest.csv beside this file after each CT, where rows of other CTs, numbers of views and ways stay, and prints means and
+the least lead of 256^3 over each.
 """
 
 import argparse

@@ -28,7 +28,7 @@ import nibabel
 import numpy as np
 import torch
 from hard_scenes import blurred, drifted, focal_spot, heeled, lagging, scaled, water_cube, without_left_lung
-from poses import lowered, true_beam
+from poses import USUAL, lowered, true_beam
 from scipy.ndimage import rotate
 from scipy.stats import spearmanr
 from torch import Tensor
@@ -45,7 +45,7 @@ from phydict.reconstruction import Reconstruction
 from phydict.runtime.console import sentence
 from phydict.units import mu_to_hu
 from phydict.xray import Ideal
-from phydict.xray.poses.uncertain import USUAL, Uncertain
+from phydict.xray.poses.uncertain import Uncertain
 
 sys.path.append(str(Path(__file__).parents[1]))
 from fitting import fit_to_grid

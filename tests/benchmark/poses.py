@@ -40,12 +40,13 @@ from phydict.runtime.seeds import case_seed
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Ideal, Projector
 from phydict.xray.poses.gauge import aligned, reprojection_errors
-from phydict.xray.poses.uncertain import USUAL
+from phydict.xray.poses.uncertain import Uncertain
 from phydict.xray.poses.unknowns import moved
 
 sys.path.append(str(Path(__file__).parents[1]))
 from fitting import fit_to_grid
 
+USUAL = Uncertain(detector_shift_mm=5.0, source_shift_mm=5.0, source_to_detector_mm=5.0, rotation_degrees=2.0)
 FILE = Path(__file__).with_suffix(".csv")
 GRID, WINDOW = Grid.cube(64), HUWindow()
 POINTS = middle_points(GRID)

@@ -91,10 +91,6 @@ class Uncertain:
                              "`uncertain:`, with the pixel size and distances that go with it, or give line integrals")
 
 
-USUAL = Uncertain(detector_shift_mm=5.0, source_shift_mm=5.0, source_to_detector_mm=5.0, rotation_degrees=2.0)
-"""For simulated X-rays, of which no file says it."""
-
-
 def by_hand(beam: ConeBeam) -> Uncertain:
     """What is usual of radiographs for which a patient stands and turns between exposures: a magnification within 10 %
     of what was noted among it."""

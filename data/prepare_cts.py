@@ -7,7 +7,7 @@ from pathlib import Path
 from phydict.datasets.cts.preparation import SUMMARY, prepare_folder
 from phydict.datasets.cts.spaces import Settings, atlas_lungs
 from phydict.runtime.console import check_writable, cli_errors, quiet
-from phydict.runtime.telling import run_command, told_of
+from phydict.runtime.progress_log import progress_options, run_command
 
 
 def prepare(cts: str, out: str, voxels: int = 256, side: float = 384.0, space: str = "patient",
@@ -46,7 +46,7 @@ def prepare(cts: str, out: str, voxels: int = 256, side: float = 384.0, space: s
 def main(args: list[str] | None = None) -> None:
     """Command line; a bad input ends in one sentence and exit code 2."""
     given = sys.argv[1:] if args is None else args
-    with told_of(given), cli_errors(), quiet():
+    with progress_options(given), cli_errors(), quiet():
         run_command(prepare, given, positional=True)
 
 

@@ -46,7 +46,6 @@ from phydict.prior import (
     MedSynCheckpoint,
     MedSynSuperResolution,
     SuperResolution,
-    check_prior,
     find_prior,
     is_refiner,
     load_correction,
@@ -61,9 +60,9 @@ from phydict.runtime.seeds import check_seed
 from phydict.runtime.warning import heard, warn
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam
-from phydict.xray.beyond import asked
-from phydict.xray.boxes import covers, seen_by
-from phydict.xray.checks import check_air, check_xrays, with_air_at_zero
+from phydict.xray.beyond import with_continuation
+from phydict.xray.boxes import binned_to, covers
+from phydict.xray.checks import check_fit, with_air_at_zero
 from phydict.xray.poses.uncertain import Uncertain
 
 if TYPE_CHECKING:
@@ -176,8 +175,7 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: AnyPrior | str |
         given = f"the class {method.__name__}, not an object of it," if isinstance(method, type) else repr(method)
         raise ValueError(f"a method is a name ({', '.join(METHODS)}), a Sampler or a Reconstructor, but {given} was "
                          "given")
-    loaded = find_prior(prior or method.default_prior) if prior is None or isinstance(prior, str | Path) else prior
-    check_prior(loaded)
+    loaded = find_prior(method.default_prior if prior is None or prior == "" else prior)
     name = name or type(method).__name__
     if super_resolution is None:
         otherwise = FISTATV() if method.chests_only else None
@@ -238,7 +236,7 @@ def reconstruct_by(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeB
     with heard() as warnings:
         if isinstance(method, Region) and beam.is_smaller_than(method.outer):
             method = method.base  # of a scene that is smaller than a chest
-        _check_fit(method, grid, xrays, beam)
+        check_fit(xrays, beam, grid, method.survey)
         poses: FoundPoses | None = None
         if uncertain is not None:
             xrays, poses = calibrated(method, method.survey or grid, xrays, beam, uncertain, display, on_step)
@@ -247,23 +245,11 @@ def reconstruct_by(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeB
         with watch.stage("fit to grid"):
             xrays = xrays.float()
             method, grid, beam = extended(method, grid, xrays, beam, display)
-            xrays, A = seen_by(grid, xrays, beam, method.full_detector, projector)
+            xrays, A = binned_to(grid, xrays, beam, method.full_detector, projector)
         result = method.reconstruct(xrays, A, report, display, seed, on_step)
         prepared = sum(watch.seconds.values()) + result.seconds.get("prepare", 0.0)
         result = replace(result, seconds=result.seconds | {"prepare": prepared})
     return replace(poses.added_to(result) if poses else result, warnings=warnings)
-
-
-def _check_fit(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam) -> None:
-    check_xrays(xrays, beam)
-    check_air(xrays)
-    beam.check(grid)
-    beam.check_scale(method.survey or grid)
-    beam.check_meets(grid)
-    if beam.continued and not grid.is_upright:
-        raise ValueError("a patient who goes on above and below is continued along the third axis of the voxels, which "
-                         f"is to run upwards, but {np.round(grid.affine[:3, 2] / grid.spacing[2], 2).tolist()} was "
-                         "given: give voxels whose third axis is superior, or leave out `continued`")
 
 
 def calibrated(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, uncertain: Uncertain,
@@ -278,7 +264,7 @@ def calibrated(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam,
 
     if not display:
         xrays = with_air_at_zero(xrays)  # which the reconstruction would see no more once offsets are found
-    stated, beam = beam.continued, asked(xrays.float(), beam, grid, display)
+    stated, beam = beam.continued, with_continuation(xrays.float(), beam, grid, display)
     poses = find_poses(xrays, beam, uncertain, grid, display, method.mu_water, on_round=on_round)
     poses = replace(poses, beam=replace(poses.beam, continued=stated))
     for words in poses.warnings():

@@ -7,8 +7,8 @@ from torch import Tensor
 from phydict.grid import Grid
 from phydict.reconstruction import Reconstructor
 from phydict.xray import ConeBeam, Projector
-from phydict.xray.beyond import asked
-from phydict.xray.boxes import seen_by
+from phydict.xray.beyond import with_continuation
+from phydict.xray.boxes import binned_to
 
 
 def fit_to_grid(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam,
@@ -17,5 +17,5 @@ def fit_to_grid(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam
     X-rays' device; `projector` is its kind, as Projector's `method`. Whether the patient goes on beyond the grid is
     asked of the X-rays where the beam does not say."""
     xrays = xrays.float()
-    beam = asked(xrays, beam, method.survey or grid, False)
-    return seen_by(grid, xrays, beam, method.full_detector, projector)
+    beam = with_continuation(xrays, beam, method.survey or grid, False)
+    return binned_to(grid, xrays, beam, method.full_detector, projector)

@@ -17,7 +17,7 @@ from phydict.posterior import Refined, Unrolled
 from phydict.posterior.refined import ON_FINER
 from phydict.prior import describe_correction, load_correction, save_correction, save_refiner
 from phydict.prior.correction import CorrectionNetwork
-from phydict.prior.finer_uncertainty import SEEN, FinerUncertainty, tissue_of_seen
+from phydict.prior.finer_uncertainty import INPUT_CHANNELS, FinerUncertainty, tissue_of_seen
 from phydict.prior.uncertainty import LEVELS, TISSUES
 from phydict.training.finer_uncertainty import FinerUncertaintyTraining
 from phydict.training.refinement import RefinementTraining
@@ -74,7 +74,7 @@ def test_an_uncalibrated_network_gives_the_intervals_of_its_own_distribution():
 
 
 def test_voxels_are_sorted_by_the_share_of_lung_and_hu():
-    given = torch.zeros(1, SEEN, 1, 1, 3)
+    given = torch.zeros(1, INPUT_CHANNELS, 1, 1, 3)
     given[0, 0, 0, 0], given[0, 3, 0, 0] = torch.tensor([-0.99, 0.1, -0.99]), torch.tensor([0.8, 0.2, 0.2])
     assert [TISSUES[tissue] for tissue in tissue_of_seen(given).flatten()] == ["lung", "body", "air"]
 

@@ -209,6 +209,19 @@ def test_the_default_is_the_learned_method_unless_a_prior_must_be_sampled(tmp_pa
     assert methods == ["phydict_fast", "phydict_learned"]
 
 
+def test_a_checkpoint_of_medsyns_is_read_as_a_path_is(tmp_path):
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        reconstructor("phydict_fast", MedSynCheckpoint(str(tmp_path / "nowhere")))
+
+
+def test_a_ready_method_takes_double_precision_for_what_its_numbers_say():
+    beam = ConeBeam.orbit(4, 1020, 740, (28, 28), 20.0)
+    ready = reconstructor("phydict_fast", tiny_prior())
+    A = Projector(ready.grid, beam)
+    single, double = (ready.reconstruct(xrays, A).volume for xrays in (ball(beam, 120.0), ball(beam, 120.0).double()))
+    assert torch.equal(single, double)
+
+
 def test_one_call_takes_the_priors_grid_and_fits_the_views():
     beam = ConeBeam.orbit(4, 1020, 740, (28, 28), 20.0)
     method = SplitGibbs(6, ProximalCG(20), ProximalCG(20))

@@ -74,6 +74,7 @@ def test_the_default_prior_is_the_shipped_one_unless_the_folder_has_its_own(tmp_
     monkeypatch.chdir(tmp_path)
     name = "data/prior/phydict_64.safetensors"
     assert fingerprint(name) == fingerprint(DEFAULT_PRIOR) and load_prior(name).grid.same_as(load_prior().grid)
+    assert load_prior(name).unheard == load_prior().unheard != ""
     (tmp_path / name).parent.mkdir(parents=True)
     save_prior(tiny_prior(), name)
     assert fingerprint(name) != fingerprint(DEFAULT_PRIOR) and not load_prior(name).grid.same_as(load_prior().grid)

@@ -12,11 +12,11 @@ from rich.console import Console
 
 from phydict.evaluation.fid import distances, fid_rows
 from phydict.evaluation.planes import PLANES
-from phydict.inference.distances import told_rows
+from phydict.inference.distances import distance_rows
 from phydict.inference.scoring import FIDSettings
 from phydict.runtime import progress as module
 from phydict.runtime.progress import CaseProgress, duration
-from phydict.runtime.telling import bars_on, tell, telling
+from phydict.runtime.progress_log import bars_on, log_progress, progress_as
 from phydict.training import progress as training_progress
 from phydict.training.progress import TrainingProgress
 
@@ -27,7 +27,7 @@ def told(capsys, monkeypatch):
     def run(quiet: bool = False, json_lines: bool = False) -> list[str]:
         now = [0.0]
         monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
-        with telling(quiet, json_lines), CaseProgress(interval=10) as progress:
+        with progress_as(quiet, json_lines), CaseProgress(interval=10) as progress:
             progress.begin("sirt", 3, 2, out="there")
             for case in "abc":
                 progress.case(case)
@@ -62,7 +62,7 @@ def test_on_a_narrow_terminal_a_long_name_is_cut_and_counts_and_times_are_whole(
 def test_a_case_may_have_steps_of_its_own(capsys, monkeypatch):
     now = iter(range(0, 1000, 20))
     monkeypatch.setattr(module.time, "monotonic", lambda: float(next(now)))
-    with telling(False, False), CaseProgress(interval=10) as progress:
+    with progress_as(False, False), CaseProgress(interval=10) as progress:
         progress.begin("ablate", 1, verb="run", noun="row")
         progress.case("fast")
         progress.advance()  # of a run that warms up
@@ -81,8 +81,8 @@ def test_machines_read_the_same_as_json(told):
 
 
 def test_machines_read_null_for_what_is_no_finite_number(capsys):
-    with telling(False, True):
-        tell("scored", psnr=float("inf"), scores={"ssim": float("nan"), "views": [1, 0.5]})
+    with progress_as(False, True):
+        log_progress("scored", psnr=float("inf"), scores={"ssim": float("nan"), "views": [1, 0.5]})
     line = json.loads(capsys.readouterr().err, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
     assert line == {"psnr": None, "scores": {"ssim": None, "views": [1, 0.5]}}
 
@@ -110,7 +110,7 @@ def test_frechet_distances_tell_plane_after_plane_and_are_the_same(capsys):
     methods = {method: {case: {plane: torch.from_numpy(some.normal(size=(2, 5, 3))) for plane in PLANES}
                         for case in cases} for method, cases in (("sirt", "ab"), ("tv", "ab"), ("fdk", "a"))}
     fid = FIDSettings(replicates=7)
-    assert told_rows(methods, fid) == fid_rows(distances(methods, 7), fid.backbone, 7, fid.normalisation)
+    assert distance_rows(methods, fid) == fid_rows(distances(methods, 7), fid.backbone, 7, fid.normalisation)
     begin, *lines = capsys.readouterr().err.splitlines()
     assert begin == "Frechet distances of slices: 6 planes to measure"  # of two groups of methods with the same cases
     assert [re.sub(", about .* to go", "", line) for line in lines] == [

@@ -67,6 +67,7 @@ def test_calls_of_finer_volumes_and_masks_that_are_not_known_are_kept_as_such(re
     assert ReplayTraining(initial=refiner_file, **SETTINGS).batch_loss(data.collate([item])).isfinite()
 
 
+@pytest.mark.slow
 def test_a_resumed_run_is_the_uninterrupted_one_and_makes_each_roll_out_once(tmp_path, refiner_file, monkeypatch):
     cache, made, make = tmp_path / "cache", [], RollOuts._made
     monkeypatch.setattr(RollOuts, "_made", lambda self, n: (made.append(n), make(self, n))[1])

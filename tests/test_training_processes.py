@@ -43,6 +43,7 @@ def assert_same_curve(folder: Path, trained: Path, column: str = "loss", toleran
     assert found == pytest.approx(expected, rel=tolerance)
 
 
+@pytest.mark.slow
 def test_two_processes_train_the_prior_that_one_would(tmp_path, cache, trained):
     done = two_processes(tmp_path, cache, "ddp.yaml")
     assert done.returncode == 0, done.stderr[-2000:]

@@ -26,19 +26,19 @@ from phydict.page import check_own_page
 from phydict.runtime.console import check_apart, check_configured, check_writable, cli_errors, ended_by_sigterm, quiet
 from phydict.runtime.files import alone_in
 from phydict.runtime.help import HelpFormatter, show_settings
-from phydict.runtime.parser_message import unknown_told
+from phydict.runtime.parser_message import naming_unknown_options
 from phydict.runtime.progress import CaseProgress
+from phydict.runtime.progress_log import add_progress_options, progress_options
 from phydict.runtime.reading import reason
-from phydict.runtime.telling import add_telling, told_of
 
 
 def main(args: list[str] | None = None) -> None:
     """infer.py ablate -c <file>. A bad input ends in one sentence and exit code 2; a stopped run resumes."""
     args = sys.argv[1:] if args is None else args
-    with told_of(args), cli_errors(), quiet():
+    with progress_options(args), cli_errors(), quiet():
         check_configured(args, (), "configs/ablate/pareto.yaml")
         parser = _parser(args)
-        with unknown_told(parser):
+        with naming_unknown_options(parser):
             given = parser.parse_args(args).as_dict()
         device = given.pop("device") or ("cuda" if torch.cuda.is_available() else "cpu")
         try:
@@ -109,7 +109,7 @@ def _parser(args: Sequence[str]) -> ArgumentParser:
     parser.add_argument("--keep_volumes", action="store_true",
                         help="keep each row's volume, in volumes/<key>, and show it on the page")
     parser.add_argument("--device", type=str, help="cpu or cuda; left out: cuda where there is one")
-    add_telling(parser)
+    add_progress_options(parser)
     words = {word for arg in args for word in re.findall(r"\w+", arg)}
     for name in reversed([name for name in METHODS if name in words]):
         show_settings(parser, name, METHODS[name], "method")

@@ -11,7 +11,7 @@ from phydict.datasets import patient_of
 from phydict.evaluation import read_csv, write_csv
 from phydict.evaluation.fid import StoredFeatures
 from phydict.evaluation.tables import Table, fid_tables
-from phydict.inference.distances import told_rows
+from phydict.inference.distances import distance_rows
 from phydict.inference.scoring import FIDSettings, Scoring
 
 
@@ -27,7 +27,7 @@ def write_distances(out: Path, entries: Sequence[Entry], scoring: Scoring) -> No
         features = {label: {name: StoredFeatures(features_file(out, key), backbone) for name, key in _named(kept)}
                     for label, kept in there.items() if kept}
         if features:
-            rows += [{"method": row["method"]} | condition | row for row in told_rows(features, scoring.fid)]
+            rows += [{"method": row["method"]} | condition | row for row in distance_rows(features, scoring.fid)]
     write_csv(out / FID, rows)
 
 

@@ -16,8 +16,8 @@ from phydict.evaluation.metrics import MEASURES
 from phydict.evaluation.tables import Table
 from phydict.inference.case_files import remake_page_files
 from phydict.page import Contents, PageCase, check_own_page, write_page
+from phydict.runtime.progress_log import log_progress
 from phydict.runtime.reading import reason
-from phydict.runtime.telling import tell
 from phydict.runtime.warning import warn
 
 
@@ -32,9 +32,9 @@ def page_anew(folder: Path) -> Path:
     stored = read_csv(folder / RESULTS)
     rows = without_repeats(stored)
     if repeats := len(stored) - len(rows):
-        tell(f"{repeats} of the {len(stored)} rows in {folder / RESULTS} are left out, each of the case, method, "
-             "settings and seed of an earlier row but of other weights or data: give methods that are to be compared "
-             "names of their own", event="others", cases=repeats, out=str(folder / RESULTS))
+        log_progress(f"{repeats} of the {len(stored)} rows in {folder / RESULTS} are left out, each of the case, "
+                     "method, settings and seed of an earlier row but of other weights or data: give methods that are "
+                     "to be compared names of their own", event="others", cases=repeats, out=str(folder / RESULTS))
     entries = summarise(rows)
     return comparison_page(folder, entries, all_tables(entries) + distance_tables(folder, entries))
 

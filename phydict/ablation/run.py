@@ -33,10 +33,10 @@ from phydict.runtime.files import atomic_directory
 from phydict.runtime.precision import instruction_set
 from phydict.runtime.profiling import peak_memory, profiled, reset_peak_memory
 from phydict.runtime.progress import CaseProgress
+from phydict.runtime.progress_log import log_progress
 from phydict.runtime.reading import TooLittleMemory
 from phydict.runtime.seeds import case_seed
 from phydict.runtime.strict_json import strict_json
-from phydict.runtime.telling import tell
 
 RESULTS, TABLES, FID = "results.csv", ("tables.md", "tables.tex"), "fid.csv"
 """The results of a folder, the tables that are made of them, and the Frechet distances."""
@@ -153,10 +153,11 @@ def run(results: Results, cases: dict[str, Work], device: torch.device, progress
         results.forget(lambda name: not volume_folder(out, name).is_dir())
     of = len(results.planned)
     left = sum(not results.finished(name) for name in results.planned)
-    tell(f"{of - left} of {of} rows are there already, {left} are to be run", event="kept", cases=of - left, of=of)
+    log_progress(f"{of - left} of {of} rows are there already, {left} are to be run", event="kept",
+                 cases=of - left, of=of)
     if others := len(results.others):
-        tell(f"{others} rows of other settings or data are kept in {results.file} and left out of tables",
-             event="others", cases=others, out=str(results.file))
+        log_progress(f"{others} rows of other settings or data are kept in {results.file} and left out of tables",
+                     event="others", cases=others, out=str(results.file))
     runner = Runner(device, scoring, out, progress, keep_volumes)
     progress.begin("ablate", left, verb="run", out=out, noun="row")
     for case, work in cases.items():
@@ -330,6 +331,8 @@ def _attempt(work: Callable[[], object], unwilling: str = "failed"):
             raise
         if isinstance(error, ValueError):
             return {"status": "failed" if isinstance(error, TooLittleMemory) else unwilling, "error": sentence(error)}
+        if isinstance(error, FloatingPointError):
+            return {"status": "diverged", "error": sentence(error)}
         return {"status": "failed", "error": f"{type(error).__name__}: {sentence(error)}"}
 
 

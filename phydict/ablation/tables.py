@@ -24,6 +24,7 @@ from phydict.evaluation.tables import (
     INTERVAL,
     Table,
     caption,
+    comparable,
     empty_notes,
     interval_note,
     listed,
@@ -121,7 +122,9 @@ def _entry_table(title: str, first: str, names: Sequence[str], lines: Sequence[t
     printed = [(label, entry.complete, [entry.estimate(name) for name in names]) for label, entry in lines]
     why = empty_notes(empty, {name for entry in entries for name in entry.values}) + partial_notes(
         (label, entry.cases, {name: len(entry.values.get(name, ())) for name in names}) for label, entry in lines)
-    return Table(title, [first, *(measure.heading for measure in measures)], measures, printed,
+    ranked = [comparable(measure, (entry.values[name] for entry in entries if entry.complete and name in entry.values))
+              for name, measure in zip(names, measures)]
+    return Table(title, [first, *(measure.heading for measure in measures)], ranked, printed,
                  [_caption(entries), *why, *_origins(entries), *notes, *interval_note(printed), *_reasons(entries)])
 
 
@@ -133,13 +136,17 @@ def _axis_tables(title: str, rest: dict, group: Sequence[Entry], columns: Mappin
     lines: dict[str, dict[object, Entry]] = {}
     for entry in group:
         lines.setdefault(entry.name, {})[entry.condition[axis]] = entry
+    complete = {label for label, line in lines.items()
+                if all(entry.complete or not entry.cases for entry in line.values())}
     for name in _measured(OF_VIEWS, group):
         measure = SHOWN_MEASURES[name]
-        printed = [(label, all(entry.complete or not entry.cases for entry in line.values()),
-                    [line[k].estimate(name) if k in line else None for k in columns]) for label, line in lines.items()]
+        printed = [(label, label in complete, [line[k].estimate(name) if k in line else None for k in columns])
+                   for label, line in lines.items()]
+        ranked = [comparable(measure, (lines[label][k].values[name] for label in complete
+                                       if k in lines[label] and name in lines[label][k].values)) for k in columns]
         tables.append(Table(
             format_settings(f"{measure.heading} {title}", rest), ["method", *columns.values()],
-            [measure] * len(columns), printed,
+            ranked, printed,
             [_caption(group), *_origins(group), *interval_note(printed), *_reasons(group), *partial_notes(
                 (f"{label}, {columns[k]}", entry.cases, {name: len(entry.values.get(name, ()))})
                 for label, line in lines.items() for k, entry in line.items())]))

@@ -15,7 +15,7 @@ from phydict.runtime.profiling import Stopwatch
 from phydict.units import HUWindow, mu_to_hu
 from phydict.xray import Projector
 from phydict.xray.calibration import match_views
-from phydict.xray.checks import check_line_integrals, check_xrays, with_air_at_zero
+from phydict.xray.checks import prepared_xrays
 
 
 class CountingProjector:
@@ -64,10 +64,7 @@ class Baseline(Reconstructor):
                     outside: Tensor | None = None) -> Reconstruction:
         """As a Reconstructor; outside: line integrals (K, V, U) of what lies outside the voxels."""
         watch, A = Stopwatch(), CountingProjector(projector)
-        check_xrays(xrays, A.beam)
-        if not display:
-            check_line_integrals(xrays)
-            xrays = with_air_at_zero(xrays)
+        xrays = prepared_xrays(xrays, A.beam, display)
         with watch.stage("prepare"):
             y = xrays[None] / self.mu_water
             if display:

@@ -13,10 +13,10 @@ from torch import Tensor
 from phydict.baselines.tv import FISTATV
 from phydict.grid import Grid
 from phydict.reconstruction import Delegating, Reconstruction, Reconstructor
-from phydict.runtime.warning import Remark, warn
-from phydict.xray.beyond import asked, asks_for_taller, coarsened, unexplained
+from phydict.runtime.warning import Remark, heard, warn
+from phydict.xray.beyond import coarsened, needs_taller, unexplained, with_continuation
 from phydict.xray.binning import binned, binning
-from phydict.xray.boxes import along, in_other_voxels, lacking, seen_by
+from phydict.xray.boxes import along, binned_to, in_other_voxels, lacking
 from phydict.xray.geometry import ConeBeam
 from phydict.xray.projectors.continued import reach_beyond
 from phydict.xray.projectors.projector import Projector
@@ -52,7 +52,7 @@ REST = 0.15
 """What a box may leave of what the widest one explains and the volume does not: of four CTs with arms of 42 mm beside
 it, 48 mm more leave 0.03 to 0.13, 24 mm 0.16 to 0.37."""
 
-GOES_ON = "the X-rays show that the patient goes on above or below the volume"
+CONTINUES = "the X-rays show that the patient goes on above or below the volume"
 OVERRULED = "`continued: false` in geometry.yaml, in Python of the ConeBeam, if he ends"
 
 
@@ -106,40 +106,41 @@ def extended(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, d
     says whether he goes on even beyond these. A method that takes no more voxels, or has no memory for them, is left
     as it is.
 
-    Above and below, he goes on where the beam says so, or else where the X-rays are `asked`. Beside the volume, of
-    LEAST_VIEWS views or more, of line integrals, where source and detectors leave room: it is seen where rays that
-    hardly meet the volume show more than water that fills it, and else has to explain much.
+    Above and below, the patient continues where the beam says so or, where it does not say, the X-rays show it
+    (`with_continuation`). Beside the volume, of line integrals of LEAST_VIEWS views or more, where source and detectors
+    leave room: it is seen where rays that hardly meet the volume show more than water that fills it, and else has to
+    explain much.
     """
     volume = method.survey or grid
     factor = binning(coarsened(volume), beam)
     few, pixels = binned(xrays, factor), beam.binned(factor)
-    answered = asked(few, pixels, volume, display).continued
+    answered = with_continuation(few, pixels, volume, display).continued
     takes_more = method.with_room(STEP, STEP, 0) or method.with_room(0, 0, STEP)
     room = _room(volume, few, pixels, answered, method.mu_water, display) if takes_more else (0, 0, 0)
     wider = method.with_room(*room) if any(room) else None
     whole = grid if wider is None else wider.grid or grid.grown(*room)
     if wider is None or not wider.has_memory_for(whole):
         if answered and beam.continued is None:
-            warn(f"{GOES_ON}: each column is taken to go on there as its last voxel does ({OVERRULED})", Remark)
-        return method, grid, beam.saying(answered)
+            warn(f"{CONTINUES}: each column is taken to go on there as its last voxel does ({OVERRULED})", Remark)
+        return method, grid, beam.with_continued(answered)
     x, y, z = (n * float(length) for n, length in zip(room, volume.spacing))
     if z and beam.continued is None:
-        warn(f"{GOES_ON}: {z:g} mm more are reconstructed at both ends and cut off ({OVERRULED})", Remark)
+        warn(f"{CONTINUES}: {z:g} mm more are reconstructed at both ends and cut off ({OVERRULED})", Remark)
     if x:
         warn("the X-rays show that something stands beside the volume, such as a wider patient, arms or a couch: "
              f"{x:g} mm more are reconstructed at each side and cut off", Remark)
-    answered = asked(few, pixels, volume.grown(*room), display).continued
-    return Extended(wider, whole, grid, (x, y, z)), whole, beam.saying(answered)
+    answered = with_continuation(few, pixels, volume.grown(*room), display).continued
+    return Extended(wider, whole, grid, (x, y, z)), whole, beam.with_continued(answered)
 
 
 def _room(volume: Grid, xrays: Tensor, beam: ConeBeam, answered: bool | None, mu_water: float, display: bool
           ) -> tuple[int, int, int]:
     """How many voxels more the volume needs at both ends of each axis; answered: whether the patient goes on above and
-    below, `asked` of the volume."""
+    below, `with_continuation` of the volume."""
     aside = 0 if display else _columns(volume, xrays, replace(beam, continued=answered), mu_water)
     wide = volume.grown(aside, aside, 0)
-    goes_on = asked(xrays, beam, wide, display).continued if aside else answered
-    if not (goes_on or (beam.continued is None and asks_for_taller(xrays, beam, wide, display))):
+    goes_on = with_continuation(xrays, beam, wide, display).continued if aside else answered
+    if not (goes_on or (beam.continued is None and needs_taller(xrays, beam, wide, display))):
         return aside, aside, 0
     slices = STEP * math.ceil(min(reach_beyond(beam, wide), UP / volume.spacing[2]) / STEP)
     while slices and not beam.has_room_for(wide.grown(0, 0, slices)):
@@ -157,16 +158,16 @@ def _columns(volume: Grid, xrays: Tensor, beam: ConeBeam, mu_water: float) -> in
     if beam.views < LEAST_VIEWS or not room or room[-1] < LEAST * across:
         return 0
     coarse, wide = _coarse(volume, 0), _coarse(volume, room[-1])
-    y, A = seen_by(coarse, xrays, replace(beam, continued=True), False)
+    y, A = binned_to(coarse, xrays, replace(beam, continued=True), False)
     full = mu_water * A(torch.ones(1, 1, *coarse.shape).to(y))[0]
     seen = int((y > full + FULL).sum()) >= LEAST_PIXELS
     most, least = (unexplained(xrays, beam, grid) for grid in (coarse, wide))
     if not seen and most < SUSPECT * least:
         return 0
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the method will say itself what is doubtful of the X-rays
+    with warnings.catch_warnings(), heard():  # the method will say itself what is doubtful of the X-rays
+        warnings.simplefilter("ignore")
         tv = FISTATV(iterations=TRIES, mu_water=mu_water)
-        alone, together = (tv.reconstruct(*seen_by(grid, xrays, beam, False)).misfit for grid in (coarse, wide))
+        alone, together = (tv.reconstruct(*binned_to(grid, xrays, beam, False)).misfit for grid in (coarse, wide))
     if not ((seen and alone > EXPLAINED * together) or alone > max(GROSS, MUCH * together)):
         return 0
     enough = least + REST * (most - least)

@@ -36,13 +36,19 @@ class CircularOrbit:
     @staticmethod
     def of(beam: ConeBeam, grid: Grid) -> CircularOrbit:
         """The orbit of a beam. Where the views leave the axis open, as one view does, it is the one nearest to the
-        grid's centre. Raises ValueError unless every detector is upright and faces one axis at one distance."""
+        grid's centre, of opposed views the one half-way between their sources. Raises ValueError unless every detector
+        is upright and faces one axis at one distance."""
         across, axis = beam.u / np.linalg.norm(beam.u, axis=1, keepdims=True), beam.v[0] / np.linalg.norm(beam.v[0])
         upright = abs(np.cross(beam.v, axis)).max(1) / np.linalg.norm(beam.v, axis=1)
         _demand(upright < 1e-3, "has a detector whose columns are tilted against those of view 0")
         off = (across * (beam.sources - grid.centre)).sum(1)
         centre = grid.centre + np.linalg.lstsq(across, off, rcond=1e-6)[0]
         arm = beam.sources - centre
+        if np.linalg.matrix_rank(across, 1e-6) == 1:
+            depth = arm @ np.cross(axis, across[0])
+            if depth.min() < 0 < depth.max():
+                centre = centre + (depth.min() + depth.max()) / 2 * np.cross(axis, across[0])
+                arm = beam.sources - centre
         height, arm = arm @ axis, arm - (arm @ axis)[:, None] * axis
         distance = np.linalg.norm(arm, axis=1)
         radius = float(distance.mean())

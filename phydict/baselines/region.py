@@ -14,7 +14,7 @@ from phydict.reconstruction import Delegating, Reconstruction
 from phydict.runtime.profiling import Stopwatch
 from phydict.units import hu_to_mu
 from phydict.xray import Projector
-from phydict.xray.boxes import elsewhere, outside_projection, seen_by
+from phydict.xray.boxes import binned_to, outside_projection, projector_method
 from phydict.xray.calibration import match_views
 
 
@@ -51,8 +51,8 @@ class Region(Delegating):
                     seed: int = 0, on_step: Callable[[], None] = lambda: None) -> Reconstruction:
         watch = Stopwatch()
         with watch.stage("base"):
-            method = elsewhere(projector)
-            binned = seen_by(self.outer, xrays, projector.beam, self.full_detector, method)
+            method = projector_method(projector)
+            binned = binned_to(self.outer, xrays, projector.beam, self.full_detector, method)
             coarse = self.base.reconstruct(*binned, report, display, seed, on_step)
         with watch.stage("outside"):
             mu = hu_to_mu(coarse.volume.to(xrays), self.mu_water)
@@ -63,6 +63,7 @@ class Region(Delegating):
             projector = Projector(self.target, replace(projector.beam, continued=False), method,
                                   device=xrays.device, full_detector=True)
             outside = outside_projection(mu, self.outer, projector, continued)
+        calls = coarse.projector_calls + 2 + display  # outside: of all and of what lies in the target's columns
         result = self.base.reconstruct(xrays, projector, report, False, seed, on_step, outside)
         return replace(result, coarse=coarse, seconds=watch.seconds | result.seconds,
-                       projector_calls=coarse.projector_calls + result.projector_calls)
+                       projector_calls=calls + result.projector_calls)

@@ -19,7 +19,7 @@ from phydict.prior.stage_file import STAGES, is_saved_prior
 from phydict.prior.text_file import build_text, has_text
 from phydict.rivals import NETWORKS, build_rival, save_rival
 from phydict.runtime.console import check_writable
-from phydict.runtime.telling import tell
+from phydict.runtime.progress_log import log_progress
 from phydict.training.checkpoints import read_checkpoint
 
 
@@ -41,8 +41,8 @@ def export_prior(checkpoint: str, out: str, overwrite: bool = False) -> None:
     content = read_checkpoint(checkpoint)
     header = content["phydict"]
     stage, steps = header.get("stage", "base"), content.get("global_step")
-    tell(f"export: stage {stage} after {steps} steps, to {out}", event="begin", name="export", stage=stage, steps=steps,
-         out=out)
+    log_progress(f"export: stage {stage} after {steps} steps, to {out}", event="begin", name="export", stage=stage,
+                 steps=steps, out=out)
     weights = {k.removeprefix("prior."): w for k, w in content["state_dict"].items() if k.startswith("prior.")}
     training = header.get("training", {"steps": steps})
     if stage == "super_resolution":

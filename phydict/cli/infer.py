@@ -15,7 +15,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from phydict.ablation import main as ablate
 from phydict.cli.help import describe_commands, method_help, predict_help
 from phydict.cli.page import main as page
-from phydict.cli.telling import TellingCLI
+from phydict.cli.progress_cli import ProgressCLI
 from phydict.datasets.radiographs.radiographs import load_xrays
 from phydict.inference.data import ReconstructionData
 from phydict.inference.dry_run import dry_run
@@ -35,15 +35,15 @@ from phydict.runtime.console import (
     sentence,
 )
 from phydict.runtime.help import HelpFormatter
+from phydict.runtime.progress_log import log_problem, progress_options
 from phydict.runtime.reading import reading
 from phydict.runtime.shipped import configuration
-from phydict.runtime.telling import exclaim, told_of
 
 COMMANDS = {"predict": "X-rays -> volumes", "test": "CTs -> X-rays -> volumes and scores",
             "ablate": "methods compared on the same X-rays", "page": "results -> a page for the browser"}
 
 
-class InferenceCLI(TellingCLI):
+class InferenceCLI(ProgressCLI):
     """predict and test only; no logs, no checkpoints, gradients allowed inside the steps."""
 
     def setup_parser(self, *args) -> None:
@@ -118,7 +118,7 @@ class InferenceCLI(TellingCLI):
                 if len(folders) == 1:
                     raise
                 bad.append(name)
-                exclaim("error", f"{name}: {sentence(error)}")
+                log_problem("error", f"{name}: {sentence(error)}")
         print(f"pages in {model.pages}")
         if bad:
             raise ValueError(f"{len(bad)} of {len(folders)} cases cannot be reconstructed ({', '.join(bad)}): see the "
@@ -242,7 +242,7 @@ def main(args: list[str] | None = None) -> None:
         return ablate(args[1:])
     if args[:1] == ["page"]:
         return page(args[1:])
-    with told_of(args), cli_errors(MisconfigurationException), quiet():
+    with progress_options(args), cli_errors(MisconfigurationException), quiet():
         check_command(args, COMMANDS, InferenceCLI.subcommands(), "predict --data.xrays data/example/xrays")
         InferenceCLI(
             ReconstructionTask, ReconstructionData, args=args, seed_everything_default=0, save_config_callback=None,

@@ -9,7 +9,7 @@ from pathlib import Path
 from phydict.ablation.page import is_comparison, page_anew
 from phydict.inference.page import results_page
 from phydict.runtime.console import cli_errors, quiet
-from phydict.runtime.telling import run_command, told_of
+from phydict.runtime.progress_log import progress_options, run_command
 
 
 def write_page(folder: Path) -> None:
@@ -25,5 +25,5 @@ def write_page(folder: Path) -> None:
 
 def main(args: Sequence[str]) -> None:
     """infer.py page <folder>. A bad input ends in one sentence and exit code 2."""
-    with told_of(args), cli_errors(), quiet():
+    with progress_options(args), cli_errors(), quiet():
         run_command(write_page, args, f"{Path(sys.argv[0]).name} page", positional=True)

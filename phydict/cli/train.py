@@ -17,7 +17,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from phydict.cli.export import export_prior, print_prior
 from phydict.cli.help import describe_commands, fit_help
-from phydict.cli.telling import TellingCLI
+from phydict.cli.progress_cli import ProgressCLI
 from phydict.prior import DEFAULT_REFINER
 from phydict.runtime.console import (
     check_apart,
@@ -33,9 +33,9 @@ from phydict.runtime.console import (
 from phydict.runtime.files import alone_in, atomic_write
 from phydict.runtime.help import HelpFormatter
 from phydict.runtime.precision import PRECISIONS, resolve_precision, trainer_precision
+from phydict.runtime.progress_log import log_progress, progress_as, progress_options, run_command
 from phydict.runtime.ranges import check_between
 from phydict.runtime.reading import reading
-from phydict.runtime.telling import run_command, tell, telling, told_of
 from phydict.training.checkpoints import BEST, HELD_OUT, RESUMED, BestCheckpoint, WholeCheckpoints, read_checkpoint
 from phydict.training.crops import SuperResolutionData
 from phydict.training.data import PriorData
@@ -83,7 +83,7 @@ def stage_of(args: list[str]) -> str:
     return stage
 
 
-class PriorCLI(TellingCLI):
+class PriorCLI(ProgressCLI):
     """fit and validate; ties the data's grid and HU window to the model's, and writes everything below `out`."""
 
     @staticmethod
@@ -154,13 +154,13 @@ class PriorCLI(TellingCLI):
         """Train, alone in the folder of the run."""
         out, cts = Path(self.config.fit.out), self.config.fit.data.cts
         check_apart(out, "--out", [Path(cts)] if cts else [])
-        with alone_in(out, "--out") if self.trainer.is_global_zero else telling(quiet=True, json_lines=False):
+        with alone_in(out, "--out") if self.trainer.is_global_zero else progress_as(quiet=True, json_lines=False):
             self._begin(out, ckpt_path)
             if cts:
                 held_out, trained = datamodule.held_out, len(datamodule.cts)
-                tell(f"{len(held_out)} of {len(held_out) + trained} CTs are held out for validation" if held_out else
-                     "no CT is held out, so that none tells which weights are best: data.holdout.ids may name some",
-                     event="held_out", cts=held_out)
+                log_progress(f"{len(held_out)} of {len(held_out) + trained} CTs are held out for validation" if held_out
+                             else "no CT is held out, so that none tells which weights are best: data.holdout.ids may "
+                             "name some", event="held_out", cts=held_out)
             try:
                 self.trainer.fit(model, datamodule=datamodule, ckpt_path=ckpt_path, weights_only=weights_only)
             except BaseException as stop:
@@ -220,7 +220,7 @@ def main(args: list[str] | None = None) -> None:
     """Command line of training: fit, validate, export, inspect-prior. A bad input ends in one sentence and code 2."""
     given = sys.argv[1:] if args is None else args
     resuming = "add --ckpt_path and the run's last.ckpt"
-    with told_of(given), cli_errors(MisconfigurationException, to_resume=resuming), quiet():
+    with progress_options(given), cli_errors(MisconfigurationException, to_resume=resuming), quiet():
         if given[:1] == ["export"]:
             run_command(export_prior, given[1:], f"{Path(sys.argv[0]).name} export")
         elif given[:1] == ["inspect-prior"]:

@@ -14,6 +14,7 @@ beside the script's, are `maisi_voxels`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -37,6 +38,8 @@ NORMALISATION = (f"HU clipped to [{RANGE.low:g}, {RANGE.high:g}], each volume's 
 MAISI_SIDE = 512
 """Voxels of 1 mm along each side of MAISI's volumes."""
 BATCH = 16
+LEAST_SIDE = 17
+"""Pixels along each side of the smallest images that SqueezeNet takes."""
 
 
 def maisi_voxels(hu: Tensor, grid: Grid) -> Tensor:
@@ -73,9 +76,18 @@ class SliceFeatures(nn.Module):
             _load(self.network, Path(weights), name)
         self.eval().requires_grad_(False)
 
+    def check(self, shape: Sequence[int]) -> None:
+        """Raises ValueError where the slices of volumes of a shape are too small for the backbone."""
+        if self.name == "squeezenet" and min(shape) < LEAST_SIDE:
+            raise ValueError(f"slices of {' x '.join(map(str, shape))} voxels are too small for the FID backbone "
+                             f"squeezenet, which needs {LEAST_SIDE} along each side: give more voxels, or leave fid "
+                             "out of the metrics")
+
     @torch.no_grad()
     def forward(self, hu: Tensor, plane: str) -> Tensor:
-        """Features (N, d), float32 on the CPU, of the slices of a volume (X, Y, Z) in HU in one plane."""
+        """Features (N, d), float32 on the CPU, of the slices of a volume (X, Y, Z) in HU in one plane; raises as
+        `check`."""
+        self.check(hu.shape)
         volume = hu.float().clamp(RANGE.low, RANGE.high)
         low, high = volume.min(), volume.max()
         volume = (volume - low) / (high - low).clamp(min=1e-6)

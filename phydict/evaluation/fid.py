@@ -157,8 +157,8 @@ def _distance(of: Moments, to: Reference) -> float:
 
 def fid_rows(methods: Mapping[str, Distances], backbone: str, replicates: int, normalisation: str) -> list[dict]:
     """The distances of methods by label, a row each, with what they rest on and, in columns that begin with "less_", by
-    how much they are above those of `less`, the method of most cases and of these the nearest, where their cases are
-    the same. A distance's interval is in columns that end in "_low" and "_high".
+    how much they are above those of `less`, the method of most cases and of these the nearest, where they are of the
+    same cases and of as many slices. A distance's interval is in columns that end in "_low" and "_high".
 
     backbone: whose features they were; replicates: the draws of patients that they were found with; normalisation: of
     the slices, in words.
@@ -170,7 +170,7 @@ def fid_rows(methods: Mapping[str, Distances], backbone: str, replicates: int, n
                      "replicates": replicates, "cases": len(found.cases)}
         row |= {f"{of}slices_{plane}": n for of in ("", "truth_") for plane, n in found.slices.items()}
         row |= _numbers("", found.estimates())
-        if label != best and found.cases == methods[best].cases:
+        if label != best and (found.cases, found.slices) == (methods[best].cases, methods[best].slices):
             row["less"] = best
             row |= _numbers("less_", found.estimates(methods[best]))
         rows.append(row)
@@ -182,21 +182,28 @@ def _numbers(of: str, estimates: Mapping[str, Estimate]) -> dict[str, float]:
             for end, number in zip(("", "_low", "_high"), estimate) if not math.isnan(number)}
 
 
+def comparable(methods: Mapping[str, Mapping[str, Features]]) -> list[list[str]]:
+    """The labels of methods in groups of the same cases, of as many slices each."""
+    groups: dict[tuple, list[str]] = {}
+    for label, cases in methods.items():
+        slices = tuple(features[plane].shape[1] for features in cases.values() for plane in PLANES)
+        groups.setdefault((*cases, *slices), []).append(label)
+    return list(groups.values())
+
+
 def distances(methods: Mapping[str, Mapping[str, Features]], replicates: int = 0,
               on_plane: Callable[[str], None] = lambda plane: None) -> dict[str, Distances]:
     """Those of all slices of some methods' cases, label -> case id -> features.
 
     replicates: draws of patients, each with its slices of reconstruction and truth, of which the 95 % intervals are
-    taken; 0: none. on_plane: called with each plane before it is measured, for each group of methods with the same
-    cases. Raises ValueError without a case.
+    taken; 0: none. on_plane: called with each plane before it is measured, for each group of `comparable` methods.
+    Raises ValueError without a case.
     """
     if not all(methods.values()):
         raise ValueError("there are no cases to take a Frechet distance of: score at least one")
-    groups: dict[tuple[str, ...], list[str]] = {}
-    for label, cases in methods.items():
-        groups.setdefault(tuple(cases), []).append(label)
     found = {}
-    for names, labels in groups.items():
+    for labels in comparable(methods):
+        names = tuple(methods[labels[0]])
         planes = {}
         for plane in PLANES:
             on_plane(plane)
@@ -209,8 +216,8 @@ def distances(methods: Mapping[str, Mapping[str, Features]], replicates: int = 0
 
 
 def _plane(methods: Sequence[Mapping[str, Features]], plane: str, replicates: int) -> tuple[int, np.ndarray]:
-    """The number of slices of each of some methods with the same cases in one plane, and their distances (methods,
-    1 + R). A truth that methods share is summed up once for each draw; draws that are alike are one."""
+    """The number of slices of each of some `comparable` methods in one plane, and their distances (methods, 1 + R). A
+    truth that methods share is summed up once for each draw; draws that are alike are one."""
     patients: dict[str, list[str]] = {}
     for case in methods[0]:
         patients.setdefault(patient_of(case), []).append(case)

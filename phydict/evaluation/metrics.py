@@ -72,7 +72,6 @@ MEASURES = {
     "cldice_vessel": Measure("clDice vessels", True, 3),
     "edge_diaphragm": Measure("diaphragm's width", False, 2),
     "edge_chest_wall": Measure("chest wall's width", False, 2),
-    "edge_ribs": Measure("ribs' width", False, 2),
     "ribs": Measure("ribs' contrast", True, 2),
     "vessels": Measure("vessels' contrast", True, 2),
     "clip_t2i": Measure("CLIP T2I (%)", True, 2),
@@ -142,12 +141,12 @@ def volume_metrics(hu: Tensor, true_hu: Tensor, lung: Tensor | None = None, body
 
 
 class Summary(NamedTuple):
-    """Mean and sample standard deviation over `cases` cases (std NaN for one case), and the ends of the mean's 95 %
-    interval by the bootstrap over patients (NaN for one); prints as mean ± std [low, high]."""
+    """Mean and sample standard deviation over `cases` (std NaN for one case), and the ends of the mean's 95 % interval
+    by the bootstrap over patients (NaN for one); prints as mean ± std [low, high]."""
 
     mean: float
     std: float
-    cases: int
+    cases: frozenset[str]
     low: float = math.nan
     high: float = math.nan
 
@@ -178,7 +177,7 @@ def over_cases(rows: Sequence[Mapping], metrics: Iterable[str]) -> dict[str, Sum
                 values = np.array(list(cases.values()))
                 std = float(values.std(ddof=1)) if len(values) > 1 else math.nan
                 mean, low, high = estimate(cases)
-            result[name] = Summary(mean, std, len(values), low, high)
+            result[name] = Summary(mean, std, frozenset(cases), low, high)
     return result
 
 

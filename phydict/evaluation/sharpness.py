@@ -46,7 +46,10 @@ def edge_profile(volume: Tensor, lung: Tensor, edge: str, reach: int = 5) -> Ten
 
 
 def edge_width(profile: Tensor, spacing: float) -> float:
-    """mm over which a profile rises from 10 to 90 % of the way between its ends; of `spacing` mm between samples."""
+    """mm over which a profile rises from 10 to 90 % of the way between its ends; of `spacing` mm between samples.
+    Raises ValueError where the ends are equal."""
+    if profile[0] == profile[-1]:
+        raise ValueError("the profile's ends are equal, so that nothing rises between them: give one across an edge")
     share = ((profile - profile[0]) / (profile[-1] - profile[0])).double().numpy(force=True)
     share = np.maximum.accumulate(share)
     places = np.arange(len(share))
@@ -94,11 +97,12 @@ def vessel_visibility(volume: Tensor, truth: Tensor, lung: Tensor, count: int = 
 
 
 def sharpness_scores(volume: Tensor, truth: Tensor, lung: Tensor, grid: Grid) -> dict[str, float]:
-    """{"edge_diaphragm", "edge_chest_wall", "edge_ribs", "ribs", "vessels"} of a volume (X, Y, Z) in HU on `grid`, each
-    as a share of the truth's: widths (edge_) are 1 where edges are as sharp as there, more where they are blurred; of
-    ribs, from their middle to between them, and of vessels the contrast is 1 where all of it is there.
+    """{"edge_diaphragm", "edge_chest_wall", "ribs", "vessels"} of a volume (X, Y, Z) in HU on `grid`, as shares of the
+    truth's: widths (edge_) are 1 where edges are as sharp as there, more where they are blurred; of ribs, from
+    their middle to between them, and of vessels the contrast is 1 where all of it is there.
 
-    lung: mask (X, Y, Z) in the truth. An edge that no line crosses, and ribs and vessels without lungs, have no score.
+    lung: mask (X, Y, Z) in the truth. An edge that no line crosses or that does not show, and ribs and vessels without
+    lungs, have no score.
     """
     scores = {}
     for edge in AXES:
@@ -107,7 +111,6 @@ def sharpness_scores(volume: Tensor, truth: Tensor, lung: Tensor, grid: Grid) ->
             scores[f"edge_{edge}"] = spread / true_spread
     with suppress(ValueError):
         ribs, true_ribs = rib_profile(torch.stack([volume, truth]), truth, lung, grid)
-        scores["edge_ribs"] = edge_width(ribs, 1.0) / edge_width(true_ribs, 1.0)
         scores["ribs"] = float((ribs[0] - ribs[-1]) / (true_ribs[0] - true_ribs[-1]))
     if (lung > 0.5).any():
         scores["vessels"] = vessel_visibility(volume, truth, lung)

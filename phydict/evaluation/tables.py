@@ -111,10 +111,16 @@ def ranks(values: Sequence[float], higher_is_better: bool | None) -> list[int]:
     return [1 if value == best else 2 if value == second else 0 for value in values]
 
 
+def comparable(measure: Measure, cases: Iterable[Iterable[str]]) -> Measure:
+    """A measure, without a better direction where lines, of these cases each, have not all the same: it then ranks
+    nothing."""
+    return measure if len({frozenset(of) for of in cases}) < 2 else measure._replace(higher_is_better=None)
+
+
 def mean_table(rows: Iterable[Mapping], by: str = "method", metrics: Sequence[str] | None = None,
                window: HUWindow = RANGE, empty: Mapping[str, str] = MappingProxyType({})) -> Table:
-    """Mean ± standard deviation over cases, a line per group; where rows have warnings, a last column counts their
-    cases.
+    """Mean ± standard deviation over cases, a line per group, ranked by what all of them have of the same cases; where
+    rows have warnings, a last column counts their cases.
 
     by, metrics: as in `summarise`. window: the HU range of `volume_metrics`. empty: metric -> why it has no value, if
     it has none; it then has a column all the same, and a note. The caption takes grid and views from the
@@ -125,9 +131,13 @@ def mean_table(rows: Iterable[Mapping], by: str = "method", metrics: Sequence[st
     measured = [name for name in metrics or MEASURES if any(name in group for group in groups.values())]
     names = [name for name in metrics or MEASURES if name in measured or name in empty]
     measures = [MEASURES.get(name, Measure(name, None, 3)) for name in names]
+    header = [by, *(measure.heading for measure in measures)]
+    measures = [comparable(measure, (group[name].cases for group in groups.values() if name in group))
+                for name, measure in zip(names, measures)]
     lines: list[tuple[str, bool, list[Value | None]]] = [
         (label, True, [group.get(name) for name in names]) for label, group in groups.items()]
     if warned := warned_cases(rows, by):
+        header.append("warned")
         measures.append(Measure("warned", None, 0))
         lines = [(label, ranked, [*values, len(warned.get(label, ()))]) for label, ranked, values in lines]
     of_group = {group: frozenset(row.get("case", f"row {n}") for n, row in enumerate(rows) if str(row[by]) == group)
@@ -135,10 +145,10 @@ def mean_table(rows: Iterable[Mapping], by: str = "method", metrics: Sequence[st
     cases = set(of_group.values())
     counts = sorted({min(map(len, cases)), max(map(len, cases))})
     unequal = " (not the same cases in every line)" if len(cases) > 1 else ""
-    parts = partial_notes((label, len(of_group[label]), {name: summary.cases for name, summary in group.items()
+    parts = partial_notes((label, len(of_group[label]), {name: len(summary.cases) for name, summary in group.items()
                                                          if name in MEASURES}) for label, group in groups.items())
     over = f"Mean ± standard deviation over n = {' to '.join(map(str, counts))} cases{unequal}"
-    return Table(f"Scores by {by}", [by, *(measure.heading for measure in measures)], measures, lines,
+    return Table(f"Scores by {by}", header, measures, lines,
                  [caption(over, rows, {"Grid": "grid", "Views": "views"}, window), *interval_note(lines), *parts,
                   *empty_notes(empty, measured), *warning_notes(rows, by)])
 

@@ -18,6 +18,7 @@ from torch.utils.data import DataLoader, Dataset
 from phydict.datasets import CTFile, CTSource, find_xrays, load_case, load_xrays, phantom_case
 from phydict.datasets.case import Case
 from phydict.datasets.cts.segmentations import mask_files
+from phydict.datasets.itk_file import voxel_files
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM, PHANTOM_VERSION
 from phydict.datasets.radiographs.radiographs import case_files
 from phydict.grid import Grid
@@ -217,11 +218,13 @@ class ReconstructionData(lightning.LightningDataModule):
 
 
 def _ct_source(ct: CTFile) -> str:
-    """What identifies a CT, its report and the masks of it, wherever the file lies."""
+    """What identifies a CT, the file of its voxels where that is another, its report and the masks of it, wherever they
+    lie."""
     report, masks = zlib.crc32(ct.report.encode()), 0
     for file in mask_files(ct.path):
         masks = zlib.crc32(f"{file.name} {_contents(file)}".encode(), masks)
-    return f"{ct.path.name}, crc32 {_contents(ct.path)}, {ct.calibration}, report crc32 {report:08x}" + (
+    voxels = "".join(f", voxels crc32 {_contents(file)}" for file in voxel_files(ct.path))
+    return f"{ct.path.name}, crc32 {_contents(ct.path)}{voxels}, {ct.calibration}, report crc32 {report:08x}" + (
         f", masks crc32 {masks:08x}" if masks else "")
 
 

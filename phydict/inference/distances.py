@@ -1,17 +1,17 @@
-"""Frechet distances of slices, which take minutes where the slices are many, with what is done of them told."""
+"""Frechet distances of slices, which take minutes where the slices are many, with their progress."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
-from phydict.evaluation.fid import Features, distances, fid_rows
+from phydict.evaluation.fid import Features, comparable, distances, fid_rows
 from phydict.evaluation.planes import PLANES
 from phydict.inference.scoring import FIDSettings
 from phydict.runtime.progress import CaseProgress
 
 
-def told_rows(methods: Mapping[str, Mapping[str, Features]], fid: FIDSettings) -> list[dict]:
-    """The `fid_rows` of methods, label -> case id -> features, telling which planes are done. Raises ValueError without
+def distance_rows(methods: Mapping[str, Mapping[str, Features]], fid: FIDSettings) -> list[dict]:
+    """The `fid_rows` of methods, label -> case id -> features, logging which planes are done. Raises ValueError without
     a case."""
     begun = False
 
@@ -23,8 +23,8 @@ def told_rows(methods: Mapping[str, Mapping[str, Features]], fid: FIDSettings) -
         begun = True
 
     with CaseProgress() as progress:
-        progress.begin("Frechet distances of slices", len({tuple(cases) for cases in methods.values()}) * len(PLANES),
-                       verb="measure", noun="plane")
+        progress.begin("Frechet distances of slices", len(comparable(methods)) * len(PLANES), verb="measure",
+                       noun="plane")
         found = distances(methods, fid.replicates, on_plane)
         progress.finished("measured")
     return fid_rows(found, fid.backbone, fid.replicates, fid.normalisation)

@@ -15,7 +15,7 @@ from phydict.runtime.warning import warn
 from phydict.units import hu_to_mu
 from phydict.xray import Projector
 from phydict.xray.binning import binned, binning
-from phydict.xray.checks import check_air, check_xrays
+from phydict.xray.checks import check_fit
 
 LOW_VIEW, LOW_MEDIAN = 0.3, 0.45
 """Correlations with the standard thorax below which a view, and the median of all views, is low. In the right geometry
@@ -30,10 +30,7 @@ def dry_run(path: str | Path, case: Case, grid: Grid) -> list[str]:
     grid: where a reconstruction would put its voxels. Raises ValueError where X-rays, geometry and grid do not fit.
     """
     beam = case["beam"]
-    check_xrays(case["xrays"], beam)
-    check_air(case["xrays"])
-    beam.check(grid)
-    beam.check_scale(grid)
+    check_fit(case["xrays"], beam, grid)
     factor = binning(grid, beam)
     coarse = beam.binned(factor)
     hu = build(Thorax.standard(), grid)[0]

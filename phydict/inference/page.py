@@ -12,7 +12,7 @@ from types import MappingProxyType
 from phydict.evaluation.fid import StoredFeatures
 from phydict.evaluation.tables import Table, fid_tables
 from phydict.inference.case_files import missing_page_files, remake_page_files
-from phydict.inference.distances import told_rows
+from phydict.inference.distances import distance_rows
 from phydict.inference.protocols import protocol_of
 from phydict.inference.results import FEATURES, RECORD, TABLE, score_row, score_table
 from phydict.inference.scoring import FIDSettings
@@ -110,9 +110,10 @@ def _noted(tables: Sequence[Table], records: Sequence[Mapping]) -> list[Table]:
 
 
 def _kept_distances(folder: Path, cases: Sequence[PageCase]) -> list[Table]:
-    """The tables of Frechet distances that features in the cases' folders give, a line per method."""
-    methods: dict[FIDSettings, dict[str, dict[str, StoredFeatures]]] = {}
-    records: dict[FIDSettings, list[Mapping]] = {}
+    """The tables of Frechet distances that features in the cases' folders give, a line per method; those of other
+    weights and of each protocol are tables of their own."""
+    methods: dict[tuple, dict[str, dict[str, StoredFeatures]]] = {}
+    records: dict[tuple, list[Mapping]] = {}
     for case in cases:
         settings, file = case.record.get("settings", {}), folder / case.folder / FEATURES
         if (backbone := settings.get("fid_backbone")) and file.is_file():
@@ -121,8 +122,9 @@ def _kept_distances(folder: Path, cases: Sequence[PageCase]) -> list[Table]:
             except ValueError as error:
                 warn(f"a case is left out of the Frechet distances: {error}")
                 continue
-            measured = FIDSettings(backbone, maisi_voxels=settings.get("fid_maisi_voxels", False))
+            fid = FIDSettings(backbone, maisi_voxels=settings.get("fid_maisi_voxels", False))
+            measured = fid, settings.get("fid_weights_crc32"), settings.get("data", {}).get("protocol")
             methods.setdefault(measured, {}).setdefault(case.record["method"], {})[case.record["case"]] = features
             records.setdefault(measured, []).append(case.record)
-    return [table for fid, features in methods.items()
-            for table in _noted(fid_tables(told_rows(features, fid)), records[fid])]
+    return [table for measured, features in methods.items()
+            for table in _noted(fid_tables(distance_rows(features, measured[0])), records[measured])]

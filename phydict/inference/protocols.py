@@ -94,15 +94,15 @@ class Protocol:
         if fixed is None or given is None or given.same_as(fixed):
             return
         if not bound:
-            raise ValueError(f"data.protocol {self.name} fixes {_told(fixed)}, but {_told(given)} were given: leave "
-                             "one of the two out")
+            raise ValueError(f"data.protocol {self.name} fixes {_grid_text(fixed)}, but {_grid_text(given)} were given"
+                             ": leave one of the two out")
         if not any(covers(given, box) for box in (fixed, DEFAULT_GRID)):
-            raise ValueError(f"data.protocol {self.name} scores {_told(fixed)}, but {_told(given)} were given, which "
-                             f"leave out a part of them: give a box that holds the chest, {DEFAULT_GRID.extent[0]:g} "
-                             "mm, or leave one of the two out")
+            raise ValueError(f"data.protocol {self.name} scores {_grid_text(fixed)}, but {_grid_text(given)} were "
+                             "given, which leave out a part of them: give a box that holds the chest, "
+                             f"{DEFAULT_GRID.extent[0]:g} mm, or leave one of the two out")
 
 
-def _told(grid: Grid) -> str:
+def _grid_text(grid: Grid) -> str:
     """The number of voxels of a box along its sides, these in mm, and where its centre is unless at the isocentre."""
     sizes, sides = (values[:1] if len(set(values)) == 1 else values
                     for values in (grid.shape, (*grid.extent.round(3),)))

@@ -13,7 +13,8 @@ from phydict.datasets.case import Case
 from phydict.grid import Grid
 from phydict.inference.case_files import body_interval
 from phydict.inference.settings import Sampling
-from phydict.posterior import CascadePosterior, Refined, Sampler
+from phydict.methods import corrections_of
+from phydict.posterior import CascadePosterior, Posterior, Refined, Sampler
 from phydict.prior import AnyPrior, MedSynCheckpoint, file_read, fingerprint, own_identity
 from phydict.reconstruction import Reconstruction, Reconstructor, describe
 from phydict.runtime.precision import instruction_set
@@ -21,10 +22,11 @@ from phydict.runtime.profiling import process_peak
 from phydict.runtime.version import VERSION
 
 
-def method_settings(name: str, seed: int, method: Sampler | Reconstructor, projector: str) -> dict:
-    """Those of a method, and of the projector where one is chosen."""
+def method_settings(name: str, seed: int, method: Sampler | Reconstructor, projector: str, sampling: Sampling) -> dict:
+    """Those of a method, and of the projector and the precision where one is chosen."""
     return {"name": name, "seed": seed, "method": describe(method)} | (
-        {"projector": projector} if projector != "auto" else {})
+        {"projector": projector} if projector != "auto" else {}) | (
+        {"precision": sampling.precision} if sampling.precision != "auto" else {})
 
 
 def prior_settings(prior: AnyPrior, given: Any, sampling: Sampling) -> dict:
@@ -34,8 +36,6 @@ def prior_settings(prior: AnyPrior, given: Any, sampling: Sampling) -> dict:
     settings["guidance"] = sampling.guidance
     if sampling.samples != 1:
         settings["samples"] = sampling.samples
-    if sampling.precision != "auto":
-        settings["precision"] = sampling.precision
     return settings
 
 
@@ -45,10 +45,13 @@ def cascade_settings(file: str | MedSynCheckpoint, cascade: CascadePosterior) ->
         "sr_noise_augmentation": cascade.level, "second": describe(cascade.second)}
 
 
-def grid_settings(grid: Grid, method: Reconstructor) -> dict:
-    """Those of voxels that were chosen, and of the refinement to them."""
-    return {"grid": grid.to_dict()} | (
-        {"refinement": describe(method.refinement)} if isinstance(method, Refined) else {})
+def grid_settings(grid: Grid, plain: Reconstructor, method: Reconstructor) -> dict:
+    """Those of voxels that were chosen, and of the refinement to them by `method` of what the `plain` one gives."""
+    if not isinstance(method, Refined):
+        return {"grid": grid.to_dict()}
+    files = corrections_of(plain.sampler, grid) if isinstance(plain, Posterior) and method.networks else []
+    return {"grid": grid.to_dict(), "refinement": describe(method.refinement)} | {
+        f"correction_{n}_crc32": fingerprint(str(file)) for n, file in enumerate(files)}
 
 
 def case_record(case: Case, result: Reconstruction, name: str, method: Reconstructor, scores: dict | None,

@@ -11,10 +11,12 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from phydict.evaluation import RANGE, Table, mean_table, write_csv
-from phydict.inference.protocols import Protocol
+from phydict.grid import Grid
+from phydict.inference.protocols import Protocol, protocol_of, whole
 from phydict.page import CASE_FILES
 from phydict.runtime.files import atomic_directory, atomic_write, check_replaceable, remove_leftovers, undisturbed
 from phydict.runtime.reading import not_written
+from phydict.runtime.strict_json import strict_json
 
 RECORD = "reconstruction.json"
 """The file that marks a case as finished."""
@@ -88,7 +90,7 @@ class CaseResults:
             with atomic_directory(final, lambda: self._is_free(case)) as partial:
                 write_files(partial)
                 files = sorted(file.name for file in partial.iterdir())
-                (partial / RECORD).write_text(json.dumps(record | {"files": files}, indent=1))
+                (partial / RECORD).write_text(strict_json(record | {"files": files}, indent=1))
         except OSError as error:
             raise not_written(f"the case {final}", error, "give another model.out") from error
 
@@ -184,9 +186,15 @@ def _xrays(settings: Mapping) -> str:
     stated = {name: value for name, value in (data["simulator"] | data).items()
               if name not in ("class", "protocol", "simulation_voxels") and isinstance(value, str | int | float | list)
               and not isinstance(value, bool)}
-    voxels = data.get("simulation_voxels")
-    places = (f"{voxels}^3 voxels" if voxels else "the protocol's voxels" if "protocol" in data else
-              "the voxels that are reconstructed, which is optimistic")
+    voxels, protocol = data.get("simulation_voxels"), data.get("protocol")
+    box = Grid(**settings["grid"]) if "grid" in settings else None
+    places = "the voxels that are reconstructed, which is optimistic"
+    if voxels:
+        places = f"{voxels}^3 voxels"
+    elif protocol and protocol_of(protocol).cube:
+        places = "the protocol's voxels"
+    elif box and not (made := whole(box)).same_as(box):
+        places = f"{made.shape[0]}^3 voxels of {made.spacing[0]:g} mm"
     return (f"X-rays: {data['simulator']['class']}, {', '.join(f'{name} {value}' for name, value in stated.items())}; "
             f"made on {places}; seed {settings['seed']}.")
 

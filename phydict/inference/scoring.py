@@ -108,6 +108,11 @@ class Scoring:
             {"organs_version": ORGANS_VERSION} if "organs" in self.metrics else {}) | (
             {"clip_text": self.clip.text_transformer is not None} if self.clip else {}) | self.checksums
 
+    def check(self, grid: Grid) -> None:
+        """Raises ValueError where volumes on `grid` are too small for a metric."""
+        if self.network and not self.fid.maisi_voxels:
+            self.network.check(grid.shape)
+
     @property
     def empty(self) -> dict[str, str]:
         """Scores that may stay empty -> why they then do."""

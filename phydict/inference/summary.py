@@ -10,7 +10,7 @@ from rich.console import Console
 from phydict.evaluation import Table
 from phydict.evaluation.fid import StoredFeatures
 from phydict.evaluation.tables import fid_tables
-from phydict.inference.distances import told_rows
+from phydict.inference.distances import distance_rows
 from phydict.inference.page import results_page
 from phydict.inference.protocols import Protocol
 from phydict.inference.results import FEATURES, CaseResults
@@ -48,4 +48,4 @@ def _distances(results: CaseResults, cases: list[str], name: str, scoring: Scori
     if scoring.network is None or not cases:
         return []
     features = {case: StoredFeatures(results.folder / case / FEATURES, scoring.fid.backbone) for case in cases}
-    return fid_tables(told_rows({name: features}, scoring.fid))
+    return fid_tables(distance_rows({name: features}, scoring.fid))

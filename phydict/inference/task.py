@@ -41,8 +41,9 @@ from phydict.reconstruction import Reconstruction, Reconstructor
 from phydict.runtime.console import TRACEBACK, check_apart, check_writable, noted, sentence
 from phydict.runtime.profiling import profiled, stage
 from phydict.runtime.progress import CaseProgress
+from phydict.runtime.progress_log import log_problem, log_progress
+from phydict.runtime.reading import enough_memory
 from phydict.runtime.seeds import case_seed, check_seed
-from phydict.runtime.telling import exclaim, tell
 from phydict.runtime.warning import Remark, warn
 from phydict.units import HUWindow
 from phydict.xray.projectors.projector import METHODS as PROJECTORS
@@ -97,7 +98,7 @@ class ReconstructionTask(lightning.LightningModule):
         self.projector = projector
         self.results = CaseResults(Path(out) / name, overwrite)
         check_writable(self.results.folder, "model.out")
-        self.settings = method_settings(name, seed, method, projector)
+        self.settings = method_settings(name, seed, method, projector, sampling)
         self.window = HUWindow()
         prior = prior or (str(method.default_prior) if isinstance(method, Sampler) else None)
         self.prior = find_prior(prior) if prior and isinstance(method, Sampler) else None
@@ -134,7 +135,7 @@ class ReconstructionTask(lightning.LightningModule):
         self.reconstructor = onto_grid(self.plain, self.grid)
         if self.keep_coarse and not isinstance(self.reconstructor, Refined | Region):
             warn(f"there is no coarse volume to keep: {self.method_name} works on the given voxels directly", Remark)
-        self.settings |= grid_settings(self.grid, self.reconstructor)
+        self.settings |= grid_settings(self.grid, self.plain, self.reconstructor)
 
     def measure(self, scoring: Scoring) -> None:
         """Take these metrics in test."""
@@ -165,6 +166,7 @@ class ReconstructionTask(lightning.LightningModule):
                 held = self.plain if self.plain.grid is None else covering(self.reconstructor, data.protocol.grid)
                 self.reconstructor, self.grid = held, held.grid or data.protocol.grid
                 self.around = self.grid
+            self.scoring.check(self.grid)
         check_apart(self.results.folder, "model.out", data.inputs(stage))
         check_own_page(self.results.folder.parent, "model.out")
 
@@ -178,9 +180,9 @@ class ReconstructionTask(lightning.LightningModule):
         left = self.results.unfinished(sources, self.settings)
         if len(left) < len(sources) and self.trainer.is_global_zero:
             kept = len(sources) - len(left)
-            tell(f"{kept} of {len(sources)} cases are finished already and are kept"
-                 + (", so they are not profiled: --model.overwrite true does them again" if self.profile else ""),
-                 event="kept", cases=kept, of=len(sources))
+            log_progress(f"{kept} of {len(sources)} cases are finished already and are kept"
+                         + (", so they are not profiled: --model.overwrite true does them again" if self.profile
+                            else ""), event="kept", cases=kept, of=len(sources))
         return left
 
     def predict_step(self, case: Case, index: int = 0) -> None:
@@ -220,7 +222,8 @@ class ReconstructionTask(lightning.LightningModule):
             if "error" in case:
                 raise ValueError(case["error"]) from case["error"]
             case["ct_report"], case["report"] = case["report"], self._report(case)
-            with noted(case["warnings"], case["id"]), profiled() if self.profile else nullcontext() as profile:
+            with (enough_memory(), noted(case["warnings"], case["id"]),
+                  profiled() if self.profile else nullcontext() as profile):
                 work(case)
             if profile:
                 print(f"{case['id']}: {self.method_name}", profile.table(), sep="\n")
@@ -230,7 +233,7 @@ class ReconstructionTask(lightning.LightningModule):
             if len(self.cases) == 1:
                 raise
             self.progress.finished("not reconstructed")
-            exclaim("error", f"{case['id']}: {sentence(error)}")
+            log_problem("error", f"{case['id']}: {sentence(error)}")
 
     def on_test_epoch_end(self) -> None:
         self.log_dict(self.metrics.compute())
@@ -277,7 +280,7 @@ class ReconstructionTask(lightning.LightningModule):
             record = case_record(case, result, self.method_name, self.reconstructor, scores, self.settings, self.device)
             self.results.write(case["id"], record, lambda folder: write_result(
                 folder, case, result, self.method_name, truth, self.keep_coarse, features))
-        self.progress.finished(_said_of(result))
+        self.progress.finished(_finished_line(result))
 
     def show_finished(self) -> None:
         """Writes the page of what a stopped run has finished, if that is anything."""
@@ -297,7 +300,7 @@ def _moved(result: Reconstruction, like: Grid, affine: np.ndarray) -> Reconstruc
                    coarse=result.coarse and _moved(result.coarse, like, affine))
 
 
-def _said_of(result: Reconstruction) -> str:
+def _finished_line(result: Reconstruction) -> str:
     """What a line tells of a finished case."""
     wider = result.interval_widening
     return (f"{sum(result.seconds.values()):.1f} s, misfit {result.misfit:.4f}"

@@ -24,7 +24,7 @@ from phydict.runtime.precision import check_precision, resolve_precision
 from phydict.runtime.profiling import Stopwatch
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import Projector
-from phydict.xray.boxes import elsewhere, seen_by
+from phydict.xray.boxes import binned_to, projector_method
 
 
 @dataclass(frozen=True)
@@ -148,6 +148,6 @@ class CascadePosterior(Reconstructor):
               on_step: Callable[[], None]) -> Reconstruction:
         """The base stage's reconstruction, by the same kind of projector, from X-rays binned to what its grid holds."""
         prior = self.cascade.base
-        binned = seen_by(prior.grid, xrays, projector.beam, self.sampler.full_detector, elsewhere(projector))
+        binned = binned_to(prior.grid, xrays, projector.beam, self.sampler.full_detector, projector_method(projector))
         posterior = Posterior(prior, self.sampler, self.guidance, self.mu_water, self.name, self.precision)
         return posterior.reconstruct(*binned, report, display, seed, on_step)

@@ -17,7 +17,7 @@ from phydict.units import MU_WATER, HUWindow
 from phydict.xray import Projector
 from phydict.xray.calibration import match_views, subtract_scatter, without_hardening
 from phydict.xray.carried import Carried
-from phydict.xray.checks import check_line_integrals, check_xrays, with_air_at_zero
+from phydict.xray.checks import prepared_xrays
 from phydict.xray.noise_level import noise_level
 from phydict.xray.residuals import shared_norms, worst_misfit
 
@@ -44,10 +44,7 @@ class Measurement:
     def __init__(self, projector: Projector, xrays: Tensor, window: HUWindow, display: bool = False,
                  mu_water: float = MU_WATER, noise: float | Tensor | None = None,
                  outside: Tensor | None = None):
-        check_xrays(xrays, projector.beam)
-        if not display:
-            check_line_integrals(xrays)
-            xrays = with_air_at_zero(xrays)
+        xrays = prepared_xrays(xrays, projector.beam, display)
         self.noise, self.measured = noise, xrays[None]
         self.projector, self.display = projector, xrays[None] if display else None
         self.slope, self.offset = window.mu_affine(mu_water)

@@ -160,6 +160,7 @@ class Posterior(Reconstructor):
         prior, grid, watch = self.prior, self.grid, Stopwatch()
         if isinstance(prior, torch.nn.Module):
             prior.to(xrays.device)
+            xrays = xrays.to(next((weight.dtype for weight in prior.parameters()), xrays.dtype))
         if not grid.same_as(projector.grid):
             raise ValueError(
                 f"the prior was trained on {grid.shape} voxels of {grid.spacing} mm, but the X-rays are "

@@ -17,7 +17,7 @@ from phydict.posterior.coarse_correction import coarse_correction
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.posterior import WIDEST
 from phydict.posterior.refinement import Correction, Refinement
-from phydict.prior.finer_uncertainty import SEEN_LEVEL
+from phydict.prior.finer_uncertainty import INPUT_LEVEL
 from phydict.reconstruction import Delegating, Reconstruction
 from phydict.runtime.profiling import Stopwatch
 from phydict.runtime.warning import Remark, warn
@@ -26,13 +26,13 @@ from phydict.xray import Projector
 from phydict.xray.boxes import (
     SLACK,
     averaged,
+    binned_to,
     covers,
-    elsewhere,
     interpolated,
     no_finer,
     outside_projection,
+    projector_method,
     refinements,
-    seen_by,
 )
 
 ON_FINER = {0.5: (0.85, 0.0), 0.8: (1.0, 0.0), 0.9: (1.0, 0.1), 0.95: (1.0, 0.2)}
@@ -180,7 +180,7 @@ class Refined(Delegating):
                          ) -> tuple[dict[float, Tensor], Grid] | None:
         """The half-widths in HU that a network knows on a level's voxels, and these; None where it knows none."""
         window = self.base.window
-        widths = network.half_widths(level, seen_of(x, start, coarse, window, level), self.base.precision)
+        widths = network.half_widths(level, network_input(x, start, coarse, window, level), self.base.precision)
         if widths is None:
             return None
         return dict(zip(coarse.intervals, window.half_width * widths[0].clamp(max=WIDEST).cpu())), level
@@ -202,7 +202,7 @@ class Refined(Delegating):
             beam = replace(beam, continued=False)
         elif grid.same_as(projector.grid):
             return xrays, projector
-        return seen_by(grid, xrays, beam, self.full_detector, elsewhere(projector))
+        return binned_to(grid, xrays, beam, self.full_detector, projector_method(projector))
 
     def _measurement(self, y: Tensor, A: Projector, coarse: Reconstruction, display: bool, continued: bool
                      ) -> Measurement:
@@ -216,10 +216,10 @@ class Refined(Delegating):
         return measurement
 
 
-def seen_of(x: Tensor, start: Tensor, coarse: Reconstruction, window: HUWindow, level: Grid) -> Tensor:
-    """What a FinerUncertainty sees (1, SEEN, X, Y, Z) of an estimate x on a level's voxels, of `start`, which it was
-    interpolated from, both (1, 1, X, Y, Z) in the prior's range, and of the coarse result."""
+def network_input(x: Tensor, start: Tensor, coarse: Reconstruction, window: HUWindow, level: Grid) -> Tensor:
+    """The input of a FinerUncertainty (1, INPUT_CHANNELS, X, Y, Z): an estimate x on a level's voxels, `start`, from
+    which it was interpolated, both (1, 1, X, Y, Z) in the prior's range, and the coarse result's interval and lungs."""
     assert coarse.masks is not None
     width, lung = (interpolated(of_coarse, coarse.grid, level, 0.0)[None, None].to(x)
-                   for of_coarse in (coarse.intervals[SEEN_LEVEL] / window.half_width, coarse.masks[0]))
+                   for of_coarse in (coarse.intervals[INPUT_LEVEL] / window.half_width, coarse.masks[0]))
     return torch.cat([x.clamp(-1, 1), start, width, lung], 1)

@@ -30,8 +30,8 @@ class Correction(Protocol):
         ...
 
     def half_widths(self, grid: Grid, seen: Tensor, precision: str) -> Tensor | None:
-        """Half-widths (1, levels, X, Y, Z) of intervals around the result, given SEEN (1, 4, X, Y, Z); None where it
-        knows none on these voxels."""
+        """Half-widths (1, levels, X, Y, Z) of intervals around the result, given a FinerUncertainty's input `seen`;
+        None where it knows none on these voxels."""
         ...
 
 

@@ -9,13 +9,14 @@ import numpy as np
 from phydict.prior.contract import AnyPrior
 from phydict.prior.medsyn.super_resolution import MedSynSuperResolution
 from phydict.prior.super_resolution import SuperResolution
+from phydict.xray.boxes import along
 
 
 @dataclass(frozen=True)
 class Cascade:
     """A base prior and a super-resolution stage for the same cube and HU window, such as 64^3 and 256^3.
 
-    Raises ValueError where the stages do not fit: cube, window, factor, or channels.
+    Raises ValueError where the stages do not fit: cube, axes, window, factor, or channels.
     """
 
     base: AnyPrior
@@ -26,6 +27,9 @@ class Cascade:
         if not np.allclose(base.grid.extent, stage.grid.extent) or not np.allclose(base.grid.centre, stage.grid.centre):
             raise ValueError(f"the base prior's cube has sides of {_mm(base)} mm and the super-resolution stage's of "
                              f"{_mm(stage)} mm, or another centre: use stages trained with the same model.cube.side")
+        if not along(base.grid, stage.grid):
+            raise ValueError("the base prior's voxels are stacked in other directions than the super-resolution "
+                             "stage's: use stages whose affines have axes of the same directions")
         if base.window != stage.window:
             raise ValueError(f"the base prior's HU window is [{base.window.low:g}, {base.window.high:g}] and the "
                              f"super-resolution stage's [{stage.window.low:g}, {stage.window.high:g}]: use stages "

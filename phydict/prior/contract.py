@@ -91,14 +91,14 @@ def is_class_path(given: object) -> bool:
 
 def own_identity(prior: AnyPrior, given: object) -> dict | None:
     """What decides the answers of a prior given as an object or by the path of its class: its own `identity`, or its
-    plain attributes and the CRC-32 of its weights; None for one that is read from a file."""
+    plain attributes, and the CRC-32 of its weights; None for one that is read from a file."""
     if isinstance(given, str | Path | MedSynCheckpoint) and not is_class_path(given):
         return None
-    if callable(method := getattr(prior, "identity", None)):
-        return method()
-    identity, crc = PriorContract.identity(prior), 0  # type: ignore[arg-type]  # which asks for attributes alone
-    if not isinstance(prior, nn.Module):
+    stated = getattr(prior, "identity", None)
+    identity = stated() if callable(stated) else PriorContract.identity(prior)  # type: ignore[arg-type]
+    if not isinstance(prior, nn.Module) or "weights_crc32" in identity:
         return identity
+    crc = 0
     for weight in prior.state_dict().values():
         crc = crc32(weight.cpu().contiguous().flatten().view(torch.uint8).numpy(), crc)
     return identity | {"weights_crc32": crc}

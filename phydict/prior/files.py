@@ -49,7 +49,7 @@ DEFAULT_PRIOR = shipped("data/prior/phydict_64.safetensors")
 
 UNHEARD = ("phydict_64 hears of a report that there is a finding, not on which side: for reports give "
            "data/prior/phydict_64_reports.safetensors")
-"""What is warned of when the first report is given to DEFAULT_PRIOR."""
+"""What is warned of when a report is given to DEFAULT_PRIOR."""
 
 DEFAULT_REFINER = shipped("data/prior/refiner_64.safetensors")
 """The refiner that comes with the project."""
@@ -69,7 +69,7 @@ def save_prior(prior: Prior, path: str | Path, training: dict | None = None, dty
     dtype: precision of the weights on disk.
     """
     if prior.text is None and prior.load_text is not None:
-        prior.text = prior.load_text()
+        prior.text = prior.load_text().to(prior.null.device)
     weights = prior.state_dict()
     if prior.text is not None and prior.text.source:  # a pretrained BERT is named, not copied
         weights = {k: w for k, w in weights.items() if not k.startswith("text.")}
@@ -86,7 +86,7 @@ def save_refiner(refiner: Refiner, path: str | Path, training: dict | None = Non
     """Writes `refiner`, with the priors that it is made of, to one .safetensors file, as `save_prior` does."""
     reader = refiner.reader
     if reader.text is None and reader.load_text is not None:
-        reader.text = reader.load_text()
+        reader.text = reader.load_text().to(reader.null.device)
     copied = reader.text is not None and not reader.text.source
     named = {re.sub(r"^(prior|first)\.text\.", "text.", k): w for k, w in refiner.state_dict().items()}
     weights = {k: w for k, w in named.items() if copied or not k.startswith("text.")}
@@ -160,7 +160,7 @@ def load_prior(path: str | Path | MedSynCheckpoint = DEFAULT_PRIOR,
         if has_text(header):
             reader = loaded.reader if isinstance(loaded, Refiner) else loaded
             reader.load_text = lambda: load_text(path, header["text"])
-            reader.unheard = UNHEARD if path == DEFAULT_PRIOR else ""
+            reader.unheard = UNHEARD if Path(path).resolve() == DEFAULT_PRIOR.resolve() else ""
         return loaded
 
     return loaded_stage(path, ("base", "refiner"), build, device)

@@ -10,10 +10,10 @@ from phydict.prior.convolution import lay_out, speed_up
 from phydict.prior.local_unet import prolonged
 from phydict.prior.uncertainty import LEVELS, LOG_SCALE, TISSUES, quantiles_of, steepness, tissue_of
 
-SEEN = 4
+INPUT_CHANNELS = 4
 """The estimate, what it was interpolated from, the coarse interval's half-width, the share of lung."""
 
-SEEN_LEVEL = 0.9
+INPUT_LEVEL = 0.9
 """The level of the coarse interval that is seen."""
 
 LEAST_WIDTH = 0.003
@@ -23,7 +23,7 @@ LEAST_WIDTH = 0.003
 class FinerUncertainty(nn.Module):
     """The scale b of the error of each finer voxel, and from it the half-widths of intervals.
 
-    A UNet of what is SEEN and of its steepness, joined with these by a head of two convolutions, answers with
+    A UNet of its INPUT_CHANNELS and of its steepness, joined with these by a head of two convolutions, answers with
     log(b / w), w the coarse interval's half-width: what widens coarse intervals widens these. It learns as
     `Uncertainty` does, and is calibrated as that is, by tissue alone.
 
@@ -38,16 +38,16 @@ class FinerUncertainty(nn.Module):
         super().__init__()
         self.settings = {"channels": list(channels), "width": width}
         self.divisor = 2 ** (len(channels) - 1)
-        self.unet = UNet(3, SEEN + 1, width, tuple(channels), (2,) * (len(channels) - 1), num_res_units=1, act="swish",
-                         norm=None)  # type: ignore[arg-type]  # which MONAI takes for no norm
-        self.join = nn.Conv3d(width + SEEN + 1, width, 3, padding=1)
+        self.unet = UNet(3, INPUT_CHANNELS + 1, width, tuple(channels), (2,) * (len(channels) - 1), num_res_units=1,
+                         act="swish", norm=None)  # type: ignore[arg-type]  # which MONAI takes for no norm
+        self.join = nn.Conv3d(width + INPUT_CHANNELS + 1, width, 3, padding=1)
         self.leave = nn.Conv3d(width, 1, 1)
         speed_up(self)
         lay_out(self)
         self.register_buffer("quantiles", -torch.log1p(-torch.tensor(LEVELS)).expand(len(TISSUES), -1).clone())
 
     def forward(self, seen: Tensor) -> Tensor:
-        """log b (B, 1, X, Y, Z) of what is seen (B, SEEN, X, Y, Z), all in the prior's range, for any sizes."""
+        """log b (B, 1, X, Y, Z) of its input (B, INPUT_CHANNELS, X, Y, Z), both in the prior's range, for any sizes."""
         z, before, width, lung = prolonged(seen, self.divisor).split(1, 1)
         log_width = width.clamp(min=LEAST_WIDTH).log()
         given = torch.cat([z, 2 * (z - before).abs(), 2 * steepness(z), log_width / 2 + 1.5, lung], 1)
@@ -68,5 +68,5 @@ class FinerUncertainty(nn.Module):
 
 
 def tissue_of_seen(seen: Tensor) -> Tensor:
-    """The index in TISSUES (B, X, Y, Z) of the voxels of what is seen (B, SEEN, X, Y, Z)."""
+    """The index in TISSUES (B, X, Y, Z) of the voxels of what is seen (B, INPUT_CHANNELS, X, Y, Z)."""
     return tissue_of(torch.cat([seen[:, :1], 2 * seen[:, 3:] - 1], 1))

@@ -84,9 +84,6 @@ class Prior(nn.Module):
         """
         if not any(reports):
             return self.null.expand(len(reports), 1, -1)
-        if self.unheard:
-            warn(self.unheard)
-            self.unheard = ""
         if self.text is None:
             if self.load_text is None:
                 raise ValueError("this prior was trained without text, but a report was given: leave the report out")
@@ -154,12 +151,14 @@ class Prior(nn.Module):
     def bind(self, report: str = "", guidance: float = 1.0, precision: str = "auto") -> BoundPrior:
         """The denoiser of one report, with classifier-free guidance of the given scale inside (1 = none).
 
-        precision: see phydict.runtime.precision. Warns, once for each report, where it is cut or in words that the text
+        precision: see phydict.runtime.precision. Warns where a report is cut or in words that the text
         encoder does not know.
         """
         if guidance < 0:
             raise ValueError(f"the guidance scale is at least 0, but {guidance} was given")
         context = self.context([report])
+        if report and self.unheard:
+            warn(self.unheard)
         if report and self.text is not None:
             self.text.check([report])
         return BoundPrior(self, context, guidance if report else 1.0, precision)

@@ -131,4 +131,4 @@ class BoundSuperResolution:
         level = torch.full((len(x),), float(self.noise), device=x.device)
         with network_precision(self.precision, x):
             return self.stage.tiles()(lambda part, coarse: self.stage(part, times, coarse, level), x,
-                                      self.upsampled.to(x.dtype))
+                                      self.upsampled.to(x.dtype).expand(len(x), -1, -1, -1, -1))

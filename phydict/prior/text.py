@@ -58,7 +58,6 @@ class TextEncoder(nn.Module):
         self._kept: dict[str, tuple[Tensor, Tensor]] = {}
         self._kept_of: tuple | None = None
         self._kept_bytes = 0
-        self._checked: set[str] = set()
 
     @property
     def width(self) -> int:
@@ -119,25 +118,22 @@ class TextEncoder(nn.Module):
     def check(self, reports: Iterable[str]) -> None:
         """Warns of reports that are longer than is read (`sentences`, else `padded_to`, else `length`) and of reports
         in words that the vocabulary lacks.
-
-        Each report is looked at once: later calls speak of new reports alone.
         """
-        new = [report for report in dict.fromkeys(reports) if report and report not in self._checked]
-        if not new:
+        given = [report for report in dict.fromkeys(reports) if report]
+        if not given:
             return
-        self._checked.update(new)
-        tokens = self.tokenizer(new, add_special_tokens=False, verbose=False)["input_ids"]
+        tokens = self.tokenizer(given, add_special_tokens=False, verbose=False)["input_ids"]
         sizes, read, unit = [len(ids) + 2 for ids in tokens], self.padded_to or self.length, "tokens"
         if self.sentences:
-            sizes, read, unit = [len(split_sentences(report)) for report in new], self.sentences, "sentences"
+            sizes, read, unit = [len(split_sentences(report)) for report in given], self.sentences, "sentences"
         excess = [size - read for size in sizes if size > read]
         if excess:
-            warn(f"{len(excess)} of {len(new)} reports are longer than the {read} {unit} that the text "
+            warn(f"{len(excess)} of {len(given)} reports are longer than the {read} {unit} that the text "
                  f"encoder reads: up to {max(excess)} {unit} at their end are left out")
         unknown = [sum(token == self.tokenizer.unk_token_id for token in ids) / max(len(ids), 1) for ids in tokens]
         foreign = [share for share in unknown if share > FOREIGN]
         if foreign:
-            warn(f"{len(foreign)} of {len(new)} reports are in words that the text encoder does not know, up "
+            warn(f"{len(foreign)} of {len(given)} reports are in words that the text encoder does not know, up "
                  f"to {max(foreign):.0%} of a report, and say little to it: give them in the language that "
                  "it learnt, or leave them out")
 

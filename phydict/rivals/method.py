@@ -47,9 +47,10 @@ class RivalAnswer(Baseline):
 
     def solve(self, A: CountingProjector, y: Tensor, on_step: Callable[[], None]) -> Tensor:
         self.rival.check(A.grid, A.beam)
-        with network_precision(self.precision, y):
-            x = self.rival.reconstruct(y, A.beam, torch.Generator().manual_seed(self.seed), on_step)
-        return self.rival.window.to_mu(x, 1.0)
+        seen = y.float()
+        with network_precision(self.precision, seen):
+            x = self.rival.reconstruct(seen, A.beam, torch.Generator().manual_seed(self.seed), on_step)
+        return self.rival.window.to_mu(x, 1.0).to(y)
 
     def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,
                     seed: int = 0, on_step: Callable[[], None] = lambda: None,

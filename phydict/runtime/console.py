@@ -19,9 +19,9 @@ from pathlib import Path
 from jsonargparse import set_loader
 
 from phydict.runtime.parser_message import plain
-from phydict.runtime.reading import one_line
+from phydict.runtime.progress_log import log_always, log_problem, log_progress
+from phydict.runtime.reading import enough_memory, one_line
 from phydict.runtime.shipped import configuration
-from phydict.runtime.telling import exclaim, proclaim, tell
 from phydict.runtime.warning import Remark
 from phydict.runtime.yaml_file import parse_yaml, read_yaml
 
@@ -62,26 +62,27 @@ def cli_errors(*also: type[Exception], to_resume: str = "run the same command ag
     the environment variable PHYDICT_TRACEBACK=1 shows the trace instead. A run that a signal stopped says how to resume
     and exits with code 130 (SIGINT) or 143 (SIGTERM): as `to_resume` has it, or the note of what was raised."""
     try:
-        yield
+        with enough_memory():
+            yield
     except (KeyboardInterrupt, SystemExit) as stop:  # Lightning exits with 1 on SIGINT and without a code on SIGTERM
         interrupted = isinstance(stop, KeyboardInterrupt) or isinstance(stop.__context__, KeyboardInterrupt)
         if not interrupted and isinstance(stop, SystemExit) and stop.code is not None:
             raise
         text = f"stopped by a signal; to resume, {_advice(stop, to_resume)}"
-        proclaim(text, event="stopped", text=text)
+        log_always(text, event="stopped", text=text)
         raise SystemExit(130 if interrupted else 143) from None
     except (ValueError, OSError, FloatingPointError, ArgumentError, *also) as error:  # type: ignore[misc]
         if os.environ.get(TRACEBACK):
             raise
         full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
         advice = f": free some space; to resume, {_advice(error, to_resume)}" if full else ""
-        exclaim("error", f"{sentence(error)}{advice}")
+        log_problem("error", f"{sentence(error)}{advice}")
         raise SystemExit(2) from None
     except RuntimeError as error:
         if os.environ.get(TRACEBACK) or not re.search("Connection (closed|reset) by peer", str(error)):
             raise
         text = "stopped, because another process of this run ended; its message says why"
-        proclaim(text, event="stopped", text=text)
+        log_always(text, event="stopped", text=text)
         raise SystemExit(2) from None
 
 
@@ -233,15 +234,18 @@ def quiet() -> Iterator[None]:
     def show(message: Warning | str, category: type[Warning], *_) -> None:
         text = " ".join(str(message).split())
         if category is not Remark:
-            exclaim("warning", text)
+            log_problem("warning", text)
         elif text not in remarks:
             remarks.add(text)
-            tell(text, event="note", text=text)
+            log_progress(text, event="note", text=text)
 
     loggers = [logging.getLogger(name) for name in ("lightning.pytorch", "lightning.fabric")]
     levels = [logger.level for logger in loggers]
     with warnings.catch_warnings():
         warnings.showwarning = show  # type: ignore[assignment]
+        if any(action == "ignore" and message is None and issubclass(UserWarning, category)
+               for action, message, category, *_ in warnings.filters):
+            warnings.filterwarnings("default", category=UserWarning)  # records of cases hold them all the same
         for message in NOISE:
             warnings.filterwarnings("ignore", message)
         for logger in loggers:

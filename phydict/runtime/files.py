@@ -44,7 +44,8 @@ def atomic_directory(final: Path, wanted: Callable[[], bool] = lambda: True) -> 
     """
     partial = _partial(final)
     try:
-        partial.mkdir(parents=True, exist_ok=True)
+        shutil.rmtree(partial, ignore_errors=True)  # of a killed process that had this one's number
+        partial.mkdir(parents=True)
         yield partial
         for path in (*partial.rglob("*"), partial):
             _sync(path)

@@ -9,6 +9,8 @@ from functools import lru_cache
 import torch
 from torch import Tensor, nn
 
+from phydict.runtime.reading import reason
+
 FILES = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth", "squeeze": "squeezenet1_1-b8a52dc0.pth"}
 """Backbone -> the file of its trained weights, torchvision's."""
 
@@ -21,7 +23,7 @@ def load_lpips(backbone: str, random_backbone: bool, otherwise: str = OF_A_REWAR
     """LPIPS, frozen and in evaluation mode.
 
     Raises FileNotFoundError naming the file, what is `needing` it and what can be done `otherwise` when the trained
-    backbone is not there and cannot be downloaded, and ValueError for an unknown backbone.
+    backbone is not there and cannot be downloaded, and ValueError for an unknown backbone or a damaged file.
     """
     if backbone not in FILES:
         raise ValueError(f"LPIPS backbones are {', '.join(FILES)}, but '{backbone}' was given")
@@ -36,6 +38,10 @@ def load_lpips(backbone: str, random_backbone: bool, otherwise: str = OF_A_REWAR
         raise FileNotFoundError(
             f"{needing} needs the trained backbone {FILES[backbone]} in {torch.hub.get_dir()}/checkpoints and could "
             f"not download it: put the file there, or {otherwise}") from error
+    except Exception as error:  # whatever a damaged file leads to
+        raise ValueError(f"{torch.hub.get_dir()}/checkpoints/{FILES[backbone]} cannot be read as the trained backbone "
+                         f"that {needing} needs ({reason(error)}): put the file of torchvision there, or {otherwise}"
+                         ) from error
     return network.eval().requires_grad_(False)
 
 

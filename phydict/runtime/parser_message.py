@@ -30,7 +30,7 @@ UNKNOWN = re.compile(r"unrecognized arguments: (\S+)|Subcommand '\w+' does not a
 
 
 @contextmanager
-def unknown_told(*parsers: ArgumentParser) -> Iterator[None]:
+def naming_unknown_options(*parsers: ArgumentParser) -> Iterator[None]:
     """An option that parsers refuse inside as unknown is raised as a ValueError that names the nearest of theirs."""
     try:
         yield

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from phydict.runtime.telling import bars_on, tell
+from phydict.runtime.progress_log import bars_on, log_progress
 
 
 class CaseProgress:
@@ -30,8 +30,8 @@ class CaseProgress:
               noun: str = "case") -> None:
         """A run over `cases` cases of `steps` steps each, 0 where steps are not followed, whose results go to `out`."""
         where = f", results in {out}" if str(out) else ""
-        tell(f"{name}: {cases} {noun}{'' if cases == 1 else 's'} to {verb}{where}",
-             event="begin", name=name, cases=cases, steps=steps, out=str(out))
+        log_progress(f"{name}: {cases} {noun}{'' if cases == 1 else 's'} to {verb}{where}",
+                     event="begin", name=name, cases=cases, steps=steps, out=str(out))
         if self.entered:
             self.bars.start()
         self.cases = self.bars.add_task(name, total=cases)
@@ -76,7 +76,7 @@ class CaseProgress:
 
     def _line(self, text: str, **event: object) -> None:
         if self.bars.disable:
-            tell(text, **event)
+            log_progress(text, **event)
 
 
 def to_go(seconds: float) -> str:

@@ -148,6 +148,19 @@ def check_memory(needed: int, what: str, advice: str) -> None:
                               f"{there / 2**30:,.1f}; {advice}")
 
 
+@contextmanager
+def enough_memory() -> Iterator[None]:
+    """Raises TooLittleMemory where main memory or a device's gives out inside."""
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        device = type(error).__name__ == "OutOfMemoryError"  # torch's, which takes long to import
+        if not (device or isinstance(error, MemoryError) or "can't allocate memory" in str(error)):
+            raise
+        raise TooLittleMemory(f"memory gave out ({one_line(str(error)) or 'MemoryError'}): give fewer voxels, fewer "
+                              "samples or a smaller batch, or use a machine with more") from error
+
+
 def container_limits() -> list[int]:
     """Bytes of memory that control groups of either version allow, where they say so."""
     texts = [path.read_text().strip() for path in CONTROL_GROUPS if os.access(path, os.R_OK)]

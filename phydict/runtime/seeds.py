@@ -15,5 +15,5 @@ def case_seed(seed: int, case: str) -> int:
 
 def check_seed(seed: int, name: str = "a seed") -> None:
     """Raises ValueError, with the name of the setting, unless a seed is a whole number that random generators take."""
-    if isinstance(seed, bool) or not isinstance(seed, Integral) or not 0 <= int(seed) < 2**63:
-        raise ValueError(f"{name} is a whole number from 0 to 2^63 - 1, but {seed} was given")
+    if isinstance(seed, bool) or not isinstance(seed, Integral) or not 0 <= int(seed) < 2**32:
+        raise ValueError(f"{name} is a whole number from 0 to 2^32 - 1, but {seed} was given")

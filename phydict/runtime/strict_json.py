@@ -7,9 +7,9 @@ import math
 from collections.abc import Mapping
 
 
-def strict_json(value: object) -> str:
+def strict_json(value: object, indent: int | None = None) -> str:
     """Nested plain values as JSON, with null for what is no finite number, which JSON cannot say."""
-    return json.dumps(_finite(value), allow_nan=False)
+    return json.dumps(_finite(value), allow_nan=False, indent=indent)
 
 
 def _finite(value: object) -> object:

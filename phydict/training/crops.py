@@ -14,7 +14,7 @@ from phydict.datasets import CTCases, CTSource, Deformation, load_case, phantom_
 from phydict.datasets.cts.cache import write_array
 from phydict.datasets.phantoms.cached import VALIDATION_PHANTOM, CachedPhantoms
 from phydict.grid import Cube
-from phydict.runtime.telling import tell
+from phydict.runtime.progress_log import log_progress
 from phydict.runtime.warning import warn
 from phydict.training.data import PriorData, check_plain
 from phydict.training.draws import Draws, Items
@@ -36,12 +36,12 @@ def mapped_volume(file: Path, make: Callable[[], Tensor]) -> np.ndarray:
     return np.load(file, mmap_mode="r")
 
 
-def tell_made(what: str, folder: Path, count: int) -> None:
+def log_made(what: str, folder: Path, count: int) -> None:
     """Says how many of `count` `mapped_volume`s, whose names are their numbers, a folder holds, where some remain."""
     made = sum((folder / f"{n:05d}.npy").is_file() for n in range(count))
     if made < count:
-        tell(f"{made} of {count} {what} are made, the others are when they are first drawn, in {folder}", event="made",
-             name=what, done=made, of=count, out=str(folder))
+        log_progress(f"{made} of {count} {what} are made, the others are when they are first drawn, in {folder}",
+                     event="made", name=what, done=made, of=count, out=str(folder))
 
 
 class PhantomVolumes(CachedPhantoms):

@@ -8,7 +8,7 @@ from torchmetrics.functional import spearman_corrcoef
 from phydict.grid import Cube
 from phydict.prior import DEFAULT_CORRECTION, describe_correction, fingerprint, load_correction
 from phydict.prior.correction import CorrectionNetwork
-from phydict.prior.finer_uncertainty import SEEN, FinerUncertainty, tissue_of_seen
+from phydict.prior.finer_uncertainty import INPUT_CHANNELS, FinerUncertainty, tissue_of_seen
 from phydict.prior.uncertainty import TISSUES
 from phydict.training.settings import Optimisation
 from phydict.training.stage import StageTraining, check_continues
@@ -60,10 +60,11 @@ class FinerUncertaintyTraining(StageTraining):
 
     def _compared(self, volume: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """What the network says of the log of the errors' scale, the errors, and the tissues, (B, X, Y, Z) each, of
-        what is seen and the truth (B, SEEN + 1, X, Y, Z)."""
-        seen = volume[:, :SEEN]
+        what is seen and the truth (B, INPUT_CHANNELS + 1, X, Y, Z)."""
+        seen = volume[:, :INPUT_CHANNELS]
         assert self.prior.uncertainty is not None
-        return (self.prior.uncertainty(seen)[:, 0], (seen[:, 0] - volume[:, SEEN]).abs(), tissue_of_seen(seen))
+        error = (seen[:, 0] - volume[:, INPUT_CHANNELS]).abs()
+        return self.prior.uncertainty(seen)[:, 0], error, tissue_of_seen(seen)
 
     def on_validation_start(self) -> None:
         super().on_validation_start()

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.progress import Progress, TextColumn
 
 from phydict.runtime.progress import CaseProgress, to_go
-from phydict.runtime.telling import bars_on, tell
+from phydict.runtime.progress_log import bars_on, log_progress
 
 BAR_METRICS = ("loss", "val/psnr")
 """Of what is logged, what the bar has room for."""
@@ -37,8 +37,8 @@ class TrainingProgress(lightning.Callback):
         self.bar = bars_on(console, TextColumn("{task.fields[logged]}"))
         self.bar.disable |= not trainer.is_global_zero
         of = f" of {self.total}" if self.total else ""
-        self._tell(trainer, f"training: step {self.first}{of}, results in {trainer.default_root_dir}", event="begin",
-                   name="training", step=self.first, steps=self.total, out=trainer.default_root_dir)
+        self._log(trainer, f"training: step {self.first}{of}, results in {trainer.default_root_dir}", event="begin",
+                  name="training", step=self.first, steps=self.total, out=trainer.default_root_dir)
         self.task = self.bar.add_task("training", total=self.total, completed=self.first, logged="")
         self.bar.start()
 
@@ -59,8 +59,8 @@ class TrainingProgress(lightning.Callback):
             self.cases.finished("measured")
         elif self._fits(trainer) and self.bar.disable and time.monotonic() - self.spoke > self.interval:
             self.spoke, cases = time.monotonic(), sum(trainer.num_val_batches)
-            self._tell(trainer, f"validation: {index + 1} of {cases} cases", event="validation", done=index + 1,
-                       cases=cases)
+            self._log(trainer, f"validation: {index + 1} of {cases} cases", event="validation", done=index + 1,
+                      cases=cases)
 
     def on_validation_end(self, trainer, module) -> None:
         if self._fits(trainer):
@@ -91,8 +91,8 @@ class TrainingProgress(lightning.Callback):
         if self.total and done > 0:
             left = round((time.monotonic() - self.began) / done * max(self.total - step, 0), 1)
         logged = _logged(trainer)
-        self._tell(trainer, f"step {step}{of}{to_go(left or 0)}: {_in_words(logged)}", event="step", step=step,
-                   steps=self.total, seconds_to_go=left, **logged)
+        self._log(trainer, f"step {step}{of}{to_go(left or 0)}: {_in_words(logged)}", event="step", step=step,
+                  steps=self.total, seconds_to_go=left, **logged)
 
     @staticmethod
     def _fits(trainer) -> bool:
@@ -100,9 +100,9 @@ class TrainingProgress(lightning.Callback):
         return trainer.state.fn == "fit" and not trainer.sanity_checking
 
     @staticmethod
-    def _tell(trainer, text: str, **event) -> None:
+    def _log(trainer, text: str, **event) -> None:
         if trainer.is_global_zero:
-            tell(text, **event)
+            log_progress(text, **event)
 
 
 def _logged(trainer) -> dict[str, float]:

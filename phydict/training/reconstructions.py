@@ -20,21 +20,21 @@ from phydict.datasets.phantoms.cached import VALIDATION_PHANTOM
 from phydict.datasets.surroundings.surroundings import Surroundings
 from phydict.grid import Cube, Grid
 from phydict.posterior import Posterior, Refined, Refinement, Unrolled
-from phydict.posterior.refined import seen_of
+from phydict.posterior.refined import network_input
 from phydict.prior import DEFAULT_CORRECTION, DEFAULT_REFINER, Refiner, fingerprint, load_correction, load_prior
 from phydict.prior.correction import INPUTS, CorrectionNetwork
-from phydict.prior.finer_uncertainty import SEEN
+from phydict.prior.finer_uncertainty import INPUT_CHANNELS
 from phydict.reconstruction import describe
 from phydict.runtime.ranges import check_fields
 from phydict.runtime.seeds import check_seed
-from phydict.training.crops import CTVolumes, PhantomVolumes, mapped_volume, tell_made
+from phydict.training.crops import CTVolumes, PhantomVolumes, log_made, mapped_volume
 from phydict.training.data import PriorData, check_plain
 from phydict.training.draws import Draws, Items
 from phydict.training.scenes import Scenes
 from phydict.training.settings import HoldOut, Loading
 from phydict.units import AIR, HUWindow
 from phydict.xray import Projector
-from phydict.xray.boxes import interpolated, refinements, seen_by
+from phydict.xray.boxes import binned_to, interpolated, refinements
 
 FINER = 2
 """How many times finer the voxels that X-rays are made of are than those of a reconstruction."""
@@ -121,7 +121,7 @@ class Reconstructions(Dataset):
                       "id": str(n)}
         ct = augment(case, int(rng.integers(2**31)), scene, window, self.strength)["volume"][None]
         y, projector = self.scenes.xrays(ct, rng, scene, window)
-        seen = self._seen(Posterior(refiner, Unrolled()), *seen_by(self.grid, y, projector.beam, False))
+        seen = self._seen(Posterior(refiner, Unrolled()), *binned_to(self.grid, y, projector.beam, False))
         return torch.cat([seen, avg_pool3d(ct, FINER)], 1)[0]
 
     def _seen(self, base: Posterior, xrays: Tensor, projector: Projector) -> Tensor:
@@ -133,9 +133,9 @@ class Reconstructions(Dataset):
 
 
 class RefinedResults(Reconstructions):
-    """What a FinerUncertainty sees of the results of `network`, and last the truth: (SEEN + 1, X, Y, Z)."""
+    """What a FinerUncertainty sees of the results of `network`, and last the truth: (INPUT_CHANNELS + 1, X, Y, Z)."""
 
-    name, channels, default_network, of_intervals = "results", SEEN, str(DEFAULT_CORRECTION), True
+    name, channels, default_network, of_intervals = "results", INPUT_CHANNELS, str(DEFAULT_CORRECTION), True
 
     def _seen(self, base: Posterior, xrays: Tensor, projector: Projector) -> Tensor:
         network = load_correction(cast(str, self.network))
@@ -143,7 +143,7 @@ class RefinedResults(Reconstructions):
         assert found.coarse is not None
         start = interpolated(found.coarse.within, found.coarse.grid, self.grid, AIR)
         x, start = (base.window.to_range(hu)[None, None] for hu in (found.within, start))
-        return seen_of(x, start, found.coarse, base.window, self.grid)
+        return network_input(x, start, found.coarse, base.window, self.grid)
 
 
 class ReconstructionCrops(Draws):
@@ -252,7 +252,7 @@ class RefinementData(PriorData):
 
     def draws(self, epoch: int) -> Dataset:
         if not self.trainer or self.trainer.is_global_zero:
-            tell_made(self.made.name, self.made.folder, len(self.made))
+            log_made(self.made.name, self.made.folder, len(self.made))
         return ReconstructionCrops(self.made, self.crop, self.loading.epoch_size, epoch, self.seed)
 
     def collate(self, cases: list[dict]) -> dict:

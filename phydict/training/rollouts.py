@@ -20,7 +20,7 @@ from phydict.posterior import Unrolled
 from phydict.prior import DEFAULT_REFINER, BoundRefiner, Refiner, fingerprint, load_prior
 from phydict.prior.evidence_channels import EVIDENCE_CHANNELS
 from phydict.runtime.ranges import check_fields
-from phydict.training.crops import mapped_volume, tell_made
+from phydict.training.crops import log_made, mapped_volume
 from phydict.training.data import PriorData, check_plain
 from phydict.training.draws import Draws, Items
 from phydict.training.refiner import RefinerTraining
@@ -152,7 +152,7 @@ class RollOutData(PriorData):
 
     def draws(self, epoch: int) -> Dataset:
         if not self.trainer or self.trainer.is_global_zero:
-            tell_made("roll-outs", self.rollouts.folder, len(self.rollouts))
+            log_made("roll-outs", self.rollouts.folder, len(self.rollouts))
         return Calls(self.rollouts, self.channels, self.loading.epoch_size, epoch, self.seed)
 
     def collate(self, cases: list[dict]) -> dict:

@@ -15,7 +15,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from phydict.prior import Prior, SuperResolution
 from phydict.runtime.precision import instruction_set
-from phydict.runtime.telling import tell
+from phydict.runtime.progress_log import log_progress
 
 REPEATS = 5
 """Matrix products of which the fastest counts."""
@@ -42,7 +42,7 @@ class Throughput(lightning.Callback):
     def on_fit_start(self, trainer, module) -> None:
         self.began, self.flop = None, 0
 
-    def _tell_costs(self, trainer, module, shape: tuple[int, ...]) -> None:
+    def _log_costs(self, trainer, module, shape: tuple[int, ...]) -> None:
         self.flop = module.calls * sample_flop(module.prior, shape)
         low = torch.bfloat16 if "bf16" in str(trainer.precision) else torch.float32
         precision, instructions = str(low).removeprefix("torch."), instruction_set(module.device)
@@ -50,14 +50,14 @@ class Throughput(lightning.Callback):
             self.peak = matmul_peak(module.device, low) / 1e12
         weights = sum(weight.numel() for weight in module.prior.parameters() if weight.requires_grad)
         if trainer.is_global_zero:
-            tell(f"training {weights / 1e6:.3g} M weights in {precision} on {instructions}: a sample costs "
-                 f"{self.flop / 1e9:.3g} GFLOP forward and backward; a {precision} matrix product reaches "
-                 f"{self.peak:.3g} TFLOP/s on this device", event="costs", weights=weights, precision=precision,
-                 instruction_set=instructions, sample_flop=self.flop, peak_tflop_per_s=self.peak)
+            log_progress(f"training {weights / 1e6:.3g} M weights in {precision} on {instructions}: a sample costs "
+                         f"{self.flop / 1e9:.3g} GFLOP forward and backward; a {precision} matrix product reaches "
+                         f"{self.peak:.3g} TFLOP/s on this device", event="costs", weights=weights, precision=precision,
+                         instruction_set=instructions, sample_flop=self.flop, peak_tflop_per_s=self.peak)
 
     def on_train_batch_start(self, trainer, module, batch, _) -> None:
         if not self.flop:
-            self._tell_costs(trainer, module, batch["volume"].shape[2:])
+            self._log_costs(trainer, module, batch["volume"].shape[2:])
         now, samples = time.perf_counter(), len(batch["volume"])
         if self.began is not None:
             rate = samples * trainer.world_size / (now - self.began)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from phydict.grid import Grid
 from phydict.linalg.conjugate_gradients import conjugate_gradients
-from phydict.xray.boxes import in_other_voxels, seen_by
+from phydict.xray.boxes import binned_to, in_other_voxels
 from phydict.xray.geometry import ConeBeam
 
 SIDE, ITERATIONS, CLEARLY = 32, 10, 1.1
@@ -27,7 +27,7 @@ LOW = 0.01
 """The share of a display image's pixels at or below what stands for air."""
 
 
-def asked(xrays: Tensor, beam: ConeBeam, grid: Grid, display: bool) -> ConeBeam:
+def with_continuation(xrays: Tensor, beam: ConeBeam, grid: Grid, display: bool) -> ConeBeam:
     """The beam, `continued`, where it is None, as the X-rays (K, V, U) of a patient in the box of `grid` show it: true
     where a volume whose last slices are repeated beyond it clearly explains them better. Of voxels that are not stacked
     upwards nothing is repeated.
@@ -43,9 +43,9 @@ def asked(xrays: Tensor, beam: ConeBeam, grid: Grid, display: bool) -> ConeBeam:
     return replace(beam, continued=CLEARLY * repeated < alone)
 
 
-def asks_for_taller(xrays: Tensor, beam: ConeBeam, grid: Grid, display: bool) -> bool:
+def needs_taller(xrays: Tensor, beam: ConeBeam, grid: Grid, display: bool) -> bool:
     """Whether a taller volume, if source and detectors leave room for it, clearly explains the X-rays better, of a
-    patient who ends in it. Arguments as those of `asked`."""
+    patient who ends in it. Arguments as those of `with_continuation`."""
     coarse, beam = coarsened(grid), replace(beam, continued=False)
     taller = coarse.grown(0, 0, round(TALLER * coarse.shape[2]))
     if not (grid.is_upright and beam.has_room_for(taller)):
@@ -61,7 +61,7 @@ def coarsened(grid: Grid) -> Grid:
 
 def unexplained(xrays: Tensor, beam: ConeBeam, grid: Grid) -> float:
     """The norm of what ITERATIONS steps leave of the X-rays."""
-    y, A = seen_by(grid, xrays, beam, False)
+    y, A = binned_to(grid, xrays, beam, False)
     x = conjugate_gradients(lambda mu: A.T(A(mu)), A.T(y[None]), ITERATIONS)
     return float((y - A(x)[0]).norm())
 

@@ -23,15 +23,15 @@ SLACK = 1e-3
 """A share of a voxel by which a box may stand out of another one that covers it."""
 
 
-def seen_by(grid: Grid, xrays: Tensor, beam: ConeBeam, full_detector: bool, method: str = "auto"
-            ) -> tuple[Tensor, Projector]:
+def binned_to(grid: Grid, xrays: Tensor, beam: ConeBeam, full_detector: bool, method: str = "auto"
+              ) -> tuple[Tensor, Projector]:
     """X-rays (K, V, U), binned to what the voxels can hold unless every pixel is wanted, and the projector that goes
     with them on their device; `method` as Projector's."""
     factor = 1 if full_detector else binning(grid, beam)
     return binned(xrays, factor), Projector(grid, beam.binned(factor), method, device=xrays.device, full_detector=True)
 
 
-def elsewhere(projector: Projector) -> str:
+def projector_method(projector: Projector) -> str:
     """The method by which X-rays are projected on other voxels than a projector's own; a projector that is not
     phydict's gives its place to it there, and a warning says so."""
     method = getattr(projector, "method", None)
@@ -113,7 +113,7 @@ def outside_projection(mu: Tensor, grid: Grid, projector: Projector, continued: 
     """Line integrals (K, V, U), along the projector's rays, of what of mu (X, Y, Z) in 1/mm on `grid` lies outside the
     projector's own box, and, where it is continued, above and below `grid`."""
     beam = replace(projector.beam, continued=continued)
-    whole = Projector(grid, beam, elsewhere(projector), device=mu.device, full_detector=True)(mu[None, None])
+    whole = Projector(grid, beam, projector_method(projector), device=mu.device, full_detector=True)(mu[None, None])
     return (whole - projector(interpolated(mu, grid, projector.grid, 0.0)[None, None]))[0]
 
 

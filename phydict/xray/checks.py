@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from phydict.grid import Grid
 from phydict.runtime.warning import warn
 from phydict.xray.geometry import ConeBeam
 
@@ -34,6 +36,20 @@ def check_xrays(xrays: Tensor, beam: ConeBeam) -> None:
         which = "every view" if blank.all() else f"view {int(blank.nonzero()[0])}"
         raise ValueError(f"{which} holds the same value in every pixel, as a missing or saturated image does: leave it "
                          "out of the X-rays and of the geometry")
+
+
+def check_fit(xrays: Tensor, beam: ConeBeam, grid: Grid, survey: Grid | None = None) -> None:
+    """Raises ValueError where X-rays (K, V, U), geometry and the voxels of `grid` do not fit; warns where X-rays look
+    inverted. survey: the voxels that hold the whole scene, where `grid` does not."""
+    check_xrays(xrays, beam)
+    check_air(xrays)
+    beam.check(grid)
+    beam.check_scale(survey or grid)
+    beam.check_meets(grid)
+    if beam.continued and not grid.is_upright:
+        raise ValueError("a patient who goes on above and below is continued along the third axis of the voxels, which "
+                         f"is to run upwards, but {np.round(grid.affine[:3, 2] / grid.spacing[2], 2).tolist()} was "
+                         "given: give voxels whose third axis is superior, or leave out `continued`")
 
 
 def outer_columns(xrays: Tensor) -> Tensor:
@@ -71,6 +87,16 @@ def check_line_integrals(xrays: Tensor) -> None:
     if (views := int((middle.flatten(2).median(2).values.amin(0) > CUT_OFF).sum())) > len(xrays) / 2:
         warn(f"{views} of {len(xrays)} views cut the patient off at the left and right side of the detector: what lies "
              "beyond is the method's guess, and HU near it are less certain; a wider detector would show it")
+
+
+def prepared_xrays(xrays: Tensor, beam: ConeBeam, display: bool) -> Tensor:
+    """X-rays (K, V, U) as a reconstruction takes them: checked and, of no display values, as `with_air_at_zero`. Raises
+    as `check_xrays`, and warns as `check_line_integrals`."""
+    check_xrays(xrays, beam)
+    if display:
+        return xrays
+    check_line_integrals(xrays)
+    return with_air_at_zero(xrays)
 
 
 def with_air_at_zero(xrays: Tensor) -> Tensor:

@@ -334,7 +334,7 @@ class ConeBeam:
         with atomic_write(Path(path)) as part:
             part.write_text(yaml.safe_dump(self.to_dict(), sort_keys=False, default_flow_style=None))
 
-    def saying(self, continued: bool | None) -> ConeBeam:
+    def with_continued(self, continued: bool | None) -> ConeBeam:
         """The same beam, which says so of `continued`; None leaves it. Raises ValueError where it says otherwise."""
         if continued is None or continued is self.continued:
             return self
@@ -363,7 +363,7 @@ class ConeBeam:
         try:
             if not isinstance(content, dict) or "beam" not in content:
                 return cls.from_dict(content)
-            return cls.from_dict(content["beam"]).saying(content.get("continued"))
+            return cls.from_dict(content["beam"]).with_continued(content.get("continued"))
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
 

@@ -10,7 +10,7 @@ from fitting import fit_to_grid
 from torch.nn.functional import pad
 
 from phydict import ConeBeam, Projector, reconstruct
-from phydict.baselines import FISTATV
+from phydict.baselines import CGLS, FISTATV
 from phydict.baselines.extended import Extended, covering, extended
 from phydict.datasets import phantom_case
 from phydict.evaluation import volume_metrics
@@ -20,7 +20,7 @@ from phydict.posterior import Posterior, Refined, SplitGibbs
 from phydict.runtime.warning import Remark
 from phydict.units import HUWindow
 from phydict.xray import Ideal
-from phydict.xray.boxes import covers, lacking, seen_by
+from phydict.xray.boxes import binned_to, covers, lacking
 
 TV = FISTATV(iterations=80)
 CHEST, WIDE, WINDOW = Grid.cube(64), Grid.box([80, 80, 64], [480.0, 480.0, 384.0]), HUWindow()
@@ -58,6 +58,13 @@ def test_what_stands_beside_the_volume_does_not_spoil_it(patients, method, monke
     assert found.misfit == pytest.approx(float((found.reprojection - found.xrays).norm() / found.xrays.norm()),
                                          rel=1e-4)
     assert found.misfit < spoilt.misfit and found.method == spoilt.method
+
+
+@pytest.mark.filterwarnings("ignore:the X-rays show that something")
+def test_what_is_tried_to_see_what_stands_beside_the_volume_makes_no_result_doubtful(patients):
+    dense = torch.where(patients["with arms"] != patients["alone"], 1.0, patients["alone"])
+    found = reconstruct(xrays_of(dense), ORBIT, method=CGLS(8), grid=CHEST)
+    assert found.extended_mm == (48, 48, 0) and found.misfit < 0.03 and not found.warnings
 
 
 def test_nothing_is_sought_where_nothing_stands_or_can_be_told(patients):
@@ -113,7 +120,7 @@ def test_a_method_bound_to_its_voxels_is_left_as_it_is(patients):
 def test_the_result_is_cut_out_of_what_more_voxels_give(patients):
     xrays = xrays_of(patients["with arms"])
     ready, grid, beam = extended(reconstructor("phydict_learned"), CHEST, xrays, ORBIT, False)
-    xrays, A = seen_by(grid, xrays, beam, False)
+    xrays, A = binned_to(grid, xrays, beam, False)
     found, whole = ready.reconstruct(xrays, A), ready.base.reconstruct(xrays, A)
     for part, of in ((found.volume, whole.volume), (found.masks, whole.masks), *zip(
             found.intervals.values(), whole.intervals.values())):
@@ -135,6 +142,7 @@ def test_a_method_takes_as_many_voxels_as_hold_a_box_and_no_more(box, target):
     assert covering(method, CHEST) is method and covering(TV, box) is TV
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:no volume explains", "ignore:no network has learnt")
 def test_a_volume_wider_than_the_priors_holds_what_stands_there(patients):
     y, truth = xrays_of(patients["with arms"]), WINDOW.to_hu(patients["with arms"])

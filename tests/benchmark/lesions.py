@@ -33,7 +33,7 @@ from phydict.xray.binning import benchmark_orbit
 
 WINDOW, GRID = HUWindow(), Grid.cube(64)
 NODULES, APART, VIEWS = 5, 50.0, (2, 4, 8)
-MISSED, SEEN = 0.5, 50.0
+MISSED, INPUT_CHANNELS = 0.5, 50.0
 """Share of its contrast below which a nodule is missed; HU of contrast from which a blob is taken for one."""
 BLOB = 14.0
 
@@ -95,7 +95,7 @@ def draw(ct, views: int, number: int, refiner) -> dict[str, list]:
             found["missed"].append(held(error, width, ball))
     shown, there = contrasts(result.volume), contrasts(truth)
     peaks = (shown.numpy() == maximum_filter(shown.numpy(), 5)) & binary_erosion(lung, iterations=2)
-    for index in np.argwhere(peaks & (shown.numpy() >= SEEN) & (there < MISSED * shown).numpy()):
+    for index in np.argwhere(peaks & (shown.numpy() >= INPUT_CHANNELS) & (there < MISSED * shown).numpy()):
         point = GRID.affine[:3, :3] @ index + GRID.affine[:3, 3]
         found["invented"].append(held(error, width, ball_and_shell(point, BLOB)[0]))
     return found

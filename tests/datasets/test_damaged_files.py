@@ -132,9 +132,10 @@ def test_x_rays_in_the_place_of_the_beam_are_named_in_one_short_line():
     assert len(str(caught.value)) < 200
 
 
-def test_true_is_no_seed():
-    with pytest.raises(ValueError, match="a seed is a whole number"):
-        check_seed(True)
+@pytest.mark.parametrize("seed", [True, -1, 1.5, 2**32], ids=str)  # of more bits torch's generator drops the upper ones
+def test_what_is_no_seed_of_its_own_is_refused(seed):
+    with pytest.raises(ValueError, match="a seed is a whole number from 0"):
+        check_seed(seed)
 
 
 def test_what_refuses_keeps_its_own_sentence_and_every_other_error_becomes_one():

@@ -148,6 +148,20 @@ def test_methods_are_paired_draw_by_draw_and_each_is_as_it_is_alone(monkeypatch)
     assert len(fid_tables(fid_rows(distances(methods), "squeezenet", 0, NORMALISATION))) == 1
 
 
+def test_methods_of_other_numbers_of_slices_are_each_as_alone_and_neither_paired_nor_ranked():
+    methods = {"whole": of_volumes(lambda hu: blurred(hu, 1)), "half": {
+        case: {plane: slices[:, ::2] for plane, slices in features.items()}
+        for case, features in of_volumes(lambda hu: blurred(hu, 2)).items()}}
+    found = distances(methods, replicates=20)
+    rows = fid_rows(found, "squeezenet", 20, NORMALISATION)
+    for row, (label, cases) in zip(rows, methods.items()):
+        assert "less" not in row and row["slices_xy"] == {"whole": 64, "half": 32}[label]
+        for name, alone in fid(cases, replicates=20).items():
+            assert tuple(found[label].estimates()[name]) == pytest.approx(tuple(alone))
+    (table,) = fid_tables(rows)
+    assert "XY 64" in table.notes[0] and "XY 32" in table.notes[0] and "**" not in table.markdown()
+
+
 def test_moments_of_parts_are_those_of_the_whole_whatever_their_order_and_how_often_they_count():
     x, repeats = 5 + normal(40, 6), torch.arange(40) // 10 % 3
     whole, streamed = Moments.of(x.repeat_interleave(repeats, 0)), Moments(6)

@@ -174,6 +174,7 @@ def test_a_reconstruction_holds_the_metal_says_so_and_says_what_it_does_not_do()
     assert result.misfit < off.misfit
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*as dense as metal")
 def test_finer_voxels_and_several_samples_hold_the_metal_too():
     target = in_other_voxels(GRID, (48, 48, 48))

@@ -2,13 +2,14 @@
 
 import json
 
+import numpy as np
 import pytest
 import torch
 from laws import random_like
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from phydict.grid import Grid
+from phydict.grid import Grid, centred
 from phydict.prior import (
     Cascade,
     LocalUNet,
@@ -41,6 +42,14 @@ def test_stages_of_one_cube_and_window_make_a_cascade():
 def test_stages_that_do_not_fit_are_refused(change, words):
     with pytest.raises(ValueError, match=words):
         Cascade(tiny_prior(False), stage(**change))
+
+
+def test_stages_stacked_in_other_directions_are_refused():
+    fine = stage()
+    mirrored = Grid((32, 32, 32), affine=fine.grid.affine @ np.diag([-1.0, 1.0, 1.0, 1.0]))
+    fine.grid = Grid((32, 32, 32), affine=centred(mirrored.affine[:3, :3], (32, 32, 32), fine.grid.centre))
+    with pytest.raises(ValueError, match="other directions"):
+        Cascade(tiny_prior(False), fine)
 
 
 @pytest.fixture

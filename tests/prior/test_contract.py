@@ -14,7 +14,7 @@ import phydict
 from phydict.cli.infer import main as infer
 from phydict.inference import ReconstructionTask
 from phydict.methods import METHODS, reconstructor
-from phydict.prior import find_prior
+from phydict.prior import find_prior, own_identity
 
 MODULE = (Path(__file__).parents[2] / "data" / "example" / "own_prior" / "my_prior.py").read_text() + '''
 
@@ -37,6 +37,12 @@ class Underived:
 
 
 class Weighted(Underived, torch.nn.Module):
+    def __init__(self, weight: float = 0.0):
+        torch.nn.Module.__init__(self)
+        self.weight, self.hu = torch.nn.Parameter(torch.full((2,), weight)), -500.0
+
+
+class Derived(OwnPrior, torch.nn.Module):
     def __init__(self, weight: float = 0.0):
         torch.nn.Module.__init__(self)
         self.weight, self.hu = torch.nn.Parameter(torch.full((2,), weight)), -500.0
@@ -108,6 +114,13 @@ def test_it_need_not_derive_from_the_contract(module, xrays, tmp_path):
     settings = [task.settings["prior"] for task in tasks]
     assert settings[0] == record["settings"]["prior"] and settings[1]["hu"] == -300.0
     assert settings[2] | {"weights_crc32": settings[3]["weights_crc32"]} == settings[3] != settings[2]
+
+
+def test_other_weights_are_another_prior_however_it_is_made(module, tmp_path):
+    made = vars(import_module(module))
+    for kind in (made["Weighted"], made["Derived"]):
+        crcs = [own_identity(kind(weight), None)["weights_crc32"] for weight in (0.0, 1.0, 0.0)]
+        assert crcs[0] == crcs[2] != crcs[1]
 
 
 def test_what_keeps_no_contract_is_refused_in_one_sentence(module, xrays, tmp_path):

@@ -88,6 +88,7 @@ def test_learning_replays_from_its_seed_and_leaves_what_rests_at_rest():
     assert run() == run()
 
 
+@pytest.mark.slow
 def test_a_short_lesson_of_written_sentences_teaches_the_side_of_what_others_state():
     torch.manual_seed(0)
     text = TextEncoder.small(learn_vocabulary([*written_words(), *STRANGE]), 64, 2, 64, sentences=8)

@@ -49,6 +49,12 @@ def test_the_noise_level_of_the_coarse_volume_is_told():
     assert (estimates[0] - estimates[1]).std() > 1e-4 and (estimates[1] - estimates[2]).std() > 1e-4
 
 
+def test_states_of_one_coarse_volume_are_each_as_they_are_alone():
+    bound, others = tiny_super_resolution().bind(COARSE, precision="float32"), random_like(X.shape, torch.float32, 3)
+    together = bound.denoise(torch.cat([X, others]), 0.5)
+    torch.testing.assert_close(together, torch.cat([bound.denoise(x, 0.5) for x in (X, others)]), atol=1e-5, rtol=1e-4)
+
+
 def test_half_precision_changes_little_and_double_precision_stays():
     fine = tiny_super_resolution()
     exact = fine.bind(COARSE, precision="float32").denoise(X, 0.5)

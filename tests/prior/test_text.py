@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from phydict.prior import Prior, TextEncoder, learn_vocabulary
+from phydict.runtime.warning import heard
 from prior.tiny import REPORTS, tiny_prior, write_cxr_bert
 
 STRANGE = "Naïve Übermaß: 2.5×3 cm (T4/N1), SUV≥4; [UNKNOWN] ground-glass!"
@@ -232,26 +233,28 @@ def test_reports_in_another_script_are_told_with_their_share(tmp_path):
     assert not torch.equal(encoder(["肺 結 節"])[0], encoder([""])[0])
 
 
-def test_a_report_is_spoken_of_once_and_good_ones_never(tmp_path):
+def test_a_report_is_spoken_of_each_time_and_good_ones_never(tmp_path):
     encoder = frozen(tmp_path, length=24)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         encoder.check(["", *REPORTS])
-    with pytest.warns(UserWarning):
-        encoder.check([LONG])
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        encoder.check([LONG, *REPORTS])
+    for _ in range(2):  # the records of two cases with one report both hold it
+        with pytest.warns(UserWarning, match="1 of 4 reports are longer"):
+            encoder.check([LONG, LONG, *REPORTS])
 
 
 def test_binding_a_prior_speaks_of_its_report():
     prior = tiny_prior()
-    with pytest.warns(UserWarning, match="1 of 1 reports are longer"):
-        prior.bind(LONG)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        for report in ("", REPORTS[0], LONG):
-            prior.bind(report)
+    prior.unheard = "the side is not heard"
+    for _ in range(2):
+        with heard() as texts, warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            prior.bind(LONG)
+        assert [text.split(" than ")[0] for text in texts] == ["the side is not heard", "1 of 1 reports are longer"]
+    with heard() as texts, pytest.warns(UserWarning, match="the side"):
+        prior.bind(REPORTS[0])
+    prior.bind("")
+    assert texts == ["the side is not heard"]
 
 
 def test_an_encoder_of_another_width_than_the_network_is_refused(tmp_path):

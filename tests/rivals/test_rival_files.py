@@ -13,6 +13,8 @@ from phydict.datasets import phantom_case
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM
 from phydict.evaluation import read_csv
 from phydict.grid import Grid
+from phydict.inference import ReconstructionTask
+from phydict.inference.settings import Sampling
 from phydict.methods import METHODS, reconstruct, reconstructor
 from phydict.prior import load_prior, save_prior
 from phydict.rivals import LiftedNetwork, Rival, RivalAnswer, TrainedRival, load_rival, save_rival
@@ -122,6 +124,15 @@ def test_the_precision_that_is_asked_for_is_a_ready_rival_s(file):
     for method in (TrainedRival(file), RivalAnswer(tiny_lifted())):
         assert reconstructor(method, precision="float32") == replace(method, precision="float32")
         assert reconstructor(method) == method
+
+
+def test_cases_of_another_precision_are_others_and_double_precision_is_taken(file, tmp_path):
+    tasks = [ReconstructionTask(TrainedRival(file), out=str(tmp_path), sampling=Sampling(precision=precision))
+             for precision in ("auto", "float32", "bfloat16")]
+    assert len({str(task.settings) for task in tasks}) == 3
+    ready, A = RivalAnswer(tiny_lifted()), Projector(GRID, ORBIT)
+    found = [ready.reconstruct(y, A).volume for y in (xrays(), xrays().double())]
+    torch.testing.assert_close(*found, check_dtype=False, atol=0.5, rtol=0)
 
 
 def test_a_prior_is_no_rival_and_a_rival_no_prior(file, tmp_path):

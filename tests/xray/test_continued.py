@@ -16,7 +16,7 @@ from phydict.grid import Grid
 from phydict.inference.data import ReconstructionData
 from phydict.units import HUWindow
 from phydict.xray import Ideal, Polychromatic, Simulator
-from phydict.xray.beyond import asked, asks_for_taller
+from phydict.xray.beyond import needs_taller, with_continuation
 from phydict.xray.projectors.continued import reach_beyond
 
 GRID = Grid.cube(16)
@@ -105,22 +105,22 @@ def test_x_rays_tell_whether_a_patient_goes_on(patients, beam, simulator):
         y = xrays_of(WINDOW.to_mu(volume), beam, simulator)
         gains = torch.linspace(0.3, 3, beam.views)[:, None, None]
         for xrays, display in ((y, False), (gains * y - 2 + gains, True)):
-            found = asked(xrays, beam, CHEST, display)
+            found = with_continuation(xrays, beam, CHEST, display)
             assert found.continued == (scene != "ends") and found.same_as(beam)
-            assert scene != "ends" or not asks_for_taller(xrays, beam, CHEST, display)
+            assert scene != "ends" or not needs_taller(xrays, beam, CHEST, display)
 
 
 def test_what_is_stated_is_not_asked(patients):
     beam = ConeBeam.orbit(2, 1020, 740, (112, 112), 5.0)
     y = xrays_of(WINDOW.to_mu(patients["goes on"]), beam)
     for stated in (True, False):
-        assert asked(y, replace(beam, continued=stated), CHEST, False).continued is stated
-    assert asked(torch.zeros_like(y), beam, CHEST, False).continued is False
-    assert asked(torch.zeros_like(y), beam, CHEST, True).continued is False
+        assert with_continuation(y, replace(beam, continued=stated), CHEST, False).continued is stated
+    assert with_continuation(torch.zeros_like(y), beam, CHEST, False).continued is False
+    assert with_continuation(torch.zeros_like(y), beam, CHEST, True).continued is False
 
 
 @pytest.mark.filterwarnings("ignore:no volume explains", "ignore:the X-rays show")
-@pytest.mark.parametrize("method", ["phydict_learned", "cgls"])
+@pytest.mark.parametrize("method", [pytest.param("phydict_learned", marks=pytest.mark.slow), "cgls"])
 def test_a_patient_who_goes_on_is_found_better_where_the_rays_do(patients, method):
     beam = ConeBeam.orbit(8, 1020, 740, (112, 112), 5.0)
     y = xrays_of(WINDOW.to_mu(patients["goes on"]), beam)
@@ -133,7 +133,7 @@ def test_a_patient_who_goes_on_is_found_better_where_the_rays_do(patients, metho
 
 
 @pytest.mark.filterwarnings("ignore:no volume explains", "ignore:the X-rays show")
-@pytest.mark.parametrize("method", ["phydict_learned", FISTATV(iterations=80)])
+@pytest.mark.parametrize("method", [pytest.param("phydict_learned", marks=pytest.mark.slow), FISTATV(iterations=80)])
 def test_a_box_in_a_patient_who_goes_on_is_as_the_whole_volume_shows_it(patients, method):
     beam, box = ConeBeam.orbit(8, 1020, 740, (112, 112), 5.0), Grid.box(32, 192.0, (0.0, 0.0, 96.0))
     y = xrays_of(WINDOW.to_mu(patients["goes on"]), beam)

@@ -27,8 +27,8 @@ from phydict.datasets.cts.transforms import SEGMENTATION_MM, check_hu, covering_
 from phydict.grid import Grid
 from phydict.runtime.files import atomic_directory, atomic_removal, atomic_write, check_replaceable, remove_leftovers
 from phydict.runtime.progress import CaseProgress
+from phydict.runtime.progress_log import log_progress
 from phydict.runtime.reading import Unreadable, not_written
-from phydict.runtime.telling import tell
 from phydict.runtime.warning import warn
 
 SUMMARY = "summary.csv"
@@ -84,16 +84,16 @@ def _kept(sources: list[Source], out: Path, settings: Settings, workers: int) ->
     """
     there = [source for source in sources if os.path.lexists(out / source.id)]
     if there:
-        tell(f"{out} holds {_cases(there)}, whose inputs are compared with what they were", event="compare",
-             cases=len(there), out=str(out))
+        log_progress(f"{out} holds {_cases(there)}, whose inputs are compared with what they were", event="compare",
+                     cases=len(there), out=str(out))
     with ThreadPoolExecutor(workers) as threads:
         found = list(threads.map(lambda s: _finished(out / s.id, settings, s.fingerprint), there))
     again = [source for source, row in zip(there, found) if row is None]
     if again:
         names = ", ".join(source.id for source in again[:3]) + ", ..." * (len(again) > 3)
-        tell(f"{_cases(again)} in {out} will be prepared again and replaced ({names}): a CT, segmentation, report or "
-             "calibration is another than it was, or was not recorded then",
-             event="again", cases=[source.id for source in again], out=str(out))
+        log_progress(f"{_cases(again)} in {out} will be prepared again and replaced ({names}): a CT, segmentation, "
+                     "report or calibration is another than it was, or was not recorded then",
+                     event="again", cases=[source.id for source in again], out=str(out))
     return {source.id: row for source, row in zip(there, found) if row is not None}
 
 

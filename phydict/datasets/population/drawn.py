@@ -16,8 +16,8 @@ from phydict.datasets.population.population import Population
 from phydict.datasets.population.registration import Registered, features, medoid, register
 from phydict.datasets.prose import write_report
 from phydict.runtime.progress import CaseProgress
+from phydict.runtime.progress_log import log_progress
 from phydict.runtime.ranges import check_fields
-from phydict.runtime.telling import tell
 from phydict.runtime.warning import warn
 
 POPULATION_VERSION = 2
@@ -66,8 +66,9 @@ class DrawnPatients(Dataset):
                              + as_one_patient(ct.id for ct in cts.cts)
                              + ": give more CTs, or set data.loading.population.share to 0")
         if len(firsts) < len(cts.cts):
-            tell(f"the population is of one scan of each of {len(firsts)} patients, of {len(cts.cts)} CTs; those in "
-                 "one subfolder count as one patient's", event="population", patients=len(firsts), cts=len(cts.cts))
+            log_progress(f"the population is of one scan of each of {len(firsts)} patients, of {len(cts.cts)} CTs; "
+                         "those in one subfolder count as one patient's", event="population", patients=len(firsts),
+                         cts=len(cts.cts))
         self.cts = CTCases([cts.cts[i] for i in picked], cts.cache, cts.grid, cts.window)
         self.folder = cts.cache and cts.cache / f"population{POPULATION_VERSION}"
         self.population: Population | None = None

@@ -92,7 +92,7 @@ class Description:
         """The beam for images of `shape` (V, U), turned, and their DICOM tags, if any. Raises ValueError."""
         beam = self._stated_beam(shape, tags)
         try:
-            return beam.saying(self.continued)
+            return beam.with_continued(self.continued)
         except ValueError as error:
             raise ValueError(f"{self.source}: {error}") from error
 

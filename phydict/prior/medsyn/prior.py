@@ -100,7 +100,7 @@ class MedSynPrior(nn.Module):
     def bind(self, report: str = "", guidance: float = 1.0, precision: str = "auto") -> BoundPrior:
         """The denoiser of one report, with classifier-free guidance of the given scale inside (1 = none).
 
-        Warns, once for each report, where a TextEncoder cuts it or does not know its words.
+        Warns where a TextEncoder cuts the report or does not know its words.
         """
         if guidance < 0:
             raise ValueError(f"the guidance scale is at least 0, but {guidance} was given")

@@ -6,11 +6,11 @@ from typing import Any
 
 from lightning.pytorch.cli import LightningCLI
 
-from phydict.runtime.parser_message import unknown_told
-from phydict.runtime.telling import add_telling, telling
+from phydict.runtime.parser_message import naming_unknown_options
+from phydict.runtime.progress_log import add_progress_options, progress_as
 
 
-class TellingCLI(LightningCLI):
+class ProgressCLI(LightningCLI):
     """A LightningCLI whose subcommands take --quiet and --json_lines, and which builds the one that is given alone."""
 
     def __init__(self, model: type, data: type, *, args: list[str], **settings: Any):
@@ -21,11 +21,12 @@ class TellingCLI(LightningCLI):
 
     def _prepare_subcommand_parser(self, klass: type, subcommand: str, **kwargs):
         parser = super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
-        add_telling(parser)
+        add_progress_options(parser)
         return parser
 
     def parse_arguments(self, parser, args) -> None:
-        with unknown_told(parser, *getattr(self, "_subcommand_parsers", {}).values()):  # none where nothing is run
+        subcommands = getattr(self, "_subcommand_parsers", {})  # none where nothing is run
+        with naming_unknown_options(parser, *subcommands.values()):
             super().parse_arguments(parser, args)
 
     def flag(self, name: str) -> bool:
@@ -36,5 +37,5 @@ class TellingCLI(LightningCLI):
         return value
 
     def _run_subcommand(self, subcommand: str) -> None:
-        with telling(self.flag("quiet"), self.flag("json_lines")):
+        with progress_as(self.flag("quiet"), self.flag("json_lines")):
             super()._run_subcommand(subcommand)

@@ -20,7 +20,7 @@ from rich.progress import (
 )
 from rich.table import Column
 
-from phydict.runtime.parser_message import unknown_told
+from phydict.runtime.parser_message import naming_unknown_options
 from phydict.runtime.strict_json import strict_json
 
 WORDS, JSON, SILENCE = "words", "json", "silence"
@@ -32,7 +32,7 @@ _MANNER: ContextVar[str] = ContextVar("manner", default=WORDS)
 
 
 @contextmanager
-def telling(quiet: bool, json_lines: bool) -> Iterator[None]:
+def progress_as(quiet: bool, json_lines: bool) -> Iterator[None]:
     """Runs inside tell nothing of their progress (quiet, which goes first), or a JSON object on each line."""
     before = _MANNER.set(SILENCE if quiet else JSON if json_lines else WORDS)
     try:
@@ -41,31 +41,31 @@ def telling(quiet: bool, json_lines: bool) -> Iterator[None]:
         _MANNER.reset(before)
 
 
-def told_of(args: Sequence[str]) -> AbstractContextManager[None]:
-    """`telling` as the options of a whole command line have it, errors in that line included."""
-    return telling("--quiet" in args, "--json_lines" in args)
+def progress_options(args: Sequence[str]) -> AbstractContextManager[None]:
+    """`progress_as` as the options of a whole command line have it, errors in that line included."""
+    return progress_as("--quiet" in args, "--json_lines" in args)
 
 
-def add_telling(parser: ArgumentParser) -> None:
-    """The options of a command line that `telling` takes."""
+def add_progress_options(parser: ArgumentParser) -> None:
+    """The options of a command line that `progress_as` takes."""
     parser.add_argument("--quiet", action="store_true", help="tell no progress, only results, warnings and errors")
     parser.add_argument("--json_lines", action="store_true", help="tell the progress as a JSON object on each line")
 
 
-def tell(text: str, /, **event: object) -> None:
-    """A line on standard error: the text or, as `telling` has it, the event as JSON, or nothing."""
+def log_progress(text: str, /, **event: object) -> None:
+    """A line on standard error: the text or, as `progress_as` has it, the event as JSON, or nothing."""
     if _MANNER.get() != SILENCE:
-        proclaim(text, **event)
+        log_always(text, **event)
 
 
-def proclaim(text: str, /, **event: object) -> None:
-    """As `tell`, but never silenced."""
+def log_always(text: str, /, **event: object) -> None:
+    """As `log_progress`, but never silenced."""
     print(strict_json(event) if _MANNER.get() == JSON else text, file=sys.stderr, flush=True)
 
 
-def exclaim(kind: str, text: str) -> None:
+def log_problem(kind: str, text: str) -> None:
     """A warning or an error on standard error: as JSON where progress is, and never silenced."""
-    proclaim(f"{kind}: {text}", event=kind, text=text)
+    log_always(f"{kind}: {text}", event=kind, text=text)
 
 
 def bars_on(console: Console, *columns: ProgressColumn) -> Progress:
@@ -85,8 +85,8 @@ def run_command(function: Callable[..., object], args: Sequence[str] | None, pro
     description = " ".join((function.__doc__ or "").partition("\n\n")[0].split())
     parser = ArgumentParser(prog=program, description=description, exit_on_error=False, allow_abbrev=False)
     parser.add_function_arguments(function, as_positional=positional, as_group=False)
-    add_telling(parser)
-    with unknown_told(parser):
+    add_progress_options(parser)
+    with naming_unknown_options(parser):
         given = parser.instantiate(parser.parse_args(args)).as_dict()
-    with telling(given.pop("quiet"), given.pop("json_lines")):
+    with progress_as(given.pop("quiet"), given.pop("json_lines")):
         function(**given)

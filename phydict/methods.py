@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -156,18 +156,7 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: AnyPrior | str |
         beside = [setting for setting, given in (
             ("prior", prior is not None), ("samples", samples != 1), ("guidance", guidance != 1),
             ("super_resolution", super_resolution is not None), ("precision", precision != "auto")) if given]
-        if isinstance(method, Posterior | CascadePosterior | Refined) and beside:
-            raise ValueError(f"a ready {type(method).__name__} has its own settings, but {' and '.join(beside)} came "
-                             "beside it: leave that out, or give its sampler and its prior in its place")
-        if super_resolution is not None:
-            raise ValueError(f"super_resolution refines what a prior gives, but {type(method).__name__} has none: "
-                             "leave it out, or use a method with a prior")
-        if samples != 1:
-            raise ValueError(f"several samples are drawn of a prior, but {type(method).__name__} has none: leave "
-                             f"samples at 1 instead of {samples}, or use a method with a prior")
-        if guidance != 1:
-            raise ValueError(f"guidance strengthens what a report tells a prior, but {type(method).__name__} has none: "
-                             f"leave guidance at 1 instead of {guidance}, or use a method with a prior")
+        _check_beside(method, beside)
         if precision != "auto":
             method = method.with_precision(precision)
         return method.with_name(name) if name else method
@@ -188,6 +177,22 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: AnyPrior | str |
     ready = CascadePosterior(Cascade(loaded, super_resolution), method, sr_guided, noise=sr_noise_augmentation,
                              guidance=guidance, name=name, precision=precision)
     return replace(ready, sr_sampler=sr_sampler) if sr_sampler else ready
+
+
+OF_A_PRIOR = {"super_resolution": "refines what a prior gives", "samples": "are drawn from a prior",
+              "guidance": "strengthens what a report tells a prior"}
+"""Settings that mean nothing without a prior, and why."""
+
+
+def _check_beside(method: Reconstructor, beside: Collection[str]) -> None:
+    """Raises ValueError where settings beside a ready method mean nothing to it."""
+    if isinstance(method, Posterior | CascadePosterior | Refined) and beside:
+        raise ValueError(f"a ready {type(method).__name__} has its own settings, but {' and '.join(beside)} came "
+                         "beside it: leave that out, or give its sampler and its prior in its place")
+    for name in beside:
+        if name in OF_A_PRIOR:
+            raise ValueError(f"{name} {OF_A_PRIOR[name]}, but {type(method).__name__} has none: leave {name} out, or "
+                             "use a method with a prior")
 
 
 CORRECTIONS = {3.0: DEFAULT_CORRECTION, 1.5: FINEST_CORRECTION}
@@ -230,7 +235,7 @@ def reconstruct_by(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeB
     """What a method makes of X-rays (K, V, U) on `grid`, its own if it has one, or the voxels it refines to.
 
     First the poses are searched, where they are `uncertain`; then the X-rays are asked whether the patient
-    goes on beyond the voxels (`extended`) and binned; other arguments as those of `reconstruct`. Raises ValueError
+    continues beyond the voxels (`extended`) and binned; other arguments as those of `reconstruct`. Raises ValueError
     where X-rays, geometry and grid do not fit, and warns where the X-rays look inverted.
     """
     with heard() as warnings:

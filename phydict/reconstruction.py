@@ -42,7 +42,7 @@ class Reconstruction:
     beam, poses: where poses were searched, the beam found, and what was corrected in it (phydict.poses);
     coarse: the reconstruction on coarser voxels that was refined, or that says what lies outside a region of interest;
     carried: what of the volume is denser than the prior's window, such as metal, where it was found;
-    extended_mm: how much more was reconstructed at both ends of each axis, where the patient goes on, and cut off;
+    extended_mm: how much more was reconstructed at both ends of each axis, where the patient continues, and cut off;
     warnings: what makes the result doubtful, in words, even where Python's filters hide warnings.
     """
 

@@ -14,7 +14,7 @@ from phydict.xray.boxes import binned_to
 def fit_to_grid(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam,
                 projector: str = "auto") -> tuple[Tensor, Projector]:
     """X-rays (K, V, U), binned unless the method wants the full detector, and the projector that goes with them on the
-    X-rays' device; `projector` is its kind, as Projector's `method`. Whether the patient goes on beyond the grid is
+    X-rays' device; `projector` is its kind, as Projector's `method`. Whether the patient continues beyond the grid is
     asked of the X-rays where the beam does not say."""
     xrays = xrays.float()
     beam = with_continuation(xrays, beam, method.survey or grid, False)

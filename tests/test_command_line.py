@@ -8,13 +8,16 @@ import sys
 import warnings
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 from command_lines import refusal
 
 from phydict.cli.infer import main as infer
 from phydict.cli.train import main as train
 from phydict.runtime.console import check_writable, cli_errors, noted, quiet, with_configurations
 from phydict.runtime.shipped import shipped
+from phydict.runtime.warning import warn
 
 ROOT = Path(__file__).parents[1]
 
@@ -26,6 +29,27 @@ def test_a_full_disk_is_one_sentence_that_says_how_to_resume(number, capsys):
     said = capsys.readouterr().err
     assert stopped.value.code == 2 and said.count("\n") == 1
     assert os.strerror(number) in said and "'metrics.csv'" in said and "free some space; to resume, add --ckpt" in said
+
+
+def used_up() -> None:
+    raise torch.OutOfMemoryError("CUDA out of memory.\nTried to allocate 2.00 GiB")
+
+
+@pytest.mark.parametrize("take, words", [
+    (lambda: torch.empty(2**50), "can't allocate memory"), (lambda: np.empty(2**50), "Unable to allocate"),
+    (used_up, "CUDA out of memory. Tried to allocate 2.00 GiB")], ids=["torch", "numpy", "device"])
+def test_memory_that_gives_out_is_one_sentence(take, words, capsys):
+    with pytest.raises(SystemExit) as stopped, cli_errors():
+        take()
+    said = capsys.readouterr().err
+    assert stopped.value.code == 2 and said.count("\n") == 1 and said.startswith("error: memory gave out (")
+    assert words in said and "give fewer voxels" in said
+
+
+def test_other_errors_of_torch_show_where_they_arise(capsys):
+    with pytest.raises(RuntimeError, match="must match the size") as error, cli_errors():
+        torch.zeros(2) + torch.zeros(3)
+    assert type(error.value) is RuntimeError and not capsys.readouterr().err
 
 
 @pytest.fixture
@@ -82,6 +106,16 @@ def test_a_cases_warnings_are_noted_and_shown_with_its_name_however_often_others
     assert found == {"anna": ["too dark"], "bert": ["too dark"]}
     said = capsys.readouterr().err.splitlines()
     assert [line for line in said if "dark" in line] == ["warning: anna: too dark", "warning: bert: too dark"]
+
+
+@pytest.mark.parametrize("category", [UserWarning, Warning])
+def test_a_cases_warnings_are_noted_where_python_is_told_to_show_none(category):
+    found: list[str] = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", category)
+        with quiet(), noted(found, "anna"):
+            warn("too dark")
+    assert found == ["too dark"]
 
 
 BOMB = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(

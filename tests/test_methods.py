@@ -170,7 +170,7 @@ def test_priors_samplers_and_projectors_of_ones_own_fit_in():
     ({"seed": -1}, "a seed is a whole number"), ({"seed": 2**70}, "a seed is a whole number"),
     ({"mu_water": -0.02}, "mu_water"), ({"mu_water": 0}, "mu_water"), ({"mu_water": float("nan")}, "mu_water"),
     ({"method": "dds", "prior": tiny_prior(False), "guidance": float("nan")}, "scale lies between 0 and 1,000,000"),
-    ({"method": "tv", "guidance": 3.0}, "leave guidance at 1 instead of 3.0"),
+    ({"method": "tv", "guidance": 3.0}, "FISTATV has none: leave guidance out"),
     ({"method": "dds", "prior": tiny_prior(False), "samples": 10**9}, "would take .* GiB of memory")],
     ids=lambda value: str(value)[:30] if isinstance(value, dict) else "")
 def test_bad_arguments_are_one_sentence(change, sentence):

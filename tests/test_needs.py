@@ -178,7 +178,7 @@ def test_a_profile_holds_the_calls_that_a_reconstruction_reports_and_its_table_e
         result = reconstruct(views(), BEAM, tiny_prior(), replace(METHODS["phydict_fast"], iterations=3))
     assert profile.uses["sample / network"].calls == result.network_calls == 3
     projector = {name: use.calls for name, use in profile.uses.items() if name.endswith(" / projector")}
-    asking = projector.pop("fit to grid / projector")  # on coarse voxels, whether the patient goes on
+    asking = projector.pop("fit to grid / projector")  # on coarse voxels, whether the patient continues
     assert asking > 0 and sum(projector.values()) == result.projector_calls
     for name, seconds in result.seconds.items():
         assert profile.uses[name].seconds <= seconds

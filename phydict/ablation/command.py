@@ -78,7 +78,7 @@ def _page_so_far(out: Path, rows: Sequence[dict], scoring: Scoring) -> None:
     """Writes the page of the rows that a stopped run has finished, where there are any, without the Frechet distances
     of slices, which take long."""
     entries = summarise(rows)
-    with suppress(ValueError, OSError):  # what stopped the run is what is to be told
+    with suppress(ValueError, OSError):  # what stopped the run is the error to show
         if any(entry.counted for entry in entries):
             print(f"page: {comparison_page(out, entries, all_tables(entries, scoring.empty))}")
 

@@ -28,7 +28,7 @@ def is_comparison(folder: Path) -> bool:
 
 def page_anew(folder: Path) -> Path:
     """Writes the page of a folder's table; returns its path. Of rows that differ in no setting the first counts, and
-    how many others there are is told."""
+    how many others there are is logged."""
     stored = read_csv(folder / RESULTS)
     rows = without_repeats(stored)
     if repeats := len(stored) - len(rows):

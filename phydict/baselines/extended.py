@@ -52,8 +52,8 @@ REST = 0.15
 """What a box may leave of what the widest one explains and the volume does not: of four CTs with arms of 42 mm beside
 it, 48 mm more leave 0.03 to 0.13, 24 mm 0.16 to 0.37."""
 
-CONTINUES = "the X-rays show that the patient goes on above or below the volume"
-OVERRULED = "`continued: false` in geometry.yaml, in Python of the ConeBeam, if he ends"
+CONTINUES = "the X-rays show that the patient continues above or below the volume"
+OVERRULED = "`continued: false` in geometry.yaml, in Python of the ConeBeam, if the patient ends"
 
 
 @dataclass(frozen=True)
@@ -101,10 +101,9 @@ def covering(method: Reconstructor, box: Grid) -> Reconstructor:
 @torch.no_grad()
 def extended(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, display: bool
              ) -> tuple[Reconstructor, Grid, ConeBeam]:
-    """The method, its voxels and the beam, or, where the X-rays (K, V, U) show that the patient goes on beyond the
-    volume, which is said in a remark, what reconstructs on more voxels and cuts the result to `grid`; the beam then
-    says whether he goes on even beyond these. A method that takes no more voxels, or has no memory for them, is left
-    as it is.
+    """The method, its voxels and the beam; or, where the X-rays (K, V, U) show that the patient continues beyond the
+    volume, which a remark states, a method on more voxels that cuts the result to `grid`, and the beam of these. A
+    method that takes no more voxels, or has no memory for them, stays as it is.
 
     Above and below, the patient continues where the beam says so or, where it does not say, the X-rays show it
     (`with_continuation`). Beside the volume, of line integrals of LEAST_VIEWS views or more, where source and detectors
@@ -121,7 +120,7 @@ def extended(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, d
     whole = grid if wider is None else wider.grid or grid.grown(*room)
     if wider is None or not wider.has_memory_for(whole):
         if answered and beam.continued is None:
-            warn(f"{CONTINUES}: each column is taken to go on there as its last voxel does ({OVERRULED})", Remark)
+            warn(f"{CONTINUES}: each column is taken to continue there as its last voxel ({OVERRULED})", Remark)
         return method, grid, beam.with_continued(answered)
     x, y, z = (n * float(length) for n, length in zip(room, volume.spacing))
     if z and beam.continued is None:
@@ -135,8 +134,8 @@ def extended(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, d
 
 def _room(volume: Grid, xrays: Tensor, beam: ConeBeam, answered: bool | None, mu_water: float, display: bool
           ) -> tuple[int, int, int]:
-    """How many voxels more the volume needs at both ends of each axis; answered: whether the patient goes on above and
-    below, `with_continuation` of the volume."""
+    """How many voxels more the volume needs at both ends of each axis; answered: whether the patient continues above
+    and below, `with_continuation` of the volume."""
     aside = 0 if display else _columns(volume, xrays, replace(beam, continued=answered), mu_water)
     wide = volume.grown(aside, aside, 0)
     goes_on = with_continuation(xrays, beam, wide, display).continued if aside else answered

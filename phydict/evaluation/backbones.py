@@ -43,7 +43,7 @@ LEAST_SIDE = 17
 
 
 def maisi_voxels(hu: Tensor, grid: Grid) -> Tensor:
-    """A volume (X, Y, Z) in HU on `grid` as MAISI's script takes it, where it is asked for 1 mm and 512^3 voxels: on
+    """A volume (X, Y, Z) in HU on `grid` as MAISI's script takes it, when set to 1 mm and 512^3 voxels: on
     (512, 512, 512) voxels of 1 mm about its centre, what does not fit cut off and air around the rest."""
     shape = (MAISI_SIDE,) * 3
     onto = Grid(shape, affine=centred(grid.affine[:3, :3] / grid.spacing, shape, grid.centre))

@@ -79,7 +79,7 @@ class Moments:
 
 
 class StoredFeatures(Mapping[str, Tensor]):
-    """The features in a file, of which a plane is read when it is asked for and is not kept.
+    """The features in a file, of which a plane is read on request and not kept; shapes: plane -> that of its features.
 
     backbone: whose they are to be. Raises ValueError, naming the file, where it is something else.
     """
@@ -88,10 +88,10 @@ class StoredFeatures(Mapping[str, Tensor]):
         self.file = file
         try:
             with safe_open(file, "pt") as content:
-                shapes = [tuple(content.get_slice(plane).get_shape()) for plane in PLANES]
+                self.shapes = {plane: tuple(content.get_slice(plane).get_shape()) for plane in PLANES}
         except Exception as error:  # whatever a missing or damaged file leads to
             raise ValueError(f"the features of slices {file} are missing or damaged: do the case again") from error
-        if any(len(shape) != 3 or shape[::2] != (2, DIMENSIONS[backbone]) for shape in shapes):
+        if any(len(shape) != 3 or shape[::2] != (2, DIMENSIONS[backbone]) for shape in self.shapes.values()):
             raise ValueError(f"{file} does not hold features of the FID backbone {backbone}: do the case again")
 
     def __getitem__(self, plane: str) -> Tensor:
@@ -109,12 +109,12 @@ class StoredFeatures(Mapping[str, Tensor]):
 class Distances:
     """The Frechet distances of a method's cases.
 
-    cases: their names; slices: plane -> how many; values: for each of NAMES (1 + R,), that of the cases, and of R draws
-    of their patients, which are the same for every method with the same cases.
+    cases: their names; slices: plane -> how many of each case; values: for each of NAMES (1 + R,), that of the cases,
+    and of R draws of their patients, which are the same for every method with the same cases.
     """
 
     cases: tuple[str, ...]
-    slices: dict[str, int]
+    slices: dict[str, tuple[int, ...]]
     values: dict[str, np.ndarray]
 
     def estimates(self, other: Distances | None = None) -> dict[str, Estimate]:
@@ -166,9 +166,10 @@ def fid_rows(methods: Mapping[str, Distances], backbone: str, replicates: int, n
     best = min(methods, key=lambda label: (-len(methods[label].cases), float(methods[label].values["fid"][0])))
     rows = []
     for label, found in methods.items():
+        counts = {plane: sum(slices) for plane, slices in found.slices.items()}
         row: dict = {"method": label, "fid_backbone": backbone, "fid_normalisation": normalisation,
                      "replicates": replicates, "cases": len(found.cases)}
-        row |= {f"{of}slices_{plane}": n for of in ("", "truth_") for plane, n in found.slices.items()}
+        row |= {f"{of}slices_{plane}": n for of in ("", "truth_") for plane, n in counts.items()}
         row |= _numbers("", found.estimates())
         if label != best and (found.cases, found.slices) == (methods[best].cases, methods[best].slices):
             row["less"] = best
@@ -186,9 +187,15 @@ def comparable(methods: Mapping[str, Mapping[str, Features]]) -> list[list[str]]
     """The labels of methods in groups of the same cases, of as many slices each."""
     groups: dict[tuple, list[str]] = {}
     for label, cases in methods.items():
-        slices = tuple(features[plane].shape[1] for features in cases.values() for plane in PLANES)
-        groups.setdefault((*cases, *slices), []).append(label)
+        groups.setdefault((*cases, *_slices(cases).values()), []).append(label)
     return list(groups.values())
+
+
+def _slices(cases: Mapping[str, Features]) -> dict[str, tuple[int, ...]]:
+    """Plane -> the number of slices of each case."""
+    shapes = [features.shapes if isinstance(features, StoredFeatures) else
+              {plane: of.shape for plane, of in features.items()} for features in cases.values()]
+    return {plane: tuple(shape[plane][1] for shape in shapes) for plane in PLANES}
 
 
 def distances(methods: Mapping[str, Mapping[str, Features]], replicates: int = 0,
@@ -203,21 +210,20 @@ def distances(methods: Mapping[str, Mapping[str, Features]], replicates: int = 0
         raise ValueError("there are no cases to take a Frechet distance of: score at least one")
     found = {}
     for labels in comparable(methods):
-        names = tuple(methods[labels[0]])
-        planes = {}
+        first, planes = methods[labels[0]], {}
         for plane in PLANES:
             on_plane(plane)
             planes[plane] = _plane([methods[label] for label in labels], plane, replicates)
         for place, label in enumerate(labels):
-            values = {f"fid_{plane}": drawn[place] for plane, (_, drawn) in planes.items()}
-            found[label] = Distances(names, {plane: count for plane, (count, _) in planes.items()},
-                                     values | {"fid": sum(values.values()) / len(PLANES)})
+            values = {f"fid_{plane}": drawn[place] for plane, drawn in planes.items()}
+            values["fid"] = sum(values.values()) / len(PLANES)
+            found[label] = Distances(tuple(first), _slices(first), values)
     return {label: found[label] for label in methods}
 
 
-def _plane(methods: Sequence[Mapping[str, Features]], plane: str, replicates: int) -> tuple[int, np.ndarray]:
-    """The number of slices of each of some `comparable` methods in one plane, and their distances (methods, 1 + R). A
-    truth that methods share is summed up once for each draw; draws that are alike are one."""
+def _plane(methods: Sequence[Mapping[str, Features]], plane: str, replicates: int) -> np.ndarray:
+    """The distances (methods, 1 + R) of some `comparable` methods in one plane. A truth that methods share is summed up
+    once for each draw; draws that are alike are one."""
     patients: dict[str, list[str]] = {}
     for case in methods[0]:
         patients.setdefault(patient_of(case), []).append(case)
@@ -225,8 +231,8 @@ def _plane(methods: Sequence[Mapping[str, Features]], plane: str, replicates: in
     drawn = np.vstack([np.ones((1, len(patients)), int), *([] if alone else [draws(len(patients), replicates)])])
     distinct, place = np.unique(drawn, axis=0, return_inverse=True)
     shared = [next(k for k, other in enumerate(methods) if _same_truth(cases, other, plane)) for cases in methods]
-    shapes = [features[plane].shape for features in methods[0].values()]
-    size, values = max(1, BLOCK_BYTES // (8 * shapes[0][2] ** 2)), np.empty((len(methods), len(distinct)))
+    dimensions = next(iter(methods[0].values()))[plane].shape[2]
+    size, values = max(1, BLOCK_BYTES // (8 * dimensions**2)), np.empty((len(methods), len(distinct)))
     for start in range(0, len(distinct), size):
         block = slice(start, start + size)
         for first in dict.fromkeys(shared):
@@ -234,7 +240,7 @@ def _plane(methods: Sequence[Mapping[str, Features]], plane: str, replicates: in
             for k in (k for k, other in enumerate(shared) if other == first):
                 fakes = _drawn(methods[k], 0, plane, patients, distinct[block])
                 values[k, block] = [_distance(fake, truth) for fake, truth in zip(fakes, truths)]
-    return sum(shape[1] for shape in shapes), values[:, place.ravel()]
+    return values[:, place.ravel()]
 
 
 def _same_truth(cases: Mapping[str, Features], others: Mapping[str, Features], plane: str) -> bool:

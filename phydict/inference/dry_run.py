@@ -23,14 +23,15 @@ the median was 0.72 to 0.86 on five chest CTs and 0.50 on a sixth whose lungs ar
 0.26 to 0.49. A wrong order of views stays above."""
 
 
-def dry_run(path: str | Path, case: Case, grid: Grid) -> list[str]:
+def dry_run(path: str | Path, case: Case, grid: Grid, box: Grid | None = None) -> list[str]:
     """Write the geometry page of an X-ray Case as PNG; returns one line per view that says what is seen in it, and
     warns of views that look upside down, mirrored or unlike a thorax in this geometry.
 
-    grid: where a reconstruction would put its voxels. Raises ValueError where X-rays, geometry and grid do not fit.
+    grid: where a reconstruction would put its voxels; box: those of its result, where they are others. Raises
+    ValueError where X-rays, geometry and grid do not fit.
     """
     beam = case["beam"]
-    check_fit(case["xrays"], beam, grid)
+    check_fit(case["xrays"], beam, box or grid, grid)
     factor = binning(grid, beam)
     coarse = beam.binned(factor)
     hu = build(Thorax.standard(), grid)[0]

@@ -56,7 +56,7 @@ def _case_folders(folder: Path) -> list[Path]:
 
 
 def _cases(folder: Path) -> list[PageCase]:
-    """The finished cases; what the page shows of them and older results lack is made, and told as cases are."""
+    """The finished cases; files of the page that they lack are made, with progress."""
     paths, cases = _case_folders(folder), []
     lacking = {path for path in paths if missing_page_files(path)}
     with CaseProgress() as progress:

@@ -38,7 +38,7 @@ def summarise(results: CaseResults, cases: list[str], name: str, scoring: Scorin
 def show_finished(results: CaseResults, cases: Collection[str], scoring: Scoring) -> None:
     """Writes the page where some of a stopped run's cases are finished, without the Frechet distances of slices, which
     take long, and prints where it is."""
-    with suppress(ValueError, OSError):  # what stopped the run is what is to be told
+    with suppress(ValueError, OSError):  # what stopped the run is the error to show
         if len(results.missing()) < len(cases):
             print(f"page: {results_page(results.folder.parent, (), scoring.empty)}")
 

@@ -52,7 +52,7 @@ PREDICTED_VOXELS = 128
 """Along each side of 384 mm, of what phydict_learned predicts: 2.1 to 2.5 times the seconds of its network's 64."""
 
 WIDER = 1.05
-"""The factor, of intervals over those that were calibrated, from which on it is told."""
+"""The factor, of intervals over those that were calibrated, from which on it is warned of."""
 
 
 class ReconstructionTask(lightning.LightningModule):
@@ -166,7 +166,7 @@ class ReconstructionTask(lightning.LightningModule):
                 held = self.plain if self.plain.grid is None else covering(self.reconstructor, data.protocol.grid)
                 self.reconstructor, self.grid = held, held.grid or data.protocol.grid
                 self.around = self.grid
-            self.scoring.check(self.grid)
+            self.scoring.check(self.scene()[0] if self.around is self.grid else self.grid)
         check_apart(self.results.folder, "model.out", data.inputs(stage))
         check_own_page(self.results.folder.parent, "model.out")
 

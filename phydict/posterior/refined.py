@@ -206,7 +206,7 @@ class Refined(Delegating):
 
     def _measurement(self, y: Tensor, A: Projector, coarse: Reconstruction, display: bool, continued: bool
                      ) -> Measurement:
-        """The X-rays as a problem on a level's voxels alone; continued: whether the coarse volume goes on."""
+        """The X-rays as a problem on a level's voxels alone; continued: whether the coarse volume continues."""
         outside = None
         if not covers(self.target, coarse.grid):
             mu = hu_to_mu(coarse.within.to(y), self.mu_water)

@@ -38,7 +38,7 @@ class PriorContract(ABC):
 
     def takes(self, shape: Sequence[int]) -> bool:
         """Whether its denoisers take states of this shape as well, as voxels of the same size: where the X-rays show
-        that the patient goes on beyond `grid`, more of them are reconstructed then."""
+        that the patient continues beyond `grid`, more of them are reconstructed then."""
         return tuple(shape) == self.grid.shape
 
     @abstractmethod

@@ -35,8 +35,8 @@ def load_rival(path: str | Path, device: str = "cpu") -> Rival:
     """
     def build(header: dict, weights: dict[str, Tensor]) -> Rival:
         rival, training = build_rival(header, weights), header.get("training")
-        told = training if isinstance(training, dict) else {}
-        rival.budget = {name: told[name] for name in ("steps", "samples") if type(told.get(name)) is int}
+        known = training if isinstance(training, dict) else {}
+        rival.budget = {name: known[name] for name in ("steps", "samples") if type(known.get(name)) is int}
         return rival
 
     return loaded_stage(Path(path), tuple(NETWORKS), build, device)

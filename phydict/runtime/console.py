@@ -243,8 +243,9 @@ def quiet() -> Iterator[None]:
     levels = [logger.level for logger in loggers]
     with warnings.catch_warnings():
         warnings.showwarning = show  # type: ignore[assignment]
-        if any(action == "ignore" and message is None and issubclass(UserWarning, category)
-               for action, message, category, *_ in warnings.filters):
+        if any(action == "ignore" and message is module is None and issubclass(UserWarning, category)
+               for action, message, category, module, _ in warnings.filters):
+            warnings.showwarning = lambda *_: None  # type: ignore[assignment]
             warnings.filterwarnings("default", category=UserWarning)  # records of cases hold them all the same
         for message in NOISE:
             warnings.filterwarnings("ignore", message)

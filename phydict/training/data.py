@@ -140,7 +140,7 @@ class PriorData(lightning.LightningDataModule):
         draws, fit = self.draws(self.trainer.current_epoch), self.trainer.fit_loop
         epoch: Any = fit.epoch_progress.current
         if fit.restarting and fit.epoch_loop.batch_progress.is_last_batch and epoch.ready == epoch.processed:
-            # Where steps are counted, Lightning takes a finished epoch for a part of one, and would go on within it.
+            # Where steps are counted, Lightning takes a finished epoch for a part of one, and would continue within it.
             _Loop.restarting.fset(fit, False)  # type: ignore[attr-defined]
         if fit.restarting:  # perhaps within an epoch, whose first batches are done
             length = self.loading.epoch_size
@@ -178,7 +178,7 @@ class PriorData(lightning.LightningDataModule):
 
 
 def check_plain(loading: Loading) -> None:
-    """Raises ValueError where draws are asked for as only stages that learn from whole cases have them."""
+    """Raises ValueError where draws are requested as only stages that learn from whole cases have them."""
     for name, unlike in (("draw_voxels", loading.draw_voxels is not None), ("reuse", loading.reuse > 1)):
         if unlike:
             raise ValueError(f"this stage makes its draws in its own way, but data.loading.{name} is "

@@ -23,7 +23,7 @@ class RefinementTraining(StageTraining):
         window: HU that the prior's range [-1, 1] stands for
         optimisation: how the weights are learnt
         body_weight: how many times more a voxel of the body counts than one of air, plus 1
-        initial: a network's file to go on from, of these voxels or of twice as long ones, which then decides its size
+        initial: a network's file to continue from, of these voxels or twice as long ones, which then decides its size
     """
 
     prior: CorrectionNetwork

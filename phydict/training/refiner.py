@@ -51,7 +51,7 @@ class RefinerTraining(StageTraining):
         validation: what validation measures
         body_weight: how many times more a voxel of the body counts than one of air, plus 1
         mask_weight: weight of the anatomy masks' error beside the CT's
-        initial: a prior's file to begin with, or a refiner's to go on from
+        initial: a prior's file to begin with, or a refiner's to continue from
         seed: of scenes and noise
     """
 

@@ -25,7 +25,7 @@ class RivalTraining(StageTraining):
 
     made: the rival to train; scenes: its X-rays; views: numbers of X-rays from which validation reconstructs; initial:
     a rival's file to continue from, one that is not bound to a geometry also of another grid; seed: of scenes, noise
-    and whatever else is drawn; given: whether made's network was asked for, which that in `initial` must then equal.
+    and whatever else is drawn; given: whether made's network was requested, which that in `initial` must then equal.
     """
 
     prior: Rival
@@ -39,11 +39,11 @@ class RivalTraining(StageTraining):
             if rival.describe()[part] != made.describe()[part]:
                 raise ValueError(f"the rival {initial} and this training differ in '{part}': give another "
                                  "model.initial, or the settings that it was trained with")
-        own, asked = rival.network.settings, made.network.settings
-        if given and (name := next((name for name in asked if asked[name] != own[name]), None)):
-            raise ValueError(f"model.network has {name} {asked[name]}, but the rival {initial} that training continues "
-                             f"from has {own[name]}: leave model.network out, give it all of that rival's settings, or "
-                             "leave model.initial out")
+        own, requested = rival.network.settings, made.network.settings
+        if given and (name := next((name for name in requested if requested[name] != own[name]), None)):
+            raise ValueError(f"model.network has {name} {requested[name]}, but the rival {initial} that training "
+                             f"continues from has {own[name]}: leave model.network out, give it all of that rival's "
+                             "settings, or leave model.initial out")
         rival = Rival(rival.network, made.grid, made.window, made.beam)
         super().__init__(rival.train().requires_grad_(True), optimisation, seed)
         self.before = before

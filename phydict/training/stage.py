@@ -28,7 +28,7 @@ CHECKPOINT = "last.ckpt"
 
 def check_continues(kind: str, file: str, stage: Prior | Refiner | CorrectionNetwork, grid: Grid,
                     window: HUWindow) -> None:
-    """Raises ValueError unless the stage that a training goes on from, a `kind` in `file`, is of the training's own
+    """Raises ValueError unless the stage that a training continues from, a `kind` in `file`, is of the training's own
     grid and HU window."""
     if not stage.grid.same_as(grid) or stage.window != window:
         raise ValueError(f"the {kind} {file} has another grid or HU window than this training: set model.cube and "
@@ -50,7 +50,7 @@ class StageTraining(lightning.LightningModule, ABC):
         check_seed(seed, "model.seed")
         self.prior, self.optimisation, self.seed, self.samples = prior, optimisation, seed, 0
         self.before: dict[str, int] = {}
-        """Steps and samples that the weights had learnt from when this training was given them, where they say so."""
+        """Steps and samples that the weights had learnt from when this training was given them, where known."""
 
     @abstractmethod
     def batch_loss(self, batch: dict, key: tuple[int, ...] = (0,), rank: int = 0, processes: int = 1) -> Tensor:

@@ -1,4 +1,4 @@
-"""Whether a patient goes on above and below a volume, as the X-rays themselves show."""
+"""Whether a patient continues above and below a volume, as the X-rays themselves show."""
 
 from __future__ import annotations
 

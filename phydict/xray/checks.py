@@ -47,9 +47,10 @@ def check_fit(xrays: Tensor, beam: ConeBeam, grid: Grid, survey: Grid | None = N
     beam.check_scale(survey or grid)
     beam.check_meets(grid)
     if beam.continued and not grid.is_upright:
-        raise ValueError("a patient who goes on above and below is continued along the third axis of the voxels, which "
-                         f"is to run upwards, but {np.round(grid.affine[:3, 2] / grid.spacing[2], 2).tolist()} was "
-                         "given: give voxels whose third axis is superior, or leave out `continued`")
+        raise ValueError("a patient who continues above and below is repeated along the third axis of the voxels, "
+                         "which is to run upwards, but "
+                         f"{np.round(grid.affine[:3, 2] / grid.spacing[2], 2).tolist()} was given: give voxels whose "
+                         "third axis is superior, or leave out `continued`")
 
 
 def outer_columns(xrays: Tensor) -> Tensor:

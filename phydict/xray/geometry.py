@@ -46,7 +46,7 @@ class ConeBeam:
     sources, detectors: (K, 3) the focal spots and the detectors' centres.
     u, v: (K, 3) the step from one column to the next and from one row to the next, perpendicular to each other.
     shape: (V, U) pixels. Pixel (r, c) is centred on detector + (c - (U-1)/2) u + (r - (V-1)/2) v.
-    continued: whether what a volume holds goes on above and below it where rays meet it, each column as its last voxel
+    continued: whether what a volume holds continues above and below it where rays meet it, each column as its end voxel
         does, as a patient is taller than a scan; False: there is nothing beyond. None: a reconstruction asks the X-rays
         (phydict.xray.beyond), and a projector sees nothing beyond.
     Raises ValueError for wrong shapes, non-finite numbers, degenerate detectors and a source in a detector's plane.
@@ -335,7 +335,7 @@ class ConeBeam:
             part.write_text(yaml.safe_dump(self.to_dict(), sort_keys=False, default_flow_style=None))
 
     def with_continued(self, continued: bool | None) -> ConeBeam:
-        """The same beam, which says so of `continued`; None leaves it. Raises ValueError where it says otherwise."""
+        """The same beam with `continued`; None leaves it. Raises ValueError where it has the other value."""
         if continued is None or continued is self.continued:
             return self
         if self.continued is not None:
@@ -352,7 +352,7 @@ class ConeBeam:
         and optionally start_degrees (0) and arc_degrees (360), or start and arc in radians; angles_degrees: [...] in
         place of views, start and arc; or one mapping `sweep:` with sweep_degrees beside the orbit's five keys. Both
         take detector_shift (mm from column to column, or [from row to row, from column to column]) and tilt_degrees.
-        Beside any of these forms, or beside `beam:`, `continued` says whether the patient goes on above and below the
+        Beside any of these forms, or beside `beam:`, `continued` says whether the patient continues above and below the
         volume.
         Raises FileNotFoundError, and ValueError naming the file for unknown or missing keys and impossible geometry.
         """

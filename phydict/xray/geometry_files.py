@@ -81,8 +81,8 @@ def write_beam(path: str | Path, beam: ConeBeam) -> None:
         with atomic_write(Path(path)) as part:
             part.write_text("\n".join(lines) + "\n")
     if beam.continued is not None:
-        warn(f"{path} cannot say whether the patient goes on: state `continued: {str(beam.continued).lower()}` in the "
-             "geometry.yaml that names it")
+        warn(f"{path} cannot say whether the patient continues: state `continued: {str(beam.continued).lower()}` in "
+             "the geometry.yaml that names it")
 
 
 def _ending(path: Path) -> str:

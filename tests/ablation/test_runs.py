@@ -133,6 +133,7 @@ def test_every_error_of_a_method_shows_where_it_is_asked_to(tmp_path, monkeypatc
 
 @pytest.mark.parametrize("error, status, again", [(ValueError("Two\nlines."), "refused", 0),
                                                   (TooLittleMemory("It would take 9 GiB"), "failed", 1),
+                                                  (FloatingPointError("Not finite from step 2 on."), "diverged", 0),
                                                   (RuntimeError("no memory"), "failed", 1)])
 def test_a_method_that_gives_up_is_a_row_with_its_sentence(tmp_path, monkeypatch, trace, error, status, again):
     def give_up(calls):

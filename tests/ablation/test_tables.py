@@ -100,6 +100,19 @@ def test_a_score_of_some_cases_is_their_mean_and_says_of_how_many():
     assert "cases (y)" not in table
 
 
+def test_a_column_of_unlike_cases_ranks_nothing_and_the_others_do():
+    def ranked() -> set[tuple[str, str]]:
+        return {(table.title, name) for table in all_tables(summarise(rows))
+                for name, *column in zip(table.header[1:], *table.cells()) if any(place for _, place in column)}
+
+    rows = [row(case, method, 20.0 + n, views=views) for n, method in enumerate("xy") for case in "ab"
+            for views in (2, 8)]
+    whole = ranked()
+    rows[-1]["ssim"] = None  # of one case, method and number of views
+    assert ranked() == whole - {("Methods, K = 8", "SSIM ↑"), ("SSIM ↑ against the number of views", "K = 8")}
+    assert len(whole - ranked()) == 2
+
+
 def test_the_table_of_delta_has_the_misfit_beside_ssim():
     rows = [row("a", "x", 20.0 + d, delta=d) for d in (0.0, 0.8, 0.1)] + [row("a", "x", 21.0, delta=None)]
     table = next(t for t in all_tables(summarise(rows)) if "delta" in t.header)

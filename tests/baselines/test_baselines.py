@@ -6,7 +6,7 @@ import pytest
 import torch
 from laws import random_like
 
-from phydict.baselines import CGLS, FDK, FISTATV, SIRT, DiffVox
+from phydict.baselines import CGLS, FDK, FISTATV, SIRT, DiffVox, Region
 from phydict.baselines.baseline import typical_chest
 from phydict.grid import Grid
 from phydict.units import MU_WATER, HUWindow, hu_to_mu
@@ -50,6 +50,17 @@ def test_projector_calls_and_steps_are_those_that_happened(method, display):
     backprojections = isinstance(method, FDK)  # FDK's own, which is not the adjoint
     assert result.projector_calls == watched.calls + backprojections and result.network_calls == 0
     assert len(steps) == method.steps()
+
+
+@pytest.mark.parametrize("display", [False, True])
+def test_projector_calls_of_a_box_are_those_that_happened(method, display, monkeypatch):
+    y, box, calls = views(), Grid.box(8, 192.0, (48.0, 0.0, 0.0)), []
+    for name in ("__call__", "T"):
+        plain = getattr(Projector, name)
+        monkeypatch.setattr(Projector, name, lambda self, x, plain=plain: calls.append(1) or plain(self, x))
+    result = Region(method, box, GRID).reconstruct(y, Projector(box, CHEST.beam, full_detector=True), display=display)
+    backprojections = 2 * isinstance(method, FDK)
+    assert result.projector_calls == len(calls) + backprojections
 
 
 def test_misfit_and_reprojection_are_those_of_the_volume(method):

@@ -148,6 +148,20 @@ def test_few_views_and_short_arcs_are_finite(beam):
     assert found.isfinite().all() and found.abs().max() < 10
 
 
+def test_opposed_views_give_in_a_box_beside_their_axis_what_they_give_around_it():
+    beam = orbit(2, start=0.0)
+    beside = Grid.box(32, 384.0, (0.0, 24.0, 0.0))
+    of = CircularOrbit.of(beam, beside)
+    assert of.centre == pytest.approx([0, 0, 0], abs=1e-6) and of.radius == pytest.approx(740)
+    torch.testing.assert_close(density(beam, grid=beside)[:, :-2], density(beam)[:, 2:], rtol=0, atol=1e-6)
+
+
+def test_the_axis_of_a_single_view_is_the_one_nearest_to_the_grids_centre():
+    grid = Grid.box(32, 384.0, (5.0, 24.0, 0.0))
+    for beam in (orbit(1, 0.0), orbit(1, 0.0).select([0, 0])):
+        assert CircularOrbit.of(beam, grid).centre == pytest.approx([0, 24, 0], abs=1e-6)
+
+
 def test_the_ramp_removes_the_mean_and_keeps_half_at_nyquist():
     response = ramp(1024)
     assert response[0] == pytest.approx(0, abs=1e-3) and response[-1] == pytest.approx(0.5, rel=1e-3)

@@ -3,7 +3,7 @@
     python tests/benchmark/beyond.py <folder of CTs> [--methods phydict_learned ...] [--geometries "orbit of 8" ...]
 
 Scenes of each CT: as it is in 384 mm, ending in air (`ends`); its last scanned slices repeated to 576 mm at both ends
-(`goes on`) or below (`goes on below`); moved down or up by 96 mm, so that it really goes on there (`lower`, `higher`);
+(`continues`) or below (`continues below`); moved down or up by 96 mm, so that it does continue (`lower`, `higher`);
 and with arms of 42 x 72 mm and 40 HU at its sides, outside the volume (`arms`). Ideal X-rays in geometries that meet
 these. Each is reconstructed by the default, which asks the X-rays, and by the same where nothing lies beyond
 (`_unasked`), CTs that end also where `continued` says that they do not (`_told`); within_90: the share of the body
@@ -55,7 +55,7 @@ def scenes_of(volume: Tensor) -> dict[str, Tensor]:
     ends, goes_on = pad(volume, (MORE, MORE), value=-1.0), going_on(volume)
     below = torch.where(torch.arange(goes_on.shape[-1]) < GRID.shape[2] + MORE, goes_on, -1.0)
     wide = {name: pad(scene, (0, 0, SIDE, SIDE, SIDE, SIDE), value=-1.0)
-            for name, scene in (("ends", ends), ("goes on", goes_on), ("goes on below", below),
+            for name, scene in (("ends", ends), ("continues", goes_on), ("continues below", below),
                                 ("lower", ends.roll(-MORE, -1)), ("higher", ends.roll(MORE, -1)))}
     places = torch.arange(GRID.shape[0] + 2 * SIDE) - GRID.shape[0] / 2 - SIDE + 0.5
     arms = (((places[:, None].abs() - 36) / 3.5) ** 2 + (places / 6) ** 2 < 1)[..., None]

@@ -17,7 +17,7 @@ from phydict.page import CASE_FILES
 
 
 def interruptions():
-    """Runs that are stopped, share a folder or lack room: nothing finished is lost, and the next run goes on."""
+    """Runs that are stopped, share a folder or lack room: nothing finished is lost, and the next run continues."""
     code = "import sys; from phydict.cli.infer import main; main(sys.argv[1:])"
 
     def command(p, *more, cases=3) -> list[str]:

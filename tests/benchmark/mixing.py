@@ -2,7 +2,7 @@
 
     python tests/benchmark/mixing.py <folder of CTs> <prior of phantoms alone> --left_out <CT> <CT> [--recipes ...]
 
-Each recipe goes on from the same prior, which has seen no CT, with the same number of draws of all patients but those
+Each recipe continues from the same prior, which has seen no CT, with the same number of draws of all patients but those
 left out. One that was stopped resumes from its last checkpoint in --out, one that ended is not trained again.
 
 Writes mixing.csv beside this file, a row per recipe, left-out CT, number of ideal views and draw: scores of

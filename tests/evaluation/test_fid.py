@@ -27,6 +27,7 @@ from phydict.evaluation.fid import (
 from phydict.evaluation.planes import PLANES, slices
 from phydict.evaluation.tables import fid_tables
 from phydict.grid import Grid
+from phydict.runtime.lpips_networks import load_lpips
 
 
 def moments_of(x: torch.Tensor, repeats: torch.Tensor) -> Moments:
@@ -150,7 +151,7 @@ def test_methods_are_paired_draw_by_draw_and_each_is_as_it_is_alone(monkeypatch)
 
 def test_methods_of_other_numbers_of_slices_are_each_as_alone_and_neither_paired_nor_ranked():
     methods = {"whole": of_volumes(lambda hu: blurred(hu, 1)), "half": {
-        case: {plane: slices[:, ::2] for plane, slices in features.items()}
+        case: {plane: values[:, ::2] for plane, values in features.items()}
         for case, features in of_volumes(lambda hu: blurred(hu, 2)).items()}}
     found = distances(methods, replicates=20)
     rows = fid_rows(found, "squeezenet", 20, NORMALISATION)
@@ -280,6 +281,14 @@ def test_a_backbone_is_read_from_its_file_and_is_blind_to_a_scale_and_an_offset_
     assert torch.allclose(network(0.5 * hu + 100, "xy"), plain, rtol=1e-2, atol=1e-4)
     assert not torch.allclose(network(hu.flip(1), "xy"), plain, rtol=1e-2, atol=1e-4)
     assert not network.training and not any(weight.requires_grad for weight in network.parameters())
+
+
+def test_squeezenet_takes_slices_from_its_least_side_on_and_refuses_smaller_ones_in_one_sentence(monkeypatch):
+    monkeypatch.setattr(backbones, "load_lpips", lambda backbone, *_: load_lpips(backbone, True))
+    network, side = SliceFeatures("squeezenet"), backbones.LEAST_SIDE
+    assert all(network(torch.zeros(side, side, side), plane).shape == (side, 512) for plane in PLANES)
+    with pytest.raises(ValueError, match=f"^slices of {side} x {side - 1} x {side} voxels are too small .* leave fid"):
+        network(torch.zeros(side, side - 1, side), "zx")
 
 
 def test_squeezenet_that_is_not_there_is_missed_for_fid_and_not_for_lpips(tmp_path, monkeypatch):

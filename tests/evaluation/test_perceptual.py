@@ -55,3 +55,16 @@ def test_slices_that_are_too_small_and_a_missing_backbone_are_refused(untrained,
     lpips_networks.load_lpips.cache_clear()
     with pytest.raises(FileNotFoundError, match="alexnet-owt-7be5be79.pth .* leave lpips out of the metrics"):
         load_networks()
+
+
+@pytest.mark.parametrize("content", [b"<!DOCTYPE html><html>Not found</html>", b"PK\x03\x04 and no more", b""],
+                         ids=["page", "truncated", "empty"])
+def test_a_damaged_backbone_is_one_sentence_that_names_the_file(content, tmp_path, monkeypatch):
+    file = tmp_path / "hub" / "checkpoints" / lpips_networks.FILES["alex"]
+    file.parent.mkdir(parents=True)
+    file.write_bytes(content)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    load_lpips.cache_clear()
+    with pytest.raises(ValueError, match="cannot be read as the trained backbone .* leave lpips out") as error:
+        load_networks()
+    assert str(file) in str(error.value) and "\n" not in str(error.value)

@@ -161,6 +161,13 @@ def test_the_caption_tells_when_methods_had_different_cases():
     assert "not the same" not in mean_table(ROWS).notes[0]
 
 
+def test_a_column_of_unlike_cases_ranks_nothing_and_the_others_do():
+    rows = [*ROWS[:3], {name: value for name, value in ROWS[3].items() if name != "ssim"}]
+    marked = {name for line in cells(rows).values() for name, cell in line.items() if re.search("[*]|<u>", cell)}
+    assert marked == {"PSNR (dB)", "MAE (HU)", "time (s)"} and "| SSIM ↑ |" in mean_table(rows).markdown()
+    assert not re.search("[*]|<u>", mean_table(ROWS[:3]).markdown())
+
+
 def test_warnings_are_counted_in_the_line_and_name_their_cases_in_the_caption():
     rows = [row | ({"warning": "no lungs"} if row["case"] == "008" and row["method"] == "fdk" else {}) for row in ROWS]
     table = cells(rows)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import shutil
+from dataclasses import replace
 
 import pytest
 import torch
@@ -13,6 +15,8 @@ from inference.runs import contents, names, phantoms, sirt
 from phydict.cli.infer import main
 from phydict.datasets import load_xrays, phantom_case, save_xrays
 from phydict.grid import Grid
+from phydict.inference.dry_run import dry_run
+from phydict.methods import reconstruct
 from phydict.runtime.shipped import shipped
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
@@ -100,3 +104,20 @@ def test_a_dry_run_writes_no_page_among_the_xrays(measured, tmp_path, capsys):
     before = contents(tmp_path)
     said = refusal(capsys, main, sirt("predict", tmp_path, f"--data.xrays={tmp_path / 'dry_run'}", "--dry_run"))
     assert "is the input" in said and contents(tmp_path) == before
+
+
+def test_a_dry_run_refuses_lying_voxels_of_a_patient_who_goes_on_as_a_reconstruction_does(measured, tmp_path):
+    case, upright = load_xrays(measured / "anna") | {"id": "anna"}, Grid.cube(16)
+    lying = Grid(upright.shape, affine=upright.affine[:, [0, 2, 1, 3]])
+    beam = replace(case["beam"], continued=True)
+    with pytest.raises(ValueError) as refused:
+        reconstruct(case["xrays"], beam, method="sirt", grid=lying)
+    with pytest.raises(ValueError, match=f"^{re.escape(str(refused.value))}$"):
+        dry_run(tmp_path / "anna.png", case | {"beam": beam}, lying)
+    assert names(tmp_path) == []
+
+
+def test_a_dry_run_refuses_a_box_that_no_ray_meets_as_a_reconstruction_does(measured, tmp_path, capsys):
+    args = sirt("predict", tmp_path, f"--data.xrays={measured / 'anna'}", "--model.grid.voxels=8",
+                "--model.grid.side=96", "--model.grid.centre=[0,0,900]")
+    assert "no ray of any view meets" in refusal(capsys, main, args) == refusal(capsys, main, [*args, "--dry_run"])

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
+import torch
 import yaml
 from command_lines import refusal
 from processes import INFER, Python
@@ -80,7 +81,8 @@ def test_a_partial_folder_is_never_a_finished_case(measured, scored, tmp_path):
     for process in (gone.pid, os.getpid()):  # killed while it wrote, and writing now
         partial = tmp_path / "sirt" / f".anna.{socket.gethostname()}.{process}.partial"
         partial.mkdir(parents=True)
-        (partial / "volume.nii.gz").write_bytes(b"half")
+        for name in ("volume.nii.gz", "coarse.nii.gz"):
+            (partial / name).write_bytes(b"half")
     main(sirt("predict", tmp_path, f"--data.xrays={measured / 'anna'}"))
     assert names(tmp_path / "sirt" / "anna") == FILES and volume(tmp_path / "sirt" / "anna").shape == (64, 64, 64)
     assert names(tmp_path / "sirt") == ["anna"]
@@ -222,6 +224,21 @@ def test_one_bad_case_spoils_no_other(measured, tmp_path, capsys):
     assert stopped.value.code == 2 and len(said) == 2
     assert said[0].startswith("error: anna: ") and "1 of 2 cases were not reconstructed (anna)" in said[1]
     assert names(tmp_path / "out" / "sirt") == ["bert"] and names(tmp_path / "out" / "sirt" / "bert") == FILES
+
+
+def test_a_case_that_memory_gives_out_for_spoils_no_other(measured, tmp_path, capsys, monkeypatch):
+    calls, whole = [], SIRT.reconstruct
+
+    def large_at_first(self, *given):
+        calls.append(given)
+        return torch.empty(2**50) if len(calls) == 1 else whole(self, *given)
+
+    monkeypatch.setattr(SIRT, "reconstruct", large_at_first)
+    with pytest.raises(SystemExit) as stopped:
+        main(sirt("predict", tmp_path, f"--data.xrays={measured}"))
+    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+    assert stopped.value.code == 2 and said[0].startswith("error: anna: memory gave out (")
+    assert "1 of 2 cases were not reconstructed (anna)" in said[1] and names(tmp_path / "sirt") == ["bert"]
 
 
 def test_a_signal_ends_the_run_between_cases_and_is_no_success(tmp_path):

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from command_lines import refusal
+from page import made
 
 import phydict
 from inference.runs import BEAM, ORBIT, ROOT, names, phantoms, record, sirt, stamp, volume, with_prior, write_ct
@@ -20,6 +21,10 @@ from phydict.cli.infer import main
 from phydict.datasets import body_mask, phantom_case, prepare_ct
 from phydict.evaluation import volume_metrics
 from phydict.grid import Grid
+from phydict.inference import ReconstructionData
+from phydict.inference.protocols import PROTOCOLS
+from phydict.inference.results import score_table
+from phydict.inference.scoring import Scoring
 from phydict.methods import reconstruct
 from phydict.posterior import PriorOnly
 from phydict.runtime.precision import instruction_set
@@ -145,6 +150,36 @@ def test_the_simulated_orbit_is_the_one_asked_for(scored, tmp_path, capsys):
     main(phantoms(tmp_path / "finer", 1, "--data.simulation_voxels=128"))
     assert not np.array_equal(volume(tmp_path / "finer" / "sirt" / case), volume(scored / case))
     assert "multiple" in refusal(capsys, main, phantoms(tmp_path / "coarser", 1, "--data.simulation_voxels=96"))
+
+
+OPTIMISTIC = "the voxels that are reconstructed, which is optimistic"
+
+
+@pytest.mark.parametrize("given, grid, places", [
+    ({}, None, OPTIMISTIC), ({"protocol": "phydict"}, None, OPTIMISTIC), ({"protocol": "x2ct"}, None, "the protocol's"),
+    ({}, Grid.cube(128), OPTIMISTIC), ({}, Grid.box(32, 96.0, (60.0, 0.0, 0.0)), "128^3 voxels of 3 mm"),
+    ({"protocol": "phydict"}, Grid.box(16, 96.0), "64^3 voxels of 6 mm"),
+    ({"simulation_voxels": 192}, Grid.box(16, 96.0), "192^3 voxels"),
+    ({"protocol": "x2ct", "simulation_voxels": 256}, None, "256^3 voxels")])
+def test_a_table_names_the_voxels_that_its_x_rays_were_made_of(given, grid, places):
+    settings = {"seed": 0, "data": ReconstructionData(cts="phantom", **given).settings("test")} | (
+        {"grid": grid.to_dict()} if grid else {})
+    finished = made.record("anna", "sirt", settings=settings)
+    table = score_table([finished], PROTOCOLS.get(given.get("protocol")), {})
+    (said,) = (note for note in table.notes if note.startswith("X-rays: "))
+    assert f"; made on {places}" in said and said.endswith("; seed 0.")
+
+
+def test_a_score_that_is_not_finite_leaves_strict_json_and_the_same_table_again(tmp_path, monkeypatch):
+    whole = Scoring.scores
+    monkeypatch.setattr(Scoring, "scores", lambda *given: whole(*given) | {"psnr": float("inf"), "ssim": float("nan")})
+    tables = []
+    for _ in range(2):
+        main(phantoms(tmp_path, 1))
+        tables.append([(tmp_path / "sirt" / name).read_text() for name in ("results.md", "results.csv")])
+    text = (tmp_path / "sirt" / "phantom-1000000" / "reconstruction.json").read_text()
+    scores = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))["scores"]
+    assert (scores["psnr"], scores["ssim"]) == (None, None) and scores["mae_hu"] > 0 and tables[0] == tables[1]
 
 
 def test_simulated_xrays_are_taken_where_a_geometry_file_says(scored, tmp_path, capsys):

@@ -155,6 +155,14 @@ def test_what_cannot_be_measured_is_refused_before_any_work(tmp_path, capsys, gi
     assert not (tmp_path / "sirt" / "phantom-1000000").exists()
 
 
+def test_volumes_that_are_too_small_for_fid_are_refused_before_any_work(tmp_path, capsys, untrained):
+    said = refusal(capsys, main, phantoms(tmp_path, 1, "--model.grid=16", "--metrics=[fid]"))
+    assert "16 x 16 x 16 voxels are too small for the FID backbone squeezenet" in said and "leave fid out" in said
+    assert not (tmp_path / "sirt" / "phantom-1000000").exists()
+    Scoring(["fid"]).check(Grid.cube(backbones.LEAST_SIDE))
+    Scoring(["fid"], FIDSettings(maisi_voxels=True)).check(Grid.cube(16))
+
+
 def test_a_specification_with_unknown_metrics_is_refused(tmp_path, capsys):
     for content, sentence in (({"metrics": ["psnr"]}, "some of volume"), ({"fid": {"net": 1}}, "no setting 'net'"),
                               ({"metrics": 3}, "metrics takes")):
@@ -175,21 +183,31 @@ def test_lungs_that_are_segmented_beside_a_ct_are_those_of_the_truth(tmp_path):
     assert organs_beside(tmp_path / "bert.nii.gz", grid) == {}
 
 
-def test_cases_of_other_masks_are_other_data_and_those_without_are_known_by_the_ct_alone(tmp_path):
-    def source() -> str:
-        (_, source, _), = ReconstructionData(cts=str(ct)).test_cases(Grid.cube(16), HUWindow())
-        return source
+def source_of(ct) -> str:
+    (_, source, _), = ReconstructionData(cts=str(ct)).test_cases(Grid.cube(16), HUWindow())
+    return source
 
+
+def test_other_voxels_beside_the_same_header_are_other_data(tmp_path):
+    (tmp_path / "anna.mhd").write_text("ElementDataFile = anna.raw\n")
+    found = []
+    for content in (b"one", b"other"):
+        (tmp_path / "anna.raw").write_bytes(content)
+        found.append(source_of(tmp_path / "anna.mhd"))
+    assert found[0] != found[1]
+
+
+def test_cases_of_other_masks_are_other_data_and_those_without_are_known_by_the_ct_alone(tmp_path):
     ct, mask = tmp_path / "anna.nii.gz", tmp_path / "anna_lungmask.nii.gz"
     ct.write_bytes(b"ct")
-    alone = source()
+    alone = source_of(ct)
     assert alone == f"anna.nii.gz, crc32 {file_crc32(ct):08x}, None, report crc32 00000000"
     found = []
     for content in (b"one", b"other"):
         mask.write_bytes(content)
-        found.append(source())
+        found.append(source_of(ct))
     mask.unlink()
-    assert len({alone, *found}) == 3 and source() == alone
+    assert len({alone, *found}) == 3 and source_of(ct) == alone
 
 
 def test_the_prepared_lungs_are_those_of_the_truth_and_its_vessels_are_found_in_the_ct(tmp_path):

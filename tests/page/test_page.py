@@ -14,9 +14,12 @@ import torch
 from page.made import TURNED, finish, random_hu
 from phydict.cli.infer import main
 from phydict.evaluation import Table, write_csv
+from phydict.evaluation.backbones import DIMENSIONS
+from phydict.evaluation.fid import save_features
 from phydict.evaluation.metrics import MEASURES
+from phydict.evaluation.planes import PLANES
 from phydict.inference.page import results_page
-from phydict.inference.results import RECORD, CaseResults
+from phydict.inference.results import FEATURES, RECORD, CaseResults
 from phydict.page import CASE_FILES, PAGE, Contents, write_case_files, write_page
 from phydict.page.case_files import NO_VALUE
 
@@ -173,6 +176,19 @@ def test_cases_of_several_protocols_have_a_table_each_of_its_own_range(tmp_path)
     assert [[row[0]["text"] for row in table["rows"]] for table in tables] == [["fdk", "tv"], ["sirt"]]
     for table, ends in zip(tables, ("[-1000, 1500]", "[-1000, 1000]")):
         assert ends in " ".join([table["title"], *table["notes"]])
+
+
+def test_frechet_distances_of_other_weights_and_of_each_protocol_have_a_table_each(tmp_path, monkeypatch):
+    monkeypatch.setitem(DIMENSIONS, "squeezenet", 3)
+    others = {"cgls": {"data": {"protocol": "x2ct"}}, "tv": {"fid_weights_crc32": 2}}
+    for n, method in enumerate(("cgls", "fdk", "sirt", "tv")):
+        settings = {"seed": 0, "data": {}, "fid_backbone": "squeezenet", "fid_weights_crc32": 1}
+        settings |= others.get(method, {})
+        generator = torch.Generator().manual_seed(n)
+        save_features(finish(tmp_path, "anna", method, settings=settings) / FEATURES,
+                      {plane: torch.randn(2, 9, 3, generator=generator) for plane in PLANES})
+    distances = [table for table in content(results_page(tmp_path))["tables"] if "(FID)" in table["title"]]
+    assert [[row[0]["text"] for row in table["rows"]] for table in distances] == [["cgls"], ["fdk", "sirt"], ["tv"]]
 
 
 def test_a_damaged_case_is_left_out_with_a_word(tmp_path):

@@ -89,7 +89,7 @@ def patients() -> dict[str, torch.Tensor]:
     case = phantom_case(3, CHEST, WINDOW)["volume"][None]
     ends = pad(case, (ROWS, ROWS, 0, 0, 0, 0), value=-1.0)
     goes_on = pad(case[..., 12:52], (28, 28, 0, 0, 0, 0), mode="replicate")
-    return {"ends": ends, "goes on": goes_on, "goes on below": torch.where(torch.arange(96) < 68, goes_on, -1.0),
+    return {"ends": ends, "continues": goes_on, "continues below": torch.where(torch.arange(96) < 68, goes_on, -1.0),
             "lies lower": ends.roll(-ROWS, -1)}
 
 
@@ -112,7 +112,7 @@ def test_x_rays_tell_whether_a_patient_goes_on(patients, beam, simulator):
 
 def test_what_is_stated_is_not_asked(patients):
     beam = ConeBeam.orbit(2, 1020, 740, (112, 112), 5.0)
-    y = xrays_of(WINDOW.to_mu(patients["goes on"]), beam)
+    y = xrays_of(WINDOW.to_mu(patients["continues"]), beam)
     for stated in (True, False):
         assert with_continuation(y, replace(beam, continued=stated), CHEST, False).continued is stated
     assert with_continuation(torch.zeros_like(y), beam, CHEST, False).continued is False
@@ -123,8 +123,8 @@ def test_what_is_stated_is_not_asked(patients):
 @pytest.mark.parametrize("method", [pytest.param("phydict_learned", marks=pytest.mark.slow), "cgls"])
 def test_a_patient_who_goes_on_is_found_better_where_the_rays_do(patients, method):
     beam = ConeBeam.orbit(8, 1020, 740, (112, 112), 5.0)
-    y = xrays_of(WINDOW.to_mu(patients["goes on"]), beam)
-    truth = WINDOW.to_hu(patients["goes on"][..., ROWS:-ROWS].contiguous())
+    y = xrays_of(WINDOW.to_mu(patients["continues"]), beam)
+    truth = WINDOW.to_hu(patients["continues"][..., ROWS:-ROWS].contiguous())
     of_box, told, found = (reconstruct(y, replace(beam, continued=given), method=method, grid=CHEST).volume
                            for given in (False, True, None))
     gains = [volume_metrics(volume[None, None], truth)["psnr"] - volume_metrics(of_box[None, None], truth)["psnr"]
@@ -136,8 +136,8 @@ def test_a_patient_who_goes_on_is_found_better_where_the_rays_do(patients, metho
 @pytest.mark.parametrize("method", [pytest.param("phydict_learned", marks=pytest.mark.slow), FISTATV(iterations=80)])
 def test_a_box_in_a_patient_who_goes_on_is_as_the_whole_volume_shows_it(patients, method):
     beam, box = ConeBeam.orbit(8, 1020, 740, (112, 112), 5.0), Grid.box(32, 192.0, (0.0, 0.0, 96.0))
-    y = xrays_of(WINDOW.to_mu(patients["goes on"]), beam)
-    truth = WINDOW.to_hu(patients["goes on"][0, 0, 16:48, 16:48, ROWS + 32:-ROWS])
+    y = xrays_of(WINDOW.to_mu(patients["continues"]), beam)
+    truth = WINDOW.to_hu(patients["continues"][0, 0, 16:48, 16:48, ROWS + 32:-ROWS])
     whole = reconstruct(y, beam, method=method, grid=CHEST).volume[16:48, 16:48, 32:]
     of_box, ending = (reconstruct(y, replace(beam, continued=given), method=method, grid=box).volume
                       for given in (None, False))

@@ -48,7 +48,7 @@ OUTSIDE = ["Degenerative changes of the thoracic spine.", "Mild thoracic scolios
            "Goitre with calcification.", "Hiatal hernia.", "Small sliding hiatus hernia.", "Gynaecomastia.",
            "Diverticula of the colon.", "Mild atherosclerosis of the abdominal aorta.",
            "Lipoma of {n} mm in the {s} chest wall."]
-"""What may be said of a phantom, since it lies outside the chest cavity."""
+"""What a phantom's report may state, since it lies outside the chest cavity."""
 
 INSIDE = ["Calcified plaques in the coronary arteries.", "Coronary artery calcification.",
           "Atherosclerotic wall calcification of the aorta.", "Ectasia of the ascending aorta, {n} mm.",
@@ -88,4 +88,4 @@ INSIDE = ["Calcified plaques in the coronary arteries.", "Coronary artery calcif
           "History of smoking.", "Clinical correlation is recommended.", "Control after treatment is advised.",
           "Viral pneumonia should be considered.", "The appearance is not typical of infection.",
           "Findings are stable.", "Changes have regressed under therapy."]
-"""Of the chest, and of no kind that a phantom has: for teaching a reader what not to read, never said of a phantom."""
+"""Of the chest, and of no kind that a phantom has: to teach a reader what not to read; in no phantom's report."""

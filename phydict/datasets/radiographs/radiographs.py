@@ -113,7 +113,7 @@ def case_files(folder: Path, geometry: Path | None = None) -> list[Path]:
     its own, and those that a geometry file names elsewhere, whether they are there or not."""
     files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
     source = folder / GEOMETRY if geometry is None else geometry
-    with suppress(ValueError, OSError):  # what is wrong with it is told where the case is read
+    with suppress(ValueError, OSError):  # what is wrong with it is reported where the case is read
         files += read_description(source).named_files()
     return list(dict.fromkeys([*files, geometry] if geometry else files))
 

@@ -10,7 +10,7 @@
     orientation: {rotate_degrees: 0, flip_rows: false, flip_columns: false}
     uncertain: {detector_shift_mm: 5, rotation_degrees: 2}    # what is not exactly known, for --calibrate; see
     #                                                         # phydict.xray.poses.uncertain
-    continued: true                                      # the patient goes on above and below the volume
+    continued: true                                      # the patient continues above and below the volume
 
 Without `beam:` the tags of DICOM images decide. Rotation is clockwise, in quarters, and comes before the flips. The
 beam, wherever it comes from, is that of the images once they are turned.

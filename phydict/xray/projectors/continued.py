@@ -1,4 +1,4 @@
-"""A volume that goes on above and below its voxels, each column as its last voxel does."""
+"""A volume that continues above and below its voxels, each column as its last voxel does."""
 
 from __future__ import annotations
 

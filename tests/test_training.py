@@ -286,3 +286,10 @@ def test_a_damaged_phantom_in_the_cache_is_made_again(tmp_path):
         file.write_bytes(file.read_bytes()[:500])
         again = phantoms[0]
     assert torch.equal(first["volume"], again["volume"]) and torch.equal(first["masks"], again["masks"])
+
+
+def test_phantoms_on_other_voxels_of_as_many_are_others(tmp_path):
+    longer = Grid((16, 16, 16), spacing=(24.0, 24.0, 12.0))
+    one, other = (CachedPhantoms(0, 1, grid, HUWindow(), tmp_path)[0]["volume"] for grid in (Grid.cube(16), longer))
+    assert not torch.equal(one, other)
+    assert torch.equal(CachedPhantoms(0, 1, Grid.cube(16), HUWindow(), tmp_path)[0]["volume"], one)

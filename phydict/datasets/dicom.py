@@ -23,24 +23,33 @@ from phydict.runtime.reading import MOST_SQUEEZED, check_held, check_memory, one
 
 VIEW_POSITIONS = {"PA": 0.0, "LL": 90.0, "AP": 180.0, "RL": -90.0}
 
+TILTS, LEVEL = ("DetectorPrimaryAngle", "DetectorSecondaryAngle", "ColumnAngulation"), 1.0
+"""Tags of a detector or a tube that is tilted against the other, and the degrees below which it counts as level."""
+
 
 @dataclass(frozen=True)
 class DicomTags:
     """What the tags of one frame say of its geometry and pixel values; None or "" where they are silent.
 
-    name: of file and frame. Lengths in mm, angles in degrees; pixel: (row height, column width); patient_orientation:
-    letters of the directions in which (columns, rows) run. magnification: of CR and DX, detector over isocentre
+    name: of file and frame; frame: its index in the file. Lengths in mm, angles in degrees; pixel: (row height, column
+    width); view_degrees: of ViewPosition; patient_orientation: letters of the directions in which (columns, rows) of
+    the file's first frame run. reoriented: how the image was flipped or rotated since it was taken, in words; detector:
+    how the detector is tilted against the beam, in words. magnification: of CR and DX, detector over isocentre
     distance. inverted: MONOCHROME1. relationship, sign: PixelIntensityRelationship(Sign).
     """
 
     name: str
+    frame: int
     source_to_detector: float | None
     source_to_isocentre: float | None
     magnification: float | None
     pixel: tuple[float, ...] | None
     primary_degrees: float | None
     secondary_degrees: float | None
+    view_degrees: float | None
     patient_orientation: tuple[str, str] | None
+    reoriented: str
+    detector: str
     angiographic: bool
     inverted: bool
     relationship: str
@@ -152,10 +161,15 @@ def _tags(dataset: pydicom.Dataset, frame: int, name: str) -> DicomTags:
         magnification = _number(dataset, frame, "EstimatedRadiographicMagnificationFactor", name)
     primary = _angle(dataset, frame, "PositionerPrimaryAngle", name)
     secondary = _angle(dataset, frame, "PositionerSecondaryAngle", name)
-    position = _code(dataset, frame, "ViewPosition", name)
-    if primary is None and position in VIEW_POSITIONS:
-        primary = VIEW_POSITIONS[position]
+    view = VIEW_POSITIONS.get(_code(dataset, frame, "ViewPosition", name))
+    if view is not None:
+        primary = view if primary is None else primary
         secondary = secondary or 0.0
+    turn = _number(dataset, frame, "FieldOfViewRotation", name) or 0.0
+    reoriented = " and ".join([f"rotated by {turn:g} degrees"] * bool(turn) + ["flipped"] * (
+        _code(dataset, frame, "FieldOfViewHorizontalFlip", name) == "YES"))
+    tilts = {keyword: _number(dataset, frame, keyword, name) or 0.0 for keyword in TILTS}
+    detector = " and ".join(f"{keyword} {degrees:g}" for keyword, degrees in tilts.items() if abs(degrees) > LEVEL)
     orientation = _find(dataset, frame, "PatientOrientation", name)
     if orientation is not None:
         letters = orientation if isinstance(orientation, MultiValue) else str(orientation).split("\\")
@@ -164,9 +178,9 @@ def _tags(dataset: pydicom.Dataset, frame: int, name: str) -> DicomTags:
     if sign and (_number(dataset, frame, "RescaleSlope", name) or 1) < 0:
         sign = -sign  # the tag speaks of stored values
     return DicomTags(
-        name, _number(dataset, frame, "DistanceSourceToDetector", name), to_isocentre, magnification,
-        tag_numbers(dataset, frame, "ImagerPixelSpacing", name, 2), primary, secondary,
-        orientation, angiographic, _code(dataset, frame, "PhotometricInterpretation", name) == "MONOCHROME1",
+        name, frame, _number(dataset, frame, "DistanceSourceToDetector", name), to_isocentre, magnification,
+        tag_numbers(dataset, frame, "ImagerPixelSpacing", name, 2), primary, secondary, view, orientation, reoriented,
+        detector, angiographic, _code(dataset, frame, "PhotometricInterpretation", name) == "MONOCHROME1",
         _code(dataset, frame, "PixelIntensityRelationship", name), None if sign is None else int(sign))
 
 

@@ -19,9 +19,9 @@ class FinerProjector(Projector):
     """
 
     def __init__(self, projector: Projector, factor: int = 2):
-        self.beam, self.factor = projector.beam, factor
+        self.beam, self.factor, self.device = projector.beam, factor, getattr(projector, "device", torch.device("cpu"))
         self.grid = divided(projector.grid, factor)
-        self._rays = Projector(self.grid, projector.beam.divided(factor), full_detector=True)
+        self._rays = Projector(self.grid, projector.beam.divided(factor), device=self.device, full_detector=True)
         self.method, self.reason = self._rays.method, self._rays.reason
 
     def __call__(self, mu: Tensor) -> Tensor:

@@ -74,6 +74,8 @@ class Polychromatic(Simulator):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
                 raise ValueError(f"{name} must be finite and > 0, but {value} was given; leave it out for the default")
+        if self.scatter_width is None:
+            raise ValueError("scatter_width must be finite and > 0, but None was given; leave it out for the default")
         for energies in (self.ct_energy, self.beam_spectrum.energies):
             attenuation("water", energies)  # refuses energies off its table
 

@@ -72,7 +72,7 @@ class Spectrum:
 
         Raises ValueError for other voltages.
         """
-        table = _table("tungsten.csv")
+        table, kvp = _table("tungsten.csv"), int(kvp) if kvp == int(kvp) else kvp
         if f"{kvp}kvp" not in table:
             tubes = ", ".join(name.removesuffix("kvp") for name in list(table)[1:])
             raise ValueError(f"there is no tube spectrum of {kvp} kVp; use one of {tubes}, or give a Spectrum")

@@ -118,6 +118,45 @@ def group(**sequences):
     return item
 
 
+@pytest.mark.parametrize("where", ["tag", "geometry.yaml"])
+@pytest.mark.parametrize("frames", [3, 5, 8])
+def test_the_orientation_of_a_run_is_of_its_first_frame(tmp_path, frames, where):
+    tags = orbit_tags(frames, 1020.0, 740.0, PIXEL) | ({"PatientOrientation": ["L", "F"]} if where == "tag" else {})
+    write_dicom(tmp_path / "run.dcm", counts(frames), **tags)
+    if where != "tag":
+        described(tmp_path, beam={"dicom": {"patient_orientation": "L\\F"}})
+    expected = ConeBeam.orbit(frames, 1020, 740, SHAPE, PIXEL)
+    assert load_xrays(tmp_path, intensity=LINES)["beam"].same_as(expected, 1e-6)
+
+
+@pytest.mark.parametrize("tags, words", [
+    ({"FieldOfViewHorizontalFlip": "YES"}, "was flipped since"),
+    ({"FieldOfViewRotation": 90.0}, "rotated by 90 degrees"),
+    ({"FieldOfViewRotation": 180.0, "FieldOfViewHorizontalFlip": "YES"}, "rotated by 180 degrees and flipped")])
+def test_an_image_that_was_turned_since_it_was_taken_needs_its_orientation(tmp_path, tags, words):
+    fails(f"{words}.*patient_orientation", one(tmp_path, **angled(0.0), **tags), intensity=LINES)
+    described(tmp_path, beam={"dicom": {"patient_orientation": "R\\F"}})
+    assert load_xrays(tmp_path, intensity=LINES)["beam"].u[0].tolist() == pytest.approx([80, 0, 0])
+    (tmp_path / "geometry.yaml").unlink()
+    assert beam_of(tmp_path, **angled(0.0), PatientOrientation=["L", "F"], **tags).u[0, 0] < 0
+
+
+def test_a_detector_tilted_against_the_beam_is_warned_of(tmp_path):
+    with pytest.warns(UserWarning, match="DetectorPrimaryAngle 10 degrees, but the beam is taken as perpendicular"):
+        beam_of(tmp_path, **angled(0.0), DetectorPrimaryAngle=10.0, DetectorSecondaryAngle=0.5)
+
+
+def test_an_angle_that_contradicts_the_view_position_is_refused_unless_one_is_stated(tmp_path):
+    tags = DX | {"ViewPosition": "AP", "PositionerPrimaryAngle": 0.0}
+    fails("PositionerPrimaryAngle 0 contradicts ViewPosition, which means 180", one(tmp_path, None, "DX", **tags),
+          intensity=LINES)
+    described(tmp_path, beam={"dicom": {"primary_degrees": 180.0}})
+    assert load_xrays(tmp_path, intensity=LINES)["beam"].sources[0, 1] == pytest.approx(1500)
+    (tmp_path / "geometry.yaml").unlink()
+    near = beam_of(tmp_path, "DX", **DX | {"PositionerPrimaryAngle": 30.0})  # its secondary angle is 0
+    np.testing.assert_allclose(near.sources[0], [750, -1500 * 0.75**0.5, 0], atol=1e-9)
+
+
 @pytest.mark.parametrize("position, orientation, source, u", [
     ("PA", ["L", "F"], [0, -1, 0], [-1, 0, 0]), ("AP", ["L", "F"], [0, 1, 0], [-1, 0, 0]),
     ("LL", ["A", "F"], [1, 0, 0], [0, 1, 0]), ("RL", ["A", "F"], [-1, 0, 0], [0, 1, 0]),

@@ -133,6 +133,15 @@ def test_npy_nifti_png_and_tiff_of_the_same_counts_agree(tmp_path):
     assert all(a.equal(other) for other in others)
 
 
+def test_a_tiff_whose_least_value_is_white_is_turned_over(tmp_path):
+    pixels = np.arange(30, dtype=np.uint16).reshape(SHAPE)
+    for k in range(2):
+        Image.fromarray(pixels).save(tmp_path / f"{k}.tif", tiffinfo={262: 0})
+    scaled = {"kind": "line_integrals", "scale": 1e-4}
+    (tmp_path / "geometry.yaml").write_text(yaml.safe_dump({"orbit": ORBIT, "intensity": scaled}))
+    np.testing.assert_allclose(load_xrays(tmp_path)["xrays"][1].numpy(), 1e-4 * (65535.0 - pixels), rtol=1e-5)
+
+
 def test_floating_point_tiffs_are_line_integrals(tmp_path):
     assert (load_xrays(write(tmp_path, images(), "tif"))["xrays"].numpy() == images()).all()
 

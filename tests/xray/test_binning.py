@@ -61,6 +61,7 @@ def test_binning_views_and_beam_together_measures_the_same():
 def test_finer_voxels_and_rays_have_an_exact_adjoint_and_measure_the_same_of_what_is_smooth():
     projector = Projector(Grid.cube(12), ConeBeam.orbit(3, 1020, 740, (14, 18), 30.0), full_detector=True)
     finer = FinerProjector(projector)
+    assert finer.device == projector.device == torch.device("cpu")
     assert_adjoint(finer, finer.T, (1, 1, 24, 24, 24), torch.float64, 1e-10)
     smooth = torch.sin(torch.arange(24) / 7.0)[:, None, None].expand(1, 1, 24, 24, 24).abs().contiguous()
     torch.testing.assert_close(finer(smooth), projector(avg_pool3d(smooth, 2)), rtol=0.05, atol=5.0)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -44,6 +45,18 @@ def test_the_adjoint_is_exact(method):
     mu = random_like((1, 1, *GRID.shape), torch.float64)
     y = random_like((1, 3, 40, 40), torch.float64, seed=1)
     assert float((A(mu) * y).sum()) == pytest.approx(float((mu * A.T(y)).sum()), rel=1e-10)
+
+
+@pytest.mark.parametrize("rows, degrees", [(40, 0), (40, 15), (40, 30), (40, 45), (40, -30), (8, 30)])
+def test_no_ray_leaves_the_columns_beyond_the_slices_that_are_repeated(rows, degrees):
+    grid = Grid.cube(16, 320.0)
+    beam = ConeBeam.at_angles([3.0, 40.0], 1500, 900, (rows, 40), (20.0, 20.0)).tilted(degrees)
+    rays = beam.pixels() - beam.sources[:, None, None]
+    faces = [(side - beam.sources[:, None, None, :2]) / rays[..., :2] for side in (-160, 160)]
+    inside = np.minimum(np.maximum(*faces).min(-1), 1) - np.minimum(*faces).max(-1)
+    A = Projector(grid, replace(beam, continued=True), "siddon")
+    found = A(torch.ones(1, 1, *grid.shape, dtype=torch.float64))[0].numpy()
+    np.testing.assert_allclose(found, inside.clip(0) * np.linalg.norm(rays, axis=-1), atol=1e-9)
 
 
 def test_a_small_detector_meets_nothing_beyond():

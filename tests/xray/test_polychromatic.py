@@ -232,6 +232,7 @@ def test_the_stated_attenuation_gives_water_its_hu_back(kvp):
     ({"readout": -1}, "readout must be finite and >= 0"), ({"scatter": float("nan")}, "scatter must be finite"),
     ({"scintillator": 0}, "scintillator must be finite and > 0"),
     ({"saturation": -1.0}, "saturation must be finite"), ({"scatter_width": math.inf}, "scatter_width must be finite"),
+    ({"scatter": 0.3, "scatter_width": None}, "scatter_width must be finite"),
     ({"air_photons": math.inf}, "photons per pixel must be > 0"), ({"ct_energy": 300.0}, "300.0 keV were given"),
     ({"spectrum": Spectrum((5.0, 60.0), (1, 1))}, "from 5.0 to 60.0 keV")])
 def test_bad_settings_are_refused(settings, words):

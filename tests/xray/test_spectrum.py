@@ -116,6 +116,7 @@ def test_one_energy_has_an_analytic_half_value_layer():
 
 
 def test_bad_input_is_refused():
+    assert Spectrum.tube(120.0) == Spectrum.tube(120)
     with pytest.raises(ValueError, match="no tube spectrum of 90 kVp; use one of 70, 80, 100, 120"):
         Spectrum.tube(90)
     with pytest.raises(ValueError, match="no attenuation table of 'gold'"):

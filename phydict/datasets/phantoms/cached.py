@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from zlib import crc32
 
 import torch
 from torch.utils.data import Dataset
@@ -29,8 +30,10 @@ class CachedPhantoms(Dataset):
 
     def __init__(self, first_seed: int, count: int, grid: Grid, window: HUWindow, cache: Path):
         self.first_seed, self.count, self.grid, self.window = first_seed, count, grid, window
-        size = "x".join(map(str, grid.shape))
-        self.folder = cache / f"phantoms{PHANTOM_VERSION}-{size}-{grid.spacing[0]:g}mm-{window.low:g}-{window.high:g}"
+        size, cube = "x".join(map(str, grid.shape)), Grid.cube(grid.shape[0], grid.extent[0])
+        other = "" if grid.same_as(cube) else f"-{crc32(grid.affine.tobytes()):08x}"
+        self.folder = cache / (f"phantoms{PHANTOM_VERSION}-{size}-{grid.spacing[0]:g}mm{other}-{window.low:g}-"
+                               f"{window.high:g}")
 
     def __len__(self) -> int:
         return self.count

@@ -13,7 +13,8 @@ EstimatedRadiographicMagnificationFactor. Without angles, ViewPosition PA, LL, A
 beam is taken as perpendicular to the detector and centred on it; pixels are ImagerPixelSpacing, never the calibrated
 PixelSpacing.
 
-Rows and columns: where PatientOrientation says what way they run, it is believed. Without it an XA or RF image is taken
+Rows and columns: where PatientOrientation says what way those of a file's first frame run, it is believed, and other
+frames stand alike to the detector. Without it an XA or RF image is taken
 as head up and as seen from the detector (PS3.17 FFF.2.1.3), which shows the patient's right on the left in a PA view; a
 CR or DX image must have it.
 """
@@ -27,6 +28,7 @@ import numpy as np
 from pydicom.tag import Tag
 
 from phydict.datasets.dicom import DicomTags
+from phydict.runtime.warning import warn
 from phydict.xray.geometry import MOST_MM, ConeBeam
 
 DIRECTIONS = {"R": (1, 0, 0), "L": (-1, 0, 0), "A": (0, 1, 0), "P": (0, -1, 0), "H": (0, 0, 1), "F": (0, 0, -1)}
@@ -43,9 +45,16 @@ def tags_beam(tags: list[DicomTags], shape: tuple[int, int], overrides: dict | N
     source: where the overrides stand, for messages.
     Raises ValueError naming the frame and the tags that are missing, zero or contradictory.
     """
-    stated = _per_frame(overrides or {}, len(tags), source)
-    poses = [_pose(frame, {name: values[k] for name, values in stated.items()}, turned)
-             for k, frame in enumerate(tags)]
+    stated, poses, axes = _per_frame(overrides or {}, len(tags), source), [], (0, 0)
+    each = isinstance((overrides or {}).get("patient_orientation"), list)
+    for k, frame in enumerate(tags):
+        values = _values(frame, {name: of_frames[k] for name, of_frames in stated.items()})
+        if each or not frame.frame:  # PatientOrientation is of a file's first frame (PS3.3 C.7.6.6.1)
+            axes = _image_axes(frame, values)
+        poses.append(_pose(values, axes, turned))
+    if tilted := next((frame for frame in tags if frame.detector), None):
+        warn(f"{tilted.name} has {tilted.detector} degrees, but the beam is taken as perpendicular to the detector: "
+             "describe it by another form of `beam:` where that matters")
     sources, detectors, u, v = (np.stack(part) for part in zip(*poses))
     return ConeBeam(sources, detectors, u, v, shape)
 
@@ -79,24 +88,49 @@ def _stated(name: str, value, source: str):
     return float(value) if name != "pixel" else (float(parts[0]), float(parts[-1]))
 
 
-def _pose(tags: DicomTags, stated: dict, turned: bool) -> tuple[np.ndarray, ...]:
-    """Source, detector's centre, u and v (3,) in RAS+ mm of one frame."""
+def _values(tags: DicomTags, stated: dict) -> dict:
+    """What is stated of one frame, or else its tags say, by the names of OVERRIDES."""
     values = {name: stated.get(name, getattr(tags, name)) for name in OVERRIDES}
     if values["source_to_isocentre"] is None and tags.magnification and values["source_to_detector"] is not None:
         values["source_to_isocentre"] = values["source_to_detector"] / tags.magnification
-    _check(tags, values)
+    _check(tags, values, "primary_degrees" in stated)
+    return values
+
+
+def _directions(values: dict) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Unit vectors (3,) towards the detector, and to the right and down for a viewer at the detector, head up."""
     p, s = math.radians(values["primary_degrees"]), math.radians(values["secondary_degrees"])
     towards = np.array([-math.sin(p) * math.cos(s), math.cos(p) * math.cos(s), math.sin(s)])
-    right = np.array([-math.cos(p), -math.sin(p), 0.0])  # of a viewer at the detector, head up
-    columns, rows = right, np.cross(right, towards)
+    right = np.array([-math.cos(p), -math.sin(p), 0.0])
+    return towards, right, np.cross(right, towards)
+
+
+def _sides(right: np.ndarray, down: np.ndarray) -> tuple[np.ndarray, ...]:
+    return right, -right, down, -down
+
+
+def _image_axes(tags: DicomTags, values: dict) -> tuple[int, int]:
+    """Which of `_sides` the columns and the rows of a frame run to."""
+    _, right, down = _directions(values)
     if values["patient_orientation"] is not None:
-        columns, rows = _oriented(tags.name, values["patient_orientation"], right, rows)
+        return _oriented(tags.name, values["patient_orientation"], right, down)
+    if tags.reoriented:
+        raise ValueError(f"{tags.name} was {tags.reoriented} since it was taken (FieldOfViewRotation, "
+                         "FieldOfViewHorizontalFlip): state which way its columns and rows run, `beam: {dicom: "
+                         "{patient_orientation: ...}}` in geometry.yaml, such as 'L\\F'")
+    return 0, 2
+
+
+def _pose(values: dict, axes: tuple[int, int], turned: bool) -> tuple[np.ndarray, ...]:
+    """Source, detector's centre, u and v (3,) in RAS+ mm of one frame."""
+    towards, right, down = _directions(values)
+    columns, rows = (_sides(right, down)[axis] for axis in axes)
     height, width = reversed(values["pixel"]) if turned else values["pixel"]
     to_isocentre, to_detector = values["source_to_isocentre"], values["source_to_detector"]
     return -to_isocentre * towards, (to_detector - to_isocentre) * towards, width * columns, height * rows
 
 
-def _check(tags: DicomTags, values: dict) -> None:
+def _check(tags: DicomTags, values: dict, primary_stated: bool) -> None:
     middle = "DistanceSourceToPatient" if tags.angiographic else "EstimatedRadiographicMagnificationFactor"
     keywords = dict(zip(OVERRIDES, ("DistanceSourceToDetector", middle, "ImagerPixelSpacing", "PositionerPrimaryAngle",
                                     "PositionerSecondaryAngle", "PatientOrientation")))
@@ -112,6 +146,11 @@ def _check(tags: DicomTags, values: dict) -> None:
         if not (np.isfinite(numbers).all() and (numbers > 0).all()):
             raise ValueError(f"{tags.name}: {name} is {values[name]} (from {keywords[name]} or geometry.yaml), but it "
                              f"must be positive; state `beam: {{dicom: {{{name}: ...}}}}` in mm in geometry.yaml")
+    apart = abs((values["primary_degrees"] - (tags.view_degrees or 0) + 180) % 360 - 180)
+    if tags.view_degrees is not None and not primary_stated and apart > 45:
+        raise ValueError(f"{tags.name}: PositionerPrimaryAngle {values['primary_degrees']:g} contradicts ViewPosition, "
+                         f"which means {tags.view_degrees:g}; state `beam: {{dicom: {{primary_degrees: ...}}}}` in "
+                         "geometry.yaml")
     near, far = values["source_to_isocentre"], values["source_to_detector"]
     if not near < far:
         raise ValueError(f"{tags.name}: the isocentre must lie between source and detector, but source_to_isocentre="
@@ -124,17 +163,18 @@ def _tag(keyword: str) -> str:
     return f"({tag.group:04x},{tag.element:04x})"
 
 
-def _oriented(name: str, orientation, right: np.ndarray, down: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The unit steps of columns and rows that lie in the detector's plane and agree best with PatientOrientation."""
+def _oriented(name: str, orientation, right: np.ndarray, down: np.ndarray) -> tuple[int, int]:
+    """Which of `_sides` agree best with PatientOrientation's columns and rows."""
+    sides = _sides(right, down)
     letters = orientation.split("\\") if isinstance(orientation, str) else list(orientation)
     shown, steps, along = reprlib.repr(letters), [], []
     for word in letters:
         if not word or any(letter not in DIRECTIONS for letter in word):
             raise ValueError(f"{name}: PatientOrientation {shown} must name directions by R, L, A, P, H, F")
         wanted = sum(np.array(DIRECTIONS[letter], float) for letter in word)
-        steps.append(max((right, -right, down, -down), key=lambda step: step @ wanted))
-        along.append(steps[-1] @ wanted / max(float(np.linalg.norm(wanted)), 1e-12))
-    if len(steps) != 2 or abs(steps[0] @ steps[1]) > 0.5 or min(along) < 0.3:
+        steps.append(max(range(4), key=lambda side: sides[side] @ wanted))
+        along.append(sides[steps[-1]] @ wanted / max(float(np.linalg.norm(wanted)), 1e-12))
+    if len(steps) != 2 or steps[0] // 2 == steps[1] // 2 or min(along) < 0.3:
         raise ValueError(f"{name}: PatientOrientation {shown} does not give two directions across this view; correct "
                          "it or the positioner angles under `beam: {dicom: ...}` in geometry.yaml")
     return steps[0], steps[1]

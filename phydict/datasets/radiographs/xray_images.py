@@ -17,6 +17,9 @@ DICOM = (".dcm", ".dicom", ".ima")
 ENDINGS = (".png", ".tif", ".tiff", ".npy", *NIFTI, *DICOM)
 GREY = ("L", "I;16", "I;16B", "I;16L", "I", "F")
 
+PHOTOMETRIC = 262
+"""The tag of a TIFF that is 0 where its least value is shown white."""
+
 
 def image_files(folder: Path) -> list[Path]:
     """The X-ray images of a folder in the natural order of their names; DICOM files need no ending."""
@@ -91,7 +94,9 @@ def _read_picture(path: Path) -> np.ndarray:
         if image.mode in GREY:
             pixels = np.asarray(image)
             sixteen = image.mode.startswith("I;16") or (image.mode == "I" and image.format == "PNG")
-            return pixels.astype(np.uint16) if sixteen else pixels
+            pixels = pixels.astype(np.uint16) if sixteen else pixels
+            white = sixteen and image.format == "TIFF" and image.getexif().get(PHOTOMETRIC) == 0
+            return 65535 - pixels if white else pixels  # of 8 bits PIL does it
         pixels = np.asarray(image.convert("RGBA"))
     if (pixels[..., 3] != 255).any():
         raise ValueError("it is partly transparent; store it as grey without transparency")

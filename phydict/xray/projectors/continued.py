@@ -10,7 +10,10 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from phydict.grid import Grid
-from phydict.xray.geometry import LEAST_MM, ConeBeam
+from phydict.xray.geometry import ConeBeam
+
+RAYS = 64
+"""Rays along each side of a detector, those at its ends among them, of which the farthest is taken."""
 
 
 class Continued:
@@ -33,14 +36,15 @@ class Continued:
 
 def reach_beyond(beam: ConeBeam, grid: Grid) -> int:
     """How many slices above or below a grid the detector's rays meet, at most, while they are over its columns."""
-    up = grid.affine[:3, 2] / grid.spacing[2]
-    across = beam.normals - np.outer(beam.normals @ up, up)
-    across *= np.hypot(*(grid.extent[:2] / 2)) / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), LEAST_MM)
-    rows, columns = ((n - 1) / 2 * step for n, step in zip(beam.shape, (beam.v, beam.u)))
-    places = []
-    for side in (-across, across):  # where rays come over the columns, and where they leave them
-        depth = ((grid.centre + side - beam.sources) * beam.normals).sum(1) / beam.distances
-        for pixel in (rows + columns, rows - columns, columns - rows, -rows - columns):
-            ray = beam.detectors + pixel - beam.sources
-            places.append(grid.index(beam.sources + depth.clip(0, 1)[:, None] * ray)[:, 2])
-    return max(0, math.ceil(max(-np.min(places), np.max(places) - (grid.shape[2] - 1))))
+    rows, columns = (np.linspace(-(n - 1) / 2, (n - 1) / 2, min(n, RAYS)) for n in beam.shape)
+    pixels = beam.detectors[:, None, None] + rows[:, None, None] * beam.v[:, None, None] + (
+        columns[:, None] * beam.u[:, None, None])
+    source = grid.index(beam.sources)[:, None, None]
+    ray = grid.index(pixels) - source
+    with np.errstate(divide="ignore", invalid="ignore"):  # rays along a face
+        faces = [(face - source[..., :2]) / ray[..., :2] for face in (-1.0, np.array(grid.shape[:2]))]
+    enters = np.fmax.reduce(np.fmin(*faces), -1, initial=0.0)
+    leaves = np.fmin.reduce(np.fmax(*faces), -1, initial=1.0)
+    heights = [(source[..., 2] + t * ray[..., 2])[enters < leaves] for t in (enters, leaves)]
+    low, high = np.min(heights, initial=0.0), np.max(heights, initial=grid.shape[2] - 1)
+    return math.ceil(max(-low, high - (grid.shape[2] - 1)))

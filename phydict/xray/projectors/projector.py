@@ -66,8 +66,8 @@ class Projector:
             warn(f"the detector's pixels are finer than this grid can resolve: beam.binned({factor}) and "
                  f"phydict.xray.binned(xrays, {factor}) measure the same in less time; full_detector=True "
                  "keeps every pixel without this warning")
-        self.grid, self.beam = grid, beam
-        self._engine = _engine(grid, beam, method, int(memory), torch.device(device or "cpu").type)
+        self.grid, self.beam, self.device = grid, beam, torch.device(device or "cpu")
+        self._engine = _engine(grid, beam, method, int(memory), self.device.type)
         self.method, self.reason = self._engine.method, self._engine.reason
 
     def __call__(self, mu: torch.Tensor) -> torch.Tensor:

@@ -27,6 +27,7 @@ from phydict.runtime.files import atomic_write
 COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f", "#bcbd22", "#17becf",
            "#005f40", "#b15928", "#6a3d9a", "#ff1493")
 MARKERS = "osD^v<>pP*Xhd8"
+LINES, FILLS = ("-", "--", "-.", ":"), ("full", "none", "left", "right", "top", "bottom")
 STAGES = {"seconds_network": "network", "seconds_projector": "projector", "rest": "the rest"}
 
 
@@ -54,6 +55,16 @@ def styles(entries: Sequence[Entry]) -> dict[str, dict]:
     """A colour and a marker for each method, the same in every plot."""
     return {method: {"color": COLOURS[i % len(COLOURS)], "marker": MARKERS[i % len(MARKERS)]}
             for i, method in enumerate(dict.fromkeys(entry.method for entry in entries))}
+
+
+def setting_styles(entries: Sequence[Entry], style: dict[str, dict]) -> dict[str, dict]:
+    """A style for each method with its settings: its method's, each setting's line and marker's filling its own."""
+    found: dict[str, dict] = {}
+    for method in dict.fromkeys(entry.method for entry in entries):
+        names = dict.fromkeys(entry.name for entry in entries if entry.method == method)
+        found |= {name: style[method] | {"linestyle": LINES[i % len(LINES)], "fillstyle": FILLS[i % len(FILLS)]}
+                  for i, name in enumerate(names)}
+    return found
 
 
 def front(points: Sequence[tuple[float, float]]) -> list[int]:
@@ -98,10 +109,9 @@ def _pareto(axes: Sequence[Axes], group: Sequence[Entry], where: str, style: dic
 
 def _views(axes: Sequence[Axes], group: Sequence[Entry], style: dict) -> None:
     for ax, name in zip(axes, ("psnr", "ssim")):
-        labels = {e.name: e.method for e in group}
-        for label, method in labels.items():
+        for label, look in setting_styles(group, style).items():
             points = sorted((e.condition["views"], e.means[name]) for e in group if e.name == label)
-            ax.plot(*zip(*points), **style[method], markersize=5, label=literal(label))
+            ax.plot(*zip(*points), **look, markersize=5, label=literal(label))
         views = sorted({e.condition["views"] for e in group})
         ax.set_xscale("log", base=2)
         ax.set_xticks(views, map(str, views))
@@ -112,11 +122,10 @@ def _geometries(axes: Sequence[Axes], group: Sequence[Entry], style: dict) -> No
     """Where each method stands, a line of the plot for each geometry."""
     places = list(dict.fromkeys(entry.condition["geometry"] for entry in group))
     for ax, name in zip(axes, ("psnr", "ssim")):
-        labels = {entry.name: entry.method for entry in group}
-        for label, method in labels.items():
+        for label, look in setting_styles(group, style).items():
             points = [(entry.means[name], places.index(entry.condition["geometry"])) for entry in group
                       if entry.name == label]
-            ax.plot(*zip(*points), **style[method], linestyle="", markersize=6, label=literal(label))
+            ax.plot(*zip(*points), **look | {"linestyle": ""}, markersize=6, label=literal(label))
         ax.set_yticks(range(len(places)), [literal(Path(place).stem) for place in places])
         ax.invert_yaxis()
         _dress(ax, SHOWN_MEASURES[name].heading, "")

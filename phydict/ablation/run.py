@@ -306,7 +306,7 @@ def _keep(folder: Path, result: Reconstruction, scene: MeasuredCase, trial: Tria
                "settings": trial.identity(), "versions": versions()}
     with atomic_directory(folder) as partial:
         save_nifti(partial / VOLUME, result.volume.numpy(), result.grid, np.int16)
-        write_page_files(partial, result, truth)
+        write_page_files(partial, result, truth, scene.beam)
         (partial / DETAILS).write_text(strict_json(details))
 
 

@@ -37,6 +37,9 @@ PLANES = {"axial": (2, "RLAP"), "coronal": (1, "RLSI"), "sagittal": (0, "APSI")}
 
 MOST_VIEWS = 8
 
+STRETCH = 15.0
+"""An X-ray's longer side over its shorter one, above which it is shown stretched to this, to be seen at all."""
+
 GREY = colormaps["gray"].with_extremes(bad="magenta")
 SPREAD = colormaps["inferno"].with_extremes(bad="magenta")
 SIGNED = colormaps["RdBu_r"].with_extremes(bad="magenta")
@@ -64,14 +67,15 @@ def plane(volume, grid: Grid, name: str) -> tuple[np.ndarray, float]:
 
 
 def panel(path: str | Path, reconstruction_hu, grid: Grid, xrays=None, reprojection=None, truth_hu=None,
-          title: str = "", deviation_hu=None, deviation_label: str = "standard deviation") -> None:
+          title: str = "", deviation_hu=None, deviation_label: str = "standard deviation", pixel: float = 1.0) -> None:
     """Write one PNG page of a case: three planes, beside the truth and the difference, and its X-rays below.
 
     deviation_hu: (X, Y, Z), how uncertain each voxel is, shown beside them from black to yellow under its label.
 
     reconstruction_hu, truth_hu: (X, Y, Z) in HU. xrays, reprojection: (K, V, U) line integrals, measured and of the
     reconstruction; up to 8 views, evenly picked, all in one scale. The misfit ||A x - y|| / ||y|| of each view stands
-    above its residual. Leading axes of size 1 are allowed everywhere; values may be NaN.
+    above its residual. pixel: the height of their pixels over their width. Leading axes of size 1 are allowed
+    everywhere; values may be NaN.
     Raises ValueError on unequal shapes, or on a re-projection without measured X-rays.
     """
     if reprojection is not None and xrays is None:
@@ -95,7 +99,7 @@ def panel(path: str | Path, reconstruction_hu, grid: Grid, xrays=None, reproject
             _show_image(upper.add_subplot(cells[n, 2]), difference, grid, name,
                         f"difference, ±{DIFFERENCE:g} HU", SIGNED, -DIFFERENCE, DIFFERENCE)
     if xrays is not None:
-        _show_xrays(lower, xrays_height, xrays, reprojection)
+        _show_xrays(lower, xrays_height, xrays, reprojection, pixel)
     _save(figure, path)
 
 
@@ -165,7 +169,7 @@ def _write(ax: Axes, x: float, y: float, text: str, align: str) -> None:
     ax.text(x, y, text, transform=ax.transAxes, color="gold", fontsize=8, ha=align, va="center", path_effects=outline)
 
 
-def _show_xrays(figure, height: float, xrays, reprojection) -> None:
+def _show_xrays(figure, height: float, xrays, reprojection, pixel: float) -> None:
     measured = _array(xrays, 3, "a set of X-rays")
     rows = {"measured": measured}
     if reprojection is not None:
@@ -184,6 +188,7 @@ def _show_xrays(figure, height: float, xrays, reprojection) -> None:
     if "residual" in rows:
         headings["residual"] = [f"misfit {per_view[view]:.3g}" for view in views]
     tall, wide = measured.shape[1:]
+    aspect = np.clip(pixel * tall / wide, 1 / STRETCH, STRETCH) * wide / tall
     gap = max(1, round(0.06 * wide))
     starts = (wide + gap) * np.arange(MOST_VIEWS)
     width = starts[-1] + wide
@@ -194,7 +199,7 @@ def _show_xrays(figure, height: float, xrays, reprojection) -> None:
         for start, view in zip(starts, views):
             strip[:, start:start + wide] = mapped.cmap(mapped.norm(np.ma.masked_invalid(images[view])))
         ax = figure.add_subplot(cells[row, 0])
-        ax.imshow(strip, interpolation="nearest")
+        ax.imshow(strip, aspect=aspect, interpolation="nearest")
         _finish(ax, "")
         ax.set_ylabel(name, fontsize=9)
         for start, heading in zip(starts, headings.get(name, [])):

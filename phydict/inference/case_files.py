@@ -16,6 +16,7 @@ from phydict.grid import Grid
 from phydict.inference.results import FEATURES
 from phydict.page import CASE_FILES, write_case_files
 from phydict.reconstruction import Reconstruction
+from phydict.xray import ConeBeam
 
 VOLUME = "volume.nii.gz"
 
@@ -45,19 +46,26 @@ def write_result(folder: Path, case: Case, result: Reconstruction, method: str, 
     if result.intervals:
         result.save_nifti(folder / INTERVAL, result.intervals[SHOWN_LEVEL])
     label, uncertain = _uncertain(result)
+    beam = result.beam or case.get("beam")
     panel(folder / "panel.png", result.volume, result.grid, result.xrays, result.reprojection, truth,
-          title=f"{case['id']}: {method}", deviation_hu=uncertain, deviation_label=label)
-    write_page_files(folder, result, truth)
+          title=f"{case['id']}: {method}", deviation_hu=uncertain, deviation_label=label, pixel=_pixel(beam))
+    write_page_files(folder, result, truth, beam)
     if features:
         save_features(folder / FEATURES, features)
 
 
-def write_page_files(folder: Path, result: Reconstruction, truth: Tensor | None) -> None:
-    """Writes what the page shows of a result; truth: HU (X, Y, Z) on the result's voxels."""
+def write_page_files(folder: Path, result: Reconstruction, truth: Tensor | None, beam: ConeBeam | None = None) -> None:
+    """Writes what the page shows of a result; truth: HU (X, Y, Z) on the result's voxels; beam: that of its X-rays,
+    whose pixels are square without it."""
     label, uncertain = _uncertain(result)
     volumes = {"reconstruction": result.volume, "truth": truth, label: uncertain}
     write_case_files(folder, result.grid, {k: v for k, v in volumes.items() if v is not None}, result.xrays,
-                     result.reprojection)
+                     result.reprojection, pixel=_pixel(beam))
+
+
+def _pixel(beam: ConeBeam | None) -> float:
+    """The height of a beam's pixels over their width, the mean of its views; 1 without a beam."""
+    return 1.0 if beam is None else float((np.linalg.norm(beam.v, axis=1) / np.linalg.norm(beam.u, axis=1)).mean())
 
 
 def missing_page_files(folder: Path) -> list[str]:

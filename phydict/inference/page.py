@@ -22,13 +22,13 @@ from phydict.runtime.warning import warn
 
 
 def results_page(folder: Path, further: Sequence[Table] | None = None,
-                 empty: Mapping[str, str] = MappingProxyType({})) -> Path:
+                 empty: Mapping[str, str] = MappingProxyType({}), note: str = "") -> Path:
     """Writes the page of a folder's finished cases, one method's or several methods' in a folder each; returns its
     path. What the page needs of a case and older results lack is made of their NIfTI files.
 
     further: tables behind that of the means; if left out, those of the Frechet distances of slices whose features lie
-    in the cases' folders. empty: scores that may stay empty -> why. Raises ValueError where there is no finished case,
-    or where a page of someone else's is in its place.
+    in the cases' folders. empty: scores that may stay empty -> why. note: what is said beneath the means.
+    Raises ValueError where there is no finished case, or where a page of someone else's is in its place.
     """
     check_own_page(folder, "folder")
     cases = _cases(folder)
@@ -39,14 +39,17 @@ def results_page(folder: Path, further: Sequence[Table] | None = None,
         further = _kept_distances(folder, cases)
     scored = [case.record for case in cases if case.record["scores"]]
     error = "mae_hu" if any("mae_hu" in record["scores"] for record in scored) else "misfit"
-    points = [{"name": f"{case.record['case']}, {case.record['method']}", "series": case.record["method"],
+    points = [{"name": f"{case.record['case']}, {case.record['method']}", "series": _series(case.record),
                "seconds": sum(case.record["seconds"].values()),
                "error": case.record["misfit"] if error == "misfit" else (case.record["scores"] or {}).get(error)}
               for case in cases]
+    means = _mean_tables(scored, empty)
+    if note and means:
+        means[-1] = replace(means[-1], notes=[*means[-1].notes, note])
     tables = sorted({path.relative_to(folder).as_posix() for depth in ("", "*/") for name in (TABLE, "results.md")
                      for path in folder.glob(depth + name)})
     return write_page(folder, Contents(f"Results in {folder.resolve().name}",
-                                       [*_mean_tables(scored, empty), *further], cases, points, error, links=tables))
+                                       [*means, *further], cases, points, error, links=tables))
 
 
 def _case_folders(folder: Path) -> list[Path]:
@@ -73,29 +76,44 @@ def _cases(folder: Path) -> list[PageCase]:
 
 
 def _case(folder: Path, path: Path) -> PageCase | None:
-    """A finished case, None, with a warning, where its files are damaged. Behind the method stands the name of its
-    folder where that is another, as a copy's is."""
+    """A finished case, None, with a warning, where its files are damaged. Behind the case and the method stand the
+    names of their folders where these are others, as a copy's are."""
     try:
         record = json.loads((path / RECORD).read_text())
         score_row(record["case"], record | {"scores": record["scores"] or {}})
-        float(record["misfit"]), list(record["misfit_per_view"])
+        float(record["misfit"] or 0), list(record["misfit_per_view"])
+        group = json.dumps([record["case"], record.get("source"), record["views"], _protocol(record)])
         remake_page_files(path)
     except Exception as error:  # whatever a damaged record or volume leads to
         warn(f"{path} is left out of the page, since its files are damaged ({type(error).__name__}: {error})")
         return None
     if path.parent != folder and (given := path.parent.name) != record["method"]:
         record["method"] += f" ({given})"
-    return PageCase(path.relative_to(folder).as_posix(), sorted(os.listdir(path)), record,
-                    f"{record['case']}, {record.get('views')}")
+    if path.name != record["case"]:
+        record["case"] += f" ({path.name})"
+    return PageCase(path.relative_to(folder).as_posix(), sorted(os.listdir(path)), record, group)
+
+
+def _protocol(record: Mapping) -> str | None:
+    """The name of the protocol that a case was scored by, None without one."""
+    return record.get("settings", {}).get("data", {}).get("protocol")
+
+
+def _series(record: Mapping) -> str:
+    """The method of a case, and the protocol that its error was taken by."""
+    return ", ".join(filter(None, (record["method"], _protocol(record))))
 
 
 def _mean_tables(scored: list, empty: Mapping[str, str]) -> list[Table]:
     """The means over scored cases by method, a table for each protocol, since their HU ranges differ."""
     protocols: dict[str | None, list] = {}
     for record in scored:
-        protocols.setdefault(record["settings"].get("data", {}).get("protocol"), []).append(record)
-    return [table for name, records in protocols.items()
-            for table in _noted([score_table(records, protocol_of(name) if name else None, empty)], records)]
+        protocols.setdefault(_protocol(record), []).append(record)
+    tables = [table for name, records in protocols.items()
+              for table in _noted([score_table(records, protocol_of(name) if name else None, empty)], records)]
+    return tables if len(tables) < 2 else [
+        replace(table, title=f"{table.title}, {f'protocol {name}' if name else 'no protocol'}")
+        for table, name in zip(tables, protocols)]
 
 
 def _noted(tables: Sequence[Table], records: Sequence[Mapping]) -> list[Table]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from contextlib import suppress
+from pathlib import Path
 
 from rich.console import Console
 
@@ -29,7 +30,8 @@ def summarise(results: CaseResults, cases: list[str], name: str, scoring: Scorin
         console.print(table)
     print(f"results in {results.folder}")
     if finished:
-        print(f"page: {results_page(results.folder.parent, further, scoring.empty)}")
+        others = any(file.parents[1] != results.folder for file in _features(results))
+        print(f"page: {results_page(results.folder.parent, None if others else further, scoring.empty)}")
     if missing:
         raise ValueError(f"{len(missing)} of {len(cases)} cases were not reconstructed "
                          f"({', '.join(missing)}): see the messages above, and {results.to_resume}")
@@ -40,7 +42,13 @@ def show_finished(results: CaseResults, cases: Collection[str], scoring: Scoring
     take long, and prints where it is."""
     with suppress(ValueError, OSError):  # what stopped the run is the error to show
         if len(results.missing()) < len(cases):
-            print(f"page: {results_page(results.folder.parent, (), scoring.empty)}")
+            note = "The Frechet distances of slices are shown by: infer.py page <folder>." if _features(results) else ""
+            print(f"page: {results_page(results.folder.parent, (), scoring.empty, note)}")
+
+
+def _features(results: CaseResults) -> list[Path]:
+    """The features of slices of finished cases, those by other methods in the same model.out included."""
+    return list(results.folder.parent.glob(f"[!.]*/[!.]*/{FEATURES}"))
 
 
 def _distances(results: CaseResults, cases: list[str], name: str, scoring: Scoring) -> list[Table]:

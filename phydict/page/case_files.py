@@ -32,12 +32,12 @@ THUMBNAIL_SIDE = 96
 
 def write_case_files(folder: Path, grid: Grid, volumes: Mapping[str, Tensor | np.ndarray],
                      xrays: Tensor | None = None, reprojection: Tensor | None = None,
-                     names: Collection[str] = CASE_FILES) -> None:
+                     names: Collection[str] = CASE_FILES, pixel: float = 1.0) -> None:
     """Writes what the page shows of a case into its folder, of `names` alone.
 
     volumes: name -> HU (X, Y, Z) on `grid`, "reconstruction" first, then "truth" where it is known and how uncertain a
     voxel is, by any other name; kept as int16 in RAS+, rounded. xrays, reprojection: line integrals (K, V, U), kept as
-    uint16 over the range of both; None where they are not known.
+    uint16 over the range of both; None where they are not known. pixel: the height of their pixels over their width.
     """
     if THUMBNAIL in names:
         _write_thumbnail(folder / THUMBNAIL, next(iter(volumes.values())), grid)
@@ -52,7 +52,7 @@ def write_case_files(folder: Path, grid: Grid, volumes: Mapping[str, Tensor | np
             file.write(f'{", " * (n > 0)}{json.dumps(name)}: "{packed(turned.ravel(order="F"))}"')
         file.write("},\n")
         if xrays is not None and reprojection is not None:
-            file.write(f'"X-rays": {json.dumps(_xrays(np.asarray(xrays), np.asarray(reprojection)))},\n')
+            file.write(f'"X-rays": {json.dumps(_xrays(np.asarray(xrays), np.asarray(reprojection), pixel))},\n')
         file.write(f'"shape": {list(turned.shape)}, "affine": {affine[:3].tolist()}, '
                    f'"inverse": {np.linalg.inv(affine)[:3].tolist()}}});\n')
 
@@ -73,22 +73,25 @@ def _int16(volume: Tensor | np.ndarray) -> np.ndarray:
     return out
 
 
-def _xrays(measured: np.ndarray, rendered: np.ndarray) -> dict:
+def _xrays(measured: np.ndarray, rendered: np.ndarray, pixel: float) -> dict:
     factor = -(-max(measured.shape[1:]) // XRAY_SIDE)
-    images = [_binned(values, factor) for values in (measured, rendered)]
+    rows, columns = (min(factor, size) for size in measured.shape[1:])
+    images = [_binned(values, rows, columns) for values in (measured, rendered)]
     finite = np.concatenate([image[np.isfinite(image)] for image in images])
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
     step = (high - low or 1.0) / (2**16 - 1)
     codes = [packed(np.rint((np.nan_to_num(image, nan=low, posinf=high, neginf=low) - low) / step).astype(np.uint16))
              for image in images]
-    return {"shape": images[0].shape, "low": low, "step": step, "measured": codes[0], "rendered": codes[1]}
+    return {"shape": images[0].shape, "pixel": pixel * rows / columns, "low": low, "step": step, "measured": codes[0],
+            "rendered": codes[1]}
 
 
-def _binned(images: np.ndarray, factor: int) -> np.ndarray:
-    """Means of blocks of pixels (K, V, U); incomplete blocks at the far edges are left out."""
-    views, rows, columns = images.shape[0], images.shape[1] // factor, images.shape[2] // factor
-    cut = images[:, :rows * factor, :columns * factor].astype(np.float32)
-    return cut.reshape(views, rows, factor, columns, factor).mean((2, 4))
+def _binned(images: np.ndarray, rows: int, columns: int) -> np.ndarray:
+    """Means of blocks of so many rows and columns of pixels (K, V, U); incomplete blocks at the far edges are left
+    out."""
+    views, high, wide = images.shape[0], images.shape[1] // rows, images.shape[2] // columns
+    cut = images[:, :high * rows, :wide * columns].astype(np.float32)
+    return cut.reshape(views, high, rows, wide, columns).mean((2, 4))
 
 
 def _write_thumbnail(path: Path, volume: Tensor | np.ndarray, grid: Grid) -> None:

@@ -13,12 +13,14 @@ const KINDS = new Map(Object.entries({
   "slice_features.safetensors": "features of slices, for Frechet distances", "results.csv": "a row per case",
   "results.md": "the tables as Markdown", "tables.md": "the tables as Markdown", "tables.tex": "the tables as LaTeX"}));
 
-/* A value as it is read: numbers to four digits, parts that are not known left out. */
+/* A value as it is read: numbers to four digits, named parts that are not known left out, those of a list as a dash. */
 function words(value, unit = "") {
   if (typeof value === "number") return (Number.isInteger(value) ? value : Number(value.toPrecision(4))) + unit;
+  if (value === null) return "–";
   if (typeof value !== "object") return String(value);
+  if (Array.isArray(value)) return value.map(part => words(part, unit)).join(", ");
   return Object.entries(value).filter(([, part]) => part !== null).map(
-    ([name, part]) => (Array.isArray(value) ? "" : name.replaceAll("_", " ") + " ") + words(part, unit)).join(", ");
+    ([name, part]) => `${name.replaceAll("_", " ")} ${words(part, unit)}`).join(", ");
 }
 
 /* A list's line for a file in a folder, with a few words on what it is. */
@@ -45,6 +47,7 @@ function table(title, header, rows, notes = []) {
         for (const other of heads) other.setAttribute("aria-sort", "none");
         head.setAttribute("aria-sort", down ? "descending" : "ascending");
         fill(inOrder(rows, column, down));
+        linkNeighbours();
       }}, name.replace(/ (?=[↑↓])/, "\u00a0")));
     return head;
   });
@@ -132,11 +135,13 @@ function showRun() {
       ({name, heading}) => name === "seconds" ? [heading, "warnings"] : [heading])];
     const rows = cases.map(case_ => caseRow(case_, pictured)), none = element("p", {role: "status"});
     const caseTable = table("Cases", header, rows, [
-      "Best of each case and number of views in bold, second underlined. A name opens the case."]);
+      "Best of each case, number of views and protocol in bold, second underlined. A name opens the case."]);
     const filter = element("input", {type: "search", oninput: () => {
-      const wanted = filter.value.toLowerCase(), lines = [...caseTable.querySelectorAll("tbody tr")];
-      for (const row of lines) row.hidden = !row.dataset.key.toLowerCase().includes(wanted);
+      const wanted = filter.value.toLowerCase().trim().split(/\s+/);
+      const lines = [...caseTable.querySelectorAll("tbody tr")];
+      for (const row of lines) row.hidden = !wanted.every(word => row.dataset.key.toLowerCase().includes(word));
       none.textContent = lines.every(row => row.hidden) ? "none found" : "";
+      linkNeighbours();
     }});
     run.append(element("section", {id: "cases", "aria-label": "Cases"},
       element("p", {}, element("label", {}, "show cases and methods with ", filter)), caseTable, none));
@@ -147,26 +152,51 @@ function showRun() {
     element("ul", {}, ...links.map(link => fileLine(link))));
 }
 
+/* The volumes and X-rays that a case's script holds. */
+async function unpacked(data) {
+  const volumes = {}, xrays = data["X-rays"] ?? null;
+  for (const [name, text] of Object.entries(data.volumes))
+    volumes[name] = new Volume(name, await unpack(text, Int16Array), data);
+  for (const name of xrays ? ["measured", "rendered"] : []) xrays[name] = await unpack(xrays[name], Uint16Array);
+  return {volumes, xrays};
+}
+
+/* Why a case is not shown: its script, or else this browser. */
+const because = error => error.ofFile ? error.message : `this browser cannot show it, since ${error.message}`;
+
 /* A case's volumes and X-rays; the last few opened are kept. */
 async function load(case_) {
   const key = keyOf(case_);
   if (!loaded.has(key)) {
+    if (!window.DecompressionStream) throw new Error("it does not know DecompressionStream");
     const script = element("script", {src: `${case_.folder}/view.js`});
-    const data = await new Promise((resolve, reject) => {
-      script.onload = () => script.data ? resolve(script.data) : reject(new Error("it is damaged"));
-      script.onerror = () => reject(new Error("it is missing"));
-      document.head.append(script);
-    }).finally(() => script.remove());
-    const volumes = {}, xrays = data["X-rays"] ?? null;
-    for (const [name, text] of Object.entries(data.volumes))
-      volumes[name] = new Volume(name, await unpack(text, Int16Array), data);
-    for (const name of xrays ? ["measured", "rendered"] : []) xrays[name] = await unpack(xrays[name], Uint16Array);
-    loaded.set(key, {volumes, xrays});
+    try {
+      const data = await new Promise((resolve, reject) => {
+        script.onload = () => script.data ? resolve(script.data) : reject(new Error("it is damaged"));
+        script.onerror = () => reject(new Error("it is missing"));
+        document.head.append(script);
+      }).finally(() => script.remove());
+      loaded.set(key, await unpacked(data));
+    } catch (error) {
+      throw error instanceof RangeError ? error  // too little memory
+        : Object.assign(new Error(`${case_.folder}/view.js cannot be used, since ${error.message}`), {ofFile: true});
+    }
     if (loaded.size > 4) loaded.delete(loaded.keys().next().value);
   }
   return loaded.get(key);
 }
 window.phydictView = data => { document.currentScript.data = data; };
+
+/* Leads from the open case to those before and behind it, as the table is sorted and searched. */
+function linkNeighbours() {
+  const rows = [...document.querySelectorAll("tr[data-key]:not([hidden])")].map(row => row.dataset.key);
+  for (const [id, step] of [["previous", -1], ["next", 1]]) {
+    const to = rows[rows.indexOf(opened) + step] ?? "";
+    byId(id).hidden = !to;
+    byId(id).title = to;
+    byId(id).href = `#${encodeURIComponent(to)}`;
+  }
+}
 
 async function showCase(key) {
   const case_ = places.get(key);
@@ -178,13 +208,7 @@ async function showCase(key) {
     if (key === "cases") byId("cases")?.scrollIntoView();
     return;
   }
-  const rows = [...document.querySelectorAll("tr[data-key]:not([hidden])")].map(row => row.dataset.key);
-  for (const [id, step] of [["previous", -1], ["next", 1]]) {
-    const to = rows[rows.indexOf(key) + step] ?? "";
-    byId(id).hidden = !to;
-    byId(id).title = to;
-    byId(id).href = `#${encodeURIComponent(to)}`;
-  }
+  linkNeighbours();
   const {record, scores, folder, files} = case_;
   byId("case-name").textContent = `${record.case}: ${record.method}`;
   byId("case-scores").textContent = content.measures.filter(({name}) => (scores[name] ?? null) !== null)
@@ -219,8 +243,8 @@ async function showCase(key) {
     xrayViewer.show(xrays, record.misfit_per_view ?? []);
     await offerOthers(case_, volumes);
   } catch (error) {
-    if (opened === key) byId("state").textContent = `The volume is not shown: ${folder}/view.js cannot be used, ` +
-      `since ${error.message}. Delete it and make the page anew, without truth and X-rays: infer.py page <folder>.`;
+    if (opened === key) byId("state").textContent = `The volume is not shown: ${because(error)}.` + (error.ofFile
+      ? " Delete it and make the page anew, without truth and X-rays: infer.py page <folder>." : "");
   } finally {
     if (opened === key) {
       byId("case-name").focus({preventScroll: true});
@@ -243,7 +267,7 @@ async function offerOthers(case_, volumes) {
     if (chosen?.record) try {
       other = Object.assign(Object.create(Volume.prototype), (await load(chosen)).volumes.reconstruction, {name});
     } catch (error) {
-      [other, problem] = [null, `${chosen.folder}/view.js cannot be used, since ${error.message}`];
+      [other, problem] = [null, because(error)];
     }
     if (opened !== keyOf(case_) || byId("other").value !== value) return;
     if (!viewer.compare(other)) problem = "it lies askew to this one";

@@ -18,9 +18,16 @@ function element(tag, attributes = {}, ...children) {
 }
 
 const share = (value, low, high) => Math.min(Math.max((value - low) / (high - low), 0), 1);
+const grey = part => {
+  const shade = 255 * part;
+  return [shade, shade, shade];
+};
 const signed = part => part > 0 ? [255, 255 * (1 - part), 255 * (1 - part)] : [255 * (1 + part), 255 * (1 + part), 255];
+const laidOver = (shade, part) => [shade + part * (255 - shade), shade + part * (160 - shade), shade - part * shade];
+const NO_VALUE = [255, 0, 255];  // the colour of a voxel without one
 
-/* Draws values through a colour (value, position -> [r, g, b]) onto a canvas; ratio: its height over its width. */
+/* Draws values through a colour (value, position -> [r, g, b]) onto a canvas; ratio: its height over its width, within
+   limits, so that a picture of few pixels along a side is seen. */
 function paint(canvas, values, wide, high, ratio, colour) {
   const image = new ImageData(wide, high), raw = new OffscreenCanvas(wide, high);
   for (let n = 0; n < values.length; n++) {
@@ -29,7 +36,7 @@ function paint(canvas, values, wide, high, ratio, colour) {
   }
   raw.getContext("2d").putImageData(image, 0, 0);
   canvas.width = WIDE;
-  canvas.height = Math.max(Math.round(WIDE * ratio), 1);
+  canvas.height = Math.round(WIDE * Math.min(Math.max(ratio, 1 / 15), 4));
   const context = canvas.getContext("2d");
   context.imageSmoothingEnabled = false;
   context.drawImage(raw, 0, 0, canvas.width, canvas.height);
@@ -102,6 +109,7 @@ class Viewer {
       this.rolled = 0;
     }, {passive: false});
     canvas.addEventListener("keydown", event => {
+      if (event.altKey || event.ctrlKey || event.metaKey) return;  // the browser's own
       const size = this.volume.shape[across];
       const step = {ArrowUp: 1, ArrowRight: 1, PageUp: 1, ArrowDown: -1, ArrowLeft: -1, PageDown: -1,
                     Home: -size, End: size}[event.key];
@@ -182,18 +190,18 @@ class Viewer {
     byId("difference-scale").hidden = !difference;
     byId("overlay-scale").hidden = !overlay;
     const low = this.window[0] - this.window[1] / 2, high = low + this.window[1];
-    const grey = hu => hu === EMPTY ? [255, 0, 255] : Array(3).fill(255 * share(hu, low, high));
+    const shade = hu => hu === EMPTY ? NO_VALUE : grey(share(hu, low, high));
     for (const [name, plane] of Object.entries(PLANES)) {
       const {across, x, y, edges} = plane, [wide, tall] = [volume.shape[x], volume.shape[y]];
       const ratio = tall * volume.spacing[y] / (wide * volume.spacing[x]);
       const hu = volume.plane(plane, at[across], this.indices);
       const spread = overlay?.plane(plane, at[across], this.indices);
       const beside = other?.volume.plane(plane, at[across], other.indices);
-      const colours = [spread ? (value, n) => {
-        const part = 0.8 * share(spread[n], 0, SPREAD), [base] = grey(value);
-        return [255, 160, 0].map(full => base + part * (full - base));
-      } : grey, difference ? (value, n) => value === EMPTY || hu[n] === EMPTY ? [128, 128, 128]
-        : signed(Math.min(Math.max((hu[n] - value) / SPREAD, -1), 1)) : grey];
+      const overlaid = (value, n) => value === EMPTY || spread[n] === EMPTY ? NO_VALUE
+        : laidOver(255 * share(value, low, high), 0.8 * share(spread[n], 0, SPREAD));
+      const compared = (value, n) => value === EMPTY || hu[n] === EMPTY ? [128, 128, 128]
+        : signed(Math.min(Math.max((hu[n] - value) / SPREAD, -1), 1));
+      const colours = [spread ? overlaid : shade, difference ? compared : shade];
       for (const [row, values] of [hu, beside].entries()) {
         const canvas = this.rows[row].canvases[name], figure = canvas.parentNode;
         figure.hidden = !values;
@@ -241,13 +249,13 @@ class Viewer {
 
   drawTurning() {
     const volumes = [this.volume, ...this.other && !this.difference() ? [this.other.volume] : []];
-    const seen = volumes.map(volume => volume.projection(this.angle, this.mean)), low = this.mean ? -1024 : -200;
+    const seen = volumes.map(volume => volume.projection(this.angle, this.mean, this.volume)), low = this.mean ? -1024 : -200;
     const top = seen.reduce((most, {values}) => values.reduce((a, b) => Math.max(a, b), most), low + 1);
     for (const [row, {turning}] of this.rows.entries()) {
       turning.parentNode.hidden = !seen[row];
       if (!seen[row]) continue;
       const {values, wide, high, ratio} = seen[row];
-      paint(turning, values, wide, high, ratio, hu => Array(3).fill(255 * share(hu, low, top)));
+      paint(turning, values, wide, high, ratio, hu => grey(share(hu, low, top)));
       const kind = this.mean ? "mean" : "maximum";
       turning.nextSibling.textContent = `${volumes[row].name}, ${kind} along rays, ${this.angle}°`;
     }

@@ -33,15 +33,16 @@ class XrayViewer {
     for (const [n, bar] of bars.entries()) bar.setAttribute("aria-pressed", n === this.view);
     byId("view-name").textContent = `view ${this.view} (of 0 to ${bars.length - 1})${this.misfit(this.view, ", ")}`;
     if (!this.xrays) return;
-    const {shape: [, tall, wide], low, step, measured, rendered} = this.xrays, size = wide * tall;
+    const {shape: [, tall, wide], pixel = 1, low, step, measured, rendered} = this.xrays, size = wide * tall;
+    const ratio = pixel * tall / wide;
     const [y, p] = [measured, rendered].map(all => all.subarray(this.view * size, (this.view + 1) * size));
     const edge = Math.round(wide * byId("wipe").value / 100);
     const residual = Float32Array.from(p, (code, n) => step * (code - y[n]));
     const top = 65535 * step || 1, most = residual.reduce((a, b) => Math.max(a, Math.abs(b)), step);
-    const context = paint(byId("xray"), y, wide, tall, tall / wide,
-                          (code, n) => Array(3).fill(255 * step * (n % wide < edge ? code : p[n]) / top));
+    const context = paint(byId("xray"), y, wide, tall, ratio,
+                          (code, n) => grey(step * (n % wide < edge ? code : p[n]) / top));
     rule(context, Math.round(edge / wide * WIDE), 0, 1, context.canvas.height);
-    paint(byId("residual"), residual, wide, tall, tall / wide, value => signed(value / most));
+    paint(byId("residual"), residual, wide, tall, ratio, value => signed(value / most));
     byId("residual-scale").textContent = `residual, ±${most.toPrecision(2)} in line integrals from ` +
       `${low.toPrecision(2)} to ${(low + top).toPrecision(2)}; red: re-projected too high`;
   }

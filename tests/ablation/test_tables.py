@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import random
 
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
 from ablation.runs import ablate, row
 from phydict.ablation import plots
 from phydict.ablation.fid import FID, distance_tables
@@ -138,6 +141,17 @@ def test_every_plot_that_the_rows_allow_is_drawn(tmp_path):
     files = plots.write_plots(tmp_path, summarise(rows))
     assert sorted(file.name for file in files) == sorted(p.name for p in tmp_path.iterdir())
     assert {file.stem for file in files} == {"pareto_K_1", "pareto_K_8", "stages_K_1", "stages_K_8", "views", "delta"}
+
+
+def test_settings_of_a_method_differ_in_its_plots_in_line_and_filling():
+    rows = [row("a", "x", 20.0 + views, views=views, geometry=f"{views}.yaml", delta=delta) for views in (2, 8)
+            for delta in (0.0, 0.4, 0.8)]
+    entries = summarise(rows)
+    for draw, looked in ((plots._views, Line2D.get_linestyle), (plots._geometries, Line2D.get_fillstyle)):
+        axes = Figure().subplots(1, 2)
+        draw(axes, entries, plots.styles(entries))
+        assert len({looked(line) for line in axes[0].lines}) == 3
+        assert len({line.get_color() for line in axes[0].lines}) == 1
 
 
 def test_plots_of_boxes_on_either_side_are_two(tmp_path):

@@ -105,6 +105,16 @@ def test_values_that_are_not_finite_are_shown_in_magenta(tmp_path):
     assert (np.abs(page[..., :3] - [1, 0, 1]).max(2) < 0.01).sum() > 1000
 
 
+@pytest.mark.parametrize("shape, pixel, ratio", [((8, 8), 2.0, 2.0), ((8, 8), 0.5, 0.5), ((1, 600), 1.0, 1 / 15),
+                                                 ((600, 1), 1.0, 15.0)])
+def test_xrays_have_their_pixels_aspect_and_those_of_a_line_are_seen(tmp_path, shape, pixel, ratio):
+    panel(tmp_path / "p.png", np.zeros(GRID.shape), GRID, np.full((1, *shape), np.nan), pixel=pixel)
+    page = matplotlib.image.imread(tmp_path / "p.png")
+    seen = np.argwhere(np.abs(page[..., :3] - [1, 0, 1]).max(2) < 0.01)
+    high, wide = np.ptp(seen, axis=0) + 1
+    assert high / wide == pytest.approx(ratio, rel=0.2)
+
+
 def test_method_panel_shows_each_method_in_its_column(tmp_path):
     right = air_with_block(HIGH, MIDDLE, MIDDLE)
     left = air_with_block(slice(3, 11), MIDDLE, MIDDLE)

@@ -15,7 +15,7 @@ from command_lines import refusal
 from dicom_files import orbit_tags, write_dicom
 from PIL import Image
 
-from inference.runs import BEAM, FILES, ROOT, names, record, sirt, volume, with_prior
+from inference.runs import BEAM, FILES, ROOT, names, record, sirt, volume, with_prior, xrays
 from phydict.baselines import SIRT
 from phydict.cli.infer import main
 from phydict.datasets import load_xrays, save_xrays
@@ -23,7 +23,14 @@ from phydict.grid import Grid
 from phydict.methods import reconstruct
 from phydict.posterior import PriorOnly
 from phydict.runtime.precision import instruction_set
+from phydict.xray import ConeBeam
 from phydict.xray.geometry_files import write_beam
+
+
+def test_the_page_knows_the_aspect_of_the_detector_s_pixels(tmp_path):
+    xrays(tmp_path / "anna", ConeBeam.orbit(3, 1020.0, 740.0, (12, 24), (48.0, 24.0)))
+    main(sirt("predict", tmp_path / "out", f"--data.xrays={tmp_path / 'anna'}"))
+    assert '"pixel": 2.0, ' in (tmp_path / "out" / "sirt" / "anna" / "view.js").read_text()
 
 
 def test_predict_writes_what_the_library_reconstructs(measured, tmp_path, capsys):

@@ -24,8 +24,9 @@ from phydict.grid import Grid
 from phydict.inference import scoring
 from phydict.inference.data import ReconstructionData
 from phydict.inference.page import results_page
-from phydict.inference.results import FEATURES
+from phydict.inference.results import FEATURES, CaseResults
 from phydict.inference.scoring import FIDSettings, Scoring
+from phydict.inference.summary import show_finished
 from phydict.runtime.files import file_crc32
 from phydict.runtime.lpips_networks import load_lpips
 from phydict.units import HUWindow
@@ -91,6 +92,23 @@ def test_a_page_made_anew_has_the_frechet_distances_whose_features_are_kept(tmp_
     with pytest.warns(UserWarning, match="left out of the Frechet distances: .*are missing or damaged"):
         results_page(tmp_path)
     assert "1 cases with XY 34" in (tmp_path / "index.html").read_text()
+
+
+def test_a_later_method_s_page_keeps_the_frechet_distances_of_those_before(tmp_path, untrained):
+    main(phantoms(tmp_path, 1, "--model.grid=34", "--metrics=[fid]"))
+    given = phantoms(tmp_path, 1, "--model.grid=34", "--metrics=[volume]")
+    main([text.replace("sirt", "cgls") for text in given])
+    assert "Frechet distance of slices (FID)" in (tmp_path / "index.html").read_text()
+
+
+def test_the_page_of_a_stopped_run_says_how_frechet_distances_are_shown(tmp_path, untrained):
+    main(phantoms(tmp_path, 1, "--model.grid=34", "--metrics=[fid]"))
+    results = CaseResults(tmp_path / "sirt")
+    held = record(tmp_path / "sirt" / "phantom-1000000")
+    results.unfinished({"phantom-1000000": held["source"]}, held["settings"])
+    show_finished(results, ["phantom-1000000", "another"], Scoring(["fid"]))
+    page = (tmp_path / "index.html").read_text()
+    assert "infer.py page \\u003cfolder>" in page and "(FID)" not in page
 
 
 def test_other_metrics_do_not_pass_for_those_of_a_finished_case(tmp_path, capsys, untrained):

@@ -1,6 +1,5 @@
 """Finished cases made up on disk, as predict and test leave them."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +9,7 @@ from phydict.grid import Grid
 from phydict.inference.results import RECORD
 from phydict.page import write_case_files
 from phydict.reconstruction import save_nifti
+from phydict.runtime.strict_json import strict_json
 
 TURNED = Grid((6, 9, 7), affine=np.array([[0, -4.0, 0, 11], [-3.0, 0, 0, 7], [0, 0, 5.0, -20], [0, 0, 0, 1]]))
 """Voxels whose first axis runs to the back and whose second runs to the patient's left."""
@@ -39,5 +39,5 @@ def finish(out: Path, case: str, method: str, with_page: bool = True, grid: Grid
         volumes = {"reconstruction": volume, "truth": truth, "standard deviation": volume.abs() / 4}
         write_case_files(folder, grid, volumes, xrays, xrays + torch.linspace(-1, 1, 10))
     made = record(case, method, **{"grid": grid.to_dict()} | changes)
-    (folder / RECORD).write_text(json.dumps(made | {"files": [file.name for file in folder.iterdir()]}))
+    (folder / RECORD).write_text(strict_json(made | {"files": [file.name for file in folder.iterdir()]}))
     return folder

@@ -9,6 +9,7 @@ from urllib.parse import quote
 import nibabel
 import numpy as np
 import pytest
+import torch
 import yaml
 
 from page.made import TURNED, finish
@@ -167,6 +168,16 @@ def test_wheel_and_keys_change_the_slice_that_a_screen_reader_is_told(shown):
         assert canvas.get_attribute("aria-valuenow") == end
 
 
+def test_keys_of_the_browser_change_no_slice(shown):
+    page = shown("#sirt%2Fanna")
+    canvas = page.locator("[data-plane=coronal][data-row='0']")
+    before = canvas.get_attribute("aria-valuenow")
+    for held in ("altKey", "ctrlKey", "metaKey"):
+        assert canvas.evaluate("(canvas, held) => canvas.dispatchEvent(new KeyboardEvent('keydown', "
+                               "{key: 'ArrowUp', cancelable: true, [held]: true}))", held)
+        assert canvas.get_attribute("aria-valuenow") == before
+
+
 def test_the_small_steps_of_a_trackpad_add_up_to_slices(shown):
     page = shown("#sirt%2Fanna")
     canvas = page.locator("[data-plane=coronal][data-row='0']")
@@ -227,6 +238,20 @@ def test_from_an_open_case_links_lead_to_its_neighbours_and_to_all_cases(shown):
     page.click("text=all cases")
     page.wait_for_selector("#case", state="hidden")
     assert page.locator("#cases caption").is_visible()
+
+
+def test_links_to_neighbours_follow_the_table_as_it_is_sorted_and_searched_by_words_in_any_order(shown):
+    page = shown("#sirt%2Fanna")
+
+    def neighbours() -> list[str | None]:
+        return [page.locator(f"#{name}").get_attribute("title") or None for name in ("previous", "next")]
+
+    page.locator("#cases th", has_text="PSNR").locator("button").click()
+    assert neighbours() == [None, "tv/anna"]
+    page.locator("#cases th", has_text="PSNR").locator("button").click()
+    assert neighbours() == ["tv/anna", "fine/anna"]
+    page.fill("[type=search]", " ANNA  sirt ")
+    assert page.locator("tr[data-key]:visible").count() == 1 and neighbours() == [None, None]
 
 
 def test_an_address_that_is_none_opens_no_case(shown):
@@ -304,6 +329,39 @@ def test_projections_side_by_side_share_one_window(shown, tmp_path):
         page.click("button:text-is('mean')")
 
 
+def test_a_projection_skips_no_slice_and_has_the_volume_s_extent(shown):
+    page = shown()
+    for shape, spacing in (((150, 150, 9), (1, 1, 5)), ((40, 45, 140), (5, 5, 0.5))):
+        for axis, mean in product(range(3), (False, True)):
+            seen = page.evaluate("""([shape, spacing, axis, mean]) => {
+                const rows = at => [0, 1, 2].map(a => [...[0, 1, 2].map(b => a === b ? at(spacing[a]) : 0), 0]);
+                const strides = [1, shape[0], shape[0] * shape[1]];
+                return [4, 5].map(slice => {
+                  const data = Int16Array.from({length: shape[0] * shape[1] * shape[2]}, (_, n) =>
+                    Math.floor(n / strides[axis]) % shape[axis] === slice ? 1000 : -1024);
+                  const volume = new Volume("", data, {shape, affine: rows(s => s), inverse: rows(s => 1 / s)});
+                  const {values, ratio} = volume.projection(0, mean);
+                  return [values.reduce((a, b) => Math.max(a, b)), ratio];
+                });}""", [shape, spacing, axis, mean])
+            assert all(most == 1000 if not mean else most > -1024 for most, _ in seen)
+            wide = np.hypot(*np.multiply(shape, spacing)[:2])
+            assert np.allclose([ratio for _, ratio in seen], shape[2] * spacing[2] / wide, rtol=0.03)
+
+
+def test_projections_of_volumes_on_other_voxels_show_what_is_in_the_same_place(shown, tmp_path):
+    grids = {"whole": Grid.cube(32), "region": Grid.box(48, 150.0, (30, 0, 20))}
+    for method, grid in grids.items():
+        mm = np.moveaxis(np.indices(grid.shape), 0, -1) @ grid.affine[:3, :3].T + grid.affine[:3, 3]
+        ball = np.where(((mm - [40, 0, 30]) ** 2).sum(-1) < 30**2, 500.0, -1000.0)
+        write_case_files(finish(tmp_path, "anna", method, grid=grid), grid, {"reconstruction": ball})
+    results_page(tmp_path)
+    page = shown("#whole%2Fanna", folder=tmp_path)
+    page.select_option("#other", label="region")
+    page.wait_for_selector(f":nth-match({TURNING}, 2)")
+    one, other = (pixels(page, f":nth-match({TURNING}, {n})")[..., 0] > 100 for n in (1, 2))
+    assert one.shape == other.shape and (one & other).sum() > 0.8 * (one | other).sum() > 0
+
+
 def test_a_window_can_be_typed_anew(shown):
     page = shown("#sirt%2Fanna")
     page.click("#width")
@@ -311,6 +369,62 @@ def test_a_window_can_be_typed_anew(shown):
     page.keyboard.press("Delete")
     page.keyboard.type("1500")
     assert page.input_value("#width") == "1500"
+
+
+def test_voxels_without_a_value_stay_marked_beneath_the_overlay(shown, tmp_path):
+    hu = np.zeros(TURNED.shape)
+    hu[3, 4, 3] = np.nan
+    write_case_files(finish(tmp_path, "anna", "sirt"), TURNED, {
+        "reconstruction": hu, "standard deviation": np.full(TURNED.shape, 100.0)})
+    results_page(tmp_path)
+    page = shown("#sirt%2Fanna", folder=tmp_path)
+    counts = []
+    for act in (page.uncheck, page.check):
+        act("#overlay")
+        counts.append((pixels(page, "[data-plane=axial][data-row='0']")[..., :3] == [255, 0, 255]).all(-1).sum())
+    assert counts[0] == counts[1] > 100
+
+
+def test_no_list_is_filled_for_each_pixel(shown):
+    page = shown("#sirt%2Fanna")
+    assert page.evaluate("""() => {
+        const fill = Array.prototype.fill;
+        let count = 0;
+        Array.prototype.fill = function (...given) { count++; return fill.apply(this, given); };
+        viewer.draw();
+        xrayViewer.draw();
+        Array.prototype.fill = fill;
+        return count;}""") == 0
+
+
+@pytest.mark.parametrize("shape, pixel, ratio", [((8, 10), 2.0, 1.6), ((1, 600), 1.0, 1 / 15), ((600, 1), 1.0, 4.0)])
+def test_xrays_have_the_detectors_aspect_and_those_of_a_line_are_seen(shown, tmp_path, shape, pixel, ratio):
+    y = torch.rand(3, *shape)
+    write_case_files(finish(tmp_path, "anna", "sirt"), TURNED, {"reconstruction": np.zeros(TURNED.shape)}, y, y + 1,
+                     pixel=pixel)
+    results_page(tmp_path)
+    page = shown("#sirt%2Fanna", folder=tmp_path)
+    for name in ("#xray", "#residual"):
+        assert pixels(page, name).shape[:2] == (round(360 * ratio), 360)
+
+
+def test_xrays_of_older_files_have_square_pixels(shown, tmp_path):
+    file = finish(tmp_path, "anna", "sirt") / "view.js"
+    file.write_text(file.read_text().replace('"pixel": 1.0, ', ""))
+    results_page(tmp_path)
+    assert pixels(shown("#sirt%2Fanna", folder=tmp_path), "#xray").shape[:2] == (288, 360)
+
+
+def test_a_browser_that_lacks_what_is_needed_is_named_as_the_reason_and_no_file_is(shown, results):
+    page = shown()
+    page.evaluate("() => { delete window.DecompressionStream; location.hash = 'sirt%2Fanna'; }")
+    page.wait_for_function("document.getElementById('state').textContent.startsWith('The volume is not shown')")
+    assert page.inner_text("#state") == ("The volume is not shown: this browser cannot show it, since it does not know "
+                                         "DecompressionStream.")
+    page = shown()
+    page.evaluate("() => { delete window.OffscreenCanvas; location.hash = 'sirt%2Fanna'; }")
+    page.wait_for_function("document.getElementById('state').textContent.includes('this browser cannot show it')")
+    assert "Delete" not in page.inner_text("#state")
 
 
 def test_without_xrays_the_misfit_of_each_view_is_shown_alone(shown, tmp_path):
@@ -490,13 +604,13 @@ def test_on_a_phone_the_plot_s_letters_are_as_large_as_elsewhere_and_it_scrolls(
 
 
 def test_facts_are_rounded_what_is_not_known_is_left_out_and_files_say_what_they_are(shown, tmp_path):
-    finish(tmp_path, "anna", "sirt", misfit=0.002272926038131118, diverged_at=None,
+    finish(tmp_path, "anna", "sirt", misfit=0.002272926038131118, diverged_at=None, misfit_per_view=[0.1, None, 0.3],
            seconds={"sample": 10.141537, "score": 2.0}, settings={"detector": [448, 448], "names": ["a", "b"]})
     results_page(tmp_path)
     page = shown("#sirt%2Fanna", folder=tmp_path)
     page.click("summary")
     facts = page.inner_text("#facts").split("\n")
-    assert {"0.002273", "sample 10.14 s, score 2 s", "6 x 9 x 7", "0.1, 0.2, 0.05"} < set(facts)
+    assert {"0.002273", "sample 10.14 s, score 2 s", "6 x 9 x 7", "0.1, –, 0.3"} < set(facts)
     assert "diverged at" not in facts and '"detector": [448, 448]' in page.inner_text("#settings")
     files = page.locator("#files li").all_inner_texts()
     assert "volume.nii.gz: the reconstruction in HU" in files and not re.search("thumbnail|view.js", str(files))

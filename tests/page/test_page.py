@@ -64,14 +64,17 @@ def test_voxels_that_are_not_finite_and_beyond_int16_are_marked_and_clipped(tmp_
     assert (volume == NO_VALUE).sum() == 2 and (volume == 32767).sum() == 1
 
 
-@pytest.mark.parametrize("shape, shown", [((2, 40, 30), (2, 40, 30)), ((1, 600, 301), (1, 200, 100))])
+@pytest.mark.parametrize("shape, shown", [((2, 40, 30), (2, 40, 30)), ((1, 600, 301), (1, 200, 100)),
+                                          ((2, 1, 600), (2, 1, 200)), ((2, 600, 1), (2, 200, 1)),
+                                          ((2, 2, 600), (2, 1, 200))])
 def test_the_pages_xrays_are_the_measured_ones_to_half_a_step(tmp_path, shape, shown):
     y = torch.from_numpy(np.random.default_rng(0).uniform(-1, 8, shape))
-    write_case_files(tmp_path, TURNED, {"reconstruction": random_hu(0)}, y, y + 1)
+    write_case_files(tmp_path, TURNED, {"reconstruction": random_hu(0)}, y, y + 1, pixel=2.0)
     held = view(tmp_path)["X-rays"]
     codes = unpacked(held["measured"], "<u2").reshape(held["shape"])
-    factor = shape[1] // shown[1]
-    wanted = y.numpy()[:, :, :shown[2] * factor].reshape(shape[0], shown[1], factor, shown[2], factor).mean((2, 4))
+    rows, columns = shape[1] // shown[1], shape[2] // shown[2]
+    wanted = y.numpy()[:, :, :shown[2] * columns].reshape(shape[0], shown[1], rows, shown[2], columns).mean((2, 4))
+    assert held["pixel"] == 2 * rows / columns
     assert codes.shape == shown and abs(held["low"] + codes * held["step"] - wanted).max() <= 0.51 * held["step"]
     assert abs(unpacked(held["rendered"], "<u2").astype(float) - codes.ravel() - 1 / held["step"]).max() <= 1
 
@@ -104,7 +107,8 @@ def test_the_best_of_each_case_is_marked_among_the_methods(tmp_path):
 
 
 def test_what_is_not_a_number_leaves_the_page_readable(tmp_path):
-    finish(tmp_path, "anna", "sirt", misfit=float("nan"), scores={"psnr": float("inf")})
+    finish(tmp_path, "anna", "sirt", misfit=float("nan"), misfit_per_view=[float("nan")] * 3,
+           scores={"psnr": float("inf")})
     [case] = content(results_page(tmp_path))["cases"]
     assert case["record"]["misfit"] is None and case["scores"]["psnr"] is None
 
@@ -169,6 +173,14 @@ def test_a_method_s_folder_of_another_name_is_a_line_and_cases_of_its_own(tmp_pa
         "sirt": "sirt/anna", "sirt (sirt_old)": "sirt_old/anna"}
 
 
+def test_a_case_s_folder_of_another_name_is_a_case_of_its_own(tmp_path):
+    shutil.copytree(finish(tmp_path, "anna", "sirt"), tmp_path / "sirt" / "anna_old")
+    held = content(results_page(tmp_path))
+    assert {case["record"]["case"]: case["folder"] for case in held["cases"]} == {
+        "anna": "sirt/anna", "anna (anna_old)": "sirt/anna_old"}
+    assert "n = 2 cases" in " ".join(held["tables"][0]["notes"])
+
+
 def test_cases_of_several_protocols_have_a_table_each_of_its_own_range(tmp_path):
     for method, data in (("sirt", {}), ("tv", {"protocol": "x2ct"}), ("fdk", {"protocol": "x2ct"})):
         finish(tmp_path, "anna", method, settings={"seed": 0, "data": data})
@@ -176,6 +188,17 @@ def test_cases_of_several_protocols_have_a_table_each_of_its_own_range(tmp_path)
     assert [[row[0]["text"] for row in table["rows"]] for table in tables] == [["fdk", "tv"], ["sirt"]]
     for table, ends in zip(tables, ("[-1000, 1500]", "[-1000, 1000]")):
         assert ends in " ".join([table["title"], *table["notes"]])
+
+
+def test_of_other_data_or_protocols_none_is_the_better_and_what_is_of_a_protocol_is_named(tmp_path):
+    finish(tmp_path, "anna", "sirt", scores={"psnr": 20.0}, source="crc32 1")
+    finish(tmp_path, "anna", "tv", scores={"psnr": 21.0}, source="crc32 2")
+    finish(tmp_path, "anna", "fdk", scores={"psnr": 22.0}, settings={"seed": 0, "data": {"protocol": "x2ct"}})
+    held = content(results_page(tmp_path))
+    assert [case["places"]["psnr"] for case in held["cases"]] == [0, 0, 0]
+    assert [point["series"] for point in held["points"]] == ["fdk, x2ct", "sirt", "tv"]
+    assert [table["title"].removeprefix("Scores by method") for table in held["tables"]] == [
+        ", protocol x2ct", ", no protocol"]
 
 
 def test_frechet_distances_of_other_weights_and_of_each_protocol_have_a_table_each(tmp_path, monkeypatch):

@@ -182,6 +182,11 @@ def test_an_option_of_the_wrong_kind_is_told_in_words_of_the_settings(empty, cap
     assert not re.search("Parser key|<class|Expected|has no attribute", said)
 
 
+def test_settings_of_a_method_before_its_name_are_one_sentence(capsys):
+    said = refusal(capsys, infer, ["predict", "--model.method.init_args.iterations=5", "--model.method=tv"])
+    assert "but 5 was given: settings of a method come after its name" in said
+
+
 @pytest.mark.parametrize("out", ["x" * 300, "/".join(["x" * 100] * 60), "broken/link"])
 def test_an_output_that_cannot_be_is_refused_with_its_option(empty, out):
     (empty / "broken").symlink_to("nowhere")

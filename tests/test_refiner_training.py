@@ -14,7 +14,7 @@ from phydict.cli.train import main
 from phydict.datasets import phantom_case
 from phydict.grid import Cube, Grid
 from phydict.methods import reconstruct
-from phydict.posterior import measurement
+from phydict.posterior.measurement import Measurement
 from phydict.prior import Refiner, load_prior, save_prior
 from phydict.runtime.warning import warn
 from phydict.training.data import PriorData
@@ -22,7 +22,7 @@ from phydict.training.refiner import RefinerTraining
 from phydict.training.scenes import PHOTONS, Scenes
 from phydict.training.settings import Loading
 from phydict.units import HUWindow
-from phydict.xray import ConeBeam, Projector
+from phydict.xray import ConeBeam, Projector, checks
 from phydict.xray.finer import FinerProjector
 
 CONFIG = Path(__file__).parents[1] / "configs" / "prior" / "refiner.yaml"
@@ -84,13 +84,13 @@ def test_more_views_than_degrees_can_be_drawn():
 
 
 def test_nobody_is_warned_of_what_a_scene_was_drawn_with(recwarn, monkeypatch):
-    monkeypatch.setattr(measurement, "check_line_integrals", lambda y: warn("these line integrals are doubtful"))
+    monkeypatch.setattr(checks, "check_line_integrals", lambda y: warn("these line integrals are doubtful"))
     scenes, grid, ct = Scenes(), Grid.cube(16), torch.zeros(1, 1, 16, 16, 16)
     scenes.measure(ct, np.random.default_rng(0), grid, HUWindow())
     assert not recwarn.list
     y, projector = scenes.xrays(ct, np.random.default_rng(0), grid, HUWindow())
     with pytest.warns(UserWarning, match="doubtful"):
-        measurement.Measurement(projector, y, HUWindow())
+        Measurement(projector, y, HUWindow())
 
 
 def test_every_drawn_scene_can_be_reconstructed_on_its_grid():

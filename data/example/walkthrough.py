@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import nibabel
+import numpy as np
 import torch
 
 import phydict
@@ -20,8 +21,8 @@ def main(out: Path, methods=METHODS) -> None:
     case = phydict.load_xrays(here / "xrays")
     views, rows, columns = case["xrays"].shape
     print(f"1. {views} X-rays of {rows} x {columns} pixels, line integrals up to {case['xrays'].max():.1f}")
-    distance = torch.from_numpy(case["beam"].sources).norm(dim=1).mean()
-    print(f"2. the sources stand {distance:.0f} mm from the isocentre; the report, heard with up to three X-rays: "
+    distance = np.linalg.norm(case["beam"].sources, axis=1).mean()
+    print(f"2. the sources stand {distance:.0f} mm from the isocentre; the report, used with up to three X-rays: "
           f"{case['report']}")
     truth = torch.from_numpy(nibabel.load(here / "truth.nii.gz").get_fdata(dtype="float32").copy())
     volumes, captions = {}, {}

@@ -105,7 +105,8 @@ class ReconstructionData(lightning.LightningDataModule):
             self.protocol.check_simulation(simulation_voxels)
         self.geometry_file = configuration(geometry, ("geometry",)) if geometry else None
         self.beam, self._beam_settings = self.orbit.beam(), self.orbit.settings()
-        changed = {"only": only is not None, "orbit": orbit != Orbit(), "simulator": simulator != Ideal(),
+        changed = {"cts": cts is not None, "phantoms": phantoms != 4, "source": source != CTSource(),
+                   "only": only is not None, "orbit": orbit != Orbit(), "simulator": simulator != Ideal(),
                    "simulation_voxels": simulation_voxels is not None, "protocol": protocol is not None}
         self._of_test = [name for name, given in changed.items() if given]
         if cts and self.geometry_file:

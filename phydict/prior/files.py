@@ -47,7 +47,7 @@ from phydict.runtime.shipped import own_or_shipped, shipped
 DEFAULT_PRIOR = shipped("data/prior/phydict_64.safetensors")
 """The prior that comes with the project."""
 
-UNHEARD = ("phydict_64 hears of a report that there is a finding, not on which side: for reports give "
+UNHEARD = ("phydict_64 takes from a report that there is a finding, not its side: for reports give "
            "data/prior/phydict_64_reports.safetensors")
 """What is warned of when a report is given to DEFAULT_PRIOR."""
 

@@ -76,6 +76,8 @@ def plain(message: str) -> str:
         return _of_class(key, problem[1], problem[2])
     given = next((value[1] or value[2] for value in GIVEN.finditer(text)), "something else")
     given = _short(re.sub(r"^NestedArg\(key='\w+', val=(.*)\)$", r"\1", given))
+    if "is abstract" in text and "." not in given:
+        return f"{key} is the path of a class, but {given} was given: settings of a method come after its name"
     if "is abstract" in text:
         return f"{key} is the path of a class that can be used, but {given} is abstract: give one derived from it"
     wanted = _wanted(text)

@@ -372,7 +372,7 @@ class ConeBeam:
         """The beam of a mapping in one of the forms that `load` reads. Raises ValueError naming the key."""
         form = next((name for name in ("orbit", "sweep") if isinstance(content, dict) and name in content), None)
         if form is None:
-            content = dict(_check_keys(content, VECTOR_KEYS, CONTINUED))
+            content = dict(_check_keys(content, VECTOR_KEYS, CONTINUED, ", or orbit or sweep in their place"))
             continued = content.pop("continued", None)
             numbers: dict[str, Any] = {key: _numbers(key, value) for key, value in content.items()}
             return cls(**numbers, continued=continued)
@@ -445,12 +445,13 @@ def _numbers(key: str, value) -> float | np.ndarray:
     return numbers if numbers.ndim else numbers.item()
 
 
-def _check_keys(content: object, required: tuple[str, ...], optional: tuple[str, ...]) -> dict:
-    """The mapping with these keys that `content` is. Raises ValueError, naming the key, where it is none."""
+def _check_keys(content: object, required: tuple[str, ...], optional: tuple[str, ...], instead: str = "") -> dict:
+    """The mapping with these keys that `content` is; instead: what else may be given, for the message. Raises
+    ValueError, naming the key, where it is none."""
     if not isinstance(content, dict):
         raise ValueError(f"a mapping with the keys {', '.join(required)} was expected, but "
                          f"{reprlib.repr(content)} was found")
-    allowed = ", ".join(required + optional)
+    allowed = ", ".join(required + optional) + instead
     for key in content:
         if key not in required + optional:
             raise ValueError(f"unknown key {reprlib.repr(key)}; the keys are {allowed}")

@@ -111,7 +111,8 @@ def test_a_prior_refuses_xrays_of_another_grid(prior):
 
 @pytest.mark.parametrize("name, change", [
     ("orbit", "orbit.views=4"), ("simulator", "simulator.noise=0.1"), ("simulation_voxels", "simulation_voxels=128"),
-    ("only", "only=nowhere.txt"), ("protocol", "protocol=x2ct")])
+    ("only", "only=nowhere.txt"), ("protocol", "protocol=x2ct"), ("cts", "cts=phantom"), ("phantoms", "phantoms=2"),
+    ("source", "source.reports=nowhere.csv")])
 def test_what_simulates_x_rays_is_refused_where_they_were_measured(name, change, measured, tmp_path, capsys):
     said = refusal(capsys, main, sirt("predict", tmp_path / "out", f"--data.xrays={measured}", f"--data.{change}"))
     assert f"data.{name} is a setting of test" in said and not (tmp_path / "out").exists()
@@ -191,7 +192,7 @@ def test_a_read_only_disk_is_one_sentence(measured, tmp_path, capsys, monkeypatc
 
 
 def test_samples_of_a_method_without_a_prior_are_refused(capsys, measured, tmp_path):
-    assert "leave samples at 1" in refusal(capsys, main, sirt("predict", tmp_path, f"--data.xrays={measured}",
+    assert "leave samples out" in refusal(capsys, main, sirt("predict", tmp_path, f"--data.xrays={measured}",
                                                         "--model.sampling.samples=3"))
 
 

@@ -134,5 +134,5 @@ def test_impossible_numbers_are_refused(method, settings):
 
 
 def test_a_method_without_a_prior_has_no_samples():
-    with pytest.raises(ValueError, match="leave samples at 1"):
+    with pytest.raises(ValueError, match="leave samples out"):
         reconstruct(views(), BEAM, method="sirt", samples=2)

@@ -217,10 +217,10 @@ def test_a_text_encoder_that_contradicts_its_header_names_the_file(file, change)
         prior.bind(REPORTS[0])
 
 
-def test_the_shipped_prior_that_hears_no_sides_says_so_at_the_first_and_the_one_that_hears_them_does_not(recwarn):
+def test_the_shipped_prior_that_hears_no_sides_says_so_and_the_one_that_hears_them_does_not(recwarn):
     prior, hears = load_prior(), load_prior(shipped("data/prior/phydict_64_reports.safetensors"))
     for loaded in (prior, hears):
-        loaded.context([""])
-        loaded.context(["a nodule in the left lung"])
+        loaded.bind("")
+        loaded.bind("a nodule in the left lung")
     said = [str(w.message) for w in recwarn]
-    assert len(said) == 1 and "phydict_64 hears of a report that there is a finding, not on which side" in said[0]
+    assert len(said) == 1 and "phydict_64 takes from a report that there is a finding, not its side" in said[0]

@@ -245,6 +245,7 @@ def test_a_patient_who_goes_on_and_one_who_ends_are_not_seen_alike():
     (ORBIT + "  arc_degrees: 0\n", "an orbit of 4 views has an arc"),
     (ORBIT.replace("  views: 4\n", ""), "missing key 'views'"),
     (ORBIT + "shape: [1, 1]\n", "unknown key 'shape'"),
+    ("orbits: {views: 8}\n", "unknown key 'orbits'; the keys are sources, .*, or orbit or sweep in their place"),
     (ORBIT.replace("740", "2000"), "must lie between"),
     (ORBIT.replace("740", "far"), ""),
     ("sources: [[0, -1, 0]]\n", "missing key 'detectors'"),

@@ -168,7 +168,7 @@ def test_auto_looks_at_pose_size_memory_and_device_and_says_what_it_took():
 
 
 def test_impossible_choices_are_refused_with_a_reason():
-    with pytest.raises(ValueError, match="'separable' needs detectors"):
+    with pytest.raises(ValueError, match="the projector separable needs detectors"):
         Projector(GRIDS["turned"], TILTED, "separable")
     with pytest.raises(ValueError, match="no projector method 'fast'; choose one of auto, separable, siddon, eq4"):
         Projector(GRIDS["turned"], BEAM, "fast")

@@ -201,8 +201,8 @@ class Unrolled(Sampler):
 
         views = measurement.projector.beam.views
         if self.first is not None and denoiser.begins and views > self.first_views:
-            warn(f"the report is not used: {views} X-rays show themselves what it could add, up to {self.first_views} "
-                 "do not; phydict_fast with a prior that reads reports uses it at any number")
+            warn(f"the report is not used: phydict_learned reads one with up to {self.first_views} X-rays, and {views} "
+                 "were given; phydict_fast with a prior that reads reports uses it with any number")
         z = with_metal(measurement, self.metal, lambda: explained(on_step), explained)
         for state, evidence in results:
             if torch.equal(state, z):

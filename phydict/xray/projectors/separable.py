@@ -77,8 +77,8 @@ class Separable:
 
     def __init__(self, grid: Grid, beam: ConeBeam):
         if not beam.is_upright(grid):
-            raise ValueError("method 'separable' needs detectors whose rows are stacked along the grid's third axis, "
-                             "but this beam's are tilted; use method='siddon' or 'auto'")
+            raise ValueError("the projector separable needs detectors whose rows are stacked along the grid's third "
+                             "axis, but this beam's are tilted; use the projector siddon, or auto")
         self.grid, self.beam, self.rays = grid, beam, Rays.of(grid, beam)
         self._sparse: SparseFactors | None = None
 

@@ -24,11 +24,11 @@ from phydict.evaluation.tables import (
     INTERVAL,
     Table,
     caption,
-    comparable,
     empty_notes,
     interval_note,
     listed,
     partial_notes,
+    rankable,
     warning_notes,
 )
 from phydict.inference.protocols import Protocol, protocol_of
@@ -122,7 +122,7 @@ def _entry_table(title: str, first: str, names: Sequence[str], lines: Sequence[t
     printed = [(label, entry.complete, [entry.estimate(name) for name in names]) for label, entry in lines]
     why = empty_notes(empty, {name for entry in entries for name in entry.values}) + partial_notes(
         (label, entry.cases, {name: len(entry.values.get(name, ())) for name in names}) for label, entry in lines)
-    ranked = [comparable(measure, (entry.values[name] for entry in entries if entry.complete and name in entry.values))
+    ranked = [rankable(measure, (entry.values[name] for entry in entries if entry.complete and name in entry.values))
               for name, measure in zip(names, measures)]
     return Table(title, [first, *(measure.heading for measure in measures)], ranked, printed,
                  [_caption(entries), *why, *_origins(entries), *notes, *interval_note(printed), *_reasons(entries)])
@@ -142,7 +142,7 @@ def _axis_tables(title: str, rest: dict, group: Sequence[Entry], columns: Mappin
         measure = SHOWN_MEASURES[name]
         printed = [(label, label in complete, [line[k].estimate(name) if k in line else None for k in columns])
                    for label, line in lines.items()]
-        ranked = [comparable(measure, (lines[label][k].values[name] for label in complete
+        ranked = [rankable(measure, (lines[label][k].values[name] for label in complete
                                        if k in lines[label] and name in lines[label][k].values)) for k in columns]
         tables.append(Table(
             format_settings(f"{measure.heading} {title}", rest), ["method", *columns.values()],

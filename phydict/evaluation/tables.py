@@ -111,7 +111,7 @@ def ranks(values: Sequence[float], higher_is_better: bool | None) -> list[int]:
     return [1 if value == best else 2 if value == second else 0 for value in values]
 
 
-def comparable(measure: Measure, cases: Iterable[Iterable[str]]) -> Measure:
+def rankable(measure: Measure, cases: Iterable[Iterable[str]]) -> Measure:
     """A measure, without a better direction where lines, of these cases each, have not all the same: it then ranks
     nothing."""
     return measure if len({frozenset(of) for of in cases}) < 2 else measure._replace(higher_is_better=None)
@@ -132,7 +132,7 @@ def mean_table(rows: Iterable[Mapping], by: str = "method", metrics: Sequence[st
     names = [name for name in metrics or MEASURES if name in measured or name in empty]
     measures = [MEASURES.get(name, Measure(name, None, 3)) for name in names]
     header = [by, *(measure.heading for measure in measures)]
-    measures = [comparable(measure, (group[name].cases for group in groups.values() if name in group))
+    measures = [rankable(measure, (group[name].cases for group in groups.values() if name in group))
                 for name, measure in zip(names, measures)]
     lines: list[tuple[str, bool, list[Value | None]]] = [
         (label, True, [group.get(name) for name in names]) for label, group in groups.items()]

@@ -14,9 +14,9 @@ beam is taken as perpendicular to the detector and centred on it; pixels are Ima
 PixelSpacing.
 
 Rows and columns: where PatientOrientation says what way those of a file's first frame run, it is believed, and other
-frames stand alike to the detector. Without it an XA or RF image is taken
-as head up and as seen from the detector (PS3.17 FFF.2.1.3), which shows the patient's right on the left in a PA view; a
-CR or DX image must have it.
+frames lie alike on the detector. Without it an XA or RF image is taken as head up and as seen from the detector (PS3.17
+FFF.2.1.3), which shows the patient's right on the left in a PA view, unless it was flipped or rotated since it was
+taken; a CR or DX image must have it.
 """
 
 from __future__ import annotations

@@ -143,7 +143,7 @@ def _axis_tables(title: str, rest: dict, group: Sequence[Entry], columns: Mappin
         printed = [(label, label in complete, [line[k].estimate(name) if k in line else None for k in columns])
                    for label, line in lines.items()]
         ranked = [rankable(measure, (lines[label][k].values[name] for label in complete
-                                       if k in lines[label] and name in lines[label][k].values)) for k in columns]
+                                     if k in lines[label] and name in lines[label][k].values)) for k in columns]
         tables.append(Table(
             format_settings(f"{measure.heading} {title}", rest), ["method", *columns.values()],
             ranked, printed,

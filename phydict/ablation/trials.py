@@ -18,6 +18,7 @@ from phydict.ablation.nested import changed, field_of, has_field, parsed, plain
 from phydict.grid import Box, Grid
 from phydict.inference.data import ReconstructionData
 from phydict.inference.protocols import whole
+from phydict.inference.record import correction_checksums
 from phydict.inference.settings import Orbit
 from phydict.methods import DEFAULT_GRID, METHODS, corrections_of
 from phydict.posterior import Refinement, Sampler
@@ -157,8 +158,7 @@ class Trial:
         if self.prior is not None and self.box and not self.first().same_as(self.box.grid()):
             identity["refinement"] = describe(self.refinement)
             files = corrections_of(self.method, self.box.grid()) if self.refine else []
-            identity |= {key: _crc(str(file))
-                         for key, file in zip(("correction_crc32", "finer_correction_crc32"), files)}
+            identity |= correction_checksums(files, _crc)
         if self.box and not self.box.grid().same_as(grid):
             identity["region"] = self.box.grid().to_dict()
         if self.projector != "auto":

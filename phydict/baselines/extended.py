@@ -138,8 +138,8 @@ def _room(volume: Grid, xrays: Tensor, beam: ConeBeam, answered: bool | None, mu
     and below, `with_continuation` of the volume."""
     aside = 0 if display else _columns(volume, xrays, replace(beam, continued=answered), mu_water)
     wide = volume.grown(aside, aside, 0)
-    goes_on = with_continuation(xrays, beam, wide, display).continued if aside else answered
-    if not (goes_on or (beam.continued is None and needs_taller(xrays, beam, wide, display))):
+    continues = with_continuation(xrays, beam, wide, display).continued if aside else answered
+    if not (continues or (beam.continued is None and needs_taller(xrays, beam, wide, display))):
         return aside, aside, 0
     slices = STEP * math.ceil(min(reach_beyond(beam, wide), UP / volume.spacing[2]) / STEP)
     while slices and not beam.has_room_for(wide.grown(0, 0, slices)):

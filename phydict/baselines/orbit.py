@@ -45,9 +45,10 @@ class CircularOrbit:
         centre = grid.centre + np.linalg.lstsq(across, off, rcond=1e-6)[0]
         arm = beam.sources - centre
         if np.linalg.matrix_rank(across, 1e-6) == 1:
-            depth = arm @ np.cross(axis, across[0])
+            inward = np.cross(axis, across[0])
+            depth = arm @ inward
             if depth.min() < 0 < depth.max():
-                centre = centre + (depth.min() + depth.max()) / 2 * np.cross(axis, across[0])
+                centre = centre + (depth.min() + depth.max()) / 2 * inward
                 arm = beam.sources - centre
         height, arm = arm @ axis, arm - (arm @ axis)[:, None] * axis
         distance = np.linalg.norm(arm, axis=1)

@@ -141,7 +141,7 @@ def _kept_distances(folder: Path, cases: Sequence[PageCase]) -> list[Table]:
                 warn(f"a case is left out of the Frechet distances: {error}")
                 continue
             fid = FIDSettings(backbone, maisi_voxels=settings.get("fid_maisi_voxels", False))
-            measured = fid, settings.get("fid_weights_crc32"), settings.get("data", {}).get("protocol")
+            measured = fid, settings.get("fid_weights_crc32"), _protocol(case.record)
             methods.setdefault(measured, {}).setdefault(case.record["method"], {})[case.record["case"]] = features
             records.setdefault(measured, []).append(case.record)
     return [table for measured, features in methods.items()

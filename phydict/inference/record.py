@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -50,8 +51,12 @@ def grid_settings(grid: Grid, plain: Reconstructor, method: Reconstructor) -> di
     if not isinstance(method, Refined):
         return {"grid": grid.to_dict()}
     files = corrections_of(plain.sampler, grid) if isinstance(plain, Posterior) and method.networks else []
-    return {"grid": grid.to_dict(), "refinement": describe(method.refinement)} | {
-        f"correction_{n}_crc32": fingerprint(str(file)) for n, file in enumerate(files)}
+    return {"grid": grid.to_dict(), "refinement": describe(method.refinement)} | correction_checksums(files)
+
+
+def correction_checksums(files: Sequence[Path], checksum: Callable[[str], int] = fingerprint) -> dict[str, int]:
+    """Those of the networks that correct estimates on finer voxels, of long voxels first."""
+    return {name: checksum(str(file)) for name, file in zip(("correction_crc32", "finer_correction_crc32"), files)}
 
 
 def case_record(case: Case, result: Reconstruction, name: str, method: Reconstructor, scores: dict | None,

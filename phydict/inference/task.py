@@ -166,13 +166,17 @@ class ReconstructionTask(lightning.LightningModule):
                 held = self.plain if self.plain.grid is None else covering(self.reconstructor, data.protocol.grid)
                 self.reconstructor, self.grid = held, held.grid or data.protocol.grid
                 self.around = self.grid
-            self.scoring.check(self.scene()[0] if self.around is self.grid else self.grid)
+            self.scoring.check(self.scored())
         check_apart(self.results.folder, "model.out", data.inputs(stage))
         check_own_page(self.results.folder.parent, "model.out")
 
     def scene(self) -> tuple[Grid, HUWindow]:
         """The voxels and the HU range of the CTs that X-rays are made of."""
         return self._data.scene(self.around, self.window)
+
+    def scored(self) -> Grid:
+        """The voxels that volumes are scored on: those of the CTs, or a box that was chosen in them."""
+        return self.scene()[0] if self.around is self.grid else self.grid
 
     def unfinished(self, sources: dict[str, str]) -> list[str]:
         """Of this run's cases, id -> what identifies their data, those that remain to be done."""
@@ -202,7 +206,8 @@ class ReconstructionTask(lightning.LightningModule):
             case["xrays"] = data.simulate(case, seed, grid, window, self.device)
         case["mu_water"] = data.simulator.effective_mu_water
         if self.around is not self.grid:
-            case, grid = case | cut_out(case, grid, self.grid, window), self.grid
+            case = case | cut_out(case, grid, self.grid, window)
+        grid = self.scored()
         result = self._reconstruct(case, seed)
         volume, truth = resampled(result.volume, self.grid, grid), window.to_hu(case["volume"])[0].cpu()
         if "affine" in case:  # back to its place in the CT it came from

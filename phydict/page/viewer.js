@@ -249,7 +249,8 @@ class Viewer {
 
   drawTurning() {
     const volumes = [this.volume, ...this.other && !this.difference() ? [this.other.volume] : []];
-    const seen = volumes.map(volume => volume.projection(this.angle, this.mean, this.volume)), low = this.mean ? -1024 : -200;
+    const seen = volumes.map(volume => volume.projection(this.angle, this.mean, this.volume));
+    const low = this.mean ? -1024 : -200;
     const top = seen.reduce((most, {values}) => values.reduce((a, b) => Math.max(a, b), most), low + 1);
     for (const [row, {turning}] of this.rows.entries()) {
       turning.parentNode.hidden = !seen[row];

@@ -20,8 +20,10 @@ from phydict.baselines import SIRT
 from phydict.cli.infer import main
 from phydict.datasets import load_xrays, save_xrays
 from phydict.grid import Grid
-from phydict.methods import reconstruct
+from phydict.inference import ReconstructionTask
+from phydict.methods import CORRECTIONS, METHODS, reconstruct
 from phydict.posterior import PriorOnly
+from phydict.prior import load_correction, save_correction
 from phydict.runtime.precision import instruction_set
 from phydict.xray import ConeBeam
 from phydict.xray.geometry_files import write_beam
@@ -218,3 +220,14 @@ def test_a_projector_is_chosen_and_recorded_and_another_result_is_not_taken_for_
     assert "projector" not in record(tmp_path / "out" / "sirt" / "anna")["settings"]
     assert not np.array_equal(volume(tmp_path / "out" / "sirt" / "anna"), other)
     assert "model.projector is one of" in refusal(capsys, main, [*args, "--model.projector=lines"])
+
+
+def test_cases_refined_by_another_network_are_others(tmp_path, monkeypatch):
+    def settings() -> dict:
+        return ReconstructionTask(METHODS["phydict_learned"], grid=128, out=str(tmp_path / "out")).settings
+
+    shipped_one = settings()
+    save_correction(load_correction(), tmp_path / "other.safetensors", {"steps": 1})
+    monkeypatch.setitem(CORRECTIONS, 3.0, tmp_path / "other.safetensors")
+    other = settings()
+    assert shipped_one.pop("correction_crc32") != other.pop("correction_crc32") and shipped_one == other

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from zlib import crc32
 
 import torch
 from torch.utils.data import Dataset
 
 from phydict.datasets.case import Case
-from phydict.datasets.cts.cache import pack_case, read_arrays, unpack_case, write_arrays
+from phydict.datasets.cts.cache import key_of, pack_case, read_arrays, unpack_case, write_arrays
 from phydict.datasets.phantoms.phantom import phantom_case
 from phydict.datasets.phantoms.thorax import Thorax, report
 from phydict.grid import Grid
@@ -31,7 +30,7 @@ class CachedPhantoms(Dataset):
     def __init__(self, first_seed: int, count: int, grid: Grid, window: HUWindow, cache: Path):
         self.first_seed, self.count, self.grid, self.window = first_seed, count, grid, window
         size, cube = "x".join(map(str, grid.shape)), Grid.cube(grid.shape[0], grid.extent[0])
-        other = "" if grid.same_as(cube) else f"-{crc32(grid.affine.tobytes()):08x}"
+        other = "" if grid.same_as(cube) else f"-{key_of(grid.to_dict())}"
         self.folder = cache / (f"phantoms{PHANTOM_VERSION}-{size}-{grid.spacing[0]:g}mm{other}-{window.low:g}-"
                                f"{window.high:g}")
 

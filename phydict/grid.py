@@ -11,10 +11,19 @@ import numpy as np
 from phydict.runtime.reading import check_memory
 
 
+def _numbers(values) -> np.ndarray:
+    """A copy of `values` as float64, of one axis or more; NaN alone where they are no array of numbers."""
+    try:
+        array = np.atleast_1d(np.asarray(values))
+    except ValueError:  # of rows of different lengths
+        return np.full(1, np.nan)
+    return array.astype(float) if array.dtype.kind in "iuf" else np.full(1, np.nan)
+
+
 def whole_sizes(values) -> tuple[int, ...] | None:
     """`values` as whole numbers of 1 or more; None where they are anything else."""
-    sizes = np.atleast_1d(np.asarray(values))
-    if sizes.ndim != 1 or sizes.dtype.kind not in "iuf" or not np.isfinite(sizes).all():
+    sizes = _numbers(values)
+    if sizes.ndim != 1 or not np.isfinite(sizes).all():
         return None
     return tuple(map(int, sizes)) if (sizes >= 1).all() and (sizes == np.floor(sizes)).all() else None
 
@@ -47,20 +56,24 @@ class Grid:
             raise ValueError(f"a grid needs three positive sizes (X, Y, Z), whole numbers, but {self.shape} was given")
         check_memory(3 * 4 * math.prod(shape), f"a reconstruction on {' x '.join(map(str, shape))} voxels, three "
                      "volumes at least,", "give fewer voxels")
+        given = None if self.spacing is None else _numbers(self.spacing)
+        if given is not None and (given.shape not in ((1,), (3,)) or np.isnan(given).any()):
+            raise ValueError("a grid's spacing is a length in mm, one for all axes or three, but "
+                             f"{reprlib.repr(self.spacing)} was given")
         if self.affine is None:
-            if self.spacing is None:
+            if given is None:
                 raise ValueError("a grid needs either its spacing in mm or its index-to-world affine")
-            spacing = np.broadcast_to(np.asarray(self.spacing, float), 3)
+            spacing = np.broadcast_to(given, 3)
             affine = centred(np.diag(spacing), shape)
         else:
-            affine = np.array(self.affine, float)
+            affine = _numbers(self.affine)
             if affine.shape != (4, 4):
-                raise ValueError(f"a grid's affine is 4x4, but shape {affine.shape} was given")
+                raise ValueError(f"a grid's affine is 4x4 numbers, but {reprlib.repr(self.affine)} was given")
             spacing = np.linalg.norm(affine[:3, :3], axis=0)
-            if self.spacing is not None and not np.allclose(spacing, self.spacing, rtol=1e-4):
-                raise ValueError(f"spacing {tuple(self.spacing)} mm contradicts the affine's {tuple(spacing)} mm")
+            if given is not None and not np.allclose(spacing, given, rtol=1e-4):
+                raise ValueError(f"spacing {given.tolist()} mm contradicts the affine's {spacing.tolist()} mm")
         if not (np.isfinite(affine).all() and (spacing > 0).all()):
-            raise ValueError(f"a grid's spacing must be positive and finite, but {tuple(spacing)} mm was given")
+            raise ValueError(f"a grid's spacing must be positive and finite, but {spacing.tolist()} mm was given")
         axes = affine[:3, :3] / spacing
         cosines = axes.T @ axes - np.eye(3)
         if abs(cosines).max() > 1e-3:
@@ -76,18 +89,20 @@ class Grid:
     @classmethod
     def cube(cls, voxels: int, side: float = 384.0) -> Grid:
         """`voxels`^3 voxels over a cube of `side` mm centred on the isocentre."""
-        if whole_sizes(voxels) is None:
-            raise ValueError(f"a cube has a whole number of voxels along each side, 1 or more, but "
-                             f"{reprlib.repr(voxels)} was given")
-        if not 1e-3 < side < 1e6:
-            raise ValueError(f"the side of a cube of voxels is a length in mm, but {side:g} was given")
-        return cls((voxels,) * 3, (side / voxels,) * 3)
+        count, length = whole_sizes(voxels), _numbers(side)
+        if count is None or len(count) != 1:
+            raise ValueError("a cube has one whole number of voxels for all sides, 1 or more, but "
+                             f"{reprlib.repr(voxels)} was given; Grid.box takes three")
+        if length.shape != (1,) or not 1e-3 < length[0] < 1e6:
+            raise ValueError(f"the side of a cube of voxels is one length in mm, but {reprlib.repr(side)} was given; "
+                             "Grid.box takes three")
+        return cls((count[0],) * 3, (length[0] / count[0],) * 3)
 
     @classmethod
     def box(cls, voxels, side=384.0, centre=(0.0, 0.0, 0.0)) -> Grid:
         """`voxels` along each side of a box of `side` mm, one number or three each, whose centre lies `centre` mm from
         the isocentre towards right, anterior and superior."""
-        shape, lengths, place = whole_sizes(voxels), np.atleast_1d(side), np.asarray(centre, float)
+        shape, lengths, place = whole_sizes(voxels), _numbers(side), _numbers(centre)
         if shape is None or len(shape) not in (1, 3):
             raise ValueError("a box has a whole number of voxels along each side, 1 or more, one for all or three, but "
                              f"{reprlib.repr(voxels)} was given")

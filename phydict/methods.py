@@ -241,7 +241,7 @@ def reconstruct_by(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeB
     with heard() as warnings:
         if isinstance(method, Region) and beam.is_smaller_than(method.outer):
             method = method.base  # of a scene that is smaller than a chest
-        check_fit(xrays, beam, grid, method.survey)
+        check_fit(xrays, beam, grid, method.survey, display)
         poses: FoundPoses | None = None
         if uncertain is not None:
             xrays, poses = calibrated(method, method.survey or grid, xrays, beam, uncertain, display, on_step)

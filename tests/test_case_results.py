@@ -218,3 +218,10 @@ def test_a_whole_record_gives_its_row(old):
     (old / RECORD).write_text(json.dumps(SCORED))
     assert len(begun(old.parent).summarise(["anna"])) == 1
     assert read_csv(old.parent / TABLE)[0]["psnr"] == 20.0
+
+
+@pytest.mark.parametrize("setting", [float("inf"), float("nan")])
+def test_a_case_of_settings_that_are_no_finite_number_is_finished(tmp_path, setting):
+    settings = {"seed": 0, "prior": {"cap": setting}}
+    finish(results := begun(tmp_path, settings=settings), "old", settings)
+    assert results.missing() == [] and CaseResults(tmp_path).unfinished({"anna": "crc32 1"}, settings) == []

@@ -14,6 +14,7 @@ import torch
 from command_lines import refusal
 
 from phydict.cli.infer import main as infer
+from phydict.cli.infer import with_methods
 from phydict.cli.train import main as train
 from phydict.runtime.console import check_writable, cli_errors, noted, quiet, with_configurations
 from phydict.runtime.shipped import shipped
@@ -73,7 +74,18 @@ def test_what_is_there_comes_before_what_is_shipped(empty):
     own.touch()
     (empty / "phydict_fast").touch()
     for given in ("configs/reconstruct/phydict_fast.yaml", "phydict_fast", str(own), "{model: {seed: 1}}"):
-        assert with_configurations(["-c", given], ("reconstruct",)) == ["-c", given]
+        for args in (["-c", given], [f"-c{given}"]):
+            assert with_configurations(args, ("reconstruct",)) == ["-c", given]
+
+
+@pytest.mark.parametrize("given", [["-cmine.yaml"], ["-c", "a:b.yaml"], ["-ca:b.yaml"], ["--config=a:b.yaml"]],
+                         ids=repr)
+def test_a_configuration_names_its_method_however_its_file_is_given(empty, given):
+    for name in ("mine.yaml", "a:b.yaml"):
+        (empty / name).write_text("model: {method: sirt}")
+    (arg,) = with_methods(given)
+    assert "phydict.baselines.sirt.SIRT" in arg
+    assert with_methods(["-cmodel: {method: mine}"]) == ["--config=model: {method: mine}"]
 
 
 @pytest.mark.parametrize("main, command, names", [

@@ -77,10 +77,24 @@ def test_shear_is_refused():
     ({"spacing": None}, "either its spacing"), ({"spacing": (1.0, -1.0, 1.0)}, "positive and finite"),
     ({"spacing": (1.0, 0.0, 1.0)}, "positive and finite"),
     ({"spacing": (1.0, float("inf"), 1.0)}, "positive and finite"),
-    ({"spacing": None, "affine": np.eye(3)}, "4x4"), ({"spacing": None, "affine": np.full((4, 4), np.nan)}, "finite")])
+    ({"spacing": None, "affine": np.eye(3)}, "4x4"), ({"spacing": None, "affine": np.full((4, 4), np.nan)}, "finite"),
+    ({"spacing": (6, 6)}, "length in mm, one for all axes or three"), ({"spacing": "a"}, "but 'a' was given"),
+    ({"spacing": None, "affine": [[1, 2], [3]]}, "4x4")])
 def test_impossible_grids_are_refused(change, message):
     with np.errstate(all="ignore"), pytest.raises(ValueError, match=message):
         Grid(**{"shape": (4, 5, 6), "spacing": (1.0, 1.0, 1.0)} | change)
+
+
+@pytest.mark.parametrize("make, words", [
+    (lambda: Grid.cube((64, 64, 64)), "one whole number .* Grid.box takes three"),
+    (lambda: Grid.cube([[1, 2], [3]]), "one whole number"),
+    (lambda: Grid.cube(64, (384, 384, 300)), "one length in mm.* Grid.box takes three"),
+    (lambda: Grid.cube(64, "384"), "one length in mm, but '384' was given"),
+    (lambda: Grid.box(64, "384"), "a length in mm, one for all or three, but '384' was given"),
+    (lambda: Grid.box(64, centre="here"), "three numbers in mm")])
+def test_sizes_of_another_kind_are_refused_in_a_sentence(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()
 
 
 @pytest.mark.parametrize("grid", GRIDS)

@@ -134,4 +134,6 @@ def test_a_reconstruction_names_what_it_was_computed_in_and_differs_with_it(aske
 
 
 def test_methods_without_a_network_name_the_precision_of_the_xrays():
-    assert SIRT(iterations=1).reconstruct(views(), PROJECTOR).precision == "float32"
+    for kind in ("float32", "float64"):
+        found = SIRT(iterations=1).reconstruct(views().to(getattr(torch, kind)), PROJECTOR)
+        assert found.precision == str(found.volume.dtype).removeprefix("torch.") == kind

@@ -128,6 +128,8 @@ def test_training_goes_on_from_a_stage_and_refuses_one_of_another_grid(tmp_path)
     assert all(weight.requires_grad for weight in task.prior.parameters())
     with pytest.raises(ValueError, match="another grid"):
         SuperResolutionTraining(initial=str(path), cube=Cube(64), factor=2, window=(-1000, 600))
+    with pytest.raises(ValueError, match="model.network has block 4, but the stage"):
+        SuperResolutionTraining(LocalUNet(), initial=str(path), cube=Cube(32), factor=2, window=(-1000, 600))
 
 
 def test_the_stage_is_the_command_lines_or_the_last_configurations(tmp_path):

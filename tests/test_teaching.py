@@ -43,6 +43,17 @@ def test_training_goes_on_from_a_prior_and_refuses_one_of_another_grid(tmp_path)
         PriorTraining(initial=str(path), cube=Cube(32, 300.0), window=(-1000, 600), text=TextSettings("none"))
 
 
+def test_a_prior_that_training_starts_from_keeps_its_own_network_and_scale(tmp_path):
+    path, first = str(tmp_path / "prior.safetensors"), tiny_prior(text=False)
+    first.sigma_data = 0.7
+    save_prior(first, path, dtype=torch.float32)
+    task = PriorTraining(first.network, initial=path, cube=Cube(16), window=(-1000, 600))
+    torch.testing.assert_close(task.time_weight(torch.ones(1)).squeeze(), torch.tensor(0.7**-2))
+    with pytest.raises(ValueError, match="model.network has channels .8, 8., but the prior .* leave model.network out"):
+        PriorTraining(VolumeUNet(4, 2, (8, 8), (False, True), 1, 8, 16), initial=path, cube=Cube(16),
+                      window=(-1000, 600))
+
+
 def test_text_that_is_kept_is_taught_first_and_not_moved_by_denoising(cache):
     data = PriorData(phantoms=4, cache=str(cache), cube=Cube(16))
     for frozen in (True, False):

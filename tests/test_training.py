@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,7 +25,8 @@ from phydict.training import PriorTraining
 from phydict.training.data import PriorData
 from phydict.training.draws import MixedCases
 from phydict.training.prior import reconstruction_scores
-from phydict.training.settings import HoldOut
+from phydict.training.refinement import RefinementTraining
+from phydict.training.settings import HoldOut, Optimisation
 from phydict.units import HUWindow
 
 
@@ -176,9 +178,11 @@ def test_the_held_out_cts_are_written_down_and_told(cts, cache, tmp_path, capsys
                      "--trainer.limit_val_batches=0", f"--data.cts={cts}")
     main([*args, "--data.holdout.ids=[patient1]"])
     assert (tmp_path / "held_out.txt").read_text() == "patient1\n"
-    assert "1 of 2 CTs are held out" in capsys.readouterr().err
+    assert checkpoint(tmp_path)["phydict"]["training"]["held_out"] == ["patient1"]
+    assert "1 of 2 CTs are held out for validation, beside phantoms" in capsys.readouterr().err
     main([*args, f"--out={tmp_path / 'all'}"])
-    assert "no CT is held out, so that none tells which weights are best" in capsys.readouterr().err
+    assert checkpoint(tmp_path / "all")["phydict"]["training"]["held_out"] == []
+    assert "no CT is held out, so that phantoms alone tell which weights are best" in capsys.readouterr().err
 
 
 def test_a_training_resumes_with_the_same_cts_held_out(cts, cache, tmp_path, capsys):
@@ -213,6 +217,16 @@ def test_a_resumed_run_learns_at_the_rate_and_decay_that_are_given(trained, cach
     for group in resumed["optimizer_states"][0]["param_groups"]:
         assert group["lr"] == group["initial_lr"] == 1e-3 and group["weight_decay"] == 0.5
     assert resumed["lr_schedulers"][0]["base_lrs"] == [1e-3]
+
+
+@pytest.mark.parametrize("steps, said", [(40, "nothing is learnt after step 30"), (20, "it does not come to 0"),
+                                         (30, None), (-1, None)])
+def test_a_training_that_does_not_end_with_its_decay_is_warned_of(monkeypatch, recwarn, steps, said):
+    task = RefinementTraining((8, 8), optimisation=Optimisation(decay_from=10, decay_steps=20))
+    monkeypatch.setattr(RefinementTraining, "trainer", SimpleNamespace(max_steps=steps, callbacks=[]))
+    task.on_fit_start()
+    told = f"falls to 0 from step 10 to 30, but trainer.max_steps is {steps}, so that {said}"
+    assert [told in str(warning.message) for warning in recwarn] == [True] * bool(said)
 
 
 def test_a_run_that_stopped_within_an_epoch_goes_on_with_the_draws_after_it(tmp_path, cache, monkeypatch):

@@ -18,6 +18,7 @@ from phydict.cli.train import main
      ["at least 2 patients", "there is 1", "patient0"]),
     (["--data.loading.population.share=0.5"], ["at least 2 patients", "there are 0"]),
     (["--data.loading.population.variation.lungs=3"], ["variation.lungs", "3"]),
+    (["--data.loading.simulation_voxels=32"], ["learns from no X-rays", "32"]),
     (["--data.loading.epoch_size=1"], ["epoch_size", "batch"]),
     (["--data.lungs=2"], ["data.lungs"]),
     (["--data.augmentation.shift=-5"], ["shift", "-5"]),

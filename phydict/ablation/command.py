@@ -50,7 +50,11 @@ def main(args: list[str] | None = None) -> None:
         keep_volumes = given.pop("keep_volumes")
         source = {name: value for name, value in given.pop("source").items() if value is not None}
         given["source"] = source or None
-        specification = read_specification(given.pop("config"), given.pop("set"), **given)
+        file, *more = given.pop("config")
+        if more:
+            raise ValueError(f"one file says what to compare, but {' and '.join([file, *more])} were given: give one, "
+                             "and change its settings by --set")
+        specification = read_specification(file, given.pop("set"), **given)
         check_writable(specification.out, "out")
         check_own_page(specification.out, "out")
         check_apart(specification.out, "out", [Path(cts)] if (cts := specification.cases.cts) else [])
@@ -62,7 +66,7 @@ def main(args: list[str] | None = None) -> None:
                 run(results, cases, torch.device(device), progress, scoring, keep_volumes)
         except (KeyboardInterrupt, SystemExit):
             if results:
-                _page_so_far(specification.out, results.rows, scoring)
+                _page_so_far(specification.out, results.all_rows, scoring)
             raise
         print(f"{len(results.rows)} rows in {specification.out / RESULTS}")
         entries = summarise(results.rows)
@@ -72,11 +76,14 @@ def main(args: list[str] | None = None) -> None:
         written = write_tables(specification.out, tables) + plots
         print(f"tables and plots in {specification.out}: {', '.join(path.name for path in written)}")
         print(f"page: {comparison_page(specification.out, entries, tables, plots)}")
+        if not any(row["status"] == "ok" for row in results.rows):
+            raise ValueError(f"none of the rows in {specification.out / RESULTS} is ok; the first: "
+                             f"{entries[0].error}")
 
 
 def _page_so_far(out: Path, rows: Sequence[dict], scoring: Scoring) -> None:
-    """Writes the page of the rows that a stopped run has finished, where there are any, without the Frechet distances
-    of slices, which take long."""
+    """Writes the page of the rows of a stopped run, where any came out well, without the Frechet distances of slices,
+    which take long."""
     entries = summarise(rows)
     with suppress(ValueError, OSError):  # what stopped the run is the error to show
         if any(entry.counted for entry in entries):
@@ -91,7 +98,7 @@ def _parser(args: Sequence[str]) -> ArgumentParser:
         description="Compare methods on the same X-rays: every combination of settings that a file names, one row of "
                     "results each, then tables and plots. `ablate --set method=NAME --help` shows the settings of a "
                     f"method, one of {', '.join(METHODS)}.")
-    parser.add_argument("-c", "--config", required=True,
+    parser.add_argument("-c", "--config", required=True, action="append",
                         help="what to compare: a YAML file, or the name of a shipped one, such as pareto")
     parser.add_argument("--cts", type=str, help="a NIfTI file or a folder of CTs, instead of the file's cases")
     parser.add_argument("--phantoms", type=int, help="a number of phantoms, instead of the file's cases")

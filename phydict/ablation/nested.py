@@ -61,7 +61,9 @@ def _parsed(hint, value, name: str):
 
 def plain(value):
     """A setting as one field of a table, where an empty field means that it is the method's own."""
-    return json.dumps(describe(value)) if is_dataclass(value) else "none" if value is None else value
+    if is_dataclass(value) or isinstance(value, list | tuple | Mapping):
+        return json.dumps(value, default=lambda inner: describe(inner) if is_dataclass(inner) else str(inner))
+    return "none" if value is None else value
 
 
 _parsed_once = lru_cache(10_000, typed=True)(_parsed)

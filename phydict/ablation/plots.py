@@ -28,11 +28,15 @@ COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e
            "#005f40", "#b15928", "#6a3d9a", "#ff1493")
 MARKERS = "osD^v<>pP*Xhd8"
 LINES, FILLS = ("-", "--", "-.", ":"), ("full", "none", "left", "right", "top", "bottom")
+KINDS = ("pareto", "stages", "views", "geometry", "delta")
+"""What the names of plots begin with."""
+
 STAGES = {"seconds_network": "network", "seconds_projector": "projector", "rest": "the rest"}
 
 
 def write_plots(folder: Path, entries: Sequence[Entry]) -> list[Path]:
-    """Every plot that the entries with all of their cases allow, as PNG in a folder; returns the files."""
+    """Every plot that the entries with all of their cases allow, as PNG in a folder, in place of earlier ones; returns
+    the files."""
     written, style = [], styles(entries)
     entries = [entry for entry in entries if entry.complete]
     for condition, group in conditions(entries):
@@ -48,6 +52,9 @@ def write_plots(folder: Path, entries: Sequence[Entry]) -> list[Path]:
     curves = [(label, group) for label, group in deltas(entries) if len(group) > 1]
     if curves:
         written.append(_draw(folder, "delta", 2, lambda axes: _deltas(axes, curves)))
+    for path in folder.glob("*.png"):
+        if path.stem.partition("_")[0] in KINDS and path not in written:
+            path.unlink()
     return written
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from safetensors import SafetensorError
 
 from phydict.ablation.spec import Specification
 from phydict.ablation.trials import Trial, key, prior_of, stage_of
@@ -29,12 +30,12 @@ from phydict.methods import onto_grid, reconstruct_by, reconstructor
 from phydict.posterior import Sampler
 from phydict.reconstruction import Reconstruction, save_nifti
 from phydict.runtime.console import TRACEBACK, noted, sentence
-from phydict.runtime.files import atomic_directory
+from phydict.runtime.files import atomic_directory, remove_leftovers
 from phydict.runtime.precision import instruction_set
 from phydict.runtime.profiling import peak_memory, profiled, reset_peak_memory
 from phydict.runtime.progress import CaseProgress
 from phydict.runtime.progress_log import log_progress
-from phydict.runtime.reading import TooLittleMemory
+from phydict.runtime.reading import TooLittleMemory, not_written
 from phydict.runtime.seeds import case_seed
 from phydict.runtime.strict_json import strict_json
 
@@ -69,17 +70,17 @@ class Results:
 
     def __init__(self, folder: Path, planned: Mapping[str, dict]):
         self.file, self.planned = folder / RESULTS, planned
-        others = [file.name for file in folder.glob("*") if file.suffix == ".png" or file.name in (*TABLES, FID)]
+        others = sorted(file.name for file in folder.glob("*") if file.suffix == ".png" or file.name in (*TABLES, FID))
         if others and not self.file.exists():
-            raise ValueError(f"{folder} holds {others[0]}, but no {RESULTS} of this command, and is not written to: "
-                             "give another out, or move that away")
+            raise ValueError(f"{folder} holds {', '.join(others)}, but no {RESULTS} of this command, and is not "
+                             "written to: give another out, or move that away")
         stored: dict = {row.get("key"): row for row in read_csv(self.file)}
         if None in stored:
             raise ValueError(f"{self.file} has rows without a key, so that it is no table of this command: give "
                              "another out")
         if stored and not stored.keys() & planned.keys():
             raise ValueError(f"{self.file} is the table of another comparison, whose {len(stored)} rows are all of "
-                             "other settings or data: give another out, or remove it")
+                             f"other settings or data: give another out, or remove {', '.join([RESULTS, *others])}")
         for name, row in stored.items():
             wrong = next((k for k in MEASURED if k not in WORDS and isinstance(row.get(k), str)), None)
             if wrong:
@@ -97,6 +98,12 @@ class Results:
     def rows(self) -> list[dict]:
         """The rows of what is planned, in its order."""
         return [self.done[name] for name in self.planned if name in self.done]
+
+    @property
+    def all_rows(self) -> list[dict]:
+        """The rows of what is planned, in its order, where they are not there yet as not run."""
+        return [self.done.get(name, columns | {"status": "not run", "error": "the run was stopped", "key": name})
+                for name, columns in self.planned.items()]
 
     def add(self, name: str, measured: Mapping) -> None:
         """Adds a row and writes the table, in one step."""
@@ -147,6 +154,8 @@ def run(results: Results, cases: dict[str, Work], device: torch.device, progress
     Case by case; the X-rays of a case are simulated once for all trials that share an acquisition.
     """
     out = results.file.parent
+    for folder in (features_file(out, "").parent, volume_folder(out, "")):
+        remove_leftovers(folder)
     if scoring.network:
         results.forget(lambda name: not features_file(out, name).is_file())
     if keep_volumes:
@@ -255,10 +264,15 @@ class Runner:
             volume = resampled(result.volume, result.grid, scene.grid)
             scores = self.scoring.scores(volume, result.misfit, scene.truth, scene.grid, scene.window, self.device,
                                          trial.data.protocol)
-            if features := self.scoring.features(volume, scene.truth, scene.grid, scene.window, self.device):
-                save_features(features_file(self.out, key), features)
-            if self.keep_volumes:
-                _keep(volume_folder(self.out, key), result, scene, trial)
+            features = self.scoring.features(volume, scene.truth, scene.grid, scene.window, self.device)
+            try:
+                if features:
+                    save_features(features_file(self.out, key), features)
+                if self.keep_volumes:
+                    _keep(volume_folder(self.out, key), result, scene, trial)
+            except (OSError, SafetensorError) as error:
+                raise NotKept(not_written(f"what is kept of row {key} in {self.out}", error,
+                                          "give another out")) from error
         return scores | {
             "status": "ok" if finite else "diverged",
             "error": None if finite else "the volume holds NaN or infinite voxels", "misfit": result.misfit,
@@ -310,6 +324,10 @@ def _keep(folder: Path, result: Reconstruction, scene: MeasuredCase, trial: Tria
         (partial / DETAILS).write_text(strict_json(details))
 
 
+class NotKept(OSError):
+    """What is to be kept of a row could not be written, which is no fault of its method's."""
+
+
 @cache
 def _on(file: str, device: torch.device):
     prior = prior_of(file)
@@ -323,9 +341,11 @@ def _stage_on(file: str, device: torch.device):
 
 def _attempt(work: Callable[[], object], unwilling: str = "failed"):
     """What `work` gives, or the columns of a row that says why there is nothing; with PHYDICT_TRACEBACK=1 the trace of
-    a failure instead. unwilling: the status after a ValueError, unless another machine could do it."""
+    a failure instead. unwilling: the status after a ValueError, unless another machine could do it. Raises NotKept."""
     try:
         return work()
+    except NotKept:
+        raise
     except Exception as error:  # of whatever kind: one method's failure must not end the others' runs
         if os.environ.get(TRACEBACK):
             raise

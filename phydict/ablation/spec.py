@@ -34,8 +34,8 @@ class Specification:
 def read_specification(file: str | Path, changes: Sequence[str] | None = None, **given) -> Specification:
     """The specification in a YAML file, or in a shipped one by its name; `given` (out, cts, phantoms, only, reports,
     source, metrics), where not None, takes the place of what the file says, and so do `changes`: settings as
-    "name=value", of which a list of values is an axis, or as "method.setting=value" of one of the file's changed
-    methods.
+    "name=value", also in place of those of changed methods, of which a list of values is an axis, or as
+    "method.setting=value" of one of the file's changed methods.
 
     Its keys: out; cts or phantoms, only, source: which CTs of the folder are taken, as data.source in infer.py test,
     and reports, short for source.reports; metrics, fid, clip: what is measured, as there; methods: names for changed
@@ -65,12 +65,14 @@ def _specification(content, given: Mapping, changed: dict) -> Specification:
         content = {k: v for k, v in content.items() if k not in ("cts", "phantoms", "only", "reports", "source")}
     source = {**_mapping(content.get("source"), "source"), **given.get("source", {})}
     content = content | given | {"source": source}
-    methods = dict(_mapping(content.get("methods"), "methods"))
+    methods = {name: {setting: value for setting, value in _mapping(changes, f"methods.{name}").items()
+                      if not dotted({setting: value}).keys() & changed.keys()}
+               for name, changes in _mapping(content.get("methods"), "methods").items()}
     for name in [name for name in changed if name.partition(".")[0] in methods]:
         method, _, setting = name.partition(".")
-        methods[method] = {**_mapping(methods[method], f"methods.{method}"), setting: changed.pop(name)}
+        methods[method] = {**methods[method], setting: changed.pop(name)}
     for name, changes in methods.items():
-        of = _mapping(changes, f"methods.{name}").get("of", name)
+        of = changes.get("of", name)
         try:
             method_of(of)
         except ValueError as error:

@@ -10,9 +10,10 @@ from functools import cached_property
 import numpy as np
 
 from phydict.ablation.run import MEASURED
-from phydict.ablation.trials import PRIOR_SETTINGS
+from phydict.ablation.trials import PRIOR_SETTINGS, SETTINGS
 from phydict.evaluation.bootstrap import Estimate, estimate
 from phydict.evaluation.metrics import MEASURES, Measure, case_values
+from phydict.inference.protocols import protocol_of
 
 SHOWN_MEASURES = MEASURES | {"network_calls": Measure("network calls", None, 0),
                              "projector_calls": Measure("projector calls", None, 0),
@@ -24,14 +25,20 @@ SCORES = MEASURES.keys() - {"seconds"}
 
 NON_SETTING_COLUMNS = (*MEASURED, "case", "key", "seed", "grid", "training")
 
+METHOD_SETTINGS = ("method", "projector", *PRIOR_SETTINGS)
+"""Settings of the method, as method.<field> are; the others are of the X-rays."""
+
+BOX_SETTINGS = ("voxels", "side", "centre")
+"""Settings of the voxels of the result, which are the method's where a protocol has voxels of its own to score on."""
+
 
 @dataclass(frozen=True)
 class Entry:
     """The mean over cases of one method's settings under one condition.
 
     settings: those that differ among the method's entries, beside its name; values: measure -> {case: value}, the
-    seeds of a case averaged, of those measures that all its cases have; cases, of: how many cases it has and how many
-    it was to have; rows: of results; error: why one of them does not count.
+    seeds of a case averaged, of those measures that all its cases have; cases, of: how many cases it has, with all of
+    their seeds, and how many it was to have; rows: of results; error: why one of them does not count.
     """
 
     method: str
@@ -46,7 +53,7 @@ class Entry:
     @property
     def counted(self) -> list[Mapping]:
         """The rows that its values are of."""
-        return [row for row in self.rows if row["status"] == "ok"]
+        return _of_whole_cases(self.rows)
 
     @cached_property
     def means(self) -> dict[str, float]:
@@ -96,17 +103,17 @@ def summarise(rows: Iterable[Mapping]) -> list[Entry]:
 
     The condition of an entry is what differs among the rows' X-rays.
     """
-    rows = list(rows)
-    names = [name for name in dict.fromkeys(k for row in rows for k in row) if name not in NON_SETTING_COLUMNS]
-    common = [name for name in names if name in ("method", *PRIOR_SETTINGS) or name.startswith("method.")]
-    varying = _varying(rows, [name for name in names if name not in common])
-    changed = {method: _varying([row for row in rows if row["method"] == method], [n for n in common if n != "method"])
-           for method in dict.fromkeys(row["method"] for row in rows)}
+    parts = [(row, *_parted(row)) for row in rows]
+    varying = _varying([xrays for _, _, xrays in parts])
+    changed = {method: _varying([settings for _, settings, _ in parts if settings["method"] == method])
+               for method in dict.fromkeys(row["method"] for row, _, _ in parts)}
     groups: dict[tuple, list] = {}
-    for row in rows:
-        place = (row["method"], *(row.get(name) for name in (*changed[row["method"]], *varying)))
-        groups.setdefault(place, []).append(row)
-    return [_entry(group, changed[group[0]["method"]], varying) for group in groups.values()]
+    for row, settings, xrays in parts:
+        of_method = changed[row["method"]]
+        place = (row["method"], *(settings.get(name) for name in of_method), *(xrays.get(name) for name in varying))
+        groups.setdefault(place, []).append((row, {name: settings[name] for name in of_method if name in settings},
+                                             {name: xrays[name] for name in varying if name in xrays}))
+    return [_entry([row for row, _, _ in group], *group[0][1:]) for group in groups.values()]
 
 
 def without_repeats(rows: Iterable[Mapping]) -> list[Mapping]:
@@ -133,8 +140,8 @@ def compared_views(entries: Sequence[Entry]) -> list[tuple[dict, list[Entry]]]:
 
 
 def compared_geometries(entries: Sequence[Entry]) -> list[tuple[dict, list[Entry]]]:
-    """The entries under each other condition that has several geometry files, which fix the views."""
-    return _along(entries, "geometry", ("geometry", "views"))
+    """The entries under each other condition that has several geometry files, which fix views and detector."""
+    return _along(entries, "geometry", ("geometry", "views", "detector"))
 
 
 def _along(entries: Sequence[Entry], axis: str, without: Sequence[str]) -> list[tuple[dict, list[Entry]]]:
@@ -167,18 +174,43 @@ def deltas(entries: Sequence[Entry]) -> list[tuple[str, list[Entry]]]:
     return [(label, sorted(group, key=lambda entry: entry.settings["delta"])) for label, group in groups.items()]
 
 
-def _entry(rows: Sequence[Mapping], changed: Sequence[str], varying: Sequence[str]) -> Entry:
-    first, good = rows[0], [row for row in rows if row["status"] == "ok"]
+def fixed_settings(entries: Sequence[Entry]) -> str:
+    """The settings that all rows of entries share, other than by default and in no entry's name or condition, in
+    words."""
+    settings = [xrays | own for entry in entries for own, xrays in map(_parted, entry.rows)]
+    told = {"method", "protocol", *_varying(settings)}.union(
+        *(entry.settings.keys() | entry.condition.keys() for entry in entries))
+    return format_settings({name: value for name, value in settings[0].items() if name not in told
+                            and value is not None and str(value) != str(SETTINGS.get(name, (None, None))[1])})
+
+
+def _parted(row: Mapping) -> tuple[dict, dict]:
+    """The settings of a row that are its method's, and those of its X-rays."""
+    protocol = row.get("protocol")
+    own = METHOD_SETTINGS + (BOX_SETTINGS if protocol is not None and protocol_of(protocol).grid else ())
+    settings = {name: value for name, value in row.items() if name not in NON_SETTING_COLUMNS}
+    of_method = {name for name in settings if name in own or name.startswith("method.")}
+    return ({name: value for name, value in settings.items() if name in of_method},
+            {name: value for name, value in settings.items() if name not in of_method})
+
+
+def _of_whole_cases(rows: Sequence[Mapping]) -> list[Mapping]:
+    """The rows of those cases of which each seed is ok."""
+    lacking = {row["case"] for row in rows if row["status"] != "ok"}
+    return [row for row in rows if row["case"] not in lacking]
+
+
+def _entry(rows: Sequence[Mapping], settings: dict, condition: dict) -> Entry:
+    good = _of_whole_cases(rows)
     cases = len({row["case"] for row in good})
     stages = {name for row in good for name in row if name.startswith("seconds_")}
     values = {name: scores for name in [*SHOWN_MEASURES, *stages]
               if (scores := case_values(good, name)) and (name in SCORES or len(scores) == cases)}
     error = next((f"{row['status']}: {row['error']}" for row in rows if row["status"] != "ok"), None)
-    return Entry(first["method"], {n: first[n] for n in changed if n in first},
-                 {n: first[n] for n in varying if n in first}, values, cases, len({row["case"] for row in rows}), rows,
-                 error)
+    return Entry(rows[0]["method"], settings, condition, values, cases, len({row["case"] for row in rows}), rows, error)
 
 
-def _varying(rows: Sequence[Mapping], names: Sequence[str]) -> list[str]:
-    return [name for name in names if len({row.get(name) for row in rows}) > 1]
-
+def _varying(settings: Sequence[Mapping]) -> list[str]:
+    """The names whose values differ."""
+    names = dict.fromkeys(name for given in settings for name in given)
+    return [name for name in names if len({given.get(name) for given in settings}) > 1]

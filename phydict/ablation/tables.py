@@ -15,6 +15,7 @@ from phydict.ablation.summary import (
     compared_views,
     conditions,
     deltas,
+    fixed_settings,
     format_settings,
     rank,
 )
@@ -172,11 +173,13 @@ def _caption(entries: Sequence[Entry]) -> str:
 
 
 def _origins(entries: Sequence[Entry]) -> list[str]:
-    """The protocol that the rows of a table's entries were taken by, how long trained rivals among them have learnt,
-    and the cases that are doubtful."""
+    """The protocol that the rows of a table's entries were taken by, the settings that its title and labels do not
+    tell, how long trained rivals among them have learnt, and the cases that are doubtful."""
     rows = [row for entry in entries for row in entry.rows]
     trained = dict.fromkeys(f"{row['method']} {row['training']}" for row in rows if row.get("training"))
-    return [*(protocol.note for protocol in _protocols(rows)), *warning_notes(rows),
+    fixed = fixed_settings(entries)
+    return [*(protocol.note for protocol in _protocols(rows)), *([f"Fixed settings: {fixed}."] if fixed else []),
+            *warning_notes(rows),
             *([f"Trained rivals, as their files tell: {'; '.join(trained)}."] if trained else [])]
 
 

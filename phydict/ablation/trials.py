@@ -23,7 +23,7 @@ from phydict.inference.settings import Orbit
 from phydict.methods import DEFAULT_GRID, METHODS, corrections_of
 from phydict.posterior import Refinement, Sampler
 from phydict.prior import find_prior, fingerprint, load_super_resolution, own_identity
-from phydict.reconstruction import Reconstructor, describe
+from phydict.reconstruction import Reconstructor, describe, own_code
 from phydict.rivals import TrainedRival
 from phydict.runtime.reading import reason
 from phydict.runtime.seeds import check_seed
@@ -150,8 +150,10 @@ class Trial:
         identity = {"name": self.name, "method": describe(self.method), "seed": self.seed, "grid": grid.to_dict(),
                     "window": describe(window), "data": {"with_report": self.with_report} | self.data.settings("test")}
         if self.prior is not None:
-            prior_identity = own_identity(prior_of(self.prior), self.prior)
-            identity |= {"prior_crc32": _crc(self.prior)} if prior_identity is None else {"prior": prior_identity}
+            prior = prior_of(self.prior)
+            kind: type = type(prior)
+            own = own_identity(prior, self.prior)
+            identity |= {"prior_crc32": _crc(self.prior)} if own is None else {"prior": own | own_code(kind)}
             identity |= {"guidance": self.guidance, "samples": self.samples}
         if self.super_resolution:
             identity["super_resolution_crc32"] = _crc(self.super_resolution)
@@ -205,6 +207,10 @@ def trials_of(base: dict, axes: dict, methods: Mapping, cases: Cases,
     like = next((trial.prior for trial in trials if trial.prior), None)
     trials = [trial if trial.prior else replace(trial, like=like) for trial in trials]
     scenes = [trial.scene() for trial in trials]
+    for trial, (grid, _) in zip(trials, scenes):
+        if (voxels := trial.data.simulation_voxels) and voxels % grid.shape[0]:
+            raise ValueError(f"simulation_voxels is a multiple of the {grid.shape[0]} voxels along each side that are "
+                             f"scored, but {voxels} was given: give such a one, or leave it out")
     results = [trial.result_scene()[0] for trial in trials] if not any(trial.data.protocol for trial in trials) else []
     if any(window != scenes[0][1] for _, window in scenes) or not all(
             grid.same_as(grids[0]) for grids in (results, [grid for grid, _ in scenes]) for grid in grids):
@@ -220,6 +226,8 @@ def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
         if isinstance(value, float) and not math.isfinite(value):
             raise ValueError(f"{name} must be a finite number, but {value} was given")
     check_seed(given.get("seed", 0))
+    if (samples := given.get("samples", 1)) < 1:
+        raise ValueError(f"samples is a number of draws, 1 or more, but {samples} was given")
     if (projector := given.get("projector", "auto")) not in PROJECTORS:
         raise ValueError(f"there is no projector {projector!r}: use one of {', '.join(PROJECTORS)}")
     base = method_of(of)

@@ -62,9 +62,10 @@ class Baseline(Reconstructor):
     def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,
                     seed: int = 0, on_step: Callable[[], None] = lambda: None,
                     outside: Tensor | None = None) -> Reconstruction:
-        """As a Reconstructor; outside: line integrals (K, V, U) of what lies outside the voxels."""
+        """As a Reconstructor; outside: line integrals (K, V, U) of what lies outside the voxels, from a reconstruction
+        of the same X-rays, which said what is doubtful in them."""
         watch, A = Stopwatch(), CountingProjector(projector)
-        xrays = prepared_xrays(xrays, A.beam, display)
+        xrays = prepared_xrays(xrays, A.beam, display, told=outside is not None)
         with watch.stage("prepare"):
             y = xrays[None] / self.mu_water
             if display:
@@ -77,7 +78,8 @@ class Baseline(Reconstructor):
             fit = guard.score(density, self.mu_water * (A(density) + beyond), self.mu_water * y)
         return Reconstruction(
             volume=mu_to_hu(density[0, 0], 1.0).cpu(), grid=A.grid, method=self.name, seed=seed,
-            **fit, seconds=watch.seconds, projector_calls=A.calls)
+            **fit, seconds=watch.seconds, projector_calls=A.calls,
+            precision=str(y.dtype).removeprefix("torch."))
 
 
 def empty(A: CountingProjector, y: Tensor) -> Tensor:

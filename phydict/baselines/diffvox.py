@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -10,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from phydict.baselines.baseline import Baseline, CountingProjector, clip, empty
+from phydict.runtime.ranges import LEAST, MOST, check_fields
 from phydict.units import MU_WATER, HUWindow
 
 SHIFT, SHARPNESS = 0.3, 20.0
@@ -46,11 +48,7 @@ class DiffVox(Baseline):
 
     def __post_init__(self):
         super().__post_init__()
-        if self.iterations < 1:
-            raise ValueError(f"DiffVox needs at least 1 iteration, but {self.iterations} was given")
-        if not (self.smoothness >= 0 and self.learning_rate > 0):
-            raise ValueError("DiffVox needs smoothness >= 0 and learning_rate > 0, but "
-                             f"{self.smoothness} and {self.learning_rate} were given")
+        check_fields(self, "DiffVox", iterations=(1, math.inf), smoothness=(0, MOST), learning_rate=(LEAST, MOST))
 
     def steps(self) -> int:
         return self.iterations

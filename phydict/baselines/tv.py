@@ -11,7 +11,7 @@ from torch import Tensor
 from phydict.baselines.baseline import Baseline, CountingProjector, clip, empty
 from phydict.linalg.power_iteration import operator_norm
 from phydict.linalg.total_variation import finest_to_own, tv_proximal
-from phydict.runtime.ranges import check_fields
+from phydict.runtime.ranges import MOST, check_fields
 from phydict.units import MU_WATER, HUWindow
 
 
@@ -47,7 +47,7 @@ class FISTATV(Baseline):
 
     def __post_init__(self):
         super().__post_init__()
-        check_fields(self, "FISTATV", iterations=(1, math.inf), inner=(1, math.inf), weight=(0, math.inf))
+        check_fields(self, "FISTATV", iterations=(1, math.inf), inner=(1, math.inf), weight=(0, MOST))
 
     @property
     def volumes(self) -> int:

@@ -45,6 +45,9 @@ def export_prior(checkpoint: str, out: str, overwrite: bool = False) -> None:
                  steps=steps, out=out)
     weights = {k.removeprefix("prior."): w for k, w in content["state_dict"].items() if k.startswith("prior.")}
     training = header.get("training", {"steps": steps})
+    ids = next((part["held_out"] for part in content.values() if isinstance(part, dict) and part.get("held_out")), None)
+    if ids and isinstance(training, dict):
+        training = {"held_out": ids} | training
     if stage == "super_resolution":
         save_super_resolution(build_super_resolution(header, weights), out, training)
     elif stage == "refinement":

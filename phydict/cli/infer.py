@@ -29,10 +29,12 @@ from phydict.runtime.console import (
     check_processes,
     cli_errors,
     ended_by_sigterm,
+    is_yaml,
     noted,
     quiet,
     read_configuration,
     sentence,
+    split_configurations,
 )
 from phydict.runtime.help import HelpFormatter
 from phydict.runtime.progress_log import log_problem, progress_options
@@ -160,6 +162,7 @@ def with_methods(args: list[str]) -> list[str]:
     `voxels`, which other settings of the box leave alone. Raises ValueError for names of no method and of no
     configuration, and for settings without a method.
     """
+    args = split_configurations(args)
     given = [arg.partition("=")[0] for arg in args]
     if any(option.startswith("--model.cube") for option in given):
         raise ValueError("model.cube is a setting of train.py: give model.grid")
@@ -193,7 +196,7 @@ def with_methods(args: list[str]) -> list[str]:
 def _configuration(given: str) -> tuple[str, bool]:
     """A configuration, its file or what it holds where it names a method or gives a number of voxels, and whether it
     gives a method at all."""
-    if ":" in given:  # YAML itself
+    if is_yaml(given):
         return given, "method" in given
     try:
         file = str(configuration(given, ("reconstruct", "simulate")))

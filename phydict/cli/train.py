@@ -158,9 +158,12 @@ class PriorCLI(ProgressCLI):
             self._begin(out, ckpt_path)
             if cts:
                 held_out, trained = datamodule.held_out, len(datamodule.cts)
-                log_progress(f"{len(held_out)} of {len(held_out) + trained} CTs are held out for validation" if held_out
-                             else "no CT is held out, so that none tells which weights are best: data.holdout.ids may "
-                             "name some", event="held_out", cts=held_out)
+                phantoms = bool(self.config.fit.data.holdout.phantoms)
+                beside = ", beside phantoms (data.holdout.phantoms)" * phantoms
+                tells = "phantoms alone tell" if phantoms else "nothing tells"
+                log_progress(f"{len(held_out)} of {len(held_out) + trained} CTs are held out for validation{beside}"
+                             if held_out else f"no CT is held out, so that {tells} which weights are best: "
+                             "data.holdout.ids may name some", event="held_out", cts=held_out)
             try:
                 self.trainer.fit(model, datamodule=datamodule, ckpt_path=ckpt_path, weights_only=weights_only)
             except BaseException as stop:
@@ -205,6 +208,9 @@ class PriorCLI(ProgressCLI):
             return
         check_writable(Path(self.config[command].out), "--out")
         settings = self.config[command]
+        if self.model_class is PriorTraining and settings.data.loading.simulation_voxels is not None:
+            raise ValueError("this stage learns from no X-rays, but data.loading.simulation_voxels is "
+                             f"{settings.data.loading.simulation_voxels}: leave it out")
         if settings.ckpt_path in NAMED_CHECKPOINTS:
             file = Path(settings.out) / NAMED_CHECKPOINTS[settings.ckpt_path]
             begins = command == "fit" and settings.ckpt_path == "last" and not file.is_file()

@@ -55,7 +55,8 @@ class CosineSchedule:
     def steps(self, n: int, start: float = 1.0, last: float | None = None) -> Iterator[tuple[float, float]]:
         """n time pairs (t, s) with start = t_1 > s_1 = t_2 > ... > s_n = 0, evenly spaced in t.
 
-        last: t_n, from which the final pair goes to 0 at once; None spaces all of them evenly down to 0.
+        last: t_n, from which the final pair goes to 0 at once; None spaces all of them evenly down to 0. A single
+        pair goes from start to 0 whatever it is.
         """
         if n < 1:
             raise ValueError(f"a sampler needs at least one step, but {n} was given")

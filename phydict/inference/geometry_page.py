@@ -15,16 +15,13 @@ from matplotlib.figure import Figure
 
 from phydict.evaluation.gallery import DISPLAY, GREY, MOST_VIEWS, PLANES, literal, plane
 from phydict.grid import Grid
+from phydict.inference.orientation import better_flip, correlation
 from phydict.runtime.files import atomic_write
 from phydict.xray import ConeBeam
 
 SIDES = (("right", "left"), ("anterior", "posterior"), ("superior", "inferior"))
 DRAWN = {"axial": 1, "coronal": 2}
 """Planes of the geometry -> the world axis that runs up the page; across it run the patient's right and left."""
-
-FLIPS = {"as it is": (1, 1), "flip_rows": (-1, 1), "flip_columns": (1, -1), "flip_rows and flip_columns": (-1, -1)}
-CLEAR = 0.03
-"""By how much a flip must agree better with the standard thorax before it is worth a word."""
 
 SIGNED = "phydict's page of a geometry"
 """What the file of a page says wrote it, so that none but a page is ever replaced."""
@@ -46,14 +43,11 @@ def view_sides(beam: ConeBeam, grid: Grid) -> list[str]:
 def agreement(xray: np.ndarray, thorax: np.ndarray) -> str:
     """How well a view (V, U) correlates with the standard thorax's, and what clearly agrees better, if anything: a
     flip, or the image inverted."""
-    scores = {name: correlation(xray[::rows, ::columns], thorax) for name, (rows, columns) in FLIPS.items()}
-    best = max(scores, key=scores.__getitem__)
-    label = f"agreement {scores['as it is']:.2f}"
-    if max(0, scores[best]) < -scores["as it is"]:
-        return f"{label}, better ({-scores['as it is']:.2f}) inverted"
-    if scores[best] <= scores["as it is"] + CLEAR:
-        return label
-    return f"{label}, better ({scores[best]:.2f}) with {best} changed"
+    stated, (flip, score) = correlation(xray, thorax), better_flip(xray, thorax)
+    label = f"agreement {stated:.2f}"
+    if max(0, score) < -stated:
+        return f"{label}, better ({-stated:.2f}) inverted"
+    return label if flip == "as it is" else f"{label}, better ({score:.2f}) with {flip} changed"
 
 
 def geometry_page(path: str | Path, beam: ConeBeam, grid: Grid, xrays: np.ndarray, thorax: np.ndarray,
@@ -118,9 +112,3 @@ def _draw(ax: Axes, beam: ConeBeam, grid: Grid, thorax_hu: np.ndarray, name: str
     for x, y, letter in ((0.02, 0.5, letters[0]), (0.98, 0.5, letters[1]), (0.5, 0.98, letters[2]),
                          (0.5, 0.02, letters[3])):
         ax.text(x, y, letter, transform=ax.transAxes, ha="center", va="center", fontsize=11, fontweight="bold")
-
-
-def correlation(a: np.ndarray, b: np.ndarray) -> float:
-    """Pearson's, in [-1, 1], of two images of one shape; 0 where one is constant."""
-    a, b = a - a.mean(), b - b.mean()
-    return float((a * b).sum() / max(np.sqrt((a * a).sum() * (b * b).sum()), 1e-12))

@@ -60,7 +60,7 @@ class CaseResults:
         """
         remove_leftovers(self.folder)
         self._check_table()
-        self._sources, self._settings = sources, json.loads(json.dumps(settings))
+        self._sources, self._settings = sources, json.loads(strict_json(settings))  # as records hold them
         with undisturbed(self.folder):
             self._before = {case: self._there(case) for case in sources}
         for case, there in self._before.items():
@@ -111,6 +111,10 @@ class CaseResults:
         with atomic_write(self.folder / "results.md") as part:
             part.write_text("\n".join(table.markdown() for table in tables))
         return tables
+
+    def beside(self, cases: Iterable[str]) -> int:
+        """How many finished cases the folder holds beside these."""
+        return len({file.parent.name for file in self.folder.glob(f"[!.]*/{RECORD}")} - set(cases))
 
     def _there(self, case: str) -> Finished | None:
         """The finished case in its place, None where nothing is. Raises ValueError for anything else."""
@@ -184,8 +188,8 @@ def _xrays(settings: Mapping) -> str:
     """How the X-rays of a scored case were made."""
     data = settings["data"]
     stated = {name: value for name, value in (data["simulator"] | data).items()
-              if name not in ("class", "protocol", "simulation_voxels") and isinstance(value, str | int | float | list)
-              and not isinstance(value, bool)}
+              if name not in ("class", "code_crc32", "protocol", "simulation_voxels")
+              and isinstance(value, str | int | float | list) and not isinstance(value, bool)}
     voxels, protocol = data.get("simulation_voxels"), data.get("protocol")
     box = Grid(**settings["grid"]) if "grid" in settings else None
     places = "the voxels that are reconstructed, which is optimistic"

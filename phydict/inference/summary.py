@@ -14,8 +14,9 @@ from phydict.evaluation.tables import fid_tables
 from phydict.inference.distances import distance_rows
 from phydict.inference.page import results_page
 from phydict.inference.protocols import Protocol
-from phydict.inference.results import FEATURES, CaseResults
+from phydict.inference.results import FEATURES, TABLE, CaseResults
 from phydict.inference.scoring import Scoring
+from phydict.runtime.progress_log import log_progress
 
 
 def summarise(results: CaseResults, cases: list[str], name: str, scoring: Scoring, protocol: Protocol | None) -> None:
@@ -26,12 +27,17 @@ def summarise(results: CaseResults, cases: list[str], name: str, scoring: Scorin
     console = Console()
     console.width = max(console.width, 80 if console.is_terminal else 120)
     further = _distances(results, finished, name, scoring)
-    for table in results.summarise(finished, further, protocol, scoring.empty):
+    tables = results.summarise(finished, further, protocol, scoring.empty)
+    for table in tables:
         console.print(table)
+    if tables and (others := results.beside(cases)):
+        log_progress(f"{TABLE} and results.md hold this run's cases, and {others} more that are finished in "
+                     f"{results.folder} are left out: name all in one run, which keeps what is finished",
+                     event="left_out", cases=others, out=str(results.folder))
     print(f"results in {results.folder}")
     if finished:
-        others = any(file.parents[1] != results.folder for file in _features(results))
-        print(f"page: {results_page(results.folder.parent, None if others else further, scoring.empty)}")
+        shared = any(file.parents[1] != results.folder for file in _features(results))
+        print(f"page: {results_page(results.folder.parent, None if shared else further, scoring.empty)}")
     if missing:
         raise ValueError(f"{len(missing)} of {len(cases)} cases were not reconstructed "
                          f"({', '.join(missing)}): see the messages above, and {results.to_resume}")

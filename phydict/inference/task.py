@@ -24,8 +24,9 @@ from phydict.evaluation import CaseMetrics
 from phydict.evaluation.fid import Features, PlaneFID
 from phydict.grid import Box, Grid
 from phydict.inference.calibration import uncertain_of
-from phydict.inference.case_files import write_result
+from phydict.inference.case_files import body_interval, write_result
 from phydict.inference.data import ReconstructionData
+from phydict.inference.orientation import orientation_doubts
 from phydict.inference.protocols import cut_out, placed, resampled, whole
 from phydict.inference.record import cascade_settings, case_record, grid_settings, method_settings, prior_settings
 from phydict.inference.results import CaseResults
@@ -196,7 +197,10 @@ class ReconstructionTask(lightning.LightningModule):
         self._attempt(case, self._test)
 
     def _predict(self, case: Case) -> None:
-        self._finish(case, self._reconstruct(case, self.seed))
+        result = self._reconstruct(case, self.seed)
+        for doubt in orientation_doubts(case["xrays"], case["beam"], self.around):
+            warn(doubt)
+        self._finish(case, result)
 
     def _test(self, case: Case) -> None:
         data = self._data
@@ -307,6 +311,7 @@ def _moved(result: Reconstruction, like: Grid, affine: np.ndarray) -> Reconstruc
 
 def _finished_line(result: Reconstruction) -> str:
     """What a line tells of a finished case."""
-    wider = result.interval_widening
+    wider, half_width = result.interval_widening, body_interval(result)
     return (f"{sum(result.seconds.values()):.1f} s, misfit {result.misfit:.4f}"
+            + (f", 90 % intervals of ±{half_width:.0f} HU in the body" if half_width is not None else "")
             + (f", intervals {wider:.1f} times as wide as calibrated" if wider >= WIDER else ""))

@@ -7,6 +7,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+KEPT = 32
+"""Residuals for which there is room at first; it doubles where more iterations are done."""
+
 
 def conjugate_gradients(operator: Callable[[Tensor], Tensor], right: Tensor, iterations: int, tolerance: float = 1e-6,
                         preconditioner: Tensor | float = 1.0, on_step: Callable[[], None] = lambda: None,
@@ -18,14 +21,15 @@ def conjugate_gradients(operator: Callable[[Tensor], Tensor], right: Tensor, ite
     inverse; where it is 0, d stays 0. on_step: called `iterations` times, as each is done or found needless.
     reorthogonalise: each residual is made orthogonal again to all before it, which in single precision it no longer is
     after a dozen iterations, so that what more of them give turns on the last digit (Golub & Van Loan, Matrix
-    Computations, 10.3); takes the memory of `iterations` right sides.
+    Computations, 10.3); takes the memory of up to two right sides for each iteration that is
+    done.
     """
     over = tuple(range(1, right.ndim))
     residual, d = right.clone(), torch.zeros_like(right)
     direction = preconditioner * residual
     energy = (residual * direction).sum(over, keepdim=True)
     stop = energy * tolerance**2
-    kept = right.new_empty(iterations, len(right), right[0].numel()) if reorthogonalise else None
+    kept = right.new_empty(min(iterations, KEPT), len(right), right[0].numel()) if reorthogonalise else None
     for n in range(iterations):
         if (energy > stop).any():
             product = operator(direction)
@@ -34,6 +38,8 @@ def conjugate_gradients(operator: Callable[[Tensor], Tensor], right: Tensor, ite
             step = torch.where(active, energy / curvature, 0)
             d.addcmul_(step, direction)
             if kept is not None:
+                if n == len(kept):
+                    kept = torch.cat([kept, torch.empty_like(kept)])
                 torch.mul(residual, torch.where(active, energy.rsqrt(), 0), out=kept[n].view_as(residual))
             residual.addcmul_(step, product, value=-1)
             if kept is not None:

@@ -44,7 +44,7 @@ class CascadePosterior(Reconstructor):
     sampler: Sampler = field(default_factory=SplitGibbs)
     sr_guided: bool = True
     sr_sampler: Sampler = SplitGibbs(
-        iterations=2, t_start=0.3, t_end=0.15, noise_fraction=0.0, prior_std=0.2,
+        iterations=2, t_start=0.3, noise_fraction=0.0, prior_std=0.2,
         likelihood=ProximalCG(iterations=5, restarts=2, tv_weight=10.0, tv_eps=0.003),
         final_likelihood=ProximalCG(iterations=10, restarts=2, tv_weight=10.0, tv_eps=0.003))
     unguided: Sampler = PriorOnly(20)
@@ -117,7 +117,7 @@ class CascadePosterior(Reconstructor):
             masks: Tensor = base.masks  # type: ignore[assignment]  # a prior gives them
             state = torch.cat([stage.window.to_range(base.within)[None], 2 * masks - 1])[None].to(xrays)
             state = state[:, :stage.coarse_channels]
-            measurement = Measurement(projector, xrays, stage.window, display, self.mu_water)
+            measurement = Measurement(projector, xrays, stage.window, display, self.mu_water, told=True)
             measurement.adopt(base)
             if base.scatter:
                 measurement.refit(stage.upsample(state)[:, :1])

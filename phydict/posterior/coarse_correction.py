@@ -78,7 +78,7 @@ def coarse_correction(base: object, level: Grid, seen: tuple[Tensor, Projector],
         return None
     if not has_finer(projector) or found.masks is None or len(found.masks) + 1 != base.prior.state_channels:
         return None
-    measurement = Measurement(projector, xrays, base.window, display, base.mu_water)
+    measurement = Measurement(projector, xrays, base.window, display, base.mu_water, told=True)
     measurement.adopt(found)
     state = torch.cat([base.window.to_range(found.within)[None], 2 * found.masks - 1])[None].to(xrays)
     refiner = base.prior.bind(report, base.guidance, base.precision)

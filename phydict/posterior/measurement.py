@@ -30,7 +30,7 @@ class Measurement:
 
     noise: standard deviation of the noise of y, as a share of its largest value or, as a tensor that expands to
     (K, V, U), of each pixel; None: estimated from y where it is needed. outside: line integrals (K, V, U) of what
-    lies outside the voxels, which P adds.
+    lies outside the voxels, which P adds. told: whether what is doubtful in the X-rays was said before.
     carried, beside: what is carried beside the CTs, if anything, and its line integrals (K, V, U), which P adds.
     subgrid: line integrals (1, K, V, U) that P adds for what the voxels cannot hold, 0 until somebody sets them.
     model_variance: variance (K, 1, 1) of what a view's line integrals hold beside noise that no volume explains, which
@@ -43,8 +43,8 @@ class Measurement:
 
     def __init__(self, projector: Projector, xrays: Tensor, window: HUWindow, display: bool = False,
                  mu_water: float = MU_WATER, noise: float | Tensor | None = None,
-                 outside: Tensor | None = None):
-        xrays = prepared_xrays(xrays, projector.beam, display)
+                 outside: Tensor | None = None, told: bool = False):
+        xrays = prepared_xrays(xrays, projector.beam, display, told)
         self.noise, self.measured = noise, xrays[None]
         self.projector, self.display = projector, xrays[None] if display else None
         self.slope, self.offset = window.mu_affine(mu_water)

@@ -6,13 +6,15 @@ from torch import Tensor
 
 from phydict.linalg.conjugate_gradients import conjugate_gradients
 from phydict.posterior.measurement import Measurement
+from phydict.runtime.ranges import LEAST, MOST, check_between
 
 
 class NormalisedMeasurement:
     """`measurement` with line integrals, operator and noise divided by |A|, the operator's largest singular value.
 
     noise: standard deviation of the line integrals' errors, given in their own units and kept as `noise` in the new.
-    Volumes keep their range. Raises ValueError where the noise is not above 0, or the operator sees nothing.
+    Volumes keep their range. Raises ValueError where the noise is not between LEAST and MOST, or the operator sees
+    nothing.
     """
 
     def __init__(self, measurement: Measurement, noise: float):
@@ -42,10 +44,8 @@ class NormalisedMeasurement:
 
 
 def check_noise(noise: float) -> None:
-    """Raises ValueError unless the noise of the line integrals is above 0."""
-    if not noise > 0:
-        raise ValueError(f"the noise of the line integrals must be above 0, but {noise} was given: state the standard "
-                         "deviation of their error, model error included")
+    """Raises ValueError unless the noise of the line integrals lies between LEAST and MOST."""
+    check_between("the noise of the line integrals, the standard deviation of their error,", noise, LEAST, MOST)
 
 
 def nearest_fit(measurement: NormalisedMeasurement, x: Tensor, weight: float, iterations: int,

@@ -24,7 +24,7 @@ from phydict.prior.uncertainty import LEVELS
 from phydict.reconstruction import Reconstruction, Reconstructor
 from phydict.runtime.precision import check_precision, precision_name
 from phydict.runtime.profiling import Stopwatch, stage
-from phydict.runtime.ranges import check_between
+from phydict.runtime.ranges import check_between, check_fields
 from phydict.runtime.reading import check_memory
 from phydict.runtime.warning import warn
 from phydict.units import MU_WATER, HUWindow
@@ -121,11 +121,7 @@ class Posterior(Reconstructor):
         if self.samples != 1 and self.sampler.needs_refiner:
             raise ValueError("an unrolled reconstruction is not random, so that samples of it do not differ, but "
                              f"{self.samples} were given: leave samples at 1, or use phydict_fast")
-        for name in ("samples", "batch"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is a number of reconstructions, 1 or more, but {getattr(self, name)} was "
-                                 "given")
-
+        check_fields(self, "Posterior", samples=(1, math.inf), batch=(1, math.inf))
         size = self.prior.state_channels * math.prod(self.grid.shape)
         check_memory(4 * self.samples * size, f"samples={self.samples} states of {size:,} numbers", "draw fewer")
 

@@ -211,7 +211,7 @@ class Refined(Delegating):
         if not covers(self.target, coarse.grid):
             mu = hu_to_mu(coarse.within.to(y), self.mu_water)
             outside = outside_projection(mu, coarse.grid, A, continued)
-        measurement = Measurement(A, y, self.base.window, display, self.mu_water, outside=outside)
+        measurement = Measurement(A, y, self.base.window, display, self.mu_water, outside=outside, told=True)
         measurement.adopt(coarse)
         return measurement
 

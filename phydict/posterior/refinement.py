@@ -15,6 +15,7 @@ from phydict.posterior.evidence import Evidence
 from phydict.posterior.likelihood.likelihood import LikelihoodStep, ProximalCG
 from phydict.posterior.measurement import Measurement
 from phydict.runtime.profiling import stage
+from phydict.runtime.ranges import LEAST, MOST, check_fields
 from phydict.units import HUWindow
 
 
@@ -70,11 +71,7 @@ class Refinement:
     mirrored: bool = True
 
     def __post_init__(self):
-        for name in ("x0_std", "call_std"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} is a standard deviation above 0, but {getattr(self, name)} was given")
-        if self.calls < 0:
-            raise ValueError(f"calls is a number of corrections, 0 or more, but {self.calls} was given")
+        check_fields(self, "Refinement", x0_std=(LEAST, MOST), call_std=(LEAST, MOST), calls=(0, math.inf))
 
     def of_views(self, views: int) -> Refinement:
         """How it is done from so many X-rays."""

@@ -191,6 +191,15 @@ def is_refiner(given: object) -> bool:
         return False
 
 
+def held_out_of(path: str | Path) -> list[str] | None:
+    """The ids of the CTs that the trainings of a saved stage held out, by its file's header; None where it tells
+    nothing of them."""
+    with safe_open(own_or_shipped(path), "pt") as file:
+        training = json.loads((file.metadata() or {}).get("phydict", "{}")).get("training")
+    held_out = training.get("held_out") if isinstance(training, dict) else None
+    return held_out if isinstance(held_out, list) and all(isinstance(id, str) for id in held_out) else None
+
+
 def _resolved(path: str | Path | MedSynCheckpoint) -> Path | MedSynCheckpoint:
     return path if isinstance(path, MedSynCheckpoint) else own_or_shipped(path)
 

@@ -101,7 +101,7 @@ class X2CTNetwork(RivalNetwork):
     bound = True
 
     def __init__(self, stem: int = 32, growth: int = 16, blocks: tuple[int, ...] = (3, 6, 12, 8),
-                 channels: tuple[int, ...] = (8, 16, 32, 64, 128)):
+                 channels: tuple[int, ...] = (8, 16, 32, 64, 64)):
         super().__init__()
         check_sizes(stem=stem, growth=growth, blocks=blocks, channels=channels)
         if len(channels) != len(blocks) + 1:

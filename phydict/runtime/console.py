@@ -104,13 +104,23 @@ def _advice(stop: BaseException, to_resume: str) -> str:
     return getattr(stop, "__notes__", [to_resume])[-1]
 
 
+def split_configurations(args: Iterable[str]) -> list[str]:
+    """Arguments with a glued -cFILE as the two that it stands for."""
+    return [part for arg in args for part in ([arg] if arg[:2] != "-c" or arg[2:3] in ("", "=") else ["-c", arg[2:]])]
+
+
+def is_yaml(given: str) -> bool:
+    """Whether a configuration is "key: value", YAML itself, and no file whose name has a colon."""
+    return ":" in given and not os.path.isfile(given)
+
+
 def with_configurations(args: list[str], kinds: tuple[str, ...]) -> list[str]:
     """Arguments with the place of every configuration (-c, --config) that is a shipped one by its path or its name; see
     `phydict.runtime.shipped.configuration`, which raises ValueError for those that are nowhere."""
     def place(given: str) -> str:
-        return given if ":" in given else str(configuration(given, kinds))  # "key: value" is YAML itself
+        return given if is_yaml(given) else str(configuration(given, kinds))
 
-    out = []
+    args, out = split_configurations(args), []
     for before, arg in zip(["", *args], args):
         option, equals, value = arg.partition("=")
         if before in CONFIGURATION:

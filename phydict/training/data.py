@@ -22,12 +22,15 @@ from phydict.datasets import (
     split_by_patient,
 )
 from phydict.datasets.cts.cache import key_of
+from phydict.datasets.cts.transforms import LEAST_SLICES
+from phydict.datasets.nifti_file import NIFTI, open_nifti
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM, VALIDATION_PHANTOM, CachedPhantoms
 from phydict.datasets.population import DrawnPatients
 from phydict.datasets.population.drawn import POPULATION_VERSION
 from phydict.grid import Cube, Grid
 from phydict.runtime.console import check_writable
 from phydict.runtime.ranges import check_between
+from phydict.runtime.reading import reading
 from phydict.runtime.seeds import check_seed
 from phydict.runtime.warning import warn
 from phydict.training.draws import Averaged, KeptDraws, MixedCases, averaged, training_parts
@@ -78,12 +81,13 @@ class PriorData(lightning.LightningDataModule):
         def meant(word: str, id: str) -> bool:
             return word == id if word in names else word in id
 
-        for word in holdout.ids or []:
+        words = holdout.words()
+        for word in words:
             if not any(meant(word, f.id) for f in files):
                 raise ValueError(f"data.holdout.ids names '{word}', but no CT has that in its id"
                                  + (f" (the first id is {files[0].id})" if files else "") + ": correct or remove it")
         validating = set(split_by_patient([f.id for f in files], holdout.fraction, seed)[1])
-        named = {patient_of(f.id) for f in files if any(meant(word, f.id) for word in holdout.ids or [])}
+        named = {patient_of(f.id) for f in files if any(meant(word, f.id) for word in words)}
         held_out = [f for f in files if f.id in validating or patient_of(f.id) in named]
         if len(held_out) == len(files) and not phantoms:
             raise ValueError("there is nothing to train on: data.holdout holds out every CT, and data.phantoms is 0")
@@ -111,20 +115,32 @@ class PriorData(lightning.LightningDataModule):
         return [drawn, *([ct.id, self.cts.key(ct)] for ct in self.cts.cts)]
 
     def state_dict(self) -> dict:
-        return {"held_out": self.held_out}
+        return {"held_out": self.held_out, "trained": len(self.cts)}
 
     def load_state_dict(self, state_dict: dict) -> None:
-        """Raises ValueError where a training that resumes holds out other CTs than it did."""
-        changed = sorted(set(state_dict["held_out"]) ^ set(self.held_out))
-        if self.trainer.state.fn == "fit" and changed:
+        """Raises ValueError where a training that resumes holds out other CTs than it did; validation warns of those
+        that it did not hold out."""
+        before = state_dict["held_out"]
+        if self.trainer.state.fn != "fit":
+            return self.check_unseen(before if state_dict.get("trained", True) else None, "the training")
+        if changed := sorted(set(before) ^ set(self.held_out)):
             is_now = "held out" if changed[0] in self.held_out else "not held out"
             raise ValueError(f"a training resumes with the CTs held out that were before, but {changed[0]} is {is_now} "
-                             "now: give the same data.cts, data.holdout and data.seed, or the ids of the training's "
-                             "held_out.txt as data.holdout.ids with data.holdout.fraction 0, or start anew with "
-                             "model.initial")
+                             "now: give the same data.cts, data.holdout and data.seed, or --data.holdout.ids "
+                             "<out>/held_out.txt with data.holdout.fraction 0, or start anew with model.initial")
+
+    def check_unseen(self, before: list[str] | None, training: str) -> None:
+        """Warns where a CT is held out that an earlier training did not hold out; None: that is not known."""
+        if before is not None and (trained := sorted(set(self.held_out) - set(before))):
+            warn(f"{trained[0]} was not among the held-out CTs of {training}: unless it is new, it was trained on, and "
+                 "tells nothing of unseen patients; hold out those of that training's held_out.txt by data.holdout.ids")
 
     def prepare_data(self) -> None:
-        if self.population and self.trainer.state.fn == "fit":
+        if self.trainer.state.fn != "fit":
+            return
+        for ct in (*self.cts.cts, *self.held_out_cts.cts):
+            check_header(ct.path)
+        if self.population:
             self.population.prepare()
 
     def train_dataloader(self) -> DataLoader:
@@ -175,6 +191,18 @@ class PriorData(lightning.LightningDataModule):
         means over blocks are what is learnt."""
         batch = torch.utils.data.default_collate([training_parts(case) for case in cases])
         return batch if self.factor == 1 else averaged(batch, self.factor) | {"fine": batch["volume"]}
+
+
+def check_header(path: Path) -> None:
+    """Raises ValueError where the header of a NIfTI file, which alone is read, is not that of a CT: of one 3D volume
+    with LEAST_SLICES or more."""
+    if not path.name.lower().endswith(NIFTI):
+        return
+    with reading(path, "convert it again, or list it in data.source.exclude"):
+        shape = open_nifti(path).header.get_data_shape()
+    if len(shape) < 3 or min(shape[:3]) < LEAST_SLICES or max(shape[3:], default=1) > 1:
+        raise ValueError(f"{path} has the shape {tuple(shape)}, but a CT is one 3D volume with at least {LEAST_SLICES} "
+                         "slices: give the whole series, or list it in data.source.exclude")
 
 
 def check_plain(loading: Loading) -> None:

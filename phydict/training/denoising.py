@@ -30,8 +30,8 @@ class DenoisingTraining(StageTraining):
     prior: Prior | SuperResolution
 
     def __init__(self, prior: Prior | SuperResolution, typical_std: float, optimisation: Optimisation,
-                 preview_steps: int, seed: int, mask_weight: float = 0.0):
-        super().__init__(prior, optimisation, seed)
+                 preview_steps: int, seed: int, mask_weight: float = 0.0, initial: str | None = None):
+        super().__init__(prior, optimisation, seed, initial)
         self.typical_std, self.preview_steps, self.mask_weight = typical_std, preview_steps, mask_weight
 
     @abstractmethod

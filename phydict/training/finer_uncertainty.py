@@ -42,14 +42,15 @@ class FinerUncertaintyTraining(StageTraining):
         corrects = load_correction(initial)
         check_continues("network", initial, corrects, cube.grid(), HUWindow(*window))
         corrects.uncertainty = network or corrects.uncertainty or FinerUncertainty()
-        super().__init__(corrects, optimisation, 0)
+        super().__init__(corrects, optimisation, 0, initial)
         corrects.uncertainty.train().requires_grad_(True)
-        self.body_weight, self.initial = body_weight, initial
+        self.body_weight = body_weight
         self.held_out: list[tuple[Tensor, Tensor]] = []
 
     def setup(self, stage: str) -> None:
+        super().setup(stage)
         made = self.trainer.datamodule.made.network  # type: ignore[attr-defined]
-        if fingerprint(made) != fingerprint(self.initial):
+        if fingerprint(made) != fingerprint(str(self.initial)):
             raise ValueError(f"the results are those of {made}, but the intervals are to be those of {self.initial}: "
                              "give one file as model.initial and data.made.network")
 

@@ -26,7 +26,7 @@ from phydict.training.denoising import DenoisingTraining
 from phydict.training.reports import BATCH, learn_sentences
 from phydict.training.settings import Execution, PriorOptimisation, PriorValidation, TextSettings
 from phydict.training.sharding import shard
-from phydict.training.stage import check_continues
+from phydict.training.stage import check_continues, check_network
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Ideal, Projector
 from phydict.xray.binning import benchmark_orbit
@@ -41,7 +41,7 @@ class PriorTraining(DenoisingTraining):
     """Learns a Prior, first its text, then denoising.
 
     Args:
-        network: the UNet; none given: the default VolumeUNet
+        network: the UNet; none given: that of initial, else the default VolumeUNet
         text: what reads reports, and how it learns to
         detail: the network for what the UNet's blocks of voxels cannot hold; none given: the default DetailNetwork
         cube: of voxels
@@ -65,7 +65,7 @@ class PriorTraining(DenoisingTraining):
         if text.renew and not initial:
             raise ValueError("model.text.renew gives a prior a new text side, but none was given to start from: give "
                              "model.initial, or leave it out")
-        network = network or VolumeUNet()
+        requested, network = network is not None, network or VolumeUNet()
         if network.state_channels > 1 + len(MASKS):
             raise ValueError(f"model.network has state_channels for a CT and up to {len(MASKS)} masks, at most "
                              f"{1 + len(MASKS)}, but {network.state_channels} was given")
@@ -74,11 +74,12 @@ class PriorTraining(DenoisingTraining):
                       detail=detail or DetailNetwork(network.state_channels))
         if initial:
             prior = _loaded(initial, prior)
+            check_network("prior", initial, prior.network.settings, network.settings if requested else {})
         if text.renew:
             prior = _renewed(prior, _text_encoder(text, prior.network))
         new_text = text.renew or not initial
-        super().__init__(prior, optimisation.sigma_data, optimisation, validation.preview_steps, seed,
-                         optimisation.mask_weight)
+        super().__init__(prior, prior.sigma_data, optimisation, validation.preview_steps, seed,
+                         optimisation.mask_weight, initial)
         reader = self.prior.text
         if reader is not None and text.reports:
             reader.check(text.reports)

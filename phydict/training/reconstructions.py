@@ -23,6 +23,7 @@ from phydict.posterior import Posterior, Refined, Refinement, Unrolled
 from phydict.posterior.refined import network_input
 from phydict.prior import DEFAULT_CORRECTION, DEFAULT_REFINER, Refiner, fingerprint, load_correction, load_prior
 from phydict.prior.correction import INPUTS, CorrectionNetwork
+from phydict.prior.files import held_out_of
 from phydict.prior.finer_uncertainty import INPUT_CHANNELS
 from phydict.reconstruction import describe
 from phydict.runtime.ranges import check_fields
@@ -57,6 +58,7 @@ class RefinementCases:
         network: the file of a network of this kind; the reconstructions are then also shown as they are at the second
             call, after its correction at the first
         seed: of the scenes that are learnt from, for a further run to learn from others
+        source: which CTs of data.cts' folder are taken, as data.source of other stages
     """
 
     reconstructions: int = 60
@@ -64,6 +66,7 @@ class RefinementCases:
     crop: int = 64
     network: str | None = None
     seed: int = 0
+    source: CTSource = CTSource()
 
     def __post_init__(self):
         check_seed(self.seed)
@@ -213,7 +216,7 @@ class RefinementData(PriorData):
             raise ValueError(f"a refinement learns from reconstructions of CTs and phantoms alone, but "
                              f"data.loading.population.share is {loading.population.share}: set it to 0")
         check_plain(loading)
-        super().__init__(cts, CTSource(), holdout, phantoms, loading, cache, cube=cube, window=window)
+        super().__init__(cts, made.source, holdout, phantoms, loading, cache, cube=cube, window=window)
         if self.factor != 1:
             raise ValueError(f"X-rays of reconstructions are made of {FINER * cube.voxels} voxels anyway, but "
                              f"data.loading.simulation_voxels is {loading.simulation_voxels}: leave it out")
@@ -224,6 +227,7 @@ class RefinementData(PriorData):
         if self.kind.of_intervals and refiner.uncertainty is None:
             raise ValueError(f"intervals on finer voxels are made of a refiner's own, but {initial} has none: "
                              "train them first, with configs/prior/uncertainty.yaml")
+        self.check_unseen(held_out_of(initial), f"the training of {initial}")
         if not refinements(refiner.grid, self.grid):
             raise ValueError(f"reconstructions are refined to voxels finer than the refiner's, but model.cube has "
                              f"{cube.voxels} as it has: give more")

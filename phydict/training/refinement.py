@@ -37,7 +37,7 @@ class RefinementTraining(StageTraining):
             check_continues("network", str(initial), network, cube.grid(), hu)
         network.grid = cube.grid()
         network.uncertainty = None  # of the errors of other weights
-        super().__init__(network.train().requires_grad_(True), optimisation, 0)
+        super().__init__(network.train().requires_grad_(True), optimisation, 0, initial)
         self.body_weight = body_weight
 
     def batch_loss(self, batch: dict, key: tuple[int, ...] = (0,), rank: int = 0, processes: int = 1) -> Tensor:

@@ -69,7 +69,7 @@ class RefinerTraining(StageTraining):
         refiner = loaded if isinstance(loaded, Refiner) else Refiner(
             loaded, _mean(loaded), first=deepcopy(loaded) if loaded.reads_text else None)
         refiner.uncertainty = None  # of what it was
-        super().__init__(refiner.train().requires_grad_(True), optimisation, seed)
+        super().__init__(refiner.train().requires_grad_(True), optimisation, seed, initial)
         if refiner.reader.load_text is not None:
             refiner.reader.text = refiner.reader.load_text()
         if refiner.first is not None:

@@ -15,7 +15,7 @@ from phydict.rivals.rival import bound_orbit
 from phydict.training.refiner import log_error, log_scores
 from phydict.training.scenes import Scenes
 from phydict.training.settings import Optimisation, RefinerValidation
-from phydict.training.stage import StageTraining
+from phydict.training.stage import StageTraining, check_network
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import ConeBeam
 
@@ -39,13 +39,10 @@ class RivalTraining(StageTraining):
             if rival.describe()[part] != made.describe()[part]:
                 raise ValueError(f"the rival {initial} and this training differ in '{part}': give another "
                                  "model.initial, or the settings that it was trained with")
-        own, requested = rival.network.settings, made.network.settings
-        if given and (name := next((name for name in requested if requested[name] != own[name]), None)):
-            raise ValueError(f"model.network has {name} {requested[name]}, but the rival {initial} that training "
-                             f"continues from has {own[name]}: leave model.network out, give it all of that rival's "
-                             "settings, or leave model.initial out")
+        if given:
+            check_network("rival", str(initial), rival.network.settings, made.network.settings)
         rival = Rival(rival.network, made.grid, made.window, made.beam)
-        super().__init__(rival.train().requires_grad_(True), optimisation, seed)
+        super().__init__(rival.train().requires_grad_(True), optimisation, seed, initial)
         self.before = before
         self.scenes, self.validation_views = scenes, views
 

@@ -36,11 +36,13 @@ class RollOutSettings:
         count: of them
         scenes: the X-rays that are drawn for them
         initial: the file of the refiner whose calls they hold, tied to model.initial
+        source: which CTs of data.cts' folder are taken, as data.source of other stages
     """
 
     count: int = 300
     scenes: Scenes = Scenes(most_views=16)
     initial: str = str(DEFAULT_REFINER)
+    source: CTSource = CTSource()
 
     def __post_init__(self):
         check_fields(self, "data.rollouts", count=(1, 1_000_000))
@@ -121,7 +123,7 @@ class RollOutData(PriorData):
         loading: how the cases of roll-outs are drawn, and how calls
         cache: folder for prepared cases and roll-outs, never inside the CTs' folder
         augmentation: strengths of the random changes of each roll-out's case
-        seed: of the draws
+        seed: of the draws and of the split into patients
         cube: tied to model.cube
         window: tied to model.window
     """
@@ -131,7 +133,7 @@ class RollOutData(PriorData):
                  cache: str = "runs/cache", augmentation: Augmentation = Augmentation(), seed: int = 0,
                  cube: Cube = Cube(), window: tuple[float, float] = (-1000.0, 1000.0)):
         check_plain(loading)
-        super().__init__(cts, CTSource(), holdout, phantoms, loading, cache, augmentation, seed, cube, window)
+        super().__init__(cts, rollouts.source, holdout, phantoms, loading, cache, augmentation, seed, cube, window)
         refiner = load_prior(rollouts.initial)
         if not isinstance(refiner, Refiner) or not refiner.grid.same_as(cube.grid()) or refiner.window != self.window:
             raise ValueError(f"roll-outs are a refiner's on {cube.voxels} voxels per side in the HU window {window}, "

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 from phydict.datasets.population import PopulationSettings
 from phydict.runtime.ranges import check_between, check_fields
+from phydict.runtime.reading import read_ids
+from phydict.runtime.warning import warn
 
 MOST_DRAWS, MOST_WORKERS = 10_000_000, 1000
 """Draws of an epoch are listed before it begins, and loader processes are all started then."""
@@ -76,13 +79,21 @@ class Optimisation:
         past = step - self.decay_from
         return rise * (max(0.0, 1 - past / self.decay_steps) if self.decay_steps and past > 0 else 1.0)
 
+    def check_end(self, max_steps: int) -> None:
+        """Warns where a training of so many steps does not end with its decay; -1: their number is not given."""
+        end = self.decay_from + self.decay_steps
+        if self.decay_steps and max_steps not in (-1, end):
+            past = f"nothing is learnt after step {end:,}" if max_steps > end else "it does not come to 0"
+            warn(f"the learning rate falls to 0 from step {self.decay_from:,} to {end:,}, but trainer.max_steps is "
+                 f"{max_steps:,}, so that {past}: set model.optimisation.decay_from and decay_steps to end with it")
+
 
 @dataclass(frozen=True)
 class PriorOptimisation(Optimisation):
     """How a prior's weights are learnt.
 
     Args:
-        sigma_data: standard deviation of the data in the prior's range
+        sigma_data: standard deviation of the data in the prior's range; a prior that training starts from has its own
         mask_weight: weight of the anatomy masks' error beside the CT's
     """
 
@@ -175,17 +186,28 @@ class HoldOut:
     """What validates instead of training.
 
     Args:
-        ids: CTs whose id is one of these words or, of a word that is no id, contains it
+        ids: CTs whose id is one of these words or, of a word that is no id, contains it; or a text file of them, one a
+            line, such as a training's held_out.txt
         fraction: share of the patients, in [0, 1]
         phantoms: a number of phantoms that are never trained on
     """
 
-    ids: list[str] | None = None
+    ids: list[str] | str | None = None
     fraction: float = 0.0
     phantoms: int = 6
 
     def __post_init__(self):
         check_between("data.holdout.phantoms", self.phantoms, 0, MOST_DRAWS)
+        if isinstance(self.ids, str) and self.ids.startswith("["):
+            raise ValueError(f"data.holdout.ids are words, but {self.ids} has numbers among them: quote each, as in "
+                             "'[\"0002\"]'")
+
+    def words(self) -> list[str]:
+        """The words of `ids`. Raises FileNotFoundError for a text file that is not there."""
+        if not isinstance(self.ids, str):
+            return self.ids or []
+        is_list = Path(self.ids).is_file() or self.ids.endswith(".txt")
+        return read_ids(self.ids, "data.holdout.ids") if is_list else [self.ids]
 
 
 @dataclass(frozen=True)

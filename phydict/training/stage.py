@@ -15,10 +15,12 @@ from torch import Tensor
 
 from phydict.grid import Grid
 from phydict.prior import CorrectionNetwork, Prior, Refiner, SuperResolution
+from phydict.prior.files import held_out_of
 from phydict.prior.finite import not_finite
 from phydict.prior.stage_file import check_stage
 from phydict.rivals import Rival
 from phydict.runtime.seeds import check_seed
+from phydict.training.data import PriorData
 from phydict.training.settings import Optimisation
 from phydict.units import HUWindow
 
@@ -35,20 +37,30 @@ def check_continues(kind: str, file: str, stage: Prior | Refiner | CorrectionNet
                          "model.window to its own")
 
 
+def check_network(kind: str, file: str, own: dict, requested: dict) -> None:
+    """Raises ValueError unless the network that was requested for a training has the settings of the one that it
+    continues from, of a `kind` in `file`."""
+    if name := next((name for name in requested if requested[name] != own.get(name)), None):
+        raise ValueError(f"model.network has {name} {requested[name]}, but the {kind} {file} that training continues "
+                         f"from has {own.get(name)}: leave model.network out, give it all of that {kind}'s settings, "
+                         "or leave model.initial out")
+
+
 class StageTraining(lightning.LightningModule, ABC):
     """Learns one stage, its network `self.prior`, by the loss of a batch (`batch_loss`).
 
     calls: of the network, forward and backward, that a sample costs. calibrates: whether validation changes the
-    weights.
+    weights. initial: the file that training starts from, if any.
     """
 
     calls, calibrates = 1, False
 
     def __init__(self, prior: Prior | SuperResolution | Refiner | CorrectionNetwork | Rival,
-                 optimisation: Optimisation, seed: int):
+                 optimisation: Optimisation, seed: int, initial: str | None = None):
         super().__init__()
         check_seed(seed, "model.seed")
         self.prior, self.optimisation, self.seed, self.samples = prior, optimisation, seed, 0
+        self.initial, self.held_out_before = initial, held_out_of(initial) if initial else None
         self.before: dict[str, int] = {}
         """Steps and samples that the weights had learnt from when this training was given them, where known."""
 
@@ -78,12 +90,17 @@ class StageTraining(lightning.LightningModule, ABC):
         """The trainer's callbacks that average weights."""
         return [one for one in self.trainer.callbacks if isinstance(one, WeightAveraging)]  # type: ignore[attr-defined]
 
+    def setup(self, stage: str) -> None:
+        if isinstance(data := self.trainer.datamodule, PriorData):  # type: ignore[attr-defined]
+            data.check_unseen(self.held_out_before, f"the training of {self.initial}")
+
     def configure_model(self) -> None:
         if self.device_mesh is not None:  # only of a strategy that shards the weights
             raise ValueError("this stage is too small to be sharded over devices: train it with "
                              "configs/prior/ddp.yaml instead of fsdp.yaml")
 
     def on_fit_start(self) -> None:
+        self.optimisation.check_end(self.trainer.max_steps)
         if self.calibrates and not len(self.trainer.datamodule.validation):  # type: ignore[attr-defined]
             raise ValueError("validation calibrates the intervals, but nothing is held out: name CTs by "
                              "data.holdout.ids, or give a share of them as data.holdout.fraction")
@@ -175,7 +192,17 @@ class StageTraining(lightning.LightningModule, ABC):
         self._check_weights(checkpoint["state_dict"], checkpoint.get("current_model_state", {}))
         progress = {"steps": self.trainer.global_step, "samples": self.samples}
         progress = {name: count + self.before.get(name, 0) for name, count in progress.items()}
-        checkpoint["phydict"] = self._describe() | {"training": progress}
+        held_out = self._held_out()
+        known = {} if held_out is None else {"held_out": held_out}
+        checkpoint["phydict"] = self._describe() | {"training": progress | known}
+
+    def _held_out(self) -> list[str] | None:
+        """The held-out CTs that the weights never learnt from, not before this training either; None where no training
+        on CTs is known."""
+        data, before = self.trainer.datamodule, self.held_out_before  # type: ignore[attr-defined]
+        if not isinstance(data, PriorData) or not len(data.cts):
+            return before
+        return [id for id in data.held_out if before is None or id in before]
 
     def on_load_checkpoint(self, checkpoint: dict) -> None:
         resumed, current = {"stage": "base"} | checkpoint["phydict"], self._describe()

@@ -16,6 +16,7 @@ from phydict.prior import LocalUNet, SuperResolution, describe_super_resolution,
 from phydict.runtime.ranges import check_between
 from phydict.training.denoising import DenoisingTraining
 from phydict.training.settings import Optimisation, Previews
+from phydict.training.stage import check_network
 from phydict.units import HUWindow
 
 
@@ -23,7 +24,7 @@ class SuperResolutionTraining(DenoisingTraining):
     """Learns a SuperResolution from crops; a crop's block means are its coarse volume.
 
     Args:
-        network: the UNet; none given: the default LocalUNet
+        network: the UNet; none given: that of initial, else the default LocalUNet
         cube: of fine voxels
         factor: fine voxels along each side of a coarse one
         window: HU that the prior's range [-1, 1] stands for
@@ -51,8 +52,9 @@ class SuperResolutionTraining(DenoisingTraining):
                     or first.window != stage.window or first.factor != factor):
                 raise ValueError(f"the stage {initial} has another grid, HU window or factor than this training: set "
                                  "model.cube, model.window and model.factor to its own")
+            check_network("stage", initial, first.network.settings, network.settings if network else {})
             stage = first.train().requires_grad_(True)
-        super().__init__(stage, stage.detail_std, optimisation, validation.preview_steps, seed)
+        super().__init__(stage, stage.detail_std, optimisation, validation.preview_steps, seed, initial=initial)
         self.most_noise = most_noise
 
     def _clean_state(self, batch: dict) -> tuple[Tensor, Tensor]:

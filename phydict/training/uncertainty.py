@@ -56,7 +56,7 @@ class UncertaintyTraining(StageTraining):
                              "model.initial")
         check_continues("refiner", initial, refiner, cube.grid(), HUWindow(*window))
         refiner.uncertainty = network or refiner.uncertainty or Uncertainty(refiner.state_channels)
-        super().__init__(refiner, optimisation, seed)
+        super().__init__(refiner, optimisation, seed, initial)
         reader = refiner.reader
         if reader.load_text is not None:  # to be written with the rest
             reader.text = reader.load_text().requires_grad_(False)

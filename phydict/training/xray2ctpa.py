@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
 
@@ -34,7 +34,8 @@ class LatentSettings:
     """The parts around the diffusion.
 
     Args:
-        autoencoder_steps: of the training, the first, in which the autoencoder learns and nothing else
+        autoencoder_steps: of the training, the first, in which the autoencoder learns and nothing else; none where
+            model.initial knows X-rays, whose diffusion is that of its autoencoder's latents
         slices: of a case, that each of them takes
         kl_weight: of the latents' divergence from a normal distribution beside the mean absolute error
         autoencoder: a .safetensors file of weights of MONAI's AutoencoderKL of the network's slice_channels, to begin
@@ -84,7 +85,8 @@ class XrayToCTPATraining(RivalTraining):
                 _load_own(getattr(network, part), file, f"model.latent.{part}")
         made = Rival(network, grid, HUWindow(*window), bound_orbit(grid, scenes.views, scenes.arc_degrees))
         super().__init__(made, scenes, (scenes.views,), optimisation, initial, seed, given)
-        self.latent, self.settles = latent, not (self.network.knows_xrays and self.network.latent_size)
+        self.latent = replace(latent, autoencoder_steps=0) if initial and self.network.knows_xrays else latent
+        self.settles = not (self.network.knows_xrays and self.network.latent_size)
 
     @property
     def network(self) -> XrayToCTPANetwork:

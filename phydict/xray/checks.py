@@ -22,9 +22,9 @@ AIR_BLOCKS, AIR_FLAT, AIR_MOST, AIR_DRIFT = 8, 0.05, 0.5, 0.1
 by less than AIR_FLAT and are below AIR_MOST; between views those of air differ by less than AIR_DRIFT."""
 
 
-def check_xrays(xrays: Tensor, beam: ConeBeam) -> None:
+def check_xrays(xrays: Tensor, beam: ConeBeam, display: bool = False) -> None:
     """Raises ValueError unless the X-rays (K, V, U) are finite, as many and as large as the beam's views, and none of
-    them is blank, but for X-rays that are 0 everywhere."""
+    them is blank, but for line integrals that are 0 everywhere, those of air."""
     expected = (beam.views, *beam.shape)
     if tuple(xrays.shape) != expected:
         raise ValueError(f"the geometry describes {expected[0]} views of {expected[1]} x {expected[2]} pixels, "
@@ -32,16 +32,17 @@ def check_xrays(xrays: Tensor, beam: ConeBeam) -> None:
     if not xrays.isfinite().all():
         raise ValueError("the X-rays contain NaN or infinite pixels: repair or remove those views first")
     blank = xrays.flatten(1).amin(1) == xrays.flatten(1).amax(1)
-    if blank.any() and xrays.any():
+    if blank.any() and (display or xrays.any()):
         which = "every view" if blank.all() else f"view {int(blank.nonzero()[0])}"
         raise ValueError(f"{which} holds the same value in every pixel, as a missing or saturated image does: leave it "
                          "out of the X-rays and of the geometry")
 
 
-def check_fit(xrays: Tensor, beam: ConeBeam, grid: Grid, survey: Grid | None = None) -> None:
+def check_fit(xrays: Tensor, beam: ConeBeam, grid: Grid, survey: Grid | None = None, display: bool = False) -> None:
     """Raises ValueError where X-rays (K, V, U), geometry and the voxels of `grid` do not fit; warns where X-rays look
-    inverted. survey: the voxels that hold the whole scene, where `grid` does not."""
-    check_xrays(xrays, beam)
+    inverted. survey: the voxels that hold the whole scene, where `grid` does not. display: whether they are display
+    values."""
+    check_xrays(xrays, beam, display)
     check_air(xrays)
     beam.check(grid)
     beam.check_scale(survey or grid)
@@ -90,20 +91,22 @@ def check_line_integrals(xrays: Tensor) -> None:
              "beyond is the method's guess, and HU near it are less certain; a wider detector would show it")
 
 
-def prepared_xrays(xrays: Tensor, beam: ConeBeam, display: bool) -> Tensor:
+def prepared_xrays(xrays: Tensor, beam: ConeBeam, display: bool, told: bool = False) -> Tensor:
     """X-rays (K, V, U) as a reconstruction takes them: checked and, of no display values, as `with_air_at_zero`. Raises
-    as `check_xrays`, and warns as `check_line_integrals`."""
-    check_xrays(xrays, beam)
+    as `check_xrays`, and warns as `check_line_integrals`. told: whether the same X-rays, binned otherwise, were warned
+    of before, so that nothing is said."""
+    check_xrays(xrays, beam, display)
     if display:
         return xrays
-    check_line_integrals(xrays)
-    return with_air_at_zero(xrays)
+    if not told:
+        check_line_integrals(xrays)
+    return with_air_at_zero(xrays, told)
 
 
-def with_air_at_zero(xrays: Tensor) -> Tensor:
+def with_air_at_zero(xrays: Tensor, told: bool = False) -> Tensor:
     """The line integrals (K, V, U), less what each view reads in air where that differs from view to view, which is
-    said in a warning: of a tube's output or a detector's gain that drifts. Views that show no air stay, and all of
-    them where none reads it as 0 within AIR_DRIFT, as where the patient fills the detector."""
+    said in a warning, unless it was `told` before: of a tube's output or a detector's gain that drifts. Views that show
+    no air stay, and all of them where none reads it as 0 within AIR_DRIFT, as where the patient fills the detector."""
     sides = outer_columns(xrays).float()
     blocks = torch.stack([rows.flatten(2).median(2).values for rows in
                           sides.tensor_split(min(AIR_BLOCKS, xrays.shape[1]), 2)])
@@ -113,8 +116,9 @@ def with_air_at_zero(xrays: Tensor) -> Tensor:
     visible = air.isfinite()
     if visible.sum() < 2 or air[visible].max() - air[visible].min() <= AIR_DRIFT or air.abs().min() > AIR_DRIFT:
         return xrays
-    few = "" if visible.all() else f", but not of the {len(air) - int(visible.sum())} views that show no air"
-    warn(f"air beside the patient reads from {float(air[visible].min()):.2f} to {float(air[visible].max()):.2f} from "
-         "view to view, but as a line integral it is 0: the tube's output or the detector's gain drifted; each view's "
-         f"own value of air is subtracted{few}. If what lies there is not air, crop it off")
+    if not told:
+        few = "" if visible.all() else f", but not of the {len(air) - int(visible.sum())} views that show no air"
+        warn(f"air beside the patient reads from {float(air[visible].min()):.2f} to {float(air[visible].max()):.2f} "
+             "from view to view, but as a line integral it is 0: the tube's output or the detector's gain drifted; "
+             f"each view's own value of air is subtracted{few}. If what lies there is not air, crop it off")
     return xrays - torch.where(visible, air, 0).to(xrays)[:, None, None]

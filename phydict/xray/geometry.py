@@ -28,6 +28,8 @@ FORMS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 """Required and optional keys of the mappings that a YAML file may hold in place of vectors."""
 CONTINUED = ("continued",)
 PLACE_OPTIONS = ("detector_shift", "tilt_degrees")
+INSTEAD = {"orbit": ", or angles_degrees: [...] in the place of views, start and arc",
+           "angles": "; angles_degrees takes the place of views, start and arc"}
 LISTS = ("shape", "pixel", "angles_degrees", "detector_shift")
 MOST_RADIANS = 4 * math.pi
 """An angle in radians beyond two turns was meant in degrees."""
@@ -381,7 +383,7 @@ class ConeBeam:
         if form == "orbit" and isinstance(given, dict) and "angles_degrees" in given:
             form = "angles"
         required, optional = FORMS[form]
-        given = dict(_check_keys(given, required, optional + PLACE_OPTIONS))
+        given = dict(_check_keys(given, required, optional + PLACE_OPTIONS, INSTEAD.get(form, "")))
         for key, value in given.items():
             if np.ndim(_numbers(key, value)) and key not in LISTS:
                 raise ValueError(f"{key} is one number, but {reprlib.repr(value)} was given")

@@ -51,8 +51,12 @@ def write(folder: Path, **content) -> Path:
 
 def ablate(folder: Path, *more: str, **content) -> list[dict]:
     """The rows after a run with more options."""
-    main(["ablate", "-c", str(write(folder, **content)), "--device", "cpu", *more])
+    main(arguments(folder, **content) + [*more])
     return read_csv(folder / "out" / "results.csv")
+
+
+def arguments(folder: Path, **content) -> list[str]:
+    return ["ablate", "-c", str(write(folder, **content)), "--device", "cpu"]
 
 
 def row(case: str, method: str, psnr: float | None, **more) -> dict:

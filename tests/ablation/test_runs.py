@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 import json
+import socket
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import nibabel
@@ -14,7 +17,7 @@ import yaml
 from command_lines import refusal
 from prior.tiny import tiny_prior
 
-from ablation.runs import TINY, Trace, ablate, write
+from ablation.runs import TINY, Trace, ablate, arguments, write
 from phydict.ablation import read_specification
 from phydict.cli.infer import main
 from phydict.evaluation import read_csv
@@ -52,6 +55,8 @@ def test_a_stopped_run_loses_no_row_and_ends_as_if_it_had_not_been_stopped(tmp_p
     with pytest.raises(SystemExit) as stopped:
         ablate(tmp_path, axes=axes)
     assert stopped.value.code == 130
+    page = (tmp_path / "out" / "index.html").read_text()
+    assert "trace (1 of 2 cases)" in page and "sirt (1 of 2 cases)" in page and "not run: the run was stopped" in page
     kept = {row["key"]: row for row in read_csv(tmp_path / "out" / "results.csv")}
     assert 0 < len(kept) < 8
     monkeypatch.setattr(trace, "behave", staticmethod(lambda calls: None))
@@ -152,15 +157,17 @@ def test_a_method_that_gives_up_is_a_row_with_its_sentence(tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize("owner, name", [(ReconstructionData, "simulate"), (Scoring, "scores")])
-def test_what_goes_wrong_outside_the_method_is_tried_again(tmp_path, monkeypatch, trace, owner, name):
+def test_what_goes_wrong_outside_the_method_is_tried_again(tmp_path, monkeypatch, capsys, trace, owner, name):
     def give_up(*_):
         raise ValueError("The case is damaged.")
 
     content = {"phantoms": 1, "axes": {"method": ["trace"]}}
     with monkeypatch.context() as patch:
         patch.setattr(owner, name, give_up)
-        assert [(row["status"], row["error"]) for row in ablate(tmp_path, **content)] == [
-            ("failed", "The case is damaged.")]
+        said = refusal(capsys, main, arguments(tmp_path, **content))  # since no row is ok
+    assert "none of the rows" in said and said.endswith("failed: The case is damaged.")
+    (row,) = read_csv(tmp_path / "out" / "results.csv")
+    assert (row["status"], row["error"]) == ("failed", "The case is damaged.")
     assert [row["status"] for row in ablate(tmp_path, **content)] == ["ok"]
 
 
@@ -206,8 +213,12 @@ def test_the_table_of_another_comparison_is_left_alone(tmp_path, capsys, trace):
     ablate(tmp_path, phantoms=1, base=TINY, axes={"method": ["trace"]})
     before = {file: file.read_bytes() for file in (tmp_path / "out").iterdir()}
     other = write(tmp_path, phantoms=1, base=TINY | {"seed": 7}, axes={"method": ["trace"]})
-    assert "another out" in refusal(capsys, main, ["ablate", "-c", str(other)])
+    said = refusal(capsys, main, ["ablate", "-c", str(other)])
+    assert "another out" in said
     assert {file: file.read_bytes() for file in (tmp_path / "out").iterdir()} == before
+    for name in said.partition("or remove ")[2].split(", "):
+        (tmp_path / "out" / name).unlink()
+    main(["ablate", "-c", str(other), "--device", "cpu"])
 
 
 @pytest.mark.parametrize("name", ["tables.md", "picture.png", "fid.csv"])
@@ -348,3 +359,53 @@ def test_a_table_with_words_for_numbers_is_refused_by_row_and_column(tmp_path, c
     table.write_text(table.read_text().replace(repr(row["psnr"]), "1e999"))
     said = refusal(capsys, main, ["ablate", "-c", str(tmp_path / "spec.yaml"), "--device", "cpu"])
     assert f"psnr of row {row['key']} is '1e999'" in said and "results.csv" in said
+
+
+def test_what_a_row_is_to_keep_and_cannot_ends_the_run(tmp_path, monkeypatch, capsys, trace):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    content = {"phantoms": 1, "axes": {"method": ["trace", "sirt"]}}
+    with monkeypatch.context() as patch:
+        patch.setattr("phydict.ablation.run.save_nifti", full)
+        said = refusal(capsys, main, [*arguments(tmp_path, **content), "--keep_volumes"])
+    assert "free some space" in said and not (tmp_path / "out" / "results.csv").exists()
+    assert {row["status"] for row in ablate(tmp_path, "--keep_volumes", **content)} == {"ok"}
+
+
+def test_what_a_killed_run_had_begun_to_keep_is_removed(tmp_path, trace):
+    begun = [tmp_path / "out" / "volumes" / f".k1.{socket.gethostname()}.99999999.partial",
+             tmp_path / "out" / "features" / f".{socket.gethostname()}.99999999.part.k1.safetensors"]
+    for folder in begun:
+        folder.parent.mkdir(parents=True)
+    begun[0].mkdir()
+    begun[1].touch()
+    ablate(tmp_path, phantoms=1, axes={"method": ["trace"]})
+    assert not any(path.exists() for path in begun)
+
+
+def test_plots_of_an_earlier_run_make_way_for_those_of_this_one(tmp_path, trace):
+    axes = {"method": ["trace", "sirt"], "method.iterations": [2]}
+    ablate(tmp_path, phantoms=1, axes=axes | {"views": [2]})
+    assert (tmp_path / "out" / "pareto.png").exists()
+    (tmp_path / "out" / "mine.png").touch()
+    ablate(tmp_path, phantoms=1, axes=axes | {"views": [2, 3]})
+    assert {path.stem for path in (tmp_path / "out").glob("*.png")} == {
+        "mine", "views", *(f"{kind}_K_{views}" for kind in ("pareto", "stages") for views in (2, 3))}
+
+
+@dataclass(frozen=True)
+class Weighted(Trace):
+    """A method with settings that are a list and a mapping."""
+
+    weights: list[float] = field(default_factory=list)
+    named: dict[str, float] = field(default_factory=dict)
+
+
+def test_a_list_or_a_mapping_is_a_setting_as_others_are(tmp_path):
+    path = f"{Weighted.__module__}.{Weighted.__qualname__}"
+    axes = {"method.weights": [[1.0, 2.0], [3.0]], "method.named": [{"a": 1.0}, {}]}
+    rows = ablate(tmp_path, phantoms=1, methods={"own": {"of": path}}, axes=axes)
+    assert [(row["method.named"], row["method.weights"]) for row in rows] == [
+        ('{"a": 1.0}', "[1.0, 2.0]"), ('{"a": 1.0}', "[3.0]"), ("{}", "[1.0, 2.0]"), ("{}", "[3.0]")]
+    assert "own, named {}, weights [3.0]" in (tmp_path / "out" / "tables.md").read_text()

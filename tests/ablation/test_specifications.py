@@ -90,6 +90,13 @@ def test_set_takes_the_place_of_a_files_axis_base_and_product(tmp_path):
         (name, 5, seed, 24) for name in ("sirt", "cgls") for seed in (1, 2)}
 
 
+def test_set_takes_the_place_of_what_changed_methods_set_and_their_own_set_that_of_both(tmp_path):
+    methods = {name: {"of": "sirt", "method.init_args.iterations": count} for name, count in (("a", 2), ("b", 3))}
+    file = write(tmp_path, methods=methods)
+    trials = read_specification(file, ["method.iterations=5", "b.method.iterations=7"]).trials
+    assert [(trial.name, trial.method.iterations) for trial in trials] == [("a", 5), ("b", 7)]
+
+
 @pytest.mark.parametrize("changes, words", [
     (["views"], "name=value"), (["=3"], "name=value"), (["views=[2"], "value of views is not valid YAML"),
     (["view=3"], "no setting 'view'"), (["projector=lines"], "no projector 'lines'"), (["method.steps=2"], "nothing"),
@@ -140,6 +147,8 @@ def test_delta_keeps_the_length_of_a_step():
     ({"methods": {"mine": {"of": "sirt", "method.iteration": 2}}}, ["method.iteration ", "iterations"]),
     ({"base": TINY | {"method.iteration": 3}, "axes": {"method": ["sirt"]}}, ["method.iteration "]),
     ({"axes": {"method": ["phydict_fast"], "method.iterations": [1]}}, ["phydict_fast: ", "2 iterations"]),
+    ({"base": TINY | {"simulation_voxels": 40}, "axes": {"method": ["sirt"]}}, ["simulation_voxels", "the 16", "40"]),
+    ({"axes": {"method": ["phydict_fast"], "samples": [0]}}, ["samples", "1 or more", "0"]),
     ({"axes": [1]}, ["axes", "mapping"])], ids=lambda value: str(value)[:60] if isinstance(value, dict) else "")
 def test_a_specification_that_cannot_be_meant_is_one_sentence(tmp_path, capsys, content, words):
     said = refusal(capsys, main, ["ablate", "-c", str(write(tmp_path, **content))])
@@ -151,6 +160,8 @@ def test_arguments_and_files_that_cannot_be_meant_are_one_sentence(tmp_path, cap
     assert "nowhere.yaml" in refusal(capsys, main, ["ablate", "-c", str(tmp_path / "nowhere.yaml")])
     file = write(tmp_path, axes={"method": ["trace"]})
     assert "nowhere" in refusal(capsys, main, ["ablate", "-c", str(file), "--cts", str(tmp_path / "nowhere")])
+    said = refusal(capsys, main, ["ablate", "-c", str(file), "-c", "pareto"])
+    assert "one file says what to compare" in said and "spec.yaml and pareto" in said
     (tmp_path / "bad.yaml").write_text("axes: [")
     assert "bad.yaml is not valid YAML" in refusal(capsys, main, ["ablate", "-c", str(tmp_path / "bad.yaml")])
     (tmp_path / "bad.yaml").write_text("axes:\n\tviews: [2]\n")

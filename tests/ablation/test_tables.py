@@ -32,6 +32,46 @@ def test_a_case_counts_once_whatever_its_seeds_and_a_missing_case_takes_a_method
     assert "| z | -0.500 [-0.750, -0.250] | -20.00 [-30.00, -10.00] |" in differences.markdown()
 
 
+def test_a_case_that_lacks_a_seed_does_not_count():
+    rows = [row(case, method, 20.0, seed=seed) for method in "xy" for case in "ab" for seed in (0, 1)]
+    rows[-1] = row("b", "y", None, seed=1)
+    x, y = summarise(rows)
+    assert x.complete and not y.complete and y.label == "y (1 of 2 cases)" and y.values["psnr"] == {"a": 20.0}
+    assert {counted["case"] for counted in y.counted} == {"a"}
+
+
+def test_what_a_method_makes_of_the_same_xrays_is_its_own_setting():
+    rows = [row("a", "x", 20.0, projector="siddon"), row("a", "y", 21.0), row("a", "z", 22.0, projector="joseph"),
+            row("a", "z", 23.0, projector="siddon")]
+    entries = summarise(rows)
+    assert [entry.label for entry in entries] == ["x", "y", "z, projector joseph", "z, projector siddon"]
+    assert not any(entry.condition for entry in entries)
+
+
+def test_voxels_are_a_methods_where_a_protocols_are_scored_and_else_the_xrays():
+    boxes = [{}, {"voxels": 128}, {"voxels": 256, "side": 400.0}]
+    scored = [row("a", method, 20.0, protocol="x2ct", **box) for method, box in zip("xyy", boxes)]
+    entries = summarise(scored)
+    assert [entry.label for entry in entries] == ["x", "y, voxels 128", "y, voxels 256, side 400"]
+    assert not any(entry.condition for entry in entries)
+    *_, first, second = summarise([*scored, *(row("a", "y", 20.0, voxels=voxels) for voxels in (64, 128))])
+    assert (first.condition["voxels"], second.condition["voxels"]) == (64, 128) and not first.settings.get("voxels")
+
+
+def test_geometries_with_detectors_of_their_own_are_compared():
+    rows = [row("a", "x", 20.0, geometry=name, detector=size) for name, size in (("arc.yaml", 200), ("two.yaml", 300))]
+    assert "PSNR (dB) ↑ by geometry" in {table.title for table in all_tables(summarise(rows))}
+
+
+def test_a_table_tells_the_settings_of_all_its_rows_that_are_no_defaults():
+    shared = {"guidance": 1.0, "geometry": "arc_60", "simulator.noise": 0.2, "method.iterations": 2}
+    rows = [row("a", method, 20.0, simulation_voxels=voxels, delta=0.5 if method == "y" else None, **shared)
+            for method in "xy" for voxels in (128, 256)]
+    for table in all_tables(summarise(rows)):
+        assert "Fixed settings: geometry arc_60, noise 0.2, iterations 2." in table.notes
+    assert "Fixed" not in all_tables(summarise([row("a", method, 20.0) for method in "xy"]))[0].markdown()
+
+
 def test_of_rows_that_differ_in_what_was_measured_alone_the_first_counts():
     first = [row("a", "x", 10.0, key="1", training="2 steps"), row("a", "x", 20.0, seed=1, key="2"),
              row("a", "y", 30.0, key="3"), row("a", "x", 40.0, key="4", delta=0.1), row("b", "x", None, key="5")]

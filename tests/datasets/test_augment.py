@@ -92,7 +92,10 @@ def test_hu_changes_spare_air_and_scale_tissue(case):
 @pytest.mark.parametrize("report, may", [
     ("", True), ("No focal consolidation.", True), ("Bilateral pleural effusion.", True),
     ("Nodule, right lung.", False), ("LEFT-sided effusion", False),
-    ("Consolidation of the middle lobe.", False), ("Opacity in the LLL.", False), ("Lingular atelectasis", False)])
+    ("Consolidation of the middle lobe.", False), ("Opacity in the LLL.", False), ("Lingular atelectasis", False),
+    ("Rt lower lobe nodule", False), ("Lt. pleural effusion", False), ("Leftward shift", False),
+    ("Levoscoliosis", False), ("Mild dextroscoliosis.", False), ("leftsided effusion", False),
+    ("Upright, brighter, altered.", True)])
 def test_only_a_report_without_side_may_be_mirrored_and_only_on_demand(case, report, may):
     case = case | {"report": report}
     for strength, mirrored in ((0.0, False), (1.0, may)):

@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 import torch
 from ct_files import AFFINE, LIVER, save_ct
+from torch.utils.data import DataLoader, Dataset
 
 from phydict.datasets.cts.ct_rate import CTCases, find_cts
-from phydict.datasets.cts.transforms import Calibration, covering_grid, load_ct, prepare_ct, to_grid
+from phydict.datasets.cts.transforms import Calibration, check_hu, covering_grid, load_ct, prepare_ct, to_grid
 from phydict.grid import Grid
 from phydict.units import AIR, HUWindow
 
@@ -127,7 +128,7 @@ def test_without_lungs_the_scan_is_centred_with_a_warning():
     assert case["centred_on"] == "volume" and not case["has_masks"].any() and not case["masks"].any()
 
 
-@pytest.mark.parametrize("wrong, sentence", [(lambda hu: hu + 1024, "no value lies below -300"),
+@pytest.mark.parametrize("wrong, sentence", [(lambda hu: hu + 1024, "only 0.0 % of it lies between -1100 and -300"),
                                                  (lambda hu: hu / 2, "the most frequent value below -300 is -490"),
                                                  (lambda hu: hu - 1024, "only 0.* % of it lies above -200")])
 def test_numbers_that_are_not_hu_are_warned_of(chest, wrong, sentence):
@@ -135,6 +136,15 @@ def test_numbers_that_are_not_hu_are_warned_of(chest, wrong, sentence):
         warnings.simplefilter("always")
         prepare_ct((wrong(chest.astype(np.float32)), AFFINE), GRID, id="odd")
     assert re.search(f"odd does not look like HU: {sentence}", " ".join(str(w.message) for w in caught))
+
+
+@pytest.mark.parametrize("offset", [0, 1024])
+def test_padding_outside_the_field_of_view_is_no_air(chest, offset, recwarn):
+    hu = chest + np.float32(offset)
+    x, y = np.indices(hu.shape[:2])
+    hu[np.hypot(x - hu.shape[0] / 2, y - hu.shape[1] / 2) > min(hu.shape[:2]) / 2] = -2000
+    check_hu(hu, "padded")
+    assert ["between -1100 and -300" in str(warning.message) for warning in recwarn] == [True] * bool(offset)
 
 
 def test_missing_and_unreadable_files(tmp_path, chest):
@@ -214,6 +224,32 @@ def test_a_broken_cache_file_is_made_again(tmp_path, chest):
     with pytest.warns(UserWarning, match="it is prepared again"):
         assert cases[0]["volume"].equal(first["volume"])
     assert cases[0]["volume"].equal(first["volume"])
+
+
+class Warned(Dataset):
+    """What is warned of while the first case is loaded, twice."""
+
+    def __init__(self, cases):
+        self.cases = cases
+
+    def __len__(self):
+        return 2
+
+    def __getitem__(self, _):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            assert "warnings" not in self.cases[0]
+        return [str(warning.message) for warning in caught if "odd does not look like HU" in str(warning.message)]
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_a_doubtful_ct_is_warned_of_once_by_each_run_that_reads_it_from_the_cache(tmp_path, chest, workers):
+    save_ct(tmp_path / "odd.nii.gz", (chest + 1024).astype(np.int16))
+    for _ in range(3):
+        cases = Warned(CTCases(find_cts(tmp_path / "odd.nii.gz"), tmp_path / "cache", GRID))
+        epochs = [[*DataLoader(cases, None, num_workers=workers)] for _ in range(2)]
+        assert [len(texts) for epoch in epochs for texts in epoch] == [1, 0, 0, 0]
+    assert len([*(tmp_path / "cache").iterdir()]) == 1
 
 
 def test_voxels_without_their_place_are_no_ct(chest):

@@ -128,9 +128,30 @@ def test_files_of_the_same_name_in_patient_folders_are_told_apart(tmp_path, ches
     for folder in ("x", "y"):
         save_ct(tmp_path / folder / "ct.nii", chest[:4, :4, :4])
     assert [ct.id for ct in find_cts(tmp_path)] == ["x__ct", "y__ct"] and patient_of("x__ct") == "x"
-    save_ct(tmp_path / "x" / "again" / "ct.nii", chest[:4, :4, :4])
-    with pytest.raises(ValueError, match="would both become case x__ct"):
+    save_ct(tmp_path / "y" / "ct.nii.gz", chest[:4, :4, :4])
+    with pytest.raises(ValueError, match="would both become case y__ct"):
         find_cts(tmp_path)
+
+
+@pytest.mark.parametrize("names, ids", [
+    (("sub-01/ses-1/ct", "sub-01/ses-2/ct", "sub-02/ses-1/ct"),
+     ["sub-01__ses-1__ct", "sub-01__ses-2__ct", "sub-02__ct"]),
+    (("data/p1/ct", "data/p2/ct", "data/p2/other"), ["data__other", "data__p1__ct", "data__p2__ct"]),
+    (("x/ct", "x/again/ct", "ct"), ["ct", "x__again__ct", "x__ct"])])
+def test_where_names_clash_all_folders_are_in_the_id_and_the_patient_stays(tmp_path, chest, names, ids):
+    for name in names:
+        save_ct(tmp_path / f"{name}.nii.gz", chest[:4, :4, :4])
+    found = {ct.id: ct.path.relative_to(tmp_path).parts for ct in find_cts(tmp_path)}
+    assert [*found] == ids and all(patient_of(id) == parts[0].split(".")[0] for id, parts in found.items())
+
+
+def test_links_to_one_ct_are_warned_of_unless_one_is_excluded(tmp_path, chest):
+    save_ct(tmp_path / "cts" / "a.nii.gz", chest[:4, :4, :4])
+    (tmp_path / "cts" / "b.nii.gz").symlink_to("a.nii.gz")
+    with pytest.warns(UserWarning, match=r"1 of the 2 CTs in .* \(b is .*a.nii.gz, as a is\)"):
+        assert len(find_cts(tmp_path / "cts")) == 2
+    (tmp_path / "list.txt").write_text("b\n")
+    assert len(find_cts(tmp_path / "cts", exclude=tmp_path / "list.txt")) == 1
 
 
 def test_linked_folders_are_entered_once_and_hidden_ones_never(tmp_path, chest):
@@ -184,6 +205,20 @@ def test_a_table_without_a_row_is_refused_as_one_of_others_is(tmp_path, chest):
         find_cts(tmp_path / "cts", reports=empty)
 
 
+def test_it_is_told_how_many_cts_have_a_report_where_not_all_have(tmp_path, chest, capsys):
+    rows = [(f"{name}.nii.gz", "", "", "Nodule, 4 mm.", "Nodule.") for name in ("a", "B", "C_1")]
+    table = write_csv(tmp_path / "reports.csv", REPORT_COLUMNS, *rows)
+    for name in ("a", "b", "c"):
+        save_ct(tmp_path / "cts" / f"{name}.nii.gz", chest[:4, :4, :4])
+        write_ct_series(tmp_path / "dicom" / name, np.zeros((8, 8, 4)), AFFINE)
+    for root in (tmp_path / "cts", tmp_path / "dicom"):
+        assert sum(bool(source.report) for source in find_sources(root, reports=table)) == 1
+        assert capsys.readouterr().err == "reports for 1 of 3 CTs; the first without is b\n"
+    find_cts(tmp_path / "cts" / "a.nii.gz", reports=table)
+    find_cts(tmp_path / "cts")
+    assert not capsys.readouterr().err
+
+
 def test_dicom_series_have_their_reports_by_name_and_a_table_of_others_is_refused(tmp_path):
     write_ct_series(tmp_path / "cts" / "anna", np.zeros((8, 8, 4)), AFFINE)
     rows = [("bob.nii.gz", "", "", "Nodule, 4 mm.", "Nodule."), ("anna.nii.gz", "", "", "Effusion.", "Effusion.")]
@@ -211,6 +246,17 @@ def test_a_patient_never_straddles_the_split():
     assert split_by_patient(["a", "b"], 0.01)[1] and not split_by_patient(ids, 0)[1]
     with pytest.raises(ValueError, match="must lie in"):
         split_by_patient(ids, 1.5)
+
+
+@pytest.mark.parametrize("fraction", [0.05, 0.3, 0.5])
+@pytest.mark.parametrize("count", [2, 9, 50])
+def test_a_patient_more_or_fewer_moves_at_most_one_other(count, fraction):
+    patients = [f"p{n}" for n in range(count)]
+    for seed in range(5):
+        before = {*split_by_patient(patients, fraction, seed)[1]}
+        for fewer in ([p for p in patients if p != left] for left in patients):
+            now = {*split_by_patient(fewer, fraction, seed)[1]}
+            assert len((before ^ now) & {*fewer}) <= 1
 
 
 def test_metadata_of_voxels_that_no_ct_has_are_refused(tmp_path, chest):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import shutil
 import subprocess
 import sys
 
@@ -108,6 +109,16 @@ def test_a_second_test_scores_nothing_twice_and_shows_one_table(scored, capsys):
     assert (stamp(scored / "phantom-1000000"), (scored / "results.csv").read_text()) == before
     out = " ".join(capsys.readouterr().out.split())
     assert "n = 2 cases" in out and "Test metric" not in out and "Warning" not in out
+
+
+def test_a_test_of_fewer_cases_says_how_many_of_the_folder_its_table_leaves_out(scored, tmp_path, capsys):
+    shutil.copytree(scored, tmp_path / "sirt")
+    main(phantoms(tmp_path, 2))
+    assert "left out" not in capsys.readouterr().err
+    main(phantoms(tmp_path, 1))
+    assert "hold this run's cases, and 1 more that are finished in" in capsys.readouterr().err
+    main(phantoms(tmp_path, 2))
+    assert (tmp_path / "sirt" / "results.csv").read_text() == (scored / "results.csv").read_text()
 
 
 def test_a_case_depends_on_its_id_and_the_seed_alone(cts, tmp_path):

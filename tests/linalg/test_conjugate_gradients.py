@@ -37,3 +37,18 @@ def test_in_double_precision_few_iterations_are_the_same_and_a_solved_case_stays
     found = solved(torch.float64, 20, True, half)
     torch.testing.assert_close(found[:1], solved(torch.float64, 20, True)[:1])
     assert not found[1].any()
+
+
+def test_iterations_are_a_bound_for_which_no_memory_is_kept():
+    """10^10 residuals were 32 TB."""
+    def stop():
+        raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        conjugate_gradients(lambda d: SCALE * d, RIGHT, 10**10, on_step=stop, reorthogonalise=True)
+
+
+def test_more_room_for_residuals_changes_no_bit(monkeypatch):
+    plain = solved(torch.float32, 60, True)
+    monkeypatch.setattr("phydict.linalg.conjugate_gradients.KEPT", 3)
+    assert torch.equal(solved(torch.float32, 60, True), plain)

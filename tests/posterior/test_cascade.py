@@ -89,6 +89,12 @@ def test_what_the_x_rays_hold_beside_the_ct_is_as_the_base_stage_found_it():
     assert not (second.scatter or second.hardening or second.metal) and second.iterations == sampler.iterations
 
 
+def test_no_setting_of_the_second_stage_s_own_sampler_is_without_effect():
+    own = CascadePosterior(Cascade(tiny_prior(False), GaussianStage(1e-2)), SAMPLER).sr_sampler
+    denoiser = GaussianDenoiser(torch.zeros(1), torch.ones(1))
+    assert own.t_end is None and own.times(denoiser) == [(1.0, 0.3), (0.3, 0.0)]
+
+
 def test_a_projector_of_one_s_own_leaves_the_base_stage_to_phydict_s(xrays):
     class Own:
         grid, beam, method = FINE, BEAM, "mine"

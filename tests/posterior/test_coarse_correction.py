@@ -98,5 +98,5 @@ def test_every_correction_is_a_call_of_the_network_and_less_than_none_is_refused
         return ready.reconstruct(*fit_to_grid(ready, fine, y, BEAM)).network_calls
 
     assert [network_calls(calls) - network_calls(0) for calls in (1, 3)] == [1, 3]
-    with pytest.raises(ValueError, match="calls is a number of corrections, 0 or more, but -1 was given"):
+    with pytest.raises(ValueError, match="Refinement.calls is a finite number, 0 or more, but -1 was given"):
         Refinement(calls=-1)

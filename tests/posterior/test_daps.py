@@ -90,7 +90,8 @@ def test_the_result_depends_on_the_seed_alone():
 
 
 @pytest.mark.parametrize("settings", [{"levels": 0}, {"flow_steps": 0}, {"sigma_min": 200.0}, {"noise": -1.0},
-                                      {"prior_std": 0.0}])
+                                      {"prior_std": 0.0}, {"noise": 1e-200}, {"noise": float("inf")},
+                                      {"sigma_max": float("inf")}])
 def test_impossible_settings_are_refused(settings):
     with pytest.raises(ValueError, match=str(next(iter(settings.values())))):
         DAPS(**settings)

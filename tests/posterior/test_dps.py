@@ -89,7 +89,7 @@ def test_the_result_depends_on_the_seed_alone():
     assert torch.equal(one, sample(DPS(5), seed=3)) and not torch.allclose(one, sample(DPS(5), seed=4))
 
 
-@pytest.mark.parametrize("settings", [{"iterations": 0}, {"scale": -1.0}])
+@pytest.mark.parametrize("settings", [{"iterations": 0}, {"scale": -1.0}, {"scale": float("inf")}])
 def test_impossible_settings_are_refused(settings):
     with pytest.raises(ValueError, match=str(next(iter(settings.values())))):
         DPS(**settings)

@@ -101,7 +101,7 @@ def test_a_normalised_measurement_has_norm_one_and_the_same_relative_misfit():
 
 
 def test_no_noise_and_no_view_are_refused():
-    with pytest.raises(ValueError, match="above 0, but 0"):
+    with pytest.raises(ValueError, match="noise of the line integrals.* lies between .*, but 0.0 was given"):
         NormalisedMeasurement(measurement(), 0.0)
     with pytest.raises(ValueError, match="no ray"):
         NormalisedMeasurement(DenseMeasurement(torch.zeros(2, N).double(), torch.zeros(2).double()), 0.1)

@@ -85,7 +85,7 @@ def test_the_result_depends_on_the_seed_alone():
 
 
 @pytest.mark.parametrize("settings", [{"rho_min": 20.0}, {"decay": 1.5}, {"levels": 0}, {"noise": 0.0},
-                                      {"burn_in": 98}, {"thinning": 0}])
+                                      {"burn_in": 98}, {"thinning": 0}, {"noise": 1e-200}])
 def test_impossible_settings_are_refused(settings):
     with pytest.raises(ValueError, match=str(next(iter(settings.values())))):
         PnPDM(**settings)

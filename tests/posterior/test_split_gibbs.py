@@ -179,7 +179,8 @@ def test_on_step_is_called_as_often_as_promised(settings):
 
 
 @pytest.mark.parametrize("settings, message", [
-    ({"iterations": 0}, "at least one iteration"), ({"t_start": 0.0}, "t_start"),
+    ({"iterations": 0}, "SplitGibbs.iterations"), ({"iterations": 2.5}, "whole number, but 2.5"),
+    ({"t_start": 0.0}, "t_start"),
     ({"t_start": 1.2}, "t_start"), ({"prior_std": 0.0}, "prior_std"), ({"prior_std": -0.5}, "prior_std"),
     ({"ec_delta": 1.0}, "ec_delta"), ({"ec_delta": -0.1}, "ec_delta")])
 def test_impossible_settings_are_refused(settings, message):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from prior.tiny import tiny_prior, tiny_refiner, tiny_super_resolution
-from torch.nn.functional import avg_pool3d, interpolate
+from torch.nn.functional import avg_pool3d, interpolate, max_pool3d
 
 from phydict.datasets import Thorax, build, load_xrays
 from phydict.diffusion import CosineSchedule, renoise
@@ -227,6 +227,17 @@ def test_air_and_one_material_in_it_are_no_chest_and_a_body_with_a_hollow_is_ano
     assert not one_material(hu + grain) and not one_material(1000 * torch.randn(hu.shape, generator=draw))
 
 
+@pytest.mark.parametrize("share", [1.0, 0.6, 0.5, 0.42])
+def test_a_small_chest_is_a_chest_and_a_body_of_its_shape_of_one_material_is_none(share):
+    hu = torch.from_numpy(build(Thorax.standard(), Grid.cube(64))[0]).float()[None, None].clamp(-1000, 1000)
+    small = interpolate(hu, scale_factor=share, mode="trilinear")
+    size = 64 - small.shape[2]
+    chest = torch.nn.functional.pad(small, 3 * [size // 2, size - size // 2], value=-1000.0)[0, 0]
+    shape = max_pool3d((chest > -900).float()[None], 3, 1, 1)[0]
+    blurred = 1000 * avg_pool3d(shape[None], 3, 1, 1)[0] - 1000  # edges as the network's own
+    assert not one_material(chest) and one_material(blurred)
+
+
 def test_what_is_no_chest_is_reconstructed_without_a_network_and_that_is_said():
     projector = Projector(GRID, EIGHT, full_detector=True)
     xrays = projector(torch.full((1, 1, *GRID.shape), 0.02))[0]
@@ -368,8 +379,9 @@ def test_what_does_not_fit_is_refused_in_a_sentence(tmp_path):
         Refiner(tiny_prior(), torch.zeros(4, *GRID.shape))
     for change, words in (({"times": ()}, "one or more"), ({"times": (0.0,), "x0_stds": (1, 1)}, "between 0 and 1"),
                           ({"more_times": (1.0,)}, "between 0 and 1"),
-                          ({"x0_stds": (0.1,)}, "5 numbers above 0"), ({"x0_stds": (0, 1, 1, 1, 1)}, "above 0"),
-                          ({"contradiction": -1.0}, "contradiction is")):
+                          ({"x0_stds": (0.1,)}, "5 numbers, one more"), ({"x0_stds": (0, 1, 1, 1, 1)}, "x0_stds lies"),
+                          ({"x0_stds": (1e200, 1, 1, 1, 1)}, "x0_stds lies"),
+                          ({"contradiction": -1.0}, "contradiction lies")):
         with pytest.raises(ValueError, match=words):
             replace(METHODS["phydict_learned"], **change)
     save_prior(tiny_prior(), tmp_path / "prior.safetensors")

@@ -15,6 +15,7 @@ from phydict.cli.infer import main as infer
 from phydict.inference import ReconstructionTask
 from phydict.methods import METHODS, reconstructor
 from phydict.prior import find_prior, own_identity
+from phydict.reconstruction import own_code
 
 MODULE = (Path(__file__).parents[2] / "data" / "example" / "own_prior" / "my_prior.py").read_text() + '''
 
@@ -88,7 +89,9 @@ def test_on_the_command_line_it_is_a_class_with_its_settings(module, tmp_path):
     levels = []
     for name, hu in (("a", -500.0), ("b", -300.0)):
         record = json.loads(next((tmp_path / name).rglob("reconstruction.json")).read_text())
-        assert {"class": f"{module}.OwnPrior", "hu": hu}.items() <= record["settings"]["prior"].items()
+        code = own_code(import_module(module).OwnPrior)
+        told = {"class": f"{module}.OwnPrior", "hu": hu} | code
+        assert code and told.items() <= record["settings"]["prior"].items()
         levels.append(record["misfit"])
     assert levels[0] != levels[1]
 

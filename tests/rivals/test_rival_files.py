@@ -162,7 +162,8 @@ def test_the_table_of_a_comparison_says_so_and_that_of_a_damaged_file_is_made_to
             Path(file).write_bytes(b"no rival")
         (tmp_path / "spec.yaml").write_text(yaml.safe_dump({
             "out": str(tmp_path / f"out{damage}"), "phantoms": 1, "base": {"detector": 24, "views": 3, "voxels": 16},
-            "methods": {"mine": {"of": "phydict.rivals.TrainedRival", "method.file": file}}}))
+            "methods": {"mine": {"of": "phydict.rivals.TrainedRival", "method.file": file}},
+            "axes": {"method": ["mine", "fdk"]}}))
         infer(["ablate", "-c", str(tmp_path / "spec.yaml"), "--device", "cpu"])
         return (tmp_path / f"out{damage}" / "tables.md").read_text()
 

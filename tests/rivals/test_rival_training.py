@@ -133,7 +133,7 @@ def test_a_rival_counts_the_steps_that_it_went_on_from(tmp_path, monkeypatch):
     save_rival(tiny_lifted(), file, {"steps": 6, "samples": 12})
     task = LiftedTraining(cube=Cube(16), window=(-1000, 600), initial=str(file))
     monkeypatch.setattr(LiftedTraining, "trainer", SimpleNamespace(
-        global_step=2, strategy=SimpleNamespace(reduce=lambda value, **_: value)))
+        global_step=2, datamodule=None, strategy=SimpleNamespace(reduce=lambda value, **_: value)))
     task.samples, checkpoint = 4, {"state_dict": {}}
     task.on_save_checkpoint(checkpoint)
     assert checkpoint["phydict"]["training"] == {"steps": 8, "samples": 16}

@@ -107,6 +107,16 @@ def test_a_trained_diffusion_keeps_the_size_of_its_latents_and_is_validated_from
     assert "val/psnr" in logged
 
 
+def test_a_rival_that_knows_xrays_goes_on_with_the_latents_that_it_knows(tmp_path):
+    first, file = tiny_xray2ctpa(), str(tmp_path / "rival.safetensors")
+    for knows in (True, False):
+        first.network.denoiser.leave.weight.data *= knows
+        save_rival(first, file)
+        went_on = XrayToCTPATraining(scenes=OrbitScenes(views=2), cube=Cube(16), window=(WINDOW.low, WINDOW.high),
+                                     initial=file)
+        assert went_on.learns_slices != knows
+
+
 def test_what_has_learnt_nothing_of_xrays_or_of_slices_is_refused(tmp_path):
     network = XrayToCTPANetwork((4, 4), 8, (4, 8), (4, 8), 4)
     method = RivalAnswer(Rival(network, GRID, HUWindow(), BEAM))

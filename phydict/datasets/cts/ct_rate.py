@@ -8,11 +8,13 @@ CT-RATE (arXiv 2403.17834) names its volumes (train|valid)_<patient>_<scan>_<rec
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from torch.utils.data import Dataset
 
 from phydict.datasets.case import Case
@@ -26,8 +28,9 @@ from phydict.datasets.natural_order import natural_order
 from phydict.datasets.nifti_file import NIFTI
 from phydict.grid import Grid
 from phydict.runtime.files import files_below
+from phydict.runtime.progress_log import log_progress
 from phydict.runtime.reading import name_of, read_ids
-from phydict.runtime.warning import warn
+from phydict.runtime.warning import heard, warn
 from phydict.units import HUWindow
 
 NAME = re.compile(r"(?P<patient>(?:train|valid)_\d+)_(?P<scan>[a-z]+)_(?P<reconstruction>\d+)", re.IGNORECASE)
@@ -111,14 +114,19 @@ def find_cts(root: str | Path, reports: str | Path | None = None, metadata: str 
     files to leave out, one a line (CT-RATE's no_chest_*.txt).
     Segmentations beside CTs are passed over. Of cases prepared by data/prepare_cts.py the volume alone is taken, with
     their own ids, and with their own reports where no table has one.
-    Ids are file names without ending; outside CT-RATE's names, a file in a subfolder gets `<first subfolder>__<name>`.
-    Raises FileNotFoundError where there is no NIfTI, ValueError for ids found twice, v1 volumes without metadata, and a
-    given table of reports without any of the CTs; one that was found by itself is warned of.
+    Ids are file names without ending; outside CT-RATE's names, a file in a subfolder gets `<first subfolder>__<name>`,
+    or all its folders where two CTs would have the same id.
+    Warns of CTs that are the same file. Raises FileNotFoundError where there is no NIfTI, ValueError for ids found
+    twice, v1 volumes without metadata, and a given table of reports without any of the CTs; one that was found by
+    itself is warned of.
     """
     root = Path(root)
+    paths = _ct_files(root)
+    short = Counter(_id(path, root) for path in paths)
     files: dict[str, Path] = {}
-    for path in _ct_files(root):
+    for path in paths:
         id = _id(path, root)
+        id = id if short[id] == 1 else _id(path, root, every_folder=True)
         if id in files and NAME.fullmatch(id) and _is_fixed(path) != _is_fixed(files[id]):
             path = path if _is_fixed(path) == fixed else files[id]
         elif id in files:
@@ -129,6 +137,7 @@ def find_cts(root: str | Path, reports: str | Path | None = None, metadata: str 
         ids = without_excluded(ids, exclude, root)
     if first_reconstruction:
         ids = first_of_scans(ids)
+    _warn_of_links({id: files[id].resolve() for id in ids}, root)
     table_given = reports is not None
     reports = reports or _beside(root, "radiology_text_reports")
     texts = read_reports(reports) if reports else {}
@@ -142,7 +151,17 @@ def find_cts(root: str | Path, reports: str | Path | None = None, metadata: str 
             raise ValueError(f"{message}: give the table of these CTs, or leave out data.source.reports")
         warn(message)
     cts = [CTFile(files[id], id, _own_report(files[id]) if text is None else text) for id, text in reports_of.items()]
+    if texts:
+        log_reports(ids, [ct.id for ct in cts if reports_of[ct.id] is None and not ct.report])
     return cts if fixed else _calibrated(cts, metadata or _beside(root, "metadata"))
+
+
+def log_reports(ids: list[str], without: list[str]) -> None:
+    """Tells how many of the CTs have a report, where some have and the ids `without` have none."""
+    if 0 < len(without) < len(ids):
+        count = len(ids) - len(without)
+        log_progress(f"reports for {count} of {len(ids)} CTs; the first without is {without[0]}", event="reports",
+                     reports=count, cts=len(ids), without=without[0])
 
 
 def first_of_scans(ids: list[str]) -> list[str]:
@@ -200,12 +219,23 @@ def _ct_files(root: Path) -> list[Path]:
     return files
 
 
-def _id(path: Path, root: Path) -> str:
+def _id(path: Path, root: Path, every_folder: bool = False) -> str:
     if is_prepared(path):
         return name_of(path.absolute().parent)
     name = case_id(path)
-    inner = path.relative_to(root).parts if root.is_dir() else ()
-    return name if NAME.fullmatch(name) or len(inner) < 2 else f"{name_of(inner[0])}__{name}"
+    folders = path.relative_to(root).parts[:-1] if root.is_dir() and not NAME.fullmatch(name) else ()
+    return "__".join((*map(name_of, folders if every_folder else folders[:1]), name))
+
+
+def _warn_of_links(files: dict[str, Path], root: Path) -> None:
+    """Warns where ids have the same file."""
+    first: dict[Path, str] = {}
+    again = [id for id, file in files.items() if first.setdefault(file, id) != id]
+    if again:
+        file = files[again[0]]
+        warn(f"{len(again)} of the {len(files)} CTs in {root} are links to files of others ({again[0]} is {file}, as "
+             f"{first[file]} is), so that one may be held out and trained on: remove one of them, or exclude it by "
+             "data.source.exclude")
 
 
 def _own_report(path: Path) -> str:
@@ -224,16 +254,16 @@ def _beside(root: Path, name: str) -> Path | None:
 def split_by_patient(ids: list[str], fraction: float, seed: int = 0) -> tuple[list[str], list[str]]:
     """(training ids, held-out ids): about `fraction` of the patients are held out, all their scans together.
 
-    With two or more patients and 0 < fraction < 1 neither side is empty.
-    Raises ValueError for a fraction outside [0, 1].
+    Patients are in the order of a hash of seed and name, so that one more or fewer moves at most one other. With two or
+    more patients and 0 < fraction < 1 neither side is empty. Raises ValueError for a fraction outside [0, 1].
     """
     if not 0 <= fraction <= 1:
         raise ValueError(f"the held-out fraction must lie in [0, 1], but {fraction} was given")
-    patients = sorted({patient_of(id) for id in ids})
+    patients = sorted({patient_of(id) for id in ids}, key=lambda patient: key_of([seed, patient]))
     count = round(fraction * len(patients))
     if 0 < fraction < 1 and len(patients) > 1:
         count = min(max(count, 1), len(patients) - 1)
-    held = {patients[i] for i in np.random.default_rng(seed).permutation(len(patients))[:count]}
+    held = set(patients[:count])
     return [id for id in ids if patient_of(id) not in held], [id for id in ids if patient_of(id) in held]
 
 
@@ -249,14 +279,15 @@ class CTCases(Dataset):
 
     cts: what `find_cts` returns. cache: a folder for the prepared cases, made when missing; None keeps nothing. A case
     is prepared anew when its file, grid, window or calibration changes, or a mask of one that was prepared before.
-    Volumes are stored to half precision (0.5 HU), masks to 1/255; a case is the same before and after caching. The
-    folder of the CTs is never written to.
+    Volumes are stored to half precision (0.5 HU), masks to 1/255; a case is the same before and after caching. What was
+    warned of when it was prepared is warned of once when it is read. The folder of the CTs is never written to.
     """
 
     def __init__(self, cts: list[CTFile], cache: str | Path | None, grid: Grid = Grid.cube(64),
                  window: HUWindow = HUWindow()):
         self.cts, self.grid, self.window = list(cts), grid, window
         self.cache = None if cache is None else Path(cache)
+        self.told = torch.zeros(len(self.cts), dtype=torch.bool).share_memory_()  # by any process that loads cases
         if self.cache is not None:
             self.cache.mkdir(parents=True, exist_ok=True)
 
@@ -268,9 +299,15 @@ class CTCases(Dataset):
         file = self.cache and self.cache / f"{ct.id}-{self.key(ct)}.npz"
         packed = read_arrays(file) if file else None
         if packed is None:
-            packed = pack_case(load_case(ct, self.grid, self.window), PACKED)
+            with heard() as texts:
+                packed = pack_case(load_case(ct, self.grid, self.window), PACKED)
             if file:
-                write_arrays(file, packed)
+                write_arrays(file, packed | ({"warnings": np.array(texts)} if texts else {}))
+        warnings = packed.pop("warnings", None)
+        if warnings is not None and not self.told[index]:
+            for text in warnings:
+                warn(str(text))
+        self.told[index] = True
         return unpack_case(packed) | {"id": ct.id, "report": ct.report}
 
     def key(self, ct: CTFile) -> str:

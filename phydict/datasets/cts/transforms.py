@@ -23,6 +23,8 @@ from phydict.runtime.warning import warn
 from phydict.units import AIR, HUWindow
 
 SEGMENTATION_MM = 2.0
+PADDING = AIR - 100
+"""HU from which downwards voxels are no noisy air, but padding outside the scanner's circular field."""
 LARGEST_VOXEL, FURTHEST = 100.0, 1e6
 """mm that no voxel's side and no CT's distance from its origin reach."""
 LEAST_SLICES = 8
@@ -143,13 +145,14 @@ def _check_affine(path: Path, affine: np.ndarray, advice: str) -> None:
 
 def check_hu(hu: np.ndarray, name: str) -> None:
     """Warn where air is not near -1000 or hardly any tissue is left: the numbers are then hardly HU."""
-    sample = hu[::3, ::3, ::3].clip(AIR, 3000)
+    sample = hu[::3, ::3, ::3]
     low = sample[sample < -300]
-    tissue = float((sample > -200).mean())
-    counts, edges = np.histogram(low, bins=35, range=(AIR, -300))
+    tissue, gas = float((sample > -200).mean()), float((low > PADDING).sum() / sample.size)
+    counts, edges = np.histogram(low.clip(AIR), bins=35, range=(AIR, -300))
     mode = edges[counts.argmax()] + 10
-    if not low.size or mode > -900:
-        air = f"the most frequent value below -300 is {mode:.0f}" if low.size else "no value lies below -300"
+    if gas < 0.01 or mode > -900:
+        air = f"only {100 * gas:.1f} % of it lies between {PADDING:g} and -300" if gas < 0.01 else \
+            f"the most frequent value below -300 is {mode:.0f}"
         warn(f"{name} does not look like HU: {air}, but air should lie near -1000; check slope, intercept "
              "and whether `fixed` (data.source.fixed) is right")
     elif tissue < 0.01:

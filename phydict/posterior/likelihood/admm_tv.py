@@ -9,6 +9,7 @@ from torch import Tensor
 from phydict.linalg.conjugate_gradients import conjugate_gradients
 from phydict.linalg.total_variation import differences, differences_adjoint
 from phydict.posterior.normalised import NormalisedMeasurement
+from phydict.runtime.ranges import LEAST, MOST, check_fields
 
 
 @dataclass(frozen=True)
@@ -30,9 +31,7 @@ class ADMMTV:
     def __post_init__(self):
         if not self.axes or set(self.axes) - set("xyz") or len(set(self.axes)) < len(self.axes):
             raise ValueError(f"the axes of total variation are of 'xyz', each once, but '{self.axes}' was given")
-        if not self.weight >= 0 or not self.rho > 0:
-            raise ValueError("total variation needs a weight of at least 0 and rho above 0, but "
-                             f"{self.weight} and {self.rho} were given")
+        check_fields(self, "ADMMTV", weight=(0, MOST), rho=(LEAST, MOST))
 
     def begin(self, x: Tensor) -> ADMMPasses:
         """The passes of one sampling; x (B, 1, X, Y, Z) gives sizes alone."""

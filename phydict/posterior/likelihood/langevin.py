@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -10,6 +11,7 @@ from torch import Tensor
 from phydict.diffusion.steps import Generators, noise_like
 from phydict.posterior.likelihood.likelihood_draw import LikelihoodDraw
 from phydict.posterior.normalised import NormalisedMeasurement
+from phydict.runtime.ranges import LEAST, MOST, check_fields
 
 
 def langevin(score: Callable[[Tensor], Tensor], z: Tensor, step: float, iterations: int,
@@ -39,9 +41,7 @@ class Langevin(LikelihoodDraw):
     last_share: float = 0.01
 
     def __post_init__(self):
-        if self.iterations < 1 or not self.step > 0 or not 0 < self.last_share <= 1:
-            raise ValueError("Langevin dynamics need at least 1 iteration, a step above 0 and a last_share in (0, 1], "
-                             f"but {self.iterations}, {self.step} and {self.last_share} were given")
+        check_fields(self, "Langevin", iterations=(1, math.inf), step=(LEAST, MOST), last_share=(LEAST, 1))
 
     def __call__(self, measurement: NormalisedMeasurement, x0: Tensor, x0_std: float, generator: Generators,
                  progress: float) -> Tensor:

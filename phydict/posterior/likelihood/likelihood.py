@@ -18,10 +18,7 @@ from phydict.linalg.conjugate_gradients import conjugate_gradients
 from phydict.linalg.total_variation import TVQuadraticMajorizer
 from phydict.posterior.likelihood.reward import Reward
 from phydict.posterior.measurement import Measurement
-from phydict.runtime.ranges import check_fields
-
-LEAST, MOST = 1e-9, 1_000_000
-"""Of settings that are divided by or squared, so that neither overflows."""
+from phydict.runtime.ranges import LEAST, MOST, check_fields
 
 LONG = 12
 """Iterations of one restart beyond which residuals are kept orthogonal."""

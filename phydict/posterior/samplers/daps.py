@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -23,6 +24,7 @@ from phydict.posterior.measurement import Measurement
 from phydict.posterior.normalised import NormalisedMeasurement, check_noise
 from phydict.posterior.samplers.noise_levels import denoise_along, polynomial_levels, times_of
 from phydict.posterior.samplers.sampler import Sampler
+from phydict.runtime.ranges import LEAST, MOST, check_fields
 
 
 @dataclass(frozen=True)
@@ -60,14 +62,11 @@ class DAPS(Sampler):
 
     def __post_init__(self):
         check_noise(self.noise)
-        if self.levels < 1 or self.flow_steps < 1:
-            raise ValueError("DAPS needs at least one level and one flow step, but "
-                             f"{self.levels} and {self.flow_steps} were given")
-        if not 0 < self.flow_end <= self.sigma_min <= self.sigma_max:
-            raise ValueError("DAPS needs 0 < flow_end <= sigma_min <= sigma_max, but "
+        check_fields(self, "DAPS", levels=(1, math.inf), flow_steps=(1, math.inf), prior_std=(LEAST, MOST),
+                     **dict.fromkeys(("sigma_max", "sigma_min", "flow_end"), (LEAST, MOST)))
+        if not self.flow_end <= self.sigma_min <= self.sigma_max:
+            raise ValueError("DAPS needs flow_end <= sigma_min <= sigma_max, but "
                              f"{self.flow_end}, {self.sigma_min} and {self.sigma_max} were given")
-        if self.prior_std is not None and not self.prior_std > 0:
-            raise ValueError(f"prior_std is a standard deviation above 0 or left out, but {self.prior_std} was given")
 
     def steps(self) -> int:
         return self.levels

@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -23,6 +24,7 @@ from phydict.posterior.measurement import Measurement
 from phydict.posterior.normalised import NormalisedMeasurement, nearest_fit
 from phydict.posterior.samplers.noise_levels import stochastic_ddim_step
 from phydict.posterior.samplers.sampler import Sampler
+from phydict.runtime.ranges import LEAST, MOST, check_fields
 
 
 @dataclass(frozen=True)
@@ -49,9 +51,8 @@ class DDS(Sampler):
     tv: ADMMTV | None = None
 
     def __post_init__(self):
-        if self.iterations < 1 or not 0 <= self.eta <= 1 or not (self.gamma is None or self.gamma > 0):
-            raise ValueError("DDS needs at least 1 iteration, eta in [0, 1] and gamma above 0 or left out, but "
-                             f"{self.iterations}, {self.eta} and {self.gamma} were given")
+        check_fields(self, "DDS", iterations=(1, math.inf), eta=(0, 1), cg_iterations=(1, math.inf),
+                     gamma=(LEAST, MOST))
         if self.tv and self.gamma is not None:
             raise ValueError("DDS takes gamma or total variation, but both were given: leave one out")
 

@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -21,6 +22,7 @@ from phydict.posterior.measurement import Measurement
 from phydict.posterior.normalised import NormalisedMeasurement, check_noise, nearest_fit
 from phydict.posterior.samplers.noise_levels import stochastic_ddim_step
 from phydict.posterior.samplers.sampler import Sampler
+from phydict.runtime.ranges import LEAST, MOST, check_fields
 
 
 @dataclass(frozen=True)
@@ -50,10 +52,8 @@ class DiffPIR(Sampler):
 
     def __post_init__(self):
         check_noise(self.noise)
-        if self.iterations < 1 or not self.spacing > 0 or not self.prior_weight > 0 or not 0 <= self.zeta <= 1:
-            raise ValueError("DiffPIR needs at least 1 iteration, spacing and prior_weight above 0 and a zeta share in "
-                             f"[0, 1], but {self.iterations}, {self.spacing}, {self.prior_weight} and {self.zeta} were "
-                             "given")
+        check_fields(self, "DiffPIR", iterations=(1, math.inf), spacing=(LEAST, MOST), prior_weight=(LEAST, MOST),
+                     zeta=(0, 1), cg_iterations=(1, math.inf))
 
     def steps(self) -> int:
         return self.iterations

@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -20,6 +21,7 @@ from phydict.posterior.measurement import Measurement
 from phydict.posterior.normalised import NormalisedMeasurement
 from phydict.posterior.samplers.noise_levels import stochastic_ddim_step
 from phydict.posterior.samplers.sampler import Sampler
+from phydict.runtime.ranges import MOST, check_fields
 
 
 @dataclass(frozen=True)
@@ -44,9 +46,7 @@ class DPS(Sampler):
     scale: float = 0.3
 
     def __post_init__(self):
-        if self.iterations < 1 or not self.scale >= 0:
-            raise ValueError("DPS needs at least 1 iteration and a scale of at least 0, but "
-                             f"{self.iterations} and {self.scale} were given")
+        check_fields(self, "DPS", iterations=(1, math.inf), scale=(0, MOST))
 
     def steps(self) -> int:
         return self.iterations

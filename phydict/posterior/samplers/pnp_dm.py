@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -21,6 +22,7 @@ from phydict.posterior.measurement import Measurement
 from phydict.posterior.normalised import NormalisedMeasurement, check_noise
 from phydict.posterior.samplers.noise_levels import denoise_along, polynomial_levels, times_of
 from phydict.posterior.samplers.sampler import Sampler
+from phydict.runtime.ranges import LEAST, MOST, check_fields
 
 
 @dataclass(frozen=True)
@@ -64,13 +66,13 @@ class PnPDM(Sampler):
 
     def __post_init__(self):
         check_noise(self.noise)
-        if not 0 < self.rho_min <= self.rho_max or not 0 < self.decay <= 1:
-            raise ValueError("PnP-DM needs 0 < rho_min <= rho_max and a decay in (0, 1], but "
-                             f"{self.rho_min}, {self.rho_max} and {self.decay} were given")
-        if self.levels < 1 or not 0 < self.sigma_min <= self.sigma_max:
-            raise ValueError("PnP-DM needs at least 1 level and 0 < sigma_min <= sigma_max, but "
-                             f"{self.levels}, {self.sigma_min} and {self.sigma_max} were given")
-        if self.thinning < 1 or not 0 <= self.burn_in <= self.iterations - self.thinning:
+        check_fields(self, "PnPDM", iterations=(1, math.inf), burn_in=(0, math.inf), thinning=(1, math.inf),
+                     levels=(1, math.inf), decay=(LEAST, 1),
+                     **dict.fromkeys(("rho_max", "rho_min", "sigma_max", "sigma_min"), (LEAST, MOST)))
+        if not (self.rho_min <= self.rho_max and self.sigma_min <= self.sigma_max):
+            raise ValueError("PnP-DM needs rho_min <= rho_max and sigma_min <= sigma_max, but "
+                             f"{self.rho_min}, {self.rho_max}, {self.sigma_min} and {self.sigma_max} were given")
+        if self.burn_in > self.iterations - self.thinning:
             raise ValueError("PnP-DM keeps every thinning-th state after burn_in, which leaves none of "
                              f"{self.iterations} iterations with burn_in {self.burn_in} and thinning {self.thinning}")
 

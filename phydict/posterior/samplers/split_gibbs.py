@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 
@@ -20,12 +21,12 @@ from phydict.diffusion import Denoiser, ddim, renoise
 from phydict.diffusion.steps import Generators, noise_like
 from phydict.posterior.discretisation import find_subgrid
 from phydict.posterior.hardening import with_hardening
-from phydict.posterior.likelihood.likelihood import LEAST, MOST, LikelihoodStep, ProximalCG
+from phydict.posterior.likelihood.likelihood import LikelihoodStep, ProximalCG
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.metal import Metal, with_metal
 from phydict.posterior.samplers.sampler import Sampler, ddim_sample
 from phydict.posterior.scatter import with_scatter
-from phydict.runtime.ranges import check_between
+from phydict.runtime.ranges import LEAST, MOST, check_fields
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,8 @@ class SplitGibbs(Sampler):
         likelihood: the step towards the X-rays
         final_likelihood: the one at the last level, None to return the denoiser's estimate there, as the paper does
         t_start: below 1, the first estimate, the prior's mean moved onto the X-rays, is taken at once to this time
-        t_end: the last level's time (None: levels evenly spaced down to 0)
+        t_end: the last level's time (None: levels evenly spaced down to 0); where t_start leaves one level, it is that
+            one's, whatever t_end is
         noise_fraction: None for the paper's DDIM moves; else each level starts from the estimate with new noise of this
             share of the level's own: 1 decouples the levels, 0 adds none and descends to a point estimate
         momentum: with noise_fraction, each level starts beyond the estimate, by this share of how far it has moved
@@ -87,8 +89,8 @@ class SplitGibbs(Sampler):
     metal: Metal | None = None
 
     def __post_init__(self):
-        if self.iterations < 1:
-            raise ValueError(f"split Gibbs sampling needs at least one iteration, but {self.iterations} was given")
+        check_fields(self, "SplitGibbs", iterations=(1, math.inf), ec_steps=(0, math.inf), prior_std=(LEAST, MOST),
+                     noise_fraction=(0, 1), sampling_noise=(0, 1))
         if not 0 < self.t_start <= 1:
             raise ValueError(f"t_start is a time in (0, 1], but {self.t_start} was given")
         if self.t_start < 1 and self.iterations < 2:
@@ -98,10 +100,6 @@ class SplitGibbs(Sampler):
         if not 0 <= self.momentum <= 1 or (self.momentum and self.noise_fraction is None):
             raise ValueError("momentum is a share in [0, 1], and above 0 only where noise_fraction is given, but "
                              f"{self.momentum} was given, with a noise_fraction of {self.noise_fraction}")
-        check_between("prior_std", self.prior_std, LEAST, MOST)
-        for name in ("noise_fraction", "sampling_noise"):
-            if getattr(self, name) is not None:
-                check_between(name, getattr(self, name))
         if not 0 <= self.ec_delta < 1:
             raise ValueError(f"ec_delta (the paper's delta) lies in [0, 1), but {self.ec_delta} was given")
         if self.ec_delta and self.ec_steps < 1:

@@ -20,6 +20,7 @@ from phydict.posterior.samplers.sampler import Sampler
 from phydict.posterior.samplers.split_gibbs import SplitGibbs
 from phydict.posterior.scatter import with_scatter
 from phydict.prior import DEFAULT_REFINER, BoundRefiner
+from phydict.runtime.ranges import LEAST, MOST, check_between, check_fields
 from phydict.runtime.warning import warn
 
 CAUTION = 3.0
@@ -100,12 +101,12 @@ class Unrolled(Sampler):
         if not self.times or not all(0 < t < 1 for t in self.times + self.more_times):
             raise ValueError("times are one or more numbers between 0 and 1, and more_times any number of them, but "
                              f"{self.times} and {self.more_times} were given")
-        if len(self.x0_stds) != len(self.times) + 1 or not all(std > 0 for std in self.x0_stds):
-            raise ValueError(f"x0_stds are {len(self.times) + 1} numbers above 0, one more than times, but "
-                             f"{self.x0_stds} was given")
-        if self.contradiction is not None and not self.contradiction >= 0:
-            raise ValueError("contradiction is an error of line integrals in voxels of water, 0 or more, or none, but "
-                             f"{self.contradiction} was given")
+        if len(self.x0_stds) != len(self.times) + 1:
+            raise ValueError(f"x0_stds are {len(self.times) + 1} numbers, one more than times, but {self.x0_stds} was "
+                             "given")
+        for std in self.x0_stds:
+            check_between("each of Unrolled.x0_stds", std, LEAST, MOST)
+        check_fields(self, "Unrolled", contradiction=(0, MOST))
 
     def steps(self) -> int:
         return len(self.times) + 1

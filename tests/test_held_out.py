@@ -1,0 +1,111 @@
+"""Whom a training holds out: who is meant, what its files say of it, and what is said where it is not so."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import nibabel
+import numpy as np
+import pytest
+import torch
+from command_lines import checkpoint
+from prior.tiny import tiny_prior, tiny_refiner
+
+from phydict.cli.train import main
+from phydict.datasets import CTSource
+from phydict.grid import Cube
+from phydict.prior import save_prior, save_refiner
+from phydict.prior.files import held_out_of
+from phydict.training import PriorTraining
+from phydict.training.data import PriorData
+from phydict.training.reconstructions import RefinementCases, RefinementData
+from phydict.training.rollouts import RollOutData, RollOutSettings
+from phydict.training.settings import HoldOut
+
+WINDOW = (-1000, 600)
+
+
+def data(cts: Path, folder: Path, ids: list[str] | str | None = None, phantoms: int = 2) -> PriorData:
+    return PriorData(str(cts), holdout=HoldOut(ids, phantoms=1), phantoms=phantoms, cache=str(folder / "cache"),
+                     cube=Cube(16), window=WINDOW)
+
+
+def in_trainer(made: PriorData, fn: str) -> PriorData:
+    made.trainer = SimpleNamespace(state=SimpleNamespace(fn=fn))
+    return made
+
+
+def test_those_that_validate_are_a_list_a_word_or_the_lines_of_a_text_file(cts, tmp_path):
+    (tmp_path / "held_out.txt").write_text("patient1\n")
+    for ids in (["patient1"], "t1", str(tmp_path / "held_out.txt")):
+        assert data(cts, tmp_path, ids).held_out == ["patient1"]
+    with pytest.raises(FileNotFoundError, match="there is no file none.txt: give another data.holdout.ids"):
+        data(cts, tmp_path, "none.txt")
+    with pytest.raises(ValueError, match=r"\[0002\] has numbers among them: quote each"):
+        HoldOut("[0002]")
+
+
+@pytest.mark.parametrize("before, said, known", [
+    (None, False, ["patient1"]), (["patient1", "patient7"], False, ["patient1"]), (["patient0"], True, []),
+    ([], True, [])])
+def test_a_file_tells_whom_it_never_learnt_from_and_others_are_warned_of(cts, tmp_path, monkeypatch, recwarn, before,
+                                                                          said, known):
+    file = str(tmp_path / "prior.safetensors")
+    save_prior(tiny_prior(detail=True), file, {} if before is None else {"held_out": before})
+    task = PriorTraining(cube=Cube(16), window=WINDOW, initial=file)
+    monkeypatch.setattr(PriorTraining, "trainer", SimpleNamespace(
+        datamodule=data(cts, tmp_path, ["patient1"]), global_step=2,
+        strategy=SimpleNamespace(reduce=lambda value, **_: value)))
+    task.setup("fit")
+    told = f"patient1 was not among the held-out CTs of the training of {file}: unless it is new, it was trained on"
+    assert [told in str(warning.message) for warning in recwarn] == [True] * said
+    task.on_save_checkpoint(saved := {"state_dict": {}})
+    assert saved["phydict"]["training"] == {"steps": 2, "samples": 0, "held_out": known}
+
+
+def test_an_export_names_those_that_an_older_checkpoint_held_out(trained, tmp_path):
+    content = checkpoint(trained)
+    for name, held_out in (("phantoms", []), ("cts", ["patient1"])):
+        content["PriorData"] = {"held_out": held_out}
+        torch.save(content, tmp_path / "last.ckpt")
+        main(["export", f"--checkpoint={tmp_path / 'last.ckpt'}", f"--out={tmp_path / name}.safetensors"])
+        assert held_out_of(tmp_path / f"{name}.safetensors") == (held_out or None)
+
+
+def test_reconstructions_of_those_that_their_refiner_learnt_from_are_warned_of(cts, tmp_path):
+    save_refiner(tiny_refiner(), file := str(tmp_path / "refiner.safetensors"), {"held_out": ["patient0"]})
+    with pytest.warns(UserWarning, match="patient1 was not among the held-out CTs of the training of .*refiner"):
+        RefinementData(RefinementCases(crop=16), cts=str(cts), holdout=HoldOut(["patient1"], phantoms=0), initial=file,
+                       cache=str(tmp_path / "cache"), cube=Cube(32), window=WINDOW)
+
+
+def test_validation_on_those_that_were_trained_on_is_warned_of(cts, tmp_path):
+    validated = in_trainer(data(cts, tmp_path, ["patient1"]), "validate")
+    validated.load_state_dict(validated.state_dict())
+    validated.load_state_dict({"held_out": [], "trained": 0})  # of a training on phantoms
+    with pytest.warns(UserWarning, match="patient1 was not among the held-out CTs of the training: unless it is new"):
+        validated.load_state_dict({"held_out": ["patient0"]})
+
+
+@pytest.mark.parametrize("shape, refused", [((20, 20, 20, 1), False), ((20, 20, 20, 2), True), ((20, 20, 5), True)])
+def test_a_ct_that_is_none_is_refused_before_the_first_step(tmp_path, shape, refused):
+    (tmp_path / "cts").mkdir()
+    for name, size in (("a", (20, 20, 20)), ("b", shape)):
+        nibabel.save(nibabel.Nifti1Image(np.zeros(size, np.int16), np.eye(4)), tmp_path / "cts" / f"{name}.nii.gz")
+    fitted = in_trainer(data(tmp_path / "cts", tmp_path), "fit")
+    if not refused:
+        return fitted.prepare_data()
+    with pytest.raises(ValueError, match=r"b.nii.gz has the shape .* data.source.exclude"):
+        fitted.prepare_data()
+
+
+def test_stages_that_learn_from_reconstructions_leave_the_same_cts_out_as_others(cts, tmp_path):
+    save_refiner(tiny_refiner(), file := str(tmp_path / "refiner.safetensors"))
+    (tmp_path / "excluded.txt").write_text("patient0\n")
+    source, cache = CTSource(exclude=str(tmp_path / "excluded.txt")), str(tmp_path / "cache")
+    replayed = RollOutData(RollOutSettings(initial=file, source=source), str(cts), phantoms=1, cache=cache,
+                           cube=Cube(16), window=WINDOW)
+    refined = RefinementData(RefinementCases(crop=16, source=source), cts=str(cts), cache=cache, initial=file,
+                             cube=Cube(32), window=WINDOW)
+    assert [[ct.id for ct in made.cts.cts] for made in (replayed, refined)] == [["patient1"]] * 2

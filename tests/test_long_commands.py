@@ -220,4 +220,4 @@ def test_a_training_stopped_before_its_first_checkpoint_says_that_nothing_is_kep
     monkeypatch.setattr(PriorTraining, "training_step", lambda *_: signal.raise_signal(signal.SIGINT))
     with pytest.raises(SystemExit):
         run("fit")
-    assert "run the same command again: no epoch was done" in capfd.readouterr().err
+    assert "run the same command again: no checkpoint was written" in capfd.readouterr().err

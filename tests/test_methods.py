@@ -195,6 +195,7 @@ def test_a_method_may_be_a_name_a_sampler_or_a_reconstructor(tmp_path):
     assert reconstructor(made) is made
 
 
+@pytest.mark.filterwarnings("ignore:the X-rays show one material")
 def test_the_default_is_the_learned_method_unless_a_prior_must_be_sampled(tmp_path):
     save_prior(tiny_prior(), tmp_path / "prior.safetensors")
     save_refiner(tiny_refiner(), tmp_path / "refiner.safetensors")

@@ -95,6 +95,21 @@ def test_a_killed_run_goes_on_as_if_it_had_not_been(tmp_path, trained, cache):
     assert ours["phydict"]["training"] == {"steps": 8, "samples": 16}
 
 
+def test_a_run_stopped_within_a_long_epoch_resumes_from_its_last_minutes(tmp_path, cache, monkeypatch):
+    args = arguments(tmp_path, cache, "--trainer.limit_val_batches=0", "--model.text.encoder=none",
+                     "--trainer.max_steps=4", "--trainer.max_epochs=1", "--recent.train_time_interval=0:00:00")
+    main([*args, f"--out={tmp_path / 'straight'}"])
+    step = PriorTraining.training_step
+    with monkeypatch.context() as stopping, pytest.raises(SystemExit):
+        stopping.setattr(PriorTraining, "training_step", lambda task, *given: (
+            signal.raise_signal(signal.SIGINT) if task.global_step == 3 else step(task, *given)))
+        main([*args, f"--out={tmp_path / 'halved'}"])
+    assert checkpoint(tmp_path / "halved")["global_step"] == 3
+    main([*args, f"--out={tmp_path / 'halved'}", "--ckpt_path=last"])
+    one, other = (checkpoint(tmp_path / run)["state_dict"] for run in ("straight", "halved"))
+    assert one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
+
+
 @pytest.mark.parametrize("before", [False, True], ids=["at once", "after a checkpoint"])
 def test_a_loss_that_is_not_finite_stops_the_training(tmp_path, cache, capsys, monkeypatch, before):
     loss, at = PriorTraining.batch_loss, 5 if before else 1

@@ -6,6 +6,7 @@ import argparse
 import math
 import reprlib
 import sys
+from datetime import timedelta
 from pathlib import Path
 
 import lightning
@@ -36,7 +37,15 @@ from phydict.runtime.precision import PRECISIONS, resolve_precision, trainer_pre
 from phydict.runtime.progress_log import log_progress, progress_as, progress_options, run_command
 from phydict.runtime.ranges import check_between
 from phydict.runtime.reading import reading
-from phydict.training.checkpoints import BEST, HELD_OUT, RESUMED, BestCheckpoint, WholeCheckpoints, read_checkpoint
+from phydict.training.checkpoints import (
+    BEST,
+    HELD_OUT,
+    RESUMED,
+    BestCheckpoint,
+    RecentCheckpoint,
+    WholeCheckpoints,
+    read_checkpoint,
+)
 from phydict.training.crops import SuperResolutionData
 from phydict.training.data import PriorData
 from phydict.training.finer_uncertainty import FinerUncertaintyTraining
@@ -108,6 +117,10 @@ class PriorCLI(ProgressCLI):
         parser.add_lightning_class_args(ModelCheckpoint, "checkpoint")
         parser.set_defaults({"checkpoint.filename": "last", "checkpoint.enable_version_counter": False,
                              "checkpoint.every_n_epochs": 1, "checkpoint.save_on_train_epoch_end": True})
+        parser.add_lightning_class_args(RecentCheckpoint, "recent")  # within an epoch that takes longer
+        parser.set_defaults({"recent.filename": "last", "recent.enable_version_counter": False,
+                             "recent.train_time_interval": timedelta(minutes=10)})
+        parser.link_arguments("out", "recent.dirpath")
         parser.add_lightning_class_args(Throughput, "throughput")
         parser.add_lightning_class_args(TrainingProgress, "progress")
         parser.link_arguments("out", "checkpoint.dirpath")
@@ -169,7 +182,7 @@ class PriorCLI(ProgressCLI):
             except BaseException as stop:
                 there = (out / CHECKPOINT).is_file()
                 stop.add_note(f"add --ckpt_path {out / CHECKPOINT}" if there else
-                              "run the same command again: no epoch was done, and nothing is kept")
+                              "run the same command again: no checkpoint was written, and nothing is kept")
                 raise
 
     def _begin(self, out: Path, resumed: str | None) -> None:

@@ -171,7 +171,7 @@ def test_an_unknown_key_of_a_config_file_is_named(tmp_path, capsys):
 def test_an_impossible_setting_is_named_without_the_parsers_noise(prior, tmp_path, capsys):
     said = refusal(capsys, main, ["test", "--model.method=phydict_fast", f"--model.prior={prior}",
                                   "--model.method.init_args.iterations=0"])
-    assert "at least one iteration, but 0" in said and "Union" not in said
+    assert "SplitGibbs.iterations is a finite number, 1 or more, but 0" in said and "Union" not in said
 
 
 def test_an_output_folder_that_cannot_be_is_one_sentence(measured, tmp_path, capsys):

@@ -132,7 +132,7 @@ def test_a_step_that_would_put_the_source_into_the_volume_is_shortened(thorax):
 def test_x_rays_of_nothing_have_no_poses_and_a_volume_of_air_sways_by_nothing():
     with pytest.raises(ValueError, match="are 0 in every pixel"):
         find_poses(torch.zeros(8, 48, 48), BEAM, UNCERTAIN, GRID)
-    views = Views(torch.zeros(8, 48, 48), BEAM, GRID, torch.ones(10), 0.02, SEARCH)
+    views = Views(torch.rand(8, 48, 48), BEAM, GRID, torch.ones(10), 0.02, SEARCH)
     state = State(torch.zeros(8, 10), torch.zeros(8, 10), torch.full((1, 1, *GRID.shape), -1.0))
     assert not views.sway(state).any()
 

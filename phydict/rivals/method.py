@@ -67,7 +67,7 @@ class TrainedRival(Reconstructor):
     It reads no report. Finer voxels are refined from its own; a rival that is bound to one geometry refuses any other.
 
     Args:
-        file: the rival's .safetensors file, or the name of a shipped one, data/rivals/lifted_64.safetensors
+        file: the rival's .safetensors file, or the name of a shipped one, such as data/rivals/lifted_64.safetensors
         precision: of its network: auto, float32 or bfloat16
     """
 

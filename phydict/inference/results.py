@@ -175,13 +175,17 @@ class CaseResults:
 
 
 def score_table(records: Sequence[dict], protocol: Protocol | None, empty: Mapping[str, str]) -> Table:
-    """The means of records' scores by method, with notes on how their X-rays were made and on the protocol, if any,
-    that they were taken by; empty: scores that may stay empty -> why."""
+    """The means of records' scores by method, with notes on their priors' files, how their X-rays were made and the
+    protocol, if any, that they were taken by; empty: scores that may stay empty -> why."""
     rows = [score_row(record["case"], record) for record in records]
     table = mean_table(rows, window=protocol.window if protocol else RANGE, empty=empty)
     made = dict.fromkeys(_xrays(record["settings"]) for record in records
                          if "simulator" in record["settings"].get("data", {}))
-    return replace(table, notes=[*table.notes, *made, *([protocol.note] if protocol else [])])
+    priors = dict.fromkeys(f"{record['method']} with {record['settings']['prior']} (CRC-32 "
+                           f"{record['settings']['prior_crc32']:08x})" for record in records
+                           if "prior_crc32" in record["settings"])
+    told = [f"Priors: {', '.join(priors)}."] if priors else []
+    return replace(table, notes=[*table.notes, *told, *made, *([protocol.note] if protocol else [])])
 
 
 def _xrays(settings: Mapping) -> str:

@@ -147,6 +147,8 @@ def test_the_default_method_reconstructs_with_a_prior(prior, measured, tmp_path)
     main(["test", *ORBIT, f"--model.prior={prior}", f"--model.out={tmp_path}", "--data.cts=phantom",
           "--data.phantoms=1", "--model.sampling.with_report=false", "--trainer.accelerator=cpu"])
     said = record(tmp_path / "phydict_fast" / "phantom-1000000")
+    named = f"Priors: phydict_fast with {prior.name} (CRC-32 {said['settings']['prior_crc32']:08x})."
+    assert named in (tmp_path / "phydict_fast" / "results.md").read_text()
     assert said["network_calls"] == 10 and said["grid"]["shape"] == [16, 16, 16] and said["report"] == ""
     assert said["settings"]["prior"] == "tiny.safetensors" and said["settings"]["prior_crc32"]
     assert said["misfit"] < 0.5

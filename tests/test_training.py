@@ -100,9 +100,14 @@ def test_a_run_stopped_within_a_long_epoch_resumes_from_its_last_minutes(tmp_pat
                      "--trainer.max_steps=4", "--trainer.max_epochs=1", "--recent.train_time_interval=0:00:00")
     main([*args, f"--out={tmp_path / 'straight'}"])
     step = PriorTraining.training_step
+
+    def stopped(task, *given):
+        if task.global_step == 3:
+            raise KeyboardInterrupt
+        return step(task, *given)
+
     with monkeypatch.context() as stopping, pytest.raises(SystemExit):
-        stopping.setattr(PriorTraining, "training_step", lambda task, *given: (
-            signal.raise_signal(signal.SIGINT) if task.global_step == 3 else step(task, *given)))
+        stopping.setattr(PriorTraining, "training_step", stopped)
         main([*args, f"--out={tmp_path / 'halved'}"])
     assert checkpoint(tmp_path / "halved")["global_step"] == 3
     main([*args, f"--out={tmp_path / 'halved'}", "--ckpt_path=last"])

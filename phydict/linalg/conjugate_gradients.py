@@ -21,8 +21,7 @@ def conjugate_gradients(operator: Callable[[Tensor], Tensor], right: Tensor, ite
     inverse; where it is 0, d stays 0. on_step: called `iterations` times, as each is done or found needless.
     reorthogonalise: each residual is made orthogonal again to all before it, which in single precision it no longer is
     after a dozen iterations, so that what more of them give turns on the last digit (Golub & Van Loan, Matrix
-    Computations, 10.3); takes the memory of up to two right sides for each iteration that is
-    done.
+    Computations, 10.3); takes the memory of up to two right sides for each iteration that is done.
     """
     over = tuple(range(1, right.ndim))
     residual, d = right.clone(), torch.zeros_like(right)

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import inspect
 import math
-import sys
-import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from functools import cache
 from pathlib import Path
 from typing import Any, Self
 
@@ -20,6 +16,7 @@ from torch import Tensor
 
 from phydict.grid import Grid
 from phydict.runtime.files import atomic_write
+from phydict.runtime.own_code import is_own, own_code
 from phydict.runtime.reading import TooLittleMemory, check_memory
 from phydict.units import MU_WATER
 from phydict.xray import ConeBeam, Projector
@@ -246,29 +243,8 @@ def describe(settings) -> dict:
     """A method's settings as plain JSON values: class name and fields, nested; of a class outside phydict its path and
     `own_code` as well, so that results of other code are not taken for its own."""
     kind: type = type(settings)
-    name = f"{kind.__module__}.{kind.__qualname__}" if _is_own(kind) else kind.__name__
+    name = f"{kind.__module__}.{kind.__qualname__}" if is_own(kind) else kind.__name__
     return {"class": name} | own_code(kind) | {f.name: _plain(getattr(settings, f.name)) for f in fields(settings)}
-
-
-@cache
-def own_code(kind: type) -> dict[str, int]:
-    """code_crc32: of the source files of a class and of its bases outside phydict, torch, lightning and the standard
-    library, as they are when it is first asked for; empty where there is none."""
-    code = b"".join(dict.fromkeys(_source(base) for base in kind.__mro__ if _is_own(base)))
-    return {"code_crc32": zlib.crc32(code)} if code else {}
-
-
-def _is_own(kind: type) -> bool:
-    return kind.__module__.partition(".")[0] not in {"phydict", "torch", "lightning", *sys.stdlib_module_names}
-
-
-def _source(kind: type) -> bytes:
-    """What the file of a class's module holds; the class's own lines in a script, whose others may change; empty where
-    neither can be read."""
-    file = getattr(sys.modules.get(kind.__module__), "__file__", None)
-    with suppress(OSError, TypeError):
-        return Path(file).read_bytes() if file and kind.__module__ != "__main__" else inspect.getsource(kind).encode()
-    return b""
 
 
 def _plain(value):

@@ -23,7 +23,7 @@ from phydict.inference.settings import Orbit
 from phydict.methods import DEFAULT_GRID, METHODS, corrections_of
 from phydict.posterior import Refinement, Sampler
 from phydict.prior import find_prior, fingerprint, load_super_resolution, own_identity
-from phydict.reconstruction import Reconstructor, describe, own_code
+from phydict.reconstruction import Reconstructor, describe
 from phydict.rivals import TrainedRival
 from phydict.runtime.reading import reason
 from phydict.runtime.seeds import check_seed
@@ -150,10 +150,8 @@ class Trial:
         identity = {"name": self.name, "method": describe(self.method), "seed": self.seed, "grid": grid.to_dict(),
                     "window": describe(window), "data": {"with_report": self.with_report} | self.data.settings("test")}
         if self.prior is not None:
-            prior = prior_of(self.prior)
-            kind: type = type(prior)
-            own = own_identity(prior, self.prior)
-            identity |= {"prior_crc32": _crc(self.prior)} if own is None else {"prior": own | own_code(kind)}
+            prior_identity = own_identity(prior_of(self.prior), self.prior)
+            identity |= {"prior_crc32": _crc(self.prior)} if prior_identity is None else {"prior": prior_identity}
             identity |= {"guidance": self.guidance, "samples": self.samples}
         if self.super_resolution:
             identity["super_resolution_crc32"] = _crc(self.super_resolution)

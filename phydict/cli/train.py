@@ -37,15 +37,7 @@ from phydict.runtime.precision import PRECISIONS, resolve_precision, trainer_pre
 from phydict.runtime.progress_log import log_progress, progress_as, progress_options, run_command
 from phydict.runtime.ranges import check_between
 from phydict.runtime.reading import reading
-from phydict.training.checkpoints import (
-    BEST,
-    HELD_OUT,
-    RESUMED,
-    BestCheckpoint,
-    RecentCheckpoint,
-    WholeCheckpoints,
-    read_checkpoint,
-)
+from phydict.training.checkpoints import BEST, HELD_OUT, RESUMED, BestCheckpoint, WholeCheckpoints, read_checkpoint
 from phydict.training.crops import SuperResolutionData
 from phydict.training.data import PriorData
 from phydict.training.finer_uncertainty import FinerUncertaintyTraining
@@ -117,7 +109,7 @@ class PriorCLI(ProgressCLI):
         parser.add_lightning_class_args(ModelCheckpoint, "checkpoint")
         parser.set_defaults({"checkpoint.filename": "last", "checkpoint.enable_version_counter": False,
                              "checkpoint.every_n_epochs": 1, "checkpoint.save_on_train_epoch_end": True})
-        parser.add_lightning_class_args(RecentCheckpoint, "recent")  # within an epoch that takes longer
+        parser.add_lightning_class_args(ModelCheckpoint, "recent")  # within an epoch that takes longer
         parser.set_defaults({"recent.filename": "last", "recent.enable_version_counter": False,
                              "recent.train_time_interval": timedelta(minutes=10)})
         parser.link_arguments("out", "recent.dirpath")

@@ -28,10 +28,14 @@ SIDE = 32
 """Voxels along each side of the volume that `orientation_doubts` compares with."""
 
 
-@lru_cache(1)
 def standard_thorax(grid: Grid) -> np.ndarray:
-    """HU (X, Y, Z) of the standard thorax in the middle of a grid."""
-    return build(Thorax.standard(), grid)[0]
+    """HU (X, Y, Z) of the standard thorax in the middle of a grid, built once for all cases on its voxels."""
+    return _built(grid.shape, tuple(grid.affine.flatten()))
+
+
+@lru_cache(2)
+def _built(shape: tuple[int, int, int], affine: tuple[float, ...]) -> np.ndarray:
+    return build(Thorax.standard(), Grid(shape, affine=np.reshape(affine, (4, 4))))[0]
 
 
 def thorax_views(grid: Grid, beam: ConeBeam) -> np.ndarray:

@@ -17,7 +17,7 @@ from phydict.inference.settings import Sampling
 from phydict.methods import corrections_of
 from phydict.posterior import CascadePosterior, Posterior, Refined, Sampler
 from phydict.prior import AnyPrior, MedSynCheckpoint, file_read, fingerprint, own_identity
-from phydict.reconstruction import Reconstruction, Reconstructor, describe, own_code
+from phydict.reconstruction import Reconstruction, Reconstructor, describe
 from phydict.runtime.precision import instruction_set
 from phydict.runtime.profiling import process_peak
 from phydict.runtime.version import VERSION
@@ -33,7 +33,7 @@ def method_settings(name: str, seed: int, method: Sampler | Reconstructor, proje
 def prior_settings(prior: AnyPrior, given: Any, sampling: Sampling) -> dict:
     """Those of a prior, given as an object, by its file or by its class, and of how it is sampled."""
     identity = own_identity(prior, given)
-    settings = _identity("prior", given) if identity is None else {"prior": identity | own_code(type(prior))}
+    settings = _identity("prior", given) if identity is None else {"prior": identity}
     settings["guidance"] = sampling.guidance
     if sampling.samples != 1:
         settings["samples"] = sampling.samples

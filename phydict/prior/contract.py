@@ -16,6 +16,7 @@ from phydict.diffusion import Denoiser
 from phydict.grid import Grid
 from phydict.prior.files import load_prior
 from phydict.prior.medsyn.checkpoint import MedSynCheckpoint
+from phydict.runtime.own_code import own_code
 from phydict.runtime.reading import reason
 from phydict.units import HUWindow
 
@@ -91,11 +92,12 @@ def is_class_path(given: object) -> bool:
 
 def own_identity(prior: AnyPrior, given: object) -> dict | None:
     """What decides the answers of a prior given as an object or by the path of its class: its own `identity`, or its
-    plain attributes, and the CRC-32 of its weights; None for one that is read from a file."""
+    plain attributes, its `own_code`, and the CRC-32 of its weights; None for one that is read from a file."""
     if isinstance(given, str | Path | MedSynCheckpoint) and not is_class_path(given):
         return None
     stated = getattr(prior, "identity", None)
     identity = stated() if callable(stated) else PriorContract.identity(prior)  # type: ignore[arg-type]
+    identity = identity | own_code(type(prior))
     if not isinstance(prior, nn.Module) or "weights_crc32" in identity:
         return identity
     crc = 0

@@ -63,10 +63,6 @@ class WholeCheckpoints(TorchCheckpointIO):
                               "there is one, with --ckpt_path") from error
 
 
-class RecentCheckpoint(ModelCheckpoint):
-    """Keeps the last weights at intervals of time."""
-
-
 class BestCheckpoint(ModelCheckpoint):
     """Keeps the weights with the best score so far, where validation gives one."""
 

@@ -22,15 +22,13 @@ from phydict.datasets import (
     split_by_patient,
 )
 from phydict.datasets.cts.cache import key_of
-from phydict.datasets.cts.transforms import LEAST_SLICES
-from phydict.datasets.nifti_file import NIFTI, open_nifti
+from phydict.datasets.cts.transforms import check_header
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM, VALIDATION_PHANTOM, CachedPhantoms
 from phydict.datasets.population import DrawnPatients
 from phydict.datasets.population.drawn import POPULATION_VERSION
 from phydict.grid import Cube, Grid
 from phydict.runtime.console import check_writable
 from phydict.runtime.ranges import check_between
-from phydict.runtime.reading import reading
 from phydict.runtime.seeds import check_seed
 from phydict.runtime.warning import warn
 from phydict.training.draws import Averaged, KeptDraws, MixedCases, averaged, training_parts
@@ -191,18 +189,6 @@ class PriorData(lightning.LightningDataModule):
         means over blocks are what is learnt."""
         batch = torch.utils.data.default_collate([training_parts(case) for case in cases])
         return batch if self.factor == 1 else averaged(batch, self.factor) | {"fine": batch["volume"]}
-
-
-def check_header(path: Path) -> None:
-    """Raises ValueError where the header of a NIfTI file, which alone is read, is not that of a CT: of one 3D volume
-    with LEAST_SLICES or more."""
-    if not path.name.lower().endswith(NIFTI):
-        return
-    with reading(path, "convert it again, or list it in data.source.exclude"):
-        shape = open_nifti(path).header.get_data_shape()
-    if len(shape) < 3 or min(shape[:3]) < LEAST_SLICES or max(shape[3:], default=1) > 1:
-        raise ValueError(f"{path} has the shape {tuple(shape)}, but a CT is one 3D volume with at least {LEAST_SLICES} "
-                         "slices: give the whole series, or list it in data.source.exclude")
 
 
 def check_plain(loading: Loading) -> None:

@@ -15,7 +15,7 @@ from phydict.cli.infer import main as infer
 from phydict.inference import ReconstructionTask
 from phydict.methods import METHODS, reconstructor
 from phydict.prior import find_prior, own_identity
-from phydict.reconstruction import own_code
+from phydict.runtime.own_code import own_code
 
 MODULE = (Path(__file__).parents[2] / "data" / "example" / "own_prior" / "my_prior.py").read_text() + '''
 

@@ -104,10 +104,29 @@ def to_ras(volume: np.ndarray, affine: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return turned["ct"].as_tensor()[0].numpy(), turned["ct"].affine.numpy().astype(float)
 
 
-def _check_header(path: Path, header, calibration: Calibration | None) -> None:
+def check_header(path: Path) -> None:
+    """Raises ValueError where the header of a NIfTI file, which alone is read, is not that of a CT: of one 3D volume
+    with LEAST_SLICES or more."""
+    if not path.name.lower().endswith(NIFTI):
+        return
+    with reading(path, "convert it again, or list it in data.source.exclude"):
+        header = open_nifti(path).header
+    shape = _volume_shape(header)
+    if len(shape) != 3 or min(shape) < LEAST_SLICES:
+        raise ValueError(f"{path} has the shape {header.get_data_shape()}, but a CT is one 3D volume with at least "
+                         f"{LEAST_SLICES} slices: give the whole series, or list it in data.source.exclude")
+
+
+def _volume_shape(header) -> tuple[int, ...]:
+    """The shape in a header, less further axes of one volume."""
     shape = header.get_data_shape()
     while len(shape) > 3 and shape[-1] == 1:
         shape = shape[:-1]
+    return shape
+
+
+def _check_header(path: Path, header, calibration: Calibration | None) -> None:
+    shape = _volume_shape(header)
     if len(shape) != 3:
         raise ValueError(f"{path} is {len(shape)}D with shape {tuple(shape)}; give one 3D volume per file")
     _check_shape(path, shape)

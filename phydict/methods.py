@@ -5,6 +5,7 @@ from __future__ import annotations
 import reprlib
 from collections.abc import Callable, Collection
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -164,7 +165,7 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: AnyPrior | str |
         given = f"the class {method.__name__}, not an object of it," if isinstance(method, type) else repr(method)
         raise ValueError(f"a method is a name ({', '.join(METHODS)}), a Sampler or a Reconstructor, but {given} was "
                          "given")
-    loaded = find_prior(method.default_prior if prior is None or prior == "" else prior)
+    loaded = _shipped(method.default_prior) if prior is None or prior == "" else find_prior(prior)
     name = name or type(method).__name__
     if super_resolution is None:
         otherwise = FISTATV() if method.chests_only else None
@@ -177,6 +178,12 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: AnyPrior | str |
     ready = CascadePosterior(Cascade(loaded, super_resolution), method, sr_guided, noise=sr_noise_augmentation,
                              guidance=guidance, name=name, precision=precision)
     return replace(ready, sr_sampler=sr_sampler) if sr_sampler else ready
+
+
+@lru_cache(maxsize=2)
+def _shipped(file: Path) -> AnyPrior:
+    """What a shipped file holds, read once in a process."""
+    return find_prior(file)
 
 
 OF_A_PRIOR = {"super_resolution": "refines what a prior gives", "samples": "are drawn from a prior",

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, field, fields, is_dataclass, replace
+from numbers import Real
 from pathlib import Path
 from typing import Any, Self
 
@@ -130,9 +131,9 @@ class Reconstructor(ABC):
     mu_water: float = MU_WATER
 
     def __post_init__(self):
-        if not 0 < self.mu_water < math.inf:
+        if not isinstance(self.mu_water, Real) or not 0 < self.mu_water < math.inf:
             raise ValueError(f"mu_water, the attenuation of water in 1/mm, is above 0 and about {MU_WATER}, but "
-                             f"{self.mu_water} was given")
+                             f"{self.mu_water!r} was given")
 
     def with_mu_water(self, mu_water: float) -> Reconstructor:
         """The same method for X-rays in which water attenuates `mu_water` in 1/mm."""

@@ -14,6 +14,7 @@ from prior.tiny import tiny_prior, tiny_refiner
 
 from phydict.cli.train import main
 from phydict.datasets import CTSource
+from phydict.datasets.itk_file import ENDINGS
 from phydict.grid import Cube
 from phydict.prior import save_prior, save_refiner
 from phydict.prior.files import held_out_of
@@ -88,7 +89,8 @@ def test_validation_on_those_that_were_trained_on_is_warned_of(cts, tmp_path):
         validated.load_state_dict({"held_out": ["patient0"]})
 
 
-@pytest.mark.parametrize("shape, refused", [((20, 20, 20, 1), False), ((20, 20, 20, 2), True), ((20, 20, 5), True)])
+@pytest.mark.parametrize("shape, refused", [((20, 20, 20, 1), ""), ((20, 20, 20, 2), "is 4D"),
+                                            ((20, 20, 5), "has 5 slices")])
 def test_a_ct_that_is_none_is_refused_before_the_first_step(tmp_path, shape, refused):
     (tmp_path / "cts").mkdir()
     for name, size in (("a", (20, 20, 20)), ("b", shape)):
@@ -96,8 +98,19 @@ def test_a_ct_that_is_none_is_refused_before_the_first_step(tmp_path, shape, ref
     fitted = in_trainer(data(tmp_path / "cts", tmp_path), "fit")
     if not refused:
         return fitted.prepare_data()
-    with pytest.raises(ValueError, match=r"b.nii.gz has the shape .* data.source.exclude"):
+    with pytest.raises(ValueError, match=f"b.nii.gz {refused}.* data.source.exclude"):
         fitted.prepare_data()
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_a_file_of_itk_that_is_no_ct_is_refused_before_the_first_step(tmp_path, ending):
+    SimpleITK = pytest.importorskip("SimpleITK")
+    (tmp_path / "cts").mkdir()
+    for name, slices in (("a", 20), ("b", 5)):
+        image = SimpleITK.GetImageFromArray(np.zeros((slices, 20, 20), np.int16))
+        SimpleITK.WriteImage(image, str(tmp_path / "cts" / f"{name}{ending}"))
+    with pytest.raises(ValueError, match=f"b{ending} has 5 slices .* data.source.exclude"):
+        in_trainer(data(tmp_path / "cts", tmp_path), "fit").prepare_data()
 
 
 def test_stages_that_learn_from_reconstructions_leave_the_same_cts_out_as_others(cts, tmp_path):

@@ -168,7 +168,7 @@ def test_priors_samplers_and_projectors_of_ones_own_fit_in():
     ({"method": "fbp"}, "phydict_fast, phydict_learned"),
     ({"xrays": np.full((8, 448, 448), np.nan)}, "NaN"), ({"xrays": np.zeros((7, 448, 448))}, "8 views"),
     ({"seed": -1}, "a seed is a whole number"), ({"seed": 2**70}, "a seed is a whole number"),
-    ({"mu_water": -0.02}, "mu_water"), ({"mu_water": 0}, "mu_water"), ({"mu_water": float("nan")}, "mu_water"),
+    *(({"mu_water": value}, "mu_water") for value in (-0.02, 0, "water", float("nan"))),
     ({"method": "dds", "prior": tiny_prior(False), "guidance": float("nan")}, "scale lies between 0 and 1,000,000"),
     ({"method": "tv", "guidance": 3.0}, "FISTATV has none: leave guidance out"),
     ({"method": "dds", "prior": tiny_prior(False), "samples": 10**9}, "would take .* GiB of memory")],
@@ -240,6 +240,12 @@ def test_a_source_inside_the_volume_is_refused():
     beam = ConeBeam.orbit(2, 500, 150, (28, 28), 10.0)
     with pytest.raises(ValueError, match="inside the volume"):
         reconstruct(torch.zeros(2, 28, 28), beam, method="sirt")
+
+
+def test_the_shipped_network_is_read_once_and_another_file_each_time(tmp_path):
+    assert reconstructor("phydict_fast").prior is reconstructor("dds").prior
+    save_prior(tiny_prior(), file := tmp_path / "prior.safetensors")
+    assert reconstructor("dds", file).prior is not reconstructor("dds", file).prior
 
 
 def test_a_super_resolution_stage_makes_it_a_cascade_on_the_fine_grid(tmp_path):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -27,12 +29,11 @@ def voxel_files(path: Path) -> list[Path]:
     return [path.parent / name for name in names if name and (path.parent / name).is_file()]
 
 
-def read_itk(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """The numbers (X, Y, Z) of a file with one of ENDINGS, and its 4x4 index -> RAS+ world mm affine. For use inside
-    `reading`.
+def open_itk(path: Path):
+    """SimpleITK's reader of a file with one of ENDINGS, which has read the header. For use inside `reading`.
 
-    Raises ValueError where SimpleITK is not installed, for voxels that are not one number each, for another number of
-    dimensions than three, and for more of them than this machine can hold.
+    Raises ValueError where SimpleITK is not installed, for voxels that are not one number each, and for another number
+    of dimensions than three.
     """
     try:
         import SimpleITK
@@ -40,16 +41,36 @@ def read_itk(path: Path) -> tuple[np.ndarray, np.ndarray]:
         raise ValueError("SimpleITK, which reads it, is not installed: pip install 'phydict[itk]'") from None
     reader = SimpleITK.ImageFileReader()
     reader.SetFileName(str(path))
-    try:
+    with _in_a_line():
         reader.ReadImageInformation()
-        shape = reader.GetSize()
-        if len(shape) != 3 or reader.GetNumberOfComponents() != 1:
-            raise ValueError(f"it is {len(shape)}D with shape {shape} and {reader.GetNumberOfComponents()} numbers per "
-                             "voxel; one 3D volume of one number each is needed")
-        check_memory(16 * math.prod(shape), f"its shape {shape}", "give a smaller one")
-        volume = SimpleITK.GetArrayFromImage(reader.Execute()).T
-    except RuntimeError as error:  # whose last line says what is wrong, after those of ITK's source
+    shape, numbers = reader.GetSize(), reader.GetNumberOfComponents()
+    if len(shape) != 3 or numbers != 1:
+        raise ValueError(f"it is {len(shape)}D with shape {shape} and {numbers} numbers per voxel; one 3D volume of "
+                         "one number each is needed")
+    return reader
+
+
+@contextmanager
+def _in_a_line() -> Iterator[None]:
+    """A ValueError with the last line of what SimpleITK raises, which says what is wrong."""
+    try:
+        yield
+    except RuntimeError as error:
         raise ValueError(str(error).strip().splitlines()[-1].strip()) from error
+
+
+def read_itk(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """The numbers (X, Y, Z) of a file with one of ENDINGS, and its 4x4 index -> RAS+ world mm affine. For use inside
+    `reading`.
+
+    Raises ValueError as `open_itk`, and for more voxels than this machine can hold.
+    """
+    reader = open_itk(path)
+    import SimpleITK
+
+    check_memory(16 * math.prod(reader.GetSize()), f"its shape {reader.GetSize()}", "give a smaller one")
+    with _in_a_line():
+        volume = SimpleITK.GetArrayFromImage(reader.Execute()).T
     affine = np.eye(4)
     affine[:3, :3] = np.reshape(reader.GetDirection(), (3, 3)) * reader.GetSpacing()
     affine[:3, 3] = reader.GetOrigin()

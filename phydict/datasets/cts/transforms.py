@@ -15,7 +15,7 @@ import torch
 
 from phydict.datasets.case import Case
 from phydict.datasets.cts.anatomy import lung_box_centre, segment
-from phydict.datasets.itk_file import ENDINGS, read_itk
+from phydict.datasets.itk_file import ENDINGS, open_itk, read_itk
 from phydict.datasets.nifti_file import NIFTI, open_nifti
 from phydict.grid import Grid
 from phydict.runtime.reading import name_of, reading
@@ -105,16 +105,15 @@ def to_ras(volume: np.ndarray, affine: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def check_header(path: Path) -> None:
-    """Raises ValueError where the header of a NIfTI file, which alone is read, is not that of a CT: of one 3D volume
-    with LEAST_SLICES or more."""
-    if not path.name.lower().endswith(NIFTI):
-        return
+    """Raises ValueError where the header of a file, which alone is read, is not that of a CT: of one 3D volume with
+    LEAST_SLICES or more."""
     with reading(path, "convert it again, or list it in data.source.exclude"):
-        header = open_nifti(path).header
-    shape = _volume_shape(header)
-    if len(shape) != 3 or min(shape) < LEAST_SLICES:
-        raise ValueError(f"{path} has the shape {header.get_data_shape()}, but a CT is one 3D volume with at least "
-                         f"{LEAST_SLICES} slices: give the whole series, or list it in data.source.exclude")
+        itk = path.suffix.lower() in ENDINGS
+        shape = open_itk(path).GetSize() if itk else _volume_shape(open_nifti(path).header)
+    try:
+        _check_shape(path, shape)
+    except ValueError as error:
+        raise ValueError(f"{error}, or list it in data.source.exclude") from None
 
 
 def _volume_shape(header) -> tuple[int, ...]:
@@ -127,8 +126,6 @@ def _volume_shape(header) -> tuple[int, ...]:
 
 def _check_header(path: Path, header, calibration: Calibration | None) -> None:
     shape = _volume_shape(header)
-    if len(shape) != 3:
-        raise ValueError(f"{path} is {len(shape)}D with shape {tuple(shape)}; give one 3D volume per file")
     _check_shape(path, shape)
     if calibration is not None:
         return _check_affine(path, calibration.affine(), "correct it in the metadata table")
@@ -145,6 +142,8 @@ def _check_header(path: Path, header, calibration: Calibration | None) -> None:
 
 
 def _check_shape(path: Path, shape: tuple[int, ...]) -> None:
+    if len(shape) != 3:
+        raise ValueError(f"{path} is {len(shape)}D with shape {tuple(shape)}; give one 3D volume per file")
     if min(shape) < 2:
         raise ValueError(f"{path} is a single 2D slice with shape {tuple(shape)}; give a 3D volume")
     if min(shape) < LEAST_SLICES:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import reprlib
+import time
 from collections.abc import Callable, Collection
 from dataclasses import replace
 from functools import lru_cache
@@ -13,8 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from phydict.baselines import CGLS, FDK, FISTATV, SIRT, DiffVox, Region
-from phydict.baselines.baseline import Baseline
+from phydict.baselines import CGLS, FDK, FISTATV, SIRT, Baseline, DiffVox, Region
 from phydict.baselines.extended import covering, extended
 from phydict.datasets import format_report
 from phydict.grid import Grid
@@ -54,6 +54,7 @@ from phydict.prior import (
 )
 from phydict.prior.correction import TOLERANCE
 from phydict.reconstruction import Reconstruction, Reconstructor
+from phydict.runtime.own_code import is_own
 from phydict.runtime.precision import check_precision
 from phydict.runtime.profiling import Stopwatch
 from phydict.runtime.reading import reason
@@ -258,9 +259,12 @@ def reconstruct_by(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeB
             xrays = xrays.float()
             method, grid, beam = extended(method, grid, xrays, beam, display)
             xrays, A = binned_to(grid, xrays, beam, method.full_detector, projector)
+        prepared, began = sum(watch.seconds.values()), time.perf_counter()
         result = method.reconstruct(xrays, A, report, display, seed, on_step)
-        prepared = sum(watch.seconds.values()) + result.seconds.get("prepare", 0.0)
-        result = replace(result, seconds=result.seconds | {"prepare": prepared})
+        seconds = {"prepare": 0.0} | result.seconds
+        if is_own(type(method)):  # whose stages may leave something out
+            seconds["other"] = time.perf_counter() - began - sum(result.seconds.values())
+        result = replace(result, seconds=seconds | {"prepare": prepared + seconds["prepare"]})
     return replace(poses.added_to(result) if poses else result, warnings=warnings)
 
 
@@ -301,7 +305,10 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: AnyPrior | str | Path | No
     super_resolution, sr_guided: the second stage of a cascade, as for `reconstructor`; its grid counts as the prior's.
     samples: more than one gives their mean, and `deviation`, a map of how far they differ, as for `reconstructor`.
     precision: of the networks; "auto" is bfloat16 where the device computes it faster, else float32.
-    projector: the kind of `Projector`, such as "siddon"; "auto" is the fastest that suits the geometry.
+    projector: the kind of `Projector`, such as "siddon"; "auto" is the fastest that suits the geometry. An object of
+    one's own goes to `reconstructor(...).reconstruct(xrays, projector)`.
+    on_step: is called without arguments after each of the method's steps. seed: of what is drawn. guidance: how
+    strongly a report is followed.
     uncertain: what the geometry does not know exactly, which is then found first; the result holds `beam` and `poses`.
     A detector finer than the grid can use is binned. Raises ValueError when X-rays, geometry and prior do not fit.
     """
@@ -312,6 +319,9 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: AnyPrior | str | Path | No
         raise ValueError(f"the grid must be a Grid, but {grid!r} was given; Grid.cube makes one")
     if not isinstance(report, str | None):
         raise ValueError(f"the report must be text, but {report!r} was given")
+    if not isinstance(projector, str):
+        raise ValueError("the projector is the name of one, such as 'auto', but an object was given: give it to "
+                         "reconstructor(...).reconstruct(xrays, projector)")
     check_seed(seed)
     method = default_method(prior, samples, guidance) if method is None else method
     ready = reconstructor(method, prior, guidance, super_resolution=super_resolution, sr_guided=sr_guided,

@@ -1,5 +1,6 @@
 """The named methods, and a reconstruction in one call."""
 
+import time
 import warnings
 from dataclasses import dataclass, replace
 
@@ -8,7 +9,7 @@ import pytest
 import torch
 from prior.tiny import tiny_for, tiny_prior, tiny_refiner, tiny_super_resolution
 
-from phydict.baselines import CGLS, SIRT, Region
+from phydict.baselines import CGLS, SIRT, Baseline, Region
 from phydict.diffusion import GaussianDenoiser
 from phydict.grid import Grid
 from phydict.methods import METHODS, default_method, onto_grid, reconstruct, reconstructor
@@ -165,7 +166,7 @@ def test_priors_samplers_and_projectors_of_ones_own_fit_in():
 @pytest.mark.parametrize("change, sentence", [
     ({"beam": "geometry.yaml"}, "ConeBeam.load"), ({"report": 5}, "report must be text"),
     ({"method": 123}, "a Sampler or"), ({"method": SIRT}, "a Sampler or"),
-    ({"method": "fbp"}, "phydict_fast, phydict_learned"),
+    ({"method": "fbp"}, "phydict_fast, phydict_learned"), ({"projector": object()}, "give it to reconstructor"),
     ({"xrays": np.full((8, 448, 448), np.nan)}, "NaN"), ({"xrays": np.zeros((7, 448, 448))}, "8 views"),
     ({"seed": -1}, "a seed is a whole number"), ({"seed": 2**70}, "a seed is a whole number"),
     *(({"mu_water": value}, "mu_water") for value in (-0.02, 0, "water", float("nan"))),
@@ -240,6 +241,29 @@ def test_a_source_inside_the_volume_is_refused():
     beam = ConeBeam.orbit(2, 500, 150, (28, 28), 10.0)
     with pytest.raises(ValueError, match="inside the volume"):
         reconstruct(torch.zeros(2, 28, 28), beam, method="sirt")
+
+
+@dataclass(frozen=True)
+class Slow(Baseline):
+    mu_water: float = MU_WATER
+    name: str = "Slow"
+
+    def steps(self):
+        return 1
+
+    def solve(self, A, y, on_step):
+        return torch.ones(1, 1, *A.grid.shape).to(y)
+
+    def reconstruct(self, *args, **settings):
+        time.sleep(0.2)
+        return replace(super().reconstruct(*args, **settings), seconds={})
+
+
+@pytest.mark.filterwarnings("ignore")  # of water that explains nothing
+def test_the_seconds_of_a_method_of_ones_own_are_measured():
+    beam = ConeBeam.orbit(2, 1020, 740, (28, 28), 20.0)
+    result = reconstruct(ball(beam, 90.0), beam, method=Slow(), grid=Grid.cube(16))
+    assert sum(result.seconds.values()) >= 0.2
 
 
 def test_the_shipped_network_is_read_once_and_another_file_each_time(tmp_path):

@@ -3,29 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from phydict.ablation.run import FID, features_file
-from phydict.ablation.summary import Entry, conditions, format_settings
-from phydict.datasets import patient_of
+from phydict.ablation.summary import Entry, conditions, xrays
 from phydict.evaluation import read_csv, write_csv
-from phydict.evaluation.fid import StoredFeatures
-from phydict.evaluation.tables import Table, fid_tables
+from phydict.evaluation.fid import CaseFeatures, SeedFeatures, StoredFeatures
+from phydict.evaluation.tables import FID_TITLE, Table, fid_tables
+from phydict.inference.conditions import format_settings
 from phydict.inference.distances import distance_rows
 from phydict.inference.scoring import FIDSettings, Scoring
 
 
 def write_distances(out: Path, entries: Sequence[Entry], scoring: Scoring) -> None:
     """Writes FID, the distances of each condition's entries, of those that have their features there, where the
-    distance is measured. Of several seeds of a case each counts as a case of the same patient."""
+    distance is measured."""
     if scoring.network is None:
         return
     backbone, rows = scoring.fid.backbone, []
     for condition, group in conditions(entries):
         there = {entry.label: [row for row in entry.counted if features_file(out, row["key"]).is_file()]
                  for entry in group}
-        features = {label: {name: StoredFeatures(features_file(out, key), backbone) for name, key in _named(kept)}
-                    for label, kept in there.items() if kept}
+        features = {label: _features(out, kept, backbone) for label, kept in there.items() if kept}
         if features:
             rows += [{"method": row["method"]} | condition | row for row in distance_rows(features, scoring.fid)]
     write_csv(out / FID, rows)
@@ -41,7 +41,8 @@ def distance_tables(out: Path, entries: Sequence[Entry]) -> list[Table]:
         of = [{"replicates": FIDSettings().replicates} | row for row in rows
               if row["method"] in labels and all(_text(row, name) == _text(condition, name) for name in names)]
         if of:
-            tables += fid_tables(of, format_settings("Frechet distance of slices (FID)", condition))
+            tables += [replace(table, notes=[*table.notes, xrays(group)]) for table in fid_tables(
+                of, format_settings(FID_TITLE, condition))]
     return tables
 
 
@@ -50,9 +51,9 @@ def _text(row: Mapping, name: str) -> str:
     return "" if row.get(name) is None else str(row[name])
 
 
-def _named(rows: Sequence[Mapping]) -> list[tuple[str, str]]:
-    """A name for each row of a case, of the case's patient (`patient_of`), and the row's key."""
-    cases = [row["case"] for row in rows]
-    repeats = [cases[:i].count(case) for i, case in enumerate(cases)]
-    return [(f"{patient_of(case)}__{case}__{n}" if n else case, row["key"])
-            for case, n, row in zip(cases, repeats, rows)]
+def _features(out: Path, rows: Sequence[Mapping], backbone: str) -> dict[str, CaseFeatures]:
+    """Case -> the features that its rows, of a seed each, have left."""
+    seeds: dict[str, list[StoredFeatures]] = {}
+    for row in rows:
+        seeds.setdefault(row["case"], []).append(StoredFeatures(features_file(out, row["key"]), backbone))
+    return {case: SeedFeatures(of) if len(of) > 1 else of[0] for case, of in seeds.items()}

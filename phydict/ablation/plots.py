@@ -19,9 +19,9 @@ from phydict.ablation.summary import (
     compared_views,
     conditions,
     deltas,
-    format_settings,
 )
 from phydict.evaluation.gallery import literal
+from phydict.inference.conditions import format_settings
 from phydict.runtime.files import atomic_write
 
 COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f", "#bcbd22", "#17becf",

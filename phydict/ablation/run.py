@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import reprlib
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache
@@ -79,8 +79,10 @@ class Results:
             raise ValueError(f"{self.file} has rows without a key, so that it is no table of this command: give "
                              "another out")
         if stored and not stored.keys() & planned.keys():
+            differing = _differing(stored.values(), planned.values())
             raise ValueError(f"{self.file} is the table of another comparison, whose {len(stored)} rows are all of "
-                             f"other settings or data: give another out, or remove {', '.join([RESULTS, *others])}")
+                             f"other settings or data{differing}: give another out, or remove "
+                             f"{', '.join([RESULTS, *others])}")
         for name, row in stored.items():
             wrong = next((k for k in MEASURED if k not in WORDS and isinstance(row.get(k), str)), None)
             if wrong:
@@ -126,6 +128,18 @@ class Results:
         write_csv(self.file, [{k: row.get(k) for k in order} | row for row in self.rows + self.others])
 
 
+def _differing(stored: Iterable[dict], planned: Iterable[dict]) -> str:
+    """In brackets, the columns of which no stored row has what a planned one has."""
+    of_stored, of_planned = list(stored), list(planned)
+    columns = dict.fromkeys(name for row in of_planned for name in row)
+    differ = []
+    for name in columns:
+        there, here = (dict.fromkeys(str(row.get(name)) for row in rows) for rows in (of_stored, of_planned))
+        if not there.keys() & here.keys():
+            differ.append(f"{name} {', '.join(there)} there and {', '.join(here)} here")
+    return f" ({'; '.join(differ)})" if differ else ""
+
+
 Work = list[tuple[Trial, str, Callable[[], Case]]]
 """Trials of a case, the keys of their rows, and the functions that make the case."""
 
@@ -143,6 +157,10 @@ def planned(specification: Specification, scoring: Scoring) -> tuple[Results, di
             rows[name] = {"case": case} | trial.columns | {"grid": "x".join(map(str, trial.scored().shape))} | (
                 {"training": trial.training} if trial.training else {})
             cases.setdefault(case, []).append((trial, name, make))
+    if followed := next(filter(None, (trial.followed for trial in specification.trials)), None):
+        log_progress(f"methods without voxels of their own take the {'x'.join(map(str, followed[0].shape))} of "
+                     f"{followed[1]}: the setting voxels gives others", event="voxels",
+                     voxels=list(followed[0].shape), prior=followed[1])
     return Results(specification.out, rows), cases
 
 
@@ -278,7 +296,8 @@ class Runner:
             "error": None if finite else "the volume holds NaN or infinite voxels", "misfit": result.misfit,
             "seconds": sum(result.seconds.values()),
             **{f"seconds_{stage}": value for stage, value in seconds.items()},
-            "network_calls": result.network_calls, "projector_calls": result.projector_calls,
+            "network_calls": result.network_calls,
+            "projector_calls": result.projector_calls or profile.calls("projector"),
             "peak_memory_mb": peak,
             "device": self.device.type, "threads": torch.get_num_threads(), "precision": result.precision,
             "instruction_set": instruction_set(self.device)}

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+from ast import literal_eval
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,10 +12,15 @@ from functools import cached_property
 import numpy as np
 
 from phydict.ablation.run import MEASURED
-from phydict.ablation.trials import PRIOR_SETTINGS, SETTINGS
+from phydict.ablation.trials import ORBIT_SETTINGS, PRIOR_SETTINGS, SETTINGS, SIDE, SIMULATORS
 from phydict.evaluation.bootstrap import Estimate, estimate
 from phydict.evaluation.metrics import MEASURES, Measure, case_values
+from phydict.grid import Box, Grid
+from phydict.inference.conditions import format_settings, simulated, simulated_on, xrays_note
 from phydict.inference.protocols import protocol_of
+from phydict.inference.settings import Orbit
+from phydict.reconstruction import describe
+from phydict.xray import Ideal, Simulator
 
 SHOWN_MEASURES = MEASURES | {"network_calls": Measure("network calls", None, 0),
                              "projector_calls": Measure("projector calls", None, 0),
@@ -27,6 +34,9 @@ NON_SETTING_COLUMNS = (*MEASURED, "case", "key", "seed", "grid", "training")
 
 METHOD_SETTINGS = ("method", "projector", *PRIOR_SETTINGS)
 """Settings of the method, as method.<field> are; the others are of the X-rays."""
+
+XRAY_SETTINGS = (*ORBIT_SETTINGS, "simulator", "simulation_voxels", "geometry", "protocol")
+"""Settings of simulated X-rays beside the simulator's own, which `xrays` tells."""
 
 BOX_SETTINGS = ("voxels", "side", "centre")
 """Settings of the voxels of the result, which are the method's where a protocol has voxels of its own to score on."""
@@ -54,6 +64,11 @@ class Entry:
     def counted(self) -> list[Mapping]:
         """The rows that its values are of."""
         return _of_whole_cases(self.rows)
+
+    @property
+    def case_ids(self) -> frozenset[str]:
+        """The cases that its values are of."""
+        return frozenset(str(row["case"]) for row in self.counted)
 
     @cached_property
     def means(self) -> dict[str, float]:
@@ -83,19 +98,6 @@ class Entry:
     def label(self) -> str:
         """The method with its settings, and how many cases it has where some are missing."""
         return self.name + self.lacking
-
-
-def format_settings(*parts: str | Mapping) -> str:
-    """Names, and settings in words, behind each other: "K = 8, iterations 50"."""
-    return ", ".join(text for part in parts for text in (
-        [part] if isinstance(part, str) else [_format_setting(*setting) for setting in part.items()]))
-
-
-def _format_setting(name: str, value: object) -> str:
-    if name == "simulator":
-        return str(value)
-    value = f"{value:g}" if isinstance(value, float) else value
-    return f"K = {value}" if name == "views" else f"{name.split('.', 1)[-1].replace('_', ' ')} {value}"
 
 
 def summarise(rows: Iterable[Mapping]) -> list[Entry]:
@@ -175,13 +177,47 @@ def deltas(entries: Sequence[Entry]) -> list[tuple[str, list[Entry]]]:
 
 
 def fixed_settings(entries: Sequence[Entry]) -> str:
-    """The settings that all rows of entries share, other than by default and in no entry's name or condition, in
-    words."""
+    """The settings beside those of the X-rays that all rows of entries share, other than by default and in no entry's
+    name or condition, in words."""
     settings = [xrays | own for entry in entries for own, xrays in map(_parted, entry.rows)]
-    told = {"method", "protocol", *_varying(settings)}.union(
+    told = {"method", *XRAY_SETTINGS, *_varying(settings)}.union(
         *(entry.settings.keys() | entry.condition.keys() for entry in entries))
     return format_settings({name: value for name, value in settings[0].items() if name not in told
-                            and value is not None and str(value) != str(SETTINGS.get(name, (None, None))[1])})
+                            and not name.startswith("simulator.") and value is not None
+                            and str(value) != str(SETTINGS.get(name, (None, None))[1])})
+
+
+def xrays(entries: Sequence[Entry]) -> str:
+    """How the X-rays of entries' rows were made, what differs among the rows left out."""
+    first, *others = [_simulated(row) | {"places": _places(row)} for entry in entries for row in entry.rows]
+    shared = {name: value for name, value in first.items() if all(other.get(name) == value for other in others)}
+    return xrays_note(shared, shared.pop("places", None)) + "."
+
+
+def _simulated(row: Mapping) -> dict:
+    """The settings of a row's X-rays, as a record of `test` names them."""
+    given = {name: default if row.get(name) is None else row[name] for name, (_, default) in SETTINGS.items()}
+    simulator: Simulator = SIMULATORS[given["simulator"]]
+    if given["protocol"]:
+        protocol = protocol_of(given["protocol"])
+        simulator, orbit = Ideal(noise=protocol.noise), Orbit(given["views"]).filled(protocol.orbit).settings()
+    elif given["geometry"]:
+        orbit = {"views": given["views"], "geometry": given["geometry"]}
+    else:
+        pixel = given["pixel"] or SIDE / given["detector"]
+        orbit = Orbit(given["views"], given["source_to_detector"], given["source_to_isocentre"],
+                      (given["detector"],) * 2, (pixel,) * 2).settings()
+    fields = {name.removeprefix("simulator."): value for name, value in row.items() if name.startswith("simulator.")}
+    return simulated(json.loads(json.dumps(orbit | {"simulator": describe(simulator) | fields})))
+
+
+def _places(row: Mapping) -> str:
+    """Of what voxels a row's X-rays were made."""
+    box: Grid | None = None
+    if row.get("voxels") is not None:
+        given = {name: literal_eval(str(row[name])) for name in BOX_SETTINGS if row.get(name) is not None}
+        box = Box(**given).grid()
+    return simulated_on(row.get("simulation_voxels"), row.get("protocol"), box)
 
 
 def _parted(row: Mapping) -> tuple[dict, dict]:

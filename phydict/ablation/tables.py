@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -16,22 +17,23 @@ from phydict.ablation.summary import (
     conditions,
     deltas,
     fixed_settings,
-    format_settings,
     rank,
+    xrays,
 )
-from phydict.evaluation.bootstrap import difference
+from phydict.evaluation.bootstrap import Estimate, difference
 from phydict.evaluation.metrics import MEASURES, RANGE
 from phydict.evaluation.tables import (
-    INTERVAL,
     Table,
     caption,
     empty_notes,
+    has_intervals,
     interval_note,
     listed,
     partial_notes,
     rankable,
     warning_notes,
 )
+from phydict.inference.conditions import format_settings
 from phydict.inference.protocols import Protocol, protocol_of
 from phydict.runtime.files import atomic_write
 
@@ -47,6 +49,9 @@ OF_VIEWS = ("ssim", "psnr", *FURTHER, "seconds")
 
 OF_DIFFERENCES = ("ssim", "psnr", "mae_hu", *(name for name in FURTHER if name != "dice_lung_ct"), "misfit")
 """Measures whose differences between methods are tabled; one that is of the CT alone has none."""
+
+OFF_TARGET = "Off 1: |value - 1|, whose differences below 0 are for the better."
+"""The note on differences of measures whose right value is 1."""
 
 OF_DELTA = ("ssim", "misfit", "psnr", "mae_hu", *FURTHER, "seconds")
 """Columns of the table of Extra Compute, the misfit beside SSIM: what looks better may fit the X-rays worse."""
@@ -97,16 +102,24 @@ def _difference_tables(title: str, entries: Sequence[Entry]) -> list[Table]:
     if len(compared) < 2:
         return []
     best, names = max(compared, key=rank), _measured(OF_DIFFERENCES, entries)
-    lines: list[tuple[str, bool, list]] = []
-    for entry in compared:
-        if entry is not best:
-            values = [difference(entry.values.get(name, {}), best.values.get(name, {})) for name in names]
-            lines.append((entry.label, False, values))
-    if not interval_note(lines):
+    others = [entry for entry in compared if entry is not best]
+    lines: list[tuple[str, bool, list]] = [(entry.label, False, [_less(entry, best, name) for name in names])
+                                           for entry in others]
+    if not has_intervals(lines):
         return []
-    measures = [SHOWN_MEASURES[name] for name in names]
-    return [Table(f"{title}: less {best.name}, case by case", ["method", *(m.heading for m in measures)],
-                  measures, lines, [INTERVAL, *_origins(entries)])]
+    measures = [SHOWN_MEASURES[name].off_target() for name in names]
+    off = [OFF_TARGET] if measures != [SHOWN_MEASURES[name] for name in names] else []
+    return [Table(f"{title}: less {best.name}, case by case", ["method", *(m.heading for m in measures)], measures,
+                  lines, [*interval_note(lines, (entry.case_ids & best.case_ids for entry in others)), *off,
+                          *_origins(entries)])]
+
+
+def _less(entry: Entry, other: Entry, name: str) -> Estimate | None:
+    """By how much an entry's measure is above another's, or further off its target."""
+    target = SHOWN_MEASURES[name].target
+    one, two = ({case: value if target is None else abs(value - target) for case, value in of.values[name].items()}
+                if name in of.values else {} for of in (entry, other))
+    return difference(one, two)
 
 
 def _delta_table(label: str, entries: Sequence[Entry], empty: Mapping[str, str]) -> Table:
@@ -125,8 +138,9 @@ def _entry_table(title: str, first: str, names: Sequence[str], lines: Sequence[t
         (label, entry.cases, {name: len(entry.values.get(name, ())) for name in names}) for label, entry in lines)
     ranked = [rankable(measure, (entry.values[name] for entry in entries if entry.complete and name in entry.values))
               for name, measure in zip(names, measures)]
-    return Table(title, [first, *(measure.heading for measure in measures)], ranked, printed,
-                 [_caption(entries), *why, *_origins(entries), *notes, *interval_note(printed), *_reasons(entries)])
+    table = Table(title, [first, *(measure.heading for measure in measures)], ranked, printed, [])
+    return replace(table, notes=[_caption(entries, table.ranks), *why, *_origins(entries), *notes,
+                                 *interval_note(printed, (entry.case_ids for entry in entries)), *_reasons(entries)])
 
 
 def _axis_tables(title: str, rest: dict, group: Sequence[Entry], columns: Mapping[object, str],
@@ -145,12 +159,13 @@ def _axis_tables(title: str, rest: dict, group: Sequence[Entry], columns: Mappin
                    for label, line in lines.items()]
         ranked = [rankable(measure, (lines[label][k].values[name] for label in complete
                                      if k in lines[label] and name in lines[label][k].values)) for k in columns]
-        tables.append(Table(
-            format_settings(f"{measure.heading} {title}", rest), ["method", *columns.values()],
-            ranked, printed,
-            [_caption(group), *_origins(group), *interval_note(printed), *_reasons(group), *partial_notes(
-                (f"{label}, {columns[k]}", entry.cases, {name: len(entry.values.get(name, ()))})
-                for label, line in lines.items() for k, entry in line.items())]))
+        table = Table(format_settings(f"{measure.heading} {title}", rest), ["method", *columns.values()], ranked,
+                      printed, [])
+        parts = partial_notes((f"{label}, {columns[k]}", entry.cases, {name: len(entry.values.get(name, ()))})
+                              for label, line in lines.items() for k, entry in line.items())
+        tables.append(replace(table, notes=[
+            _caption(group, table.ranks), *_origins(group),
+            *interval_note(printed, (entry.case_ids for entry in group)), *_reasons(group), *parts]))
     return tables
 
 
@@ -160,26 +175,26 @@ def _measured(names: Sequence[str], entries: Sequence[Entry], empty: Iterable[st
             or any(name in entry.values for entry in entries)]
 
 
-def _caption(entries: Sequence[Entry]) -> str:
-    """What the numbers of a table of entries were taken from."""
+def _caption(entries: Sequence[Entry], marked: bool) -> str:
+    """What the numbers of a table of entries were taken from; marked: whether some are marked as the best."""
     rows = [row for entry in entries for row in entry.rows]
-    count = len({row["case"] for row in rows})
-    over = f"Mean over {count} {'case' if count == 1 else 'cases'}"
+    count, seeds = len({row["case"] for row in rows}), len({row.get("seed") for row in rows})
+    over = f"Mean over {count} cases" if count > 1 else "One case" if seeds == 1 else "Mean over the seeds of one case"
     how = " on ".join(filter(None, (listed(rows, name) for name in ("precision", "instruction_set"))))
     window = next((protocol.window for protocol in _protocols(rows)), RANGE)
-    return caption(over, rows, {"Grid": "grid", "Seeds": "seed"}, window) + (
+    return caption(over, marked, rows, {"Grid": "grid", "Seeds": "seed"}, window) + (
         f" Seconds: one reconstruction after a warm-up, {listed(rows, 'device') or 'none'}, threads "
         f"{listed(rows, 'threads') or 'none'}{how and f', {how}'}; loading and scoring excluded.")
 
 
 def _origins(entries: Sequence[Entry]) -> list[str]:
-    """The protocol that the rows of a table's entries were taken by, the settings that its title and labels do not
-    tell, how long trained rivals among them have learnt, and the cases that are doubtful."""
+    """The protocol and the X-rays that the rows of a table's entries were taken by, the settings that its title and
+    labels do not tell, how long trained rivals among them have learnt, and the cases that are doubtful."""
     rows = [row for entry in entries for row in entry.rows]
     trained = dict.fromkeys(f"{row['method']} {row['training']}" for row in rows if row.get("training"))
     fixed = fixed_settings(entries)
-    return [*(protocol.note for protocol in _protocols(rows)), *([f"Fixed settings: {fixed}."] if fixed else []),
-            *warning_notes(rows),
+    return [*(protocol.note for protocol in _protocols(rows)), xrays(entries),
+            *([f"Fixed settings: {fixed}."] if fixed else []), *warning_notes(rows),
             *([f"Trained rivals, as their files tell: {'; '.join(trained)}."] if trained else [])]
 
 

@@ -128,6 +128,13 @@ class Trial:
         file = self.prior or self.like
         return prior_of(file).grid if file else DEFAULT_GRID
 
+    @property
+    def followed(self) -> tuple[Grid, str] | None:
+        """The grid, unlike the usual, that a method without one of its own takes, and the prior file it is of."""
+        if self.like is None or self.bound or self.box or self.fixed or self.first().same_as(DEFAULT_GRID):
+            return None
+        return self.first(), self.like
+
     def scored(self) -> Grid:
         """The grid on which results are scored."""
         return self.box.grid() if self.box and not self.fixed else self.scene()[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -12,10 +13,12 @@ from phydict.baselines.baseline import Baseline
 from phydict.grid import Grid
 from phydict.reconstruction import Delegating, Reconstruction
 from phydict.runtime.profiling import Stopwatch
+from phydict.runtime.warning import heard
 from phydict.units import hu_to_mu
 from phydict.xray import Projector
 from phydict.xray.boxes import binned_to, outside_projection, projector_method
 from phydict.xray.calibration import match_views
+from phydict.xray.checks import prepared_xrays
 
 
 @dataclass(frozen=True)
@@ -52,13 +55,16 @@ class Region(Delegating):
         watch = Stopwatch()
         with watch.stage("base"):
             method = projector_method(projector)
-            binned = binned_to(self.outer, xrays, projector.beam, self.full_detector, method)
-            coarse = self.base.reconstruct(*binned, report, display, seed, on_step)
+            y, whole = binned_to(self.outer, xrays, projector.beam, self.full_detector, method)
+            prepared_xrays(y, whole.beam, display)
+            with warnings.catch_warnings(), heard():  # what is doubtful of the X-rays is said, of the fit the box will
+                warnings.simplefilter("ignore")
+                coarse = self.base.reconstruct(y, whole, report, display, seed, on_step)
         with watch.stage("outside"):
             mu = hu_to_mu(coarse.volume.to(xrays), self.mu_water)
             if display:
-                whole = Projector(self.outer, projector.beam, method, device=xrays.device, full_detector=True)
-                xrays = match_views(xrays[None], whole(mu[None, None]))[0]
+                outer = Projector(self.outer, projector.beam, method, device=xrays.device, full_detector=True)
+                xrays = match_views(xrays[None], outer(mu[None, None]))[0]
             continued = bool(projector.beam.continued)
             projector = Projector(self.target, replace(projector.beam, continued=False), method,
                                   device=xrays.device, full_detector=True)

@@ -8,7 +8,7 @@ four, a draw knows 35 different sets at most.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -36,6 +36,11 @@ class Estimate(NamedTuple):
 def bounds(low: float, high: float, spec: str) -> str:
     """The ends of an interval as " [low, high]"; nothing where they are NaN."""
     return "" if math.isnan(low + high) else f" [{format(low, spec)}, {format(high, spec)}]"
+
+
+def patients(cases: Iterable[str]) -> int:
+    """How many patients cases are of, by their ids (`patient_of`)."""
+    return len(set(map(patient_of, cases)))
 
 
 @lru_cache(maxsize=8)

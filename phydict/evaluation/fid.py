@@ -30,7 +30,7 @@ from torchmetrics.utilities.data import dim_zero_cat
 
 from phydict.datasets.cts.ct_rate import patient_of
 from phydict.evaluation.backbones import DIMENSIONS, SliceFeatures
-from phydict.evaluation.bootstrap import Estimate, draws, percentiles
+from phydict.evaluation.bootstrap import Estimate, draws, patients, percentiles
 from phydict.evaluation.planes import PLANES
 from phydict.runtime.files import atomic_write
 
@@ -105,17 +105,46 @@ class StoredFeatures(Mapping[str, Tensor]):
         return len(PLANES)
 
 
+class SeedFeatures(Mapping[str, tuple[Tensor, Tensor]]):
+    """The features of a case that was reconstructed by several seeds: plane -> those of all reconstructions, and the
+    truth's once."""
+
+    def __init__(self, seeds: Sequence[Features]):
+        self.seeds = seeds
+
+    def __getitem__(self, plane: str) -> tuple[Tensor, Tensor]:
+        fake, truth = self.seeds[0][plane]
+        return torch.cat([fake, *(seed[plane][0] for seed in self.seeds[1:])]), truth
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(PLANES)
+
+    def __len__(self) -> int:
+        return len(PLANES)
+
+
+CaseFeatures = Features | SeedFeatures
+"""The features of a case: plane -> those of its reconstructions and of the truth."""
+
+
 @dataclass(frozen=True)
 class Distances:
     """The Frechet distances of a method's cases.
 
-    cases: their names; slices: plane -> how many of each case; values: for each of NAMES (1 + R,), that of the cases,
-    and of R draws of their patients, which are the same for every method with the same cases.
+    cases: their names; seeds: how many reconstructions each has; slices: plane -> how many each case's truth has;
+    values: for each of NAMES (1 + R,), that of the cases, and of R draws of their patients, which are the same for
+    every method with the same cases.
     """
 
     cases: tuple[str, ...]
+    seeds: tuple[int, ...]
     slices: dict[str, tuple[int, ...]]
     values: dict[str, np.ndarray]
+
+    @property
+    def basis(self) -> tuple:
+        """What they rest on: those of other numbers of slices are not compared."""
+        return self.cases, self.seeds, self.slices
 
     def estimates(self, other: Distances | None = None) -> dict[str, Estimate]:
         """The distances, or by how much they are above those of another method with the same cases, draw by draw."""
@@ -158,24 +187,34 @@ def _distance(of: Moments, to: Reference) -> float:
 def fid_rows(methods: Mapping[str, Distances], backbone: str, replicates: int, normalisation: str) -> list[dict]:
     """The distances of methods by label, a row each, with what they rest on and, in columns that begin with "less_", by
     how much they are above those of `less`, the method of most cases and of these the nearest, where they are of the
-    same cases and of as many slices. A distance's interval is in columns that end in "_low" and "_high".
+    same cases and of as many slices; a distance that is not a number comes behind all others. A distance's interval is
+    in columns that end in "_low" and "_high".
 
     backbone: whose features they were; replicates: the draws of patients that they were found with; normalisation: of
     the slices, in words.
     """
-    best = min(methods, key=lambda label: (-len(methods[label].cases), float(methods[label].values["fid"][0])))
+    best = min(methods, key=lambda label: _place(methods[label]))
     rows = []
     for label, found in methods.items():
-        counts = {plane: sum(slices) for plane, slices in found.slices.items()}
         row: dict = {"method": label, "fid_backbone": backbone, "fid_normalisation": normalisation,
-                     "replicates": replicates, "cases": len(found.cases)}
-        row |= {f"{of}slices_{plane}": n for of in ("", "truth_") for plane, n in counts.items()}
+                     "replicates": replicates, "cases": len(found.cases), "patients": patients(found.cases),
+                     "seeds": " to ".join(str(n) for n in sorted({min(found.seeds), max(found.seeds)}))}
+        row |= {f"slices_{plane}": sum(n * slices for n, slices in zip(found.seeds, of))
+                for plane, of in found.slices.items()}
+        row |= {f"truth_slices_{plane}": sum(of) for plane, of in found.slices.items()}
         row |= _numbers("", found.estimates())
-        if label != best and (found.cases, found.slices) == (methods[best].cases, methods[best].slices):
+        if label != best and found.basis == methods[best].basis and not math.isnan(_place(methods[best])[-1]):
             row["less"] = best
             row |= _numbers("less_", found.estimates(methods[best]))
         rows.append(row)
     return rows
+
+
+def _place(found: Distances) -> tuple[bool, int, float]:
+    """By what a method is the one that others are compared with, the least: it has a distance, most cases, and is the
+    nearest."""
+    distance = float(found.values["fid"][0])
+    return math.isnan(distance), -len(found.cases), distance
 
 
 def _numbers(of: str, estimates: Mapping[str, Estimate]) -> dict[str, float]:
@@ -183,22 +222,28 @@ def _numbers(of: str, estimates: Mapping[str, Estimate]) -> dict[str, float]:
             for end, number in zip(("", "_low", "_high"), estimate) if not math.isnan(number)}
 
 
-def comparable(methods: Mapping[str, Mapping[str, Features]]) -> list[list[str]]:
+def comparable(methods: Mapping[str, Mapping[str, CaseFeatures]]) -> list[list[str]]:
     """The labels of methods in groups of the same cases, of as many slices each."""
     groups: dict[tuple, list[str]] = {}
     for label, cases in methods.items():
-        groups.setdefault((*cases, *_slices(cases).values()), []).append(label)
+        groups.setdefault((*cases, *_seeds(cases), *_slices(cases).values()), []).append(label)
     return list(groups.values())
 
 
-def _slices(cases: Mapping[str, Features]) -> dict[str, tuple[int, ...]]:
-    """Plane -> the number of slices of each case."""
+def _seeds(cases: Mapping[str, CaseFeatures]) -> tuple[int, ...]:
+    """How many reconstructions each case has."""
+    return tuple(len(of.seeds) if isinstance(of, SeedFeatures) else 1 for of in cases.values())
+
+
+def _slices(cases: Mapping[str, CaseFeatures]) -> dict[str, tuple[int, ...]]:
+    """Plane -> the number of slices of each case's truth."""
+    firsts = [of.seeds[0] if isinstance(of, SeedFeatures) else of for of in cases.values()]
     shapes = [features.shapes if isinstance(features, StoredFeatures) else
-              {plane: of.shape for plane, of in features.items()} for features in cases.values()]
+              {plane: of.shape for plane, of in features.items()} for features in firsts]
     return {plane: tuple(shape[plane][1] for shape in shapes) for plane in PLANES}
 
 
-def distances(methods: Mapping[str, Mapping[str, Features]], replicates: int = 0,
+def distances(methods: Mapping[str, Mapping[str, CaseFeatures]], replicates: int = 0,
               on_plane: Callable[[str], None] = lambda plane: None) -> dict[str, Distances]:
     """Those of all slices of some methods' cases, label -> case id -> features.
 
@@ -217,43 +262,43 @@ def distances(methods: Mapping[str, Mapping[str, Features]], replicates: int = 0
         for place, label in enumerate(labels):
             values = {f"fid_{plane}": drawn[place] for plane, drawn in planes.items()}
             values["fid"] = sum(values.values()) / len(PLANES)
-            found[label] = Distances(tuple(first), _slices(first), values)
+            found[label] = Distances(tuple(first), _seeds(first), _slices(first), values)
     return {label: found[label] for label in methods}
 
 
-def _plane(methods: Sequence[Mapping[str, Features]], plane: str, replicates: int) -> np.ndarray:
+def _plane(methods: Sequence[Mapping[str, CaseFeatures]], plane: str, replicates: int) -> np.ndarray:
     """The distances (methods, 1 + R) of some `comparable` methods in one plane. A truth that methods share is summed up
     once for each draw; draws that are alike are one."""
-    patients: dict[str, list[str]] = {}
+    of_patient: dict[str, list[str]] = {}
     for case in methods[0]:
-        patients.setdefault(patient_of(case), []).append(case)
-    alone = replicates < 1 or len(patients) < 2
-    drawn = np.vstack([np.ones((1, len(patients)), int), *([] if alone else [draws(len(patients), replicates)])])
+        of_patient.setdefault(patient_of(case), []).append(case)
+    n = len(of_patient)
+    drawn = np.vstack([np.ones((1, n), int), *([] if replicates < 1 or n < 2 else [draws(n, replicates)])])
     distinct, place = np.unique(drawn, axis=0, return_inverse=True)
     shared = [next(k for k, other in enumerate(methods) if _same_truth(cases, other, plane)) for cases in methods]
-    dimensions = next(iter(methods[0].values()))[plane].shape[2]
+    dimensions = next(iter(methods[0].values()))[plane][0].shape[1]
     size, values = max(1, BLOCK_BYTES // (8 * dimensions**2)), np.empty((len(methods), len(distinct)))
     for start in range(0, len(distinct), size):
         block = slice(start, start + size)
         for first in dict.fromkeys(shared):
-            truths = [_reduced(moments) for moments in _drawn(methods[first], 1, plane, patients, distinct[block])]
+            truths = [_reduced(moments) for moments in _drawn(methods[first], 1, plane, of_patient, distinct[block])]
             for k in (k for k, other in enumerate(shared) if other == first):
-                fakes = _drawn(methods[k], 0, plane, patients, distinct[block])
+                fakes = _drawn(methods[k], 0, plane, of_patient, distinct[block])
                 values[k, block] = [_distance(fake, truth) for fake, truth in zip(fakes, truths)]
     return values[:, place.ravel()]
 
 
-def _same_truth(cases: Mapping[str, Features], others: Mapping[str, Features], plane: str) -> bool:
+def _same_truth(cases: Mapping[str, CaseFeatures], others: Mapping[str, CaseFeatures], plane: str) -> bool:
     return cases is others or all(torch.equal(features[plane][1], others[case][plane][1])
                                   for case, features in cases.items())
 
 
-def _drawn(cases: Mapping[str, Features], of: int, plane: str, patients: Mapping[str, Sequence[str]],
+def _drawn(cases: Mapping[str, CaseFeatures], of: int, plane: str, of_patient: Mapping[str, Sequence[str]],
            counts: np.ndarray) -> list[Moments]:
     """The moments of cases' reconstructions (of 0) or truths (1) in draws of their patients, by counts (draws,
     patients); the features of one case alone are in memory."""
     sums: list[Moments] = []
-    for names, repeats in zip(patients.values(), counts.T):
+    for names, repeats in zip(of_patient.values(), counts.T):
         patient = Moments.of(cases[names[0]][plane][of])
         for case in names[1:]:
             patient.add(Moments.of(cases[case][plane][of]))

@@ -39,16 +39,41 @@ TAPS, SIGMA = 11, 1.5
 
 
 class Measure(NamedTuple):
-    """How a metric is printed: label with its unit, whether higher is better (None: neither), decimals."""
+    """How a metric is printed: label with its unit, whether higher is better (None: neither), decimals; target: the
+    right value, where values on both sides of it are worse."""
 
     label: str
     higher_is_better: bool | None
     decimals: int
+    target: float | None = None
 
     @property
     def heading(self) -> str:
         """The label with the direction in which the metric is better."""
+        if self.target is not None:
+            return f"{self.label} → {self.target:g}"
         return self.label + {True: " ↑", False: " ↓", None: ""}[self.higher_is_better]
+
+    @property
+    def ranks(self) -> bool:
+        """Whether one value is better than another."""
+        return self.higher_is_better is not None or self.target is not None
+
+    def worth(self, value: float) -> float:
+        """What is the higher, the better a value is."""
+        if self.target is not None:
+            return -abs(value - self.target)
+        return value if self.higher_is_better else -value
+
+    def unranked(self) -> Measure:
+        """The same, of which no value is better than another."""
+        return self._replace(higher_is_better=None, target=None)
+
+    def off_target(self) -> Measure:
+        """How far values are from the target; the measure itself without one."""
+        if self.target is None:
+            return self
+        return self._replace(label=f"{self.label}, off {self.target:g}", higher_is_better=False, target=None)
 
 
 MEASURES = {
@@ -70,10 +95,10 @@ MEASURES = {
     "dice_lung_ct": Measure("Dice lungs, of the CT itself", None, 3),
     "hd95_lung": Measure("HD95 lungs (mm)", False, 1),
     "cldice_vessel": Measure("clDice vessels", True, 3),
-    "edge_diaphragm": Measure("diaphragm's width", False, 2),
-    "edge_chest_wall": Measure("chest wall's width", False, 2),
-    "ribs": Measure("ribs' contrast", True, 2),
-    "vessels": Measure("vessels' contrast", True, 2),
+    "edge_diaphragm": Measure("diaphragm's width", None, 2, target=1.0),
+    "edge_chest_wall": Measure("chest wall's width", None, 2, target=1.0),
+    "ribs": Measure("ribs' contrast", None, 2, target=1.0),
+    "vessels": Measure("vessels' contrast", None, 2, target=1.0),
     "clip_t2i": Measure("CLIP T2I (%)", True, 2),
     "clip_i2i": Measure("CLIP I2I (%)", True, 2),
     "misfit": Measure("misfit", False, 4),

@@ -17,7 +17,7 @@ from rich.measure import Measurement
 from rich.table import Table as ConsoleTable
 from rich.text import Text
 
-from phydict.evaluation.bootstrap import Estimate
+from phydict.evaluation.bootstrap import Estimate, patients
 from phydict.evaluation.fid import NAMES
 from phydict.evaluation.metrics import MEASURES, RANGE, SIGMA, TAPS, Measure, Summary, summarise
 from phydict.evaluation.planes import PLANES
@@ -28,7 +28,24 @@ Value = float | Summary | Estimate
 
 IN_BRACKETS = "In brackets: 95 % interval"
 """How the notes on intervals begin."""
-INTERVAL = f"{IN_BRACKETS} of the mean, bootstrap over patients."
+
+NAMED = "whom the first folder or CT-RATE's number names"
+"""By what `patient_of` tells patients apart."""
+
+NO_INTERVALS = f"No intervals: all cases are of one patient, {NAMED}."
+
+FIRST_CALLS = "Seconds: first calls included, such as compiling; ablate leaves them out."
+
+FID_TITLE = "Frechet distance of slices (FID)"
+
+MARKDOWN = str.maketrans({"\\": "\\\\", "&": "&amp;", "<": "&lt;", ">": "&gt;", "$": "\\$", "*": "\\*", "`": "\\`"})
+"""What Markdown takes for more than text, but for a pipe, which ends a cell."""
+
+LATEX = str.maketrans({
+    "\\": "\\textbackslash{}", "$": "\\$", "&": "\\&", "%": "\\%", "_": "\\_", "#": "\\#", "{": "\\{", "}": "\\}",
+    "~": "\\textasciitilde{}", "^": "\\textasciicircum{}", "|": "\\textbar{}", "<": "\\textless{}",
+    ">": "\\textgreater{}", "↑": "$\\uparrow$", "↓": "$\\downarrow$", "→": "$\\rightarrow$", "±": "$\\pm$", "–": "--"})
+"""What LaTeX takes for more than text, or has no letter for."""
 
 
 @dataclass(frozen=True)
@@ -44,10 +61,11 @@ class Table:
 
     def markdown(self) -> str:
         """Best in bold, second underlined."""
-        lines = self._marked(("{}", "**{}**", "<u>{}</u>"), lambda text: text.replace("|", "\\|"))
+        lines = self._marked(("{}", "**{}**", "<u>{}</u>"), _markdown_cell)
         rule = ["---", *["---:"] * len(self.measures)]
-        table = "\n".join(f"| {' | '.join(line)} |" for line in [self.header, rule, *lines])
-        return "\n\n".join([f"### {self.title}", table, *self.notes]) + "\n\n"
+        table = "\n".join(f"| {' | '.join(line)} |" for line in [list(map(_markdown_cell, self.header)), rule, *lines])
+        title, *notes = (text.translate(MARKDOWN) for text in (self.title, *self.notes))
+        return "\n\n".join([f"### {title}", table, *notes]) + "\n\n"
 
     def latex(self) -> str:
         """A tabular with booktabs' rules: best in bold, second underlined."""
@@ -85,11 +103,16 @@ class Table:
         columns = []
         for c, measure in enumerate(self.measures):
             values = [values[c] for _, _, values in self.lines]
-            places = ranks([round(float(value), measure.decimals) if ranked and value is not None else math.nan
-                            for (_, ranked, _), value in zip(self.lines, values)], measure.higher_is_better)
+            places = ranks([float(value) if ranked and value is not None else math.nan
+                            for (_, ranked, _), value in zip(self.lines, values)], measure)
             columns.append([("–" if value is None else f"{value:.{measure.decimals}f}", place)
                             for value, place in zip(values, places)])
         return [[column[n] for column in columns] for n in range(len(self.lines))]
+
+    @property
+    def ranks(self) -> bool:
+        """Whether a value is marked."""
+        return any(place for line in self.cells() for _, place in line)
 
     def _marked(self, marks: Sequence[str], printed: Callable[[str], str]) -> list[list[str]]:
         """The lines as text, each value in the mark of its place."""
@@ -101,29 +124,38 @@ def _without_interval(value: Value | None) -> Value | None:
     return value._replace(low=math.nan, high=math.nan) if isinstance(value, Summary | Estimate) else value
 
 
-def ranks(values: Sequence[float], higher_is_better: bool | None) -> list[int]:
-    """1 for the best, 2 for the second best, 0 for others; the second is marked only where the best is alone; NaN takes
-    no part, and neither does a lone value."""
-    known = [value for value in values if not math.isnan(value)]
-    if higher_is_better is None or len(known) < 2:
+def _markdown_cell(text: str) -> str:
+    return text.translate(MARKDOWN).replace("|", "\\|")
+
+
+def ranks(values: Sequence[float], measure: Measure) -> list[int]:
+    """1 for the best by what is printed of a measure, 2 for the second best, 0 for others; the second is marked only
+    where the best is alone; NaN takes no part, and none is marked where all others are alike."""
+    if not measure.ranks:
         return [0] * len(values)
-    best, second = sorted(known, reverse=higher_is_better)[:2]
-    return [1 if value == best else 2 if value == second else 0 for value in values]
+    worths = [round(measure.worth(round(value, measure.decimals)), measure.decimals) for value in values]
+    known = sorted((worth for worth in worths if not math.isnan(worth)), reverse=True)
+    if len(set(known)) < 2:
+        return [0] * len(values)
+    best, second = known[:2]
+    return [1 if worth == best else 2 if worth == second else 0 for worth in worths]
 
 
 def rankable(measure: Measure, cases: Iterable[Iterable[str]]) -> Measure:
     """A measure, without a better direction where lines, of these cases each, have not all the same: it then ranks
     nothing."""
-    return measure if len({frozenset(of) for of in cases}) < 2 else measure._replace(higher_is_better=None)
+    return measure if len({frozenset(of) for of in cases}) < 2 else measure.unranked()
 
 
 def mean_table(rows: Iterable[Mapping], by: str = "method", metrics: Sequence[str] | None = None,
-               window: HUWindow = RANGE, empty: Mapping[str, str] = MappingProxyType({})) -> Table:
+               window: HUWindow = RANGE, empty: Mapping[str, str] = MappingProxyType({}),
+               first_calls: bool = False) -> Table:
     """Mean ± standard deviation over cases, a line per group, ranked by what all of them have of the same cases; where
     rows have warnings, a last column counts their cases.
 
     by, metrics: as in `summarise`. window: the HU range of `volume_metrics`. empty: metric -> why it has no value, if
-    it has none; it then has a column all the same, and a note. The caption takes grid and views from the
+    it has none; it then has a column all the same, and a note. first_calls: whether seconds hold what only a first call
+    costs, such as compiling: they are then not ranked and have no interval. The caption takes grid and views from the
     rows' columns of these names.
     """
     rows = list(rows)
@@ -131,11 +163,14 @@ def mean_table(rows: Iterable[Mapping], by: str = "method", metrics: Sequence[st
     measured = [name for name in metrics or MEASURES if any(name in group for group in groups.values())]
     names = [name for name in metrics or MEASURES if name in measured or name in empty]
     measures = [MEASURES.get(name, Measure(name, None, 3)) for name in names]
+    if first_calls and "seconds" in names:
+        measures[names.index("seconds")] = MEASURES["seconds"].unranked()
     header = [by, *(measure.heading for measure in measures)]
     measures = [rankable(measure, (group[name].cases for group in groups.values() if name in group))
                 for name, measure in zip(names, measures)]
     lines: list[tuple[str, bool, list[Value | None]]] = [
-        (label, True, [group.get(name) for name in names]) for label, group in groups.items()]
+        (label, True, [_without_interval(group.get(name)) if first_calls and name == "seconds" else group.get(name)
+                       for name in names]) for label, group in groups.items()]
     if warned := warned_cases(rows, by):
         header.append("warned")
         measures.append(Measure("warned", None, 0))
@@ -143,34 +178,46 @@ def mean_table(rows: Iterable[Mapping], by: str = "method", metrics: Sequence[st
     of_group = {group: frozenset(row.get("case", f"row {n}") for n, row in enumerate(rows) if str(row[by]) == group)
                 for group in groups}
     cases = set(of_group.values())
-    counts = sorted({min(map(len, cases)), max(map(len, cases))})
     unequal = " (not the same cases in every line)" if len(cases) > 1 else ""
     parts = partial_notes((label, len(of_group[label]), {name: len(summary.cases) for name, summary in group.items()
                                                          if name in MEASURES}) for label, group in groups.items())
-    over = f"Mean ± standard deviation over n = {' to '.join(map(str, counts))} cases{unequal}"
-    return Table(f"Scores by {by}", header, measures, lines,
-                 [caption(over, rows, {"Grid": "grid", "Views": "views"}, window), *interval_note(lines), *parts,
-                  *empty_notes(empty, measured), *warning_notes(rows, by)])
+    number = _span(map(len, cases))
+    over = "One case" if number == "1" else f"Mean ± standard deviation over n = {number} cases"
+    table = Table(f"Scores by {by}", header, measures, lines, [])
+    timed = first_calls and "seconds" in measured
+    return replace(table, notes=[
+        caption(over + unequal, table.ranks, rows, {"Grid": "grid", "Views": "views"}, window),
+        *interval_note(lines, cases), *([FIRST_CALLS] if timed else []), *parts, *empty_notes(empty, measured),
+        *warning_notes(rows, by)])
 
 
-def fid_tables(rows: Sequence[Mapping], title: str = "Frechet distance of slices (FID)") -> list[Table]:
+def _span(numbers: Iterable[int]) -> str:
+    """The least and the largest of some numbers."""
+    ordered = sorted(numbers)
+    return " to ".join(map(str, dict.fromkeys((ordered[0], ordered[-1]))))
+
+
+def fid_tables(rows: Sequence[Mapping], title: str = FID_TITLE) -> list[Table]:
     """The Frechet distances of `fid_rows`, a line each, with what they rest on; where they have intervals, a second
     table has their differences from the least distance of most cases."""
     paired = [row for row in rows if row.get("less")]
     alike = len(paired) == len(rows) - 1
-    counts = dict.fromkeys(f"{row['cases']} cases with " + ", ".join(
-        f"{plane.upper()} {row[f'slices_{plane}']}" for plane in PLANES) + " slices" for row in rows)
+    counts = dict.fromkeys(map(_counts, rows))
     note = (f"Backbone {rows[0]['fid_backbone']}, a scale of its own: {'; '.join(counts)}, all of each volume, against "
             f"the truth's of the same cases. {rows[0]['fid_normalisation']}, so that a wrong HU scale is not seen. "
             "FID: mean of the planes.")
+    people = [row["patients"] for row in rows if "patients" in row]  # which older tables lack
+    several = any(row.get("patients", row["cases"]) < row["cases"] for row in rows)
     measures = [Measure(f"FID-{name[4:].upper()}" if "_" in name else "FID", False, 3) for name in NAMES]
     header = ["method", *(measure.heading for measure in measures)]
     lines = [(row["method"], alike, _estimates(row, "")) for row in rows]
-    if not interval_note(lines):
-        return [Table(title, header, measures, lines, [note])]
-    replicates = rows[0]["replicates"]
+    if not has_intervals(lines):
+        alone = several and max(people) < 2
+        return [Table(title, header, measures, lines, [note, *([NO_INTERVALS] if alone else [])])]
+    replicates, who = rows[0]["replicates"], f"{f'{_span(people)} ' if people else ''}patients"
     tables = [Table(title, header, measures, lines, [
-        note, f"{IN_BRACKETS}, {replicates} draws of patients; repeated slices make it too high."])]
+        note, f"{IN_BRACKETS}, {replicates} draws of {who}{f', {NAMED}' if several else ''}; repeated slices make it "
+              "too high."])]
     if paired:
         less = [(row["method"], False, _estimates(row, "less_")) for row in paired]
         tables.append(Table(f"{title}: less {paired[0]['less']}, draw by draw", header, measures, less, [
@@ -178,25 +225,49 @@ def fid_tables(rows: Sequence[Mapping], title: str = "Frechet distance of slices
     return tables
 
 
+def _counts(row: Mapping) -> str:
+    """What a row's distances rest on: its cases, their seeds and slices, and how many the truth has where it has
+    others."""
+    slices, truth = (", ".join(f"{plane.upper()} {row.get(f'{of}slices_{plane}')}" for plane in PLANES)
+                     for of in ("", "truth_"))
+    seeds = str(row.get("seeds", 1))
+    return (f"{row['cases']} case{'s' if row['cases'] > 1 else ''}"
+            + (f", {seeds} seeds each, with {slices} slices beside {truth} of the truth" if seeds != "1" else
+               f" with {slices} slices"))
+
+
 def _estimates(row: Mapping, of: str) -> list[Value | None]:
     """The distances of a row, or, `of` "less_", their differences."""
     return [Estimate(*(row.get(f"{of}{name}{end}", math.nan) for end in ("", "_low", "_high"))) for name in NAMES]
 
 
-def caption(statistic: str, rows: Sequence[Mapping], columns: Mapping[str, str], window: HUWindow = RANGE) -> str:
+def caption(statistic: str, marked: bool, rows: Sequence[Mapping], columns: Mapping[str, str],
+            window: HUWindow = RANGE) -> str:
     """One line that says what the numbers of a table are: a statistic of scores in an HU range, of rows that have these
-    values in some columns, label -> column."""
+    values in some columns, label -> column; marked: whether some are marked as the best."""
     stated = "".join(f" {label}: {listed(rows, column) or 'not stated'}." for label, column in columns.items())
-    return (f"{statistic}; best in bold, second underlined. HU clipped to [{window.low:g}, {window.high:g}], data "
+    marks = "; best in bold, second underlined" if marked else ""
+    return (f"{statistic}{marks}. HU clipped to [{window.low:g}, {window.high:g}], data "
             f"range {2 * window.half_width:g} HU; SSIM 3-D on HU from the range's low end, Gaussian of {TAPS} taps, "
             f"sigma {SIGMA:g} voxels.{stated}")
 
 
-def interval_note(lines: Iterable[tuple[str, bool, Sequence[Value | None]]]) -> list[str]:
-    """The note on intervals, where some value of a table's lines has one."""
-    values = [value for _, _, line in lines for value in line]
-    shown = any(isinstance(value, Summary | Estimate) and not math.isnan(value.low + value.high) for value in values)
-    return [INTERVAL] if shown else []
+def has_intervals(lines: Iterable[tuple[str, bool, Sequence[Value | None]]]) -> bool:
+    """Whether some value of a table's lines has an interval."""
+    return any(isinstance(value, Summary | Estimate) and not math.isnan(value.low + value.high)
+               for _, _, line in lines for value in line)
+
+
+def interval_note(lines: Iterable[tuple[str, bool, Sequence[Value | None]]],
+                  cases: Iterable[Iterable[str]]) -> list[str]:
+    """The note on the intervals of a table's lines, of these cases each: over how many patients they are, or that a
+    single one has none."""
+    each = [list(of) for of in cases]
+    several = any(patients(of) < len(of) for of in each)
+    if has_intervals(lines):
+        number = _span(map(patients, each))
+        return [f"{IN_BRACKETS} of the mean, bootstrap over {number} patients{f', {NAMED}' if several else ''}."]
+    return [NO_INTERVALS] if several and all(patients(of) < 2 for of in each) else []
 
 
 def empty_notes(empty: Mapping[str, str], measured: Iterable[str]) -> list[str]:
@@ -237,9 +308,4 @@ def warning_notes(rows: Sequence[Mapping], by: str = "method") -> list[str]:
 
 def escaped(text: str) -> str:
     """Text as LaTeX prints it."""
-    for plain, printed in (
-            ("\\", "\\textbackslash "), ("$", "\\$"), ("&", "\\&"), ("%", "\\%"), ("_", "\\_"), ("#", "\\#"),
-            ("{", "\\{"), ("}", "\\}"), ("~", "\\textasciitilde "), ("^", "\\textasciicircum "),
-            ("↑", "$\\uparrow$"), ("↓", "$\\downarrow$"), ("±", "$\\pm$"), ("–", "--")):
-        text = text.replace(plain, printed)
-    return text
+    return text.translate(LATEX)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from phydict.evaluation.fid import Features, comparable, distances, fid_rows
+from phydict.evaluation.fid import CaseFeatures, comparable, distances, fid_rows
 from phydict.evaluation.planes import PLANES
 from phydict.inference.scoring import FIDSettings
 from phydict.runtime.progress import CaseProgress
 
 
-def distance_rows(methods: Mapping[str, Mapping[str, Features]], fid: FIDSettings) -> list[dict]:
+def distance_rows(methods: Mapping[str, Mapping[str, CaseFeatures]], fid: FIDSettings) -> list[dict]:
     """The `fid_rows` of methods, label -> case id -> features, logging which planes are done. Raises ValueError without
     a case."""
     begun = False

@@ -10,8 +10,9 @@ from pathlib import Path
 from types import MappingProxyType
 
 from phydict.evaluation.fid import StoredFeatures
-from phydict.evaluation.tables import Table, fid_tables
+from phydict.evaluation.tables import FID_TITLE, Table, fid_tables
 from phydict.inference.case_files import missing_page_files, remake_page_files
+from phydict.inference.conditions import condition, condition_titles, format_settings
 from phydict.inference.distances import distance_rows
 from phydict.inference.protocols import protocol_of
 from phydict.inference.results import FEATURES, RECORD, TABLE, score_row, score_table
@@ -39,7 +40,9 @@ def results_page(folder: Path, further: Sequence[Table] | None = None,
         further = _kept_distances(folder, cases)
     scored = [case.record for case in cases if case.record["scores"]]
     error = "mae_hu" if any("mae_hu" in record["scores"] for record in scored) else "misfit"
-    points = [{"name": f"{case.record['case']}, {case.record['method']}", "series": _series(case.record),
+    titles = condition_titles([case.record for case in cases])
+    points = [{"name": f"{case.record['case']}, {case.record['method']}",
+               "series": _joined(case.record["method"], titles[_condition(case.record)]),
                "seconds": sum(case.record["seconds"].values()),
                "error": case.record["misfit"] if error == "misfit" else (case.record["scores"] or {}).get(error)}
               for case in cases]
@@ -49,7 +52,7 @@ def results_page(folder: Path, further: Sequence[Table] | None = None,
     tables = sorted({path.relative_to(folder).as_posix() for depth in ("", "*/") for name in (TABLE, "results.md")
                      for path in folder.glob(depth + name)})
     return write_page(folder, Contents(f"Results in {folder.resolve().name}",
-                                       [*means, *further], cases, points, error, links=tables))
+                                       [*means, *further], cases, points, error, links=tables, unranked=("seconds",)))
 
 
 def _case_folders(folder: Path) -> list[Path]:
@@ -82,7 +85,7 @@ def _case(folder: Path, path: Path) -> PageCase | None:
         record = json.loads((path / RECORD).read_text())
         score_row(record["case"], record | {"scores": record["scores"] or {}})
         float(record["misfit"] or 0), list(record["misfit_per_view"])
-        group = json.dumps([record["case"], record.get("source"), record["views"], _protocol(record)])
+        group = json.dumps([record["case"], record.get("source"), _condition(record)])
         remake_page_files(path)
     except Exception as error:  # whatever a damaged record or volume leads to
         warn(f"{path} is left out of the page, since its files are damaged ({type(error).__name__}: {error})")
@@ -94,26 +97,26 @@ def _case(folder: Path, path: Path) -> PageCase | None:
     return PageCase(path.relative_to(folder).as_posix(), sorted(os.listdir(path)), record, group)
 
 
-def _protocol(record: Mapping) -> str | None:
-    """The name of the protocol that a case was scored by, None without one."""
-    return record.get("settings", {}).get("data", {}).get("protocol")
+def _condition(record: Mapping) -> str:
+    """What a case's scores are compared under, in words."""
+    return format_settings(condition(record))
 
 
-def _series(record: Mapping) -> str:
-    """The method of a case, and the protocol that its error was taken by."""
-    return ", ".join(filter(None, (record["method"], _protocol(record))))
+def _joined(*parts: str) -> str:
+    return ", ".join(filter(None, parts))
 
 
-def _mean_tables(scored: list, empty: Mapping[str, str]) -> list[Table]:
-    """The means over scored cases by method, a table for each protocol, since their HU ranges differ."""
-    protocols: dict[str | None, list] = {}
+def _mean_tables(scored: Sequence[Mapping], empty: Mapping[str, str]) -> list[Table]:
+    """The means over scored cases by method, a table for each condition."""
+    groups: dict[str, list] = {}
     for record in scored:
-        protocols.setdefault(_protocol(record), []).append(record)
-    tables = [table for name, records in protocols.items()
-              for table in _noted([score_table(records, protocol_of(name) if name else None, empty)], records)]
-    return tables if len(tables) < 2 else [
-        replace(table, title=f"{table.title}, {f'protocol {name}' if name else 'no protocol'}")
-        for table, name in zip(tables, protocols)]
+        groups.setdefault(_condition(record), []).append(record)
+    titles, tables = condition_titles(scored), []
+    for words, records in groups.items():
+        protocol = condition(records[0])["protocol"]
+        table = score_table(records, protocol_of(protocol) if protocol else None, empty)
+        tables += _noted([replace(table, title=_joined(table.title, titles[words]))], records)
+    return tables
 
 
 def _noted(tables: Sequence[Table], records: Sequence[Mapping]) -> list[Table]:
@@ -129,7 +132,7 @@ def _noted(tables: Sequence[Table], records: Sequence[Mapping]) -> list[Table]:
 
 def _kept_distances(folder: Path, cases: Sequence[PageCase]) -> list[Table]:
     """The tables of Frechet distances that features in the cases' folders give, a line per method; those of other
-    weights and of each protocol are tables of their own."""
+    weights and of each condition are tables of their own."""
     methods: dict[tuple, dict[str, dict[str, StoredFeatures]]] = {}
     records: dict[tuple, list[Mapping]] = {}
     for case in cases:
@@ -141,8 +144,9 @@ def _kept_distances(folder: Path, cases: Sequence[PageCase]) -> list[Table]:
                 warn(f"a case is left out of the Frechet distances: {error}")
                 continue
             fid = FIDSettings(backbone, maisi_voxels=settings.get("fid_maisi_voxels", False))
-            measured = fid, settings.get("fid_weights_crc32"), _protocol(case.record)
+            measured = fid, settings.get("fid_weights_crc32"), _condition(case.record)
             methods.setdefault(measured, {}).setdefault(case.record["method"], {})[case.record["case"]] = features
             records.setdefault(measured, []).append(case.record)
-    return [table for measured, features in methods.items()
-            for table in _noted(fid_tables(distance_rows(features, measured[0])), records[measured])]
+    titles = condition_titles([record for of in records.values() for record in of])
+    return [table for measured, features in methods.items() for table in _noted(fid_tables(
+        distance_rows(features, measured[0]), _joined(FID_TITLE, titles[measured[-1]])), records[measured])]

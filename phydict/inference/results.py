@@ -12,7 +12,8 @@ from typing import NamedTuple
 
 from phydict.evaluation import RANGE, Table, mean_table, write_csv
 from phydict.grid import Grid
-from phydict.inference.protocols import Protocol, protocol_of, whole
+from phydict.inference.conditions import simulated, simulated_on, xrays_note
+from phydict.inference.protocols import Protocol
 from phydict.page import CASE_FILES
 from phydict.runtime.files import atomic_directory, atomic_write, check_replaceable, remove_leftovers, undisturbed
 from phydict.runtime.reading import not_written
@@ -178,7 +179,7 @@ def score_table(records: Sequence[dict], protocol: Protocol | None, empty: Mappi
     """The means of records' scores by method, with notes on their priors' files, how their X-rays were made and the
     protocol, if any, that they were taken by; empty: scores that may stay empty -> why."""
     rows = [score_row(record["case"], record) for record in records]
-    table = mean_table(rows, window=protocol.window if protocol else RANGE, empty=empty)
+    table = mean_table(rows, window=protocol.window if protocol else RANGE, empty=empty, first_calls=True)
     made = dict.fromkeys(_xrays(record["settings"]) for record in records
                          if "simulator" in record["settings"].get("data", {}))
     priors = dict.fromkeys(f"{record['method']} with {record['settings']['prior']} (CRC-32 "
@@ -191,20 +192,9 @@ def score_table(records: Sequence[dict], protocol: Protocol | None, empty: Mappi
 def _xrays(settings: Mapping) -> str:
     """How the X-rays of a scored case were made."""
     data = settings["data"]
-    stated = {name: value for name, value in (data["simulator"] | data).items()
-              if name not in ("class", "code_crc32", "protocol", "simulation_voxels")
-              and isinstance(value, str | int | float | list) and not isinstance(value, bool)}
-    voxels, protocol = data.get("simulation_voxels"), data.get("protocol")
-    box = Grid(**settings["grid"]) if "grid" in settings else None
-    places = "the voxels that are reconstructed, which is optimistic"
-    if voxels:
-        places = f"{voxels}^3 voxels"
-    elif protocol and protocol_of(protocol).cube:
-        places = "the protocol's voxels"
-    elif box and not (made := whole(box)).same_as(box):
-        places = f"{made.shape[0]}^3 voxels of {made.spacing[0]:g} mm"
-    return (f"X-rays: {data['simulator']['class']}, {', '.join(f'{name} {value}' for name, value in stated.items())}; "
-            f"made on {places}; seed {settings['seed']}.")
+    places = simulated_on(data.get("simulation_voxels"), data.get("protocol"),
+                          Grid(**settings["grid"]) if "grid" in settings else None)
+    return f"{xrays_note(simulated(data), places)}; seed {settings['seed']}."
 
 
 def score_row(case: str, record: dict) -> dict:

@@ -44,7 +44,8 @@ class PageCase:
 @dataclass(frozen=True)
 class Contents:
     """What a page shows. points: one per dot of seconds against error, {name, series, seconds, error}; error: the name
-    of that measure; plots: files of pictures from the page's folder."""
+    of that measure; plots: files of pictures from the page's folder; unranked: measures whose best is not marked in the
+    list of cases."""
 
     title: str
     tables: Sequence[Table] = ()
@@ -53,6 +54,7 @@ class Contents:
     error: str = "mae_hu"
     plots: Sequence[str] = ()
     links: Sequence[str] = ()
+    unranked: Sequence[str] = ()
 
 
 def check_own_page(folder: Path, option: str) -> None:
@@ -84,10 +86,11 @@ def write_page(folder: Path, contents: Contents) -> Path:
 def _content(contents: Contents) -> dict:
     shared: dict[str, int] = {}
     cases = [_case(case, shared) for case in contents.cases]
-    _mark_best([case.group or case.record["case"] for case in contents.cases], cases)
+    known = {name: measure.unranked() if name in contents.unranked else measure for name, measure in MEASURES.items()}
+    _mark_best([case.group or case.record["case"] for case in contents.cases], cases, known)
     scored = {name for case in cases for name in case["scores"]}
     measures = [{"name": name, "label": measure.label, "heading": measure.heading, "decimals": measure.decimals}
-                for name, measure in sorted(MEASURES.items(), key=lambda item: _stands_behind(item[1]))
+                for name, measure in sorted(known.items(), key=lambda item: _stands_behind(item[1]))
                 if name in scored]
     error = MEASURES[contents.error].label
     return {"title": contents.title, "version": VERSION, "tables": [_table(t) for t in contents.tables],
@@ -106,7 +109,7 @@ def _case(case: PageCase, shared: dict[str, int]) -> dict:
             "scores": scores}
 
 
-def _mark_best(names: Sequence[str], cases: Sequence[dict]) -> None:
+def _mark_best(names: Sequence[str], cases: Sequence[dict], measures: Mapping[str, Measure]) -> None:
     """Adds to the scores of each case their places in the group of its name: 1 the best, 2 the second, 0 others."""
     groups: dict[str, list[dict]] = {}
     for group_name, case in zip(names, cases):
@@ -114,8 +117,8 @@ def _mark_best(names: Sequence[str], cases: Sequence[dict]) -> None:
     for group in groups.values():
         for name in {name for case in group for name in case["scores"]}:
             values = [case["scores"].get(name) for case in group]
-            known = [math.nan if value is None else round(value, MEASURES[name].decimals) for value in values]
-            for case, place in zip(group, ranks(known, MEASURES[name].higher_is_better)):
+            known = [math.nan if value is None else value for value in values]
+            for case, place in zip(group, ranks(known, measures[name])):
                 case.setdefault("places", {})[name] = place
 
 

@@ -48,7 +48,7 @@ function table(title, header, rows, notes = []) {
         head.setAttribute("aria-sort", down ? "descending" : "ascending");
         fill(inOrder(rows, column, down));
         linkNeighbours();
-      }}, name.replace(/ (?=[↑↓])/, "\u00a0")));
+      }}, name.replace(/ (?=[↑↓→])/, "\u00a0")));
     return head;
   });
   fill(rows);
@@ -135,7 +135,7 @@ function showRun() {
       ({name, heading}) => name === "seconds" ? [heading, "warnings"] : [heading])];
     const rows = cases.map(case_ => caseRow(case_, pictured)), none = element("p", {role: "status"});
     const caseTable = table("Cases", header, rows, [
-      "Best of each case, number of views and protocol in bold, second underlined. A name opens the case."]);
+      "Best of each case by equal X-rays and voxels in bold, second underlined. A name opens the case."]);
     const filter = element("input", {type: "search", oninput: () => {
       const wanted = filter.value.toLowerCase().trim().split(/\s+/);
       const lines = [...caseTable.querySelectorAll("tbody tr")];

@@ -152,8 +152,8 @@ class Refined(Delegating):
             if refinement.step and not fine_calls and correction is None:
                 alone.append(" x ".join(map(str, level.shape)))
         if alone:
-            warn(f"no network has learnt to refine to {' and '.join(alone)} voxels here: the X-rays and total "
-                 "variation alone do", Remark)
+            warn(f"no network has learnt to refine {self.name} to {' and '.join(alone)} voxels here: the X-rays and "
+                 "total variation alone do", Remark)
         deviation, volume = coarse.deviation, volume.cpu()
         intervals = self._intervals(coarse, volume, known)
         if coarse.carried:

@@ -81,6 +81,10 @@ class Profile:
                  for name in stages}
         return {name: sum(seconds) for name, seconds in by_stage.items() if seconds}
 
+    def calls(self, stage: str) -> int:
+        """How often a stage ran, whatever it ran in."""
+        return sum(use.calls for full, use in self.uses.items() if full.split(" / ")[-1] == stage)
+
     def table(self) -> str:
         """One line per stage."""
         on_device = any(use.device_mib for use in self.uses.values())

@@ -19,6 +19,7 @@ from prior.tiny import tiny_prior
 
 from ablation.runs import TINY, Trace, ablate, arguments, write
 from phydict.ablation import read_specification
+from phydict.ablation.run import planned
 from phydict.cli.infer import main
 from phydict.evaluation import read_csv
 from phydict.grid import Grid
@@ -171,10 +172,16 @@ def test_what_goes_wrong_outside_the_method_is_tried_again(tmp_path, monkeypatch
     assert [row["status"] for row in ablate(tmp_path, **content)] == ["ok"]
 
 
-def test_methods_without_a_prior_take_the_grid_and_window_of_those_with_one(tmp_path):
+@pytest.mark.parametrize("voxels", [None, 16])
+def test_methods_without_a_prior_take_the_grid_and_window_of_those_with_one(tmp_path, capsys, voxels):
     save_prior(tiny_prior(False), tmp_path / "tiny.safetensors")
-    sirt, fast = read_specification(write(tmp_path, base={"prior": str(tmp_path / "tiny.safetensors")},
-                                          axes={"method": ["sirt", "phydict_fast"]})).trials
+    specification = read_specification(write(
+        tmp_path, base={"prior": str(tmp_path / "tiny.safetensors"), "voxels": voxels, "detector": 24},
+        axes={"method": ["sirt", "phydict_fast"]}))
+    sirt, fast = specification.trials
+    planned(specification, Scoring(["volume"]))
+    told = "methods without voxels of their own take the 16x16x16 of" in capsys.readouterr().err
+    assert told == (voxels is None)
     assert sirt.scene()[0].shape == (16, 16, 16) and sirt.scene()[1] == fast.scene()[1] != HUWindow()
     assert sirt.acquisition() == fast.acquisition()
 
@@ -214,7 +221,7 @@ def test_the_table_of_another_comparison_is_left_alone(tmp_path, capsys, trace):
     before = {file: file.read_bytes() for file in (tmp_path / "out").iterdir()}
     other = write(tmp_path, phantoms=1, base=TINY | {"seed": 7}, axes={"method": ["trace"]})
     said = refusal(capsys, main, ["ablate", "-c", str(other)])
-    assert "another out" in said
+    assert "another out" in said and "(seed 0 there and 7 here)" in said
     assert {file: file.read_bytes() for file in (tmp_path / "out").iterdir()} == before
     for name in said.partition("or remove ")[2].split(", "):
         (tmp_path / "out" / name).unlink()

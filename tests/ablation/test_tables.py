@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import random
 
+import torch
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from ablation.runs import ablate, row
 from phydict.ablation import plots
-from phydict.ablation.fid import FID, distance_tables
+from phydict.ablation.fid import FID, distance_tables, write_distances
+from phydict.ablation.run import features_file
 from phydict.ablation.summary import summarise, without_repeats
 from phydict.ablation.tables import all_tables
-from phydict.evaluation import write_csv
-from phydict.evaluation.fid import NAMES
+from phydict.evaluation import read_csv, write_csv
+from phydict.evaluation.backbones import DIMENSIONS
+from phydict.evaluation.fid import NAMES, save_features
 from phydict.evaluation.planes import PLANES
+from phydict.inference.scoring import FIDSettings, Scoring
 
 
 def test_a_case_counts_once_whatever_its_seeds_and_a_missing_case_takes_a_method_out():
@@ -68,8 +72,44 @@ def test_a_table_tells_the_settings_of_all_its_rows_that_are_no_defaults():
     rows = [row("a", method, 20.0, simulation_voxels=voxels, delta=0.5 if method == "y" else None, **shared)
             for method in "xy" for voxels in (128, 256)]
     for table in all_tables(summarise(rows)):
-        assert "Fixed settings: geometry arc_60, noise 0.2, iterations 2." in table.notes
+        assert "Fixed settings: iterations 2." in table.notes
     assert "Fixed" not in all_tables(summarise([row("a", method, 20.0) for method in "xy"]))[0].markdown()
+
+
+ORBIT = "source to detector 1020, source to isocentre 740, detector 448 x 448, pixel 1.25 x 1.25"
+OPTIMISTIC = "made on the voxels that are reconstructed, which is optimistic."
+
+
+def test_a_table_says_how_its_x_rays_were_made_defaults_included_and_leaves_what_differs_to_titles_and_columns():
+    def told(*changes: dict) -> set[str]:
+        return {note for table in all_tables(summarise(row("a", "x", 20.0, **change) for change in changes))
+                for note in table.notes if note.startswith("X-rays: ")}
+
+    assert told({}) == {f"X-rays: Ideal, noise 0.005, K = 8, {ORBIT}; {OPTIMISTIC}"}
+    polychromatic, ideal = sorted(told({"simulator": "polychromatic", "simulator.scatter": 0.3}, {}), reverse=True)
+    assert "Polychromatic, kvp 120" in polychromatic and "scatter 0.3" in polychromatic and "K = 8" in polychromatic
+    assert ideal == f"X-rays: Ideal, noise 0.005, K = 8, {ORBIT}; {OPTIMISTIC}"
+    finer = {"simulation_voxels": 128, "geometry": "arc_60", "simulator.noise": 0.2}
+    assert told(finer) == {"X-rays: Ideal, noise 0.2, K = 8, geometry arc_60; made on 128^3 voxels."}
+    assert told(*({"views": views} for views in (2, 8))) == {
+        f"X-rays: Ideal, noise 0.005, {k}{ORBIT}; {OPTIMISTIC}" for k in ("K = 2, ", "K = 8, ", "")}
+    (box,) = told({"voxels": "(16, 16, 8)", "side": 96.0, "centre": "(60.0, 0.0, 0.0)"})  # as a CSV holds them
+    assert box.endswith("; made on 64^3 voxels of 6 mm.")
+    (protocol,) = told({"protocol": "x2ct", "views": 2})
+    assert "noise 0, K = 2, source to detector 949" in protocol and protocol.endswith("made on the protocol's voxels.")
+
+
+def test_differences_of_a_measure_whose_right_value_is_1_are_of_its_distance_from_it():
+    rows = [row(case, method, psnr, ribs=ribs) for case in "ab"
+            for method, psnr, ribs in (("best", 30.0, 0.9), ("sharp", 20.0, 1.4), ("right", 10.0, 1.0))]
+    table, differences = all_tables(summarise(rows))
+    places = {label: cells[table.header.index("ribs' contrast → 1") - 1][1]
+              for (label, _, _), cells in zip(table.lines, table.cells())}
+    assert places == {"best": 2, "sharp": 0, "right": 1}
+    column = differences.header.index("ribs' contrast, off 1 ↓") - 1
+    assert [round(values[column].mean, 6) for _, _, values in differences.lines] == [0.3, -0.1]
+    assert any("|value - 1|" in note for note in differences.notes)
+    assert not any("|value - 1|" in note for note in table.notes)
 
 
 def test_of_rows_that_differ_in_what_was_measured_alone_the_first_counts():
@@ -106,7 +146,7 @@ def test_a_table_says_what_its_own_rows_rest_on_alone():
     assert "Doubtful cases, by the column warning: x: a." in of_x2ct and "Doubtful" not in of_sparc
     assert "Protocol x2ct" in of_x2ct and "data range 2500 HU" in of_x2ct and "threads 1;" in of_x2ct
     assert "Protocol sparc" in of_sparc and "data range 2048 HU" in of_sparc and "threads 2;" in of_sparc
-    assert "sparc" not in of_x2ct and "Mean over 1 case;" in of_x2ct and "Mean over 2 cases;" in of_sparc
+    assert "sparc" not in of_x2ct and "One case;" in of_x2ct and "Mean over 2 cases. HU" in of_sparc  # of unlike ones
 
 
 def test_the_ceiling_of_dice_stands_beside_it_and_has_no_differences_between_methods():
@@ -219,4 +259,24 @@ def test_distances_are_told_of_their_own_condition_alone(tmp_path):
         "fid_backbone": "b", "fid_normalisation": "n", "cases": 1} | dict.fromkeys(NAMES, float(n))
         for n, box in enumerate(boxes)])
     tables = distance_tables(tmp_path, entries)
+    assert all("1 case with XY 16, YZ 16, ZX 16 slices" in table.notes[0] for table in tables)  # none tells seeds
+    assert "made on 128^3 voxels." in tables[1].notes[-1]
     assert [[values[-1].mean for _, _, values in table.lines] for table in tables] == [[0.0], [1.0], [2.0]]
+
+
+def test_seeds_of_a_case_are_no_cases_of_their_own_in_its_distances(tmp_path, monkeypatch):
+    monkeypatch.setitem(DIMENSIONS, "squeezenet", 3)
+    rows = [row(case, "x", 20.0, seed=seed, key=f"{case}{seed}") for case in ("p__a", "q__a") for seed in (0, 1)]
+    for n, of in enumerate(rows):
+        features_file(tmp_path, "").parent.mkdir(exist_ok=True)
+        generator = torch.Generator().manual_seed(n)
+        save_features(features_file(tmp_path, of["key"]),
+                      {plane: torch.randn(2, 9, 3, generator=generator) for plane in PLANES})
+    scoring = Scoring()
+    scoring.network, scoring.fid = torch.nn.Identity(), FIDSettings(replicates=5)
+    write_distances(tmp_path, entries := summarise(rows), scoring)
+    (found,) = read_csv(tmp_path / FID)
+    assert (found["cases"], found["patients"], found["seeds"]) == (2, 2, 2)
+    assert (found["slices_xy"], found["truth_slices_xy"]) == (36, 18)
+    (table,) = distance_tables(tmp_path, entries)
+    assert "2 cases, 2 seeds each, with XY 36" in table.notes[0] and "of 2 patients;" in table.notes[1]

@@ -65,6 +65,15 @@ def test_projector_calls_of_a_box_are_those_that_happened(method, display, monke
     assert result.projector_calls == len(calls) + backprojections
 
 
+def test_a_box_says_of_its_own_fit_alone_and_once_what_is_doubtful_of_the_xrays():
+    unlike = 1e3 * views() * torch.tensor([1.0, 3.0, 1.0, 3.0])[:, None, None]
+    box = Grid.box(8, 192.0, (48.0, 0.0, 0.0))
+    with pytest.warns(UserWarning) as told:
+        Region(SIRT(8), box, GRID).reconstruct(unlike, Projector(box, CHEST.beam, full_detector=True))
+    line, fit = [str(warning.message) for warning in told]
+    assert "the largest line integral" in line and "no volume was found" in fit
+
+
 def test_misfit_and_reprojection_are_those_of_the_volume(method):
     y = views()
     result = method.reconstruct(y, CHEST)

@@ -18,6 +18,7 @@ from phydict.evaluation.fid import (
     NAMES,
     Moments,
     PlaneFID,
+    SeedFeatures,
     StoredFeatures,
     case_features,
     distances,
@@ -161,6 +162,37 @@ def test_methods_of_other_numbers_of_slices_are_each_as_alone_and_neither_paired
             assert tuple(found[label].estimates()[name]) == pytest.approx(tuple(alone))
     (table,) = fid_tables(rows)
     assert "XY 64" in table.notes[0] and "XY 32" in table.notes[0] and "**" not in table.markdown()
+
+
+def test_a_method_without_a_distance_is_compared_with_the_others_and_they_not_with_it():
+    plain = of_volumes(lambda hu: blurred(hu, 1))
+    broken = of_volumes(lambda hu: hu.clone().fill_(math.nan))
+    rows = fid_rows(distances({"broken": broken, "one": plain, "two": of_volumes(lambda hu: blurred(hu, 2))}, 5),
+                    "squeezenet", 5, NORMALISATION)
+    assert [row.get("less") for row in rows] == ["one", None, "one"]
+    assert len(fid_tables(fid_rows(distances({"a": broken, "b": broken}, 5), "squeezenet", 5, NORMALISATION))) == 1
+
+
+def test_the_seeds_of_a_case_are_one_case_whose_truth_counts_once():
+    one, two = (of_volumes(lambda hu, n=n: blurred(hu, n)) for n in (1, 2))
+    cases = {case: SeedFeatures([one[case], two[case]]) for case in one}
+    found = distances({"seeds": cases, "one": one}, replicates=5)
+    for plane in PLANES:
+        fake = torch.cat([features[plane][0] for of in (one, two) for features in of.values()])
+        truth = torch.cat([features[plane][1] for features in one.values()])
+        assert found["seeds"].values[f"fid_{plane}"][0] == pytest.approx(frechet_distance(fake, truth), rel=1e-6)
+    seeds, single = rows = fid_rows(found, "squeezenet", 5, NORMALISATION)
+    assert (seeds["cases"], seeds["patients"], seeds["slices_xy"], seeds["truth_slices_xy"]) == (4, 4, 128, 64)
+    assert single["slices_xy"] == 64 and "less" not in seeds and "less" not in single  # of other numbers of slices
+    notes = fid_tables(rows)[0].notes
+    assert "4 cases, 2 seeds each, with XY 128, YZ 192, ZX 160 slices beside XY 64, YZ 96, ZX 80 of the" in notes[0]
+    assert "4 cases with XY 64" in notes[0] and "5 draws of 4 patients;" in notes[1]
+
+
+def test_several_cases_of_one_patient_say_why_they_have_no_intervals():
+    cases = {f"p__{case}": features for case, features in of_volumes(lambda hu: blurred(hu, 1)).items()}
+    (table,) = fid_tables(fid_rows(distances({"m": cases}, 5), "squeezenet", 5, NORMALISATION))
+    assert table.notes[1].startswith("No intervals: all cases are of one patient")
 
 
 def test_moments_of_parts_are_those_of_the_whole_whatever_their_order_and_how_often_they_count():

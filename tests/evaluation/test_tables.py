@@ -13,7 +13,7 @@ import torch
 from rich.console import Console
 
 from phydict.evaluation import Table, mean_table, read_csv, summarise, write_csv
-from phydict.evaluation.metrics import MEASURES
+from phydict.evaluation.metrics import MEASURES, Measure
 from phydict.evaluation.tables import ranks
 from phydict.runtime.files import alone_in, atomic_write, remove_leftovers
 from phydict.units import HUWindow
@@ -90,7 +90,7 @@ def cells(rows: list[dict]) -> dict[str, dict[str, str]]:
     """{row name: {column name without its arrow: cell}} of the Markdown table of some rows."""
     lines = [[c.strip() for c in line.strip("| ").split(" | ")]
              for line in mean_table(rows).markdown().splitlines() if line.startswith("|")]
-    names = [re.sub(" [↑↓]$", "", name) for name in lines[0]]
+    names = [re.sub(" (↑|↓|→ 1)$", "", name) for name in lines[0]]
     return {line[0]: dict(zip(names, line)) for line in lines[2:]}
 
 
@@ -108,13 +108,15 @@ def test_ranks_follow_the_direction_and_the_printed_values():
     for _ in range(200):
         values = [draw.choice([draw.random(), 0.5, math.nan]) for _ in range(draw.randint(0, 6))]
         known = sorted(v for v in values if not math.isnan(v))
-        places = ranks(values, False)
-        assert places == ranks([-v for v in values], True)
+        places = ranks(values, Measure("low", False, 20))
+        assert places == ranks([-v for v in values], Measure("high", True, 20))
+        assert places == ranks([draw.choice([3 - v, 3 + v]) for v in values], Measure("right", None, 12, target=3.0))
+        unlike = len(set(known)) > 1
         assert [v for v, place in zip(values, places) if place == 1] == (
-            known[:known.count(known[0])] if len(known) > 1 else [])
+            known[:known.count(known[0])] if unlike else [])
         seconds = {v for v, place in zip(values, places) if place == 2}
-        assert seconds == ({known[1]} if len(known) > 1 and known[1] > known[0] else set())
-        assert ranks(values, None) == [0] * len(values)
+        assert seconds == ({known[1]} if unlike and known[1] > known[0] else set())
+        assert ranks(values, Measure("neither", None, 20)) == [0] * len(values)
 
 
 def test_the_best_is_bold_and_the_second_underlined_by_what_is_printed():
@@ -129,13 +131,42 @@ def test_the_best_is_bold_and_the_second_underlined_by_what_is_printed():
     assert "T\\_1 \\$. 100 \\%" in tex and "d & \\underline{20.00} & --" in tex
 
 
-@pytest.mark.parametrize("name", [name for name in MEASURES if name != "dice_lung_ct"])  # no method makes it
+NAME = "s|<b>$x$_%&*\\`"
+
+
+def test_a_name_is_text_in_markdown_and_latex_whatever_its_letters():
+    table = Table(NAME, [NAME], [], [(NAME, True, [])], [NAME])
+    text = "s|&lt;b&gt;\\$x\\$_%&amp;\\*\\\\\\`"
+    cell = text.replace("|", "\\|")
+    assert table.markdown() == f"### {text}\n\n| {cell} |\n| --- |\n| {cell} |\n\n{text}\n\n"
+    tex = "s\\textbar{}\\textless{}b\\textgreater{}\\$x\\$\\_\\%\\&*\\textbackslash{}`"
+    assert table.latex().count(tex) == 4
+
+
+@pytest.mark.parametrize("name", [name for name, measure in MEASURES.items() if measure.higher_is_better is not None])
 def test_every_known_metric_has_its_direction(name):
     good_when_low = {"mae_hu", "mae_hu_body", "mae_hu_lung", "lpips_alex", "lpips_squeeze", "hd95_lung", "misfit",
-                     "seconds", "edge_diaphragm", "edge_chest_wall"}
+                     "seconds"}
     table = cells([{"case": "a", "method": "low", name: 1.0}, {"case": "a", "method": "high", name: 2.0}])
     best = "low" if name in good_when_low else "high"
     assert [row for row, values in table.items() if "**" in list(values.values())[1]] == [best]
+
+
+def test_the_nearest_to_the_right_value_is_the_best_on_either_side_of_it():
+    named = {"edge_diaphragm", "edge_chest_wall", "ribs", "vessels"}
+    assert {name for name, measure in MEASURES.items() if measure.target == 1} == named
+    for name in named:
+        table = mean_table([{"case": "a", "method": str(value), name: value} for value in (1.4, 0.9, 1.1, 1.0, 0.5)])
+        assert {label: place for (label, _, _), ((_, place),) in zip(table.lines, table.cells())} == {
+            "1.0": 1, "0.9": 2, "1.1": 2, "1.4": 0, "0.5": 0}
+        assert table.header[1].endswith(" → 1") and "$\\rightarrow$ 1" in table.latex()
+
+
+def test_a_column_of_equal_values_has_no_best():
+    table = cells([{"case": "a", "method": method, "dice_lung": 0.0, "psnr": psnr, "ssim": ssim}
+                   for method, psnr, ssim in (("x", 1.0, math.nan), ("y", 2.0, 0.5))])
+    assert [table[method]["Dice lungs"] for method in "xy"] == ["0.000", "0.000"]
+    assert table["y"]["PSNR (dB)"] == "**2.00**" and table["y"]["SSIM"] == "0.500"
 
 
 def test_ties_share_the_place_and_failures_never_win():
@@ -148,12 +179,40 @@ def test_ties_share_the_place_and_failures_never_win():
 
 def test_the_caption_states_range_grid_views_and_cases():
     text, interval = mean_table(STATED).notes
-    assert "bootstrap over patients" in interval and len(mean_table(STATED[::2]).notes) == 1
+    assert "bootstrap over 2 patients." in interval and len(mean_table(STATED[::2]).notes) == 1
     for part in ("n = 2 cases", "[-1000, 1000]", "2000 HU", "Grid: 64x64x64.", "Views: 8."):
         assert part in text
     assert "Views: not stated" in mean_table(ROWS).notes[0]
     assert "Views: 4, 8" in mean_table([{**row, "views": v} for row in ROWS for v in (4, 8)], by="views").notes[0]
     assert "[-900, 700], data range 1600 HU" in mean_table(ROWS, window=HUWindow(-900, 700)).notes[0]
+
+
+def of_cases(*names: str) -> str:
+    """The notes of a table of these cases."""
+    rows = [{"case": name, "method": "m", "psnr": 20.0 + n} for n, name in enumerate(names)]
+    return "\n".join(mean_table(rows).notes)
+
+
+def test_intervals_name_the_number_of_patients_and_what_names_these():
+    named = "whom the first folder or CT-RATE's number names."
+    assert "bootstrap over 3 patients." in of_cases("a", "b", "c")
+    for pair in (("p__a", "p__b"), ("train_1_a_1", "train_1_b_1")):
+        assert f"bootstrap over 2 patients, {named}" in of_cases(*pair, "c")
+        assert f"No intervals: all cases are of one patient, {named}" in of_cases(*pair)
+    assert "patient" not in of_cases("p__a")
+
+
+def test_a_single_case_is_one_case_and_what_ranks_nothing_says_nothing_of_marks():
+    assert of_cases("a").startswith("One case. HU clipped") and "n = 2 cases. HU" in of_cases("a", "b")
+    assert mean_table(ROWS[::2]).notes[0].startswith("One case; best in bold, second underlined. HU clipped")
+
+
+def test_seconds_with_first_calls_are_neither_ranked_nor_have_an_interval():
+    table = mean_table(ROWS, first_calls=True)
+    times = [line.split(" | ")[-1] for line in table.markdown().splitlines() if line.startswith("| ")]
+    assert times == ["time (s) |", "---: |", "1.00 ± 0.00 |", "80.00 ± 14.14 |"]
+    assert [note for note in table.notes if note.startswith("Seconds: first calls included")]
+    assert "first calls" not in mean_table(ROWS).markdown()
 
 
 def test_the_caption_tells_when_methods_had_different_cases():

@@ -18,10 +18,14 @@ from phydict.evaluation.backbones import DIMENSIONS
 from phydict.evaluation.fid import save_features
 from phydict.evaluation.metrics import MEASURES
 from phydict.evaluation.planes import PLANES
+from phydict.grid import Grid
+from phydict.inference import ReconstructionData
 from phydict.inference.page import results_page
 from phydict.inference.results import FEATURES, RECORD, CaseResults
+from phydict.inference.settings import Orbit
 from phydict.page import CASE_FILES, PAGE, Contents, write_case_files, write_page
 from phydict.page.case_files import NO_VALUE
+from phydict.xray import Ideal, Polychromatic
 
 HOSTILE = "</script><script>alert(1)</script> \"'&# %é😀<!--CONTENT-->"
 
@@ -95,6 +99,59 @@ def test_of_unequal_numbers_of_views_none_is_the_better(tmp_path):
         finish(tmp_path, "anna", method, views=views, scores={"psnr": psnr})
     places = {c["record"]["method"]: c["places"]["psnr"] for c in content(results_page(tmp_path))["cases"]}
     assert places == {"sirt": 0, "tv": 1, "fdk": 2}
+
+
+def of_test(**data) -> dict:
+    """The settings of a test whose X-rays are of these settings."""
+    return {"seed": 0, "data": {"with_report": True} | ReconstructionData(cts="phantom", **data).settings("test")}
+
+
+FINE = Grid((12, 18, 14), affine=TURNED.affine @ np.diag([0.5, 0.5, 0.5, 1.0]))
+
+
+@pytest.mark.parametrize("title, views, settings, grid", [
+    ("K = 8", 8, {"orbit": Orbit(8)}, TURNED), ("noise 0.02", 3, {"simulator": Ideal(noise=0.02)}, TURNED),
+    ("Polychromatic", 3, {"simulator": Polychromatic()}, TURNED),
+    ("geometry biplanar", 3, {"geometry": "biplanar"}, TURNED),
+    ("simulation voxels 128", 3, {"simulation_voxels": 128}, TURNED),
+    ("grid 12x18x14 of 1.5 x 2 x 2.5 mm", 3, {}, FINE)])
+def test_what_is_of_unlike_xrays_or_voxels_is_neither_ranked_nor_paired_together(
+        title, views, settings, grid, tmp_path, monkeypatch):
+    monkeypatch.setitem(DIMENSIONS, "squeezenet", 3)
+    for n, method in enumerate(("fdk", "sirt", "tv")):
+        of = (views, settings, grid) if method == "tv" else (3, {}, TURNED)
+        folder = finish(tmp_path, "anna", method, grid=of[2], views=of[0], scores={"psnr": 20.0 + n},
+                        settings=of_test(**of[1]) | {"fid_backbone": "squeezenet"})
+        generator = torch.Generator().manual_seed(n)
+        save_features(folder / FEATURES, {plane: torch.randn(2, 9, 3, generator=generator) for plane in PLANES})
+    held = content(results_page(tmp_path))
+    assert [case["places"]["psnr"] for case in held["cases"]] == [2, 1, 0]
+    for kind in ("Scores by method", "Frechet distance"):
+        first, second = (table for table in held["tables"] if table["title"].startswith(kind))
+        assert [row[0]["text"] for row in first["rows"]] == ["fdk", "sirt"]
+        assert [row[0]["text"] for row in second["rows"]] == ["tv"]
+        assert title in second["title"] and title not in first["title"] and first["title"] != second["title"]
+
+
+def test_what_is_no_matter_of_xrays_and_voxels_keeps_cases_in_one_table_as_a_report_and_a_seed(tmp_path):
+    for n, (method, change) in enumerate((("fdk", {}), ("sirt", {"with_report": False}), ("tv", {"photons": None}))):
+        settings = of_test() | {"seed": n}
+        settings["data"] |= {name: value for name, value in change.items() if name == "with_report"}
+        settings["data"]["simulator"] |= {name: value for name, value in change.items() if name == "photons"}
+        finish(tmp_path, "anna", method, settings=settings, scores={"psnr": 20.0 + n})
+    held = content(results_page(tmp_path))
+    assert [table["title"] for table in held["tables"]] == ["Scores by method"]
+    assert [case["places"]["psnr"] for case in held["cases"]] == [0, 2, 1]
+
+
+def test_seconds_of_first_calls_are_not_ranked(tmp_path):
+    for method, seconds in (("sirt", 1.0), ("tv", 9.0)):
+        finish(tmp_path, "anna", method, seconds={"sample": seconds})
+    held = content(results_page(tmp_path))
+    assert [case["places"]["seconds"] for case in held["cases"]] == [0, 0]
+    (table,) = held["tables"]
+    assert all(row[table["header"].index("time (s)")]["place"] == 0 for row in table["rows"])
+    assert any(note.startswith("Seconds: first calls included") for note in table["notes"])
 
 
 def test_the_best_of_each_case_is_marked_among_the_methods(tmp_path):
@@ -196,7 +253,8 @@ def test_of_other_data_or_protocols_none_is_the_better_and_what_is_of_a_protocol
     finish(tmp_path, "anna", "fdk", scores={"psnr": 22.0}, settings={"seed": 0, "data": {"protocol": "x2ct"}})
     held = content(results_page(tmp_path))
     assert [case["places"]["psnr"] for case in held["cases"]] == [0, 0, 0]
-    assert [point["series"] for point in held["points"]] == ["fdk, x2ct", "sirt", "tv"]
+    assert [point["series"] for point in held["points"]] == [
+        "fdk, protocol x2ct", "sirt, no protocol", "tv, no protocol"]
     assert [table["title"].removeprefix("Scores by method") for table in held["tables"]] == [
         ", protocol x2ct", ", no protocol"]
 

@@ -28,6 +28,18 @@ def whole_sizes(values) -> tuple[int, ...] | None:
     return tuple(map(int, sizes)) if (sizes >= 1).all() and (sizes == np.floor(sizes)).all() else None
 
 
+def index_to_mm(name: str, values) -> np.ndarray:
+    """A copy of an affine (4, 4) from voxel indices to mm. Raises ValueError where `values`, which `name` says, cannot
+    be one."""
+    affine = _numbers(values)
+    if affine.shape != (4, 4) or not np.isfinite(affine).all():
+        raise ValueError(f"{name} is 4x4 finite numbers, but {reprlib.repr(values)} was given")
+    if not np.allclose(affine[3], (0, 0, 0, 1)):
+        raise ValueError(f"{name} has the last row 0 0 0 1, but {affine[3].tolist()} was given: transpose it where its "
+                         "last column is 0 0 0 1")
+    return affine
+
+
 def centred(axes: np.ndarray, shape: tuple[int, int, int], centre=(0.0, 0.0, 0.0)) -> np.ndarray:
     """The affine (4, 4) of voxels whose steps are the columns of `axes` (3, 3), in mm, about a `centre` in mm."""
     affine = np.eye(4)
@@ -66,9 +78,7 @@ class Grid:
             spacing = np.broadcast_to(given, 3)
             affine = centred(np.diag(spacing), shape)
         else:
-            affine = _numbers(self.affine)
-            if affine.shape != (4, 4):
-                raise ValueError(f"a grid's affine is 4x4 numbers, but {reprlib.repr(self.affine)} was given")
+            affine = index_to_mm("a grid's affine", self.affine)
             spacing = np.linalg.norm(affine[:3, :3], axis=0)
             if given is not None and not np.allclose(spacing, given, rtol=1e-4):
                 raise ValueError(f"spacing {given.tolist()} mm contradicts the affine's {spacing.tolist()} mm")

@@ -79,7 +79,9 @@ def test_shear_is_refused():
     ({"spacing": (1.0, float("inf"), 1.0)}, "positive and finite"),
     ({"spacing": None, "affine": np.eye(3)}, "4x4"), ({"spacing": None, "affine": np.full((4, 4), np.nan)}, "finite"),
     ({"spacing": (6, 6)}, "length in mm, one for all axes or three"), ({"spacing": "a"}, "but 'a' was given"),
-    ({"spacing": None, "affine": [[1, 2], [3]]}, "4x4")])
+    ({"spacing": None, "affine": [[1, 2], [3]]}, "4x4"),
+    ({"spacing": None, "affine": TURNED.T}, "last row 0 0 0 1, but .* was given: transpose it"),
+    ({"spacing": None, "affine": np.diag([1.0, 1, 1, 2])}, r"but \[0.0, 0.0, 0.0, 2.0\] was given")])
 def test_impossible_grids_are_refused(change, message):
     with np.errstate(all="ignore"), pytest.raises(ValueError, match=message):
         Grid(**{"shape": (4, 5, 6), "spacing": (1.0, 1.0, 1.0)} | change)

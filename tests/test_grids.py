@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import nibabel
@@ -65,8 +66,22 @@ def test_predict_writes_any_box_with_its_affine_and_the_coarse_volume_on_request
     record = json.loads((folder / "reconstruction.json").read_text())
     said = record["settings"]
     assert Grid(**said["grid"]).same_as(REGION) and ("refinement" in said) == (method == "prior_only")
-    told = capsys.readouterr().err.count("no network has learnt to refine to 15 x 12 x 9 voxels here")
+    told = capsys.readouterr().err.count(" to 15 x 12 x 9 voxels here")
     assert told == (method == "prior_only") and not any("learnt" in words for words in record["warnings"])
+
+
+def test_hu_are_those_of_the_water_that_the_geometry_file_states(measured, prior, tmp_path):
+    volumes = []
+    for water in (0.02, 0.025):
+        folder = tmp_path / str(water) / "anna"
+        shutil.copytree(measured, folder)
+        for file in folder.glob("*.npy"):
+            np.save(file, np.load(file) * np.float32(water / 0.02))
+        (folder / "geometry.yaml").write_text((folder / "geometry.yaml").read_text() + f"mu_water: {water}\n")
+        main(arguments("predict", out := tmp_path / f"out {water}", prior, f"--data.xrays={folder}", method="sirt"))
+        assert json.loads((out / "sirt/anna/reconstruction.json").read_text())["mu_water"] == water
+        volumes.append(nibabel.load(out / "sirt/anna/volume.nii.gz").get_fdata())
+    np.testing.assert_allclose(*volumes, atol=0.1)
 
 
 def test_the_default_method_predicts_on_128_voxels_unless_a_grid_or_another_network_is_given(prior):

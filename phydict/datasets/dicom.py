@@ -1,9 +1,9 @@
 """DICOM radiographs (CR, DX) and angiographic or fluoroscopic runs (XA, RF): images, and what their tags say.
 
 Pixels: rescale slope and intercept, or the modality LUT, are applied; the VOI window, a choice for the eye, never is.
-MONOCHROME1 says how values are shown, so it inverts display images alone. Tags are looked for in a frame's own
-functional groups, in the shared ones, and in the file. The beam they state is
-phydict.datasets.radiographs.dicom_beam's.
+Padding is told by the values as they are stored (PS3.3 C.7.5.1.1.2). MONOCHROME1 says how values are shown, so it
+inverts display images alone. Tags are looked for in a frame's own functional groups, in the shared ones, and in the
+file. The beam they state is phydict.datasets.radiographs.dicom_beam's.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pydicom
+import scipy
 from pydicom.multival import MultiValue
 from pydicom.pixels import apply_modality_lut
 
@@ -66,16 +67,17 @@ def open_dicom(path: Path, **settings) -> pydicom.Dataset:
     return pydicom.dcmread(path, **settings)
 
 
-def read_dicom(path: Path) -> list[tuple[np.ndarray, DicomTags]]:
+def read_dicom(path: Path, padding: float | None = None) -> list[tuple[np.ndarray, DicomTags]]:
     """The frames of a DICOM file: pixels (V, U) float64 after the modality transform, and their tags.
 
-    Raises ValueError naming the file where it cannot be read or decoded, or is not grey.
+    padding: the most that padding which reaches an edge of its image is read as; None: an image may have no padding.
+    Raises ValueError naming the file where it cannot be read or decoded, is not grey, or has padding.
     """
     with refusing(path, "export it again, uncompressed"):
-        return _frames(path)
+        return _frames(path, padding)
 
 
-def _frames(path: Path) -> list[tuple[np.ndarray, DicomTags]]:
+def _frames(path: Path, padding: float | None) -> list[tuple[np.ndarray, DicomTags]]:
     with reading(f"the DICOM file {path}", "export it again, uncompressed"):
         dataset = open_dicom(path)
         if dataset.get("SamplesPerPixel", 1) != 1:
@@ -91,7 +93,7 @@ def _frames(path: Path) -> list[tuple[np.ndarray, DicomTags]]:
     frames = stored[None] if stored.ndim == 2 else stored
     several = len(frames) > 1
     names = [f"{path} frame {k + 1}" if several else str(path) for k in range(len(frames))]
-    return [(_rescaled(frame, dataset, k, name), _tags(dataset, k, name))
+    return [(_values(frame, dataset, k, name, padding), _tags(dataset, k, name))
             for k, (frame, name) in enumerate(zip(frames, names))]
 
 
@@ -140,6 +142,30 @@ def _find(dataset: pydicom.Dataset, frame: int, keyword: str, name: str):
             if value is not None and value != "" and not (hasattr(value, "__len__") and len(value) == 0):
                 return value
     return None
+
+
+def _values(stored: np.ndarray, dataset: pydicom.Dataset, frame: int, name: str, padding: float | None) -> np.ndarray:
+    """Stored values (V, U) after the modality transform, with padding as `read_dicom` says."""
+    values, padded = _rescaled(stored, dataset, frame, name), _padded(stored, dataset, frame, name)
+    if not padded.any():
+        return values
+    if padding is None:
+        raise ValueError(f"{int(padded.sum())} pixels of {name} are padding (PixelPaddingValue "
+                         f"{_find(dataset, frame, 'PixelPaddingValue', name)}): crop the views to the exposed field, "
+                         "and state shape and the detector's shift in geometry.yaml, or remove that tag if they are no "
+                         "padding")
+    regions, _ = scipy.ndimage.label(np.pad(padded, 1, constant_values=True))
+    outside = regions[1:-1, 1:-1] == regions[0, 0]
+    return np.where(outside, np.minimum(values, padding), values)
+
+
+def _padded(stored: np.ndarray, dataset: pydicom.Dataset, frame: int, name: str) -> np.ndarray:
+    """Which stored values (V, U) lie between PixelPaddingValue and PixelPaddingRangeLimit, both included."""
+    value, limit = (_number(dataset, frame, f"PixelPadding{part}", name) for part in ("Value", "RangeLimit"))
+    if value is None:
+        return np.zeros(stored.shape, bool)
+    ends = np.array([int(value), int(value if limit is None else limit)]).astype(stored.dtype)  # some lack a sign
+    return (stored >= ends.min()) & (stored <= ends.max())
 
 
 def _rescaled(pixels: np.ndarray, dataset: pydicom.Dataset, frame: int, name: str) -> np.ndarray:

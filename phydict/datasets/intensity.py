@@ -14,7 +14,13 @@ from numbers import Real
 
 import numpy as np
 
-KINDS = ("line_integrals", "counts", "display")
+KINDS = {"line_integrals": ("scale", "offset"), "counts": ("air", "flat", "dark", "floor"),
+         "display": ("bright_is_dense",)}
+"""What pixel values may be -> the settings that belong to it."""
+
+NEUTRAL = {"scale": 1.0, "offset": 0.0} | dict.fromkeys(("air", "flat", "dark", "floor", "bright_is_dense"))
+"""Settings as they are when left out."""
+
 LARGEST_LINE_INTEGRAL = 100.0
 """No line integral of a patient is larger: it is 2 m of bone."""
 
@@ -45,7 +51,7 @@ class Intensity:
     bright_is_dense: bool | None = None
 
     def __post_init__(self):
-        if self.kind not in KINDS:
+        if self.kind not in tuple(KINDS):
             raise ValueError(f"intensity kind {reprlib.repr(self.kind)} is unknown; give one of {', '.join(KINDS)}")
         for name in ("scale", "offset", "air", "floor"):
             self._make_number(name)
@@ -56,9 +62,11 @@ class Intensity:
                              f"{reprlib.repr(self.flat)} was given")
         if self.scale == 0:
             raise ValueError("the scale of line integrals must not be 0; give what one pixel value stands for")
-        counts = [name for name in ("air", "flat", "dark", "floor") if getattr(self, name) is not None]
-        if self.kind != "counts" and counts:
-            raise ValueError(f"`{counts[0]}` belongs to the intensity kind counts, but the kind is {self.kind}")
+        given = {name for name, default in NEUTRAL.items() if getattr(self, name) != default}
+        for kind, names in KINDS.items():
+            if kind != self.kind and (foreign := [name for name in names if name in given]):
+                raise ValueError(f"`{foreign[0]}` belongs to the intensity kind {kind}, but the kind is {self.kind}; "
+                                 "leave it out")
         if self.kind == "counts" and self.flat is None and not (self.air and self.air > 0):
             raise ValueError(f"counts need `air`, the positive count without a patient, but air={self.air} was given; "
                              "or give `flat`, an image without one")

@@ -148,7 +148,7 @@ class ConeBeam:
         count = whole_sizes(views)
         if count is None or len(count) != 1 or count[0] < 2:
             raise ValueError(f"a sweep needs two views or more, but views={reprlib.repr(views)} was given")
-        if not 0 < sweep_degrees <= 160:
+        if not 0 < _number("sweep_degrees", sweep_degrees) <= 160:
             raise ValueError(f"sweep_degrees lies in (0, 160], but {sweep_degrees} was given")
         _check_isocentre(source_to_detector, source_to_isocentre)
         reach = math.tan(math.radians(sweep_degrees) / 2)
@@ -158,6 +158,7 @@ class ConeBeam:
     def shifted(self, rows: float = 0.0, columns: float = 0.0) -> ConeBeam:
         """The beam with its detectors moved in their planes, by mm in the direction from row to row and from column to
         column, as for a half-fan acquisition."""
+        rows, columns = _number("rows", rows), _number("columns", columns)
         height, width = np.linalg.norm(self.v, axis=1), np.linalg.norm(self.u, axis=1)
         move = rows * self.v / height[:, None] + columns * self.u / width[:, None]
         return replace(self, detectors=self.detectors + move)
@@ -169,7 +170,7 @@ class ConeBeam:
     def tilted(self, degrees: float) -> ConeBeam:
         """The beam with each view turned about the line through the isocentre that its rows run along, so that the
         source rises by `degrees`: the angulation of a C-arm."""
-        if not abs(degrees) < 90:
+        if not abs(_number("tilt_degrees", degrees)) < 90:
             raise ValueError(f"tilt_degrees lies between -90 and 90, but {degrees} was given")
         return self.at(*turned((self.sources, self.detectors, self.u, self.v), math.radians(degrees)))
 
@@ -385,8 +386,7 @@ class ConeBeam:
         required, optional = FORMS[form]
         given = dict(_check_keys(given, required, optional + PLACE_OPTIONS, INSTEAD.get(form, "")))
         for key, value in given.items():
-            if np.ndim(_numbers(key, value)) and key not in LISTS:
-                raise ValueError(f"{key} is one number, but {reprlib.repr(value)} was given")
+            (_numbers if key in LISTS else _number)(key, value)
         shift, tilt = given.pop("detector_shift", 0.0), given.pop("tilt_degrees", 0.0)
         if np.shape(shift) not in ((), (2,)):
             raise ValueError("detector_shift is mm from column to column, or [from row to row, from column to column], "
@@ -403,6 +403,9 @@ def _radians(name: str, radians: float | None, degrees: float | None, otherwise:
     """An angle of an orbit that was given in radians, in degrees or not at all."""
     if radians is not None and degrees is not None:
         raise ValueError(f"{name}={radians} (radians) and {name}_degrees={degrees} were both given; leave one out")
+    for key, value in ((name, radians), (f"{name}_degrees", degrees)):
+        if value is not None:
+            _number(key, value)
     if radians is not None and abs(radians) > MOST_RADIANS:
         raise ValueError(f"{name} is in radians, but {radians} was given, more than two turns; give {name}_degrees for "
                          "degrees")
@@ -422,6 +425,8 @@ def pixel_sizes(pixel) -> tuple[float, float]:
 
 
 def _check_isocentre(source_to_detector: float, source_to_isocentre: float) -> None:
+    _number("source_to_detector", source_to_detector)
+    _number("source_to_isocentre", source_to_isocentre)
     if not 0 < source_to_isocentre < source_to_detector < MOST_MM:
         raise ValueError(f"the isocentre must lie between source and detector, but source_to_isocentre="
                          f"{source_to_isocentre} mm and source_to_detector={source_to_detector} mm were given; "
@@ -445,6 +450,14 @@ def _numbers(key: str, value) -> float | np.ndarray:
     if not np.isfinite(numbers).all():
         raise ValueError(f"{key} must be finite, but {reprlib.repr(value)} was given")
     return numbers if numbers.ndim else numbers.item()
+
+
+def _number(key: str, value) -> float:
+    """One finite number. Raises ValueError naming the key."""
+    number = _numbers(key, value)
+    if isinstance(number, np.ndarray):
+        raise ValueError(f"{key} is one number, but {reprlib.repr(value)} was given")
+    return number
 
 
 def _check_keys(content: object, required: tuple[str, ...], optional: tuple[str, ...], instead: str = "") -> dict:

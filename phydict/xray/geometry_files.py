@@ -1,10 +1,12 @@
-"""Geometry files of other programs to and from ConeBeam: RTK's XML, ASTRA's cone vectors, tables with named columns.
+"""Geometry files of other programs to and from ConeBeam: RTK's XML, ASTRA's cone vectors, projection matrices, tables.
 
     .yaml .yml   ours (ConeBeam.load)
     .xml         RTK's circular geometry (phydict.xray.rtk)
     .npy         ASTRA's cone_vec, (views, 12): source, detector centre, u, v; u leads from one column to the next, v
                  from one row to the next
-    .csv .txt    a header that names the columns of COLUMNS in any order, or without a header the numbers of cone_vec
+    .npy         projection matrices, (views, 3, 4): phydict.xray.projection_matrices
+    .csv .txt    a header that names the columns of COLUMNS in any order, among others that are passed over, or without
+                 a header the numbers of cone_vec; pandas' and R's row names may stand before them
 
 Vectors are taken as world millimetres, RAS+: where another program's axes differ, turn them first.
 """
@@ -12,6 +14,8 @@ Vectors are taken as world millimetres, RAS+: where another program's axes diffe
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import takewhile
 from pathlib import Path
 
@@ -21,6 +25,7 @@ from phydict.runtime.files import atomic_write
 from phydict.runtime.reading import read_npy, read_text, reading, reason
 from phydict.runtime.warning import warn
 from phydict.xray.geometry import ConeBeam
+from phydict.xray.projection_matrices import beam_of_matrices
 from phydict.xray.rtk import check_beam, read_rtk, write_rtk
 
 VECTORS = ("source", "detector", "u", "v")
@@ -32,7 +37,8 @@ def read_beam(path: str | Path, shape: tuple[int, int] | None = None,
               pixel: float | tuple[float, float] | None = None) -> ConeBeam:
     """The beam of a geometry file of any of the module's kinds, chosen by its ending.
 
-    shape: (V, U) pixels, needed but for YAML. pixel: (row height, column width) in mm, needed for RTK's XML.
+    shape: (V, U) pixels, needed but for YAML. pixel: (row height, column width) in mm, needed for RTK's XML and
+    projection matrices.
     Raises FileNotFoundError, and ValueError naming the file for other endings, missing shape or pixel and bad content.
     """
     path = Path(path)
@@ -44,17 +50,32 @@ def read_beam(path: str | Path, shape: tuple[int, int] | None = None,
     if shape is None:
         raise ValueError(f"{path} does not say how many pixels the detector has; state its `shape`: [rows, columns]")
     if ending == ".xml":
-        if pixel is None:
-            raise ValueError(f"{path} does not say how large the pixels are; state `pixel`: [row height, column width] "
-                             "in mm")
-        return read_rtk(path, shape, pixel)
+        return read_rtk(path, shape, _stated(path, pixel))
     vectors = _read_npy(path) if ending == ".npy" else _read_table(path)
+    if vectors.shape[1:] == (3, 4) and len(vectors):
+        sides = _stated(path, pixel)
+        with _of(path):
+            return beam_of_matrices(vectors, shape, sides)
     if vectors.ndim != 2 or vectors.shape[1] != 12 or not len(vectors):
         raise ValueError(f"{path} holds numbers of shape {vectors.shape}, but 12 per view were expected: source, "
-                         "detector centre, u and v")
-    try:
+                         "detector centre, u and v; or (views, 3, 4), projection matrices")
+    with _of(path):
         sources, detectors, u, v = np.split(vectors, 4, axis=1)
         return ConeBeam(sources, detectors, u, v, shape)
+
+
+def _stated(path: Path, pixel: float | tuple[float, float] | None) -> float | tuple[float, float]:
+    if pixel is None:
+        raise ValueError(f"{path} does not say how large the pixels are; state `pixel`: [row height, column width] in "
+                         "mm")
+    return pixel
+
+
+@contextmanager
+def _of(path: Path) -> Iterator[None]:
+    """A ValueError raised inside names the file."""
+    try:
+        yield
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
@@ -101,26 +122,52 @@ def _read_npy(path: Path) -> np.ndarray:
 
 
 def _read_table(path: Path) -> np.ndarray:
-    lines = [line for line in (line.strip(" ,;\t") for line in read_text(path).splitlines()) if line]
+    lines = [line for line in (line.rstrip(" ,;\t").lstrip() for line in read_text(path).splitlines()) if line]
     header = next((line for line in takewhile(lambda line: line.startswith("#"), lines) if _names_columns(line)), None)
-    rows = [re.split(r"[,;\s]+", line) for line in lines if not line.startswith("#")]
-    if header and rows and not rows[0][0][:1].isalpha():  # as numpy.savetxt writes it
-        rows.insert(0, re.split(r"[,;\s]+", header.lstrip("# ")))
+    lines = [line for line in lines if not line.startswith("#")]
+    if header and lines and not _is_header(lines[0]):  # as numpy.savetxt writes it
+        lines.insert(0, header.lstrip("# "))
     columns = list(COLUMNS)
-    if rows and rows[0][0][:1].isalpha():
-        columns = [name.lower() for name in rows.pop(0)]
+    if lines and _is_header(lines[0]):
+        columns = _cells(lines.pop(0).lower())
         missing = [name for name in COLUMNS if name not in columns]
         if missing:
             raise ValueError(f"{path} has no column {', '.join(missing)}; the columns are {', '.join(COLUMNS)}")
-    for number, row in enumerate(rows):
-        if len(row) != len(columns):
-            raise ValueError(f"{path}: view {number} has {len(row)} values, but {len(columns)} were expected")
+        if _are_counted(lines, len(columns) + 1):
+            columns.insert(0, "")
+    rows = [_row(path, number, line, len(columns)) for number, line in enumerate(lines)]
+    places = [columns.index(name) for name in COLUMNS]
     try:
-        table = np.array(rows, float).reshape(len(rows), len(columns))
+        return np.array([[row[place] for place in places] for row in rows], float).reshape(len(rows), len(COLUMNS))
     except ValueError as error:
         raise ValueError(f"{path}: {reason(error)[:100]}; give numbers in mm") from error
-    return table[:, [columns.index(name) for name in COLUMNS]]
+
+
+def _row(path: Path, number: int, line: str, expected: int) -> list[str]:
+    """The cells of one view. Raises ValueError where they are more or fewer than expected."""
+    cells = _cells(line)
+    if len(cells) == expected:
+        return cells
+    if "," in line and len(re.split(r"[;\s]+", line)) == expected:
+        raise ValueError(f"{path}: view {number} has decimal commas; write its numbers with decimal points")
+    raise ValueError(f"{path}: view {number} has {len(cells)} values, but {expected} were expected")
+
+
+def _cells(line: str) -> list[str]:
+    """What stands in a line of a table, without quotes."""
+    return [cell.strip("\"'") for cell in re.split(r"\s*[,;]\s*|\s+", line)]
+
+
+def _is_header(line: str) -> bool:
+    return line.lstrip("\"',; \t")[:1].isalpha()
+
+
+def _are_counted(lines: list[str], width: int) -> bool:
+    """Whether rows of `width` cells begin with their count, from 0 or 1 on, as pandas and R name them."""
+    rows = [_cells(line) for line in lines]
+    return all(len(row) == width for row in rows) and [row[0] for row in rows] in (
+        [str(first + k) for k in range(len(rows))] for first in (0, 1))
 
 
 def _names_columns(line: str) -> bool:
-    return set(COLUMNS) <= set(re.split(r"[,;\s]+", line.lstrip("# ").lower()))
+    return set(COLUMNS) <= set(_cells(line.lstrip("# ").lower()))

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from numbers import Real
 
 import numpy as np
 import torch
@@ -68,14 +69,15 @@ class Polychromatic(Simulator):
     def __post_init__(self):
         check_photons(self.air_photons)
         for name in ("readout", "scatter"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be finite and >= 0, 0 for none; {getattr(self, name)} was given")
-        for name in ("scintillator", "saturation", "scatter_width", "metal"):
             value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise ValueError(f"{name} must be finite and > 0, but {value} was given; leave it out for the default")
-        if self.scatter_width is None:
-            raise ValueError("scatter_width must be finite and > 0, but None was given; leave it out for the default")
+            if not (_is_number(value) and 0 <= value < math.inf):
+                raise ValueError(f"{name} must be finite and >= 0, 0 for none; {value!r} was given")
+        for name in ("scintillator", "saturation", "metal", "scatter_width", "ct_energy"):
+            value = getattr(self, name)
+            left_out = value is None and name not in ("scatter_width", "ct_energy")
+            if not left_out and not (_is_number(value) and 0 < value < math.inf):
+                raise ValueError(f"{name} must be finite and > 0, but {value!r} was given; leave it out for the "
+                                 "default")
         for energies in (self.ct_energy, self.beam_spectrum.energies):
             attenuation("water", energies)  # refuses energies off its table
 
@@ -131,6 +133,10 @@ class Polychromatic(Simulator):
         if self.saturation is not None:
             signal = signal.clamp(max=self.saturation)
         return -signal.log().to(mu)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, Real)
 
 
 def scatter_of(primary: torch.Tensor, beam: ConeBeam, amplitude: float, width: float) -> torch.Tensor:

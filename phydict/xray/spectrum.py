@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from numbers import Real
 
 import numpy as np
 
@@ -72,9 +73,9 @@ class Spectrum:
 
         Raises ValueError for other voltages.
         """
-        table, kvp = _table("tungsten.csv"), int(kvp) if kvp == int(kvp) else kvp
-        if f"{kvp}kvp" not in table:
+        table, tube = _table("tungsten.csv"), f"{kvp:g}kvp" if isinstance(kvp, Real) else ""
+        if tube not in table:
             tubes = ", ".join(name.removesuffix("kvp") for name in list(table)[1:])
-            raise ValueError(f"there is no tube spectrum of {kvp} kVp; use one of {tubes}, or give a Spectrum")
-        there = table[f"{kvp}kvp"] > 1e-7
-        return cls(tuple(table["energy_kev"][there]), tuple(table[f"{kvp}kvp"][there]))
+            raise ValueError(f"there is no tube spectrum of {kvp!r} kVp; use one of {tubes}, or give a Spectrum")
+        there = table[tube] > 1e-7
+        return cls(tuple(table["energy_kev"][there]), tuple(table[tube][there]))

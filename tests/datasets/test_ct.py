@@ -190,6 +190,14 @@ def test_nan_and_flat_voxels_are_refused(tmp_path, chest):
     fails("voxels without volume", tmp_path / "flat.nii")
 
 
+@pytest.mark.parametrize("factor, words", [(1e-3, "0.006 x 0.006 x 0.006 mm"), (1e3, "6000 x 6000 x 6000 mm")])
+def test_lengths_in_another_unit_are_no_flat_voxels(tmp_path, chest, factor, words):
+    scaled = np.diag([factor, factor, factor, 1]) @ AFFINE
+    fails(f"has voxels of {words}, .* which no CT does", save_ct(tmp_path / "a.nii", chest, scaled))
+    with pytest.raises(ValueError, match=f"the CT has voxels of {words}, .* which no CT does; give an affine"):
+        prepare_ct((chest, scaled), GRID)
+
+
 def test_scaled_integers_are_read_as_hu(tmp_path, chest):
     image = nibabel.Nifti1Image(chest, AFFINE)
     data = bytearray(image.to_bytes())
@@ -256,3 +264,24 @@ def test_voxels_without_their_place_are_no_ct(chest):
     for ct in ((chest,), (chest[0], AFFINE), (chest, AFFINE, AFFINE)):
         with pytest.raises(ValueError, match="a CT is a file, or HU"):
             prepare_ct(ct, GRID)
+
+
+@pytest.mark.parametrize("change, sentence", [
+    (lambda hu, affine: (np.where(hu > 800, np.nan, hu), affine), r"the CT holds \d+ NaN or infinite voxels; replace"),
+    (lambda hu, affine: (hu + 0j, affine), "the CT holds voxels of type complex128; give integers or"),
+    (lambda hu, affine: (hu[:, :, :5], affine), "the CT has 5 slices .* give the whole series"),
+    (lambda hu, affine: (hu, affine[:3]), "the affine of the CT is 4x4 finite numbers, but"),
+    (lambda hu, affine: (hu, affine.T), "the affine of the CT has the last row 0 0 0 1, but .* transpose it where"),
+    (lambda hu, affine: (hu, np.diag([0, 1, 1, 1])), "the CT has voxels without volume"),
+    (lambda hu, affine: (hu, np.diag([np.nan, 1, 1, 1])), "the affine of the CT is 4x4 finite numbers, but")])
+def test_a_ct_given_as_arrays_is_checked_as_a_file_is(chest, change, sentence):
+    with pytest.raises(ValueError, match=sentence) as caught:
+        prepare_ct(change(chest, AFFINE), GRID)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", [lambda part: part.tolist(), torch.tensor,
+                                  lambda part: torch.tensor(part, dtype=torch.float64, requires_grad=True)])
+def test_lists_and_tensors_are_the_case_of_their_arrays(chest, kind):
+    expected, found = prepare_ct((chest, AFFINE), GRID), prepare_ct((kind(chest), kind(AFFINE)), GRID)
+    assert all(found[name].equal(expected[name]) for name in ("volume", "masks", "affine"))

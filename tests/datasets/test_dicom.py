@@ -218,6 +218,29 @@ def test_rescaling_is_applied_and_the_window_is_not(tmp_path):
     np.testing.assert_allclose(case["xrays"][0], 1e-3 * (0.25 * counts()[0] - 2), rtol=1e-5)
 
 
+@pytest.mark.parametrize("tags, hidden", [
+    ({"PixelPaddingValue": 65535}, [65535]),
+    ({"PixelPaddingValue": 0, "PixelPaddingRangeLimit": 9}, [0, 4, 9]),
+    ({"PixelPaddingValue": 65535, "PixelPaddingRangeLimit": 65000}, [65000, 65500])])
+@pytest.mark.parametrize("rescale", [{}, {"RescaleSlope": -0.5, "RescaleIntercept": 40000.0}])
+def test_padding_is_no_xray_whatever_the_rescale_makes_of_it(tmp_path, tags, hidden, rescale):
+    stored = counts()[0] // 4 + 1000
+    tags = angled(0.0) | rescale | tags
+    plain = load_xrays(one(tmp_path / "a", stored, **tags), intensity=LINES)["xrays"]
+    without = {name: value for name, value in tags.items() if "Padding" not in name}
+    assert plain.equal(load_xrays(one(tmp_path / "b", stored, **without), intensity=LINES)["xrays"])
+    stored[0, :len(hidden)] = hidden
+    fails(f"{len(hidden)} pixels of .*a.dcm are padding .PixelPaddingValue {tags['PixelPaddingValue']}.: crop the",
+          one(tmp_path / "c", stored, **tags), intensity=LINES)
+
+
+def test_padding_is_named_by_its_frame(tmp_path):
+    stored = counts(2)
+    stored[1, 2] = 0
+    write_dicom(tmp_path / "run.dcm", stored, **orbit_tags(2, 1020.0, 740.0, PIXEL), PixelPaddingValue=0)
+    fails("5 pixels of .*run.dcm frame 2 are padding", tmp_path, intensity=LINES)
+
+
 def test_monochrome1_turns_what_is_shown_and_leaves_quantities_alone(tmp_path):
     plain = one(tmp_path / "plain", **angled(0.0))
     inverted = one(tmp_path / "inverted", **angled(0.0), PhotometricInterpretation="MONOCHROME1")

@@ -50,6 +50,20 @@ def test_slope_and_intercept_give_hu(tmp_path, thorax):
     assert np.array_equal(load_series(*find_series(tmp_path))[0], 2 * stored - 1000)
 
 
+@pytest.mark.parametrize("kind, unsigned", [("SS", 0), ("US", 2**16)])
+@pytest.mark.parametrize("value, reads", [(2000, -1000), (-2000, -2000)])
+def test_padding_about_the_scan_is_no_denser_than_air(tmp_path, thorax, value, reads, kind, unsigned):
+    hu = thorax.copy()
+    hu[:3, :, 4:], hu[20, 20, 9] = value, value
+    for path in write_ct_series(tmp_path, hu - 1024, AFFINE, RescaleIntercept=0, PixelRepresentation=1):
+        dataset = pydicom.dcmread(path)
+        dataset.add_new("PixelPaddingValue", kind, value % unsigned if unsigned else value)
+        dataset.save_as(path)
+    expected = hu.copy()
+    expected[:3, :, 4:] = reads
+    assert np.array_equal(load_series(*find_series(tmp_path))[0], expected)
+
+
 def test_a_sagittal_series_is_the_same_patient(tmp_path, thorax):
     for k in range(thorax.shape[0]):
         corner = np.diag([-1.0, -1, 1, 1]) @ AFFINE @ [k, thorax.shape[1] - 1, thorax.shape[2] - 1, 1]
@@ -106,13 +120,15 @@ def position(paths, shift):
     (lambda p: position(p, lambda k: [0, 0, 2.0 * max(0, k - 20)]), "unevenly spaced, from 6 to 8 mm"),
     (lambda p: position(p, lambda k: [0, 1.5 * k, 0]), "gantry was tilted by 14.0 degrees"),
     (lambda p: edit(p[9:10], PixelSpacing=[[5.0, 6.0]]), "PixelSpacing changes within the series"),
+    (lambda p: edit(p, PixelSpacing=[[0.006] * 2] * len(p)), "it has voxels of 0.006 x 0.006 x 6 mm, or lies at"),
+    (lambda p: edit(p, PixelSpacing=[[6000.0] * 2] * len(p)), "mm, which no CT does; correct PixelSpacing"),
     (lacking, "slice005.dcm lacks RescaleIntercept"),
     (lambda p: edit(p[9:10], PixelSpacing=[6.0]), "slice009.dcm: PixelSpacing must be 2 finite numbers"),
     (lambda p: p[7].write_bytes(p[7].read_bytes()[:1500]), "slice007.dcm cannot be read"),
     (lambda p: edit(p, ImageType=[["ORIGINAL", "PRIMARY", "LOCALIZER"]] * len(p)), "only localizer"),
     (lambda p: edit(p, NumberOfFrames=[2] * len(p)), "multi-frame")],
-    ids=["3 slices", "gap", "gaps", "twice", "uneven", "tilt", "pixels", "no rescale", "one spacing",
-         "cut", "localizer", "frames"])
+    ids=["3 slices", "gap", "gaps", "twice", "uneven", "tilt", "pixels", "metres", "micrometres", "no rescale",
+         "one spacing", "cut", "localizer", "frames"])
 def test_a_bad_series_is_rejected_with_its_reason(tmp_path, thorax, spoil, reason):
     spoil(write_ct_series(tmp_path / "in/s", thorax, AFFINE))
     (found,) = rejected(tmp_path / "in", tmp_path / "out")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import re
+import struct
 
 import nibabel
 import numpy as np
@@ -16,7 +17,8 @@ from PIL import Image
 from phydict.datasets.intensity import Intensity
 from phydict.datasets.radiographs import xray_description
 from phydict.datasets.radiographs.radiographs import find_xrays, load_xrays, save_xrays
-from phydict.datasets.radiographs.xray_description import Orientation, read_description
+from phydict.datasets.radiographs.xray_description import Orientation, read_description, save_geometry
+from phydict.datasets.radiographs.xray_images import read_image
 from phydict.xray.geometry import ConeBeam
 from phydict.xray.geometry_files import write_beam
 from phydict.xray.poses.uncertain import Uncertain
@@ -105,9 +107,29 @@ def test_saving_that_fails_leaves_the_old_case_whole(tmp_path, monkeypatch, png)
     assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
 
 
-def test_saving_checks_the_xrays_against_the_beam(tmp_path):
-    with pytest.raises(ValueError, match=r"\(3, 6, 5\) were given for a beam .* \(2, 6, 5\)"):
-        save_xrays(tmp_path, images(3), ConeBeam.orbit(2, 1020, 740, SHAPE, 70))
+@pytest.mark.parametrize("xrays, sentence", [
+    (images(3), r"\(3, 6, 5\) were given for a beam .* \(2, 6, 5\)"),
+    (images() * 1000, r"reach 5.\d+e\+03, but line integrals behind a patient .* in 1/mm along mm"),
+    (images() - 7, "have a median of -3.* but line integrals behind a patient lie between 0 and about 10"),
+    (np.concatenate([images(1), np.ones((1, *SHAPE))]), "view 1 shows nothing")])
+def test_what_would_not_be_read_back_is_not_written(tmp_path, xrays, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        save_xrays(tmp_path / "case", xrays, ConeBeam.orbit(2, 1020, 740, SHAPE, 70))
+    assert not (tmp_path / "case").exists()
+
+
+@pytest.mark.parametrize("beam", [None, "case", torch.zeros(2, *SHAPE)])
+def test_saving_names_the_order_of_what_it_takes(tmp_path, beam):
+    with pytest.raises(ValueError, match="takes a folder, X-rays and a ConeBeam, in that order, but") as caught:
+        save_xrays(tmp_path / "case", images(), beam)
+    assert "\n" not in str(caught.value) and not (tmp_path / "case").exists()
+
+
+@pytest.mark.parametrize("kind", [torch.bfloat16, torch.float16, torch.float64])
+def test_tensors_of_any_precision_are_saved_with_or_without_a_gradient(tmp_path, kind):
+    xrays = torch.from_numpy(images()).to(kind).requires_grad_()
+    save_xrays(tmp_path, xrays, ConeBeam.orbit(2, 1020, 740, SHAPE, 70))
+    assert load_xrays(tmp_path)["xrays"].equal(xrays.detach().float())
 
 
 @pytest.mark.parametrize("blocks", [{"orbit": ORBIT}, {"beam": {"orbit": ORBIT}},
@@ -140,6 +162,22 @@ def test_a_tiff_whose_least_value_is_white_is_turned_over(tmp_path):
     scaled = {"kind": "line_integrals", "scale": 1e-4}
     (tmp_path / "geometry.yaml").write_text(yaml.safe_dump({"orbit": ORBIT, "intensity": scaled}))
     np.testing.assert_allclose(load_xrays(tmp_path)["xrays"][1].numpy(), 1e-4 * (65535.0 - pixels), rtol=1e-5)
+
+
+def colour_tiff(grey):
+    """A TIFF of three equal channels of 16 bits, which Pillow reads and does not write."""
+    size, bits = 3 * grey.nbytes, 10 + 12 * 9 + 4
+    tags = [(256, 3, 1, grey.shape[1]), (257, 3, 1, grey.shape[0]), (258, 3, 3, bits), (259, 3, 1, 1), (262, 3, 1, 2),
+            (273, 4, 1, bits + 6), (277, 3, 1, 3), (278, 3, 1, grey.shape[0]), (279, 4, 1, size)]
+    head = struct.pack("<2sHIH", b"II", 42, 8, len(tags)) + b"".join(struct.pack("<HHII", *tag) for tag in tags)
+    return head + struct.pack("<I3H", 0, 16, 16, 16) + np.repeat(grey[..., None], 3, -1).astype("<u2").tobytes()
+
+
+def test_colour_of_16_bits_is_refused_where_it_would_be_cut_to_8(tmp_path):
+    folder = write(tmp_path, np.ones((2, *SHAPE), np.uint8), "tif")
+    (folder / "view_1.tif").write_bytes(colour_tiff(np.full(SHAPE, 50_000, np.uint16)))
+    assert Image.open(folder / "view_1.tif").getpixel((0, 0)) == (195,) * 3
+    fails("view_1.tif cannot be read .16-bit colour would be cut to 8 bit; store it as 16-bit grey", folder)
 
 
 def test_floating_point_tiffs_are_line_integrals(tmp_path):
@@ -291,6 +329,22 @@ def test_a_geometry_file_of_another_program_gives_the_same_beam(tmp_path, ending
         assert load_xrays(folder, geometry=tmp_path / f"beam.{ending}")["beam"].same_as(beam)
 
 
+@pytest.mark.parametrize("place", [(0,), (1,), (2,), (0, 1), (2, 3)])
+def test_a_nifti_image_is_the_same_wherever_it_has_axes_of_length_1(tmp_path, place):
+    folder = write(tmp_path, images())
+    for k, image in enumerate(images()):
+        (folder / f"view_{k}.npy").unlink()
+        nibabel.save(nibabel.Nifti1Image(np.expand_dims(image.T, place), np.eye(4)), folder / f"view_{k}.nii.gz")
+    assert (load_xrays(folder)["xrays"].numpy() == images()).all()
+
+
+def test_a_nifti_image_may_be_one_pixel_wide(tmp_path):
+    for side in ((1, 6), (6, 1)):
+        stored = np.arange(6.0).reshape(*side)
+        nibabel.save(nibabel.Nifti1Image(stored[..., None], np.eye(4)), tmp_path / "v.nii")
+        assert (read_image(tmp_path / "v.nii") == stored.T).all()
+
+
 def test_rgba_with_equal_channels_is_grey(tmp_path):
     grey = np.arange(60, dtype=np.uint8).reshape(2, *SHAPE)
     rgba = np.concatenate([np.repeat(grey[..., None], 3, -1), np.full((2, *SHAPE, 1), 255, np.uint8)], -1)
@@ -307,6 +361,16 @@ def test_a_shared_geometry_and_an_intensity_argument_replace_the_folders_own(tmp
     shared.write_text(yaml.safe_dump({"orbit": ORBIT}))
     case = load_xrays(folder, geometry=shared, intensity=Intensity("line_integrals", scale=0.5))
     assert (case["xrays"].numpy() == 0.5 * stored).all()
+
+
+def test_what_water_attenuates_is_read_and_kept_beside_a_geometry_that_was_found(tmp_path):
+    folder = write(tmp_path / "case", images(), orbit=ORBIT, mu_water=0.0222)
+    case = load_xrays(folder)
+    assert case["mu_water"] == 0.0222 and "mu_water" not in load_xrays(write(tmp_path / "other", images()))
+    save_geometry(folder / "geometry.yaml", case["beam"], case["description"])
+    assert load_xrays(folder)["mu_water"] == 0.0222
+    for bad in (0.2, "water", True):
+        fails("what water attenuates in 1/mm", write(tmp_path / "bad", images(), orbit=ORBIT, mu_water=bad))
 
 
 def test_find_xrays_takes_a_case_or_a_folder_of_cases(tmp_path):
@@ -353,6 +417,8 @@ def test_missing_things_are_named(tmp_path):
     ({"orbit": ORBIT, "intensity": {"kind": "counts", "air": 5, "flat": "a.png"}}, "both were given"),
     ({"orbit": ORBIT, "intensity": {"kind": "counts", "flat": 5}}, "`flat` is the name of an image"),
     ({"orbit": ORBIT, "intensity": {"kind": "display", "bright_is_dense": True, "air": 5}}, "`air` belongs to"),
+    ({"orbit": ORBIT, "intensity": {"kind": "counts", "air": 5, "scale": 0.5}}, "`scale` belongs to .* line_integrals"),
+    ({"orbit": ORBIT, "intensity": {"kind": "line_integrals", "bright_is_dense": True}}, "belongs to .* display"),
     ({"beam": {"file": "a.xml", "spacing": 1}}, "unknown key 'spacing' in `beam:`; the keys are file, pixel"),
     ({"beam": {"dicom": {"pixel": [1, 1]}}}, "the images are not DICOM"),
     ({"beam": 3}, "`beam:` must be a mapping"),

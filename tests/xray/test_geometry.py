@@ -137,6 +137,21 @@ def test_bad_orbits_are_refused_with_a_reason(arguments, sentence):
         ConeBeam.orbit(*arguments)
 
 
+@pytest.mark.parametrize("make, sentence", [
+    (lambda: ConeBeam.orbit(8, "1020", 740, (3, 3), 1), "source_to_detector is a number .* but '1020' was given"),
+    (lambda: ConeBeam.orbit(8, None, 740, (3, 3), 1), "source_to_detector is a number .* but None was given"),
+    (lambda: ConeBeam.orbit(8, 1020, [740], (3, 3), 1), "source_to_isocentre is one number, but .740. was given"),
+    (lambda: orbit(start_degrees="9"), "start_degrees is a number .* but '9' was given"),
+    (lambda: orbit(arc="9"), "arc is a number .* but '9' was given"),
+    (lambda: ConeBeam.at_angles([0, 90], 1020, "740", (3, 3), 1), "source_to_isocentre is a number .* but '740'"),
+    (lambda: ConeBeam.sweep(8, 1020, 740, (3, 3), 1, "40"), "sweep_degrees is a number .* but '40' was given"),
+    (lambda: orbit().tilted("5"), "tilt_degrees is a number .* but '5' was given"),
+    (lambda: orbit().shifted(None), "rows is a number .* but None was given")])
+def test_text_and_nothing_in_the_place_of_a_number_are_named(make, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        make()
+
+
 def test_a_detector_inside_the_volume_is_refused_with_both_distances():
     beam = ConeBeam.orbit(1, 1020, 950, (8, 8), 1)
     with pytest.raises(ValueError, match=r"detector lies inside.*950\.0 mm.*70\.0 mm.*reaches 128\.0 mm"):

@@ -150,6 +150,31 @@ def test_named_columns_come_in_any_order(tmp_path):
     assert read_beam(tmp_path / "views.csv", SHAPE).same_as(beam, 1e-9)
 
 
+@pytest.mark.parametrize("separator, quote, names", [
+    (",", '"', None), (",", "'", None), (" ", '"', None),
+    (",", "", [",", "0,", "1,", "2,"]), (",", '"', ['"",', '"1",', '"2",', '"3",']),
+    ("\t", "", ["", "0\t", "1\t", "2\t"]), (" ", '"', ["", '"1" ', '"2" ', '"3" ']),
+    (",", '"', ["number,name,", '1,"first",', "2,second,", "3,,"])],
+    ids=["quotes", "single quotes", "spaces", "pandas", "R", "pandas, tabs", "R, spaces", "other columns"])
+def test_a_table_of_another_program_is_read_by_its_names(tmp_path, separator, quote, names):
+    rows = np.concatenate([orbit(3).sources, orbit(3).detectors, orbit(3).u, orbit(3).v], 1)
+    lines = [separator.join(f"{quote}{name}{quote}" for name in COLUMNS),
+             *(separator.join(map(repr, row.tolist())) for row in rows)]
+    text = "\n".join(name + line for name, line in zip(names or [""] * 4, lines))
+    (tmp_path / "views.csv").write_text(text)
+    assert read_beam(tmp_path / "views.csv", SHAPE).same_as(orbit(3), 1e-9)
+
+
+@pytest.mark.parametrize("separator", [";", "\t", "; "])
+@pytest.mark.parametrize("header", [True, False])
+def test_decimal_commas_are_told_as_such(tmp_path, separator, header):
+    write_beam(tmp_path / "a.csv", orbit(3))
+    lines = (tmp_path / "a.csv").read_text().replace(",", separator).replace(".", ",").splitlines()
+    (tmp_path / "a.csv").write_text("\n".join(lines[0 if header else 1:]))
+    with pytest.raises(ValueError, match="a.csv: view 0 has decimal commas; write its numbers with decimal points"):
+        read_beam(tmp_path / "a.csv", SHAPE)
+
+
 @pytest.mark.parametrize("views, options, sentence", [
     (["<GantryAngle>0</GantryAngle>"], {"head": ""}, "no SourceToIsocenterDistance, SourceToDetectorDistance"),
     (["<GantryAngle>0</GantryAngle><SourceToDetectorDistance>0</SourceToDetectorDistance>"], {},
@@ -185,6 +210,7 @@ def test_a_beam_and_a_path_in_each_others_place_are_told_their_order(tmp_path, w
 @pytest.mark.parametrize("name, text, sentence", [
     ("a.csv", "source_x,source_y\n1,2\n", "no column source_z, detector_x"),
     ("a.csv", "1,2,3\n", "view 0 has 3 values, but 12"),
+    ("a.csv", ",".join(COLUMNS) + "\n" + ",".join(["7"] * 13), "view 0 has 13 values, but 12"),
     ("a.csv", ",".join(["1"] * 11 + ["many"]), "'many'"),
     ("a.csv", "", r"shape \(0, 12\), but 12 per view"),
     ("a.csv", ",".join(["0"] * 12), "one of 0 mm"),

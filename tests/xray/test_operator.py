@@ -117,6 +117,13 @@ def test_selecting_views_and_batching_change_nothing(method):
 
 
 @pytest.mark.parametrize("method", METHODS)
+def test_a_batch_of_no_case_gives_none(method):
+    A = Projector(Grid.cube(8), BEAM, method)
+    assert A(torch.zeros(0, 1, 8, 8, 8)).shape == (0, BEAM.views, *BEAM.shape)
+    assert A.T(torch.zeros(0, BEAM.views, *BEAM.shape)).shape == (0, 1, 8, 8, 8)
+
+
+@pytest.mark.parametrize("method", METHODS)
 def test_float32_agrees_with_float64(method):
     A = Projector(Grid.cube(16), BEAM, method)
     mu = random_like((1, 1, 16, 16, 16)).abs()
@@ -297,6 +304,8 @@ def test_bad_input_is_told_what_was_expected():
         A(torch.zeros(8, 8, 8))
     with pytest.raises(ValueError, match=r"xrays must be \(batch, 3, 14, 18\)"):
         A.T(torch.zeros(1, 3, 18, 14))
+    with pytest.raises(ValueError, match="mu must be a tensor, but a ndarray was given; convert it by torch.as_ten"):
+        A(np.zeros((1, 1, 8, 8, 8), np.float32))
     with pytest.raises(ValueError, match="float32 or float64, but torch.float16"):
         A(torch.zeros(1, 1, 8, 8, 8, dtype=torch.float16))
     with pytest.raises(ValueError, match="detector lies inside"):

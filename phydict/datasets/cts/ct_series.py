@@ -15,12 +15,13 @@ import numpy as np
 import pydicom
 from pydicom.errors import InvalidDicomError
 
-from phydict.datasets.cts.transforms import LEAST_SLICES, to_ras
+from phydict.datasets.cts.transforms import LEAST_SLICES, check_affine, to_ras
 from phydict.datasets.dicom import open_dicom, read_dicom, tag_numbers
 from phydict.datasets.natural_order import natural_order
 from phydict.datasets.nifti_file import NIFTI
 from phydict.runtime.files import files_below
 from phydict.runtime.reading import reading
+from phydict.units import AIR
 
 NEEDED = {"Rows": 1, "Columns": 1, "ImagePositionPatient": 3, "ImageOrientationPatient": 6, "PixelSpacing": 2,
           "RescaleSlope": 1, "RescaleIntercept": 1}
@@ -77,7 +78,7 @@ def load_series(series: Series) -> tuple[np.ndarray, np.ndarray]:
         raise ValueError(f"it has {len(headers)} slices, but a chest CT has at least {LEAST_SLICES}; "
                          "give the whole series")
     paths, affine = _stack({path: _geometry(path, header) for path, header in headers.items()})
-    volume = np.stack([read_dicom(path)[0][0].T.astype(np.float32) for path in paths], axis=2)
+    volume = np.stack([read_dicom(path, AIR)[0][0].T.astype(np.float32) for path in paths], axis=2)
     return to_ras(volume, affine)
 
 
@@ -121,6 +122,7 @@ def _stack(slices: dict[Path, dict[str, np.ndarray]]) -> tuple[list[Path], np.nd
     row_mm, column_mm = first["PixelSpacing"]
     affine = np.eye(4)
     affine[:3] = np.diag([-1.0, -1.0, 1.0]) @ np.stack([across * column_mm, down * row_mm, step, positions[0]], axis=1)
+    check_affine("it", affine, "correct PixelSpacing and ImagePositionPatient, or export the series again")
     return paths, affine
 
 

@@ -17,7 +17,7 @@ from phydict.datasets.case import Case
 from phydict.datasets.cts.anatomy import lung_box_centre, segment
 from phydict.datasets.itk_file import ENDINGS, open_itk, read_itk
 from phydict.datasets.nifti_file import NIFTI, open_nifti
-from phydict.grid import Grid
+from phydict.grid import Grid, index_to_mm
 from phydict.runtime.reading import name_of, reading
 from phydict.runtime.warning import warn
 from phydict.units import AIR, HUWindow
@@ -25,8 +25,8 @@ from phydict.units import AIR, HUWindow
 SEGMENTATION_MM = 2.0
 PADDING = AIR - 100
 """HU from which downwards voxels are no noisy air, but padding outside the scanner's circular field."""
-LARGEST_VOXEL, FURTHEST = 100.0, 1e6
-"""mm that no voxel's side and no CT's distance from its origin reach."""
+SMALLEST_VOXEL, LARGEST_VOXEL, FURTHEST = 0.02, 100.0, 1e6
+"""mm between which every voxel's side lies, and that no CT's distance from its origin reaches."""
 LEAST_SLICES = 8
 """Fewer are a scout or a test image, from which no lungs can be found."""
 
@@ -68,9 +68,7 @@ def load_ct(path: str | Path, calibration: Calibration | None = None) -> tuple[n
     if calibration is not None:
         hu, affine = hu * np.float32(calibration.slope) + np.float32(calibration.intercept), calibration.affine()
     hu, affine = to_ras(hu, affine)
-    bad = hu.size - int(np.isfinite(hu).sum())
-    if bad:
-        raise ValueError(f"{path} holds {bad} NaN or infinite voxels; replace them, by -1000 HU where there is no data")
+    _check_finite(path, hu)
     return hu, affine
 
 
@@ -90,7 +88,7 @@ def _load_itk(path: Path) -> tuple[np.ndarray, np.ndarray]:
     with reading(path, "convert it to NIfTI, or download it, again"):
         stored, affine = read_itk(path)
     _check_shape(path, stored.shape)
-    _check_affine(path, affine, "convert it from DICOM again")
+    check_affine(path, affine, "convert it from DICOM again")
     return np.array(stored, np.float32), affine
 
 
@@ -128,37 +126,45 @@ def _check_header(path: Path, header, calibration: Calibration | None) -> None:
     shape = _volume_shape(header)
     _check_shape(path, shape)
     if calibration is not None:
-        return _check_affine(path, calibration.affine(), "correct it in the metadata table")
+        return check_affine(path, calibration.affine(), "correct it in the metadata table")
     codes = [int(header[name]) for name in ("sform_code", "qform_code") if name in header]
     if not any(codes):
         raise ValueError(f"{path} does not say how the patient lies (neither sform nor qform is set); convert it from "
                          "DICOM again, or read CT-RATE v1 files with data.source.fixed false and their metadata table")
     affine = header.get_best_affine()
     axes = affine[:3, :3]
-    _check_affine(path, affine, "convert it from DICOM again")
+    check_affine(path, affine, "convert it from DICOM again")
     if np.allclose(axes, np.eye(3)) and shape[0] >= 512:
         warn(f"{path} has the blank header of CT-RATE v1 (1 mm voxels, identity axes); "
              "read such files with data.source.fixed false and their metadata table")
 
 
-def _check_shape(path: Path, shape: tuple[int, ...]) -> None:
+def _check_shape(name: str | Path, shape: tuple[int, ...]) -> None:
     if len(shape) != 3:
-        raise ValueError(f"{path} is {len(shape)}D with shape {tuple(shape)}; give one 3D volume per file")
+        raise ValueError(f"{name} is {len(shape)}D with shape {tuple(shape)}; give one 3D volume per file")
     if min(shape) < 2:
-        raise ValueError(f"{path} is a single 2D slice with shape {tuple(shape)}; give a 3D volume")
+        raise ValueError(f"{name} is a single 2D slice with shape {tuple(shape)}; give a 3D volume")
     if min(shape) < LEAST_SLICES:
-        raise ValueError(f"{path} has {min(shape)} slices (its shape is {tuple(shape)}), but a chest CT has at least "
+        raise ValueError(f"{name} has {min(shape)} slices (its shape is {tuple(shape)}), but a chest CT has at least "
                          f"{LEAST_SLICES}; give the whole series")
 
 
-def _check_affine(path: Path, affine: np.ndarray, advice: str) -> None:
-    """Raises ValueError unless a 4x4 affine gives voxels a volume, no larger and no further away than a CT's."""
+def check_affine(name: str | Path, affine: np.ndarray, advice: str) -> None:
+    """Raises ValueError unless a 4x4 affine gives voxels a volume, and sides and a place as a CT's."""
     axes = affine[:3, :3]
-    if not np.isfinite(axes).all() or abs(np.linalg.det(axes)) < 1e-6:
-        raise ValueError(f"{path} has voxels without volume (affine {axes.tolist()}); {advice}")
-    if not (np.abs(affine[:3]) < FURTHEST).all() or np.linalg.norm(axes, axis=0).max() > LARGEST_VOXEL:
-        raise ValueError(f"{path} has voxels of {np.linalg.norm(axes, axis=0).max():g} mm, or lies at "
+    longest = np.abs(axes).max(axis=0)
+    if not (np.isfinite(axes).all() and longest.all() and abs(np.linalg.det(axes / longest)) > 1e-6):
+        raise ValueError(f"{name} has voxels without volume (affine {axes.tolist()}); {advice}")
+    sides = np.linalg.norm(axes, axis=0)
+    if not ((np.abs(affine[:3]) < FURTHEST).all() and SMALLEST_VOXEL <= sides.min() <= sides.max() <= LARGEST_VOXEL):
+        raise ValueError(f"{name} has voxels of {' x '.join(f'{side:g}' for side in sides)} mm, or lies at "
                          f"{affine[:3, 3].tolist()} mm, which no CT does; {advice}")
+
+
+def _check_finite(name: str | Path, hu: np.ndarray) -> None:
+    bad = hu.size - int(np.isfinite(hu).sum())
+    if bad:
+        raise ValueError(f"{name} holds {bad} NaN or infinite voxels; replace them, by -1000 HU where there is no data")
 
 
 def check_hu(hu: np.ndarray, name: str) -> None:
@@ -257,6 +263,20 @@ def case_id(path: str | Path) -> str:
     return name
 
 
+def _given_ct(ct: tuple, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """HU (X, Y, Z) float32 and the 4x4 affine of arrays or tensors. Raises ValueError as `load_ct` does of a file."""
+    if [np.ndim(part) for part in ct] != [3, 2]:
+        raise ValueError("a CT is a file, or HU (X, Y, Z) and the 4x4 affine that says where they are")
+    hu, affine = (np.asarray(part.detach().cpu().double() if isinstance(part, torch.Tensor) else part) for part in ct)
+    if hu.dtype.kind not in "iuf":
+        raise ValueError(f"{name} holds voxels of type {hu.dtype}; give integers or floating-point numbers")
+    _check_shape(name, hu.shape)
+    affine = index_to_mm(f"the affine of {name}", affine)
+    check_affine(name, affine, "give an affine that leads from voxel indices to mm")
+    _check_finite(name, hu)
+    return hu.astype(np.float32, copy=False), affine
+
+
 def prepare_ct(ct: str | Path | tuple[np.ndarray, np.ndarray], grid: Grid = Grid.cube(64),
                window: HUWindow = HUWindow(), report: str = "", id: str | None = None,
                calibration: Calibration | None = None) -> Case:
@@ -266,10 +286,8 @@ def prepare_ct(ct: str | Path | tuple[np.ndarray, np.ndarray], grid: Grid = Grid
     "report", "affine" (4,4) float64: the voxels' place in the CT's own world, "centred_on": "lungs" or "volume"}.
     Without lungs the box is centred on the scan, with a warning. Raises what `load_ct` raises.
     """
-    if isinstance(ct, tuple) and [np.ndim(part) for part in ct] != [3, 2]:
-        raise ValueError("a CT is a file, or HU (X, Y, Z) and the 4x4 affine that says where they are")
-    hu, affine = ct if isinstance(ct, tuple) else load_ct(ct, calibration)
     name = id or ("the CT" if isinstance(ct, tuple) else case_id(ct))
+    hu, affine = _given_ct(ct, name) if isinstance(ct, tuple) else load_ct(ct, calibration)
     check_hu(hu, name)
     hu = hu.clip(AIR)
     work = covering_grid(hu.shape, affine, SEGMENTATION_MM)

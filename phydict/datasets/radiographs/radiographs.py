@@ -8,8 +8,10 @@ DICOM with one or more frames, in the natural order of their names: view_2 comes
 from __future__ import annotations
 
 import os
+import reprlib
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -19,13 +21,13 @@ from PIL import Image
 
 from phydict.datasets.case import Case
 from phydict.datasets.dicom import DicomTags, read_dicom, shown, tags_intensity
-from phydict.datasets.intensity import KINDS, Intensity
+from phydict.datasets.intensity import KINDS, LARGEST_LINE_INTEGRAL, Intensity
 from phydict.datasets.natural_order import natural_order
 from phydict.datasets.radiographs.xray_description import GEOMETRY, Description, read_description
 from phydict.datasets.radiographs.xray_images import ENDINGS, image_files, is_dicom, read_image
 from phydict.datasets.reports import format_report
 from phydict.runtime.files import atomic_write
-from phydict.runtime.reading import name_of, read_text
+from phydict.runtime.reading import name_of, one_line, read_text
 from phydict.runtime.shipped import own_or_shipped
 from phydict.xray.geometry import ConeBeam
 
@@ -60,9 +62,10 @@ def load_xrays(folder: str | Path, geometry: str | Path | None = None, intensity
     `phydict.xray.geometry_files` reads. intensity: used instead of the YAML's block. Without either, DICOM's tags
     decide, other floating-point images are taken as line integrals, and integer images are refused.
     Returns {"id": folder name, "xrays": (K,V,U) float32, "beam": ConeBeam, "report": str, "display": bool,
-    "uncertain": Uncertain or None, "description": Description}; with display True, the X-rays are display values whose
-    gain and offset per view are unknown; uncertain: what the geometry file is not sure of, or, where CR and DX tags
-    state the beam and no file says it, `by_hand`; description: all that the file says.
+    "uncertain": Uncertain or None, "description": Description}, and "mu_water" where the geometry file says it; with
+    display True, the X-rays are display values whose gain and offset per view are unknown; uncertain: what the geometry
+    file is not sure of, or, where CR and DX tags state the beam and no file says it, `by_hand`; description: all that
+    the file says.
     Raises FileNotFoundError for a missing folder, geometry or images, ValueError for everything that does not fit.
     """
     folder = own_or_shipped(folder)
@@ -74,7 +77,7 @@ def load_xrays(folder: str | Path, geometry: str | Path | None = None, intensity
     described = read_description(source, needed=geometry is not None or not tagged) if files else Description(source)
     intensity = intensity or described.intensity
     references = described.reference_files(intensity)
-    apart = {path.resolve() for paths in references.values() for path in paths}
+    apart = {path.resolve() for path in chain(described.named_files(), *references.values())}
     views = _read_views([file for file in files if file.resolve() not in apart])
     if not views.images:
         raise FileNotFoundError(f"{folder} holds no X-ray image; put one of {', '.join(ENDINGS)} per view there")
@@ -97,15 +100,14 @@ def load_xrays(folder: str | Path, geometry: str | Path | None = None, intensity
         xrays = intensity.line_integrals(np.stack(views.images).astype(np.float64), views.full_scale, flat_and_dark)
     except ValueError as error:
         raise ValueError(f"{folder}: {error}") from error
-    saturated = (xrays == xrays.max((1, 2), keepdims=True)).mean((1, 2)) >= SATURATED
-    if saturated.any():
-        raise ValueError(f"{views.names[saturated.argmax()]} shows nothing: {SATURATED:.0%} of its pixels or more hold "
-                         "its densest value, as in a missing or saturated image; export it again, or leave the view "
-                         "out of the images and of the geometry")
-    return {"id": name_of(folder.absolute()), "beam": beam, "report": _read_report(folder / REPORT),
+    _check_saturation(views.names, xrays)
+    case: Case = {"id": name_of(folder.absolute()), "beam": beam, "report": _read_report(folder / REPORT),
             "xrays": torch.from_numpy(described.orientation.apply(xrays).astype(np.float32)),
             "display": intensity.kind == "display", "uncertain": described.uncertain_of(beam, views.tags),
             "description": described}
+    if described.mu_water is not None:
+        case["mu_water"] = described.mu_water
+    return case
 
 
 def case_files(folder: Path, geometry: Path | None = None) -> list[Path]:
@@ -124,15 +126,25 @@ def save_xrays(folder: str | Path, xrays: torch.Tensor | np.ndarray, beam: ConeB
 
     `load_xrays` reads them back: NPY as float32 exactly, PNG to half a step of range / 65535.
     overwrite: whether a case that lies there is replaced, its report included.
-    Raises ValueError where the X-rays do not fit the beam, FileExistsError where other images lie in the folder, or a
-    case that is not to be replaced.
+    Raises ValueError where the X-rays do not fit the beam or would not be read back, FileExistsError where other images
+    lie in the folder, or a case that is not to be replaced.
     """
+    if not isinstance(beam, ConeBeam):
+        raise ValueError("save_xrays takes a folder, X-rays and a ConeBeam, in that order, but "
+                         f"{one_line(reprlib.repr(beam))} was given as the beam")
+    if isinstance(xrays, torch.Tensor):
+        xrays = xrays.detach().float().cpu().numpy()
     xrays = np.asarray(xrays, np.float32)
     if xrays.shape != (beam.views, *beam.shape):
         raise ValueError(f"X-rays of shape {xrays.shape} were given for a beam of (views, rows, columns) "
                          f"{(beam.views, *beam.shape)}; give the X-rays of this beam")
     if not np.isfinite(xrays).all():
         raise ValueError("the X-rays hold NaN or infinite values; give finite line integrals")
+    if xrays.max() > LARGEST_LINE_INTEGRAL or np.median(xrays) < 0:
+        raise ValueError(f"the X-rays have a median of {np.median(xrays):.3g} and reach {xrays.max():.3g}, but line "
+                         "integrals behind a patient lie between 0 and about 10; give those of attenuation in 1/mm "
+                         "along mm")
+    _check_saturation([f"view {k}" for k in range(beam.views)], xrays)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     names = [f"view_{k}.{'png' if png else 'npy'}" for k in range(beam.views)]
@@ -162,6 +174,15 @@ def save_xrays(folder: str | Path, xrays: torch.Tensor | np.ndarray, beam: ConeB
             part(REPORT).write_text(report + "\n", encoding="utf-8")
     if not report:
         (folder / REPORT).unlink(missing_ok=True)
+
+
+def _check_saturation(names: list[str], xrays: np.ndarray) -> None:
+    """Raises ValueError, with its name, where a view of line integrals (K, V, U) shows nothing."""
+    saturated = (xrays == xrays.max((1, 2), keepdims=True)).mean((1, 2)) >= SATURATED
+    if saturated.any():
+        raise ValueError(f"{names[saturated.argmax()]} shows nothing: {SATURATED:.0%} of its pixels or more hold "
+                         "its densest value, as in a missing or saturated image; export it again, or leave the view "
+                         "out of the images and of the geometry")
 
 
 def _check_count(folder: Path, source: Path, images: int, views: int | None) -> None:

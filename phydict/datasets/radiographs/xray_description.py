@@ -3,7 +3,7 @@
     beam:                                                # ConeBeam's YAML, which may also stand at the top level
       orbit: {views: 8, source_to_detector: 1020.0, source_to_isocentre: 740.0, shape: [448, 448], pixel: [1.25, 1.25]}
     # beam: {file: geometry.xml, pixel: [1.25, 1.25]}    # a file that phydict.xray.geometry_files reads, beside this
-    #                                                    # one; pixel is for RTK's XML alone
+    #                                                    # one; pixel is for RTK's XML and matrices
     # beam: {dicom: {source_to_isocentre: 765.0}}        # values used instead of tags; see
     #                                                    # phydict.datasets.radiographs.dicom_beam
     intensity: {kind: counts, air: 50000}                # see phydict.datasets.intensity
@@ -11,6 +11,7 @@
     uncertain: {detector_shift_mm: 5, rotation_degrees: 2}    # what is not exactly known, for --calibrate; see
     #                                                         # phydict.xray.poses.uncertain
     continued: true                                      # the patient continues above and below the volume
+    mu_water: 0.0206                                     # 1/mm that water attenuates in these X-rays
 
 Without `beam:` the tags of DICOM images decide. Rotation is clockwise, in quarters, and comes before the flips. The
 beam, wherever it comes from, is that of the images once they are turned.
@@ -35,6 +36,9 @@ from phydict.xray.geometry_files import read_beam
 from phydict.xray.poses.uncertain import Uncertain, by_hand
 
 GEOMETRY = "geometry.yaml"
+
+WATER = (0.005, 0.1)
+"""1/mm that water attenuates from 20 keV to 1 MeV, and some more."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +75,8 @@ class Orientation:
 @dataclass(frozen=True)
 class Description:
     """What one geometry file says. source: the file; beam: its mapping, None where the tags of DICOM images decide;
-    continued: as ConeBeam's, whatever states the beam; None: as the beam says."""
+    continued: as ConeBeam's, whatever states the beam; None: as the beam says; mu_water: what water attenuates in 1/mm,
+    None where a method's own is taken."""
 
     source: Path
     beam: dict | None = None
@@ -79,6 +84,7 @@ class Description:
     orientation: Orientation = Orientation()
     uncertain: Uncertain | None = None
     continued: bool | None = None
+    mu_water: float | None = None
 
     @property
     def views(self) -> int | None:
@@ -152,16 +158,20 @@ def read_description(path: Path, needed: bool = True) -> Description:
         return Description(path, {"file": path.name})
     content = read_yaml(path)
     if not isinstance(content, dict):
-        raise ValueError(f"{path} must hold `beam:`, and may hold `intensity:`, `orientation:`, `uncertain:` and "
-                         "`continued:`")
+        raise ValueError(f"{path} must hold `beam:`, and may hold `intensity:`, `orientation:`, `uncertain:`, "
+                         "`continued:` and `mu_water:`")
     intensity, orientation = content.pop("intensity", None) or {}, content.pop("orientation", None) or {}
     uncertain, continued = content.pop("uncertain", None), content.pop("continued", None)
     if not isinstance(continued, bool | None):
         raise ValueError(f"{path}: `continued:` is true or false, but {reprlib.repr(continued)} was found")
+    if not isinstance(mu_water := content.pop("mu_water", None), float | None) or not (
+            mu_water is None or WATER[0] < mu_water < WATER[1]):
+        raise ValueError(f"{path}: `mu_water:` is what water attenuates in 1/mm, between {WATER[0]} and {WATER[1]}, "
+                         f"but {reprlib.repr(mu_water)} was found")
     if "beam" in content and len(content) > 1:
         unknown = [reprlib.repr(key) for key in content if key != "beam"]
         raise ValueError(f"{path}: unknown key {', '.join(unknown)}; the keys are beam, intensity, orientation, "
-                         "uncertain, continued")
+                         "uncertain, continued, mu_water")
     beam = content.get("beam", content or None)
     _check_beam(path, beam)
     for block, value, kind in (("intensity", intensity, Intensity), ("orientation", orientation, Orientation)):
@@ -174,7 +184,7 @@ def read_description(path: Path, needed: bool = True) -> Description:
         raise ValueError(f"{path}: `intensity:` needs `kind`, one of {', '.join(KINDS)}")
     try:
         return Description(path, beam, Intensity(**intensity) if intensity else None, Orientation(**orientation),
-                           None if uncertain is None else Uncertain.from_dict(uncertain), continued)
+                           None if uncertain is None else Uncertain.from_dict(uncertain), continued, mu_water)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
@@ -190,6 +200,8 @@ def save_geometry(path: Path, beam: ConeBeam, described: Description | None = No
                                 if value != getattr(Intensity, name, None)}
     if described:
         content["orientation"] = vars(described.orientation)
+        if described.mu_water is not None:
+            content["mu_water"] = described.mu_water
     with atomic_write(path) as part:
         part.write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
 

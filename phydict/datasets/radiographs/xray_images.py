@@ -16,9 +16,10 @@ from phydict.runtime.reading import MOST_SQUEEZED, check_held, read_npy, reading
 DICOM = (".dcm", ".dicom", ".ima")
 ENDINGS = (".png", ".tif", ".tiff", ".npy", *NIFTI, *DICOM)
 GREY = ("L", "I;16", "I;16B", "I;16L", "I", "F")
+CUT = "16-bit colour would be cut to 8 bit; store it as 16-bit grey"
 
-PHOTOMETRIC = 262
-"""The tag of a TIFF that is 0 where its least value is shown white."""
+BITS, PHOTOMETRIC = 258, 262
+"""Tags of a TIFF: the bits of each channel, and what is 0 where its least value is shown white."""
 
 
 def image_files(folder: Path) -> list[Path]:
@@ -73,16 +74,19 @@ def _checked(image: np.ndarray, path: Path) -> np.ndarray:
 
 
 def _read_nifti(path: Path) -> np.ndarray:
-    """An image (U, V) with any number of axes of length 1 behind, as (V, U); other shapes as they are."""
+    """An image (U, V) with any number of axes of length 1 beside, as (V, U); other shapes without such axes."""
     image = np.asarray(open_nifti(path).dataobj)
-    return image.reshape(image.shape[:2]).T if image.size == np.prod(image.shape[:2]) else image
+    for axis in reversed(range(image.ndim)):
+        if image.ndim > 2 and image.shape[axis] == 1:
+            image = image.squeeze(axis)
+    return image.T if image.ndim == 2 else image
 
 
 def _read_picture(path: Path) -> np.ndarray:
     """A grey PNG or TIFF; colours are allowed where all channels are equal."""
     header = path.read_bytes()[:26]
     if header[1:4] == b"PNG" and len(header) == 26 and header[24] == 16 and header[25] != 0:
-        raise ValueError("16-bit colour would be cut to 8 bit; store it as 16-bit grey")
+        raise ValueError(CUT)
     with warnings.catch_warnings():
         warnings.simplefilter("error", Image.DecompressionBombWarning)
         opened = Image.open(path)
@@ -90,6 +94,8 @@ def _read_picture(path: Path) -> np.ndarray:
         if (pages := getattr(image, "n_frames", 1)) > 1:
             raise ValueError(f"it holds {pages} pages; store one image per file")
         check_held(math.prod(image.size), path, f"pixels, {image.height} x {image.width},", 8 * MOST_SQUEEZED)
+        if image.mode not in GREY and max(getattr(image, "tag_v2", {}).get(BITS, (8,))) > 8:
+            raise ValueError(CUT)
         image.load()
         if image.mode in GREY:
             pixels = np.asarray(image)

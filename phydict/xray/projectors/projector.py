@@ -159,6 +159,8 @@ class _Linear(torch.autograd.Function):
 
 
 def _check(x: torch.Tensor, shape: tuple[int, ...], name: str) -> None:
+    if not isinstance(x, torch.Tensor):
+        raise ValueError(f"{name} must be a tensor, but a {type(x).__name__} was given; convert it by torch.as_tensor")
     if tuple(x.shape[1:]) != shape or x.ndim != len(shape) + 1:
         raise ValueError(f"{name} must be (batch, {', '.join(map(str, shape))}), but shape {tuple(x.shape)} was given")
     if x.dtype not in (torch.float32, torch.float64):

@@ -36,12 +36,11 @@ class SystemMatrix:
 
     def forward(self, mu: torch.Tensor) -> torch.Tensor:
         matrix, _ = self._on(mu)
-        return torch.stack([torch.mv(matrix, case.reshape(-1)) for case in mu]).view(-1, self.beam.views,
-                                                                                     *self.beam.shape)
+        return _products(matrix, mu).view(len(mu), self.beam.views, *self.beam.shape)
 
     def adjoint(self, xrays: torch.Tensor) -> torch.Tensor:
         _, transpose = self._on(xrays)
-        return torch.stack([torch.mv(transpose, case.reshape(-1)) for case in xrays]).view(-1, *self.grid.shape)
+        return _products(transpose, xrays).view(len(xrays), *self.grid.shape)
 
     def _on(self, like: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """A and its transpose in the precision and on the device of `like`, made once."""
@@ -82,6 +81,14 @@ class SystemMatrix:
     def bytes_for(grid: Grid, beam: ConeBeam, dtype: torch.dtype) -> int:
         """Bytes of A and its transpose, without building them."""
         return _table_bytes(_crossed_voxels(grid, beam), math.prod(grid.shape), dtype)
+
+
+def _products(matrix: torch.Tensor, cases: torch.Tensor) -> torch.Tensor:
+    """The matrix (M, N) times each of the cases (B, ...) of N numbers: (B, M)."""
+    products = cases.new_empty(len(cases), matrix.shape[0])
+    for product, case in zip(products, cases):
+        product.copy_(torch.mv(matrix, case.reshape(-1)))
+    return products
 
 
 def _crossed_voxels(grid: Grid, beam: ConeBeam) -> np.ndarray:

@@ -1,0 +1,44 @@
+"""Projection matrices of C-arms and computer vision as a ConeBeam."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from phydict.xray.geometry import ConeBeam, pixel_sizes
+
+LEAST_VOLUME = 1e-12
+"""Of the left 3x3 part of a matrix, relative to the product of its rows' lengths: below, it has no source."""
+ALIKE = 0.01
+"""Share by which a pixel's height over its width may differ from what the matrix says."""
+
+
+def beam_of_matrices(matrices: np.ndarray, shape: tuple[int, int], pixel: float | tuple[float, float]) -> ConeBeam:
+    """The beam of matrices (K, 3, 4) that take world mm (x, y, z, 1) to multiples of (column, row, 1), where pixel (0,
+    0) is centred on (0, 0) and a matrix may have any factor (Hartley & Zisserman, Multiple View Geometry, 2003, 6.2).
+
+    shape: (V, U) pixels and pixel: (row height, column width) in mm, which the matrices do not hold.
+    Raises ValueError, with the view, for matrices without a source, whose source lies level with the world's origin, or
+    whose pixels have another height over width.
+    """
+    height, width = pixel_sizes(pixel)
+    poses = [_pose(view, matrix, height, width, shape) for view, matrix in enumerate(matrices)]
+    sources, detectors, u, v = (np.stack(part) for part in zip(*poses))
+    return ConeBeam(sources, detectors, u, v, shape)
+
+
+def _pose(view: int, matrix: np.ndarray, height: float, width: float, shape: tuple[int, int]) -> tuple[np.ndarray, ...]:
+    """Source, detector's centre, u and v of one matrix."""
+    depth = matrix[2, 3]  # of the world's origin, which lies in front of the source
+    scale = np.linalg.norm(matrix[:, :3], axis=1).prod()
+    if not abs(np.linalg.det(matrix[:, :3])) > LEAST_VOLUME * scale or depth == 0:
+        raise ValueError(f"view {view}: the projection matrix {matrix.tolist()} has no source in front of which the "
+                         "world's origin lies; give one from world mm to (column, row, 1)")
+    rays = np.linalg.inv(np.sign(depth) * matrix[:, :3])  # of pixel (c, r): rays @ (c, r, 1)
+    rays *= width / np.linalg.norm(rays[:, 0])
+    high = float(np.linalg.norm(rays[:, 1]))
+    if abs(high / height - 1) > ALIKE:
+        raise ValueError(f"view {view}: by its projection matrix pixels of {width:g} mm width are {high:.4g} mm high, "
+                         f"but a pixel of [{height:g}, {width:g}] mm was given")
+    source = -np.linalg.solve(matrix[:, :3], matrix[:, 3])
+    centre = rays @ ((shape[1] - 1) / 2, (shape[0] - 1) / 2, 1.0)
+    return source, source + centre, rays[:, 0], rays[:, 1]

@@ -55,8 +55,8 @@ class FoundPoses:
     volumes, at first and at last. sway (2, K): by how many mm on the detector each view shows the lower end of the body
     moved against the upper one, and the standard error of that. shift (2, K): by how many mm on the detector (root mean
     square over the middle of the volume) each view's shadows were corrected, and what the stated deviations shift them
-    by. The beam is the corrected one carried as a whole to the
-    nominal one, which changes no projection. display: of display values, whose gains and offsets are unknown anyway.
+    by. The beam is the corrected one carried as a whole to the nominal one, its detectors drawn back to behind the
+    volume's box: neither changes a projection. display: of display values, whose gains and offsets are unknown anyway.
     """
 
     beam: ConeBeam
@@ -108,7 +108,8 @@ class FoundPoses:
                        interval_widening=factor * result.interval_widening)
 
     def warnings(self) -> list[str]:
-        """What is to be said: that few views cannot show depth, and which views were corrected by more than stated."""
+        """What is to be said: that few views cannot show depth, which views were corrected by more than stated, and
+        which show that the patient moved."""
         messages = []
         if len(self.corrections) <= UNDETERMINED_VIEWS:
             wider = f"; intervals, if any, are {FEW_WIDENING} times as wide for it" if self.undetermined else ""

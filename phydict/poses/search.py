@@ -11,7 +11,8 @@ Each round, at the current unknowns theta and volume x:
 
 Steps 2 and 3 together approach a Gauss-Newton step in volume and poses (variable projection, Golub & Pereyra 1973,
 doi:10.1137/0710036). The whole scene moved changes no projection (phydict.xray.poses.gauge), so that six numbers are
-chosen: at the end the beam is carried to where its shadows are most like the nominal beam's.
+chosen: at the end the beam is carried to where its shadows are most like the nominal beam's. A detector that comes to
+lie in an empty corner of the volume's box is drawn back along its rays, which changes no projection either.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from phydict.xray.boxes import halved
 from phydict.xray.calibration import match_views
 from phydict.xray.checks import check_xrays
 from phydict.xray.noise_level import MEDIAN
-from phydict.xray.poses.gauge import aligned, reprojection_errors
+from phydict.xray.poses.gauge import aligned, drawn_back, obstructed, reprojection_errors
 from phydict.xray.poses.sensitivity import pose_derivatives
 from phydict.xray.poses.uncertain import Uncertain
 from phydict.xray.poses.unknowns import moved
@@ -55,7 +56,7 @@ SAME_FIT, LEAST_FIT, MOST_FIT = 6.5, 1.05, 1.4
 no less than LEAST_FIT and no more than MOST_FIT times: fewer views are the easier to fit by poses. Right ones of seven
 training CTs have 1.08 at most from eight views and 1.38 from four, those off by 5 mm and 2 degrees 2.9 or more."""
 HALVINGS = 6
-"""Of a step that would put a source or a detector into the volume."""
+"""Of a view's step that would put its source into the volume or its detector before the volume's middle."""
 
 
 @dataclass(frozen=True)
@@ -122,16 +123,28 @@ def find_poses(xrays: Tensor, beam: ConeBeam, uncertain: Uncertain, grid: Grid, 
                 views.improve(state)
                 on_round()
             if n == 0:
-                sway = views.sway(state).double().numpy()
-            if n == 0 and views.fits_as_stated(state):
+                first, volume, sway = views, state.x, views.sway(state).double().numpy()
+            if first.fits_as_stated(replace(state, x=volume), same_fit(beam.views) if n == 0 else 1.0):
                 state.theta, state.misfits = torch.zeros_like(state.theta), state.misfits[:1]
                 break
         there, points = moved(beam, state.theta[:, :8].double().numpy()), middle_points(grid)
         if state.theta[:, :8].any():
-            there = aligned(there, beam, points)
+            there = carried(there, beam, points, grid)
         shift = np.stack([reprojection_errors(there, beam, points), stated_shift(beam, uncertain, points)])
-    return FoundPoses(there, deviations, state.theta.double().numpy(), state.errors.double().numpy(),
+    return FoundPoses(drawn_back(there, grid), deviations, state.theta.double().numpy(), state.errors.double().numpy(),
                       (state.misfits[0], state.misfits[-1]), sway, shift, watch.seconds["calibrate"], display)
+
+
+def carried(beam: ConeBeam, nominal: ConeBeam, points: np.ndarray, grid: Grid) -> ConeBeam:
+    """The beam carried as a whole to where its points' shadows are most like the nominal beam's, or, where that would
+    put a source into the volume, as it is."""
+    there = aligned(beam, nominal, points)
+    return beam if obstructed(there, grid).any() else there
+
+
+def same_fit(views: int) -> float:
+    """How many times the misfit of the poses found those of the nominal ones may be to be kept."""
+    return min(max(1 + SAME_FIT / views**2, LEAST_FIT), MOST_FIT)
 
 
 def stated_shift(beam: ConeBeam, uncertain: Uncertain, points: np.ndarray) -> np.ndarray:
@@ -169,7 +182,7 @@ class Views:
 
     def measurement(self, theta: Tensor) -> Measurement:
         """The X-rays without their gains and offsets, seen from the poses."""
-        poses = moved(self.beam, theta[:, :8].double().numpy())
+        poses = drawn_back(moved(self.beam, theta[:, :8].double().numpy()), self.grid)
         corrected = (self.xrays - theta[:, 9, None, None]) / (1 + theta[:, 8, None, None])
         measurement = Measurement(Projector(self.grid, poses, full_detector=True), corrected, WINDOW, True,
                                   self.mu_water)
@@ -185,13 +198,12 @@ class Views:
         state.x = self.search.first(plain, torch.full((1, 1, *self.grid.shape), -1.0), X0_STD)
         state.misfits.append(misfits(plain.project(state.x)[0], plain.y[0])["misfit"])
 
-    def fits_as_stated(self, state: State) -> bool:
-        """Whether a volume of the nominal poses fits about as well as one of those found (SAME_FIT)."""
+    def fits_as_stated(self, state: State, allowed: float) -> bool:
+        """Whether a volume of the nominal poses has at most `allowed` times the misfit of one of those found."""
         fits = []
         for theta in (torch.zeros_like(state.theta), state.theta):
             plain = self.measurement(theta)
             fits.append(misfits(plain.project(self.search.first(plain, state.x, X0_STD))[0], plain.y[0])["misfit"])
-        allowed = min(max(1 + SAME_FIT / len(state.theta) ** 2, LEAST_FIT), MOST_FIT)
         return fits[0] <= allowed * fits[1]
 
     def improve(self, state: State) -> None:
@@ -244,11 +256,13 @@ class Views:
         return torch.stack([fitted[:, -1], covariance[:, -1, -1].sqrt() * left.std(1)])
 
     def clear(self, theta: Tensor, step: Tensor) -> Tensor:
-        """The step, shortened where a source or a detector would come to lie in the volume."""
+        """The step, shortened for the views that it would obstruct."""
+        step = step.clone()
         for _ in range(HALVINGS):
-            try:
-                moved(self.beam, (theta + step)[:, :8].double().numpy()).check(self.grid)
-                return step
-            except ValueError:
-                step = step / 2
-        return torch.zeros_like(step)
+            wrong = torch.as_tensor(obstructed(moved(self.beam, (theta + step)[:, :8].double().numpy()), self.grid))
+            step[wrong] /= 2
+            if not wrong.any():
+                break
+        else:
+            step[wrong] = 0
+        return step

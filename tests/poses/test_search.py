@@ -11,11 +11,11 @@ from phydict.datasets import Thorax, build
 from phydict.grid import Grid
 from phydict.poses import find_poses
 from phydict.poses.blind import BlindMeasurement
-from phydict.poses.search import PoseSearch, State, Views, middle_points
+from phydict.poses.search import PoseSearch, State, Views, carried, middle_points
 from phydict.posterior import Measurement
 from phydict.units import HUWindow, hu_to_mu
 from phydict.xray import ConeBeam, Projector
-from phydict.xray.poses.gauge import aligned, reprojection_errors
+from phydict.xray.poses.gauge import aligned, drawn_back, moved_as_a_whole, reprojection_errors
 from phydict.xray.poses.uncertain import Uncertain
 from phydict.xray.poses.unknowns import moved
 
@@ -119,14 +119,57 @@ def test_dead_pixels_pull_the_poses_along_less_than_least_squares_would_let_them
     assert huber < 0.95 * squares and huber < 0.5 * error(BEAM, true)
 
 
-def test_a_step_that_would_put_the_source_into_the_volume_is_shortened(thorax):
+def test_a_detector_past_the_middle_of_the_volume_shortens_the_step_of_its_view_alone(thorax):
     views = Views(xrays(thorax, BEAM), BEAM, GRID, torch.ones(10), 0.02, SEARCH)
-    small, large = torch.zeros(8, 10), torch.zeros(8, 10)
-    small[:, 0], large[:, 4] = 5.0, -900.0  # towards the source, past the isocentre
-    assert torch.equal(views.clear(torch.zeros(8, 10), small), small)
-    step = views.clear(torch.zeros(8, 10), large)
-    assert (step[:, 4] / large[:, 4]).unique().numel() == 1 and -900 < step[0, 4] < 0
-    moved(BEAM, step[:, :8].double().numpy()).check(GRID)
+    step = torch.zeros(8, 10)
+    step[:, 4] = -150.0  # towards the source, some into corners of the box
+    assert not moved(BEAM, step[:, :8].double().numpy()).has_room_for(GRID)
+    assert torch.equal(views.clear(torch.zeros(8, 10), step), step)
+    step[3, 4] = -900.0
+    clear = views.clear(torch.zeros(8, 10), step)
+    assert torch.equal(clear[[0, 1, 2, 4, 5, 6, 7]], step[[0, 1, 2, 4, 5, 6, 7]]) and -900 < clear[3, 4] < 0
+    assert drawn_back(moved(BEAM, clear[:, :8].double().numpy()), GRID).has_room_for(GRID)
+    step[3, 4] = -1e5  # half of it, and half of that, is still too far
+    assert not views.clear(torch.zeros(8, 10), step)[3].any()
+
+
+def test_views_drawn_back_measure_the_same_and_those_with_room_stay_as_they_are(thorax):
+    beam = moved(BEAM, np.outer([0, -200, 0, 0, 0, -150, 0, 0], np.eye(8)[4]))
+    small = GRID.grown(-4, -4, 0)
+    back = drawn_back(beam, GRID)
+    assert not beam.has_room_for(GRID) and back.has_room_for(GRID)
+    inside = thorax[..., 4:-4, 4:-4, :]
+    padded = torch.nn.functional.pad(inside, (0, 0, 4, 4, 4, 4))
+    torch.testing.assert_close(xrays(padded, back), Projector(small, beam, "siddon", full_detector=True)(inside)[0])
+    assert back.select([0, 2, 3, 4, 6, 7]).same_as(beam.select([0, 2, 3, 4, 6, 7]), tolerance=0)
+
+
+def test_detectors_near_the_corners_of_the_volume_stop_no_search_and_lie_behind_it_at_the_end(thorax):
+    close = ConeBeam.orbit(8, 1020, 740, (48, 48), 11.0)  # 8 mm behind the corners
+    true = moved(close, np.random.default_rng(4).normal(0, 1, (8, 8)) * UNCERTAIN.poses)
+    found = find_poses(xrays(thorax, drawn_back(true, GRID)), close, UNCERTAIN, GRID, search=replace(SEARCH, fine=7))
+    found.beam.check(GRID)
+    assert error(found.beam, true) < 0.3 * error(close, true)
+
+
+def test_a_beam_is_not_carried_to_where_its_source_lies_in_the_volume():
+    outside = ConeBeam.orbit(1, 1150, 210, (48, 48), 60.0)  # 18 mm before the volume
+    near, inside = (moved_as_a_whole(outside, np.array([0, mm, 0, 0, 0, 0])) for mm in (10.0, 30.0))
+    assert carried(outside, near, POINTS, GRID).same_as(near, tolerance=0.1)
+    assert carried(outside, inside, POINTS, GRID) is outside
+
+
+def test_a_search_that_goes_astray_on_finer_voxels_ends_in_the_nominal_poses(thorax, monkeypatch):
+    true = moved(BEAM, np.random.default_rng(0).normal(0, 1, (8, 8)) * UNCERTAIN.poses)
+    improve = Views.improve
+
+    def astray(views, state):
+        improve(views, state)
+        state.theta = state.theta + (views.grid.shape == GRID.shape) * 60.0 * torch.eye(10)[:8]
+
+    monkeypatch.setattr(Views, "improve", astray)
+    found = find_poses(xrays(thorax, true), BEAM, UNCERTAIN, GRID, search=PoseSearch(coarse=3, fine=1))
+    assert found.beam.same_as(BEAM) and not found.corrections.any() and found.misfits[0] == found.misfits[1]
 
 
 def test_x_rays_of_nothing_have_no_poses_and_a_volume_of_air_sways_by_nothing():

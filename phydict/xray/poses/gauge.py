@@ -1,7 +1,7 @@
-"""The whole scene moved: what no X-ray shows.
+"""What no X-ray shows: the whole scene moved, and how far along its rays a detector stands.
 
 A rotation and a shift of all views together with the volume change no line integral: six numbers of all views' poses
-cannot be found from X-rays, and are chosen.
+cannot be found from X-rays, and are chosen. Behind the volume, a detector drawn back along its rays measures the same.
 """
 
 from __future__ import annotations
@@ -9,14 +9,17 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from phydict.grid import Grid
 from phydict.xray.geometry import ConeBeam
 
 STEPS = 20
 """Of reweighted least squares, each of which halves what is left or better."""
 
-
 STEP = 1e-4
 """mm and degrees of the differences that stand for derivatives."""
+
+ROOM_MM = 1.0
+"""Between a box and a detector drawn back behind it."""
 
 
 def moved_as_a_whole(beam: ConeBeam, motion: np.ndarray) -> ConeBeam:
@@ -49,3 +52,19 @@ def aligned(beam: ConeBeam, to: ConeBeam, points: np.ndarray) -> ConeBeam:
         if np.abs(motion).max() < 1e-6:
             break
     return beam
+
+
+def drawn_back(beam: ConeBeam, grid: Grid) -> ConeBeam:
+    """The beam whose detectors that reach into a grid's box are drawn back along their rays to behind it, and whose
+    pixels grow with that, so that no ray changes."""
+    reach, distance = beam._depths(grid).max(0), beam.distances
+    stretch = np.where(reach < distance, 1, (reach + ROOM_MM) / distance)[:, None]
+    return beam.at(beam.sources, beam.detectors + (stretch - 1) * (beam.detectors - beam.sources), stretch * beam.u,
+                   stretch * beam.v)
+
+
+def obstructed(beam: ConeBeam, grid: Grid) -> np.ndarray:
+    """The views (K,) whose source reaches into a grid's box, or whose detector lies before its middle, so that drawing
+    it back does not help."""
+    depth = beam._depths(grid)
+    return (depth.min(0) <= 0) | (depth.mean(0) >= beam.distances)

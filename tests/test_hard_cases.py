@@ -29,8 +29,8 @@ from phydict.posterior import (
     ProximalCG,
     SplitGibbs,
 )
-from phydict.xray import Ideal
-from phydict.xray.checks import check_line_integrals, with_air_at_zero
+from phydict.xray import Ideal, Polychromatic
+from phydict.xray.checks import check_flat, check_line_integrals, with_air_at_zero
 from phydict.xray.residuals import misfits
 
 pytestmark = [pytest.mark.filterwarnings(f"ignore:{said}") for said in
@@ -260,6 +260,21 @@ def test_air_is_the_thinner_side_of_a_view_and_views_without_it_keep_their_value
     assert torch.equal(found[2], drifted[2])
     for view in (0, 1, 3, 7):
         assert (found[view, :, :-1] - exact[view, :, :-1]).abs().max() < 1e-5
+
+
+def test_air_that_differs_across_the_detector_alike_in_all_views_is_that_of_a_missing_flat_image():
+    exact = views(simulator=Ideal(0))
+    rows = torch.linspace(0, 0.2, 24)[:, None]
+    for uneven in (rows, 0.2 * (torch.arange(24) > 12)):
+        with pytest.warns(UserWarning, match="air is not the same across the detector.* give `flat:`"):
+            check_flat(exact + uneven)
+    scattered = -0.2 * torch.linspace(0, 1, 24)[:, None]
+    drifted = exact - torch.linspace(1, 0.8, len(exact)).log()[:, None, None]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for xrays in (exact, exact + 0.3, exact + scattered, drifted, (exact + rows)[:2], exact[..., 7:17] + rows):
+            check_flat(xrays)
+        check_flat(Polychromatic(scatter=1.0)(Projector(GRID, BEAM, full_detector=True), body(), 0)[0])
 
 
 def test_what_is_denser_than_the_prior_knows_is_said_with_its_place_and_size():

@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -78,6 +79,9 @@ class Extended(Delegating):
     def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,
                     seed: int = 0, on_step: Callable[[], None] = lambda: None) -> Reconstruction:
         found = self.base.reconstruct(xrays, projector, report, display, seed, on_step)
+        if found.carried is not None and not holds(self.kept, found.carried.centre):
+            warn("what was found as dense as metal lies outside the volume that is kept, which does not hold it: check "
+                 "the geometry, of which a wrong one shows such things where nothing is")
         return replace(found, grid=self.kept, extended_mm=self.room_mm, volume=self._cut(found.volume),
                        masks=None if found.masks is None else self._cut(found.masks),
                        deviation=None if found.deviation is None else self._cut(found.deviation),
@@ -86,6 +90,12 @@ class Extended(Delegating):
     def _cut(self, volume: Tensor) -> Tensor:
         x, y, z = (slice((n - kept) // 2, (n + kept) // 2) for n, kept in zip(self.target.shape, self.kept.shape))
         return volume[..., x, y, z].clone()
+
+
+def holds(grid: Grid, point: np.ndarray) -> bool:
+    """Whether a point (3,) in mm lies in the box of voxels."""
+    index = grid.index(point)
+    return bool(((index >= -0.5) & (index <= np.array(grid.shape) - 0.5)).all())
 
 
 def covering(method: Reconstructor, box: Grid) -> Reconstructor:

@@ -8,7 +8,14 @@ from statistics import median
 from phydict.datasets.case import Case
 from phydict.grid import Grid
 from phydict.inference.geometry_page import agreement, geometry_page, view_sides
-from phydict.inference.orientation import correlation, orientation_doubts, standard_thorax, thorax_views
+from phydict.inference.orientation import (
+    Comparison,
+    correlation,
+    flip_doubts,
+    standard_thorax,
+    thorax_views,
+    whole_doubts,
+)
 from phydict.runtime.warning import warn
 from phydict.xray.binning import binned, binning
 from phydict.xray.checks import check_fit, prepared_xrays
@@ -21,8 +28,8 @@ the median was 0.72 to 0.86 on five chest CTs and 0.50 on a sixth whose lungs ar
 
 def dry_run(path: str | Path, case: Case, grid: Grid, box: Grid | None = None) -> list[str]:
     """Write the geometry page of an X-ray Case as PNG; returns one line per view that says what is seen in it, and
-    warns of line integrals that no chest has and of views that look upside down, mirrored or unlike a thorax in this
-    geometry.
+    warns of line integrals that no chest has and of views that look turned, moved, upside down, mirrored or unlike a
+    thorax in this geometry.
 
     grid: where a reconstruction would put its voxels; box: those of its result, where they are others. Raises
     ValueError where X-rays, geometry and grid do not fit.
@@ -34,12 +41,17 @@ def dry_run(path: str | Path, case: Case, grid: Grid, box: Grid | None = None) -
     measured = binned(case["xrays"].float(), factor)
     prepared_xrays(measured, coarse, display)
     xrays, thorax = measured.numpy(), thorax_views(grid, coarse)
-    geometry_page(path, coarse, grid, xrays, thorax, standard_thorax(grid), title=case["id"])
-    for doubt in orientation_doubts(case["xrays"], beam, grid):
+    compared = Comparison(case["xrays"], beam, grid)
+    whole = whole_doubts(compared)
+    flips = [] if whole else flip_doubts(compared)
+    for doubt in whole + flips:
         warn(f"{case['id']}: {doubt}")
-    agreements, values = [agreement(*pair) for pair in zip(xrays, thorax)], list(map(correlation, xrays, thorax))
+    geometry_page(path, coarse, grid, xrays, thorax, standard_thorax(grid), title=case["id"], flips=bool(flips))
+    agreements = [agreement(*pair, bool(flips)) for pair in zip(xrays, thorax)]
+    values = list(map(correlation, xrays, thorax))
     unlike = [k for k, value in enumerate(values) if value < LOW_VIEW or median(values) < LOW_MEDIAN]
-    if named := [str(k) for k in unlike if "better" not in agreements[k]]:
+    named = [str(k) for k in unlike if "changed" not in agreements[k]]
+    if named and not whole:
         warn(f"{case['id']}: view {', '.join(named)} agrees little with a standard thorax in this geometry (median of "
              f"all {median(values):.2f}): check distances, size of the pixels, turn and order of the views")
     kind = "display values" if display else "line integrals"

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from phydict.evaluation.gallery import DISPLAY, GREY, MOST_VIEWS, PLANES, literal, plane
 from phydict.grid import Grid
-from phydict.inference.orientation import better_flip, correlation
+from phydict.inference.orientation import LEAST, better_flip, correlation
 from phydict.runtime.files import atomic_write
 from phydict.xray import ConeBeam
 
@@ -40,22 +40,22 @@ def view_sides(beam: ConeBeam, grid: Grid) -> list[str]:
             for source, u, v in zip(beam.sources, beam.u, beam.v)]
 
 
-def agreement(xray: np.ndarray, thorax: np.ndarray) -> str:
-    """How well a view (V, U) correlates with the standard thorax's, and what clearly agrees better, if anything: a
-    flip, or the image inverted."""
+def agreement(xray: np.ndarray, thorax: np.ndarray, flips: bool = True) -> str:
+    """How well a view (V, U) correlates with the standard thorax's, and what clearly agrees better, if anything: the
+    image inverted or, if `flips` count, a flip."""
     stated, (flip, score) = correlation(xray, thorax), better_flip(xray, thorax)
     label = f"agreement {stated:.2f}"
-    if max(0, score) < -stated:
+    if -stated > max(LEAST, score):
         return f"{label}, better ({-stated:.2f}) inverted"
-    return label if flip == "as it is" else f"{label}, better ({score:.2f}) with {flip} changed"
+    return f"{label}, better ({score:.2f}) with {flip} changed" if flips and flip != "as it is" else label
 
 
 def geometry_page(path: str | Path, beam: ConeBeam, grid: Grid, xrays: np.ndarray, thorax: np.ndarray,
-                  thorax_hu: np.ndarray, title: str = "") -> None:
+                  thorax_hu: np.ndarray, title: str = "", flips: bool = True) -> None:
     """Write the page as PNG: the geometry, and up to 8 views, evenly picked.
 
     xrays: (K, V, U) the measured images; thorax: (K, V, U) the standard thorax's in the same beam; thorax_hu: its HU
-    (X, Y, Z) on `grid`, shown where it lies.
+    (X, Y, Z) on `grid`, shown where it lies; flips: whether flips that agree better are named, as in `agreement`.
     Raises ValueError where the images do not have the beam's shape, or where what is at `path` is no such page.
     """
     for images in (xrays, thorax):
@@ -81,7 +81,8 @@ def geometry_page(path: str | Path, beam: ConeBeam, grid: Grid, xrays: np.ndarra
             ax.imshow(image, "gray", interpolation="nearest",
                       aspect=float(np.linalg.norm(beam.v[k]) / np.linalg.norm(beam.u[k])))
             ax.set(xticks=[], yticks=[])
-        bottom.set_xlabel(agreement(xrays[k], thorax[k]).replace(", ", ",\n").replace(" with ", "\nwith "), fontsize=8)
+        words = agreement(xrays[k], thorax[k], flips).replace(", ", ",\n").replace(" with ", "\nwith ")
+        bottom.set_xlabel(words, fontsize=8)
     cells[0, 0].set_ylabel("your X-rays", fontsize=9)
     cells[1, 0].set_ylabel("a standard thorax", fontsize=9)
     with atomic_write(Path(path)) as part:

@@ -173,6 +173,7 @@ def carried_note(carried: Carried, window: HUWindow) -> str:
     """What was carried, where, and what that leaves wrong."""
     place = ", ".join(f"{mm:.0f}" for mm in carried.centre)
     return (f"{carried.millilitres:.1f} ml as dense as metal were found, about {carried.density:.0f} HU above what "
-            f"surrounds them, around ({place}) mm: the volume holds them beside what the method knows, up to "
-            f"{window.high:g} HU; beam hardening and scatter of metal are not corrected, and intervals do not hold "
-            "there")
+            f"surrounds them, around ({place}) mm: as far as the volume that is kept reaches, it holds them beside "
+            f"what the method knows, up to {window.high:g} HU, and where the place is outside of it or of the patient, "
+            "the geometry is doubtful; beam hardening and scatter of metal are not corrected, and intervals do not "
+            "hold there")

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from phydict.guard import worst_view
 from phydict.posterior.measurement import Measurement
 from phydict.runtime.warning import warn
 from phydict.xray import Projector
@@ -27,6 +28,10 @@ CONTRADICTION_WIDENING = 0.4
 """Power of the geometric mean of these ratios over the views by which intervals widen: in eight scenes of two held-out
 CTs, 4 to 16 views in poses wrong by up to 5 mm and 2 degrees or with breathing by 10 mm, 88 to 92 % of the body is then
 in the 90 % interval, before 75 to 92 %. A gain that drifts by 20 %, which they see less of, is held to 70 % on one."""
+
+STANDS_OUT = 1.2
+"""How many times the median view's is the share of a view that counts as noise for it to be named as the one that fits
+worst: of five views of which one is another patient's it is 1.4."""
 
 LIMITED_ANGLE_VIEWS, WIDE_SPREAD, LIMITED_POWER = 6, 0.35, 0.6
 """Views up to which, and `angular_spread` from which on, errors are as large as the network says that tells their size;
@@ -76,17 +81,20 @@ def contradiction_widening(measurement: Measurement) -> float:
 
 
 def warn_of_contradictions(measurement: Measurement, widening: float | None) -> None:
-    """Warns where a part of the X-rays counted as noise because no volume explains it; widening: of the intervals, if
-    there are any."""
+    """Warns where a part of the X-rays counted as noise because no volume explains it, and names the view that fits
+    worst where it stands out of three or more; widening: of the intervals, if there are any."""
     variance = torch.as_tensor(measurement.model_variance).flatten()
     views = variance.nonzero().flatten().tolist()
     if views:
         which = "any view" if len(views) == measurement.projector.beam.views else (
             f"view {', '.join(map(str, views))} (counted from 0)")
         wider = "" if widening is None else f", and intervals are {widening:.1f} times as wide as calibrated"
+        worst, ratio = worst_view((variance / measurement.y[0].square().mean((1, 2)).clamp(min=1e-12)).sqrt().tolist())
+        alone = f"; view {worst} (counted from 0) fits worst: reconstruct without it and compare" if (
+            len(variance) > 2 and ratio >= STANDS_OUT) else ""
         warn(f"no volume explains {which}: as much of it as contradicts the rest counted as noise, so that the volume "
              f"follows it less and the prior more{wider}; check geometry and scale, and whether the patient moved or "
-             "is wider than the volume")
+             f"is wider than the volume{alone}")
 
 
 def angular_spread(projector: Projector) -> float:

@@ -21,6 +21,11 @@ AIR_BLOCKS, AIR_FLAT, AIR_MOST, AIR_DRIFT = 8, 0.05, 0.5, 0.1
 """At a side of the detector a view's line integrals are those of air where the medians of so many blocks of rows differ
 by less than AIR_FLAT and are below AIR_MOST; between views those of air differ by less than AIR_DRIFT."""
 
+FLAT_VIEWS, FLAT_ALIKE, UNEVEN = 3, 0.03, 0.05
+"""Of so many views or more, a side of the detector on which every block of rows reads the same, up to FLAT_ALIKE, in
+all of them shows air; values of air that differ by more than UNEVEN between blocks are those of a missing flat image.
+Scatter makes them negative, which counts as 0."""
+
 
 def check_xrays(xrays: Tensor, beam: ConeBeam, display: bool = False) -> None:
     """Raises ValueError unless the X-rays (K, V, U) are finite, as many and as large as the beam's views, and none of
@@ -91,15 +96,36 @@ def check_line_integrals(xrays: Tensor) -> None:
              "beyond is the method's guess, and HU near it are less certain; a wider detector would show it")
 
 
+def check_flat(xrays: Tensor) -> None:
+    """Warns where air beside the patient, which all views (K, V, U) show alike, reads otherwise from place to place, as
+    without a flat image."""
+    blocks = side_blocks(xrays)
+    shown = (blocks.amax(1) - blocks.amin(1) < FLAT_ALIKE).all(1) & (blocks < AIR_MOST).all(2).all(1)
+    if len(xrays) < FLAT_VIEWS or not shown.any():
+        return
+    air = blocks[shown].median(1).values.clamp(min=0)
+    if air.max() - air.min() > UNEVEN:
+        warn(f"air is not the same across the detector: beside the patient it reads from {float(air.min()):.2f} to "
+             f"{float(air.max()):.2f}, in all views alike, but as a line integral it is 0: give `flat:`, an image "
+             "without a patient, in place of one number for `air:`")
+
+
+def side_blocks(xrays: Tensor) -> Tensor:
+    """Medians (2, K, AIR_BLOCKS or fewer) of blocks of rows in the outer columns of views (K, V, U) at each side."""
+    return torch.stack([rows.flatten(2).median(2).values for rows in
+                        outer_columns(xrays).float().tensor_split(min(AIR_BLOCKS, xrays.shape[1]), 2)], 2)
+
+
 def prepared_xrays(xrays: Tensor, beam: ConeBeam, display: bool, told: bool = False) -> Tensor:
     """X-rays (K, V, U) as a reconstruction takes them: checked and, of no display values, as `with_air_at_zero`. Raises
-    as `check_xrays`, and warns as `check_line_integrals`. told: whether the same X-rays, binned otherwise, were warned
-    of before, so that nothing is said."""
+    as `check_xrays`, and warns as `check_line_integrals` and `check_flat`. told: whether the same X-rays, binned
+    otherwise, were warned of before, so that nothing is said."""
     check_xrays(xrays, beam, display)
     if display:
         return xrays
     if not told:
         check_line_integrals(xrays)
+        check_flat(xrays)
     return with_air_at_zero(xrays, told)
 
 
@@ -107,11 +133,9 @@ def with_air_at_zero(xrays: Tensor, told: bool = False) -> Tensor:
     """The line integrals (K, V, U), less what each view reads in air where that differs from view to view, which is
     said in a warning, unless it was `told` before: of a tube's output or a detector's gain that drifts. Views that show
     no air stay, and all of them where none reads it as 0 within AIR_DRIFT, as where the patient fills the detector."""
-    sides = outer_columns(xrays).float()
-    blocks = torch.stack([rows.flatten(2).median(2).values for rows in
-                          sides.tensor_split(min(AIR_BLOCKS, xrays.shape[1]), 2)])
-    level = blocks.median(0).values
-    is_air = (blocks.amax(0) - blocks.amin(0) < AIR_FLAT) & (level.abs() < AIR_MOST)
+    blocks = side_blocks(xrays)
+    level = blocks.median(2).values
+    is_air = (blocks.amax(2) - blocks.amin(2) < AIR_FLAT) & (level.abs() < AIR_MOST)
     air = torch.where(is_air, level, torch.inf).amin(0)
     visible = air.isfinite()
     if visible.sum() < 2 or air[visible].max() - air[visible].min() <= AIR_DRIFT or air.abs().min() > AIR_DRIFT:

@@ -17,10 +17,12 @@ from phydict.evaluation import volume_metrics
 from phydict.grid import Grid
 from phydict.methods import onto_grid, reconstructor
 from phydict.posterior import Posterior, Refined, SplitGibbs
+from phydict.reconstruction import Reconstruction
 from phydict.runtime.warning import Remark
 from phydict.units import HUWindow
 from phydict.xray import Ideal
 from phydict.xray.boxes import binned_to, covers, lacking
+from phydict.xray.carried import Carried
 
 TV = FISTATV(iterations=80)
 CHEST, WIDE, WINDOW = Grid.cube(64), Grid.box([80, 80, 64], [480.0, 480.0, 384.0]), HUWindow()
@@ -127,6 +129,30 @@ def test_the_result_is_cut_out_of_what_more_voxels_give(patients):
         assert torch.equal(part, of[..., 8:72, 8:72, :])
     assert found.grid is CHEST and found.extended_mm == (48, 48, 0) and found.misfit == whole.misfit
     assert ready.steps() == ready.base.steps()
+
+
+def test_metal_outside_of_the_volume_that_is_kept_is_said_to_be_outside():
+    class Found:
+        """A method that finds metal at one place."""
+
+        name, mu_water = "found", 0.02
+
+        def __init__(self, place: tuple[float, float, float]):
+            self.carried = Carried(torch.ones(2, 2, 2), Grid.box(2, 12.0, place))
+
+        def reconstruct(self, *_):
+            none = torch.zeros(1, 2, 2)
+            return Reconstruction(torch.zeros(WIDE.shape), WIDE, "found", 0, 0.0, [0.0], {}, none, none,
+                                  carried=self.carried)
+
+    def said(*place: float) -> list:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            Extended(Found(place), WIDE, CHEST, (48.0, 48.0, 0.0)).reconstruct(None, None)
+        return caught
+
+    assert not said(180.0, 0.0, 0.0)
+    assert "lies outside the volume that is kept" in str(said(-218.0, 133.0, -33.0)[0].message)
 
 
 @pytest.mark.parametrize("box", [Grid.cube(256, 409.6), Grid.box([40, 90, 64], [380.0, 400.0, 384.0]),

@@ -1,14 +1,17 @@
-"""How often flips, the wrong sense of angles and mirrored patients are named, and the right geometry left alone.
+"""How often flips, turns, the wrong sense of angles, a wrong detector shift and mirrored patients are named, and the
+right geometry left alone.
 
     python tests/benchmark/orientation.py <folder of CTs> [<number of phantoms>]
 
 X-rays of each CT and phantom (6) on 64^3 voxels, without noise, for orbits of 1, 2, 4 and 8 views and every file of
-configs/geometry, as they are and with one mistake each. Writes orientation.csv beside this file: of each geometry and
-mistake the number of cases of which each was said.
+configs/geometry, as they are and with one mistake each: "shift" is a detector 20 mm along the rows and 50 mm along the
+columns beside where it is told to be, "turn" are transposed images. Writes orientation.csv beside this file: of each
+geometry and mistake the number of cases of which each was said.
 """
 
 import sys
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -24,7 +27,9 @@ from phydict.xray.binning import benchmark_orbit, binning
 FILE = Path(__file__).with_suffix(".csv")
 GRID, WINDOW = Grid.cube(64), HUWindow()
 FIRST_PHANTOM = 5000
-SAID = {"upside down": "rows", "turned by 180": "rows and columns", "looks mirrored": "patient"}
+SAID = {"upside down": "rows", "turned by 180": "rows and columns", "looks mirrored": "patient",
+        "moved alike": "shift", "by a quarter": "turn"}
+SHIFT = 20.0, 50.0
 
 
 def geometries() -> dict[str, ConeBeam]:
@@ -34,7 +39,7 @@ def geometries() -> dict[str, ConeBeam]:
 
 
 def said(xrays: torch.Tensor, beam: ConeBeam) -> str:
-    """What the first doubt names: rows, rows and columns, columns, sense, patient; nothing."""
+    """What the first doubt names: rows, rows and columns, columns, sense, patient, shift, turn; nothing."""
     doubts = orientation_doubts(xrays, beam, GRID)
     if not doubts:
         return "nothing"
@@ -51,16 +56,19 @@ if __name__ == "__main__":
     rows: dict[tuple[str, str], Counter] = {}
     for name, beam in geometries().items():
         beam = beam.binned(binning(GRID, beam))
-        A = Projector(GRID, beam, full_detector=True)
+        A, moved = (Projector(GRID, b, full_detector=True) for b in (beam, beam.shifted(*SHIFT)))
+        lying = replace(beam, shape=beam.shape[::-1])
         for volume in volumes:
-            xrays = A(WINDOW.to_mu(torch.as_tensor(volume))[None])[0]
+            mu = WINDOW.to_mu(torch.as_tensor(volume))[None]
+            xrays = A(mu)[0]
             mirrored, other = xrays.flip(2), in_other_sense(beam, GRID)
             given = {"none": (xrays, beam), "rows": (xrays.flip(1), beam), "columns": (mirrored, beam),
-                     "sense": (xrays, other), "patient": (mirrored, other)}
+                     "sense": (xrays, other), "patient": (mirrored, other), "shift": (moved(mu)[0], beam),
+                     "turn": (xrays.mT, lying)}
             for mistake, scene in given.items():
                 rows.setdefault((name, mistake), Counter())[said(*scene)] += 1
+    what = ("nothing", "rows", "rows and columns", "columns", "sense", "patient", "shift", "turn")
     write_csv(FILE, [{"geometry": name, "mistake": mistake, "cases": len(volumes)} | {
-        f"said {what}": counts[what] for what in ("nothing", "rows", "rows and columns", "columns", "sense", "patient")}
-        for (name, mistake), counts in rows.items()])
+        f"said {word}": counts[word] for word in what} for (name, mistake), counts in rows.items()])
     right = sum(counts["nothing"] for (_, mistake), counts in rows.items() if mistake == "none")
-    print(f"right geometries left alone: {right} of {len(volumes) * len(rows) // 5}")
+    print(f"right geometries left alone: {right} of {len(volumes) * len(rows) // len(given)}")

@@ -72,6 +72,38 @@ def test_a_dry_run_warns_of_images_unlike_a_thorax_in_their_geometry(measured, t
         assert ("agrees little with a standard thorax" in capsys.readouterr().err) == (name == "magnified")
 
 
+@pytest.mark.filterwarnings("default")
+def test_a_dry_run_says_how_lying_images_are_turned_and_nothing_of_flips(measured, tmp_path, capsys):
+    case = load_xrays(measured / "anna")
+    save_xrays(tmp_path / "case", case["xrays"].mT, case["beam"])
+    main(sirt("predict", tmp_path / "out", f"--data.xrays={tmp_path / 'case'}", "--dry_run"))
+    out, err = capsys.readouterr()
+    assert "`orientation: {rotate_degrees: 90, flip_columns: true}`" in err
+    assert "agrees little" not in err and "better" not in out
+
+
+@pytest.mark.filterwarnings("default")
+def test_a_dry_run_warns_of_images_that_agree_less_than_nothing(measured, tmp_path, capsys):
+    case = load_xrays(measured / "anna")
+    height, width = case["xrays"].shape[1:]
+    save_xrays(tmp_path / "case", case["xrays"].roll((height // 2, width // 2), (1, 2)), case["beam"])
+    main(sirt("predict", tmp_path / "out", f"--data.xrays={tmp_path / 'case'}", "--dry_run"))
+    out, err = capsys.readouterr()
+    assert "agreement -" in out and "view 0, 1, 2 agrees little with a standard thorax" in err
+
+
+@pytest.mark.filterwarnings("default")
+def test_a_dry_run_names_a_wrong_shift_of_the_detector_and_no_flip(tmp_path, capsys):
+    beam = ConeBeam.at_angles([0.0, 37.5, 75.0, 112.5, 150.0], 1500.0, 1100.0, (48, 60), 8.0)
+    grid = Grid.cube(64)
+    truth = HUWindow().to_mu(phantom_case(1, grid)["volume"])[None]
+    xrays = Projector(grid, beam.shifted(10.0, 25.0), full_detector=True)(truth)[0]
+    save_xrays(tmp_path / "case", xrays, beam.shifted(-10.0, -25.0))
+    main(sirt("predict", tmp_path / "out", f"--data.xrays={tmp_path / 'case'}", "--dry_run"))
+    out, err = capsys.readouterr()
+    assert "check whether detector_shift is missing or has the wrong sign" in err and "flip" not in out + err
+
+
 def test_a_dry_run_goes_on_after_a_bad_case_and_names_it_at_the_end(measured, tmp_path, capsys):
     shutil.copytree(measured, tmp_path / "cases")
     (tmp_path / "cases" / "anna" / "view_1.npy").unlink()

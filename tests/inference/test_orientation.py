@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -10,7 +13,7 @@ from inference.runs import record, sirt
 from phydict.cli.infer import main
 from phydict.datasets import phantom_case, save_xrays
 from phydict.grid import Grid
-from phydict.inference.orientation import in_other_sense, orientation_doubts
+from phydict.inference.orientation import TURNS, correlation, in_other_sense, moved_agreements, orientation_doubts
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 
@@ -18,10 +21,19 @@ GRID = Grid.cube(32)
 BEAM = ConeBeam.orbit(4, 1020.0, 740.0, (56, 56), 10.0, arc_degrees=180.0)
 
 
+PATIENT = phantom_case(1, GRID)["volume"]
+C_ARM = ConeBeam.at_angles([0.0, 37.5, 75.0, 112.5, 150.0], 1500.0, 1100.0, (48, 60), 8.0)
+
+
+def views(beam: ConeBeam, volume: torch.Tensor = PATIENT) -> torch.Tensor:
+    """X-rays (K, V, U) of a CT (1, 32, 32, 32) in the prior's range."""
+    return Projector(GRID, beam, full_detector=True)(HUWindow().to_mu(volume)[None])[0]
+
+
 @pytest.fixture(scope="module")
 def xrays() -> torch.Tensor:
     """(4, 56, 56) of a phantom."""
-    return Projector(GRID, BEAM, full_detector=True)(HUWindow().to_mu(phantom_case(1, GRID)["volume"])[None])[0]
+    return views(BEAM)
 
 
 def test_angles_in_the_other_sense_are_a_reflection_that_keeps_lengths_and_is_its_own_inverse():
@@ -30,6 +42,23 @@ def test_angles_in_the_other_sense_are_a_reflection_that_keeps_lengths_and_is_it
     for part in ("sources", "detectors", "u", "v"):
         assert np.allclose(getattr(other, part), getattr(negated, part))
         assert np.allclose(getattr(in_other_sense(other, GRID), part), getattr(BEAM, part))
+
+
+def test_the_other_sense_of_the_angles_keeps_the_shift_of_the_detector():
+    other, negated = in_other_sense(C_ARM.shifted(10.0, 25.0), GRID), ConeBeam.at_angles(
+        [0.0, -37.5, -75.0, -112.5, -150.0], 1500.0, 1100.0, (48, 60), 8.0).shifted(10.0, 25.0)
+    for part in ("sources", "detectors", "u", "v"):
+        assert np.allclose(getattr(other, part), getattr(negated, part))
+        assert np.allclose(getattr(in_other_sense(other, GRID), part), getattr(C_ARM.shifted(10.0, 25.0), part))
+
+
+def test_images_are_correlated_with_every_part_of_wider_ones():
+    images, wide = torch.rand(2, 5, 4), torch.rand(2, 7, 9)
+    found = moved_agreements(images, wide)
+    assert found.shape == (2, 3, 6)
+    for k, row, column in np.ndindex(*found.shape):
+        part = wide[k, row:row + 5, column:column + 4]
+        assert float(found[k, row, column]) == pytest.approx(correlation(images[k].numpy(), part.numpy()), abs=1e-4)
 
 
 def test_nothing_is_said_of_the_right_geometry(xrays):
@@ -47,6 +76,45 @@ def test_the_sense_of_the_angles_and_flipped_columns_are_told_apart(xrays):
 def test_a_patient_mirrored_by_two_mistakes_that_fit_each_other_is_noticed(xrays):
     (said,) = orientation_doubts(xrays.flip(2), in_other_sense(BEAM, GRID), GRID)
     assert "the patient looks mirrored" in said
+
+
+def test_of_three_ways_to_mend_a_mirrored_patient_the_one_that_agrees_best_is_named_first(xrays):
+    (said,) = orientation_doubts(xrays.flip(2), in_other_sense(BEAM, GRID), GRID)
+    ways = "change flip_columns and negate the angles", "change flip_columns alone", "negate the angles alone"
+    values = {way: float(value) for way, value in re.findall(rf"({'|'.join(ways)}) \((.*?)\)", said)}
+    assert len(values) == 3 and list(values.values()) == sorted(values.values(), reverse=True)
+    assert next(iter(values)) == ways[0]
+
+
+def test_the_wrong_sense_of_the_angles_is_named_where_the_detector_is_shifted():
+    shifted = C_ARM.shifted(10.0, 25.0)
+    (said,) = orientation_doubts(views(shifted), in_other_sense(shifted, GRID), GRID)
+    assert -1 < said.index("negate the angles") < said.index("change flip_columns")
+
+
+@pytest.mark.parametrize("told", [(-10.0, -25.0), (0.0, 0.0), (10.0, 85.0)])
+def test_a_wrong_shift_of_the_detector_is_named_and_no_flip_advised(told):
+    (said,) = orientation_doubts(views(C_ARM.shifted(10.0, 25.0)), C_ARM.shifted(*told), GRID)
+    assert "detector_shift" in said and "flip" not in said and f"columns are {told[1]:+.0f} mm as stated" in said
+    assert float(re.search(r"about ([-+]\d+) mm would fit", said)[1]) == pytest.approx(25, abs=15)
+
+
+@pytest.mark.parametrize("x, y, z", [(2, 2, 0), (-2, 2, 2), (2, -2, -2)])
+def test_a_patient_beside_the_middle_is_no_wrong_shift_and_no_flip(x, y, z):
+    moved = torch.roll(PATIENT, (x, y, z), (1, 2, 3))  # by 24 mm
+    for beam in (BEAM, C_ARM):
+        assert orientation_doubts(views(beam, moved), beam, GRID) == []
+
+
+@pytest.mark.parametrize("turn", TURNS)
+@pytest.mark.parametrize("beam", [BEAM, C_ARM])
+def test_images_that_lie_are_named_with_what_turns_them_up(turn, beam):
+    turned = views(beam).numpy()[:, :, ::-1 if turn.flip_columns else 1]
+    stored = np.rot90(turned, turn.rotate_degrees // 90, axes=(1, 2)).copy()
+    assert np.array_equal(turn.apply(stored), views(beam).numpy())
+    (said,) = orientation_doubts(torch.from_numpy(stored), replace(beam, shape=stored.shape[1:]), GRID)
+    words = f"{{rotate_degrees: {turn.rotate_degrees}" + ", flip_columns: true" * turn.flip_columns + "}"
+    assert words in said and str(list(beam.shape)) in said
 
 
 @pytest.mark.filterwarnings("default")

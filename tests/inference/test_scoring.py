@@ -91,7 +91,7 @@ def test_a_page_made_anew_has_the_frechet_distances_whose_features_are_kept(tmp_
     (tmp_path / "sirt" / "phantom-1000000" / FEATURES).write_bytes(b"no features")
     with pytest.warns(UserWarning, match="left out of the Frechet distances: .*are missing or damaged"):
         results_page(tmp_path)
-    assert "1 cases with XY 34" in (tmp_path / "index.html").read_text()
+    assert "1 case with XY 34" in (tmp_path / "index.html").read_text()
 
 
 def test_a_later_method_s_page_keeps_the_frechet_distances_of_those_before(tmp_path, untrained):

@@ -162,7 +162,8 @@ def reconstructed(sampler=FAST, target: Grid | None = None, **settings) -> Recon
 
 
 def test_a_reconstruction_holds_the_metal_says_so_and_says_what_it_does_not_do():
-    words = "ml as dense as metal were found, about .* HU above .* beam hardening .* intervals"
+    words = ("ml as dense as metal were found, about .* HU above .* as far as the volume that is kept reaches, .* beam "
+             "hardening .* intervals")
     with pytest.warns(UserWarning, match=words) as said:
         result = reconstructed()
     assert not [w for w in said if "as dense as 1000 HU" in str(w.message)]

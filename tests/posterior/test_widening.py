@@ -9,7 +9,12 @@ from prior.tiny import tiny_refiner
 
 from phydict.methods import reconstruct
 from phydict.posterior import posterior
-from phydict.posterior.widening import angular_spread, limited_angle_factor, narrow_arc_widening
+from phydict.posterior.widening import (
+    angular_spread,
+    limited_angle_factor,
+    narrow_arc_widening,
+    warn_of_contradictions,
+)
 from phydict.xray import ConeBeam, Projector
 from posterior.hollow import GRID, ORBIT, measured
 
@@ -69,3 +74,15 @@ def test_a_narrower_arc_than_in_the_calibration_widens_and_is_said():
 def test_arcs_of_the_calibration_few_views_and_full_orbits_do_not():
     scenes = *(seen(views, 40.0) for views in (4, 8, 32)), *(seen(views) for views in (1, 2, 3, 4, 200)), seen(3, 10.0)
     assert all(narrow_arc_widening(scene) == 1 for scene in scenes)
+
+
+@pytest.mark.parametrize("shares, named", [((1.0, 1.0, 1.5, 1.0), 2), ((0.0, 2.0, 0.0, 0.0), 1),
+                                           ((1.0, 1.0, 1.1, 1.0), None), ((1.0, 2.0), None)])
+def test_the_view_that_fits_worst_is_named_where_it_stands_out(shares, named):
+    m = measured(ConeBeam.orbit(len(shares), 1020, 740, (28, 28), 20.0))
+    size = m.y[0].square().mean((1, 2))
+    m.model_variance = (0.01 * torch.tensor(shares).square() * size)[:, None, None]
+    with pytest.warns(UserWarning, match="no volume explains") as said:
+        warn_of_contradictions(m, None)
+    words = f"view {named} (counted from 0) fits worst: reconstruct without it and compare"
+    assert (words in str(said[0].message)) if named is not None else ("fits worst" not in str(said[0].message))

@@ -195,7 +195,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Cube:
-    """A cube around the isocentre.
+    """A cube around the isocentre. Raises ValueError for what cannot be.
 
     Args:
         voxels: how many along each side
@@ -205,6 +205,9 @@ class Cube:
     voxels: int = 64
     side: float = 384.0
 
+    def __post_init__(self):
+        self.grid()
+
     def grid(self) -> Grid:
-        """Its voxels. Raises ValueError for what cannot be."""
+        """Its voxels."""
         return Grid.cube(self.voxels, self.side)

@@ -23,7 +23,7 @@ from phydict.cli.train import main
     (["--data.lungs=2"], ["data.lungs"]),
     (["--data.augmentation.shift=-5"], ["shift", "-5"]),
     (["--throughput.peak=0"], ["throughput.peak"]),
-    (["--model.cube.voxels=15"], ["15", "divisible"]),
+    (["--model.cube.voxels=15"], ["15", "divisible"]), (["--model.cube.voxels=0"], ["0 was given"]),
     (["--ckpt_path=/nowhere/last.ckpt"], ["/nowhere/last.ckpt"]),
     (["--ckpt_path={cut}"], ["cut.ckpt", "truncated"]),
 ], ids=lambda value: value[0].split("=")[0].strip("-") if isinstance(value, list) and value[0][0] == "-" else "")

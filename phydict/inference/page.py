@@ -18,6 +18,7 @@ from phydict.inference.protocols import protocol_of
 from phydict.inference.results import FEATURES, RECORD, TABLE, score_row, score_table
 from phydict.inference.scoring import FIDSettings
 from phydict.page import Contents, PageCase, check_own_page, write_page
+from phydict.runtime.files import in_between
 from phydict.runtime.progress import CaseProgress
 from phydict.runtime.warning import warn
 
@@ -56,9 +57,10 @@ def results_page(folder: Path, further: Sequence[Table] | None = None,
 
 
 def _case_folders(folder: Path) -> list[Path]:
-    """The folders of finished cases, those that are just being written left out."""
+    """The folders of finished cases, those that are just being written, or lie in a hidden one, left out."""
     folders = {path.parent for depth in ("*", "*/*") for path in folder.glob(f"{depth}/{RECORD}")}
-    return sorted(path for path in folders if not any(part[:1] == "." for part in path.relative_to(folder).parts))
+    return sorted(path for path in folders if not in_between(path.name) and (
+        path.parent == folder or path.parent.name[:1] != "."))
 
 
 def _cases(folder: Path) -> list[PageCase]:

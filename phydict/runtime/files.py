@@ -144,6 +144,11 @@ def _settle(final: Path) -> None:
         aside.rename(final)
 
 
+def in_between(name: str) -> bool:
+    """Whether a folder of this name is just being written, or set aside while another takes its place."""
+    return name.startswith(".") and name.endswith((".partial", ASIDE))
+
+
 def _aside(final: Path) -> Path:
     return final.with_name(f".{final.name}{ASIDE}")
 

@@ -158,7 +158,7 @@ def tables():
 
     yield "as it should be", *report(head + "ct.nii.gz,Nodule.,Nodule.\n")
     yield "empty", *report("", no, "r.csv")
-    yield "header alone", *report(head)
+    yield "header alone", *report(head, no, "r.csv")
     yield "one field of 200000 letters", *report(head + f"ct.nii.gz,{'x' * 200000},y\n", None, "r.csv")
     yield "a quote that never ends", *report(head + 'ct.nii.gz,"Nodule', None, "")
     yield "a null byte", *report(head + "ct.nii.gz,a\0b,c\n", None, "r.csv")

@@ -50,12 +50,12 @@ def python_api():
     yield "a beam that is a mapping", no, "ConeBeam", reconstruct(y, ORBIT)
     yield "a method that is not there", no, "magic", reconstruct(y, BEAM, method="magic")
     yield "a method that is a class", no, "method", reconstruct(y, BEAM, method=type(sirt))
-    yield "a method None", no, "method", reconstruct(y, BEAM, method=None)
+    yield "a method None", True, "", reconstruct(y, BEAM, method=None)
     yield "a seed of 1.5", no, "seed", reconstruct(y, BEAM, seed=1.5)
     yield "a seed None", no, "seed", reconstruct(y, BEAM, seed=None)
     yield "a seed of numpy", None, "seed", reconstruct(y, BEAM, seed=np.int64(3))
     yield "a report of bytes", no, "report", reconstruct(y, BEAM, report=b"x")
-    yield "a grid None", no, "", reconstruct(y, BEAM, grid=None)
+    yield "a grid None", True, "", reconstruct(y, BEAM, grid=None)
     yield "a grid of a tuple", no, "", reconstruct(y, BEAM, grid=(16, 16, 16))
     yield "mu_water of a text", None, "TypeError", reconstruct(y, BEAM, mu_water="0.02")
     yield "mu_water nan", no, "mu_water", reconstruct(y, BEAM, mu_water=float("nan"))
@@ -88,8 +88,8 @@ def python_api():
             ("a", "b"), {}), ("HUWindow of None", HUWindow, (None, 3), {}),
             ("Ideal of text", Ideal, ("a",), {}), ("Polychromatic kvp text", Polychromatic, ("120",), {}),
             ("read_beam without ending", read_beam, ("geometry",), {}), ("read_beam of None", read_beam, (None,), {}),
-            ("write_beam to nowhere", write_beam, ("no/where/g.yaml", BEAM), {}), ("write_beam of another ending",
-            write_beam, ("g.json", BEAM), {}), ("write_beam of a mapping", write_beam, ("g.yaml", ORBIT), {}),
+            ("write_beam of another ending", write_beam, ("g.json", BEAM), {}),
+            ("write_beam of a mapping", write_beam, ("g.yaml", ORBIT), {}),
             ("load_prior of None", phydict.load_prior, (None,), {}), ("load_prior of a number", phydict.load_prior, (3,
             ), {}), ("load_prior on a device that is not there", phydict.load_prior, (), {"device": "warp"}),
             ("load_super_resolution of nothing", load_super_resolution, ("",), {}),

@@ -215,6 +215,13 @@ def test_the_page_of_one_method_is_that_of_its_folder(tmp_path):
     assert [case["folder"] for case in content(results_page(tmp_path))["cases"]] == ["sirt/anna", "tv/anna"]
 
 
+def test_cases_that_are_being_written_or_set_aside_are_no_results_and_a_name_that_begins_with_a_dot_is_one(tmp_path):
+    for case in ("..anna", ".12-host-anna.partial", ".anna.set-aside-by-phydict"):
+        finish(tmp_path, case, "sirt")
+    finish(tmp_path, "anna", ".hidden")
+    assert [case["folder"] for case in content(results_page(tmp_path))["cases"]] == ["sirt/..anna"]
+
+
 def test_a_line_of_several_settings_is_named_beneath_the_means_and_one_of_several_seeds_is_not(tmp_path):
     for method, change in (("sirt", {"noise": 0.1}), ("tv", {"seed": 1})):
         finish(tmp_path, "anna", method), finish(tmp_path, "bert", method, settings={"seed": 0} | change)

@@ -84,6 +84,15 @@ def test_hu_are_those_of_the_water_that_the_geometry_file_states(measured, prior
     np.testing.assert_allclose(*volumes, atol=0.1)
 
 
+def test_one_batch_of_two_is_a_whole_number_and_what_it_leaves_out_is_named(measured, prior, tmp_path, capsys):
+    for name in ("a", "b"):
+        shutil.copytree(measured, tmp_path / "two" / name)
+    with pytest.raises(SystemExit):
+        main(arguments("predict", tmp_path / "out", prior, f"--data.xrays={tmp_path / 'two'}",
+                       "--trainer.limit_predict_batches=1", method="sirt"))
+    assert "1 of 2 cases were not reconstructed" in capsys.readouterr().err
+
+
 def test_the_default_method_predicts_on_128_voxels_unless_a_grid_or_another_network_is_given(prior):
     assert ReconstructionTask().predicted.grid().same_as(Grid.cube(128))
     assert ReconstructionTask().grid.same_as(Grid.cube(64))  # what test scores

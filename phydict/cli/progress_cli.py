@@ -4,10 +4,20 @@ from __future__ import annotations
 
 from typing import Any
 
-from lightning.pytorch.cli import LightningCLI
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
 from phydict.runtime.parser_message import naming_unknown_options
 from phydict.runtime.progress_log import add_progress_options, progress_as
+
+NUMBER = int | float | None
+
+
+def keep_whole(parser: LightningArgumentParser) -> None:
+    """Has options that are a whole number or a share, such as trainer.limit_val_batches, read 1 as the whole number:
+    `typing` may have cached Lightning's types in the other order, in which 1 is the share 1.0, all."""
+    for action in parser._actions:
+        if getattr(action, "_typehint", None) == NUMBER:
+            action._typehint = NUMBER  # type: ignore[attr-defined]
 
 
 class ProgressCLI(LightningCLI):
@@ -21,6 +31,7 @@ class ProgressCLI(LightningCLI):
 
     def _prepare_subcommand_parser(self, klass: type, subcommand: str, **kwargs):
         parser = super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
+        keep_whole(parser)
         add_progress_options(parser)
         return parser
 

@@ -201,10 +201,12 @@ def score_row(case: str, record: dict) -> dict:
     """The row of scores of a record; of whatever kind the error where it lacks what a record holds."""
     if not isinstance(record["method"], str) or not isinstance(record["views"], int):
         raise TypeError
-    scores = {name: None if score is None else float(score) for name, score in (record["scores"] or {}).items()}
-    return {"case": case, "method": record["method"], "views": record["views"],
-            "grid": "x".join(map(str, record["grid"]["shape"]))} | scores | {
-                "seconds": float(sum(record["seconds"].values())),
-                "network_calls": int(record["network_calls"]), "projector_calls": int(record["projector_calls"]),
-                "precision": record.get("precision"), "instruction_set": record.get("instruction_set"),
-                "warning": "; ".join(record.get("warnings", [])) or None}
+    row = {"case": case, "method": record["method"], "views": record["views"],
+           "grid": "x".join(map(str, record["grid"]["shape"]))}
+    scores = {name: None if score is None else float(score) for name, score in (record["scores"] or {}).items()
+              if name not in row}
+    return row | scores | {
+        "seconds": float(sum(record["seconds"].values())),
+        "network_calls": int(record["network_calls"]), "projector_calls": int(record["projector_calls"]),
+        "precision": record.get("precision"), "instruction_set": record.get("instruction_set"),
+        "warning": "; ".join(record.get("warnings", [])) or None}

@@ -18,9 +18,6 @@ KINDS = {"line_integrals": ("scale", "offset"), "counts": ("air", "flat", "dark"
          "display": ("bright_is_dense",)}
 """What pixel values may be -> the settings that belong to it."""
 
-NEUTRAL = {"scale": 1.0, "offset": 0.0} | dict.fromkeys(("air", "flat", "dark", "floor", "bright_is_dense"))
-"""Settings as they are when left out."""
-
 LARGEST_LINE_INTEGRAL = 100.0
 """No line integral of a patient is larger: it is 2 m of bone."""
 
@@ -62,9 +59,9 @@ class Intensity:
                              f"{reprlib.repr(self.flat)} was given")
         if self.scale == 0:
             raise ValueError("the scale of line integrals must not be 0; give what one pixel value stands for")
-        given = {name for name, default in NEUTRAL.items() if getattr(self, name) != default}
         for kind, names in KINDS.items():
-            if kind != self.kind and (foreign := [name for name in names if name in given]):
+            foreign = [name for name in names if getattr(self, name) != getattr(Intensity, name)]
+            if kind != self.kind and foreign:
                 raise ValueError(f"`{foreign[0]}` belongs to the intensity kind {kind}, but the kind is {self.kind}; "
                                  "leave it out")
         if self.kind == "counts" and self.flat is None and not (self.air and self.air > 0):
@@ -102,10 +99,7 @@ class Intensity:
         """
         if self.kind == "line_integrals":
             y = self.scale * pixels + self.offset
-            if np.nanmax(y) > LARGEST_LINE_INTEGRAL or np.nanmedian(y) < 0:
-                raise ValueError(f"the line integrals have a median of {np.nanmedian(y):.3g} and reach "
-                                 f"{np.nanmax(y):.3g}, but behind a patient they lie between 0 and about 10; correct "
-                                 "`scale` and `offset`, or state another intensity kind")
+            check_of_patient(y, "correct `scale` and `offset`, or state another intensity kind")
             return y
         if self.kind == "display":
             return pixels / full_scale if self.bright_is_dense else 1 - pixels / full_scale
@@ -125,6 +119,13 @@ class Intensity:
             raise ValueError(f"{int((above > ABOVE_AIR).sum())} pixels hold counts above air, up to {above.max():.3g} "
                              "times; correct `air` or `flat`, or repair hot pixels")
         return np.log(air / np.maximum(signal, self.floor or 1e-5 * air))
+
+
+def check_of_patient(y: np.ndarray, advice: str) -> None:
+    """Raises ValueError, with what to do, where line integrals are those of no patient."""
+    if np.nanmax(y) > LARGEST_LINE_INTEGRAL or np.nanmedian(y) < 0:
+        raise ValueError(f"the X-rays have a median of {np.nanmedian(y):.3g} and reach {np.nanmax(y):.3g}, but line "
+                         f"integrals behind a patient lie between 0 and about 10; {advice}")
 
 
 def _names(value) -> list[str]:

@@ -77,13 +77,15 @@ class Profile:
 
     def seconds(self, *stages: str) -> dict[str, float]:
         """Seconds of each of the innermost `stages` that ran, whatever they ran in."""
-        by_stage = {name: [use.seconds for full, use in self.uses.items() if full.split(" / ")[-1] == name]
-                 for name in stages}
+        by_stage = {name: [use.seconds for use in self._of(name)] for name in stages}
         return {name: sum(seconds) for name, seconds in by_stage.items() if seconds}
 
     def calls(self, stage: str) -> int:
         """How often a stage ran, whatever it ran in."""
-        return sum(use.calls for full, use in self.uses.items() if full.split(" / ")[-1] == stage)
+        return sum(use.calls for use in self._of(stage))
+
+    def _of(self, stage: str) -> list[StageUsage]:
+        return [use for full, use in self.uses.items() if full.split(" / ")[-1] == stage]
 
     def table(self) -> str:
         """One line per stage."""

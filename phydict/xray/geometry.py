@@ -226,7 +226,7 @@ class ConeBeam:
 
     def check(self, grid: Grid) -> None:
         """Raise ValueError unless the whole box of voxels lies between every source and its detector's plane."""
-        depth = self._depths(grid)
+        depth = self.depths(grid)
         centre = ((grid.centre - self.sources) * self.normals).sum(1)
         for k, distance in enumerate(self.distances):
             near, far = depth[:, k].min(), depth[:, k].max()
@@ -257,20 +257,20 @@ class ConeBeam:
 
     def has_room_for(self, grid: Grid) -> bool:
         """Whether the whole box of voxels lies between every source and its detector's plane."""
-        depth = self._depths(grid)
+        depth = self.depths(grid)
         return bool((depth > 0).all() and (depth < self.distances).all())
 
     def is_smaller_than(self, grid: Grid) -> bool:
         """Whether the scene is that of something smaller than the box of voxels: a part of it lies beside or behind a
         source, or a source stands in the sphere about it and sees, along both sides of the detector, less than a third.
         """
-        if (self._depths(grid) <= 0).any():
+        if (self.depths(grid) <= 0).any():
             return True
         near = np.linalg.norm(self.sources - grid.centre, axis=1) < np.linalg.norm(grid.extent) / 2
         low, high = self._shadow(grid)
         return bool((near & ((high - low) > 3 * self._sides).all(1)).any())
 
-    def _depths(self, grid: Grid) -> np.ndarray:
+    def depths(self, grid: Grid) -> np.ndarray:
         """How far (8, K) in mm the box's corners lie from the sources' planes, towards the detectors."""
         return (grid.corners() @ self.normals.T) - (self.sources * self.normals).sum(1)
 

@@ -21,7 +21,7 @@ from PIL import Image
 
 from phydict.datasets.case import Case
 from phydict.datasets.dicom import DicomTags, read_dicom, shown, tags_intensity
-from phydict.datasets.intensity import KINDS, LARGEST_LINE_INTEGRAL, Intensity
+from phydict.datasets.intensity import KINDS, Intensity, check_of_patient
 from phydict.datasets.natural_order import natural_order
 from phydict.datasets.radiographs.xray_description import GEOMETRY, Description, read_description
 from phydict.datasets.radiographs.xray_images import ENDINGS, image_files, is_dicom, read_image
@@ -140,10 +140,7 @@ def save_xrays(folder: str | Path, xrays: torch.Tensor | np.ndarray, beam: ConeB
                          f"{(beam.views, *beam.shape)}; give the X-rays of this beam")
     if not np.isfinite(xrays).all():
         raise ValueError("the X-rays hold NaN or infinite values; give finite line integrals")
-    if xrays.max() > LARGEST_LINE_INTEGRAL or np.median(xrays) < 0:
-        raise ValueError(f"the X-rays have a median of {np.median(xrays):.3g} and reach {xrays.max():.3g}, but line "
-                         "integrals behind a patient lie between 0 and about 10; give those of attenuation in 1/mm "
-                         "along mm")
+    check_of_patient(xrays, "give those of attenuation in 1/mm along mm")
     _check_saturation([f"view {k}" for k in range(beam.views)], xrays)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)

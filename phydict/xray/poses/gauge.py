@@ -57,7 +57,7 @@ def aligned(beam: ConeBeam, to: ConeBeam, points: np.ndarray) -> ConeBeam:
 def drawn_back(beam: ConeBeam, grid: Grid) -> ConeBeam:
     """The beam whose detectors that reach into a grid's box are drawn back along their rays to behind it, and whose
     pixels grow with that, so that no ray changes."""
-    reach, distance = beam._depths(grid).max(0), beam.distances
+    reach, distance = beam.depths(grid).max(0), beam.distances
     stretch = np.where(reach < distance, 1, (reach + ROOM_MM) / distance)[:, None]
     return beam.at(beam.sources, beam.detectors + (stretch - 1) * (beam.detectors - beam.sources), stretch * beam.u,
                    stretch * beam.v)
@@ -66,5 +66,5 @@ def drawn_back(beam: ConeBeam, grid: Grid) -> ConeBeam:
 def obstructed(beam: ConeBeam, grid: Grid) -> np.ndarray:
     """The views (K,) whose source reaches into a grid's box, or whose detector lies before its middle, so that drawing
     it back does not help."""
-    depth = beam._depths(grid)
+    depth = beam.depths(grid)
     return (depth.min(0) <= 0) | (depth.mean(0) >= beam.distances)

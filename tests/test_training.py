@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -272,14 +273,24 @@ def test_a_run_that_stopped_at_an_epochs_last_batch_goes_on_with_the_next_ones_f
     assert drawn[before:before + 4] == [(1, i) for i in range(4)]
 
 
+def ten_steps(folder: Path, cache: Path, *more: str) -> dict:
+    """The checkpoint of ten steps that are validated now and then."""
+    main(arguments(folder, cache, "--model.text.encoder=none", "--data.loading.epoch_size=4",
+                   "--trainer.check_val_every_n_epoch=5", "--trainer.limit_val_batches=1", "--trainer.max_steps=10",
+                   *more))
+    return checkpoint(folder)
+
+
+@pytest.fixture(scope="module")
+def straight(tmp_path_factory, cache) -> dict:
+    return ten_steps(tmp_path_factory.mktemp("straight"), cache)
+
+
 @pytest.mark.parametrize("stop", [4, 6])
-def test_a_run_of_so_many_steps_that_validates_now_and_then_resumes_as_the_uninterrupted_one(tmp_path, cache, stop):
-    args = arguments(tmp_path, cache, "--model.text.encoder=none", "--data.loading.epoch_size=4",
-                     "--trainer.check_val_every_n_epoch=5", "--trainer.limit_val_batches=1")
-    main([*args, f"--out={tmp_path / 'straight'}", "--trainer.max_steps=10"])
-    main([*args, f"--out={tmp_path / 'halved'}", f"--trainer.max_steps={stop}"])
-    main([*args, f"--out={tmp_path / 'halved'}", "--trainer.max_steps=10", "--ckpt_path=last"])
-    one, other = (checkpoint(tmp_path / run) for run in ("straight", "halved"))
+def test_a_run_of_so_many_steps_that_validates_now_and_then_resumes_as_the_uninterrupted_one(straight, tmp_path, cache,
+                                                                                             stop):
+    ten_steps(tmp_path, cache, f"--trainer.max_steps={stop}")
+    one, other = straight, ten_steps(tmp_path, cache, "--ckpt_path=last")
     assert one["global_step"] == other["global_step"] == 10 and one["epoch"] == other["epoch"]
     assert all(torch.equal(one["state_dict"][name], other["state_dict"][name]) for name in one["state_dict"])
 

@@ -69,6 +69,12 @@ def population(drawn) -> Population:
     return drawn.population
 
 
+@pytest.fixture(scope="module")
+def coarse(tmp_path_factory) -> Path:
+    """A cache in which two patients on coarse voxels are registered once."""
+    return tmp_path_factory.mktemp("coarse")
+
+
 def rmse(a: dict, b: dict) -> float:
     return WINDOW.half_width * float((a["volume"] - b["volume"]).square().mean().sqrt())
 
@@ -271,9 +277,9 @@ def test_a_share_of_the_draws_from_cts_comes_from_the_population(drawn, share):
     assert all((plain.source(np.random.default_rng(i)) is phantoms) == (picked[i] is phantoms) for i in range(400))
 
 
-def test_training_draws_from_the_population_what_it_draws_from_the_folder(folder, tmp_path):
+def test_training_draws_from_the_population_what_it_draws_from_the_folder(folder, coarse):
     settings = PopulationSettings(1.0, draws=2, variation=Variation(findings=1.0))
-    data = PriorData(str(folder), holdout=HoldOut(["patient2"], phantoms=0), phantoms=0, cache=str(tmp_path),
+    data = PriorData(str(folder), holdout=HoldOut(["patient2"], phantoms=0), phantoms=0, cache=str(coarse),
                      loading=Loading(epoch_size=2, population=settings), cube=Cube(16))
     item = data.draws(0)[0]
     assert {case["id"] for case in data.population.population.cases} == {"patient0", "patient1"}
@@ -294,13 +300,13 @@ def water(folder: Path) -> None:
     write_ct(folder / "water.nii.gz", hu, 20.0)
 
 
-def test_a_ct_that_does_not_register_is_named_and_left_out(folder, tmp_path):
+def test_a_ct_that_does_not_register_is_named_and_left_out(folder, coarse, tmp_path):
     cts = tmp_path / "cts"
     cts.mkdir()
     for n in range(2):
         (cts / f"patient{n}.nii.gz").symlink_to(folder / f"patient{n}.nii.gz")
     water(cts)
-    drawn = DrawnPatients(CTCases(find_cts(cts), tmp_path / "cache", Grid.cube(16)))
+    drawn = DrawnPatients(CTCases(find_cts(cts), coarse, Grid.cube(16)))
     with pytest.warns(UserWarning, match=r"the CT water does not register \(no lungs were found in it\)"):
         drawn.prepare()
     assert [case["id"] for case in drawn.population.cases] == ["patient0", "patient1"]

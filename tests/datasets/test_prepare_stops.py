@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import multiprocessing
 import os
 import runpy
 import shutil
@@ -15,7 +16,7 @@ import numpy as np
 import pytest
 from ct_files import AFFINE, save_ct
 from dicom_files import write_ct_series
-from processes import Python
+from processes import FORKS, Python
 
 from phydict.datasets.cts import cache, preparation
 from phydict.datasets.cts.ct_rate import CTCases, find_cts
@@ -39,7 +40,8 @@ def contents(folder):
             else p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file() and p.name != SUMMARY}
 
 
-def test_two_workers_give_what_one_gives(tmp_path, thorax):
+def test_two_workers_give_what_one_gives(tmp_path, thorax, monkeypatch):
+    monkeypatch.setattr(multiprocessing, "get_context", {"spawn": FORKS}.get)  # whose workers need not import anew
     for n in range(2):
         save_ct(tmp_path / f"in/{n}.nii.gz", thorax + np.int16(10 * n))
     save_ct(tmp_path / "in/short.nii.gz", thorax[:, :, :3])

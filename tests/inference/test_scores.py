@@ -8,6 +8,7 @@ import os
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import nibabel
 import numpy as np
@@ -34,9 +35,10 @@ from phydict.xray import Ideal, Polychromatic, Projector
 
 
 def test_a_table_holds_the_cases_of_its_run_alone(cts, tmp_path):
-    main(sirt("test", tmp_path, f"--data.cts={cts}", *ORBIT))
+    coarse = [*ORBIT, "--model.grid=32"]
+    main(sirt("test", tmp_path, f"--data.cts={cts}", *coarse))
     (tmp_path / "only.txt").write_text("b\n")
-    main(sirt("test", tmp_path, f"--data.cts={cts}", *ORBIT, f"--data.only={tmp_path / 'only.txt'}"))
+    main(sirt("test", tmp_path, f"--data.cts={cts}", *coarse, f"--data.only={tmp_path / 'only.txt'}"))
     with (tmp_path / "sirt" / "results.csv").open() as file:
         assert [row["case"] for row in csv.DictReader(file)] == ["b"]
 
@@ -72,7 +74,7 @@ def test_a_doubtful_ct_marks_its_row_its_record_and_the_table(tmp_path, capsys):
         write_ct(tmp_path / "cts" / f"{name}.nii.gz", 0, change=change)
     image = nibabel.load(write_ct(tmp_path / "cts" / "cm.nii.gz", 0))
     nibabel.save(nibabel.Nifti1Image(np.asarray(image.dataobj), np.diag([1.0, 1.0, 1.0, 1.0])), image.get_filename())
-    main(sirt("test", tmp_path / "out", f"--data.cts={tmp_path / 'cts'}", *ORBIT))
+    main(sirt("test", tmp_path / "out", f"--data.cts={tmp_path / 'cts'}", *ORBIT, "--model.grid=32"))
     out, err = capsys.readouterr()
     with (tmp_path / "out" / "sirt" / "results.csv").open() as file:
         rows = {row["case"]: row["warning"] for row in csv.DictReader(file)}
@@ -122,9 +124,10 @@ def test_a_test_of_fewer_cases_says_how_many_of_the_folder_its_table_leaves_out(
 
 
 def test_a_case_depends_on_its_id_and_the_seed_alone(cts, tmp_path):
-    main(sirt("test", tmp_path / "both", f"--data.cts={cts}", *ORBIT))
-    main(sirt("test", tmp_path / "one", f"--data.cts={cts / 'b.nii.gz'}", *ORBIT))
-    main(sirt("test", tmp_path / "seed", f"--data.cts={cts / 'b.nii.gz'}", *ORBIT, "--model.seed=1"))
+    coarse = [*ORBIT, "--model.grid=32"]
+    main(sirt("test", tmp_path / "both", f"--data.cts={cts}", *coarse))
+    main(sirt("test", tmp_path / "one", f"--data.cts={cts / 'b.nii.gz'}", *coarse))
+    main(sirt("test", tmp_path / "seed", f"--data.cts={cts / 'b.nii.gz'}", *coarse, "--model.seed=1"))
     both, one, seed = (volume(tmp_path / name / "sirt" / "b") for name in ("both", "one", "seed"))
     np.testing.assert_array_equal(both, one)
     assert not np.array_equal(one, seed)  # other noise in the X-rays
@@ -154,15 +157,19 @@ def test_the_default_method_reconstructs_with_a_prior(prior, measured, tmp_path)
     assert said["misfit"] < 0.5
 
 
-def test_the_simulated_orbit_is_the_one_asked_for(scored, tmp_path, capsys):
-    case = "phantom-1000000"
-    main(phantoms(tmp_path / "five", 1, "--data.orbit.views=5"))
-    assert len(record(tmp_path / "five" / "sirt" / case)["misfit_per_view"]) == 5
-    main(phantoms(tmp_path / "same", 1, "--data.simulation_voxels=64"))
-    np.testing.assert_array_equal(volume(tmp_path / "same" / "sirt" / case), volume(scored / case))
-    main(phantoms(tmp_path / "finer", 1, "--data.simulation_voxels=128"))
-    assert not np.array_equal(volume(tmp_path / "finer" / "sirt" / case), volume(scored / case))
-    assert "multiple" in refusal(capsys, main, phantoms(tmp_path / "coarser", 1, "--data.simulation_voxels=96"))
+def test_the_simulated_orbit_is_the_one_asked_for(tmp_path, capsys):
+    def arguments(name: str, *more: str) -> list[str]:
+        return phantoms(tmp_path / name, 1, "--model.grid=32", *more)
+
+    def found(name: str, *more: str) -> Path:
+        main(arguments(name, *more))
+        return tmp_path / name / "sirt" / "phantom-1000000"
+
+    own = volume(found("own"))
+    assert len(record(found("five", "--data.orbit.views=5"))["misfit_per_view"]) == 5
+    np.testing.assert_array_equal(volume(found("same", "--data.simulation_voxels=32")), own)
+    assert not np.array_equal(volume(found("finer", "--data.simulation_voxels=64")), own)
+    assert "multiple" in refusal(capsys, main, arguments("coarser", "--data.simulation_voxels=48"))
 
 
 OPTIMISTIC = "the voxels that are reconstructed, which is optimistic"
@@ -197,7 +204,7 @@ def test_a_score_that_is_not_finite_leaves_strict_json_and_the_same_table_again(
 
 def test_simulated_xrays_are_taken_where_a_geometry_file_says(scored, tmp_path, capsys):
     other = ["test", "--data.cts=phantom", "--data.phantoms=1", f"--model.out={tmp_path}", "--model.method=sirt",
-             "--data.geometry=biplanar"]
+             "--model.method.init_args.iterations=3", "--model.grid=32", "--data.geometry=biplanar"]
     main(other)
     assert len(record(tmp_path / "sirt" / "phantom-1000000")["misfit_per_view"]) == 2
     assert "leave one out" in refusal(capsys, main, [*other, "--data.orbit.views=4"])

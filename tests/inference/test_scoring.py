@@ -72,7 +72,7 @@ def test_volumes_are_scored_by_ct_clip_and_the_table_says_why_reports_are_not(te
     monkeypatch.setattr(scoring, "load_ct_clip", lambda *_: model)
     (tmp_path / "clip.pt").write_bytes(b"")
     main(sirt("test", tmp_path / "out", f"--data.cts={cts}", *ORBIT, "--metrics=[clip]",
-              f"--clip.weights={tmp_path / 'clip.pt'}"))
+              f"--clip.weights={tmp_path / 'clip.pt'}", "--model.grid.voxels=16", "--model.grid.side=96"))
     folder = tmp_path / "out" / "sirt"
     assert f"CLIP T2I (%): empty, since {why}" in (folder / "results.md").read_text()
     assert all(0 <= row["clip_i2i"] <= 100 and "clip_t2i" not in row for row in read_csv(folder / "results.csv"))

@@ -1,5 +1,6 @@
 """The page of results in a real browser, from disk; skipped where no Chromium or no playwright is found."""
 
+import base64
 import json
 import re
 import shutil
@@ -82,9 +83,10 @@ def readout(page) -> tuple[np.ndarray, dict[str, int]]:
 
 def pixels(page, selector: str) -> np.ndarray:
     """A canvas's picture (height, width, RGBA)."""
-    width, *values = page.eval_on_selector(selector, """canvas => [
-        canvas.width, ...canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data]""")
-    return np.array(values).reshape(-1, width, 4)
+    width, values = page.eval_on_selector(selector, """canvas => {
+        const values = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;
+        return [canvas.width, btoa(values.reduce((text, value) => text + String.fromCharCode(value), ""))];}""")
+    return np.frombuffer(base64.b64decode(values), np.uint8).reshape(-1, width, 4).astype(int)
 
 
 def look(page, selector: str) -> str:

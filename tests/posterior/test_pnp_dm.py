@@ -34,7 +34,7 @@ def blurred(rho):
 @pytest.mark.parametrize("rho", [0.1, 0.3])
 @pytest.mark.parametrize("likelihood", [ExactDraw(20, 1e-12), Langevin(400, 2e-3, 1.0)])
 def test_at_a_constant_coupling_the_states_have_the_blurred_posterior(rho, likelihood):
-    levels = 600 if isinstance(likelihood, ExactDraw) else 200
+    levels = 300 if isinstance(likelihood, ExactDraw) else 200
     settings = one_draw(30, rho_max=rho, rho_min=rho, levels=levels, likelihood=likelihood, noise=NOISE)
     mean, covariance = blurred(rho)
     found, spread = moments(sample(settings, 3000))
@@ -44,7 +44,7 @@ def test_at_a_constant_coupling_the_states_have_the_blurred_posterior(rho, likel
 
 def test_as_the_coupling_tightens_the_annealed_states_tend_to_the_posterior():
     mean, covariance = condition(measurement(), denoiser(V).mean, V, NOISE)
-    found, spread = moments(sample(one_draw(120, rho_min=0.04, levels=400, **EXACT), 3000))
+    found, spread = moments(sample(one_draw(120, rho_min=0.04, levels=200, **EXACT), 3000))
     torch.testing.assert_close(found, mean, atol=0.015, rtol=0)
     assert (spread - covariance).norm() < 0.1 * covariance.norm()
 
@@ -57,7 +57,7 @@ def test_the_mean_of_many_states_is_nearer_the_posterior_mean_than_one_of_them()
 
 
 def test_data_without_weight_leave_the_prior():
-    found, spread = moments(sample(one_draw(30, levels=600, likelihood=ExactDraw(), noise=1e6), 3000))
+    found, spread = moments(sample(one_draw(30, levels=300, likelihood=ExactDraw(), noise=1e6), 3000))
     torch.testing.assert_close(found, denoiser(V).mean.flatten(), atol=0.015, rtol=0)
     assert (spread / V - torch.eye(N).double()).norm() < 0.08 * N**0.5
 

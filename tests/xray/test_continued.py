@@ -10,7 +10,7 @@ from laws import random_like
 from torch.nn.functional import pad
 
 from phydict import ConeBeam, Projector, reconstruct
-from phydict.baselines import FISTATV
+from phydict.baselines import CGLS, FISTATV
 from phydict.datasets import load_xrays, phantom_case, save_xrays
 from phydict.evaluation import volume_metrics
 from phydict.grid import Grid
@@ -133,7 +133,7 @@ def test_what_is_stated_is_not_asked(patients):
 
 
 @pytest.mark.filterwarnings("ignore:no volume explains", "ignore:the X-rays show")
-@pytest.mark.parametrize("method", [pytest.param("phydict_learned", marks=pytest.mark.slow), "cgls"])
+@pytest.mark.parametrize("method", [pytest.param("phydict_learned", marks=pytest.mark.slow), CGLS(8)])
 def test_a_patient_who_goes_on_is_found_better_where_the_rays_do(patients, method):
     beam = ConeBeam.orbit(8, 1020, 740, (112, 112), 5.0)
     y = xrays_of(WINDOW.to_mu(patients["continues"]), beam)
@@ -146,7 +146,7 @@ def test_a_patient_who_goes_on_is_found_better_where_the_rays_do(patients, metho
 
 
 @pytest.mark.filterwarnings("ignore:no volume explains", "ignore:the X-rays show")
-@pytest.mark.parametrize("method", [pytest.param("phydict_learned", marks=pytest.mark.slow), FISTATV(iterations=80)])
+@pytest.mark.parametrize("method", [pytest.param("phydict_learned", marks=pytest.mark.slow), FISTATV(iterations=40)])
 def test_a_box_in_a_patient_who_goes_on_is_as_the_whole_volume_shows_it(patients, method):
     beam, box = ConeBeam.orbit(8, 1020, 740, (112, 112), 5.0), Grid.box(32, 192.0, (0.0, 0.0, 96.0))
     y = xrays_of(WINDOW.to_mu(patients["continues"]), beam)

@@ -23,7 +23,7 @@ from torch.nn.functional import interpolate
 
 from phydict.evaluation.metrics import RANGE
 from phydict.evaluation.planes import slices
-from phydict.grid import Grid, centred
+from phydict.grid import Grid
 from phydict.prior.finite import check_finite
 from phydict.prior.tensors import read_torch
 from phydict.runtime.lpips_networks import load_lpips
@@ -43,11 +43,18 @@ LEAST_SIDE = 17
 
 
 def maisi_voxels(hu: Tensor, grid: Grid) -> Tensor:
-    """A volume (X, Y, Z) in HU on `grid` as MAISI's script takes it, when set to 1 mm and 512^3 voxels: on
-    (512, 512, 512) voxels of 1 mm about its centre, what does not fit cut off and air around the rest."""
-    shape = (MAISI_SIDE,) * 3
-    onto = Grid(shape, affine=centred(grid.affine[:3, :3] / grid.spacing, shape, grid.centre))
-    return interpolated(hu, grid, onto, RANGE.low)
+    """A volume (X, Y, Z) in HU on `grid` as MAISI's script takes it, when set to 1 mm and 512^3 voxels: voxels of 1 mm
+    from the centre of its first one to that of its last one, of which the middle 512 are taken, or air put around."""
+    sizes = [round((n - 1) * mm + 1) for n, mm in zip(grid.shape, grid.spacing)]
+    first = [n // 2 - MAISI_SIDE // 2 if n > MAISI_SIDE else -((MAISI_SIDE - n) // 2) for n in sizes]
+    affine = grid.affine.copy()
+    affine[:3, :3] /= grid.spacing
+    affine[:3, 3] += affine[:3, :3] @ first
+    shown = interpolated(hu, grid, Grid((MAISI_SIDE,) * 3, affine=affine), RANGE.low)
+    for axis, (n, start) in enumerate(zip(sizes, first)):
+        along = shown.movedim(axis, 0)
+        along[:max(0, -start)] = along[max(0, n - start):] = RANGE.low
+    return shown
 
 
 class SliceFeatures(nn.Module):

@@ -66,6 +66,7 @@ from phydict.xray.beyond import with_continuation
 from phydict.xray.boxes import binned_to, covers
 from phydict.xray.checks import check_fit, with_air_at_zero
 from phydict.xray.poses.uncertain import Uncertain
+from phydict.xray.projectors.own import projector_kind
 
 if TYPE_CHECKING:
     from phydict.poses import FoundPoses
@@ -239,7 +240,7 @@ def onto_grid(method: Reconstructor, grid: Grid | None, refinement: Refinement =
 
 def reconstruct_by(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, report: str = "",
                    display: bool = False, seed: int = 0, on_step: Callable[[], None] = lambda: None,
-                   projector: str = "auto", uncertain: Uncertain | None = None) -> Reconstruction:
+                   projector: str | type = "auto", uncertain: Uncertain | None = None) -> Reconstruction:
     """What a method makes of X-rays (K, V, U) on `grid`, its own if it has one, or the voxels it refines to.
 
     First the poses are searched, where they are `uncertain`; then the X-rays are asked whether the patient
@@ -294,7 +295,7 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: AnyPrior | str | Path | No
                 grid: Grid | None = None, on_step=lambda: None,
                 super_resolution: SuperResolution | MedSynSuperResolution | str | Path | None = None,
                 sr_guided: bool = True, samples: int = 1, precision: str = "auto",
-                projector: str = "auto", uncertain: Uncertain | None = None) -> Reconstruction:
+                projector: str | type = "auto", uncertain: Uncertain | None = None) -> Reconstruction:
     """A CT volume from X-rays (K, V, U) and their geometry.
 
     xrays: tensor or array of line integrals; with display=True, of display values with an unknown gain and offset per
@@ -305,8 +306,9 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: AnyPrior | str | Path | No
     super_resolution, sr_guided: the second stage of a cascade, as for `reconstructor`; its grid counts as the prior's.
     samples: more than one gives their mean, and `deviation`, a map of how far they differ, as for `reconstructor`.
     precision: of the networks; "auto" is bfloat16 where the device computes it faster, else float32.
-    projector: the kind of `Projector`, such as "siddon"; "auto" is the fastest that suits the geometry. An object of
-    one's own goes to `reconstructor(...).reconstruct(xrays, projector)`.
+    projector: the `method` of the Projector, such as "siddon", or a class of one's own, which is made of a grid and a
+    beam; "auto" is the fastest that suits the geometry. An object goes to `reconstructor(...).reconstruct(xrays,
+    projector)`.
     on_step: is called without arguments after each of the method's steps. seed: of what is drawn. guidance: how
     strongly a report is followed.
     uncertain: what the geometry does not know exactly, which is then found first; the result holds `beam` and `poses`.
@@ -319,9 +321,7 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: AnyPrior | str | Path | No
         raise ValueError(f"the grid must be a Grid, but {grid!r} was given; Grid.cube makes one")
     if not isinstance(report, str | None):
         raise ValueError(f"the report must be text, but {report!r} was given")
-    if not isinstance(projector, str):
-        raise ValueError("the projector is the name of one, such as 'auto', but an object was given: give it to "
-                         "reconstructor(...).reconstruct(xrays, projector)")
+    projector = projector_kind(projector)
     check_seed(seed)
     method = default_method(prior, samples, guidance) if method is None else method
     ready = reconstructor(method, prior, guidance, super_resolution=super_resolution, sr_guided=sr_guided,

@@ -30,7 +30,7 @@ from phydict.runtime.seeds import check_seed
 from phydict.units import HUWindow
 from phydict.xray import Ideal, Polychromatic, Simulator
 from phydict.xray.orbits import PIXEL, PIXELS, SOURCE_TO_DETECTOR, SOURCE_TO_ISOCENTRE
-from phydict.xray.projectors.projector import METHODS as PROJECTORS
+from phydict.xray.projectors.own import projector_kind, projector_settings
 
 SIDE = PIXELS * PIXEL
 """mm along each side of the simulated detector unless the size of its pixels is given."""
@@ -84,7 +84,7 @@ class Trial:
     refine: bool = True
     super_resolution: str | None = None
     like: str | None = None
-    projector: str = "auto"
+    projector: str | type = "auto"
     with_report: bool = True
 
     @property
@@ -169,7 +169,7 @@ class Trial:
         if self.box and not self.box.grid().same_as(grid):
             identity["region"] = self.box.grid().to_dict()
         if self.projector != "auto":
-            identity["projector"] = self.projector
+            identity["projector"] = projector_settings(self.projector)
         return json.loads(json.dumps(identity))
 
     def acquisition(self) -> str:
@@ -233,8 +233,7 @@ def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
     check_seed(given.get("seed", 0))
     if (samples := given.get("samples", 1)) < 1:
         raise ValueError(f"samples is a number of draws, 1 or more, but {samples} was given")
-    if (projector := given.get("projector", "auto")) not in PROJECTORS:
-        raise ValueError(f"there is no projector {projector!r}: use one of {', '.join(PROJECTORS)}")
+    projector = projector_kind(given.get("projector", "auto"))
     base = method_of(of)
     simulator = SIMULATORS.get(given.get("simulator", "ideal"))
     if simulator is None:
@@ -281,7 +280,7 @@ def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
     if box is None and (alone := {"side", "centre", "refine"} & set(given)):
         raise ValueError(f"{', '.join(sorted(alone))} of a box of voxels means nothing without voxels: give them too")
     trial = Trial(columns, method, data, prior, value["guidance"], value["samples"], value["seed"], box,
-                  value["refine"], value["super_resolution"], projector=value["projector"],
+                  value["refine"], value["super_resolution"], projector=projector,
                   with_report=value["report"])
     if box and data.protocol:
         data.protocol.check_voxels(box.grid(), trial.bound)

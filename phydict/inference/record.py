@@ -21,12 +21,14 @@ from phydict.reconstruction import Reconstruction, Reconstructor, describe
 from phydict.runtime.precision import instruction_set
 from phydict.runtime.profiling import process_peak
 from phydict.runtime.version import VERSION
+from phydict.xray.projectors.own import projector_settings
 
 
-def method_settings(name: str, seed: int, method: Sampler | Reconstructor, projector: str, sampling: Sampling) -> dict:
+def method_settings(name: str, seed: int, method: Sampler | Reconstructor, projector: str | type, sampling: Sampling
+                    ) -> dict:
     """Those of a method, and of the projector and the precision where one is chosen."""
     return {"name": name, "seed": seed, "method": describe(method)} | (
-        {"projector": projector} if projector != "auto" else {}) | (
+        {"projector": projector_settings(projector)} if projector != "auto" else {}) | (
         {"precision": sampling.precision} if sampling.precision != "auto" else {})
 
 

@@ -47,7 +47,7 @@ from phydict.runtime.reading import enough_memory
 from phydict.runtime.seeds import case_seed, check_seed
 from phydict.runtime.warning import Remark, warn
 from phydict.units import HUWindow
-from phydict.xray.projectors.projector import METHODS as PROJECTORS
+from phydict.xray.projectors.own import projector_kind
 
 PREDICTED_VOXELS = 128
 """Along each side of 384 mm, of what phydict_learned predicts: 2.1 to 2.5 times the seconds of its network's 64."""
@@ -74,7 +74,8 @@ class ReconstructionTask(lightning.LightningModule):
         seed: the only source of randomness; of each case in predict, as in Python, and by phydict.case_seed in test
         grid: the result's voxels along each side of 384 mm, such as 128, or a box: voxels, side, centre, keep_coarse;
             none given: the prior's own, without a prior 64; in predict, of phydict_learned with its own network, 128
-        projector: auto (the fastest that suits the geometry), separable, siddon, eq4, joseph or matrix
+        projector: auto (the fastest that suits the geometry), separable, siddon, eq4, joseph or matrix, or the path of
+            a class that is made of a grid and a beam
     """
 
     def __init__(self, method: Sampler | Reconstructor | None = None, name: str | None = None,
@@ -83,8 +84,6 @@ class ReconstructionTask(lightning.LightningModule):
                  overwrite: bool = False, seed: int = 0, grid: int | Box | None = None, projector: str = "auto"):
         super().__init__()
         check_seed(seed)
-        if projector not in PROJECTORS:
-            raise ValueError(f"model.projector is one of {', '.join(PROJECTORS)}, but {projector!r} was given")
         if method is None:
             chosen = default_method(prior, sampling.samples, sampling.guidance)
             method, name = METHODS[chosen], name or chosen
@@ -96,10 +95,10 @@ class ReconstructionTask(lightning.LightningModule):
         if name in ("", "..") or name != Path(name).name:
             raise ValueError(f"model.name is the name of one folder inside model.out, but '{name}' was given")
         self.method_name, self.seed, self.pages = name, seed, Path(out) / "dry_run"
-        self.projector = projector
+        self.projector = projector_kind(projector)
         self.results = CaseResults(Path(out) / name, overwrite)
         check_writable(self.results.folder, "model.out")
-        self.settings = method_settings(name, seed, method, projector, sampling)
+        self.settings = method_settings(name, seed, method, self.projector, sampling)
         self.window = HUWindow()
         prior = prior or (str(method.default_prior) if isinstance(method, Sampler) else None)
         self.prior = find_prior(prior) if prior and isinstance(method, Sampler) else None

@@ -23,7 +23,7 @@ SLACK = 1e-3
 """A share of a voxel by which a box may stand out of another one that covers it."""
 
 
-def binned_to(grid: Grid, xrays: Tensor, beam: ConeBeam, full_detector: bool, method: str = "auto"
+def binned_to(grid: Grid, xrays: Tensor, beam: ConeBeam, full_detector: bool, method: str | type = "auto"
               ) -> tuple[Tensor, Projector]:
     """X-rays (K, V, U), binned to what the voxels can hold unless every pixel is wanted, and the projector that goes
     with them on their device; `method` as Projector's."""
@@ -31,13 +31,14 @@ def binned_to(grid: Grid, xrays: Tensor, beam: ConeBeam, full_detector: bool, me
     return binned(xrays, factor), Projector(grid, beam.binned(factor), method, device=xrays.device, full_detector=True)
 
 
-def projector_method(projector: Projector) -> str:
-    """The method by which X-rays are projected on other voxels than a projector's own; a projector that is not
-    phydict's gives its place to it there, and a warning says so."""
+def projector_method(projector: Projector) -> str | type:
+    """The method by which X-rays are projected on other voxels than a projector's own; an object that is no `Projector`
+    gives its place to one there, and a warning says so."""
     method = getattr(projector, "method", None)
-    if method in METHODS:
+    if isinstance(method, type) or method in METHODS:
         return method
-    warn(f"{type(projector).__name__} projects its own voxels alone: on others phydict's projector takes its place")
+    warn(f"{type(projector).__name__} projects its own voxels alone: on others phydict's projector takes its place; "
+         "its class, as `projector` of phydict.reconstruct or --model.projector, projects all")
     return "auto"
 
 

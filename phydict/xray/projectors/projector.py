@@ -19,6 +19,7 @@ from phydict.xray.projectors.continued import Continued, reach_beyond
 if TYPE_CHECKING:  # they bring a compiler, so that each is imported where it is first needed
     from phydict.xray.projectors.eq4 import Eq4
     from phydict.xray.projectors.joseph import Joseph
+    from phydict.xray.projectors.own import OwnOperator
     from phydict.xray.projectors.separable import Separable
     from phydict.xray.projectors.siddon import Siddon
     from phydict.xray.projectors.system_matrix import SystemMatrix
@@ -45,7 +46,10 @@ class Projector:
         "joseph": plane sweep with bilinear samples, any pose and device (phydict.xray.projectors.joseph);
         "matrix": what siddon computes, as a stored matrix, any pose and device (phydict.xray.projectors.system_matrix);
         "auto": separable for upright detectors; else the matrix if it fits, else siddon on the CPU and joseph on other
-            devices. `A.method` is the one that runs and `A.reason` says why.
+            devices. `A.method` is the one that runs and `A.reason` says why;
+        a class of one's own: an object that it makes of a grid and a beam, with `A(mu)` and `A.T(xrays)`, computes what
+            this projector gives (phydict.xray.projectors.own). A volume that is continued is given to it as a taller
+            one.
     memory: bytes that the stored matrix, or the plane sweep's temporaries and rays, may take. The other methods hold
         little: the separable one, on other devices than the CPU, the sparse factors of every view (some 15 MB each at
         256^3 voxels, 448^2 pixels and float32), which the budget does not count.
@@ -55,10 +59,11 @@ class Projector:
     matrix does not fit the memory.
     """
 
-    def __init__(self, grid: Grid, beam: ConeBeam, method: str = "auto", memory: int = MEMORY,
+    def __init__(self, grid: Grid, beam: ConeBeam, method: str | type = "auto", memory: int = MEMORY,
                  device: torch.device | str | None = None, full_detector: bool = False):
-        if method not in METHODS:
-            raise ValueError(f"there is no projector method {method!r}; choose one of {', '.join(METHODS)}")
+        if not isinstance(method, type) and method not in METHODS:
+            raise ValueError(f"there is no projector method {method!r}; choose one of {', '.join(METHODS)}, or give a "
+                             "class of your own")
         if not memory > 0:
             raise ValueError(f"memory is a budget in bytes > 0, but {memory} was given")
         beam.check(grid)
@@ -91,8 +96,8 @@ class Projector:
 class _Engine:
     """What projectors of the same grid and beam share: the operator, why it was chosen, and its norm once known."""
 
-    operator: Eq4 | Joseph | Separable | Siddon | SystemMatrix | Continued
-    method: str
+    operator: Eq4 | Joseph | Separable | Siddon | SystemMatrix | OwnOperator | Continued
+    method: str | type
     reason: str
     norm: float | None = None
 
@@ -100,7 +105,7 @@ class _Engine:
 _engines: OrderedDict[tuple, _Engine] = OrderedDict()
 
 
-def _engine(grid: Grid, beam: ConeBeam, method: str, memory: int, device: str) -> _Engine:
+def _engine(grid: Grid, beam: ConeBeam, method: str | type, memory: int, device: str) -> _Engine:
     """The engine for a geometry, from among those last used if it is there."""
     key = (method, memory, device, grid.shape, grid.affine.tobytes(), beam.shape, bool(beam.continued),
            *(getattr(beam, name).tobytes() for name in VECTOR_KEYS[:4]))
@@ -132,7 +137,11 @@ def _choose(grid: Grid, beam: ConeBeam, memory: int, device: str) -> tuple[str, 
                     f"{memory:,}, and {why}")
 
 
-def _operator(grid: Grid, beam: ConeBeam, method: str, memory: int):
+def _operator(grid: Grid, beam: ConeBeam, method: str | type, memory: int):
+    if isinstance(method, type):
+        from phydict.xray.projectors.own import OwnOperator
+
+        return OwnOperator(method, grid, beam)
     from phydict.xray.projectors.eq4 import Eq4
     from phydict.xray.projectors.joseph import Joseph
     from phydict.xray.projectors.separable import Separable

@@ -1,0 +1,161 @@
+"""Projectors of a user's own: given by their class, they take phydict's place on all voxels."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from inference.runs import phantoms, record
+from laws import assert_adjoint, assert_gradient_is_adjoint, assert_linear
+from prior.tiny import tiny_prior
+
+from phydict.baselines import CGLS, Region
+from phydict.cli.infer import main
+from phydict.datasets import Thorax, build
+from phydict.grid import Grid
+from phydict.inference.record import method_settings
+from phydict.inference.settings import Sampling
+from phydict.methods import reconstruct, reconstruct_by, reconstructor
+from phydict.units import hu_to_mu
+from phydict.xray import ConeBeam, Projector
+from phydict.xray.projectors.own import projector_kind
+
+GRID = Grid.cube(12, 360.0)
+BEAM = ConeBeam.orbit(3, 1020.0, 740.0, (10, 14), 40.0)
+OWN = '''from phydict.xray import Projector
+
+
+class Own:
+    made = []
+
+    def __init__(self, grid, beam):
+        self.A = Projector(grid, beam, "joseph", full_detector=True)
+        self.made.append(grid.shape)
+
+    def __call__(self, mu):
+        return self.A(mu)
+
+    def T(self, xrays):
+        return self.A.T(xrays)
+'''
+
+
+@pytest.fixture
+def module(tmp_path, monkeypatch):
+    """Writes a module of a name that no test has had, and imports it."""
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def write(code: str):
+        name = f"own_{abs(hash((code, str(tmp_path))))}"
+        (tmp_path / f"{name}.py").write_text(code)
+        importlib.invalidate_caches()
+        return importlib.import_module(name)
+
+    return write
+
+
+def of_thorax(grid: Grid, beam: ConeBeam) -> torch.Tensor:
+    return Projector(grid, beam, "joseph", full_detector=True)(
+        hu_to_mu(torch.from_numpy(build(Thorax.standard(), grid)[0]))[None, None])[0]
+
+
+@pytest.mark.parametrize("continued", [None, True])
+def test_it_keeps_the_laws_and_projects_what_it_wraps(module, continued):
+    beam = BEAM.with_continued(continued)
+    A = Projector(GRID, beam, module(OWN).Own)
+    wrapped = Projector(GRID, beam, "joseph")
+    x = torch.rand(2, 1, *GRID.shape, generator=torch.Generator().manual_seed(1))
+    assert torch.equal(A(x), wrapped(x)) and A.norm() == pytest.approx(wrapped.norm(), rel=1e-5)
+    for law in (assert_adjoint, assert_gradient_is_adjoint):
+        law(A, A.T, (1, 1, *GRID.shape))
+    assert_linear(A, (1, 1, *GRID.shape))
+
+
+@pytest.mark.filterwarnings("ignore")  # of few iterations and views
+@pytest.mark.parametrize("method, grid", [("sirt", Grid.cube(24)), ("phydict_fast", None),
+                                          ("phydict_fast", Grid.cube(24)), ("dds", None)])
+def test_methods_use_it_on_every_grid_of_theirs_and_give_what_the_wrapped_one_gives(module, method, grid):
+    kind, beam, prior = module(OWN).Own, BEAM.with_continued(False), tiny_prior(False)
+    xrays = of_thorax(Grid.cube(24), beam)
+    own, wrapped = (reconstruct(xrays, beam, None if method == "sirt" else prior, method, grid=grid,
+                                projector=projector) for projector in (kind, "joseph"))
+    assert torch.equal(own.volume, wrapped.volume) and own.misfit == wrapped.misfit
+    assert {(grid or prior.grid).shape} | ({prior.grid.shape} if method != "sirt" else set()) <= {*kind.made}
+
+
+def test_a_box_in_the_patient_and_what_lies_around_are_both_its_own(module):
+    kind = module(OWN).Own
+    xrays, box = of_thorax(GRID, BEAM), Region(CGLS(3), Grid.box(8, 120.0), GRID)
+    own, wrapped = (reconstruct_by(box, box.target, xrays, BEAM.with_continued(False), projector=projector)
+                    for projector in (kind, "joseph"))
+    assert torch.equal(own.volume, wrapped.volume)
+    assert {GRID.shape, (8, 8, 8)} <= {*kind.made}
+
+
+def test_its_results_are_converted_to_the_type_that_was_given(module):
+    kind = module(OWN.replace("return self.A(mu)", "return self.A(mu.double())")).Own
+    x = torch.rand(1, 1, *GRID.shape)
+    assert Projector(GRID, BEAM, kind)(x).dtype == torch.float32
+
+
+@pytest.mark.parametrize("old, new, sentence", [
+    ("return self.A(mu)", "return self.A(mu)[:, :2]",
+     r"A\(mu\) of the projector Own .*\(1, 3, 10, 14\), but gave \(1, 2"),
+    ("return self.A(mu)", "return self.A(mu).numpy()", r"A\(mu\) of the projector Own .* but gave ndarray"),
+    ("return self.A.T(xrays)", "return self.A.T(xrays)[0]", r"A.T\(xrays\) of the projector Own must be a tensor"),
+    ("return self.A(mu)", "return self.A(mu) / 0", "the projector Own gives numbers that are not finite"),
+    ("def T", "def adjoint", r"the projector Own needs __call__\(mu\) and T\(xrays\)"),
+    ("def __init__(self, grid, beam)", "def __init__(self, grid)", "projector Own cannot be made .* .TypeError"),
+    ("self.made.append(grid.shape)", "1 / 0", "projector Own cannot be made .* .ZeroDivision")])
+def test_one_that_gives_something_else_is_refused_by_its_name(module, old, new, sentence):
+    assert OWN.count(old) == 1
+    with pytest.raises(ValueError, match=sentence):
+        Projector(GRID, BEAM, module(OWN.replace(old, new)).Own)
+
+
+def test_a_transpose_that_is_not_the_adjoint_is_warned_of(module):
+    kind = module(OWN.replace("return self.A.T(xrays)", "return 1.01 * self.A.T(xrays)")).Own
+    with pytest.warns(UserWarning, match="T of the projector Own is not the adjoint of A"):
+        Projector(GRID, BEAM, kind)
+
+
+def test_what_is_no_projector_is_refused_in_one_sentence(module):
+    name = module(OWN + "\n\nnumber = 3\n").__name__
+    for given, sentence in (("fastest", "there is no projector 'fastest'"), ("no_such.Module", "cannot be imported"),
+                            (f"{name}.Missing", "cannot be imported"), (f"{name}.number", "is no class"),
+                            (3, "an object of int was given")):
+        with pytest.raises(ValueError, match=sentence):
+            projector_kind(given)
+
+
+def test_its_edited_code_is_another_setting(module):
+    first, second = (module(code).Own for code in (OWN, OWN + "# edited\n"))
+    settings = [method_settings("tv", 0, reconstructor("tv"), kind, Sampling())["projector"]
+                for kind in (first, second)]
+    assert settings[0]["code_crc32"] != settings[1]["code_crc32"] and settings[0]["class"].endswith(".Own")
+    assert method_settings("tv", 0, reconstructor("tv"), "siddon", Sampling())["projector"] == "siddon"
+
+
+def test_the_command_line_takes_its_path_and_records_it(module, tmp_path):
+    own = module(OWN)
+    main(phantoms(tmp_path / "own", 1, f"--model.projector={own.__name__}.Own"))
+    main(phantoms(tmp_path / "joseph", 1, "--model.projector=joseph"))
+    [mine], [theirs] = ([*(tmp_path / name / "sirt").glob("*/reconstruction.json")] for name in ("own", "joseph"))
+    assert record(mine.parent)["settings"]["projector"]["class"] == f"{own.__name__}.Own"
+    assert record(mine.parent)["scores"] == record(theirs.parent)["scores"]
+
+
+def test_the_example_is_its_own_adjoint_and_projects_a_box_of_water_as_phydict_does(monkeypatch):
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "data" / "example" / "own_projector")
+    kind = projector_kind("my_projector.MyProjector")
+    grid = Grid.cube(16, 360.0)
+    A, exact = Projector(grid, BEAM, kind), Projector(grid, BEAM, "eq4")
+    assert_adjoint(A, A.T, (1, 1, *grid.shape))
+    mu = torch.zeros(1, 1, *grid.shape)
+    mu[..., 4:12, 5:11, 3:13] = 0.02
+    projected, wanted = A(mu), exact(mu)
+    assert float((projected - wanted).norm() / wanted.norm()) < 0.02
+    assert np.isfinite(projected.numpy()).all() and projected.max() > 2

@@ -206,8 +206,12 @@ class ConeBeam:
                          for step in (self.u, self.v)], 2)
 
     def select(self, views) -> ConeBeam:
-        """The beam with only `views` (indices, slice or mask), in the order given."""
-        index = np.atleast_1d(np.arange(self.views)[views])
+        """The beam with only `views` (indices, slice or mask), in the order given. Raises ValueError for others."""
+        try:
+            index = np.atleast_1d(np.arange(self.views)[views])
+        except IndexError as error:
+            raise ValueError(f"views are indices below {self.views}, a slice or a mask, but {reprlib.repr(views)} was "
+                             "given") from error
         return self.at(self.sources[index], self.detectors[index], self.u[index], self.v[index])
 
     def binned(self, factor: int) -> ConeBeam:

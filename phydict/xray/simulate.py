@@ -6,6 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from numbers import Real
 
 import torch
 
@@ -58,8 +59,8 @@ class Ideal(Simulator):
     photons: float | None = None
 
     def __post_init__(self):
-        if not 0 <= self.noise < math.inf:
-            raise ValueError(f"noise is a fraction >= 0 of the largest line integral, but {self.noise} was given")
+        if not (isinstance(self.noise, Real) and 0 <= self.noise < math.inf):
+            raise ValueError(f"noise is a fraction >= 0 of the largest line integral, but {self.noise!r} was given")
         check_photons(self.photons)
 
     @property
@@ -80,5 +81,5 @@ class Ideal(Simulator):
 
 def check_photons(photons: float | None) -> None:
     """Raises ValueError unless `photons` is None or finite and > 0."""
-    if photons is not None and not 0 < photons < math.inf:
-        raise ValueError(f"photons per pixel must be > 0, or None for no counting noise; {photons} was given")
+    if photons is not None and not (isinstance(photons, Real) and 0 < photons < math.inf):
+        raise ValueError(f"photons per pixel must be > 0, or None for no counting noise; {photons!r} was given")

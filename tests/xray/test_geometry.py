@@ -39,6 +39,9 @@ def test_start_and_arc_place_the_same_views():
     assert orbit(4, start=np.pi, arc=np.pi).same_as(full.select(slice(4, 8)))
     assert full.select([6, 1]).same_as(full.select([6]).select([0])) is False
     assert full.select(np.arange(8) % 2 == 0).same_as(orbit(4))
+    for views in ([8], "a", np.arange(3) > 0):
+        with pytest.raises(ValueError, match="views are indices below 8, a slice or a mask, but"):
+            full.select(views)
 
 
 def test_angles_are_taken_in_degrees_or_radians_but_not_in_both():

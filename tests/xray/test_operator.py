@@ -181,6 +181,8 @@ def test_impossible_choices_are_refused_with_a_reason():
         Projector(GRIDS["turned"], BEAM, "fast")
     with pytest.raises(ValueError, match=r"the system matrix needs [\d,]+ bytes in float32, but .* is 1,000 bytes"):
         Projector(GRIDS["turned"], TILTED, "matrix", memory=1000)
+    with pytest.raises(ValueError, match="of a Grid and a ConeBeam, in this order, but ConeBeam and Grid were given"):
+        Projector(BEAM, GRIDS["turned"])
     with pytest.raises(ValueError, match="memory is a budget in bytes > 0, but 0"):
         Projector(GRIDS["turned"], TILTED, memory=0)
 

@@ -232,7 +232,7 @@ def test_the_stated_attenuation_gives_water_its_hu_back(kvp):
     ({"kvp": "120"}, "no tube spectrum of '120' kVp"), ({"metal": "x"}, "metal must be finite and > 0, but 'x' was"),
     ({"readout": None}, "readout must be finite and >= 0, 0 for none; None was given"),
     ({"ct_energy": None}, "ct_energy must be finite and > 0, but None was given"),
-    ({"air_photons": 0}, "photons per pixel must be > 0"),
+    ({"air_photons": 0}, "photons per pixel must be > 0"), ({"air_photons": "x"}, "photons per pixel must be > 0"),
     ({"readout": -1}, "readout must be finite and >= 0"), ({"scatter": float("nan")}, "scatter must be finite"),
     ({"scintillator": 0}, "scintillator must be finite and > 0"),
     ({"saturation": -1.0}, "saturation must be finite"), ({"scatter_width": math.inf}, "scatter_width must be finite"),

@@ -43,7 +43,9 @@ def test_counting_noise_follows_the_photons():
 def test_bad_settings_are_refused():
     with pytest.raises(ValueError, match="2 cases need one seed each, but 1 were given"):
         Ideal()(A, MU, 3)
-    with pytest.raises(ValueError, match="noise is a fraction >= 0"):
-        Ideal(noise=-1)
-    with pytest.raises(ValueError, match="photons per pixel must be > 0"):
-        Ideal(photons=0)
+    for noise in (-1, "0.005"):
+        with pytest.raises(ValueError, match=f"noise is a fraction >= 0 .* but {noise!r} was given"):
+            Ideal(noise=noise)
+    for photons in (0, "many"):
+        with pytest.raises(ValueError, match="photons per pixel must be > 0"):
+            Ideal(photons=photons)

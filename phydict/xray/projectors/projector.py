@@ -61,6 +61,9 @@ class Projector:
 
     def __init__(self, grid: Grid, beam: ConeBeam, method: str | type = "auto", memory: int = MEMORY,
                  device: torch.device | str | None = None, full_detector: bool = False):
+        if not (isinstance(grid, Grid) and isinstance(beam, ConeBeam)):
+            raise ValueError("a Projector is made of a Grid and a ConeBeam, in this order, but "
+                             f"{type(grid).__name__} and {type(beam).__name__} were given")
         if not isinstance(method, type) and method not in METHODS:
             raise ValueError(f"there is no projector method {method!r}; choose one of {', '.join(METHODS)}, or give a "
                              "class of your own")

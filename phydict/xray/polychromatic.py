@@ -70,12 +70,12 @@ class Polychromatic(Simulator):
         check_photons(self.air_photons)
         for name in ("readout", "scatter"):
             value = getattr(self, name)
-            if not (isinstance(value, Real) and 0 <= value < math.inf):
+            if not (_is_number(value) and 0 <= value < math.inf):
                 raise ValueError(f"{name} must be finite and >= 0, 0 for none; {value!r} was given")
         for name in ("scintillator", "saturation", "metal", "scatter_width", "ct_energy"):
             value = getattr(self, name)
             left_out = value is None and name not in ("scatter_width", "ct_energy")
-            if not left_out and not (isinstance(value, Real) and 0 < value < math.inf):
+            if not left_out and not (_is_number(value) and 0 < value < math.inf):
                 raise ValueError(f"{name} must be finite and > 0, but {value!r} was given; leave it out for the "
                                  "default")
         for energies in (self.ct_energy, self.beam_spectrum.energies):
@@ -133,6 +133,10 @@ class Polychromatic(Simulator):
         if self.saturation is not None:
             signal = signal.clamp(max=self.saturation)
         return -signal.log().to(mu)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, Real)
 
 
 def scatter_of(primary: torch.Tensor, beam: ConeBeam, amplitude: float, width: float) -> torch.Tensor:

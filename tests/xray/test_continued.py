@@ -167,3 +167,21 @@ def test_a_folder_of_xrays_says_that_the_patient_goes_on(beam, tmp_path):
     (tmp_path / "scan" / "geometry.yaml").write_text(yaml.safe_dump(beam | {"continued": 1}))
     with pytest.raises(ValueError, match="true or false"):
         load_xrays(tmp_path / "scan")
+
+
+@pytest.mark.parametrize("order", [(2, 0, 1), (0, 2, 1), (2, 1, 0)])
+@pytest.mark.parametrize("beam", [ORBIT, TILTED])
+def test_whichever_axis_runs_upwards_the_same_rays_meet_the_same_and_go_on_above_and_below(order, beam):
+    grid = Grid((16, 14, 12), (24.0, 27.0, 30.0))
+    affine = grid.affine.copy()
+    affine[:3, :3] = affine[:3, order]
+    other = Grid(tuple(grid.shape[axis] for axis in order), affine=affine)
+    mu, places = random_like((1, 1, *grid.shape), torch.float64), [0, 1, *(2 + axis for axis in order)]
+    for continued in (False, True):
+        A, B = (Projector(g, replace(beam, continued=continued), full_detector=True) for g in (grid, other))
+        assert A.method == B.method
+        y = A(mu)
+        torch.testing.assert_close(B(mu.permute(places)), y, rtol=0, atol=1e-12)
+        torch.testing.assert_close(B.T(y), A.T(y).permute(places), rtol=0, atol=1e-9)
+    found = [CGLS(3).reconstruct(y[0].float(), projector).volume for projector in (A, B)]
+    torch.testing.assert_close(found[1], found[0].permute(order), rtol=0, atol=0.1)

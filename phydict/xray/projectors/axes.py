@@ -1,0 +1,38 @@
+"""A volume whose axes do not end with the one that runs from inferior to superior."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from phydict.grid import Grid
+
+
+class SuperiorLast:
+    """The projection, and its adjoint, of a volume (B, X, Y, Z) by the operator of the grid with `axis` put last."""
+
+    def __init__(self, operator: Any, axis: int):
+        self.operator, self.axis = operator, axis + 1
+
+    def forward(self, mu: Tensor) -> Tensor:
+        return self.operator.forward(mu.movedim(self.axis, -1).contiguous())
+
+    def adjoint(self, xrays: Tensor) -> Tensor:
+        return self.operator.adjoint(xrays).movedim(-1, self.axis).contiguous()
+
+
+def superior_axis(grid: Grid) -> int:
+    """The axis of a grid that runs nearest to the superior direction, the third where others are no nearer."""
+    upwards = np.abs(grid.affine[2, :3]) / grid.spacing
+    return int(upwards.argmax()) if upwards.max() > upwards[2] + 1e-6 else 2
+
+
+def put_last(grid: Grid, axis: int) -> Grid:
+    """The same voxels with one axis put last."""
+    order = [other for other in range(3) if other != axis] + [axis]
+    affine = grid.affine.copy()
+    affine[:3, :3] = affine[:3, order]
+    x, y, z = (grid.shape[other] for other in order)
+    return Grid((x, y, z), affine=affine)

@@ -2,6 +2,7 @@
 
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -211,3 +212,39 @@ def test_a_correction_that_is_trained_on_loses_what_was_known_of_its_errors(tmp_
     save_correction(knowing(), tmp_path / "knows.safetensors", dtype=torch.float32)
     trained = RefinementTraining(cube=Cube(32), window=(-1000, 600), initial=str(tmp_path / "knows.safetensors"))
     assert trained.prior.uncertainty is None and all(w.requires_grad for w in trained.parameters())
+
+
+def test_intervals_are_exported_with_those_weights_alone_that_they_are_of(tmp_path, files, monkeypatch, capsys):
+    task = FinerUncertaintyTraining(FinerUncertainty((4, 8)), Cube(32), (-1000, 600), initial=files[2])
+    trainer = SimpleNamespace(datamodule=None, strategy=SimpleNamespace(reduce=lambda value, **_: value))
+    monkeypatch.setattr(FinerUncertaintyTraining, "trainer", trainer)
+    monkeypatch.setattr(FinerUncertaintyTraining, "of_all_processes", lambda self, given: given[0])
+    export = ["export", f"--checkpoint={tmp_path / 'c.ckpt'}", f"--out={tmp_path / 'knows.safetensors'}",
+              "--overwrite=true"]
+
+    def save(step: int) -> dict:
+        trainer.global_step = step
+        task.on_save_checkpoint(content := {"state_dict": task.state_dict(), "global_step": step})
+        torch.save(content, tmp_path / "c.ckpt")
+        return content
+
+    never = save(2)
+    assert "were not calibrated, but its weights are those after step 2" in refusal(capsys, main, export)
+    task.held_out = [(torch.rand(100), torch.zeros(100))]
+    task.on_validation_epoch_end()
+    save(2)
+    main(export)
+    save(3)
+    assert "were calibrated after step 2, but its weights are those after step 3" in refusal(capsys, main, export)
+    task.on_load_checkpoint(never)
+    save(2)
+    assert "were not calibrated" in refusal(capsys, main, export)
+    torch.save({name: part for name, part in never.items() if name != "calibrated_at"}, tmp_path / "c.ckpt")
+    main(export)  # one from before it was kept
+
+
+def test_a_stage_that_validation_calibrates_is_not_trained_without_validation(tmp_path, cache, files, capsys):
+    refiner, _, fine = files
+    said = refusal(capsys, main, arguments(tmp_path / "run", cache, refiner, fine, "--trainer.limit_val_batches=0",
+                                           "--trainer.max_epochs=1"))
+    assert "validation calibrates the intervals, but trainer.limit_val_batches is 0: leave it out" in said

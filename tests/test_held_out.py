@@ -19,10 +19,11 @@ from phydict.grid import Cube
 from phydict.prior import save_prior, save_refiner
 from phydict.prior.files import held_out_of
 from phydict.training import PriorTraining
+from phydict.training.crops import SuperResolutionData
 from phydict.training.data import PriorData
 from phydict.training.reconstructions import RefinementCases, RefinementData
 from phydict.training.rollouts import RollOutData, RollOutSettings
-from phydict.training.settings import HoldOut
+from phydict.training.settings import Crops, HoldOut
 
 WINDOW = (-1000, 600)
 
@@ -33,7 +34,7 @@ def data(cts: Path, folder: Path, ids: list[str] | str | None = None, phantoms: 
 
 
 def in_trainer(made: PriorData, fn: str) -> PriorData:
-    made.trainer = SimpleNamespace(state=SimpleNamespace(fn=fn))
+    made.trainer = SimpleNamespace(state=SimpleNamespace(fn=fn), limit_val_batches=1.0)
     return made
 
 
@@ -122,3 +123,55 @@ def test_stages_that_learn_from_reconstructions_leave_the_same_cts_out_as_others
     refined = RefinementData(RefinementCases(crop=16, source=source), cts=str(cts), cache=cache, initial=file,
                              cube=Cube(32), window=WINDOW)
     assert [[ct.id for ct in made.cts.cts] for made in (replayed, refined)] == [["patient1"]] * 2
+
+
+def with_damaged(folder: Path) -> str:
+    """A folder of three CTs, of which the second holds a voxel that is no number."""
+    folder.mkdir()
+    for name in ("a", "b", "c"):
+        hu = np.full((12, 12, 12), -1000, np.float32)
+        hu[3:9, 3:9] = 40
+        if name == "b":
+            hu[5, 5, 5] = np.nan
+        nibabel.save(nibabel.Nifti1Image(hu, np.diag([10.0, 10.0, 10.0, 1.0])), folder / f"{name}.nii.gz")
+    return str(folder)
+
+
+@pytest.mark.parametrize("stage", ["base", "super_resolution"])
+def test_a_damaged_ct_that_is_held_out_is_refused_before_the_first_step(tmp_path, stage):
+    cts = with_damaged(tmp_path / "cts")
+
+    def made(ids: list[str]) -> PriorData:
+        if stage == "base":
+            return in_trainer(data(cts, tmp_path, ids), "fit")
+        return in_trainer(SuperResolutionData(Crops(8), cts, holdout=HoldOut(ids, phantoms=0), phantoms=1,
+                                              cache=str(tmp_path / "cache"), cube=Cube(16)), "fit")
+
+    made(["a"]).prepare_data()
+    limited = made(["a", "b"])
+    limited.trainer.limit_val_batches = 1
+    limited.prepare_data()  # which never validates on it
+    with pytest.raises(ValueError, match="b.nii.gz holds 1 NaN or infinite voxels"):
+        made(["a", "b"]).prepare_data()
+
+
+def test_a_training_resumes_without_cts_that_it_held_out_and_never_trains_on_one(tmp_path):
+    cts = with_damaged(tmp_path / "cts")
+    before = data(cts, tmp_path, ["a", "b"]).state_dict()
+    Path(cts, "b.nii.gz").unlink()
+    resumed = in_trainer(data(cts, tmp_path, ["a"]), "fit")
+    with pytest.warns(UserWarning, match=r"of the 2 CTs that were held out, 1 are not among the data now .* is b\)"):
+        resumed.load_state_dict(before)
+    for ids, said in ((["c"], "a is not held out now"), (["a", "c"], "c is held out now")):
+        with pytest.raises(ValueError, match=said):
+            in_trainer(data(cts, tmp_path, ids), "fit").load_state_dict(before)
+
+
+def test_a_list_of_those_held_out_may_name_one_that_is_no_longer_there_and_words_may_not(cts, tmp_path):
+    (tmp_path / "held_out.txt").write_text("patient7\npatient1\n")
+    with pytest.warns(UserWarning, match="names 'patient7', but no CT has .* of the 2 lines of .*, 1 hold out"):
+        assert data(cts, tmp_path, str(tmp_path / "held_out.txt")).held_out == ["patient1"]
+    (tmp_path / "held_out.txt").write_text("patient7\n")
+    for ids in (str(tmp_path / "held_out.txt"), ["patient7", "patient1"]):
+        with pytest.raises(ValueError, match="names 'patient7', .*: correct or remove it"):
+            data(cts, tmp_path, ids)

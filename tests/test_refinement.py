@@ -4,11 +4,13 @@ import re
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from command_lines import refusal, resumed_as_uninterrupted
+from ct_files import save_ct, thorax_hu
 from fitting import fit_to_grid
 from prior.tiny import tiny_prior, tiny_refiner
 from torch.nn.functional import pad
@@ -352,8 +354,30 @@ def test_a_network_goes_on_on_its_own_voxels_or_half_as_long_ones(tmp_path):
     (["--model.window=[-1000,1000]"], "model.window as its own"),
     (["--data.loading.simulation_voxels=64"], "data.loading.simulation_voxels is 64: leave it out"),
     (["--data.loading.population.share=0.5"], "data.loading.population.share is 0.5: set it to 0"),
+    (["--data.loading.ct_fraction=0.7"], "data.loading.ct_fraction is 0.7: leave it out"),
     (["--data.made.reconstructions=0"], "data.made")])
 def test_what_cannot_be_learnt_from_is_refused(tmp_path, cache, refiner_file, capsys, monkeypatch, given, words):
     monkeypatch.chdir(tmp_path)
     save_prior(tiny_prior(detail=True), "prior.safetensors")
     assert words in refusal(capsys, main, arguments(tmp_path / "run", cache, refiner_file, *given))
+
+
+def test_of_more_cts_than_reconstructions_any_may_be_learnt_from_and_more_keep_those_that_were(tmp_path, refiner_file,
+                                                                                               capsys):
+    for n in range(6):
+        save_ct(tmp_path / "cts" / f"{n}.nii.gz", thorax_hu())
+
+    def made(count: int, seed: int = 0) -> RefinementData:
+        return RefinementData(RefinementCases(count, 1, 16, seed=seed), cts=str(tmp_path / "cts"),
+                              cache=str(tmp_path / "cache"), initial=refiner_file, cube=Cube(32), window=(-1000, 600))
+
+    def shown(data: RefinementData) -> list[str]:
+        return [ct.id for ct in data.made.volumes.datasets[0].cts]
+
+    assert shown(made(6)) == shown(made(9)) == [*"012345"]
+    assert len({tuple(shown(made(2, seed))) for seed in range(8)}) > 3
+    assert shown(made(4))[:2] == shown(made(2)) and made(4).made.folder == made(2).made.folder != made(6).made.folder
+    data = made(2)
+    data.trainer = SimpleNamespace(state=SimpleNamespace(fn="fit"), limit_val_batches=1.0)
+    data.prepare_data()
+    assert "2 of 6 CTs are learnt from, chosen at random; data.made.reconstructions 6 would" in capsys.readouterr().err

@@ -173,3 +173,13 @@ def test_a_refiner_learns_from_xrays_of_finer_volumes(tmp_path, cache, prior_fil
     main(arguments(tmp_path, cache, prior_file, "--data.loading.simulation_voxels=32", "--model.scenes.fine=1",
                    "--trainer.max_epochs=1"))
     assert (tmp_path / "last.ckpt").is_file()
+
+
+@pytest.mark.parametrize("noise", [(0.02, 0.03), (1e-4, 2e-4)])
+def test_no_scene_has_more_or_less_noise_than_its_range(noise):
+    grid, window = Grid.cube(16), HUWindow(-1000, 600)
+    ct, scenes = torch.zeros(1, 1, *grid.shape), Scenes(noise=noise, model_error=0.0, most_views=2)
+    for seed in range(8):
+        y, projector = scenes.xrays(ct, np.random.default_rng(seed), grid, window)
+        exact = projector(window.to_mu(ct))[0]
+        assert 0.9 * noise[0] < (y - exact).std() / exact.max() < 1.1 * noise[1]

@@ -10,6 +10,7 @@ from ct_files import save_ct, thorax_hu
 from prior.tiny import tiny_prior, tiny_refiner
 
 from phydict.cli.train import main
+from phydict.datasets import CTSource
 from phydict.grid import Cube
 from phydict.prior import Refiner, load_prior, save_prior, save_refiner
 from phydict.training.refiner import RefinerTraining
@@ -112,3 +113,16 @@ def test_stored_calls_are_learnt_from_at_the_times_at_which_they_were_made(tmp_p
                              "--trainer.max_epochs=1")
     args = [arg.replace("--model.scenes", "--data.rollouts.scenes") for arg in args]
     assert "leave model.method out" in refusal(capsys, main, args)
+
+
+def test_other_reports_have_other_roll_outs_since_they_decide_what_may_be_mirrored(tmp_path, refiner_file):
+    save_ct(tmp_path / "cts" / "a.nii.gz", thorax_hu())
+
+    def folder(report: str) -> Path:
+        table = tmp_path / "reports.csv"
+        table.write_text(f"VolumeName,Findings_EN,Impressions_EN\na,{report},\n")
+        settings = RollOutSettings(1, Scenes(most_views=4), refiner_file, CTSource(str(table)))
+        return RollOutData(settings, str(tmp_path / "cts"), phantoms=2, cache=str(tmp_path / "cache"),
+                           **SETTINGS).rollouts.folder
+
+    assert folder("Nodule.") == folder("Nodule.") != folder("Nodule at the left.")

@@ -104,7 +104,8 @@ def test_a_checkpoint_of_the_other_stage_is_one_sentence(straight, cache, tmp_pa
 
 
 @pytest.mark.parametrize("change, words", [
-    (["--data.crops.size=15"], ["data.crops.size", "15"]), (["--data.crops.size=18"], ["18", "divisible by 4"]),
+    (["--data.crops.size=15"], ["data.crops.size", "15"]),
+    (["--data.crops.size=18"], ["data.crops.size", "a multiple of 4", "18"]),
     (["--model.factor=0"], ["model.factor", "1 or more", "0"]),
     (["--data.crops.validation=-1"], ["crops.validation", "-1"]),
     (["--model.cube.voxels=34"], ["34", "divisible"]), (["--model.most_noise=2"], ["most_noise"]),

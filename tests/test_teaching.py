@@ -11,7 +11,7 @@ from torch.utils.data import default_collate
 
 from phydict.datasets.phantoms.findings import KINDS
 from phydict.grid import Cube
-from phydict.prior import VolumeUNet, load_prior, save_prior
+from phydict.prior import DetailNetwork, VolumeUNet, load_prior, save_prior
 from phydict.training import PriorTraining
 from phydict.training.data import PriorData
 from phydict.training.settings import TextSettings
@@ -31,7 +31,7 @@ def test_training_goes_on_from_a_prior_and_refuses_one_of_another_grid(tmp_path)
     path = tmp_path / "prior.safetensors"
     first = tiny_prior()
     save_prior(first, path, dtype=torch.float32)
-    task = PriorTraining(initial=str(path), cube=Cube(16), window=(-1000, 600), text=TextSettings("none"))
+    task = PriorTraining(initial=str(path), cube=Cube(16), window=(-1000, 600))
     x, t = torch.randn(1, 4, 16, 16, 16), torch.tensor([0.4])
     reports = ["Pleural effusion (right), 12 mm."]
     torch.testing.assert_close(task.prior(x, t, task.prior.context(reports)), first(x, t, first.context(reports)))
@@ -40,7 +40,7 @@ def test_training_goes_on_from_a_prior_and_refuses_one_of_another_grid(tmp_path)
     task = PriorTraining(initial=str(path), cube=Cube(16), window=(-1000, 600), text=TextSettings(frozen=False))
     assert all(w.requires_grad for w in task.prior.parameters())
     with pytest.raises(ValueError, match="another grid"):
-        PriorTraining(initial=str(path), cube=Cube(32, 300.0), window=(-1000, 600), text=TextSettings("none"))
+        PriorTraining(initial=str(path), cube=Cube(32, 300.0), window=(-1000, 600))
 
 
 def test_a_prior_that_training_starts_from_keeps_its_own_network_and_scale(tmp_path):
@@ -52,6 +52,18 @@ def test_a_prior_that_training_starts_from_keeps_its_own_network_and_scale(tmp_p
     with pytest.raises(ValueError, match="model.network has channels .8, 8., but the prior .* leave model.network out"):
         PriorTraining(VolumeUNet(4, 2, (8, 8), (False, True), 1, 8, 16), initial=path, cube=Cube(16),
                       window=(-1000, 600))
+
+
+@pytest.mark.parametrize("option, given", [
+    ("text.encoder", {"text": TextSettings("none")}), ("text.encoder", {"text": TextSettings("nowhere")}),
+    ("text.length", {"text": TextSettings(length=64)}), ("text.padded_to", {"text": TextSettings(padded_to=2048)}),
+    ("text.texts", {"text": TextSettings(texts="nowhere.txt")}), ("detail", {"detail": DetailNetwork(4, 8)})])
+def test_what_a_prior_that_training_starts_from_brings_itself_is_not_silently_ignored(tmp_path, option, given):
+    save_prior(tiny_prior(detail=True), tmp_path / "prior.safetensors", dtype=torch.float32)
+    initial = {"initial": str(tmp_path / "prior.safetensors"), "cube": Cube(16), "window": (-1000, 600)}
+    PriorTraining(**initial, text=TextSettings(dropout=0.5, frozen=False), detail=tiny_prior(detail=True).detail)
+    with pytest.raises(ValueError, match=f"model.{option} .* that training continues from has .*: leave"):
+        PriorTraining(**initial, **given)
 
 
 def test_text_that_is_kept_is_taught_first_and_not_moved_by_denoising(cache):

@@ -1,6 +1,7 @@
 """Throughput: FLOP are those of the layers, counted by hand, and the rates follow from them."""
 
 import csv
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -56,3 +57,23 @@ def test_rates_follow_from_one_another(cache, tmp_path, capsys):
 def test_a_peak_is_positive():
     with pytest.raises(ValueError, match="positive"):
         Throughput(peak=0.0)
+
+
+def test_seconds_of_validations_and_checkpoints_are_none_of_a_step(monkeypatch):
+    """Of steps of one second each, with a validation or a checkpoint of a hundred after every third."""
+    clock, rates, meter = [0.0], [], Throughput(peak=1.0)
+    monkeypatch.setattr("phydict.training.throughput.time.perf_counter", lambda: clock[0])
+    trainer = SimpleNamespace(world_size=1)
+    module = SimpleNamespace(log=lambda name, value, **_: rates.append(value) if name == "samples_per_s" else None)
+    meter.on_fit_start(trainer, module)
+    meter.flop = 1
+    for step in range(12):
+        meter.on_train_batch_start(trainer, module, {"volume": torch.zeros(2, 1)}, step)
+        clock[0] += 1
+        if step % 6 == 2:
+            meter.on_validation_start(trainer, module)
+            clock[0] += 100
+        if step % 6 == 5:
+            meter.on_save_checkpoint(trainer, module, {})
+            clock[0] += 100
+    assert rates == [2.0] * 8

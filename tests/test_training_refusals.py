@@ -2,10 +2,23 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
+import numpy as np
 import pytest
+import torch
 from command_lines import TINY, arguments, refusal
+from ct_files import save_ct
 
 from phydict.cli.train import main
+from phydict.grid import Cube
+from phydict.rivals import X2CTNetwork
+from phydict.training.finer_uncertainty import FinerUncertaintyTraining
+from phydict.training.refinement import RefinementTraining
+from phydict.training.refiner import RefinerTraining
+from phydict.training.rivals import LiftedTraining, OrbitScenes
+from phydict.training.uncertainty import UncertaintyTraining
+from phydict.training.x2ct import Adversary, X2CTTraining
 
 
 @pytest.mark.parametrize("change, words", [
@@ -21,6 +34,7 @@ from phydict.cli.train import main
     (["--data.loading.simulation_voxels=32"], ["learns from no X-rays", "32"]),
     (["--data.loading.epoch_size=1"], ["epoch_size", "batch"]),
     (["--data.lungs=2"], ["data.lungs"]),
+    (["--model.window=[-900,600]"], ["model.window begins at -900 HU", "air"]),
     (["--data.augmentation.shift=-5"], ["shift", "-5"]),
     (["--throughput.peak=0"], ["throughput.peak"]),
     (["--model.cube.voxels=15"], ["15", "divisible"]), (["--model.cube.voxels=0"], ["0 was given"]),
@@ -74,7 +88,43 @@ def test_a_loader_process_sends_the_message_too(cts, tmp_path, cache, capsys):
                                     "--model.network.init_args.state_channels=6", "--data.phantoms=1000001",
                                     "--model.optimisation.sigma_data=0", "--model.seed=-1",
                                     "--trainer.check_val_every_n_epoch=0", "--trainer.accumulate_grad_batches=0",
-                                    "--trainer.precision=16-true"])
+                                    "--trainer.precision=16-true", "--trainer.limit_train_batches=0",
+                                    "--model.optimisation.mask_weight=-1", "--model.optimisation.mask_weight=.inf"])
 def test_data_that_cannot_be_are_refused_by_their_option(tmp_path, capsys, cache, option):
     said = refusal(capsys, main, arguments(tmp_path, cache, option))
     assert option.partition("=")[0].rpartition(".")[2] in said
+
+
+def test_the_headers_of_the_cts_are_checked_before_reports_are_learnt(cts, tmp_path, cache, capsys, monkeypatch):
+    monkeypatch.setattr("phydict.training.prior.PriorTraining.learn_reports", lambda self: pytest.fail("learnt first"))
+    save_ct(tmp_path / "cts" / "scout.nii.gz", np.zeros((20, 20, 5), np.int16))
+    said = refusal(capsys, main, arguments(tmp_path / "run", cache, "--trainer.max_epochs=1",
+                                           f"--data.cts={tmp_path / 'cts'}"))
+    assert "scout.nii.gz has 5 slices" in said and "data.source.exclude" in said
+
+
+@pytest.mark.parametrize("stage, weight", [
+    (RefinerTraining, "body_weight"), (RefinerTraining, "mask_weight"), (UncertaintyTraining, "body_weight"),
+    (FinerUncertaintyTraining, "body_weight"), (RefinementTraining, "body_weight"), (LiftedTraining, "body_weight")])
+@pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf")])
+def test_no_part_of_a_loss_weighs_less_than_nothing_or_beyond_all_bounds(stage, weight, value):
+    with pytest.raises(ValueError, match=f"^model.{weight} is a finite number, 0 or more, but {value}"):
+        stage(**{weight: value})
+
+
+@pytest.mark.parametrize("setting, value", [("views", 0), ("views", 1.5), ("arc_degrees", 0.0), ("arc_degrees", 361.0),
+                                            ("arc_degrees", float("nan"))])
+def test_an_orbit_that_cannot_be_is_refused_by_its_option(setting, value):
+    with pytest.raises(ValueError, match=f"^model.scenes.{setting} "):
+        OrbitScenes(**{setting: value})
+
+
+def test_a_discriminator_has_no_more_layers_than_halve_the_grid():
+    for layers in (3, 4):
+        made = pytest.raises(ValueError, match="model.adversary.layers lies between 1 and 3, but 4 was given") \
+            if layers == 4 else nullcontext()
+        with made:
+            task = X2CTTraining(X2CTNetwork(8, 4, (2, 2), (4, 8, 8)), OrbitScenes(views=2), Cube(16), (-1000, 600),
+                                adversary=Adversary(width=4, layers=layers))
+            judged = task.discriminator(torch.rand(1, 1, 16, 16, 16), torch.rand(1, 2, 16, 16, 16))
+            assert judged.isfinite().all()

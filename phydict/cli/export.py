@@ -20,7 +20,7 @@ from phydict.prior.text_file import build_text, has_text
 from phydict.rivals import NETWORKS, build_rival, save_rival
 from phydict.runtime.console import check_writable
 from phydict.runtime.progress_log import log_progress
-from phydict.training.checkpoints import read_checkpoint
+from phydict.training.checkpoints import check_calibrated, read_checkpoint
 
 
 def export_prior(checkpoint: str, out: str, overwrite: bool = False) -> None:
@@ -39,6 +39,7 @@ def export_prior(checkpoint: str, out: str, overwrite: bool = False) -> None:
     if Path(out).exists() and not overwrite:
         raise ValueError(f"{out} is a prior already: add --overwrite true to replace it, or give another --out")
     content = read_checkpoint(checkpoint)
+    check_calibrated(content, checkpoint)
     header = content["phydict"]
     stage, steps = header.get("stage", "base"), content.get("global_step")
     log_progress(f"export: stage {stage} after {steps} steps, to {out}", event="begin", name="export", stage=stage,

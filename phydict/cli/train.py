@@ -140,6 +140,9 @@ class PriorCLI(ProgressCLI):
         if str(trainer.precision) in ("16-true", "bf16-true", "64-true", "64"):
             raise ValueError(f"weights are learnt in float32, but trainer.precision is {trainer.precision}: leave it "
                              "out, and give --precision bfloat16 for networks that compute in that")
+        if self.subcommand == "fit" and trainer.limit_train_batches == 0:
+            raise ValueError("nothing is learnt from no batches, but trainer.limit_train_batches is "
+                             f"{trainer.limit_train_batches}: leave it out, or measure by validate")
         for name in ("accumulate_grad_batches", "check_val_every_n_epoch"):
             if (number := getattr(trainer, name)) is not None:
                 check_between(f"trainer.{name}", number, 1, math.inf)
@@ -194,6 +197,8 @@ class PriorCLI(ProgressCLI):
             listing = LambdaCallback(on_train_start=lambda *_: self._write_held_out(out, held_out))
             self.trainer.callbacks.append(listing)  # type: ignore[attr-defined]
             return
+        if self.trainer.is_global_zero:
+            self.datamodule.check_headers()
         self._write_held_out(out, held_out)
         self.model.learn_reports()
 

@@ -24,6 +24,9 @@ saw."""
 RESUMED = ("epoch", "global_step", "loops", "optimizer_states", "lr_schedulers", "callbacks")
 """What a checkpoint must hold beside the weights for its training to resume."""
 
+CALIBRATED_AT = "calibrated_at"
+"""A checkpoint's entry, where validation calibrates the weights: the step after which it last did, None: not yet."""
+
 
 def read_checkpoint(path: str | Path) -> dict:
     """A checkpoint that training wrote. Raises FileNotFoundError, or ValueError when it is truncated, holds code, is
@@ -47,6 +50,17 @@ def read_checkpoint(path: str | Path) -> dict:
     for state in ("state_dict", "current_model_state"):
         check_finite(checkpoint.get(state, {}), path)
     return checkpoint
+
+
+def check_calibrated(checkpoint: dict, path: str | Path) -> None:
+    """Raises ValueError where validation was to calibrate the weights of a checkpoint from `path`, and did not, or
+    other weights; of older checkpoints, without that entry, it is not known."""
+    steps = checkpoint.get("global_step")
+    if (at := checkpoint.get(CALIBRATED_AT, steps)) != steps:
+        calibrated = "were not calibrated" if at is None else f"were calibrated after step {at}"
+        raise ValueError(f"the intervals of {path} {calibrated}, but its weights are those after step {steps}: resume "
+                         "its training with --ckpt_path to its next validation, with more trainer.max_steps where it "
+                         "has ended, or give the best.ckpt beside it")
 
 
 class WholeCheckpoints(TorchCheckpointIO):

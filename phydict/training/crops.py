@@ -132,6 +132,7 @@ class SuperResolutionData(PriorData):
         self.crops, folder = crops, Path(cache)
         self.phantoms = PhantomVolumes(0, phantoms, self.grid, self.window, folder)
         self.cts = CTVolumes(self.cts.cts, folder, self.grid, self.window)
+        self.held_out_cts = CTVolumes(self.held_out_cts.cts, folder, self.grid, self.window)
         self.validation = ConcatDataset([self._fixed([], [], 0)] + [
             self._fixed([], PhantomVolumes(VALIDATION_PHANTOM + i, 1, self.grid, self.window, folder), crops.validation)
             for i in range(holdout.phantoms)] + [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -28,12 +29,13 @@ from phydict.datasets.population import DrawnPatients
 from phydict.datasets.population.drawn import POPULATION_VERSION
 from phydict.grid import Cube, Grid
 from phydict.runtime.console import check_writable
+from phydict.runtime.progress_log import log_progress
 from phydict.runtime.ranges import check_between
 from phydict.runtime.seeds import check_seed
 from phydict.runtime.warning import warn
 from phydict.training.draws import Averaged, KeptDraws, MixedCases, averaged, training_parts
 from phydict.training.settings import HoldOut, Loading
-from phydict.units import HUWindow
+from phydict.units import AIR, HUWindow
 
 
 class PriorData(lightning.LightningDataModule):
@@ -70,6 +72,9 @@ class PriorData(lightning.LightningDataModule):
             raise ValueError(f"data.cache {cache} lies inside data.cts {cts}: give a folder elsewhere")
         check_writable(Path(cache), "data.cache")
         hu = HUWindow(*window)
+        if hu.low > AIR:
+            raise ValueError(f"model.window begins at {hu.low:g} HU, so that air, which lies at {AIR:g}, would "
+                             f"attenuate X-rays: begin it at {AIR:g} or below")
         self.grid, self.window = Grid.cube(trained, cube.side), hu
         self.draw_grid = Grid.cube(self.block * trained, cube.side)
         self.phantoms = CachedPhantoms(0, phantoms, self.draw_grid, hu, Path(cache))
@@ -80,10 +85,12 @@ class PriorData(lightning.LightningDataModule):
             return word == id if word in names else word in id
 
         words = holdout.words()
-        for word in words:
-            if not any(meant(word, f.id) for f in files):
-                raise ValueError(f"data.holdout.ids names '{word}', but no CT has that in its id"
-                                 + (f" (the first id is {files[0].id})" if files else "") + ": correct or remove it")
+        if unknown := [word for word in words if not any(meant(word, f.id) for f in files)]:
+            said = (f"data.holdout.ids names '{unknown[0]}', but no CT has that in its id"
+                    + (f" (the first id is {files[0].id})" if files else ""))
+            if len(unknown) == len(words) or not holdout.is_file:
+                raise ValueError(f"{said}: correct or remove it")
+            warn(f"{said}: of the {len(words)} lines of {holdout.ids}, {len(unknown)} hold out nothing")
         validating = set(split_by_patient([f.id for f in files], holdout.fraction, seed)[1])
         named = {patient_of(f.id) for f in files if any(meant(word, f.id) for word in words)}
         held_out = [f for f in files if f.id in validating or patient_of(f.id) in named]
@@ -96,7 +103,7 @@ class PriorData(lightning.LightningDataModule):
         validating = set(self.held_out)
         self.cts = CTCases([f for f in files if f.id not in validating], cache, self.draw_grid, hu)
         self.population = DrawnPatients(self.cts, loading.population) if loading.population.share else None
-        self.held_out_cts = CTCases(held_out, cache, self.grid, hu)
+        self.held_out_cts, self.headers_checked = CTCases(held_out, cache, self.grid, hu), False
         self.validation: Dataset = ConcatDataset([
             CachedPhantoms(VALIDATION_PHANTOM, holdout.phantoms, self.grid, hu, Path(cache)), self.held_out_cts])
         self.reports = [f.report for f in files if f.report and f.id not in validating]
@@ -116,16 +123,20 @@ class PriorData(lightning.LightningDataModule):
         return {"held_out": self.held_out, "trained": len(self.cts)}
 
     def load_state_dict(self, state_dict: dict) -> None:
-        """Raises ValueError where a training that resumes holds out other CTs than it did; validation warns of those
-        that it did not hold out."""
+        """Raises ValueError where a training that resumes holds out CTs that it did not, or trains on those that it
+        held out; warns of those that are no longer there, and in validation of those that it did not hold out."""
         before = state_dict["held_out"]
         if self.trainer.state.fn != "fit":
             return self.check_unseen(before if state_dict.get("trained", True) else None, "the training")
-        if changed := sorted(set(before) ^ set(self.held_out)):
+        trained = [ct.id for ct in self.cts.cts]
+        if changed := sorted({*self.held_out} - {*before} | {*before}.intersection(trained)):
             is_now = "held out" if changed[0] in self.held_out else "not held out"
             raise ValueError(f"a training resumes with the CTs held out that were before, but {changed[0]} is {is_now} "
                              "now: give the same data.cts, data.holdout and data.seed, or --data.holdout.ids "
                              "<out>/held_out.txt with data.holdout.fraction 0, or start anew with model.initial")
+        if gone := sorted({*before} - {*self.held_out}):
+            warn(f"of the {len(before)} CTs that were held out, {len(gone)} are not among the data now (the first is "
+                 f"{gone[0]}): the training goes on with the others, whose scores are not those of all")
 
     def check_unseen(self, before: list[str] | None, training: str) -> None:
         """Warns where a CT is held out that an earlier training did not hold out; None: that is not known."""
@@ -136,10 +147,27 @@ class PriorData(lightning.LightningDataModule):
     def prepare_data(self) -> None:
         if self.trainer.state.fn != "fit":
             return
-        for ct in (*self.cts.cts, *self.held_out_cts.cts):
-            check_header(ct.path)
+        self.check_headers()
+        self._read_held_out()
         if self.population:
             self.population.prepare()
+
+    def check_headers(self) -> None:
+        """Raises ValueError where the header of a CT is not that of one; each is read once."""
+        if not self.headers_checked:
+            for ct in (*self.cts.cts, *self.held_out_cts.cts):
+                check_header(ct.path)
+        self.headers_checked = True
+
+    def _read_held_out(self) -> None:
+        """Reads, and caches, the CTs that validation will need, so that a damaged one ends no training on its way."""
+        limit, held_out = self.trainer.limit_val_batches, self.held_out_cts
+        count = min(len(held_out), limit if isinstance(limit, int) else math.ceil(limit * len(held_out)))
+        if count:
+            log_progress(f"{count} of {len(held_out)} held-out CTs are read before the training begins", event="read",
+                         cts=count)
+        for _ in DataLoader(Subset(held_out, range(count)), 1, num_workers=self.loading.workers, collate_fn=len):
+            pass
 
     def train_dataloader(self) -> DataLoader:
         every = self.trainer.reload_dataloaders_every_n_epochs  # type: ignore[attr-defined]

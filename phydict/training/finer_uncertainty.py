@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from torch import Tensor
 from torchmetrics.functional import spearman_corrcoef
 
@@ -10,6 +12,7 @@ from phydict.prior import DEFAULT_CORRECTION, describe_correction, fingerprint, 
 from phydict.prior.correction import CorrectionNetwork
 from phydict.prior.finer_uncertainty import INPUT_CHANNELS, FinerUncertainty, tissue_of_seen
 from phydict.prior.uncertainty import TISSUES
+from phydict.runtime.ranges import check_between
 from phydict.training.settings import Optimisation
 from phydict.training.stage import StageTraining, check_continues
 from phydict.units import HUWindow
@@ -39,6 +42,7 @@ class FinerUncertaintyTraining(StageTraining):
     def __init__(self, network: FinerUncertainty | None = None, cube: Cube = Cube(128),
                  window: tuple[float, float] = (-1000.0, 1000.0), optimisation: Optimisation = Optimisation(),
                  body_weight: float = 9.0, initial: str = str(DEFAULT_CORRECTION)):
+        check_between("model.body_weight", body_weight, 0, math.inf)
         corrects = load_correction(initial)
         check_continues("network", initial, corrects, cube.grid(), HUWindow(*window))
         corrects.uncertainty = network or corrects.uncertainty or FinerUncertainty()
@@ -82,6 +86,7 @@ class FinerUncertaintyTraining(StageTraining):
         if self.held_out:
             assert self.prior.uncertainty is not None
             self.prior.uncertainty.calibrate(*self.of_all_processes(self.held_out))
+            self.calibrated_at = self.trainer.global_step
 
     def _describe(self) -> dict:
         return describe_correction(self.prior)

@@ -75,6 +75,10 @@ class PriorTraining(DenoisingTraining):
         if initial:
             prior = _loaded(initial, prior)
             check_network("prior", initial, prior.network.settings, network.settings if requested else {})
+            if detail and prior.detail:
+                check_network("prior", initial, prior.detail.settings, detail.settings, "detail")
+            if not text.renew:
+                _check_text(text, initial, prior.text)
         if text.renew:
             prior = _renewed(prior, _text_encoder(text, prior.network))
         new_text = text.renew or not initial
@@ -176,6 +180,16 @@ def _loaded(path: str, requested: Prior) -> Prior:
     if prior.text is not None:
         prior.text.requires_grad_(prior.text.trainable)
     return prior
+
+
+def _check_text(text: TextSettings, initial: str, own: TextEncoder | None) -> None:
+    """Raises ValueError where settings of a new text side were given beside a prior that brings its own."""
+    has = {"encoder": "none" if own is None else own.source or "small", "length": getattr(own, "length", None),
+           "padded_to": getattr(own, "padded_to", None), "texts": None}
+    for name, value in has.items():
+        if (given := getattr(text, name)) not in (value, getattr(TextSettings, name)):
+            raise ValueError(f"model.text.{name} is {given}, but the prior {initial} that training continues from has "
+                             "what reads reports already: leave it out, or set model.text.renew for a new text side")
 
 
 def _renewed(prior: Prior, text: TextEncoder | None) -> Prior:

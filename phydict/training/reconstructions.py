@@ -26,6 +26,7 @@ from phydict.prior.correction import INPUTS, CorrectionNetwork
 from phydict.prior.files import held_out_of
 from phydict.prior.finer_uncertainty import INPUT_CHANNELS
 from phydict.reconstruction import describe
+from phydict.runtime.progress_log import log_progress
 from phydict.runtime.ranges import check_fields
 from phydict.runtime.seeds import check_seed
 from phydict.training.crops import CTVolumes, PhantomVolumes, log_made, mapped_volume
@@ -52,7 +53,7 @@ class RefinementCases:
     """The reconstructions that a refinement learns from.
 
     Args:
-        reconstructions: how many are made to learn from
+        reconstructions: how many are made to learn from; with more CTs, of CTs that are chosen at random
         validation: how many of each held-out volume
         crop: voxels along each side of what is learnt from at once
         network: the file of a network of this kind; the reconstructions are then also shown as they are at the second
@@ -216,6 +217,9 @@ class RefinementData(PriorData):
             raise ValueError(f"a refinement learns from reconstructions of CTs and phantoms alone, but "
                              f"data.loading.population.share is {loading.population.share}: set it to 0")
         check_plain(loading)
+        if loading.ct_fraction != Loading.ct_fraction:
+            raise ValueError("reconstructions are made of CTs and phantoms in turn, but data.loading.ct_fraction is "
+                             f"{loading.ct_fraction}: leave it out")
         super().__init__(cts, made.source, holdout, phantoms, loading, cache, cube=cube, window=window)
         if self.factor != 1:
             raise ValueError(f"X-rays of reconstructions are made of {FINER * cube.voxels} voxels anyway, but "
@@ -234,11 +238,15 @@ class RefinementData(PriorData):
         if not made.crop <= cube.voxels:
             raise ValueError(f"data.made.crop is at most the {cube.voxels} voxels of a reconstruction, but {made.crop} "
                              "was given")
+        shown, name = self.cts.cts, f"trained-{made.seed}"
+        if made.reconstructions < len(shown):
+            chosen = np.random.default_rng(made.seed).permutation(len(shown))[:made.reconstructions]
+            shown, name = [shown[i] for i in chosen], f"{name}-chosen"
         scene, folder = Grid.cube(FINER * cube.voxels, cube.side), Path(cache)
         volumes: list[ConcatDataset] = [
             ConcatDataset([CTVolumes(cts, folder, scene, self.window),
                            PhantomVolumes(first, count, scene, self.window, folder)])
-            for cts, first, count in ((self.cts.cts, 0, phantoms),
+            for cts, first, count in ((shown, 0, phantoms),
                                       (self.held_out_cts.cts, VALIDATION_PHANTOM, holdout.phantoms))]
         trained, validated = volumes
         network = made.network or self.kind.default_network
@@ -248,11 +256,19 @@ class RefinementData(PriorData):
                  [[ct.id, self.held_out_cts.key(ct)] for ct in self.held_out_cts.cts]]
         folder = folder / f"{self.kind.name}-{key_of(parts)}"
         self.crop, self.made = made.crop, self.kind(
-            trained, self.grid, initial, network, scenes, STRENGTH, folder / f"trained-{made.seed}",
+            trained, self.grid, initial, network, scenes, STRENGTH, folder / name,
             made.reconstructions, made.seed)
         self.validation = Whole(self.kind(
             validated, self.grid, initial, network, scenes, Augmentation.none(), folder / "validated",
             made.validation * len(validated), 1))
+        self.held_out_cts = CTVolumes(self.held_out_cts.cts, Path(cache), scene, self.window)
+
+    def prepare_data(self) -> None:
+        super().prepare_data()
+        shown, cts = len(self.made), len(self.cts)
+        if self.trainer.state.fn == "fit" and shown < cts:
+            log_progress(f"{shown} of {cts} CTs are learnt from, chosen at random; data.made.reconstructions {cts} "
+                         "would take them all", event="shown", cts=cts, shown=shown)
 
     def draws(self, epoch: int) -> Dataset:
         if not self.trainer or self.trainer.is_global_zero:

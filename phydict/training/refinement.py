@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 from torch import Tensor
 
 from phydict.grid import Cube
 from phydict.prior import describe_correction, load_correction
 from phydict.prior.correction import CorrectionNetwork
+from phydict.runtime.ranges import check_between
 from phydict.training.settings import Optimisation
 from phydict.training.stage import StageTraining, check_continues
 from phydict.units import HUWindow
@@ -31,6 +34,7 @@ class RefinementTraining(StageTraining):
     def __init__(self, channels: tuple[int, ...] = (32, 64, 96), cube: Cube = Cube(128),
                  window: tuple[float, float] = (-1000.0, 1000.0), optimisation: Optimisation = Optimisation(),
                  body_weight: float = 2.0, initial: str | None = None):
+        check_between("model.body_weight", body_weight, 0, math.inf)
         hu = HUWindow(*window)
         network = load_correction(initial) if initial else CorrectionNetwork(channels, 16, cube.grid(), hu)
         if not network.suits(cube.grid(), hu):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from copy import deepcopy
 
@@ -13,6 +14,7 @@ from phydict.grid import Cube
 from phydict.posterior import Sampler, Unrolled
 from phydict.prior import DEFAULT_PRIOR, BoundPrior, BoundRefiner, Prior, Refiner, describe_refiner, load_prior
 from phydict.reconstruction import Reconstructor
+from phydict.runtime.ranges import check_between
 from phydict.training.prior import reconstruction_scores
 from phydict.training.scenes import Scenes
 from phydict.training.settings import Optimisation, RefinerValidation
@@ -61,6 +63,8 @@ class RefinerTraining(StageTraining):
                  window: tuple[float, float] = (-1000.0, 1000.0), optimisation: Optimisation = Optimisation(),
                  validation: RefinerValidation = RefinerValidation(), body_weight: float = 2.0,
                  mask_weight: float = 0.1, initial: str = str(DEFAULT_PRIOR), seed: int = 0):
+        check_between("model.body_weight", body_weight, 0, math.inf)
+        check_between("model.mask_weight", mask_weight, 0, math.inf)
         loaded = load_prior(initial)
         if not isinstance(loaded, Prior | Refiner):
             raise ValueError(f"a refiner begins with a prior of phydict's own, but {initial} is MedSyn's: give another "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from dataclasses import dataclass
 
@@ -12,6 +13,7 @@ from torch import Tensor
 from phydict.grid import Cube, Grid
 from phydict.rivals import LiftedNetwork, Rival, RivalAnswer, load_rival
 from phydict.rivals.rival import bound_orbit
+from phydict.runtime.ranges import LEAST, check_between, check_fields
 from phydict.training.refiner import log_error, log_scores
 from phydict.training.scenes import Scenes
 from phydict.training.settings import Optimisation, RefinerValidation
@@ -85,6 +87,7 @@ class LiftedTraining(RivalTraining):
                  window: tuple[float, float] = (-1000.0, 1000.0), optimisation: Optimisation = Optimisation(),
                  validation: RefinerValidation = RefinerValidation(), body_weight: float = 2.0,
                  initial: str | None = None, seed: int = 0):
+        check_between("model.body_weight", body_weight, 0, math.inf)
         made = Rival(network or LiftedNetwork(), cube.grid(), HUWindow(*window))
         super().__init__(made, scenes, validation.views, optimisation, initial, seed, network is not None)
         self.body_weight = body_weight
@@ -104,6 +107,10 @@ class OrbitScenes(Scenes):
 
     views: int = 8
     arc_degrees: float = 360.0
+
+    def __post_init__(self):
+        super().__post_init__()
+        check_fields(self, "model.scenes", views=(1, 1000), arc_degrees=(LEAST, 360))
 
     def beam(self, rng: np.random.Generator, grid: Grid) -> ConeBeam:
         return bound_orbit(grid, self.views, self.arc_degrees)

@@ -142,6 +142,8 @@ class RollOutData(PriorData):
         self.channels, method = refiner.state_channels, Unrolled()
         parts = [asdict(rollouts.scenes), fingerprint(rollouts.initial), str(method), seed, asdict(augmentation),
                  loading.ct_fraction, self.factor, self.origin()]
+        if any(reports := [ct.report for ct in self.cts.cts]):  # whose words decide what may be mirrored or cut off
+            parts.append(reports)
         folder = Path(cache) / f"rollouts-{key_of(parts)}"
         self.rollouts = RollOuts(self._case, rollouts, method, folder, seed)
 

@@ -103,6 +103,7 @@ class PriorOptimisation(Optimisation):
     def __post_init__(self):
         super().__post_init__()
         check_between("model.optimisation.sigma_data", self.sigma_data, 1e-3, 1000)
+        check_between("model.optimisation.mask_weight", self.mask_weight, 0, math.inf)
 
 
 @dataclass(frozen=True)
@@ -202,12 +203,16 @@ class HoldOut:
             raise ValueError(f"data.holdout.ids are words, but {self.ids} has numbers among them: quote each, as in "
                              "'[\"0002\"]'")
 
+    @property
+    def is_file(self) -> bool:
+        """Whether `ids` is a text file."""
+        return isinstance(self.ids, str) and (Path(self.ids).is_file() or self.ids.endswith(".txt"))
+
     def words(self) -> list[str]:
         """The words of `ids`. Raises FileNotFoundError for a text file that is not there."""
-        if not isinstance(self.ids, str):
-            return self.ids or []
-        is_list = Path(self.ids).is_file() or self.ids.endswith(".txt")
-        return read_ids(self.ids, "data.holdout.ids") if is_list else [self.ids]
+        if isinstance(self.ids, str):
+            return read_ids(self.ids, "data.holdout.ids") if self.is_file else [self.ids]
+        return self.ids or []
 
 
 @dataclass(frozen=True)

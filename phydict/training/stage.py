@@ -20,6 +20,7 @@ from phydict.prior.finite import not_finite
 from phydict.prior.stage_file import check_stage
 from phydict.rivals import Rival
 from phydict.runtime.seeds import check_seed
+from phydict.training.checkpoints import CALIBRATED_AT
 from phydict.training.data import PriorData
 from phydict.training.settings import Optimisation
 from phydict.units import HUWindow
@@ -37,12 +38,12 @@ def check_continues(kind: str, file: str, stage: Prior | Refiner | CorrectionNet
                          "model.window to its own")
 
 
-def check_network(kind: str, file: str, own: dict, requested: dict) -> None:
-    """Raises ValueError unless the network that was requested for a training has the settings of the one that it
-    continues from, of a `kind` in `file`."""
+def check_network(kind: str, file: str, own: dict, requested: dict, part: str = "network") -> None:
+    """Raises ValueError unless the network that was requested for a training, as model.`part`, has the settings of the
+    one that it continues from, of a `kind` in `file`."""
     if name := next((name for name in requested if requested[name] != own.get(name)), None):
-        raise ValueError(f"model.network has {name} {requested[name]}, but the {kind} {file} that training continues "
-                         f"from has {own.get(name)}: leave model.network out, give it all of that {kind}'s settings, "
+        raise ValueError(f"model.{part} has {name} {requested[name]}, but the {kind} {file} that training continues "
+                         f"from has {own.get(name)}: leave model.{part} out, give it all of that {kind}'s settings, "
                          "or leave model.initial out")
 
 
@@ -50,10 +51,11 @@ class StageTraining(lightning.LightningModule, ABC):
     """Learns one stage, its network `self.prior`, by the loss of a batch (`batch_loss`).
 
     calls: of the network, forward and backward, that a sample costs. calibrates: whether validation changes the
-    weights. initial: the file that training starts from, if any.
+    weights. calibrated_at: the step after which it last did, None: not yet. initial: the file that training starts
+    from, if any.
     """
 
-    calls, calibrates = 1, False
+    calls, calibrates, calibrated_at = 1, False, None
 
     def __init__(self, prior: Prior | SuperResolution | Refiner | CorrectionNetwork | Rival,
                  optimisation: Optimisation, seed: int, initial: str | None = None):
@@ -104,6 +106,9 @@ class StageTraining(lightning.LightningModule, ABC):
         if self.calibrates and not len(self.trainer.datamodule.validation):  # type: ignore[attr-defined]
             raise ValueError("validation calibrates the intervals, but nothing is held out: name CTs by "
                              "data.holdout.ids, or give a share of them as data.holdout.fraction")
+        if self.calibrates and not self.trainer.limit_val_batches:
+            raise ValueError("validation calibrates the intervals, but trainer.limit_val_batches is "
+                             f"{self.trainer.limit_val_batches}: leave it out")
         for callback in self.averaging():
             if self.calibrates:
                 raise ValueError("weights that validation calibrates cannot be averaged: train without "
@@ -195,6 +200,8 @@ class StageTraining(lightning.LightningModule, ABC):
         held_out = self._held_out()
         known = {} if held_out is None else {"held_out": held_out}
         checkpoint["phydict"] = self._describe() | {"training": progress | known}
+        if self.calibrates:
+            checkpoint[CALIBRATED_AT] = self.calibrated_at
 
     def _held_out(self) -> list[str] | None:
         """The held-out CTs that the weights never learnt from, not before this training either; None where no training
@@ -212,3 +219,4 @@ class StageTraining(lightning.LightningModule, ABC):
                 raise ValueError(f"the checkpoint's prior and this training's differ in '{key}': give the settings and "
                                  "data that the checkpoint was trained with, or start anew with model.initial")
         self.samples = checkpoint["phydict"].get("training", {}).get("samples", 0) - self.before.get("samples", 0)
+        self.calibrated_at = checkpoint.get(CALIBRATED_AT)

@@ -14,6 +14,7 @@ from phydict.evaluation import method_panel
 from phydict.grid import Cube, Grid
 from phydict.prior import LocalUNet, SuperResolution, describe_super_resolution, load_super_resolution
 from phydict.runtime.ranges import check_between
+from phydict.training.crops import SuperResolutionData
 from phydict.training.denoising import DenoisingTraining
 from phydict.training.settings import Optimisation, Previews
 from phydict.training.stage import check_network
@@ -56,6 +57,13 @@ class SuperResolutionTraining(DenoisingTraining):
             stage = first.train().requires_grad_(True)
         super().__init__(stage, stage.detail_std, optimisation, validation.preview_steps, seed, initial=initial)
         self.most_noise = most_noise
+
+    def setup(self, stage: str) -> None:
+        super().setup(stage)
+        data, divisor = self.trainer.datamodule, self.prior.network.divisor  # type: ignore[attr-defined]
+        if isinstance(data, SuperResolutionData) and data.crops.size % divisor:
+            raise ValueError(f"data.crops.size is a multiple of {divisor}, by which the network divides, but "
+                             f"{data.crops.size} was given")
 
     def _clean_state(self, batch: dict) -> tuple[Tensor, Tensor]:
         return batch["volume"], torch.ones(len(batch["volume"]), 1, 1, 1, 1, device=self.device)

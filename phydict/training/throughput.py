@@ -24,6 +24,8 @@ REPEATS = 5
 class Throughput(lightning.Callback):
     """Logs samples/s and TFLOP/s of all processes together, and prints at the start what to compare them with.
 
+    A step that follows a validation or a checkpoint is not timed.
+
     FLOP are those of the network's forward and backward pass, a multiplication and an addition counting two; what
     gradient checkpointing computes twice counts once.
 
@@ -66,6 +68,12 @@ class Throughput(lightning.Callback):
             module.log("tflop_per_s", tflops, prog_bar=True, batch_size=samples)
             module.log("share_of_peak", tflops / (self.peak * trainer.world_size), batch_size=samples)
         self.began = now
+
+    def on_validation_start(self, trainer, module) -> None:
+        self.began = None
+
+    def on_save_checkpoint(self, trainer, module, checkpoint) -> None:
+        self.began = None
 
 
 def sample_flop(prior: Prior | SuperResolution, shape: Sequence[int]) -> int:

@@ -15,6 +15,7 @@ from phydict.posterior import Measurement, Unrolled
 from phydict.posterior.widening import limited_angle_factor
 from phydict.prior import DEFAULT_REFINER, Refiner, describe_refiner, load_prior
 from phydict.prior.uncertainty import AIR_BELOW, Uncertainty, coverage_of, tissue_of
+from phydict.runtime.ranges import check_between
 from phydict.training.scenes import Scenes
 from phydict.training.settings import CalibrationScenes, Optimisation
 from phydict.training.stage import StageTraining, check_continues
@@ -50,6 +51,7 @@ class UncertaintyTraining(StageTraining):
                  cube: Cube = Cube(), window: tuple[float, float] = (-1000.0, 1000.0),
                  optimisation: Optimisation = Optimisation(), validation: CalibrationScenes = CalibrationScenes(),
                  body_weight: float = 9.0, initial: str = str(DEFAULT_REFINER), seed: int = 0):
+        check_between("model.body_weight", body_weight, 0, math.inf)
         refiner = load_prior(initial)
         if not isinstance(refiner, Refiner):
             raise ValueError(f"uncertainty is learnt of a refiner, but {initial} is none: give a refiner's file as "
@@ -113,6 +115,7 @@ class UncertaintyTraining(StageTraining):
     def on_validation_epoch_end(self) -> None:
         if self.held_out:
             self.prior.uncertainty.calibrate(*self.of_all_processes(self.held_out))
+            self.calibrated_at = self.trainer.global_step
 
     def _describe(self) -> dict:
         return describe_refiner(self.prior)

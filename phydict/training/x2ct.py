@@ -15,7 +15,7 @@ from torch.nn.functional import l1_loss, mse_loss
 from phydict.grid import Cube
 from phydict.rivals import PatchDiscriminator, Rival, X2CTNetwork
 from phydict.rivals.rival import WATER_MM, bound_orbit
-from phydict.runtime.ranges import check_fields
+from phydict.runtime.ranges import check_between, check_fields
 from phydict.training.rivals import OrbitScenes, RivalTraining
 from phydict.training.settings import Optimisation
 from phydict.units import HUWindow
@@ -72,6 +72,8 @@ class X2CTTraining(RivalTraining):
         beam = bound_orbit(grid, scenes.views, scenes.arc_degrees)
         made = Rival(network or X2CTNetwork(), grid, HUWindow(*window), beam)
         super().__init__(made, scenes, (scenes.views,), optimisation, initial, seed, network is not None)
+        deepest = max(cube.voxels.bit_length() - 2, 1)  # whose patches are still of more than one voxel
+        check_between("model.adversary.layers", adversary.layers, 1, deepest)
         self.discriminator = PatchDiscriminator(scenes.views, adversary.width, adversary.layers)
         self.adversary = adversary
 

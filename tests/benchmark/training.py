@@ -30,7 +30,7 @@ from phydict.prior.files import DEFAULT_PRIOR
 from phydict.runtime.console import quiet
 from phydict.runtime.precision import instruction_set
 from phydict.training import PriorTraining
-from phydict.training.settings import Execution, PriorValidation, TextSettings
+from phydict.training.settings import Execution, PriorValidation
 from phydict.training.throughput import matmul_peak, sample_flop
 
 BATCH, STEPS, WARM_UP = 2, 8, 1
@@ -99,7 +99,7 @@ def monai_steps(loader: DataLoader) -> Clock:
 def new_task(**flags) -> PriorTraining:
     torch.manual_seed(0)
     prior = load_prior(DEFAULT_PRIOR)
-    return PriorTraining(text=TextSettings("none"), initial=str(DEFAULT_PRIOR),
+    return PriorTraining(initial=str(DEFAULT_PRIOR),
                          window=(prior.window.low, prior.window.high),
                          cube=Cube(prior.grid.shape[0], prior.grid.extent[0]), validation=PriorValidation(0),
                          execution=Execution(**flags))

@@ -92,7 +92,9 @@ def test_hu_changes_spare_air_and_scale_tissue(case):
 @pytest.mark.parametrize("report, may", [
     ("", True), ("No focal consolidation.", True), ("Bilateral pleural effusion.", True),
     ("Nodule, right lung.", False), ("LEFT-sided effusion", False),
-    ("Consolidation of the middle lobe.", False), ("Opacity in the LLL.", False), ("Lingular atelectasis", False),
+    ("Consolidation of the middle lobe.", False), ("Middle-lobe nodule.", False), ("Middle  lobe syndrome.", False),
+    ("Nodule of the middle lung lobe.", False), ("Mid lobe scar.", False), ("An azygos lobe.", False),
+    ("Opacity in the LLL.", False), ("Lingular atelectasis", False),
     ("Rt lower lobe nodule", False), ("Lt. pleural effusion", False), ("Leftward shift", False),
     ("Levoscoliosis", False), ("Mild dextroscoliosis.", False), ("leftsided effusion", False),
     ("Upright, brighter, altered.", True)])

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from ct_files import AFFINE, LIVER, save_ct
+from scipy.ndimage import gaussian_filter
 from torch.utils.data import DataLoader, Dataset
 
 from phydict.datasets.cts.ct_rate import CTCases, find_cts
@@ -285,3 +286,40 @@ def test_a_ct_given_as_arrays_is_checked_as_a_file_is(chest, change, sentence):
 def test_lists_and_tensors_are_the_case_of_their_arrays(chest, kind):
     expected, found = prepare_ct((chest, AFFINE), GRID), prepare_ct((kind(chest), kind(AFFINE)), GRID)
     assert all(found[name].equal(expected[name]) for name in ("volume", "masks", "affine"))
+
+
+def blurred(hu: np.ndarray, noise: float) -> np.ndarray:
+    """A CT with partial volumes and noise, as scanners give."""
+    draw = np.random.default_rng(0)
+    return gaussian_filter(hu.astype(float), 0.8) + noise * draw.standard_normal(hu.shape)
+
+
+def test_hu_twice_as_steep_are_warned_of_and_noise_and_padding_are_not(chest):
+    check_hu(blurred(chest, 80.0).astype(np.float32), "noisy")
+    padded = blurred(np.where(chest == AIR, -3024, chest), 0.0)  # resampled, which leaves a rim
+    check_hu(padded.astype(np.float32), "padded")
+    with pytest.warns(UserWarning, match="steep does not look like HU: .* below -1100, and not at one number"):
+        check_hu((2 * blurred(chest, 20.0)).astype(np.float32), "steep")
+
+
+def test_a_scan_without_lungs_may_be_one_of_other_numbers(tmp_path):
+    said = "no lungs were found in odd, .*; it may be no chest, or its numbers no HU"
+    with pytest.warns(UserWarning, match=said):
+        prepare_ct((np.where(np.indices((20, 20, 20))[0] > 9, 40.0, AIR), np.diag([9.0, 9, 9, 1])), GRID, id="odd")
+
+
+@pytest.mark.parametrize("codes, told", [((1, 1), True), ((1, 0), False), ((0, 1), False)])
+def test_a_header_that_places_the_axes_twice_is_warned_of_where_they_differ(tmp_path, chest, codes, told):
+    image = nibabel.Nifti1Image(chest, AFFINE)
+    image.set_sform(AFFINE, codes[0])
+    image.set_qform(AFFINE @ np.diag([-1, 1, 1, 1]), codes[1])
+    nibabel.save(image, tmp_path / "a.nii")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        hu, _ = load_ct(tmp_path / "a.nii")
+    said = f"{tmp_path / 'a.nii'} says by its sform that its axes are RAS, and by its qform LAS: the sform is used"
+    assert [said in str(warning.message) for warning in caught] == [True] * told
+    assert (hu == (chest if codes[0] else chest[::-1])).all()
+    image.set_qform(AFFINE, 1)
+    nibabel.save(image, tmp_path / "a.nii")
+    load_ct(tmp_path / "a.nii")  # both say the same

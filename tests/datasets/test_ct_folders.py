@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import warnings
 
 import numpy as np
 import pytest
@@ -264,3 +265,52 @@ def test_metadata_of_voxels_that_no_ct_has_are_refused(tmp_path, chest):
     for spacing in (1e30, 500.0, 1e-5):
         with pytest.raises(ValueError, match="a.nii.gz has voxels .*; correct it in the metadata table"):
             load_ct(file, Calibration(1, 0, (spacing,) * 3))
+
+
+def written(path, *rows: str):
+    path.write_text("\n".join(["VolumeName,Findings_EN,Impressions_EN", *rows, ""]), encoding="utf-8")
+    return path
+
+
+def test_a_comma_that_is_not_quoted_never_cuts_a_report_silently(tmp_path):
+    table = written(tmp_path / "t.csv", "a.nii.gz,Normal.,Normal.", "b.nii.gz,Nodule, 4 mm.,Nodule.")
+    with pytest.raises(ValueError, match=r"^row 3 of .*t.csv has more fields than its header: quote texts that hold"):
+        read_reports(table)
+
+
+@pytest.mark.parametrize("rows", [
+    ('a,"Normal.,Normal.', "b,Nodule.,Nodule."), ('a,"Normal.,Normal.', 'b,"Nodule.","Nodule, 4 mm."'),
+    ('a,Normal.,"Normal.', "b,Nodule.," + "x" * 140_000)])
+def test_a_quote_that_is_not_closed_gives_no_patient_the_reports_of_others(tmp_path, rows):
+    with pytest.raises(ValueError, match=r"^row 2 of .*t.csv cannot be read .*: close each quote") as caught:
+        read_reports(written(tmp_path / "t.csv", *rows))
+    assert "\n" not in str(caught.value)
+
+
+def test_quoted_reports_keep_their_lines_commas_quotes_and_tabs(tmp_path):
+    table = written(tmp_path / "t.csv", 'a,"Nodule, 4 mm;\n""ground\tglass"".",Nodule; benign.,', "b,x,y")
+    assert read_reports(table) == {"a": 'Findings: Nodule, 4 mm; "ground glass". Impression: Nodule; benign.',
+                                   "b": "Findings: x Impression: y"}
+
+
+def test_a_blank_row_of_a_table_leaves_a_prepared_ct_its_own_report(tmp_path, chest, monkeypatch):
+    save_ct(tmp_path / "cts" / "mine.nii.gz", chest[:4, :4, :4])
+    monkeypatch.setattr("phydict.datasets.cts.ct_rate._own_report", lambda path: "Findings: Nodule.")
+    for row, report in (("mine,,", "Nodule."), ("mine,Effusion.,", "Effusion.")):
+        table = written(tmp_path / "t.csv", row, "other,Normal.,")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            assert find_cts(tmp_path / "cts", reports=table)[0].report == f"Findings: {report}"
+
+
+def test_blank_texts_are_no_reports_and_a_table_of_blank_ones_alone_is_warned_of(tmp_path, chest, capsys):
+    for name in ("a", "b", "c"):
+        save_ct(tmp_path / "cts" / f"{name}.nii.gz", chest[:4, :4, :4])
+        write_ct_series(tmp_path / "dicom" / name, np.zeros((8, 8, 4)), AFFINE)
+    some = written(tmp_path / "some.csv", "a,Nodule.,", "b,,Not given.", "c,nan,")
+    none = written(tmp_path / "none.csv", "a,,", "other,Nodule.,")
+    for root in (tmp_path / "cts", tmp_path / "dicom"):
+        find_sources(root, reports=some)
+        assert capsys.readouterr().err == "reports for 1 of 3 CTs; the first without is b\n"
+        with pytest.warns(UserWarning, match=r"none.csv has no report of any of the 3 CTs, the first of which is a"):
+            find_sources(root, reports=none)

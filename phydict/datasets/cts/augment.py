@@ -17,7 +17,8 @@ from phydict.grid import Grid
 from phydict.runtime.ranges import check_fields
 from phydict.units import AIR, HUWindow
 
-NAMES_A_SIDE = re.compile(r"\b((left|right|levo|dextro|lingula)\w*|middle lobe|[LR](t|UL|ML|LL)?)\b", re.IGNORECASE)
+NAMES_A_SIDE = re.compile(r"\b((left|right|levo|dextro|lingula)\w*|(mid|middle)[\s-]+(lung[\s-]+)?lobes?|"
+                          r"azygos[\s-]+lobes?|[LR](t|UL|ML|LL)?)\b", re.IGNORECASE)
 """What makes an English report one of a side."""
 
 FIELD_MM, FIELD_SHIFT_MM = (310.0, 400.0), 15.0

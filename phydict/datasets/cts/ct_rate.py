@@ -113,12 +113,12 @@ def find_cts(root: str | Path, reports: str | Path | None = None, metadata: str 
     the one of `fixed` is read. first_reconstruction: keep one volume per scan. exclude: a text file of ids or
     files to leave out, one a line (CT-RATE's no_chest_*.txt).
     Segmentations beside CTs are passed over. Of cases prepared by data/prepare_cts.py the volume alone is taken, with
-    their own ids, and with their own reports where no table has one.
+    their own ids, and with their own reports where no table has one, or a blank one.
     Ids are file names without ending; outside CT-RATE's names, a file in a subfolder gets `<first subfolder>__<name>`,
     or all its folders where two CTs would have the same id.
     Warns of CTs that are the same file. Raises FileNotFoundError where there is no NIfTI, ValueError for ids found
     twice, v1 volumes without metadata, and a given table of reports without any of the CTs; one that was found by
-    itself is warned of.
+    itself is warned of, and so is one whose rows of them are blank.
     """
     root = Path(root)
     paths = _ct_files(root)
@@ -150,10 +150,18 @@ def find_cts(root: str | Path, reports: str | Path | None = None, metadata: str 
         if table_given:
             raise ValueError(f"{message}: give the table of these CTs, or leave out data.source.reports")
         warn(message)
-    cts = [CTFile(files[id], id, _own_report(files[id]) if text is None else text) for id, text in reports_of.items()]
+    elif texts and not any(reports_of.values()):
+        warn_of_blank(reports, ids)
+    cts = [CTFile(files[id], id, text or _own_report(files[id])) for id, text in reports_of.items()]
     if texts:
-        log_reports(ids, [ct.id for ct in cts if reports_of[ct.id] is None and not ct.report])
+        log_reports(ids, [ct.id for ct in cts if not ct.report])
     return cts if fixed else _calibrated(cts, metadata or _beside(root, "metadata"))
+
+
+def warn_of_blank(reports: str | Path | None, ids: list[str]) -> None:
+    """Warns that a table has rows of these CTs, and no report in any."""
+    warn(f"{reports} has no report of any of the {len(ids)} CTs, the first of which is {ids[0]}: in their rows, "
+         "Findings_EN and Impressions_EN are blank")
 
 
 def log_reports(ids: list[str], without: list[str]) -> None:

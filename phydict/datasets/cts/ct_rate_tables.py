@@ -9,7 +9,7 @@ from pathlib import Path
 
 from phydict.datasets.cts.transforms import Calibration, case_id
 from phydict.datasets.reports import join_report
-from phydict.runtime.reading import reading, refusing
+from phydict.runtime.reading import Unreadable, reading, refusing
 
 TABLE_ADVICE = "save it as CSV in UTF-8"
 
@@ -18,7 +18,8 @@ def read_reports(path: str | Path) -> dict[str, str]:
     """Reports by volume name (without .nii.gz) from one CT-RATE CSV, or from all CSVs of a folder.
 
     Columns VolumeName, Findings_EN, Impressions_EN; a report is laid out by `join_report`. Raises FileNotFoundError,
-    and ValueError for missing columns and for volumes without a name or with two rows.
+    and ValueError for missing columns, for rows of more fields than the header, for quotes that are not closed, and for
+    volumes without a name or with two rows.
     """
     with refusing(path, TABLE_ADVICE):
         rows = _rows(path, ("VolumeName", "Findings_EN", "Impressions_EN"))
@@ -28,8 +29,7 @@ def read_reports(path: str | Path) -> dict[str, str]:
 def read_calibrations(path: str | Path) -> dict[str, Calibration]:
     """HU scale, spacing and orientation by volume name from CT-RATE's metadata CSV, or from all CSVs of a folder.
 
-    Raises FileNotFoundError, and ValueError for missing columns, numbers that cannot be read and volumes
-    with two rows.
+    Raises FileNotFoundError, and ValueError as `read_reports` and for numbers that cannot be read.
     """
     columns = ("VolumeName", "RescaleSlope", "RescaleIntercept", "XYSpacing", "ZSpacing")
     with refusing(path, TABLE_ADVICE):
@@ -81,10 +81,20 @@ def _rows(path: str | Path, columns: tuple[str, ...]) -> list[dict[str, str]]:
 
 
 def _table(file: Path, columns: tuple[str, ...]) -> list[dict[str, str]]:
+    rows: list[dict[str, str]] = []
     with reading(f"the table {file}", TABLE_ADVICE), file.open(newline="", encoding="utf-8-sig") as lines:
-        table = csv.DictReader(lines)
-        rows, header = list(table), table.fieldnames or ()
-    missing = [name for name in columns if name not in header]
-    if missing:
-        raise ValueError(f"{file} lacks the columns {', '.join(missing)}; CT-RATE's tables have {', '.join(columns)}")
+        table = csv.DictReader(lines, strict=True)
+        try:
+            header = table.fieldnames or ()
+            if missing := [name for name in columns if name not in header]:
+                raise Unreadable(f"{file} lacks the columns {', '.join(missing)}; CT-RATE's tables have "
+                                 f"{', '.join(columns)}")
+            for row in table:
+                if any(row.pop(None, ())):
+                    raise Unreadable(f"row {len(rows) + 2} of {file} has more fields than its header: quote texts that "
+                                     "hold commas")
+                rows.append(row)
+        except csv.Error as error:
+            raise Unreadable(f"row {len(rows) + 2} of {file} cannot be read ({error}): close each quote, and write "
+                             "those within a text twice") from error
     return rows

@@ -205,7 +205,7 @@ def _place(hu: np.ndarray, affine: np.ndarray, beside: dict[str, tuple[Path, ...
     masks |= {name: (read_segmentation(files, hu.shape, affine), affine) for name, files in beside.items()}
     lung = to_grid(masks["lung"][0], masks["lung"][1], work, 0.0) if "lung" in masks else np.zeros(1)
     if not (lung > 0.5).any():
-        raise ValueError("no lungs were found; give a chest CT, or lay a lung segmentation beside it")
+        raise ValueError("no lungs were found; give a chest CT in HU, or lay a lung segmentation beside it")
     size = lung_box_size(lung, work.spacing)
     grid = settings.grid(lung_box_centre(lung, work.affine), size)
     images = {"ct": to_grid(hu, affine, grid, settings.outside)}

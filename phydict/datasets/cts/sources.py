@@ -9,7 +9,15 @@ from zlib import crc32
 
 import numpy as np
 
-from phydict.datasets.cts.ct_rate import CTFile, NoNIfTI, find_cts, first_of_scans, log_reports, without_excluded
+from phydict.datasets.cts.ct_rate import (
+    CTFile,
+    NoNIfTI,
+    find_cts,
+    first_of_scans,
+    log_reports,
+    warn_of_blank,
+    without_excluded,
+)
 from phydict.datasets.cts.ct_rate_tables import read_reports
 from phydict.datasets.cts.ct_series import Series, find_series, load_series
 from phydict.datasets.cts.segmentations import segmentations_beside
@@ -97,8 +105,12 @@ def _reported(sources: list[Source], reports: str | Path | None) -> list[Source]
     if reports is not None and not any(source.id in texts for source in sources):
         raise ValueError(f"none of the {len(texts)} reports in {reports} is of one of the {len(sources)} DICOM series "
                          f"(the first is {sources[0].id}): name them so in the table, or leave it out")
-    if texts:
-        log_reports([source.id for source in sources], [source.id for source in sources if source.id not in texts])
+    if reports is not None:
+        ids = [source.id for source in sources]
+        without = [id for id in ids if not texts.get(id)]
+        if without == ids:
+            warn_of_blank(reports, ids)
+        log_reports(ids, without)
     return [replace(source, report=texts.get(source.id, "")) for source in sources]
 
 

@@ -6,6 +6,7 @@ anti-aliased when shrinking, smooth when enlarging, and every old voxel keeps it
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -134,9 +135,23 @@ def _check_header(path: Path, header, calibration: Calibration | None) -> None:
     affine = header.get_best_affine()
     axes = affine[:3, :3]
     check_affine(path, affine, "convert it from DICOM again")
+    if len(codes) == 2 and all(codes):
+        _warn_of_other_axes(path, header)
     if np.allclose(axes, np.eye(3)) and shape[0] >= 512:
         warn(f"{path} has the blank header of CT-RATE v1 (1 mm voxels, identity axes); "
              "read such files with data.source.fixed false and their metadata table")
+
+
+def _warn_of_other_axes(path: Path, header) -> None:
+    """Warns where a header places the voxels twice, and by other axes; a qform that cannot be read is passed over."""
+    from nibabel.orientations import aff2axcodes
+
+    with suppress(ValueError):
+        sform, qform = ("".join(map(str, aff2axcodes(place))) for place in (header.get_sform(), header.get_qform()))
+        if sform == qform:
+            return
+        warn(f"{path} says by its sform that its axes are {sform}, and by its qform {qform}: the sform is used, and "
+             "mirrors or turns the patient if the qform is right; convert it from DICOM again, or remove the wrong one")
 
 
 def _check_shape(name: str | Path, shape: tuple[int, ...]) -> None:
@@ -168,10 +183,16 @@ def _check_finite(name: str | Path, hu: np.ndarray) -> None:
 
 
 def check_hu(hu: np.ndarray, name: str) -> None:
-    """Warn where air is not near -1000 or hardly any tissue is left: the numbers are then hardly HU."""
+    """Warn where air is not near -1000 or hardly any tissue is left: the numbers are then hardly HU.
+
+    Padding is one number: where most of what lies below PADDING has others, and is more than what lies above it, air's
+    noise included, it is neither padding nor noise.
+    """
     sample = hu[::3, ::3, ::3]
     low = sample[sample < -300]
     tissue, gas = float((sample > -200).mean()), float((low > PADDING).sum() / sample.size)
+    below = low[low <= PADDING]
+    varied = below.size - int(np.unique(np.rint(below), return_counts=True)[1].max(initial=0))
     counts, edges = np.histogram(low.clip(AIR), bins=35, range=(AIR, -300))
     mode = edges[counts.argmax()] + 10
     if gas < 0.01 or mode > -900:
@@ -179,6 +200,9 @@ def check_hu(hu: np.ndarray, name: str) -> None:
             f"the most frequent value below -300 is {mode:.0f}"
         warn(f"{name} does not look like HU: {air}, but air should lie near -1000; check slope, intercept "
              "and whether `fixed` (data.source.fixed) is right")
+    elif varied > max(below.size / 2, gas * sample.size):
+        warn(f"{name} does not look like HU: {100 * below.size / sample.size:.1f} % of it lies below {PADDING:g}, and "
+             "not at one number, as padding does; check slope and intercept, HU may have been scaled twice")
     elif tissue < 0.01:
         warn(f"{name} does not look like HU: only {100 * tissue:.1f} % of it lies above -200; it may have "
              "been rescaled twice, check whether `fixed` (data.source.fixed) is right")
@@ -297,8 +321,8 @@ def prepare_ct(ct: str | Path | tuple[np.ndarray, np.ndarray], grid: Grid = Grid
     else:
         centre = affine[:3, :3] @ ((np.asarray(hu.shape) - 1) / 2) + affine[:3, 3]
         size = " x ".join(f"{length:.0f}" for length in np.linalg.norm(affine[:3, :3], axis=0) * hu.shape)
-        warn(f"no lungs were found in {name}, a scan of {size} mm; its volume is centred on the scan and its "
-             "masks are unknown")
+        warn(f"no lungs were found in {name}, a scan of {size} mm; its volume is centred on the scan and its masks are "
+             "unknown; it may be no chest, or its numbers no HU")
     target = moved_to(grid, centre)
     volume = window.to_range(to_grid(hu, affine, target, AIR))
     masks = np.stack([to_grid(m, work.affine, target, 0.0) for m in masks]).clip(0, 1)

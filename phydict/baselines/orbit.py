@@ -13,6 +13,9 @@ from phydict.xray import ConeBeam
 TOLERANCE = 0.01
 """How far, as a share of the source's distance from the axis, views may stand off the circle."""
 
+ONE_PLACE = 1e-6
+"""Angle in radians below which views are of one place."""
+
 TAPER = math.radians(10)
 """Angle over which an open arc's ends share with the views that see the same lines from the other side."""
 
@@ -63,7 +66,7 @@ class CircularOrbit:
 
     def shares(self) -> np.ndarray:
         """The angle (K,) in radians that each view stands for: half the way to both neighbours, and at the ends of an
-        open arc half a typical step outwards. Views all in one place share half a turn."""
+        open arc half a typical step outwards. Views of one place share alike, and half a turn if all are there."""
         gaps, step, order, arc = self._steps()
         if arc < 1e-6:
             return np.full(len(gaps), math.pi / len(gaps))
@@ -71,7 +74,8 @@ class CircularOrbit:
             gaps[-1] = step
         shares = np.empty(len(gaps))
         shares[order] = (gaps + np.roll(gaps, 1)) / 2
-        return shares
+        beside = np.cos(self.angles[:, None] - self.angles) > math.cos(ONE_PLACE)
+        return beside @ shares / beside.sum(1)
 
     def redundancy(self, tangents: np.ndarray) -> np.ndarray:
         """Weights (K, U) of rays that leave their view's central plane at `tangents` (K, U), counted along u.
@@ -99,14 +103,26 @@ class CircularOrbit:
 
     def _steps(self) -> tuple[np.ndarray, float, np.ndarray, float]:
         """Gaps (K,) to the next view in the order of angles, the largest last; the typical gap; that order; and the arc
-        that the views stand for, which is open where the largest gap exceeds one and a half typical ones."""
+        that the views stand for, which is open where the largest gap exceeds one and a half typical ones. Typical is
+        the median of those longer than half of the gap that most of the arc is made of, so that views that repeat or
+        come in pairs change it no more than single ones."""
         order = np.argsort(self.angles, kind="stable")
         gaps = np.diff(self.angles[order], append=self.angles[order[0]] + 2 * math.pi)
         last = int(gaps.argmax())
         order, gaps = np.roll(order, -last - 1), np.roll(gaps, -last - 1)
-        step = float(np.median(gaps[:-1])) if len(gaps) > 1 else 0.0
+        step = _typical(gaps[:-1])
         arc = 2 * math.pi if gaps[-1] <= 1.5 * step else 2 * math.pi - gaps[-1] + step
         return gaps, step, order, arc
+
+
+def _typical(gaps: np.ndarray) -> float:
+    """The median of the gaps (N,) longer than half of that at which those not longer fill half of the way; 0 if none is
+    above 0."""
+    ordered = np.sort(gaps)
+    filled = ordered.cumsum()
+    if not len(gaps) or filled[-1] <= 0:
+        return 0.0
+    return float(np.median(gaps[gaps > ordered[np.searchsorted(filled, filled[-1] / 2)] / 2]))
 
 
 def _demand(holds: np.ndarray, what: str) -> None:

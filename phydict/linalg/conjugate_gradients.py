@@ -49,3 +49,12 @@ def conjugate_gradients(operator: Callable[[Tensor], Tensor], right: Tensor, ite
             direction.mul_(torch.where(active, energy / previous, 0)).add_(scaled)
         on_step()
     return d
+
+
+def most_kept(iterations: int) -> int:
+    """How many residuals, each of the size of the right side, are held at most where so many iterations are done
+    orthogonally; while their room doubles both rooms are."""
+    room = most = min(iterations, KEPT)
+    while room < iterations:
+        room, most = 2 * room, 4 * room
+    return most

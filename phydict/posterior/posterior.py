@@ -139,6 +139,10 @@ class Posterior(Reconstructor):
         return self.prior.window
 
     @property
+    def volumes(self) -> int:
+        return super().volumes + max((getattr(step, "kept", 0) for step in vars(self.sampler).values()), default=0)
+
+    @property
     def full_detector(self) -> bool:  # type: ignore[override]
         return self.sampler.full_detector
 

@@ -100,7 +100,9 @@ class Refined(Delegating):
 
     @property
     def volumes(self) -> int:
-        return CORRECTED_VOLUMES if any(map(self._network, self.levels)) else super().volumes
+        if any(map(self._network, self.levels)):
+            return CORRECTED_VOLUMES
+        return super(Delegating, self).volumes  # the base holds its own on coarser voxels
 
     def _network(self, level: Grid) -> Correction | None:
         suiting = [network for network in self.networks if network.suits(level, self.base.window)]

@@ -17,6 +17,11 @@ LARGEST_SHARE = 0.9
 ORDER = 3
 """The cosines that a view's scatter is made of have total orders below it."""
 
+USUAL, BEYOND = 0.99, 1.0
+"""A pixel tells the less of scatter the further its line integral, or what that exceeds the reference's by, is more
+than BEYOND above what the share USUAL of its view's pixels have at most: it is dead or behind metal. In scenes of two
+CTs with scatter no pixel is above it by more than 0.73."""
+
 HARDENING = 0.011
 """By how much a tube's line integrals m of water bend: m + HARDENING m (m - m_0) is straight in the water's thickness,
 within 0.07 over 450 mm, where m itself errs by 0.4 to 0.65. The best value is 0.0105 to 0.0121 for tubes of 70 to 120
@@ -43,18 +48,35 @@ def subtract_scatter(xrays: Tensor, reference: Tensor) -> Tensor:
     """Line integrals (B, K, V, U) without the scatter that makes their signal exceed that of `reference`.
 
     exp(-xrays) = exp(-reference) + S, with S per view a sum of the cosines of a total order below ORDER along rows
-    and columns, fitted by least squares relative to the signal, so that what is thick counts as much as what is thin.
-    S is kept above zero and below LARGEST_SHARE of the signal.
+    and columns, fitted by least squares relative to the signal, so that what is thick counts as much as what is thin,
+    but for pixels that stand out (USUAL, BEYOND), which would outweigh all others. S is kept above zero and below
+    LARGEST_SHARE of the signal, and is zero where the pixels of a view do not tell it.
     """
     signal = torch.exp(-xrays.double())
     down, along = (torch.linspace(0, math.pi, n, dtype=torch.float64, device=xrays.device) for n in xrays.shape[-2:])
     smooth = torch.stack([torch.cos(i * down)[:, None] * torch.cos(j * along)
                           for i in range(min(ORDER, len(down))) for j in range(min(ORDER - i, len(along)))])
-    design = (smooth / signal[..., None, :, :]).flatten(-2)
-    excess = (1 - torch.exp(-reference.double()) / signal).flatten(-2)
+    counts = _counts(xrays.double(), reference.double())
+    design = (counts[..., None, :, :] * smooth / signal[..., None, :, :]).flatten(-2)
+    excess = (counts * (1 - torch.exp(-reference.double()) / signal)).flatten(-2)
     normal, right = design @ design.transpose(-1, -2), design @ excess[..., None]
-    scatter = torch.einsum("...q,qvu->...vu", torch.linalg.solve(normal, right)[..., 0], smooth)
+    shares, singular = torch.linalg.solve_ex(normal, right)
+    shares = torch.where(singular[..., None] > 0, 0, shares[..., 0])
+    scatter = torch.einsum("...q,qvu->...vu", shares, smooth)
     return -torch.log(signal - torch.minimum(scatter.clamp(min=0), LARGEST_SHARE * signal)).to(xrays)
+
+
+def _counts(xrays: Tensor, reference: Tensor) -> Tensor:
+    """How much the pixels of line integrals (B, K, V, U) count in a fit of scatter: 1, of those that stand out less."""
+    most = torch.minimum(_usual_most(xrays), reference + _usual_most(xrays - reference)) + BEYOND
+    return torch.exp(-2 * (xrays - most).clamp(min=0))
+
+
+def _usual_most(values: Tensor) -> Tensor:
+    """What the share USUAL of each view's pixels (..., V, U), all but one at least, have at most: (..., 1, 1)."""
+    flat = values.flatten(-2)
+    n = flat.shape[-1]
+    return flat.kthvalue(max(1, min(math.ceil(USUAL * n), n - 1))).values[..., None, None]
 
 
 def without_hardening(xrays: Tensor, mu_water: float) -> Tensor:

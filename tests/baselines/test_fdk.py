@@ -55,6 +55,23 @@ def test_a_balls_value_is_found_from_many_views_of_full_and_short_scans(arc, vie
     assert found[:, :, 12:20][(level > RADIUS + 30) & (level < 160)].abs().mean() < 0.03
 
 
+@pytest.mark.parametrize("arc", [360, 216])
+@pytest.mark.parametrize("again", [[7], [0, 0, 35], [*range(24)], 3 * [*range(24)]])
+def test_views_that_repeat_change_nothing_of_full_and_short_scans(arc, again):
+    beam = orbit(24, arc=arc)
+    repeated = beam.select([*range(24), *(k % 24 for k in again)])
+    torch.testing.assert_close(density(repeated), density(beam), atol=1e-5, rtol=0)
+
+
+def test_views_that_repeat_share_alike_and_views_in_pairs_are_a_full_circle():
+    beam = orbit(8)
+    shares = CircularOrbit.of(beam.select([*range(8), 3, 3]), GRID).shares()
+    assert shares[[3, 8, 9]] == pytest.approx(math.pi / 4 / 3) and shares[:3] == pytest.approx(math.pi / 4)
+    pairs = ConeBeam.at_angles([10.0 * (k // 2) + k % 2 for k in range(72)], 1020, 740, (48, 60), 12.0)
+    assert CircularOrbit.of(pairs, GRID).shares().sum() == pytest.approx(2 * math.pi)
+    assert density(pairs)[distance() < RADIUS - 20].mean() == pytest.approx(1, abs=0.02)
+
+
 def test_few_views_have_the_right_mean_and_streaks():
     errors = [float((density(orbit(k)) - (distance() < RADIUS).double()).norm()) for k in (4, 12, 36, 108)]
     assert errors == sorted(errors, reverse=True)

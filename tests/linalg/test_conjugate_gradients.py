@@ -4,7 +4,7 @@ import pytest
 import torch
 from laws import random_like
 
-from phydict.linalg.conjugate_gradients import conjugate_gradients
+from phydict.linalg.conjugate_gradients import conjugate_gradients, most_kept
 
 SIZE = 200
 EIGENVALUES = torch.logspace(0, 5, SIZE).double()
@@ -52,3 +52,12 @@ def test_more_room_for_residuals_changes_no_bit(monkeypatch):
     plain = solved(torch.float32, 60, True)
     monkeypatch.setattr("phydict.linalg.conjugate_gradients.KEPT", 3)
     assert torch.equal(solved(torch.float32, 60, True), plain)
+
+
+@pytest.mark.parametrize("iterations, doubled", [(3, False), (4, True), (10, True)])
+def test_the_most_residuals_that_are_held_are_both_rooms_while_the_second_is_made(monkeypatch, iterations, doubled):
+    monkeypatch.setattr("phydict.linalg.conjugate_gradients.KEPT", 3)
+    held, cat = [3], torch.cat
+    monkeypatch.setattr(torch, "cat", lambda parts: held.append(2 * sum(map(len, parts))) or cat(parts))
+    solved(torch.float32, iterations, True)
+    assert max(held) == most_kept(iterations) and (len(held) > 1) == doubled

@@ -55,6 +55,26 @@ def denoiser(variance: float = 0.04, schedule: CosineSchedule = FINE) -> Gaussia
     return GaussianDenoiser(0.1 * random_like((1, *SHAPE), seed=3), torch.tensor(variance).double(), schedule)
 
 
+class WithMask:
+    """A Gaussian prior of a CT and a mask, each of the variance and zero mean, whose voxels are `alike` correlated."""
+
+    schedule = FINE
+
+    def __init__(self, variance: float, alike: float):
+        self.alike, self.covariance = alike, variance * torch.tensor([[1, alike], [alike, 1]]).double()
+
+    def denoise(self, x: Tensor, t: float) -> Tensor:
+        a, s = (w.to(x) for w in self.schedule.scales(t))
+        gain = a * self.covariance @ torch.linalg.inv(a**2 * self.covariance + s**2 * torch.eye(2).to(x))
+        return torch.einsum("cd,bd...->bc...", gain, x)
+
+    def spreads(self, m: DenseMeasurement, noise: float) -> tuple[float, float]:
+        """The summed variances of the CT and of the mask, given m."""
+        variance = float(self.covariance[0, 0])
+        ct = float(condition(m, torch.zeros(SHAPE).double(), variance, noise)[1].trace())
+        return ct, N * variance * (1 - self.alike**2) + self.alike**2 * ct
+
+
 def condition(m: DenseMeasurement, mean: Tensor, variance: float, noise: float) -> tuple[Tensor, Tensor]:
     """Mean (N,) and covariance (N, N) of N(mean, variance I) given m, whose errors have standard deviation noise."""
     precision = m.matrix.T @ m.matrix / noise**2 + torch.eye(N).double() / variance

@@ -7,7 +7,7 @@ import torch
 from laws import random_like
 
 from phydict.posterior import DAPS, ExactDraw, Langevin
-from posterior.dense import SHAPE, condition, denoiser, measurement, moments
+from posterior.dense import SHAPE, WithMask, condition, denoiser, measurement, moments
 
 V, NOISE = 0.04, 0.3
 EXACT = {"likelihood": ExactDraw(20, 1e-12), "noise": NOISE}
@@ -27,6 +27,15 @@ def test_with_the_true_spread_the_samples_are_the_posteriors_whatever_the_levels
     found, spread = moments(sample(DAPS(levels, **EXACT, **TRUE), 20000))
     torch.testing.assert_close(found, mean, atol=0.006, rtol=0)
     assert (spread - covariance).norm() < 0.04 * covariance.norm()
+
+
+@pytest.mark.parametrize("alike", [0.0, 0.9])
+def test_a_ct_and_a_mask_that_no_x_ray_measures_have_the_spread_of_their_posterior(alike):
+    prior, x = WithMask(V, alike), random_like((1500, 2, *SHAPE[1:]), seed=11)
+    settings = DAPS(60, sigma_min=0.001, flow_end=0.001, **EXACT, **TRUE)
+    states = settings.sample(prior, measurement(), x, torch.Generator().manual_seed(0))
+    found = [float(states[:, i].flatten(1).T.cov().trace()) for i in (0, 1)]
+    assert found == pytest.approx(prior.spreads(measurement(), NOISE), rel=0.08)
 
 
 def test_the_published_spread_and_a_full_flow_see_the_prior_with_half_its_weight():

@@ -11,7 +11,7 @@ from torch.nn.functional import avg_pool3d
 from phydict.diffusion import GaussianDenoiser
 from phydict.grid import Grid
 from phydict.methods import METHODS
-from phydict.posterior import Measurement, Metal, Posterior, ProximalCG, Refined
+from phydict.posterior import Measurement, Metal, Posterior, ProximalCG, Refined, metal
 from phydict.posterior.metal import with_metal
 from phydict.reconstruction import Reconstruction
 from phydict.units import HUWindow, hu_to_mu
@@ -91,6 +91,32 @@ def test_two_display_images_of_unknown_gain_have_no_metal_and_two_of_line_integr
     method = Method(m)
     with_metal(m, Metal(), method, method)
     assert (m.carried is None) == display == (method.runs == 1)
+
+
+WITHOUT = {"shown_by": lambda *_: [0, 1], "DENSEST": math.inf}
+
+
+@pytest.mark.parametrize("off", WITHOUT)
+def test_a_bad_pixel_of_one_view_is_no_metal_as_no_other_view_shows_it_and_nothing_is_as_dense(monkeypatch, off):
+    m = measured(0.0, beam=BEAM.select([0, 4]))
+    m.y = m.y.clone()
+    m.y[0, 1, 25, 20] = 8.0
+    method = Method(m)
+    plain = method()
+    monkeypatch.setattr(metal, off, WITHOUT[off])  # either reason is enough
+    assert torch.equal(with_metal(m, Metal(), method, method), plain) and m.carried is None
+    for name, value in WITHOUT.items():
+        monkeypatch.setattr(metal, name, value)
+    with_metal(m, Metal(), method, method)
+    assert m.carried.density > 40_000
+
+
+@pytest.mark.parametrize("views", [[0], [0, 0, 0]])
+def test_views_from_one_direction_cannot_say_where_metal_is_so_that_it_is_not_sought(views):
+    m = measured(beam=BEAM.select(views))
+    method = Method(m)
+    with_metal(m, Metal(), method, lambda: pytest.fail("it ran again"))
+    assert method.runs == 1 and m.carried is None
 
 
 def test_metal_that_does_not_help_is_given_up_and_nothing_is_left_of_it():

@@ -7,7 +7,7 @@ import torch
 from laws import random_like
 
 from phydict.posterior import ExactDraw, Langevin, PnPDM
-from posterior.dense import SHAPE, N, condition, denoiser, measurement, moments
+from posterior.dense import SHAPE, N, WithMask, condition, denoiser, measurement, moments
 
 V, NOISE = 0.04, 0.3
 EXACT = {"likelihood": ExactDraw(20, 1e-12), "noise": NOISE}
@@ -47,6 +47,15 @@ def test_as_the_coupling_tightens_the_annealed_states_tend_to_the_posterior():
     found, spread = moments(sample(one_draw(120, rho_min=0.04, levels=200, **EXACT), 3000))
     torch.testing.assert_close(found, mean, atol=0.015, rtol=0)
     assert (spread - covariance).norm() < 0.1 * covariance.norm()
+
+
+@pytest.mark.parametrize("alike", [0.0, 0.9])
+def test_a_ct_and_a_mask_that_no_x_ray_measures_have_the_spread_of_their_posterior(alike):
+    prior, x = WithMask(V, alike), random_like((1500, 2, *SHAPE[1:]), seed=11)
+    settings = one_draw(20, rho_max=0.2, rho_min=0.05, levels=150, **EXACT)
+    states = settings.sample(prior, measurement(), x, torch.Generator().manual_seed(0))
+    found = [float(states[:, i].flatten(1).T.cov().trace()) for i in (0, 1)]
+    assert found == pytest.approx(prior.spreads(measurement(), NOISE), rel=0.12)
 
 
 def test_the_mean_of_many_states_is_nearer_the_posterior_mean_than_one_of_them():

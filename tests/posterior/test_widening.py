@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -11,8 +13,10 @@ from phydict.methods import reconstruct
 from phydict.posterior import posterior
 from phydict.posterior.widening import (
     angular_spread,
+    directions,
     limited_angle_factor,
     narrow_arc_widening,
+    repeated_widening,
     warn_of_contradictions,
 )
 from phydict.xray import ConeBeam, Projector
@@ -58,6 +62,7 @@ def test_a_limited_angle_belongs_to_the_calibration_so_that_nothing_counts_as_wi
         torch.testing.assert_close(wider.intervals[level], (1.5 * half_width).clamp(max=2 * refiner.window.half_width))
 
 
+@pytest.mark.filterwarnings("ignore:.* views come from 1 direction")
 def test_a_narrower_arc_than_in_the_calibration_widens_and_is_said():
     wider = []
     for degrees in (30.0, 20.0, 10.0, 0.1):
@@ -74,6 +79,23 @@ def test_a_narrower_arc_than_in_the_calibration_widens_and_is_said():
 def test_arcs_of_the_calibration_few_views_and_full_orbits_do_not():
     scenes = *(seen(views, 40.0) for views in (4, 8, 32)), *(seen(views) for views in (1, 2, 3, 4, 200)), seen(3, 10.0)
     assert all(narrow_arc_widening(scene) == 1 for scene in scenes)
+
+
+@pytest.mark.parametrize("views, times", [(1, 2), (4, 4), (5, 3)])
+def test_views_that_repeat_count_once_whatever_their_order_and_widen_intervals_by_the_root_of_how_often(views, times):
+    beam = seen(views).beam
+    repeated = Projector(GRID, beam.select([*range(views), *reversed(range(views))] + [*range(views)] * (times - 2)))
+    assert directions(repeated.beam, GRID.centre) == views
+    with pytest.warns(UserWarning, match=f"{times * views} views come from {views} directions? alone.* times as wide"):
+        assert repeated_widening(repeated) == pytest.approx(times**0.5)
+
+
+@pytest.mark.filterwarnings("error")
+def test_views_half_a_degree_apart_opposed_ones_and_tiles_of_one_source_are_all_distinct():
+    dense, opposed, one = seen(36, 20.0), seen(2), seen(1).beam
+    tiles = ConeBeam(*(np.repeat(rows, 2, 0) for rows in (one.sources, one.detectors, one.u, one.v)), one.shape)
+    tiles = replace(tiles, detectors=tiles.detectors + 14 * np.array([[1], [-1]]) * tiles.u)
+    assert all(repeated_widening(scene) == 1 for scene in (dense, opposed, seen(1), seen(200), Projector(GRID, tiles)))
 
 
 @pytest.mark.parametrize("shares, named", [((1.0, 1.0, 1.5, 1.0), 2), ((0.0, 2.0, 0.0, 0.0), 1),

@@ -52,6 +52,27 @@ def test_each_view_and_each_reference_of_a_batch_has_its_own_scatter():
             torch.testing.assert_close(row[None, k:k + 1], alone)
 
 
+@pytest.mark.parametrize("reading", [8.0, 12.0, 16.0, 29.0])
+@pytest.mark.parametrize("in_the_reference", [False, True])
+def test_a_dead_pixel_changes_nothing_of_the_scatter_found_in_the_others(reading, in_the_reference):
+    """In air or behind the patient, whether or not the reference has taken it for something dense."""
+    for row, column in ((1, 1), (12, 16)):
+        measured, reference = scattered(CLEAN, SMOOTH), CLEAN.clone()
+        measured[..., row, column] = reading
+        if in_the_reference:
+            reference[..., row, column] = reading + 1
+        alive = torch.ones(V, U, dtype=torch.bool)
+        alive[row, column] = False
+        found = subtract_scatter(measured, reference)
+        torch.testing.assert_close(found[..., alive], CLEAN[..., alive], atol=2e-3, rtol=0)
+
+
+def test_x_rays_whose_scatter_no_pixels_tell_are_left_as_they_are():
+    measured = torch.zeros(1, 1, 3, 3).double()
+    measured[..., 0, :2] = 29.0
+    torch.testing.assert_close(subtract_scatter(measured, 0.9 * measured), measured, atol=1e-6, rtol=0)
+
+
 @pytest.mark.parametrize("reference", [0.0, 50.0])
 def test_the_signal_is_never_used_up(reference):
     found = subtract_scatter(CLEAN.float(), torch.full_like(CLEAN, reference).float())

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from phydict.linalg.conjugate_gradients import conjugate_gradients
+from phydict.linalg.conjugate_gradients import conjugate_gradients, most_kept
 from phydict.linalg.total_variation import TVQuadraticMajorizer
 from phydict.posterior.likelihood.reward import Reward
 from phydict.posterior.measurement import Measurement
@@ -30,10 +30,12 @@ MOST_SMOOTHING = 10.0
 class LikelihoodStep(ABC):
     """z = step(measurement, x0, x0_std): x0 and z (B, 1, X, Y, Z); x0_std is the standard deviation of x0's error.
 
-    batches: whether the states of a batch do not influence each other.
+    batches: whether the states of a batch do not influence each other. kept: how many volumes it keeps beside the few
+    that any step needs.
     """
 
     batches = True
+    kept = 0
 
     @abstractmethod
     def __call__(self, measurement: Measurement, x0: Tensor, x0_std: float) -> Tensor: ...
@@ -98,6 +100,10 @@ class ProximalCG(LikelihoodStep):
     def batches(self) -> bool:  # type: ignore[override]
         """Not with a noise, of pixels or of the model, that is one for all states."""
         return not (self.weighted_least_squares or self.discrepancy)
+
+    @property
+    def kept(self) -> int:  # type: ignore[override]
+        return most_kept(self.iterations) if self.iterations > LONG else 0
 
     def __call__(self, measurement: Measurement, x0: Tensor, x0_std: float) -> Tensor:
         weight = (self.noise / x0_std) ** 2

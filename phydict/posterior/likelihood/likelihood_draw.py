@@ -6,6 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from phydict.diffusion.steps import Generators, noise_like
@@ -22,6 +23,13 @@ class LikelihoodDraw(ABC):
     @abstractmethod
     def __call__(self, measurement: NormalisedMeasurement, x0: Tensor, x0_std: float, generator: Generators,
                  progress: float) -> Tensor: ...
+
+    def of_states(self, measurement: NormalisedMeasurement, x0: Tensor, x0_std: float, generator: Generators,
+                  progress: float) -> Tensor:
+        """A draw for states x0 (B, C, X, Y, Z): of the CT the above, of the other channels, which X-rays do not
+        measure, x0 with noise of x0_std."""
+        ct, masks = self(measurement, x0[:, :1], x0_std, generator, progress), x0[:, 1:]
+        return torch.cat([ct, masks + x0_std * noise_like(masks, generator)], 1)
 
 
 @dataclass(frozen=True)

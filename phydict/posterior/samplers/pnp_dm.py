@@ -90,7 +90,7 @@ class PnPDM(Sampler):
             rho = max(self.rho_max * self.decay**i, self.rho_min)
             times = times_of(schedule, [rho, *(sigma for sigma in grid if sigma < rho)])
             rho = float(schedule.sigma(times[0]))
-            z = torch.cat([self.likelihood(m, x[:, :1], rho, generator, i / self.iterations), x[:, 1:]], 1)
+            z = self.likelihood.of_states(m, x, rho, generator, i / self.iterations)
             signal, _ = schedule.scales(times[0])
             x = denoise_along(denoiser, signal.to(z) * z, times, generator if self.stochastic else None)
             measurement.match_gain_offset(x[:, :1])

@@ -95,7 +95,7 @@ class ReconstructionTask(lightning.LightningModule):
         if name in ("", "..") or name != Path(name).name:
             raise ValueError(f"model.name is the name of one folder inside model.out, but '{name}' was given")
         self.method_name, self.seed, self.pages = name, seed, Path(out) / "dry_run"
-        self.projector = projector_kind(projector)
+        self.projector = projector_kind(projector, "model.projector")
         self.results = CaseResults(Path(out) / name, overwrite)
         check_writable(self.results.folder, "model.out")
         self.settings = method_settings(name, seed, method, self.projector, sampling)

@@ -47,7 +47,7 @@ degrees; and the power of how far that of more views is below it, by which inter
 88 % of the body are otherwise in the 90 % interval from 8 and 16 views within 15 and 25 degrees. From 64 and 128 views,
 and tilted by 30 and 45 degrees, it holds 88 to 94 % as it is."""
 
-ALIKE, REPEATED_POWER = math.radians(0.5), 0.5
+ALIKE, REPEATED_POWER = math.radians(0.2), 0.5
 """Angle within which views come from one direction; and the power of how many come from one, on average, by which
 intervals widen, since the network counts them all. Of two CTs from 3 to 8 directions with two, three and four views
 each they have to be 1.3, 1.6 and 1.9 times as wide to hold what they hold of single ones; as they are the 90 % one

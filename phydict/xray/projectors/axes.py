@@ -1,4 +1,4 @@
-"""A volume whose axes do not end with the one that runs from inferior to superior."""
+"""A volume whose last axis is not the one that runs upwards."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ import numpy as np
 from torch import Tensor
 
 from phydict.grid import Grid
+from phydict.xray.geometry import ConeBeam
 
 
-class SuperiorLast:
+class InOtherOrder:
     """The projection, and its adjoint, of a volume (B, X, Y, Z) by the operator of the grid with `axis` put last."""
 
     def __init__(self, operator: Any, axis: int):
@@ -23,8 +24,12 @@ class SuperiorLast:
         return self.operator.adjoint(xrays).movedim(-1, self.axis).contiguous()
 
 
-def superior_axis(grid: Grid) -> int:
-    """The axis of a grid that runs nearest to the superior direction, the third where others are no nearer."""
+def axis_upwards(grid: Grid, beam: ConeBeam) -> int:
+    """The axis of a grid along which the detectors stand upright or, of tilted ones, that runs nearest to the superior
+    direction; the third where others are no nearer."""
+    for axis in (2, 0, 1):
+        if beam.is_upright(put_last(grid, axis)):
+            return axis
     upwards = np.abs(grid.affine[2, :3]) / grid.spacing
     return int(upwards.argmax()) if upwards.max() > upwards[2] + 1e-6 else 2
 

@@ -65,9 +65,9 @@ class OwnOperator:
                  f"<x, T y> {here:.6g} for random x and y, so that iterations may diverge")
 
 
-def projector_kind(given: str | type) -> str | type:
+def projector_kind(given: str | type, setting: str = "projector") -> str | type:
     """The `method` of a Projector that is given by its name, by the path of a class of one's own, such as
-    my_module.MyProjector, or as that class. Raises ValueError where it is none."""
+    my_module.MyProjector, or as that class. Raises ValueError, naming the `setting`, where it is none."""
     if isinstance(given, type) or given in METHODS:
         return given
     if not isinstance(given, str):
@@ -76,8 +76,8 @@ def projector_kind(given: str | type) -> str | type:
                          "reconstructor(...).reconstruct(xrays, projector)")
     module, _, name = given.rpartition(".")
     if not (module and name):
-        raise ValueError(f"there is no projector {given!r}: use one of {', '.join(METHODS)}, or the path of a class of "
-                         "your own, such as my_module.MyProjector")
+        raise ValueError(f"there is no projector {given!r}: {setting} is one of {', '.join(METHODS)}, or the path of a "
+                         "class of your own, such as my_module.MyProjector")
     try:
         kind = getattr(import_module(module), name)
     except (Exception, SystemExit) as error:  # of whatever kind: another's code runs

@@ -14,7 +14,7 @@ from phydict.runtime.profiling import stage
 from phydict.runtime.warning import warn
 from phydict.xray.binning import binning
 from phydict.xray.geometry import VECTOR_KEYS, ConeBeam
-from phydict.xray.projectors.axes import SuperiorLast, put_last, superior_axis
+from phydict.xray.projectors.axes import InOtherOrder, axis_upwards, put_last
 from phydict.xray.projectors.continued import Continued, reach_beyond
 
 if TYPE_CHECKING:  # they bring a compiler, so that each is imported where it is first needed
@@ -101,7 +101,7 @@ class Projector:
 class _Engine:
     """What projectors of the same grid and beam share: the operator, why it was chosen, and its norm once known."""
 
-    operator: Eq4 | Joseph | Separable | Siddon | SystemMatrix | OwnOperator | Continued | SuperiorLast
+    operator: Eq4 | Joseph | Separable | Siddon | SystemMatrix | OwnOperator | Continued | InOtherOrder
     method: str | type
     reason: str
     norm: float | None = None
@@ -115,14 +115,14 @@ def _engine(grid: Grid, beam: ConeBeam, method: str | type, memory: int, device:
     key = (method, memory, device, grid.shape, grid.affine.tobytes(), beam.shape, bool(beam.continued),
            *(getattr(beam, name).tobytes() for name in VECTOR_KEYS[:4]))
     if key not in _engines:
-        axis = superior_axis(grid)
+        axis = axis_upwards(grid, beam)
         upright = put_last(grid, axis)
         slices = reach_beyond(beam, upright) if beam.continued else 0
         tall = upright.grown(0, 0, slices)
         chosen, reason = _choose(tall, beam, memory, device) if method == "auto" else (method, "it was requested")
         operator = _operator(tall, beam, chosen, memory)
         operator = Continued(operator, slices) if slices else operator
-        _engines[key] = _Engine(operator if axis == 2 else SuperiorLast(operator, axis), chosen, reason)
+        _engines[key] = _Engine(operator if axis == 2 else InOtherOrder(operator, axis), chosen, reason)
     _engines.move_to_end(key)
     while len(_engines) > CACHE_SIZE:
         _engines.popitem(last=False)

@@ -9,7 +9,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cache
-from importlib import import_module
 from itertools import product
 from types import MappingProxyType
 
@@ -25,6 +24,7 @@ from phydict.posterior import Refinement, Sampler
 from phydict.prior import find_prior, fingerprint, load_super_resolution, own_identity
 from phydict.reconstruction import Reconstructor, describe
 from phydict.rivals import TrainedRival
+from phydict.runtime.own_code import imported
 from phydict.runtime.reading import reason
 from phydict.runtime.seeds import check_seed
 from phydict.units import HUWindow
@@ -280,8 +280,7 @@ def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
     if box is None and (alone := {"side", "centre", "refine"} & set(given)):
         raise ValueError(f"{', '.join(sorted(alone))} of a box of voxels means nothing without voxels: give them too")
     trial = Trial(columns, method, data, prior, value["guidance"], value["samples"], value["seed"], box,
-                  value["refine"], value["super_resolution"], projector=projector,
-                  with_report=value["report"])
+                  value["refine"], value["super_resolution"], projector=projector, with_report=value["report"])
     if box and data.protocol:
         data.protocol.check_voxels(box.grid(), trial.bound)
     return trial, set(given) | set(overrides)
@@ -300,12 +299,11 @@ def method_of(name: object, known: Iterable[str] = ()) -> Sampler | Reconstructo
     """
     if isinstance(name, str) and name in METHODS:
         return METHODS[name]
-    module, _, attribute = name.rpartition(".") if isinstance(name, str) else ("", "", "")
-    if not module:
+    if not (isinstance(name, str) and name.rpartition(".")[0]):
         raise ValueError(f"there is no method {name!r}: use one of {', '.join([*known, *METHODS])}, or the path of a "
                          "class, such as my_module.MySampler")
     try:
-        kind = getattr(import_module(module), attribute)
+        kind = imported(name)
         if isinstance(kind, type) and issubclass(kind, Sampler | Reconstructor) and is_dataclass(kind):
             return kind()
     except (Exception, SystemExit) as error:  # of whatever kind: another's code runs

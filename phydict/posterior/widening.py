@@ -120,9 +120,9 @@ def warn_of_contradictions(measurement: Measurement, widening: float | None) -> 
 def angular_spread(projector: Projector) -> float:
     """How widely the views see the grid's centre, from 0, all along one line, to 0.5, evenly around it: the second
     largest eigenvalue of the mean of d d^T over their directions d; 0.09 for an arc of 60 degrees, 0.18 for 90."""
-    directions = projector.grid.centre - projector.beam.sources
-    directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    return float(np.linalg.eigvalsh(directions.T @ directions / len(directions))[1])
+    towards = projector.grid.centre - projector.beam.sources
+    towards = towards / np.linalg.norm(towards, axis=1, keepdims=True)
+    return float(np.linalg.eigvalsh(towards.T @ towards / len(towards))[1])
 
 
 def directions(beam: ConeBeam, centre: np.ndarray) -> int:

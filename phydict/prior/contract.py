@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import Protocol
 from zlib import crc32
@@ -16,7 +15,7 @@ from phydict.diffusion import Denoiser
 from phydict.grid import Grid
 from phydict.prior.files import load_prior
 from phydict.prior.medsyn.checkpoint import MedSynCheckpoint
-from phydict.runtime.own_code import own_code
+from phydict.runtime.own_code import imported, own_code
 from phydict.runtime.reading import reason
 from phydict.units import HUWindow
 
@@ -117,9 +116,8 @@ def find_prior(given: str | Path | MedSynCheckpoint | AnyPrior) -> AnyPrior:
         return given
     if not is_class_path(given):
         return load_prior(given)
-    module, _, name = str(given).rpartition(".")
     try:
-        prior = getattr(import_module(module), name)()
+        prior = imported(str(given))()
     except (Exception, SystemExit) as error:  # of whatever kind: another's code runs
         raise ValueError(f"the prior {given} cannot be made ({reason(error)}): its module must be importable, and its "
                          "settings need defaults") from error

@@ -1,4 +1,4 @@
-"""What tells a user's own class from another of the same name, or from itself before an edit."""
+"""A user's own class: by its path, and what tells it from another of the same name or from itself before an edit."""
 
 from __future__ import annotations
 
@@ -7,7 +7,15 @@ import sys
 import zlib
 from contextlib import suppress
 from functools import cache
+from importlib import import_module
 from pathlib import Path
+from typing import Any
+
+
+def imported(path: str) -> Any:
+    """What a path such as my_module.MyClass names; of whatever kind the error where it cannot be imported."""
+    module, _, name = path.rpartition(".")
+    return getattr(import_module(module), name)
 
 
 @cache

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from phydict.grid import Grid
-from phydict.runtime.own_code import own_code
+from phydict.runtime.own_code import imported, own_code
 from phydict.runtime.warning import warn
 from phydict.xray.geometry import ConeBeam
 from phydict.xray.projectors.projector import METHODS
@@ -79,7 +78,7 @@ def projector_kind(given: str | type, setting: str = "projector") -> str | type:
         raise ValueError(f"there is no projector {given!r}: {setting} is one of {', '.join(METHODS)}, or the path of a "
                          "class of your own, such as my_module.MyProjector")
     try:
-        kind = getattr(import_module(module), name)
+        kind = imported(given)
     except (Exception, SystemExit) as error:  # of whatever kind: another's code runs
         raise ValueError(f"the projector {given} cannot be imported ({_words(error)}): its module must be importable"
                          ) from error

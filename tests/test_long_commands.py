@@ -155,7 +155,7 @@ def test_ctrl_c_on_a_terminal_says_how_to_resume_and_a_log_file_tells_the_rest(c
         assert len(shown_in(tmp_path / "out" / "index.html")) == 1
     log = run(command, *more)
     assert f"results in {tmp_path / 'out'}" in log and "\x1b" not in log
-    wanted = r"step 5 of 8, about \d+ s to go: loss" if command == "fit" else r"\(1 of 1\)$"
+    wanted = r"step 7 of 8, about \d+ s to go: loss" if command == "fit" else r"\(1 of 1\)$"
     assert re.search(wanted, log, flags=re.MULTILINE), log
 
 
@@ -216,8 +216,14 @@ def test_a_run_that_overwrites_says_that_it_begins_anew(run, handlers, monkeypat
     assert "with --model.overwrite true does the finished cases again" in capfd.readouterr().err
 
 
-def test_a_training_stopped_before_its_first_checkpoint_says_that_nothing_is_kept(run, handlers, monkeypatch, capfd):
-    monkeypatch.setattr(PriorTraining, "training_step", lambda *_: signal.raise_signal(signal.SIGINT))
-    with pytest.raises(SystemExit):
+def test_a_second_ctrl_c_stops_a_training_at_once_and_it_says_that_nothing_is_kept(run, handlers, monkeypatch, capfd):
+    def pressed_twice(*_: object) -> None:
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        pytest.fail("the step went on")
+
+    monkeypatch.setattr(PriorTraining, "training_step", pressed_twice)
+    with pytest.raises(SystemExit) as stopped:
         run("fit")
+    assert stopped.value.code == 130
     assert "run the same command again: no checkpoint was written" in capfd.readouterr().err

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -114,6 +115,41 @@ def test_a_run_stopped_within_a_long_epoch_resumes_from_its_last_minutes(tmp_pat
     main([*args, f"--out={tmp_path / 'halved'}", "--ckpt_path=last"])
     one, other = (checkpoint(tmp_path / run)["state_dict"] for run in ("straight", "halved"))
     assert one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
+
+
+@pytest.fixture
+def handler_of_sigint() -> Iterator[None]:
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_run_that_a_signal_stops_within_a_step_keeps_that_step(number, straight, handler_of_sigint, tmp_path, cache,
+                                                                 monkeypatch, capfd):
+    step = PriorTraining.training_step
+
+    def signalled(task, *given):
+        if task.global_step == 6:
+            signal.raise_signal(number)
+        return step(task, *given)
+
+    with monkeypatch.context() as stopping, pytest.raises(SystemExit) as stopped:
+        stopping.setattr(PriorTraining, "training_step", signalled)
+        ten_steps(tmp_path, cache)
+    assert stopped.value.code == 128 + number and checkpoint(tmp_path)["global_step"] == 7
+    assert ("stopping after this step" in capfd.readouterr().err) == (number == signal.SIGINT)
+    resumed = ten_steps(tmp_path, cache, "--ckpt_path=last")
+    assert all(torch.equal(weight, resumed["state_dict"][name]) for name, weight in straight["state_dict"].items())
+
+
+def test_a_training_that_ends_gives_ctrl_c_back(handler_of_sigint, tmp_path, cache, capsys, monkeypatch):
+    main(arguments(tmp_path, cache, "--trainer.max_steps=1", "--trainer.limit_val_batches=0",
+                   "--model.text.encoder=none"))
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    monkeypatch.setattr(PriorTraining, "batch_loss", lambda *_: torch.tensor(float("nan"), requires_grad=True))
+    refusal(capsys, main, arguments(tmp_path / "nan", cache, "--trainer.max_steps=1", "--model.text.encoder=none"))
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 @pytest.mark.parametrize("before", [False, True], ids=["at once", "after a checkpoint"])

@@ -37,7 +37,15 @@ from phydict.runtime.precision import PRECISIONS, resolve_precision, trainer_pre
 from phydict.runtime.progress_log import log_progress, progress_as, progress_options, run_command
 from phydict.runtime.ranges import check_between
 from phydict.runtime.reading import reading
-from phydict.training.checkpoints import BEST, HELD_OUT, RESUMED, BestCheckpoint, WholeCheckpoints, read_checkpoint
+from phydict.training.checkpoints import (
+    BEST,
+    HELD_OUT,
+    RESUMED,
+    BestCheckpoint,
+    StopBetweenSteps,
+    WholeCheckpoints,
+    read_checkpoint,
+)
 from phydict.training.crops import SuperResolutionData
 from phydict.training.data import PriorData
 from phydict.training.finer_uncertainty import FinerUncertaintyTraining
@@ -164,6 +172,7 @@ class PriorCLI(ProgressCLI):
         check_apart(out, "--out", [Path(cts)] if cts else [])
         with alone_in(out, "--out") if self.trainer.is_global_zero else progress_as(quiet=True, json_lines=False):
             self._begin(out, ckpt_path)
+            self.trainer.callbacks.append(StopBetweenSteps(out / CHECKPOINT))  # type: ignore[attr-defined]
             if cts:
                 held_out, trained = datamodule.held_out, len(datamodule.cts)
                 phantoms = bool(self.config.fit.data.holdout.phantoms)

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import errno
 import reprlib
+import signal
+import threading
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import lightning
 import torch
-from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from phydict.prior.finite import check_finite
 from phydict.prior.stage_file import STAGES
 from phydict.prior.tensors import read_torch
 from phydict.runtime.files import atomic_write
+from phydict.runtime.progress_log import log_progress
 from phydict.runtime.reading import not_written
 
 BEST, HELD_OUT = "best.ckpt", "held_out.txt"
@@ -83,3 +88,50 @@ class BestCheckpoint(ModelCheckpoint):
     def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         if self.monitor in trainer.callback_metrics:
             super().on_validation_end(trainer, pl_module)
+
+
+class StopBetweenSteps(Checkpoint):
+    """Lets Ctrl-C and SIGTERM end the training of one process after the step that they strike, whose weights are kept.
+
+    A second Ctrl-C, or one during validation, ends it at once. Several processes are not stopped after the same step:
+    they keep what they last wrote.
+
+    Args:
+        path: the checkpoint, which is replaced
+    """
+
+    def __init__(self, path: Path):
+        self.path, self.asked = path, False
+        self.before: Any = None
+
+    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        self.first = trainer.global_step
+        if trainer.world_size == 1 and threading.current_thread() is threading.main_thread():
+            self.before = signal.signal(signal.SIGINT, lambda *_: self._ask(trainer))
+
+    def _ask(self, trainer: lightning.Trainer) -> None:
+        if self.asked or not trainer.training:
+            raise KeyboardInterrupt
+        self.asked, text = True, "stopping after this step; Ctrl-C again stops at once, and loses it"
+        with suppress(RuntimeError):  # it struck within a line that is being written
+            log_progress(text, event="stopping", text=text)
+
+    def on_train_batch_end(self, trainer: lightning.Trainer, *_: object) -> None:
+        if not self.asked and not (trainer.received_sigterm and trainer.world_size == 1):
+            return
+        if trainer.global_step > self.first:
+            trainer.save_checkpoint(self.path)
+        if self.asked:
+            raise KeyboardInterrupt
+
+    def on_train_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        self._give_back()
+
+    def on_exception(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule,
+                     exception: BaseException) -> None:
+        if not isinstance(exception, KeyboardInterrupt):  # where Lightning ignores further ones until it has ended
+            self._give_back()
+
+    def _give_back(self) -> None:
+        if self.before is not None:
+            signal.signal(signal.SIGINT, self.before)

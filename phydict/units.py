@@ -44,6 +44,12 @@ class HUWindow:
         if not (self.low < self.high and math.isfinite(self.low) and math.isfinite(self.high)):
             raise ValueError(f"an HU window needs low < high, both finite, but [{self.low}, {self.high}] was given")
 
+    def check_air(self, which: str) -> None:
+        """Raises ValueError, with the name of `which` window this is, where air, at -1000 HU, lies below it."""
+        if self.low > AIR:
+            raise ValueError(f"{which} begins at {self.low:g} HU, so that air, which lies at {AIR:g}, would attenuate "
+                             f"X-rays: begin it at {AIR:g} or below")
+
     @property
     def centre(self) -> float:
         return (self.high + self.low) / 2

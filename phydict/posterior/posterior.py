@@ -121,6 +121,7 @@ class Posterior(Reconstructor):
         if self.samples != 1 and self.sampler.needs_refiner:
             raise ValueError("an unrolled reconstruction is not random, so that samples of it do not differ, but "
                              f"{self.samples} were given: leave samples at 1, or use phydict_fast")
+        self.window.check_air("the prior's window")
         check_fields(self, "Posterior", samples=(1, math.inf), batch=(1, math.inf))
         size = self.prior.state_channels * math.prod(self.grid.shape)
         check_memory(4 * self.samples * size, f"samples={self.samples} states of {size:,} numbers", "draw fewer")

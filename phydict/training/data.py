@@ -35,7 +35,7 @@ from phydict.runtime.seeds import check_seed
 from phydict.runtime.warning import warn
 from phydict.training.draws import Averaged, KeptDraws, MixedCases, averaged, training_parts
 from phydict.training.settings import HoldOut, Loading
-from phydict.units import AIR, HUWindow
+from phydict.units import HUWindow
 
 
 class PriorData(lightning.LightningDataModule):
@@ -72,9 +72,7 @@ class PriorData(lightning.LightningDataModule):
             raise ValueError(f"data.cache {cache} lies inside data.cts {cts}: give a folder elsewhere")
         check_writable(Path(cache), "data.cache")
         hu = HUWindow(*window)
-        if hu.low > AIR:
-            raise ValueError(f"model.window begins at {hu.low:g} HU, so that air, which lies at {AIR:g}, would "
-                             f"attenuate X-rays: begin it at {AIR:g} or below")
+        hu.check_air("model.window")
         self.grid, self.window = Grid.cube(trained, cube.side), hu
         self.draw_grid = Grid.cube(self.block * trained, cube.side)
         self.phantoms = CachedPhantoms(0, phantoms, self.draw_grid, hu, Path(cache))

@@ -176,3 +176,10 @@ def test_the_window_of_the_prior_is_the_window_of_the_result(prior):
     y = PROJECTOR(HUWindow(-1000, 600).to_mu(x))[0]
     sampler = SplitGibbs(10, ProximalCG(60, noise=1e-3), ProximalCG(60, noise=1e-3))
     assert Posterior(prior, sampler).reconstruct(y, PROJECTOR).misfit < 0.01
+
+
+def test_a_prior_whose_window_cannot_hold_air_is_refused():
+    prior = tiny_prior()
+    prior.window = HUWindow(-900, 600)
+    with pytest.raises(ValueError, match="the prior's window begins at -900 HU, so that air"):
+        Posterior(prior)

@@ -18,6 +18,16 @@ from phydict.runtime.reading import check_memory
 from phydict.runtime.warning import warn
 from phydict.runtime.yaml_file import read_yaml
 from phydict.xray.orbits import on_circle, on_line, turned
+from phydict.xray.stated import (
+    LEAST_MM,
+    MOST_MM,
+    check_isocentre,
+    check_keys,
+    number_of,
+    numbers_of,
+    pixel_sizes,
+    radians_of,
+)
 
 VECTOR_KEYS = ("sources", "detectors", "u", "v", "shape")
 ORBIT_KEYS = ("views", "source_to_detector", "source_to_isocentre", "shape", "pixel")
@@ -31,12 +41,8 @@ PLACE_OPTIONS = ("detector_shift", "tilt_degrees")
 INSTEAD = {"orbit": ", or angles_degrees: [...] in the place of views, start and arc",
            "angles": "; angles_degrees takes the place of views, start and arc"}
 LISTS = ("shape", "pixel", "angles_degrees", "detector_shift")
-MOST_RADIANS = 4 * math.pi
-"""An angle in radians beyond two turns was meant in degrees."""
 LEAST_ARC_DEGREES = 1e-3
 """Several views over less of an arc would all come from one angle."""
-LEAST_MM, MOST_MM = 1e-6, 1e9
-"""No pixel's side is shorter, and no length as long: they would be those of a mistake, and underflow or overflow."""
 SHORT_MM = 200
 """Of a distance from source to detector that may have been meant in another unit, where it fits no volume."""
 
@@ -115,8 +121,8 @@ class ConeBeam:
                              "given")
         if sizes is not None and len(sizes) == 2:
             _check_room(count[0], sizes)
-        _check_isocentre(source_to_detector, source_to_isocentre)
-        first, turn = _radians("start", start, start_degrees, 0.0), _radians("arc", arc, arc_degrees, 2 * math.pi)
+        check_isocentre(source_to_detector, source_to_isocentre)
+        first, turn = radians_of("start", start, start_degrees, 0.0), radians_of("arc", arc, arc_degrees, 2 * math.pi)
         if count[0] > 1 and abs(turn) < math.radians(LEAST_ARC_DEGREES):
             raise ValueError(f"an orbit of {count[0]} views has an arc that they are spread over, but one of "
                              f"{math.degrees(turn):g} degrees, at which all come from one angle, was given: give "
@@ -129,11 +135,11 @@ class ConeBeam:
     def at_angles(cls, angles_degrees: Sequence[float], source_to_detector: float, source_to_isocentre: float,
                   shape: tuple[int, int], pixel: float | tuple[float, float]) -> ConeBeam:
         """Views of an orbit at any angles, in degrees, and in any order."""
-        angles = _numbers("angles_degrees", angles_degrees)
+        angles = numbers_of("angles_degrees", angles_degrees)
         if np.ndim(angles) != 1 or not np.size(angles):
             raise ValueError("angles_degrees is a list of an angle for each view, but "
                              f"{reprlib.repr(angles_degrees)} was given")
-        _check_isocentre(source_to_detector, source_to_isocentre)
+        check_isocentre(source_to_detector, source_to_isocentre)
         poses = on_circle(np.radians(angles), source_to_detector, source_to_isocentre, pixel_sizes(pixel))
         return cls(*poses, shape)
 
@@ -148,9 +154,9 @@ class ConeBeam:
         count = whole_sizes(views)
         if count is None or len(count) != 1 or count[0] < 2:
             raise ValueError(f"a sweep needs two views or more, but views={reprlib.repr(views)} was given")
-        if not 0 < _number("sweep_degrees", sweep_degrees) <= 160:
+        if not 0 < number_of("sweep_degrees", sweep_degrees) <= 160:
             raise ValueError(f"sweep_degrees lies in (0, 160], but {sweep_degrees} was given")
-        _check_isocentre(source_to_detector, source_to_isocentre)
+        check_isocentre(source_to_detector, source_to_isocentre)
         reach = math.tan(math.radians(sweep_degrees) / 2)
         tangents = np.linspace(-reach, reach, count[0])
         return cls(*on_line(tangents, source_to_detector, source_to_isocentre, pixel_sizes(pixel)), shape)
@@ -158,7 +164,7 @@ class ConeBeam:
     def shifted(self, rows: float = 0.0, columns: float = 0.0) -> ConeBeam:
         """The beam with its detectors moved in their planes, by mm in the direction from row to row and from column to
         column, as for a half-fan acquisition."""
-        rows, columns = _number("rows", rows), _number("columns", columns)
+        rows, columns = number_of("rows", rows), number_of("columns", columns)
         height, width = np.linalg.norm(self.v, axis=1), np.linalg.norm(self.u, axis=1)
         move = rows * self.v / height[:, None] + columns * self.u / width[:, None]
         return replace(self, detectors=self.detectors + move)
@@ -170,7 +176,7 @@ class ConeBeam:
     def tilted(self, degrees: float) -> ConeBeam:
         """The beam with each view turned about the line through the isocentre that its rows run along, so that the
         source rises by `degrees`: the angulation of a C-arm."""
-        if not abs(_number("tilt_degrees", degrees)) < 90:
+        if not abs(number_of("tilt_degrees", degrees)) < 90:
             raise ValueError(f"tilt_degrees lies between -90 and 90, but {degrees} was given")
         return self.at(*turned((self.sources, self.detectors, self.u, self.v), math.radians(degrees)))
 
@@ -379,18 +385,18 @@ class ConeBeam:
         """The beam of a mapping in one of the forms that `load` reads. Raises ValueError naming the key."""
         form = next((name for name in ("orbit", "sweep") if isinstance(content, dict) and name in content), None)
         if form is None:
-            content = dict(_check_keys(content, VECTOR_KEYS, CONTINUED, ", or orbit or sweep in their place"))
+            content = dict(check_keys(content, VECTOR_KEYS, CONTINUED, ", or orbit or sweep in their place"))
             continued = content.pop("continued", None)
-            numbers: dict[str, Any] = {key: _numbers(key, value) for key, value in content.items()}
+            numbers: dict[str, Any] = {key: numbers_of(key, value) for key, value in content.items()}
             return cls(**numbers, continued=continued)
-        content = _check_keys(content, (form,), CONTINUED)
+        content = check_keys(content, (form,), CONTINUED)
         given: Any = content[form]
         if form == "orbit" and isinstance(given, dict) and "angles_degrees" in given:
             form = "angles"
         required, optional = FORMS[form]
-        given = dict(_check_keys(given, required, optional + PLACE_OPTIONS, INSTEAD.get(form, "")))
+        given = dict(check_keys(given, required, optional + PLACE_OPTIONS, INSTEAD.get(form, "")))
         for key, value in given.items():
-            (_numbers if key in LISTS else _number)(key, value)
+            (numbers_of if key in LISTS else number_of)(key, value)
         shift, tilt = given.pop("detector_shift", 0.0), given.pop("tilt_degrees", 0.0)
         if np.shape(shift) not in ((), (2,)):
             raise ValueError("detector_shift is mm from column to column, or [from row to row, from column to column], "
@@ -403,78 +409,6 @@ class ConeBeam:
         return replace(beam, continued=content.get("continued"))
 
 
-def _radians(name: str, radians: float | None, degrees: float | None, otherwise: float) -> float:
-    """An angle of an orbit that was given in radians, in degrees or not at all."""
-    if radians is not None and degrees is not None:
-        raise ValueError(f"{name}={radians} (radians) and {name}_degrees={degrees} were both given; leave one out")
-    for key, value in ((name, radians), (f"{name}_degrees", degrees)):
-        if value is not None:
-            _number(key, value)
-    if radians is not None and abs(radians) > MOST_RADIANS:
-        raise ValueError(f"{name} is in radians, but {radians} was given, more than two turns; give {name}_degrees for "
-                         "degrees")
-    return math.radians(degrees) if degrees is not None else otherwise if radians is None else radians
-
-
-def pixel_sizes(pixel) -> tuple[float, float]:
-    """(row height, column width) in mm of one number or two. Raises ValueError where they are not positive and
-    finite."""
-    try:
-        height, width = map(float, np.broadcast_to(_numbers("pixel", pixel), 2))
-    except ValueError:
-        height = width = 0.0
-    if not (0 < height < MOST_MM and 0 < width < MOST_MM):
-        raise ValueError(f"pixel must be (row height, column width) > 0 in mm, but {reprlib.repr(pixel)} was given")
-    return height, width
-
-
-def _check_isocentre(source_to_detector: float, source_to_isocentre: float) -> None:
-    _number("source_to_detector", source_to_detector)
-    _number("source_to_isocentre", source_to_isocentre)
-    if not 0 < source_to_isocentre < source_to_detector < MOST_MM:
-        raise ValueError(f"the isocentre must lie between source and detector, but source_to_isocentre="
-                         f"{source_to_isocentre} mm and source_to_detector={source_to_detector} mm were given; "
-                         "correct them, both from the source and in mm")
-
-
 def _check_room(views: int, shape: tuple[int, int]) -> None:
     check_memory(views * (8 * 12 + 4 * math.prod(shape)), f"{views:,} views of {shape[0]:,} x {shape[1]:,} pixels",
                  "give fewer views or pixels")
-
-
-def _numbers(key: str, value) -> float | np.ndarray:
-    """A number, or a regular list of numbers as an array, all finite. Raises ValueError naming the key."""
-    try:
-        numbers = np.asarray(value)
-    except ValueError:  # lists of different lengths
-        numbers = np.asarray(None)
-    if numbers.dtype.kind not in "iuf":
-        raise ValueError(f"{key} is a number or a list of numbers without units and quotes, but {reprlib.repr(value)} "
-                         "was given")
-    if not np.isfinite(numbers).all():
-        raise ValueError(f"{key} must be finite, but {reprlib.repr(value)} was given")
-    return numbers if numbers.ndim else numbers.item()
-
-
-def _number(key: str, value) -> float:
-    """One finite number. Raises ValueError naming the key."""
-    number = _numbers(key, value)
-    if isinstance(number, np.ndarray):
-        raise ValueError(f"{key} is one number, but {reprlib.repr(value)} was given")
-    return number
-
-
-def _check_keys(content: object, required: tuple[str, ...], optional: tuple[str, ...], instead: str = "") -> dict:
-    """The mapping with these keys that `content` is; instead: what else may be given, for the message. Raises
-    ValueError, naming the key, where it is none."""
-    if not isinstance(content, dict):
-        raise ValueError(f"a mapping with the keys {', '.join(required)} was expected, but "
-                         f"{reprlib.repr(content)} was found")
-    allowed = ", ".join(required + optional) + instead
-    for key in content:
-        if key not in required + optional:
-            raise ValueError(f"unknown key {reprlib.repr(key)}; the keys are {allowed}")
-    for key in required:
-        if key not in content:
-            raise ValueError(f"missing key {key!r}; the keys are {allowed}")
-    return content

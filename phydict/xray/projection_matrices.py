@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from phydict.xray.geometry import ConeBeam, pixel_sizes
+from phydict.xray.geometry import ConeBeam
+from phydict.xray.stated import pixel_sizes
 
 LEAST_VOLUME = 1e-12
 """Of the left 3x3 part of a matrix, relative to the product of its rows' lengths: below, it has no source."""

@@ -24,7 +24,8 @@ import numpy as np
 
 from phydict.runtime.files import atomic_write
 from phydict.runtime.reading import read_text, reason
-from phydict.xray.geometry import ConeBeam, pixel_sizes
+from phydict.xray.geometry import ConeBeam
+from phydict.xray.stated import pixel_sizes
 
 FIXED_TO_RAS = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 PARAMETERS = ("SourceToIsocenterDistance", "SourceToDetectorDistance", "GantryAngle", "OutOfPlaneAngle", "InPlaneAngle",

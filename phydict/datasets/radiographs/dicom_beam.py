@@ -29,7 +29,8 @@ from pydicom.tag import Tag
 
 from phydict.datasets.dicom import DicomTags
 from phydict.runtime.warning import warn
-from phydict.xray.geometry import MOST_MM, ConeBeam
+from phydict.xray.geometry import ConeBeam
+from phydict.xray.stated import MOST_MM
 
 DIRECTIONS = {"R": (1, 0, 0), "L": (-1, 0, 0), "A": (0, 1, 0), "P": (0, -1, 0), "H": (0, 0, 1), "F": (0, 0, -1)}
 OVERRIDES = ("source_to_detector", "source_to_isocentre", "pixel", "primary_degrees", "secondary_degrees",

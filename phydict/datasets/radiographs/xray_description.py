@@ -31,9 +31,10 @@ from phydict.datasets.intensity import KINDS, Intensity, is_file_name
 from phydict.datasets.radiographs.dicom_beam import tags_beam
 from phydict.runtime.files import atomic_write
 from phydict.runtime.yaml_file import read_yaml
-from phydict.xray.geometry import ConeBeam, pixel_sizes
+from phydict.xray.geometry import ConeBeam
 from phydict.xray.geometry_files import read_beam
 from phydict.xray.poses.uncertain import Uncertain, by_hand
+from phydict.xray.stated import pixel_sizes
 
 GEOMETRY = "geometry.yaml"
 

@@ -70,7 +70,7 @@ class Measurement:
         return projected
 
     def on(self, projector: Projector) -> Measurement:
-        """The same X-rays, as they are now, as a problem on other voxels of the same box."""
+        """The same X-rays, as they are now, as a problem on other voxels."""
         other = copy(self)
         other.background = self.offset * projector(torch.ones(1, 1, *projector.grid.shape).to(self.y))
         other.projector, other.scales = projector, finest_to_own(projector.grid.spacing)

@@ -71,7 +71,7 @@ class Prior(nn.Module):
         if not self.takes(grid.shape):
             raise ValueError(f"this network needs sizes divisible by {self.network.divisor}, but the grid is "
                              f"{grid.shape}")
-        self.grid = grid
+        self.grid, self.network.map_shape = grid, tuple(n // self.network.block for n in grid.shape)
 
     def takes(self, shape: Sequence[int]) -> bool:
         """Whether the network can halve a state of so many voxels along each axis."""
@@ -104,7 +104,7 @@ class Prior(nn.Module):
 
     def forward(self, x: Tensor, t: Tensor, context: Tensor,
                 offsets: tuple[Tensor | None, Tensor | None] = (None, None)) -> Tensor:
-        """Clean estimate of the state x (B, C, X, Y, Z) at times t (B,), in x's dtype.
+        """Clean estimate of the state x (B, C, X, Y, Z) at times t (B,), in x's dtype, of 32 bits at least.
 
         offsets: what is added at the entrance of the network and of the detail network (see Refiner).
         """

@@ -116,8 +116,8 @@ class TextEncoder(nn.Module):
         return torch.stack(states).to(self.bert.device), torch.stack(masks).to(self.bert.device)
 
     def check(self, reports: Iterable[str]) -> None:
-        """Warns of reports that are longer than is read (`sentences`, else `padded_to`, else `length`) and of reports
-        in words that the vocabulary lacks.
+        """Warns of reports that are longer than is read (`sentences`, else `padded_to`, else `length`), of sentences
+        that are, and of reports in words that the vocabulary lacks.
         """
         given = [report for report in dict.fromkeys(reports) if report]
         if not given:
@@ -130,6 +130,13 @@ class TextEncoder(nn.Module):
         if excess:
             warn(f"{len(excess)} of {len(given)} reports are longer than the {read} {unit} that the text "
                  f"encoder reads: up to {max(excess)} {unit} at their end are left out")
+        if self.sentences:
+            read_ones = [one for report in given for one in split_sentences(report)[:self.sentences]]
+            lengths = [len(ids) for ids in self.tokenizer(read_ones, verbose=False)["input_ids"]]
+            if excess := [length - self.length for length in lengths if length > self.length]:
+                warn(f"{len(excess)} of {len(lengths)} sentences of reports are longer than the {self.length} tokens "
+                     f"that the text encoder reads: up to {max(excess)} tokens at their end are left out; divide them "
+                     "into shorter ones")
         unknown = [sum(token == self.tokenizer.unk_token_id for token in ids) / max(len(ids), 1) for ids in tokens]
         foreign = [share for share in unknown if share > FOREIGN]
         if foreign:

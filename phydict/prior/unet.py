@@ -9,7 +9,7 @@ from types import MethodType
 import torch
 from einops import rearrange
 from torch import Tensor, nn
-from torch.nn.functional import interpolate
+from torch.nn.functional import interpolate, pad
 from torch.utils.checkpoint import checkpoint
 
 from phydict.prior.convolution import lay_out, silence, speed_up
@@ -38,6 +38,10 @@ class TextMap(nn.Module):
         return self.answer(attended).transpose(1, 2).unflatten(2, (self.cells,) * 3)
 
 
+NORM_GROUPS = 8
+"""Into how many groups channels are divided to be normalised."""
+
+
 def check_sizes(**sizes: int | Sequence[int]) -> None:
     """Raises ValueError, naming the setting, unless each of a network's sizes is one number above 0 or some."""
     for name, size in sizes.items():
@@ -58,7 +62,8 @@ class VolumeUNet(nn.Module):
     state_channels: channels of the state (CT and masks).
     channels, attention: width of each level, and whether it attends to itself and to the text.
     context_dim: width D of the text context (B, L, D).
-    kinds: of findings, each with a map of its own.
+    kinds: of findings, each with a map of its own. map_shape: how many blocks along each axis the map of a report
+    covers; None: as many as a state has.
     Spatial sizes must be divisible by block * 2^(levels - 1).
     """
 
@@ -77,17 +82,24 @@ class VolumeUNet(nn.Module):
 
         super().__init__()
         check_sizes(block=block, channels=channels, res_blocks=res_blocks, head_channels=head_channels)
+        if len(attention) != len(channels):
+            raise ValueError("a network's attention says for each level of its channels whether it attends, but "
+                             f"attention {list(attention)} and channels {list(channels)} were given")
+        if channels[-1] < head_channels or any(width % NORM_GROUPS for width in channels):
+            raise ValueError(f"a network's channels are multiples of {NORM_GROUPS}, the last not below head_channels, "
+                             f"but {list(channels)} and head_channels {head_channels} were given")
         self.settings: dict = {
             "state_channels": state_channels, "block": block, "channels": list(channels),
             "attention": list(attention), "res_blocks": res_blocks, "head_channels": head_channels,
             "context_dim": context_dim}
         self.block, self.context_dim, self.state_channels = block, context_dim, state_channels
         self.divisor = block * 2 ** (len(channels) - 1)
+        self.map_shape: tuple[int, ...] | None = None
         self.fold = nn.Conv3d(state_channels * block**3, channels[0], 1)
         self.draw_kinds(kinds)
         self.unet = DiffusionModelUNet(
             spatial_dims=3, in_channels=channels[0], out_channels=channels[0], channels=tuple(channels),
-            attention_levels=tuple(attention), num_res_blocks=res_blocks, norm_num_groups=8,
+            attention_levels=tuple(attention), num_res_blocks=res_blocks, norm_num_groups=NORM_GROUPS,
             num_head_channels=head_channels, with_conditioning=True, cross_attention_dim=context_dim,
             use_flash_attention=True)
         self.unfold = nn.Conv3d(channels[0], state_channels * block**3, 1)
@@ -143,6 +155,14 @@ class VolumeUNet(nn.Module):
         h = rearrange(x, "b c (x i) (y j) (z k) -> b (c i j k) x y z", i=n, j=n, k=n)
         return h.contiguous(memory_format=self.memory_format)
 
+    def hint_over(self, context: Tensor, shape: Sequence[int]) -> Tensor:
+        """What the map of a report adds to states of so many blocks: it lies over `map_shape` in their middle, and goes
+        on beyond as at its ends."""
+        own = self.map_shape or tuple(shape)
+        hint = interpolate(self.hint(self.text_map(context)), own, mode="trilinear")
+        more = [(n - there) // 2 for n, there in zip(shape, own)]
+        return pad(hint, [n for n in reversed(more) for _ in range(2)], mode="replicate") if any(more) else hint
+
     def forward(self, x: Tensor, t: Tensor, context: Tensor, offset: Tensor | None = None) -> Tensor:
         """x (B, C, X, Y, Z), t (B,) in [0, 1], context (B, L, D) -> (B, C, X, Y, Z).
 
@@ -151,6 +171,6 @@ class VolumeUNet(nn.Module):
         n = self.block
         h = self.fold(self.blocked(x))
         h = h if offset is None else h + offset
-        h = h + interpolate(self.hint(self.text_map(context)), h.shape[2:], mode="trilinear")
+        h = h + self.hint_over(context, h.shape[2:])
         h = self.unfold(self.unet(h, 1000 * t, context=context))
         return rearrange(h, "b (c i j k) x y z -> b c (x i) (y j) (z k)", i=n, j=n, k=n)

@@ -3,6 +3,7 @@
 import itertools
 import json
 from contextlib import nullcontext
+from dataclasses import replace
 
 import pytest
 import torch
@@ -75,6 +76,17 @@ def test_a_report_that_states_no_finding_counts_as_none(probability, heard):
     assert told.begins == heard and not untold.begins
     starts = [METHOD.start_state(bound, measured(FEW)) for bound in (told, untold)]
     assert torch.equal(*starts) != heard
+
+
+@torch.no_grad()
+def test_where_more_slices_are_reconstructed_it_starts_from_what_the_prior_makes_on_its_own():
+    refiner = tiny_refiner(begins=True).bind(REPORTS[0], precision="float32")
+    tall = replace(FEW, continued=True)
+    own, grown = (METHOD.start_state(refiner, Measurement(Projector(grid, tall, full_detector=True), xrays(FEW), WINDOW))
+                  for grid in (GRID, GRID.grown(0, 0, 4)))
+    assert torch.equal(grown[..., 4:-4], own)
+    assert torch.equal(grown[..., :4], own[..., :1].expand(-1, -1, -1, -1, 4))
+    assert torch.equal(grown[..., -4:], own[..., -1:].expand(-1, -1, -1, -1, 4))
 
 
 def test_neither_the_seed_nor_the_order_of_the_views_counts():

@@ -213,6 +213,14 @@ def test_reports_that_are_cut_are_counted_and_measured(tmp_path):
     assert torch.equal(encoder([words])[0], encoder(["left nodule " * 11])[0])  # 22 words, [CLS] and [SEP]
 
 
+def test_a_sentence_that_is_cut_is_told_where_reports_are_read_by_sentence():
+    encoder = TextEncoder.small(learn_vocabulary(REPORTS), 16, 1, 8, sentences=3)
+    short, long = "Left nodule. No nodule.", "Left nodule. " + "left nodule " * 6
+    with pytest.warns(UserWarning, match="1 of 4 sentences of reports are longer than the 8 tokens .* up to 6 tokens"):
+        encoder.check([short, long])
+    encoder.check([short])
+
+
 def test_a_report_that_medsyns_bert_reads_whole_is_not_called_cut(tmp_path):
     encoder = frozen(tmp_path, length=24, padded_to=40)
     with warnings.catch_warnings():

@@ -8,6 +8,7 @@ from einops import rearrange
 from laws import random_like
 
 from phydict.prior import VolumeUNet
+from prior.tiny import REPORTS, tiny_prior
 
 
 def network(**settings):
@@ -104,3 +105,24 @@ def test_a_checkpointed_copy_computes_with_its_own_weights():
         net.blocks()[0].conv1.conv.weight.zero_()
     arguments = random_like((1, 2, 8, 8, 8)), torch.tensor([0.5]), random_like((1, 3, 16))
     assert torch.equal(copy(*arguments), awake()(*arguments)) and not torch.equal(net(*arguments), copy(*arguments))
+
+
+@torch.no_grad()
+def test_the_map_of_a_report_stays_where_it_is_in_more_voxels():
+    prior = tiny_prior()
+    network, context = prior.network, prior.context([REPORTS[0]])
+    own = network.hint_over(context, (8, 8, 8))
+    assert own.std((2, 3, 4)).max() > 0
+    grown = network.hint_over(context, (8, 10, 12))
+    assert torch.equal(grown[..., 1:9, 2:10], own)
+    assert torch.equal(grown[..., 1:9, :2], own[..., :1].expand(-1, -1, -1, -1, 2))
+    assert torch.equal(grown[:, :, :, -1], grown[:, :, :, -2])
+
+
+@pytest.mark.parametrize("settings, words", [
+    ({"attention": (True,)}, r"attention \[True\] and channels \[8, 8\]"),
+    ({"head_channels": 16}, r"the last not below head_channels, but \[8, 8\] and head_channels 16"),
+    ({"channels": (8, 12)}, r"multiples of 8, .* but \[8, 12\]")])
+def test_a_network_that_cannot_be_built_is_refused_by_its_settings(settings, words):
+    with pytest.raises(ValueError, match=words):
+        network(**settings)

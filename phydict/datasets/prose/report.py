@@ -22,7 +22,8 @@ def write_report(findings: Sequence[Finding], contrast: bool, seed: int) -> str:
 
     It states every finding with its side and lobe, denies absent kinds alone, and speaks of technique and of organs
     outside the chest cavity. Findings of one kind may share a sentence, and one of the two sections may be missing.
-    Where the same findings lie on other sides, the sentences are the same but for their places.
+    Where the same findings lie on other sides, the sentences are the same but for their places and, where fewer or more
+    places have names of their own there, for what is drawn after these.
     """
     choose = Pen(np.random.default_rng([seed, 7]))
     pens = (Pen(np.random.default_rng([seed, 7, part])) for part in range(1000))

@@ -36,8 +36,8 @@ RELATED = {"consolidation": "opacity", "opacity": "consolidation", "nodule": "ma
 class Pen:
     """Writes sentences; the same random generator writes the same ones.
 
-    exact: nothing is stated of findings but what they are; else segments, sizes and changes that nothing shows are
-    added, and places left out, as in the reports of others, for teaching a reader.
+    exact: of findings their places and sizes are stated as they are, and perhaps a change since before; else segments
+    and sizes that nothing shows are added, and places left out, as in the reports of others, for teaching a reader.
     """
 
     def __init__(self, rng: np.random.Generator, exact: bool = True):

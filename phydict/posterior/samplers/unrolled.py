@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -22,6 +22,8 @@ from phydict.posterior.scatter import with_scatter
 from phydict.prior import DEFAULT_REFINER, BoundRefiner
 from phydict.runtime.ranges import LEAST, MOST, check_between, check_fields
 from phydict.runtime.warning import warn
+from phydict.xray import Projector
+from phydict.xray.boxes import projector_method
 
 CAUTION = 3.0
 """Standard deviation that a view's contradiction counts as, over its root mean square: neighbouring pixels share it."""
@@ -172,15 +174,16 @@ class Unrolled(Sampler):
 
     def start_state(self, refiner: BoundRefiner, measurement: Measurement) -> Tensor:
         """The state (1, C, X, Y, Z) before the first step: of few views with a report what the refiner's prior to begin
-        with makes of both, in one pass from noise that is always the same. Beyond the refiner's own voxels the mean is
-        as it is at their ends."""
+        with makes of both, in one pass from noise that is always the same. Beyond the refiner's own slices it is as in
+        their last ones, and so is the mean beyond its own voxels."""
         mean = refiner.mean.to(measurement.y)
-        more = [(n - own) // 2 for n, own in zip(measurement.projector.grid.shape, mean.shape[2:])]
-        mean = pad(mean, [n for n in reversed(more) for _ in range(2)], mode="replicate")
-        if self.first is None or not refiner.begins or measurement.projector.beam.views > self.first_views:
-            return mean
-        generator = torch.Generator().manual_seed(0)
-        return self.first.one_pass(refiner, measurement, noise_like(mean, generator), generator)
+        x, y, z = ((n - own) // 2 for n, own in zip(measurement.projector.grid.shape, mean.shape[2:]))
+        state = pad(mean, (0, 0, y, y, x, x), mode="replicate")
+        if self.first is not None and refiner.begins and measurement.projector.beam.views <= self.first_views:
+            generator = torch.Generator().manual_seed(0)
+            own = without_slices(measurement, z) if z else measurement
+            state = self.first.one_pass(refiner, own, noise_like(state, generator), generator)
+        return pad(state, (z, z, 0, 0, 0, 0), mode="replicate")
 
     @staticmethod
     def _likelihood_step(step: LikelihoodStep, measurement: Measurement, x0: Tensor, x0_std: float) -> Tensor:
@@ -209,3 +212,11 @@ class Unrolled(Sampler):
             if torch.equal(state, z):
                 denoiser.conclude(z, evidence)
         return z
+
+
+def without_slices(measurement: Measurement, slices: int) -> Measurement:
+    """The same X-rays on a grid of so many slices less at both ends, beyond which the patient continues."""
+    projector = measurement.projector
+    return measurement.on(Projector(
+        projector.grid.grown(0, 0, -slices), replace(projector.beam, continued=True), projector_method(projector),
+        device=measurement.y.device, full_detector=True))

@@ -146,11 +146,17 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: AnyPrior | str |
     own name).
     super_resolution: the second stage of a cascade, or its file; None reconstructs on the prior's own grid. sr_guided:
     whether the X-rays guide that stage too; sr_sampler: how (None: CascadePosterior's own); sr_noise_augmentation: its
-    noise (None: the stage's own).
+    noise (None: the stage's own). These three mean nothing without it.
     samples: how many to draw; of several, the result is the mean, with their standard deviation as a map.
     precision: of the networks, one of phydict.runtime.precision.PRECISIONS. Raises ValueError for what cannot be meant.
     """
     check_precision(precision)
+    of_stage = [setting for setting, given in (
+        ("sr_guided", not sr_guided), ("sr_sampler", sr_sampler is not None),
+        ("sr_noise_augmentation", sr_noise_augmentation is not None)) if given]
+    if of_stage and super_resolution is None:
+        raise ValueError(f"without super_resolution there is no second stage, but {' and '.join(of_stage)} came for "
+                         "it: leave that out, or give super_resolution as well")
     if isinstance(method, str):
         if method not in METHODS:
             raise ValueError(f"there is no method '{method}': use one of {', '.join(METHODS)}")

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from phydict.grid import Grid
 from phydict.runtime.files import atomic_write
-from phydict.runtime.own_code import is_own, own_code
+from phydict.runtime.own_code import check_dataclass, is_own, own_code
 from phydict.runtime.reading import TooLittleMemory, check_memory
 from phydict.units import MU_WATER
 from phydict.xray import ConeBeam, Projector
@@ -37,7 +37,8 @@ class Reconstruction:
     intervals: level -> HU (X, Y, Z), half the width of the interval around the volume that is to hold that share of
     voxels, where the method knows it, and interval_widening, the factor by which they are wider than calibrated;
     diverged_at: the step, counted from 1, from which on the misfit had risen until the end, None where it had not;
-    precision: what the networks computed in, or, without any, the X-rays' type;
+    precision: what the networks computed in, "own" where a prior of one's own does not say it, or, without any, the
+    X-rays' type;
     hardened: whether the line integrals bent as a tube's do, and are straightened in xrays;
     scatter: the mean share of the pixels' signal that was subtracted as scatter, and is no longer in xrays;
     model_variance: variance (K, 1, 1) of what counted as noise of each view because no volume explains it;
@@ -115,7 +116,8 @@ PROCESS = 1250 * 2**20
 
 
 class Reconstructor(ABC):
-    """Turns X-rays into a CT volume. Implementations are dataclasses of settings; one object serves many cases.
+    """Turns X-rays into a CT volume. Implementations are frozen dataclasses, @dataclass(frozen=True), of which records
+    tell the fields as the settings; one object serves many cases.
 
     name: what its results call the method.
     full_detector: whether the method wants every pixel, instead of a detector binned to what the grid can hold.
@@ -124,6 +126,7 @@ class Reconstructor(ABC):
     precision: of its networks, where it has some; see phydict.runtime.precision.
     """
 
+    settings_are_fields = True
     name: str = ""
     full_detector = False
     citation = ""
@@ -146,6 +149,10 @@ class Reconstructor(ABC):
     def with_precision(self, precision: str) -> Reconstructor:
         """The same method with its networks computed in a precision of phydict.runtime.precision.PRECISIONS."""
         return self._changed("precision", precision)
+
+    def of_case(self, case: str) -> Reconstructor:
+        """The method for the case of this id, of one that must know it."""
+        return self
 
     def _changed(self, name: str, value: object) -> Reconstructor:
         if name in getattr(self, "__dataclass_fields__", {}):
@@ -236,14 +243,19 @@ class Delegating(Reconstructor):
     def with_mu_water(self, mu_water: float) -> Self:
         return replace(self, base=self.base.with_mu_water(mu_water))  # type: ignore[type-var]
 
+    def of_case(self, case: str) -> Self:
+        return replace(self, base=self.base.of_case(case))  # type: ignore[type-var]
+
     def with_name(self, name: str) -> Self:
         return replace(self, base=self.base.with_name(name))  # type: ignore[type-var]
 
 
 def describe(settings) -> dict:
     """A method's settings as plain JSON values: class name and fields, nested; of a class outside phydict its path and
-    `own_code` as well, so that results of other code are not taken for its own."""
+    `own_code` as well, so that results of other code are not taken for its own. Raises ValueError for a class that is
+    no dataclass."""
     kind: type = type(settings)
+    check_dataclass(kind)
     name = f"{kind.__module__}.{kind.__qualname__}" if is_own(kind) else kind.__name__
     return {"class": name} | own_code(kind) | {f.name: _plain(getattr(settings, f.name)) for f in fields(settings)}
 

@@ -85,7 +85,25 @@ def test_a_configuration_names_its_method_however_its_file_is_given(empty, given
         (empty / name).write_text("model: {method: sirt}")
     (arg,) = with_methods(given)
     assert "phydict.baselines.sirt.SIRT" in arg
-    assert with_methods(["-cmodel: {method: mine}"]) == ["--config=model: {method: mine}"]
+
+
+@pytest.mark.parametrize("text", [
+    "{model: {method: sirt}}", "model: {method: tv, grid: 32, name: mine, seed: 4}", "model: {name: my_method}",
+    "model: {method: phydict.posterior.DDS}", "data: {xrays: x}"])
+def test_a_configuration_on_the_command_line_means_what_it_means_in_a_file(empty, text):
+    (empty / "mine.yaml").write_text(text)
+    in_file, inline = (with_methods(["-c", given])[0].removeprefix("--config=") for given in ("mine.yaml", text))
+    assert inline == (text if in_file == "mine.yaml" else in_file)
+
+
+@pytest.mark.parametrize("text, words", [
+    ("model: {method: mine}", "there is no method 'mine'"), ("model: [1]", "a mapping of settings, such as `model:"),
+    ("{model: {seed: 1, seed: 2}}", "`model.seed` is given twice"), ("model: {method: tv", "config is not valid YAML"),
+    ("- model: {seed: 1}", "a mapping of settings, such as `model:"),
+    ("model: {name: my_method}", "--model.method.init_args.iterations is a setting of a method, but none was given")])
+def test_a_configuration_on_the_command_line_that_cannot_be_meant_is_one_sentence(capsys, text, words):
+    said = refusal(capsys, infer, ["predict", "-c", text, "--model.method.init_args.iterations=4"])
+    assert words in said
 
 
 @pytest.mark.parametrize("main, command, names", [

@@ -11,9 +11,11 @@ import torch
 
 import phydict
 from phydict.cli.infer import main as infer
+from phydict.evaluation import read_csv
 
 ROOT = Path(__file__).parents[1]
 EXAMPLE = ROOT / "data" / "example"
+VOLUMES = EXAMPLE / "own_volumes"
 FAST = ["--model.method=sirt", "--model.method.init_args.iterations=2", "--model.grid=32"]
 
 
@@ -24,7 +26,8 @@ def written(out: Path) -> Path:
 
 
 @pytest.mark.filterwarnings("ignore")  # of a method that is stopped early
-@pytest.mark.parametrize("folder", sorted(file.parent for file in EXAMPLE.glob("*/README.md")), ids=lambda f: f.name)
+@pytest.mark.parametrize("folder", sorted(
+    file.parent for file in EXAMPLE.glob("*/README.md") if file.parent != VOLUMES), ids=lambda f: f.name)
 def test_the_commands_of_an_examples_readme_run(folder, tmp_path, monkeypatch):
     text = (folder / "README.md").read_text()
     assert text.count("\n") <= 16
@@ -41,6 +44,26 @@ def test_the_commands_of_an_examples_readme_run(folder, tmp_path, monkeypatch):
             more = [] if "--model.method" in words else FAST
             infer([*words[2:], *more, f"--model.out={tmp_path}", "--trainer.accelerator=cpu"])
     assert written(tmp_path).with_name("volume.nii.gz").is_file() and (tmp_path / "index.html").is_file()
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_volumes_of_another_program_are_scored_on_the_x_rays_that_it_was_given(tmp_path, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    [block] = re.findall(r"```\n(.*?)```", (VOLUMES / "README.md").read_text(), re.DOTALL)
+    block = block.replace("runs/", f"{tmp_path}/").replace("--model.method sirt", f"{shlex.join(FAST[:2])}")
+    simulated, predicted, compared = (shlex.split(line, comments=True) for line in block.splitlines())
+    with monkeypatch.context() as argv:
+        argv.setattr("sys.argv", simulated[1:])
+        runpy.run_path(simulated[1], run_name="__main__")
+    infer([*predicted[2:], "--trainer.accelerator=cpu"])
+    infer([*compared[2:], "--out", str(tmp_path / "out"), "--device", "cpu", "--set", "method=[elsewhere,sirt]",
+           f"elsewhere.method.folder={tmp_path / 'elsewhere' / 'sirt'}", "method.iterations=2"])
+    rows = read_csv(tmp_path / "out" / "results.csv")
+    for case in {row["case"] for row in rows}:
+        elsewhere, here = (next(row for row in rows if (row["case"], row["method"]) == (case, method))
+                           for method in ("elsewhere", "sirt"))
+        assert elsewhere["psnr"] == pytest.approx(here["psnr"], abs=1e-3)
+        assert elsewhere["misfit"] == pytest.approx(here["misfit"], rel=1e-3)
 
 
 def test_the_geometries_are_those_that_the_readmes_speak_of():

@@ -320,6 +320,14 @@ def test_a_method_without_a_prior_takes_no_second_stage():
                       sr_noise_augmentation=1.5)
 
 
+@pytest.mark.parametrize("method", ["sirt", PriorOnly(2)], ids=["sirt", "prior"])
+@pytest.mark.parametrize("setting", [{"sr_guided": False}, {"sr_sampler": PriorOnly(3)},
+                                     {"sr_noise_augmentation": 0.0}], ids=lambda setting: next(iter(setting)))
+def test_settings_of_a_second_stage_are_refused_without_one(method, setting):
+    with pytest.raises(ValueError, match=f"no second stage, but {next(iter(setting))} came for it: leave that out"):
+        reconstructor(method, tiny_prior(False), **setting)
+
+
 @pytest.mark.parametrize("method", ["cgls", "phydict_fast"])
 def test_a_warning_points_at_the_line_that_called(method):
     beam = ConeBeam.orbit(3, 1020, 740, (28, 28), 20.0)

@@ -2,17 +2,24 @@
 
 import json
 import math
+import re
 import sys
 from dataclasses import dataclass, field
-from importlib import import_module
+from importlib import import_module, invalidate_caches
 from pathlib import Path
 
 import pytest
 import torch
+from command_lines import refusal
+from posterior.scene import BEAM, GRID, views
 
-from phydict.methods import METHODS
+from phydict.ablation.trials import method_of
+from phydict.cli.infer import main as infer
+from phydict.guard import BAD_GUESS
+from phydict.methods import METHODS, reconstruct
 from phydict.posterior import Refinement
 from phydict.reconstruction import describe
+from phydict.runtime.own_code import imported
 from phydict.xray import Ideal, Polychromatic
 from phydict.xray.residuals import misfits, shared_norms
 
@@ -67,6 +74,106 @@ def test_shipped_settings_are_told_by_the_name_of_their_class_and_their_fields_a
     for settings in (*METHODS.values(), Refinement(), Ideal(), Polychromatic()):
         told = describe(settings)
         assert told["class"] == type(settings).__name__ and "code_crc32" not in json.dumps(told)
+
+
+NOT_DATACLASSES = """
+from phydict.baselines import Baseline
+from phydict.posterior import Sampler
+
+class Method(Baseline):
+    def __init__(self, scale: float = 1.0):
+        self.scale = scale
+
+    def steps(self):
+        return 1
+
+    def solve(self, A, y, on_step):
+        return A.T(y)
+
+class Drawn(Sampler):
+    def steps(self):
+        return 1
+
+    def sample(self, denoiser, measurement, x, generator, on_step=lambda: None):
+        return x
+"""
+BACKPROJECTION = """
+from dataclasses import dataclass
+from phydict.baselines import Baseline
+from phydict.units import MU_WATER
+
+@dataclass(frozen=True)
+class Method(Baseline):
+    scale: float = 1.0
+    mu_water: float = MU_WATER
+    name: str = "mine"
+
+    def steps(self):
+        return 1
+
+    def solve(self, A, y, on_step):
+        on_step()
+        return self.scale * A.T(y)
+"""
+PREDICT = ["predict", "--data.xrays", "data/example/xrays", "--model.grid=16", "--trainer.accelerator=cpu"]
+
+
+@pytest.fixture
+def written(tmp_path, monkeypatch):
+    """Writes a module of a name that no test has had."""
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def write(code: str) -> str:
+        name = f"own_{abs(hash((code, str(tmp_path))))}"
+        (tmp_path / f"{name}.py").write_text(code)
+        invalidate_caches()
+        return name
+
+    return write
+
+
+@pytest.mark.parametrize("kind", ["Method", "Drawn"])
+def test_a_class_that_is_no_dataclass_is_told_to_become_one(kind, written, tmp_path, capsys):
+    module, words = written(NOT_DATACLASSES), rf"{kind} is no dataclass, .*: put @dataclass\(frozen=True\) above"
+    assert re.search(words, refusal(capsys, infer, [*PREDICT, f"--model.out={tmp_path / 'out'}",
+                                                    f"--model.method={module}.{kind}"]))
+    for wrong in (lambda: describe(getattr(import_module(module), kind)()), lambda: imported(f"{module}.{kind}"),
+                  lambda: method_of(f"{module}.{kind}")):
+        with pytest.raises(ValueError, match=words):
+            wrong()
+
+
+def test_a_fault_of_own_code_does_not_advise_to_run_the_same_again(written, tmp_path):
+    module = written(BACKPROJECTION.replace("return self.scale * A.T(y)", "raise KeyError('mask')"))
+    with pytest.raises(KeyError) as raised:
+        infer([*PREDICT, f"--model.out={tmp_path / 'out'}", f"--model.method={module}.Method"])
+    assert not any("same command" in note for note in getattr(raised.value, "__notes__", ()))
+
+
+def test_a_network_that_never_projects_is_doubted_where_it_explains_nothing(written):
+    kind = import_module(written(BACKPROJECTION)).Method
+    found = reconstruct(views(), BEAM, method=kind(), grid=GRID)
+    assert found.misfit > 10 and "no volume was found that explains the X-rays" in "".join(found.warnings)
+    scale = (found.reprojection * found.xrays).sum() / found.reprojection.square().sum()
+    fitting = reconstruct(views(), BEAM, method=kind(float(scale)), grid=GRID)
+    assert fitting.misfit < BAD_GUESS and "no volume" not in "".join(fitting.warnings)
+
+
+@pytest.mark.parametrize("code, path, words", [
+    ("", "nowhere.Mine", "there is no module nowhere: put its folder on PYTHONPATH"),
+    ("", "json.nowhere.Mine", "there is no module json.nowhere$"),
+    ("import not_there", "{}.Mine", "module own_.* needs not_there, which is not installed$"),
+    ("number = undefined_thing", "{}.Mine", "module own_.* ends in NameError: name 'undefined_thing' is not defined$"),
+    ("number = 3", "{}.Mine", "module own_.* has no Mine$")])
+def test_why_a_class_cannot_be_imported_is_said_of_each_setting_that_takes_one(code, path, words, written, tmp_path,
+                                                                                capsys):
+    path = path.format(written(code))
+    with pytest.raises(ValueError, match=words):
+        imported(path)
+    for setting in ("method", "prior", "projector"):
+        more = ["--model.method=phydict_fast"] if setting == "prior" else []
+        said = refusal(capsys, infer, [*PREDICT, f"--model.out={tmp_path / 'out'}", f"--model.{setting}={path}", *more])
+        assert re.search(rf"{path} cannot be imported: {words}", said.strip())
 
 
 BASE = """

@@ -133,6 +133,17 @@ def test_training_goes_on_from_a_stage_and_refuses_one_of_another_grid(tmp_path)
         SuperResolutionTraining(LocalUNet(), initial=str(path), cube=Cube(32), factor=2, window=(-1000, 600))
 
 
+def test_a_stage_keeps_its_own_detail_and_another_is_refused_beside_it(tmp_path):
+    first, given = tiny_super_resolution(), {"cube": Cube(32), "factor": 2, "window": (-1000, 600)}
+    first.detail_std = 0.3
+    save_super_resolution(first, tmp_path / "fine.safetensors")
+    given["initial"] = str(tmp_path / "fine.safetensors")
+    for same in ({}, {"detail_std": 0.3}):
+        assert SuperResolutionTraining(**given, **same).prior.detail_std == 0.3
+    with pytest.raises(ValueError, match="model.detail_std is 0.08, but the stage .* has 0.3: leave it out"):
+        SuperResolutionTraining(**given, detail_std=0.08)
+
+
 def test_the_stage_is_the_command_lines_or_the_last_configurations(tmp_path):
     assert stage_of(["fit", "-c", str(CONFIG)]) == "super_resolution"
     assert stage_of(["fit", f"--config={BASE_CONFIG}"]) == stage_of([]) == "base"

@@ -17,15 +17,19 @@ from prior.tiny import tiny_prior, tiny_refiner
 
 from phydict.cli.infer import main as infer
 from phydict.cli.train import main
+from phydict.datasets import phantom_case
 from phydict.grid import Cube, Grid
 from phydict.inference import case_files
 from phydict.methods import reconstruct
 from phydict.posterior import Measurement, Unrolled
 from phydict.posterior.refined import ON_FINER
-from phydict.posterior.widening import contradiction_widening
+from phydict.posterior.widening import contradiction_widening, widening_of
 from phydict.prior import load_prior, save_prior, save_refiner
 from phydict.prior.uncertainty import COVERAGES, LEVELS, TISSUES, Uncertainty, coverage_of, tissue_of
 from phydict.training.refiner import RefinerTraining
+from phydict.training.scenes import Scenes
+from phydict.training.settings import CalibrationScenes
+from phydict.training.uncertainty import UncertaintyTraining
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 from phydict.xray.boxes import interpolated
@@ -170,6 +174,27 @@ def test_no_interval_is_wider_than_the_window_in_which_volume_and_truth_lie():
     refiner.uncertainty.quantiles.mul_(1e6)
     found = reconstruct(views(), BEAM, refiner, display=True)
     assert all(float(half_width.max()) == 2 * refiner.window.half_width for half_width in found.intervals.values())
+
+
+def test_the_residual_of_calibration_is_the_one_by_which_intervals_widen(refiner_file, monkeypatch):
+    """Where views contradict each other too, of which a part counts as noise."""
+    task = UncertaintyTraining(cube=Cube(16), window=(-1000, 600), scenes=Scenes(most_views=4),
+                               validation=CalibrationScenes(scenes=1), initial=refiner_file)
+    ends, whole = [], task._reconstruct
+
+    def contradicting(*given):
+        ends.extend(whole(*given))
+        ends[-1].model_variance = 8 * ends[-1].noise_variance.mean((1, 2), keepdim=True)
+        return ends
+
+    monkeypatch.setattr(task, "_reconstruct", contradicting)
+    monkeypatch.setattr(task, "validation_number", lambda index: index)
+    for name in ("log", "log_case"):
+        monkeypatch.setattr(task, name, Mock())
+    task.validation_step({"volume": phantom_case(1, GRID, HUWindow(-1000, 600))["volume"][None]}, 0)
+    (z, _, measurement), residual = ends, float(task.held_out[0][3])
+    usual, wider = (widening_of(measurement, measurement.project(z[:, :1]), share * residual) for share in (1.001, 0.9))
+    assert wider == pytest.approx(usual * 0.9**-0.25)
 
 
 def test_subtracted_scatter_leaves_the_intervals_as_wide_as_calibrated():

@@ -10,10 +10,12 @@ from pathlib import Path
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from PIL import Image
 
 from phydict.ablation.summary import (
     SHOWN_MEASURES,
     Entry,
+    alike,
     best_settings,
     compared_geometries,
     compared_views,
@@ -31,31 +33,43 @@ LINES, FILLS = ("-", "--", "-.", ":"), ("full", "none", "left", "right", "top", 
 KINDS = ("pareto", "stages", "views", "geometry", "delta")
 """What the names of plots begin with."""
 
+WRITER = {"Software": "phydict"}
+"""What a plot's file says of who wrote it."""
+
 STAGES = {"seconds_network": "network", "seconds_projector": "projector", "rest": "the rest"}
 
 
 def write_plots(folder: Path, entries: Sequence[Entry]) -> list[Path]:
-    """Every plot that the entries with all of their cases allow, as PNG in a folder, in place of earlier ones; returns
-    the files."""
+    """Every plot that the entries of the same cases allow, as PNG in a folder, in place of earlier ones, which stay
+    where there is none since cases failed; returns the files."""
     written, style = [], styles(entries)
-    entries = [entry for entry in entries if entry.complete]
-    for condition, group in conditions(entries):
-        where = format_settings(condition)
+    for condition, of in conditions(entries):
+        where, group = format_settings(condition), alike(of)
         if len(group) > 1 and "geometry" not in condition:
-            written.append(_draw(folder, f"pareto {where}", 2, lambda axes: _pareto(axes, group, where, style)))
-            written.append(_draw(folder, f"stages {where}", 1, lambda axes: _stages(axes[0], group, where)))
-    for rest, group in compared_views(entries):
-        written.append(_draw(folder, f"views {format_settings(rest)}", 2, lambda axes: _views(axes, group, style)))
-    for rest, group in compared_geometries(entries):
-        written.append(_draw(folder, f"geometry {format_settings(rest)}", 2,
-                             lambda axes: _geometries(axes, group, style)))
-    curves = [(label, group) for label, group in deltas(entries) if len(group) > 1]
+            written += [_draw(folder, f"pareto {where}", group, 2, lambda axes: _pareto(axes, group, where, style)),
+                        _draw(folder, f"stages {where}", group, 1, lambda axes: _stages(axes[0], group, where))]
+    for name, compared, draw in (("views", compared_views, _views), ("geometry", compared_geometries, _geometries)):
+        for _, of in compared(entries):
+            for rest, group in compared(alike(of)):
+                written.append(_draw(folder, f"{name} {format_settings(rest)}", group, 2,
+                                     lambda axes: draw(axes, group, style)))
+    curves = [(label, group) for label, group in deltas(alike(entries)) if len(group) > 1]
     if curves:
-        written.append(_draw(folder, "delta", 2, lambda axes: _deltas(axes, curves)))
-    for path in folder.glob("*.png"):
-        if path.stem.partition("_")[0] in KINDS and path not in written:
-            path.unlink()
+        written.append(_draw(folder, "delta", curves[0][1], 2, lambda axes: _deltas(axes, curves)))
+    if written or all(entry.complete for entry in entries):
+        for path in folder.glob("*.png"):
+            if path.stem.partition("_")[0] in KINDS and path not in written and _is_own(path):
+                path.unlink()
     return written
+
+
+def _is_own(path: Path) -> bool:
+    """Whether a picture is a plot that this command wrote."""
+    try:
+        with Image.open(path) as image:
+            return image.info.get("Software") == WRITER["Software"]
+    except OSError:  # no picture
+        return False
 
 
 def styles(entries: Sequence[Entry]) -> dict[str, dict]:
@@ -85,16 +99,19 @@ def front(points: Sequence[tuple[float, float]]) -> list[int]:
     return kept
 
 
-def _draw(folder: Path, name: str, panels: int, draw: Callable[[Sequence[Axes]], None]) -> Path:
+def _draw(folder: Path, name: str, group: Sequence[Entry], panels: int,
+          draw: Callable[[Sequence[Axes]], None]) -> Path:
     figure = Figure(figsize=(5.5 * panels + 2.5, 4.8), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(1, panels, squeeze=False)[0]
     draw(axes)
+    if lacking := group[0].lacking:
+        figure.suptitle(lacking.strip(), fontsize=9)
     if not axes[-1].get_legend():
         axes[-1].legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
     path = folder / (re.sub(r"[^\w.-]+", "_", name.strip()) + ".png")
     with atomic_write(path) as part:
-        figure.savefig(part, format="png")
+        figure.savefig(part, format="png", metadata=WRITER)
     return path
 
 

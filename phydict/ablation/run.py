@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import reprlib
 import warnings
+import zlib
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -59,6 +60,15 @@ CUDA device, else of the process."""
 WORDS = ("status", "error", "warning", "device", "precision", "instruction_set")
 """Those of MEASURED that are no numbers."""
 
+IDENTIFYING = ("window", "data")
+"""What tells apart rows of equal settings, and older rows lack: the HU window of the truth, and a short checksum of
+what identifies the case's data."""
+
+
+def is_measured(name: str) -> bool:
+    """Whether a run fills a column: those of MEASURED, and the seconds of whatever stages a method has."""
+    return name in MEASURED or name.startswith("seconds_")
+
 
 class Results:
     """The table of results in a folder, of which this process alone writes while it is open.
@@ -84,7 +94,7 @@ class Results:
                              f"other settings or data{differing}: give another out, or remove "
                              f"{', '.join([RESULTS, *others])}")
         for name, row in stored.items():
-            wrong = next((k for k in MEASURED if k not in WORDS and isinstance(row.get(k), str)), None)
+            wrong = next((k for k in row if is_measured(k) and k not in WORDS and isinstance(row[k], str)), None)
             if wrong:
                 raise ValueError(f"{self.file}: {wrong} of row {name} is {reprlib.repr(row[wrong])}, which is no "
                                  "number: remove that row, and it is run again")
@@ -94,7 +104,8 @@ class Results:
         self.again: set[str] = set()
 
     def _row(self, name: str, measured: Mapping) -> dict:
-        return self.planned[name] | {k: measured[k] for k in MEASURED if measured.get(k) is not None} | {"key": name}
+        return self.planned[name] | {k: value for k, value in measured.items()
+                                     if is_measured(k) and value is not None} | {"key": name}
 
     @property
     def rows(self) -> list[dict]:
@@ -129,14 +140,19 @@ class Results:
 
 
 def _differing(stored: Iterable[dict], planned: Iterable[dict]) -> str:
-    """In brackets, the columns of which no stored row has what a planned one has."""
+    """In brackets, the columns of which no stored row has what a planned one has, with some of their values."""
+    def some(values: Iterable[str]) -> str:
+        first, rest = [*values][:3], [*values][3:]
+        return ", ".join(first + (["..."] if rest else []))
+
     of_stored, of_planned = list(stored), list(planned)
     columns = dict.fromkeys(name for row in of_planned for name in row)
     differ = []
     for name in columns:
         there, here = (dict.fromkeys(str(row.get(name)) for row in rows) for rows in (of_stored, of_planned))
-        if not there.keys() & here.keys():
-            differ.append(f"{name} {', '.join(there)} there and {', '.join(here)} here")
+        unknown = name in IDENTIFYING and there.keys() == {"None"}
+        if not there.keys() & here.keys() and not unknown:
+            differ.append(f"{name} {some(there)} there and {some(here)} here")
     return f" ({'; '.join(differ)})" if differ else ""
 
 
@@ -154,7 +170,8 @@ def planned(specification: Specification, scoring: Scoring) -> tuple[Results, di
             cases_of[acquisition] = trial.data.test_cases(*trial.scene())
         for case, source, make in cases_of[acquisition]:
             name = key(trial, case, source, scoring.settings())
-            rows[name] = {"case": case} | trial.columns | {"grid": "x".join(map(str, trial.scored().shape))} | (
+            rows[name] = {"case": case} | trial.columns | trial.scored_columns() | {
+                "data": f"d{zlib.crc32(source.encode()):08x}"} | (
                 {"training": trial.training} if trial.training else {})
             cases.setdefault(case, []).append((trial, name, make))
     if followed := next(filter(None, (trial.followed for trial in specification.trials)), None):
@@ -307,10 +324,11 @@ class Runner:
         torch.manual_seed(seed)
         prior = _on(trial.prior, self.device) if isinstance(trial.method, Sampler) else None
         stage = _stage_on(trial.super_resolution, self.device) if trial.super_resolution else None
-        ready = reconstructor(trial.method, prior, trial.guidance, trial.name, stage, samples=trial.samples)
+        ready = reconstructor(trial.method, prior, trial.guidance, trial.name, stage, samples=trial.samples,
+                              precision=trial.precision)
         ready = onto_grid(ready, trial.box.grid() if trial.box else None, trial.refinement)
         self.progress.follow(ready.steps())
-        ready = ready.with_mu_water(scene.mu_water)
+        ready = ready.with_mu_water(scene.mu_water).of_case(scene.case)
         grid = trial.result_scene()[0]
         if trial.fixed:
             ready = covering(ready, trial.fixed)

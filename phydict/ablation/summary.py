@@ -5,18 +5,20 @@ from __future__ import annotations
 import json
 import math
 from ast import literal_eval
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from phydict.ablation.run import MEASURED
-from phydict.ablation.trials import ORBIT_SETTINGS, PRIOR_SETTINGS, SETTINGS, SIDE, SIMULATORS
+from phydict.ablation.nested import field_of, has_field, plain
+from phydict.ablation.run import IDENTIFYING, is_measured
+from phydict.ablation.trials import ORBIT_SETTINGS, PRECISION, PRIOR_SETTINGS, SETTINGS, SIDE, SIMULATORS
 from phydict.evaluation.bootstrap import Estimate, estimate
 from phydict.evaluation.metrics import MEASURES, Measure, case_values
 from phydict.grid import Box, Grid
-from phydict.inference.conditions import format_settings, simulated, simulated_on, xrays_note
+from phydict.inference.conditions import format_settings, simulated, simulated_on, told_apart, xrays_note
 from phydict.inference.protocols import protocol_of
 from phydict.inference.settings import Orbit
 from phydict.reconstruction import describe
@@ -30,9 +32,13 @@ SHOWN_MEASURES = MEASURES | {"network_calls": Measure("network calls", None, 0),
 SCORES = MEASURES.keys() - {"seconds"}
 """The measures of how good a volume is, whose means have intervals."""
 
-NON_SETTING_COLUMNS = (*MEASURED, "case", "key", "seed", "grid", "training")
+NON_SETTING_COLUMNS = (*IDENTIFYING, "case", "namesake", "key", "seed", "grid", "training")
+"""Columns beside the measured ones that are no settings."""
 
-METHOD_SETTINGS = ("method", "projector", *PRIOR_SETTINGS)
+SCORED = ("grid", "window")
+"""What volumes were scored on, which parts rows that no setting of the X-rays parts."""
+
+METHOD_SETTINGS = ("method", "projector", PRECISION, *PRIOR_SETTINGS)
 """Settings of the method, as method.<field> are; the others are of the X-rays."""
 
 XRAY_SETTINGS = (*ORBIT_SETTINGS, "simulator", "simulation_voxels", "geometry", "protocol")
@@ -103,29 +109,72 @@ class Entry:
 def summarise(rows: Iterable[Mapping]) -> list[Entry]:
     """One entry per method, settings and condition, in the order of the rows.
 
-    The condition of an entry is what differs among the rows' X-rays.
+    The condition of an entry is what differs among the rows' X-rays, a setting that is not given taken for its default,
+    and, among rows of equal X-rays, of what they were scored on. Rows of a case of other data are another case's.
     """
-    parts = [(row, *_parted(row)) for row in rows]
-    varying = _varying([xrays for _, _, xrays in parts])
+    parts = [(row, *_parted(row)) for row in told_apart(rows, lambda row: row.get("data"))]
+    apart = _conditions([(row, xrays) for row, _, xrays in parts])
     changed = {method: _varying([settings for _, settings, _ in parts if settings["method"] == method])
                for method in dict.fromkeys(row["method"] for row, _, _ in parts)}
     groups: dict[tuple, list] = {}
-    for row, settings, xrays in parts:
+    for (row, settings, _), condition in zip(parts, apart):
         of_method = changed[row["method"]]
-        place = (row["method"], *(settings.get(name) for name in of_method), *(xrays.get(name) for name in varying))
+        place = (row["method"], *(settings.get(name) for name in of_method), *condition.items())
         groups.setdefault(place, []).append((row, {name: settings[name] for name in of_method if name in settings},
-                                             {name: xrays[name] for name in varying if name in xrays}))
+                                             condition))
     return [_entry([row for row, _, _ in group], *group[0][1:]) for group in groups.values()]
 
 
 def without_repeats(rows: Iterable[Mapping]) -> list[Mapping]:
     """The first of those rows of a case that have the same method, settings and seed: `ablate` writes the rows of other
-    weights or data, which it keeps, behind its own."""
-    kept: dict[frozenset, Mapping] = {}
+    weights or data, which it keeps, behind its own. Older rows that do not tell their HU window are of any."""
+    kept: dict[frozenset, dict[object, Mapping]] = {}
     for row in rows:
-        kept.setdefault(frozenset((name, value) for name, value in row.items()
-                                  if name not in (*MEASURED, "key", "training")), row)
-    return list(kept.values())
+        windows = kept.setdefault(frozenset((name, value) for name, value in row.items() if not (
+            is_measured(name) or name in (*IDENTIFYING, "key", "training"))), {})
+        if not windows or (row.get("window") is not None and None not in windows):
+            windows.setdefault(row.get("window"), row)
+    return [row for windows in kept.values() for row in windows.values()]
+
+
+def _conditions(rows: Sequence[tuple[Mapping, Mapping]]) -> list[dict]:
+    """Of each row, with the settings of its X-rays, what sets it apart from rows of other conditions: what is given in
+    no row of its condition is left out."""
+    names = dict.fromkeys(name for _, given in rows for name, value in given.items() if value is not None)
+    meant = [_meant(row, given, names) for row, given in rows]
+    varying = [name for name in names if len({meaning.get(name) for meaning in meant}) > 1]
+    places = [tuple(meaning.get(name) for name in varying) for meaning in meant]
+    told: dict[tuple, set[str]] = {}
+    for place, (_, given) in zip(places, rows):
+        told.setdefault(place, set()).update(name for name in varying if given.get(name) is not None)
+    found = [{name: meaning[name] for name in varying if name in told[place] and name in meaning}
+             for place, meaning in zip(places, meant)]
+    for column in SCORED:
+        values: dict[tuple, set] = {}
+        for (row, _), condition in zip(rows, found):
+            values.setdefault(tuple(condition.items()), set()).add(row.get(column))
+        if any(len(of - {None}) > 1 for of in values.values()):
+            found = [condition | ({} if row.get(column) is None else {column: row[column]})
+                     for (row, _), condition in zip(rows, found)]
+    return found
+
+
+def _meant(row: Mapping, given: Mapping, names: Iterable[str]) -> dict:
+    """Of the settings `names` of X-rays what a row gives, or means by giving none."""
+    simulator, orbit = _made(row)
+    defaults = {name: default for name, (_, default) in SETTINGS.items() if name not in ORBIT_SETTINGS}
+    if orbit is not None:
+        defaults |= {name: value[0] if isinstance(value, list | tuple) else value
+                     for name, value in orbit.settings().items()}
+    meant = {}
+    for name in names:
+        part, _, path = name.partition(".")
+        if (value := given.get(name)) is None:
+            is_field = part == "simulator" and path and has_field(simulator, path.split("."))
+            value = plain(field_of(simulator, path.split("."))) if is_field else defaults.get(name)
+        if value is not None:
+            meant[name] = value if type(value) in (int, float) else str(value)  # as a CSV holds it
+    return meant
 
 
 def conditions(entries: Sequence[Entry], without: Sequence[str] = ()) -> list[tuple[dict, list[Entry]]]:
@@ -151,9 +200,20 @@ def _along(entries: Sequence[Entry], axis: str, without: Sequence[str]) -> list[
     return [(rest, group) for rest, group in groups if len({entry.condition[axis] for entry in group}) > 1]
 
 
+def alike(entries: Sequence[Entry]) -> list[Entry]:
+    """Those of entries that are marked and plotted together: with all of their cases, or, where none has all, as of a
+    CT that cannot be read, those of the same cases, as many as there are."""
+    if complete := [entry for entry in entries if entry.complete]:
+        return complete
+    sets = Counter(entry.case_ids for entry in entries if entry.cases)
+    most = max(sets, key=lambda cases: (len(cases), sets[cases]), default=None)
+    return [entry for entry in entries if entry.case_ids == most]
+
+
 def best_settings(entries: Sequence[Entry]) -> list[Entry]:
-    """Of each method the entry with the highest mean PSNR, complete ones first."""
+    """Of each method the entry with the highest mean PSNR, those that are `alike` first."""
     best: dict[str, Entry] = {}
+    rank = ranking(entries)
     for entry in entries:
         other = best.get(entry.method)
         if other is None or rank(entry) > rank(other):
@@ -161,9 +221,10 @@ def best_settings(entries: Sequence[Entry]) -> list[Entry]:
     return list(best.values())
 
 
-def rank(entry: Entry) -> tuple[bool, float]:
-    """What orders entries by their mean PSNR, those of all cases above others."""
-    return entry.complete, entry.means.get("psnr", -math.inf)
+def ranking(entries: Sequence[Entry]) -> Callable[[Entry], tuple[bool, float]]:
+    """What orders entries by their mean PSNR, those that are `alike` above others."""
+    among = set(map(id, alike(entries)))
+    return lambda entry: (id(entry) in among, entry.means.get("psnr", -math.inf))
 
 
 def deltas(entries: Sequence[Entry]) -> list[tuple[str, list[Entry]]]:
@@ -196,19 +257,24 @@ def xrays(entries: Sequence[Entry]) -> str:
 
 def _simulated(row: Mapping) -> dict:
     """The settings of a row's X-rays, as a record of `test` names them."""
+    simulator, orbit = _made(row)
+    settings = {"views": row["views"], "geometry": row["geometry"]} if orbit is None else orbit.settings()
+    fields = {name.removeprefix("simulator."): value for name, value in row.items() if name.startswith("simulator.")}
+    return simulated(json.loads(json.dumps(settings | {"simulator": describe(simulator) | fields})))
+
+
+def _made(row: Mapping) -> tuple[Simulator, Orbit | None]:
+    """What a row's X-rays were made by, the simulator's own settings left out, and their orbit, None where a geometry
+    file gives it."""
     given = {name: default if row.get(name) is None else row[name] for name, (_, default) in SETTINGS.items()}
-    simulator: Simulator = SIMULATORS[given["simulator"]]
     if given["protocol"]:
         protocol = protocol_of(given["protocol"])
-        simulator, orbit = Ideal(noise=protocol.noise), Orbit(given["views"]).filled(protocol.orbit).settings()
-    elif given["geometry"]:
-        orbit = {"views": given["views"], "geometry": given["geometry"]}
-    else:
-        pixel = given["pixel"] or SIDE / given["detector"]
-        orbit = Orbit(given["views"], given["source_to_detector"], given["source_to_isocentre"],
-                      (given["detector"],) * 2, (pixel,) * 2).settings()
-    fields = {name.removeprefix("simulator."): value for name, value in row.items() if name.startswith("simulator.")}
-    return simulated(json.loads(json.dumps(orbit | {"simulator": describe(simulator) | fields})))
+        return Ideal(noise=protocol.noise), Orbit(given["views"]).filled(protocol.orbit)
+    if given["geometry"]:
+        return SIMULATORS[given["simulator"]], None
+    pixel = given["pixel"] or SIDE / given["detector"]
+    return SIMULATORS[given["simulator"]], Orbit(given["views"], given["source_to_detector"], given[
+        "source_to_isocentre"], (given["detector"],) * 2, (pixel,) * 2)
 
 
 def _places(row: Mapping) -> str:
@@ -224,7 +290,8 @@ def _parted(row: Mapping) -> tuple[dict, dict]:
     """The settings of a row that are its method's, and those of its X-rays."""
     protocol = row.get("protocol")
     own = METHOD_SETTINGS + (BOX_SETTINGS if protocol is not None and protocol_of(protocol).grid else ())
-    settings = {name: value for name, value in row.items() if name not in NON_SETTING_COLUMNS}
+    settings = {name: value for name, value in row.items()
+                if not is_measured(name) and name not in NON_SETTING_COLUMNS}
     of_method = {name for name in settings if name in own or name.startswith("method.")}
     return ({name: value for name, value in settings.items() if name in of_method},
             {name: value for name, value in settings.items() if name not in of_method})

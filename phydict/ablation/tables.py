@@ -11,15 +11,17 @@ from phydict.ablation.run import TABLES
 from phydict.ablation.summary import (
     SHOWN_MEASURES,
     Entry,
+    alike,
     best_settings,
     compared_geometries,
     compared_views,
     conditions,
     deltas,
     fixed_settings,
-    rank,
+    ranking,
     xrays,
 )
+from phydict.ablation.trials import PRECISION
 from phydict.evaluation.bootstrap import Estimate, difference
 from phydict.evaluation.metrics import MEASURES, RANGE
 from phydict.evaluation.tables import (
@@ -33,8 +35,9 @@ from phydict.evaluation.tables import (
     rankable,
     warning_notes,
 )
-from phydict.inference.conditions import format_settings
+from phydict.inference.conditions import format_settings, namesakes
 from phydict.inference.protocols import Protocol, protocol_of
+from phydict.prior.contract import OWN_PRECISION
 from phydict.runtime.files import atomic_write
 
 FURTHER = tuple(name for name in MEASURES if name not in (
@@ -101,7 +104,7 @@ def _difference_tables(title: str, entries: Sequence[Entry]) -> list[Table]:
     compared = [entry for entry in entries if entry.cases]
     if len(compared) < 2:
         return []
-    best, names = max(compared, key=rank), _measured(OF_DIFFERENCES, entries)
+    best, names = max(compared, key=ranking(compared)), _measured(OF_DIFFERENCES, entries)
     others = [entry for entry in compared if entry is not best]
     lines: list[tuple[str, bool, list]] = [(entry.label, False, [_less(entry, best, name) for name in names])
                                            for entry in others]
@@ -133,10 +136,12 @@ def _entry_table(title: str, first: str, names: Sequence[str], lines: Sequence[t
     entries = [entry for _, entry in lines]
     names = _measured(names, entries, empty)
     measures = [SHOWN_MEASURES[name] for name in names]
-    printed = [(label, entry.complete, [entry.estimate(name) for name in names]) for label, entry in lines]
+    among = alike(entries)
+    printed = [(label, any(entry is other for other in among), [entry.estimate(name) for name in names])
+               for label, entry in lines]
     why = empty_notes(empty, {name for entry in entries for name in entry.values}) + partial_notes(
         (label, entry.cases, {name: len(entry.values.get(name, ())) for name in names}) for label, entry in lines)
-    ranked = [rankable(measure, (entry.values[name] for entry in entries if entry.complete and name in entry.values))
+    ranked = [rankable(measure, (entry.values[name] for entry in among if name in entry.values))
               for name, measure in zip(names, measures)]
     table = Table(title, [first, *(measure.heading for measure in measures)], ranked, printed, [])
     return replace(table, notes=[_caption(entries, table.ranks), *why, *_origins(entries), *notes,
@@ -151,13 +156,16 @@ def _axis_tables(title: str, rest: dict, group: Sequence[Entry], columns: Mappin
     lines: dict[str, dict[object, Entry]] = {}
     for entry in group:
         lines.setdefault(entry.name, {})[entry.condition[axis]] = entry
-    complete = {label for label, line in lines.items()
-                if all(entry.complete or not entry.cases for entry in line.values())}
+    among = {id(entry) for k in columns for entry in alike([line[k] for line in lines.values() if k in line])}
+    marked = {label for label, line in lines.items()
+              if all(id(entry) in among or not entry.cases for entry in line.values())}
+    lacking = [f"{label}, {columns[k]}{entry.lacking}" for label, line in lines.items() if label in marked
+               for k, entry in line.items() if entry.lacking]
     for name in _measured(OF_VIEWS, group):
         measure = SHOWN_MEASURES[name]
-        printed = [(label, label in complete, [line[k].estimate(name) if k in line else None for k in columns])
+        printed = [(label, label in marked, [line[k].estimate(name) if k in line else None for k in columns])
                    for label, line in lines.items()]
-        ranked = [rankable(measure, (lines[label][k].values[name] for label in complete
+        ranked = [rankable(measure, (lines[label][k].values[name] for label in marked
                                      if k in lines[label] and name in lines[label][k].values)) for k in columns]
         table = Table(format_settings(f"{measure.heading} {title}", rest), ["method", *columns.values()], ranked,
                       printed, [])
@@ -165,7 +173,8 @@ def _axis_tables(title: str, rest: dict, group: Sequence[Entry], columns: Mappin
                               for label, line in lines.items() for k, entry in line.items())
         tables.append(replace(table, notes=[
             _caption(group, table.ranks), *_origins(group),
-            *interval_note(printed, (entry.case_ids for entry in group)), *_reasons(group), *parts]))
+            *interval_note(printed, (entry.case_ids for entry in group)), *_reasons(group), *parts,
+            *([f"Not of all cases: {'; '.join(lacking)}."] if lacking else [])]))
     return tables
 
 
@@ -189,13 +198,27 @@ def _caption(entries: Sequence[Entry], marked: bool) -> str:
 
 def _origins(entries: Sequence[Entry]) -> list[str]:
     """The protocol and the X-rays that the rows of a table's entries were taken by, the settings that its title and
-    labels do not tell, how long trained rivals among them have learnt, and the cases that are doubtful."""
+    labels do not tell, how long trained rivals among them have learnt, the cases that are doubtful, and what was not
+    computed or measured alike."""
     rows = [row for entry in entries for row in entry.rows]
     trained = dict.fromkeys(f"{row['method']} {row['training']}" for row in rows if row.get("training"))
-    fixed = fixed_settings(entries)
+    fixed, apart, precisions = fixed_settings(entries), namesakes(rows), _precisions(entries)
     return [*(protocol.note for protocol in _protocols(rows)), xrays(entries),
             *([f"Fixed settings: {fixed}."] if fixed else []), *warning_notes(rows),
-            *([f"Trained rivals, as their files tell: {'; '.join(trained)}."] if trained else [])]
+            *([f"Trained rivals, as their files tell: {'; '.join(trained)}."] if trained else []),
+            *([f"Of other data under one name, and so neither ranked nor paired: {apart}."] if apart else []),
+            *([f"Networks computed in several precisions: {precisions}; the setting precision fixes one."]
+              if precisions else [])]
+
+
+def _precisions(entries: Sequence[Entry]) -> str:
+    """The methods whose rows were computed in several precisions, where no setting tells these apart."""
+    found: dict[str, dict[str, None]] = {}
+    for entry in entries:
+        if PRECISION not in entry.settings:
+            found.setdefault(entry.method, {}).update(
+                {row["precision"]: None for row in entry.counted if row.get("precision") not in (None, OWN_PRECISION)})
+    return "; ".join(f"{method} {', '.join(of)}" for method, of in found.items() if len(of) > 1)
 
 
 def _protocols(rows: Sequence[Mapping]) -> list[Protocol]:

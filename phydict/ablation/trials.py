@@ -15,6 +15,7 @@ from types import MappingProxyType
 from phydict.ablation.cases import Cases
 from phydict.ablation.nested import changed, field_of, has_field, parsed, plain
 from phydict.grid import Box, Grid
+from phydict.inference.conditions import voxels_in_words
 from phydict.inference.data import ReconstructionData
 from phydict.inference.protocols import whole
 from phydict.inference.record import correction_checksums
@@ -25,6 +26,7 @@ from phydict.prior import find_prior, fingerprint, load_super_resolution, own_id
 from phydict.reconstruction import Reconstructor, describe
 from phydict.rivals import TrainedRival
 from phydict.runtime.own_code import imported
+from phydict.runtime.precision import check_precision
 from phydict.runtime.reading import reason
 from phydict.runtime.seeds import check_seed
 from phydict.units import HUWindow
@@ -49,7 +51,7 @@ SETTINGS: dict[str, tuple] = {
     "side": (float | tuple[float, float, float], 384.0), "centre": (tuple[float, float, float], (0.0, 0.0, 0.0)),
     "refine": (bool, True), "super_resolution": (str | None, None),
     "protocol": (str | None, None), "prior": (str | None, None), "guidance": (float, 1.0), "samples": (int, 1),
-    "delta": (float | None, None), "projector": (str, "auto")}
+    "delta": (float | None, None), "projector": (str, "auto"), "precision": (str, "auto")}
 """Type and default of what an axis may be; beside these, method.<field> and simulator.<field>."""
 
 PRIOR_SETTINGS = ("prior", "guidance", "samples", "delta", "report", "refine", "super_resolution")
@@ -57,6 +59,10 @@ PRIOR_SETTINGS = ("prior", "guidance", "samples", "delta", "report", "refine", "
 
 ORBIT_SETTINGS = ("views", "detector", "pixel", "source_to_detector", "source_to_isocentre")
 """Settings that mean nothing where a geometry file is given."""
+
+PRECISION = "networks.precision"
+"""The column of the setting precision, which is there where one is chosen; the column precision is what was computed
+in."""
 
 DEFAULT_COLUMNS = ("method", "views", "simulator", "detector", "seed", "guidance", "samples")
 """Settings that the table of results always has as columns; others where a specification gives them."""
@@ -70,7 +76,7 @@ class Trial:
     samples, seed: as in infer.py; data: the X-rays; like: for a method without a prior, the file of the prior whose
     grid and HU window it takes; box: the result's voxels, None for the method's own; refine: whether finer voxels than
     a prior's are met with the X-rays, or interpolated; super_resolution: a second stage's file; projector: the
-    method's, as Projector's `method`; X-rays are made by the automatic one.
+    method's, as Projector's `method`; X-rays are made by the automatic one; precision: of the method's networks.
     """
 
     columns: dict
@@ -86,6 +92,7 @@ class Trial:
     like: str | None = None
     projector: str | type = "auto"
     with_report: bool = True
+    precision: str = "auto"
 
     @property
     def name(self) -> str:
@@ -139,6 +146,14 @@ class Trial:
         """The grid on which results are scored."""
         return self.box.grid() if self.box and not self.fixed else self.scene()[0]
 
+    def scored_columns(self) -> dict[str, str]:
+        """What a row says of the voxels and the HU window that its truth has: of voxels that are no cube as long as
+        the usual one, and that no other setting tells, also their length and place."""
+        grid, window = self.scored(), self.scene()[1]
+        told = self.box or self.fixed or grid.same_as(Grid.cube(grid.shape[0]))
+        return {"grid": "x".join(map(str, grid.shape)) if told else voxels_in_words(grid),
+                "window": f"[{window.low:g}, {window.high:g}]"}
+
     @property
     def refinement(self) -> Refinement:
         return Refinement() if self.refine else Refinement(None)
@@ -170,6 +185,8 @@ class Trial:
             identity["region"] = self.box.grid().to_dict()
         if self.projector != "auto":
             identity["projector"] = projector_settings(self.projector)
+        if self.precision != "auto":
+            identity["precision"] = self.precision
         return json.loads(json.dumps(identity))
 
     def acquisition(self) -> str:
@@ -205,6 +222,10 @@ def trials_of(base: dict, axes: dict, methods: Mapping, cases: Cases,
             method_of(name, methods)
         changes = dotted(methods.get(name) or {})
         of = changes.pop("of", name)
+        if clash := next((k for k in changes if k in combination and combination[k] != changes[k]), None):
+            raise ValueError(f"methods.{name} gives {clash} {changes[clash]!r}, but an axis gives it "
+                             f"{combination[clash]!r}: leave one of the two out, or give the method a product of its "
+                             "own without that axis")
         trial, meant = _trial(of, base | changes | combination | {"method": name}, cases)
         check_used(changes, meant, [trial])
         trials.append(trial)
@@ -234,6 +255,7 @@ def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
     if (samples := given.get("samples", 1)) < 1:
         raise ValueError(f"samples is a number of draws, 1 or more, but {samples} was given")
     projector = projector_kind(given.get("projector", "auto"))
+    check_precision(given.get("precision", "auto"))
     base = method_of(of)
     simulator = SIMULATORS.get(given.get("simulator", "ideal"))
     if simulator is None:
@@ -254,6 +276,8 @@ def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
         method = refined_from(method, given["delta"], "ec_steps" in changes["method"])
     if not isinstance(method, Sampler):
         given = {name: value for name, value in given.items() if name not in PRIOR_SETTINGS}
+        if not has_field(method, ["precision"]):
+            given.pop("precision", None)
     if given.get("geometry") is not None:
         given = {name: value for name, value in given.items() if name not in ORBIT_SETTINGS}
     value = {name: default for name, (_, default) in SETTINGS.items()} | given
@@ -274,13 +298,17 @@ def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
                  for part, paths in changes.items() for path in paths}
     columns = {name: value[name] for name in DEFAULT_COLUMNS
                if name in given or name not in PRIOR_SETTINGS or with_prior}
-    columns |= {name: given[name] for name in SETTINGS if name in given and name not in columns} | overrides
+    columns |= {name: given[name] for name in SETTINGS
+                if name in given and name not in columns and name != "precision"} | overrides
+    if value["precision"] != "auto":
+        columns[PRECISION] = value["precision"]
     prior = value["prior"] or str(method.default_prior) if with_prior else None
     box = None if value["voxels"] is None else Box(value["voxels"], value["side"], value["centre"])
     if box is None and (alone := {"side", "centre", "refine"} & set(given)):
         raise ValueError(f"{', '.join(sorted(alone))} of a box of voxels means nothing without voxels: give them too")
     trial = Trial(columns, method, data, prior, value["guidance"], value["samples"], value["seed"], box,
-                  value["refine"], value["super_resolution"], projector=projector, with_report=value["report"])
+                  value["refine"], value["super_resolution"], projector=projector, with_report=value["report"],
+                  precision=value["precision"])
     if box and data.protocol:
         data.protocol.check_voxels(box.grid(), trial.bound)
     return trial, set(given) | set(overrides)

@@ -6,6 +6,7 @@ from phydict.baselines.diffvox import DiffVox
 from phydict.baselines.fdk import FDK
 from phydict.baselines.region import Region
 from phydict.baselines.sirt import SIRT
+from phydict.baselines.stored import Stored
 from phydict.baselines.tv import FISTATV
 
-__all__ = ["CGLS", "FDK", "FISTATV", "SIRT", "Baseline", "DiffVox", "Region"]
+__all__ = ["CGLS", "FDK", "FISTATV", "SIRT", "Baseline", "DiffVox", "Region", "Stored"]

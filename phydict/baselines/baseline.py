@@ -46,7 +46,8 @@ class Baseline(Reconstructor):
 
     Works on densities relative to water, so that HU do not depend on what water attenuates in the X-rays. Display
     values need a scale to start from: they are first matched to a water ellipse of a typical chest.
-    Subclasses are frozen dataclasses with the fields mu_water (1/mm) and name beside their own.
+    Subclasses are frozen dataclasses, @dataclass(frozen=True), with the fields mu_water (1/mm) and name beside their
+    own.
     local: whether a voxel's value depends on the X-rays alone, and not on which other voxels there are.
     """
 
@@ -72,7 +73,7 @@ class Baseline(Reconstructor):
                 y = match_views(xrays[None], A(typical_chest(A).to(xrays)))
         beyond = torch.zeros_like(y) if outside is None else outside[None] / self.mu_water
         with watch.stage("sample"):
-            A.y, guard = y if self.local else y - beyond, Guard(A, on_step, self.steps())
+            A.y, guard = y if self.local else y - beyond, Guard(A, on_step, self.steps(), True)
             density = self.solve(A, A.y, guard)
         with watch.stage("score"):
             fit = guard.score(density, self.mu_water * (A(density) + beyond), self.mu_water * y)

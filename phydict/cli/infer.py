@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import reprlib
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -40,6 +41,7 @@ from phydict.runtime.help import HelpFormatter
 from phydict.runtime.progress_log import log_problem, progress_options
 from phydict.runtime.reading import reading
 from phydict.runtime.shipped import configuration
+from phydict.runtime.yaml_file import parse_yaml
 
 COMMANDS = {"predict": "X-rays -> volumes", "test": "CTs -> X-rays -> volumes and scores",
             "ablate": "methods compared on the same X-rays", "page": "results -> a page for the browser"}
@@ -82,9 +84,14 @@ class InferenceCLI(ProgressCLI):
         super().parse_arguments(parser, args)
         given = [value for name, value in zip(args, [*args[1:], ""]) if name == "--model.prior"]
         given += [arg.partition("=")[2] for arg in args if arg.startswith("--model.prior=")]
-        chosen = self.config.get(str(self.config.get("subcommand")), self.config).get("model.prior")
+        settings = self.config.get(str(self.config.get("subcommand")), self.config)
+        chosen = settings.get("model.prior")
         if given and Path(given[-1]).is_file() and chosen is None:  # its content was read, as a null
             raise ValueError(f"the prior {given[-1]} is empty: give the .safetensors file that training wrote")
+        guided = any(arg.partition("=")[0] == "--model.super_resolution.guided" for arg in args)
+        if guided and not settings.get("model.super_resolution.file"):  # a configuration says so of any stage
+            raise ValueError("model.super_resolution.guided means nothing without model.super_resolution.file, the "
+                             "second stage's: give it too, or leave that out")
 
     @property
     def dry_run(self) -> bool:
@@ -197,14 +204,15 @@ def _configuration(given: str) -> tuple[str, bool]:
     """A configuration, its file or what it holds where it names a method or gives a number of voxels, and whether it
     gives a method at all."""
     if is_yaml(given):
-        return given, "method" in given
-    try:
-        file = str(configuration(given, ("reconstruct", "simulate")))
-    except ValueError:
-        if (name := given.removeprefix("configs/reconstruct/").removesuffix(".yaml")) not in METHODS:
-            raise
-        return json.dumps({"model": _named(name)}), True
-    settings = read_configuration(file)
+        file, settings = given, _inline(given)
+    else:
+        try:
+            file = str(configuration(given, ("reconstruct", "simulate")))
+        except ValueError:
+            if (name := given.removeprefix("configs/reconstruct/").removesuffix(".yaml")) not in METHODS:
+                raise
+            return json.dumps({"model": _named(name)}), True
+        settings = read_configuration(file)
     model = settings.get("model", {})
     own: dict = {}
     if _is_name(model.get("method")):
@@ -215,6 +223,15 @@ def _configuration(given: str) -> tuple[str, bool]:
         return file, "method" in model
     written = own | model | {key: own[key] for key in own if key != "name"}  # a name in the file stays
     return json.dumps(settings | {"model": written}), "method" in model
+
+
+def _inline(given: str) -> dict:
+    """What a configuration holds that is given as YAML itself. Raises ValueError for what is no settings."""
+    settings = parse_yaml(given, "config")
+    if not isinstance(settings, dict) or not isinstance(settings.get("model", {}), dict):
+        raise ValueError("config: a mapping of settings, such as `model: {...}`, was expected, but "
+                         f"{reprlib.repr(settings)} was given")
+    return settings
 
 
 def _is_name(method: object) -> bool:

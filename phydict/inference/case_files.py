@@ -13,7 +13,7 @@ from phydict.datasets.radiographs.xray_description import save_geometry
 from phydict.evaluation import panel
 from phydict.evaluation.fid import Features, save_features
 from phydict.grid import Grid
-from phydict.inference.results import FEATURES
+from phydict.inference.results import COARSE, FEATURES
 from phydict.page import CASE_FILES, write_case_files
 from phydict.reconstruction import Reconstruction
 from phydict.xray import ConeBeam
@@ -42,8 +42,8 @@ def write_result(folder: Path, case: Case, result: Reconstruction, method: str, 
     if result.deviation is not None:
         result.save_nifti(folder / DEVIATION, result.deviation)
     if keep_coarse and result.coarse is not None:
-        result.coarse.save_nifti(folder / "coarse.nii.gz")
-    if result.intervals:
+        result.coarse.save_nifti(folder / COARSE)
+    if SHOWN_LEVEL in result.intervals:
         result.save_nifti(folder / INTERVAL, result.intervals[SHOWN_LEVEL])
     label, uncertain = _uncertain(result)
     beam = result.beam or case.get("beam")
@@ -87,14 +87,14 @@ def remake_page_files(folder: Path) -> None:
 
 def _uncertain(result: Reconstruction) -> tuple[str, Tensor | None]:
     """How uncertain each voxel is, HU (X, Y, Z), and what that is called; None where it is not known."""
-    if result.intervals:
+    if SHOWN_LEVEL in result.intervals:
         return UNCERTAIN[INTERVAL], result.intervals[SHOWN_LEVEL]
     return UNCERTAIN[DEVIATION], result.deviation
 
 
 def body_interval(result: Reconstruction) -> float | None:
-    """Half the interval's width in HU, mean over tissue and lungs; None where the method knows none."""
-    if not result.intervals:
+    """Half the interval's width in HU, mean over tissue and lungs; None where the method knows none of that level."""
+    if SHOWN_LEVEL not in result.intervals:
         return None
     lung = result.masks[0] > 0.5 if result.masks is not None and len(result.masks) else False
     inside = (result.volume > TISSUE) | lung

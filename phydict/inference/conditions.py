@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
+from phydict.datasets.cts.ct_rate import patient_of
 from phydict.grid import Grid
 from phydict.inference.protocols import protocol_of, whole
 from phydict.inference.settings import PAPER
@@ -70,11 +71,40 @@ def condition(record: Mapping) -> dict:
     elif voxels := data.get("simulation_voxels"):
         stated["simulation_voxels"] = voxels
     if protocol is None or not protocol_of(protocol).cube:
-        stated["grid"] = _voxels(Grid(**record["grid"]), settings.get("grid"))
+        stated["grid"] = voxels_in_words(Grid(**record["grid"]), settings.get("grid"))
     return stated
 
 
-def _voxels(grid: Grid, box: Mapping | None) -> str:
+def told_apart(records: Iterable[Mapping], data: Callable[[Mapping], object]) -> list[dict]:
+    """Records, of which those of one case but of unlike `data` are cases of their own, which are neither averaged nor
+    paired: "anna", "anna (2)", the latter with the `namesake` "anna". Data None counts as the first of its case."""
+    found: dict[str, list] = {}
+    apart = []
+    for record in records:
+        case, mine = str(record["case"]), data(record)
+        known = found.setdefault(case, [])
+        if mine is not None and mine not in known:
+            known.append(mine)
+        number = known.index(mine) + 1 if mine is not None else 1
+        apart.append({**record} if number == 1 else {**record, "case": _another(case, number), "namesake": case})
+    return apart
+
+
+def _another(case: str, number: int) -> str:
+    """The id of another case of the same name, and of the same patient."""
+    patient = patient_of(case)
+    return f"{case} ({number})" if patient in (case, case.split("__")[0]) else f"{patient}__{case} ({number})"
+
+
+def namesakes(records: Iterable[Mapping]) -> str:
+    """The cases of one name among records that were `told_apart`."""
+    of: dict[str, dict[str, None]] = {}
+    for record in records:
+        of.setdefault(str(record.get("namesake", record["case"])), {})[str(record["case"])] = None
+    return ", ".join(case for cases in of.values() if len(cases) > 1 for case in cases)
+
+
+def voxels_in_words(grid: Grid, box: Mapping | None = None) -> str:
     """A grid in words, and where the box is that it was asked for, unless at the isocentre."""
     sides = [f"{mm:.3g}" for mm in grid.spacing]
     spacing = sides[0] if len(set(sides)) == 1 else " x ".join(sides)

@@ -35,7 +35,8 @@ from phydict.xray import Ideal, Projector, Simulator
 from phydict.xray.boxes import divided, in_other_voxels
 from phydict.xray.geometry_files import read_beam
 
-MOST_PHANTOMS = 100_000
+PHANTOMS, MOST_PHANTOMS = 4, 100_000
+"""How many phantoms where no number is given, and at most."""
 
 
 class LazyCases(Dataset):
@@ -79,7 +80,7 @@ class ReconstructionData(lightning.LightningDataModule):
     trainer: Any
 
     def __init__(self, xrays: str | None = None, geometry: str | None = None, cts: str | None = None,
-                 source: CTSource = CTSource(), only: str | None = None, phantoms: int = 4,
+                 source: CTSource = CTSource(), only: str | None = None, phantoms: int = PHANTOMS,
                  orbit: Orbit = Orbit(), simulator: Simulator = Ideal(), simulation_voxels: int | None = None,
                  protocol: str | None = None):
         super().__init__()
@@ -92,6 +93,9 @@ class ReconstructionData(lightning.LightningDataModule):
         if cts == "phantom" and (only is not None or source != CTSource()):
             raise ValueError("only, reports and source choose among the CTs of a folder, but the cases are phantoms: "
                              "leave them out, or give a folder of CTs")
+        if cts and cts != "phantom" and phantoms != PHANTOMS:
+            raise ValueError(f"data.phantoms ({phantoms}) is a number of phantoms, but the cases are the CTs of {cts}: "
+                             "leave it out, or give data.cts phantom")
         if cts and geometry and orbit != Orbit():
             raise ValueError(f"the simulated X-rays are those of data.geometry ({geometry}), but data.orbit was "
                              "given as well: leave one out")
@@ -105,7 +109,7 @@ class ReconstructionData(lightning.LightningDataModule):
             self.protocol.check_simulation(simulation_voxels)
         self.geometry_file = configuration(geometry, ("geometry",)) if geometry else None
         self.beam, self._beam_settings = self.orbit.beam(), self.orbit.settings()
-        changed = {"cts": cts is not None, "phantoms": phantoms != 4, "source": source != CTSource(),
+        changed = {"cts": cts is not None, "phantoms": phantoms != PHANTOMS, "source": source != CTSource(),
                    "only": only is not None, "orbit": orbit != Orbit(), "simulator": simulator != Ideal(),
                    "simulation_voxels": simulation_voxels is not None, "protocol": protocol is not None}
         self._of_test = [name for name, given in changed.items() if given]

@@ -12,7 +12,7 @@ from types import MappingProxyType
 from phydict.evaluation.fid import StoredFeatures
 from phydict.evaluation.tables import FID_TITLE, Table, fid_tables
 from phydict.inference.case_files import missing_page_files, remake_page_files
-from phydict.inference.conditions import condition, condition_titles, format_settings
+from phydict.inference.conditions import condition, condition_titles, format_settings, namesakes, told_apart
 from phydict.inference.distances import distance_rows
 from phydict.inference.protocols import protocol_of
 from phydict.inference.results import FEATURES, RECORD, TABLE, score_row, score_table
@@ -87,7 +87,7 @@ def _case(folder: Path, path: Path) -> PageCase | None:
         record = json.loads((path / RECORD).read_text())
         score_row(record["case"], record | {"scores": record["scores"] or {}})
         float(record["misfit"] or 0), list(record["misfit_per_view"])
-        group = json.dumps([record["case"], record.get("source"), _condition(record)])
+        group = json.dumps([record["case"], _data(record), _condition(record)])
         remake_page_files(path)
     except Exception as error:  # whatever a damaged record or volume leads to
         warn(f"{path} is left out of the page, since its files are damaged ({type(error).__name__}: {error})")
@@ -104,17 +104,24 @@ def _condition(record: Mapping) -> str:
     return format_settings(condition(record))
 
 
+def _data(record: Mapping) -> tuple:
+    """What a case of a name was measured on: its source, and the seed of the noise of its X-rays."""
+    return record.get("source"), record.get("settings", {}).get("seed")
+
+
 def _joined(*parts: str) -> str:
     return ", ".join(filter(None, parts))
 
 
 def _mean_tables(scored: Sequence[Mapping], empty: Mapping[str, str]) -> list[Table]:
-    """The means over scored cases by method, a table for each condition."""
+    """The means over scored cases by method, a table for each condition; cases of one name that are of other data or
+    seeds are cases of their own."""
     groups: dict[str, list] = {}
     for record in scored:
         groups.setdefault(_condition(record), []).append(record)
     titles, tables = condition_titles(scored), []
-    for words, records in groups.items():
+    for words, of in groups.items():
+        records = told_apart(of, _data)
         protocol = condition(records[0])["protocol"]
         table = score_table(records, protocol_of(protocol) if protocol else None, empty)
         tables += _noted([replace(table, title=_joined(table.title, titles[words]))], records)
@@ -122,20 +129,23 @@ def _mean_tables(scored: Sequence[Mapping], empty: Mapping[str, str]) -> list[Ta
 
 
 def _noted(tables: Sequence[Table], records: Sequence[Mapping]) -> list[Table]:
-    """Tables of some cases, the last note naming methods whose cases are of several settings, but for the seed."""
+    """Tables of some cases, the last notes naming methods whose cases are of several settings, but for the seed, and
+    cases of one name that are not compared."""
     settings: dict[str, set[str]] = {}
     for record in records:
         kind = json.dumps(record.get("settings", {}) | {"seed": None}, sort_keys=True)
         settings.setdefault(record["method"], set()).add(kind)
     several = ", ".join(method for method, kinds in settings.items() if len(kinds) > 1)
     note = [f"Cases of several settings, as their records tell, in one line: {several}."] if several else []
+    if apart := namesakes(records):
+        note.append(f"Of other data or another seed under one name, and so neither ranked nor paired: {apart}.")
     return [replace(table, notes=[*table.notes, *note]) for table in tables]
 
 
 def _kept_distances(folder: Path, cases: Sequence[PageCase]) -> list[Table]:
     """The tables of Frechet distances that features in the cases' folders give, a line per method; those of other
     weights and of each condition are tables of their own."""
-    methods: dict[tuple, dict[str, dict[str, StoredFeatures]]] = {}
+    found: dict[tuple, list[StoredFeatures]] = {}
     records: dict[tuple, list[Mapping]] = {}
     for case in cases:
         settings, file = case.record.get("settings", {}), folder / case.folder / FEATURES
@@ -147,8 +157,13 @@ def _kept_distances(folder: Path, cases: Sequence[PageCase]) -> list[Table]:
                 continue
             fid = FIDSettings(backbone, maisi_voxels=settings.get("fid_maisi_voxels", False))
             measured = fid, settings.get("fid_weights_crc32"), _condition(case.record)
-            methods.setdefault(measured, {}).setdefault(case.record["method"], {})[case.record["case"]] = features
+            found.setdefault(measured, []).append(features)
             records.setdefault(measured, []).append(case.record)
     titles = condition_titles([record for of in records.values() for record in of])
-    return [table for measured, features in methods.items() for table in _noted(fid_tables(
-        distance_rows(features, measured[0]), _joined(FID_TITLE, titles[measured[-1]])), records[measured])]
+    tables: list[Table] = []
+    for measured, kept in found.items():
+        methods: dict[str, dict[str, StoredFeatures]] = {}
+        for record, features in zip(of := told_apart(records[measured], _data), kept):
+            methods.setdefault(record["method"], {})[record["case"]] = features
+        tables += _noted(fid_tables(distance_rows(methods, measured[0]), _joined(FID_TITLE, titles[measured[-1]])), of)
+    return tables

@@ -68,6 +68,7 @@ def case_record(case: Case, result: Reconstruction, name: str, method: Reconstru
             "misfit": result.misfit, "misfit_per_view": result.misfit_per_view, "diverged_at": result.diverged_at,
             "hardened": result.hardened, "scatter": result.scatter, "interval_90_hu": body_interval(result),
             "interval_widening": result.interval_widening, "seconds": result.seconds,
+            "coarse": result.coarse is not None,
             "network_calls": result.network_calls, "projector_calls": result.projector_calls,
             "process_peak_memory_mb": process_peak(), "mu_water": case.get("mu_water", method.mu_water),
             "views": len(result.xrays), "precision": result.precision, "instruction_set": instruction_set(device),

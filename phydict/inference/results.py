@@ -25,6 +25,9 @@ RECORD = "reconstruction.json"
 UNLISTED = ("volume.nii.gz", "deviation.nii.gz", "panel.png")
 """The files, beside the record, of cases whose record does not list them, as older ones do not."""
 
+COARSE = "coarse.nii.gz"
+"""The coarse volume of a case, where one was made and is kept."""
+
 TABLE, FEATURES = "results.csv", "slice_features.safetensors"
 """The table of scores, and of a case the features of its slices, where the Frechet distance is measured."""
 
@@ -51,10 +54,12 @@ class CaseResults:
             ", which with --model.overwrite true does the finished cases again as well" if overwrite else "")
         self._sources: dict[str, str] = {}
         self._settings: dict = {}
+        self._keep_coarse = False
         self._before: dict[str, Finished | None] = {}
 
-    def unfinished(self, sources: dict[str, str], settings: dict) -> list[str]:
-        """Of the cases, id -> source, those that remain to be done; all of them with `overwrite`.
+    def unfinished(self, sources: dict[str, str], settings: dict, keep_coarse: bool = False) -> list[str]:
+        """Of the cases, id -> source, those that remain to be done; all of them with `overwrite`. keep_coarse: those
+        that lack a coarse volume, but made one, are to be done again.
 
         Removes what killed processes left. Raises ValueError where what is in the place of a case or of the table must
         stay: what this project did not write, and without `overwrite` a result of other settings or another source.
@@ -62,22 +67,25 @@ class CaseResults:
         remove_leftovers(self.folder)
         self._check_table()
         self._sources, self._settings = sources, json.loads(strict_json(settings))  # as records hold them
+        self._keep_coarse = keep_coarse
         with undisturbed(self.folder):
             self._before = {case: self._there(case) for case in sources}
         for case, there in self._before.items():
-            if there and self.overwrite:
-                self._check_own(case, there)
-            elif there and (other := self._other(case, there)):
+            if there and not self.overwrite and (other := self._other(case, there)):
                 raise ValueError(f"{self.folder / case} was finished with other {other}: add --model.overwrite true, "
                                  "or give another --model.out")
-        return [case for case, there in self._before.items() if self.overwrite or not there]
+            if there and (self.overwrite or self._lacks_coarse(case, there)):
+                self._check_own(case, there)
+        return [case for case, there in self._before.items()
+                if self.overwrite or not there or self._lacks_coarse(case, there)]
 
     def missing(self) -> list[str]:
         """Of the cases given to `unfinished`, those that are not finished as they should be by now."""
         with undisturbed(self.folder):
             now = {case: self._there(case) for case in self._sources}
         return [case for case, there in now.items()
-                if not there or self._other(case, there) or (self.overwrite and self._is_unchanged(case, there))]
+                if not there or self._other(case, there) or self._lacks_coarse(case, there)
+                or (self.overwrite and self._is_unchanged(case, there))]
 
     def write(self, case: str, record: dict, write_files: Callable[[Path], None]) -> None:
         """Makes a case's folder: `write_files` fills it, the record, which lists them, completes it, then it takes its
@@ -138,6 +146,11 @@ class CaseResults:
         same = {"settings": there.record["settings"] == self._settings,
                 "data": there.record["source"] == self._sources[case]}
         return " and ".join(what for what in same if not same[what])
+
+    def _lacks_coarse(self, case: str, there: Finished) -> bool:
+        """Whether a finished case lacks a coarse volume that is to be kept; of older ones none says that none was made.
+        """
+        return self._keep_coarse and there.record.get("coarse", True) and not (self.folder / case / COARSE).is_file()
 
     def _is_unchanged(self, case: str, there: Finished) -> bool:
         """Whether a finished case is the one that was there when `unfinished` looked."""

@@ -27,13 +27,17 @@ class Sampling:
     with_report: bool = True
 
 
+MEMORY = 4.0
+"""GiB that a second stage's network may take where no other amount is given."""
+
+
 @dataclass(frozen=True)
 class CascadeSettings:
-    """A second stage, which refines what the prior gives.
+    """A second stage, which refines what the prior gives. Raises ValueError for settings of one that is not given.
 
     Args:
         file: the second stage's file; none given: no second stage
-        guided: whether the X-rays guide it too
+        guided: whether the X-rays guide it too; a method's configuration may say so of any stage, given or not
         sampler: the Sampler that guides it; none given: the cascade's own
         noise_augmentation: level in [0, 1] of the noise that the prior's estimate is given before the second stage sees
             it; none given: the stage's own, 0.05, or 0 for MedSyn's
@@ -45,12 +49,18 @@ class CascadeSettings:
     guided: bool = True
     sampler: Sampler | None = None
     noise_augmentation: float | None = None
-    memory: float = 4.0
+    memory: float = MEMORY
 
     def __post_init__(self):
         if not 0 < self.memory < 2**20:
             raise ValueError(f"model.super_resolution.memory is an amount in GiB, above 0, but {self.memory:g} was "
                              "given")
+        alone = {"sampler": self.sampler is not None, "noise_augmentation": self.noise_augmentation is not None,
+                 "memory": self.memory != MEMORY}
+        if not self.file and any(alone.values()):
+            name = next(name for name, given in alone.items() if given)
+            raise ValueError(f"model.super_resolution.{name} means nothing without model.super_resolution.file, the "
+                             "second stage's: give it too, or leave that out")
 
 
 @dataclass(frozen=True)

@@ -92,8 +92,9 @@ class ReconstructionTask(lightning.LightningModule):
         if own_choice and isinstance(method, Sampler) and method.needs_refiner:
             self.predicted, grid = Box(PREDICTED_VOXELS, keep_coarse=coarse_too), None
         name = type(method).__name__ if name is None else name
-        if name in ("", "..") or name != Path(name).name:
-            raise ValueError(f"model.name is the name of one folder inside model.out, but '{name}' was given")
+        if not name or name.startswith(".") or name != Path(name).name:
+            raise ValueError("model.name is the name, without a dot at its beginning, of one folder inside model.out, "
+                             f"but '{name}' was given")
         self.method_name, self.seed, self.pages = name, seed, Path(out) / "dry_run"
         self.projector = projector_kind(projector, "model.projector")
         self.results = CaseResults(Path(out) / name, overwrite)
@@ -109,9 +110,10 @@ class ReconstructionTask(lightning.LightningModule):
         if super_resolution.file:
             self.super_resolution = load_super_resolution(super_resolution.file)
             self.super_resolution.memory = int(super_resolution.memory * 2**30)
+        guided = super_resolution.guided or self.super_resolution is None
         self.plain = reconstructor(
-            method, self.prior, sampling.guidance, name, self.super_resolution, super_resolution.guided,
-            super_resolution.sampler, super_resolution.noise_augmentation, sampling.samples, sampling.precision)
+            method, self.prior, sampling.guidance, name, self.super_resolution, guided, super_resolution.sampler,
+            super_resolution.noise_augmentation, sampling.samples, sampling.precision)
         if isinstance(self.plain, CascadePosterior) and super_resolution.file:
             self.settings |= cascade_settings(super_resolution.file, self.plain)
         self._take(Box(grid) if isinstance(grid, int) else grid)
@@ -181,7 +183,8 @@ class ReconstructionTask(lightning.LightningModule):
     def unfinished(self, sources: dict[str, str]) -> list[str]:
         """Of this run's cases, id -> what identifies their data, those that remain to be done."""
         self.cases = list(sources)
-        left = self.results.unfinished(sources, self.settings)
+        coarse = self.keep_coarse and isinstance(self.reconstructor, Refined | Region)
+        left = self.results.unfinished(sources, self.settings, coarse)
         if len(left) < len(sources) and self.trainer.is_global_zero:
             kept = len(sources) - len(left)
             log_progress(f"{kept} of {len(sources)} cases are finished already and are kept"
@@ -276,7 +279,8 @@ class ReconstructionTask(lightning.LightningModule):
         return "" if self.reads_no_text else case["report"]
 
     def _reconstruct(self, case: Case, seed: int) -> Reconstruction:
-        ready = self.reconstructor.with_mu_water(case["mu_water"]) if "mu_water" in case else self.reconstructor
+        ready = self.reconstructor.of_case(case["id"])
+        ready = ready.with_mu_water(case["mu_water"]) if "mu_water" in case else ready
         xrays, beam, display = case["xrays"].to(self.device), case["beam"], case.get("display", False)
         uncertain = uncertain_of(case) if self.calibrate else None
         return reconstruct_by(ready, self.grid, xrays, beam, case["report"], display, seed, self.progress.advance,

@@ -16,13 +16,15 @@ from phydict.grid import Grid
 from phydict.guard import Guard, check_ceiling, one_material
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.metal import carried_note
-from phydict.posterior.samplers.sampler import Sampler
+from phydict.posterior.samplers.sampler import Sampler, check_drawn, check_sampler
 from phydict.posterior.samplers.split_gibbs import SplitGibbs
 from phydict.posterior.widening import limited_angle_factor, warn_of_contradictions, widening_of
 from phydict.prior import AnyPrior, BoundRefiner, Refiner
+from phydict.prior.contract import bound, precision_of
 from phydict.prior.uncertainty import LEVELS
 from phydict.reconstruction import Reconstruction, Reconstructor
-from phydict.runtime.precision import check_precision, precision_name
+from phydict.runtime.own_code import is_own
+from phydict.runtime.precision import check_precision
 from phydict.runtime.profiling import Stopwatch, stage
 from phydict.runtime.ranges import check_between, check_fields
 from phydict.runtime.reading import check_memory
@@ -52,9 +54,10 @@ class CountingDenoiser:
         self.calls += len(x)
         with stage("network"):
             x0 = call()
-        if x0.shape != x.shape:
+        if not isinstance(x0, Tensor) or x0.shape != x.shape:
+            came = tuple(x0.shape) if isinstance(x0, Tensor) else type(x0).__name__
             raise ValueError(f"a denoiser answers with states like those it is given, {tuple(x.shape)}, but "
-                             f"{tuple(x0.shape)} came: correct the prior's denoise, or its grid and state_channels")
+                             f"{came} came: correct the prior's denoise, or its grid and state_channels")
         self.guard.estimate = x0.detach()
         return x0
 
@@ -161,6 +164,8 @@ class Posterior(Reconstructor):
         prior, grid, watch = self.prior, self.grid, Stopwatch()
         if isinstance(prior, torch.nn.Module):
             prior.to(xrays.device)
+            if is_own(type(prior)):
+                prior.eval()
             xrays = xrays.to(next((weight.dtype for weight in prior.parameters()), xrays.dtype))
         if not grid.same_as(projector.grid):
             raise ValueError(
@@ -170,11 +175,12 @@ class Posterior(Reconstructor):
         together = self.batch if self.sampler.batches else 1
         sampler = self.sampler.suited(prior)
         sampler = sampler.for_sampling() if self.samples > 1 else sampler
+        check_sampler(sampler)
         with watch.stage("prepare"):
             measurement = Measurement(projector, xrays, prior.window, display, self.mu_water)
-            guard = Guard(measurement, on_step, sampler.steps())
+            guard = Guard(measurement, on_step, sampler.steps(), sampler.sees_xrays)
             counting = CountingRefiner if sampler.needs_refiner else CountingDenoiser
-            denoiser = counting(prior.bind(report, self.guidance, self.precision), guard)
+            denoiser = counting(bound(prior, report, self.guidance, self.precision), guard)
             state = torch.empty(1, prior.state_channels, *grid.shape, device=xrays.device)
         with watch.stage("sample"):
             drawn, carried, plain = [], list[Carried | None](), measurement.fitted
@@ -185,7 +191,8 @@ class Posterior(Reconstructor):
                 generators = [torch.Generator().manual_seed(s) for s in seeds[first:first + together]]
                 x = noise_like(state.expand(len(generators), -1, -1, -1, -1), generators).to(xrays.dtype)
                 generator = generators if len(generators) > 1 else generators[0]
-                drawn.append(sampler.sample(denoiser, measurement, x, generator, guard))
+                states = sampler.sample(denoiser, measurement, x, generator, guard)
+                drawn.append(check_drawn(sampler, states, x))
                 carried += len(generators) * [measurement.carried]
                 if self.samples > 1:
                     guard.finish(drawn[-1])
@@ -217,7 +224,7 @@ class Posterior(Reconstructor):
             projector_calls=measurement.calls, masks=((state[1:] + 1) / 2).cpu(), deviation=deviation,
             intervals=intervals, interval_widening=widening, hardened=measurement.hardened,
             scatter=measurement.scatter, model_variance=variance.cpu() if isinstance(variance, Tensor) else variance,
-            precision=precision_name(self.precision, xrays), carried=mean)
+            precision=precision_of(prior, self.precision, xrays), carried=mean)
 
     def _volume(self, measurement: Measurement, x: Tensor) -> tuple[Tensor, Carried | None]:
         """HU (X, Y, Z) of a result x in the prior's range, and what of them is carried beside it. Says what is as dense

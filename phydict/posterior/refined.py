@@ -18,6 +18,7 @@ from phydict.posterior.measurement import Measurement
 from phydict.posterior.posterior import WIDEST
 from phydict.posterior.refinement import Correction, Refinement
 from phydict.prior.finer_uncertainty import INPUT_LEVEL
+from phydict.prior.uncertainty import LEVELS
 from phydict.reconstruction import Delegating, Reconstruction
 from phydict.runtime.profiling import Stopwatch
 from phydict.runtime.warning import Remark, warn
@@ -37,7 +38,8 @@ from phydict.xray.boxes import (
 
 ON_FINER = {0.5: (0.85, 0.0), 0.8: (1.0, 0.0), 0.9: (1.0, 0.1), 0.95: (1.0, 0.2)}
 """Level -> the shares of a coarse interval and of the refinement's change of which one on finer voxels is the sum: of
-two CTs kept from training these hold 43 to 52, 75 to 86, 85 to 95 and 92 to 99 % of the body from 1 to 16 views."""
+two CTs kept from training these hold 43 to 52, 75 to 86, 85 to 95 and 92 to 99 % of the body from 1 to 16 views. Those
+of other levels are interpolated, and beyond the ends they are those there."""
 
 CORRECTED_VOLUMES = 55
 """Volumes of the finest voxels that a refinement by a network on them holds at most, in float32
@@ -57,8 +59,8 @@ class Refined(Delegating):
     estimate anew. What a base without masks reconstructed, such as water, no network corrects.
 
     Masks and deviations of the result are the base's, interpolated. Its intervals are the network's where it knows
-    them, on still finer voxels interpolated, and else made of the base's and of what the refinement changed of the
-    interpolated volume, as ON_FINER says. Remarks on voxels on which no network corrects.
+    them and the base's have its LEVELS, on still finer voxels interpolated, and else made of the base's and of what the
+    refinement changed of the interpolated volume, as ON_FINER says. Remarks on voxels on which no network corrects.
 
     A target in the base's box whose voxels are along no axis shorter than the base's is not refined: its volume, masks,
     deviation and intervals are the base's, averaged over its voxels, and its misfit that of the base's volume.
@@ -181,11 +183,13 @@ class Refined(Delegating):
     def _known_intervals(self, network: Correction, level: Grid, x: Tensor, start: Tensor, coarse: Reconstruction
                          ) -> tuple[dict[float, Tensor], Grid] | None:
         """The half-widths in HU that a network knows on a level's voxels, and these; None where it knows none."""
+        if tuple(coarse.intervals) != LEVELS:
+            return None
         window = self.base.window
         widths = network.half_widths(level, network_input(x, start, coarse, window, level), self.base.precision)
         if widths is None:
             return None
-        return dict(zip(coarse.intervals, window.half_width * widths[0].clamp(max=WIDEST).cpu())), level
+        return dict(zip(LEVELS, window.half_width * widths[0].clamp(max=WIDEST).cpu())), level
 
     def _intervals(self, coarse: Reconstruction, volume: Tensor, known: tuple[dict[float, Tensor], Grid] | None
                    ) -> dict[float, Tensor]:
@@ -194,8 +198,11 @@ class Refined(Delegating):
             return {level: interpolated(half_width, known[1], self.target, 0.0)
                     for level, half_width in known[0].items()}
         change = (volume - interpolated(coarse.within, coarse.grid, self.target, AIR)).abs()
-        return {level: ON_FINER[level][0] * interpolated(half_width, coarse.grid, self.target, 0.0)
-                + ON_FINER[level][1] * change for level, half_width in coarse.intervals.items()}
+        intervals = {}
+        for level, half_width in coarse.intervals.items():
+            own, changed = on_finer(level)
+            intervals[level] = own * interpolated(half_width, coarse.grid, self.target, 0.0) + changed * change
+        return intervals
 
     def _binned(self, xrays: Tensor, projector: Projector, grid: Grid) -> tuple[Tensor, Projector]:
         """The X-rays as a level sees them, binned to what its voxels can hold, and the projector to them."""
@@ -216,6 +223,12 @@ class Refined(Delegating):
         measurement = Measurement(A, y, self.base.window, display, self.mu_water, outside=outside, told=True)
         measurement.adopt(coarse)
         return measurement
+
+
+def on_finer(level: float) -> tuple[float, float]:
+    """The shares of ON_FINER at any level."""
+    own, changed = (float(np.interp(level, list(ON_FINER), shares)) for shares in zip(*ON_FINER.values()))
+    return own, changed
 
 
 def network_input(x: Tensor, start: Tensor, coarse: Reconstruction, window: HUWindow, level: Grid) -> Tensor:

@@ -15,9 +15,16 @@ from phydict.diffusion import Denoiser
 from phydict.grid import Grid
 from phydict.prior.files import load_prior
 from phydict.prior.medsyn.checkpoint import MedSynCheckpoint
-from phydict.runtime.own_code import imported, own_code
-from phydict.runtime.reading import reason
+from phydict.runtime.own_code import check_takes, imported, is_own, own_code, words
+from phydict.runtime.precision import precision_name
+from phydict.runtime.warning import warn
 from phydict.units import HUWindow
+
+OWN_PRECISION = "own"
+"""What a prior of one's own computes in where its class does not say it."""
+
+OF_MODULES = frozenset(vars(nn.Module()))
+"""Attributes that every torch.nn.Module has."""
 
 
 class PriorContract(ABC):
@@ -26,8 +33,9 @@ class PriorContract(ABC):
 
     grid, window: where the volumes live, and the HU that x = -1 and 1 stand for; state_channels: channels of the state,
     the CT first, then soft masks in [-1, 1]; reads_text: whether `bind` takes a report; ends_at_zero: whether its own
-    sampling ends with a call at time 0 (see PriorOnly). A torch.nn.Module is moved to the device of the X-rays; others
-    answer on the device of x.
+    sampling ends with a call at time 0 (see PriorOnly); precision: what its network computes in, such as "float32", as
+    records name it. A torch.nn.Module is moved to the device of the X-rays and set to evaluation, as by `eval()`;
+    others answer on the device of x.
     """
 
     grid: Grid
@@ -35,6 +43,7 @@ class PriorContract(ABC):
     state_channels: int = 1
     reads_text: bool = False
     ends_at_zero: bool = False
+    precision: str = OWN_PRECISION
 
     def takes(self, shape: Sequence[int]) -> bool:
         """Whether its denoisers take states of this shape as well, as voxels of the same size: where the X-rays show
@@ -44,16 +53,26 @@ class PriorContract(ABC):
     @abstractmethod
     def bind(self, report: str, guidance: float, precision: str) -> Denoiser:
         """The denoiser of states (B, state_channels, *grid.shape) for one report, "" for none: `denoise(x, t)`, the
-        estimate of the clean state, and `schedule`, such as CosineSchedule().
+        estimate of the clean state of x at a time t in [0, 1], and `schedule`, such as CosineSchedule(), which says how
+        noisy x is then.
 
         guidance: scale of classifier-free guidance; precision: see phydict.runtime.precision.
+
+        The schedule of another network derives from CosineSchedule and says anew `alpha_bar(t)`, the share of the clean
+        state's variance in x, a tensor that falls from nearly 1 at t = 0 to nearly 0 at t = 1 and reaches neither, and
+        `time(sigma)`, the time in [0, 1] of a noise level, as a number. CosineSchedule makes of these what samplers
+        ask for: `scales(t)`, the weights (sqrt(alpha_bar), sqrt(1 - alpha_bar)) of the clean state and of the noise in
+        x; `sigma(t)`, the noise level, their quotient sqrt((1 - alpha_bar) / alpha_bar), of which `time` is the
+        inverse; and `steps(n, start)`, pairs of times (t, s) from `start` down to 0. A whole one, of a network that
+        predicts the noise, is in data/example/own_prior/noise_prior.py.
         """
 
     def identity(self) -> dict:
         """What decides its answers, as plain JSON values: its class, voxels, HU window and channels, and those of its
-        attributes that are plain. A prior with weights adds their checksum, so that results of others are not taken
-        for its own."""
-        plain = {name: value for name, value in vars(self).items() if isinstance(value, str | int | float | None)}
+        attributes that are plain, but for what every torch.nn.Module has. A prior with weights adds their checksum, so
+        that results of others are not taken for its own."""
+        plain = {name: value for name, value in vars(self).items()
+                 if isinstance(value, str | int | float | None) and name not in OF_MODULES}
         return {"class": f"{type(self).__module__}.{type(self).__qualname__}", "grid": self.grid.to_dict(),
                 "window": [self.window.low, self.window.high], "state_channels": self.state_channels} | plain
 
@@ -81,6 +100,34 @@ def check_prior(prior: object) -> None:
     if bad:
         raise ValueError("a prior has a grid (Grid), a window (HUWindow), state_channels (int) and a method bind, but "
                          f"{type(prior).__name__} lacks {', '.join(bad)}: see phydict.prior.PriorContract")
+
+
+def bound(prior: AnyPrior, report: str, guidance: float, precision: str) -> Denoiser:
+    """What a prior's `bind` returns. Raises ValueError, naming the class, unless that is a denoiser with a schedule,
+    and warns where the schedule's time is not the inverse of its sigma."""
+    name = f"the prior {type(prior).__name__}"
+    check_takes(prior.bind, f"bind of {name}", "report", "guidance", "precision")
+    denoiser = prior.bind(report, guidance, precision)
+    schedule = getattr(denoiser, "schedule", None)
+    lacking = ["denoise"] if not callable(getattr(denoiser, "denoise", None)) else []
+    lacking += ["schedule"] if schedule is None else [
+        f"schedule.{method}" for method in ("scales", "sigma", "time", "steps")
+        if not callable(getattr(schedule, method, None))]
+    if schedule is None or lacking:
+        raise ValueError(f"bind of {name} must return a denoiser, which has denoise(x, t) and a schedule such as "
+                         f"CosineSchedule(), but what it gave, {type(denoiser).__name__}, lacks {', '.join(lacking)}: "
+                         "see phydict.prior.PriorContract.bind")
+    check_takes(denoiser.denoise, f"denoise of {name}", "x", "t")
+    if abs((found := float(schedule.time(float(schedule.sigma(0.5))))) - 0.5) > 0.01:
+        warn(f"the schedule of {name} contradicts itself: time(sigma(0.5)) is {found:.3g} in place of 0.5, so that "
+             "some samplers ask it at wrong times: write its time as the inverse of its sigma")
+    return denoiser
+
+
+def precision_of(prior: AnyPrior, precision: str, x: torch.Tensor) -> str:
+    """What a prior's networks compute in for the state x where `precision` is asked for, as results name it; what one
+    of one's own says itself."""
+    return str(getattr(prior, "precision", OWN_PRECISION)) if is_own(type(prior)) else precision_name(precision, x)
 
 
 def is_class_path(given: object) -> bool:
@@ -117,9 +164,12 @@ def find_prior(given: str | Path | MedSynCheckpoint | AnyPrior) -> AnyPrior:
     if not is_class_path(given):
         return load_prior(given)
     try:
-        prior = imported(str(given))()
+        kind = imported(str(given))
+    except ValueError as error:
+        raise ValueError(f"the prior {given} cannot be imported: {error}") from error
+    try:
+        prior = kind()
     except (Exception, SystemExit) as error:  # of whatever kind: another's code runs
-        raise ValueError(f"the prior {given} cannot be made ({reason(error)}): its module must be importable, and its "
-                         "settings need defaults") from error
+        raise ValueError(f"the prior {given} cannot be made ({words(error)}): its settings need defaults") from error
     check_prior(prior)
     return prior

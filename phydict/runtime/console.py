@@ -52,15 +52,19 @@ def _bounded(text: str) -> object:
 
 set_loader("yaml", _bounded, (ValueError,))
 
+AGAIN = "run the same command again"
+"""How notes begin that help after a signal or where a disk was full, and not after a fault of code."""
+
 TRACEBACK = "PHYDICT_TRACEBACK"
 """The environment variable that, where it is set, lets every error show its trace."""
 
 
 @contextmanager
-def cli_errors(*also: type[Exception], to_resume: str = "run the same command again") -> Iterator[None]:
+def cli_errors(*also: type[Exception], to_resume: str = AGAIN) -> Iterator[None]:
     """Prints bad arguments, ValueError, OSError, FloatingPointError and `also` as one sentence and exits with code 2;
     the environment variable PHYDICT_TRACEBACK=1 shows the trace instead. A run that a signal stopped says how to resume
-    and exits with code 130 (SIGINT) or 143 (SIGTERM): as `to_resume` has it, or the note of what was raised."""
+    and exits with code 130 (SIGINT) or 143 (SIGTERM): as `to_resume` has it, or the note of what was raised. Faults of
+    code pass, without the notes that begin with AGAIN."""
     try:
         with enough_memory():
             yield
@@ -80,10 +84,14 @@ def cli_errors(*also: type[Exception], to_resume: str = "run the same command ag
         raise SystemExit(2) from None
     except RuntimeError as error:
         if os.environ.get(TRACEBACK) or not re.search("Connection (closed|reset) by peer", str(error)):
+            _leave_out_again(error)
             raise
         text = "stopped, because another process of this run ended; its message says why"
         log_always(text, event="stopped", text=text)
         raise SystemExit(2) from None
+    except Exception as error:
+        _leave_out_again(error)
+        raise
 
 
 @contextmanager
@@ -102,6 +110,11 @@ def ended_by_sigterm() -> Iterator[None]:
 
 def _advice(stop: BaseException, to_resume: str) -> str:
     return getattr(stop, "__notes__", [to_resume])[-1]
+
+
+def _leave_out_again(error: Exception) -> None:
+    if notes := getattr(error, "__notes__", None):
+        notes[:] = [note for note in notes if not note.startswith(AGAIN)]
 
 
 def split_configurations(args: Iterable[str]) -> list[str]:

@@ -10,6 +10,8 @@ from contextlib import contextmanager
 from difflib import get_close_matches
 from pydoc import locate
 
+from phydict.runtime.own_code import imported
+
 KINDS = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "a text", "list": "a list",
          "tuple": "a list", "dict": "a mapping of settings"}
 """How sentences name the types of settings."""
@@ -81,6 +83,8 @@ def plain(message: str) -> str:
     if "is abstract" in text:
         return f"{key} is the path of a class that can be used, but {given} is abstract: give one derived from it"
     wanted = _wanted(text)
+    if not wanted and (fault := _import_fault(given, ours)):
+        return f"{key} is the path of a class, but {given} cannot be imported: {fault}"
     return f"{key} is {wanted}, but {given} was given" if wanted else f"{key}: {ours or text[len(start[0]):]}"
 
 
@@ -90,11 +94,18 @@ def _of_class(key: str, path: str, reason: str) -> str:
         return f"{key}: {path} has no setting {option[1]}: {_meant(option[1], known)}--help lists what it has"
     if reason.endswith("has no attribute 'keys'"):
         return f"{key}.init_args is a mapping of the settings of {path}, but something else was given"
-    reason = re.sub(r"^module '([^']*)' has no attribute '([^']*)'", r"\1 has no \2", reason)
-    if " has no " in reason or reason.startswith("No module named"):
-        hint = ": put its folder on PYTHONPATH" if reason.startswith("No module named") else ""
-        return f"{key} is the path of a class, but {path} cannot be imported ({reason}){hint}"
-    return f"{key}: {reason}"
+    fault = _import_fault(path, reason)
+    return f"{key} is the path of a class, but {path} cannot be imported: {fault}" if fault else f"{key}: {reason}"
+
+
+def _import_fault(path: str, reason: str) -> str:
+    """Why a class cannot be imported, where the parser's reason is the same; empty where that is another."""
+    try:
+        imported(path)
+    except ValueError as error:
+        told = " ".join(str(error.__cause__ or "").split())
+        return str(error) if told == reason or "has no attribute" in reason else ""
+    return ""
 
 
 def _wanted(text: str) -> str:

@@ -20,6 +20,9 @@ from phydict.training.settings import Optimisation, Previews
 from phydict.training.stage import check_network
 from phydict.units import HUWindow
 
+DETAIL_STD = 0.08
+"""What a stage's detail_std is where training starts from none and is given no other."""
+
 
 class SuperResolutionTraining(DenoisingTraining):
     """Learns a SuperResolution from crops; a crop's block means are its coarse volume.
@@ -29,7 +32,8 @@ class SuperResolutionTraining(DenoisingTraining):
         cube: of fine voxels
         factor: fine voxels along each side of a coarse one
         window: HU that the prior's range [-1, 1] stands for
-        detail_std: standard deviation, in the prior's range, of what the fine CT adds to the coarse one
+        detail_std: standard deviation, in the prior's range, of what the fine CT adds to the coarse one; none given:
+            that of initial, else 0.08
         most_noise: highest level of the noise that the coarse volume is given, in [0, 1]
         optimisation: how the weights are learnt
         validation: what validation shows
@@ -40,10 +44,11 @@ class SuperResolutionTraining(DenoisingTraining):
     prior: SuperResolution
 
     def __init__(self, network: LocalUNet | None = None, cube: Cube = Cube(256), factor: int = 4,
-                 window: tuple[float, float] = (-1000.0, 1000.0), detail_std: float = 0.08, most_noise: float = 0.3,
-                 optimisation: Optimisation = Optimisation(), validation: Previews = Previews(),
-                 initial: str | None = None, seed: int = 0):
+                 window: tuple[float, float] = (-1000.0, 1000.0), detail_std: float | None = None,
+                 most_noise: float = 0.3, optimisation: Optimisation = Optimisation(),
+                 validation: Previews = Previews(), initial: str | None = None, seed: int = 0):
         check_between("model.most_noise", most_noise)
+        requested, detail_std = detail_std, DETAIL_STD if detail_std is None else detail_std
         check_between("model.detail_std", detail_std, 1e-3, 1000)
         stage = SuperResolution(network or LocalUNet(), cube.grid(), HUWindow(*window), factor,
                                detail_std=detail_std)
@@ -54,6 +59,9 @@ class SuperResolutionTraining(DenoisingTraining):
                 raise ValueError(f"the stage {initial} has another grid, HU window or factor than this training: set "
                                  "model.cube, model.window and model.factor to its own")
             check_network("stage", initial, first.network.settings, network.settings if network else {})
+            if requested not in (None, first.detail_std):
+                raise ValueError(f"model.detail_std is {requested:g}, but the stage {initial} that training continues "
+                                 f"from has {first.detail_std:g}: leave it out, or leave model.initial out")
             stage = first.train().requires_grad_(True)
         super().__init__(stage, stage.detail_std, optimisation, validation.preview_steps, seed, initial=initial)
         self.most_noise = most_noise

@@ -108,7 +108,8 @@ class UncertaintyTraining(StageTraining):
             chosen = torch.from_numpy(rng.integers(error.numel(), size=VOXELS)).to(ct.device)
             scenes.append((
                 (error / log_scale.exp()).flatten()[chosen], tissue_of(z).flatten()[chosen],
-                coverage_of(evidence).flatten()[chosen], measurement.normalised_residual(z[:, :1]).flatten()))
+                coverage_of(evidence).flatten()[chosen],
+                measurement.normalised_residual(z[:, :1], modelled=True).flatten()))
         self.held_out.append(tuple(map(torch.cat, zip(*scenes))))
         self.log("samples", float(self.samples), rank_zero_only=True, batch_size=1)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import itertools
 import json
+import shutil
 import socket
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,7 +22,7 @@ from ablation.runs import TINY, Trace, ablate, arguments, write
 from phydict.ablation import read_specification
 from phydict.ablation.run import planned
 from phydict.cli.infer import main
-from phydict.evaluation import read_csv
+from phydict.evaluation import read_csv, write_csv
 from phydict.grid import Grid
 from phydict.inference.data import ReconstructionData
 from phydict.inference.scoring import Scoring
@@ -247,6 +248,46 @@ def test_parts_of_the_time_are_parts_of_it_and_calls_are_counted(tmp_path):
         assert 0 < row["seconds_network"] + row["seconds_projector"] <= row["seconds"]
         assert row["seconds"] == pytest.approx(sum(row[f"seconds_{stage}"] for stage in ("prepare", "sample", "score")))
         assert row["prior"].endswith("tiny.safetensors") and row["grid"] == "16x16x16"
+
+
+def test_a_refined_rows_seconds_are_those_of_its_own_stages_and_its_precision_the_one_that_is_set(tmp_path):
+    save_prior(tiny_prior(False), tmp_path / "tiny.safetensors")
+    base = TINY | {"voxels": 32, "prior": str(tmp_path / "tiny.safetensors"), "method.iterations": 2}
+    content = {"phantoms": 1, "base": base, "axes": {"method": ["phydict_fast"], "precision": ["float32", "bfloat16"]}}
+    rows = ablate(tmp_path, **content)
+    assert [row["precision"] for row in rows] == ["float32", "bfloat16"]
+    for row in rows:
+        stages = ("prepare", "base", "refine", "score")
+        assert row["seconds"] == pytest.approx(sum(row[f"seconds_{stage}"] for stage in stages))
+        assert 0 < row["seconds_base"] < row["seconds"] and "seconds_sample" not in row
+    assert "phydict_fast, precision bfloat16" in (tmp_path / "out" / "tables.md").read_text()
+    assert ablate(tmp_path, **content) == rows
+
+
+def test_a_ct_that_has_changed_is_another_case_to_the_rows_of_its_earlier_state(tmp_path):
+    (tmp_path / "cts").mkdir()
+
+    def run(*methods: str, hu: int) -> list[dict]:
+        volume = np.full((20, 20, 20), -1000, np.float32)
+        volume[4:16, 6:15] = hu
+        image = nibabel.Nifti1Image(volume, np.diag([10.0, 10, 10, 1]))
+        image.set_sform(image.affine, code=1)
+        nibabel.save(image, tmp_path / "cts" / "b.nii.gz")
+        return ablate(tmp_path, cts=str(tmp_path / "cts"), phantoms=None, axes={"method": [*methods]})
+
+    (old,) = run("cgls", hu=40)
+    shutil.rmtree(tmp_path / "out")
+    new = run("sirt", "cgls", hu=60)
+    assert old["data"] != new[0]["data"] == new[1]["data"]
+    table = tmp_path / "out" / "results.csv"
+    mixed = [new[0], old]  # as where cgls was not run again
+    older = [{name: value for name, value in row.items() if name != "data"} for row in mixed]
+    for rows, marked in ((mixed, False), (new, True), (older, True)):
+        write_csv(table, rows)
+        main(["page", str(tmp_path / "out")])
+        page = (tmp_path / "out" / "index.html").read_text()
+        assert ('"place": 1' in page) == marked
+        assert ("Of other data under one name, and so neither ranked nor paired: b, b (2)." in page) != marked
 
 
 @pytest.mark.filterwarnings("default")

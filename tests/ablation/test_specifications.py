@@ -7,11 +7,12 @@ from pathlib import Path
 import pytest
 import yaml
 from command_lines import refusal
+from prior.tiny import tiny_prior
 
 from ablation.runs import TINY, write
 from phydict.ablation import read_specification
 from phydict.ablation.nested import changed
-from phydict.ablation.trials import refined_from
+from phydict.ablation.trials import prior_of, refined_from
 from phydict.cli.infer import main
 from phydict.datasets import CTSource
 from phydict.evaluation import read_csv
@@ -19,6 +20,7 @@ from phydict.grid import Grid
 from phydict.inference import ReconstructionData
 from phydict.methods import METHODS
 from phydict.posterior import DAPS, SplitGibbs
+from phydict.prior import Prior, save_prior
 from phydict.runtime.files import alone_in
 from phydict.units import HUWindow
 
@@ -37,10 +39,51 @@ def test_a_setting_that_means_nothing_to_a_method_does_not_multiply_it(tmp_path)
 def test_named_variants_change_a_method_under_the_axes(tmp_path):
     methods = {"mine": {"of": "phydict_paper", "method.likelihood.reward.lpips": 0, "method.iterations": 7}}
     one, two = read_specification(write(tmp_path, base={}, methods=methods,
-                                        axes={"method.init_args.iterations": [7, 9]})).trials
-    assert (one.name, two.name) == ("mine", "mine") and (one.method.iterations, two.method.iterations) == (7, 9)
+                                        axes={"method.init_args.iterations": [7], "views": [2, 4]})).trials
+    assert (one.name, two.name) == ("mine", "mine") and (one.method.iterations, two.method.iterations) == (7, 7)
     assert one.method.likelihood.reward.lpips == 0
     assert changed(one.method, {"likelihood.reward.lpips": 1.0, "iterations": 50}, "method") == METHODS["phydict_paper"]
+
+
+@pytest.mark.parametrize("name, value, values", [("method.weight", 8.0e-4, [8.0e-4, 0.1]), ("views", 2, [4])])
+def test_an_axis_takes_the_place_of_no_changed_methods_own_setting(tmp_path, name, value, values):
+    file = write(tmp_path, base={"voxels": 16}, methods={"weak": {"of": "tv", name: value}},
+                 axes={"method": ["tv", "weak"], name.replace("method.", "method.init_args."): values})
+    with pytest.raises(ValueError, match=rf"methods.weak gives {name} {value}, but an axis gives it {values[-1]}: "):
+        read_specification(file)
+    trials = read_specification(file, [f"{name}=[3,5]"]).trials  # which takes the place of both
+    assert [(trial.name, trial.columns[name]) for trial in trials] == [
+        (method, value) for method in ("tv", "weak") for value in (3, 5)]
+
+
+def test_a_precision_is_of_networks_alone_and_the_automatic_one_is_as_none_given(tmp_path):
+    def trials(**base) -> list:
+        return read_specification(write(tmp_path, base={"voxels": 64} | base,
+                                        axes={"method": ["sirt", "phydict_fast"]})).trials
+
+    (sirt, fast), (_, auto), (same, single) = trials(), trials(precision="auto"), trials(precision="float32")
+    assert sirt.identity() == same.identity() and fast.identity() == auto.identity() and fast.columns == auto.columns
+    assert single.identity() == fast.identity() | {"precision": "float32"}
+    assert single.columns == fast.columns | {"networks.precision": "float32"} and same.columns == sirt.columns
+    with pytest.raises(ValueError, match="precision is auto, float32 or bfloat16, but 'half' was given"):
+        trials(precision="half")
+    with pytest.raises(ValueError, match="the setting precision means nothing"):
+        read_specification(write(tmp_path, axes={"method": ["sirt"], "precision": ["float32"]}))
+
+
+def test_a_row_tells_the_voxels_and_the_window_that_it_was_scored_on(tmp_path):
+    def told(prior: Prior, **base) -> list[dict]:
+        save_prior(prior, tmp_path / "tiny.safetensors")
+        prior_of.cache_clear()
+        return [trial.scored_columns() for trial in read_specification(write(
+            tmp_path, base=TINY | {"voxels": None, "prior": str(tmp_path / "tiny.safetensors")} | base,
+            axes={"method": ["phydict_fast", "tv"]})).trials]
+
+    prior, short = tiny_prior(False), tiny_prior(False)
+    short.grid, short.window = Grid.cube(16, 320.0), HUWindow(-1000, 300)
+    assert told(prior) == [{"grid": "16x16x16", "window": "[-1000, 600]"}] * 2
+    assert told(short) == [{"grid": "16x16x16 of 20 mm", "window": "[-1000, 300]"}] * 2
+    assert told(prior, voxels=8, side=200.0)[0]["grid"] == "8x8x8"  # which these settings tell
 
 
 @pytest.mark.parametrize("file", sorted((ROOT / "configs" / "ablate").glob("*.yaml")), ids=lambda file: file.stem)

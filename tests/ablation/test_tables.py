@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 
+import pytest
 import torch
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -14,6 +15,7 @@ from phydict.ablation.fid import FID, distance_tables, write_distances
 from phydict.ablation.run import features_file
 from phydict.ablation.summary import summarise, without_repeats
 from phydict.ablation.tables import all_tables
+from phydict.datasets.cts.ct_rate import patient_of
 from phydict.evaluation import read_csv, write_csv
 from phydict.evaluation.backbones import DIMENSIONS
 from phydict.evaluation.fid import NAMES, save_features
@@ -60,6 +62,102 @@ def test_voxels_are_a_methods_where_a_protocols_are_scored_and_else_the_xrays():
     assert not any(entry.condition for entry in entries)
     *_, first, second = summarise([*scored, *(row("a", "y", 20.0, voxels=voxels) for voxels in (64, 128))])
     assert (first.condition["voxels"], second.condition["voxels"]) == (64, 128) and not first.settings.get("voxels")
+
+
+@pytest.mark.parametrize("name, values", [("grid", ("16x16x16", "24x24x24")),
+                                          ("window", ("[-1000, 600]", "[-1000, 300]"))])
+def test_what_was_scored_on_other_voxels_or_windows_is_neither_averaged_nor_ranked_together(name, values):
+    rows = [row(case, method, 20.0 + n, **{name: value}) for value in values for n, method in enumerate("xy")
+            for case in "ab"]
+    entries = summarise(rows)
+    assert [(entry.method, entry.condition) for entry in entries] == [
+        (method, {name: value}) for value in values for method in "xy"]
+    tables = all_tables(entries)
+    assert [table.title for table in tables] == [title for value in values for title in (
+        f"Methods, {name} {value}", f"Methods, {name} {value}: less y, case by case")]
+    older = row("a", "z", 20.0, grid=rows[0]["grid"])  # which tells no window
+    assert not any(entry.condition for entry in summarise([*rows[:4], older]))
+
+
+def test_voxels_that_a_setting_of_the_xrays_or_a_protocol_tells_are_no_condition_of_their_own():
+    rows = [row("a", "x", 20.0, grid=f"{voxels}x{voxels}x{voxels}", **{name: value}) for voxels, name, value in (
+        (128, "protocol", "x2ct"), (256, "protocol", "luna16"), (32, "voxels", 32), (48, "voxels", 48))]
+    assert [entry.condition for entry in summarise(rows)] == [
+        {"protocol": "x2ct"}, {"protocol": "luna16"}, {"voxels": 32}, {"voxels": 48}]
+
+
+def test_a_setting_of_the_xrays_that_is_not_given_means_its_default():
+    defaults = {"simulator.noise": 0.005, "source_to_detector": 1020.0, "centre": (0.0, 0.0, 0.0), "pixel": 1.25}
+    for name, default in defaults.items():
+        other = (0.0, 0.0, 9.0) if name == "centre" else 2 * default
+        for as_stored in (lambda value: value, lambda value: str(value) if isinstance(value, tuple) else value):
+            rows = [row("a", "x", 20.0), row("a", "y", 21.0, **{name: as_stored(default)}),
+                    *(row("a", method, 22.0, **{name: as_stored(other)}) for method in "xy")]
+            first, second, *others = summarise(rows)
+            assert first.condition == second.condition != others[0].condition == others[1].condition, name
+    fixed = {"protocol": "x2ct", "views": 2}
+    first, second, _ = summarise([row("a", "x", 20.0, **fixed), row("a", "y", 20.0, pixel=1.5625, **fixed),
+                                  row("a", "x", 20.0, pixel=2.5)])
+    assert first.condition == second.condition == fixed | {"pixel": 1.5625}
+
+
+def test_a_case_of_other_data_is_another_case():
+    other = "train_1_a_1"
+    rows = [row("a", "x", 10.0, data="d1"), row(other, "x", 20.0, data="d2"), row("b", "x", 9.0, data="d4"),
+            row("a", "y", 31.0, data="d1"), row(other, "y", 40.0, data="d3"), row("b", "y", 29.0, data="d4"),
+            row("a", "z", 30.0), row(other, "z", 40.0), row("b", "z", 28.0)]
+    x, y, z = entries = summarise(rows)
+    assert x.case_ids == z.case_ids == {"a", "b", other} and set(map(patient_of, y.case_ids)) == {"a", "b", "train_1"}
+    table, differences = all_tables(entries)
+    assert not table.ranks and all("neither ranked nor paired: train_1_a_1, train_1__train_1_a_1 (2)." in
+                                   " ".join(of.notes) for of in (table, differences))
+    assert {label: values[1].mean for label, _, values in differences.lines} == {"x": -20.5, "z": -1.0}
+    assert without_repeats([*rows, rows[1] | {"data": "d9"}]) == rows
+
+
+def test_rows_of_older_tables_that_tell_no_window_are_repeats_of_those_that_do():
+    one, other = (row("a", "x", 10.0, window=window) for window in ("[-1000, 600]", "[-1000, 300]"))
+    old = row("a", "x", 11.0)
+    assert without_repeats([one, other, old]) == [one, other] and without_repeats([old, one, other]) == [old]
+
+
+def test_one_case_that_no_method_has_takes_no_marks_pairs_or_plots(tmp_path):
+    rows = [row(case, method, None if case == "c" else 20.0 + n, views=views)
+            for n, method in enumerate("xy") for case in "abc" for views in (2, 8)]
+    entries = summarise(rows)
+    whole = summarise(of for of in rows if of["case"] != "c")
+    for found, wanted in zip(all_tables(entries), all_tables(whole), strict=True):
+        assert found.cells() == wanted.cells() and found.title == wanted.title
+        assert "(2 of 3 cases)" in found.markdown()
+    names = [file.name for file in plots.write_plots(tmp_path, entries)]
+    assert names == [file.name for file in plots.write_plots(tmp_path, whole)] and "views.png" in names
+    rows[-1] = row("c", "y", 30.0, views=8)
+    rows[-3] = row("b", "y", None, views=8)
+    assert not all_tables(summarise(rows))[-1].ranks  # as many cases, but not the same
+
+
+def test_pictures_that_are_no_plots_of_this_command_stay_and_its_own_too_where_cases_failed(tmp_path):
+    Figure().savefig(tmp_path / "pareto_mine.png")
+    (tmp_path / "stages_notes.png").write_text("no picture")
+    rows = [row("a", method, 20.0 + n, views=views) for n, method in enumerate("xy") for views in (2, 8)]
+    mine = {"pareto_mine.png", "stages_notes.png"}
+    first = {file.name for file in plots.write_plots(tmp_path, summarise(rows))}
+    failed = [row("a", method, None, views=views) for method in "xy" for views in (2, 8)]
+    assert plots.write_plots(tmp_path, summarise(failed)) == []
+    assert {path.name for path in tmp_path.iterdir()} == first | mine
+    fewer = {file.name for file in plots.write_plots(tmp_path, summarise(of for of in rows if of["views"] == 2))}
+    assert {path.name for path in tmp_path.iterdir()} == fewer | mine and not fewer & first
+
+
+def test_a_table_tells_methods_whose_rows_were_computed_in_several_precisions():
+    rows = [row(case, method, 20.0, precision="bfloat16" if (case, method) == ("b", "x") else "float32")
+            for method in "xy" for case in "ab"]
+    told = "Networks computed in several precisions: x float32, bfloat16; the setting precision fixes one."
+    assert all(told in table.notes for table in all_tables(summarise(rows)))
+    for of in rows:
+        of["networks.precision"] = of["precision"]
+    assert [entry.label for entry in summarise(rows)] == ["x, precision float32", "x, precision bfloat16", "y"]
+    assert not any("several precisions" in note for table in all_tables(summarise(rows)) for note in table.notes)
 
 
 def test_geometries_with_detectors_of_their_own_are_compared():

@@ -10,7 +10,7 @@ import torch
 from command_lines import refusal
 from prior.medsyn_files import entries, super_resolution_unet, text_unet, write
 
-from inference.runs import BEAM, LAUGHS, ORBIT, contents, phantoms, sirt, with_prior
+from inference.runs import BEAM, LAUGHS, ORBIT, contents, phantoms, record, sirt, with_prior
 from phydict.baselines import SIRT
 from phydict.cli.infer import main
 from phydict.grid import Grid
@@ -103,6 +103,27 @@ def test_stages_in_each_others_place_are_one_sentence(prior, fine, measured, tmp
     assert "SIRT has none" in said
 
 
+@pytest.mark.parametrize("setting", ["guided=false", "guided=true", "noise_augmentation=0.3", "memory=1",
+                                     "sampler=phydict.posterior.DDS"])
+def test_settings_of_a_second_stage_are_refused_without_its_file(setting, measured, prior, tmp_path, capsys):
+    name, data = setting.partition("=")[0], f"--data.xrays={measured}"
+    for run in (sirt("predict", tmp_path / "out", data), with_prior("predict", tmp_path / "out", prior, data)):
+        said = refusal(capsys, main, [*run, f"--model.super_resolution.{setting}"])
+        assert f"model.super_resolution.{name} means nothing without model.super_resolution.file" in said
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.filterwarnings("default")
+def test_a_configuration_says_of_any_second_stage_whether_it_is_guided(prior, fine, tmp_path):
+    configured = ["-c", "{model: {super_resolution: {guided: false}}}"]
+    for file in ([], [f"--model.super_resolution.file={fine}"]):
+        args = with_prior("test", tmp_path / str(len(file)), prior, "--data.cts=phantom", "--data.phantoms=1", *ORBIT)
+        main([*args, *configured, *file, *["--model.super_resolution.noise_augmentation=0.1"] * len(file)])
+    [case] = (tmp_path / "1" / "prior_only").glob("phantom*")
+    assert record(case)["settings"]["sr_noise_augmentation"] == 0.1
+    assert record(case)["settings"]["second"]["class"] == "PriorOnly"
+
+
 def test_a_prior_refuses_xrays_of_another_grid(prior):
     posterior = reconstructor(PriorOnly(iterations=1), prior)
     with pytest.raises(ValueError, match="16.*64.*use the prior's grid"):
@@ -125,6 +146,11 @@ def test_phantoms_are_not_chosen_among_as_a_folder_s_cts_are(change, tmp_path, c
     option = change.replace("--data.", "--").replace("source.reports", "reports").split("=")
     said = refusal(capsys, main, ["ablate", "-c", str(tmp_path / "spec.yaml"), "--out", str(tmp_path / "out"), *option])
     assert "the cases are phantoms" in said and not (tmp_path / "out").exists()
+
+
+def test_a_number_of_phantoms_is_refused_beside_a_folder_of_cts(cts, tmp_path, capsys):
+    said = refusal(capsys, main, sirt("test", tmp_path / "out", f"--data.cts={cts}", *ORBIT, "--data.phantoms=2"))
+    assert f"the cases are the CTs of {cts}: leave it out" in said and not (tmp_path / "out").exists()
 
 
 def test_measured_x_rays_and_their_calibration_are_refused_where_x_rays_are_simulated(measured, tmp_path, capsys):

@@ -18,11 +18,12 @@ import yaml
 from command_lines import refusal
 from processes import INFER, Python
 
-from inference.runs import FILES, ORBIT, contents, names, phantoms, record, sirt, stamp, volume
+from inference.runs import FILES, ORBIT, contents, names, phantoms, record, sirt, stamp, volume, with_prior, xrays
 from phydict.baselines import SIRT
 from phydict.cli.infer import main
 from phydict.datasets import load_xrays
 from phydict.methods import reconstruct
+from phydict.xray import ConeBeam
 
 
 @contextmanager
@@ -105,11 +106,38 @@ def test_results_are_never_written_among_the_cts(cts, tmp_path, capsys):
     assert "lies inside the input" in said and contents(cts) == before
 
 
-@pytest.mark.parametrize("name", ["../other", "/{out}/other", "a/b", "..", ".", ""])
+@pytest.mark.parametrize("name", ["../other", "/{out}/other", "a/b", "..", ".", ".x", ""])
 def test_a_name_is_that_of_one_folder_inside_the_output(measured, tmp_path, capsys, name):
     name = name.format(out=str(tmp_path).strip("/"))
     said = refusal(capsys, main, sirt("predict", tmp_path / "out", f"--data.xrays={measured}", f"--model.name={name}"))
     assert f"one folder inside model.out, but '{name}' was given" in said and names(tmp_path) == []
+
+
+@pytest.mark.filterwarnings("default")
+def test_a_coarse_volume_that_is_to_be_kept_is_made_where_a_finished_case_lacks_it(measured, prior, tmp_path, capsys):
+    args = with_prior("predict", tmp_path, prior, f"--data.xrays={measured / 'anna'}", "--model.grid=24")
+    folder, keep = tmp_path / "prior_only" / "anna", "--model.grid.keep_coarse=true"
+    main(args)
+    main([*args, keep])
+    assert (folder / "coarse.nii.gz").is_file() and "finished already" not in capsys.readouterr().err
+    before = stamp(folder)
+    for again in (args, [*args, keep]):
+        main(again)
+    assert stamp(folder) == before
+    (folder / "coarse.nii.gz").unlink()
+    (folder / "notes.txt").write_text("mine")
+    assert "notes.txt" in refusal(capsys, main, [*args, keep]) and stamp(folder) == before
+
+
+@pytest.mark.filterwarnings("default")
+def test_a_finished_case_is_kept_where_no_coarse_volume_was_made(measured, tmp_path):
+    small = xrays(tmp_path / "small", ConeBeam.orbit(3, 600.0, 300.0, (24, 24), 2.5))
+    for case, box in ((measured / "anna", ["--model.grid=32"]), (small, ["--model.grid=16", "--model.grid.side=60"])):
+        args = sirt("predict", tmp_path / "out", f"--data.xrays={case}", *box)
+        main(args)
+        before = stamp(tmp_path / "out" / "sirt" / case.name)
+        main([*args, "--model.grid.keep_coarse=true"])
+        assert stamp(tmp_path / "out" / "sirt" / case.name) == before
 
 
 @pytest.mark.parametrize("several", [False, True])

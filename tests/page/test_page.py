@@ -133,15 +133,33 @@ def test_what_is_of_unlike_xrays_or_voxels_is_neither_ranked_nor_paired_together
         assert title in second["title"] and title not in first["title"] and first["title"] != second["title"]
 
 
-def test_what_is_no_matter_of_xrays_and_voxels_keeps_cases_in_one_table_as_a_report_and_a_seed(tmp_path):
+def test_what_is_no_matter_of_xrays_and_voxels_keeps_cases_in_one_table_as_a_report(tmp_path):
     for n, (method, change) in enumerate((("fdk", {}), ("sirt", {"with_report": False}), ("tv", {"photons": None}))):
-        settings = of_test() | {"seed": n}
+        settings = of_test()
         settings["data"] |= {name: value for name, value in change.items() if name == "with_report"}
         settings["data"]["simulator"] |= {name: value for name, value in change.items() if name == "photons"}
         finish(tmp_path, "anna", method, settings=settings, scores={"psnr": 20.0 + n})
     held = content(results_page(tmp_path))
     assert [table["title"] for table in held["tables"]] == ["Scores by method"]
     assert [case["places"]["psnr"] for case in held["cases"]] == [0, 2, 1]
+
+
+@pytest.mark.parametrize("of", [{"settings": of_test() | {"seed": 1}}, {"source": "crc32 2"}], ids=["seed", "data"])
+def test_cases_of_one_name_but_other_data_or_seeds_are_neither_ranked_nor_paired(tmp_path, monkeypatch, of):
+    monkeypatch.setitem(DIMENSIONS, "squeezenet", 3)
+    for n, (method, change) in enumerate((("fdk", {}), ("sirt", {}), ("tv", of))):
+        more = {"settings": of_test()} | change
+        more["settings"] |= {"fid_backbone": "squeezenet"}
+        folder = finish(tmp_path, "anna", method, scores={"psnr": 20.0 + n}, **more)
+        generator = torch.Generator().manual_seed(n)
+        save_features(folder / FEATURES, {plane: torch.randn(2, 9, 3, generator=generator) for plane in PLANES})
+    held = content(results_page(tmp_path))
+    assert [case["places"]["psnr"] for case in held["cases"]] == [2, 1, 0]
+    assert {table["title"] for table in held["tables"]} == {"Scores by method", "Frechet distance of slices (FID)"}
+    for table in held["tables"]:
+        assert not any(cell.get("place") for row in table["rows"] for cell in row)
+        assert "under one name, and so neither ranked nor paired: anna, anna (2)." in " ".join(table["notes"])
+    assert all(case["record"]["case"] == "anna" for case in held["cases"])
 
 
 def test_seconds_of_first_calls_are_not_ranked(tmp_path):

@@ -82,8 +82,9 @@ def test_a_report_that_states_no_finding_counts_as_none(probability, heard):
 def test_where_more_slices_are_reconstructed_it_starts_from_what_the_prior_makes_on_its_own():
     refiner = tiny_refiner(begins=True).bind(REPORTS[0], precision="float32")
     tall = replace(FEW, continued=True)
-    own, grown = (METHOD.start_state(refiner, Measurement(Projector(grid, tall, full_detector=True), xrays(FEW), WINDOW))
-                  for grid in (GRID, GRID.grown(0, 0, 4)))
+    own, grown = (
+        METHOD.start_state(refiner, Measurement(Projector(grid, tall, full_detector=True), xrays(FEW), WINDOW))
+        for grid in (GRID, GRID.grown(0, 0, 4)))
     assert torch.equal(grown[..., 4:-4], own)
     assert torch.equal(grown[..., :4], own[..., :1].expand(-1, -1, -1, -1, 4))
     assert torch.equal(grown[..., -4:], own[..., -1:].expand(-1, -1, -1, -1, 4))

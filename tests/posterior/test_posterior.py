@@ -1,6 +1,9 @@
 """The whole method on a tiny prior: what a result depends on, and what is refused."""
 
 import json
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import nibabel
 import numpy as np
@@ -10,8 +13,9 @@ from laws import random_like
 from prior.tiny import REPORTS, tiny_prior
 
 from phydict.grid import Grid
+from phydict.guard import BAD_GUESS
 from phydict.methods import METHODS
-from phydict.posterior import GradientSteps, Posterior, PriorOnly, ProximalCG, Refined, SplitGibbs
+from phydict.posterior import GradientSteps, Posterior, PriorOnly, ProximalCG, Refined, Sampler, SplitGibbs
 from phydict.prior import load_prior, save_prior
 from phydict.reconstruction import describe
 from phydict.units import HUWindow
@@ -176,6 +180,44 @@ def test_the_window_of_the_prior_is_the_window_of_the_result(prior):
     y = PROJECTOR(HUWindow(-1000, 600).to_mu(x))[0]
     sampler = SplitGibbs(10, ProximalCG(60, noise=1e-3), ProximalCG(60, noise=1e-3))
     assert Posterior(prior, sampler).reconstruct(y, PROJECTOR).misfit < 0.01
+
+
+@dataclass(frozen=True)
+class Own(Sampler):
+    """A sampler that gives what its `function` makes of the noise."""
+
+    function: Callable = field(default=lambda measurement, x: x.clamp(-1, 1))
+
+    def steps(self):
+        return 1
+
+    def sample(self, denoiser, measurement, x, generator, on_step=lambda: None):
+        on_step()
+        return self.function(measurement, x)
+
+
+class Short(Own):
+    def sample(self, denoiser, measurement, x):
+        return x
+
+
+@pytest.mark.parametrize("sampler, words", [
+    (Own(lambda measurement, x: None), r"sample of the sampler Own must return .* of shape \(1, 4, .* gave NoneType"),
+    (Own(lambda measurement, x: x[..., :-1]), r"sample of the sampler Own must return .* gave \(1, 4, 16, 16, 15\)"),
+    (Own(lambda measurement, x: x[0, 0]), r"sample of the sampler Own must return .* gave \(16, 16, 16\)"),
+    (Short(), r"sample of the sampler Short is called as .*on_step\), but is written as \(denoiser, measurement, x\)")])
+def test_what_a_sampler_of_ones_own_gives_wrongly_is_one_sentence_that_names_its_class(prior, sampler, words):
+    with pytest.raises(ValueError, match=words):
+        Posterior(prior, sampler).reconstruct(views(), PROJECTOR)
+
+
+def test_what_explains_no_xrays_is_told_of_every_method_but_one_that_does_not_look_at_them(prior):
+    dense = torch.full((1, prior.state_channels, *GRID.shape), 1.0)
+    with pytest.warns(UserWarning, match="no volume was found .* and the method does not correct"):
+        Posterior(prior, Own(lambda measurement, x: dense)).reconstruct(views(), PROJECTOR)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert Posterior(prior, PriorOnly(2)).reconstruct(views(), PROJECTOR).misfit > BAD_GUESS
 
 
 def test_a_prior_whose_window_cannot_hold_air_is_refused():

@@ -14,6 +14,7 @@ from phydict.grid import Grid
 from phydict.methods import onto_grid, reconstruct, reconstructor
 from phydict.posterior import Measurement, PriorOnly, ProximalCG, Refined, Refinement
 from phydict.prior import CorrectionNetwork
+from phydict.prior.uncertainty import LEVELS
 from phydict.runtime.reading import check_memory
 from phydict.units import HUWindow, hu_to_mu
 from phydict.xray import ConeBeam, Projector
@@ -183,6 +184,44 @@ def test_a_correction_makes_the_back_projection_of_ones_once_and_is_told_of_the_
     assert once - none == 4 and thrice - once == 2 * 3  # evidence takes two, a refit one, and A' 1 is the first's
     assert all(seen == pytest.approx(noise, rel=1e-4) for seen, noise in told)
     assert told[0] != pytest.approx(told[1], rel=1e-2)
+
+
+class Sure(Known):
+    """The same with intervals of 10 HU at levels of its own."""
+
+    def __init__(self, *levels: float):
+        super().__init__()
+        self.levels = levels
+
+    def reconstruct(self, *args, **settings):
+        wide = torch.full(self.grid.shape, 10.0)
+        return replace(super().reconstruct(*args, **settings), intervals=dict.fromkeys(self.levels, wide))
+
+
+def test_intervals_of_any_levels_are_made_on_finer_voxels_by_shares_between_those_of_the_known_ones(xrays):
+    ready = Refined(Sure(0.3, 0.5, 0.68, 0.8, 0.93, 0.95, 0.99), Grid.cube(32))
+    found = ready.reconstruct(*fit_to_grid(ready, ready.grid, xrays, BEAM)).intervals
+    assert list(found) == list(ready.base.levels)
+    torch.testing.assert_close(found[0.68], 0.4 * found[0.5] + 0.6 * found[0.8])
+    assert found[0.3].equal(found[0.5]) and found[0.99].equal(found[0.95])
+    assert (found[0.93] <= found[0.95]).all() and found[0.93].mean() < found[0.95].mean()
+
+
+def test_a_network_that_knows_intervals_of_the_usual_levels_leaves_others_alone(xrays):
+    class Knowing(Watched):
+        def __init__(self):
+            pass
+
+        def corrected(self, z, evidence, precision):
+            return z
+
+        def half_widths(self, level, seen, precision):
+            return torch.zeros(1, len(LEVELS), *level.shape)
+
+    for levels, known in ((LEVELS, True), ((0.68,), False), ((0.68, 0.9), False)):
+        ready = Refined(Sure(*levels), Grid.cube(32), networks=(Knowing(),))
+        found = ready.reconstruct(*fit_to_grid(ready, ready.grid, xrays, BEAM)).intervals
+        assert tuple(found) == levels and all((width == 0).all() == known for width in found.values())
 
 
 def test_what_contradicts_counts_as_noise_on_finer_voxels_too(xrays):

@@ -4,18 +4,22 @@ import json
 import re
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 import yaml
 from command_lines import refusal
+from posterior.scene import PROJECTOR, views
 
 import phydict
 from phydict.cli.infer import main as infer
+from phydict.diffusion import CosineSchedule
 from phydict.inference import ReconstructionTask
 from phydict.methods import METHODS, reconstructor
 from phydict.prior import find_prior, own_identity
 from phydict.runtime.own_code import own_code
+from prior.tiny import tiny_prior
 
 MODULE = (Path(__file__).parents[2] / "data" / "example" / "own_prior" / "my_prior.py").read_text() + '''
 
@@ -51,6 +55,39 @@ class Derived(OwnPrior, torch.nn.Module):
 
 class Unbound:
     grid, window, state_channels = Grid.cube(16), HUWindow(), 1
+
+
+class Needy(OwnPrior):
+    def __init__(self, hu):
+        self.hu = hu
+
+
+class Reportless(OwnPrior):
+    def bind(self, report):
+        return super().bind(report, 1.0, "auto")
+
+
+class Nothing(OwnPrior):
+    def bind(self, report, guidance, precision):
+        super().bind(report, guidance, precision)
+
+
+class Given(OwnPrior):
+    def bind(self, report, guidance, precision):
+        return self.denoiser
+
+
+class Timeless(CosineSchedule):
+    def alpha_bar(self, t):
+        return super().alpha_bar(t) ** 2
+
+
+class Dropping(Derived):
+    precision = "float32"
+
+    def bind(self, report, guidance, precision):
+        self.was_training = self.training
+        return super().bind(report, guidance, precision)
 '''
 
 
@@ -128,13 +165,71 @@ def test_other_weights_are_another_prior_however_it_is_made(module, tmp_path):
 
 def test_what_keeps_no_contract_is_refused_in_one_sentence(module, xrays, tmp_path):
     for path, words in (("Unbound", "Unbound lacks bind: see phydict.prior.PriorContract"),
-                        ("Absent", "cannot be made .*module must be importable")):
+                        ("Absent", "cannot be imported: module own_.* has no Absent"),
+                        ("Needy", "Needy cannot be made .*missing 1 required .*: its settings need defaults")):
         with pytest.raises(ValueError, match=words):
             find_prior(f"{module}.{path}")
     with pytest.raises(ValueError, match="dict lacks grid, window, state_channels, bind"):
         reconstructor("phydict_fast", {})
     with pytest.raises(ValueError, match=r"states like those it is given, \(1, 1, 16, 16, 16\)"):
         phydict.reconstruct(xrays["xrays"], xrays["beam"], f"{module}.Shapeless", display=xrays["display"])
+
+
+@pytest.mark.parametrize("kind, denoiser, words", [
+    ("Reportless", None, r"bind of the prior Reportless is called as \(report, guidance, precision\), but is "
+                         r"written as \(report\)"),
+    ("Nothing", None, r"bind of the prior Nothing must return a denoiser.* NoneType, lacks denoise, schedule"),
+    ("Given", SimpleNamespace(denoise=lambda x, t: x), "bind of the prior Given .* lacks schedule:"),
+    ("Given", SimpleNamespace(schedule=CosineSchedule()), "bind of the prior Given .* lacks denoise:"),
+    ("Given", SimpleNamespace(denoise=lambda x, t: x, schedule=SimpleNamespace(scales=min, steps=min)),
+     "lacks schedule.sigma, schedule.time:"),
+    ("Given", SimpleNamespace(denoise=lambda x: x, schedule=CosineSchedule()), r"denoise of the prior Given .*, t\)"),
+    ("Given", SimpleNamespace(denoise=lambda x, t: None, schedule=CosineSchedule()), "NoneType came: correct the")])
+def test_what_bind_returns_is_refused_in_one_sentence_that_names_the_class(module, kind, denoiser, words):
+    prior = vars(import_module(module))[kind]()
+    prior.denoiser = denoiser
+    with pytest.raises(ValueError, match=words):
+        of_scene(prior)
+
+
+def test_a_schedule_whose_time_is_of_another_is_warned_of(module):
+    prior, made = find_prior(f"{module}.Given"), vars(import_module(module))
+    prior.denoiser = made["Smooth"](-0.5, made["Timeless"]())
+    with pytest.warns(UserWarning, match="the schedule of the prior Given contradicts itself: time"):
+        of_scene(prior)
+
+
+def of_scene(prior):
+    return reconstructor("prior_only", prior).reconstruct(views(), PROJECTOR)
+
+
+def test_a_network_of_ones_own_is_asked_in_evaluation_and_told_by_its_own_settings_and_precision(module):
+    made = vars(import_module(module))
+    prior = made["Dropping"]()
+    told, result = own_identity(prior, prior), of_scene(prior)
+    assert not prior.was_training and result.precision == "float32"
+    assert not {"training", "_is_full_backward_hook"} & set(told) and told["hu"] == -500.0
+    assert {of_scene(made[name]()).precision for name in ("OwnPrior", "Underived", "Derived")} == {"own"}
+    assert own_identity(prior, prior) == told | {"was_training": False}
+    assert of_scene(tiny_prior()).precision in ("float32", "bfloat16")
+
+
+def test_the_example_that_predicts_noise_has_the_schedule_of_ddpm_and_the_denoiser_of_its_network(monkeypatch):
+    monkeypatch.syspath_prepend(Path("data/example/own_prior"))
+    prior = find_prior("noise_prior.NoisePrior")
+    denoiser, times = prior.bind("", 1.0, "auto"), torch.arange(1, 1001, dtype=torch.float64) / 1000
+    exact = (1 - torch.linspace(1e-4, 0.02, 1000, dtype=torch.float64)).cumprod(0)
+    schedule = denoiser.schedule
+    assert ((schedule.alpha_bar(times).log() - exact.log()).abs() < 0.01 + 0.01 * exact.log().abs()).all()
+    for t in (0.02, 0.3, 1.0):
+        assert schedule.time(float(schedule.sigma(t))) == pytest.approx(t)
+    x0, noise = torch.rand(2, 1, 4, 4, 4) - 0.5, torch.randn(2, 1, 4, 4, 4)
+    signal, sigma = (float(weight) for weight in schedule.scales(0.4))
+    knows = type(denoiser)(lambda x, steps: noise if (steps == 400).all() else None)
+    torch.testing.assert_close(knows.denoise(signal * x0 + sigma * noise, 0.4), x0, atol=1e-4, rtol=0)
+    reconstructed = phydict.reconstruct(**{name: phydict.load_xrays("data/example/xrays")[name]
+                                           for name in ("xrays", "beam")}, prior=prior, method="prior_only")
+    assert reconstructed.volume.shape == (32, 32, 32)
 
 
 def test_an_empty_file_is_not_taken_for_no_prior(tmp_path, capsys):

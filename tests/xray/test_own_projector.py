@@ -116,10 +116,59 @@ def test_one_that_gives_something_else_is_refused_by_its_name(module, old, new, 
         Projector(GRID, BEAM, module(OWN.replace(old, new)).Own)
 
 
-def test_a_transpose_that_is_not_the_adjoint_is_warned_of(module):
-    kind = module(OWN.replace("return self.A.T(xrays)", "return 1.01 * self.A.T(xrays)")).Own
+SCENES = {"few": (GRID, BEAM), "fine": (Grid.cube(64), ConeBeam.orbit(4, 1020.0, 740.0, (56, 56), 8.0)),
+          "tilted": (Grid.cube(24, 360.0), ConeBeam.orbit(3, 1020.0, 740.0, (40, 40), 12.0).tilted(7.0)),
+          "long": (Grid((16, 20, 12), (20.0, 16.0, 25.0)), ConeBeam.orbit(3, 1020.0, 740.0, (40, 40), 12.0)),
+          "box": (Grid.box(16, 60.0, (40.0, 30.0, -20.0)), ConeBeam.orbit(4, 1020.0, 740.0, (112, 112), 4.0)),
+          "beside": (Grid.box(8, 60.0, (0.0, 0.0, 190.0)), ConeBeam.orbit(2, 1020.0, 740.0, (24, 40), 4.0))}
+
+
+@pytest.mark.parametrize("transpose", ["1.01 * self.A.T(xrays)", "self.A.T(xrays).flip(2)", "self.A.T(xrays).flip(4)",
+                                       "self.A.T(xrays.flip(1))", "self.A.T(xrays.flip(3))"])
+def test_a_transpose_that_is_not_the_adjoint_is_warned_of(module, transpose):
+    kind = module(OWN.replace("return self.A.T(xrays)", f"return {transpose}")).Own
     with pytest.warns(UserWarning, match="T of the projector Own is not the adjoint of A"):
-        Projector(GRID, BEAM, kind)
+        Projector(*SCENES["fine"], kind, full_detector=True)
+
+
+def changed(module, volume: str = "", views: str = "") -> type:
+    """A projector of volumes and of views that are changed before and afterwards, with the exact adjoint."""
+    code = OWN.replace("self.A(mu)", f"self.A(mu{volume}){views}")
+    return module(code.replace("self.A.T(xrays)", f"self.A.T(xrays{views}){volume}")).Own
+
+
+@pytest.mark.parametrize("volume, views, words", [
+    ("", " / 10", "Own is 0.1 of what phydict's projector gives for a test body: attenuation is in 1/mm"),
+    ("", " * 0", "Own is 0 of what"), (".flip(2)", "", "Own shows a test body elsewhere"),
+    (".flip(3)", "", "shows a test body elsewhere"), (".flip(4)", "", "shows a test body elsewhere"),
+    (".transpose(2, 3)", "", "shows a test body elsewhere"), (".transpose(3, 4)", "", "shows a test body elsewhere"),
+    ("", ".flip(1)", "shows a test body elsewhere"), ("", ".flip(2)", "shows a test body elsewhere"),
+    ("", ".flip(3)", r"elsewhere .* most in view \d \(counted from 0\): check that no axis is flipped")])
+def test_other_units_and_other_axes_are_warned_of(module, volume, views, words):
+    with pytest.warns(UserWarning, match=words) as warned:
+        Projector(GRID, BEAM, changed(module, volume, views))
+    assert len(warned) == 1
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("method", ["separable", "siddon", "eq4", "joseph"])
+def test_other_models_of_the_rays_are_not_warned_of(module, method, scene):
+    if method != "separable" or scene != "tilted":
+        grid, beam = SCENES[scene]
+        Projector(grid, beam.with_continued(False), module(OWN.replace("joseph", method)).Own, full_detector=True)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("scene", ["few", "fine", "tilted"])
+def test_a_detector_that_blurs_is_not_warned_of(module, scene):
+    code = OWN.replace("import Projector", "import Projector\nfrom torch import full\nfrom torch.nn.functional import "
+                       "conv3d").replace("class", """def blur(views):
+    return conv3d(views[:, None], full((1, 1, 1, 3, 3), 1 / 9).to(views), padding=(0, 1, 1))[:, 0]
+
+
+class""").replace("self.A(mu)", "blur(self.A(mu))").replace("self.A.T(xrays)", "self.A.T(blur(xrays))")
+    Projector(*SCENES[scene], module(code).Own, full_detector=True)
 
 
 def test_what_is_no_projector_is_refused_in_one_sentence(module):

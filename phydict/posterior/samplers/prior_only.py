@@ -28,6 +28,7 @@ class PriorOnly(Sampler):
     iterations: int = 50
     final_denoise: bool | None = None
     batches = True
+    sees_xrays = False
 
     def steps(self) -> int:
         return self.iterations + bool(self.final_denoise)

@@ -1,0 +1,81 @@
+"""Volumes that another program made, in the place of a reconstruction."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from phydict.baselines.baseline import Baseline, CountingProjector
+from phydict.datasets import load_ct
+from phydict.datasets.cts.transforms import to_grid
+from phydict.grid import Grid
+from phydict.units import AIR, MU_WATER, hu_to_mu
+from phydict.xray.boxes import along, averaged, interpolated, no_finer
+
+
+@dataclass(frozen=True)
+class Stored(Baseline):
+    """The volume of a case, made by another program from its X-rays: <folder>/<case>.nii.gz, <folder>/<case>.nii or, as
+    predict writes it, <folder>/<case>/volume.nii.gz.
+
+    In HU, in world mm of the X-rays' geometry; averaged or interpolated onto the voxels that are wanted, air outside.
+    Its misfit is that of the X-rays that it is compared on.
+
+    Args:
+        folder: of the volumes; where one of them changes, what was made of them before is made again
+        mu_water: attenuation of water in 1/mm in the X-rays
+        name: what results call the method
+        case: whose volume; infer.py fills it in
+    """
+
+    local = True
+    folder: str = ""
+    mu_water: float = MU_WATER
+    name: str = "stored"
+    case: str = ""
+    files: str = field(default="", init=False)
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.folder and not self.case:
+            stats = ((file.relative_to(self.folder), file.stat()) for file in sorted(Path(self.folder).rglob("*.nii*")))
+            stated = "".join(f"{name} {stat.st_size} {stat.st_mtime_ns}\n" for name, stat in stats)
+            object.__setattr__(self, "files", f"crc32 {zlib.crc32(stated.encode()):08x}")
+
+    def of_case(self, case: str) -> Stored:
+        return replace(self, case=case)
+
+    def steps(self) -> int:
+        return 1
+
+    @property
+    def file(self) -> Path:
+        """The file of the case. Raises ValueError where the folder or the case is not given, FileNotFoundError where
+        there is none."""
+        if not (self.folder and self.case):
+            raise ValueError("Stored shows the volume of a case from a folder, but "
+                             f"folder {self.folder!r} and case {self.case!r} were given: give both")
+        places = [Path(self.folder) / name for name in (
+            f"{self.case}.nii.gz", f"{self.case}.nii", f"{self.case}/volume.nii.gz")]
+        for place in places:
+            if place.is_file():
+                return place
+        raise FileNotFoundError(f"there is no volume of {self.case} in {self.folder}: name it {places[0].name}, or "
+                                f"{self.case}/volume.nii.gz")
+
+    def solve(self, A: CountingProjector, y: Tensor, on_step: Callable[[], None]) -> Tensor:
+        hu, affine = load_ct(self.file)
+        own, volume = Grid(hu.shape, affine=affine), torch.from_numpy(hu)
+        if not along(own, A.grid):
+            volume = torch.from_numpy(to_grid(hu, affine, A.grid, AIR))
+        elif no_finer(A.grid, own):
+            volume = averaged(volume, own, A.grid)
+        else:
+            volume = interpolated(volume, own, A.grid, AIR)
+        on_step()
+        return hu_to_mu(volume, 1.0).to(y)[None, None]

@@ -331,6 +331,11 @@ def test_a_run_of_so_many_steps_that_validates_now_and_then_resumes_as_the_unint
     assert all(torch.equal(one["state_dict"][name], other["state_dict"][name]) for name in one["state_dict"])
 
 
+def test_a_training_that_has_ended_says_that_nothing_is_left(trained, cache, tmp_path, capsys):
+    main(arguments(tmp_path, cache, "--trainer.max_steps=8", f"--ckpt_path={trained / 'last.ckpt'}"))
+    assert "is of step 8 already, and trainer.max_steps is 8: nothing is left to learn" in capsys.readouterr().err
+
+
 def test_an_id_that_is_held_out_is_no_word_for_longer_ones(tmp_path):
     for name in ("1", "10", "21"):
         save_ct(tmp_path / "cts" / f"{name}.nii.gz", thorax_hu())

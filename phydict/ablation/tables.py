@@ -187,8 +187,10 @@ def _measured(names: Sequence[str], entries: Sequence[Entry], empty: Iterable[st
 def _caption(entries: Sequence[Entry], marked: bool) -> str:
     """What the numbers of a table of entries were taken from; marked: whether some are marked as the best."""
     rows = [row for entry in entries for row in entry.rows]
-    count, seeds = len({row["case"] for row in rows}), len({row.get("seed") for row in rows})
-    over = f"Mean over {count} cases" if count > 1 else "One case" if seeds == 1 else "Mean over the seeds of one case"
+    of, seeds = len({row["case"] for row in rows}), len({row.get("seed") for row in rows})
+    count = len({case for entry in entries for case in entry.case_ids}) or of
+    among = f"{count} of {of}" if count < of else count
+    over = f"Mean over {among} cases" if of > 1 else "One case" if seeds == 1 else "Mean over the seeds of one case"
     how = " on ".join(filter(None, (listed(rows, name) for name in ("precision", "instruction_set"))))
     window = next((protocol.window for protocol in _protocols(rows)), RANGE)
     return caption(over, marked, rows, {"Grid": "grid", "Seeds": "seed"}, window) + (

@@ -42,6 +42,8 @@ class Stored(Baseline):
 
     def __post_init__(self):
         super().__post_init__()
+        if self.folder and not Path(self.folder).is_dir():
+            raise ValueError(f"there is no folder {self.folder} of volumes: give the one that holds them")
         if self.folder and not self.case:
             stats = ((file.relative_to(self.folder), file.stat()) for file in sorted(Path(self.folder).rglob("*.nii*")))
             stated = "".join(f"{name} {stat.st_size} {stat.st_mtime_ns}\n" for name, stat in stats)
@@ -58,8 +60,9 @@ class Stored(Baseline):
         """The file of the case. Raises ValueError where the folder or the case is not given, FileNotFoundError where
         there is none."""
         if not (self.folder and self.case):
+            wanted = "give the folder" if self.case else "give the folder, and in Python the case"
             raise ValueError("Stored shows the volume of a case from a folder, but "
-                             f"folder {self.folder!r} and case {self.case!r} were given: give both")
+                             f"folder {self.folder!r} and case {self.case!r} were given: {wanted}")
         places = [Path(self.folder) / name for name in (
             f"{self.case}.nii.gz", f"{self.case}.nii", f"{self.case}/volume.nii.gz")]
         for place in places:

@@ -235,10 +235,14 @@ class PriorCLI(ProgressCLI):
             begins = command == "fit" and settings.ckpt_path == "last" and not file.is_file()
             settings.ckpt_path = None if begins else str(file)
         if checkpoint := settings.ckpt_path:
-            lacks = [part for part in RESUMED if part not in read_checkpoint(checkpoint)]
+            read = read_checkpoint(checkpoint)
+            lacks = [part for part in RESUMED if part not in read]
             if lacks:
                 raise ValueError(f"{checkpoint} lacks {', '.join(lacks)}, and cannot be resumed: give the "
                                  "last.ckpt of a training")
+            if command == "fit" and 0 <= settings.trainer.max_steps <= read["global_step"]:
+                log_progress(f"{checkpoint} is of step {read['global_step']} already, and trainer.max_steps is "
+                             f"{settings.trainer.max_steps}: nothing is left to learn", event="ended")
 
 
 def main(args: list[str] | None = None) -> None:

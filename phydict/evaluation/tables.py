@@ -262,7 +262,7 @@ def interval_note(lines: Iterable[tuple[str, bool, Sequence[Value | None]]],
                   cases: Iterable[Iterable[str]]) -> list[str]:
     """The note on the intervals of a table's lines, of these cases each: over how many patients they are, or that a
     single one has none."""
-    each = [list(of) for of in cases]
+    each = [found for of in cases if (found := list(of))]
     several = any(patients(of) < len(of) for of in each)
     if has_intervals(lines):
         number = _span(map(patients, each))

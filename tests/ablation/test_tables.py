@@ -129,6 +129,7 @@ def test_one_case_that_no_method_has_takes_no_marks_pairs_or_plots(tmp_path):
     for found, wanted in zip(all_tables(entries), all_tables(whole), strict=True):
         assert found.cells() == wanted.cells() and found.title == wanted.title
         assert "(2 of 3 cases)" in found.markdown()
+        assert "case by case" in found.title or "Mean over 2 of 3 cases" in found.notes[0]
     names = [file.name for file in plots.write_plots(tmp_path, entries)]
     assert names == [file.name for file in plots.write_plots(tmp_path, whole)] and "views.png" in names
     rows[-1] = row("c", "y", 30.0, views=8)

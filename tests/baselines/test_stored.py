@@ -54,11 +54,17 @@ def test_methods_that_use_another_pass_the_case_on(tmp_path):
 
 
 @pytest.mark.parametrize("method, words", [
-    (Stored(), "folder '' and case '' were given: give both"),
-    (Stored("nowhere", case="a"), "no volume of a in nowhere: name it a.nii.gz, or a/volume.nii.gz")])
+    (Stored(), "folder '' and case '' were given: give the folder, and in Python the case"),
+    (Stored(case="a"), "folder '' and case 'a' were given: give the folder$"),
+    (Stored(".", case="a"), "no volume of a in .: name it a.nii.gz, or a/volume.nii.gz")])
 def test_a_volume_that_is_not_there_is_asked_for(method, words):
     with pytest.raises((ValueError, FileNotFoundError), match=words):
         method.reconstruct(torch.rand(3, 24, 24), Projector(GRID, BEAM))
+
+
+def test_a_folder_that_is_not_there_is_refused_before_anything_is_run():
+    with pytest.raises(ValueError, match="no folder nowhere of volumes"):
+        Stored("nowhere")
 
 
 def test_in_a_comparison_each_case_has_its_own_and_a_changed_one_is_scored_again(tmp_path):

@@ -12,6 +12,7 @@ from phydict import Grid, HUWindow, case_seed
 from phydict.datasets import save_xrays
 from phydict.inference.data import ReconstructionData
 from phydict.inference.settings import Orbit
+from phydict.runtime.console import cli_errors
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -22,7 +23,8 @@ if __name__ == "__main__":
     given = parser.parse_args()
     grid, window = Grid.cube(given.voxels), HUWindow()
     data = ReconstructionData(cts=given.cts, orbit=Orbit(views=given.views), phantoms=given.phantoms)
-    for case, _, made in data.test_cases(grid, window):
-        xrays = data.simulate(made(), case_seed(given.seed, case), grid, window, torch.device("cpu"))
-        save_xrays(given.out / case, xrays, data.beam)
-        print(given.out / case)
+    with cli_errors():
+        for case, _, made in data.test_cases(grid, window):
+            xrays = data.simulate(made(), case_seed(given.seed, case), grid, window, torch.device("cpu"))
+            save_xrays(given.out / case, xrays, data.beam)
+            print(given.out / case)

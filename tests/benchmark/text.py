@@ -2,9 +2,11 @@
 
     python tests/benchmark/text.py [prior.safetensors ...] [--phantoms 48] [--views 1 2 4] [--guidance 1]
                                    [--first_views N] [--first_seed 1001000] [--out FILE]
+    python tests/benchmark/text.py [prior.safetensors ...] --lowered 10 [--phantoms 16] [--views 1 2]
     python tests/benchmark/text.py [prior.safetensors ...] --cts <folder of CTs> [--views 1 2 4]
 
-The second: what a report that all is normal does to CTs, in text_cts.csv beside this file.
+The second: of phantoms that so many voxels at their lower end lie below the volume, in text_lowered.csv beside this
+file. The third: what a report that all is normal does to CTs, in text_cts.csv.
 
 Without a prior, the shipped one. The error is the mean absolute HU error over the voxels that the phantom's findings
 changed; where the method knows intervals, inside_90 is the share of these voxels, and of the body's, in the 90 % one.
@@ -20,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch.nn.functional import pad
 
 import phydict
 from phydict.datasets import Thorax, find_cts, pathology_region, phantom_case, prepare_ct, report, wrong_side
@@ -52,15 +55,19 @@ def one_sided(count: int, grid: phydict.Grid, seed: int) -> list[tuple[int, torc
 
 
 def compared(name: str, prior: Prior, cases: list[tuple[int, torch.Tensor]], views: int, guidance: float,
-             method=None) -> list[dict]:
+             method=None, lowered: int = 0) -> list[dict]:
     """One row for each phantom and report, reconstructed from a number of X-rays."""
     rows = []
     beam = phydict.ConeBeam.orbit(views, 1020.0, 740.0, shape=(112, 112), pixel=(5.0, 5.0))
-    projector = phydict.Projector(prior.grid, beam)
+    projector = phydict.Projector(prior.grid.grown(0, 0, lowered), beam, full_detector=bool(lowered))
     for seed, region in cases:
         case, thorax = phantom_case(seed, prior.grid, prior.window), Thorax.draw(seed)
-        xrays = Ideal()(projector, prior.window.to_mu(case["volume"])[None], seed)[0]
-        truth = prior.window.to_hu(case["volume"])[None]
+        seen = pad(case["volume"][None], (0, 2 * lowered), value=-1.0)
+        xrays = Ideal()(projector, prior.window.to_mu(seen), seed)[0]
+        held = slice(lowered, lowered + prior.grid.shape[2])
+        truth, region = prior.window.to_hu(seen[..., held]), pad(region, (0, 2 * lowered))[..., held]
+        if not region.any():
+            continue
         body = body_weights(truth, prior.grid.spacing)
         for kind, text in zip(REPORTS, (report(thorax), "", report(wrong_side(thorax)))):
             result = phydict.reconstruct(xrays, beam, prior, method, text, seed=seed, guidance=guidance)
@@ -115,12 +122,14 @@ if __name__ == "__main__":
     parser.add_argument("--guidance", type=float, default=1.0)
     parser.add_argument("--first_views", type=int)
     parser.add_argument("--first_seed", type=int, default=HELD_OUT, help="of the phantoms")
+    parser.add_argument("--lowered", type=int, default=0, help="voxels by which phantoms lie lower")
     parser.add_argument("--cts", type=Path)
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
     if given.first_seed != HELD_OUT and not given.out:
         parser.error("rows of other phantoms do not belong into text.csv: give --out")
-    out = given.out or Path(__file__).with_name("text_cts.csv" if given.cts else "text.csv")
+    out = given.out or Path(__file__).with_name(
+        "text_cts.csv" if given.cts else "text_lowered.csv" if given.lowered else "text.csv")
     method, suffix = None, ""
     if given.first_views is not None:
         method = replace(METHODS["phydict_learned"], first_views=given.first_views)
@@ -133,7 +142,7 @@ if __name__ == "__main__":
             if given.cts:
                 found = spared(name, prior, given.cts, views)
             else:
-                found = compared(name, prior, cases, views, guidance, method)
+                found = compared(name, prior, cases, views, guidance, method, given.lowered)
                 print(f"{name}:\n{summary(found)}", flush=True)
             own = name, views, guidance
             write_csv(out, [row for row in read_csv(out)

@@ -328,7 +328,7 @@ class Runner:
                               precision=trial.precision)
         ready = onto_grid(ready, trial.box.grid() if trial.box else None, trial.refinement)
         self.progress.follow(ready.steps())
-        ready = ready.with_mu_water(scene.mu_water).of_case(scene.case)
+        ready = ready.of_case(scene.case).with_mu_water(scene.mu_water)
         grid = trial.result_scene()[0]
         if trial.fixed:
             ready = covering(ready, trial.fixed)

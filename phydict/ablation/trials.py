@@ -7,7 +7,7 @@ import math
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from itertools import product
 from types import MappingProxyType
@@ -332,7 +332,7 @@ def method_of(name: object, known: Iterable[str] = ()) -> Sampler | Reconstructo
                          "class, such as my_module.MySampler")
     try:
         kind = imported(name)
-        if isinstance(kind, type) and issubclass(kind, Sampler | Reconstructor) and is_dataclass(kind):
+        if isinstance(kind, type) and issubclass(kind, Sampler | Reconstructor):
             return kind()
     except (Exception, SystemExit) as error:  # of whatever kind: another's code runs
         raise ValueError(f"the method {name} cannot be made ({reason(error)}): its module must be importable, and its "

@@ -73,7 +73,7 @@ class Baseline(Reconstructor):
                 y = match_views(xrays[None], A(typical_chest(A).to(xrays)))
         beyond = torch.zeros_like(y) if outside is None else outside[None] / self.mu_water
         with watch.stage("sample"):
-            A.y, guard = y if self.local else y - beyond, Guard(A, on_step, self.steps(), True)
+            A.y, guard = y if self.local else y - beyond, Guard(A, on_step, self.steps(), sees_xrays=True)
             density = self.solve(A, A.y, guard)
         with watch.stage("score"):
             fit = guard.score(density, self.mu_water * (A(density) + beyond), self.mu_water * y)

@@ -21,6 +21,7 @@ from phydict.datasets.radiographs.radiographs import load_xrays
 from phydict.inference.data import ReconstructionData
 from phydict.inference.dry_run import dry_run
 from phydict.inference.scoring import METRICS, CLIPSettings, FIDSettings, Scoring
+from phydict.inference.settings import WITHOUT_STAGE
 from phydict.inference.task import ReconstructionTask
 from phydict.methods import METHODS
 from phydict.runtime.console import (
@@ -90,8 +91,7 @@ class InferenceCLI(ProgressCLI):
             raise ValueError(f"the prior {given[-1]} is empty: give the .safetensors file that training wrote")
         guided = any(arg.partition("=")[0] == "--model.super_resolution.guided" for arg in args)
         if guided and not settings.get("model.super_resolution.file"):  # a configuration says so of any stage
-            raise ValueError("model.super_resolution.guided means nothing without model.super_resolution.file, the "
-                             "second stage's: give it too, or leave that out")
+            raise ValueError(WITHOUT_STAGE.format("guided"))
 
     @property
     def dry_run(self) -> bool:

@@ -70,14 +70,17 @@ class CaseResults:
         self._keep_coarse = keep_coarse
         with undisturbed(self.folder):
             self._before = {case: self._there(case) for case in sources}
+        left = []
         for case, there in self._before.items():
             if there and not self.overwrite and (other := self._other(case, there)):
                 raise ValueError(f"{self.folder / case} was finished with other {other}: add --model.overwrite true, "
                                  "or give another --model.out")
-            if there and (self.overwrite or self._lacks_coarse(case, there)):
+            if there and not self.overwrite and not self._lacks_coarse(case, there):
+                continue
+            if there:
                 self._check_own(case, there)
-        return [case for case, there in self._before.items()
-                if self.overwrite or not there or self._lacks_coarse(case, there)]
+            left.append(case)
+        return left
 
     def missing(self) -> list[str]:
         """Of the cases given to `unfinished`, those that are not finished as they should be by now."""

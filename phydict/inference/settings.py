@@ -30,6 +30,10 @@ class Sampling:
 MEMORY = 4.0
 """GiB that a second stage's network may take where no other amount is given."""
 
+WITHOUT_STAGE = ("model.super_resolution.{} means nothing without model.super_resolution.file, the second stage's: "
+                 "give it too, or leave that out")
+"""What is said of a setting of a second stage that is not given."""
+
 
 @dataclass(frozen=True)
 class CascadeSettings:
@@ -59,8 +63,7 @@ class CascadeSettings:
                  "memory": self.memory != MEMORY}
         if not self.file and any(alone.values()):
             name = next(name for name, given in alone.items() if given)
-            raise ValueError(f"model.super_resolution.{name} means nothing without model.super_resolution.file, the "
-                             "second stage's: give it too, or leave that out")
+            raise ValueError(WITHOUT_STAGE.format(name))
 
 
 @dataclass(frozen=True)

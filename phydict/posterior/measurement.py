@@ -174,6 +174,13 @@ class Measurement:
         if self.scatter_enabled:
             self.subtract_scatter(self.project(x))
 
+    def conclude(self, x: Tensor) -> Tensor:
+        """P(x) of the result x, to which gains and offsets of display values are refit before, and scatter after."""
+        self.match_gain_offset(x)
+        reprojection = self.project(x)
+        self.subtract_scatter(reprojection)
+        return reprojection
+
     def straighten(self) -> None:
         """From now on the line integrals are those of a tube, straightened; once."""
         if not self.hardened:

@@ -1,10 +1,10 @@
-"""DiffPIR: a proximal step onto the X-rays per noise level, then diffusion with partly zeta noise.
+"""DiffPIR: a proximal step onto the X-rays per noise level, then diffusion with noise of which a share is new.
 
 | here                           | publication                                        |
 |--------------------------------|----------------------------------------------------|
 | denoise(x, t)                  | Algorithm 1, line 3                                |
 | nearest_fit(m, x0, rho_t)      | line 4, rho_t = prior_weight sigma_y^2 / sigma_t^2 |
-| noise_in, stochastic_ddim_step | lines 5 and 6, zeta = zeta                         |
+| noise_in, stochastic_ddim_step | lines 5 and 6, with zeta of the noise new          |
 """
 
 from __future__ import annotations

@@ -16,6 +16,7 @@ from phydict.runtime.own_code import check_takes
 if TYPE_CHECKING:
     from phydict.posterior.measurement import Measurement
 
+
 class Sampler(ABC):
     """Settings of a sampling method; `sample` turns noise into a clean state. A sampler of one's own has
     @dataclass(frozen=True) above its class, as records tell its fields as the settings.

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from phydict.diffusion.steps import noise_like
+from phydict.diffusion import noise_like
 from phydict.grid import Grid
 from phydict.guard import Guard
 from phydict.posterior.likelihood.likelihood import ProximalCG

@@ -10,8 +10,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from phydict.diffusion import Denoiser
-from phydict.diffusion.steps import noise_like
+from phydict.diffusion import Denoiser, noise_like
 from phydict.grid import Grid
 from phydict.guard import Guard, check_ceiling, one_material
 from phydict.posterior.measurement import Measurement

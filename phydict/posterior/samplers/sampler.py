@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
-from phydict.diffusion import Denoiser, ddim
-from phydict.diffusion.steps import Generators
+from phydict.diffusion import Denoiser, Generators, ddim
 from phydict.prior import DEFAULT_PRIOR
 from phydict.runtime.own_code import check_takes
 

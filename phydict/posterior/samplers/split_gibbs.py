@@ -18,8 +18,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from phydict.diffusion import Denoiser, ddim, renoise
-from phydict.diffusion.steps import Generators, noise_like
+from phydict.diffusion import Denoiser, Generators, ddim, noise_like, renoise
 from phydict.posterior.discretisation import find_subgrid
 from phydict.posterior.explained import explained
 from phydict.posterior.likelihood.likelihood import LikelihoodStep, ProximalCG

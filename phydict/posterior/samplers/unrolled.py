@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from phydict.diffusion.steps import Generators, noise_like
+from phydict.diffusion import Generators, noise_like
 from phydict.posterior.discretisation import FINER_STEP, find_subgrid, has_finer, subgrid_projection
 from phydict.posterior.evidence import Evidence
 from phydict.posterior.explained import explained

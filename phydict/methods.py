@@ -64,7 +64,7 @@ from phydict.units import HUWindow
 from phydict.xray import ConeBeam
 from phydict.xray.beyond import with_continuation
 from phydict.xray.boxes import binned_to, covers
-from phydict.xray.checks import check_fit, with_air_at_zero
+from phydict.xray.checks import check_fit, is_smaller_scene, with_air_at_zero
 from phydict.xray.poses.uncertain import Uncertain
 from phydict.xray.projectors.own import projector_kind
 
@@ -254,7 +254,7 @@ def reconstruct_by(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeB
     where X-rays, geometry and grid do not fit, and warns where the X-rays look inverted.
     """
     with heard() as warnings:
-        if isinstance(method, Region) and beam.is_smaller_than(method.outer):
+        if isinstance(method, Region) and is_smaller_scene(beam, method.outer):
             method = method.base  # of a scene that is smaller than a chest
         check_fit(xrays, beam, grid, method.survey, display)
         poses: FoundPoses | None = None

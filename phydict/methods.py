@@ -134,6 +134,11 @@ DEFAULT_GRID = Grid.cube(64)
 """The voxels of methods that are bound to none; what lies outside a smaller box is taken from a reconstruction here."""
 
 
+UNGUIDED = ("{0}sampler is how the X-rays guide the second stage, but {0}guided was given as false, so that they do "
+            "not: leave one of the two out")
+"""What is said of a sampler for a second stage that is not guided, by what its settings' names begin with."""
+
+
 def reconstructor(method: str | Sampler | Reconstructor, prior: AnyPrior | str | Path | None = None,
                   guidance: float = 1.0, name: str | None = None,
                   super_resolution: SuperResolution | MedSynSuperResolution | str | Path | None = None,
@@ -157,6 +162,8 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: AnyPrior | str |
     if of_stage and super_resolution is None:
         raise ValueError(f"without super_resolution there is no second stage, but {' and '.join(of_stage)} came for "
                          "it: leave that out, or give super_resolution as well")
+    if sr_sampler is not None and not sr_guided:
+        raise ValueError(UNGUIDED.format("sr_"))
     if isinstance(method, str):
         if method not in METHODS:
             raise ValueError(f"there is no method '{method}': use one of {', '.join(METHODS)}")

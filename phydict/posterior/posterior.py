@@ -117,6 +117,10 @@ class Posterior(Reconstructor):
         check_precision(self.precision)
         check_guidance(self.guidance)
         if isinstance(self.prior, Refiner) != self.sampler.needs_refiner:
+            if self.sampler.needs_refiner and is_own(type(self.prior)):
+                raise ValueError(f"{self.name} needs a refiner, its file or object, but {type(self.prior).__name__}, a "
+                                 "prior of your own, was given: give it to phydict_fast, which takes any prior, or "
+                                 "leave it out")
             needed, given = ("a refiner", "a prior") if self.sampler.needs_refiner else ("a prior", "a refiner")
             raise ValueError(f"{type(self.sampler).__name__} needs {needed}, but the file is {given}: give {needed}'s "
                              "file, or leave it out")

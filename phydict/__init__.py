@@ -15,7 +15,7 @@
     page             a page for the browser beside every result
     poses            geometry found with the volume
     methods          the named methods, and `reconstruct` in one call
-    training         priors and super-resolution stages                             Lightning
+    training         priors, super-resolution, refiners, uncertainty, rivals        Lightning
     inference        X-rays -> volumes, CTs -> scores                               Lightning
     ablation         methods and settings compared on the same X-rays
     cli              the command lines of train.py and infer.py                     Lightning

@@ -64,7 +64,7 @@ from phydict.units import HUWindow
 from phydict.xray import ConeBeam
 from phydict.xray.beyond import with_continuation
 from phydict.xray.boxes import binned_to, covers
-from phydict.xray.checks import check_fit, with_air_at_zero
+from phydict.xray.checks import check_fit, is_smaller_scene, with_air_at_zero
 from phydict.xray.poses.uncertain import Uncertain
 from phydict.xray.projectors.own import projector_kind
 
@@ -134,6 +134,11 @@ DEFAULT_GRID = Grid.cube(64)
 """The voxels of methods that are bound to none; what lies outside a smaller box is taken from a reconstruction here."""
 
 
+UNGUIDED = ("{0}sampler is how the X-rays guide the second stage, but {0}guided was given as false, so that they do "
+            "not: leave one of the two out")
+"""What is said of a sampler for a second stage that is not guided, by what its settings' names begin with."""
+
+
 def reconstructor(method: str | Sampler | Reconstructor, prior: AnyPrior | str | Path | None = None,
                   guidance: float = 1.0, name: str | None = None,
                   super_resolution: SuperResolution | MedSynSuperResolution | str | Path | None = None,
@@ -157,6 +162,8 @@ def reconstructor(method: str | Sampler | Reconstructor, prior: AnyPrior | str |
     if of_stage and super_resolution is None:
         raise ValueError(f"without super_resolution there is no second stage, but {' and '.join(of_stage)} came for "
                          "it: leave that out, or give super_resolution as well")
+    if sr_sampler is not None and not sr_guided:
+        raise ValueError(UNGUIDED.format("sr_"))
     if isinstance(method, str):
         if method not in METHODS:
             raise ValueError(f"there is no method '{method}': use one of {', '.join(METHODS)}")
@@ -254,7 +261,7 @@ def reconstruct_by(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeB
     where X-rays, geometry and grid do not fit, and warns where the X-rays look inverted.
     """
     with heard() as warnings:
-        if isinstance(method, Region) and beam.is_smaller_than(method.outer):
+        if isinstance(method, Region) and is_smaller_scene(beam, method.outer):
             method = method.base  # of a scene that is smaller than a chest
         check_fit(xrays, beam, grid, method.survey, display)
         poses: FoundPoses | None = None

@@ -209,6 +209,14 @@ class Reconstructor(ABC):
         """How often `reconstruct` calls on_step."""
 
 
+def check_projected_from(grid: Grid, projector: Projector, whose: str, does: str) -> None:
+    """Raises ValueError unless X-rays are projected from the voxels of `grid`, of which a sentence says `does`, such as
+    "the target is", and which `whose`, such as "the target's", names."""
+    if not grid.same_as(projector.grid):
+        raise ValueError(f"{does} {grid.shape} voxels of {grid.spacing} mm, but the X-rays are projected from "
+                         f"{projector.grid.shape} voxels of {projector.grid.spacing} mm: use {whose} grid")
+
+
 class Delegating(Reconstructor):
     """A method that reconstructs on the voxels `target` by another one, its `base`, whose name, needs and citation are
     its own. Both are fields of a subclass, a frozen dataclass."""

@@ -27,6 +27,7 @@ from phydict.methods import METHODS
 from phydict.posterior import DDS, Posterior
 from phydict.prior import save_prior, save_refiner
 from phydict.xray import ConeBeam, Ideal, Polychromatic
+from phydict.xray.checks import check_scale
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "phydict"
@@ -256,7 +257,7 @@ def test_every_geometry_is_read_and_clear_of_the_default_volume(config):
     beam.check(Grid.cube(64))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        beam.check_scale(Grid.cube(64))
+        check_scale(beam, Grid.cube(64))
 
 
 @pytest.mark.parametrize("main, command", [(infer, "predict"), (train.main, "fit")], ids=["infer", "train"])

@@ -12,6 +12,7 @@ from prior.tiny import tiny_for, tiny_prior, tiny_refiner, tiny_super_resolution
 from phydict.baselines import CGLS, SIRT, Baseline, Region
 from phydict.diffusion import GaussianDenoiser
 from phydict.grid import Grid
+from phydict.inference.settings import CascadeSettings
 from phydict.methods import METHODS, default_method, onto_grid, reconstruct, reconstructor
 from phydict.posterior import CascadePosterior, Posterior, PriorOnly, ProximalCG, Sampler, SplitGibbs
 from phydict.prior import MedSynCheckpoint, save_prior, save_refiner, save_super_resolution
@@ -326,6 +327,14 @@ def test_a_method_without_a_prior_takes_no_second_stage():
 def test_settings_of_a_second_stage_are_refused_without_one(method, setting):
     with pytest.raises(ValueError, match=f"no second stage, but {next(iter(setting))} came for it: leave that out"):
         reconstructor(method, tiny_prior(False), **setting)
+
+
+def test_a_sampler_of_a_second_stage_that_is_not_guided_is_refused():
+    with pytest.raises(ValueError, match="sr_sampler is how .* but sr_guided was given as false.*leave one of the two"):
+        reconstructor(PriorOnly(2), tiny_prior(False), super_resolution=tiny_super_resolution(), sr_guided=False,
+                      sr_sampler=PriorOnly(3))
+    with pytest.raises(ValueError, match=r"model.super_resolution.sampler is how .* model.super_resolution.guided"):
+        CascadeSettings("fine.safetensors", guided=False, sampler=PriorOnly(3))
 
 
 @pytest.mark.parametrize("method", ["cgls", "phydict_fast"])

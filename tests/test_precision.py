@@ -32,7 +32,7 @@ X86 = pytest.mark.skipif(not torch.cpu._is_avx2_supported(), reason="these varia
 @pytest.fixture(autouse=True)
 def said_anew():
     precision._warn_slow.cache_clear()
-    precision._log_gpu.cache_clear()
+    precision._warn_gpu.cache_clear()
 
 
 @pytest.fixture

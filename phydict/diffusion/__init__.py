@@ -2,6 +2,7 @@
 
 from phydict.diffusion.denoiser import Denoiser, GaussianDenoiser, guided
 from phydict.diffusion.schedule import CosineSchedule
-from phydict.diffusion.steps import ddim, noise_in, renoise
+from phydict.diffusion.steps import Generators, ddim, noise_in, noise_like, renoise
 
-__all__ = ["CosineSchedule", "Denoiser", "GaussianDenoiser", "ddim", "guided", "noise_in", "renoise"]
+__all__ = ["CosineSchedule", "Denoiser", "GaussianDenoiser", "Generators", "ddim", "guided", "noise_in", "noise_like",
+           "renoise"]

@@ -1,9 +1,9 @@
 """The moves every sampler is made of.
 
-| here                      | paper                                    |
-|---------------------------|------------------------------------------|
-| ddim(z, x, t, s)          | Eq. 2, from time t to time s < t         |
-| renoise(x0, t, noise)     | forward diffusion, the start of EC       |
+| here                            | paper                              |
+|---------------------------------|------------------------------------|
+| ddim(schedule, z, x, t, s)      | Eq. 2, from time t to time s < t   |
+| renoise(schedule, x0, t, noise) | forward diffusion, the start of EC |
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ def renoise(schedule: CosineSchedule, x0: Tensor, t: float, noise: Tensor) -> Te
     """Forward diffusion of the clean state x0 to time t with the given standard normal noise."""
     signal, sigma = schedule.scales(t)
     return signal.to(x0) * x0 + sigma.to(x0) * noise
+
 
 Generators = torch.Generator | Sequence[torch.Generator]
 """Where noise comes from: one generator, or one for each state of a batch."""

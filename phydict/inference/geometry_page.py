@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from phydict.evaluation.gallery import DISPLAY, GREY, MOST_VIEWS, PLANES, literal, plane
 from phydict.grid import Grid
 from phydict.inference.orientation import LEAST, better_flip, correlation
-from phydict.runtime.files import atomic_write
+from phydict.runtime.files import atomic_write, is_signed
 from phydict.xray import ConeBeam
 
 SIDES = (("right", "left"), ("anterior", "posterior"), ("superior", "inferior"))
@@ -62,7 +62,7 @@ def geometry_page(path: str | Path, beam: ConeBeam, grid: Grid, xrays: np.ndarra
         if images.shape != (beam.views, *beam.shape):
             raise ValueError(f"images of shape {images.shape} were given for a beam of {(beam.views, *beam.shape)}; "
                              "give the images of this beam")
-    if Path(path).exists() and SIGNED.encode() not in Path(path).read_bytes()[:1000]:
+    if Path(path).exists() and not is_signed(Path(path), SIGNED):
         raise ValueError(f"{path} is there already, is no page of this kind, and is not replaced: move it away, or "
                          "give another place")
     shown = np.linspace(0, beam.views - 1, min(beam.views, MOST_VIEWS)).round().astype(int)

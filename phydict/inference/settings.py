@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from phydict.methods import UNGUIDED
 from phydict.posterior import Sampler
 from phydict.prior import MedSynCheckpoint
 from phydict.xray import ConeBeam
@@ -64,6 +65,8 @@ class CascadeSettings:
         if not self.file and any(alone.values()):
             name = next(name for name, given in alone.items() if given)
             raise ValueError(WITHOUT_STAGE.format(name))
+        if self.sampler is not None and not self.guided:
+            raise ValueError(UNGUIDED.format("model.super_resolution."))
 
 
 @dataclass(frozen=True)

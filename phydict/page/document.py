@@ -14,7 +14,7 @@ from urllib.parse import quote
 
 from phydict.evaluation.metrics import MEASURES, Measure
 from phydict.evaluation.tables import Table, ranks
-from phydict.runtime.files import atomic_write
+from phydict.runtime.files import atomic_write, is_signed
 from phydict.runtime.strict_json import strict_json
 from phydict.runtime.version import VERSION
 
@@ -60,14 +60,9 @@ class Contents:
 def check_own_page(folder: Path, option: str) -> None:
     """Raises ValueError where a page of someone else's would be replaced; `option` is what the user may change."""
     path = folder / PAGE
-    if os.path.lexists(path):
-        replaceable = path.is_file() and not path.is_symlink()
-        if replaceable:
-            with path.open("rb") as file:
-                replaceable = SIGNED.encode() in file.read(1000)
-        if not replaceable:
-            raise ValueError(f"{path} is no page of results by phydict, and is not replaced: move it away, or give "
-                             f"another {option}")
+    if os.path.lexists(path) and (path.is_symlink() or not is_signed(path, SIGNED)):
+        raise ValueError(f"{path} is no page of results by phydict, and is not replaced: move it away, or give "
+                         f"another {option}")
 
 
 def write_page(folder: Path, contents: Contents) -> Path:

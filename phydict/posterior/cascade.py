@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from phydict.diffusion.steps import noise_like
+from phydict.diffusion import noise_like
 from phydict.grid import Grid
 from phydict.guard import Guard
 from phydict.posterior.likelihood.likelihood import ProximalCG
@@ -19,7 +19,7 @@ from phydict.posterior.samplers.prior_only import PriorOnly
 from phydict.posterior.samplers.sampler import Sampler
 from phydict.posterior.samplers.split_gibbs import SplitGibbs
 from phydict.prior import Cascade
-from phydict.reconstruction import Reconstruction, Reconstructor
+from phydict.reconstruction import Reconstruction, Reconstructor, check_projected_from
 from phydict.runtime.precision import check_precision, resolve_precision
 from phydict.runtime.profiling import Stopwatch
 from phydict.units import MU_WATER, HUWindow
@@ -103,10 +103,7 @@ class CascadePosterior(Reconstructor):
     def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,
                     seed: int = 0, on_step: Callable[[], None] = lambda: None) -> Reconstruction:
         stage, watch = self.cascade.super_resolution, Stopwatch()
-        if not stage.grid.same_as(projector.grid):
-            raise ValueError(
-                f"the super-resolution stage makes {stage.grid.shape} voxels of {stage.grid.spacing} mm, but the "
-                f"X-rays are projected from {projector.grid.shape} voxels of {projector.grid.spacing} mm: use its grid")
+        check_projected_from(stage.grid, projector, "its", "the super-resolution stage makes")
         self.check_memory(xrays.device, xrays.dtype)
         if isinstance(stage, torch.nn.Module):
             stage.to(xrays.device)
@@ -129,8 +126,7 @@ class CascadePosterior(Reconstructor):
             state = self.second.sample(denoiser, measurement, x, generator, guard)
         with watch.stage("score"):
             ct = state[:, :1]
-            measurement.match_gain_offset(ct)
-            fit = guard.score(state, measurement.project(ct), measurement.y)
+            fit = guard.score(state, measurement.conclude(ct), measurement.y)
             masks = interpolate(masks[None], stage.grid.shape, mode="trilinear")[0] if len(masks) else (
                 masks.new_zeros(0, *stage.grid.shape))
             masks[:stage.state_channels - 1] = ((state[0, 1:] + 1) / 2).cpu()

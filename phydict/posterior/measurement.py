@@ -7,6 +7,7 @@ on x is computed once.
 from __future__ import annotations
 
 from copy import copy
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,6 +24,20 @@ from phydict.xray.residuals import shared_norms, worst_misfit
 
 MAX_LINE_INTEGRAL = 30.0
 """Line integrals above which no photon comes through, so that they hold no scatter either."""
+
+
+class Fitted(NamedTuple):
+    """What was found of X-rays beside the CT: fields of a Measurement.
+
+    y, measured: line integrals without scatter or with gains matched, and with it.
+    """
+
+    y: Tensor
+    measured: Tensor
+    hardened: bool
+    scatter_enabled: bool
+    subgrid: Tensor | float
+    model_variance: Tensor | float
 
 
 class Measurement:
@@ -93,15 +108,14 @@ class Measurement:
         self.reset_scatter(found.scatter > 0)
 
     @property
-    def fitted(self) -> tuple[Tensor, Tensor, bool, bool, Tensor | float, Tensor | float]:
-        """What was found of the X-rays beside the CT: line integrals without scatter or with gains matched, and with
-        it; whether they were straightened, whether scatter is sought, what finer voxels add, and what no volume
-        explains."""
-        return self.y, self.measured, self.hardened, self.scatter_enabled, self.subgrid, self.model_variance
+    def fitted(self) -> Fitted:
+        """What was found of the X-rays beside the CT."""
+        return Fitted(*(getattr(self, name) for name in Fitted._fields))
 
     @fitted.setter
-    def fitted(self, values: tuple[Tensor, Tensor, bool, bool, Tensor | float, Tensor | float]) -> None:
-        self.y, self.measured, self.hardened, self.scatter_enabled, self.subgrid, self.model_variance = values
+    def fitted(self, found: Fitted) -> None:
+        for name, value in found._asdict().items():
+            setattr(self, name, value)
 
     @property
     def added(self) -> Tensor | float:
@@ -173,6 +187,13 @@ class Measurement:
         self.match_gain_offset(x)
         if self.scatter_enabled:
             self.subtract_scatter(self.project(x))
+
+    def conclude(self, x: Tensor) -> Tensor:
+        """P(x) of the result x, to which gains and offsets of display values are refit before, and scatter after."""
+        self.match_gain_offset(x)
+        reprojection = self.project(x)
+        self.subtract_scatter(reprojection)
+        return reprojection
 
     def straighten(self) -> None:
         """From now on the line integrals are those of a tube, straightened; once."""

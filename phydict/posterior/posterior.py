@@ -10,8 +10,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from phydict.diffusion import Denoiser
-from phydict.diffusion.steps import noise_like
+from phydict.diffusion import Denoiser, noise_like
 from phydict.grid import Grid
 from phydict.guard import Guard, check_ceiling, one_material
 from phydict.posterior.measurement import Measurement
@@ -22,7 +21,7 @@ from phydict.posterior.widening import limited_angle_factor, warn_of_contradicti
 from phydict.prior import AnyPrior, BoundRefiner, Refiner
 from phydict.prior.contract import bound, precision_of
 from phydict.prior.uncertainty import LEVELS
-from phydict.reconstruction import Reconstruction, Reconstructor
+from phydict.reconstruction import Reconstruction, Reconstructor, check_projected_from
 from phydict.runtime.own_code import is_own
 from phydict.runtime.precision import check_precision
 from phydict.runtime.profiling import Stopwatch, stage
@@ -118,6 +117,10 @@ class Posterior(Reconstructor):
         check_precision(self.precision)
         check_guidance(self.guidance)
         if isinstance(self.prior, Refiner) != self.sampler.needs_refiner:
+            if self.sampler.needs_refiner and is_own(type(self.prior)):
+                raise ValueError(f"{self.name} needs a refiner, its file or object, but {type(self.prior).__name__}, a "
+                                 "prior of your own, was given: give it to phydict_fast, which takes any prior, or "
+                                 "leave it out")
             needed, given = ("a refiner", "a prior") if self.sampler.needs_refiner else ("a prior", "a refiner")
             raise ValueError(f"{type(self.sampler).__name__} needs {needed}, but the file is {given}: give {needed}'s "
                              "file, or leave it out")
@@ -161,18 +164,13 @@ class Posterior(Reconstructor):
     @torch.no_grad()
     def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,
                     seed: int = 0, on_step: Callable[[], None] = lambda: None) -> Reconstruction:
-        prior, grid, watch = self.prior, self.grid, Stopwatch()
+        prior, watch = self.prior, Stopwatch()
         if isinstance(prior, torch.nn.Module):
             prior.to(xrays.device)
             if is_own(type(prior)):
                 prior.eval()
             xrays = xrays.to(next((weight.dtype for weight in prior.parameters()), xrays.dtype))
-        if not grid.same_as(projector.grid):
-            raise ValueError(
-                f"the prior was trained on {grid.shape} voxels of {grid.spacing} mm, but the X-rays are "
-                f"projected from {projector.grid.shape} voxels of {projector.grid.spacing} mm: use the prior's grid")
-        seeds = [sample_seed(seed, i) for i in range(self.samples)]
-        together = self.batch if self.sampler.batches else 1
+        check_projected_from(self.grid, projector, "the prior's", "the prior was trained on")
         sampler = self.sampler.suited(prior)
         sampler = sampler.for_sampling() if self.samples > 1 else sampler
         check_sampler(sampler)
@@ -181,21 +179,9 @@ class Posterior(Reconstructor):
             guard = Guard(measurement, on_step, sampler.steps(), sampler.sees_xrays)
             counting = CountingRefiner if sampler.needs_refiner else CountingDenoiser
             denoiser = counting(bound(prior, report, self.guidance, self.precision), guard)
-            state = torch.empty(1, prior.state_channels, *grid.shape, device=xrays.device)
+            state = torch.empty(1, prior.state_channels, *self.grid.shape).to(xrays)
         with watch.stage("sample"):
-            drawn, carried, plain = [], list[Carried | None](), measurement.fitted
-            for first in range(0, self.samples, together):
-                measurement.carry(None)
-                measurement.fitted = plain
-                guard.reset()
-                generators = [torch.Generator().manual_seed(s) for s in seeds[first:first + together]]
-                x = noise_like(state.expand(len(generators), -1, -1, -1, -1), generators).to(xrays.dtype)
-                generator = generators if len(generators) > 1 else generators[0]
-                states = sampler.sample(denoiser, measurement, x, generator, guard)
-                drawn.append(check_drawn(sampler, states, x))
-                carried += len(generators) * [measurement.carried]
-                if self.samples > 1:
-                    guard.finish(drawn[-1])
+            drawn, carried = self._drawn(sampler, denoiser, measurement, state, seed)
             states = torch.cat(drawn)
         if self.otherwise and one_material(prior.window.to_hu(states[:, 0].mean(0))):
             warn("the X-rays show one material in air and no chest, and of other objects the network knows nothing: a "
@@ -208,10 +194,8 @@ class Posterior(Reconstructor):
         with watch.stage("score"):
             state, ct = states.mean(0), states[:, :1].mean(0, keepdim=True)
             if len(drawn) > 1 and any(carried):
-                measurement.carry(mean_carried(carried, grid))
-            measurement.match_gain_offset(ct)
-            reprojection = measurement.project(ct)
-            measurement.subtract_scatter(reprojection)
+                measurement.carry(mean_carried(carried, self.grid))
+            reprojection = measurement.conclude(ct)
             fit = guard.score(states if self.samples == 1 else None, reprojection, measurement.y)
             deviation = self._deviation(states[:, 0], carried) if self.samples > 1 else None
             volume, mean = self._volume(measurement, ct[0, 0])
@@ -219,12 +203,32 @@ class Posterior(Reconstructor):
             warn_of_contradictions(measurement, widening if intervals else None)
             variance = measurement.model_variance
         return Reconstruction(
-            volume=volume, grid=grid, method=self.name, seed=seed, **fit, seconds=watch.seconds,
+            volume=volume, grid=self.grid, method=self.name, seed=seed, **fit, seconds=watch.seconds,
             network_calls=denoiser.calls * (2 if report and self.guidance != 1 else 1),
             projector_calls=measurement.calls, masks=((state[1:] + 1) / 2).cpu(), deviation=deviation,
             intervals=intervals, interval_widening=widening, hardened=measurement.hardened,
             scatter=measurement.scatter, model_variance=variance.cpu() if isinstance(variance, Tensor) else variance,
             precision=precision_of(prior, self.precision, xrays), carried=mean)
+
+    def _drawn(self, sampler: Sampler, denoiser: CountingDenoiser, measurement: Measurement, state: Tensor, seed: int
+               ) -> tuple[list[Tensor], list[Carried | None]]:
+        """The samples' states, those of a batch like `state` (1, C, X, Y, Z) together, and what each carries."""
+        seeds = [sample_seed(seed, i) for i in range(self.samples)]
+        together = self.batch if self.sampler.batches else 1
+        drawn, carried, plain = [], list[Carried | None](), measurement.fitted
+        for first in range(0, self.samples, together):
+            measurement.carry(None)
+            measurement.fitted = plain
+            denoiser.guard.reset()
+            generators = [torch.Generator().manual_seed(s) for s in seeds[first:first + together]]
+            x = noise_like(state.expand(len(generators), -1, -1, -1, -1), generators)
+            generator = generators if len(generators) > 1 else generators[0]
+            states = sampler.sample(denoiser, measurement, x, generator, denoiser.guard)
+            drawn.append(check_drawn(sampler, states, x))
+            carried += len(generators) * [measurement.carried]
+            if self.samples > 1:
+                denoiser.guard.finish(drawn[-1])
+        return drawn, carried
 
     def _volume(self, measurement: Measurement, x: Tensor) -> tuple[Tensor, Carried | None]:
         """HU (X, Y, Z) of a result x in the prior's range, and what of them is carried beside it. Says what is as dense

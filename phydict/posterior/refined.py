@@ -19,7 +19,7 @@ from phydict.posterior.posterior import WIDEST
 from phydict.posterior.refinement import Correction, Refinement
 from phydict.prior.finer_uncertainty import INPUT_LEVEL
 from phydict.prior.uncertainty import LEVELS
-from phydict.reconstruction import Delegating, Reconstruction
+from phydict.reconstruction import Delegating, Reconstruction, check_projected_from
 from phydict.runtime.profiling import Stopwatch
 from phydict.runtime.warning import Remark, warn
 from phydict.units import AIR, HUWindow, hu_to_mu
@@ -116,10 +116,7 @@ class Refined(Delegating):
     @torch.no_grad()
     def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,
                     seed: int = 0, on_step: Callable[[], None] = lambda: None) -> Reconstruction:
-        if not self.target.same_as(projector.grid):
-            raise ValueError(
-                f"the target is {self.target.shape} voxels of {self.target.spacing} mm, but the X-rays are projected "
-                f"from {projector.grid.shape} voxels of {projector.grid.spacing} mm: use the target's grid")
+        check_projected_from(self.target, projector, "the target's", "the target is")
         watch, base, refinement = Stopwatch(), self.base, self.refinement.of_views(projector.beam.views)
         with watch.stage("base"):
             binned = self._binned(xrays, projector, base.grid)
@@ -144,10 +141,7 @@ class Refined(Delegating):
                     known = self._known_intervals(network, level, x, start, coarse) or known
             volume, grid = base.window.to_hu(x[0, 0]), level
             with watch.stage("score"):
-                measurement.match_gain_offset(x)
-                reprojection = measurement.project(x)
-                measurement.subtract_scatter(reprojection)
-                scores = guard.score(x, reprojection, measurement.y) | {"scatter": measurement.scatter}
+                scores = guard.score(x, measurement.conclude(x), measurement.y) | {"scatter": measurement.scatter}
             calls += measurement.calls
             network_calls += fine_calls
             if correction is not None:

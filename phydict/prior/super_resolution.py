@@ -10,8 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
-from phydict.diffusion import CosineSchedule
-from phydict.diffusion.steps import noise_like
+from phydict.diffusion import CosineSchedule, noise_like
 from phydict.grid import Grid
 from phydict.prior.local_unet import LocalUNet
 from phydict.prior.tiles import Tiles

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d
 
-from phydict.diffusion import CosineSchedule, ddim
-from phydict.diffusion.steps import noise_like
+from phydict.diffusion import CosineSchedule, ddim, noise_like
 from phydict.grid import Grid
 from phydict.prior.convolution import speed_up
 from phydict.prior.unet import check_sizes

@@ -111,6 +111,14 @@ def check_replaceable(folder: Path, written: Collection[str], option: str) -> No
         raise ValueError(f"{folder} {what}, and is not replaced: move that away, or give another {option}")
 
 
+def is_signed(path: Path, mark: str) -> bool:
+    """Whether there is a file that says `mark` at its beginning, of what wrote it."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return mark.encode() in file.read(1000)
+
+
 def remove_leftovers(folder: Path) -> None:
     """Removes what processes of this machine that are no more had begun to write as files and folders in `folder`, and
     puts back what they had set aside."""

@@ -79,7 +79,7 @@ def resolve_precision(precision: str, device: torch.device, state: torch.dtype =
         _warn_slow(device)
         return torch.bfloat16
     if device.type == "cuda":
-        _log_gpu(torch.cuda.get_device_name(device))
+        _warn_gpu(torch.cuda.get_device_name(device))
     return state
 
 
@@ -129,5 +129,5 @@ def _warn_slow(device: torch.device) -> None:
 
 
 @cache
-def _log_gpu(name: str) -> None:
+def _warn_gpu(name: str) -> None:
     warn(f"{name} does not compute bfloat16: networks run in float32", RuntimeWarning)

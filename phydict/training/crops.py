@@ -91,8 +91,7 @@ class CropDataset(Draws):
 
     def _augment(self, crop: Tensor, rng: np.random.Generator) -> Tensor:
         change = Deformation.draw(int(rng.integers(2**31)))
-        air = (self.window.to_hu(crop) - AIR).clamp(min=0)
-        crop = self.window.to_range(AIR + change.hu_scale * air + change.hu_offset * (air / 200).clamp(max=1))
+        crop = self.window.to_range(change.changed_hu(self.window.to_hu(crop).clamp(min=AIR)))
         return crop.flip(1) if rng.random() < 0.5 else crop
 
 

@@ -8,8 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from phydict.diffusion import Denoiser, renoise
-from phydict.diffusion.steps import noise_like
+from phydict.diffusion import Denoiser, noise_like, renoise
 from phydict.posterior import ddim_sample
 from phydict.prior import Prior, SuperResolution
 from phydict.training.settings import Optimisation

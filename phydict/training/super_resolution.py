@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool3d
 
-from phydict.diffusion import Denoiser
-from phydict.diffusion.steps import noise_like
+from phydict.diffusion import Denoiser, noise_like
 from phydict.evaluation import method_panel
 from phydict.grid import Cube, Grid
 from phydict.prior import LocalUNet, SuperResolution, describe_super_resolution, load_super_resolution

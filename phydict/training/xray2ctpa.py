@@ -11,7 +11,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn.functional import l1_loss
 
-from phydict.diffusion.steps import noise_like
+from phydict.diffusion import noise_like
 from phydict.grid import Cube
 from phydict.prior.stage_file import unlike
 from phydict.rivals import Rival, XrayToCTPANetwork

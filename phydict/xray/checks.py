@@ -1,4 +1,4 @@
-"""What X-rays must be, and what makes them doubtful."""
+"""What X-rays and their geometry must be, and what makes them doubtful."""
 
 from __future__ import annotations
 
@@ -50,13 +50,77 @@ def check_fit(xrays: Tensor, beam: ConeBeam, grid: Grid, survey: Grid | None = N
     check_xrays(xrays, beam, display)
     check_air(xrays)
     beam.check(grid)
-    beam.check_scale(survey or grid)
-    beam.check_meets(grid)
+    check_scale(beam, survey or grid)
+    check_meets(beam, grid)
     if beam.continued and not grid.is_upright:
         raise ValueError("a patient who continues above and below is repeated along the third axis of the voxels, "
                          "which is to run upwards, but "
                          f"{np.round(grid.affine[:3, 2] / grid.spacing[2], 2).tolist()} was given: give voxels whose "
                          "third axis is superior, or leave out `continued`")
+
+
+def check_scale(beam: ConeBeam, grid: Grid) -> None:
+    """Look for lengths that are not in mm: compare the shadow of the box of voxels with the detectors.
+
+    Raises ValueError for a view of which no ray meets the box, and where both sides of a shadow differ from the
+    detector's by a factor of 6 or more; warns from a factor of 3. The box must lie between source and detector.
+    """
+    sides, met = _sides(beam), _meets(beam, grid)
+    for k, (low, high) in enumerate(zip(*_shadow(beam, grid))):
+        if not met[k]:
+            raise ValueError(f"view {k}: no ray from the source to the detector meets the volume; check the view's "
+                             "source, detector centre, u and v, and that the volume's centre is the isocentre")
+        ratio = (high - low) / sides[k]
+        factor = max(float(ratio.min()), 1 / float(ratio.max()))
+        if factor < 3:
+            continue
+        comparison = "larger" if ratio.min() > 1 else "smaller"
+        message = (f"view {k}: the volume's shadow is {factor:.1f} times {comparison} than the detector of "
+                   f"{sides[k][0]:.4g} x {sides[k][1]:.4g} mm; check that the pixel size and all distances are in "
+                   "mm, not in cm or m, and that the pixel size is that of these images")
+        if factor >= 6:
+            raise ValueError(message)
+        warn(message)
+        return
+
+
+def check_meets(beam: ConeBeam, grid: Grid) -> None:
+    """Raise ValueError unless a ray of some view meets the box of voxels, which must lie between source and
+    detector."""
+    if not _meets(beam, grid).any():
+        size, centre = (", ".join(f"{mm:g}" for mm in np.round(place, 3) + 0.0)
+                        for place in (grid.extent, grid.centre))
+        raise ValueError(f"no ray of any view meets the box of voxels, which has sides of ({size}) mm and its "
+                         f"centre at ({centre}) mm: give a centre, in mm towards right, anterior and superior, and "
+                         "sides of a box that is seen in the X-rays")
+
+
+def is_smaller_scene(beam: ConeBeam, grid: Grid) -> bool:
+    """Whether the scene is that of something smaller than the box of voxels: a part of it lies beside or behind a
+    source, or a source stands in the sphere about it and sees, along both sides of the detector, less than a third.
+    """
+    if (beam.depths(grid) <= 0).any():
+        return True
+    near = np.linalg.norm(beam.sources - grid.centre, axis=1) < np.linalg.norm(grid.extent) / 2
+    low, high = _shadow(beam, grid)
+    return bool((near & ((high - low) > 3 * _sides(beam)).all(1)).any())
+
+
+def _sides(beam: ConeBeam) -> np.ndarray:
+    """The detectors' sides (K, 2) in mm, along their columns and their rows."""
+    return np.stack([np.linalg.norm(beam.v, axis=1), np.linalg.norm(beam.u, axis=1)], 1) * beam.shape
+
+
+def _meets(beam: ConeBeam, grid: Grid) -> np.ndarray:
+    """Whether (K,) the box's shadow, as far as it reaches along rows and columns, meets each detector."""
+    (low, high), half = _shadow(beam, grid), _sides(beam) / 2
+    return np.all((low <= half) & (high >= -half), axis=1)
+
+
+def _shadow(beam: ConeBeam, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+    """The ends (K, 2) in mm, along rows' and columns' direction from the detector's centre, of the box's shadow."""
+    places = beam.shadows(grid.corners())[..., ::-1]
+    return places.min(1), places.max(1)
 
 
 def outer_columns(xrays: Tensor) -> Tensor:

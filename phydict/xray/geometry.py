@@ -15,7 +15,6 @@ import yaml
 from phydict.grid import Grid, whole_sizes
 from phydict.runtime.files import atomic_write
 from phydict.runtime.reading import check_memory
-from phydict.runtime.warning import warn
 from phydict.runtime.yaml_file import read_yaml
 from phydict.xray.orbits import on_circle, on_line, turned
 from phydict.xray.stated import (
@@ -255,30 +254,10 @@ class ConeBeam:
                 f"its centre; {room} this source_to_detector of {distance:g} mm; move the source or the detector, or "
                 f"give a smaller volume{units}")
 
-    def check_meets(self, grid: Grid) -> None:
-        """Raise ValueError unless a ray of some view meets the box of voxels, which must lie between source and
-        detector."""
-        if not self._meets(grid).any():
-            size, centre = (", ".join(f"{mm:g}" for mm in np.round(place, 3) + 0.0)
-                            for place in (grid.extent, grid.centre))
-            raise ValueError(f"no ray of any view meets the box of voxels, which has sides of ({size}) mm and its "
-                             f"centre at ({centre}) mm: give a centre, in mm towards right, anterior and superior, and "
-                             "sides of a box that is seen in the X-rays")
-
     def has_room_for(self, grid: Grid) -> bool:
         """Whether the whole box of voxels lies between every source and its detector's plane."""
         depth = self.depths(grid)
         return bool((depth > 0).all() and (depth < self.distances).all())
-
-    def is_smaller_than(self, grid: Grid) -> bool:
-        """Whether the scene is that of something smaller than the box of voxels: a part of it lies beside or behind a
-        source, or a source stands in the sphere about it and sees, along both sides of the detector, less than a third.
-        """
-        if (self.depths(grid) <= 0).any():
-            return True
-        near = np.linalg.norm(self.sources - grid.centre, axis=1) < np.linalg.norm(grid.extent) / 2
-        low, high = self._shadow(grid)
-        return bool((near & ((high - low) > 3 * self._sides).all(1)).any())
 
     def depths(self, grid: Grid) -> np.ndarray:
         """How far (8, K) in mm the box's corners lie from the sources' planes, towards the detectors."""
@@ -289,45 +268,6 @@ class ConeBeam:
         axis = grid.affine[:3, 2] / grid.spacing[2]
         tilt = np.linalg.norm(np.cross(self.v, axis), axis=1) / np.linalg.norm(self.v, axis=1)
         return bool((tilt < 1e-6).all())
-
-    def check_scale(self, grid: Grid) -> None:
-        """Look for lengths that are not in mm: compare the shadow of the box of voxels with the detectors.
-
-        Raises ValueError for a view of which no ray meets the box, and where both sides of a shadow differ from the
-        detector's by a factor of 6 or more; warns from a factor of 3. The box must lie between source and detector.
-        """
-        sides, met = self._sides, self._meets(grid)
-        for k, (low, high) in enumerate(zip(*self._shadow(grid))):
-            if not met[k]:
-                raise ValueError(f"view {k}: no ray from the source to the detector meets the volume; check the view's "
-                                 "source, detector centre, u and v, and that the volume's centre is the isocentre")
-            ratio = (high - low) / sides[k]
-            factor = max(float(ratio.min()), 1 / float(ratio.max()))
-            if factor < 3:
-                continue
-            comparison = "larger" if ratio.min() > 1 else "smaller"
-            message = (f"view {k}: the volume's shadow is {factor:.1f} times {comparison} than the detector of "
-                       f"{sides[k][0]:.4g} x {sides[k][1]:.4g} mm; check that the pixel size and all distances are in "
-                       "mm, not in cm or m, and that the pixel size is that of these images")
-            if factor >= 6:
-                raise ValueError(message)
-            warn(message)
-            return
-
-    @property
-    def _sides(self) -> np.ndarray:
-        """The detectors' sides (K, 2) in mm, along their columns and their rows."""
-        return np.stack([np.linalg.norm(self.v, axis=1), np.linalg.norm(self.u, axis=1)], 1) * self.shape
-
-    def _meets(self, grid: Grid) -> np.ndarray:
-        """Whether (K,) the box's shadow, as far as it reaches along rows and columns, meets each detector."""
-        (low, high), half = self._shadow(grid), self._sides / 2
-        return np.all((low <= half) & (high >= -half), axis=1)
-
-    def _shadow(self, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
-        """The ends (K, 2) in mm, along rows' and columns' direction from the detector's centre, of the box's shadow."""
-        places = self.shadows(grid.corners())[..., ::-1]
-        return places.min(1), places.max(1)
 
     def same_as(self, other: ConeBeam, tolerance: float = 1e-6) -> bool:
         """Whether both beams have the same poses to `tolerance` mm, the same detector shape and, where both state it,

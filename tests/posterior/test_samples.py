@@ -9,7 +9,7 @@ from prior.tiny import tiny_prior
 from torch.nn.functional import pad
 
 from phydict import reconstruct
-from phydict.diffusion.steps import noise_like
+from phydict.diffusion import noise_like
 from phydict.methods import METHODS
 from phydict.posterior import GradientSteps, Measurement, Posterior, PriorOnly, ProximalCG, Reward, SplitGibbs
 from phydict.posterior.posterior import sample_seed

@@ -199,6 +199,12 @@ def test_a_schedule_whose_time_is_of_another_is_warned_of(module):
         of_scene(prior)
 
 
+def test_a_method_that_needs_a_refiner_names_one_that_takes_a_prior_of_ones_own(module):
+    with pytest.raises(ValueError, match="phydict_learned needs a refiner, its file or object, but OwnPrior, a prior "
+                                         "of your own, was given: give it to phydict_fast"):
+        reconstructor("phydict_learned", f"{module}.OwnPrior")
+
+
 def of_scene(prior):
     return reconstructor("prior_only", prior).reconstruct(views(), PROJECTOR)
 

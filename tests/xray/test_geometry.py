@@ -7,6 +7,7 @@ import pytest
 import yaml
 
 from phydict.xray import ConeBeam, Grid
+from phydict.xray.checks import check_meets, check_scale
 
 ORBIT = """orbit:
   views: 4
@@ -285,7 +286,7 @@ def test_a_missing_file_is_named(tmp_path):
 
 def test_a_volume_in_scale_with_its_detector_passes_without_a_word(recwarn):
     for beam in (orbit(), orbit(pixel=(2.5, 2)), ConeBeam.orbit(4, 1020, 740, (1, 448), 1.25)):  # one is a fan beam
-        beam.check_scale(Grid.cube(64))
+        check_scale(beam, Grid.cube(64))
     assert not recwarn.list
 
 
@@ -294,7 +295,7 @@ def test_pixels_in_another_unit_are_refused_by_their_factor(factor, comparison):
     side = 384 * 1020 / (740 - 192)  # of the shadow, which the box's near face casts
     beam = orbit(pixel=(side / 112 * factor, side / 96 * factor))
     with pytest.raises(ValueError, match=f"view 0: .* times {comparison} than the detector.*in mm") as caught:
-        beam.check_scale(Grid.cube(64))
+        check_scale(beam, Grid.cube(64))
     said = float(str(caught.value).split(" times")[0].split()[-1])
     assert said == pytest.approx(max(factor, 1 / factor), rel=0.01)
 
@@ -302,12 +303,12 @@ def test_pixels_in_another_unit_are_refused_by_their_factor(factor, comparison):
 def test_distances_in_another_unit_are_refused():
     beam = ConeBeam.orbit(2, 10200, 7400, (112, 112), 0.5)
     with pytest.raises(ValueError, match="times larger than the detector of 56 x 56 mm"):
-        beam.check_scale(Grid.cube(64))
+        check_scale(beam, Grid.cube(64))
 
 
 def test_a_small_field_of_view_is_a_warning():
     with pytest.warns(UserWarning, match="view 0: the volume's shadow is 5.3 times larger"):
-        orbit(pixel=(1.2, 1.4)).check_scale(Grid.cube(64))
+        check_scale(orbit(pixel=(1.2, 1.4)), Grid.cube(64))
 
 
 def test_a_view_that_misses_the_volume_is_refused():
@@ -315,7 +316,7 @@ def test_a_view_that_misses_the_volume_is_refused():
     beside = ConeBeam(beam.sources, beam.detectors + [[0, 0, 0], [0, 0, 900], [0, 0, 0], [0, 0, 0]], beam.u, beam.v,
                       beam.shape)
     with pytest.raises(ValueError, match="view 1: no ray .* meets the volume"):
-        beside.check_scale(Grid.cube(64))
+        check_scale(beside, Grid.cube(64))
 
 
 @pytest.mark.parametrize("axis, half", [(0, 192 * 836 / 1020), (2, 280 * 836 / 1020)])  # seen 96 mm behind its centre
@@ -325,7 +326,7 @@ def test_a_box_is_met_where_a_view_sees_a_part_of_it(axis, half, sign):
         return Grid.box(8, 192.0, np.eye(3)[axis] * sign * (half + 96 + beyond))
 
     beam = orbit(1)
-    beam.check_meets(box(-0.1))
+    check_meets(beam, box(-0.1))
     with pytest.raises(ValueError, match=r"no ray of any view meets the box .* \(192, 192, 192\) mm"):
-        beam.check_meets(box(0.1))
-    orbit(2, arc_degrees=180).check_meets(box(0.1) if axis == 0 else box(-0.1))  # the second view sees it
+        check_meets(beam, box(0.1))
+    check_meets(orbit(2, arc_degrees=180), box(0.1) if axis == 0 else box(-0.1))  # the second view sees it

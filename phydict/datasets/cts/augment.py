@@ -125,6 +125,11 @@ class Deformation:
             points = points * torch.tensor([-1.0, 1, 1])
         return self.girth.source(points) if self.girth else points
 
+    def changed_hu(self, hu: torch.Tensor) -> torch.Tensor:
+        """HU scaled about air and, where there is no air, offset."""
+        above = hu - AIR
+        return AIR + self.hu_scale * above + self.hu_offset * (above / 200).clamp(0, 1)
+
     def apply(self, case: Case, grid: Grid, window: HUWindow) -> Case:
         """The deformed Case; volume and masks are sampled at the same points, air and zeros outside."""
         half = torch.tensor([n * s / 2 for n, s in zip(grid.shape, grid.spacing)])
@@ -132,8 +137,7 @@ class Deformation:
         air = float(window.to_range(torch.tensor(AIR)))
         state = torch.cat([case["volume"] - air, case["masks"]])
         state = torch.nn.functional.grid_sample(state[None], points, padding_mode="zeros", align_corners=False)[0]
-        hu = window.to_hu(state[:1] + air)
-        hu = AIR + self.hu_scale * (hu - AIR) + self.hu_offset * ((hu - AIR) / 200).clamp(0, 1)
+        hu = self.changed_hu(window.to_hu(state[:1] + air))
         return lacking(case, "affine", "centred_on") | {
             "volume": window.to_range(hu), "masks": state[1:].clamp(0, 1)}
 

@@ -100,7 +100,6 @@ class NoNIfTI(FileNotFoundError):
     """There is no NIfTI file where CTs are looked for."""
 
 
-
 def find_cts(root: str | Path, reports: str | Path | None = None, metadata: str | Path | None = None,
              fixed: bool = True, first_reconstruction: bool = False,
              exclude: str | Path | None = None) -> list[CTFile]:

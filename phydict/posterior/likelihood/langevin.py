@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from phydict.diffusion.steps import Generators, noise_like
+from phydict.diffusion import Generators, noise_like
 from phydict.posterior.likelihood.likelihood_draw import LikelihoodDraw
 from phydict.posterior.normalised import NormalisedMeasurement
 from phydict.runtime.ranges import LEAST, MOST, check_fields

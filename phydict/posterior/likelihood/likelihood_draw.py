@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from phydict.diffusion.steps import Generators, noise_like
+from phydict.diffusion import Generators, noise_like
 from phydict.posterior.normalised import NormalisedMeasurement, nearest_fit
 from phydict.runtime.ranges import check_fields
 

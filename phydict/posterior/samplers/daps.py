@@ -16,8 +16,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from phydict.diffusion import Denoiser, renoise
-from phydict.diffusion.steps import Generators, noise_like
+from phydict.diffusion import Denoiser, Generators, noise_like, renoise
 from phydict.posterior.likelihood.langevin import Langevin
 from phydict.posterior.likelihood.likelihood_draw import LikelihoodDraw
 from phydict.posterior.measurement import Measurement

@@ -5,7 +5,7 @@
 | denoise(x, t)                  | Tweedie's estimate                                     |
 | nearest_fit(m, x0, 1 / gamma)  | M conjugate gradients, without or with a proximal term |
 | tv                             | the ADMM of its 3D solver, dual kept across the levels |
-| noise_in, stochastic_ddim_step | DDIM with the noise of the old estimate, eta = eta     |
+| noise_in, stochastic_ddim_step | DDIM with the noise of the old estimate, partly new    |
 """
 
 from __future__ import annotations
@@ -17,8 +17,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from phydict.diffusion import Denoiser, noise_in
-from phydict.diffusion.steps import Generators
+from phydict.diffusion import Denoiser, Generators, noise_in
 from phydict.posterior.likelihood.admm_tv import ADMMTV
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.normalised import NormalisedMeasurement, nearest_fit

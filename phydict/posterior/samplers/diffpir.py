@@ -1,10 +1,10 @@
-"""DiffPIR: a proximal step onto the X-rays per noise level, then diffusion with partly zeta noise.
+"""DiffPIR: a proximal step onto the X-rays per noise level, then diffusion with noise of which a share is new.
 
 | here                           | publication                                        |
 |--------------------------------|----------------------------------------------------|
 | denoise(x, t)                  | Algorithm 1, line 3                                |
 | nearest_fit(m, x0, rho_t)      | line 4, rho_t = prior_weight sigma_y^2 / sigma_t^2 |
-| noise_in, stochastic_ddim_step | lines 5 and 6, zeta = zeta                         |
+| noise_in, stochastic_ddim_step | lines 5 and 6, with zeta of the noise new          |
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from phydict.diffusion import Denoiser, noise_in
-from phydict.diffusion.steps import Generators
+from phydict.diffusion import Denoiser, Generators, noise_in
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.normalised import NormalisedMeasurement, check_noise, nearest_fit
 from phydict.posterior.samplers.noise_levels import stochastic_ddim_step

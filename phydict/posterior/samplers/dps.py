@@ -15,8 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from phydict.diffusion import Denoiser, noise_in
-from phydict.diffusion.steps import Generators
+from phydict.diffusion import Denoiser, Generators, noise_in
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.normalised import NormalisedMeasurement
 from phydict.posterior.samplers.noise_levels import stochastic_ddim_step

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from phydict.diffusion import CosineSchedule, Denoiser, ddim, noise_in, renoise
-from phydict.diffusion.steps import Generators, noise_like
+from phydict.diffusion import CosineSchedule, Denoiser, Generators, ddim, noise_in, noise_like, renoise
 
 POWER = 7.0
 """Of the polynomial that noise levels follow."""

@@ -15,8 +15,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from phydict.diffusion import Denoiser
-from phydict.diffusion.steps import Generators
+from phydict.diffusion import Denoiser, Generators
 from phydict.posterior.likelihood.likelihood_draw import ExactDraw, LikelihoodDraw
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.normalised import NormalisedMeasurement, check_noise

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 from torch import Tensor
 
+from phydict.diffusion import Generators
 from phydict.diffusion.denoiser import Denoiser
-from phydict.diffusion.steps import Generators
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.samplers.sampler import Sampler, ddim_sample
 

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
-from phydict.diffusion import Denoiser, ddim
-from phydict.diffusion.steps import Generators
+from phydict.diffusion import Denoiser, Generators, ddim
 from phydict.prior import DEFAULT_PRIOR
 from phydict.runtime.own_code import check_takes
 
 if TYPE_CHECKING:
     from phydict.posterior.measurement import Measurement
+
 
 class Sampler(ABC):
     """Settings of a sampling method; `sample` turns noise into a clean state. A sampler of one's own has

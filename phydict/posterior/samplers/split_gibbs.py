@@ -13,19 +13,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import torch
 from torch import Tensor
 
-from phydict.diffusion import Denoiser, ddim, renoise
-from phydict.diffusion.steps import Generators, noise_like
+from phydict.diffusion import Denoiser, Generators, ddim, noise_like, renoise
 from phydict.posterior.discretisation import find_subgrid
-from phydict.posterior.hardening import with_hardening
+from phydict.posterior.explained import explained
 from phydict.posterior.likelihood.likelihood import LikelihoodStep, ProximalCG
 from phydict.posterior.measurement import Measurement
-from phydict.posterior.metal import Metal, with_metal
+from phydict.posterior.metal import Metal
 from phydict.posterior.samplers.sampler import Sampler, ddim_sample
-from phydict.posterior.scatter import with_scatter
 from phydict.runtime.ranges import LEAST, MOST, check_fields
 
 
@@ -129,16 +128,8 @@ class SplitGibbs(Sampler):
 
     def sample(self, denoiser: Denoiser, measurement: Measurement, x: Tensor, generator: Generators,
                on_step: Callable[[], None] = lambda: None) -> Tensor:
-        def run(on_step: Callable[[], None] = lambda: None) -> Tensor:
-            return self.one_pass(denoiser, measurement, x, generator, on_step)
-
-        def explained(on_step: Callable[[], None] = lambda: None) -> Tensor:
-            def straight() -> Tensor:
-                return with_hardening(measurement, lambda: run(on_step), run) if self.hardening else run(on_step)
-
-            return with_scatter(measurement, straight, run) if self.scatter else straight()
-
-        return with_metal(measurement, self.metal, lambda: explained(on_step), explained)
+        run = partial(self.one_pass, denoiser, measurement, x, generator)
+        return explained(measurement, run, on_step, self.metal, self.scatter, self.hardening)
 
     def one_pass(self, denoiser: Denoiser, measurement: Measurement, x: Tensor, generator: Generators,
                  on_step: Callable[[], None] = lambda: None) -> Tensor:

@@ -9,16 +9,15 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from phydict.diffusion.steps import Generators, noise_like
+from phydict.diffusion import Generators, noise_like
 from phydict.posterior.discretisation import FINER_STEP, find_subgrid, has_finer, subgrid_projection
 from phydict.posterior.evidence import Evidence
-from phydict.posterior.hardening import with_hardening
+from phydict.posterior.explained import explained
 from phydict.posterior.likelihood.likelihood import LikelihoodStep, ProximalCG
 from phydict.posterior.measurement import Measurement
-from phydict.posterior.metal import Metal, with_metal
+from phydict.posterior.metal import Metal
 from phydict.posterior.samplers.sampler import Sampler
 from phydict.posterior.samplers.split_gibbs import SplitGibbs
-from phydict.posterior.scatter import with_scatter
 from phydict.prior import DEFAULT_REFINER, BoundRefiner
 from phydict.runtime.ranges import LEAST, MOST, check_between, check_fields
 from phydict.runtime.warning import warn
@@ -197,17 +196,11 @@ class Unrolled(Sampler):
             *_, z = self.estimates(denoiser, measurement, on_step, lambda *pair: results.append(pair))
             return z
 
-        def again() -> Tensor:
-            return result(lambda: None)
-
-        def explained(on_step: Callable[[], None] = lambda: None) -> Tensor:
-            return with_scatter(measurement, lambda: with_hardening(measurement, lambda: result(on_step), again), again)
-
         views = measurement.projector.beam.views
         if self.first is not None and denoiser.begins and views > self.first_views:
             warn(f"the report is not used: phydict_learned reads one with up to {self.first_views} X-rays, and {views} "
                  "were given; phydict_fast with a prior that reads reports uses it with any number")
-        z = with_metal(measurement, self.metal, lambda: explained(on_step), explained)
+        z = explained(measurement, result, on_step, self.metal)
         for state, evidence in results:
             if torch.equal(state, z):
                 denoiser.conclude(z, evidence)

@@ -34,6 +34,7 @@ FIELD = (316.0, 316.0, 292.0)
 """Edge lengths in mm (x, y, z) of MedSyn's atlas, to which its CTs were registered: mm are the atlas's, not the
 patient's."""
 
+
 def atlas_grid(voxels: int) -> Grid:
     """`voxels`^3 voxels over MedSyn's atlas, centred on the isocentre: 64 at stage 1, 256 at stage 2."""
     return Grid((voxels,) * 3, (FIELD[0] / voxels, FIELD[1] / voxels, FIELD[2] / voxels))

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
+from phydict.diffusion import noise_like
 from phydict.diffusion.schedule import CosineSchedule
-from phydict.diffusion.steps import noise_like
 from phydict.grid import Grid
 from phydict.prior.medsyn.networks import FACTOR, STATE_CHANNELS, SuperResolutionUNet, from_slices, to_slices
 from phydict.prior.medsyn.prior import WINDOW, _check_divisible, atlas_grid

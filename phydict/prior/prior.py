@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from phydict.diffusion import CosineSchedule, guided
 from phydict.grid import Grid
 from phydict.prior.detail import DetailNetwork
+from phydict.prior.stage_file import FORMAT
 from phydict.prior.text import TextEncoder
 from phydict.prior.unet import VolumeUNet
 from phydict.runtime.precision import network_precision
@@ -91,6 +92,21 @@ class Prior(nn.Module):
         states, mask = self.text(list(reports))
         mask = mask & torch.tensor([bool(r) for r in reports], device=mask.device)[:, None]
         return torch.where(mask[..., None], states, self.null)
+
+    def describe(self) -> dict:
+        """What the prior is, as plain JSON values: from this and the weights `load_prior` builds it again."""
+        encoder = self.text
+        text = None if encoder is None else {
+            "source": encoder.source, "length": encoder.length, "width": encoder.width,
+            "layers": encoder.bert.config.num_hidden_layers,
+            "vocabulary": None if encoder.source else encoder.vocabulary,
+            **({"padded_to": encoder.padded_to} if encoder.padded_to else {}),
+            **({"sentences": encoder.sentences} if encoder.sentences else {})}
+        return {"format": FORMAT, "stage": "base", "grid": self.grid.to_dict(),
+                "hu_window": [self.window.low, self.window.high], "state": STATE[:self.network.state_channels],
+                "sigma_data": self.sigma_data, "skip_std": self.skip_std, "schedule": vars(self.schedule),
+                "text": text, "network": self.network.settings,
+                **({"detail": self.detail.settings} if self.detail else {})}  # which older files do not name
 
     @property
     def state_channels(self) -> int:

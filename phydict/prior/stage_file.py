@@ -6,7 +6,7 @@ import json
 import reprlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -30,6 +30,20 @@ MOST_HU, MOST_LAYERS = 1e6, 256
 STAGES = {"base": "a base prior", "super_resolution": "a super-resolution stage", "refiner": "a refiner",
           "refinement": "a refinement on finer voxels", "lifted": "a rival", "x2ct": "a rival", "xray2ctpa": "a rival"}
 """What a file's header may call it, and what that is; a header that says nothing is of a base prior."""
+
+
+class Described(Protocol):
+    """A network that says what it is, as plain JSON values: from this and its weights it is built again."""
+
+    def describe(self) -> dict: ...
+
+    def state_dict(self) -> dict[str, Tensor]: ...
+
+
+def save_stage(stage: Described, path: str | Path, training: dict | None = None, dtype: torch.dtype = torch.float16):
+    """Writes a super-resolution stage, a correction or a rival to one .safetensors file, as `save_prior` does a
+    prior."""
+    write_stage(Path(path), stage.describe() | {"training": training or {}}, stage.state_dict(), dtype)
 
 
 def write_stage(path: Path, header: dict, weights: dict[str, Tensor], dtype: torch.dtype) -> None:

@@ -14,6 +14,8 @@ from phydict.diffusion import CosineSchedule
 from phydict.diffusion.steps import noise_like
 from phydict.grid import Grid
 from phydict.prior.local_unet import LocalUNet
+from phydict.prior.prior import STATE
+from phydict.prior.stage_file import FORMAT
 from phydict.prior.tiles import Tiles
 from phydict.runtime.precision import network_precision
 from phydict.runtime.ranges import check_between
@@ -59,6 +61,14 @@ class SuperResolution(nn.Module):
         self.factor, self.coarse_channels, self.state_channels = factor, coarse_channels, network.out_channels
         self.detail_std, self.skip_std = detail_std, skip_std
         self.memory, self.overlap = memory, math.ceil(overlap / network.divisor) * network.divisor
+
+    def describe(self) -> dict:
+        """What the stage is, as plain JSON values, for `build_super_resolution`."""
+        return {"format": FORMAT, "stage": "super_resolution", "grid": self.grid.to_dict(),
+                "hu_window": [self.window.low, self.window.high], "factor": self.factor,
+                "state": STATE[:self.state_channels], "coarse_state": STATE[:self.coarse_channels],
+                "detail_std": self.detail_std, "skip_std": self.skip_std, "schedule": vars(self.schedule),
+                "network": self.network.settings}
 
     def forward(self, x: Tensor, t: Tensor, upsampled: Tensor, level: Tensor) -> Tensor:
         """Clean estimate of the fine state x (B, C, X, Y, Z) at times t (B,), in x's dtype.

@@ -8,7 +8,7 @@ from torch import Tensor
 from torchmetrics.functional import spearman_corrcoef
 
 from phydict.grid import Cube
-from phydict.prior import DEFAULT_CORRECTION, describe_correction, fingerprint, load_correction
+from phydict.prior import DEFAULT_CORRECTION, fingerprint, load_correction
 from phydict.prior.correction import CorrectionNetwork
 from phydict.prior.finer_uncertainty import INPUT_CHANNELS, FinerUncertainty, tissue_of_seen
 from phydict.prior.uncertainty import TISSUES
@@ -87,6 +87,3 @@ class FinerUncertaintyTraining(StageTraining):
             assert self.prior.uncertainty is not None
             self.prior.uncertainty.calibrate(*self.of_all_processes(self.held_out))
             self.calibrated_at = self.trainer.global_step
-
-    def _describe(self) -> dict:
-        return describe_correction(self.prior)

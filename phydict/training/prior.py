@@ -17,7 +17,7 @@ from phydict.evaluation import body_weights, method_panel, volume_metrics
 from phydict.grid import Cube
 from phydict.methods import reconstruct
 from phydict.posterior import Sampler
-from phydict.prior import DetailNetwork, Prior, TextEncoder, VolumeUNet, describe_prior, learn_vocabulary, load_prior
+from phydict.prior import DetailNetwork, Prior, TextEncoder, VolumeUNet, learn_vocabulary, load_prior
 from phydict.prior.unet import TextMap
 from phydict.reconstruction import Reconstructor
 from phydict.runtime.progress import CaseProgress
@@ -119,9 +119,6 @@ class PriorTraining(DenoisingTraining):
 
     def _denoiser(self, batch: dict, x0: Tensor) -> Denoiser:
         return self.prior.bind(batch["report"][0] if self.prior.text is not None else "")
-
-    def _describe(self) -> dict:
-        return describe_prior(self.prior)
 
     def validation_step(self, batch: dict, index: int) -> None:
         super().validation_step(batch, index)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from phydict.grid import Cube
 from phydict.posterior import Sampler, Unrolled
-from phydict.prior import DEFAULT_PRIOR, BoundPrior, BoundRefiner, Prior, Refiner, describe_refiner, load_prior
+from phydict.prior import DEFAULT_PRIOR, BoundPrior, BoundRefiner, Prior, Refiner, load_prior
 from phydict.reconstruction import Reconstructor
 from phydict.runtime.ranges import check_between
 from phydict.training.prior import reconstruction_scores
@@ -115,9 +115,6 @@ class RefinerTraining(StageTraining):
 
     def validation_step(self, batch: dict, index: int) -> None:
         log_scores(self, batch, index, self.validation_views, self.method)
-
-    def _describe(self) -> dict:
-        return describe_refiner(self.prior)
 
 
 def log_error(x0: Tensor, ct: Tensor, body_weight: float) -> Tensor:

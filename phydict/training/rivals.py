@@ -64,9 +64,6 @@ class RivalTraining(StageTraining):
     def validation_step(self, batch: dict, index: int) -> None:
         log_scores(self, batch, index, self.validation_views, RivalAnswer(self.prior), self.prior.beam)
 
-    def _describe(self) -> dict:
-        return self.prior.describe()
-
 
 class LiftedTraining(RivalTraining):
     """Learns a LiftedNetwork by the refiner's loss of the CT.

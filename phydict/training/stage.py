@@ -81,10 +81,6 @@ class StageTraining(lightning.LightningModule, ABC):
             yield ({name: value[n:n + 1] for name, value in batch.items()},
                    np.random.default_rng((*key, rank + n * processes)))
 
-    @abstractmethod
-    def _describe(self) -> dict:
-        """What the stage is, as plain JSON values."""
-
     def learn_reports(self) -> None:
         """Teaches the text part, where there is one, before the first denoising step."""
 
@@ -199,7 +195,7 @@ class StageTraining(lightning.LightningModule, ABC):
         progress = {name: count + self.before.get(name, 0) for name, count in progress.items()}
         held_out = self._held_out()
         known = {} if held_out is None else {"held_out": held_out}
-        checkpoint["phydict"] = self._describe() | {"training": progress | known}
+        checkpoint["phydict"] = self.prior.describe() | {"training": progress | known}
         if self.calibrates:
             checkpoint[CALIBRATED_AT] = self.calibrated_at
 
@@ -212,7 +208,7 @@ class StageTraining(lightning.LightningModule, ABC):
         return [id for id in data.held_out if before is None or id in before]
 
     def on_load_checkpoint(self, checkpoint: dict) -> None:
-        resumed, current = {"stage": "base"} | checkpoint["phydict"], self._describe()
+        resumed, current = {"stage": "base"} | checkpoint["phydict"], self.prior.describe()
         check_stage(resumed, (current["stage"],), "the checkpoint")
         for key in resumed | current:
             if key != "training" and resumed.get(key) != current.get(key):

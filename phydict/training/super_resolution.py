@@ -12,7 +12,7 @@ from phydict.diffusion import Denoiser
 from phydict.diffusion.steps import noise_like
 from phydict.evaluation import method_panel
 from phydict.grid import Cube, Grid
-from phydict.prior import LocalUNet, SuperResolution, describe_super_resolution, load_super_resolution
+from phydict.prior import LocalUNet, SuperResolution, load_super_resolution
 from phydict.runtime.ranges import check_between
 from phydict.training.crops import SuperResolutionData
 from phydict.training.denoising import DenoisingTraining
@@ -84,9 +84,6 @@ class SuperResolutionTraining(DenoisingTraining):
 
     def _denoiser(self, batch: dict, x0: Tensor) -> Denoiser:
         return self.prior.bind(avg_pool3d(x0, self.prior.factor))
-
-    def _describe(self) -> dict:
-        return describe_super_resolution(self.prior)
 
     def validation_step(self, batch: dict, index: int) -> None:
         super().validation_step(batch, index)

@@ -13,7 +13,7 @@ from torchmetrics.functional import spearman_corrcoef
 from phydict.grid import Cube
 from phydict.posterior import Measurement, Unrolled
 from phydict.posterior.widening import limited_angle_factor
-from phydict.prior import DEFAULT_REFINER, Refiner, describe_refiner, load_prior
+from phydict.prior import DEFAULT_REFINER, Refiner, load_prior
 from phydict.prior.uncertainty import AIR_BELOW, Uncertainty, coverage_of, tissue_of
 from phydict.runtime.ranges import check_between
 from phydict.training.scenes import Scenes
@@ -117,9 +117,6 @@ class UncertaintyTraining(StageTraining):
         if self.held_out:
             self.prior.uncertainty.calibrate(*self.of_all_processes(self.held_out))
             self.calibrated_at = self.trainer.global_step
-
-    def _describe(self) -> dict:
-        return describe_refiner(self.prior)
 
 
 def _body(ct: Tensor, z: Tensor) -> Tensor:

@@ -20,7 +20,6 @@ from phydict.prior.finite import not_finite
 from phydict.prior.stage_file import check_stage
 from phydict.rivals import Rival
 from phydict.runtime.seeds import check_seed
-from phydict.training.checkpoints import CALIBRATED_AT
 from phydict.training.data import PriorData
 from phydict.training.settings import Optimisation
 from phydict.units import HUWindow
@@ -50,12 +49,11 @@ def check_network(kind: str, file: str, own: dict, requested: dict, part: str = 
 class StageTraining(lightning.LightningModule, ABC):
     """Learns one stage, its network `self.prior`, by the loss of a batch (`batch_loss`).
 
-    calls: of the network, forward and backward, that a sample costs. calibrates: whether validation changes the
-    weights. calibrated_at: the step after which it last did, None: not yet. initial: the file that training starts
-    from, if any.
+    calls: of the network, forward and backward, that a sample costs. initial: the file that training starts from, if
+    any.
     """
 
-    calls, calibrates, calibrated_at = 1, False, None
+    calls = 1
 
     def __init__(self, prior: Prior | SuperResolution | Refiner | CorrectionNetwork | Rival,
                  optimisation: Optimisation, seed: int, initial: str | None = None):
@@ -99,16 +97,7 @@ class StageTraining(lightning.LightningModule, ABC):
 
     def on_fit_start(self) -> None:
         self.optimisation.check_end(self.trainer.max_steps)
-        if self.calibrates and not len(self.trainer.datamodule.validation):  # type: ignore[attr-defined]
-            raise ValueError("validation calibrates the intervals, but nothing is held out: name CTs by "
-                             "data.holdout.ids, or give a share of them as data.holdout.fraction")
-        if self.calibrates and not self.trainer.limit_val_batches:
-            raise ValueError("validation calibrates the intervals, but trainer.limit_val_batches is "
-                             f"{self.trainer.limit_val_batches}: leave it out")
         for callback in self.averaging():
-            if self.calibrates:
-                raise ValueError("weights that validation calibrates cannot be averaged: train without "
-                                 f"{type(callback).__name__} (trainer.callbacks: null)")
             if callback._average_model is not None:
                 callback._average_model.to(self.device)  # made before the weights came there; each step would copy them
 
@@ -196,8 +185,6 @@ class StageTraining(lightning.LightningModule, ABC):
         held_out = self._held_out()
         known = {} if held_out is None else {"held_out": held_out}
         checkpoint["phydict"] = self.prior.describe() | {"training": progress | known}
-        if self.calibrates:
-            checkpoint[CALIBRATED_AT] = self.calibrated_at
 
     def _held_out(self) -> list[str] | None:
         """The held-out CTs that the weights never learnt from, not before this training either; None where no training
@@ -215,4 +202,3 @@ class StageTraining(lightning.LightningModule, ABC):
                 raise ValueError(f"the checkpoint's prior and this training's differ in '{key}': give the settings and "
                                  "data that the checkpoint was trained with, or start anew with model.initial")
         self.samples = checkpoint["phydict"].get("training", {}).get("samples", 0) - self.before.get("samples", 0)
-        self.calibrated_at = checkpoint.get(CALIBRATED_AT)

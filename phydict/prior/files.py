@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from torch import Tensor
 
 from phydict.diffusion import CosineSchedule
@@ -28,7 +27,7 @@ from phydict.prior.medsyn.prior import MedSynPrior
 from phydict.prior.medsyn.super_resolution import MedSynSuperResolution
 from phydict.prior.prior import Prior
 from phydict.prior.refiner import Refiner
-from phydict.prior.stage_file import built_network, loaded_stage, number_of, whole_of, window_of, write_stage
+from phydict.prior.stage_file import built_network, header_of, loaded_stage, number_of, whole_of, window_of, write_stage
 from phydict.prior.super_resolution import SuperResolution
 from phydict.prior.text_file import has_text, load_text
 from phydict.prior.uncertainty import Uncertainty
@@ -122,8 +121,7 @@ def is_refiner(given: object) -> bool:
     if not isinstance(given, str | Path):
         return isinstance(given, Refiner)
     try:
-        with safe_open(own_or_shipped(given), "pt") as file:
-            return json.loads((file.metadata() or {}).get("phydict", "{}")).get("stage") == "refiner"
+        return header_of(own_or_shipped(given)).get("stage") == "refiner"
     except (SafetensorError, OSError, ValueError, AttributeError):  # whoever reads it says what it lacks
         return False
 
@@ -131,8 +129,7 @@ def is_refiner(given: object) -> bool:
 def held_out_of(path: str | Path) -> list[str] | None:
     """The ids of the CTs that the trainings of a saved stage held out, by its file's header; None where it tells
     nothing of them."""
-    with safe_open(own_or_shipped(path), "pt") as file:
-        training = json.loads((file.metadata() or {}).get("phydict", "{}")).get("training")
+    training = header_of(own_or_shipped(path)).get("training")
     held_out = training.get("held_out") if isinstance(training, dict) else None
     return held_out if isinstance(held_out, list) and all(isinstance(id, str) for id in held_out) else None
 

@@ -59,13 +59,20 @@ def write_stage(path: Path, header: dict, weights: dict[str, Tensor], dtype: tor
         raise not_written(f"'{path}'", error, "give another place") from error
 
 
+def header_of(path: str | Path) -> dict:
+    """What `write_stage` put into a file's header, {} where it put none. Raises SafetensorError, OSError or ValueError
+    where that cannot be read."""
+    with safe_open(path, "pt") as file:
+        return json.loads((file.metadata() or {}).get("phydict", "{}"))
+
+
 def read_stage(path: Path, stages: Sequence[str], device: str) -> tuple[dict, dict[str, Tensor]]:
     """Header and weights, but those of a text encoder, of a file that must be of one of `stages`."""
     if not path.is_file():
         raise FileNotFoundError(f"no prior at '{path}': give the .safetensors file that training wrote")
     try:
+        header = header_of(path)
         with safe_open(path, "pt", device=device) as file:
-            header = json.loads((file.metadata() or {}).get("phydict", "{}"))
             weights = {k: file.get_tensor(k) for k in file.keys() if not k.startswith("text.")}
     except Exception as error:  # whatever a damaged file leads its readers to
         raise ValueError(f"'{path}' is truncated or not a safetensors file ({reason(error)}): {ADVICE}") from error

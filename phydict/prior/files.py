@@ -89,7 +89,7 @@ def load_prior(path: str | Path | MedSynCheckpoint = DEFAULT_PRIOR,
     """
     path = _resolved(path)
     if isinstance(path, MedSynCheckpoint) or is_medsyn(path):
-        return load_medsyn(path, device)
+        return load_medsyn(path).to(device)
 
     def build(header: dict, weights: dict[str, Tensor]) -> Prior | Refiner:
         loaded = (build_refiner if header.get("stage") == "refiner" else build_prior)(header, weights)
@@ -99,21 +99,20 @@ def load_prior(path: str | Path | MedSynCheckpoint = DEFAULT_PRIOR,
             reader.unheard = UNHEARD if Path(path).resolve() == DEFAULT_PRIOR.resolve() else ""
         return loaded
 
-    return loaded_stage(path, ("base", "refiner"), build, device)
+    return loaded_stage(path, ("base", "refiner"), build).to(device)
 
 
-def load_super_resolution(path: str | Path | MedSynCheckpoint,
-                          device: str = "cpu") -> SuperResolution | MedSynSuperResolution:
+def load_super_resolution(path: str | Path | MedSynCheckpoint) -> SuperResolution | MedSynSuperResolution:
     """The super-resolution stage in a file written by `save_stage`, or MedSyn's; as `load_prior`."""
     path = _resolved(path)
     if isinstance(path, MedSynCheckpoint) or is_medsyn(path):
-        return load_medsyn_super_resolution(path, device)
-    return loaded_stage(path, ("super_resolution",), build_super_resolution, device)
+        return load_medsyn_super_resolution(path)
+    return loaded_stage(path, ("super_resolution",), build_super_resolution)
 
 
-def load_correction(path: str | Path = DEFAULT_CORRECTION, device: str = "cpu") -> CorrectionNetwork:
+def load_correction(path: str | Path = DEFAULT_CORRECTION) -> CorrectionNetwork:
     """The network in a file written by `save_stage`; as `load_prior`."""
-    return loaded_stage(own_or_shipped(path), ("refinement",), build_correction, device)
+    return loaded_stage(own_or_shipped(path), ("refinement",), build_correction)
 
 
 def is_refiner(given: object) -> bool:

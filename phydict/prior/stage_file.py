@@ -66,13 +66,13 @@ def header_of(path: str | Path) -> dict:
         return json.loads((file.metadata() or {}).get("phydict", "{}"))
 
 
-def read_stage(path: Path, stages: Sequence[str], device: str) -> tuple[dict, dict[str, Tensor]]:
+def read_stage(path: Path, stages: Sequence[str]) -> tuple[dict, dict[str, Tensor]]:
     """Header and weights, but those of a text encoder, of a file that must be of one of `stages`."""
     if not path.is_file():
         raise FileNotFoundError(f"no prior at '{path}': give the .safetensors file that training wrote")
     try:
         header = header_of(path)
-        with safe_open(path, "pt", device=device) as file:
+        with safe_open(path, "pt") as file:
             weights = {k: file.get_tensor(k) for k in file.keys() if not k.startswith("text.")}
     except Exception as error:  # whatever a damaged file leads its readers to
         raise ValueError(f"'{path}' is truncated or not a safetensors file ({reason(error)}): {ADVICE}") from error
@@ -83,20 +83,19 @@ def read_stage(path: Path, stages: Sequence[str], device: str) -> tuple[dict, di
     return header, weights
 
 
-def loaded_stage(path: Path, stages: Sequence[str], build: Callable[[dict, dict[str, Tensor]], Network],
-                 device: str) -> Network:
+def loaded_stage(path: Path, stages: Sequence[str], build: Callable[[dict, dict[str, Tensor]], Network]) -> Network:
     """What `build` makes of a file of one of these stages, ready to be used (evaluation mode, no gradients).
 
     Raises FileNotFoundError where there is no file, ValueError where it is truncated, is of another stage, contradicts
     itself or holds weights that are not finite.
     """
     with refusing(path, ADVICE):
-        header, weights = read_stage(path, stages, device)
+        header, weights = read_stage(path, stages)
         try:
             loaded = build(header, weights)
         except ValueError as error:
             raise ValueError(f"'{path}' contradicts itself: {error}") from error
-    return loaded.to(device).eval().requires_grad_(False)
+    return loaded.eval().requires_grad_(False)
 
 
 def is_saved_prior(path: str | Path) -> bool:

@@ -21,7 +21,7 @@ NETWORKS: dict[str, type[RivalNetwork]] = {
 """The networks by the name that a file's header calls them."""
 
 
-def load_rival(path: str | Path, device: str = "cpu") -> Rival:
+def load_rival(path: str | Path) -> Rival:
     """The rival in a file written by `phydict.prior.save_stage`, in evaluation mode.
 
     Raises FileNotFoundError when there is no file, ValueError when it is truncated, is no rival, or holds weights that
@@ -33,7 +33,7 @@ def load_rival(path: str | Path, device: str = "cpu") -> Rival:
         rival.budget = {name: known[name] for name in ("steps", "samples") if type(known.get(name)) is int}
         return rival
 
-    return loaded_stage(Path(path), tuple(NETWORKS), build, device)
+    return loaded_stage(Path(path), tuple(NETWORKS), build)
 
 
 def build_rival(header: dict, weights: dict[str, Tensor]) -> Rival:

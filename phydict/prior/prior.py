@@ -30,6 +30,14 @@ DETAIL_REACH = 8.0
 """Noise, over the size of the detail, beyond which a detail network is not called."""
 
 
+def preconditioning(schedule: CosineSchedule, t: Tensor, size: float, skip_std: float) -> tuple[Tensor, Tensor]:
+    """At times t (B,): the share of x_t / a in an estimate, and the scale of a network's output, whose size is `size`;
+    see Prior."""
+    sigma = schedule.sigma(t.double()).float().view(-1, 1, 1, 1, 1)
+    share = skip_std**2 / (sigma**2 + skip_std**2)
+    return share, (((1 - share) * size) ** 2 + (share * sigma) ** 2).sqrt()
+
+
 class Prior(nn.Module):
     """x0-predicting denoiser of the state (B, C, X, Y, Z), channel 0 the CT in the prior's range.
 
@@ -159,9 +167,7 @@ class Prior(nn.Module):
 
     def preconditioning(self, t: Tensor) -> tuple[Tensor, Tensor]:
         """At times t (B,): the share of x_t / a in the estimate, and the scale of the network's output."""
-        sigma = self.schedule.sigma(t.double()).float().view(-1, 1, 1, 1, 1)
-        share = self.skip_std**2 / (sigma**2 + self.skip_std**2)
-        return share, (((1 - share) * self.sigma_data) ** 2 + (share * sigma) ** 2).sqrt()
+        return preconditioning(self.schedule, t, self.sigma_data, self.skip_std)
 
     @torch.no_grad()
     def bind(self, report: str = "", guidance: float = 1.0, precision: str = "auto") -> BoundPrior:

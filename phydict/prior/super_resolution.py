@@ -14,7 +14,7 @@ from phydict.diffusion import CosineSchedule
 from phydict.diffusion.steps import noise_like
 from phydict.grid import Grid
 from phydict.prior.local_unet import LocalUNet
-from phydict.prior.prior import STATE
+from phydict.prior.prior import STATE, preconditioning
 from phydict.prior.stage_file import FORMAT
 from phydict.prior.tiles import Tiles
 from phydict.runtime.precision import network_precision
@@ -87,10 +87,8 @@ class SuperResolution(nn.Module):
         return torch.zeros(1, self.network.in_channels, *shape), torch.zeros(1), torch.zeros(1)
 
     def preconditioning(self, t: Tensor) -> tuple[Tensor, Tensor]:
-        """At times t (B,): the share of x_t / a in the estimate, and the scale of the network's output."""
-        sigma = self.schedule.sigma(t.double()).float().view(-1, 1, 1, 1, 1)
-        share = self.skip_std**2 / (sigma**2 + self.skip_std**2)
-        return share, (((1 - share) * self.detail_std) ** 2 + (share * sigma) ** 2).sqrt()
+        """As for a Prior."""
+        return preconditioning(self.schedule, t, self.detail_std, self.skip_std)
 
     def upsample(self, coarse: Tensor) -> Tensor:
         """The coarse state (B, C, x, y, z), of which the first coarse_channels count, on the fine voxels."""

@@ -42,7 +42,6 @@ from phydict.datasets.radiographs.xray_description import read_description
 from phydict.datasets.radiographs.xray_images import read_image
 from phydict.evaluation import read_csv
 from phydict.inference.results import CaseResults
-from phydict.prior.files import describe_prior
 from phydict.prior.inspection import inspect_prior
 from phydict.prior.tensors import read_torch
 from phydict.runtime.console import read_configuration
@@ -114,7 +113,7 @@ def _beam_samples(ending: str) -> Callable[[], list[bytes]]:
 @cache
 def _tiny() -> tuple[dict, dict]:
     prior = tiny_prior(text=False)
-    return describe_prior(prior), {k: w.half().contiguous() for k, w in prior.state_dict().items()}
+    return prior.describe(), {k: w.half().contiguous() for k, w in prior.state_dict().items()}
 
 
 def _prior_samples() -> list[bytes]:

@@ -20,9 +20,9 @@ from phydict.evaluation.sharpness import sharpness_scores
 from phydict.grid import Cube, Grid
 from phydict.methods import METHODS, onto_grid, reconstruct
 from phydict.posterior import Posterior, Sampler
-from phydict.prior import VolumeUNet, save_prior
+from phydict.prior import VolumeUNet, save_prior, save_stage
 from phydict.reconstruction import Reconstructor
-from phydict.rivals import LiftedNetwork, X2CTNetwork, XrayToCTPANetwork, save_rival
+from phydict.rivals import LiftedNetwork, X2CTNetwork, XrayToCTPANetwork
 from phydict.training import PriorTraining
 from phydict.training.refiner import RefinerTraining
 from phydict.training.rivals import LiftedTraining, OrbitScenes
@@ -230,7 +230,7 @@ def stages(tmp_path_factory) -> Path:
     """A folder of stages to train on."""
     folder = tmp_path_factory.mktemp("stages")
     save_prior(tiny_prior(detail=True), folder / "prior.safetensors", dtype=torch.float32)
-    save_rival(tiny_xray2ctpa(), folder / "xray2ctpa.safetensors", dtype=torch.float32)
+    save_stage(tiny_xray2ctpa(), folder / "xray2ctpa.safetensors", dtype=torch.float32)
     return folder
 
 

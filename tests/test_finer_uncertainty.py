@@ -16,7 +16,7 @@ from phydict.grid import Cube, Grid
 from phydict.methods import reconstructor
 from phydict.posterior import Refined, Unrolled
 from phydict.posterior.refined import ON_FINER
-from phydict.prior import describe_correction, load_correction, save_correction, save_refiner
+from phydict.prior import load_correction, save_refiner, save_stage
 from phydict.prior.correction import CorrectionNetwork
 from phydict.prior.finer_uncertainty import INPUT_CHANNELS, FinerUncertainty, tissue_of_seen
 from phydict.prior.uncertainty import LEVELS, TISSUES
@@ -118,7 +118,7 @@ def test_on_voxels_half_as_long_they_are_interpolated_and_on_others_made_of_the_
 
 def test_a_file_holds_what_is_known_and_one_without_it_is_read_as_before(tmp_path):
     for uncertain in (True, False):
-        save_correction(knowing(uncertain=uncertain), tmp_path / "fine.safetensors", dtype=torch.float32)
+        save_stage(knowing(uncertain=uncertain), tmp_path / "fine.safetensors", dtype=torch.float32)
         loaded = load_correction(tmp_path / "fine.safetensors")
         widths = loaded.half_widths(FINE, seen(8, 8, 8))
         assert (widths is not None) == uncertain
@@ -134,7 +134,7 @@ def files(tmp_path_factory) -> tuple[str, str, str]:
     refiner, plain, fine = (folder / f"{name}.safetensors" for name in ("refiner", "plain", "fine"))
     save_refiner(tiny_refiner(uncertain=True), refiner, dtype=torch.float32)
     save_refiner(tiny_refiner(), plain, dtype=torch.float32)
-    save_correction(knowing(uncertain=False), fine, dtype=torch.float32)
+    save_stage(knowing(uncertain=False), fine, dtype=torch.float32)
     return str(refiner), str(plain), str(fine)
 
 
@@ -161,7 +161,7 @@ def test_a_resumed_run_is_the_uninterrupted_one_and_leaves_the_correction_as_it_
 
 def test_intervals_are_those_of_the_network_whose_results_are_stored(tmp_path, cache, files, capsys):
     refiner, _, fine = files
-    save_correction(knowing(uncertain=False), other := tmp_path / "other.safetensors", dtype=torch.float16)
+    save_stage(knowing(uncertain=False), other := tmp_path / "other.safetensors", dtype=torch.float16)
     said = refusal(capsys, main, arguments(tmp_path / "run", cache, refiner, fine, f"--model.initial={other}",
                                            "--trainer.max_epochs=1"))
     assert "give one file as model.initial and data.made.network" in said
@@ -179,8 +179,8 @@ def test_a_training_of_intervals_and_one_of_the_correction_are_not_resumed_as_ea
     for task, other in ((FinerUncertaintyTraining(FinerUncertainty((4, 8)), **settings), knowing(uncertain=False)),
                         (RefinementTraining(**settings), knowing())):
         with pytest.raises(ValueError, match="differ in 'uncertainty': give the settings"):
-            task.on_load_checkpoint({"phydict": describe_correction(other) | {"training": {"samples": 8}}})
-        task.on_load_checkpoint({"phydict": task._describe() | {"training": {"samples": 8}}})
+            task.on_load_checkpoint({"phydict": other.describe() | {"training": {"samples": 8}}})
+        task.on_load_checkpoint({"phydict": task.prior.describe() | {"training": {"samples": 8}}})
         assert task.samples == 8
 
 
@@ -209,7 +209,7 @@ def test_what_cannot_be_learnt_from_is_refused(tmp_path, cache, files, capsys, r
 
 
 def test_a_correction_that_is_trained_on_loses_what_was_known_of_its_errors(tmp_path):
-    save_correction(knowing(), tmp_path / "knows.safetensors", dtype=torch.float32)
+    save_stage(knowing(), tmp_path / "knows.safetensors", dtype=torch.float32)
     trained = RefinementTraining(cube=Cube(32), window=(-1000, 600), initial=str(tmp_path / "knows.safetensors"))
     assert trained.prior.uncertainty is None and all(w.requires_grad for w in trained.parameters())
 

@@ -15,7 +15,7 @@ from phydict.grid import Grid
 from phydict.inference.settings import CascadeSettings
 from phydict.methods import METHODS, default_method, onto_grid, reconstruct, reconstructor
 from phydict.posterior import CascadePosterior, Posterior, PriorOnly, ProximalCG, Sampler, SplitGibbs
-from phydict.prior import MedSynCheckpoint, save_prior, save_refiner, save_super_resolution
+from phydict.prior import MedSynCheckpoint, save_prior, save_refiner, save_stage
 from phydict.reconstruction import Reconstruction, Reconstructor
 from phydict.units import MU_WATER, HUWindow, hu_to_mu
 from phydict.xray import ConeBeam, Projector, binned, binning
@@ -274,7 +274,7 @@ def test_the_shipped_network_is_read_once_and_another_file_each_time(tmp_path):
 
 
 def test_a_super_resolution_stage_makes_it_a_cascade_on_the_fine_grid(tmp_path):
-    save_super_resolution(tiny_super_resolution(), tmp_path / "fine.safetensors")
+    save_stage(tiny_super_resolution(), tmp_path / "fine.safetensors")
     beam = ConeBeam.orbit(3, 1020, 740, (28, 28), 20.0)
     views = ball(beam, 90.0)
     results = [reconstruct(views, beam, tiny_prior(False), PriorOnly(2), super_resolution=tmp_path / "fine.safetensors",

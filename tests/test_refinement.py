@@ -22,7 +22,7 @@ from phydict.grid import Cube, Grid
 from phydict.methods import METHODS, corrections_of, reconstructor
 from phydict.posterior import ProximalCG, Refined, Refinement, Unrolled, refined
 from phydict.posterior.coarse_correction import coarse_correction
-from phydict.prior import correction, load_correction, save_correction, save_prior, save_refiner
+from phydict.prior import correction, load_correction, save_prior, save_refiner, save_stage
 from phydict.prior.correction import INPUTS, CorrectionNetwork
 from phydict.runtime.profiling import profiled
 from phydict.runtime.warning import Remark
@@ -227,7 +227,7 @@ def test_odd_sizes_are_corrected_as_their_voxels_repeated_at_the_end():
 
 
 def test_a_file_holds_the_network_and_no_other_stage_is_taken_for_it(tmp_path):
-    save_correction(network(), tmp_path / "fine.safetensors", dtype=torch.float32)
+    save_stage(network(), tmp_path / "fine.safetensors", dtype=torch.float32)
     loaded, seen = load_correction(tmp_path / "fine.safetensors"), torch.randn(1, INPUTS, 16, 16, 16)
     assert loaded(seen).equal(network()(seen)) and loaded.suits(Grid.cube(16, 192), WINDOW)
     assert loaded.suits(Grid.cube(64), WINDOW) and not loaded.suits(Grid.cube(48), WINDOW)
@@ -301,7 +301,7 @@ def test_held_out_reconstructions_are_those_of_their_own_volumes(tmp_path, refin
 
 def test_with_a_network_a_reconstruction_is_learnt_from_at_both_calls(tmp_path, refiner_file):
     file = tmp_path / "fine.safetensors"
-    save_correction(network(), file, dtype=torch.float32)
+    save_stage(network(), file, dtype=torch.float32)
 
     def data(network: str | None) -> RefinementData:
         return RefinementData(
@@ -325,7 +325,7 @@ def test_with_a_network_a_reconstruction_is_learnt_from_at_both_calls(tmp_path, 
 
 def test_finer_voxels_are_learnt_of_as_they_are_seen_after_the_coarser_ones(tmp_path, refiner_file):
     file, seen = tmp_path / "fine.safetensors", []
-    save_correction(network(), file, dtype=torch.float32)
+    save_stage(network(), file, dtype=torch.float32)
     for name in (None, str(file)):
         data = RefinementData(  # of which the first scene has more than two views
             RefinementCases(1, 1, 16, name), Scenes(most_views=200), phantoms=1, cache=str(tmp_path / "cache"),
@@ -339,7 +339,7 @@ def test_finer_voxels_are_learnt_of_as_they_are_seen_after_the_coarser_ones(tmp_
 
 def test_a_network_goes_on_on_its_own_voxels_or_half_as_long_ones(tmp_path):
     file = tmp_path / "fine.safetensors"
-    save_correction(network(), file, dtype=torch.float32)
+    save_stage(network(), file, dtype=torch.float32)
     for voxels in (32, 64):
         learns = RefinementTraining(cube=Cube(voxels), window=(-1000, 600), initial=str(file))
         assert learns.prior.grid.same_as(Grid.cube(voxels)) and learns.prior.leave.weight.equal(network().leave.weight)

@@ -13,7 +13,8 @@ from phydict.datasets import find_cts, load_case, phantom_case, prepare_ct
 from phydict.datasets.cts.preparation import prepare_folder
 from phydict.datasets.cts.spaces import Settings
 from phydict.grid import Cube, Grid
-from phydict.training.crops import CropDataset, CTVolumes, PhantomVolumes, SuperResolutionData, mapped_volume
+from phydict.training.crops import CropDataset, CTVolumes, PhantomVolumes, SuperResolutionData
+from phydict.training.made import mapped_volume
 from phydict.training.settings import Crops, HoldOut, Loading
 from phydict.units import HUWindow
 

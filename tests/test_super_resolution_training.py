@@ -12,7 +12,7 @@ from prior.tiny import tiny_prior, tiny_super_resolution
 
 from phydict.cli.train import main, stage_of
 from phydict.grid import Cube
-from phydict.prior import LocalUNet, load_super_resolution, save_prior, save_super_resolution
+from phydict.prior import LocalUNet, load_super_resolution, save_prior, save_stage
 from phydict.training import SuperResolutionTraining
 from phydict.training.crops import SuperResolutionData
 from phydict.training.settings import Crops
@@ -123,7 +123,7 @@ def test_bad_input_is_one_sentence(change, words, cache, tmp_path, capsys):
 
 def test_training_goes_on_from_a_stage_and_refuses_one_of_another_grid(tmp_path):
     path, first = tmp_path / "fine.safetensors", tiny_super_resolution()
-    save_super_resolution(first, path, dtype=torch.float32)
+    save_stage(first, path, dtype=torch.float32)
     task = SuperResolutionTraining(initial=str(path), cube=Cube(32), factor=2, window=(-1000, 600))
     assert all(torch.equal(weight, first.state_dict()[name]) for name, weight in task.prior.state_dict().items())
     assert all(weight.requires_grad for weight in task.prior.parameters())
@@ -136,7 +136,7 @@ def test_training_goes_on_from_a_stage_and_refuses_one_of_another_grid(tmp_path)
 def test_a_stage_keeps_its_own_detail_and_another_is_refused_beside_it(tmp_path):
     first, given = tiny_super_resolution(), {"cube": Cube(32), "factor": 2, "window": (-1000, 600)}
     first.detail_std = 0.3
-    save_super_resolution(first, tmp_path / "fine.safetensors")
+    save_stage(first, tmp_path / "fine.safetensors")
     given["initial"] = str(tmp_path / "fine.safetensors")
     for same in ({}, {"detail_std": 0.3}):
         assert SuperResolutionTraining(**given, **same).prior.detail_std == 0.3

@@ -26,8 +26,8 @@ from phydict.prior import load_prior, save_prior
 from phydict.training import PriorTraining
 from phydict.training.data import PriorData
 from phydict.training.draws import MixedCases
-from phydict.training.prior import reconstruction_scores
 from phydict.training.refinement import RefinementTraining
+from phydict.training.scores import reconstruction_scores
 from phydict.training.settings import HoldOut, Optimisation
 from phydict.units import HUWindow
 

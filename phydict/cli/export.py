@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
+from phydict.prior import Prior, Refiner
 from phydict.prior.files import (
     build_correction,
     build_prior,
     build_refiner,
     build_super_resolution,
-    save_correction,
     save_prior,
     save_refiner,
-    save_super_resolution,
 )
 from phydict.prior.inspection import inspect_prior
-from phydict.prior.stage_file import STAGES, is_saved_prior
+from phydict.prior.stage_file import STAGES, is_saved_prior, save_stage
 from phydict.prior.text_file import build_text, has_text
-from phydict.rivals import NETWORKS, build_rival, save_rival
+from phydict.rivals import NETWORKS, build_rival
 from phydict.runtime.console import check_writable
 from phydict.runtime.progress_log import log_progress
 from phydict.training.checkpoints import check_calibrated, read_checkpoint
+
+BUILT: dict[str, tuple[Callable, Callable]] = {
+    "base": (build_prior, save_prior), "refiner": (build_refiner, save_refiner),
+    "super_resolution": (build_super_resolution, save_stage), "refinement": (build_correction, save_stage),
+    **dict.fromkeys(NETWORKS, (build_rival, save_stage))}
+"""What builds a stage of header and weights, and what writes its file."""
 
 
 def export_prior(checkpoint: str, out: str, overwrite: bool = False) -> None:
@@ -49,22 +55,13 @@ def export_prior(checkpoint: str, out: str, overwrite: bool = False) -> None:
     ids = next((part["held_out"] for part in content.values() if isinstance(part, dict) and part.get("held_out")), None)
     if ids and isinstance(training, dict):
         training = {"held_out": ids} | training
-    if stage == "super_resolution":
-        save_super_resolution(build_super_resolution(header, weights), out, training)
-    elif stage == "refinement":
-        save_correction(build_correction(header, weights), out, training)
-    elif stage in NETWORKS:
-        save_rival(build_rival(header, weights), out, training)
-    else:
-        refiner = build_refiner(header, weights) if stage == "refiner" else None
-        prior = refiner.reader if refiner else build_prior(header, weights)
-        if has_text(header):
-            weights = {k.removeprefix("prior.").removeprefix("first."): w for k, w in weights.items()}
-            prior.text = build_text(header["text"], {k: w for k, w in weights.items() if k.startswith("text.")})
-        if refiner:
-            save_refiner(refiner, out, training)
-        else:
-            save_prior(prior, out, training)
+    build, save = BUILT[stage]
+    network = build(header, weights)
+    if isinstance(network, Prior | Refiner) and has_text(header):
+        weights = {k.removeprefix("prior.").removeprefix("first."): w for k, w in weights.items()}
+        reader = network.reader if isinstance(network, Refiner) else network
+        reader.text = build_text(header["text"], {k: w for k, w in weights.items() if k.startswith("text.")})
+    save(network, out, training)
     print(f"{STAGES[stage].removeprefix('a ')} in {out}")
 
 

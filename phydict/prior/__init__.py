@@ -9,20 +9,14 @@ from phydict.prior.files import (
     DEFAULT_PRIOR,
     DEFAULT_REFINER,
     FINEST_CORRECTION,
-    describe_correction,
-    describe_prior,
-    describe_refiner,
-    describe_super_resolution,
     file_read,
     fingerprint,
     is_refiner,
     load_correction,
     load_prior,
     load_super_resolution,
-    save_correction,
     save_prior,
     save_refiner,
-    save_super_resolution,
 )
 from phydict.prior.inspection import inspect_prior
 from phydict.prior.local_unet import LocalUNet
@@ -31,6 +25,7 @@ from phydict.prior.medsyn.prior import MedSynPrior
 from phydict.prior.medsyn.super_resolution import MedSynSuperResolution
 from phydict.prior.prior import STATE, BoundPrior, Prior
 from phydict.prior.refiner import BoundRefiner, Refiner
+from phydict.prior.stage_file import save_stage
 from phydict.prior.super_resolution import SuperResolution
 from phydict.prior.text import TextEncoder, learn_vocabulary
 from phydict.prior.unet import VolumeUNet
@@ -38,7 +33,6 @@ from phydict.prior.unet import VolumeUNet
 __all__ = ["DEFAULT_CORRECTION", "DEFAULT_PRIOR", "DEFAULT_REFINER", "FINEST_CORRECTION", "STATE", "AnyPrior",
            "BoundPrior", "BoundRefiner", "Cascade", "CorrectionNetwork", "DetailNetwork", "LocalUNet",
            "MedSynCheckpoint", "MedSynPrior", "MedSynSuperResolution", "Prior", "PriorContract", "Refiner",
-           "SuperResolution", "TextEncoder", "VolumeUNet", "check_prior", "describe_correction", "describe_prior",
-           "describe_refiner", "describe_super_resolution", "file_read", "find_prior", "fingerprint", "inspect_prior",
-           "is_refiner", "learn_vocabulary", "load_correction", "load_prior", "load_super_resolution", "own_identity",
-           "save_correction", "save_prior", "save_refiner", "save_super_resolution"]
+           "SuperResolution", "TextEncoder", "VolumeUNet", "check_prior", "file_read", "find_prior", "fingerprint",
+           "inspect_prior", "is_refiner", "learn_vocabulary", "load_correction", "load_prior", "load_super_resolution",
+           "own_identity", "save_prior", "save_refiner", "save_stage"]

@@ -14,6 +14,7 @@ from phydict.prior.convolution import lay_out, silence, speed_up
 from phydict.prior.evidence_channels import EVIDENCE_CHANNELS
 from phydict.prior.finer_uncertainty import FinerUncertainty
 from phydict.prior.local_unet import PositionNorm, prolonged
+from phydict.prior.stage_file import FORMAT
 from phydict.runtime.precision import network_precision
 from phydict.units import HUWindow
 
@@ -56,6 +57,12 @@ class CorrectionNetwork(nn.Module):
         silence(self.leave)
         speed_up(self)
         lay_out(self)
+
+    def describe(self) -> dict:
+        """What the network is, as plain JSON values, for `build_correction`."""
+        uncertainty = {"uncertainty": self.uncertainty.settings} if self.uncertainty else {}
+        return {"format": FORMAT, "stage": "refinement", "grid": self.grid.to_dict(),
+                "hu_window": [self.window.low, self.window.high], "network": self.settings, **uncertainty}
 
     @property
     def network(self) -> CorrectionNetwork:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from torch import Tensor
 
 from phydict.diffusion import CosineSchedule
@@ -26,17 +25,9 @@ from phydict.prior.medsyn.checkpoint import (
 )
 from phydict.prior.medsyn.prior import MedSynPrior
 from phydict.prior.medsyn.super_resolution import MedSynSuperResolution
-from phydict.prior.prior import STATE, Prior
+from phydict.prior.prior import Prior
 from phydict.prior.refiner import Refiner
-from phydict.prior.stage_file import (
-    FORMAT,
-    built_network,
-    loaded_stage,
-    number_of,
-    whole_of,
-    window_of,
-    write_stage,
-)
+from phydict.prior.stage_file import built_network, header_of, loaded_stage, number_of, whole_of, window_of, write_stage
 from phydict.prior.super_resolution import SuperResolution
 from phydict.prior.text_file import has_text, load_text
 from phydict.prior.uncertainty import Uncertainty
@@ -73,13 +64,7 @@ def save_prior(prior: Prior, path: str | Path, training: dict | None = None, dty
     weights = prior.state_dict()
     if prior.text is not None and prior.text.source:  # a pretrained BERT is named, not copied
         weights = {k: w for k, w in weights.items() if not k.startswith("text.")}
-    write_stage(Path(path), describe_prior(prior) | {"training": training or {}}, weights, dtype)
-
-
-def save_super_resolution(stage: SuperResolution, path: str | Path, training: dict | None = None,
-                          dtype: torch.dtype = torch.float16):
-    """Writes `stage` to one .safetensors file, as `save_prior` does."""
-    write_stage(Path(path), describe_super_resolution(stage) | {"training": training or {}}, stage.state_dict(), dtype)
+    write_stage(Path(path), prior.describe() | {"training": training or {}}, weights, dtype)
 
 
 def save_refiner(refiner: Refiner, path: str | Path, training: dict | None = None, dtype: torch.dtype = torch.float16):
@@ -90,56 +75,7 @@ def save_refiner(refiner: Refiner, path: str | Path, training: dict | None = Non
     copied = reader.text is not None and not reader.text.source
     named = {re.sub(r"^(prior|first)\.text\.", "text.", k): w for k, w in refiner.state_dict().items()}
     weights = {k: w for k, w in named.items() if copied or not k.startswith("text.")}
-    write_stage(Path(path), describe_refiner(refiner) | {"training": training or {}}, weights, dtype)
-
-
-def save_correction(network: CorrectionNetwork, path: str | Path, training: dict | None = None,
-                    dtype: torch.dtype = torch.float16):
-    """Writes `network` to one .safetensors file, as `save_prior` does."""
-    write_stage(Path(path), describe_correction(network) | {"training": training or {}}, network.state_dict(), dtype)
-
-
-def describe_prior(prior: Prior) -> dict:
-    """What a prior is, as plain JSON values: from this and the weights `load_prior` builds it again."""
-    encoder = prior.text
-    text = None if encoder is None else {
-        "source": encoder.source, "length": encoder.length, "width": encoder.width,
-        "layers": encoder.bert.config.num_hidden_layers,
-        "vocabulary": None if encoder.source else encoder.vocabulary,
-        **({"padded_to": encoder.padded_to} if encoder.padded_to else {}),
-        **({"sentences": encoder.sentences} if encoder.sentences else {})}
-    return {"format": FORMAT, "stage": "base", "grid": prior.grid.to_dict(),
-            "hu_window": [prior.window.low, prior.window.high], "state": STATE[:prior.network.state_channels],
-            "sigma_data": prior.sigma_data, "skip_std": prior.skip_std, "schedule": vars(prior.schedule),
-            "text": text, "network": prior.network.settings,
-            **({"detail": prior.detail.settings} if prior.detail else {})}  # which older files do not name
-
-
-def describe_super_resolution(stage: SuperResolution) -> dict:
-    """What a super-resolution stage is, as plain JSON values, for `build_super_resolution`."""
-    return {"format": FORMAT, "stage": "super_resolution", "grid": stage.grid.to_dict(),
-            "hu_window": [stage.window.low, stage.window.high], "factor": stage.factor,
-            "state": STATE[:stage.state_channels], "coarse_state": STATE[:stage.coarse_channels],
-            "detail_std": stage.detail_std, "skip_std": stage.skip_std, "schedule": vars(stage.schedule),
-            "network": stage.network.settings}
-
-
-def describe_refiner(refiner: Refiner) -> dict:
-    """What a refiner is, as plain JSON values, for `build_refiner`: its prior, called by another stage."""
-    described = describe_prior(refiner.prior) | {"stage": "refiner"}
-    if refiner.uncertainty:
-        described["uncertainty"] = refiner.uncertainty.settings
-    if refiner.first:
-        first = describe_prior(refiner.first)
-        described |= {"text": first.pop("text"), "first": first}
-    return described
-
-
-def describe_correction(network: CorrectionNetwork) -> dict:
-    """What a correction of finer voxels is, as plain JSON values, for `build_correction`."""
-    uncertainty = {"uncertainty": network.uncertainty.settings} if network.uncertainty else {}
-    return {"format": FORMAT, "stage": "refinement", "grid": network.grid.to_dict(),
-            "hu_window": [network.window.low, network.window.high], "network": network.settings, **uncertainty}
+    write_stage(Path(path), refiner.describe() | {"training": training or {}}, weights, dtype)
 
 
 def load_prior(path: str | Path | MedSynCheckpoint = DEFAULT_PRIOR,
@@ -153,7 +89,7 @@ def load_prior(path: str | Path | MedSynCheckpoint = DEFAULT_PRIOR,
     """
     path = _resolved(path)
     if isinstance(path, MedSynCheckpoint) or is_medsyn(path):
-        return load_medsyn(path, device)
+        return load_medsyn(path).to(device)
 
     def build(header: dict, weights: dict[str, Tensor]) -> Prior | Refiner:
         loaded = (build_refiner if header.get("stage") == "refiner" else build_prior)(header, weights)
@@ -163,21 +99,20 @@ def load_prior(path: str | Path | MedSynCheckpoint = DEFAULT_PRIOR,
             reader.unheard = UNHEARD if Path(path).resolve() == DEFAULT_PRIOR.resolve() else ""
         return loaded
 
-    return loaded_stage(path, ("base", "refiner"), build, device)
+    return loaded_stage(path, ("base", "refiner"), build).to(device)
 
 
-def load_super_resolution(path: str | Path | MedSynCheckpoint,
-                          device: str = "cpu") -> SuperResolution | MedSynSuperResolution:
-    """The super-resolution stage in a file written by `save_super_resolution`, or MedSyn's; as `load_prior`."""
+def load_super_resolution(path: str | Path | MedSynCheckpoint) -> SuperResolution | MedSynSuperResolution:
+    """The super-resolution stage in a file written by `save_stage`, or MedSyn's; as `load_prior`."""
     path = _resolved(path)
     if isinstance(path, MedSynCheckpoint) or is_medsyn(path):
-        return load_medsyn_super_resolution(path, device)
-    return loaded_stage(path, ("super_resolution",), build_super_resolution, device)
+        return load_medsyn_super_resolution(path)
+    return loaded_stage(path, ("super_resolution",), build_super_resolution)
 
 
-def load_correction(path: str | Path = DEFAULT_CORRECTION, device: str = "cpu") -> CorrectionNetwork:
-    """The network in a file written by `save_correction`; as `load_prior`."""
-    return loaded_stage(own_or_shipped(path), ("refinement",), build_correction, device)
+def load_correction(path: str | Path = DEFAULT_CORRECTION) -> CorrectionNetwork:
+    """The network in a file written by `save_stage`; as `load_prior`."""
+    return loaded_stage(own_or_shipped(path), ("refinement",), build_correction)
 
 
 def is_refiner(given: object) -> bool:
@@ -185,8 +120,7 @@ def is_refiner(given: object) -> bool:
     if not isinstance(given, str | Path):
         return isinstance(given, Refiner)
     try:
-        with safe_open(own_or_shipped(given), "pt") as file:
-            return json.loads((file.metadata() or {}).get("phydict", "{}")).get("stage") == "refiner"
+        return header_of(own_or_shipped(given)).get("stage") == "refiner"
     except (SafetensorError, OSError, ValueError, AttributeError):  # whoever reads it says what it lacks
         return False
 
@@ -194,8 +128,7 @@ def is_refiner(given: object) -> bool:
 def held_out_of(path: str | Path) -> list[str] | None:
     """The ids of the CTs that the trainings of a saved stage held out, by its file's header; None where it tells
     nothing of them."""
-    with safe_open(own_or_shipped(path), "pt") as file:
-        training = json.loads((file.metadata() or {}).get("phydict", "{}")).get("training")
+    training = header_of(own_or_shipped(path)).get("training")
     held_out = training.get("held_out") if isinstance(training, dict) else None
     return held_out if isinstance(held_out, list) and all(isinstance(id, str) for id in held_out) else None
 
@@ -222,7 +155,7 @@ def file_read(path: str | Path | MedSynCheckpoint) -> str | None:
 
 
 def build_prior(header: dict, weights: dict[str, Tensor]) -> Prior:
-    """The prior that `describe_prior` described, with these weights; those of the text encoder ("text.") are left out.
+    """The prior that `Prior.describe` described, with these weights; those of the text encoder ("text.") are left out.
 
     Raises ValueError where header and weights do not fit together.
     """
@@ -238,7 +171,7 @@ def _untrained(header: dict) -> Prior:
 
 
 def build_refiner(header: dict, weights: dict[str, Tensor]) -> Refiner:
-    """The refiner that `describe_refiner` described, with these weights, as `build_prior` builds a prior."""
+    """The refiner that `Refiner.describe` described, with these weights, as `build_prior` builds a prior."""
     def made() -> Refiner:
         prior = _untrained(header)
         uncertainty = Uncertainty(**header["uncertainty"]) if "uncertainty" in header else None
@@ -255,7 +188,7 @@ def build_refiner(header: dict, weights: dict[str, Tensor]) -> Refiner:
 
 
 def build_super_resolution(header: dict, weights: dict[str, Tensor]) -> SuperResolution:
-    """The stage that `describe_super_resolution` described, with these weights.
+    """The stage that `SuperResolution.describe` described, with these weights.
 
     Raises ValueError where header and weights do not fit together.
     """
@@ -269,7 +202,7 @@ def build_super_resolution(header: dict, weights: dict[str, Tensor]) -> SuperRes
 
 
 def build_correction(header: dict, weights: dict[str, Tensor]) -> CorrectionNetwork:
-    """The network that `describe_correction` described, with these weights, as `build_prior` builds a prior."""
+    """The network that `CorrectionNetwork.describe` described, with these weights, as `build_prior` builds a prior."""
     def made() -> CorrectionNetwork:
         uncertainty = FinerUncertainty(**header["uncertainty"]) if "uncertainty" in header else None
         return CorrectionNetwork(**header["network"], grid=Grid(**header["grid"]), window=window_of(header),

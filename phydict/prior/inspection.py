@@ -11,6 +11,7 @@ from torch import Tensor
 from phydict.prior.finite import check_finite
 from phydict.prior.medsyn.checkpoint import FILES, STAGES, MedSynWeights, default_kind, files_in, listed, read_tensors
 from phydict.prior.medsyn.networks import TextUNet
+from phydict.prior.stage_file import header_of
 from phydict.prior.tensors import read_torch
 from phydict.runtime.reading import reason, refusing
 
@@ -38,8 +39,7 @@ def _inspect_file(file: Path) -> dict[str, str]:
     try:
         if file.suffix == ".safetensors":
             entries = read_tensors(file, shapes_only=True)
-            with safe_open(file, "pt") as opened:
-                header = json.loads((opened.metadata() or {}).get("phydict", "null"))
+            header: dict | None = header_of(file)
         else:
             content = read_torch(file)
             saved = content if isinstance(content, dict) else {}

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from phydict.diffusion import CosineSchedule, guided
 from phydict.grid import Grid
 from phydict.prior.detail import DetailNetwork
+from phydict.prior.stage_file import FORMAT
 from phydict.prior.text import TextEncoder
 from phydict.prior.unet import VolumeUNet
 from phydict.runtime.precision import network_precision
@@ -27,6 +28,14 @@ STATE = ("ct", "lung", "airway", "vessel")
 
 DETAIL_REACH = 8.0
 """Noise, over the size of the detail, beyond which a detail network is not called."""
+
+
+def preconditioning(schedule: CosineSchedule, t: Tensor, size: float, skip_std: float) -> tuple[Tensor, Tensor]:
+    """At times t (B,): the share of x_t / a in an estimate, and the scale of a network's output, whose size is `size`;
+    see Prior."""
+    sigma = schedule.sigma(t.double()).float().view(-1, 1, 1, 1, 1)
+    share = skip_std**2 / (sigma**2 + skip_std**2)
+    return share, (((1 - share) * size) ** 2 + (share * sigma) ** 2).sqrt()
 
 
 class Prior(nn.Module):
@@ -92,6 +101,21 @@ class Prior(nn.Module):
         mask = mask & torch.tensor([bool(r) for r in reports], device=mask.device)[:, None]
         return torch.where(mask[..., None], states, self.null)
 
+    def describe(self) -> dict:
+        """What the prior is, as plain JSON values: from this and the weights `load_prior` builds it again."""
+        encoder = self.text
+        text = None if encoder is None else {
+            "source": encoder.source, "length": encoder.length, "width": encoder.width,
+            "layers": encoder.bert.config.num_hidden_layers,
+            "vocabulary": None if encoder.source else encoder.vocabulary,
+            **({"padded_to": encoder.padded_to} if encoder.padded_to else {}),
+            **({"sentences": encoder.sentences} if encoder.sentences else {})}
+        return {"format": FORMAT, "stage": "base", "grid": self.grid.to_dict(),
+                "hu_window": [self.window.low, self.window.high], "state": STATE[:self.network.state_channels],
+                "sigma_data": self.sigma_data, "skip_std": self.skip_std, "schedule": vars(self.schedule),
+                "text": text, "network": self.network.settings,
+                **({"detail": self.detail.settings} if self.detail else {})}  # which older files do not name
+
     @property
     def state_channels(self) -> int:
         """Channels of the state: the CT, then masks."""
@@ -143,9 +167,7 @@ class Prior(nn.Module):
 
     def preconditioning(self, t: Tensor) -> tuple[Tensor, Tensor]:
         """At times t (B,): the share of x_t / a in the estimate, and the scale of the network's output."""
-        sigma = self.schedule.sigma(t.double()).float().view(-1, 1, 1, 1, 1)
-        share = self.skip_std**2 / (sigma**2 + self.skip_std**2)
-        return share, (((1 - share) * self.sigma_data) ** 2 + (share * sigma) ** 2).sqrt()
+        return preconditioning(self.schedule, t, self.sigma_data, self.skip_std)
 
     @torch.no_grad()
     def bind(self, report: str = "", guidance: float = 1.0, precision: str = "auto") -> BoundPrior:

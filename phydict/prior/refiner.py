@@ -72,6 +72,16 @@ class Refiner(nn.Module):
         self.first = first.eval().requires_grad_(False)
         self.prior.text = self.prior.load_text = None
 
+    def describe(self) -> dict:
+        """What the refiner is, as plain JSON values, for `build_refiner`: its prior, called by another stage."""
+        described = self.prior.describe() | {"stage": "refiner"}
+        if self.uncertainty:
+            described["uncertainty"] = self.uncertainty.settings
+        if self.first:
+            first = self.first.describe()
+            described |= {"text": first.pop("text"), "first": first}
+        return described
+
     def train(self, mode: bool = True) -> Refiner:
         super().train(mode)
         if self.first is not None:

@@ -6,7 +6,7 @@ import json
 import reprlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -32,6 +32,20 @@ STAGES = {"base": "a base prior", "super_resolution": "a super-resolution stage"
 """What a file's header may call it, and what that is; a header that says nothing is of a base prior."""
 
 
+class Described(Protocol):
+    """A network that says what it is, as plain JSON values: from this and its weights it is built again."""
+
+    def describe(self) -> dict: ...
+
+    def state_dict(self) -> dict[str, Tensor]: ...
+
+
+def save_stage(stage: Described, path: str | Path, training: dict | None = None, dtype: torch.dtype = torch.float16):
+    """Writes a super-resolution stage, a correction or a rival to one .safetensors file, as `save_prior` does a
+    prior."""
+    write_stage(Path(path), stage.describe() | {"training": training or {}}, stage.state_dict(), dtype)
+
+
 def write_stage(path: Path, header: dict, weights: dict[str, Tensor], dtype: torch.dtype) -> None:
     """Writes header and weights to one .safetensors file, replacing it only when complete. Raises OSError where it
     cannot, and ValueError where weights are not finite in `dtype`."""
@@ -45,13 +59,20 @@ def write_stage(path: Path, header: dict, weights: dict[str, Tensor], dtype: tor
         raise not_written(f"'{path}'", error, "give another place") from error
 
 
-def read_stage(path: Path, stages: Sequence[str], device: str) -> tuple[dict, dict[str, Tensor]]:
+def header_of(path: str | Path) -> dict:
+    """What `write_stage` put into a file's header, {} where it put none. Raises SafetensorError, OSError or ValueError
+    where that cannot be read."""
+    with safe_open(path, "pt") as file:
+        return json.loads((file.metadata() or {}).get("phydict", "{}"))
+
+
+def read_stage(path: Path, stages: Sequence[str]) -> tuple[dict, dict[str, Tensor]]:
     """Header and weights, but those of a text encoder, of a file that must be of one of `stages`."""
     if not path.is_file():
         raise FileNotFoundError(f"no prior at '{path}': give the .safetensors file that training wrote")
     try:
-        with safe_open(path, "pt", device=device) as file:
-            header = json.loads((file.metadata() or {}).get("phydict", "{}"))
+        header = header_of(path)
+        with safe_open(path, "pt") as file:
             weights = {k: file.get_tensor(k) for k in file.keys() if not k.startswith("text.")}
     except Exception as error:  # whatever a damaged file leads its readers to
         raise ValueError(f"'{path}' is truncated or not a safetensors file ({reason(error)}): {ADVICE}") from error
@@ -62,20 +83,19 @@ def read_stage(path: Path, stages: Sequence[str], device: str) -> tuple[dict, di
     return header, weights
 
 
-def loaded_stage(path: Path, stages: Sequence[str], build: Callable[[dict, dict[str, Tensor]], Network],
-                 device: str) -> Network:
+def loaded_stage(path: Path, stages: Sequence[str], build: Callable[[dict, dict[str, Tensor]], Network]) -> Network:
     """What `build` makes of a file of one of these stages, ready to be used (evaluation mode, no gradients).
 
     Raises FileNotFoundError where there is no file, ValueError where it is truncated, is of another stage, contradicts
     itself or holds weights that are not finite.
     """
     with refusing(path, ADVICE):
-        header, weights = read_stage(path, stages, device)
+        header, weights = read_stage(path, stages)
         try:
             loaded = build(header, weights)
         except ValueError as error:
             raise ValueError(f"'{path}' contradicts itself: {error}") from error
-    return loaded.to(device).eval().requires_grad_(False)
+    return loaded.eval().requires_grad_(False)
 
 
 def is_saved_prior(path: str | Path) -> bool:

@@ -13,6 +13,8 @@ from torch.nn.functional import interpolate
 from phydict.diffusion import CosineSchedule, noise_like
 from phydict.grid import Grid
 from phydict.prior.local_unet import LocalUNet
+from phydict.prior.prior import STATE, preconditioning
+from phydict.prior.stage_file import FORMAT
 from phydict.prior.tiles import Tiles
 from phydict.runtime.precision import network_precision
 from phydict.runtime.ranges import check_between
@@ -59,6 +61,14 @@ class SuperResolution(nn.Module):
         self.detail_std, self.skip_std = detail_std, skip_std
         self.memory, self.overlap = memory, math.ceil(overlap / network.divisor) * network.divisor
 
+    def describe(self) -> dict:
+        """What the stage is, as plain JSON values, for `build_super_resolution`."""
+        return {"format": FORMAT, "stage": "super_resolution", "grid": self.grid.to_dict(),
+                "hu_window": [self.window.low, self.window.high], "factor": self.factor,
+                "state": STATE[:self.state_channels], "coarse_state": STATE[:self.coarse_channels],
+                "detail_std": self.detail_std, "skip_std": self.skip_std, "schedule": vars(self.schedule),
+                "network": self.network.settings}
+
     def forward(self, x: Tensor, t: Tensor, upsampled: Tensor, level: Tensor) -> Tensor:
         """Clean estimate of the fine state x (B, C, X, Y, Z) at times t (B,), in x's dtype.
 
@@ -76,10 +86,8 @@ class SuperResolution(nn.Module):
         return torch.zeros(1, self.network.in_channels, *shape), torch.zeros(1), torch.zeros(1)
 
     def preconditioning(self, t: Tensor) -> tuple[Tensor, Tensor]:
-        """At times t (B,): the share of x_t / a in the estimate, and the scale of the network's output."""
-        sigma = self.schedule.sigma(t.double()).float().view(-1, 1, 1, 1, 1)
-        share = self.skip_std**2 / (sigma**2 + self.skip_std**2)
-        return share, (((1 - share) * self.detail_std) ** 2 + (share * sigma) ** 2).sqrt()
+        """As for a Prior."""
+        return preconditioning(self.schedule, t, self.detail_std, self.skip_std)
 
     def upsample(self, coarse: Tensor) -> Tensor:
         """The coarse state (B, C, x, y, z), of which the first coarse_channels count, on the fine voxels."""

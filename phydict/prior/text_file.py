@@ -16,7 +16,7 @@ from phydict.runtime.reading import reason, refusing
 
 
 def has_text(header: dict) -> bool:
-    """Whether a header describes a text encoder. Raises ValueError where "text" is not what `describe_prior` writes."""
+    """Whether a header describes a text encoder. Raises ValueError where "text" is not what `Prior.describe` gives."""
     text, keys = header.get("text", "missing"), ("source", "length", "width", "layers", "vocabulary")
     if text is None:
         return False

@@ -1,7 +1,7 @@
 """Trained rivals: published networks that map X-rays to a CT without a projector in the loop, re-implemented."""
 
 from phydict.rivals.discriminator import PatchDiscriminator
-from phydict.rivals.files import NETWORKS, build_rival, load_rival, save_rival
+from phydict.rivals.files import NETWORKS, build_rival, load_rival
 from phydict.rivals.lifted import LiftedNetwork
 from phydict.rivals.method import RivalAnswer, TrainedRival
 from phydict.rivals.network import RivalNetwork
@@ -10,4 +10,4 @@ from phydict.rivals.x2ct import X2CTNetwork
 from phydict.rivals.xray2ctpa import XrayToCTPANetwork
 
 __all__ = ["NETWORKS", "LiftedNetwork", "PatchDiscriminator", "Rival", "RivalAnswer", "RivalNetwork", "TrainedRival",
-           "X2CTNetwork", "XrayToCTPANetwork", "build_rival", "load_rival", "save_rival"]
+           "X2CTNetwork", "XrayToCTPANetwork", "build_rival", "load_rival"]

@@ -5,11 +5,10 @@ from __future__ import annotations
 import reprlib
 from pathlib import Path
 
-import torch
 from torch import Tensor
 
 from phydict.grid import Grid
-from phydict.prior.stage_file import built_network, loaded_stage, window_of, write_stage
+from phydict.prior.stage_file import built_network, loaded_stage, window_of
 from phydict.rivals.lifted import LiftedNetwork
 from phydict.rivals.network import RivalNetwork
 from phydict.rivals.rival import Rival
@@ -22,13 +21,8 @@ NETWORKS: dict[str, type[RivalNetwork]] = {
 """The networks by the name that a file's header calls them."""
 
 
-def save_rival(rival: Rival, path: str | Path, training: dict | None = None, dtype: torch.dtype = torch.float16):
-    """Writes `rival` to one .safetensors file, as `phydict.prior.save_prior` writes a prior."""
-    write_stage(Path(path), rival.describe() | {"training": training or {}}, rival.state_dict(), dtype)
-
-
-def load_rival(path: str | Path, device: str = "cpu") -> Rival:
-    """The rival in a file written by `save_rival`, in evaluation mode.
+def load_rival(path: str | Path) -> Rival:
+    """The rival in a file written by `phydict.prior.save_stage`, in evaluation mode.
 
     Raises FileNotFoundError when there is no file, ValueError when it is truncated, is no rival, or holds weights that
     are not finite.
@@ -39,7 +33,7 @@ def load_rival(path: str | Path, device: str = "cpu") -> Rival:
         rival.budget = {name: known[name] for name in ("steps", "samples") if type(known.get(name)) is int}
         return rival
 
-    return loaded_stage(Path(path), tuple(NETWORKS), build, device)
+    return loaded_stage(Path(path), tuple(NETWORKS), build)
 
 
 def build_rival(header: dict, weights: dict[str, Tensor]) -> Rival:

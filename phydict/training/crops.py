@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,37 +10,16 @@ from torch import Tensor
 from torch.utils.data import ConcatDataset, Dataset
 
 from phydict.datasets import CTCases, CTSource, Deformation, load_case, phantom_case
-from phydict.datasets.cts.cache import write_array
 from phydict.datasets.phantoms.cached import VALIDATION_PHANTOM, CachedPhantoms
 from phydict.grid import Cube
-from phydict.runtime.progress_log import log_progress
-from phydict.runtime.warning import warn
 from phydict.training.data import PriorData, check_plain
 from phydict.training.draws import Draws, Items
+from phydict.training.made import mapped_volume
 from phydict.training.settings import Crops, HoldOut, Loading
 from phydict.units import AIR, HUWindow
 
 VOLUME_ENDING = ".volume2.npy"
 """Of cached CTs. Its number is raised when CTVolumes changes its result, so that older caches are not read."""
-
-
-def mapped_volume(file: Path, make: Callable[[], Tensor]) -> np.ndarray:
-    """The volume (X, Y, Z) that a file keeps in half precision, made when missing or damaged; read only where used."""
-    if file.is_file():
-        try:
-            return np.load(file, mmap_mode="r")
-        except (ValueError, EOFError) as error:
-            warn(f"the cached volume {file} cannot be read ({error}); it is prepared again")
-    write_array(file, make().numpy().astype(np.float16))
-    return np.load(file, mmap_mode="r")
-
-
-def log_made(what: str, folder: Path, count: int) -> None:
-    """Says how many of `count` `mapped_volume`s, whose names are their numbers, a folder holds, where some remain."""
-    made = sum((folder / f"{n:05d}.npy").is_file() for n in range(count))
-    if made < count:
-        log_progress(f"{made} of {count} {what} are made, the others are when they are first drawn, in {folder}",
-                     event="made", name=what, done=made, of=count, out=str(folder))
 
 
 class PhantomVolumes(CachedPhantoms):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from torch.utils.data import ConcatDataset, DataLoader, Dataset, DistributedSamp
 from phydict.datasets import (
     Augmentation,
     CTCases,
+    CTFile,
     CTSource,
     Thorax,
     as_one_patient,
@@ -77,26 +79,9 @@ class PriorData(lightning.LightningDataModule):
         self.draw_grid = Grid.cube(self.block * trained, cube.side)
         self.phantoms = CachedPhantoms(0, phantoms, self.draw_grid, hu, Path(cache))
         files = source.find(cts) if cts else []
-        names = {f.id for f in files}
-
-        def meant(word: str, id: str) -> bool:
-            return word == id if word in names else word in id
-
-        words = holdout.words()
-        if unknown := [word for word in words if not any(meant(word, f.id) for f in files)]:
-            said = (f"data.holdout.ids names '{unknown[0]}', but no CT has that in its id"
-                    + (f" (the first id is {files[0].id})" if files else ""))
-            if len(unknown) == len(words) or not holdout.is_file:
-                raise ValueError(f"{said}: correct or remove it")
-            warn(f"{said}: of the {len(words)} lines of {holdout.ids}, {len(unknown)} hold out nothing")
-        validating = set(split_by_patient([f.id for f in files], holdout.fraction, seed)[1])
-        named = {patient_of(f.id) for f in files if any(meant(word, f.id) for word in words)}
-        held_out = [f for f in files if f.id in validating or patient_of(f.id) in named]
+        held_out = _held_out(files, holdout, seed)
         if len(held_out) == len(files) and not phantoms:
             raise ValueError("there is nothing to train on: data.holdout holds out every CT, and data.phantoms is 0")
-        if files and not held_out and holdout.fraction:
-            warn(f"no CT is held out, since {holdout.fraction:g} of {len(files)} is none"
-                 f"{as_one_patient(f.id for f in files)}: give more CTs, or name some by data.holdout.ids")
         self.held_out = [f.id for f in held_out]
         validating = set(self.held_out)
         self.cts = CTCases([f for f in files if f.id not in validating], cache, self.draw_grid, hu)
@@ -104,10 +89,14 @@ class PriorData(lightning.LightningDataModule):
         self.held_out_cts, self.headers_checked = CTCases(held_out, cache, self.grid, hu), False
         self.validation: Dataset = ConcatDataset([
             CachedPhantoms(VALIDATION_PHANTOM, holdout.phantoms, self.grid, hu, Path(cache)), self.held_out_cts])
-        self.reports = [f.report for f in files if f.report and f.id not in validating]
-        self.reports += [report(Thorax.draw(s)) for s in range(min(phantoms, 1000))]
-        self.reports += self.population.reports(1000) if self.population else []
         self.loading, self.seed, self.augmentation, self.cache = loading, seed, augmentation, Path(cache)
+
+    @cached_property
+    def reports(self) -> list[str]:
+        """Reports such as the cases to train on have."""
+        reports = [ct.report for ct in self.cts.cts if ct.report]
+        reports += [report(Thorax.draw(s)) for s in range(min(len(self.phantoms), 1000))]
+        return reports + (self.population.reports(1000) if self.population else [])
 
     def origin(self) -> list:
         """Of which files and of which versions of phantoms and new patients the cases to train on are, as plain JSON
@@ -215,6 +204,29 @@ class PriorData(lightning.LightningDataModule):
         means over blocks are what is learnt."""
         batch = torch.utils.data.default_collate([training_parts(case) for case in cases])
         return batch if self.factor == 1 else averaged(batch, self.factor) | {"fine": batch["volume"]}
+
+
+def _held_out(files: list[CTFile], holdout: HoldOut, seed: int) -> list[CTFile]:
+    """The CTs that validate instead of training. Raises ValueError where a word is in no CT's id, and only warns where
+    it is one of many in a file."""
+    names, words = {f.id for f in files}, holdout.words()
+
+    def meant(word: str, id: str) -> bool:
+        return word == id if word in names else word in id
+
+    if unknown := [word for word in words if not any(meant(word, f.id) for f in files)]:
+        said = (f"data.holdout.ids names '{unknown[0]}', but no CT has that in its id"
+                + (f" (the first id is {files[0].id})" if files else ""))
+        if len(unknown) == len(words) or not holdout.is_file:
+            raise ValueError(f"{said}: correct or remove it")
+        warn(f"{said}: of the {len(words)} lines of {holdout.ids}, {len(unknown)} hold out nothing")
+    validating = set(split_by_patient([f.id for f in files], holdout.fraction, seed)[1])
+    named = {patient_of(f.id) for f in files if any(meant(word, f.id) for word in words)}
+    held_out = [f for f in files if f.id in validating or patient_of(f.id) in named]
+    if files and not held_out and holdout.fraction:
+        warn(f"no CT is held out, since {holdout.fraction:g} of {len(files)} is none"
+             f"{as_one_patient(f.id for f in files)}: give more CTs, or name some by data.holdout.ids")
+    return held_out
 
 
 def check_plain(loading: Loading) -> None:

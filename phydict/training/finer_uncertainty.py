@@ -5,16 +5,15 @@ from __future__ import annotations
 import math
 
 from torch import Tensor
-from torchmetrics.functional import spearman_corrcoef
 
 from phydict.grid import Cube
-from phydict.prior import DEFAULT_CORRECTION, describe_correction, fingerprint, load_correction
-from phydict.prior.correction import CorrectionNetwork
+from phydict.prior import DEFAULT_CORRECTION, fingerprint, load_correction
 from phydict.prior.finer_uncertainty import INPUT_CHANNELS, FinerUncertainty, tissue_of_seen
 from phydict.prior.uncertainty import TISSUES
 from phydict.runtime.ranges import check_between
+from phydict.training.calibrated import CalibratedTraining
 from phydict.training.settings import Optimisation
-from phydict.training.stage import StageTraining, check_continues
+from phydict.training.stage import check_continues
 from phydict.units import HUWindow
 
 OUTSIDE = TISSUES.index("air")
@@ -23,7 +22,7 @@ EVERY = 7
 """Of how many voxels of a reconstruction one calibrates."""
 
 
-class FinerUncertaintyTraining(StageTraining):
+class FinerUncertaintyTraining(CalibratedTraining):
     """Learns the FinerUncertainty of a CorrectionNetwork, whose own weights stay as they are, from crops of its
     results, as UncertaintyTraining learns a refiner's; each validation calibrates it.
 
@@ -36,9 +35,6 @@ class FinerUncertaintyTraining(StageTraining):
         initial: the CorrectionNetwork's file
     """
 
-    prior: CorrectionNetwork
-    calibrates = True
-
     def __init__(self, network: FinerUncertainty | None = None, cube: Cube = Cube(128),
                  window: tuple[float, float] = (-1000.0, 1000.0), optimisation: Optimisation = Optimisation(),
                  body_weight: float = 9.0, initial: str = str(DEFAULT_CORRECTION)):
@@ -46,10 +42,8 @@ class FinerUncertaintyTraining(StageTraining):
         corrects = load_correction(initial)
         check_continues("network", initial, corrects, cube.grid(), HUWindow(*window))
         corrects.uncertainty = network or corrects.uncertainty or FinerUncertainty()
-        super().__init__(corrects, optimisation, 0, initial)
+        super().__init__(corrects, optimisation, 0, initial, body_weight)
         corrects.uncertainty.train().requires_grad_(True)
-        self.body_weight = body_weight
-        self.held_out: list[tuple[Tensor, Tensor]] = []
 
     def setup(self, stage: str) -> None:
         super().setup(stage)
@@ -60,33 +54,16 @@ class FinerUncertaintyTraining(StageTraining):
 
     def batch_loss(self, batch: dict, key: tuple[int, ...] = (0,), rank: int = 0, processes: int = 1) -> Tensor:
         log_scale, error, tissue = self._compared(batch["volume"])
-        weight = 1 + self.body_weight * (tissue != OUTSIDE)
-        return (weight * (log_scale + error / log_scale.exp())).sum() / weight.sum()
+        return self.error_loss(log_scale, error, tissue != OUTSIDE)
 
     def _compared(self, volume: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """What the network says of the log of the errors' scale, the errors, and the tissues, (B, X, Y, Z) each, of
         what is seen and the truth (B, INPUT_CHANNELS + 1, X, Y, Z)."""
         seen = volume[:, :INPUT_CHANNELS]
-        assert self.prior.uncertainty is not None
         error = (seen[:, 0] - volume[:, INPUT_CHANNELS]).abs()
         return self.prior.uncertainty(seen)[:, 0], error, tissue_of_seen(seen)
 
-    def on_validation_start(self) -> None:
-        super().on_validation_start()
-        self.held_out = []
-
     def validation_step(self, batch: dict, index: int) -> None:
         log_scale, error, tissue = self._compared(batch["volume"])
-        body = tissue != OUTSIDE
-        self.log_case(index, "val/rank", spearman_corrcoef(log_scale[body].float(), error[body]), prog_bar=True)
-        self.held_out.append(((error / log_scale.exp()).flatten()[::EVERY], tissue.flatten()[::EVERY]))
-        self.log("samples", float(self.samples), rank_zero_only=True, batch_size=1)
-
-    def on_validation_epoch_end(self) -> None:
-        if self.held_out:
-            assert self.prior.uncertainty is not None
-            self.prior.uncertainty.calibrate(*self.of_all_processes(self.held_out))
-            self.calibrated_at = self.trainer.global_step
-
-    def _describe(self) -> dict:
-        return describe_correction(self.prior)
+        self.log_rank(index, log_scale, error, tissue != OUTSIDE)
+        self.hold_out((error / log_scale.exp()).flatten()[::EVERY], tissue.flatten()[::EVERY])

@@ -13,23 +13,19 @@ from phydict.datasets.phantoms.teaching import teaching_sentences
 from phydict.datasets.prose import written_words
 from phydict.datasets.reports import read_texts
 from phydict.diffusion import Denoiser
-from phydict.evaluation import body_weights, method_panel, volume_metrics
+from phydict.evaluation import method_panel
 from phydict.grid import Cube
-from phydict.methods import reconstruct
-from phydict.posterior import Sampler
-from phydict.prior import DetailNetwork, Prior, TextEncoder, VolumeUNet, describe_prior, learn_vocabulary, load_prior
+from phydict.prior import DetailNetwork, Prior, TextEncoder, VolumeUNet, learn_vocabulary, load_prior
 from phydict.prior.unet import TextMap
-from phydict.reconstruction import Reconstructor
 from phydict.runtime.progress import CaseProgress
 from phydict.runtime.warning import warn
 from phydict.training.denoising import DenoisingTraining
 from phydict.training.reports import BATCH, learn_sentences
+from phydict.training.scores import reconstruction_scores
 from phydict.training.settings import Execution, PriorOptimisation, PriorValidation, TextSettings
 from phydict.training.sharding import shard
 from phydict.training.stage import check_continues, check_network
 from phydict.units import HUWindow
-from phydict.xray import ConeBeam, Ideal, Projector
-from phydict.xray.binning import benchmark_orbit
 from phydict.xray.boxes import in_other_voxels
 
 SENTENCES, VOCABULARY_SIZE = 20_000, 5000
@@ -119,9 +115,6 @@ class PriorTraining(DenoisingTraining):
 
     def _denoiser(self, batch: dict, x0: Tensor) -> Denoiser:
         return self.prior.bind(batch["report"][0] if self.prior.text is not None else "")
-
-    def _describe(self) -> dict:
-        return describe_prior(self.prior)
 
     def validation_step(self, batch: dict, index: int) -> None:
         super().validation_step(batch, index)
@@ -213,17 +206,3 @@ def _text_encoder(text: TextSettings, network: VolumeUNet) -> TextEncoder | None
     texts = read_texts(text.texts) if text.texts else []
     vocabulary = learn_vocabulary([*written_words(), *text.reports, *texts], VOCABULARY_SIZE)
     return TextEncoder.small(vocabulary, network.context_dim, length=SENTENCE_LENGTH, sentences=MOST_SENTENCES)
-
-
-def reconstruction_scores(prior, ct: Tensor, views: int, seed: int,
-                          method: str | Sampler | Reconstructor | None = None,
-                          beam: ConeBeam | None = None) -> dict[str, float]:
-    """SSIM, PSNR (dB) and MAE (HU), whole and in the body, of a method's reconstruction, without a report, from
-    ideal X-rays of a CT (1, 1, X, Y, Z) in the range of `prior`, a Prior, Refiner or Rival, on `beam` or
-    `benchmark_orbit`."""
-    beam = beam or benchmark_orbit(prior.grid, views)
-    exact = Projector(prior.grid, beam, device=ct.device, full_detector=True)
-    result = reconstruct(Ideal()(exact, prior.window.to_mu(ct), seed)[0], beam, prior, method, seed=seed,
-                        grid=prior.grid)
-    truth = prior.window.to_hu(ct)
-    return volume_metrics(result.volume[None, None], truth, body=body_weights(truth, prior.grid.spacing))

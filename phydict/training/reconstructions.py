@@ -29,9 +29,10 @@ from phydict.reconstruction import describe
 from phydict.runtime.progress_log import log_progress
 from phydict.runtime.ranges import check_fields
 from phydict.runtime.seeds import check_seed
-from phydict.training.crops import CTVolumes, PhantomVolumes, log_made, mapped_volume
+from phydict.training.crops import CTVolumes, PhantomVolumes
 from phydict.training.data import PriorData, check_plain
 from phydict.training.draws import Draws, Items
+from phydict.training.made import MadeOnce
 from phydict.training.scenes import Scenes
 from phydict.training.settings import HoldOut, Loading
 from phydict.units import AIR, HUWindow
@@ -92,29 +93,23 @@ class _Recording:
         return None
 
 
-class Reconstructions(Dataset):
+class Reconstructions(MadeOnce):
     """What a refinement sees, at each call of `network`, and last the truth: (calls INPUTS + 1, X, Y, Z) in half
     precision, in the prior's range.
 
     name: of its folders. channels: of what is seen at a call. default_network: the file that stands for None.
     of_intervals: whether the refiner needs to know them.
 
-    Item n shows volume n modulo their number, deformed unless `strength` is that of none, in a scene of its own. It is
-    made when missing and kept in `folder`.
+    Item n shows volume n modulo their number, deformed unless `strength` is that of none, in a scene of its own.
     """
 
     name, channels, default_network, of_intervals = "reconstructions", INPUTS, cast(str | None, None), False
 
     def __init__(self, volumes: Items, grid: Grid, base: str, network: str | None, scenes: Scenes,
                  strength: Augmentation, folder: Path, length: int, seed: int):
+        super().__init__(folder, length)
         self.volumes, self.grid, self.base, self.network = volumes, grid, base, network
-        self.scenes, self.strength, self.folder, self.length, self.seed = scenes, strength, folder, length, seed
-
-    def __len__(self) -> int:
-        return self.length
-
-    def __getitem__(self, n: int) -> np.ndarray:
-        return mapped_volume(self.folder / f"{n:05d}.npy", lambda: self._made(n))
+        self.scenes, self.strength, self.seed = scenes, strength, seed
 
     @torch.no_grad()
     def _made(self, n: int) -> Tensor:
@@ -272,7 +267,7 @@ class RefinementData(PriorData):
 
     def draws(self, epoch: int) -> Dataset:
         if not self.trainer or self.trainer.is_global_zero:
-            log_made(self.made.name, self.made.folder, len(self.made))
+            self.made.log_made()
         return ReconstructionCrops(self.made, self.crop, self.loading.epoch_size, epoch, self.seed)
 
     def collate(self, cases: list[dict]) -> dict:

@@ -7,7 +7,7 @@ import math
 from torch import Tensor
 
 from phydict.grid import Cube
-from phydict.prior import describe_correction, load_correction
+from phydict.prior import load_correction
 from phydict.prior.correction import CorrectionNetwork
 from phydict.runtime.ranges import check_between
 from phydict.training.settings import Optimisation
@@ -57,6 +57,3 @@ class RefinementTraining(StageTraining):
             psnr = 10 * (4 / (x0.float() - truth).square().mean()).log10()  # the range is 2 wide
             self.log_case(index, f"val/{name}", psnr, prog_bar=name == "psnr")
         self.log("samples", float(self.samples), rank_zero_only=True, batch_size=1)
-
-    def _describe(self) -> dict:
-        return describe_correction(self.prior)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from copy import deepcopy
 
 import numpy as np
@@ -11,16 +10,14 @@ import torch
 from torch import Tensor
 
 from phydict.grid import Cube
-from phydict.posterior import Sampler, Unrolled
-from phydict.prior import DEFAULT_PRIOR, BoundPrior, BoundRefiner, Prior, Refiner, describe_refiner, load_prior
-from phydict.reconstruction import Reconstructor
+from phydict.posterior import Unrolled
+from phydict.prior import DEFAULT_PRIOR, BoundPrior, BoundRefiner, Prior, Refiner, load_prior
 from phydict.runtime.ranges import check_between
-from phydict.training.prior import reconstruction_scores
 from phydict.training.scenes import Scenes
+from phydict.training.scores import log_error, log_scores
 from phydict.training.settings import Optimisation, RefinerValidation
 from phydict.training.stage import StageTraining, check_continues
 from phydict.units import HUWindow
-from phydict.xray import ConeBeam
 
 MEAN_DRAWS = 4
 """Noise draws over which the prior's estimate at time 1 is averaged."""
@@ -115,33 +112,6 @@ class RefinerTraining(StageTraining):
 
     def validation_step(self, batch: dict, index: int) -> None:
         log_scores(self, batch, index, self.validation_views, self.method)
-
-    def _describe(self) -> dict:
-        return describe_refiner(self.prior)
-
-
-def log_error(x0: Tensor, ct: Tensor, body_weight: float) -> Tensor:
-    """The logarithms of the mean squared and of the mean absolute error of an estimate of a CT, both (B, 1, X, Y, Z) in
-    the prior's range, whose voxels of the body count 1 + body_weight times as much as those of air."""
-    weight, error = 1 + body_weight * (ct > -0.9), x0 - ct
-    weight = weight / weight.mean()
-    return ((weight * error.square()).mean() + 2e-5).log() / 2 + ((weight * error.abs()).mean() + 1e-3).log()
-
-
-def log_scores(module: StageTraining, batch: dict, index: int, views: Sequence[int],
-               method: Sampler | Reconstructor, beam: ConeBeam | None = None) -> None:
-    """Logs how well a training's network reconstructs a held-out case from each of these numbers of X-rays, or from
-    those of `beam`."""
-    scores, seed = [], module.validation_number(index)
-    with torch.autocast(module.device.type, enabled=False):
-        for count in views:
-            view_scores = reconstruction_scores(module.prior, batch["volume"], count, seed, method, beam)
-            module.log_case(index, f"val/psnr_{count}", view_scores["psnr"])
-            scores.append(view_scores)
-    for name in ("psnr", "ssim"):
-        mean = float(np.mean([view_scores[name] for view_scores in scores]))
-        module.log_case(index, f"val/{name}", mean, prog_bar=name == "psnr")
-    module.log("samples", float(module.samples), rank_zero_only=True, batch_size=1)
 
 
 @torch.no_grad()

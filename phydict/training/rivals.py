@@ -14,8 +14,8 @@ from phydict.grid import Cube, Grid
 from phydict.rivals import LiftedNetwork, Rival, RivalAnswer, load_rival
 from phydict.rivals.rival import bound_orbit
 from phydict.runtime.ranges import LEAST, check_between, check_fields
-from phydict.training.refiner import log_error, log_scores
 from phydict.training.scenes import Scenes
+from phydict.training.scores import log_error, log_scores
 from phydict.training.settings import Optimisation, RefinerValidation
 from phydict.training.stage import StageTraining, check_network
 from phydict.units import MU_WATER, HUWindow
@@ -63,9 +63,6 @@ class RivalTraining(StageTraining):
 
     def validation_step(self, batch: dict, index: int) -> None:
         log_scores(self, batch, index, self.validation_views, RivalAnswer(self.prior), self.prior.beam)
-
-    def _describe(self) -> dict:
-        return self.prior.describe()
 
 
 class LiftedTraining(RivalTraining):

@@ -20,9 +20,9 @@ from phydict.posterior import Unrolled
 from phydict.prior import DEFAULT_REFINER, BoundRefiner, Refiner, fingerprint, load_prior
 from phydict.prior.evidence_channels import EVIDENCE_CHANNELS
 from phydict.runtime.ranges import check_fields
-from phydict.training.crops import log_made, mapped_volume
 from phydict.training.data import PriorData, check_plain
 from phydict.training.draws import Draws, Items
+from phydict.training.made import MadeOnce
 from phydict.training.refiner import RefinerTraining
 from phydict.training.scenes import Scenes
 from phydict.training.settings import HoldOut, Loading
@@ -59,23 +59,20 @@ class _Recording(BoundRefiner):
         return super().refine(x, t, evidence)
 
 
-class RollOuts(Dataset):
+class RollOuts(MadeOnce):
     """What a refiner is given at each call of a case's reconstruction, without a report, and last what it should
     answer: (calls (C + EVIDENCE_CHANNELS) + C, X, Y, Z) in half precision, in the prior's range. Masks that are not
     known are NaN.
 
-    Item n is that of draw n, in a scene of its own. It is made when missing and kept in `folder`.
+    Item n is that of draw n, in a scene of its own.
     """
+
+    name = "roll-outs"
 
     def __init__(self, drawn: Callable[[int], dict], settings: RollOutSettings, method: Unrolled, folder: Path,
                  seed: int):
-        self.drawn, self.settings, self.method, self.folder, self.seed = drawn, settings, method, folder, seed
-
-    def __len__(self) -> int:
-        return self.settings.count
-
-    def __getitem__(self, n: int) -> np.ndarray:
-        return mapped_volume(self.folder / f"{n:05d}.npy", lambda: self._made(n))
+        super().__init__(folder, settings.count)
+        self.drawn, self.settings, self.method, self.seed = drawn, settings, method, seed
 
     @cached_property
     def _refiner(self) -> Refiner:
@@ -156,7 +153,7 @@ class RollOutData(PriorData):
 
     def draws(self, epoch: int) -> Dataset:
         if not self.trainer or self.trainer.is_global_zero:
-            log_made("roll-outs", self.rollouts.folder, len(self.rollouts))
+            self.rollouts.log_made()
         return Calls(self.rollouts, self.channels, self.loading.epoch_size, epoch, self.seed)
 
     def collate(self, cases: list[dict]) -> dict:

@@ -20,7 +20,6 @@ from phydict.prior.finite import not_finite
 from phydict.prior.stage_file import check_stage
 from phydict.rivals import Rival
 from phydict.runtime.seeds import check_seed
-from phydict.training.checkpoints import CALIBRATED_AT
 from phydict.training.data import PriorData
 from phydict.training.settings import Optimisation
 from phydict.units import HUWindow
@@ -50,12 +49,11 @@ def check_network(kind: str, file: str, own: dict, requested: dict, part: str = 
 class StageTraining(lightning.LightningModule, ABC):
     """Learns one stage, its network `self.prior`, by the loss of a batch (`batch_loss`).
 
-    calls: of the network, forward and backward, that a sample costs. calibrates: whether validation changes the
-    weights. calibrated_at: the step after which it last did, None: not yet. initial: the file that training starts
-    from, if any.
+    calls: of the network, forward and backward, that a sample costs. initial: the file that training starts from, if
+    any.
     """
 
-    calls, calibrates, calibrated_at = 1, False, None
+    calls = 1
 
     def __init__(self, prior: Prior | SuperResolution | Refiner | CorrectionNetwork | Rival,
                  optimisation: Optimisation, seed: int, initial: str | None = None):
@@ -81,10 +79,6 @@ class StageTraining(lightning.LightningModule, ABC):
             yield ({name: value[n:n + 1] for name, value in batch.items()},
                    np.random.default_rng((*key, rank + n * processes)))
 
-    @abstractmethod
-    def _describe(self) -> dict:
-        """What the stage is, as plain JSON values."""
-
     def learn_reports(self) -> None:
         """Teaches the text part, where there is one, before the first denoising step."""
 
@@ -103,16 +97,7 @@ class StageTraining(lightning.LightningModule, ABC):
 
     def on_fit_start(self) -> None:
         self.optimisation.check_end(self.trainer.max_steps)
-        if self.calibrates and not len(self.trainer.datamodule.validation):  # type: ignore[attr-defined]
-            raise ValueError("validation calibrates the intervals, but nothing is held out: name CTs by "
-                             "data.holdout.ids, or give a share of them as data.holdout.fraction")
-        if self.calibrates and not self.trainer.limit_val_batches:
-            raise ValueError("validation calibrates the intervals, but trainer.limit_val_batches is "
-                             f"{self.trainer.limit_val_batches}: leave it out")
         for callback in self.averaging():
-            if self.calibrates:
-                raise ValueError("weights that validation calibrates cannot be averaged: train without "
-                                 f"{type(callback).__name__} (trainer.callbacks: null)")
             if callback._average_model is not None:
                 callback._average_model.to(self.device)  # made before the weights came there; each step would copy them
 
@@ -199,9 +184,7 @@ class StageTraining(lightning.LightningModule, ABC):
         progress = {name: count + self.before.get(name, 0) for name, count in progress.items()}
         held_out = self._held_out()
         known = {} if held_out is None else {"held_out": held_out}
-        checkpoint["phydict"] = self._describe() | {"training": progress | known}
-        if self.calibrates:
-            checkpoint[CALIBRATED_AT] = self.calibrated_at
+        checkpoint["phydict"] = self.prior.describe() | {"training": progress | known}
 
     def _held_out(self) -> list[str] | None:
         """The held-out CTs that the weights never learnt from, not before this training either; None where no training
@@ -212,11 +195,10 @@ class StageTraining(lightning.LightningModule, ABC):
         return [id for id in data.held_out if before is None or id in before]
 
     def on_load_checkpoint(self, checkpoint: dict) -> None:
-        resumed, current = {"stage": "base"} | checkpoint["phydict"], self._describe()
+        resumed, current = {"stage": "base"} | checkpoint["phydict"], self.prior.describe()
         check_stage(resumed, (current["stage"],), "the checkpoint")
         for key in resumed | current:
             if key != "training" and resumed.get(key) != current.get(key):
                 raise ValueError(f"the checkpoint's prior and this training's differ in '{key}': give the settings and "
                                  "data that the checkpoint was trained with, or start anew with model.initial")
         self.samples = checkpoint["phydict"].get("training", {}).get("samples", 0) - self.before.get("samples", 0)
-        self.calibrated_at = checkpoint.get(CALIBRATED_AT)

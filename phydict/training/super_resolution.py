@@ -11,7 +11,7 @@ from torch.nn.functional import avg_pool3d
 from phydict.diffusion import Denoiser, noise_like
 from phydict.evaluation import method_panel
 from phydict.grid import Cube, Grid
-from phydict.prior import LocalUNet, SuperResolution, describe_super_resolution, load_super_resolution
+from phydict.prior import LocalUNet, SuperResolution, load_super_resolution
 from phydict.runtime.ranges import check_between
 from phydict.training.crops import SuperResolutionData
 from phydict.training.denoising import DenoisingTraining
@@ -83,9 +83,6 @@ class SuperResolutionTraining(DenoisingTraining):
 
     def _denoiser(self, batch: dict, x0: Tensor) -> Denoiser:
         return self.prior.bind(avg_pool3d(x0, self.prior.factor))
-
-    def _describe(self) -> dict:
-        return describe_super_resolution(self.prior)
 
     def validation_step(self, batch: dict, index: int) -> None:
         super().validation_step(batch, index)

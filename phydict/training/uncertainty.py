@@ -3,29 +3,28 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
-from torchmetrics.functional import spearman_corrcoef
 
 from phydict.grid import Cube
 from phydict.posterior import Measurement, Unrolled
 from phydict.posterior.widening import limited_angle_factor
-from phydict.prior import DEFAULT_REFINER, Refiner, describe_refiner, load_prior
+from phydict.prior import DEFAULT_REFINER, Refiner, load_prior
 from phydict.prior.uncertainty import AIR_BELOW, Uncertainty, coverage_of, tissue_of
 from phydict.runtime.ranges import check_between
+from phydict.training.calibrated import CalibratedTraining
 from phydict.training.scenes import Scenes
 from phydict.training.settings import CalibrationScenes, Optimisation
-from phydict.training.stage import StageTraining, check_continues
+from phydict.training.stage import check_continues
 from phydict.units import HUWindow
 
 VOXELS = 20_000
 """Voxels of a reconstruction that calibrate."""
 
 
-class UncertaintyTraining(StageTraining):
+class UncertaintyTraining(CalibratedTraining):
     """Learns the Uncertainty of a refiner, whose own weights stay as they are; each validation calibrates it.
 
     Training teaches the scale of each voxel's error; validation sets the quantiles of error over scale that make
@@ -44,9 +43,6 @@ class UncertaintyTraining(StageTraining):
         seed: of scenes and noise
     """
 
-    prior: Any  # a Refiner with uncertainty
-    calibrates = True
-
     def __init__(self, network: Uncertainty | None = None, method: Unrolled = Unrolled(), scenes: Scenes = Scenes(),
                  cube: Cube = Cube(), window: tuple[float, float] = (-1000.0, 1000.0),
                  optimisation: Optimisation = Optimisation(), validation: CalibrationScenes = CalibrationScenes(),
@@ -58,13 +54,12 @@ class UncertaintyTraining(StageTraining):
                              "model.initial")
         check_continues("refiner", initial, refiner, cube.grid(), HUWindow(*window))
         refiner.uncertainty = network or refiner.uncertainty or Uncertainty(refiner.state_channels)
-        super().__init__(refiner, optimisation, seed, initial)
+        super().__init__(refiner, optimisation, seed, initial, body_weight)
         reader = refiner.reader
         if reader.load_text is not None:  # to be written with the rest
             reader.text = reader.load_text().requires_grad_(False)
         refiner.uncertainty.requires_grad_(True)
-        self.method, self.scenes, self.validation, self.body_weight = method, scenes, validation, body_weight
-        self.held_out: list[tuple[Tensor, ...]] = []
+        self.method, self.scenes, self.validation = method, scenes, validation
 
     def batch_loss(self, batch: dict, key: tuple[int, ...] = (0,), rank: int = 0, processes: int = 1) -> Tensor:
         losses = []
@@ -72,9 +67,7 @@ class UncertaintyTraining(StageTraining):
             ct = case["volume"]
             z, evidence, measurement = self._reconstruct(case, rng)
             log_scale = self._log_scale(z, evidence, measurement)
-            error = (z[:, :1] - ct).abs()
-            weight = 1 + self.body_weight * _body(ct, z)
-            losses.append((weight * (log_scale + error / log_scale.exp())).sum() / weight.sum())
+            losses.append(self.error_loss(log_scale, (z[:, :1] - ct).abs(), _body(ct, z)))
         return torch.stack(losses).mean()
 
     @torch.no_grad()
@@ -93,33 +86,19 @@ class UncertaintyTraining(StageTraining):
         """What the network says of the log of the errors' scale, and what is known of the scene's angles."""
         return self.prior.uncertainty(z, evidence) + math.log(limited_angle_factor(measurement.projector))
 
-    def on_validation_start(self) -> None:
-        super().on_validation_start()
-        self.held_out = []
-
     def validation_step(self, batch: dict, index: int) -> None:
         ct, scenes = batch["volume"], []
         for scene in range(self.validation.scenes):
             rng = np.random.default_rng((self.seed, self.validation_number(index), scene))
             z, evidence, measurement = self._reconstruct(batch, rng)
             error, log_scale = (z[:, :1] - ct).abs(), self._log_scale(z, evidence, measurement)
-            body = _body(ct, z)
-            self.log_case(index, "val/rank", spearman_corrcoef(log_scale[body], error[body]), prog_bar=True)
+            self.log_rank(index, log_scale, error, _body(ct, z))
             chosen = torch.from_numpy(rng.integers(error.numel(), size=VOXELS)).to(ct.device)
             scenes.append((
                 (error / log_scale.exp()).flatten()[chosen], tissue_of(z).flatten()[chosen],
                 coverage_of(evidence).flatten()[chosen],
                 measurement.normalised_residual(z[:, :1], modelled=True).flatten()))
-        self.held_out.append(tuple(map(torch.cat, zip(*scenes))))
-        self.log("samples", float(self.samples), rank_zero_only=True, batch_size=1)
-
-    def on_validation_epoch_end(self) -> None:
-        if self.held_out:
-            self.prior.uncertainty.calibrate(*self.of_all_processes(self.held_out))
-            self.calibrated_at = self.trainer.global_step
-
-    def _describe(self) -> dict:
-        return describe_refiner(self.prior)
+        self.hold_out(*map(torch.cat, zip(*scenes)))
 
 
 def _body(ct: Tensor, z: Tensor) -> Tensor:

@@ -34,7 +34,8 @@ from phydict.runtime.console import quiet
 from phydict.runtime.precision import trainer_precision
 from phydict.training.data import PriorData
 from phydict.training.denoising import denoising_errors
-from phydict.training.prior import PriorTraining, reconstruction_scores
+from phydict.training.prior import PriorTraining
+from phydict.training.scores import reconstruction_scores
 from phydict.training.settings import HoldOut, Loading, PriorOptimisation, TextSettings
 from phydict.training.stage import CHECKPOINT
 

@@ -10,7 +10,7 @@ import torch
 from prior.tiny import tiny_super_resolution
 from tries import PICKLE, ROOT, tiny
 
-from phydict.prior import save_super_resolution
+from phydict.prior import save_stage
 
 
 def priors():
@@ -126,10 +126,10 @@ def priors():
     yield "inspect of a header with odd parts", None, "", lambda p: p.train("inspect-prior", p.prior({"grid": [],
         "hu_window": "ab", "text": [1]}))
     yield "inspect of the prior", True, "", lambda p: p.train("inspect-prior", p.prior())
-    yield "a second stage of another size", no, "", lambda p: (save_super_resolution(
+    yield "a second stage of another size", no, "", lambda p: (save_stage(
         tiny_super_resolution(48, 2), p.given / "f.safetensors"), p.sampled(p.prior(),
         f"--model.super_resolution.file={p.given / 'f.safetensors'}"))
-    yield "a second stage as it should be", True, "", lambda p: (save_super_resolution(
+    yield "a second stage as it should be", True, "", lambda p: (save_stage(
         tiny_super_resolution(32, 2), p.given / "f.safetensors"), p.sampled(p.prior(),
         f"--model.super_resolution.file={p.given / 'f.safetensors'}"))
 

@@ -26,7 +26,6 @@ from phydict import ConeBeam, Grid, HUWindow
 from phydict.cli.infer import main as infer
 from phydict.cli.train import main as train
 from phydict.datasets import phantom_case, save_xrays
-from phydict.prior.files import describe_prior
 
 ROOT = Path(__file__).parents[2]
 ORBIT = {"views": 3, "source_to_detector": 1020.0, "source_to_isocentre": 740.0, "shape": [24, 24],
@@ -57,7 +56,7 @@ def box(n: int = 20) -> np.ndarray:
 def tiny() -> tuple:
     """Header, weights and metadata of a prior of 16^3 voxels."""
     prior = tiny_prior()
-    return describe_prior(prior) | {"training": {}}, {k: w.half().contiguous() for k, w in prior.state_dict().items()}
+    return prior.describe() | {"training": {}}, {k: w.half().contiguous() for k, w in prior.state_dict().items()}
 
 
 class Place:

@@ -11,7 +11,7 @@ from inference.runs import BEAM, phantoms, write_ct
 from phydict.cli.infer import main
 from phydict.datasets import phantom_case, save_xrays
 from phydict.grid import Grid
-from phydict.prior import LocalUNet, Prior, SuperResolution, VolumeUNet, save_prior, save_super_resolution
+from phydict.prior import LocalUNet, Prior, SuperResolution, VolumeUNet, save_prior, save_stage
 from phydict.units import HUWindow
 from phydict.xray import Projector
 
@@ -41,7 +41,7 @@ def fine(tmp_path_factory) -> Path:
     """An untrained super-resolution stage from 16^3 to 32^3 voxels."""
     torch.manual_seed(0)
     file = tmp_path_factory.mktemp("fine") / "fine.safetensors"
-    save_super_resolution(SuperResolution(LocalUNet(2, 1, 2, (8, 8)), Grid.cube(32), HUWindow(), 2), file)
+    save_stage(SuperResolution(LocalUNet(2, 1, 2, (8, 8)), Grid.cube(32), HUWindow(), 2), file)
     return file
 
 

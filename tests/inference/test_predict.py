@@ -23,7 +23,7 @@ from phydict.grid import Grid
 from phydict.inference import ReconstructionTask
 from phydict.methods import CORRECTIONS, METHODS, reconstruct
 from phydict.posterior import PriorOnly
-from phydict.prior import load_correction, save_correction
+from phydict.prior import load_correction, save_stage
 from phydict.runtime.precision import instruction_set
 from phydict.xray import ConeBeam
 from phydict.xray.geometry_files import write_beam
@@ -227,7 +227,7 @@ def test_cases_refined_by_another_network_are_others(tmp_path, monkeypatch):
         return ReconstructionTask(METHODS["phydict_learned"], grid=128, out=str(tmp_path / "out")).settings
 
     shipped_one = settings()
-    save_correction(load_correction(), tmp_path / "other.safetensors", {"steps": 1})
+    save_stage(load_correction(), tmp_path / "other.safetensors", {"steps": 1})
     monkeypatch.setitem(CORRECTIONS, 3.0, tmp_path / "other.safetensors")
     other = settings()
     assert shipped_one.pop("correction_crc32") != other.pop("correction_crc32") and shipped_one == other

@@ -19,7 +19,7 @@ from phydict.grid import Cube, Grid
 from phydict.inference import ReconstructionData, protocols, scoring
 from phydict.inference.protocols import PROTOCOLS, placed, resampled
 from phydict.inference.settings import Orbit
-from phydict.rivals import save_rival
+from phydict.prior import save_stage
 from phydict.units import HUWindow
 from phydict.xray import Ideal, Polychromatic
 
@@ -164,7 +164,7 @@ def test_a_method_on_other_voxels_keeps_its_place_in_the_ct():
 
 def bound_methods(prior, folder) -> dict[str, list[str]]:
     """Options of a method with a prior, and of a rival, on 16^3 voxels of their own."""
-    save_rival(tiny_lifted(), folder / "lifted.safetensors")
+    save_stage(tiny_lifted(), folder / "lifted.safetensors")
     return {"prior_only": with_prior("test", folder, prior),
             "lifted": ["test", "--model.method=phydict.rivals.TrainedRival", "--model.name=lifted",
                        f"--model.method.init_args.file={folder / 'lifted.safetensors'}", f"--model.out={folder}",

@@ -17,7 +17,7 @@ from phydict.prior import (
     load_prior,
     load_super_resolution,
     save_prior,
-    save_super_resolution,
+    save_stage,
 )
 from phydict.units import HUWindow
 from prior.tiny import tiny_prior, tiny_super_resolution
@@ -55,7 +55,7 @@ def test_stages_stacked_in_other_directions_are_refused():
 @pytest.fixture
 def files(tmp_path):
     save_prior(tiny_prior(False), tmp_path / "base.safetensors")
-    save_super_resolution(tiny_super_resolution(), tmp_path / "fine.safetensors", {"steps": 3})
+    save_stage(tiny_super_resolution(), tmp_path / "fine.safetensors", {"steps": 3})
     return tmp_path / "base.safetensors", tmp_path / "fine.safetensors"
 
 
@@ -64,7 +64,7 @@ def test_a_loaded_stage_denoises_like_the_saved_one(files, tmp_path):
     expected = saved.bind(COARSE, 0.1, "float32").denoise(X, 0.5)
     found = loaded.bind(COARSE, 0.1, "float32").denoise(X, 0.5)
     assert (found - expected).square().mean().sqrt() < 3e-3 * expected.std()
-    save_super_resolution(saved, tmp_path / "full.safetensors", dtype=torch.float32)
+    save_stage(saved, tmp_path / "full.safetensors", dtype=torch.float32)
     full = load_super_resolution(tmp_path / "full.safetensors")
     assert torch.equal(full.bind(COARSE, 0.1, "float32").denoise(X, 0.5), expected)
     assert full.grid.same_as(saved.grid) and full.window == saved.window and full.factor == saved.factor

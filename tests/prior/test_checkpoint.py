@@ -9,7 +9,7 @@ from laws import random_like
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from phydict.prior import TextEncoder, describe_prior, inspect_prior, load_prior, save_prior
+from phydict.prior import TextEncoder, inspect_prior, load_prior, save_prior
 from phydict.prior.text_file import build_text
 from phydict.runtime.shipped import shipped
 from prior.tiny import REPORTS, tiny_prior, write_cxr_bert
@@ -143,7 +143,7 @@ def test_a_prior_reads_reports_as_it_was_trained_to(tmp_path, padded_to):
 
 def test_a_header_from_before_padding_was_a_choice_still_loads(tmp_path):
     write_cxr_bert(tmp_path)
-    text = describe_prior(tiny_prior())["text"] | {"source": str(tmp_path), "vocabulary": None}
+    text = tiny_prior().describe()["text"] | {"source": str(tmp_path), "vocabulary": None}
     assert set(text) == {"source", "length", "width", "layers", "vocabulary"}
     states, mask = build_text(text, {})(REPORTS)
     assert not mask.all() and torch.equal(states, TextEncoder.pretrained(tmp_path, 24)(REPORTS)[0])

@@ -16,8 +16,8 @@ from phydict.grid import Grid
 from phydict.inference import ReconstructionTask
 from phydict.inference.settings import Sampling
 from phydict.methods import METHODS, reconstruct, reconstructor
-from phydict.prior import load_prior, save_prior
-from phydict.rivals import LiftedNetwork, Rival, RivalAnswer, TrainedRival, load_rival, save_rival
+from phydict.prior import load_prior, save_prior, save_stage
+from phydict.rivals import LiftedNetwork, Rival, RivalAnswer, TrainedRival, load_rival
 from phydict.units import MU_WATER, HUWindow, hu_to_mu
 from phydict.xray import ConeBeam, Projector
 from rivals.tiny_rivals import GRID, WINDOW, body, tiny_lifted, tiny_x2ct
@@ -31,7 +31,7 @@ def xrays(beam: ConeBeam = ORBIT) -> torch.Tensor:
 
 @pytest.fixture
 def file(tmp_path) -> str:
-    save_rival(tiny_lifted(), tmp_path / "rival.safetensors", dtype=torch.float32)
+    save_stage(tiny_lifted(), tmp_path / "rival.safetensors", dtype=torch.float32)
     return str(tmp_path / "rival.safetensors")
 
 
@@ -78,14 +78,14 @@ def test_display_values_give_the_same_volume_for_any_gain_and_offset(file):
 
 
 def test_other_weights_are_another_method(file, tmp_path):
-    save_rival(tiny_lifted(seed=1), tmp_path / "other.safetensors", dtype=torch.float32)
+    save_stage(tiny_lifted(seed=1), tmp_path / "other.safetensors", dtype=torch.float32)
     other = TrainedRival(str(tmp_path / "other.safetensors"))
     assert TrainedRival(file).weights_crc32 != other.weights_crc32
 
 
 def test_a_file_is_read_anew_when_it_is_replaced(file):
     before = reconstruct(xrays(), ORBIT, method=TrainedRival(file, "float32"), grid=GRID).volume
-    save_rival(tiny_lifted(seed=1), file, dtype=torch.float32)
+    save_stage(tiny_lifted(seed=1), file, dtype=torch.float32)
     after = reconstruct(xrays(), ORBIT, method=TrainedRival(file, "float32"), grid=GRID).volume
     assert not torch.equal(before, after)
 
@@ -151,13 +151,13 @@ def test_a_prior_is_no_rival_and_a_rival_no_prior(file, tmp_path):
     ({"steps": "many"}, "steps not stated")])
 def test_a_file_tells_for_which_views_and_how_long_it_was_trained(tmp_path, training, words):
     for made, views in ((tiny_lifted(), "any K"), (tiny_x2ct(views=2), "K = 2")):
-        save_rival(made, tmp_path / f"{views}.safetensors", training)
+        save_stage(made, tmp_path / f"{views}.safetensors", training)
         assert TrainedRival(str(tmp_path / f"{views}.safetensors")).training == f"{views}, {words}"
 
 
 def test_the_table_of_a_comparison_says_so_and_that_of_a_damaged_file_is_made_too(file, tmp_path):
     def table(training: dict, damage: bool) -> str:
-        save_rival(tiny_lifted(), file, training)
+        save_stage(tiny_lifted(), file, training)
         if damage:
             Path(file).write_bytes(b"no rival")
         (tmp_path / "spec.yaml").write_text(yaml.safe_dump({

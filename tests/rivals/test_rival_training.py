@@ -13,7 +13,8 @@ from phydict.cli.train import main
 from phydict.datasets import phantom_case
 from phydict.evaluation import read_csv
 from phydict.grid import Cube, Grid
-from phydict.rivals import LiftedNetwork, X2CTNetwork, XrayToCTPANetwork, load_rival, save_rival
+from phydict.prior import save_stage
+from phydict.rivals import LiftedNetwork, X2CTNetwork, XrayToCTPANetwork, load_rival
 from phydict.training.rivals import LiftedTraining, OrbitScenes
 from phydict.training.x2ct import Adversary, X2CTTraining
 from phydict.training.xray2ctpa import XrayToCTPATraining
@@ -100,12 +101,12 @@ def test_validation_takes_the_x_rays_that_a_bound_rival_holds_for(monkeypatch):
 
 def test_what_is_bound_to_no_geometry_goes_on_with_other_voxels_and_what_is_bound_does_not(tmp_path):
     file = tmp_path / "rival.safetensors"
-    save_rival(tiny_lifted(), file, dtype=torch.float32)
+    save_stage(tiny_lifted(), file, dtype=torch.float32)
     going = LiftedTraining(cube=Cube(32), window=(-1000, 600), initial=str(file)).prior
     assert going.grid.same_as(Grid.cube(32))
     for name, weight in tiny_lifted().state_dict().items():
         assert torch.equal(weight, going.state_dict()[name])
-    save_rival(tiny_x2ct(), file)
+    save_stage(tiny_x2ct(), file)
     with pytest.raises(ValueError, match="differ in 'beam'"):
         X2CTTraining(X2CTNetwork(8, 4, (2, 2), (4, 8, 8)), OrbitScenes(views=3), Cube(16), (-1000, 600),
                      initial=str(file))
@@ -118,7 +119,7 @@ def test_what_is_bound_to_no_geometry_goes_on_with_other_voxels_and_what_is_boun
      "ddim_steps 5, .* 4:")])
 def test_a_network_beside_a_rival_to_continue_from_is_the_rivals_own(tmp_path, name, made, other, sentence):
     file, training = tmp_path / "rival.safetensors", type(TASKS[name]())
-    save_rival(made(), file)
+    save_stage(made(), file)
     more = {"cube": Cube(16), "window": (-1000, 600), "initial": str(file)}
     if name != "lifted":
         more["scenes"] = OrbitScenes(views=2)
@@ -130,7 +131,7 @@ def test_a_network_beside_a_rival_to_continue_from_is_the_rivals_own(tmp_path, n
 
 def test_a_rival_counts_the_steps_that_it_went_on_from(tmp_path, monkeypatch):
     file = tmp_path / "rival.safetensors"
-    save_rival(tiny_lifted(), file, {"steps": 6, "samples": 12})
+    save_stage(tiny_lifted(), file, {"steps": 6, "samples": 12})
     task = LiftedTraining(cube=Cube(16), window=(-1000, 600), initial=str(file))
     monkeypatch.setattr(LiftedTraining, "trainer", SimpleNamespace(
         global_step=2, datamodule=None, strategy=SimpleNamespace(reduce=lambda value, **_: value)))
@@ -145,7 +146,7 @@ def test_a_rival_counts_the_steps_that_it_went_on_from(tmp_path, monkeypatch):
 def test_training_that_cannot_be_is_refused(tmp_path, cache, capsys):
     args = arguments("lifted", tmp_path, cache, "--model.cube.voxels=18")
     assert "divisible by 4" in refusal(capsys, main, args)
-    save_rival(tiny_lifted(), tmp_path / "rival.safetensors")
+    save_stage(tiny_lifted(), tmp_path / "rival.safetensors")
     args = arguments("lifted", tmp_path, cache, f"--model.initial={tmp_path / 'rival.safetensors'}",
                      "--model.network.init_args.fine=3")
     assert "model.network has fine 3" in refusal(capsys, main, args)

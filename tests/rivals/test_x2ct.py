@@ -7,7 +7,8 @@ from torch.nn.functional import mse_loss
 
 from phydict.grid import Cube, Grid
 from phydict.methods import reconstruct
-from phydict.rivals import Rival, RivalAnswer, X2CTNetwork, load_rival, save_rival
+from phydict.prior import save_stage
+from phydict.rivals import Rival, RivalAnswer, X2CTNetwork, load_rival
 from phydict.rivals.planes import on_planes, plane_places, turned, turns
 from phydict.rivals.rival import bound_orbit
 from phydict.runtime.shipped import configuration
@@ -71,7 +72,7 @@ def test_views_in_another_order_give_the_same_ct():
 
 
 def test_another_number_of_views_geometry_or_grid_is_refused(tmp_path):
-    save_rival(tiny_x2ct(), tmp_path / "x2ct.safetensors")
+    save_stage(tiny_x2ct(), tmp_path / "x2ct.safetensors")
     method = RivalAnswer(load_rival(tmp_path / "x2ct.safetensors"))
     for beam, said in ((bound_orbit(GRID, 3), "trained for 2 X-rays, but 3 were given"),
                        (bound_orbit(GRID, 2, 180.0), "one geometry of its 2 views"),

@@ -6,7 +6,8 @@ from safetensors.torch import save_file
 
 from phydict.grid import Cube, Grid
 from phydict.methods import reconstruct
-from phydict.rivals import Rival, RivalAnswer, XrayToCTPANetwork, save_rival
+from phydict.prior import save_stage
+from phydict.rivals import Rival, RivalAnswer, XrayToCTPANetwork
 from phydict.rivals.rival import WATER_MM, bound_orbit
 from phydict.rivals.slice_unet import StackAttention, waves
 from phydict.training.rivals import OrbitScenes
@@ -94,7 +95,7 @@ def test_the_size_of_latents_is_that_of_the_largest_of_the_first_cases(autoencod
 
 
 def test_a_trained_diffusion_keeps_the_size_of_its_latents_and_is_validated_from_its_file(tmp_path):
-    save_rival(tiny_xray2ctpa(), file := str(tmp_path / "rival.safetensors"))
+    save_stage(tiny_xray2ctpa(), file := str(tmp_path / "rival.safetensors"))
     scenes, window = OrbitScenes(views=2), (WINDOW.low, WINDOW.high)
     went_on = XrayToCTPATraining(scenes=scenes, cube=Cube(16), window=window, latent=LatentSettings(0), initial=file)
     went_on.case_loss(body(), water(), BEAM, torch.Generator().manual_seed(0))
@@ -111,7 +112,7 @@ def test_a_rival_that_knows_xrays_goes_on_with_the_latents_that_it_knows(tmp_pat
     first, file = tiny_xray2ctpa(), str(tmp_path / "rival.safetensors")
     for knows in (True, False):
         first.network.denoiser.leave.weight.data *= knows
-        save_rival(first, file)
+        save_stage(first, file)
         went_on = XrayToCTPATraining(scenes=OrbitScenes(views=2), cube=Cube(16), window=(WINDOW.low, WINDOW.high),
                                      initial=file)
         assert went_on.learns_slices != knows

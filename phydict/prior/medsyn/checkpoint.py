@@ -219,7 +219,7 @@ def _tie(weights: dict[str, Tensor]) -> int:
     return len(there)
 
 
-def load_medsyn(checkpoint: MedSynCheckpoint | str | Path, device: str = "cpu") -> MedSynPrior:
+def load_medsyn(checkpoint: MedSynCheckpoint | str | Path) -> MedSynPrior:
     """MedSyn's 64^3 prior, ready to denoise (float32, evaluation mode). Its language model waits for the first report.
 
     Raises FileNotFoundError where there is no such file; ValueError where it is truncated, holds code, is of another
@@ -228,14 +228,13 @@ def load_medsyn(checkpoint: MedSynCheckpoint | str | Path, device: str = "cpu") 
     checkpoint = as_checkpoint(checkpoint)
     prior = MedSynPrior(cast("TextUNet", _network(checkpoint, 1)))
     prior.load_text = lambda: _load_text(checkpoint, prior.null.shape[1])
-    return prior.to(device).eval().requires_grad_(False)
+    return prior.eval().requires_grad_(False)
 
 
-def load_medsyn_super_resolution(checkpoint: MedSynCheckpoint | str | Path,
-                                 device: str = "cpu") -> MedSynSuperResolution:
+def load_medsyn_super_resolution(checkpoint: MedSynCheckpoint | str | Path) -> MedSynSuperResolution:
     """MedSyn's 256^3 super-resolution stage, ready to denoise; raises as `load_medsyn` does."""
     network = cast("SuperResolutionUNet", _network(as_checkpoint(checkpoint), 2))
-    return MedSynSuperResolution(network).to(device).eval().requires_grad_(False)
+    return MedSynSuperResolution(network).eval().requires_grad_(False)
 
 
 def as_checkpoint(given: MedSynCheckpoint | str | Path) -> MedSynCheckpoint:

@@ -8,7 +8,6 @@ import warnings
 import zlib
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -19,14 +18,14 @@ from safetensors import SafetensorError
 from phydict.ablation.spec import Specification
 from phydict.ablation.trials import Trial, key, prior_of, stage_of
 from phydict.baselines.extended import covering
-from phydict.datasets.case import Case, lacking
+from phydict.datasets.case import Case
 from phydict.evaluation import read_csv, write_csv
 from phydict.evaluation.fid import save_features
 from phydict.evaluation.metrics import MEASURES
 from phydict.inference.case_files import VOLUME, write_page_files
-from phydict.inference.protocols import cut_out, placed, resampled
 from phydict.inference.record import versions
 from phydict.inference.scoring import Scoring
+from phydict.inference.voxels import in_its_ct
 from phydict.methods import onto_grid, reconstruct_by, reconstructor
 from phydict.posterior import Sampler
 from phydict.reconstruction import Reconstruction, save_nifti
@@ -243,15 +242,13 @@ class MeasuredCase:
     """One case under one acquisition: X-rays for all methods, and the truth, which no method is shown."""
 
     def __init__(self, case: str, trial: Trial, made: Case, device: torch.device):
-        self.case, self.truth = case, made
-        (self.grid, self.window), data = trial.scene(), trial.data
+        self.case = case
+        (grid, self.window), data = trial.scene(), trial.data
         self.beam, self.mu_water = data.beam, data.simulator.effective_mu_water
         self.warnings = list(made["warnings"])
         with noted(self.warnings, case):
-            self.xrays = data.simulate(made, case_seed(trial.seed, case), self.grid, self.window, device)
-        if not (scored := trial.scored()).same_as(self.grid):
-            cut = cut_out(made, self.grid, scored, self.window)
-            self.truth, self.grid = lacking(made, "features", "clip_latent") | cut, scored
+            self.xrays = data.simulate(made, case_seed(trial.seed, case), grid, self.window, device)
+        self.truth, self.grid = trial.voxels.as_scored(made, self.window), trial.voxels.scored
 
     def report(self, trial: Trial) -> str:
         """The report, where the trial uses it and its prior reads text."""
@@ -294,12 +291,10 @@ class Runner:
         peak = peak_memory(self.device) if known else None
         seconds = result.seconds | profile.seconds("network", "projector")
         finite = bool(result.volume.isfinite().all())
-        scores = {}
+        scores: dict[str, float] = {}
         if finite:
-            volume = resampled(result.volume, result.grid, scene.grid)
-            scores = self.scoring.scores(volume, result.misfit, scene.truth, scene.grid, scene.window, self.device,
-                                         trial.data.protocol)
-            features = self.scoring.features(volume, scene.truth, scene.grid, scene.window, self.device)
+            scores, features = self.scoring.measured(result, scene.truth, scene.grid, scene.window, self.device,
+                                                     trial.data.protocol)
             try:
                 if features:
                     save_features(features_file(self.out, key), features)
@@ -329,7 +324,7 @@ class Runner:
         ready = onto_grid(ready, trial.box.grid() if trial.box else None, trial.refinement)
         self.progress.follow(ready.steps())
         ready = ready.of_case(scene.case).with_mu_water(scene.mu_water)
-        grid = trial.result_scene()[0]
+        grid = trial.voxels.result
         if trial.fixed:
             ready = covering(ready, trial.fixed)
             grid = ready.grid or grid
@@ -350,9 +345,7 @@ def volume_folder(out: Path, key: str) -> Path:
 def _keep(folder: Path, result: Reconstruction, scene: MeasuredCase, trial: Trial) -> None:
     """Writes a volume, in its place in the CT that it came from, what the page shows of it, and what the table's row
     does not hold."""
-    truth = resampled(scene.window.to_hu(scene.truth["volume"])[0].cpu(), scene.grid, result.grid)
-    if "affine" in scene.truth:
-        result = replace(result, grid=placed(result.grid, scene.grid, scene.truth["affine"].numpy()))
+    result, truth = in_its_ct(result, scene.truth, scene.grid, scene.window)
     details = {"misfit_per_view": result.misfit_per_view, "grid": result.grid.to_dict(), "report": scene.report(trial),
                "settings": trial.identity(), "versions": versions()}
     with atomic_directory(folder) as partial:

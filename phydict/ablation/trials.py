@@ -17,9 +17,9 @@ from phydict.ablation.nested import changed, field_of, has_field, parsed, plain
 from phydict.grid import Box, Grid
 from phydict.inference.conditions import voxels_in_words
 from phydict.inference.data import ReconstructionData
-from phydict.inference.protocols import whole
 from phydict.inference.record import correction_checksums
 from phydict.inference.settings import Orbit
+from phydict.inference.voxels import Voxels
 from phydict.methods import DEFAULT_GRID, METHODS, corrections_of
 from phydict.posterior import Refinement, Sampler
 from phydict.prior import find_prior, fingerprint, load_super_resolution, own_identity
@@ -106,14 +106,12 @@ class Trial:
 
     def scene(self) -> tuple[Grid, HUWindow]:
         """The grid of the CT that X-rays are made of, and the HU window that it is clipped to."""
-        grid, window = self.result_scene()
-        return self.data.scene(whole(grid) if self.box else grid, window)
-
-    def result_scene(self) -> tuple[Grid, HUWindow]:
-        """The result's grid and HU window."""
         file = self.prior or self.like
-        window = prior_of(file).window if file else HUWindow()
-        return self.box.grid() if self.box else self.first(), window
+        return self.voxels.made, self.voxels.window(prior_of(file).window if file else HUWindow())
+
+    @property
+    def voxels(self) -> Voxels:
+        return Voxels(self.first(), self.box.grid() if self.box else None, self.data.protocol)
 
     @property
     def bound(self) -> bool:
@@ -142,14 +140,10 @@ class Trial:
             return None
         return self.first(), self.like
 
-    def scored(self) -> Grid:
-        """The grid on which results are scored."""
-        return self.box.grid() if self.box and not self.fixed else self.scene()[0]
-
     def scored_columns(self) -> dict[str, str]:
         """What a row says of the voxels and the HU window that its truth has: of voxels that are no cube as long as
         the usual one, and that no other setting tells, also their length and place."""
-        grid, window = self.scored(), self.scene()[1]
+        grid, window = self.voxels.scored, self.scene()[1]
         told = self.box or self.fixed or grid.same_as(Grid.cube(grid.shape[0]))
         return {"grid": "x".join(map(str, grid.shape)) if told else voxels_in_words(grid),
                 "window": f"[{window.low:g}, {window.high:g}]"}
@@ -193,7 +187,7 @@ class Trial:
         """Equal for trials whose X-rays, and voxels to score on, are the same."""
         grid, window = self.scene()
         settings = self.data.settings("test") | {"seed": self.seed}
-        return json.dumps([settings, grid.to_dict(), self.scored().to_dict(), describe(window)], sort_keys=True)
+        return json.dumps([settings, grid.to_dict(), self.voxels.scored.to_dict(), describe(window)], sort_keys=True)
 
 
 def trials_of(base: dict, axes: dict, methods: Mapping, cases: Cases,
@@ -237,7 +231,7 @@ def trials_of(base: dict, axes: dict, methods: Mapping, cases: Cases,
         if (voxels := trial.data.simulation_voxels) and voxels % grid.shape[0]:
             raise ValueError(f"simulation_voxels is a multiple of the {grid.shape[0]} voxels along each side that are "
                              f"scored, but {voxels} was given: give such a one, or leave it out")
-    results = [trial.result_scene()[0] for trial in trials] if not any(trial.data.protocol for trial in trials) else []
+    results = [trial.voxels.result for trial in trials] if not any(trial.data.protocol for trial in trials) else []
     if any(window != scenes[0][1] for _, window in scenes) or not all(
             grid.same_as(grids[0]) for grids in (results, [grid for grid, _ in scenes]) for grid in grids):
         raise ValueError("the methods of a product are compared on one grid and HU window, but their priors, second "

@@ -15,7 +15,8 @@ from jsonargparse import ArgumentParser
 from phydict.ablation.fid import distance_tables, write_distances
 from phydict.ablation.page import comparison_page
 from phydict.ablation.plots import write_plots
-from phydict.ablation.run import RESULTS, planned, run
+from phydict.ablation.results import RESULTS
+from phydict.ablation.run import planned, run
 from phydict.ablation.spec import read_specification
 from phydict.ablation.summary import summarise
 from phydict.ablation.tables import all_tables, write_tables

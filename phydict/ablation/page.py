@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from phydict.ablation.fid import distance_tables
-from phydict.ablation.run import DETAILS, RESULTS, volume_folder
+from phydict.ablation.results import DETAILS, RESULTS, volume_folder
 from phydict.ablation.summary import Entry, format_settings, summarise, without_repeats
 from phydict.ablation.tables import all_tables
 from phydict.evaluation import read_csv

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from phydict.ablation.nested import field_of, has_field, plain
-from phydict.ablation.run import IDENTIFYING, is_measured
+from phydict.ablation.results import IDENTIFYING, is_measured
 from phydict.ablation.trials import ORBIT_SETTINGS, PRECISION, PRIOR_SETTINGS, SETTINGS, SIDE, SIMULATORS
 from phydict.evaluation.bootstrap import Estimate, estimate
 from phydict.evaluation.metrics import MEASURES, Measure, case_values

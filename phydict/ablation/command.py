@@ -24,7 +24,8 @@ from phydict.datasets import CTSource
 from phydict.inference.scoring import METRICS, Scoring
 from phydict.methods import METHODS
 from phydict.page import check_own_page
-from phydict.runtime.console import check_apart, check_configured, check_writable, cli_errors, ended_by_sigterm, quiet
+from phydict.runtime.configurations import check_configured
+from phydict.runtime.console import check_apart, check_writable, cli_errors, ended_by_sigterm, quiet
 from phydict.runtime.files import alone_in
 from phydict.runtime.help import HelpFormatter, show_settings
 from phydict.runtime.parser_message import naming_unknown_options

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from phydict.datasets.case import Case, lacking
-from phydict.datasets.cts.transforms import to_grid
+from phydict.datasets.cts.resampling import to_grid
 from phydict.grid import Grid
 from phydict.inference.protocols import Protocol
 from phydict.methods import DEFAULT_GRID

@@ -206,23 +206,16 @@ def over_cases(rows: Sequence[Mapping], metrics: Iterable[str]) -> dict[str, Sum
     return result
 
 
-def summarise(rows: Iterable[Mapping], by: str = "method",
-              metrics: Sequence[str] | None = None) -> dict[str, dict[str, Summary]]:
-    """{group: {metric: Summary}} by `over_cases`, groups in order of appearance.
-
-    metrics: names, or None for every known metric that some row has.
-    Raises ValueError when there is no row, a row lacks `by`, or no row has one of `metrics`.
-    """
+def summarise(rows: Iterable[Mapping]) -> dict[str, dict[str, Summary]]:
+    """{method: {metric: Summary}} by `over_cases`, of every known metric that some row has, methods in order of
+    appearance. Raises ValueError when there is no row, or a row lacks its method."""
     rows = list(rows)
     if not rows:
         raise ValueError("there are no rows to summarise; evaluate at least one case first")
-    if lacking := next((row for row in rows if by not in row), None):
-        raise ValueError(f"every row needs the column {by!r} to be grouped by, but one has only {sorted(lacking)}")
-    present = {name for row in rows for name, value in row.items() if value is not None}
-    if absent := [name for name in metrics or () if name not in present]:
-        raise ValueError(f"no row has the metrics {absent}; the rows have {sorted(present)}")
-    return {str(group): over_cases([row for row in rows if row[by] == group], metrics or MEASURES)
-            for group in dict.fromkeys(row[by] for row in rows)}
+    if lacking := next((row for row in rows if "method" not in row), None):
+        raise ValueError(f"every row needs the column 'method' to be grouped by, but one has only {sorted(lacking)}")
+    return {str(method): over_cases([row for row in rows if row["method"] == method], MEASURES)
+            for method in dict.fromkeys(row["method"] for row in rows)}
 
 
 class CaseMetrics(Metric):

@@ -22,7 +22,6 @@ from phydict.datasets.case import Case
 from phydict.evaluation import CaseMetrics
 from phydict.evaluation.fid import Features, PlaneFID
 from phydict.grid import Box, Grid
-from phydict.inference.calibration import uncertain_of
 from phydict.inference.case_files import body_interval, write_result
 from phydict.inference.data import ReconstructionData
 from phydict.inference.orientation import orientation_doubts
@@ -46,6 +45,7 @@ from phydict.runtime.reading import enough_memory
 from phydict.runtime.seeds import case_seed, check_seed
 from phydict.runtime.warning import Remark, warn
 from phydict.units import HUWindow
+from phydict.xray.poses.uncertain import Uncertain
 from phydict.xray.projectors.own import projector_kind
 
 PREDICTED_VOXELS = 128
@@ -269,7 +269,7 @@ class ReconstructionTask(lightning.LightningModule):
         ready = self.reconstructor.of_case(case["id"])
         ready = ready.with_mu_water(case["mu_water"]) if "mu_water" in case else ready
         xrays, beam, display = case["xrays"].to(self.device), case["beam"], case.get("display", False)
-        uncertain = uncertain_of(case) if self.calibrate else None
+        uncertain = _uncertain_of(case) if self.calibrate else None
         return reconstruct_by(ready, self.voxels.result, xrays, beam, case["report"], display, seed,
                               self.progress.advance, self.projector, uncertain)
 
@@ -290,6 +290,23 @@ class ReconstructionTask(lightning.LightningModule):
         """Prints and writes the scores of this run's cases. Raises ValueError, naming them, where some have failed."""
         if self.trainer.is_global_zero:
             summarise(self.results, self.cases, self.method_name, self.scoring, self._data.protocol)
+
+
+def _uncertain_of(case: Case) -> Uncertain:
+    """What is uncertain of a case's geometry, where `--calibrate` seeks its poses: what its file says not to know
+    exactly; with a warning, of radiographs whose tags are their geometry, what is usual.
+
+    Raises ValueError where a file of other measured ones does not say it.
+    """
+    if case["uncertain"] is None:
+        raise ValueError(f"--calibrate needs to know what {case['description'].source} is not sure of: state "
+                         "`uncertain:` there, such as {detector_shift_mm: 5, rotation_degrees: 2}, or leave "
+                         "--calibrate out")
+    if case["description"].uncertain is None:
+        stated = ", ".join(f"{name}: {value:g}" for name, value in vars(case["uncertain"]).items() if value)
+        warn(f"the tags do not say how exactly source and detector stood: taken is what is usual where a patient turns "
+             f"by hand ({stated}); state `uncertain:` in {case['description'].source.name} for other values")
+    return case["uncertain"]
 
 
 def _finished_line(result: Reconstruction) -> str:

@@ -19,12 +19,13 @@ SEGMENTATION_MM = 2.0
 
 
 def prepare_ct(ct: str | Path | tuple[np.ndarray, np.ndarray], grid: Grid = Grid.cube(64),
-               window: HUWindow = HUWindow(), report: str = "", id: str | None = None,
+               window: HUWindow = HUWindow(), id: str | None = None,
                calibration: Calibration | None = None) -> Case:
     """A Case from a CT file, or from (hu, affine): the grid's box centred on the lungs, -1000 HU outside the scan.
 
     Returns {"id", "volume" (1,X,Y,Z) in [-1,1], "masks" (3,X,Y,Z) in [0,1] for lung, airway, vessel, "has_masks" (3,),
-    "report", "affine" (4,4) float64: the voxels' place in the CT's own world, "centred_on": "lungs" or "volume"}.
+    "report", which is empty, "affine" (4,4) float64: the voxels' place in the CT's own world, "centred_on": "lungs" or
+    "volume"}.
     Without lungs the box is centred on the scan, with a warning. Raises what `load_ct` raises.
     """
     name = id or ("the CT" if isinstance(ct, tuple) else case_id(ct))
@@ -45,5 +46,5 @@ def prepare_ct(ct: str | Path | tuple[np.ndarray, np.ndarray], grid: Grid = Grid
     masks = np.stack([to_grid(m, work.affine, target, 0.0) for m in masks]).clip(0, 1)
     return {"id": name, "volume": torch.from_numpy(volume.astype(np.float32))[None],
             "masks": torch.from_numpy(masks.astype(np.float32)), "has_masks": torch.from_numpy(known),
-            "report": report, "affine": torch.from_numpy(target.affine.copy()),
+            "report": "", "affine": torch.from_numpy(target.affine.copy()),
             "centred_on": "lungs" if known[0] else "volume"}

@@ -8,9 +8,10 @@ from pathlib import Path
 
 from phydict.evaluation import read_csv, write_csv
 from phydict.evaluation.metrics import MEASURES
+from phydict.inference.results import RESULTS
 
-RESULTS, TABLES, FID = "results.csv", ("tables.md", "tables.tex"), "fid.csv"
-"""The results of a folder, the tables that are made of them, and the Frechet distances."""
+TABLES, FID = ("tables.md", "tables.tex"), "fid.csv"
+"""The tables that are made of a folder's results, and the Frechet distances."""
 
 DETAILS = "details.json"
 """What is known of a row whose volume is kept and the table does not hold, beside that volume."""

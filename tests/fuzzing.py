@@ -44,7 +44,7 @@ from phydict.evaluation import read_csv
 from phydict.inference.results import CaseResults
 from phydict.prior.inspection import inspect_prior
 from phydict.prior.tensors import read_torch
-from phydict.runtime.console import read_configuration
+from phydict.runtime.configurations import read_configuration
 from phydict.runtime.reading import read_ids
 from phydict.xray.geometry_files import read_beam, write_beam
 

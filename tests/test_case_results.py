@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from phydict.evaluation import read_csv
-from phydict.inference.results import RECORD, TABLE, CaseResults
+from phydict.inference.results import RECORD, RESULTS, CaseResults
 from phydict.runtime.files import ASIDE
 
 SETTINGS = {"seed": 0}
@@ -217,7 +217,7 @@ def test_a_damaged_record_is_refused_by_name_before_anything_is_done(old, damage
 def test_a_whole_record_gives_its_row(old):
     (old / RECORD).write_text(json.dumps(SCORED))
     assert len(begun(old.parent).summarise(["anna"])) == 1
-    assert read_csv(old.parent / TABLE)[0]["psnr"] == 20.0
+    assert read_csv(old.parent / RESULTS)[0]["psnr"] == 20.0
 
 
 @pytest.mark.parametrize("setting", [float("inf"), float("nan")])

@@ -21,7 +21,7 @@ from command_lines import arguments, losses
 from prior.tiny import tiny_prior, tiny_refiner, tiny_super_resolution
 
 from phydict.ablation.fid import distance_tables
-from phydict.ablation.run import TABLES
+from phydict.ablation.results import TABLES
 from phydict.ablation.summary import summarise
 from phydict.ablation.tables import all_tables, write_tables
 from phydict.cli.train import main

@@ -20,8 +20,8 @@ from phydict.datasets import phantom_case, save_xrays
 from phydict.evaluation import read_csv
 from phydict.grid import Box, Grid
 from phydict.inference import ReconstructionTask
-from phydict.inference.protocols import cut_out, placed, whole
 from phydict.inference.settings import Sampling
+from phydict.inference.voxels import cut_out, placed, whole
 from phydict.prior import save_prior
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
@@ -95,7 +95,7 @@ def test_one_batch_of_two_is_a_whole_number_and_what_it_leaves_out_is_named(meas
 
 def test_the_default_method_predicts_on_128_voxels_unless_a_grid_or_another_network_is_given(prior):
     assert ReconstructionTask().predicted.grid().same_as(Grid.cube(128))
-    assert ReconstructionTask().grid.same_as(Grid.cube(64))  # what test scores
+    assert ReconstructionTask().voxels.result.same_as(Grid.cube(64))  # what test scores
     for given in ({"grid": 64}, {"prior": str(prior)}, {"method": SIRT()}, {"sampling": Sampling(samples=2)}):
         assert ReconstructionTask(**given).predicted is None
 
@@ -117,7 +117,7 @@ def test_a_number_of_voxels_goes_with_the_other_settings_of_a_box_in_any_order(m
 def test_the_coarse_volume_of_the_default_voxels_is_kept_on_request_where_there_is_one(measured, prior, tmp_path,
                                                                                        capsys):
     kept = ReconstructionTask(grid=Box(keep_coarse=True))
-    assert kept.predicted == Box(128, keep_coarse=True) and kept.grid.same_as(Grid.cube(64))
+    assert kept.predicted == Box(128, keep_coarse=True) and kept.voxels.result.same_as(Grid.cube(64))
     alone = "--model.grid.keep_coarse=true"
     for more in [], [f"--model.prior={prior}"]:
         assert "give model.grid.voxels" in refusal(capsys, main, [

@@ -15,15 +15,17 @@ from jsonargparse import ArgumentParser
 from phydict.ablation.fid import distance_tables, write_distances
 from phydict.ablation.page import comparison_page
 from phydict.ablation.plots import write_plots
-from phydict.ablation.run import RESULTS, planned, run
+from phydict.ablation.run import planned, run
 from phydict.ablation.spec import read_specification
 from phydict.ablation.summary import summarise
 from phydict.ablation.tables import all_tables, write_tables
 from phydict.datasets import CTSource
+from phydict.inference.results import RESULTS
 from phydict.inference.scoring import METRICS, Scoring
 from phydict.methods import METHODS
 from phydict.page import check_own_page
-from phydict.runtime.console import check_apart, check_configured, check_writable, cli_errors, ended_by_sigterm, quiet
+from phydict.runtime.configurations import check_configured
+from phydict.runtime.console import check_apart, check_writable, cli_errors, ended_by_sigterm, quiet
 from phydict.runtime.files import alone_in
 from phydict.runtime.help import HelpFormatter, show_settings
 from phydict.runtime.parser_message import naming_unknown_options

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from phydict.ablation.run import FID, features_file
+from phydict.ablation.results import FID, features_file
 from phydict.ablation.summary import Entry, conditions, xrays
 from phydict.evaluation import read_csv, write_csv
 from phydict.evaluation.fid import CaseFeatures, SeedFeatures, StoredFeatures

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from phydict.ablation.fid import distance_tables
-from phydict.ablation.run import DETAILS, RESULTS, volume_folder
+from phydict.ablation.results import DETAILS, volume_folder
 from phydict.ablation.summary import Entry, summarise, without_repeats
 from phydict.ablation.tables import all_tables
 from phydict.evaluation import read_csv
@@ -16,6 +16,7 @@ from phydict.evaluation.metrics import MEASURES
 from phydict.evaluation.tables import Table
 from phydict.inference.case_files import remake_page_files
 from phydict.inference.conditions import format_settings
+from phydict.inference.results import RESULTS
 from phydict.page import Contents, PageCase, check_own_page, write_page
 from phydict.runtime.progress_log import log_progress
 from phydict.runtime.reading import reason

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import os
-import reprlib
 import warnings
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -16,17 +14,16 @@ import numpy as np
 import torch
 from safetensors import SafetensorError
 
+from phydict.ablation.results import DETAILS, Results, features_file, volume_folder
 from phydict.ablation.spec import Specification
 from phydict.ablation.trials import Trial, key, prior_of, stage_of
 from phydict.baselines.extended import covering
-from phydict.datasets.case import Case, lacking
-from phydict.evaluation import read_csv, write_csv
+from phydict.datasets.case import Case
 from phydict.evaluation.fid import save_features
-from phydict.evaluation.metrics import MEASURES
 from phydict.inference.case_files import VOLUME, write_page_files
-from phydict.inference.protocols import cut_out, placed, resampled
 from phydict.inference.record import versions
 from phydict.inference.scoring import Scoring
+from phydict.inference.voxels import in_its_ct
 from phydict.methods import onto_grid, reconstruct_by, reconstructor
 from phydict.posterior import Sampler
 from phydict.reconstruction import Reconstruction, save_nifti
@@ -39,122 +36,6 @@ from phydict.runtime.progress_log import log_progress
 from phydict.runtime.reading import TooLittleMemory, not_written
 from phydict.runtime.seeds import case_seed
 from phydict.runtime.strict_json import strict_json
-
-RESULTS, TABLES, FID = "results.csv", ("tables.md", "tables.tex"), "fid.csv"
-"""The results of a folder, the tables that are made of them, and the Frechet distances."""
-
-DETAILS = "details.json"
-"""What is known of a row whose volume is kept and the table does not hold, beside that volume."""
-
-FINISHED = ("ok", "refused", "diverged")
-"""What a row's status may be that is not tried again; "failed" is, since its reason may lie outside: "refused" is what
-the method itself raises a ValueError for."""
-
-MEASURED = ("status", "error", "warning", *MEASURES, "seconds_prepare", "seconds_sample", "seconds_score",
-            "seconds_network", "seconds_projector", "network_calls", "projector_calls", "peak_memory_mb", "device",
-            "threads", "precision", "instruction_set")
-"""Columns that a run fills; the others are the trial's. peak_memory_mb, in MiB, is that of the tensors on a
-CUDA device, else of the process."""
-
-
-WORDS = ("status", "error", "warning", "device", "precision", "instruction_set")
-"""Those of MEASURED that are no numbers."""
-
-IDENTIFYING = ("window", "data")
-"""What tells apart rows of equal settings, and older rows lack: the HU window of the truth, and a short checksum of
-what identifies the case's data."""
-
-
-def is_measured(name: str) -> bool:
-    """Whether a run fills a column: those of MEASURED, and the seconds of whatever stages a method has."""
-    return name in MEASURED or name.startswith("seconds_")
-
-
-class Results:
-    """The table of results in a folder, of which this process alone writes while it is open.
-
-    A row is known by its key (trials.key): rows of other settings or other data in the file are kept at its end.
-    Raises ValueError where the file is damaged, is the table of another comparison, with no row in common, or is not
-    there while what is made of it is, which then is someone else's.
-    """
-
-    def __init__(self, folder: Path, planned: Mapping[str, dict]):
-        self.file, self.planned = folder / RESULTS, planned
-        others = sorted(file.name for file in folder.glob("*") if file.suffix == ".png" or file.name in (*TABLES, FID))
-        if others and not self.file.exists():
-            raise ValueError(f"{folder} holds {', '.join(others)}, but no {RESULTS} of this command, and is not "
-                             "written to: give another out, or move that away")
-        stored: dict = {row.get("key"): row for row in read_csv(self.file)}
-        if None in stored:
-            raise ValueError(f"{self.file} has rows without a key, so that it is no table of this command: give "
-                             "another out")
-        if stored and not stored.keys() & planned.keys():
-            differing = _differing(stored.values(), planned.values())
-            raise ValueError(f"{self.file} is the table of another comparison, whose {len(stored)} rows are all of "
-                             f"other settings or data{differing}: give another out, or remove "
-                             f"{', '.join([RESULTS, *others])}")
-        for name, row in stored.items():
-            wrong = next((k for k in row if is_measured(k) and k not in WORDS and isinstance(row[k], str)), None)
-            if wrong:
-                raise ValueError(f"{self.file}: {wrong} of row {name} is {reprlib.repr(row[wrong])}, which is no "
-                                 "number: remove that row, and it is run again")
-        self.others = [row for name, row in stored.items() if name not in planned]
-        self.done = {name: self._row(name, row) for name, row in stored.items()
-                     if name in planned and row.get("status") in FINISHED}
-        self.again: set[str] = set()
-
-    def _row(self, name: str, measured: Mapping) -> dict:
-        return self.planned[name] | {k: value for k, value in measured.items()
-                                     if is_measured(k) and value is not None} | {"key": name}
-
-    @property
-    def rows(self) -> list[dict]:
-        """The rows of what is planned, in its order."""
-        return [self.done[name] for name in self.planned if name in self.done]
-
-    @property
-    def all_rows(self) -> list[dict]:
-        """The rows of what is planned, in its order, where they are not there yet as not run."""
-        return [self.done.get(name, columns | {"status": "not run", "error": "the run was stopped", "key": name})
-                for name, columns in self.planned.items()]
-
-    def add(self, name: str, measured: Mapping) -> None:
-        """Adds a row and writes the table, in one step."""
-        if measured["status"] == "ok" or name not in self.again:
-            self.done[name] = self._row(name, measured)
-        self.again.discard(name)
-        self.write()
-
-    def forget(self, lacking: Callable[[str], bool]) -> None:
-        """Have rows run again, by their keys, whose volume was scored but lacks something; they stay until then."""
-        self.again |= {name for name, row in self.done.items() if row["status"] == "ok" and lacking(name)}
-
-    def finished(self, name: str) -> bool:
-        """Whether nothing is to be run for a row."""
-        return name in self.done and name not in self.again
-
-    def write(self) -> None:
-        """The table with the columns in one order, whatever order its rows came in."""
-        order = dict.fromkeys(k for row in self.planned.values() for k in row) | dict.fromkeys((*MEASURED, "key"))
-        write_csv(self.file, [{k: row.get(k) for k in order} | row for row in self.rows + self.others])
-
-
-def _differing(stored: Iterable[dict], planned: Iterable[dict]) -> str:
-    """In brackets, the columns of which no stored row has what a planned one has, with some of their values."""
-    def some(values: Iterable[str]) -> str:
-        first, rest = [*values][:3], [*values][3:]
-        return ", ".join(first + (["..."] if rest else []))
-
-    of_stored, of_planned = list(stored), list(planned)
-    columns = dict.fromkeys(name for row in of_planned for name in row)
-    differ = []
-    for name in columns:
-        there, here = (dict.fromkeys(str(row.get(name)) for row in rows) for rows in (of_stored, of_planned))
-        unknown = name in IDENTIFYING and there.keys() == {"None"}
-        if not there.keys() & here.keys() and not unknown:
-            differ.append(f"{name} {some(there)} there and {some(here)} here")
-    return f" ({'; '.join(differ)})" if differ else ""
-
 
 Work = list[tuple[Trial, str, Callable[[], Case]]]
 """Trials of a case, the keys of their rows, and the functions that make the case."""
@@ -243,15 +124,13 @@ class MeasuredCase:
     """One case under one acquisition: X-rays for all methods, and the truth, which no method is shown."""
 
     def __init__(self, case: str, trial: Trial, made: Case, device: torch.device):
-        self.case, self.truth = case, made
-        (self.grid, self.window), data = trial.scene(), trial.data
+        self.case = case
+        (grid, self.window), data = trial.scene(), trial.data
         self.beam, self.mu_water = data.beam, data.simulator.effective_mu_water
         self.warnings = list(made["warnings"])
         with noted(self.warnings, case):
-            self.xrays = data.simulate(made, case_seed(trial.seed, case), self.grid, self.window, device)
-        if not (scored := trial.scored()).same_as(self.grid):
-            cut = cut_out(made, self.grid, scored, self.window)
-            self.truth, self.grid = lacking(made, "features", "clip_latent") | cut, scored
+            self.xrays = data.simulate(made, case_seed(trial.seed, case), grid, self.window, device)
+        self.truth, self.grid = trial.voxels.as_scored(made, self.window), trial.voxels.scored
 
     def report(self, trial: Trial) -> str:
         """The report, where the trial uses it and its prior reads text."""
@@ -294,12 +173,10 @@ class Runner:
         peak = peak_memory(self.device) if known else None
         seconds = result.seconds | profile.seconds("network", "projector")
         finite = bool(result.volume.isfinite().all())
-        scores = {}
+        scores: dict[str, float] = {}
         if finite:
-            volume = resampled(result.volume, result.grid, scene.grid)
-            scores = self.scoring.scores(volume, result.misfit, scene.truth, scene.grid, scene.window, self.device,
-                                         trial.data.protocol)
-            features = self.scoring.features(volume, scene.truth, scene.grid, scene.window, self.device)
+            scores, features = self.scoring.measured(result, scene.truth, scene.grid, scene.window, self.device,
+                                                     trial.data.protocol)
             try:
                 if features:
                     save_features(features_file(self.out, key), features)
@@ -329,7 +206,7 @@ class Runner:
         ready = onto_grid(ready, trial.box.grid() if trial.box else None, trial.refinement)
         self.progress.follow(ready.steps())
         ready = ready.of_case(scene.case).with_mu_water(scene.mu_water)
-        grid = trial.result_scene()[0]
+        grid = trial.voxels.result
         if trial.fixed:
             ready = covering(ready, trial.fixed)
             grid = ready.grid or grid
@@ -337,22 +214,10 @@ class Runner:
                               trial.projector)
 
 
-def features_file(out: Path, key: str) -> Path:
-    """Where the features of the slices of a row's volume are kept."""
-    return out / "features" / f"{key}.safetensors"
-
-
-def volume_folder(out: Path, key: str) -> Path:
-    """Where a row's volume is kept, with what the page shows of it, if it is."""
-    return out / "volumes" / key
-
-
 def _keep(folder: Path, result: Reconstruction, scene: MeasuredCase, trial: Trial) -> None:
     """Writes a volume, in its place in the CT that it came from, what the page shows of it, and what the table's row
     does not hold."""
-    truth = resampled(scene.window.to_hu(scene.truth["volume"])[0].cpu(), scene.grid, result.grid)
-    if "affine" in scene.truth:
-        result = replace(result, grid=placed(result.grid, scene.grid, scene.truth["affine"].numpy()))
+    result, truth = in_its_ct(result, scene.truth, scene.grid, scene.window)
     details = {"misfit_per_view": result.misfit_per_view, "grid": result.grid.to_dict(), "report": scene.report(trial),
                "settings": trial.identity(), "versions": versions()}
     with atomic_directory(folder) as partial:

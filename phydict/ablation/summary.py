@@ -13,8 +13,8 @@ from functools import cached_property
 import numpy as np
 
 from phydict.ablation.nested import field_of, has_field, plain
-from phydict.ablation.run import IDENTIFYING, is_measured
-from phydict.ablation.trials import ORBIT_SETTINGS, PRECISION, PRIOR_SETTINGS, SETTINGS, SIDE, SIMULATORS
+from phydict.ablation.results import IDENTIFYING, is_measured
+from phydict.ablation.trials import DEFAULTS, PRECISION, SIDE, SIMULATORS, settings_of
 from phydict.evaluation.bootstrap import Estimate, estimate
 from phydict.evaluation.metrics import MEASURES, Measure, case_values
 from phydict.grid import Box, Grid
@@ -38,13 +38,13 @@ NON_SETTING_COLUMNS = (*IDENTIFYING, "case", "namesake", "key", "seed", "grid", 
 SCORED = ("grid", "window")
 """What volumes were scored on, which parts rows that no setting of the X-rays parts."""
 
-METHOD_SETTINGS = ("method", "projector", PRECISION, *PRIOR_SETTINGS)
+METHOD_SETTINGS = (*settings_of("method", "prior"), PRECISION)
 """Settings of the method, as method.<field> are; the others are of the X-rays."""
 
-XRAY_SETTINGS = (*ORBIT_SETTINGS, "simulator", "simulation_voxels", "geometry", "protocol")
+XRAY_SETTINGS = settings_of("orbit", "X-rays")
 """Settings of simulated X-rays beside the simulator's own, which `xrays` tells."""
 
-BOX_SETTINGS = ("voxels", "side", "centre")
+BOX_SETTINGS = settings_of("box")
 """Settings of the voxels of the result, which are the method's where a protocol has voxels of its own to score on."""
 
 
@@ -162,7 +162,7 @@ def _conditions(rows: Sequence[tuple[Mapping, Mapping]]) -> list[dict]:
 def _meant(row: Mapping, given: Mapping, names: Iterable[str]) -> dict:
     """Of the settings `names` of X-rays what a row gives, or means by giving none."""
     simulator, orbit = _made(row)
-    defaults = {name: default for name, (_, default) in SETTINGS.items() if name not in ORBIT_SETTINGS}
+    defaults = {name: value for name, value in DEFAULTS.items() if name not in settings_of("orbit")}
     if orbit is not None:
         defaults |= {name: value[0] if isinstance(value, list | tuple) else value
                      for name, value in orbit.settings().items()}
@@ -245,7 +245,7 @@ def fixed_settings(entries: Sequence[Entry]) -> str:
         *(entry.settings.keys() | entry.condition.keys() for entry in entries))
     return format_settings({name: value for name, value in settings[0].items() if name not in told
                             and not name.startswith("simulator.") and value is not None
-                            and str(value) != str(SETTINGS.get(name, (None, None))[1])})
+                            and str(value) != str(DEFAULTS.get(name))})
 
 
 def xrays(entries: Sequence[Entry]) -> str:
@@ -266,7 +266,7 @@ def _simulated(row: Mapping) -> dict:
 def _made(row: Mapping) -> tuple[Simulator, Orbit | None]:
     """What a row's X-rays were made by, the simulator's own settings left out, and their orbit, None where a geometry
     file gives it."""
-    given = {name: default if row.get(name) is None else row[name] for name, (_, default) in SETTINGS.items()}
+    given = {name: default if row.get(name) is None else row[name] for name, default in DEFAULTS.items()}
     if given["protocol"]:
         protocol = protocol_of(given["protocol"])
         return Ideal(noise=protocol.noise), Orbit(given["views"]).filled(protocol.orbit)

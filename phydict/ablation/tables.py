@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
-from phydict.ablation.run import TABLES
+from phydict.ablation.results import TABLES
 from phydict.ablation.summary import (
     SHOWN_MEASURES,
     Entry,

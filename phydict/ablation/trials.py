@@ -17,9 +17,9 @@ from phydict.ablation.nested import changed, field_of, has_field, parsed, plain
 from phydict.grid import Box, Grid
 from phydict.inference.conditions import voxels_in_words
 from phydict.inference.data import ReconstructionData
-from phydict.inference.protocols import whole
 from phydict.inference.record import correction_checksums
 from phydict.inference.settings import Orbit
+from phydict.inference.voxels import Voxels
 from phydict.methods import DEFAULT_GRID, METHODS, corrections_of
 from phydict.posterior import Refinement, Sampler
 from phydict.prior import find_prior, fingerprint, load_super_resolution, own_identity
@@ -43,22 +43,27 @@ MOST_TRIALS = 2000
 SIMULATORS: dict[str, Simulator] = {"ideal": Ideal(), "polychromatic": Polychromatic()}
 
 SETTINGS: dict[str, tuple] = {
-    "method": (str, None), "seed": (int, 0),
-    "views": (int, 8), "detector": (int, PIXELS), "pixel": (float | None, None), "simulator": (str, "ideal"),
-    "simulation_voxels": (int | None, None), "source_to_detector": (float, SOURCE_TO_DETECTOR),
-    "source_to_isocentre": (float, SOURCE_TO_ISOCENTRE), "geometry": (str | None, None),
-    "report": (bool, True), "voxels": (int | tuple[int, int, int] | None, None),
-    "side": (float | tuple[float, float, float], 384.0), "centre": (tuple[float, float, float], (0.0, 0.0, 0.0)),
-    "refine": (bool, True), "super_resolution": (str | None, None),
-    "protocol": (str | None, None), "prior": (str | None, None), "guidance": (float, 1.0), "samples": (int, 1),
-    "delta": (float | None, None), "projector": (str, "auto"), "precision": (str, "auto")}
-"""Type and default of what an axis may be; beside these, method.<field> and simulator.<field>."""
+    "method": (str, None, "method"), "seed": (int, 0, "run"), "views": (int, 8, "orbit"),
+    "detector": (int, PIXELS, "orbit"), "pixel": (float | None, None, "orbit"), "simulator": (str, "ideal", "X-rays"),
+    "simulation_voxels": (int | None, None, "X-rays"), "source_to_detector": (float, SOURCE_TO_DETECTOR, "orbit"),
+    "source_to_isocentre": (float, SOURCE_TO_ISOCENTRE, "orbit"), "geometry": (str | None, None, "X-rays"),
+    "report": (bool, True, "prior"), "voxels": (int | tuple[int, int, int] | None, None, "box"),
+    "side": (float | tuple[float, float, float], 384.0, "box"),
+    "centre": (tuple[float, float, float], (0.0, 0.0, 0.0), "box"), "refine": (bool, True, "prior"),
+    "super_resolution": (str | None, None, "prior"), "protocol": (str | None, None, "X-rays"),
+    "prior": (str | None, None, "prior"), "guidance": (float, 1.0, "prior"), "samples": (int, 1, "prior"),
+    "delta": (float | None, None, "prior"), "projector": (str, "auto", "method"), "precision": (str, "auto", "method")}
+"""Type and default of what an axis may be, and what it belongs to: "method"; "prior", which means nothing to a method
+without one; "box" of the result's voxels; "orbit", which means nothing beside a geometry file; "X-rays" else; or "run".
+Beside these, method.<field> and simulator.<field>."""
 
-PRIOR_SETTINGS = ("prior", "guidance", "samples", "delta", "report", "refine", "super_resolution")
-"""Settings that mean nothing to a method without a prior."""
+DEFAULTS: dict = {name: default for name, (_, default, _) in SETTINGS.items()}
 
-ORBIT_SETTINGS = ("views", "detector", "pixel", "source_to_detector", "source_to_isocentre")
-"""Settings that mean nothing where a geometry file is given."""
+
+def settings_of(*owners: str) -> tuple[str, ...]:
+    """The names of the settings that belong to one of these."""
+    return tuple(name for name, (_, _, owner) in SETTINGS.items() if owner in owners)
+
 
 PRECISION = "networks.precision"
 """The column of the setting precision, which is there where one is chosen; the column precision is what was computed
@@ -102,18 +107,16 @@ class Trial:
     def label(self) -> str:
         """The method and what was changed of it or of its X-rays; the number of views always."""
         return ", ".join([self.name, *(f"{name} {value}" for name, value in self.columns.items() if name == "views" or
-                                       (name != "method" and ("." in name or value != SETTINGS[name][1])))])
+                                       (name != "method" and ("." in name or value != DEFAULTS[name])))])
 
     def scene(self) -> tuple[Grid, HUWindow]:
         """The grid of the CT that X-rays are made of, and the HU window that it is clipped to."""
-        grid, window = self.result_scene()
-        return self.data.scene(whole(grid) if self.box else grid, window)
-
-    def result_scene(self) -> tuple[Grid, HUWindow]:
-        """The result's grid and HU window."""
         file = self.prior or self.like
-        window = prior_of(file).window if file else HUWindow()
-        return self.box.grid() if self.box else self.first(), window
+        return self.voxels.made, self.voxels.window(prior_of(file).window if file else HUWindow())
+
+    @property
+    def voxels(self) -> Voxels:
+        return Voxels(self.first(), self.box.grid() if self.box else None, self.data.protocol)
 
     @property
     def bound(self) -> bool:
@@ -142,14 +145,10 @@ class Trial:
             return None
         return self.first(), self.like
 
-    def scored(self) -> Grid:
-        """The grid on which results are scored."""
-        return self.box.grid() if self.box and not self.fixed else self.scene()[0]
-
     def scored_columns(self) -> dict[str, str]:
         """What a row says of the voxels and the HU window that its truth has: of voxels that are no cube as long as
         the usual one, and that no other setting tells, also their length and place."""
-        grid, window = self.scored(), self.scene()[1]
+        grid, window = self.voxels.scored, self.scene()[1]
         told = self.box or self.fixed or grid.same_as(Grid.cube(grid.shape[0]))
         return {"grid": "x".join(map(str, grid.shape)) if told else voxels_in_words(grid),
                 "window": f"[{window.low:g}, {window.high:g}]"}
@@ -193,7 +192,7 @@ class Trial:
         """Equal for trials whose X-rays, and voxels to score on, are the same."""
         grid, window = self.scene()
         settings = self.data.settings("test") | {"seed": self.seed}
-        return json.dumps([settings, grid.to_dict(), self.scored().to_dict(), describe(window)], sort_keys=True)
+        return json.dumps([settings, grid.to_dict(), self.voxels.scored.to_dict(), describe(window)], sort_keys=True)
 
 
 def trials_of(base: dict, axes: dict, methods: Mapping, cases: Cases,
@@ -237,7 +236,7 @@ def trials_of(base: dict, axes: dict, methods: Mapping, cases: Cases,
         if (voxels := trial.data.simulation_voxels) and voxels % grid.shape[0]:
             raise ValueError(f"simulation_voxels is a multiple of the {grid.shape[0]} voxels along each side that are "
                              f"scored, but {voxels} was given: give such a one, or leave it out")
-    results = [trial.result_scene()[0] for trial in trials] if not any(trial.data.protocol for trial in trials) else []
+    results = [trial.voxels.result for trial in trials] if not any(trial.data.protocol for trial in trials) else []
     if any(window != scenes[0][1] for _, window in scenes) or not all(
             grid.same_as(grids[0]) for grids in (results, [grid for grid, _ in scenes]) for grid in grids):
         raise ValueError("the methods of a product are compared on one grid and HU window, but their priors, second "
@@ -247,6 +246,39 @@ def trials_of(base: dict, axes: dict, methods: Mapping, cases: Cases,
 
 def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
     """The trial of some settings, and the names of those that mean anything to it."""
+    given = _checked(settings)
+    method, simulator, changes = _changed(of, settings, given.get("simulator", "ideal"))
+    given = _meant(given, method)
+    if given.get("delta") is not None:
+        method = refined_from(method, given["delta"], "method.ec_steps" in changes)
+    value = DEFAULTS | given
+    data = _data(value, given, simulator, cases)
+    if value["protocol"] or value["geometry"]:
+        value |= {"views": data.beam.views, "detector": data.beam.shape[0]}
+    owners = {"method": method, "simulator": simulator}
+    overrides = {f"{part}.{path}": plain(field_of(owners[part], path.split(".")))
+                 for part, path in (name.split(".", 1) for name in changes)}
+    with_prior = isinstance(method, Sampler)
+    columns = {name: value[name] for name in DEFAULT_COLUMNS
+               if name in given or with_prior or name not in settings_of("prior")}
+    columns |= {name: given[name] for name in SETTINGS
+                if name in given and name not in columns and name != "precision"} | overrides
+    if value["precision"] != "auto":
+        columns[PRECISION] = value["precision"]
+    prior = value["prior"] or str(method.default_prior) if isinstance(method, Sampler) else None
+    box = None if value["voxels"] is None else Box(value["voxels"], value["side"], value["centre"])
+    if box is None and (alone := {"side", "centre", "refine"} & set(given)):
+        raise ValueError(f"{', '.join(sorted(alone))} of a box of voxels means nothing without voxels: give them too")
+    trial = Trial(columns, method, data, prior, value["guidance"], value["samples"], value["seed"], box,
+                  value["refine"], value["super_resolution"], projector=projector_kind(value["projector"]),
+                  with_report=value["report"], precision=value["precision"])
+    if box and data.protocol:
+        data.protocol.check_voxels(box.grid(), trial.bound)
+    return trial, set(given) | set(overrides)
+
+
+def _checked(settings: Mapping) -> dict:
+    """Those of SETTINGS that are given, as the values that they stand for. Raises ValueError where one cannot be."""
     given = {name: parsed(SETTINGS[name][0], value, name) for name, value in settings.items() if name in SETTINGS}
     for name, value in given.items():
         if isinstance(value, float) and not math.isfinite(value):
@@ -254,64 +286,50 @@ def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
     check_seed(given.get("seed", 0))
     if (samples := given.get("samples", 1)) < 1:
         raise ValueError(f"samples is a number of draws, 1 or more, but {samples} was given")
-    projector = projector_kind(given.get("projector", "auto"))
     check_precision(given.get("precision", "auto"))
-    base = method_of(of)
-    simulator = SIMULATORS.get(given.get("simulator", "ideal"))
+    return given
+
+
+def _changed(of: str, settings: Mapping, simulated_by: str) -> tuple[Sampler | Reconstructor, Simulator, list[str]]:
+    """A method and a simulator with those fields that are given of them, and the names of these settings."""
+    method, simulator = method_of(of), SIMULATORS.get(simulated_by)
     if simulator is None:
-        raise ValueError(f"there is no simulator {given['simulator']!r}: use one of {', '.join(SIMULATORS)}")
-    changeable = {"method": base, "simulator": simulator}
+        raise ValueError(f"there is no simulator {simulated_by!r}: use one of {', '.join(SIMULATORS)}")
     changes: dict[str, dict] = {"method": {}, "simulator": {}}
     for name, value in settings.items():
         part, _, path = name.partition(".")
-        if path and part in changeable and has_field(changeable[part], path.split(".")):
+        if path and part in changes and has_field({"method": method, "simulator": simulator}[part], path.split(".")):
             changes[part][path] = value
     try:
-        method, simulator = (changed(changeable[part], changes[part], part) for part in changeable)
+        method = changed(method, changes["method"], "method")
+        simulator = changed(simulator, changes["simulator"], "simulator")
     except ValueError as error:
         raise ValueError(f"{settings['method']}: {error}") from error
-    if not isinstance(method, Sampler) or not has_field(method, ["ec_delta"]):
-        given.pop("delta", None)
-    if given.get("delta") is not None:
-        method = refined_from(method, given["delta"], "ec_steps" in changes["method"])
+    return method, simulator, [f"{part}.{path}" for part, paths in changes.items() for path in paths]
+
+
+def _meant(given: Mapping, method: Sampler | Reconstructor) -> dict:
+    """Those of the given settings that mean anything to a method, or, beside a geometry file, of the X-rays."""
+    without: set[str] = set() if given.get("geometry") is None else {*settings_of("orbit")}
     if not isinstance(method, Sampler):
-        given = {name: value for name, value in given.items() if name not in PRIOR_SETTINGS}
-        if not has_field(method, ["precision"]):
-            given.pop("precision", None)
-    if given.get("geometry") is not None:
-        given = {name: value for name, value in given.items() if name not in ORBIT_SETTINGS}
-    value = {name: default for name, (_, default) in SETTINGS.items()} | given
+        without |= {*settings_of("prior"), *(() if has_field(method, ["precision"]) else ["precision"])}
+    elif not has_field(method, ["ec_delta"]):
+        without.add("delta")
+    return {name: value for name, value in given.items() if name not in without}
+
+
+def _data(value: Mapping, given: Mapping, simulator: Simulator, cases: Cases) -> ReconstructionData:
+    """The cases' X-rays by the `value` of each setting, of which some were given."""
     if value["detector"] < 1:
         raise ValueError("detector is a number of pixels along each side, 1 or more, but "
                          f"{value['detector']} was given")
     pixel = SIDE / value["detector"] if value["pixel"] is None else value["pixel"]
-    data = cases.data(
+    return cases.data(
         orbit=_orbit(given) if value["protocol"] or value["geometry"] else Orbit(
             value["views"], value["source_to_detector"], value["source_to_isocentre"], (value["detector"],) * 2,
             (pixel, pixel)),
         simulator=simulator, simulation_voxels=value["simulation_voxels"], geometry=value["geometry"],
         protocol=value["protocol"])
-    if value["protocol"] or value["geometry"]:
-        value |= {"views": data.beam.views, "detector": data.beam.shape[0]}
-    with_prior = isinstance(method, Sampler)
-    overrides = {f"{part}.{path}": plain(field_of({"method": method, "simulator": simulator}[part], path.split(".")))
-                 for part, paths in changes.items() for path in paths}
-    columns = {name: value[name] for name in DEFAULT_COLUMNS
-               if name in given or name not in PRIOR_SETTINGS or with_prior}
-    columns |= {name: given[name] for name in SETTINGS
-                if name in given and name not in columns and name != "precision"} | overrides
-    if value["precision"] != "auto":
-        columns[PRECISION] = value["precision"]
-    prior = value["prior"] or str(method.default_prior) if with_prior else None
-    box = None if value["voxels"] is None else Box(value["voxels"], value["side"], value["centre"])
-    if box is None and (alone := {"side", "centre", "refine"} & set(given)):
-        raise ValueError(f"{', '.join(sorted(alone))} of a box of voxels means nothing without voxels: give them too")
-    trial = Trial(columns, method, data, prior, value["guidance"], value["samples"], value["seed"], box,
-                  value["refine"], value["super_resolution"], projector=projector, with_report=value["report"],
-                  precision=value["precision"])
-    if box and data.protocol:
-        data.protocol.check_voxels(box.grid(), trial.bound)
-    return trial, set(given) | set(overrides)
 
 
 def _orbit(given: Mapping) -> Orbit:

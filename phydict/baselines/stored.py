@@ -12,7 +12,7 @@ from torch import Tensor
 
 from phydict.baselines.baseline import Baseline, CountingProjector
 from phydict.datasets import load_ct
-from phydict.datasets.cts.transforms import to_grid
+from phydict.datasets.cts.resampling import to_grid
 from phydict.grid import Grid
 from phydict.units import AIR, MU_WATER, hu_to_mu
 from phydict.xray.boxes import along, averaged, interpolated, no_finer

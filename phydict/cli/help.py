@@ -11,7 +11,7 @@ from phydict.ablation.nested import parsed
 from phydict.methods import DEFAULT_METHOD, METHODS
 from phydict.posterior import Sampler
 from phydict.reconstruction import Reconstructor
-from phydict.runtime.console import CONFIGURATION, read_configuration
+from phydict.runtime.configurations import CONFIGURATION, read_configuration
 from phydict.runtime.help import arrange_help, show_settings
 from phydict.runtime.yaml_file import parse_yaml
 

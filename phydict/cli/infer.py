@@ -24,19 +24,16 @@ from phydict.inference.scoring import METRICS, CLIPSettings, FIDSettings, Scorin
 from phydict.inference.settings import WITHOUT_STAGE
 from phydict.inference.task import ReconstructionTask
 from phydict.methods import METHODS
+from phydict.runtime.configurations import CONFIGURATION, is_yaml, read_configuration, split_configurations, valued
 from phydict.runtime.console import (
-    CONFIGURATION,
     check_apart,
     check_command,
     check_processes,
     cli_errors,
     ended_by_sigterm,
-    is_yaml,
     noted,
     quiet,
-    read_configuration,
     sentence,
-    split_configurations,
 )
 from phydict.runtime.help import HelpFormatter
 from phydict.runtime.progress_log import log_problem, progress_options
@@ -122,7 +119,7 @@ class InferenceCLI(ProgressCLI):
             try:
                 with noted([], name):
                     case = load_xrays(folder, geometry) | {"id": name}
-                    print(*dry_run(model.pages / f"{name}.png", case, model.around, model.grid), sep="\n")
+                    print(*dry_run(model.pages / f"{name}.png", case, model.voxels.made, model.voxels.result), sep="\n")
             except (ValueError, OSError) as error:
                 if len(folders) == 1:
                     raise
@@ -174,24 +171,23 @@ def with_methods(args: list[str]) -> list[str]:
     if any(option.startswith("--model.cube") for option in given):
         raise ValueError("model.cube is a setting of train.py: give model.grid")
     chosen = any(option in ("--model", "--model.method", "--model.method.class_path") for option in given)
-    out, rest = [], iter(args)
-    for arg in rest:
-        option, equals, value = arg.partition("=")
+    out, read = [], (*CONFIGURATION, "--model.method", "--model.grid")
+    for option, value in valued(args, read):
+        if option not in read:
+            out.append(option)
+            continue
+        value = value or ""
         if option in CONFIGURATION:
-            value, gives_method = _configuration(value if equals else next(rest, ""))
-            arg, chosen = f"--config={value}", chosen or gives_method
-        elif option == "--model.method":
-            value = value if equals else next(rest, "")
-            arg = f"{option}={value}"
-            if _is_name(value):
-                named = _named(value)
-                if "--model.name" in given:
-                    del named["name"]
-                arg = "--config=" + json.dumps({"model": named})
-        elif option == "--model.grid":
-            value = value if equals else next(rest, "")
-            arg = f"{option}.voxels={value}" if value.isdecimal() else f"{option}={value}"
-        out.append(arg)
+            option, (value, gives_method) = "--config", _configuration(value)
+            chosen = chosen or gives_method
+        elif option == "--model.method" and _is_name(value):
+            named = _named(value)
+            if "--model.name" in given:
+                del named["name"]
+            option, value = "--config", json.dumps({"model": named})
+        elif option == "--model.grid" and value.isdecimal():
+            option = "--model.grid.voxels"
+        out.append(f"{option}={value}")
     alone = [] if chosen else [option for option in given if option.startswith("--model.method.")
                                and option != "--model.method.help"]
     if alone:

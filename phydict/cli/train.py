@@ -20,16 +20,14 @@ from phydict.cli.export import export_prior, print_prior
 from phydict.cli.help import describe_commands, fit_help
 from phydict.cli.progress_cli import ProgressCLI
 from phydict.prior import DEFAULT_REFINER
+from phydict.runtime.configurations import check_configured, read_configurations, with_configurations
 from phydict.runtime.console import (
     check_apart,
     check_command,
-    check_configured,
     check_processes,
     check_writable,
     cli_errors,
     quiet,
-    read_configurations,
-    with_configurations,
 )
 from phydict.runtime.files import alone_in, atomic_write
 from phydict.runtime.help import HelpFormatter

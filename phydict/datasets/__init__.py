@@ -3,6 +3,7 @@
 from phydict.datasets.case import Case
 from phydict.datasets.cts.anatomy import MASKS, body_mask, segment
 from phydict.datasets.cts.augment import Augmentation, Deformation, augment
+from phydict.datasets.cts.ct_case import prepare_ct
 from phydict.datasets.cts.ct_rate import (
     CTCases,
     CTFile,
@@ -14,7 +15,7 @@ from phydict.datasets.cts.ct_rate import (
     split_by_patient,
 )
 from phydict.datasets.cts.ct_rate_tables import read_calibrations, read_reports
-from phydict.datasets.cts.transforms import Calibration, load_ct, prepare_ct
+from phydict.datasets.cts.reading import Calibration, load_ct
 from phydict.datasets.intensity import Intensity
 from phydict.datasets.phantoms.findings import Finding
 from phydict.datasets.phantoms.phantom import build, pathology_region, phantom_case

@@ -206,29 +206,22 @@ def over_cases(rows: Sequence[Mapping], metrics: Iterable[str]) -> dict[str, Sum
     return result
 
 
-def summarise(rows: Iterable[Mapping], by: str = "method",
-              metrics: Sequence[str] | None = None) -> dict[str, dict[str, Summary]]:
-    """{group: {metric: Summary}} by `over_cases`, groups in order of appearance.
-
-    metrics: names, or None for every known metric that some row has.
-    Raises ValueError when there is no row, a row lacks `by`, or no row has one of `metrics`.
-    """
+def summarise(rows: Iterable[Mapping]) -> dict[str, dict[str, Summary]]:
+    """{method: {metric: Summary}} by `over_cases`, of every known metric that some row has, methods in order of
+    appearance. Raises ValueError when there is no row, or a row lacks its method."""
     rows = list(rows)
     if not rows:
         raise ValueError("there are no rows to summarise; evaluate at least one case first")
-    if lacking := next((row for row in rows if by not in row), None):
-        raise ValueError(f"every row needs the column {by!r} to be grouped by, but one has only {sorted(lacking)}")
-    present = {name for row in rows for name, value in row.items() if value is not None}
-    if absent := [name for name in metrics or () if name not in present]:
-        raise ValueError(f"no row has the metrics {absent}; the rows have {sorted(present)}")
-    return {str(group): over_cases([row for row in rows if row[by] == group], metrics or MEASURES)
-            for group in dict.fromkeys(row[by] for row in rows)}
+    if lacking := next((row for row in rows if "method" not in row), None):
+        raise ValueError(f"every row needs the column 'method' to be grouped by, but one has only {sorted(lacking)}")
+    return {str(method): over_cases([row for row in rows if row["method"] == method], MEASURES)
+            for method in dict.fromkeys(row["method"] for row in rows)}
 
 
 class CaseMetrics(Metric):
     """Mean and standard deviation over cases of per-case values, for several methods; safe under DDP.
 
-    methods, names: what `update` may be given, equal in every process.
+    methods: what `update` may be given, equal in every process.
 
     `compute` returns for each method and metric the mean over cases, "method/name", the sample standard deviation,
     "method/name_std" (NaN for a single case), and the number of cases, "method/cases". A metric that no case of a
@@ -240,9 +233,9 @@ class CaseMetrics(Metric):
     higher_is_better = None
     is_differentiable = False
 
-    def __init__(self, methods: Sequence[str], names: Sequence[str] = tuple(MEASURES)):
+    def __init__(self, methods: Sequence[str]):
         super().__init__()
-        self.methods, self.names = tuple(methods), tuple(names)
+        self.methods = tuple(methods)
         # Flat float64 rows [case, method, values, present]. torchmetrics gathers an empty process as a flat tensor of
         # the metric's dtype, so the state has to be both.
         self.set_dtype(torch.float64)
@@ -254,18 +247,17 @@ class CaseMetrics(Metric):
 
         case: its index in the dataset, the same in every process. values: metric name -> value, such as
         `volume_metrics` returns; a name left out or None counts as not measured. seconds: reconstruction time.
-        Raises ValueError on a method or a name that was not announced.
+        Raises ValueError on a method that was not announced, and on an unknown name.
         """
         given = dict(values) if seconds is None else {**values, "seconds": seconds}
         if method not in self.methods:
             raise ValueError(f"method {method!r} is not one of {list(self.methods)}; "
                              "name it in CaseMetrics(methods=...)")
-        if unknown := given.keys() - set(self.names):
-            raise ValueError(f"metrics {sorted(unknown)} are not among {list(self.names)}; "
-                             "name them in CaseMetrics(names=...)")
+        if unknown := given.keys() - MEASURES.keys():
+            raise ValueError(f"metrics {sorted(unknown)} are not among {list(MEASURES)}")
         row = [float(case), float(self.methods.index(method))]
-        row += [math.nan if given.get(name) is None else float(given[name]) for name in self.names]
-        row += [float(given.get(name) is not None) for name in self.names]
+        row += [math.nan if given.get(name) is None else float(given[name]) for name in MEASURES]
+        row += [float(given.get(name) is not None) for name in MEASURES]
         self.values.append(torch.tensor(row, dtype=torch.float64, device=self.device))
 
     def compute(self) -> dict[str, Tensor]:
@@ -275,16 +267,16 @@ class CaseMetrics(Metric):
             rows = [values for (_, name), values in cases.items() if name == method]
             if rows:
                 result[f"{method}/cases"] = torch.tensor(float(len(rows)))
-            for name, summary in over_cases(rows, self.names).items():
+            for name, summary in over_cases(rows, MEASURES).items():
                 result[f"{method}/{name}"] = torch.tensor(summary.mean, dtype=torch.float64)
                 result[f"{method}/{name}_std"] = torch.tensor(summary.std, dtype=torch.float64)
         return result
 
     def _cases(self) -> dict[tuple[int, str], dict[str, float]]:
-        n = len(self.names)
+        n = len(MEASURES)
         table = dim_zero_cat(self.values).reshape(-1, 2 + 2 * n).tolist() if len(self.values) else []
         cases: dict[tuple[int, str], dict[str, float]] = {}
         for case, method, *row in sorted(table, key=lambda row: row[:2]):
-            values = {name: value for name, value, present in zip(self.names, row[:n], row[n:]) if present}
+            values = {name: value for name, value, present in zip(MEASURES, row[:n], row[n:]) if present}
             cases.setdefault((int(case), self.methods[int(method)]), values)
         return cases

@@ -14,6 +14,9 @@ from phydict.grid import Grid
 VESSELS = 200
 """How many of a lung's brightest voxels count as vessels."""
 
+REACH_MM = 24.0
+"""How far on either side of an edge its profile is looked at."""
+
 BONE, WALL_MM, RIB_MM = 200.0, 24.0, 12.0
 """Ribs: from how many HU on, how near to a lung, and how far above and below their middle they are looked at."""
 
@@ -57,11 +60,11 @@ def edge_width(profile: Tensor, spacing: float) -> float:
     return (high - low) * spacing
 
 
-def edge_spread(volume: Tensor, lung: Tensor, grid: Grid, edge: str, reach_mm: float = 24.0) -> float:
+def edge_spread(volume: Tensor, lung: Tensor, grid: Grid, edge: str) -> float:
     """Width in mm, 10 to 90 %, of a reconstruction's edge between lung and what is below or beside it; as
     `edge_profile`."""
     spacing = grid.spacing[AXES[edge]]
-    return edge_width(edge_profile(volume, lung, edge, max(2, round(reach_mm / spacing))), spacing)
+    return edge_width(edge_profile(volume, lung, edge, max(2, round(REACH_MM / spacing))), spacing)
 
 
 def rib_profile(volumes: Tensor, truth: Tensor, lung: Tensor, grid: Grid) -> Tensor:
@@ -86,12 +89,12 @@ def rib_profile(volumes: Tensor, truth: Tensor, lung: Tensor, grid: Grid) -> Ten
                         for step in range(reach + 1)], -1)
 
 
-def vessel_visibility(volume: Tensor, truth: Tensor, lung: Tensor, count: int = VESSELS) -> float:
-    """How much of the vessels' contrast a volume (X, Y, Z) holds: that of the truth's `count` brightest lung voxels to
+def vessel_visibility(volume: Tensor, truth: Tensor, lung: Tensor) -> float:
+    """How much of the vessels' contrast a volume (X, Y, Z) holds: that of the truth's VESSELS brightest lung voxels to
     the mean of their 5^3 neighbourhoods, as a share of the truth's. 1: all of it, 0: none."""
     contrasts = [x - avg_pool3d(x[None, None], 5, 1, 2, count_include_pad=False)[0, 0] for x in (volume, truth)]
     inside = (lung > 0.5).flatten()
-    brightest = torch.where(inside, truth.flatten(), -torch.inf).topk(min(count, int(inside.sum()))).indices
+    brightest = torch.where(inside, truth.flatten(), -torch.inf).topk(min(VESSELS, int(inside.sum()))).indices
     measured, expected = (float(contrast.flatten()[brightest].mean()) for contrast in contrasts)
     return measured / expected
 

@@ -147,48 +147,46 @@ def rankable(measure: Measure, cases: Iterable[Iterable[str]]) -> Measure:
     return measure if len({frozenset(of) for of in cases}) < 2 else measure.unranked()
 
 
-def mean_table(rows: Iterable[Mapping], by: str = "method", metrics: Sequence[str] | None = None,
-               window: HUWindow = RANGE, empty: Mapping[str, str] = MappingProxyType({}),
+def mean_table(rows: Iterable[Mapping], window: HUWindow = RANGE, empty: Mapping[str, str] = MappingProxyType({}),
                first_calls: bool = False) -> Table:
-    """Mean ± standard deviation over cases, a line per group, ranked by what all of them have of the same cases; where
+    """Mean ± standard deviation over cases, a line per method, ranked by what all of them have of the same cases; where
     rows have warnings, a last column counts their cases.
 
-    by, metrics: as in `summarise`. window: the HU range of `volume_metrics`. empty: metric -> why it has no value, if
-    it has none; it then has a column all the same, and a note. first_calls: whether seconds hold what only a first call
-    costs, such as compiling: they are then not ranked and have no interval. The caption takes grid and views from the
-    rows' columns of these names.
+    window: the HU range of `volume_metrics`. empty: metric -> why it has no value, if it has none; it then has a column
+    all the same, and a note. first_calls: whether seconds hold what only a first call costs, such as compiling: they
+    are then not ranked and have no interval. The caption takes grid and views from the rows' columns of these names.
     """
     rows = list(rows)
-    groups = summarise(rows, by, metrics)
-    measured = [name for name in metrics or MEASURES if any(name in group for group in groups.values())]
-    names = [name for name in metrics or MEASURES if name in measured or name in empty]
-    measures = [MEASURES.get(name, Measure(name, None, 3)) for name in names]
+    groups = summarise(rows)
+    measured = [name for name in MEASURES if any(name in group for group in groups.values())]
+    names = [name for name in MEASURES if name in measured or name in empty]
+    measures = [MEASURES[name] for name in names]
     if first_calls and "seconds" in names:
         measures[names.index("seconds")] = MEASURES["seconds"].unranked()
-    header = [by, *(measure.heading for measure in measures)]
+    header = ["method", *(measure.heading for measure in measures)]
     measures = [rankable(measure, (group[name].cases for group in groups.values() if name in group))
                 for name, measure in zip(names, measures)]
     lines: list[tuple[str, bool, list[Value | None]]] = [
         (label, True, [_without_interval(group.get(name)) if first_calls and name == "seconds" else group.get(name)
                        for name in names]) for label, group in groups.items()]
-    if warned := warned_cases(rows, by):
+    if warned := warned_cases(rows):
         header.append("warned")
         measures.append(Measure("warned", None, 0))
         lines = [(label, ranked, [*values, len(warned.get(label, ()))]) for label, ranked, values in lines]
-    of_group = {group: frozenset(row.get("case", f"row {n}") for n, row in enumerate(rows) if str(row[by]) == group)
-                for group in groups}
+    of_group = {group: frozenset(row.get("case", f"row {n}") for n, row in enumerate(rows)
+                                 if str(row["method"]) == group) for group in groups}
     cases = set(of_group.values())
     unequal = " (not the same cases in every line)" if len(cases) > 1 else ""
-    parts = partial_notes((label, len(of_group[label]), {name: len(summary.cases) for name, summary in group.items()
-                                                         if name in MEASURES}) for label, group in groups.items())
+    parts = partial_notes((label, len(of_group[label]), {name: len(summary.cases) for name, summary in group.items()})
+                          for label, group in groups.items())
     number = _span(map(len, cases))
     over = "One case" if number == "1" else f"Mean ± standard deviation over n = {number} cases"
-    table = Table(f"Scores by {by}", header, measures, lines, [])
+    table = Table("Scores by method", header, measures, lines, [])
     timed = first_calls and "seconds" in measured
     return replace(table, notes=[
         caption(over + unequal, table.ranks, rows, {"Grid": "grid", "Views": "views"}, window),
         *interval_note(lines, cases), *([FIRST_CALLS] if timed else []), *parts, *empty_notes(empty, measured),
-        *warning_notes(rows, by)])
+        *warning_notes(rows)])
 
 
 def _span(numbers: Iterable[int]) -> str:
@@ -291,18 +289,18 @@ def listed(rows: Sequence[Mapping], column: str) -> str:
     return ", ".join(dict.fromkeys(str(row[column]) for row in rows if row.get(column) is not None))
 
 
-def warned_cases(rows: Sequence[Mapping], by: str = "method") -> dict[str, list[str]]:
-    """{group: its cases with a warning}, of groups that have any."""
+def warned_cases(rows: Sequence[Mapping]) -> dict[str, list[str]]:
+    """{method: its cases with a warning}, of methods that have any."""
     warned: dict[str, dict] = {}
     for row in rows:
         if row.get("warning"):
-            warned.setdefault(str(row[by]), {})[str(row.get("case", "a row"))] = None
-    return {group: list(cases) for group, cases in warned.items()}
+            warned.setdefault(str(row["method"]), {})[str(row.get("case", "a row"))] = None
+    return {method: list(cases) for method, cases in warned.items()}
 
 
-def warning_notes(rows: Sequence[Mapping], by: str = "method") -> list[str]:
+def warning_notes(rows: Sequence[Mapping]) -> list[str]:
     """The note on cases with a warning, where there are any."""
-    warned = "; ".join(f"{group}: {', '.join(cases)}" for group, cases in warned_cases(rows, by).items())
+    warned = "; ".join(f"{method}: {', '.join(cases)}" for method, cases in warned_cases(rows).items())
     return [f"Doubtful cases, by the column warning: {warned}."] if warned else []
 
 

@@ -7,8 +7,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from phydict.datasets.cts.ct_rate import patient_of
 from phydict.grid import Grid
-from phydict.inference.protocols import protocol_of, whole
+from phydict.inference.protocols import protocol_of
 from phydict.inference.settings import PAPER
+from phydict.inference.voxels import whole
 
 PAPER_ORBIT = json.loads(json.dumps(PAPER.settings()))
 """The orbit of X-rays whose geometry is not named, as records hold it."""

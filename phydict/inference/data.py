@@ -128,11 +128,6 @@ class ReconstructionData(lightning.LightningDataModule):
             "simulator": describe(self.simulator), "simulation_voxels": self.simulation_voxels} | (
                 {"protocol": self.protocol.name} if self.protocol else {})
 
-    def scene(self, grid: Grid, window: HUWindow) -> tuple[Grid, HUWindow]:
-        """The voxels and the HU range of the CTs that X-rays are made of, where a method has these of its own."""
-        protocol = self.protocol
-        return (protocol.grid or grid, protocol.hu or window) if protocol else (grid, window)
-
     def xray_cases(self) -> dict[str, Path]:
         """Id -> folder of X-rays. Raises ValueError without data.xrays."""
         if not self.xrays:

@@ -15,7 +15,7 @@ from phydict.inference.case_files import missing_page_files, remake_page_files
 from phydict.inference.conditions import condition, condition_titles, format_settings, namesakes, told_apart
 from phydict.inference.distances import distance_rows
 from phydict.inference.protocols import protocol_of
-from phydict.inference.results import FEATURES, RECORD, TABLE, score_row, score_table
+from phydict.inference.results import FEATURES, MEANS, RECORD, RESULTS, score_row, score_table
 from phydict.inference.scoring import FIDSettings
 from phydict.page import Contents, PageCase, check_own_page, write_page
 from phydict.runtime.files import in_between
@@ -36,7 +36,7 @@ def results_page(folder: Path, further: Sequence[Table] | None = None,
     cases = _cases(folder)
     if not cases:
         raise ValueError(f"{folder} holds no results: give the folder that predict, test or ablate wrote to, which "
-                         f"holds <case>/{RECORD}, <method>/<case>/{RECORD} or ablate's {TABLE}")
+                         f"holds <case>/{RECORD}, <method>/<case>/{RECORD} or ablate's {RESULTS}")
     if further is None:
         further = _kept_distances(folder, cases)
     scored = [case.record for case in cases if case.record["scores"]]
@@ -50,7 +50,7 @@ def results_page(folder: Path, further: Sequence[Table] | None = None,
     means = _mean_tables(scored, empty)
     if note and means:
         means[-1] = replace(means[-1], notes=[*means[-1].notes, note])
-    tables = sorted({path.relative_to(folder).as_posix() for depth in ("", "*/") for name in (TABLE, "results.md")
+    tables = sorted({path.relative_to(folder).as_posix() for depth in ("", "*/") for name in (RESULTS, MEANS)
                      for path in folder.glob(depth + name)})
     return write_page(folder, Contents(f"Results in {folder.resolve().name}",
                                        [*means, *further], cases, points, error, links=tables, unranked=("seconds",)))

@@ -7,22 +7,17 @@ the lungs, where the publications crop the middle of the scan.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from phydict.datasets.case import Case
-from phydict.datasets.cts.transforms import to_grid
 from phydict.evaluation import RANGE
 from phydict.grid import Grid
 from phydict.inference.settings import PAPER, Orbit
 from phydict.methods import DEFAULT_GRID
-from phydict.units import AIR, HUWindow
+from phydict.units import HUWindow
 from phydict.xray import Ideal, Simulator
-from phydict.xray.boxes import along, covers, in_other_voxels
+from phydict.xray.boxes import covers
 
 
 @dataclass(frozen=True)
@@ -127,37 +122,3 @@ def protocol_of(name: str) -> Protocol:
     if name not in PROTOCOLS:
         raise ValueError(f"data.protocol is one of {', '.join(PROTOCOLS)}, but {name!r} was given")
     return PROTOCOLS[name]
-
-
-def resampled(volume: Tensor, grid: Grid, onto: Grid) -> Tensor:
-    """A volume (X, Y, Z) in HU on `grid` by voxel averages on another one; air lies outside."""
-    if grid.same_as(onto):
-        return volume
-    return torch.from_numpy(to_grid(volume.cpu().numpy(), grid.affine, onto, AIR).astype(np.float32))
-
-
-def whole(grid: Grid) -> Grid:
-    """The voxels of the CT that X-rays are made of: those of the result where they hold the whole chest, centred, else
-    those of the chest, as long as the result's or half again."""
-    if along(grid, DEFAULT_GRID) and covers(grid, DEFAULT_GRID) and np.allclose(grid.centre, 0):
-        return grid
-    halvings = max(0, math.ceil(math.log2(DEFAULT_GRID.spacing[0] / min(grid.spacing)) - 0.1))
-    return Grid.cube(DEFAULT_GRID.shape[0] * 2 ** min(halvings, 2))
-
-
-def cut_out(case: Case, grid: Grid, box: Grid, window: HUWindow) -> Case:
-    """What a CT case on `grid` holds in a box: volume, from its finest, masks and, where it has one, affine."""
-    source = case.get("fine", case["volume"])
-    volume = resampled(window.to_hu(source)[0].cpu(), in_other_voxels(grid, source.shape[1:]), box)
-    masks = np.stack([to_grid(mask.cpu().numpy(), grid.affine, box, 0.0) for mask in case["masks"]])
-    cut: Case = {"volume": window.to_range(volume)[None], "masks": torch.from_numpy(masks.astype(np.float32))}
-    if "affine" in case:
-        cut["affine"] = torch.from_numpy(placed(box, grid, case["affine"].numpy()).affine.copy())
-    return cut
-
-
-def placed(grid: Grid, like: Grid, affine: np.ndarray) -> Grid:
-    """A grid moved as `like` was that now has this affine."""
-    if grid.same_as(like):
-        return Grid(grid.shape, affine=affine)
-    return Grid(grid.shape, affine=affine @ np.linalg.inv(like.affine) @ grid.affine)

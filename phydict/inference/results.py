@@ -28,8 +28,11 @@ UNLISTED = ("volume.nii.gz", "deviation.nii.gz", "panel.png")
 COARSE = "coarse.nii.gz"
 """The coarse volume of a case, where one was made and is kept."""
 
-TABLE, FEATURES = "results.csv", "slice_features.safetensors"
-"""The table of scores, and of a case the features of its slices, where the Frechet distance is measured."""
+RESULTS, MEANS = "results.csv", "results.md"
+"""The table of scores, a row per case, and that of their means."""
+
+FEATURES = "slice_features.safetensors"
+"""Of a case the features of its slices, where the Frechet distance is measured."""
 
 
 class Finished(NamedTuple):
@@ -119,8 +122,8 @@ class CaseResults:
         if not records:
             return []
         tables = [score_table(records, protocol, empty), *further]
-        write_csv(self.folder / TABLE, [score_row(record["case"], record) for record in records])
-        with atomic_write(self.folder / "results.md") as part:
+        write_csv(self.folder / RESULTS, [score_row(record["case"], record) for record in records])
+        with atomic_write(self.folder / MEANS) as part:
             part.write_text("\n".join(table.markdown() for table in tables))
         return tables
 
@@ -180,7 +183,7 @@ class CaseResults:
 
     def _check_table(self) -> None:
         """Raises ValueError where a table of someone else's would be replaced."""
-        table, page = self.folder / TABLE, self.folder / "results.md"
+        table, page = self.folder / RESULTS, self.folder / MEANS
         if table.is_file():
             with table.open("rb") as file:
                 replaceable = file.read(12) == b"case,method,"

@@ -22,6 +22,8 @@ from phydict.evaluation.published import PUBLISHED
 from phydict.evaluation.sharpness import sharpness_scores
 from phydict.grid import Grid
 from phydict.inference.protocols import Protocol
+from phydict.inference.voxels import resampled
+from phydict.reconstruction import Reconstruction
 from phydict.runtime.files import file_crc32
 from phydict.units import HUWindow
 
@@ -122,6 +124,13 @@ class Scoring:
             return dict.fromkeys(("clip_t2i", "clip_i2i"), "CT-CLIP's checkpoint was not given (clip.weights)")
         return {"clip_t2i": "CXR-BERT was not given (clip.text)" if self.clip.text_transformer is None else
                 "no case has a report"}
+
+    def measured(self, result: Reconstruction, case: Case, grid: Grid, window: HUWindow, device: torch.device,
+                 protocol: Protocol | None) -> tuple[dict[str, float], dict[str, Tensor] | None]:
+        """The `scores` of a result, on whatever voxels, of a CT case on `grid`, and its `features`."""
+        volume = resampled(result.volume, result.grid, grid)
+        return (self.scores(volume, result.misfit, case, grid, window, device, protocol),
+                self.features(volume, case, grid, window, device))
 
     def scores(self, volume: Tensor, misfit: float, case: Case, grid: Grid, window: HUWindow,
                device: torch.device, protocol: Protocol | None = None) -> dict[str, float]:

@@ -14,7 +14,7 @@ from phydict.evaluation.tables import fid_tables
 from phydict.inference.distances import distance_rows
 from phydict.inference.page import results_page
 from phydict.inference.protocols import Protocol
-from phydict.inference.results import FEATURES, TABLE, CaseResults
+from phydict.inference.results import FEATURES, MEANS, RESULTS, CaseResults
 from phydict.inference.scoring import Scoring
 from phydict.runtime.progress_log import log_progress
 
@@ -31,7 +31,7 @@ def summarise(results: CaseResults, cases: list[str], name: str, scoring: Scorin
     for table in tables:
         console.print(table)
     if tables and (others := results.beside(cases)):
-        log_progress(f"{TABLE} and results.md hold this run's cases, and {others} more that are finished in "
+        log_progress(f"{RESULTS} and {MEANS} hold this run's cases, and {others} more that are finished in "
                      f"{results.folder} are left out: name all in one run, which keeps what is finished",
                      event="left_out", cases=others, out=str(results.folder))
     print(f"results in {results.folder}")

@@ -14,7 +14,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import lightning
-import numpy as np
 from torch import Tensor
 
 from phydict.baselines import Region
@@ -23,16 +22,15 @@ from phydict.datasets.case import Case
 from phydict.evaluation import CaseMetrics
 from phydict.evaluation.fid import Features, PlaneFID
 from phydict.grid import Box, Grid
-from phydict.inference.calibration import uncertain_of
 from phydict.inference.case_files import body_interval, write_result
 from phydict.inference.data import ReconstructionData
 from phydict.inference.orientation import orientation_doubts
-from phydict.inference.protocols import cut_out, placed, resampled, whole
 from phydict.inference.record import cascade_settings, case_record, grid_settings, method_settings, prior_settings
 from phydict.inference.results import CaseResults
 from phydict.inference.scoring import Scoring
 from phydict.inference.settings import CascadeSettings, Sampling
 from phydict.inference.summary import show_finished, summarise
+from phydict.inference.voxels import Voxels, in_its_ct
 from phydict.methods import DEFAULT_GRID, METHODS, default_method, onto_grid, reconstruct_by, reconstructor
 from phydict.page import check_own_page
 from phydict.poses import PoseSearch
@@ -47,6 +45,7 @@ from phydict.runtime.reading import enough_memory
 from phydict.runtime.seeds import case_seed, check_seed
 from phydict.runtime.warning import Remark, warn
 from phydict.units import HUWindow
+from phydict.xray.poses.uncertain import Uncertain
 from phydict.xray.projectors.own import projector_kind
 
 PREDICTED_VOXELS = 128
@@ -127,17 +126,14 @@ class ReconstructionTask(lightning.LightningModule):
     def _take(self, box: Box | None) -> None:
         """Reconstruct on the voxels of a box, if one is given."""
         self.keep_coarse = box is not None and box.keep_coarse
-        self.around = self.grid = self.plain.grid or DEFAULT_GRID
-        self.reconstructor = self.plain
-        self.chosen = None if box is None else box.grid()
-        if self.chosen is None:
+        chosen = None if box is None else box.grid()
+        self.voxels = Voxels(self.plain.grid or DEFAULT_GRID, chosen)
+        self.reconstructor = onto_grid(self.plain, chosen)
+        if chosen is None:
             return
-        self.grid = self.chosen
-        self.around = whole(self.grid)
-        self.reconstructor = onto_grid(self.plain, self.grid)
         if self.keep_coarse and not isinstance(self.reconstructor, Refined | Region):
             warn(f"there is no coarse volume to keep: {self.method_name} works on the given voxels directly", Remark)
-        self.settings |= grid_settings(self.grid, self.plain, self.reconstructor)
+        self.settings |= grid_settings(chosen, self.plain, self.reconstructor)
 
     def measure(self, scoring: Scoring) -> None:
         """Take these metrics in test."""
@@ -163,22 +159,18 @@ class ReconstructionTask(lightning.LightningModule):
             self._take(Box(keep_coarse=True))  # which lacks its voxels
         if stage == "test":
             self.settings |= self.scoring.settings()
-            if data.protocol and data.protocol.grid:
-                data.protocol.check_voxels(self.chosen, self.plain.grid is not None)
-                held = self.plain if self.plain.grid is None else covering(self.reconstructor, data.protocol.grid)
-                self.reconstructor, self.grid = held, held.grid or data.protocol.grid
-                self.around = self.grid
-            self.scoring.check(self.scored())
+            self.voxels = replace(self.voxels, protocol=data.protocol)
+            if data.protocol and (fixed := data.protocol.grid):
+                data.protocol.check_voxels(self.voxels.box, self.plain.grid is not None)
+                self.reconstructor = self.plain if self.plain.grid is None else covering(self.reconstructor, fixed)
+                self.voxels = Voxels(self.reconstructor.grid or fixed, None, data.protocol)
+            self.scoring.check(self.voxels.scored)
         check_apart(self.results.folder, "model.out", data.inputs(stage))
         check_own_page(self.results.folder.parent, "model.out")
 
     def scene(self) -> tuple[Grid, HUWindow]:
         """The voxels and the HU range of the CTs that X-rays are made of."""
-        return self._data.scene(self.around, self.window)
-
-    def scored(self) -> Grid:
-        """The voxels that volumes are scored on: those of the CTs, or a box that was chosen in them."""
-        return self.scene()[0] if self.around is self.grid else self.grid
+        return self.voxels.made, self.voxels.window(self.window)
 
     def unfinished(self, sources: dict[str, str]) -> list[str]:
         """Of this run's cases, id -> what identifies their data, those that remain to be done."""
@@ -200,7 +192,7 @@ class ReconstructionTask(lightning.LightningModule):
 
     def _predict(self, case: Case) -> None:
         result = self._reconstruct(case, self.seed)
-        for doubt in orientation_doubts(case["xrays"], case["beam"], self.around):
+        for doubt in orientation_doubts(case["xrays"], case["beam"], self.voxels.made):
             warn(doubt)
         self._finish(case, result)
 
@@ -211,20 +203,15 @@ class ReconstructionTask(lightning.LightningModule):
         with stage("simulate"):
             case["xrays"] = data.simulate(case, seed, grid, window, self.device)
         case["mu_water"] = data.simulator.effective_mu_water
-        if self.around is not self.grid:
-            case = case | cut_out(case, grid, self.grid, window)
-        grid = self.scored()
+        case, grid = self.voxels.as_scored(case, window), self.voxels.scored
         result = self._reconstruct(case, seed)
-        volume, truth = resampled(result.volume, self.grid, grid), window.to_hu(case["volume"])[0].cpu()
-        if "affine" in case:  # back to its place in the CT it came from
-            result = _moved(result, grid, case["affine"].numpy())
         with stage("metrics"):
-            scores = self.scoring.scores(volume, result.misfit, case, grid, window, self.device, data.protocol)
-            features = self.scoring.features(volume, case, grid, window, self.device)
+            scores, features = self.scoring.measured(result, case, grid, window, self.device, data.protocol)
         self.metrics.update(case["index"], self.method_name, scores, seconds=sum(result.seconds.values()))
         if self.slices is not None and features:
             self.slices.update(case["index"], features)
-        self._finish(case, result, scores, resampled(truth, grid, self.grid), features)
+        result, truth = in_its_ct(result, case, grid, window)
+        self._finish(case, result, scores, truth, features)
 
     def _attempt(self, case: Case, work: Callable[[Case], None]) -> None:
         """Bad input ends the run, or, where there are more cases, this one alone."""
@@ -282,9 +269,9 @@ class ReconstructionTask(lightning.LightningModule):
         ready = self.reconstructor.of_case(case["id"])
         ready = ready.with_mu_water(case["mu_water"]) if "mu_water" in case else ready
         xrays, beam, display = case["xrays"].to(self.device), case["beam"], case.get("display", False)
-        uncertain = uncertain_of(case) if self.calibrate else None
-        return reconstruct_by(ready, self.grid, xrays, beam, case["report"], display, seed, self.progress.advance,
-                              self.projector, uncertain)
+        uncertain = _uncertain_of(case) if self.calibrate else None
+        return reconstruct_by(ready, self.voxels.result, xrays, beam, case["report"], display, seed,
+                              self.progress.advance, self.projector, uncertain)
 
     def _finish(self, case: Case, result: Reconstruction, scores: dict | None = None,
                 truth: Tensor | None = None, features: Features | None = None) -> None:
@@ -305,11 +292,21 @@ class ReconstructionTask(lightning.LightningModule):
             summarise(self.results, self.cases, self.method_name, self.scoring, self._data.protocol)
 
 
-def _moved(result: Reconstruction, like: Grid, affine: np.ndarray) -> Reconstruction:
-    """A result, what it carries and its coarse one moved as the voxels `like` are that have this affine."""
-    carried = result.carried and replace(result.carried, grid=placed(result.carried.grid, like, affine))
-    return replace(result, grid=placed(result.grid, like, affine), carried=carried,
-                   coarse=result.coarse and _moved(result.coarse, like, affine))
+def _uncertain_of(case: Case) -> Uncertain:
+    """What is uncertain of a case's geometry, where `--calibrate` seeks its poses: what its file says not to know
+    exactly; with a warning, of radiographs whose tags are their geometry, what is usual.
+
+    Raises ValueError where a file of other measured ones does not say it.
+    """
+    if case["uncertain"] is None:
+        raise ValueError(f"--calibrate needs to know what {case['description'].source} is not sure of: state "
+                         "`uncertain:` there, such as {detector_shift_mm: 5, rotation_degrees: 2}, or leave "
+                         "--calibrate out")
+    if case["description"].uncertain is None:
+        stated = ", ".join(f"{name}: {value:g}" for name, value in vars(case["uncertain"]).items() if value)
+        warn(f"the tags do not say how exactly source and detector stood: taken is what is usual where a patient turns "
+             f"by hand ({stated}); state `uncertain:` in {case['description'].source.name} for other values")
+    return case["uncertain"]
 
 
 def _finished_line(result: Reconstruction) -> str:

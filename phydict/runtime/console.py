@@ -11,19 +11,15 @@ import signal
 import sys
 import tempfile
 import warnings
-from argparse import ArgumentError, ArgumentParser
+from argparse import ArgumentError
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from jsonargparse import set_loader
-
 from phydict.runtime.parser_message import plain
 from phydict.runtime.progress_log import log_always, log_problem, log_progress
 from phydict.runtime.reading import enough_memory, one_line
-from phydict.runtime.shipped import configuration
 from phydict.runtime.warning import Remark
-from phydict.runtime.yaml_file import parse_yaml, read_yaml
 
 NOISE = (".*does not have many workers", ".*LeafSpec.*is deprecated", ".*is smaller than the logging interval",
          "Total length of `DataLoader` across ranks is zero", "Checkpoint directory .* exists and is not empty",
@@ -35,22 +31,6 @@ NOISE = (".*does not have many workers", ".*LeafSpec.*is deprecated", ".*is smal
          "The dirpath has changed from",
          r"Found \d+ module\(s\) in eval mode at the start of training")
 """Warnings that tell a user of the command lines nothing to act on."""
-
-CONFIGURATION = ("-c", "--config")
-"""Options that name a configuration file, or hold settings themselves."""
-
-
-def _bounded(text: str) -> object:
-    """A value or a file of the command line's parser, read within `read_yaml`'s bounds; "a:" and "{a}" stay text."""
-    value = parse_yaml(text, "the value")
-    bare = text.strip()
-    if isinstance(value, dict) and value and all(v is None for v in value.values()) and (
-            bare == f"{next(iter(value))}:" or (bare.startswith("{") and ":" not in bare)):
-        return text
-    return value
-
-
-set_loader("yaml", _bounded, (ValueError,))
 
 AGAIN = "run the same command again"
 """How notes begin that help after a signal or where a disk was full, and not after a fault of code."""
@@ -117,33 +97,6 @@ def _leave_out_again(error: Exception) -> None:
         notes[:] = [note for note in notes if not note.startswith(AGAIN)]
 
 
-def split_configurations(args: Iterable[str]) -> list[str]:
-    """Arguments with a glued -cFILE as the two that it stands for."""
-    return [part for arg in args for part in ([arg] if arg[:2] != "-c" or arg[2:3] in ("", "=") else ["-c", arg[2:]])]
-
-
-def is_yaml(given: str) -> bool:
-    """Whether a configuration is "key: value", YAML itself, and no file whose name has a colon."""
-    return ":" in given and not os.path.isfile(given)
-
-
-def with_configurations(args: list[str], kinds: tuple[str, ...]) -> list[str]:
-    """Arguments with the place of every configuration (-c, --config) that is a shipped one by its path or its name; see
-    `phydict.runtime.shipped.configuration`, which raises ValueError for those that are nowhere."""
-    def place(given: str) -> str:
-        return given if is_yaml(given) else str(configuration(given, kinds))
-
-    args, out = split_configurations(args), []
-    for before, arg in zip(["", *args], args):
-        option, equals, value = arg.partition("=")
-        if before in CONFIGURATION:
-            arg = place(arg)
-        elif equals and option in CONFIGURATION:
-            arg = f"{option}={place(value)}"
-        out.append(arg)
-    return out
-
-
 def check_command(args: Sequence[str], commands: Mapping[str, str], anywhere: Collection[str], example: str) -> None:
     """Raises ValueError, in one sentence that names `commands`, name -> what it does, and an example, where no argument
     is one of those that may stand `anywhere`, and none asks for help."""
@@ -151,14 +104,6 @@ def check_command(args: Sequence[str], commands: Mapping[str, str], anywhere: Co
         listed = ", ".join(f"{name} ({what})" for name, what in commands.items())
         raise ValueError(f"the first word says what to do, but {repr(args[0]) if args else 'none'} was given: use one "
                          f"of {listed}; such as: {example}")
-
-
-def check_configured(args: Sequence[str], options: Collection[str], example: str) -> None:
-    """Raises ValueError where `args` hold none of the options that say what to run, and do not ask for help."""
-    options = ("-c", "--config", "-h", "--help", *options)
-    given = [arg.partition("=")[0] for arg in args]
-    if not any(arg in options or arg.startswith("-c") or arg.endswith(".help") for arg in given):
-        raise ValueError(f"no configuration file was given: add -c <file>, such as -c {example}")
 
 
 def check_writable(path: Path, option: str, file: bool = False) -> None:
@@ -204,40 +149,6 @@ def check_apart(output: Path, option: str, inputs: Iterable[Path]) -> None:
         if there.is_relative_to(here) or here.is_relative_to(there):
             how = "is" if there == here else "lies inside" if there.is_relative_to(here) else "holds"
             raise ValueError(f"the output {output} {how} the input {given}: give another {option}")
-
-
-def read_configurations(args: Sequence[str]) -> list[dict]:
-    """What the configuration files hold that a command line names, in their order; files that are not there are left
-    to the command line's own parser. Raises ValueError as `read_configuration` does."""
-    look = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    look.add_argument("--config", "-c", action="append", default=[])
-    given, _ = look.parse_known_args(list(args))
-    return [read_configuration(file) for file in given.config if os.path.isfile(file)]
-
-
-def read_configuration(file: str) -> dict:
-    """What a configuration file holds, read as `read_yaml` reads, so that what it refuses never reaches the command
-    line's own parser. Raises ValueError."""
-    settings = read_yaml(file)
-    if not isinstance(settings, dict):
-        raise ValueError(f"{file} holds no settings: it is a mapping, such as `model: {{...}}`")
-    for name in ("model", "data", "trainer"):
-        if not isinstance(settings.get(name, {}), dict):
-            raise ValueError(f"{file}: `{name}` is a mapping of settings, but {reprlib.repr(settings[name])} was given")
-    _check_classes(settings, str(file), "")
-    return settings
-
-
-def _check_classes(settings: object, file: str, key: str) -> None:
-    """Raises ValueError where a class in nested settings is not named by text, or its arguments are no mapping."""
-    if isinstance(settings, dict):
-        for name, kind, wanted in (("class_path", str, "the name of a class"), ("init_args", dict, "a mapping")):
-            if name in settings and not isinstance(settings[name], kind):
-                raise ValueError(f"{file}: `{key}{name}` is {wanted}, but {reprlib.repr(settings[name])} was given")
-        for name, value in settings.items():
-            _check_classes(value, file, f"{key}{name}.")
-    for value in settings if isinstance(settings, list) else ():
-        _check_classes(value, file, key)
 
 
 def sentence(error: Exception) -> str:

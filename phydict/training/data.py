@@ -25,7 +25,7 @@ from phydict.datasets import (
     split_by_patient,
 )
 from phydict.datasets.cts.cache import key_of
-from phydict.datasets.cts.transforms import check_header
+from phydict.datasets.cts.reading import check_header
 from phydict.datasets.phantoms.cached import HELD_OUT_PHANTOM, VALIDATION_PHANTOM, CachedPhantoms
 from phydict.datasets.population import DrawnPatients
 from phydict.datasets.population.drawn import POPULATION_VERSION

@@ -13,13 +13,10 @@ from torch.utils.data import Dataset
 
 from phydict.datasets.case import Case
 from phydict.datasets.cts.augment import Augmentation, augment
-from phydict.datasets.cts.cache import pack_case, read_arrays, unpack_case, write_arrays
+from phydict.datasets.cts.cache import TRAINING_PARTS, kept_case
 from phydict.datasets.population import DrawnPatients
 from phydict.grid import Grid
 from phydict.units import HUWindow
-
-KEYS = ("volume", "masks", "has_masks", "report")
-"""The parts of a Case that training needs."""
 
 ALL_NEW = 500
 """Draws before any is given again, so that the first steps do not see the same few."""
@@ -106,12 +103,7 @@ class KeptDraws(Dataset):
 
     def draw(self, number: int) -> dict:
         """Draw `number`, counted from the training's first."""
-        file = self.folder / f"{number:08d}.npz"
-        kept = read_arrays(file)
-        if kept is None:
-            kept = pack_case(self.drawn[number], KEYS)
-            write_arrays(file, kept)
-        return dict(unpack_case(kept))
+        return dict(kept_case(self.folder / f"{number:08d}.npz", lambda: self.drawn[number], TRAINING_PARTS))
 
     def number(self, item: int) -> int:
         """Which draw the item of this number, over all epochs, is."""
@@ -129,4 +121,4 @@ def averaged(case: Mapping, block: int) -> dict:
 
 def training_parts(case: Mapping) -> dict:
     """A Case without what training does not need."""
-    return {key: case[key] for key in KEYS if key in case}
+    return {key: case[key] for key in TRAINING_PARTS if key in case}

@@ -129,7 +129,7 @@ def test_set_takes_the_place_of_a_files_axis_base_and_product(tmp_path):
     file = write(tmp_path, products=[{"base": {"seed": 3}, "axes": {"method": ["sirt", "tv"], "views": [2, 4]}},
                                      {"axes": {"method": ["cgls"]}}])
     trials = read_specification(file, ["method=[sirt,cgls]", "views=5", "seed=[1,2]", "voxels=24"]).trials
-    assert {(t.name, t.data.beam.views, t.seed, t.scored().shape[0]) for t in trials} == {
+    assert {(t.name, t.data.beam.views, t.seed, t.voxels.scored.shape[0]) for t in trials} == {
         (name, 5, seed, 24) for name in ("sirt", "cgls") for seed in (1, 2)}
 
 

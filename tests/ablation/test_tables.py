@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from ablation.runs import ablate, row
 from phydict.ablation import plots
 from phydict.ablation.fid import FID, distance_tables, write_distances
-from phydict.ablation.run import features_file
+from phydict.ablation.results import features_file
 from phydict.ablation.summary import summarise, without_repeats
 from phydict.ablation.tables import all_tables
 from phydict.datasets.cts.ct_rate import patient_of

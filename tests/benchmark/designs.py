@@ -27,7 +27,7 @@ from torch import nn
 from torch.nn.functional import avg_pool3d
 from torch.utils.data import Dataset
 
-from phydict.datasets.cts.cache import pack_case, read_arrays, unpack_case, write_arrays
+from phydict.datasets.cts.cache import kept_case
 from phydict.evaluation import read_csv, write_csv
 from phydict.prior import Prior, VolumeUNet
 from phydict.runtime.console import quiet
@@ -127,12 +127,8 @@ class CachedDraws(Dataset):
         return len(self.draws)
 
     def __getitem__(self, i: int) -> dict:
-        file = self.folder / f"{i:04d}.npz"
-        stored = read_arrays(file)
-        if stored is None:
-            stored = pack_case(self.draws[i], ("volume", "masks", "has_masks"))
-            write_arrays(file, stored)
-        return unpack_case(stored) | {"report": ""}
+        parts = ("volume", "masks", "has_masks")
+        return kept_case(self.folder / f"{i:04d}.npz", lambda: self.draws[i], parts) | {"report": ""}
 
 
 class Draws(PriorData):

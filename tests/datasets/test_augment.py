@@ -10,7 +10,7 @@ import torch
 from ct_files import AFFINE
 
 from phydict.datasets.cts.augment import Augmentation, Deformation, augment
-from phydict.datasets.cts.transforms import prepare_ct
+from phydict.datasets.cts.ct_case import prepare_ct
 from phydict.datasets.surroundings.surroundings import Surroundings
 from phydict.grid import Grid
 from phydict.units import HUWindow

@@ -15,8 +15,10 @@ from ct_files import AFFINE, LIVER, save_ct
 from scipy.ndimage import gaussian_filter
 from torch.utils.data import DataLoader, Dataset
 
+from phydict.datasets.cts.ct_case import prepare_ct
 from phydict.datasets.cts.ct_rate import CTCases, find_cts
-from phydict.datasets.cts.transforms import Calibration, check_hu, covering_grid, load_ct, prepare_ct, to_grid
+from phydict.datasets.cts.reading import Calibration, check_hu, load_ct
+from phydict.datasets.cts.resampling import covering_grid, to_grid
 from phydict.grid import Grid
 from phydict.units import AIR, HUWindow
 

@@ -11,11 +11,12 @@ import torch
 from ct_files import AFFINE, save_ct
 from dicom_files import write_ct_series
 
+from phydict.datasets.cts.ct_case import prepare_ct
 from phydict.datasets.cts.ct_rate import CTCases, find_cts, patient_of, split_by_patient
 from phydict.datasets.cts.ct_rate_tables import read_reports
 from phydict.datasets.cts.ct_series import find_series
+from phydict.datasets.cts.reading import Calibration, load_ct
 from phydict.datasets.cts.sources import find_sources
-from phydict.datasets.cts.transforms import Calibration, load_ct, prepare_ct
 from phydict.grid import Grid
 
 GRID = Grid.cube(32)

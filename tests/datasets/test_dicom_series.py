@@ -12,8 +12,8 @@ from dicom_files import write_ct_series, write_dicom
 from phydict.datasets.cts.ct_rate import patient_of
 from phydict.datasets.cts.ct_series import find_series, load_series
 from phydict.datasets.cts.preparation import prepare_folder
+from phydict.datasets.cts.reading import load_ct
 from phydict.datasets.cts.spaces import Settings
-from phydict.datasets.cts.transforms import load_ct
 
 SMALL = Settings(voxels=32)
 

@@ -10,8 +10,8 @@ import pytest
 from ct_files import save_ct, thorax_hu
 
 from phydict.datasets.cts.ct_rate import CTCases, find_cts
+from phydict.datasets.cts.reading import load_ct
 from phydict.datasets.cts.sources import find_sources
-from phydict.datasets.cts.transforms import load_ct
 from phydict.datasets.itk_file import ENDINGS, voxel_files
 from phydict.grid import Grid
 from phydict.units import HUWindow

@@ -12,11 +12,13 @@ import pytest
 import torch
 from ct_files import AFFINE, rejected, save_ct
 
+from phydict.datasets.cts.ct_case import prepare_ct
 from phydict.datasets.cts.ct_rate import CTCases, find_cts, load_case
 from phydict.datasets.cts.preparation import prepare_folder
 from phydict.datasets.cts.prepared import RECORD, read_prepared
+from phydict.datasets.cts.reading import load_ct
+from phydict.datasets.cts.resampling import to_grid
 from phydict.datasets.cts.spaces import ATLAS_LUNGS_MM, ATLAS_MM, Settings, atlas_lungs
-from phydict.datasets.cts.transforms import load_ct, prepare_ct, to_grid
 from phydict.grid import Cube, Grid
 from phydict.training.data import PriorData
 from phydict.training.settings import HoldOut

@@ -23,9 +23,9 @@ from phydict.datasets.cts.ct_rate import CTCases, find_cts
 from phydict.datasets.cts.ct_rate_tables import read_calibrations, read_reports
 from phydict.datasets.cts.preparation import SUMMARY, prepare_folder
 from phydict.datasets.cts.prepared import RECORD
+from phydict.datasets.cts.reading import Calibration
 from phydict.datasets.cts.sources import Source
 from phydict.datasets.cts.spaces import Settings
-from phydict.datasets.cts.transforms import Calibration
 from phydict.grid import Grid
 
 SMALL = Settings(voxels=32)

@@ -206,7 +206,7 @@ def test_two_metrics_of_one_case_equal_one_metric_of_two():
 
 
 def test_missing_values_are_left_out_and_failures_are_kept():
-    metric = CaseMetrics(["a", "b", "unused"], ["psnr", "psnr_lung", "mae_hu"])
+    metric = CaseMetrics(["a", "b", "unused"])
     metric.update(0, "a", {"psnr": 10, "psnr_lung": 8})
     metric.update(1, "a", {"psnr": 20, "psnr_lung": None})
     metric.update(0, "b", {"psnr": math.nan})
@@ -235,11 +235,11 @@ def test_a_repeated_case_counts_once_and_reset_forgets():
 
 
 def test_unknown_methods_and_names_are_refused():
-    metric = CaseMetrics(["a"], ["psnr"])
+    metric = CaseMetrics(["a"])
     with pytest.raises(ValueError, match="method 'c'"):
         metric.update(0, "c", {"psnr": 1.0})
-    with pytest.raises(ValueError, match="ssim"):
-        metric.update(0, "a", {"ssim": 1.0})
+    with pytest.raises(ValueError, match="'sim'"):
+        metric.update(0, "a", {"sim": 1.0})
 
 
 VALUES = {(case, method): 20 + 3.7 * case + 0.1 * len(method) for case in range(5) for method in ("fdk", "gibbs")}

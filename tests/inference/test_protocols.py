@@ -17,8 +17,9 @@ from phydict.evaluation import read_csv
 from phydict.evaluation.published import psnr_slices, ssim_uniform
 from phydict.grid import Cube, Grid
 from phydict.inference import ReconstructionData, protocols, scoring
-from phydict.inference.protocols import PROTOCOLS, placed, resampled
+from phydict.inference.protocols import PROTOCOLS
 from phydict.inference.settings import Orbit
+from phydict.inference.voxels import Voxels, placed, resampled
 from phydict.prior import save_stage
 from phydict.units import HUWindow
 from phydict.xray import Ideal, Polychromatic
@@ -45,7 +46,7 @@ def test_distances_detectors_and_voxels_are_the_published_ones(name, distances, 
     assert np.linalg.norm(data.beam.sources[0]) == pytest.approx(distances[0])
     assert np.linalg.norm(data.beam.sources[0] - data.beam.detectors[0]) == pytest.approx(distances[1])
     assert data.beam.shape[1] * np.linalg.norm(data.beam.u[0]) == pytest.approx(detector_mm)
-    own = data.scene(Grid.cube(8), HUWindow())[0]
+    own = Voxels(Grid.cube(8), protocol=data.protocol).made
     assert (own.shape[0], own.spacing[0]) == pytest.approx(grid or (8, 48))
     assert data.simulator == Ideal(noise=0.005 if name == "phydict" else 0.0)
 

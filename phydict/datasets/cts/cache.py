@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, cast
@@ -16,6 +16,9 @@ from phydict.datasets.case import Case
 from phydict.runtime.files import atomic_write
 from phydict.runtime.reading import not_written, reason
 from phydict.runtime.warning import warn
+
+TRAINING_PARTS = ("volume", "masks", "has_masks", "report")
+"""The parts of a Case that training needs."""
 
 
 def key_of(parts: object) -> str:
@@ -54,6 +57,17 @@ def unpack_case(packed: Mapping[str, np.ndarray]) -> Case:
     parts: dict[str, Any] = {name: str(array) if array.dtype.kind == "U" else torch.from_numpy(array)
                              for name, array in packed.items()}
     return cast(Case, parts | {"volume": parts["volume"].float(), "masks": parts["masks"].float() / 255})
+
+
+def kept_case(file: Path | None, make: Callable[[], Mapping], names: Iterable[str]) -> Case:
+    """The parts `names` of a Case that a file of the cache holds, made and written to it where it does not; as they are
+    after writing also where there is no such file to be."""
+    packed = read_arrays(file) if file else None
+    if packed is None:
+        packed = pack_case(make(), names)
+        if file:
+            write_arrays(file, packed)
+    return unpack_case(packed)
 
 
 @contextmanager

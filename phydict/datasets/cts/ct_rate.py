@@ -19,10 +19,11 @@ from torch.utils.data import Dataset
 
 from phydict.datasets.case import Case
 from phydict.datasets.cts.cache import key_of, pack_case, read_arrays, unpack_case, write_arrays
+from phydict.datasets.cts.ct_case import prepare_ct
 from phydict.datasets.cts.ct_rate_tables import read_calibrations, read_reports
 from phydict.datasets.cts.prepared import VOLUME, is_prepared, read_prepared, read_record
+from phydict.datasets.cts.reading import Calibration, case_id
 from phydict.datasets.cts.segmentations import is_segmentation, mask_files
-from phydict.datasets.cts.transforms import Calibration, case_id, prepare_ct
 from phydict.datasets.itk_file import ENDINGS, voxel_files
 from phydict.datasets.natural_order import natural_order
 from phydict.datasets.nifti_file import NIFTI

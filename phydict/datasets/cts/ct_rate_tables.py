@@ -7,7 +7,7 @@ import math
 import reprlib
 from pathlib import Path
 
-from phydict.datasets.cts.transforms import Calibration, case_id
+from phydict.datasets.cts.reading import Calibration, case_id
 from phydict.datasets.reports import join_report
 from phydict.runtime.reading import Unreadable, reading, refusing
 

@@ -15,7 +15,7 @@ import numpy as np
 import pydicom
 from pydicom.errors import InvalidDicomError
 
-from phydict.datasets.cts.transforms import LEAST_SLICES, check_affine, to_ras
+from phydict.datasets.cts.reading import LEAST_SLICES, check_affine, to_ras
 from phydict.datasets.dicom import open_dicom, read_dicom, tag_numbers
 from phydict.datasets.natural_order import natural_order
 from phydict.datasets.nifti_file import NIFTI

@@ -19,11 +19,13 @@ from pathlib import Path
 import numpy as np
 
 from phydict.datasets.cts.anatomy import MASKS, body_mask, lung_box_centre, lung_box_size, segment
+from phydict.datasets.cts.ct_case import SEGMENTATION_MM
 from phydict.datasets.cts.prepared import RECORD, VOLUME, read_record, write_prepared
+from phydict.datasets.cts.reading import check_hu
+from phydict.datasets.cts.resampling import covering_grid, to_grid
 from phydict.datasets.cts.segmentations import lungs_by_lungmask, read_segmentation, segmentations_beside
 from phydict.datasets.cts.sources import Source, find_sources
 from phydict.datasets.cts.spaces import Settings
-from phydict.datasets.cts.transforms import SEGMENTATION_MM, check_hu, covering_grid, to_grid
 from phydict.grid import Grid
 from phydict.runtime.files import atomic_directory, atomic_removal, atomic_write, check_replaceable, remove_leftovers
 from phydict.runtime.progress import CaseProgress

@@ -20,7 +20,8 @@ import torch
 
 from phydict.datasets.case import Case
 from phydict.datasets.cts.anatomy import MASKS
-from phydict.datasets.cts.transforms import load_ct, moved_to, to_grid
+from phydict.datasets.cts.reading import load_ct
+from phydict.datasets.cts.resampling import moved_to, to_grid
 from phydict.grid import Grid
 from phydict.runtime.reading import read_text, reading
 from phydict.runtime.warning import warn

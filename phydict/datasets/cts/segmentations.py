@@ -20,7 +20,8 @@ import numpy as np
 
 from phydict.datasets.cts.anatomy import MASKS
 from phydict.datasets.cts.prepared import is_prepared
-from phydict.datasets.cts.transforms import case_id, load_ct, to_grid
+from phydict.datasets.cts.reading import case_id, load_ct
+from phydict.datasets.cts.resampling import to_grid
 from phydict.grid import Grid
 
 LUNGMASK, TOTALSEGMENTATOR = "_lungmask", "_totalsegmentator"

@@ -20,8 +20,8 @@ from phydict.datasets.cts.ct_rate import (
 )
 from phydict.datasets.cts.ct_rate_tables import read_reports
 from phydict.datasets.cts.ct_series import Series, find_series, load_series
+from phydict.datasets.cts.reading import case_id, load_ct
 from phydict.datasets.cts.segmentations import segmentations_beside
-from phydict.datasets.cts.transforms import case_id, load_ct
 from phydict.datasets.itk_file import ENDINGS, voxel_files
 from phydict.runtime.files import file_crc32
 from phydict.runtime.reading import reading

@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from phydict.datasets.cts.anatomy import lung_box_centre, lung_box_size
-from phydict.datasets.cts.transforms import load_ct, moved_to
+from phydict.datasets.cts.reading import load_ct
+from phydict.datasets.cts.resampling import moved_to
 from phydict.grid import Grid
 from phydict.units import AIR
 

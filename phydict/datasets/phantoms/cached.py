@@ -8,7 +8,7 @@ import torch
 from torch.utils.data import Dataset
 
 from phydict.datasets.case import Case
-from phydict.datasets.cts.cache import key_of, pack_case, read_arrays, unpack_case, write_arrays
+from phydict.datasets.cts.cache import kept_case, key_of
 from phydict.datasets.phantoms.phantom import phantom_case
 from phydict.datasets.phantoms.thorax import Thorax, report
 from phydict.grid import Grid
@@ -39,11 +39,7 @@ class CachedPhantoms(Dataset):
 
     def __getitem__(self, i: int) -> Case:
         seed = self.first_seed + i
-        file = self.folder / f"{seed:07d}.npz"
-        stored = read_arrays(file)
-        if stored is None:
-            stored = pack_case(phantom_case(seed, self.grid, self.window), ("volume", "masks"))
-            write_arrays(file, stored)
-        case = unpack_case(stored)
+        case = kept_case(self.folder / f"{seed:07d}.npz", lambda: phantom_case(seed, self.grid, self.window),
+                         ("volume", "masks"))
         return case | {"has_masks": torch.ones(len(case["masks"]), dtype=torch.bool),
                        "report": report(Thorax.draw(seed))}

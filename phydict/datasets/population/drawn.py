@@ -9,7 +9,7 @@ import torch
 from torch.utils.data import Dataset
 
 from phydict.datasets.case import Case
-from phydict.datasets.cts.cache import key_of, pack_case, read_arrays, unpack_case, write_arrays
+from phydict.datasets.cts.cache import TRAINING_PARTS, kept_case, key_of, read_arrays, write_arrays
 from phydict.datasets.cts.ct_rate import CTCases, as_one_patient, patient_of
 from phydict.datasets.population.anatomy import Variation, findings_of
 from phydict.datasets.population.population import Population
@@ -79,13 +79,9 @@ class DrawnPatients(Dataset):
     def __getitem__(self, seed: int) -> Case:
         population = self.prepare()
         file = self.drawn and self.drawn / f"{seed:07d}.npz"
-        packed = read_arrays(file) if file else None
-        if packed is None:
-            case = population.case(population.draw(seed, self.settings.variation), seed)
-            packed = pack_case(case, ("volume", "masks", "has_masks", "report"))
-            if file:
-                write_arrays(file, packed)
-        return unpack_case(packed) | {"id": f"population-{seed:06d}"}
+        case = kept_case(file, lambda: population.case(population.draw(seed, self.settings.variation), seed),
+                         TRAINING_PARTS)
+        return case | {"id": f"population-{seed:06d}"}
 
     def reports(self, most: int) -> list[str]:
         """Reports such as draws have, for learning their words; nothing is registered for them."""

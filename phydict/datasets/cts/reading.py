@@ -1,8 +1,4 @@
-"""From a CT file to a Case: reading, resampling by voxel averages, and the HU window.
-
-Resampling: every new voxel is the exact mean, over its box, of the linear interpolation between the old voxels. It is
-anti-aliased when shrinking, smooth when enlarging, and every old voxel keeps its weight, so means are preserved.
-"""
+"""A CT of a file or of arrays as HU and an affine, and what is refused or doubtful of it."""
 
 from __future__ import annotations
 
@@ -11,19 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import scipy
 import torch
 
-from phydict.datasets.case import Case
-from phydict.datasets.cts.anatomy import lung_box_centre, segment
 from phydict.datasets.itk_file import ENDINGS, open_itk, read_itk
 from phydict.datasets.nifti_file import NIFTI, open_nifti
-from phydict.grid import Grid, index_to_mm
+from phydict.grid import index_to_mm
 from phydict.runtime.reading import name_of, reading
 from phydict.runtime.warning import warn
-from phydict.units import AIR, HUWindow
+from phydict.units import AIR
 
-SEGMENTATION_MM = 2.0
 PADDING = AIR - 100
 """HU from which downwards voxels are no noisy air, but padding outside the scanner's circular field."""
 SMALLEST_VOXEL, LARGEST_VOXEL, FURTHEST = 0.02, 100.0, 1e6
@@ -182,6 +174,20 @@ def _check_finite(name: str | Path, hu: np.ndarray) -> None:
         raise ValueError(f"{name} holds {bad} NaN or infinite voxels; replace them, by -1000 HU where there is no data")
 
 
+def given_ct(ct: tuple, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """HU (X, Y, Z) float32 and the 4x4 affine of arrays or tensors. Raises ValueError as `load_ct` does of a file."""
+    if [np.ndim(part) for part in ct] != [3, 2]:
+        raise ValueError("a CT is a file, or HU (X, Y, Z) and the 4x4 affine that says where they are")
+    hu, affine = (np.asarray(part.detach().cpu().double() if isinstance(part, torch.Tensor) else part) for part in ct)
+    if hu.dtype.kind not in "iuf":
+        raise ValueError(f"{name} holds voxels of type {hu.dtype}; give integers or floating-point numbers")
+    _check_shape(name, hu.shape)
+    affine = index_to_mm(f"the affine of {name}", affine)
+    check_affine(name, affine, "give an affine that leads from voxel indices to mm")
+    _check_finite(name, hu)
+    return hu.astype(np.float32, copy=False), affine
+
+
 def check_hu(hu: np.ndarray, name: str) -> None:
     """Warn where air is not near -1000 or hardly any tissue is left: the numbers are then hardly HU.
 
@@ -208,76 +214,6 @@ def check_hu(hu: np.ndarray, name: str) -> None:
              "been rescaled twice, check whether `fixed` (data.source.fixed) is right")
 
 
-def to_grid(volume: np.ndarray, affine: np.ndarray, grid: Grid, pad: float) -> np.ndarray:
-    """Resample a volume (X, Y, Z) with its 4x4 affine onto `grid` by voxel averages; `pad` lies outside.
-
-    Where the axes are parallel the averages are exact. Otherwise the volume is averaged along its own axes to half
-    the grid's spacing, interpolated linearly at eight points per new voxel, and those are averaged.
-    """
-    relative = np.linalg.inv(affine) @ grid.affine
-    scale = np.diag(relative)[:3]
-    slant = (np.abs(relative[:3, :3] - np.diag(scale)) @ np.asarray(grid.shape)).max()
-    if slant < 0.1:
-        return _average(volume, relative[:3, 3], scale, grid.shape, pad)
-    spacing = np.linalg.norm(affine[:3, :3], axis=0)
-    step = np.maximum(1.0, min(grid.spacing) / 2 / spacing)
-    shape = np.ceil(np.asarray(volume.shape) / step).astype(int) + 1
-    first = (np.asarray(volume.shape) - 1) / 2 - step * (shape - 1) / 2
-    volume = _average(volume, first, step, shape, pad)
-    half = np.eye(4)
-    half[:3, :3] /= 2
-    half[:3, 3] = -0.25
-    fine = relative @ half
-    fine[:3] /= step[:, None]
-    fine[:3, 3] -= first / step
-    fine = scipy.ndimage.affine_transform(volume, fine[:3, :3], fine[:3, 3], tuple(2 * n for n in grid.shape), order=1,
-                                          mode="constant", cval=pad)
-    x, y, z = grid.shape
-    return fine.reshape(x, 2, y, 2, z, 2).mean((1, 3, 5))
-
-
-def _average(volume, first, step, shape, pad: float) -> np.ndarray:
-    """Means over boxes of `step` old voxels, the first centred at the old index `first`, along the volume's axes."""
-    weights = [_weights(n, f, s, m) for n, f, s, m in zip(volume.shape, first, step, shape)]
-    inside = np.einsum("i,j,k->ijk", *(w.sum(1) for w in weights))
-    x, y, z = weights
-    volume = np.asarray(volume, np.float32)
-    volume = (volume.reshape(-1, volume.shape[2]) @ z.T).reshape(*volume.shape[:2], -1)
-    volume = y @ volume
-    volume = (x @ volume.reshape(volume.shape[0], -1)).reshape(inside.shape)
-    return volume + np.float32(pad) * (1 - inside)
-
-
-def _weights(old: int, first: float, step: float, new: int) -> np.ndarray:
-    """(new, old): the integral of each old voxel's hat function over each new voxel, over the new voxel's width."""
-    centre = first + step * np.arange(new)[:, None] - np.arange(old)
-    width = abs(step)
-
-    def integral(u):
-        u = u.clip(-1, 1)
-        return 0.5 + u - np.sign(u) * u**2 / 2
-
-    return ((integral(centre + width / 2) - integral(centre - width / 2)) / width).astype(np.float32)
-
-
-def covering_grid(shape, affine: np.ndarray, spacing: float) -> Grid:
-    """The grid along the world's axes with `spacing` mm that covers a volume of `shape` with its 4x4 affine."""
-    ends = np.stack(np.meshgrid(*[(-0.5, n - 0.5) for n in shape], indexing="ij"), -1).reshape(-1, 3)
-    corners = ends @ affine[:3, :3].T + affine[:3, 3]
-    low, high = corners.min(0), corners.max(0)
-    voxels = np.maximum(1, np.ceil((high - low) / spacing - 1e-6).astype(int))
-    cover = np.diag([spacing, spacing, spacing, 1.0])
-    cover[:3, 3] = (low + high) / 2 - spacing * (voxels - 1) / 2
-    return Grid(tuple(voxels), affine=cover)
-
-
-def moved_to(grid: Grid, centre: np.ndarray) -> Grid:
-    """`grid` moved so that its centre lies at the world position `centre` (3,) in mm."""
-    affine = grid.affine.copy()
-    affine[:3, 3] += centre - grid.centre
-    return Grid(grid.shape, affine=affine)
-
-
 def case_id(path: str | Path) -> str:
     """A file's name without .nii, .nii.gz or one of the ENDINGS of MetaImage and NRRD."""
     name = name_of(path)
@@ -285,48 +221,3 @@ def case_id(path: str | Path) -> str:
         if name.lower().endswith(ending):
             return name[: -len(ending)]
     return name
-
-
-def _given_ct(ct: tuple, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """HU (X, Y, Z) float32 and the 4x4 affine of arrays or tensors. Raises ValueError as `load_ct` does of a file."""
-    if [np.ndim(part) for part in ct] != [3, 2]:
-        raise ValueError("a CT is a file, or HU (X, Y, Z) and the 4x4 affine that says where they are")
-    hu, affine = (np.asarray(part.detach().cpu().double() if isinstance(part, torch.Tensor) else part) for part in ct)
-    if hu.dtype.kind not in "iuf":
-        raise ValueError(f"{name} holds voxels of type {hu.dtype}; give integers or floating-point numbers")
-    _check_shape(name, hu.shape)
-    affine = index_to_mm(f"the affine of {name}", affine)
-    check_affine(name, affine, "give an affine that leads from voxel indices to mm")
-    _check_finite(name, hu)
-    return hu.astype(np.float32, copy=False), affine
-
-
-def prepare_ct(ct: str | Path | tuple[np.ndarray, np.ndarray], grid: Grid = Grid.cube(64),
-               window: HUWindow = HUWindow(), report: str = "", id: str | None = None,
-               calibration: Calibration | None = None) -> Case:
-    """A Case from a CT file, or from (hu, affine): the grid's box centred on the lungs, -1000 HU outside the scan.
-
-    Returns {"id", "volume" (1,X,Y,Z) in [-1,1], "masks" (3,X,Y,Z) in [0,1] for lung, airway, vessel, "has_masks" (3,),
-    "report", "affine" (4,4) float64: the voxels' place in the CT's own world, "centred_on": "lungs" or "volume"}.
-    Without lungs the box is centred on the scan, with a warning. Raises what `load_ct` raises.
-    """
-    name = id or ("the CT" if isinstance(ct, tuple) else case_id(ct))
-    hu, affine = _given_ct(ct, name) if isinstance(ct, tuple) else load_ct(ct, calibration)
-    check_hu(hu, name)
-    hu = hu.clip(AIR)
-    work = covering_grid(hu.shape, affine, SEGMENTATION_MM)
-    masks, known = segment(to_grid(hu, affine, work, AIR), work.spacing)
-    if known[0]:
-        centre = lung_box_centre(masks[0], work.affine)
-    else:
-        centre = affine[:3, :3] @ ((np.asarray(hu.shape) - 1) / 2) + affine[:3, 3]
-        size = " x ".join(f"{length:.0f}" for length in np.linalg.norm(affine[:3, :3], axis=0) * hu.shape)
-        warn(f"no lungs were found in {name}, a scan of {size} mm; its volume is centred on the scan and its masks are "
-             "unknown; it may be no chest, or its numbers no HU")
-    target = moved_to(grid, centre)
-    volume = window.to_range(to_grid(hu, affine, target, AIR))
-    masks = np.stack([to_grid(m, work.affine, target, 0.0) for m in masks]).clip(0, 1)
-    return {"id": name, "volume": torch.from_numpy(volume.astype(np.float32))[None],
-            "masks": torch.from_numpy(masks.astype(np.float32)), "has_masks": torch.from_numpy(known),
-            "report": report, "affine": torch.from_numpy(target.affine.copy()),
-            "centred_on": "lungs" if known[0] else "volume"}

@@ -57,13 +57,22 @@ def test_volumes_of_another_program_are_scored_on_the_x_rays_that_it_was_given(t
         runpy.run_path(simulated[1], run_name="__main__")
     infer([*predicted[2:], "--trainer.accelerator=cpu"])
     infer([*compared[2:], "--out", str(tmp_path / "out"), "--device", "cpu", "--set", "method=[elsewhere,sirt]",
-           f"elsewhere.method.folder={tmp_path / 'elsewhere' / 'sirt'}", "method.iterations=2"])
+           "--set", f"elsewhere.method.folder={tmp_path / 'elsewhere' / 'sirt'}", "method.iterations=2"])
     rows = read_csv(tmp_path / "out" / "results.csv")
     for case in {row["case"] for row in rows}:
         elsewhere, here = (next(row for row in rows if (row["case"], row["method"]) == (case, method))
                            for method in ("elsewhere", "sirt"))
         assert elsewhere["psnr"] == pytest.approx(here["psnr"], abs=1e-3)
         assert elsewhere["misfit"] == pytest.approx(here["misfit"], rel=1e-3)
+
+
+def test_what_no_x_rays_can_be_made_of_for_another_program_is_one_sentence(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["simulate.py", str(EXAMPLE / "truth.nii.gz"), str(tmp_path / "out"), "--views=0"])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(VOLUMES / "simulate.py"), run_name="__main__")
+    said = capsys.readouterr().err
+    assert ended.value.code == 2 and said.startswith("error: ") and said.count("\n") == 1 and "views" in said
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_geometries_are_those_that_the_readmes_speak_of():

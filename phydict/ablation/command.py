@@ -108,7 +108,7 @@ def _parser(args: Sequence[str]) -> ArgumentParser:
     parser.add_argument("--reports", type=str, help="CT-RATE's table of reports, or the folder it is in")
     for name, hint in get_type_hints(CTSource).items():
         parser.add_argument(f"--source.{name}", type=hint | None, help="as --data.source of test")
-    parser.add_argument("--set", nargs="+", metavar="NAME=VALUE",
+    parser.add_argument("--set", nargs="+", action="extend", metavar="NAME=VALUE",
                         help="settings instead of the file's; a list is an axis: --set "
                              "method=[sirt,my_module.MySampler] views=4 projector=siddon; of one of the file's changed "
                              "methods as --set X2CT.method.file=x2ct.safetensors")

@@ -11,6 +11,7 @@ from torch import Tensor
 from phydict.prior.finite import check_finite
 from phydict.prior.medsyn.checkpoint import FILES, STAGES, MedSynWeights, default_kind, files_in, listed, read_tensors
 from phydict.prior.medsyn.networks import TextUNet
+from phydict.prior.stage_file import STAGES as KINDS
 from phydict.prior.stage_file import header_of
 from phydict.prior.tensors import read_torch
 from phydict.runtime.reading import reason, refusing
@@ -64,8 +65,10 @@ def _inspect_file(file: Path) -> dict[str, str]:
 
 def _inspect_phydict(header: dict, entries: dict[str, Tensor], finished: bool) -> dict[str, str]:
     text = header.get("text") or {}
-    return {"kind": "phydict prior" if finished else "phydict training checkpoint (train.py export makes it a prior)",
-            "stage": str(header.get("stage", "base")),
+    stage = str(header.get("stage", "base"))
+    kind = KINDS.get(stage, "stage of another version").removeprefix("a ")
+    return {"kind": "phydict " + (kind if finished else f"training checkpoint of a {kind} (train.py export it)"),
+            "stage": stage,
             "grid": " x ".join(map(str, header.get("grid", {}).get("shape", "?"))),
             "HU window": " to ".join(f"{hu:g}" for hu in header.get("hu_window", ())),
             "text": text.get("source") or ("its own" if text else "none"),

@@ -38,8 +38,9 @@ def read_beam(path: str | Path, shape: tuple[int, int] | None = None,
     """The beam of a geometry file of any of the module's kinds, chosen by its ending.
 
     shape: (V, U) pixels, needed but for YAML. pixel: (row height, column width) in mm, needed for RTK's XML and
-    projection matrices.
-    Raises FileNotFoundError, and ValueError naming the file for other endings, missing shape or pixel and bad content.
+    projection matrices, stated by the other kinds themselves.
+    Raises FileNotFoundError, and ValueError naming the file for other endings, a missing shape, a pixel that is missing
+    or not the file's own, and bad content.
     """
     path = Path(path)
     ending = _ending(path)
@@ -61,7 +62,13 @@ def read_beam(path: str | Path, shape: tuple[int, int] | None = None,
                          "detector centre, u and v; or (views, 3, 4), projection matrices")
     with _of(path):
         sources, detectors, u, v = np.split(vectors, 4, axis=1)
-        return ConeBeam(sources, detectors, u, v, shape)
+        beam = ConeBeam(sources, detectors, u, v, shape)
+        if pixel is not None and not np.allclose([np.linalg.norm(v, axis=1).T, np.linalg.norm(u, axis=1).T],
+                                                 np.broadcast_to(pixel, 2)[:, None], rtol=1e-3):
+            sides = np.linalg.norm([v[0], u[0]], axis=1).round(4).tolist()
+            raise ValueError(f"its v and u state pixels of {sides} mm, but `pixel` {pixel} was given as well; leave it "
+                             "out")
+        return beam
 
 
 def _stated(path: Path, pixel: float | tuple[float, float] | None) -> float | tuple[float, float]:

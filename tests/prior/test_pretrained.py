@@ -287,7 +287,7 @@ def test_inspecting_tells_medsyns_stages_apart(results, tmp_path):
 def test_inspecting_tells_phydicts_own_files(tmp_path):
     save_prior(tiny_prior(), tmp_path / "tiny.safetensors", {"steps": 12})
     (told,) = inspect_prior(tmp_path / "tiny.safetensors").values()
-    assert told["kind"] == "phydict prior" and told["grid"] == "16 x 16 x 16" and told["text"] == "its own"
+    assert told["kind"] == "phydict base prior" and told["grid"] == "16 x 16 x 16" and told["text"] == "its own"
     assert json.loads(told["training"]) == {"steps": 12}
     assert int(told["parameters"].replace(",", "")) == sum(w.numel() for w in tiny_prior().parameters())
 
@@ -309,7 +309,7 @@ def test_the_command_line_takes_medsyns_folder_and_its_switches(switch, results,
         trainer_defaults={"logger": False, "accelerator": "cpu", "devices": 1, "enable_progress_bar": False,
                           "enable_checkpointing": False, "enable_model_summary": False},
         args=["--config=mine.yaml"]).model
-    assert model.prior.network.upsample_first is switch and model.grid.extent == pytest.approx([316, 316, 292])
+    assert model.prior.network.upsample_first is switch and model.voxels.result.extent == pytest.approx([316, 316, 292])
     expected = dict(results[1 if switch else 2].state_dict())
     assert all(torch.equal(weight, expected[name]) for name, weight in model.prior.network.state_dict().items())
     assert model.settings["prior_crc32"] == fingerprint(

@@ -239,3 +239,10 @@ def test_what_a_file_does_not_say_must_be_stated(tmp_path):
         read_beam(tmp_path / "beam.xml", SHAPE)
     with pytest.raises(FileNotFoundError, match="no geometry file .*absent.csv"):
         read_beam(tmp_path / "absent.csv", SHAPE)
+
+
+def test_pixels_that_are_not_those_of_a_files_own_vectors_are_refused(tmp_path):
+    write_beam(tmp_path / "beam.npy", orbit())
+    assert read_beam(tmp_path / "beam.npy", SHAPE, PIXEL).same_as(orbit())
+    with pytest.raises(ValueError, match=r"beam.npy: its v and u state pixels of \[.*\] mm, but `pixel` 7.5 was given"):
+        read_beam(tmp_path / "beam.npy", SHAPE, 7.5)

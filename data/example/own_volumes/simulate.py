@@ -21,9 +21,9 @@ if __name__ == "__main__":
     for name, number in (("views", 8), ("voxels", 64), ("seed", 0), ("phantoms", 4)):
         parser.add_argument(f"--{name}", type=int, default=number)
     given = parser.parse_args()
-    grid, window = Grid.cube(given.voxels), HUWindow()
-    data = ReconstructionData(cts=given.cts, orbit=Orbit(views=given.views), phantoms=given.phantoms)
     with cli_errors():
+        grid, window = Grid.cube(given.voxels), HUWindow()
+        data = ReconstructionData(cts=given.cts, orbit=Orbit(views=given.views), phantoms=given.phantoms)
         for case, _, made in data.test_cases(grid, window):
             xrays = data.simulate(made(), case_seed(given.seed, case), grid, window, torch.device("cpu"))
             save_xrays(given.out / case, xrays, data.beam)

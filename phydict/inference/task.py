@@ -225,7 +225,7 @@ class ReconstructionTask(lightning.LightningModule):
                 work(case)
             if profile:
                 print(f"{case['id']}: {self.method_name}", profile.table(), sep="\n")
-        except (ValueError, FloatingPointError) as error:
+        except (ValueError, FloatingPointError, FileNotFoundError) as error:
             if os.environ.get(TRACEBACK):
                 raise
             if len(self.cases) == 1:

@@ -22,7 +22,9 @@ from inference.runs import FILES, ORBIT, contents, names, phantoms, record, sirt
 from phydict.baselines import SIRT
 from phydict.cli.infer import main
 from phydict.datasets import load_xrays
+from phydict.grid import Grid
 from phydict.methods import reconstruct
+from phydict.reconstruction import save_nifti
 from phydict.xray import ConeBeam
 
 
@@ -252,6 +254,18 @@ def test_one_bad_case_spoils_no_other(measured, tmp_path, capsys):
     assert stopped.value.code == 2 and len(said) == 2
     assert said[0].startswith("error: anna: ") and "1 of 2 cases were not reconstructed (anna)" in said[1]
     assert names(tmp_path / "out" / "sirt") == ["bert"] and names(tmp_path / "out" / "sirt" / "bert") == FILES
+
+
+def test_a_case_without_a_volume_of_another_program_spoils_no_other(measured, tmp_path, capsys):
+    (tmp_path / "elsewhere" / "bert").mkdir(parents=True)
+    save_nifti(tmp_path / "elsewhere" / "bert" / "volume.nii.gz", np.full((8, 8, 8), -1000), Grid.cube(8))
+    with pytest.raises(SystemExit) as stopped:
+        main(["predict", f"--data.xrays={measured}", "--model.method=phydict.baselines.Stored", "--model.grid=8",
+              f"--model.method.init_args.folder={tmp_path / 'elsewhere'}", f"--model.out={tmp_path / 'out'}"])
+    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+    assert stopped.value.code == 2 and said[0].startswith("error: anna: there is no volume of anna in ")
+    assert "1 of 2 cases were not reconstructed (anna)" in said[1]
+    assert names(tmp_path / "out" / "Stored") == ["bert"] and (tmp_path / "out" / "index.html").is_file()
 
 
 def test_a_case_that_memory_gives_out_for_spoils_no_other(measured, tmp_path, capsys, monkeypatch):

@@ -67,7 +67,8 @@ def _inspect_phydict(header: dict, entries: dict[str, Tensor], finished: bool) -
     text = header.get("text") or {}
     stage = str(header.get("stage", "base"))
     kind = KINDS.get(stage, "stage of another version").removeprefix("a ")
-    return {"kind": "phydict " + (kind if finished else f"training checkpoint of a {kind} (train.py export it)"),
+    checkpoint = f"training checkpoint of a {kind} (train.py export makes its file)"
+    return {"kind": f"phydict {kind if finished else checkpoint}",
             "stage": stage,
             "grid": " x ".join(map(str, header.get("grid", {}).get("shape", "?"))),
             "HU window": " to ".join(f"{hu:g}" for hu in header.get("hu_window", ())),

@@ -27,6 +27,7 @@ from phydict.runtime.warning import warn
 from phydict.xray.geometry import ConeBeam
 from phydict.xray.projection_matrices import beam_of_matrices
 from phydict.xray.rtk import check_beam, read_rtk, write_rtk
+from phydict.xray.stated import pixel_sizes
 
 VECTORS = ("source", "detector", "u", "v")
 COLUMNS = tuple(f"{vector}_{axis}" for vector in VECTORS for axis in "xyz")
@@ -63,11 +64,10 @@ def read_beam(path: str | Path, shape: tuple[int, int] | None = None,
     with _of(path):
         sources, detectors, u, v = np.split(vectors, 4, axis=1)
         beam = ConeBeam(sources, detectors, u, v, shape)
-        if pixel is not None and not np.allclose([np.linalg.norm(v, axis=1).T, np.linalg.norm(u, axis=1).T],
-                                                 np.broadcast_to(pixel, 2)[:, None], rtol=1e-3):
-            sides = np.linalg.norm([v[0], u[0]], axis=1).round(4).tolist()
-            raise ValueError(f"its v and u state pixels of {sides} mm, but `pixel` {pixel} was given as well; leave it "
-                             "out")
+        own = np.stack([np.linalg.norm(v, axis=1), np.linalg.norm(u, axis=1)], 1)
+        if pixel is not None and (apart := ~np.isclose(own, pixel_sizes(pixel), rtol=1e-3).all(1)).any():
+            raise ValueError(f"its v and u state pixels of {own[apart][0].round(4).tolist()} mm, but `pixel` {pixel} "
+                             "was given as well; leave it out")
         return beam
 
 

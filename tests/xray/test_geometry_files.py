@@ -246,3 +246,6 @@ def test_pixels_that_are_not_those_of_a_files_own_vectors_are_refused(tmp_path):
     assert read_beam(tmp_path / "beam.npy", SHAPE, PIXEL).same_as(orbit())
     with pytest.raises(ValueError, match=r"beam.npy: its v and u state pixels of \[.*\] mm, but `pixel` 7.5 was given"):
         read_beam(tmp_path / "beam.npy", SHAPE, 7.5)
+    for wrong in ("small", (1.0, 2.0, 3.0), -1.0):
+        with pytest.raises(ValueError, match="beam.npy: pixel must be .row height, column width."):
+            read_beam(tmp_path / "beam.npy", SHAPE, wrong)

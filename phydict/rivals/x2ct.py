@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import interpolate
+from torch.nn.functional import conv2d, interpolate
 
 from phydict.grid import Grid
 from phydict.prior.convolution import channels_last, speed_up
 from phydict.prior.unet import check_sizes
 from phydict.rivals.network import Geometry, RivalNetwork
-from phydict.rivals.planes import on_planes, plane_places, turned, turns
+from phydict.rivals.planes import on_planes, plane_places, turned, turned_mean, turns
 from phydict.xray import ConeBeam
 
 BOTTOM = 4
@@ -62,8 +62,15 @@ class ConnectionB(nn.Module):
         self.flat, self.deep = nn.Conv2d(channels, out, 1), nn.Conv3d(out, out, 3, padding=1)
 
     def forward(self, h: Tensor) -> Tensor:
-        flat = self.flat(h).relu()
-        return _normal(self.deep(flat[:, :, None].expand(-1, -1, flat.shape[-1], -1, -1)))
+        flat, depth, weight = self.flat(h).relu(), h.shape[-1], self.deep.weight
+        # What is repeated is the same at all depths but the first and the last, which see the padding.
+        slices = torch.stack([conv2d(flat, weight[:, :, taps].sum(2), self.deep.bias, padding=1)
+                              for taps in (slice(1, 3), slice(3), slice(2))], 2).float()
+        repeats = slices.new_tensor([1, depth - 2, 1])[:, None, None] / depth / flat[0, 0].numel()
+        slices = slices - (repeats * slices).sum((2, 3, 4), keepdim=True)
+        slices = (slices * ((repeats * slices**2).sum((2, 3, 4), keepdim=True) + 1e-5).rsqrt()).relu().to(flat)
+        first, inner, last = slices.split(1, 2)
+        return torch.cat([first, inner.expand(-1, -1, depth - 2, -1, -1), last], 2)
 
 
 class Join(nn.Module):
@@ -151,10 +158,10 @@ class X2CTNetwork(RivalNetwork):
         for stage in self.stages:
             maps.append(stage(_normal(maps[-1])))
         view = self.a(maps[-1])
-        main = turned(view.unflatten(0, cases), theta).mean(1)
+        main = turned_mean(view.unflatten(0, cases), theta)
         for n in range(len(maps) - 1, -1, -1):
             view = self.branch[n](view, self.b[n](maps[n]))
-            main = self.main[n](main, turned(view.unflatten(0, cases), theta).mean(1))
+            main = self.main[n](main, turned_mean(view.unflatten(0, cases), theta))
         return 2 * self.leave(main).relu() - 1
 
 

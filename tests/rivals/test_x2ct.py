@@ -3,14 +3,15 @@
 import numpy as np
 import pytest
 import torch
-from torch.nn.functional import mse_loss
+from torch.nn.functional import instance_norm, mse_loss
 
 from phydict.grid import Cube, Grid
 from phydict.methods import reconstruct
 from phydict.prior import save_stage
 from phydict.rivals import Rival, RivalAnswer, X2CTNetwork, load_rival
-from phydict.rivals.planes import on_planes, plane_places, turned, turns
+from phydict.rivals.planes import on_planes, plane_places, turned, turned_mean, turns
 from phydict.rivals.rival import bound_orbit
+from phydict.rivals.x2ct import ConnectionB
 from phydict.runtime.shipped import configuration
 from phydict.training.rivals import OrbitScenes
 from phydict.training.x2ct import Adversary, X2CTTraining
@@ -36,9 +37,41 @@ def test_views_at_right_angles_are_turned_by_permuting_axes():
     torch.testing.assert_close(second, volumes[0, 1].permute(0, 1, 3, 2).flip(3), atol=1e-5, rtol=0)
 
 
-def test_places_are_not_rounded_to_the_networks_precision():
+def in_three_dimensions(theta):
+    whole = theta.new_zeros(len(theta), 3, 4)
+    whole[:, 1, 0], whole[:, ::2, 1:3] = -1, theta
+    return whole
+
+
+def test_upright_views_turned_by_slices_are_those_turned_in_three_dimensions():
+    volumes = torch.randn(2, 5, 3, *GRID.shape, generator=torch.Generator().manual_seed(0), requires_grad=True)
+    theta = turns(GRID, bound_orbit(GRID, 5), volumes)
+    slices, whole = turned(volumes, theta), turned(volumes, in_three_dimensions(theta))
+    assert theta.shape == (5, 2, 2)
+    torch.testing.assert_close(slices, whole, atol=1e-4, rtol=0)
+    torch.testing.assert_close(turned_mean(volumes, theta), whole.mean(1), atol=1e-4, rtol=0)
+    weights = torch.randn_like(slices)
+    one, other = (torch.autograd.grad(turn, volumes, weights)[0] for turn in (slices, whole))
+    torch.testing.assert_close(one, other, atol=1e-4, rtol=0)
+
+
+def test_maps_of_a_view_repeated_along_its_depth_are_convolved_as_any_volume():
+    torch.manual_seed(0)
+    connection, h = ConnectionB(6, 5), torch.randn(2, 6, 8, 8, requires_grad=True)
+    repeated = connection.flat(h).relu()[:, :, None].expand(-1, -1, 8, -1, -1)
+    whole, short = instance_norm(connection.deep(repeated)).relu(), connection(h)
+    torch.testing.assert_close(short, whole, atol=1e-5, rtol=0)
+    weights, learnt = torch.randn_like(whole), [h, *connection.parameters()]
+    # The bias goes with the mean: its gradient is 0 but for rounding.
+    for one, other in zip(torch.autograd.grad(short, learnt, weights), torch.autograd.grad(whole, learnt, weights)):
+        torch.testing.assert_close(one, other, atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("upright", [True, False])
+def test_places_are_not_rounded_to_the_networks_precision(upright):
     volumes = torch.randn(1, 3, 2, *GRID.shape, generator=torch.Generator().manual_seed(0))
     theta = turns(GRID, bound_orbit(GRID, 3), volumes)
+    theta = theta if upright else in_three_dimensions(theta)
     plain = turned(volumes, theta)
     with torch.autocast("cpu", torch.bfloat16):
         torch.testing.assert_close(turned(volumes, theta), plain, atol=1e-5, rtol=0)

@@ -26,7 +26,8 @@ class RivalTraining(StageTraining):
     """Learns a rival from CTs and X-rays of drawn scenes.
 
     made: the rival to train; scenes: its X-rays; views: numbers of X-rays from which validation reconstructs; initial:
-    a rival's file to continue from, one that is not bound to a geometry also of another grid; seed: of scenes, noise
+    a rival's file to continue from, one that is not bound to a geometry also of another grid, one that is also of
+    another geometry, whose weights then learn this one; seed: of scenes, noise
     and whatever else is drawn; given: whether made's network was requested, which that in `initial` must then equal.
     """
 
@@ -36,7 +37,7 @@ class RivalTraining(StageTraining):
                  initial: str | None, seed: int, given: bool):
         rival = made if initial is None else load_rival(initial)
         before = rival.budget
-        bound = ("grid", "beam") if made.network.bound else ()
+        bound = ("grid",) if made.network.bound else ()
         for part in ("stage", "hu_window", *bound):
             if rival.describe()[part] != made.describe()[part]:
                 raise ValueError(f"the rival {initial} and this training differ in '{part}': give another "

@@ -15,6 +15,7 @@ from phydict.evaluation import read_csv
 from phydict.grid import Cube, Grid
 from phydict.prior import save_stage
 from phydict.rivals import LiftedNetwork, X2CTNetwork, XrayToCTPANetwork, load_rival
+from phydict.rivals.rival import bound_orbit
 from phydict.training.rivals import LiftedTraining, OrbitScenes
 from phydict.training.x2ct import Adversary, X2CTTraining
 from phydict.training.xray2ctpa import XrayToCTPATraining
@@ -99,17 +100,21 @@ def test_validation_takes_the_x_rays_that_a_bound_rival_holds_for(monkeypatch):
     assert found["val/psnr"] == found["val/psnr_2"] > 5
 
 
-def test_what_is_bound_to_no_geometry_goes_on_with_other_voxels_and_what_is_bound_does_not(tmp_path):
+def test_what_is_bound_to_a_geometry_goes_on_with_another_and_what_is_not_with_other_voxels(tmp_path):
     file = tmp_path / "rival.safetensors"
     save_stage(tiny_lifted(), file, dtype=torch.float32)
     going = LiftedTraining(cube=Cube(32), window=(-1000, 600), initial=str(file)).prior
     assert going.grid.same_as(Grid.cube(32))
     for name, weight in tiny_lifted().state_dict().items():
         assert torch.equal(weight, going.state_dict()[name])
-    save_stage(tiny_x2ct(), file)
-    with pytest.raises(ValueError, match="differ in 'beam'"):
-        X2CTTraining(X2CTNetwork(8, 4, (2, 2), (4, 8, 8)), OrbitScenes(views=3), Cube(16), (-1000, 600),
-                     initial=str(file))
+    save_stage(tiny_x2ct(), file, dtype=torch.float32)
+    network, settings = X2CTNetwork(8, 4, (2, 2), (4, 8, 8)), {"window": (-1000, 600), "initial": str(file)}
+    going = X2CTTraining(network, OrbitScenes(views=3), Cube(16), **settings).prior
+    assert going.beam.same_as(bound_orbit(GRID, 3))
+    for name, weight in tiny_x2ct().state_dict().items():
+        assert torch.equal(weight, going.state_dict()[name])
+    with pytest.raises(ValueError, match="differ in 'grid'"):
+        X2CTTraining(network, OrbitScenes(views=2), Cube(16, 300.0), **settings)
 
 
 @pytest.mark.parametrize("name, made, other, sentence", [

@@ -121,9 +121,6 @@ def test_another_number_of_views_geometry_or_grid_is_refused(tmp_path):
         X2CTNetwork(blocks=(2, 2))
     with pytest.raises(ValueError, match="adversary.width"):
         Adversary(width=0)
-    with pytest.raises(ValueError, match="differ in 'beam'"):
-        X2CTTraining(X2CTNetwork(8, 4, (2, 2), (4, 8, 8)), OrbitScenes(views=3), Cube(16), (-1000, 600),
-                     initial=str(tmp_path / "x2ct.safetensors"))
 
 
 def test_the_discriminator_learns_from_its_own_loss_alone_and_the_generator_from_the_others():

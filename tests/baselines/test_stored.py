@@ -49,6 +49,14 @@ def test_a_volume_that_is_turned_lies_where_its_affine_says(truth, tmp_path):
     torch.testing.assert_close(found.volume, truth, atol=1e-3, rtol=0)
 
 
+@pytest.mark.parametrize("own", [Grid.box((64, 64, 40), (384, 384, 240)), Grid.box((64, 64, 12), 384.0)])
+def test_finer_voxels_are_averaged_also_where_they_end_before_the_others_do_or_are_longer_along_one_axis(tmp_path, own):
+    save_nifti(tmp_path / "a.nii.gz", np.random.default_rng(0).normal(0, 200, own.shape), own)
+    found = Stored(str(tmp_path), case="a").reconstruct(torch.rand(3, 24, 24), Projector(GRID, BEAM))
+    assert found.volume[2:-2, 2:-2, 5:-5].std() < 200 / 16**0.5 + 5  # the mean of 16 voxels or more
+    assert own.extent[2] == 384 or (found.volume[..., :2] == -1000).all()
+
+
 def test_methods_that_use_another_pass_the_case_on(tmp_path):
     assert Extended(Stored(str(tmp_path)), GRID, GRID, (0, 0, 0)).of_case("a").base.case == "a"
 

@@ -72,7 +72,7 @@ class Stored(Baseline):
         raise FileNotFoundError(f"there is no volume of {self.case} in {self.folder}: name it {places[0].name}, or "
                                 f"{self.case}/volume.nii.gz")
 
-    def solve(self, A: CountingProjector, y: Tensor, on_step: Callable[[], None]) -> Tensor:
+    def expected(self, A: CountingProjector) -> Tensor:
         hu, affine = load_ct(self.file)
         own, volume = Grid(hu.shape, affine=affine), torch.from_numpy(hu)
         if along(own, A.grid) and no_finer(A.grid, own):
@@ -81,5 +81,9 @@ class Stored(Baseline):
             volume = interpolated(volume, own, A.grid, AIR)
         else:
             volume = torch.from_numpy(to_grid(hu, affine, A.grid, AIR))
+        return hu_to_mu(volume, 1.0)[None, None]
+
+    def solve(self, A: CountingProjector, y: Tensor, on_step: Callable[[], None]) -> Tensor:
+        density = self.expected(A).to(y)
         on_step()
-        return hu_to_mu(volume, 1.0).to(y)[None, None]
+        return density

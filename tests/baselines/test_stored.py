@@ -40,6 +40,13 @@ def test_a_volume_is_the_files_and_its_misfit_that_of_the_x_rays(truth, tmp_path
     assert (fine.volume[..., :2] == -1000).all()
 
 
+def test_display_values_take_their_scale_from_the_volume_itself(truth, tmp_path):
+    save_nifti(tmp_path / "a.nii.gz", truth.numpy(), GRID)
+    A = Projector(GRID, BEAM)
+    shown = 3 + A(0.02 * (1 + truth / 1000)[None, None])[0] * torch.tensor([2.0, 5.0, 1.0])[:, None, None]
+    assert Stored(str(tmp_path), case="a").reconstruct(shown, A, display=True).misfit < 1e-4
+
+
 def test_a_volume_that_is_turned_lies_where_its_affine_says(truth, tmp_path):
     turned = replace(GRID, affine=GRID.affine @ np.diag([-1, 1, 1, 1]) @ np.array(
         [[1, 0, 0, -15], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]))

@@ -53,6 +53,9 @@ class Stored(Baseline):
     def of_case(self, case: str) -> Stored:
         return replace(self, case=case)
 
+    def with_room(self, x: int, y: int, z: int) -> None:
+        """On more voxels it would show air, where the patient continues."""
+
     def steps(self) -> int:
         return 1
 

@@ -12,6 +12,7 @@ from phydict.baselines.extended import Extended
 from phydict.datasets import phantom_case
 from phydict.grid import Grid
 from phydict.inference.data import ReconstructionData
+from phydict.methods import onto_grid, reconstruct_by
 from phydict.reconstruction import save_nifti
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
@@ -45,6 +46,16 @@ def test_display_values_take_their_scale_from_the_volume_itself(truth, tmp_path)
     A = Projector(GRID, BEAM)
     shown = 3 + A(0.02 * (1 + truth / 1000)[None, None])[0] * torch.tensor([2.0, 5.0, 1.0])[:, None, None]
     assert Stored(str(tmp_path), case="a").reconstruct(shown, A, display=True).misfit < 1e-4
+
+
+@pytest.mark.parametrize("box", [GRID, Grid.box(16, 192.0)])
+def test_a_patient_who_continues_beyond_the_volume_does_so_as_it_ends(truth, tmp_path, box):
+    endless = truth[..., 8:9].expand(truth.shape).clone()
+    save_nifti(tmp_path / "a.nii.gz", endless.numpy(), GRID)
+    beam = replace(BEAM, continued=True)
+    y = Projector(GRID, beam, full_detector=True)(0.02 * (1 + endless / 1000)[None, None])[0]
+    found = reconstruct_by(onto_grid(Stored(str(tmp_path), case="a"), box), box, y, beam)
+    assert found.misfit < (1e-5 if box is GRID else 0.05)
 
 
 def test_a_volume_that_is_turned_lies_where_its_affine_says(truth, tmp_path):

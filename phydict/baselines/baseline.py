@@ -59,6 +59,10 @@ class Baseline(Reconstructor):
     def solve(self, A: CountingProjector, y: Tensor, on_step: Callable[[], None]) -> Tensor:
         """Density relative to water (1, 1, X, Y, Z) of line integrals y (1, K, V, U) in mm of water."""
 
+    def expected(self, A: CountingProjector) -> Tensor:
+        """Density relative to water (1, 1, X, Y, Z) that gives display values their scale."""
+        return typical_chest(A)
+
     @torch.no_grad()
     def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,
                     seed: int = 0, on_step: Callable[[], None] = lambda: None,
@@ -70,7 +74,7 @@ class Baseline(Reconstructor):
         with watch.stage("prepare"):
             y = xrays[None] / self.mu_water
             if display:
-                y = match_views(xrays[None], A(typical_chest(A).to(xrays)))
+                y = match_views(xrays[None], A(self.expected(A).to(xrays)))
         beyond = torch.zeros_like(y) if outside is None else outside[None] / self.mu_water
         with watch.stage("sample"):
             A.y, guard = y if self.local else y - beyond, Guard(A, on_step, self.steps(), sees_xrays=True)

@@ -43,8 +43,8 @@ class Region(Delegating):
     def survey(self) -> Grid:
         return self.outer
 
-    def with_room(self, x: int, y: int, z: int) -> Region:
-        return replace(self, outer=self.outer.grown(x, y, z))
+    def with_room(self, x: int, y: int, z: int) -> Region | None:
+        return replace(self, outer=self.outer.grown(x, y, z)) if self.base.with_room(x, y, z) else None
 
     def steps(self) -> int:
         return 2 * self.base.steps()

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,7 +16,7 @@ from phydict.datasets import load_ct
 from phydict.datasets.cts.resampling import to_grid
 from phydict.grid import Grid
 from phydict.units import AIR, MU_WATER, hu_to_mu
-from phydict.xray.boxes import along, averaged, interpolated, no_finer
+from phydict.xray.boxes import SLACK, along, averaged, interpolated, no_finer
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,9 @@ class Stored(Baseline):
     def of_case(self, case: str) -> Stored:
         return replace(self, case=case)
 
+    def with_room(self, x: int, y: int, z: int) -> None:
+        """On more voxels it would show air, where the patient continues."""
+
     def steps(self) -> int:
         return 1
 
@@ -71,14 +75,18 @@ class Stored(Baseline):
         raise FileNotFoundError(f"there is no volume of {self.case} in {self.folder}: name it {places[0].name}, or "
                                 f"{self.case}/volume.nii.gz")
 
-    def solve(self, A: CountingProjector, y: Tensor, on_step: Callable[[], None]) -> Tensor:
+    def expected(self, A: CountingProjector) -> Tensor:
         hu, affine = load_ct(self.file)
         own, volume = Grid(hu.shape, affine=affine), torch.from_numpy(hu)
-        if not along(own, A.grid):
-            volume = torch.from_numpy(to_grid(hu, affine, A.grid, AIR))
-        elif no_finer(A.grid, own):
+        if along(own, A.grid) and no_finer(A.grid, own):
             volume = averaged(volume, own, A.grid)
-        else:
+        elif along(own, A.grid) and (np.divide(own.spacing, A.grid.spacing) > 1 - SLACK).all():
             volume = interpolated(volume, own, A.grid, AIR)
+        else:
+            volume = torch.from_numpy(to_grid(hu, affine, A.grid, AIR))
+        return hu_to_mu(volume, 1.0)[None, None]
+
+    def solve(self, A: CountingProjector, y: Tensor, on_step: Callable[[], None]) -> Tensor:
+        density = self.expected(A).to(y)
         on_step()
-        return hu_to_mu(volume, 1.0).to(y)[None, None]
+        return density

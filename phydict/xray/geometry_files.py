@@ -48,7 +48,7 @@ def read_beam(path: str | Path, shape: tuple[int, int] | None = None,
     if not path.is_file():
         raise FileNotFoundError(f"there is no geometry file {path}; give one of {', '.join(ENDINGS)}")
     if ending in (".yaml", ".yml"):
-        return ConeBeam.load(path)
+        return _of_pixels(path, ConeBeam.load(path), pixel)
     if shape is None:
         raise ValueError(f"{path} does not say how many pixels the detector has; state its `shape`: [rows, columns]")
     if ending == ".xml":
@@ -64,11 +64,17 @@ def read_beam(path: str | Path, shape: tuple[int, int] | None = None,
     with _of(path):
         sources, detectors, u, v = np.split(vectors, 4, axis=1)
         beam = ConeBeam(sources, detectors, u, v, shape)
-        own = np.stack([np.linalg.norm(v, axis=1), np.linalg.norm(u, axis=1)], 1)
+    return _of_pixels(path, beam, pixel)
+
+
+def _of_pixels(path: Path, beam: ConeBeam, pixel: float | tuple[float, float] | None) -> ConeBeam:
+    """The beam of a file that states its pixels itself. Raises ValueError where `pixel` is given and not the same."""
+    own = np.stack([np.linalg.norm(beam.v, axis=1), np.linalg.norm(beam.u, axis=1)], 1)
+    with _of(path):
         if pixel is not None and (apart := ~np.isclose(own, pixel_sizes(pixel), rtol=1e-3).all(1)).any():
             raise ValueError(f"its v and u state pixels of {own[apart][0].round(4).tolist()} mm, but `pixel` {pixel} "
                              "was given as well; leave it out")
-        return beam
+    return beam
 
 
 def _stated(path: Path, pixel: float | tuple[float, float] | None) -> float | tuple[float, float]:

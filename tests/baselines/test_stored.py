@@ -12,6 +12,7 @@ from phydict.baselines.extended import Extended
 from phydict.datasets import phantom_case
 from phydict.grid import Grid
 from phydict.inference.data import ReconstructionData
+from phydict.methods import onto_grid, reconstruct_by
 from phydict.reconstruction import save_nifti
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
@@ -40,6 +41,23 @@ def test_a_volume_is_the_files_and_its_misfit_that_of_the_x_rays(truth, tmp_path
     assert (fine.volume[..., :2] == -1000).all()
 
 
+def test_display_values_take_their_scale_from_the_volume_itself(truth, tmp_path):
+    save_nifti(tmp_path / "a.nii.gz", truth.numpy(), GRID)
+    A = Projector(GRID, BEAM)
+    shown = 3 + A(0.02 * (1 + truth / 1000)[None, None])[0] * torch.tensor([2.0, 5.0, 1.0])[:, None, None]
+    assert Stored(str(tmp_path), case="a").reconstruct(shown, A, display=True).misfit < 1e-4
+
+
+@pytest.mark.parametrize("box", [GRID, Grid.box(16, 192.0)])
+def test_a_patient_who_continues_beyond_the_volume_does_so_as_it_ends(truth, tmp_path, box):
+    endless = truth[..., 8:9].expand(truth.shape).clone()
+    save_nifti(tmp_path / "a.nii.gz", endless.numpy(), GRID)
+    beam = replace(BEAM, continued=True)
+    y = Projector(GRID, beam, full_detector=True)(0.02 * (1 + endless / 1000)[None, None])[0]
+    found = reconstruct_by(onto_grid(Stored(str(tmp_path), case="a"), box), box, y, beam)
+    assert found.misfit < (1e-5 if box is GRID else 0.05)
+
+
 def test_a_volume_that_is_turned_lies_where_its_affine_says(truth, tmp_path):
     turned = replace(GRID, affine=GRID.affine @ np.diag([-1, 1, 1, 1]) @ np.array(
         [[1, 0, 0, -15], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]))
@@ -47,6 +65,14 @@ def test_a_volume_that_is_turned_lies_where_its_affine_says(truth, tmp_path):
     A = Projector(GRID, BEAM)
     found = Stored(str(tmp_path), case="a").reconstruct(torch.rand(A.beam.views, *A.beam.shape), A)
     torch.testing.assert_close(found.volume, truth, atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("own", [Grid.box((64, 64, 40), (384, 384, 240)), Grid.box((64, 64, 12), 384.0)])
+def test_finer_voxels_are_averaged_also_where_they_end_before_the_others_do_or_are_longer_along_one_axis(tmp_path, own):
+    save_nifti(tmp_path / "a.nii.gz", np.random.default_rng(0).normal(0, 200, own.shape), own)
+    found = Stored(str(tmp_path), case="a").reconstruct(torch.rand(3, 24, 24), Projector(GRID, BEAM))
+    assert found.volume[2:-2, 2:-2, 5:-5].std() < 200 / 16**0.5 + 5  # the mean of 16 voxels or more
+    assert own.extent[2] == 384 or (found.volume[..., :2] == -1000).all()
 
 
 def test_methods_that_use_another_pass_the_case_on(tmp_path):

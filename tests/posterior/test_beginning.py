@@ -90,6 +90,19 @@ def test_where_more_slices_are_reconstructed_it_starts_from_what_the_prior_makes
     assert torch.equal(grown[..., -4:], own[..., -1:].expand(-1, -1, -1, -1, 4))
 
 
+@torch.no_grad()
+def test_what_projects_on_fewer_slices_is_counted(monkeypatch):
+    refiner = tiny_refiner(begins=True).bind(REPORTS[0], precision="float32")
+    measurement = Measurement(
+        Projector(GRID.grown(0, 0, 4), replace(FEW, continued=True), full_detector=True), xrays(FEW), WINDOW)
+    ran, known = [], measurement.calls
+    for name in ("__call__", "T"):
+        original = getattr(Projector, name)
+        monkeypatch.setattr(Projector, name, lambda self, x, of=original: ran.append(len(x)) or of(self, x))
+    METHOD.start_state(refiner, measurement)
+    assert measurement.calls - known == sum(ran) > 0
+
+
 def test_neither_the_seed_nor_the_order_of_the_views_counts():
     refiner, y = tiny_refiner(begins=True), xrays(FEW)
     settings = {"report": REPORTS[0], "precision": "float32"}

@@ -241,11 +241,12 @@ def test_what_a_file_does_not_say_must_be_stated(tmp_path):
         read_beam(tmp_path / "absent.csv", SHAPE)
 
 
-def test_pixels_that_are_not_those_of_a_files_own_vectors_are_refused(tmp_path):
-    write_beam(tmp_path / "beam.npy", orbit())
-    assert read_beam(tmp_path / "beam.npy", SHAPE, PIXEL).same_as(orbit())
-    with pytest.raises(ValueError, match=r"beam.npy: its v and u state pixels of \[.*\] mm, but `pixel` 7.5 was given"):
-        read_beam(tmp_path / "beam.npy", SHAPE, 7.5)
+@pytest.mark.parametrize("file", ["beam.npy", "beam.csv", "beam.yaml"])
+def test_pixels_that_are_not_those_of_a_files_own_vectors_are_refused(tmp_path, file):
+    write_beam(tmp_path / file, orbit())
+    assert read_beam(tmp_path / file, SHAPE, PIXEL).same_as(orbit())
+    with pytest.raises(ValueError, match=rf"{file}: its v and u state pixels of \[.*\] mm, but `pixel` 7.5 was given"):
+        read_beam(tmp_path / file, SHAPE, 7.5)
     for wrong in ("small", (1.0, 2.0, 3.0), -1.0):
-        with pytest.raises(ValueError, match="beam.npy: pixel must be .row height, column width."):
-            read_beam(tmp_path / "beam.npy", SHAPE, wrong)
+        with pytest.raises(ValueError, match=f"{file}: pixel must be .row height, column width."):
+            read_beam(tmp_path / file, SHAPE, wrong)

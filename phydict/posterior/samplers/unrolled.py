@@ -182,6 +182,7 @@ class Unrolled(Sampler):
             generator = torch.Generator().manual_seed(0)
             own = without_slices(measurement, z) if z else measurement
             state = self.first.one_pass(refiner, own, noise_like(state, generator), generator)
+            measurement.calls += own.calls if z else 0
         return pad(state, (z, z, 0, 0, 0, 0), mode="replicate")
 
     @staticmethod

@@ -167,6 +167,26 @@ def test_a_training_resumes_without_cts_that_it_held_out_and_never_trains_on_one
             in_trainer(data(cts, tmp_path, ids), "fit").load_state_dict(before)
 
 
+@pytest.mark.parametrize("ids", [["train_2"], "held_out.txt"], ids=["words", "the list"])
+def test_no_other_scan_of_a_patient_who_was_held_out_is_trained_on_later(tmp_path, monkeypatch, ids):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "cts").mkdir()
+    for name in ("train_1_a_1", "train_2_a_1", "train_3_a_1"):
+        (tmp_path / "cts" / f"{name}.nii.gz").touch()
+    before = data(tmp_path / "cts", tmp_path, ["train_1", "train_2"]).state_dict()
+    (tmp_path / "held_out.txt").write_text("\n".join(before["held_out"]))
+    (tmp_path / "cts" / "train_1_a_1.nii.gz").rename(tmp_path / "cts" / "train_1_b_1.nii.gz")
+    resumed = in_trainer(data(tmp_path / "cts", tmp_path, ids), "fit")
+    if ids == "held_out.txt":
+        assert resumed.held_out == ["train_1_b_1", "train_2_a_1"]
+        assert [ct.id for ct in resumed.cts.cts] == ["train_3_a_1"]
+        with pytest.warns(UserWarning, match=r"1 are not among the data now .* is train_1_a_1\)"):
+            resumed.load_state_dict(before)
+    else:
+        with pytest.raises(ValueError, match="train_1_b_1 is not held out now"):
+            resumed.load_state_dict(before)
+
+
 def test_a_list_of_those_held_out_may_name_one_that_is_no_longer_there_and_words_may_not(cts, tmp_path):
     (tmp_path / "held_out.txt").write_text("patient7\npatient1\n")
     with pytest.warns(UserWarning, match="names 'patient7', but no CT has .* of the 2 lines of .*, 1 hold out"):

@@ -149,5 +149,6 @@ def test_the_stage_is_the_command_lines_or_the_last_configurations(tmp_path):
     assert stage_of(["fit", f"--config={BASE_CONFIG}"]) == stage_of([]) == "base"
     assert stage_of(["fit", "-c", str(CONFIG), "--stage=base"]) == "base"
     assert stage_of(["fit", "-c", str(CONFIG), "-c", str(BASE_CONFIG)]) == "super_resolution"
+    assert stage_of(["fit", "-c", str(CONFIG), "-c", "{stage: lifted, out: run}"]) == "lifted"
     with pytest.raises(ValueError, match="base, super_resolution, refiner, .*, but 'third'"):
         stage_of(["--stage", "third"])

@@ -143,6 +143,23 @@ def test_a_run_that_a_signal_stops_within_a_step_keeps_that_step(number, straigh
     assert all(torch.equal(weight, resumed["state_dict"][name]) for name, weight in straight["state_dict"].items())
 
 
+def test_ctrl_c_waits_for_all_batches_of_a_step(handler_of_sigint, tmp_path, cache, monkeypatch):
+    more = "--trainer.accumulate_grad_batches=2", "--trainer.max_steps=4", "--data.loading.epoch_size=16"
+    straight, step = ten_steps(tmp_path / "straight", cache, *more), PriorTraining.training_step
+
+    def signalled(task, batch, index):
+        if (task.global_step, index % 2) == (1, 0):
+            signal.raise_signal(signal.SIGINT)
+        return step(task, batch, index)
+
+    with monkeypatch.context() as stopping, pytest.raises(SystemExit):
+        stopping.setattr(PriorTraining, "training_step", signalled)
+        ten_steps(tmp_path / "halved", cache, *more)
+    assert checkpoint(tmp_path / "halved")["global_step"] == 2
+    resumed = ten_steps(tmp_path / "halved", cache, *more, "--ckpt_path=last")
+    assert all(torch.equal(weight, resumed["state_dict"][name]) for name, weight in straight["state_dict"].items())
+
+
 def test_a_training_that_ends_gives_ctrl_c_back(handler_of_sigint, tmp_path, cache, capsys, monkeypatch):
     main(arguments(tmp_path, cache, "--trainer.max_steps=1", "--trainer.limit_val_batches=0",
                    "--model.text.encoder=none"))

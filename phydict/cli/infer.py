@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import reprlib
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,7 +23,14 @@ from phydict.inference.scoring import METRICS, CLIPSettings, FIDSettings, Scorin
 from phydict.inference.settings import WITHOUT_STAGE
 from phydict.inference.task import ReconstructionTask
 from phydict.methods import METHODS
-from phydict.runtime.configurations import CONFIGURATION, is_yaml, read_configuration, split_configurations, valued
+from phydict.runtime.configurations import (
+    CONFIGURATION,
+    inline_configuration,
+    is_yaml,
+    read_configuration,
+    split_configurations,
+    valued,
+)
 from phydict.runtime.console import (
     check_apart,
     check_command,
@@ -39,7 +45,6 @@ from phydict.runtime.help import HelpFormatter
 from phydict.runtime.progress_log import log_problem, progress_options
 from phydict.runtime.reading import reading
 from phydict.runtime.shipped import configuration
-from phydict.runtime.yaml_file import parse_yaml
 
 COMMANDS = {"predict": "X-rays -> volumes", "test": "CTs -> X-rays -> volumes and scores",
             "ablate": "methods compared on the same X-rays", "page": "results -> a page for the browser"}
@@ -200,7 +205,7 @@ def _configuration(given: str) -> tuple[str, bool]:
     """A configuration, its file or what it holds where it names a method or gives a number of voxels, and whether it
     gives a method at all."""
     if is_yaml(given):
-        file, settings = given, _inline(given)
+        file, settings = given, inline_configuration(given)
     else:
         try:
             file = str(configuration(given, ("reconstruct", "simulate")))
@@ -219,15 +224,6 @@ def _configuration(given: str) -> tuple[str, bool]:
         return file, "method" in model
     written = own | model | {key: own[key] for key in own if key != "name"}  # a name in the file stays
     return json.dumps(settings | {"model": written}), "method" in model
-
-
-def _inline(given: str) -> dict:
-    """What a configuration holds that is given as YAML itself. Raises ValueError for what is no settings."""
-    settings = parse_yaml(given, "config")
-    if not isinstance(settings, dict) or not isinstance(settings.get("model", {}), dict):
-        raise ValueError("config: a mapping of settings, such as `model: {...}`, was expected, but "
-                         f"{reprlib.repr(settings)} was given")
-    return settings
 
 
 def _is_name(method: object) -> bool:

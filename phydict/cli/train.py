@@ -77,7 +77,7 @@ NAMED_CHECKPOINTS = {"last": CHECKPOINT, "best": BEST}
 
 
 def stage_of(args: list[str]) -> str:
-    """The stage that a command line trains: its --stage, or the `stage` of the last configuration file with one."""
+    """The stage that a command line trains: its --stage, or the `stage` of the last configuration with one."""
     look = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     look.add_argument("--stage")
     given, _ = look.parse_known_args(args)

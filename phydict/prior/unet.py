@@ -85,9 +85,10 @@ class VolumeUNet(nn.Module):
         if len(attention) != len(channels):
             raise ValueError("a network's attention says for each level of its channels whether it attends, but "
                              f"attention {list(attention)} and channels {list(channels)} were given")
-        if channels[-1] < head_channels or any(width % NORM_GROUPS for width in channels):
-            raise ValueError(f"a network's channels are multiples of {NORM_GROUPS}, the last not below head_channels, "
-                             f"but {list(channels)} and head_channels {head_channels} were given")
+        attending = [*(width for width, attends in zip(channels, attention) if attends), channels[-1]]
+        if min(attending) < head_channels or any(width % NORM_GROUPS for width in channels):
+            raise ValueError(f"a network's channels are multiples of {NORM_GROUPS}, the last and those that attend not "
+                             f"below head_channels, but {list(channels)} and head_channels {head_channels} were given")
         self.settings: dict = {
             "state_channels": state_channels, "block": block, "channels": list(channels),
             "attention": list(attention), "res_blocks": res_blocks, "head_channels": head_channels,

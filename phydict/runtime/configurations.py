@@ -68,12 +68,22 @@ def check_configured(args: Sequence[str], options: Collection[str], example: str
 
 
 def read_configurations(args: Sequence[str]) -> list[dict]:
-    """What the configuration files hold that a command line names, in their order; files that are not there are left
-    to the command line's own parser. Raises ValueError as `read_configuration` does."""
+    """What the configurations of a command line hold, in their order; files that are not there are left to the command
+    line's own parser. Raises ValueError as `read_configuration` and `inline_configuration` do."""
     look = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     look.add_argument("--config", "-c", action="append", default=[])
     given, _ = look.parse_known_args(list(args))
-    return [read_configuration(file) for file in given.config if os.path.isfile(file)]
+    return [inline_configuration(one) if is_yaml(one) else read_configuration(one) for one in given.config
+            if is_yaml(one) or os.path.isfile(one)]
+
+
+def inline_configuration(given: str) -> dict:
+    """What a configuration holds that is given as YAML itself. Raises ValueError for what is no settings."""
+    settings = parse_yaml(given, "config")
+    if not isinstance(settings, dict) or not isinstance(settings.get("model", {}), dict):
+        raise ValueError("config: a mapping of settings, such as `model: {...}`, was expected, but "
+                         f"{reprlib.repr(settings)} was given")
+    return settings
 
 
 def read_configuration(file: str) -> dict:

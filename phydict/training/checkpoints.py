@@ -105,7 +105,7 @@ class StopBetweenSteps(Checkpoint):
         self.before: Any = None
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        self.first = trainer.global_step
+        self.first = self.step = trainer.global_step
         if trainer.world_size == 1 and threading.current_thread() is threading.main_thread():
             self.before = signal.signal(signal.SIGINT, lambda *_: self._ask(trainer))
 
@@ -117,11 +117,11 @@ class StopBetweenSteps(Checkpoint):
             log_progress(text, event="stopping", text=text)
 
     def on_train_batch_end(self, trainer: lightning.Trainer, *_: object) -> None:
-        if not self.asked and not (trainer.received_sigterm and trainer.world_size == 1):
-            return
-        if trainer.global_step > self.first:
+        complete, self.step = trainer.global_step > self.step, trainer.global_step  # unless gradients are accumulated
+        stops, ends = self.asked and complete, trainer.received_sigterm and trainer.world_size == 1
+        if stops or (ends and trainer.global_step > self.first):
             trainer.save_checkpoint(self.path)
-        if self.asked:
+        if stops:
             raise KeyboardInterrupt
 
     def on_train_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:

@@ -110,13 +110,14 @@ class PriorData(lightning.LightningDataModule):
         return {"held_out": self.held_out, "trained": len(self.cts)}
 
     def load_state_dict(self, state_dict: dict) -> None:
-        """Raises ValueError where a training that resumes holds out CTs that it did not, or trains on those that it
-        held out; warns of those that are no longer there, and in validation of those that it did not hold out."""
+        """Raises ValueError where a training that resumes holds out patients that it did not, or trains on those that
+        it held out; warns of CTs that are no longer there, and in validation of those that it did not hold out."""
         before = state_dict["held_out"]
         if self.trainer.state.fn != "fit":
             return self.check_unseen(before if state_dict.get("trained", True) else None, "the training")
-        trained = [ct.id for ct in self.cts.cts]
-        if changed := sorted({*self.held_out} - {*before} | {*before}.intersection(trained)):
+        patients = {patient_of(id) for id in before}
+        now_trained = [ct.id for ct in self.cts.cts if patient_of(ct.id) in patients]
+        if changed := sorted([id for id in self.held_out if patient_of(id) not in patients] + now_trained):
             is_now = "held out" if changed[0] in self.held_out else "not held out"
             raise ValueError(f"a training resumes with the CTs held out that were before, but {changed[0]} is {is_now} "
                              "now: give the same data.cts, data.holdout and data.seed, or --data.holdout.ids "
@@ -208,11 +209,11 @@ class PriorData(lightning.LightningDataModule):
 
 def _held_out(files: list[CTFile], holdout: HoldOut, seed: int) -> list[CTFile]:
     """The CTs that validate instead of training. Raises ValueError where a word is in no CT's id, and only warns where
-    it is one of many in a file."""
+    it is one of many in a file, whose lines also mean the other CTs of the patient that they name."""
     names, words = {f.id for f in files}, holdout.words()
 
     def meant(word: str, id: str) -> bool:
-        return word == id if word in names else word in id
+        return word == id if word in names else word in id or (holdout.is_file and patient_of(word) == patient_of(id))
 
     if unknown := [word for word in words if not any(meant(word, f.id) for f in files)]:
         said = (f"data.holdout.ids names '{unknown[0]}', but no CT has that in its id"

@@ -121,7 +121,8 @@ def test_the_map_of_a_report_stays_where_it_is_in_more_voxels():
 
 @pytest.mark.parametrize("settings, words", [
     ({"attention": (True,)}, r"attention \[True\] and channels \[8, 8\]"),
-    ({"head_channels": 16}, r"the last not below head_channels, but \[8, 8\] and head_channels 16"),
+    ({"head_channels": 16}, r"attend not below head_channels, but \[8, 8\] and head_channels 16"),
+    ({"channels": (8, 16), "attention": (True, True), "head_channels": 16}, r"but \[8, 16\] and head_channels 16"),
     ({"channels": (8, 12)}, r"multiples of 8, .* but \[8, 12\]")])
 def test_a_network_that_cannot_be_built_is_refused_by_its_settings(settings, words):
     with pytest.raises(ValueError, match=words):

@@ -159,8 +159,8 @@ def _axis_tables(title: str, rest: dict, group: Sequence[Entry], columns: Mappin
     among = {id(entry) for k in columns for entry in alike([line[k] for line in lines.values() if k in line])}
     marked = {label for label, line in lines.items()
               if all(id(entry) in among or not entry.cases for entry in line.values())}
-    lacking = [f"{label}, {columns[k]}{entry.lacking}" for label, line in lines.items() if label in marked
-               for k, entry in line.items() if entry.lacking]
+    lacking = [f"{label}, {columns[k]}{entry.lacking}" for label, line in lines.items() for k, entry in line.items()
+               if entry.lacking]
     for name in _measured(OF_VIEWS, group):
         measure = SHOWN_MEASURES[name]
         printed = [(label, label in marked, [line[k].estimate(name) if k in line else None for k in columns])

@@ -137,6 +137,15 @@ def test_one_case_that_no_method_has_takes_no_marks_pairs_or_plots(tmp_path):
     assert not all_tables(summarise(rows))[-1].ranks  # as many cases, but not the same
 
 
+def test_every_number_against_the_views_that_is_not_of_all_cases_is_told_as_such_marked_or_not():
+    lacking = {("x", "c"), ("y", "b"), ("y", "c")}
+    entries = summarise(row(case, method, None if views == 8 and (method, case) in lacking else 20.0, views=views)
+                        for method in "xyz" for case in "abc" for views in (2, 8))
+    told = "Not of all cases: x, K = 8 (2 of 3 cases); y, K = 8 (1 of 3 cases)."
+    for of in (entries[:4], entries):  # of x and y alone x is marked, beside z neither
+        assert all(table.notes[-1] == told for table in all_tables(of)[-3:])
+
+
 def test_pictures_that_are_no_plots_of_this_command_stay_and_its_own_too_where_cases_failed(tmp_path):
     Figure().savefig(tmp_path / "pareto_mine.png")
     (tmp_path / "stages_notes.png").write_text("no picture")

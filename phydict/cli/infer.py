@@ -124,7 +124,8 @@ class InferenceCLI(ProgressCLI):
             try:
                 with noted([], name):
                     case = load_xrays(folder, geometry) | {"id": name}
-                    print(*dry_run(model.pages / f"{name}.png", case, model.voxels.made, model.voxels.result), sep="\n")
+                    print(*dry_run(model.pages / f"{name}.png", case, model.voxels.made, model.voxels.result,
+                                   model.is_chest(case)), sep="\n")
             except (ValueError, OSError) as error:
                 if len(folders) == 1:
                     raise

@@ -45,6 +45,7 @@ from phydict.runtime.reading import enough_memory
 from phydict.runtime.seeds import case_seed, check_seed
 from phydict.runtime.warning import Remark, warn
 from phydict.units import HUWindow
+from phydict.xray.checks import is_smaller_scene
 from phydict.xray.poses.uncertain import Uncertain
 from phydict.xray.projectors.own import projector_kind
 
@@ -172,6 +173,10 @@ class ReconstructionTask(lightning.LightningModule):
         """The voxels and the HU range of the CTs that X-rays are made of."""
         return self.voxels.made, self.voxels.window(self.window)
 
+    def is_chest(self, case: Case) -> bool:
+        """Whether the X-rays of a case are of a chest, and not of a smaller scene, which no prior takes."""
+        return self.plain.grid is not None or not is_smaller_scene(case["beam"], self.voxels.made)
+
     def unfinished(self, sources: dict[str, str]) -> list[str]:
         """Of this run's cases, id -> what identifies their data, those that remain to be done."""
         self.cases = list(sources)
@@ -192,7 +197,7 @@ class ReconstructionTask(lightning.LightningModule):
 
     def _predict(self, case: Case) -> None:
         result = self._reconstruct(case, self.seed)
-        for doubt in orientation_doubts(case["xrays"], case["beam"], self.voxels.made):
+        for doubt in orientation_doubts(case["xrays"], case["beam"], self.voxels.made) if self.is_chest(case) else []:
             warn(doubt)
         self._finish(case, result)
 

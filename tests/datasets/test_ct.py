@@ -77,6 +77,18 @@ def test_detail_finer_than_a_voxel_is_averaged_not_sampled():
     assert np.abs(to_grid(board, np.eye(4), grid, 0)).max() < 10
 
 
+@pytest.mark.parametrize("order, signs", [((1, 0, 2), (1, 1, 1)), ((2, 0, 1), (-1, 1, -1)), ((2, 1, 0), (1, -1, 1))])
+def test_voxels_stacked_in_another_order_hold_the_same_averages(order, signs):
+    volume = np.random.default_rng(0).random((13, 12, 11), np.float32)
+    affine = np.array([[2.0, 0, 0, -12], [0, 2.5, 0, -15], [0, 0, 3, -14], [0, 0, 0, 1]])
+    grid = Grid.box((9, 8, 7), (20.0, 25.0, 30.0), (1.0, -2.0, 3.0))
+    moved = np.eye(4)[:, [*order, 3]] * [*signs, 1]  # from the new order's indices to the grid's
+    moved[:3, 3] = [(sign < 0) * (grid.shape[axis] - 1) for axis, sign in sorted(zip(order, signs))]
+    new = to_grid(volume, affine, Grid([grid.shape[axis] for axis in order], affine=grid.affine @ moved), -1.0)
+    expected = np.flip(to_grid(volume, affine, grid, -1.0).transpose(order), np.flatnonzero(np.less(signs, 0)))
+    np.testing.assert_allclose(new, expected, atol=1e-5)
+
+
 @pytest.mark.parametrize("degrees, tilt", [(0, 0), (20, 0), (0, 0.8)], ids=["straight", "turned", "tilted gantry"])
 def test_a_ball_keeps_its_world_position_and_mass(degrees, tilt):
     turn, angle = np.eye(4), np.radians(degrees)

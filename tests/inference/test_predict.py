@@ -25,7 +25,7 @@ from phydict.methods import CORRECTIONS, METHODS, reconstruct
 from phydict.posterior import PriorOnly
 from phydict.prior import load_correction, save_stage
 from phydict.runtime.precision import instruction_set
-from phydict.xray import ConeBeam
+from phydict.xray import ConeBeam, Projector
 from phydict.xray.geometry_files import write_beam
 
 
@@ -97,6 +97,21 @@ def test_one_folder_of_xrays_is_a_case(measured, tmp_path, monkeypatch):
     monkeypatch.chdir(measured / "bert")
     main(sirt("predict", tmp_path, "--data.xrays=../bert"))
     assert names(tmp_path / "sirt") == ["bert"]
+
+
+def test_a_scene_far_smaller_than_a_chest_is_drawn_and_reconstructed_as_by_the_library(tmp_path, capsys):
+    grid, beam = Grid.cube(8, 80.0), ConeBeam.orbit(3, 300.0, 150.0, (12, 12), 16.0)
+    mu = torch.zeros(1, 1, *grid.shape)
+    mu[..., 2:6, 2:6, 1:5] = 0.03
+    save_xrays(tmp_path / "case", Projector(grid, beam, full_detector=True)(mu)[0], beam)
+    arguments = sirt("predict", tmp_path / "out", f"--data.xrays={tmp_path / 'case'}", "--model.grid.voxels=8",
+                     "--model.grid.side=80")
+    main([*arguments, "--dry_run"])
+    main(arguments)
+    assert "thorax" not in capsys.readouterr().err
+    case = load_xrays(tmp_path / "case")
+    expected = reconstruct(case["xrays"], case["beam"], method=SIRT(3), grid=grid).volume.numpy()
+    np.testing.assert_allclose(volume(tmp_path / "out" / "sirt" / "case"), expected, atol=1e-3)
 
 
 def test_the_record_names_the_methods_publication(measured, tmp_path):

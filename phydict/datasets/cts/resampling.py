@@ -18,12 +18,15 @@ def to_grid(volume: np.ndarray, affine: np.ndarray, grid: Grid, pad: float) -> n
     Where the axes are parallel the averages are exact. Otherwise the volume is averaged along its own axes to half
     the grid's spacing, interpolated linearly at eight points per new voxel, and those are averaged.
     """
+    spacing = np.linalg.norm(affine[:3, :3], axis=0)
+    order = np.abs(spacing[:, None] * np.linalg.solve(affine, grid.affine)[:3, :3]).argmax(0)
+    if len(set(order)) == 3:  # the old axes as the new ones they run along are stacked
+        volume, affine, spacing = volume.transpose(order), affine[:, [*order, 3]], spacing[order]
     relative = np.linalg.inv(affine) @ grid.affine
     scale = np.diag(relative)[:3]
     slant = (np.abs(relative[:3, :3] - np.diag(scale)) @ np.asarray(grid.shape)).max()
     if slant < 0.1:
         return _average(volume, relative[:3, 3], scale, grid.shape, pad)
-    spacing = np.linalg.norm(affine[:3, :3], axis=0)
     step = np.maximum(1.0, min(grid.spacing) / 2 / spacing)
     shape = np.ceil(np.asarray(volume.shape) / step).astype(int) + 1
     first = (np.asarray(volume.shape) - 1) / 2 - step * (shape - 1) / 2

@@ -109,6 +109,7 @@ class CascadePosterior(Reconstructor):
                     seed: int = 0, on_step: Callable[[], None] = lambda: None) -> Reconstruction:
         stage, watch = self.cascade.super_resolution, Stopwatch()
         check_projected_from(stage.grid, projector, "its", "the super-resolution stage makes")
+        xrays = xrays.float()  # which the stage learnt in
         self.check_memory(xrays.device, xrays.dtype)
         check_sampler(self.second)
         if isinstance(stage, torch.nn.Module):

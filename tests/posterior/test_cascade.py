@@ -272,6 +272,12 @@ def test_a_stage_that_wants_the_full_detector_gets_it(cascade):
     assert not CascadePosterior(cascade, SAMPLER, False, sr_sampler=full).full_detector
 
 
+def test_x_rays_in_double_precision_are_those_in_single(cascade, xrays):
+    method = CascadePosterior(cascade, SAMPLER, precision="float32")
+    double, single = (method.reconstruct(y, PROJECTOR, seed=3) for y in (xrays.double(), xrays))
+    assert torch.equal(double.volume, single.volume) and double.precision == single.precision == "float32"
+
+
 @dataclass(frozen=True)
 class Halving(PriorOnly):
     """A sampler of one's own that gives less than it is given."""

@@ -362,6 +362,7 @@ def test_a_method_that_works_by_another_one_is_asked_what_that_is_asked(ready):
     assert told.grid is ready.target and base.citation
     assert ready.with_name("other") == replace(ready, base=base.with_name("other"))
     assert ready.with_name("other").name == "other" != ready.name
+    assert ready.with_precision("bfloat16").base.precision == ready.with_precision("bfloat16").precision == "bfloat16"
 
 
 def test_the_attenuation_of_water_reaches_every_level(xrays):

@@ -10,9 +10,11 @@ import pytest
 import torch
 from posterior.scene import PROJECTOR, views
 from prior.tiny import tiny_prior
+from rivals.tiny_rivals import tiny_lifted
 
 from phydict.baselines import SIRT
 from phydict.posterior import Posterior, PriorOnly
+from phydict.rivals import RivalAnswer
 from phydict.runtime import precision
 from phydict.runtime.precision import (
     bfloat16_gain,
@@ -137,3 +139,9 @@ def test_methods_without_a_network_name_the_precision_of_the_xrays():
     for kind in ("float32", "float64"):
         found = SIRT(iterations=1).reconstruct(views().to(getattr(torch, kind)), PROJECTOR)
         assert found.precision == str(found.volume.dtype).removeprefix("torch.") == kind
+
+
+def test_a_rival_says_what_its_network_computed_in_whatever_the_type_of_the_x_rays():
+    double, single = (RivalAnswer(tiny_lifted()).reconstruct(y, PROJECTOR) for y in (views().double(), views()))
+    torch.testing.assert_close(double.volume.float(), single.volume, atol=1e-3, rtol=0)
+    assert double.precision == single.precision

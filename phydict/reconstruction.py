@@ -251,6 +251,13 @@ class Delegating(Reconstructor):
     def with_mu_water(self, mu_water: float) -> Self:
         return replace(self, base=self.base.with_mu_water(mu_water))  # type: ignore[type-var]
 
+    @property
+    def precision(self) -> str:  # type: ignore[override]
+        return self.base.precision
+
+    def with_precision(self, precision: str) -> Self:
+        return replace(self, base=self.base.with_precision(precision))  # type: ignore[type-var]
+
     def of_case(self, case: str) -> Self:
         return replace(self, base=self.base.of_case(case))  # type: ignore[type-var]
 

@@ -10,9 +10,13 @@ import pytest
 import torch
 from posterior.scene import PROJECTOR, views
 from prior.tiny import tiny_prior
+from rivals.tiny_rivals import tiny_lifted
 
 from phydict.baselines import SIRT
-from phydict.posterior import Posterior, PriorOnly
+from phydict.diffusion import CosineSchedule
+from phydict.posterior import DDS, Posterior, PriorOnly, SplitGibbs
+from phydict.prior import PriorContract
+from phydict.rivals import RivalAnswer
 from phydict.runtime import precision
 from phydict.runtime.precision import (
     bfloat16_gain,
@@ -137,3 +141,34 @@ def test_methods_without_a_network_name_the_precision_of_the_xrays():
     for kind in ("float32", "float64"):
         found = SIRT(iterations=1).reconstruct(views().to(getattr(torch, kind)), PROJECTOR)
         assert found.precision == str(found.volume.dtype).removeprefix("torch.") == kind
+
+
+def test_a_rival_says_what_its_network_computed_in_whatever_the_type_of_the_x_rays():
+    double, single = (RivalAnswer(tiny_lifted()).reconstruct(y, PROJECTOR) for y in (views().double(), views()))
+    torch.testing.assert_close(double.volume.float(), single.volume, atol=1e-3, rtol=0)
+    assert double.precision == single.precision
+
+
+class InHalf(PriorContract, torch.nn.Module):
+    """A prior of one's own whose weights and answers are in half precision."""
+
+    grid, window = PROJECTOR.grid, tiny_prior(False).window
+    schedule = CosineSchedule()
+
+    def __init__(self, kind: torch.dtype):
+        super().__init__()
+        self.share = torch.nn.Parameter(torch.tensor(0.25, dtype=kind))
+
+    def bind(self, report, guidance, precision):
+        return self
+
+    def denoise(self, x, t):
+        return self.share * x.to(self.share)
+
+
+@pytest.mark.parametrize("kind", [torch.bfloat16, torch.float16])
+@pytest.mark.parametrize("sampler", [SplitGibbs(3), DDS(3), PriorOnly(2)])
+def test_a_prior_of_ones_own_in_half_precision_leaves_x_rays_and_volume_in_single(kind, sampler):
+    half, single = (Posterior(InHalf(of), sampler).reconstruct(views(), PROJECTOR) for of in (kind, torch.float32))
+    assert torch.equal(half.xrays, views()) and half.volume.dtype == torch.float32
+    torch.testing.assert_close(half.volume, single.volume, atol=20, rtol=0)

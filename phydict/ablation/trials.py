@@ -264,6 +264,9 @@ def _trial(of: str, settings: Mapping, cases: Cases) -> tuple[Trial, set[str]]:
     columns |= {name: given[name] for name in SETTINGS
                 if name in given and name not in columns and name != "precision"} | overrides
     if value["precision"] != "auto":
+        if (own := overrides.get("method.precision", value["precision"])) != value["precision"]:
+            raise ValueError(f"{value['method']}: precision is {value['precision']}, but method.precision {own}: leave "
+                             "one of the two out")
         columns[PRECISION] = value["precision"]
     prior = value["prior"] or str(method.default_prior) if isinstance(method, Sampler) else None
     box = None if value["voxels"] is None else Box(value["voxels"], value["side"], value["centre"])

@@ -16,7 +16,7 @@ from phydict.posterior.likelihood.likelihood import ProximalCG
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.posterior import CountingDenoiser, Posterior, check_guidance
 from phydict.posterior.samplers.prior_only import PriorOnly
-from phydict.posterior.samplers.sampler import Sampler
+from phydict.posterior.samplers.sampler import Sampler, check_drawn, check_sampler
 from phydict.posterior.samplers.split_gibbs import SplitGibbs
 from phydict.prior import Cascade
 from phydict.reconstruction import Reconstruction, Reconstructor, check_projected_from
@@ -58,6 +58,11 @@ class CascadePosterior(Reconstructor):
         super().__post_init__()
         check_precision(self.precision)
         check_guidance(self.guidance)
+        for name in ("sr_sampler", "unguided"):
+            given = getattr(self, name)
+            if not isinstance(given, Sampler) or given.needs_refiner:
+                raise ValueError(f"{name} is a Sampler that needs no refiner, since the second stage is none, but "
+                                 f"{given!r} was given")
         if not 0 <= self.level <= 1:
             raise ValueError(f"the noise of the base estimate is a level in [0, 1], but {self.noise} was given")
 
@@ -104,7 +109,9 @@ class CascadePosterior(Reconstructor):
                     seed: int = 0, on_step: Callable[[], None] = lambda: None) -> Reconstruction:
         stage, watch = self.cascade.super_resolution, Stopwatch()
         check_projected_from(stage.grid, projector, "its", "the super-resolution stage makes")
+        xrays = xrays.float()  # which the stage learnt in
         self.check_memory(xrays.device, xrays.dtype)
+        check_sampler(self.second)
         if isinstance(stage, torch.nn.Module):
             stage.to(xrays.device)
         with watch.stage("base"):
@@ -123,7 +130,7 @@ class CascadePosterior(Reconstructor):
             denoiser = CountingDenoiser(stage.bind(state, self.level, self.precision, generator), guard)
             x = noise_like(torch.empty(1, stage.state_channels, *stage.grid.shape, device=xrays.device), generator)
         with watch.stage("sample"):
-            state = self.second.sample(denoiser, measurement, x, generator, guard)
+            state = check_drawn(self.second, self.second.sample(denoiser, measurement, x, generator, guard), x)
         with watch.stage("score"):
             ct = state[:, :1]
             fit = guard.score(state, measurement.conclude(ct), measurement.y)

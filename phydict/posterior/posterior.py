@@ -58,7 +58,7 @@ class CountingDenoiser:
             raise ValueError(f"a denoiser answers with states like those it is given, {tuple(x.shape)}, but "
                              f"{came} came: correct the prior's denoise, or its grid and state_channels")
         self.guard.estimate = x0.detach()
-        return x0
+        return x0.to(x)
 
 
 class CountingRefiner(CountingDenoiser):
@@ -169,7 +169,8 @@ class Posterior(Reconstructor):
             prior.to(xrays.device)
             if is_own(type(prior)):
                 prior.eval()
-            xrays = xrays.to(next((weight.dtype for weight in prior.parameters()), xrays.dtype))
+            weights = next((weight.dtype for weight in prior.parameters()), xrays.dtype)
+            xrays = xrays.to(weights if weights in (torch.float32, torch.float64) else torch.float32)
         check_projected_from(self.grid, projector, "the prior's", "the prior was trained on")
         sampler = self.sampler.suited(prior)
         sampler = sampler.for_sampling() if self.samples > 1 else sampler

@@ -117,6 +117,7 @@ class Refined(Delegating):
     def reconstruct(self, xrays: Tensor, projector: Projector, report: str = "", display: bool = False,
                     seed: int = 0, on_step: Callable[[], None] = lambda: None) -> Reconstruction:
         check_projected_from(self.target, projector, "the target's", "the target is")
+        xrays = xrays.float()  # which the networks learnt in
         watch, base, refinement = Stopwatch(), self.base, self.refinement.of_views(projector.beam.views)
         with watch.stage("base"):
             binned = self._binned(xrays, projector, base.grid)

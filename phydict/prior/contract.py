@@ -56,7 +56,8 @@ class PriorContract(ABC):
         estimate of the clean state of x at a time t in [0, 1], and `schedule`, such as CosineSchedule(), which says how
         noisy x is then.
 
-        guidance: scale of classifier-free guidance; precision: see phydict.runtime.precision.
+        guidance: scale of classifier-free guidance; precision: see phydict.runtime.precision. States are of float32, or
+        of float64 where the weights of a torch.nn.Module are; the answer may be of another type, such as bfloat16.
 
         The schedule of another network derives from CosineSchedule and says anew `alpha_bar(t)`, the share of the clean
         state's variance in x, a tensor that falls from nearly 1 at t = 0 to nearly 0 at t = 1 and reaches neither, and

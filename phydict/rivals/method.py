@@ -57,7 +57,7 @@ class RivalAnswer(Baseline):
                     outside: Tensor | None = None) -> Reconstruction:
         seeded = replace(self, seed=seed)
         result = super(RivalAnswer, seeded).reconstruct(xrays, projector, report, display, seed, on_step, outside)
-        return replace(result, network_calls=self.steps(), precision=precision_name(self.precision, xrays))
+        return replace(result, network_calls=self.steps(), precision=precision_name(self.precision, xrays.float()))
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from prior.tiny import tiny_prior
 from ablation.runs import TINY, write
 from phydict.ablation import read_specification
 from phydict.ablation.nested import changed
-from phydict.ablation.trials import prior_of, refined_from
+from phydict.ablation.trials import Trial, prior_of, refined_from
 from phydict.cli.infer import main
 from phydict.datasets import CTSource
 from phydict.evaluation import read_csv
@@ -69,6 +69,18 @@ def test_a_precision_is_of_networks_alone_and_the_automatic_one_is_as_none_given
         trials(precision="half")
     with pytest.raises(ValueError, match="the setting precision means nothing"):
         read_specification(write(tmp_path, axes={"method": ["sirt"], "precision": ["float32"]}))
+
+
+def test_a_precision_beside_another_one_of_the_method_is_refused(tmp_path):
+    def rival(**base) -> Trial:
+        (trial,) = read_specification(write(tmp_path, base={"voxels": 16} | base, axes={
+            "method": ["phydict.rivals.TrainedRival"]})).trials
+        return trial
+
+    assert rival(**{"method.precision": "float32"}).method.precision == "float32"
+    assert rival(**{"method.precision": "float32", "precision": "float32"}).precision == "float32"
+    with pytest.raises(ValueError, match="precision is bfloat16, but method.precision float32: leave one of the two"):
+        rival(**{"method.precision": "float32", "precision": "bfloat16"})
 
 
 def test_a_row_tells_the_voxels_and_the_window_that_it_was_scored_on(tmp_path):

@@ -12,7 +12,7 @@ from torch.nn.functional import interpolate
 from phydict.diffusion import CosineSchedule, GaussianDenoiser
 from phydict.grid import Grid
 from phydict.methods import METHODS
-from phydict.posterior import CascadePosterior, Posterior, PriorOnly, ProximalCG, SplitGibbs
+from phydict.posterior import CascadePosterior, Posterior, PriorOnly, ProximalCG, SplitGibbs, Unrolled
 from phydict.prior import Cascade, MedSynSuperResolution, PriorContract
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import ConeBeam, Projector, binned
@@ -270,3 +270,40 @@ def test_a_stage_that_wants_the_full_detector_gets_it(cascade):
     assert CascadePosterior(cascade, full).full_detector
     assert CascadePosterior(cascade, SAMPLER, sr_sampler=full).full_detector
     assert not CascadePosterior(cascade, SAMPLER, False, sr_sampler=full).full_detector
+
+
+def test_x_rays_in_double_precision_are_those_in_single(cascade, xrays):
+    method = CascadePosterior(cascade, SAMPLER, precision="float32")
+    double, single = (method.reconstruct(y, PROJECTOR, seed=3) for y in (xrays.double(), xrays))
+    assert torch.equal(double.volume, single.volume) and double.precision == single.precision == "float32"
+
+
+@dataclass(frozen=True)
+class Halving(PriorOnly):
+    """A sampler of one's own that gives less than it is given."""
+
+    def sample(self, *given):
+        return super().sample(*given)[:, :, ::2]
+
+
+@dataclass(frozen=True)
+class Short(PriorOnly):
+    """A sampler of one's own that is not called as samplers are."""
+
+    def sample(self, denoiser, x):
+        return x
+
+
+@pytest.mark.parametrize("sampler, words", [
+    (Halving(2), "sample of the sampler Halving must return clean states, a tensor of shape"),
+    (Short(2), r"sample of the sampler Short is called as \(denoiser, measurement, x, generator, on_step\)")])
+def test_a_sampler_of_ones_own_is_checked_at_the_second_stage_as_at_the_first(xrays, sampler, words):
+    for method in (gaussian(sr_sampler=sampler), replace(gaussian(), sampler=sampler)):
+        with pytest.raises(ValueError, match=words):
+            method.reconstruct(xrays, PROJECTOR)
+
+
+@pytest.mark.parametrize("sampler", [Unrolled(), PriorOnly, "phydict_fast"])
+def test_what_cannot_sample_a_second_stage_is_refused(sampler):
+    with pytest.raises(ValueError, match="is a Sampler that needs no refiner"):
+        gaussian(sr_sampler=sampler)

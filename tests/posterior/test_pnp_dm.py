@@ -65,6 +65,14 @@ def test_the_mean_of_many_states_is_nearer_the_posterior_mean_than_one_of_them()
     assert errors[0] < 0.5 * errors[1]
 
 
+def test_several_samples_differ_as_much_as_the_posterior_is_wide_although_one_result_is_a_mean():
+    _, covariance = blurred(0.1)
+    averaging = PnPDM(30, rho_max=0.1, rho_min=0.1, levels=100, burn_in=0, thinning=1, **EXACT)
+    several, means = (float(moments(sample(settings, 2000))[1].trace() / covariance.trace())
+                      for settings in (averaging.for_sampling(), averaging))
+    assert several == pytest.approx(1, abs=0.2) and means < 0.5
+
+
 def test_data_without_weight_leave_the_prior():
     found, spread = moments(sample(one_draw(30, levels=300, likelihood=ExactDraw(), noise=1e6), 3000))
     torch.testing.assert_close(found, denoiser(V).mean.flatten(), atol=0.015, rtol=0)

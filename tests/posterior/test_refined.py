@@ -7,12 +7,12 @@ import pytest
 import torch
 from fitting import fit_to_grid
 from laws import random_like
-from prior.tiny import tiny_prior, tiny_super_resolution
+from prior.tiny import tiny_prior, tiny_refiner, tiny_super_resolution
 
 from phydict.baselines import CGLS, FDK, FISTATV, SIRT, Region
 from phydict.grid import Grid
 from phydict.methods import onto_grid, reconstruct, reconstructor
-from phydict.posterior import Measurement, PriorOnly, ProximalCG, Refined, Refinement
+from phydict.posterior import Measurement, Posterior, PriorOnly, ProximalCG, Refined, Refinement, Unrolled
 from phydict.prior import CorrectionNetwork
 from phydict.prior.uncertainty import LEVELS
 from phydict.runtime.reading import check_memory
@@ -256,6 +256,12 @@ def test_a_refined_method_is_refined_to_other_voxels_from_its_base(xrays):
     assert onto_grid(ready, Grid.cube(32)) is ready
 
 
+def test_x_rays_in_double_precision_are_refined_by_networks_in_single(xrays):
+    ready = onto_grid(Posterior(tiny_refiner(False), Unrolled(), precision="float32"), Grid.cube(32))
+    y, projector = fit_to_grid(ready, Grid.cube(32), xrays, BEAM)
+    assert torch.equal(ready.reconstruct(y.double(), projector).volume, ready.reconstruct(y, projector).volume)
+
+
 def test_every_level_is_one_step_and_figures_belong_to_the_volume(xrays):
     steps, target = [], Grid.box((31, 40, 27), (384, 390, 390))
     ready = Refined(Known(), target)
@@ -356,6 +362,7 @@ def test_a_method_that_works_by_another_one_is_asked_what_that_is_asked(ready):
     assert told.grid is ready.target and base.citation
     assert ready.with_name("other") == replace(ready, base=base.with_name("other"))
     assert ready.with_name("other").name == "other" != ready.name
+    assert ready.with_precision("bfloat16").base.precision == ready.with_precision("bfloat16").precision == "bfloat16"
 
 
 def test_the_attenuation_of_water_reaches_every_level(xrays):

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -43,7 +43,7 @@ class PnPDM(Sampler):
         likelihood: ExactDraw, published for linear operators, or Langevin, for others
         noise: standard deviation of the line integrals' error
         burn_in: iterations left out of the result, which is the mean of the states after them: the posterior mean; for
-            one draw, iterations - 1
+            one draw, and where several samples are drawn, iterations - 1
         thinning: every how many iterations a state is taken into that mean; for one draw, 1
     """
 
@@ -77,6 +77,9 @@ class PnPDM(Sampler):
 
     def steps(self) -> int:
         return self.iterations
+
+    def for_sampling(self) -> PnPDM:
+        return replace(self, burn_in=self.iterations - 1, thinning=1)  # means differ less than the posterior is wide
 
     def sample(self, denoiser: Denoiser, measurement: Measurement, x: Tensor, generator: Generators,
                on_step: Callable[[], None] = lambda: None) -> Tensor:

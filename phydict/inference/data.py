@@ -171,7 +171,7 @@ class ReconstructionData(lightning.LightningDataModule):
             return [(f"phantom-{seed:06d}", f"phantom version {PHANTOM_VERSION}", lambda s=seed: self._with_fine(
                         grid, lambda g: phantom_case(s, g, window)))
                     for seed in range(HELD_OUT_PHANTOM, HELD_OUT_PHANTOM + self.phantoms)]
-        return [(ct.id, _ct_source(ct), lambda c=ct: {"file": c.path} | self._with_fine(
+        return [(ct.id, _ct_source(ct), lambda c=ct: {"file": c.path, "calibration": c.calibration} | self._with_fine(
                     grid, lambda g: load_case(c, g, window)))
                 for ct in self._chosen(self.source.find(self.cts))]
 

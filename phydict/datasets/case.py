@@ -7,6 +7,7 @@ from typing import TypedDict, cast
 
 from torch import Tensor
 
+from phydict.datasets.cts.reading import Calibration
 from phydict.datasets.radiographs.xray_description import Description
 from phydict.xray.geometry import ConeBeam
 from phydict.xray.poses.uncertain import Uncertain
@@ -35,6 +36,7 @@ class Case(TypedDict, total=False):
     warnings: list[str]
     error: ValueError | OSError  # why there is nothing else
     file: Path  # of the CT
+    calibration: Calibration | None  # of its header, where that is not trusted
     fine: Tensor  # the volume that X-rays are made of, where that is finer
     mu_water: float  # 1/mm, in the X-rays
     ct_report: str  # the report, where `report` is what is used of it

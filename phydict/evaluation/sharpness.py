@@ -91,11 +91,14 @@ def rib_profile(volumes: Tensor, truth: Tensor, lung: Tensor, grid: Grid) -> Ten
 
 def vessel_visibility(volume: Tensor, truth: Tensor, lung: Tensor) -> float:
     """How much of the vessels' contrast a volume (X, Y, Z) holds: that of the truth's VESSELS brightest lung voxels to
-    the mean of their 5^3 neighbourhoods, as a share of the truth's. 1: all of it, 0: none."""
+    the mean of their 5^3 neighbourhoods, as a share of the truth's. 1: all of it, 0: none. Raises ValueError where the
+    truth has none."""
     contrasts = [x - avg_pool3d(x[None, None], 5, 1, 2, count_include_pad=False)[0, 0] for x in (volume, truth)]
     inside = (lung > 0.5).flatten()
     brightest = torch.where(inside, truth.flatten(), -torch.inf).topk(min(VESSELS, int(inside.sum()))).indices
     measured, expected = (float(contrast.flatten()[brightest].mean()) for contrast in contrasts)
+    if expected == 0:
+        raise ValueError("the truth's brightest lung voxels are as bright as what is around them: give a chest CT")
     return measured / expected
 
 
@@ -104,8 +107,8 @@ def sharpness_scores(volume: Tensor, truth: Tensor, lung: Tensor, grid: Grid) ->
     truth's: widths (edge_) are 1 where edges are as sharp as there, more where they are blurred; of ribs, from
     their middle to between them, and of vessels the contrast is 1 where all of it is there.
 
-    lung: mask (X, Y, Z) in the truth. An edge that no line crosses or that does not show, and ribs and vessels without
-    lungs, have no score.
+    lung: mask (X, Y, Z) in the truth. An edge that no line crosses or that does not show, ribs and vessels without
+    lungs, and vessels without contrast, as in a box of air alone, have no score.
     """
     scores = {}
     for edge in AXES:
@@ -116,5 +119,6 @@ def sharpness_scores(volume: Tensor, truth: Tensor, lung: Tensor, grid: Grid) ->
         ribs, true_ribs = rib_profile(torch.stack([volume, truth]), truth, lung, grid)
         scores["ribs"] = float((ribs[0] - ribs[-1]) / (true_ribs[0] - true_ribs[-1]))
     if (lung > 0.5).any():
-        scores["vessels"] = vessel_visibility(volume, truth, lung)
+        with suppress(ValueError):
+            scores["vessels"] = vessel_visibility(volume, truth, lung)
     return scores

@@ -31,7 +31,7 @@ from phydict.runtime.ranges import check_between
 from phydict.runtime.reading import name_of, read_ids
 from phydict.runtime.shipped import configuration
 from phydict.units import HUWindow
-from phydict.xray import Ideal, Projector, Simulator
+from phydict.xray import Ideal, Polychromatic, Projector, Simulator
 from phydict.xray.boxes import divided, in_other_voxels
 from phydict.xray.geometry_files import read_beam
 
@@ -164,11 +164,14 @@ class ReconstructionData(lightning.LightningDataModule):
         if self.xrays:
             raise ValueError(f"data.xrays ({self.xrays}) are for predict, but test simulates X-rays of data.cts: leave "
                              "one out")
+        if isinstance(self.simulator, Polychromatic) and (self.simulator.metal or 0) > window.high:
+            raise ValueError(f"simulator.metal {self.simulator.metal:g} is reached nowhere, since CTs are clipped to "
+                             f"an HU window that ends at {window.high:g}: leave it out, or simulate in Python")
         if self.cts == "phantom":
             return [(f"phantom-{seed:06d}", f"phantom version {PHANTOM_VERSION}", lambda s=seed: self._with_fine(
                         grid, lambda g: phantom_case(s, g, window)))
                     for seed in range(HELD_OUT_PHANTOM, HELD_OUT_PHANTOM + self.phantoms)]
-        return [(ct.id, _ct_source(ct), lambda c=ct: {"file": c.path} | self._with_fine(
+        return [(ct.id, _ct_source(ct), lambda c=ct: {"file": c.path, "calibration": c.calibration} | self._with_fine(
                     grid, lambda g: load_case(c, g, window)))
                 for ct in self._chosen(self.source.find(self.cts))]
 

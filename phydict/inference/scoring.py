@@ -195,4 +195,5 @@ def segmented(case: Case, grid: Grid) -> dict:
     file: Path | None = case.get("file")
     if file is None or "affine" not in case:
         return {}
-    return organs_beside(file, fine_grid(Grid(grid.shape, affine=case["affine"].numpy())))
+    fine = fine_grid(Grid(grid.shape, affine=case["affine"].numpy()))
+    return organs_beside(file, fine, case.get("calibration"))

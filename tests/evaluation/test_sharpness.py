@@ -91,3 +91,8 @@ def test_vessels_show_in_proportion_to_their_contrast():
     for share in (1.0, 0.4, 0.0):
         assert vessel_visibility(-850 + share * (truth + 850), truth, lung) == pytest.approx(share, abs=1e-5)
     assert vessel_visibility(truth + 200, truth, lung) == pytest.approx(1, abs=1e-5)
+
+
+def test_vessels_of_a_box_of_air_alone_have_no_score():
+    air, lung = torch.full(GRID.shape, -1000.0), torch.ones(GRID.shape)
+    assert sharpness_scores(air + torch.rand(GRID.shape), air, lung, GRID) == {}

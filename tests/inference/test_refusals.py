@@ -14,9 +14,11 @@ from inference.runs import BEAM, LAUGHS, ORBIT, contents, phantoms, record, sirt
 from phydict.baselines import SIRT
 from phydict.cli.infer import main
 from phydict.grid import Grid
+from phydict.inference.data import ReconstructionData
 from phydict.methods import reconstructor
 from phydict.posterior import PriorOnly
-from phydict.xray import Projector
+from phydict.units import HUWindow
+from phydict.xray import Polychromatic, Projector
 
 
 @pytest.mark.parametrize("place, name, how", [
@@ -227,3 +229,15 @@ def test_a_run_that_is_not_finite_ends_in_one_sentence_and_leaves_no_case(measur
     monkeypatch.setattr(SIRT, "solve", lambda self, *given: solve(self, *given) * float("nan"))
     said = refusal(capsys, main, sirt("predict", tmp_path, f"--data.xrays={measured / 'anna'}"))
     assert "not finite from step 3 of 3 on" in said and not (tmp_path / "sirt" / "anna").exists()
+
+
+def test_metal_of_more_hu_than_the_window_holds_is_refused_where_it_would_do_nothing(tmp_path, capsys):
+    tube = ["--data.simulator=phydict.xray.Polychromatic", "--data.simulator.metal=3000"]
+    said = refusal(capsys, main, phantoms(tmp_path / "out", 1, *tube))
+    assert "simulator.metal 3000 is reached nowhere" in said and "ends at 1000" in said
+    (tmp_path / "spec.yaml").write_text("phantoms: 1\nbase: {simulator: polychromatic, simulator.metal: 3000}\n"
+                                        "axes: {method: [sirt]}")
+    said = refusal(capsys, main, ["ablate", "-c", str(tmp_path / "spec.yaml"), "--out", str(tmp_path / "ablated")])
+    assert "simulator.metal 3000 is reached nowhere" in said
+    data, window = ReconstructionData(cts="phantom", simulator=Polychromatic(metal=3000.0)), HUWindow(-1000.0, 3000.0)
+    assert data.test_cases(Grid.cube(16), window)  # which holds it

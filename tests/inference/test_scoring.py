@@ -14,6 +14,7 @@ from torch.nn import Identity
 from inference.runs import ORBIT, phantoms, record, sirt
 from phydict.baselines import SIRT
 from phydict.cli.infer import main
+from phydict.datasets import CTSource
 from phydict.datasets.cts.prepared import write_prepared
 from phydict.datasets.cts.segmentations import organs_beside
 from phydict.evaluation import backbones, perceptual, read_csv
@@ -25,7 +26,7 @@ from phydict.inference import scoring
 from phydict.inference.data import ReconstructionData
 from phydict.inference.page import results_page
 from phydict.inference.results import FEATURES, CaseResults
-from phydict.inference.scoring import FIDSettings, Scoring
+from phydict.inference.scoring import FIDSettings, Scoring, segmented
 from phydict.inference.summary import show_finished
 from phydict.runtime.files import file_crc32
 from phydict.runtime.lpips_networks import load_lpips
@@ -199,6 +200,24 @@ def test_lungs_that_are_segmented_beside_a_ct_are_those_of_the_truth(tmp_path):
     assert found.keys() == {"lung"}
     assert dice(found["lung"], lung.repeat(2, 0).repeat(2, 1).repeat(2, 2) > 0) > 0.999  # but for its corners
     assert organs_beside(tmp_path / "bert.nii.gz", grid) == {}
+
+
+def test_masks_beside_a_ct_whose_header_is_not_trusted_lie_where_the_ct_does(tmp_path):
+    hu = np.full((24, 24, 24), -1000, np.int16)
+    hu[2:22, 3:21] = 0
+    hu[6:18, 6:18, 5:15] = -850
+    blank = np.eye(4)  # of 1 mm, whereas the voxels have 10
+    stored = (hu + 500) // 2
+    for name, voxels in (("valid_1_a_1", stored), ("valid_1_a_1_lungmask", (hu == -850).astype(np.int16))):
+        nibabel.save(nibabel.Nifti1Image(voxels, blank), tmp_path / f"{name}.nii.gz")
+    table = tmp_path / "metadata.csv"
+    table.write_text("VolumeName,RescaleSlope,RescaleIntercept,XYSpacing,ZSpacing\n"
+                     'valid_1_a_1.nii.gz,2,-500,"[10.0, 10.0]",10.0\n')
+    source, grid = CTSource(metadata=str(table), fixed=False), Grid.cube(24, 240.0)
+    (_, _, make), = ReconstructionData(cts=str(tmp_path), source=source).test_cases(grid, HUWindow())
+    case = make()
+    lung = case["masks"][0].numpy().repeat(4, 0).repeat(4, 1).repeat(4, 2) > 0.5
+    assert dice(segmented(case, grid)["lung"], lung) > 0.9
 
 
 def source_of(ct) -> str:

@@ -14,13 +14,14 @@ series, `name__<SeriesNumber>`); they must lie on the CT's own voxels:
 from __future__ import annotations
 
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from phydict.datasets.cts.anatomy import MASKS
 from phydict.datasets.cts.prepared import is_prepared
-from phydict.datasets.cts.reading import case_id, load_ct
+from phydict.datasets.cts.reading import Calibration, case_id, load_ct
 from phydict.datasets.cts.resampling import to_grid
 from phydict.grid import Grid
 
@@ -79,21 +80,22 @@ def read_segmentation(files: tuple[Path, ...], shape, affine: np.ndarray) -> np.
     return union
 
 
-def organs_beside(ct: Path, grid: Grid) -> dict[str, np.ndarray]:
+def organs_beside(ct: Path, grid: Grid, calibration: Calibration | None = None) -> dict[str, np.ndarray]:
     """Masks (X, Y, Z) bool of what is segmented beside a NIfTI CT, lung and vessel, on `grid` in the CT's own world.
 
+    calibration: of a CT without a usable header; it places the masks' voxels, which are the CT's, as well.
     Of a prepared CT the lung alone, since its voxels' shares of vessels lose the thin ones. Raises ValueError where a
     file cannot be read or some of the lungs' lobes are missing.
     """
     if is_prepared(ct):
         file = ct.with_name("lung.nii.gz")
         return {"lung": to_grid(*load_ct(file), grid, 0.0) > 0.5} if file.is_file() else {}
-    masks = {}
+    masks, placed = {}, calibration and replace(calibration, slope=1.0, intercept=0.0)
     for name, files in segmentations_beside(ct.with_name(case_id(ct))).items():
         if name in ("lung", "vessel"):
             union = np.zeros(grid.shape, np.float32)
             for file in files:
-                labels, place = load_ct(file)
+                labels, place = load_ct(file, placed)
                 union += to_grid((labels > 0.5).astype(np.float32), place, grid, 0.0)
             masks[name] = union > 0.5
     return masks

@@ -174,11 +174,15 @@ def test_what_cannot_be_measured_is_refused_before_any_work(tmp_path, capsys, gi
     assert not (tmp_path / "sirt" / "phantom-1000000").exists()
 
 
-def test_volumes_that_are_too_small_for_fid_are_refused_before_any_work(tmp_path, capsys, untrained):
-    said = refusal(capsys, main, phantoms(tmp_path, 1, "--model.grid=16", "--metrics=[fid]"))
-    assert "16 x 16 x 16 voxels are too small for the FID backbone squeezenet" in said and "leave fid out" in said
+@pytest.mark.parametrize("metric, of", [("fid", "the FID backbone squeezenet"), ("lpips", "LPIPS")])
+def test_volumes_that_are_too_small_for_a_metric_are_refused_before_any_work(tmp_path, capsys, untrained, monkeypatch,
+                                                                             metric, of):
+    monkeypatch.setattr(SIRT, "reconstruct", None)
+    said = refusal(capsys, main, phantoms(tmp_path, 1, "--model.grid=16", f"--metrics=[{metric}]"))
+    assert f"16 x 16 x 16 voxels are too small for {of}" in said and f"leave {metric} out" in said
     assert not (tmp_path / "sirt" / "phantom-1000000").exists()
     Scoring(["fid"]).check(Grid.cube(backbones.LEAST_SIDE))
+    Scoring(["lpips"]).check(Grid.cube(perceptual.LEAST_SIDE))
     Scoring(["fid"], FIDSettings(maisi_voxels=True)).check(Grid.cube(16))
 
 

@@ -186,6 +186,16 @@ def test_volumes_that_are_too_small_for_a_metric_are_refused_before_any_work(tmp
     Scoring(["fid"], FIDSettings(maisi_voxels=True)).check(Grid.cube(16))
 
 
+@pytest.mark.parametrize("metric", ["fid", "lpips"])
+def test_ablate_refuses_volumes_that_are_too_small_for_a_metric_before_any_work(tmp_path, capsys, untrained, metric):
+    file, out = tmp_path / "spec.yaml", tmp_path / "out"
+    file.write_text(yaml.safe_dump({"out": str(out), "phantoms": 1, "metrics": [metric], "base": {"voxels": 16},
+                                    "axes": {"method": ["sirt"]}}))
+    said = refusal(capsys, main, ["ablate", "-c", str(file), "--device", "cpu"])
+    assert "16 x 16 x 16 voxels are too small" in said and f"leave {metric} out" in said
+    assert not (out / "results.csv").exists()
+
+
 def test_a_specification_with_unknown_metrics_is_refused(tmp_path, capsys):
     for content, sentence in (({"metrics": ["psnr"]}, "some of volume"), ({"fid": {"net": 1}}, "no setting 'net'"),
                               ({"metrics": 3}, "metrics takes")):

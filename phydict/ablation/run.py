@@ -43,10 +43,11 @@ Work = list[tuple[Trial, str, Callable[[], Case]]]
 
 def planned(specification: Specification, scoring: Scoring) -> tuple[Results, dict[str, Work]]:
     """The table of a specification's rows, with those that its file holds already, and the work of each case, by its
-    id."""
+    id. Raises ValueError where the volumes of a trial are too small for a metric."""
     cases_of, rows = {}, {}  # by acquisition; key -> columns
     cases: dict[str, Work] = {}
     for trial in specification.trials:
+        scoring.check(trial.voxels.scored)
         if (acquisition := trial.acquisition()) not in cases_of:
             cases_of[acquisition] = trial.data.test_cases(*trial.scene())
         for case, source, make in cases_of[acquisition]:

@@ -17,7 +17,7 @@ from phydict.evaluation.backbones import MAISI_SIDE, NORMALISATION, SliceFeature
 from phydict.evaluation.ct_clip import clip_scores, image_latent, load_ct_clip
 from phydict.evaluation.fid import case_features
 from phydict.evaluation.organs import ORGANS_VERSION, fine_grid, organ_scores
-from phydict.evaluation.perceptual import load_networks, lpips_scores
+from phydict.evaluation.perceptual import check_sides, load_networks, lpips_scores
 from phydict.evaluation.published import PUBLISHED
 from phydict.evaluation.sharpness import sharpness_scores
 from phydict.grid import Grid
@@ -112,6 +112,8 @@ class Scoring:
 
     def check(self, grid: Grid) -> None:
         """Raises ValueError where volumes on `grid` are too small for a metric."""
+        if "lpips" in self.metrics:
+            check_sides(grid.shape)
         if self.network and not self.fid.maisi_voxels:
             self.network.check(grid.shape)
 

@@ -43,8 +43,10 @@ def test_the_range_is_the_one_that_is_scored(untrained):
 
 
 def test_slices_that_are_too_small_and_a_missing_backbone_are_refused(untrained, monkeypatch, tmp_path):
-    with pytest.raises(ValueError, match="12 x 12 pixels are too small .* more voxels, or leave lpips out"):
-        lpips_scores(torch.zeros(12, 12, 12), torch.zeros(12, 12, 12))
+    small, least = (torch.zeros(perceptual.LEAST_SIDE - lacking, 33, 33) for lacking in (1, 0))
+    with pytest.raises(ValueError, match="30 x 33 x 33 voxels are too small .* 31 .* more voxels, or leave lpips out"):
+        lpips_scores(small, small)
+    assert lpips_scores(least, least) == {"lpips_alex": 0, "lpips_squeeze": 0}
     monkeypatch.undo()
 
     def offline(*_, **__):

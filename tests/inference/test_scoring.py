@@ -174,12 +174,26 @@ def test_what_cannot_be_measured_is_refused_before_any_work(tmp_path, capsys, gi
     assert not (tmp_path / "sirt" / "phantom-1000000").exists()
 
 
-def test_volumes_that_are_too_small_for_fid_are_refused_before_any_work(tmp_path, capsys, untrained):
-    said = refusal(capsys, main, phantoms(tmp_path, 1, "--model.grid=16", "--metrics=[fid]"))
-    assert "16 x 16 x 16 voxels are too small for the FID backbone squeezenet" in said and "leave fid out" in said
+@pytest.mark.parametrize("metric, of", [("fid", "the FID backbone squeezenet"), ("lpips", "LPIPS")])
+def test_volumes_that_are_too_small_for_a_metric_are_refused_before_any_work(tmp_path, capsys, untrained, monkeypatch,
+                                                                             metric, of):
+    monkeypatch.setattr(SIRT, "reconstruct", None)
+    said = refusal(capsys, main, phantoms(tmp_path, 1, "--model.grid=16", f"--metrics=[{metric}]"))
+    assert f"16 x 16 x 16 voxels are too small for {of}" in said and f"leave {metric} out" in said
     assert not (tmp_path / "sirt" / "phantom-1000000").exists()
     Scoring(["fid"]).check(Grid.cube(backbones.LEAST_SIDE))
+    Scoring(["lpips"]).check(Grid.cube(perceptual.LEAST_SIDE))
     Scoring(["fid"], FIDSettings(maisi_voxels=True)).check(Grid.cube(16))
+
+
+@pytest.mark.parametrize("metric", ["fid", "lpips"])
+def test_ablate_refuses_volumes_that_are_too_small_for_a_metric_before_any_work(tmp_path, capsys, untrained, metric):
+    file, out = tmp_path / "spec.yaml", tmp_path / "out"
+    file.write_text(yaml.safe_dump({"out": str(out), "phantoms": 1, "metrics": [metric], "base": {"voxels": 16},
+                                    "axes": {"method": ["sirt"]}}))
+    said = refusal(capsys, main, ["ablate", "-c", str(file), "--device", "cpu"])
+    assert "16 x 16 x 16 voxels are too small" in said and f"leave {metric} out" in said
+    assert not (out / "results.csv").exists()
 
 
 def test_a_specification_with_unknown_metrics_is_refused(tmp_path, capsys):

@@ -103,6 +103,19 @@ def test_the_checkpoint_that_reconstructs_best_is_kept(tmp_path, cache, monkeypa
     assert load_prior(tmp_path / "prior.safetensors").grid.shape == (16, 16, 16)
 
 
+def test_a_moved_training_that_resumes_keeps_its_best_weights(tmp_path, cache, monkeypatch):
+    scores = iter((30.0, 10.0, 40.0))
+    monkeypatch.setattr("phydict.training.prior.reconstruction_scores",
+                        lambda *_: {"psnr": next(scores), "ssim": 0.5})
+    main(arguments(tmp_path / "there", cache, "--trainer.max_epochs=1"))
+    (tmp_path / "there").rename(run := tmp_path / "here")
+    for epochs, best in ((2, 4), (3, 12)):
+        main(arguments(run, cache, f"--trainer.max_epochs={epochs}", "--ckpt_path=last"))
+        assert torch.load(run / "best.ckpt", map_location="cpu", weights_only=True)["global_step"] == best
+        assert checkpoint(run)["global_step"] == 4 * epochs and sorted(run.glob("*.ckpt")) == [
+            run / "best.ckpt", run / "last.ckpt"]
+
+
 @pytest.mark.parametrize("every, expected", [(1, {3: 10, 5: 20}), (5, {5: 10})])
 def test_the_last_weights_are_validated_wherever_a_training_ends(tmp_path, cache, monkeypatch, every, expected):
     scores = iter((10.0, 20.0))

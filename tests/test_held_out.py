@@ -66,13 +66,14 @@ def test_a_file_tells_whom_it_never_learnt_from_and_others_are_warned_of(cts, tm
     assert saved["phydict"]["training"] == {"steps": 2, "samples": 0, "held_out": known}
 
 
-def test_an_export_names_those_that_an_older_checkpoint_held_out(trained, tmp_path):
+def test_an_export_names_those_that_an_older_checkpoint_held_out_beside_cts_it_learnt_from(trained, tmp_path):
     content = checkpoint(trained)
-    for name, held_out in (("phantoms", []), ("cts", ["patient1"])):
-        content["PriorData"] = {"held_out": held_out}
+    for name, held_out, trained_on, told in (("phantoms", [], {}, None), ("cts", ["patient1"], {}, ["patient1"]),
+                                             ("untold", ["patient1"], {"trained": 0}, None)):
+        content["PriorData"] = {"held_out": held_out} | trained_on
         torch.save(content, tmp_path / "last.ckpt")
         main(["export", f"--checkpoint={tmp_path / 'last.ckpt'}", f"--out={tmp_path / name}.safetensors"])
-        assert held_out_of(tmp_path / f"{name}.safetensors") == (held_out or None)
+        assert held_out_of(tmp_path / f"{name}.safetensors") == told
 
 
 def test_reconstructions_of_those_that_their_refiner_learnt_from_are_warned_of(cts, tmp_path):

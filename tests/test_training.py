@@ -13,6 +13,7 @@ import pytest
 import torch
 from command_lines import CONFIG, arguments, checkpoint, losses, refusal
 from ct_files import save_ct, thorax_hu
+from lightning.pytorch.callbacks import EMAWeightAveraging
 from prior.tiny import tiny_prior
 from processes import TRAIN, Python
 from torch.utils.data import default_collate
@@ -185,6 +186,19 @@ def test_validation_logs_every_noise_level_and_paints_a_montage(trained):
     assert {f"val/rmse_hu_t{t}" for t in (0.1, 0.3, 0.5, 0.7, 0.9)} | {"val/rmse_hu"} <= set(log)
     assert [file.name for file in sorted(trained.glob("logs/**/samples/*.png"))] == [
         "step000004_0.png", "step000008_0.png"]
+
+
+@pytest.mark.filterwarnings("ignore:You.re using the WeightAveraging callback")
+def test_averaged_weights_read_reports_as_the_same_weights_do_without_averaging(tmp_path, monkeypatch):
+    save_prior(tiny_prior(detail=True), file := str(tmp_path / "prior.safetensors"))
+    task, averaging = PriorTraining(cube=Cube(16), window=(-1000, 600), initial=file), EMAWeightAveraging(decay=0.9999)
+    monkeypatch.setattr(PriorTraining, "trainer", SimpleNamespace(max_steps=-1, callbacks=[averaging]))
+    averaging.setup(task.trainer, task, "fit")
+    task.on_fit_start()
+    for _ in range(20):
+        averaging._average_model.update_parameters(task)
+    averaged, report = averaging._average_model.module.prior, ["Large left pleural effusion. No nodule or mass."]
+    torch.testing.assert_close(averaged.context(report), task.prior.context(report), rtol=1e-4, atol=1e-5)
 
 
 def test_without_validation_views_nothing_is_reconstructed_or_kept(tmp_path, cache):

@@ -52,7 +52,8 @@ def export_prior(checkpoint: str, out: str, overwrite: bool = False) -> None:
                  steps=steps, out=out)
     weights = {k.removeprefix("prior."): w for k, w in content["state_dict"].items() if k.startswith("prior.")}
     training = header.get("training", {"steps": steps})
-    ids = next((part["held_out"] for part in content.values() if isinstance(part, dict) and part.get("held_out")), None)
+    ids = next((part["held_out"] for part in content.values()  # of older checkpoints, whose headers tell nothing
+                if isinstance(part, dict) and part.get("held_out") and part.get("trained", True)), None)
     if ids and isinstance(training, dict):
         training = {"held_out": ids} | training
     build, save = BUILT[stage]

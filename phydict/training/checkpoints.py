@@ -83,7 +83,16 @@ class WholeCheckpoints(TorchCheckpointIO):
 
 
 class BestCheckpoint(ModelCheckpoint):
-    """Keeps the weights with the best score so far, where validation gives one."""
+    """Keeps the weights with the best score so far, where validation gives one; also in a folder that was moved."""
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        here = Path(str(self.dirpath))
+        if (here / Path(state_dict["best_model_path"]).name).is_file():  # else nothing of it was taken along
+            best, kth = (str(here / Path(state_dict[f"{name}_model_path"]).name) for name in ("best", "kth_best"))
+            scores = {str(here / Path(path).name): score for path, score in state_dict["best_k_models"].items()}
+            state_dict = state_dict | {"dirpath": self.dirpath, "best_model_path": best, "kth_best_model_path": kth,
+                                       "best_k_models": scores}
+        super().load_state_dict(state_dict)
 
     def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         if self.monitor in trainer.callback_metrics:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import lightning
@@ -44,6 +45,13 @@ def check_network(kind: str, file: str, own: dict, requested: dict, part: str = 
         raise ValueError(f"model.{part} has {name} {requested[name]}, but the {kind} {file} that training continues "
                          f"from has {own.get(name)}: leave model.{part} out, give it all of that {kind}'s settings, "
                          "or leave model.initial out")
+
+
+def _average(mean: Callable[[Tensor, Tensor, Tensor | int], Tensor], average: Tensor, current: Tensor,
+             averaged: Tensor | int) -> Tensor:
+    """The next average of weights; whole numbers, such as tokens' places, stay as they are: a mean of them is rounded
+    down."""
+    return mean(average, current, averaged) if current.is_floating_point() else current
 
 
 class StageTraining(lightning.LightningModule, ABC):
@@ -100,6 +108,8 @@ class StageTraining(lightning.LightningModule, ABC):
         for callback in self.averaging():
             if callback._average_model is not None:
                 callback._average_model.to(self.device)  # made before the weights came there; each step would copy them
+                if (mean := callback._average_model.avg_fn) is not None:
+                    callback._average_model.avg_fn = partial(_average, mean)
 
     def on_train_start(self) -> None:
         for schedule in (config.scheduler for config in self.trainer.lr_scheduler_configs):  # type: ignore[attr-defined]

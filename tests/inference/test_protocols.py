@@ -137,6 +137,7 @@ def test_a_protocols_scores_are_those_of_its_grid_and_range(tmp_path, small, mon
 def test_lpips_is_taken_in_a_protocols_range(tmp_path, small, monkeypatch):
     ranges = []
     monkeypatch.setattr(scoring, "load_networks", lambda: None)
+    monkeypatch.setattr(scoring, "check_sides", lambda shape: None)
     monkeypatch.setattr(scoring, "lpips_scores", lambda volume, truth, device, scored: ranges.append(scored) or {})
     main(sirt("test", tmp_path, "--data.cts=phantom", "--data.phantoms=1", "--data.protocol=small",
               "--metrics=[lpips]"))

@@ -15,7 +15,6 @@ SMALL = ["detector=24", "views=3", "method.iterations=2", "method.ec_steps=1", "
 """Settings that make a row quick, and need no file of weights."""
 
 
-
 @pytest.mark.filterwarnings("always:1 of 1 reports are longer")
 def test_every_row_of_the_first_table_is_run_or_says_what_it_lacks(tmp_path, capsys):
     save_prior(tiny_prior(), tmp_path / "tiny.safetensors")

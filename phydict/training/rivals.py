@@ -27,8 +27,8 @@ class RivalTraining(StageTraining):
 
     made: the rival to train; scenes: its X-rays; views: numbers of X-rays from which validation reconstructs; initial:
     a rival's file to continue from, one that is not bound to a geometry also of another grid, one that is also of
-    another geometry, whose weights then learn this one; seed: of scenes, noise
-    and whatever else is drawn; given: whether made's network was requested, which that in `initial` must then equal.
+    another geometry, whose weights then learn this one; seed: of scenes, noise and whatever else is drawn; given:
+    whether made's network was requested, which that in `initial` must then equal.
     """
 
     prior: Rival

@@ -275,11 +275,22 @@ def reconstruct_by(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeB
             xrays, A = binned_to(grid, xrays, beam, method.full_detector, projector)
         prepared, began = sum(watch.seconds.values()), time.perf_counter()
         result = method.reconstruct(xrays, A, report, display, seed, on_step)
+        _check_returned(method, result)
         seconds = {"prepare": 0.0} | result.seconds
         if is_own(type(method)):  # whose stages may leave something out
             seconds["other"] = time.perf_counter() - began - sum(result.seconds.values())
         result = replace(result, seconds=seconds | {"prepare": prepared + seconds["prepare"]})
     return replace(poses.added_to(result) if poses else result, warnings=warnings)
+
+
+def _check_returned(method: Reconstructor, result: object) -> None:
+    """Raises ValueError unless a method returned a Reconstruction that has a value for each of its grid's voxels."""
+    name = f"reconstruct of the method {type(method).__name__} must return a Reconstruction"
+    if not isinstance(result, Reconstruction):
+        raise ValueError(f"{name}, but {type(result).__name__} came back: put the volume into one")
+    if tuple(result.volume.shape) != tuple(result.grid.shape):
+        raise ValueError(f"{name} whose volume has the grid's shape {tuple(result.grid.shape)}, but "
+                         f"{tuple(result.volume.shape)} came back")
 
 
 def calibrated(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, uncertain: Uncertain,

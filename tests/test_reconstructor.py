@@ -159,6 +159,40 @@ def test_a_network_that_never_projects_is_doubted_where_it_explains_nothing(writ
     assert fitting.misfit < BAD_GUESS and "no volume" not in "".join(fitting.warnings)
 
 
+RETURNING = """
+from dataclasses import dataclass, replace
+from phydict.baselines import CGLS
+from phydict.reconstruction import Reconstructor
+
+@dataclass(frozen=True)
+class Whole(Reconstructor):
+    def steps(self):
+        return 1
+
+    def reconstruct(self, xrays, projector, *arguments, **named):
+        found = CGLS(iterations=1).reconstruct(xrays, projector)
+        return {}
+"""
+
+
+@pytest.mark.parametrize("code, came", [
+    ("None", "a Reconstruction, but NoneType came back"), ("found.volume", "a Reconstruction, but Tensor came back"),
+    ("replace(found, volume=found.volume[1:])", r"the grid's shape \(16, 16, 16\), but \(15, 16, 16\) came back")])
+def test_a_method_that_returns_no_reconstruction_is_told_what_to_return(code, came, written):
+    method = import_module(written(RETURNING.format(code))).Whole()
+    with pytest.raises(ValueError, match=f"reconstruct of the method Whole must return .*{came}"):
+        reconstruct(views(), BEAM, method=method, grid=GRID)
+
+
+@pytest.mark.parametrize("code, came", [
+    ("None", "NoneType"), ("A.T(y)[0]", r"\(1, 16, 16, 16\)"),
+    ("A.T(y).repeat(2, 1, 1, 1, 1)", r"\(2, 1, 16, 16, 16\)")])
+def test_a_baseline_that_solves_for_no_single_density_is_told_its_shape(code, came, written):
+    method = import_module(written(BACKPROJECTION.replace("self.scale * A.T(y)", code))).Method()
+    with pytest.raises(ValueError, match=rf"solve of the method Method must return .*, but {came} came back"):
+        reconstruct(views(), BEAM, method=method, grid=GRID)
+
+
 @pytest.mark.parametrize("code, path, words", [
     ("", "nowhere.Mine", "there is no module nowhere: put its folder on PYTHONPATH"),
     ("", "json.nowhere.Mine", "there is no module json.nowhere$"),

@@ -79,6 +79,10 @@ class Baseline(Reconstructor):
         with watch.stage("sample"):
             A.y, guard = y if self.local else y - beyond, Guard(A, on_step, self.steps(), sees_xrays=True)
             density = self.solve(A, A.y, guard)
+            if not isinstance(density, Tensor) or density.shape != (1, 1, *A.grid.shape):
+                came = tuple(density.shape) if isinstance(density, Tensor) else type(density).__name__
+                raise ValueError(f"solve of the method {type(self).__name__} must return a density relative to water, "
+                                 f"a tensor of shape {(1, 1, *A.grid.shape)}, but {came} came back")
         with watch.stage("score"):
             fit = guard.score(density, self.mu_water * (A(density) + beyond), self.mu_water * y)
         return Reconstruction(

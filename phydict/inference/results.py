@@ -110,10 +110,11 @@ class CaseResults:
             raise not_written(f"the case {final}", error, "give another model.out") from error
 
     def summarise(self, cases: Iterable[str], further: Sequence[Table] = (),
-                  protocol: Protocol | None = None, empty: Mapping[str, str] = MappingProxyType({})) -> list[Table]:
+                  protocol: Protocol | None = None, empty: Mapping[str, str] = MappingProxyType({}),
+                  missing: Sequence[str] = ()) -> list[Table]:
         """The tables of the finished cases that were scored, and further ones behind them; written as results.csv, with
         one row per case, and results.md. None where no case was scored. protocol: what the scores were taken by;
-        empty: scores that may stay empty -> why."""
+        empty: scores that may stay empty -> why; missing: cases that have failed, which the first table then tells."""
         records = []
         for case in cases:
             there = self._there(case)
@@ -121,7 +122,11 @@ class CaseResults:
                 records.append(there.record | {"case": case})
         if not records:
             return []
-        tables = [score_table(records, protocol, empty), *further]
+        table = score_table(records, protocol, empty)
+        if missing:
+            table = replace(table, notes=[*table.notes, f"Not reconstructed, and so not in the means: "
+                                          f"{', '.join(missing)}."])
+        tables = [table, *further]
         write_csv(self.folder / RESULTS, [score_row(record["case"], record) for record in records])
         with atomic_write(self.folder / MEANS) as part:
             part.write_text("\n".join(table.markdown() for table in tables))

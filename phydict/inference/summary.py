@@ -27,7 +27,7 @@ def summarise(results: CaseResults, cases: list[str], name: str, scoring: Scorin
     console = Console()
     console.width = max(console.width, 80 if console.is_terminal else 120)
     further = _distances(results, finished, name, scoring)
-    tables = results.summarise(finished, further, protocol, scoring.empty)
+    tables = results.summarise(finished, further, protocol, scoring.empty, missing)
     for table in tables:
         console.print(table)
     if tables and (others := results.beside(cases)):

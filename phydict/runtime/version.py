@@ -1,3 +1,3 @@
 """Which version this is."""
 
-VERSION = "0.7.9"
+VERSION = "0.7.10"

@@ -97,6 +97,7 @@ def test_machines_read_warnings_and_failed_cases_as_json_too(tmp_path, capsys):
     assert {"begin", "case", "warning", "error"} <= {event["event"] for event in events}
     assert all("cut" in event["text"] for event in events if event["event"] == "error")
     assert last["event"] == "error" and "1 of 2 cases were not reconstructed (cut)" in last["text"]
+    assert "Not reconstructed, and so not in the means: cut." in (tmp_path / "out" / "sirt" / "results.md").read_text()
 
 
 def test_a_good_case_has_no_mark(tmp_path):

@@ -22,7 +22,6 @@ from phydict.ablation.summary import (
     conditions,
     deltas,
 )
-from phydict.evaluation.gallery import literal
 from phydict.inference.conditions import format_settings
 from phydict.runtime.files import atomic_write
 
@@ -37,6 +36,11 @@ WRITER = {"Software": "phydict"}
 """What a plot's file says of who wrote it."""
 
 STAGES = {"seconds_network": "network", "seconds_projector": "projector", "rest": "the rest"}
+
+
+def _literal(text: str) -> str:
+    """A text that Matplotlib shows as it is, whatever dollars are in it."""
+    return text.replace("$", "\\$")
 
 
 def write_plots(folder: Path, entries: Sequence[Entry]) -> list[Path]:
@@ -120,22 +124,22 @@ def _pareto(axes: Sequence[Axes], group: Sequence[Entry], where: str, style: dic
     for ax, name in zip(axes, ("psnr", "ssim")):
         for method in dict.fromkeys(entry.method for entry in group):
             points = sorted((e.means["seconds"], e.means[name]) for e in group if e.method == method)
-            ax.plot(*zip(*points), **style[method], linewidth=0.8, markersize=6, label=literal(method))
+            ax.plot(*zip(*points), **style[method], linewidth=0.8, markersize=6, label=_literal(method))
         points = [(e.means["seconds"], e.means[name]) for e in group]
         best = [points[i] for i in front(points)]
         ax.plot(*zip(*best), color="black", linestyle="--", linewidth=1, zorder=0, label="front")
         for i in front(points):
-            ax.annotate(literal(group[i].label), points[i], xytext=(4, 4), textcoords="offset points", fontsize=7)
+            ax.annotate(_literal(group[i].label), points[i], xytext=(4, 4), textcoords="offset points", fontsize=7)
         ax.set_xscale("log")
         _dress(ax, "seconds per case", SHOWN_MEASURES[name].heading)
-        ax.set_title(literal(where), fontsize=9)
+        ax.set_title(_literal(where), fontsize=9)
 
 
 def _views(axes: Sequence[Axes], group: Sequence[Entry], style: dict) -> None:
     for ax, name in zip(axes, ("psnr", "ssim")):
         for label, look in setting_styles(group, style).items():
             points = sorted((e.condition["views"], e.means[name]) for e in group if e.name == label)
-            ax.plot(*zip(*points), **look, markersize=5, label=literal(label))
+            ax.plot(*zip(*points), **look, markersize=5, label=_literal(label))
         views = sorted({e.condition["views"] for e in group})
         ax.set_xscale("log", base=2)
         ax.set_xticks(views, map(str, views))
@@ -149,8 +153,8 @@ def _geometries(axes: Sequence[Axes], group: Sequence[Entry], style: dict) -> No
         for label, look in setting_styles(group, style).items():
             points = [(entry.means[name], places.index(entry.condition["geometry"])) for entry in group
                       if entry.name == label]
-            ax.plot(*zip(*points), **look | {"linestyle": ""}, markersize=6, label=literal(label))
-        ax.set_yticks(range(len(places)), [literal(Path(place).stem) for place in places])
+            ax.plot(*zip(*points), **look | {"linestyle": ""}, markersize=6, label=_literal(label))
+        ax.set_yticks(range(len(places)), [_literal(Path(place).stem) for place in places])
         ax.invert_yaxis()
         _dress(ax, SHOWN_MEASURES[name].heading, "")
 
@@ -160,7 +164,7 @@ def _deltas(axes: Sequence[Axes], curves: Sequence[tuple[str, list[Entry]]]) -> 
     for ax, name in zip(axes, ("ssim", "misfit")):
         for i, (label, group) in enumerate(curves):
             points = [(e.settings["delta"], e.means[name]) for e in group]
-            ax.plot(*zip(*points), color=COLOURS[i % len(COLOURS)], marker="o", markersize=5, label=literal(label))
+            ax.plot(*zip(*points), color=COLOURS[i % len(COLOURS)], marker="o", markersize=5, label=_literal(label))
         _dress(ax, "delta of Extra Compute (0: none)", SHOWN_MEASURES[name].heading)
     axes[-1].set_yscale("log")
 
@@ -168,7 +172,7 @@ def _deltas(axes: Sequence[Axes], curves: Sequence[tuple[str, list[Entry]]]) -> 
 def _stages(ax: Axes, group: Sequence[Entry], where: str) -> None:
     """Stacked shares of the seconds, a bar for each method at its best setting, with the seconds in all."""
     best = sorted(best_settings(group), key=lambda entry: entry.means["seconds"])
-    labels, left = [literal(entry.label) for entry in best], [0.0] * len(best)
+    labels, left = [_literal(entry.label) for entry in best], [0.0] * len(best)
     for stage, label in STAGES.items():
         shares = []
         for entry in best:
@@ -182,7 +186,7 @@ def _stages(ax: Axes, group: Sequence[Entry], where: str) -> None:
     ax.set_xlim(0, 115)
     ax.set_axisbelow(True)
     _dress(ax, "share of the time (%)", "")
-    ax.set_title(literal(where), fontsize=9)
+    ax.set_title(_literal(where), fontsize=9)
     ax.legend(fontsize=7, loc="lower center", bbox_to_anchor=(0.5, 1.06), ncols=3)
 
 

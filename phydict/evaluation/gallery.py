@@ -8,19 +8,15 @@ not finite are shown in magenta.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
-from typing import Any
 
+import matplotlib
 import nibabel as nib
 import numpy as np
 import torch
-from matplotlib import colormaps
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, Normalize
-from matplotlib.figure import Figure
-from matplotlib.patheffects import withStroke
+from PIL import Image, ImageDraw, ImageFont
 
 from phydict.grid import Grid
 from phydict.runtime.files import atomic_write
@@ -40,9 +36,20 @@ MOST_VIEWS = 8
 STRETCH = 15.0
 """An X-ray's longer side over its shorter one, above which it is shown stretched to this, to be seen at all."""
 
-GREY = colormaps["gray"].with_extremes(bad="magenta")
-SPREAD = colormaps["inferno"].with_extremes(bad="magenta")
-SIGNED = colormaps["RdBu_r"].with_extremes(bad="magenta")
+GREY = matplotlib.colormaps["gray"].with_extremes(bad="magenta")
+SPREAD = matplotlib.colormaps["inferno"].with_extremes(bad="magenta")
+SIGNED = matplotlib.colormaps["RdBu_r"].with_extremes(bad="magenta")
+
+FONT = Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"
+
+TITLE, HEADING, LINE = 44, 26, 16
+"""Pixels from above that a page's title takes, that a heading takes, and each line of it."""
+
+CELL, METHOD_CELL, GAP = (430, 370), (320, 320), 10
+"""Pixels across and down that a plane has in a case's page and in one of several methods, and those between two."""
+
+XRAY_HEIGHT, XRAY_LEFT, XRAY_RIGHT = 170, 100, 90
+"""Pixels down of a row of X-rays at most, and across those that the names of rows and the scales of colours take."""
 
 
 def plane(volume, grid: Grid, name: str) -> tuple[np.ndarray, float]:
@@ -80,27 +87,31 @@ def panel(path: str | Path, reconstruction_hu, grid: Grid, xrays=None, reproject
     """
     if reprojection is not None and xrays is None:
         raise ValueError("a re-projection is shown against measured X-rays; pass xrays as well")
-    volumes = {"reconstruction": reconstruction_hu} | ({} if truth_hu is None else {"truth": truth_hu})
-    beside = truth_hu is not None or deviation_hu is not None
-    rows = 3 if beside else 1
-    columns = 1 + 2 * (truth_hu is not None) + (deviation_hu is not None) if beside else 3
-    planes_height, xrays_height = 3.6 * rows, 0.0 if xrays is None else (1.9 if reprojection is None else 5.6)
-    figure, upper, lower = _page(4.0 * max(columns, 3), planes_height, xrays_height, title)
-    cells = upper.add_gridspec(rows, columns, wspace=0.08, hspace=0.14, **_margins(planes_height, 0.3))
-    for n, name in enumerate(PLANES):
-        for column, (label, volume) in enumerate(volumes.items()):
-            ax = upper.add_subplot(cells[n, column] if beside else cells[0, n])
-            _show_plane(ax, volume, grid, name, f"{label}, {name}")
-        if deviation_hu is not None:
-            _show_image(upper.add_subplot(cells[n, columns - 1]), deviation_hu, grid, name,
-                        f"{deviation_label}, up to {DIFFERENCE:g} HU", SPREAD, 0, DIFFERENCE)
-        if truth_hu is not None:
-            difference = _array(reconstruction_hu, 3, "a volume") - _array(truth_hu, 3, "a volume")
-            _show_image(upper.add_subplot(cells[n, 2]), difference, grid, name,
-                        f"difference, ±{DIFFERENCE:g} HU", SIGNED, -DIFFERENCE, DIFFERENCE)
+    columns = [("reconstruction", reconstruction_hu, GREY, DISPLAY)]
+    if truth_hu is not None:
+        difference = _array(reconstruction_hu, 3, "a volume") - _array(truth_hu, 3, "a volume")
+        columns += [("truth", truth_hu, GREY, DISPLAY),
+                    (f"difference, ±{DIFFERENCE:g} HU", difference, SIGNED, (-DIFFERENCE, DIFFERENCE))]
+    if deviation_hu is not None:
+        columns.append((f"{deviation_label}, up to {DIFFERENCE:g} HU", deviation_hu, SPREAD, (0, DIFFERENCE)))
+    cells = [(row, column) for row in PLANES for column in columns]
+    wide = len(columns) if len(columns) > 1 else len(PLANES)  # planes lie beside each other where they are alone
+    across, down = CELL[0] + GAP, CELL[1] + HEADING
+    upper = TITLE + len(cells) // wide * down
+    width, shown = max(wide, len(PLANES)) * across + GAP, (0, 0)
     if xrays is not None:
-        _show_xrays(lower, xrays_height, xrays, reprojection, pixel)
-    _save(figure, path)
+        tall, broad = _array(xrays, 3, "a set of X-rays").shape[1:]
+        shown = _fitted(float(np.clip(pixel * tall / broad, 1 / STRETCH, STRETCH)),
+                        (width - XRAY_LEFT - XRAY_RIGHT) // MOST_VIEWS - GAP, XRAY_HEIGHT)
+    rows = 0 if xrays is None else 1 if reprojection is None else 3
+    page, left = _Page(width, upper + rows * (shown[1] + HEADING) + GAP, title), (width - wide * across + GAP) // 2
+    for n, (name, (label, volume, colours, limits)) in enumerate(cells):
+        heading = f"{label}, {name}" if colours is GREY else label
+        page.plane(volume, grid, name, heading, (left + n % wide * across, TITLE + n // wide * down + HEADING), CELL,
+                   colours, limits)
+    if xrays is not None:
+        _show_xrays(page, upper, shown, xrays, reprojection)
+    page.save(path)
 
 
 def method_panel(path: str | Path, volumes: Mapping[str, object], truth_hu, grid: Grid,
@@ -117,59 +128,89 @@ def method_panel(path: str | Path, volumes: Mapping[str, object], truth_hu, grid
     if unknown := captions.keys() - volumes.keys():
         raise ValueError(f"captions name the methods {sorted(unknown)}, but the volumes are of {list(volumes)}")
     shown = ([] if truth_hu is None else [("truth", truth_hu)]) + list(volumes.items())
-    height = 6.2
-    figure, page, _ = _page(max(3.0 * len(shown), 6.0), height, 0.0, title)
-    cells = page.add_gridspec(2, len(shown), wspace=0.05, hspace=0.05, **_margins(height, 0.5))
+    (wide, high), top = METHOD_CELL, TITLE + HEADING + LINE
+    page = _Page(max(len(shown), 2) * (wide + GAP) + GAP, top + 2 * (high + GAP), title)
     for column, (name, volume) in enumerate(shown):
         for row, which in enumerate(("coronal", "axial")):
             heading = f"{name}\n{captions.get(name, '')}" if row == 0 else ""
-            _show_plane(page.add_subplot(cells[row, column]), volume, grid, which, heading)
-    _save(figure, path)
+            page.plane(volume, grid, which, heading, (GAP + column * (wide + GAP), top + row * (high + GAP)),
+                       METHOD_CELL, GREY, DISPLAY)
+    page.save(path)
 
 
-def _page(width: float, upper: float, lower: float, title: str):
-    """A figure of `width` inches with a strip for a title and subfigures of these heights (the lower may be None)."""
-    strip = 0.45 if title else 0.05
-    figure = Figure(figsize=(width, strip + upper + lower), dpi=110, facecolor="white")
-    FigureCanvasAgg(figure)
-    heights = [strip, upper] + ([lower] if lower else [])
-    parts: Any = figure.subfigures(len(heights), 1, height_ratios=heights, hspace=0)
-    parts[0].suptitle(literal(title), fontsize=13, y=0.6, va="center")
-    return figure, parts[1], parts[2] if lower else None
+def binned(images: np.ndarray, rows: int, columns: int) -> np.ndarray:
+    """Means of blocks of so many rows and columns of pixels (K, V, U); incomplete blocks at the far edges are left
+    out."""
+    views, high, wide = images.shape[0], images.shape[1] // rows, images.shape[2] // columns
+    cut = images[:, :high * rows, :wide * columns].astype(np.float32)
+    return cut.reshape(views, high, rows, wide, columns).mean((2, 4))
 
 
-def literal(text: str) -> str:
-    """A text that Matplotlib shows as it is, whatever dollars are in it."""
-    return text.replace("$", "\\$")
+class _Page:
+    """A white page with a title, on which pictures and words are put; places are (x, y) in pixels from the upper left.
+    """
+
+    def __init__(self, width: int, height: int, title: str):
+        self.image = Image.new("RGB", (width, height), "white")
+        self.pen = ImageDraw.Draw(self.image)
+        self.words(title, (width // 2, TITLE // 2), width, size=18)
+
+    def words(self, text: str, place: tuple[float, float], width: float, size: int = 13, anchor: str = "mm",
+              outlined: bool = False) -> None:
+        """Writes lines, smaller where they are wider than `width` pixels; anchor: Pillow's, of the place in them;
+        outlined: in gold with a black outline, to be read on a picture."""
+        needed = max((_font(size).getlength(line) for line in text.split("\n")), default=0)
+        font = _font(max(min(size, int(size * width / needed)), 6) if needed else size)
+        ink = {"fill": "gold", "stroke_width": 1, "stroke_fill": "black"} if outlined else {"fill": "black"}
+        self.pen.text(place, text, font=font, anchor=anchor, align="center", spacing=2, **ink)
+
+    def picture(self, values: np.ndarray, place: tuple[int, int], size: tuple[int, int], colours: Colormap,
+                limits: tuple[float, float]) -> None:
+        """Shows values (rows, columns) in colours over the limits, `size` pixels across and down."""
+        shown = colours(Normalize(*limits)(np.ma.masked_invalid(values)), bytes=True)[..., :3]
+        self.image.paste(Image.fromarray(shown).resize(size, Image.Resampling.NEAREST), place)
+
+    def plane(self, volume, grid: Grid, name: str, heading: str, place: tuple[int, int], cell: tuple[int, int],
+              colours: Colormap, limits: tuple[float, float]) -> None:
+        """Shows the plane `name` of a volume in the middle of a cell, under its heading; in grey, with letters of the
+        patient's sides."""
+        image, aspect = plane(volume, grid, name)
+        wide, high = _fitted(image.shape[0] * aspect / image.shape[1], *cell)
+        left, top = place[0] + (cell[0] - wide) // 2, place[1] + (cell[1] - high) // 2
+        self.picture(image, (left, top), (wide, high), colours, limits)
+        self.words(heading, (place[0] + cell[0] / 2, top - 4), cell[0], anchor="md")
+        if colours is not GREY:
+            return
+        for (x, y), letter in zip(((0.03, 0.5), (0.97, 0.5), (0.5, 0.04), (0.5, 0.96)), PLANES[name][1]):
+            self.words(letter, (left + x * wide, top + y * high), wide, 13, outlined=True)
+        if broken := int((~np.isfinite(image)).sum()):
+            self.words(f"{broken} not finite", (left + 0.02 * wide, top + 0.96 * high), 0.45 * wide, 11, "lm", True)
+
+    def scale(self, place: tuple[int, int], height: int, colours: Colormap, limits: tuple[float, float]) -> None:
+        """Shows which colours stand for which values."""
+        x, y = place
+        self.picture(np.linspace(limits[1], limits[0], height)[:, None], place, (12, height), colours, limits)
+        for part in (0.0, 0.25, 0.5, 0.75, 1.0):
+            value = limits[1] + part * (limits[0] - limits[1])
+            self.words(f"{value:.2g}", (x + 17, y + part * height), XRAY_RIGHT - 50, 11, "lm")
+
+    def save(self, path: str | Path) -> None:
+        with atomic_write(Path(path)) as part:
+            self.image.save(part, format="png", compress_level=2)  # 6, the default, takes twice the time for 5 % less
 
 
-def _margins(height: float, heading: float) -> dict[str, float]:
-    return {"left": 0.02, "right": 0.98, "bottom": 0.1 / height, "top": 1 - heading / height}
+@cache
+def _font(size: int) -> ImageFont.FreeTypeFont:
+    return ImageFont.truetype(FONT, size, layout_engine=ImageFont.Layout.BASIC)
 
 
-def _show_image(ax: Axes, volume, grid: Grid, name: str, heading: str, colours: Colormap, low: float,
-                high: float) -> np.ndarray:
-    """Shows the plane `name` of a volume in colours from low to high; returns its pixels."""
-    image, aspect = plane(volume, grid, name)
-    ax.imshow(np.ma.masked_invalid(image), colours, aspect=aspect, vmin=low, vmax=high, interpolation="nearest")
-    _finish(ax, heading)
-    return image
+def _fitted(ratio: float, width: int, height: int) -> tuple[int, int]:
+    """The largest size of this height over width in a box."""
+    return max(round(min(width, height / ratio)), 1), max(round(min(height, width * ratio)), 1)
 
 
-def _show_plane(ax: Axes, volume, grid: Grid, name: str, heading: str) -> None:
-    image = _show_image(ax, volume, grid, name, heading, GREY, *DISPLAY)
-    for (x, y), letter in zip(((0.03, 0.5), (0.97, 0.5), (0.5, 0.96), (0.5, 0.04)), PLANES[name][1]):
-        _write(ax, x, y, letter, "center")
-    if broken := int((~np.isfinite(image)).sum()):
-        _write(ax, 0.02, 0.04, f"{broken} not finite", "left")
-
-
-def _write(ax: Axes, x: float, y: float, text: str, align: str) -> None:
-    outline = [withStroke(linewidth=2, foreground="black")]
-    ax.text(x, y, text, transform=ax.transAxes, color="gold", fontsize=8, ha=align, va="center", path_effects=outline)
-
-
-def _show_xrays(figure, height: float, xrays, reprojection, pixel: float) -> None:
+def _show_xrays(page: _Page, top: int, size: tuple[int, int], xrays, reprojection) -> None:
+    """Shows rows of X-rays of `size` pixels across and down, the first `top` pixels from above."""
     measured = _array(xrays, 3, "a set of X-rays")
     rows = {"measured": measured}
     if reprojection is not None:
@@ -178,35 +219,25 @@ def _show_xrays(figure, height: float, xrays, reprojection, pixel: float) -> Non
             raise ValueError(f"the re-projection has shape {rendered.shape}, but the X-rays have {measured.shape}")
         rows |= {"re-projected": rendered, "residual": rendered - measured}
         per_view = misfits(torch.from_numpy(rendered), torch.from_numpy(measured))["misfit_per_view"]
-    count = min(len(measured), MOST_VIEWS)
-    views = np.linspace(0, len(measured) - 1, count).round().astype(int)
-    low, high = _scale(np.concatenate([rows[name][views].ravel() for name in rows if name != "residual"]))
-    spread = np.abs(_scale(rows["residual"][views])).max() if "residual" in rows else 0.0
-    cells = figure.add_gridspec(len(rows), 1, hspace=0.22, left=0.045, right=0.93, bottom=0.1 / height,
-                                top=1 - 0.3 / height)
+    views = np.linspace(0, len(measured) - 1, min(len(measured), MOST_VIEWS)).round().astype(int)
     headings = {"measured": [f"view {view} of {len(measured)}" for view in views]}
-    if "residual" in rows:
+    if reprojection is not None:
         headings["residual"] = [f"misfit {per_view[view]:.3g}" for view in views]
-    tall, wide = measured.shape[1:]
-    aspect = np.clip(pixel * tall / wide, 1 / STRETCH, STRETCH) * wide / tall
-    gap = max(1, round(0.06 * wide))
-    starts = (wide + gap) * np.arange(MOST_VIEWS)
-    width = starts[-1] + wide
-    for row, (name, images) in enumerate(rows.items()):
-        limits, colours = ((-spread, spread), SIGNED) if name == "residual" else ((low, high), GREY)
-        mapped = ScalarMappable(Normalize(*limits), colours)
-        strip = np.ones((tall, width, 4))
-        for start, view in zip(starts, views):
-            strip[:, start:start + wide] = mapped.cmap(mapped.norm(np.ma.masked_invalid(images[view])))
-        ax = figure.add_subplot(cells[row, 0])
-        ax.imshow(strip, aspect=aspect, interpolation="nearest")
-        _finish(ax, "")
-        ax.set_ylabel(name, fontsize=9)
-        for start, heading in zip(starts, headings.get(name, [])):
-            ax.annotate(heading, ((start + wide / 2) / width, 1), (0, 3), "axes fraction", "offset points", fontsize=9,
-                        ha="center")
-        bar = ax.inset_axes(((starts[count - 1] + wide) / width + 0.017, 0, 0.0135, 1))
-        figure.colorbar(mapped, cax=bar).ax.tick_params(labelsize=7)
+    blocks = [max(pixels // shown, 1) for pixels, shown in zip(measured.shape[1:], reversed(size))]
+    rows = {name: binned(images[views], *blocks) for name, images in rows.items()}
+    limits = dict.fromkeys(rows, _scale(np.concatenate([rows[name].ravel() for name in rows if name != "residual"])))
+    if "residual" in rows:
+        spread = np.abs(_scale(rows["residual"])).max()
+        limits["residual"] = (-spread, spread)
+    for n, (name, images) in enumerate(rows.items()):
+        y, colours = top + HEADING + n * (size[1] + HEADING), SIGNED if name == "residual" else GREY
+        page.words(name, (XRAY_LEFT - GAP, y + size[1] / 2), XRAY_LEFT - 2 * GAP, anchor="rm")
+        for k, image in enumerate(images):
+            x = XRAY_LEFT + k * (size[0] + GAP)
+            page.picture(image, (x, y), size, colours, limits[name])
+            if name in headings:
+                page.words(headings[name][k], (x + size[0] / 2, y - 4), size[0] + GAP, anchor="md")
+        page.scale((XRAY_LEFT + len(images) * (size[0] + GAP), y), size[1], colours, limits[name])
 
 
 def _scale(values: np.ndarray) -> tuple[float, float]:
@@ -216,15 +247,6 @@ def _scale(values: np.ndarray) -> tuple[float, float]:
         return 0.0, 1.0
     low, high = np.percentile(finite, (0.25, 99.75))
     return (float(low), float(high)) if high > low else (float(low) - 0.5, float(low) + 0.5)
-
-
-def _finish(ax: Axes, heading: str) -> None:
-    ax.set_xticks([])
-    ax.set_yticks([])
-    for spine in ax.spines.values():
-        spine.set_visible(False)
-    if heading:
-        ax.set_title(heading, fontsize=9, pad=3)
 
 
 def _array(values, dimensions: int, noun: str) -> np.ndarray:
@@ -237,8 +259,3 @@ def _array(values, dimensions: int, noun: str) -> np.ndarray:
     if array.ndim != dimensions:
         raise ValueError(f"{noun} to show has {dimensions} axes, but shape {array.shape} was given; pass one case")
     return array
-
-
-def _save(figure: Figure, path: str | Path) -> None:
-    with atomic_write(Path(path)) as part:
-        figure.savefig(part, format="png")

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from phydict.evaluation.gallery import DISPLAY, GREY, MOST_VIEWS, PLANES, literal, plane
+from phydict.evaluation.gallery import DISPLAY, GREY, MOST_VIEWS, PLANES, plane
 from phydict.grid import Grid
 from phydict.inference.orientation import LEAST, better_flip, correlation
 from phydict.runtime.files import atomic_write, is_signed
@@ -69,7 +69,7 @@ def geometry_page(path: str | Path, beam: ConeBeam, grid: Grid, xrays: np.ndarra
     figure = Figure(figsize=(max(2.1 * len(shown), 12.0), 12.6), dpi=110, facecolor="white")
     FigureCanvasAgg(figure)
     upper, lower = figure.subfigures(2, 1, height_ratios=[7, 5.6], hspace=0)  # type: ignore[misc]
-    upper.suptitle(literal(title), fontsize=13)
+    upper.suptitle(title, fontsize=13, parse_math=False)
     for ax, (name, axis) in zip(upper.subplots(1, 2), DRAWN.items()):
         _draw(ax, beam, grid, thorax_hu, name, axis)
     sides = view_sides(beam, grid)

@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 from torch import Tensor
 
-from phydict.evaluation.gallery import DISPLAY, plane
+from phydict.evaluation.gallery import DISPLAY, binned, plane
 from phydict.grid import Grid
 from phydict.runtime.files import atomic_write
 
@@ -76,7 +76,7 @@ def _int16(volume: Tensor | np.ndarray) -> np.ndarray:
 def _xrays(measured: np.ndarray, rendered: np.ndarray, pixel: float) -> dict:
     factor = -(-max(measured.shape[1:]) // XRAY_SIDE)
     rows, columns = (min(factor, size) for size in measured.shape[1:])
-    images = [_binned(values, rows, columns) for values in (measured, rendered)]
+    images = [binned(values, rows, columns) for values in (measured, rendered)]
     finite = np.concatenate([image[np.isfinite(image)] for image in images])
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
     step = (high - low or 1.0) / (2**16 - 1)
@@ -84,14 +84,6 @@ def _xrays(measured: np.ndarray, rendered: np.ndarray, pixel: float) -> dict:
              for image in images]
     return {"shape": images[0].shape, "pixel": pixel * rows / columns, "low": low, "step": step, "measured": codes[0],
             "rendered": codes[1]}
-
-
-def _binned(images: np.ndarray, rows: int, columns: int) -> np.ndarray:
-    """Means of blocks of so many rows and columns of pixels (K, V, U); incomplete blocks at the far edges are left
-    out."""
-    views, high, wide = images.shape[0], images.shape[1] // rows, images.shape[2] // columns
-    cut = images[:, :high * rows, :wide * columns].astype(np.float32)
-    return cut.reshape(views, high, rows, wide, columns).mean((2, 4))
 
 
 def _write_thumbnail(path: Path, volume: Tensor | np.ndarray, grid: Grid) -> None:

@@ -59,7 +59,7 @@ def chests(patients) -> Callable[[object], Reconstruction]:
 
 
 @pytest.mark.filterwarnings("ignore:no volume explains")
-@pytest.mark.parametrize("method", ["phydict_learned", TV])
+@pytest.mark.parametrize("method", [pytest.param("phydict_learned", marks=pytest.mark.slow), TV])
 def test_what_stands_beside_the_volume_does_not_spoil_it(patients, chests, method, monkeypatch):
     y, truth, found = xrays_of(patients["with arms"]), inside(patients["with arms"]), chests(method)
     monkeypatch.setattr("phydict.methods.extended", lambda method, grid, xrays, beam, display: (method, grid, beam))

@@ -1,6 +1,7 @@
 """DICOM radiographs (CR, DX) and angiographic or fluoroscopic runs (XA, RF): images, and what their tags say.
 
-Pixels: rescale slope and intercept, or the modality LUT, are applied; the VOI window, a choice for the eye, never is.
+Pixels: rescale slope and intercept, or the modality LUT but that of LOG images, are applied; the VOI window, a choice
+for the eye, never is.
 Padding is told by the values as they are stored (PS3.3 C.7.5.1.1.2). MONOCHROME1 says how values are shown, so it
 inverts display images alone. Tags are looked for in a frame's own functional groups, in the shared ones, and in the
 file. The beam they state is phydict.datasets.radiographs.dicom_beam's.
@@ -169,7 +170,9 @@ def _padded(stored: np.ndarray, dataset: pydicom.Dataset, frame: int, name: str)
 
 
 def _rescaled(pixels: np.ndarray, dataset: pydicom.Dataset, frame: int, name: str) -> np.ndarray:
-    if "ModalityLUTSequence" in dataset:
+    """Stored values after the modality transform. The LUT of a LOG image leads back to intensity (PS3.3 C.8.7.1.1.2),
+    which is no display image, so that it is passed over."""
+    if "ModalityLUTSequence" in dataset and _code(dataset, frame, "PixelIntensityRelationship", name) != "LOG":
         with reading(f"the modality LUT of {name}", "export it with RescaleSlope and RescaleIntercept"):
             return np.asarray(apply_modality_lut(pixels, dataset), np.float64)
     slope, intercept = (_number(dataset, frame, f"Rescale{part}", name) for part in ("Slope", "Intercept"))

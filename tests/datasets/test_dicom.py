@@ -260,6 +260,22 @@ def test_log_images_are_display_values_that_grow_with_density(tmp_path, sign, ph
     assert np.corrcoef(case["xrays"].flatten(), stored.flatten())[0, 1] == pytest.approx(-sign)  # sign 1: bright is air
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+def test_the_modality_lut_of_a_log_image_leads_back_to_intensity_and_is_passed_over(tmp_path, sign):
+    stored, grey = counts()[0] % 4000, np.arange(4000)
+    lut = Dataset()
+    lut.LUTDescriptor, lut.ModalityLUTType = [4000, 0, 16], "US"
+    lut.LUTData = np.rint(60000 * np.exp((grey - 3999 if sign == 1 else -grey) / 1000)).astype(int).tolist()
+    lut["LUTDescriptor"].VR = lut["LUTData"].VR = "US"
+    tags = angled(0.0) | {"PixelIntensityRelationship": "LOG", "PixelIntensityRelationshipSign": sign}
+    plain, beside = one(tmp_path / "plain", stored, **tags), one(
+        tmp_path / "beside", stored, **tags, ModalityLUTSequence=Sequence([lut]))
+    assert load_xrays(beside)["xrays"].equal(load_xrays(plain)["xrays"])
+    tags["PixelIntensityRelationship"] = "DISP"
+    other = one(tmp_path / "other", stored, **tags, ModalityLUTSequence=Sequence([lut]))
+    np.testing.assert_allclose(load_xrays(other, intensity=LINES)["xrays"][0], 1e-3 * np.array(lut.LUTData)[stored])
+
+
 def test_linear_images_become_line_integrals_by_their_air(tmp_path):
     folder = one(tmp_path, **angled(0.0), PixelIntensityRelationship="LIN", PixelIntensityRelationshipSign=1)
     fails("PixelIntensityRelationship LIN.*air: ...", folder)

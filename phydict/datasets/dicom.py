@@ -31,7 +31,8 @@ TILTS, LEVEL = ("DetectorPrimaryAngle", "DetectorSecondaryAngle", "ColumnAngulat
 
 @dataclass(frozen=True)
 class DicomTags:
-    """What the tags of one frame say of its geometry and pixel values; None or "" where they are silent.
+    """What the tags of one frame say of its geometry and pixel values; None or "" where they are silent, NaN of angles
+    that they leave open.
 
     name: of file and frame; frame: its index in the file. Lengths in mm, angles in degrees; pixel: (row height, column
     width); view_degrees: of ViewPosition; patient_orientation: letters of the directions in which (columns, rows) of
@@ -243,12 +244,11 @@ def _number(dataset: pydicom.Dataset, frame: int, keyword: str, name: str) -> fl
 
 
 def _angle(dataset: pydicom.Dataset, frame: int, keyword: str, name: str) -> float | None:
-    """A positioner angle with its increment: one value per frame counts from the first, a single one is the step."""
+    """A positioner angle with its increment: one value per frame counts from the first, a single one is the step; NaN
+    where their number is another, as in a part of a run."""
     angle = _number(dataset, frame, keyword, name)
     if angle is None or (steps := tag_numbers(dataset, frame, f"{keyword}Increment", name)) is None:
         return angle
     if len(steps) == 1:
         return angle + frame * steps[0]
-    if frame >= len(steps):
-        raise ValueError(f"{name}: {keyword}Increment holds {len(steps)} values; give one, or one per frame")
-    return angle + steps[frame]
+    return angle + steps[frame] if len(steps) == int(dataset.get("NumberOfFrames") or 1) else math.nan

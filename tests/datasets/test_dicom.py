@@ -67,6 +67,18 @@ def test_one_increment_is_the_step_of_every_frame(tmp_path):
     assert load_xrays(tmp_path, intensity=LINES)["beam"].same_as(ConeBeam.orbit(8, 1020, 740, SHAPE, PIXEL), 1e-6)
 
 
+@pytest.mark.parametrize("frames", [1, 2, 5])
+def test_increments_of_another_number_of_frames_are_not_guessed_at(tmp_path, frames):
+    tags = orbit_tags(4, 1020.0, 740.0, PIXEL) | {"PositionerSecondaryAngleIncrement": 0.0}
+    write_dicom(tmp_path / "part.dcm", counts(frames), **tags)
+    fails("PositionerPrimaryAngleIncrement does not hold one value for each frame.*primary_degrees: ", tmp_path,
+          intensity=LINES)
+    angles = [30.0 * k for k in range(frames)]
+    described(tmp_path, beam={"dicom": {"primary_degrees": angles}})
+    expected = ConeBeam.at_angles([-angle for angle in angles], 1020, 740, SHAPE, PIXEL)
+    assert load_xrays(tmp_path, intensity=LINES)["beam"].same_as(expected, 1e-6)
+
+
 @pytest.mark.parametrize("primary, secondary, detector", [
     (0, 0, [0, 1, 0]), (90, 0, [-1, 0, 0]), (-90, 0, [1, 0, 0]), (180, 0, [0, -1, 0]),
     (0, 90, [0, 0, 1]), (0, -90, [0, 0, -1]), (30, 0, [-0.5, 0.75**0.5, 0]), (0, 30, [0, 0.75**0.5, 0.5]),

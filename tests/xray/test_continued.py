@@ -77,6 +77,12 @@ def test_a_small_detector_meets_nothing_beyond():
     assert torch.equal(Projector(GRID, beam, full_detector=True)(mu), plain(mu))
 
 
+def test_a_box_beside_rays_that_run_along_its_axes_is_reached_as_far_as_without_them():
+    beside = Grid.box(16, 100, (150, 0, 20))
+    odd, even = (ConeBeam.orbit(1, 1020, 740, (n, n), 600 / n) for n in (21, 22))
+    assert reach_beyond(odd, beside) == reach_beyond(even, beside) > 0
+
+
 def test_other_poses_pixels_and_views_stay_continued_and_a_file_keeps_it(tmp_path):
     beam = replace(ORBIT, continued=True)
     for other in (beam.binned(2), beam.divided(2), beam.select([0, 2]), beam.shifted(3, 4), beam.tilted(5)):

@@ -1,6 +1,7 @@
 """DICOM radiographs (CR, DX) and angiographic or fluoroscopic runs (XA, RF): images, and what their tags say.
 
-Pixels: rescale slope and intercept, or the modality LUT, are applied; the VOI window, a choice for the eye, never is.
+Pixels: rescale slope and intercept, or the modality LUT but that of LOG images, are applied; the VOI window, a choice
+for the eye, never is.
 Padding is told by the values as they are stored (PS3.3 C.7.5.1.1.2). MONOCHROME1 says how values are shown, so it
 inverts display images alone. Tags are looked for in a frame's own functional groups, in the shared ones, and in the
 file. The beam they state is phydict.datasets.radiographs.dicom_beam's.
@@ -30,7 +31,8 @@ TILTS, LEVEL = ("DetectorPrimaryAngle", "DetectorSecondaryAngle", "ColumnAngulat
 
 @dataclass(frozen=True)
 class DicomTags:
-    """What the tags of one frame say of its geometry and pixel values; None or "" where they are silent.
+    """What the tags of one frame say of its geometry and pixel values; None or "" where they are silent, NaN of angles
+    that they leave open.
 
     name: of file and frame; frame: its index in the file. Lengths in mm, angles in degrees; pixel: (row height, column
     width); view_degrees: of ViewPosition; patient_orientation: letters of the directions in which (columns, rows) of
@@ -169,7 +171,9 @@ def _padded(stored: np.ndarray, dataset: pydicom.Dataset, frame: int, name: str)
 
 
 def _rescaled(pixels: np.ndarray, dataset: pydicom.Dataset, frame: int, name: str) -> np.ndarray:
-    if "ModalityLUTSequence" in dataset:
+    """Stored values after the modality transform. The LUT of a LOG image leads back to intensity (PS3.3 C.8.7.1.1.2),
+    which is no display image, so that it is passed over."""
+    if "ModalityLUTSequence" in dataset and _code(dataset, frame, "PixelIntensityRelationship", name) != "LOG":
         with reading(f"the modality LUT of {name}", "export it with RescaleSlope and RescaleIntercept"):
             return np.asarray(apply_modality_lut(pixels, dataset), np.float64)
     slope, intercept = (_number(dataset, frame, f"Rescale{part}", name) for part in ("Slope", "Intercept"))
@@ -240,12 +244,11 @@ def _number(dataset: pydicom.Dataset, frame: int, keyword: str, name: str) -> fl
 
 
 def _angle(dataset: pydicom.Dataset, frame: int, keyword: str, name: str) -> float | None:
-    """A positioner angle with its increment: one value per frame counts from the first, a single one is the step."""
+    """A positioner angle with its increment: one value per frame counts from the first, a single one is the step; NaN
+    where their number is another, as in a part of a run."""
     angle = _number(dataset, frame, keyword, name)
     if angle is None or (steps := tag_numbers(dataset, frame, f"{keyword}Increment", name)) is None:
         return angle
     if len(steps) == 1:
         return angle + frame * steps[0]
-    if frame >= len(steps):
-        raise ValueError(f"{name}: {keyword}Increment holds {len(steps)} values; give one, or one per frame")
-    return angle + steps[frame]
+    return angle + steps[frame] if len(steps) == int(dataset.get("NumberOfFrames") or 1) else math.nan

@@ -177,7 +177,9 @@ def whole_doubts(compared: Comparison) -> list[str]:
 
 def _turned(compared: Comparison) -> list[str]:
     beam = compared.beam
-    thorax = thorax_views(compared.grid, replace(beam, shape=beam.shape[::-1]))
+    height, width = compared.pixel
+    thorax = thorax_views(compared.grid, replace(beam, u=beam.u * height / width, v=beam.v * width / height,
+                                                 shape=beam.shape[::-1]))
     scores = {turn: np.mean([*map(correlation, turn.apply(compared.images.numpy()), thorax)]) for turn in TURNS}
     best = max(scores, key=scores.__getitem__)
     if scores[best] <= max(LEAST, TURNED + max(compared.anywhere(name).mean() for name in compared.maps)):
@@ -185,7 +187,7 @@ def _turned(compared: Comparison) -> list[str]:
     keys = f"rotate_degrees: {best.rotate_degrees}" + ", flip_columns: true" * best.flip_columns
     return [f"all views agree better with a standard thorax when turned by a quarter (mean agreement "
             f"{scores[best]:.3f}, as stated {compared.stated('as it is').mean():.3f}): give `orientation: {{{keys}}}` "
-            f"and, of the turned images, shape {list(compared.stated_shape[::-1])}, and look again"]
+            f"and, of the turned images, shape {list(compared.stated_shape[::-1])} and pixel, and look again"]
 
 
 def _moved(compared: Comparison) -> list[str]:

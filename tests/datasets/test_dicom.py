@@ -67,6 +67,18 @@ def test_one_increment_is_the_step_of_every_frame(tmp_path):
     assert load_xrays(tmp_path, intensity=LINES)["beam"].same_as(ConeBeam.orbit(8, 1020, 740, SHAPE, PIXEL), 1e-6)
 
 
+@pytest.mark.parametrize("frames", [1, 2, 5])
+def test_increments_of_another_number_of_frames_are_not_guessed_at(tmp_path, frames):
+    tags = orbit_tags(4, 1020.0, 740.0, PIXEL) | {"PositionerSecondaryAngleIncrement": 0.0}
+    write_dicom(tmp_path / "part.dcm", counts(frames), **tags)
+    fails("PositionerPrimaryAngleIncrement does not hold one value for each frame.*primary_degrees: ", tmp_path,
+          intensity=LINES)
+    angles = [30.0 * k for k in range(frames)]
+    described(tmp_path, beam={"dicom": {"primary_degrees": angles}})
+    expected = ConeBeam.at_angles([-angle for angle in angles], 1020, 740, SHAPE, PIXEL)
+    assert load_xrays(tmp_path, intensity=LINES)["beam"].same_as(expected, 1e-6)
+
+
 @pytest.mark.parametrize("primary, secondary, detector", [
     (0, 0, [0, 1, 0]), (90, 0, [-1, 0, 0]), (-90, 0, [1, 0, 0]), (180, 0, [0, -1, 0]),
     (0, 90, [0, 0, 1]), (0, -90, [0, 0, -1]), (30, 0, [-0.5, 0.75**0.5, 0]), (0, 30, [0, 0.75**0.5, 0.5]),
@@ -258,6 +270,22 @@ def test_log_images_are_display_values_that_grow_with_density(tmp_path, sign, ph
     stored = torch.from_numpy(counts()[0].astype(np.float32))
     assert case["display"]
     assert np.corrcoef(case["xrays"].flatten(), stored.flatten())[0, 1] == pytest.approx(-sign)  # sign 1: bright is air
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_the_modality_lut_of_a_log_image_leads_back_to_intensity_and_is_passed_over(tmp_path, sign):
+    stored, grey = counts()[0] % 4000, np.arange(4000)
+    lut = Dataset()
+    lut.LUTDescriptor, lut.ModalityLUTType = [4000, 0, 16], "US"
+    lut.LUTData = np.rint(60000 * np.exp((grey - 3999 if sign == 1 else -grey) / 1000)).astype(int).tolist()
+    lut["LUTDescriptor"].VR = lut["LUTData"].VR = "US"
+    tags = angled(0.0) | {"PixelIntensityRelationship": "LOG", "PixelIntensityRelationshipSign": sign}
+    plain, beside = one(tmp_path / "plain", stored, **tags), one(
+        tmp_path / "beside", stored, **tags, ModalityLUTSequence=Sequence([lut]))
+    assert load_xrays(beside)["xrays"].equal(load_xrays(plain)["xrays"])
+    tags["PixelIntensityRelationship"] = "DISP"
+    other = one(tmp_path / "other", stored, **tags, ModalityLUTSequence=Sequence([lut]))
+    np.testing.assert_allclose(load_xrays(other, intensity=LINES)["xrays"][0], 1e-3 * np.array(lut.LUTData)[stored])
 
 
 def test_linear_images_become_line_integrals_by_their_air(tmp_path):

@@ -13,7 +13,14 @@ from inference.runs import record, sirt
 from phydict.cli.infer import main
 from phydict.datasets import phantom_case, save_xrays
 from phydict.grid import Grid
-from phydict.inference.orientation import TURNS, correlation, in_other_sense, moved_agreements, orientation_doubts
+from phydict.inference.orientation import (
+    TURNS,
+    correlation,
+    in_other_sense,
+    moved_agreements,
+    orientation_doubts,
+    thorax_views,
+)
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 
@@ -115,6 +122,14 @@ def test_images_that_lie_are_named_with_what_turns_them_up(turn, beam):
     (said,) = orientation_doubts(torch.from_numpy(stored), replace(beam, shape=stored.shape[1:]), GRID)
     words = f"{{rotate_degrees: {turn.rotate_degrees}" + ", flip_columns: true" * turn.flip_columns + "}"
     assert words in said and str(list(beam.shape)) in said
+
+
+@pytest.mark.parametrize("shape, pixel", [((96, 144), (5.0, 5.0)), ((60, 60), (8.0, 5.0))])
+def test_a_standard_thorax_that_lies_agrees_wholly_once_it_is_turned_up(shape, pixel):
+    beam, lying = (ConeBeam.orbit(3, 1020.0, 740.0, shape[::way], pixel[::way], arc_degrees=180.0) for way in (1, -1))
+    stored = np.rot90(thorax_views(GRID, beam), axes=(1, 2)).copy()
+    (said,) = orientation_doubts(torch.from_numpy(stored), lying, GRID)
+    assert float(re.search(r"mean agreement ([\d.]+)", said)[1]) > 0.99
 
 
 @pytest.mark.filterwarnings("default")

@@ -66,7 +66,8 @@ def test_a_calibration_is_recorded_warned_of_written_and_can_be_given_back(case,
     main(predict(case, tmp_path / "again", f"--data.geometry={done / 'geometry_found.yaml'}"))
     one, other = (np.asarray(nibabel.load(folder / "volume.nii.gz").dataobj)
                   for folder in (done, tmp_path / "again" / "sirt" / "anna"))
-    assert np.abs(one - other).mean() < 20  # HU: the gains found are not in the file
+    assert np.abs(one - other).mean() < 20  # HU: the gains found are not in the file, but that they are uncertain is
+    assert load_xrays(case, done / "geometry_found.yaml")["uncertain"] == Uncertain(gain=0.1)
 
 
 def test_without_a_calibration_nothing_is_searched(case, tmp_path):

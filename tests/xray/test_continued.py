@@ -39,6 +39,16 @@ def test_rays_meet_the_last_slices_as_far_as_they_meet_anything(beam, method):
     assert 0 < slices < 16 and not torch.allclose(continued(mu), Projector(GRID, beam, method, full_detector=True)(mu))
 
 
+@pytest.mark.parametrize("beam", [ConeBeam.orbit(1, 1020, 740, (40, 30), 14.0), SWEEP], ids=["frontal", "sweep"])
+def test_a_patient_continues_upwards_whatever_way_the_rows_of_the_detector_run(beam):
+    mu = random_like((1, 1, *GRID.shape), torch.float64).abs()
+    upright = replace(beam, continued=True)
+    lying = replace(upright, u=beam.v, v=beam.u, shape=beam.shape[::-1])
+    seen, turned = (Projector(GRID, other, "joseph", full_detector=True)(mu) for other in (upright, lying))
+    torch.testing.assert_close(turned, seen.mT)
+    assert Projector(GRID, lying, full_detector=True).method == "matrix"
+
+
 @pytest.mark.parametrize("method", ["separable", "siddon"])
 def test_the_adjoint_is_exact(method):
     A = Projector(GRID, replace(ORBIT, continued=True), method, full_detector=True)
@@ -65,6 +75,12 @@ def test_a_small_detector_meets_nothing_beyond():
     assert reach_beyond(beam, GRID) == 0
     plain = Projector(GRID, replace(beam, continued=False), full_detector=True)
     assert torch.equal(Projector(GRID, beam, full_detector=True)(mu), plain(mu))
+
+
+def test_a_box_beside_rays_that_run_along_its_axes_is_reached_as_far_as_without_them():
+    beside = Grid.box(16, 100, (150, 0, 20))
+    odd, even = (ConeBeam.orbit(1, 1020, 740, (n, n), 600 / n) for n in (21, 22))
+    assert reach_beyond(odd, beside) == reach_beyond(even, beside) > 0
 
 
 def test_other_poses_pixels_and_views_stay_continued_and_a_file_keeps_it(tmp_path):

@@ -147,6 +147,11 @@ def _check(tags: DicomTags, values: dict, primary_stated: bool) -> None:
         if not (np.isfinite(numbers).all() and (numbers > 0).all()):
             raise ValueError(f"{tags.name}: {name} is {values[name]} (from {keywords[name]} or geometry.yaml), but it "
                              f"must be positive; state `beam: {{dicom: {{{name}: ...}}}}` in mm in geometry.yaml")
+    for name in OVERRIDES[3:5]:
+        if math.isnan(values[name]):
+            raise ValueError(f"{tags.name}: {keywords[name]}Increment does not hold one value for each frame of its "
+                             "file, as in a part of a run, so that the angle of this one is unknown; state `beam: "
+                             f"{{dicom: {{{name}: [...]}}}}`, one value per view, in geometry.yaml")
     apart = abs((values["primary_degrees"] - (tags.view_degrees or 0) + 180) % 360 - 180)
     if tags.view_degrees is not None and not primary_stated and apart > 45:
         raise ValueError(f"{tags.name}: PositionerPrimaryAngle {values['primary_degrees']:g} contradicts ViewPosition, "

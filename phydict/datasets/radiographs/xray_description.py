@@ -191,8 +191,9 @@ def read_description(path: Path, needed: bool = True) -> Description:
 
 
 def save_geometry(path: Path, beam: ConeBeam, described: Description | None = None) -> None:
-    """Write `beam` as geometry.yaml, with what `described`, the file of the same images, says of their intensity and
-    orientation; images that it names are named with their folder."""
+    """Write `beam` as geometry.yaml, with what `described`, the file of the same images, says of their intensity, of
+    uncertain gains and offsets, which no beam holds, and of orientation; images that it names are named with their
+    folder."""
     content: dict = {"beam": beam.to_dict()}
     if described and described.intensity:
         folder = described.source.parent.absolute()
@@ -203,6 +204,9 @@ def save_geometry(path: Path, beam: ConeBeam, described: Description | None = No
         content["orientation"] = vars(described.orientation)
         if described.mu_water is not None:
             content["mu_water"] = described.mu_water
+    if described and described.uncertain:
+        open_still = {name: value for name in ("gain", "offset") if (value := getattr(described.uncertain, name))}
+        content |= {"uncertain": open_still} if open_still else {}
     with atomic_write(path) as part:
         part.write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
 

@@ -25,13 +25,13 @@ class InOtherOrder:
 
 
 def axis_upwards(grid: Grid, beam: ConeBeam) -> int:
-    """The axis of a grid along which the detectors stand upright or, of tilted ones, that runs nearest to the superior
-    direction; the third where others are no nearer."""
-    for axis in (2, 0, 1):
-        if beam.is_upright(put_last(grid, axis)):
-            return axis
+    """The axis of a grid along which the detectors stand upright or, of tilted ones and of a patient who continues
+    above and below, that runs nearest to the superior direction; the third where others are no nearer."""
     upwards = np.abs(grid.affine[2, :3]) / grid.spacing
-    return int(upwards.argmax()) if upwards.max() > upwards[2] + 1e-6 else 2
+    superior = int(upwards.argmax()) if upwards.max() > upwards[2] + 1e-6 else 2
+    if beam.continued:  # detectors whose rows run up the patient stand upright along another axis
+        return superior
+    return next((axis for axis in (2, 0, 1) if beam.is_upright(put_last(grid, axis))), superior)
 
 
 def put_last(grid: Grid, axis: int) -> Grid:

@@ -41,10 +41,10 @@ def reach_beyond(beam: ConeBeam, grid: Grid) -> int:
         columns[:, None] * beam.u[:, None, None])
     source = grid.index(beam.sources)[:, None, None]
     ray = grid.index(pixels) - source
-    with np.errstate(divide="ignore", invalid="ignore"):  # rays along a face
+    with np.errstate(divide="ignore", invalid="ignore"):  # rays along a face or beside the columns
         faces = [(face - source[..., :2]) / ray[..., :2] for face in (-1.0, np.array(grid.shape[:2]))]
-    enters = np.fmax.reduce(np.fmin(*faces), -1, initial=0.0)
-    leaves = np.fmin.reduce(np.fmax(*faces), -1, initial=1.0)
-    heights = [(source[..., 2] + t * ray[..., 2])[enters < leaves] for t in (enters, leaves)]
+        enters = np.fmax.reduce(np.fmin(*faces), -1, initial=0.0)
+        leaves = np.fmin.reduce(np.fmax(*faces), -1, initial=1.0)
+        heights = [(source[..., 2] + t * ray[..., 2])[enters < leaves] for t in (enters, leaves)]
     low, high = np.min(heights, initial=0.0), np.max(heights, initial=grid.shape[2] - 1)
     return math.ceil(max(-low, high - (grid.shape[2] - 1)))

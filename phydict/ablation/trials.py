@@ -27,7 +27,7 @@ from phydict.reconstruction import Reconstructor, describe
 from phydict.rivals import TrainedRival
 from phydict.runtime.own_code import imported
 from phydict.runtime.precision import check_precision
-from phydict.runtime.reading import reason
+from phydict.runtime.reading import naming, reason
 from phydict.runtime.seeds import check_seed
 from phydict.units import HUWindow
 from phydict.xray import Ideal, Polychromatic, Simulator
@@ -303,11 +303,9 @@ def _changed(of: str, settings: Mapping, simulated_by: str) -> tuple[Sampler | R
         part, _, path = name.partition(".")
         if path and part in changes and has_field({"method": method, "simulator": simulator}[part], path.split(".")):
             changes[part][path] = value
-    try:
+    with naming(settings["method"]):
         method = changed(method, changes["method"], "method")
         simulator = changed(simulator, changes["simulator"], "simulator")
-    except ValueError as error:
-        raise ValueError(f"{settings['method']}: {error}") from error
     return method, simulator, [f"{part}.{path}" for part, paths in changes.items() for path in paths]
 
 

@@ -17,6 +17,7 @@ from phydict.prior.files import load_prior
 from phydict.prior.medsyn.checkpoint import MedSynCheckpoint
 from phydict.runtime.own_code import check_takes, imported, is_own, own_code, words
 from phydict.runtime.precision import precision_name
+from phydict.runtime.reading import naming
 from phydict.runtime.warning import warn
 from phydict.units import HUWindow
 
@@ -164,10 +165,8 @@ def find_prior(given: str | Path | MedSynCheckpoint | AnyPrior) -> AnyPrior:
         return given
     if not is_class_path(given):
         return load_prior(given)
-    try:
+    with naming(f"the prior {given} cannot be imported"):
         kind = imported(str(given))
-    except ValueError as error:
-        raise ValueError(f"the prior {given} cannot be imported: {error}") from error
     try:
         prior = kind()
     except (Exception, SystemExit) as error:  # of whatever kind: another's code runs

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from phydict.prior.finite import check_finite, not_finite
 from phydict.runtime.files import atomic_write
-from phydict.runtime.reading import not_written, reason, refusing
+from phydict.runtime.reading import naming, not_written, reason, refusing
 from phydict.units import HUWindow
 
 Network = TypeVar("Network", bound=nn.Module)
@@ -91,10 +91,8 @@ def loaded_stage(path: Path, stages: Sequence[str], build: Callable[[dict, dict[
     """
     with refusing(path, ADVICE):
         header, weights = read_stage(path, stages)
-        try:
+        with naming(f"'{path}' contradicts itself"):
             loaded = build(header, weights)
-        except ValueError as error:
-            raise ValueError(f"'{path}' contradicts itself: {error}") from error
     return loaded.eval().requires_grad_(False)
 
 

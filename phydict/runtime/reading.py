@@ -59,6 +59,15 @@ def refusing(name: object, advice: str) -> Iterator[None]:
         raise Unreadable(message) from error
 
 
+@contextmanager
+def naming(name: object) -> Iterator[None]:
+    """A ValueError that is raised inside begins with `name`, such as the file that it is about."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
+
+
 def one_line(text: str) -> str:
     """A text without line breaks, cut off after MAX_MESSAGE characters."""
     text = " ".join(text.split())

@@ -86,6 +86,12 @@ class Prior(nn.Module):
         """Whether the network can halve a state of so many voxels along each axis."""
         return not any(n % self.network.divisor for n in shape)
 
+    def ready_text(self) -> TextEncoder | None:
+        """The report encoder, read from its file where it is not yet; None for a prior without text."""
+        if self.text is None and self.load_text is not None:
+            self.text = self.load_text().to(self.null.device)
+        return self.text
+
     def context(self, reports: Sequence[str]) -> Tensor:
         """Reports -> contexts (B, L, D); the learned null token stands for padding and for a report left empty.
 
@@ -93,11 +99,10 @@ class Prior(nn.Module):
         """
         if not any(reports):
             return self.null.expand(len(reports), 1, -1)
-        if self.text is None:
-            if self.load_text is None:
-                raise ValueError("this prior was trained without text, but a report was given: leave the report out")
-            self.text = self.load_text().to(self.null.device)
-        states, mask = self.text(list(reports))
+        text = self.ready_text()
+        if text is None:
+            raise ValueError("this prior was trained without text, but a report was given: leave the report out")
+        states, mask = text(list(reports))
         mask = mask & torch.tensor([bool(r) for r in reports], device=mask.device)[:, None]
         return torch.where(mask[..., None], states, self.null)
 

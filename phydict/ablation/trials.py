@@ -367,21 +367,8 @@ def refined_from(method, delta: float, keep_iterations: bool = False) -> Sampler
     return replace(method, ec_delta=delta, ec_steps=iterations if delta else method.ec_steps)
 
 
-@cache
-def prior_of(file: str):
-    """The prior in a file, or of a class, read once."""
-    return find_prior(file)
-
-
-@cache
-def stage_of(file: str):
-    """The second stage in a file, read once."""
-    return load_super_resolution(file)
-
-
-@cache
-def _crc(file: str) -> int:
-    return fingerprint(file)
+prior_of, stage_of, _crc = cache(find_prior), cache(load_super_resolution), cache(fingerprint)
+"""The prior in a file, or of a class, the second stage in a file, and a file's checksum, each read once."""
 
 
 def key(trial: Trial, case: str, source: str, measured: Mapping = MappingProxyType({})) -> str:

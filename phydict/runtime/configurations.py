@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import reprlib
-from argparse import ArgumentParser
 from collections.abc import Collection, Iterable, Iterator, Sequence
 
 from jsonargparse import set_loader
@@ -68,12 +67,10 @@ def check_configured(args: Sequence[str], options: Collection[str], example: str
 
 
 def read_configurations(args: Sequence[str]) -> list[dict]:
-    """What the configurations of a command line hold, in their order; files that are not there are left to the command
-    line's own parser. Raises ValueError as `read_configuration` and `inline_configuration` do."""
-    look = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    look.add_argument("--config", "-c", action="append", default=[])
-    given, _ = look.parse_known_args(list(args))
-    return [inline_configuration(one) if is_yaml(one) else read_configuration(one) for one in given.config
+    """What the configurations of a command line hold, in their order, without missing files, of which the command
+    line's own parser speaks. Raises ValueError as `read_configuration` and `inline_configuration` do."""
+    given = [value for _, value in valued(split_configurations(args), CONFIGURATION) if value is not None]
+    return [inline_configuration(one) if is_yaml(one) else read_configuration(one) for one in given
             if is_yaml(one) or os.path.isfile(one)]
 
 

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from phydict.diffusion import CosineSchedule, guided
 from phydict.grid import Grid
 from phydict.prior.detail import DetailNetwork
-from phydict.prior.stage_file import FORMAT
+from phydict.prior.stage_file import header_start
 from phydict.prior.text import TextEncoder
 from phydict.prior.unet import VolumeUNet
 from phydict.runtime.precision import network_precision
@@ -115,11 +115,10 @@ class Prior(nn.Module):
             "vocabulary": None if encoder.source else encoder.vocabulary,
             **({"padded_to": encoder.padded_to} if encoder.padded_to else {}),
             **({"sentences": encoder.sentences} if encoder.sentences else {})}
-        return {"format": FORMAT, "stage": "base", "grid": self.grid.to_dict(),
-                "hu_window": [self.window.low, self.window.high], "state": STATE[:self.network.state_channels],
-                "sigma_data": self.sigma_data, "skip_std": self.skip_std, "schedule": vars(self.schedule),
-                "text": text, "network": self.network.settings,
-                **({"detail": self.detail.settings} if self.detail else {})}  # which older files do not name
+        return header_start("base", self.grid, self.window) | {
+            "state": STATE[:self.network.state_channels], "sigma_data": self.sigma_data, "skip_std": self.skip_std,
+            "schedule": vars(self.schedule), "text": text, "network": self.network.settings,
+            **({"detail": self.detail.settings} if self.detail else {})}  # which older files do not name
 
     @property
     def state_channels(self) -> int:

@@ -13,6 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from phydict.grid import Grid
 from phydict.prior.finite import check_finite, not_finite
 from phydict.runtime.files import atomic_write
 from phydict.runtime.reading import naming, not_written, reason, refusing
@@ -38,6 +39,11 @@ class Described(Protocol):
     def describe(self) -> dict: ...
 
     def state_dict(self) -> dict[str, Tensor]: ...
+
+
+def header_start(stage: str, grid: Grid, window: HUWindow) -> dict:
+    """What the header of every stage's file begins with, as plain JSON values; stage: one of STAGES."""
+    return {"format": FORMAT, "stage": stage, "grid": grid.to_dict(), "hu_window": [window.low, window.high]}
 
 
 def save_stage(stage: Described, path: str | Path, training: dict | None = None, dtype: torch.dtype = torch.float16):

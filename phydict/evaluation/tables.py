@@ -239,8 +239,7 @@ def _estimates(row: Mapping, of: str) -> list[Value | None]:
     return [Estimate(*(row.get(f"{of}{name}{end}", math.nan) for end in ("", "_low", "_high"))) for name in NAMES]
 
 
-def caption(statistic: str, marked: bool, rows: Sequence[Mapping], columns: Mapping[str, str],
-            window: HUWindow = RANGE) -> str:
+def caption(statistic: str, marked: bool, rows: Sequence[Mapping], columns: Mapping[str, str], window: HUWindow) -> str:
     """One line that says what the numbers of a table are: a statistic of scores in an HU range, of rows that have these
     values in some columns, label -> column; marked: whether some are marked as the best."""
     stated = "".join(f" {label}: {listed(rows, column) or 'not stated'}." for label, column in columns.items())

@@ -133,7 +133,7 @@ class Measurement:
         self.calls += len(r)
         return self.projector.T(self.slope * r)
 
-    def mean_diagonal(self, weights: Tensor | float = 1.0) -> float:
+    def mean_diagonal(self, weights: Tensor | float) -> float:
         """The mean of the diagonal of x -> adjoint(weights * linear(x)), by one volume of random signs (Hutchinson
         1990, doi:10.1080/03610919008812866)."""
         signs = torch.randint(2, (1, 1, *self.projector.grid.shape), generator=torch.Generator().manual_seed(0))

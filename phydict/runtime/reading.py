@@ -137,8 +137,8 @@ def read_npy(path: str | Path) -> np.ndarray:
     return np.load(path, allow_pickle=False)
 
 
-def check_held(promised: int, path: Path, what: str, times: int = MOST_SQUEEZED) -> None:
-    """Raises ValueError where the header of a file promises more than so many times what the file has of bytes."""
+def check_held(promised: int, path: Path, what: str, times: int) -> None:
+    """Raises ValueError where a file's header promises more of `what` than `times` as many as the file has bytes."""
     if promised > times * (size := path.stat().st_size):
         raise ValueError(f"its header promises {promised:,} {what} but the file has {size:,} bytes: it is truncated or "
                          "damaged")

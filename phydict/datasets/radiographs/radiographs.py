@@ -108,7 +108,7 @@ def load_xrays(folder: str | Path, geometry: str | Path | None = None, intensity
     return case
 
 
-def case_files(folder: Path, geometry: Path | None = None) -> list[Path]:
+def case_files(folder: Path, geometry: Path | None) -> list[Path]:
     """The files that decide what `load_xrays` makes of a folder: all that lie there, the geometry file used instead of
     its own, and those that a geometry file names elsewhere, whether they are there or not."""
     files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))

@@ -45,11 +45,12 @@ class Measurement:
 
     noise: standard deviation of the noise of y, as a share of its largest value or, as a tensor that expands to
     (K, V, U), of each pixel; None: estimated from y where it is needed. outside: line integrals (K, V, U) of what
-    lies outside the voxels, which P adds. told: whether what is doubtful in the X-rays was said before.
-    carried, beside: what is carried beside the CTs, if anything, and its line integrals (K, V, U), which P adds.
-    subgrid: line integrals (1, K, V, U) that P adds for what the voxels cannot hold, 0 until somebody sets them.
-    model_variance: variance (K, 1, 1) of what a view's line integrals hold beside noise that no volume explains, which
-    ProximalCG counts as noise, 0 until somebody sets it.
+    lies outside the voxels, which P adds. told: whether warnings about these X-rays were given before, and are not
+    repeated.
+    carried, beside: what is carried beside the CTs, such as metal, if anything, and its line integrals (K, V, U), which
+    P adds. subgrid: line integrals (1, K, V, U) that P adds for what the voxels cannot resolve; 0 at first.
+    model_variance: variance (K, 1, 1), beside the noise, of what no volume explains in a view's line integrals;
+    ProximalCG counts it as noise; 0 at first.
     scales: per axis, the finest spacing of the voxels divided by their own.
     hardened: whether the line integrals were straightened as those of a tube.
     scatter_enabled: whether `subtract_scatter` subtracts scatter; calls: how many times A or its adjoint ran over all

@@ -138,7 +138,10 @@ def last_errors(measurement: Measurement) -> Tensor:
 
 
 def shown_by(metal: Tensor | float, without: Tensor, with_it: Tensor) -> list[int]:
-    """The views that show metal of line integrals (K, V, U), by what projections miss (K, V, U) without and with it."""
+    """The views in which the metal is seen.
+
+    metal: its line integrals (K, V, U). without, with_it: projected minus measured ones without and with it, alike.
+    """
     before, after = ((metal * errors.square()).sum((1, 2)).sqrt() for errors in (without, with_it))
     too_little = (metal * without).sum((1, 2)) < 0
     return (too_little & (after < SEEN * before)).nonzero().flatten().tolist()

@@ -127,8 +127,8 @@ def bound(prior: AnyPrior, report: str, guidance: float, precision: str) -> Deno
 
 
 def precision_of(prior: AnyPrior, precision: str, x: torch.Tensor) -> str:
-    """What a prior's networks compute in for the state x where `precision` is asked for, as results name it; what one
-    of one's own says itself."""
+    """The precision that results name for a prior's networks, given the one asked for and the state x; a prior of the
+    user's own says it itself."""
     return str(getattr(prior, "precision", OWN_PRECISION)) if is_own(type(prior)) else precision_name(precision, x)
 
 

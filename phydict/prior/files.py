@@ -46,10 +46,10 @@ DEFAULT_REFINER = shipped("data/prior/refiner_64.safetensors")
 """The refiner that comes with the project."""
 
 DEFAULT_CORRECTION = shipped("data/prior/refinement_128.safetensors")
-"""What corrects its reconstructions on voxels of 3 mm, where that comes with the project."""
+"""The network that corrects the shipped refiner's reconstructions on voxels of 3 mm, if this file is there."""
 
 FINEST_CORRECTION = shipped("data/prior/refinement_256.safetensors")
-"""And on voxels of 1.5 mm."""
+"""The same on voxels of 1.5 mm."""
 
 
 def save_prior(prior: Prior, path: str | Path, training: dict | None = None, dtype: torch.dtype = torch.float16):

@@ -39,8 +39,8 @@ def is_yaml(given: str) -> bool:
 
 
 def valued(args: Iterable[str], options: Collection[str]) -> Iterator[tuple[str, str | None]]:
-    """Arguments, those of `options` as the name and the value, which follows "=" or is the next one; the others, and
-    where nothing follows, with None."""
+    """Each of `options` with its value, which follows "=" or is the next argument; None where nothing follows. Other
+    arguments come with None."""
     rest = iter(args)
     for arg in rest:
         option, equals, value = arg.partition("=")
@@ -48,9 +48,8 @@ def valued(args: Iterable[str], options: Collection[str]) -> Iterator[tuple[str,
 
 
 def with_configurations(args: list[str], kinds: tuple[str, ...]) -> list[str]:
-    """Arguments with every configuration (-c, --config) as --config=, and with the place of those that are shipped ones
-    by their path or their name; see `phydict.runtime.shipped.configuration`, which raises ValueError for those that are
-    nowhere."""
+    """Arguments with every configuration (-c, --config) as --config=, shipped ones, which may be given by name, as
+    their path. Raises ValueError, as `phydict.runtime.shipped.configuration` does, for files that are nowhere."""
     def place(given: str) -> str:
         return given if is_yaml(given) else str(configuration(given, kinds))
 

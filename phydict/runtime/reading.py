@@ -145,7 +145,7 @@ def check_held(promised: int, path: Path, what: str, times: int) -> None:
 
 
 class TooLittleMemory(ValueError):
-    """What another machine could do."""
+    """This machine has too little memory; a larger one could do it."""
 
 
 def check_memory(needed: int, what: str, advice: str) -> None:

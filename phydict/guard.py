@@ -157,7 +157,8 @@ def worst_view(misfit_per_view: Sequence[float]) -> tuple[int, float]:
 
 
 def risen_from(misfits: dict[int, float]) -> int | None:
-    """Of misfits by step, the first step of those at the end that had all risen above what was reached before."""
+    """The step from which on the misfits (step -> misfit) stayed clearly above the smallest before them, to the last;
+    None where the last is not."""
     smallest, first = EMPTY_MISFIT, None
     for step, misfit in misfits.items():
         risen = misfit > max(RISE_FACTOR * smallest, RISE_MIN)

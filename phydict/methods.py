@@ -124,19 +124,20 @@ DEFAULT_METHOD, SAMPLING_METHOD = "phydict_learned", "phydict_fast"
 
 def default_method(prior: AnyPrior | MedSynCheckpoint | str | Path | None = None, samples: int = 1,
                    guidance: float = 1.0) -> str:
-    """The method where none is given: DEFAULT_METHOD, or SAMPLING_METHOD with a prior that is no refiner, with several
-    samples, or with guidance."""
+    """The method where none is given: DEFAULT_METHOD, but SAMPLING_METHOD for a prior that is no refiner, for several
+    samples, and for guidance."""
     sampled = samples != 1 or guidance != 1 or not (prior is None or is_refiner(prior))
     return SAMPLING_METHOD if sampled else DEFAULT_METHOD
 
 
 DEFAULT_GRID = Grid.cube(64)
-"""The voxels of methods that are bound to none; what lies outside a smaller box is taken from a reconstruction here."""
+"""The voxels of methods that have none of their own, and of the reconstruction that fills in what lies outside a
+smaller box."""
 
 
 UNGUIDED = ("{0}sampler is how the X-rays guide the second stage, but {0}guided was given as false, so that they do "
             "not: leave one of the two out")
-"""What is said of a sampler for a second stage that is not guided, by what its settings' names begin with."""
+"""Error where a sampler is given for a second stage without guidance; {0}: what the settings' names begin with."""
 
 
 def reconstructor(method: str | Sampler | Reconstructor, prior: AnyPrior | str | Path | None = None,
@@ -222,8 +223,8 @@ CORRECTIONS = {3.0: DEFAULT_CORRECTION, 1.5: FINEST_CORRECTION}
 
 
 def corrections_of(method: Sampler | Reconstructor, grid: Grid) -> list[Path]:
-    """The files of the networks that correct a method's estimates on the way to a grid, of long voxels first, where
-    they have learnt from these."""
+    """The files of the networks that correct a method's estimates on the way to a grid, those for the longest voxels
+    first; none where the method needs no refiner or the grid's voxels are longer than those learnt on."""
     if not (isinstance(method, Sampler) and method.needs_refiner):
         return []
     return [file for length, file in CORRECTIONS.items()

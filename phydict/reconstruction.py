@@ -29,15 +29,17 @@ class Reconstruction:
     """A reconstructed CT volume and the figures that say how well it fits.
 
     volume: HU (X, Y, Z) on `grid`; misfit: relative residual |A mu - y| / |y| over all views, and misfit_per_view;
-    seconds: per stage; network_calls, projector_calls: denoiser evaluations and applications of A or A.T to all
-    views, but for those that ask on coarse voxels where the patient ends; xrays, reprojection: line integrals
-    (K, V, U), measured (calibrated where they were display values) and
-    of the volume; masks: soft anatomy masks (M, X, Y, Z) in [0, 1] where the method gives them; deviation: HU
-    (X, Y, Z), the standard deviation of the samples of which the volume is the mean, where there are several;
+    seconds: per stage;
+    network_calls, projector_calls: denoiser evaluations, and applications of A or A.T to all views, without those on
+    coarse voxels that find out where the patient ends;
+    xrays, reprojection: line integrals (K, V, U), measured (calibrated where they were display values) and of the
+    volume;
+    masks: soft anatomy masks (M, X, Y, Z) in [0, 1] where the method gives them;
+    deviation: HU (X, Y, Z), the standard deviation of the samples, where the volume is the mean of several;
     intervals: level -> HU (X, Y, Z), half the width of the interval around the volume that is to hold that share of
-    voxels, where the method knows it, and interval_widening, the factor by which they are wider than calibrated;
-    diverged_at: the step, counted from 1, from which on the misfit had risen until the end, None where it had not;
-    precision: what the networks computed in, "own" where a prior of one's own does not say it, or, without any, the
+    voxels, where the method knows it; interval_widening: the factor by which they are wider than calibrated;
+    diverged_at: the step, counted from 1, from which the misfit stayed risen to the end, None where it did not;
+    precision: what the networks computed in, "own" where a prior of one's own does not say; without networks the
     X-rays' type;
     hardened: whether the line integrals bent as a tube's do, and are straightened in xrays;
     scatter: the mean share of the pixels' signal that was subtracted as scatter, and is no longer in xrays;

@@ -88,13 +88,13 @@ def run(results: Results, cases: dict[str, Work], device: torch.device, progress
     progress.begin("ablate", left, verb="run", out=out, noun="row")
     for case, work in cases.items():
         groups: dict[str, Work] = {}
-        made = CaseCache()
+        made: dict[str, Case] = {}
         for trial, name, make in work:
             if not results.finished(name):
                 groups.setdefault(trial.acquisition(), []).append((trial, name, make))
         for group in groups.values():
             first, _, make = group[0]
-            scene = _attempt(lambda: MeasuredCase(case, first, made.case(case, first, make), device))
+            scene = _attempt(lambda: MeasuredCase(case, first, _made(case, first, make, made), device))
             for trial, name, _ in group:
                 progress.case(f"{case}: {trial.label}")
                 measured = scene if isinstance(scene, dict) else runner.measure(trial, scene, name)
@@ -104,21 +104,16 @@ def run(results: Results, cases: dict[str, Work], device: torch.device, progress
     results.write()
 
 
-class CaseCache:
-    """One case as trials need it, made once for each grid, HU window and voxels of its simulation."""
-
-    def __init__(self):
-        self._kept = {}
-
-    def case(self, case: str, trial: Trial, make: Callable[[], Case]) -> Case:
-        """A case as a trial needs it, with the warnings that making it took."""
-        grid, window = trial.scene()
-        like = str((grid.to_dict(), window, trial.data.simulation_voxels))
-        if like not in self._kept:
-            warned: list[str] = []
-            with noted(warned, case):
-                self._kept[like] = make() | {"warnings": warned}
-        return self._kept[like]
+def _made(case: str, trial: Trial, make: Callable[[], Case], kept: dict[str, Case]) -> Case:
+    """A case as a trial needs it, with the warnings that making it took; made once, and then `kept`, for each grid, HU
+    window and voxels of its simulation."""
+    grid, window = trial.scene()
+    like = str((grid.to_dict(), window, trial.data.simulation_voxels))
+    if like not in kept:
+        warned: list[str] = []
+        with noted(warned, case):
+            kept[like] = make() | {"warnings": warned}
+    return kept[like]
 
 
 class MeasuredCase:
@@ -144,8 +139,7 @@ class Runner:
 
     out: where the features of slices are kept, where the Frechet distance is measured, and volumes if these are."""
 
-    def __init__(self, device: torch.device, scoring: Scoring, out: Path, progress: CaseProgress,
-                 keep_volumes: bool = False):
+    def __init__(self, device: torch.device, scoring: Scoring, out: Path, progress: CaseProgress, keep_volumes: bool):
         self.device, self.scoring, self.out, self.progress, self.warm = device, scoring, out, progress, set[str]()
         self.keep_volumes = keep_volumes
 
@@ -200,8 +194,8 @@ class Runner:
     def _reconstruct(self, trial: Trial, scene: MeasuredCase, on_step: Callable[[], None]) -> Reconstruction:
         seed = case_seed(trial.seed, scene.case)
         torch.manual_seed(seed)
-        prior = _on(trial.prior, self.device) if isinstance(trial.method, Sampler) else None
-        stage = _stage_on(trial.super_resolution, self.device) if trial.super_resolution else None
+        prior = _on(prior_of, trial.prior, self.device) if isinstance(trial.method, Sampler) else None
+        stage = _on(stage_of, trial.super_resolution, self.device) if trial.super_resolution else None
         ready = reconstructor(trial.method, prior, trial.guidance, trial.name, stage, samples=trial.samples,
                               precision=trial.precision)
         ready = onto_grid(ready, trial.box.grid() if trial.box else None, trial.refinement)
@@ -232,14 +226,10 @@ class NotKept(OSError):
 
 
 @cache
-def _on(file: str, device: torch.device):
-    prior = prior_of(file)
-    return prior.to(device) if isinstance(prior, torch.nn.Module) else prior
-
-
-@cache
-def _stage_on(file: str, device: torch.device):
-    return stage_of(file).to(device)
+def _on(read: Callable, file: str, device: torch.device):
+    """What `read` finds in a file, on a device."""
+    found = read(file)
+    return found.to(device) if isinstance(found, torch.nn.Module) else found
 
 
 def _attempt(work: Callable[[], object], unwilling: str = "failed"):
@@ -265,7 +255,7 @@ class WarmUp:
     class Warm(Exception):
         """The reconstruction has seen all of its code."""
 
-    def __init__(self, on_step: Callable[[], None] = lambda: None):
+    def __init__(self, on_step: Callable[[], None]):
         self.steps, self.on_step = 0, on_step
 
     def __call__(self) -> None:

@@ -14,7 +14,7 @@ from phydict.ablation.nested import has_field, parsed
 from phydict.ablation.trials import Trial, check_used, dotted, method_of, trials_of
 from phydict.datasets import CTSource
 from phydict.inference.scoring import CLIPSettings, FIDSettings
-from phydict.runtime.reading import refusing
+from phydict.runtime.reading import naming, refusing
 from phydict.runtime.shipped import configuration
 from phydict.runtime.yaml_file import parse_yaml, read_yaml
 
@@ -72,11 +72,8 @@ def _specification(content, given: Mapping, changed: dict) -> Specification:
         method, _, setting = name.partition(".")
         methods[method] = {**methods[method], setting: changed.pop(name)}
     for name, changes in methods.items():
-        of = changes.get("of", name)
-        try:
-            method_of(of)
-        except ValueError as error:
-            raise ValueError(f"methods.{name}.of: {error}") from error
+        with naming(f"methods.{name}.of"):
+            method_of(changes.get("of", name))
     cases = Cases(content.get("cts"), content.get("phantoms"), content.get("only"), _source(content))
     if content.get("out") is None:
         raise ValueError("there is no folder for the results: give out, in the file or as --out")

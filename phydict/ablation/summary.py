@@ -138,8 +138,8 @@ def without_repeats(rows: Iterable[Mapping]) -> list[Mapping]:
 
 
 def _conditions(rows: Sequence[tuple[Mapping, Mapping]]) -> list[dict]:
-    """Of each row, with the settings of its X-rays, what sets it apart from rows of other conditions: what is given in
-    no row of its condition is left out."""
+    """Each row's condition: the settings that tell it from rows of other conditions. A setting that no row of the same
+    condition states is left out. rows: with the settings of their X-rays."""
     names = dict.fromkeys(name for _, given in rows for name, value in given.items() if value is not None)
     meant = [_meant(row, given, names) for row, given in rows]
     varying = [name for name in names if len({meaning.get(name) for meaning in meant}) > 1]
@@ -160,7 +160,7 @@ def _conditions(rows: Sequence[tuple[Mapping, Mapping]]) -> list[dict]:
 
 
 def _meant(row: Mapping, given: Mapping, names: Iterable[str]) -> dict:
-    """Of the settings `names` of X-rays what a row gives, or means by giving none."""
+    """The settings `names` of a row's X-rays, those that it does not give at their defaults."""
     simulator, orbit = _made(row)
     defaults = {name: value for name, value in DEFAULTS.items() if name not in settings_of("orbit")}
     if orbit is not None:
@@ -201,8 +201,8 @@ def _along(entries: Sequence[Entry], axis: str, without: Sequence[str]) -> list[
 
 
 def alike(entries: Sequence[Entry]) -> list[Entry]:
-    """Those of entries that are marked and plotted together: with all of their cases, or, where none has all, as of a
-    CT that cannot be read, those of the same cases, as many as there are."""
+    """The entries that are compared in marks and plots: those with all of their cases. Where none has all, as when a CT
+    cannot be read, those of one set of cases: the largest, and of equal ones the most frequent."""
     if complete := [entry for entry in entries if entry.complete]:
         return complete
     sets = Counter(entry.case_ids for entry in entries if entry.cases)
@@ -238,8 +238,8 @@ def deltas(entries: Sequence[Entry]) -> list[tuple[str, list[Entry]]]:
 
 
 def fixed_settings(entries: Sequence[Entry]) -> str:
-    """The settings beside those of the X-rays that all rows of entries share, other than by default and in no entry's
-    name or condition, in words."""
+    """The settings that all rows of entries share, in words, without those of the X-rays, defaults, and what an entry's
+    name or condition already says."""
     settings = [xrays | own for entry in entries for own, xrays in map(_parted, entry.rows)]
     told = {"method", *XRAY_SETTINGS, *_varying(settings)}.union(
         *(entry.settings.keys() | entry.condition.keys() for entry in entries))

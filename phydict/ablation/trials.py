@@ -27,7 +27,7 @@ from phydict.reconstruction import Reconstructor, describe
 from phydict.rivals import TrainedRival
 from phydict.runtime.own_code import imported
 from phydict.runtime.precision import check_precision
-from phydict.runtime.reading import reason
+from phydict.runtime.reading import naming, reason
 from phydict.runtime.seeds import check_seed
 from phydict.units import HUWindow
 from phydict.xray import Ideal, Polychromatic, Simulator
@@ -303,11 +303,9 @@ def _changed(of: str, settings: Mapping, simulated_by: str) -> tuple[Sampler | R
         part, _, path = name.partition(".")
         if path and part in changes and has_field({"method": method, "simulator": simulator}[part], path.split(".")):
             changes[part][path] = value
-    try:
+    with naming(settings["method"]):
         method = changed(method, changes["method"], "method")
         simulator = changed(simulator, changes["simulator"], "simulator")
-    except ValueError as error:
-        raise ValueError(f"{settings['method']}: {error}") from error
     return method, simulator, [f"{part}.{path}" for part, paths in changes.items() for path in paths]
 
 
@@ -369,21 +367,8 @@ def refined_from(method, delta: float, keep_iterations: bool = False) -> Sampler
     return replace(method, ec_delta=delta, ec_steps=iterations if delta else method.ec_steps)
 
 
-@cache
-def prior_of(file: str):
-    """The prior in a file, or of a class, read once."""
-    return find_prior(file)
-
-
-@cache
-def stage_of(file: str):
-    """The second stage in a file, read once."""
-    return load_super_resolution(file)
-
-
-@cache
-def _crc(file: str) -> int:
-    return fingerprint(file)
+prior_of, stage_of, _crc = cache(find_prior), cache(load_super_resolution), cache(fingerprint)
+"""The prior in a file, or of a class, the second stage in a file, and a file's checksum, each read once."""
 
 
 def key(trial: Trial, case: str, source: str, measured: Mapping = MappingProxyType({})) -> str:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from phydict.baselines.baseline import Baseline, CountingProjector, bounds, clip, empty
-from phydict.linalg.conjugate_gradients import conjugate_gradients
+from phydict.linalg.conjugate_gradients import conjugate_gradients, may_follow
 from phydict.runtime.ranges import check_fields
 from phydict.units import MU_WATER, HUWindow
 
@@ -47,13 +47,11 @@ class CGLS(Baseline):
         return self.iterations * self.restarts
 
     def solve(self, A: CountingProjector, y: Tensor, on_step: Callable[[], None]) -> Tensor:
-        low, high = bounds(self.window)
         density = clip(empty(A, y), self.window)
         for _ in range(self.restarts):
             negative_gradient = A.T(y - A(density))
-            inactive = ~((density <= low) & (negative_gradient < 0) | (density >= high) & (negative_gradient > 0))
+            free = may_follow(density, negative_gradient, *bounds(self.window))
             density = clip(density + conjugate_gradients(
-                lambda d, inactive=inactive: inactive * A.T(A.linear(d)),  # type: ignore[misc]
-                inactive * negative_gradient, self.iterations,
-                on_step=on_step), self.window)
+                lambda d, free=free: free * A.T(A.linear(d)),  # type: ignore[misc]
+                free * negative_gradient, self.iterations, on_step=on_step), self.window)
         return density

@@ -23,35 +23,38 @@ from phydict.xray.projectors.continued import reach_beyond
 from phydict.xray.projectors.projector import Projector
 
 UP, STEP = 48.0, 4
-"""Millimetres that are reconstructed above and below the volume, at most; voxels are added in so many at a time at each
-end, which the shipped networks can halve."""
+"""The most millimetres that are reconstructed above and below the volume, and how many voxels are added at each end at
+a time: a number that the shipped networks can halve."""
 
 LEAST_VIEWS = 4
 """Views from which on total variation tells what stands beside the volume from what is in it."""
 
 MORE, LEAST = 0.25, 0.06
-"""Shares of the volume's width that are looked at beside it, at each side: at most, and at least where the geometry
-leaves so much room."""
+"""The largest and smallest share of the volume's width that is looked at on each side of it, the smallest only where
+the geometry leaves so much room."""
 
 FULL, LEAST_PIXELS = 0.3, 4
-"""The line integral beyond that of a volume full of water, and how many pixels, of a detector binned to the coarse
-voxels, must read as much for something to be seen beside it: of three CTs of 420 to 460 mm, from four views, 6 or more
-do, of CTs that end inside 2 at most, whose X-rays scatter, wrong poses and drift do not raise."""
+"""Something is seen beside the volume where at least LEAST_PIXELS pixels, of a detector binned to the coarse voxels,
+read FULL more than the line integral of a volume full of water. On three CTs of 420 to 460 mm, from four views, 6 or
+more do; on CTs that end inside 2 at most, which scatter, wrong poses and drift do not raise."""
 
 SUSPECT = 2.0
-"""How many times what conjugate gradients leave of the X-rays in the volume is what they leave in the wider one for
-something to be looked for that is not seen: 2.6 or more where arms stand there, 1.3 at most where nothing does."""
+"""Something unseen is looked for where conjugate gradients leave so many times more of the X-rays in the volume than in
+the wider one: 2.6 or more where arms stand there, 1.3 at most where nothing does."""
 
 TRIES, EXPLAINED, GROSS, MUCH = 50, 1.45, 0.055, 2.5
-"""Iterations of total variation that look for it; how many times its misfit in the volume must be that in the wider one
-for what is seen: of the wide CTs 1.39 to 1.6 from four views and 2.1 or more from eight, of patients who fill the
-volume 1.02 at most, of a tube's X-rays 1.38 from four views and 1.13 from eight; and, for what is not, how large it
-must be and how many times that in the wider one: with arms 0.05 to 0.14 and 2.9 or more, of X-rays that hold half as
-much scatter as signal or whose detector stands 8 mm elsewhere 0.053 and 3.3 at most."""
+"""Iterations of total variation that decide, and what they must find.
+
+EXPLAINED: for what is seen, the least ratio of the misfit in the volume to that in the wider one. It is 1.39 to 1.6 on
+the wide CTs from four views and 2.1 or more from eight; 1.02 at most on patients who fill the volume; 1.38 on a tube's
+X-rays from four views and 1.13 from eight.
+GROSS, MUCH: for what is not seen, the least misfit in the volume and the least such ratio. They are 0.05 to 0.14 and
+2.9 or more with arms; 0.053 and 3.3 at most on X-rays with half as much scatter as signal or with a detector 8 mm
+off."""
 
 REST = 0.15
-"""What a box may leave of what the widest one explains and the volume does not: of four CTs with arms of 42 mm beside
-it, 48 mm more leave 0.03 to 0.13, 24 mm 0.16 to 0.37."""
+"""The most that a box may leave unexplained, as a share of what the widest one explains and the volume does not. On
+four CTs with arms of 42 mm beside the volume, 48 mm more leave 0.03 to 0.13, and 24 mm 0.16 to 0.37."""
 
 CONTINUES = "the X-rays show that the patient continues above or below the volume"
 OVERRULED = "`continued: false` in geometry.yaml, in Python of the ConeBeam, if the patient ends"

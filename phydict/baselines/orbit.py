@@ -102,10 +102,8 @@ class CircularOrbit:
         return np.where(depth >= 0, np.sin(math.pi / 2 * depth.clip(0, 1)) ** 2, 0)
 
     def _steps(self) -> tuple[np.ndarray, float, np.ndarray, float]:
-        """Gaps (K,) to the next view in the order of angles, the largest last; the typical gap; that order; and the arc
-        that the views stand for, which is open where the largest gap exceeds one and a half typical ones. Typical is
-        the median of those longer than half of the gap that most of the arc is made of, so that views that repeat or
-        come in pairs change it no more than single ones."""
+        """Gaps (K,) in rad from each view to the next, in the order of angles, the largest last; the typical gap; that
+        order; and the arc that the views stand for, which is open where the largest gap exceeds 1.5 typical ones."""
         order = np.argsort(self.angles, kind="stable")
         gaps = np.diff(self.angles[order], append=self.angles[order[0]] + 2 * math.pi)
         last = int(gaps.argmax())
@@ -116,8 +114,10 @@ class CircularOrbit:
 
 
 def _typical(gaps: np.ndarray) -> float:
-    """The median of the gaps (N,) longer than half of that at which those not longer fill half of the way; 0 if none is
-    above 0."""
+    """A typical gap of gaps (N,), which views that repeat or come in pairs hardly change; 0 if no gap is above 0.
+
+    It is the median of the gaps longer than m / 2, where gaps up to m make up half of the arc.
+    """
     ordered = np.sort(gaps)
     filled = ordered.cumsum()
     if not len(gaps) or filled[-1] <= 0:

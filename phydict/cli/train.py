@@ -139,10 +139,10 @@ class PriorCLI(ProgressCLI):
             parser.link_arguments("out", "best.dirpath")
 
     def instantiate_trainer(self, **kwargs) -> lightning.Trainer:
-        given = self._get(self.config_init, "trainer").plugins or []
+        trainer = self._get(self.config_init, "trainer")
+        given = trainer.plugins or []
         plugins = [*(given if isinstance(given, list) else [given]), WholeCheckpoints()]
         logger = CSVLogger(self._get(self.config, "out"), name="logs")
-        trainer = self._get(self.config_init, "trainer")
         if str(trainer.precision) in ("16-true", "bf16-true", "64-true", "64"):
             raise ValueError(f"weights are learnt in float32, but trainer.precision is {trainer.precision}: leave it "
                              "out, and give --precision bfloat16 for networks that compute in that")
@@ -223,8 +223,8 @@ class PriorCLI(ProgressCLI):
         command = self.config.get("subcommand")  # none where nothing is run
         if not command:
             return
-        check_writable(Path(self.config[command].out), "--out")
         settings = self.config[command]
+        check_writable(Path(settings.out), "--out")
         if self.model_class is PriorTraining and settings.data.loading.simulation_voxels is not None:
             raise ValueError("this stage learns from no X-rays, but data.loading.simulation_voxels is "
                              f"{settings.data.loading.simulation_voxels}: leave it out")

@@ -89,8 +89,7 @@ class Intensity:
         """The names of the images that `flat` and `dark` call for."""
         return {name: _names(getattr(self, name)) for name in ("flat", "dark") if _names(getattr(self, name))}
 
-    def line_integrals(self, pixels: np.ndarray, full_scale: float,
-                       references: dict[str, np.ndarray] | None = None) -> np.ndarray:
+    def line_integrals(self, pixels: np.ndarray, full_scale: float, references: dict[str, np.ndarray]) -> np.ndarray:
         """Line integrals of pixels (K, V, U); for display images values in [0, 1] that grow with density.
 
         full_scale: the largest value the image format can hold. references: the images (V, U) of `references`.
@@ -103,7 +102,7 @@ class Intensity:
             return y
         if self.kind == "display":
             return pixels / full_scale if self.bright_is_dense else 1 - pixels / full_scale
-        stated: dict = {"dark": self.dark or 0.0, "flat": self.air, **(references or {})}
+        stated: dict = {"dark": self.dark or 0.0, "flat": self.air, **references}
         dark = stated["dark"]
         air = np.asarray(stated["flat"] - dark)
         if not (air > 0).all():

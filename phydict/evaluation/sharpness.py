@@ -24,7 +24,7 @@ AXES = {"diaphragm": 2, "chest_wall": 0}
 """The axis across each edge of the lungs."""
 
 
-def edge_profile(volume: Tensor, lung: Tensor, edge: str, reach: int = 5) -> Tensor:
+def edge_profile(volume: Tensor, lung: Tensor, edge: str, reach: int) -> Tensor:
     """Mean profile (2 reach,) of a volume (X, Y, Z) across an edge of the lungs, from the lung outward.
 
     lung: mask (X, Y, Z) in the truth. edge: "diaphragm", below the lowest lung voxel of each column, or "chest_wall",

@@ -142,8 +142,7 @@ def ranks(values: Sequence[float], measure: Measure) -> list[int]:
 
 
 def rankable(measure: Measure, cases: Iterable[Iterable[str]]) -> Measure:
-    """A measure, without a better direction where lines, of these cases each, have not all the same: it then ranks
-    nothing."""
+    """A measure, unranked where the lines of a table, given by their cases, do not all have the same cases."""
     return measure if len({frozenset(of) for of in cases}) < 2 else measure.unranked()
 
 
@@ -239,8 +238,7 @@ def _estimates(row: Mapping, of: str) -> list[Value | None]:
     return [Estimate(*(row.get(f"{of}{name}{end}", math.nan) for end in ("", "_low", "_high"))) for name in NAMES]
 
 
-def caption(statistic: str, marked: bool, rows: Sequence[Mapping], columns: Mapping[str, str],
-            window: HUWindow = RANGE) -> str:
+def caption(statistic: str, marked: bool, rows: Sequence[Mapping], columns: Mapping[str, str], window: HUWindow) -> str:
     """One line that says what the numbers of a table are: a statistic of scores in an HU range, of rows that have these
     values in some columns, label -> column; marked: whether some are marked as the best."""
     stated = "".join(f" {label}: {listed(rows, column) or 'not stated'}." for label, column in columns.items())
@@ -274,8 +272,8 @@ def empty_notes(empty: Mapping[str, str], measured: Iterable[str]) -> list[str]:
 
 
 def partial_notes(lines: Iterable[tuple[str, int, Mapping[str, int]]]) -> list[str]:
-    """Of how many cases a score is the mean, where that is not all of a line's; lines: (label, its cases, score ->
-    cases that have it)."""
+    """Sentences on scores that are the mean of only some of a line's cases; lines: (label, number of cases, score ->
+    number of cases that have it)."""
     parts: dict[str, list[str]] = {}
     for label, cases, counts in lines:
         for name, count in counts.items():

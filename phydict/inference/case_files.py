@@ -33,7 +33,7 @@ TISSUE = -500.0
 
 
 def write_result(folder: Path, case: Case, result: Reconstruction, method: str, truth: Tensor | None,
-                 keep_coarse: bool, features: Features | None = None) -> None:
+                 keep_coarse: bool, features: Features | None) -> None:
     """Writes volumes, panel, what the page shows of a case and the features of its slices; truth: HU (X, Y, Z) on the
     result's voxels."""
     result.save_nifti(folder / VOLUME)

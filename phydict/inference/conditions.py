@@ -77,8 +77,11 @@ def condition(record: Mapping) -> dict:
 
 
 def told_apart(records: Iterable[Mapping], data: Callable[[Mapping], object]) -> list[dict]:
-    """Records, of which those of one case but of unlike `data` are cases of their own, which are neither averaged nor
-    paired: "anna", "anna (2)", the latter with the `namesake` "anna". Data None counts as the first of its case."""
+    """Records in which one case's name stands for one set of `data` alone, so that unlike data are neither averaged nor
+    paired.
+
+    The second of "anna" becomes "anna (2)", with the `namesake` "anna". Data None counts as the first.
+    """
     found: dict[str, list] = {}
     apart = []
     for record in records:
@@ -115,7 +118,8 @@ def voxels_in_words(grid: Grid, box: Mapping | None = None) -> str:
 
 
 def condition_titles(records: Sequence[Mapping]) -> dict[str, str]:
-    """The condition of each of some records in words -> what sets it apart from the others, "" for the only one."""
+    """Each condition of records in words -> the settings that tell it from the others, in words; "" where
+    there is only one."""
     found = {format_settings(given): given for given in map(condition, records)}
     names = dict.fromkeys(name for given in found.values() for name in given)
     told = [name for name in names if len({str(given[name]) for given in found.values() if name in given}) > 1]

@@ -89,7 +89,7 @@ def cut_out(case: Case, grid: Grid, box: Grid, window: HUWindow) -> Case:
 
 
 def placed(grid: Grid, like: Grid, affine: np.ndarray) -> Grid:
-    """A grid moved as `like` was that now has this affine."""
+    """A grid after the movement that gave the grid `like` this affine."""
     if grid.same_as(like):
         return Grid(grid.shape, affine=affine)
     return Grid(grid.shape, affine=affine @ np.linalg.inv(like.affine) @ grid.affine)
@@ -103,7 +103,7 @@ def in_its_ct(result: Reconstruction, case: Case, grid: Grid, window: HUWindow) 
 
 
 def _moved(result: Reconstruction, like: Grid, affine: np.ndarray) -> Reconstruction:
-    """A result, what it carries and its coarse one moved as the voxels `like` are that have this affine."""
+    """A result, with what it carries and its coarse one, after the movement that gave `like` this affine."""
     carried = result.carried and replace(result.carried, grid=placed(result.carried.grid, like, affine))
     return replace(result, grid=placed(result.grid, like, affine), carried=carried,
                    coarse=result.coarse and _moved(result.coarse, like, affine))

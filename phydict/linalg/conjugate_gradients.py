@@ -51,6 +51,11 @@ def conjugate_gradients(operator: Callable[[Tensor], Tensor], right: Tensor, ite
     return d
 
 
+def may_follow(x: Tensor, direction: Tensor, low: float, high: float) -> Tensor:
+    """Whether each value of x in [low, high] may go along `direction`, which those at a bound may not beyond it."""
+    return ~((x <= low) & (direction < 0) | (x >= high) & (direction > 0))
+
+
 def most_kept(iterations: int) -> int:
     """How many residuals, each of the size of the right side, are held at most where so many iterations are done
     orthogonally; while their room doubles both rooms are."""

@@ -19,11 +19,11 @@ NAMES = ("detector_shift_columns_mm", "detector_shift_rows_mm", "source_shift_co
 about the detector's normal, what was measured as (1 + gain) times the line integral plus the offset."""
 
 LARGE_CORRECTION, LARGE_SHIFT = 3.0, 2.0
-"""Gains and offsets corrected by more than so many of their stated standard deviations are warned of, and views whose
-shadows were by more than so many times what the stated ones shift them by (root mean square). Of a view's unknowns many
-combinations shift shadows alike, so that a single one of them says little. On two training CTs, poses drawn as stated
-have 1.5 at most, found as right ones; one view off by 25 mm and 6 degrees, where 5 mm and 2 degrees are stated, 2.2 to
-2.6, the others 0.5 at most."""
+"""A warning names gains and offsets that were corrected by more than the first number of their stated standard
+deviations, and views whose shadows were shifted by more than the second times what the stated deviations shift them by
+(root mean square). No single unknown of a pose is judged, since many combinations shift shadows alike. On two training
+CTs the second ratio is 1.5 at most for poses drawn as stated, where the right ones are found; for one view off by 25 mm
+and 6 degrees, where 5 mm and 2 degrees are stated, it is 2.2 to 2.6, and for the other views 0.5 at most."""
 
 SWAY, SWAY_ERRORS = 0.6, 4.0
 """Views whose sway is more mm and more of its standard errors are warned of. On two training CTs at rest it was 0.4 at
@@ -36,7 +36,6 @@ FEW_WIDENING = 1.5
 """Factor by which intervals widen where so few views' poses were searched, since a volume explains what is left of
 their errors: of ten pairs of radiographs of five training CTs, eight then hold 90 % of the body and of the lungs or
 more, without it five."""
-
 
 SWAY_WIDENING = 1.25
 """Factor by which intervals widen where views are found to sway: with breathing by 10 mm between eight views of two CTs

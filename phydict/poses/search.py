@@ -127,12 +127,17 @@ def find_poses(xrays: Tensor, beam: ConeBeam, uncertain: Uncertain, grid: Grid, 
             if first.fits_as_stated(replace(state, x=volume), same_fit(beam.views) if n == 0 else 1.0):
                 state.theta, state.misfits = torch.zeros_like(state.theta), state.misfits[:1]
                 break
-        there, points = moved(beam, state.theta[:, :8].double().numpy()), middle_points(grid)
+        there, points = moved(beam, pose_unknowns(state.theta)), middle_points(grid)
         if state.theta[:, :8].any():
             there = carried(there, beam, points, grid)
         shift = np.stack([reprojection_errors(there, beam, points), stated_shift(beam, uncertain, points)])
     return FoundPoses(drawn_back(there, grid), deviations, state.theta.double().numpy(), state.errors.double().numpy(),
                       (state.misfits[0], state.misfits[-1]), sway, shift, watch.seconds["calibrate"], display)
+
+
+def pose_unknowns(theta: Tensor) -> np.ndarray:
+    """Those of all unknowns (K, 10) that `moved` takes, (K, 8) float64: the rest are gains and offsets."""
+    return theta[:, :8].double().numpy()
 
 
 def carried(beam: ConeBeam, nominal: ConeBeam, points: np.ndarray, grid: Grid) -> ConeBeam:
@@ -182,7 +187,7 @@ class Views:
 
     def measurement(self, theta: Tensor) -> Measurement:
         """The X-rays without their gains and offsets, seen from the poses."""
-        poses = drawn_back(moved(self.beam, theta[:, :8].double().numpy()), self.grid)
+        poses = drawn_back(moved(self.beam, pose_unknowns(theta)), self.grid)
         corrected = (self.xrays - theta[:, 9, None, None]) / (1 + theta[:, 8, None, None])
         measurement = Measurement(Projector(self.grid, poses, full_detector=True), corrected, WINDOW, True,
                                   self.mu_water)
@@ -229,7 +234,7 @@ class Views:
     def changes(self, state: State) -> Tensor:
         """What a standard deviation of each unknown changes in the corrected X-rays: (K, 10, V, U)."""
         mu = WINDOW.to_mu(state.x[0, 0], self.mu_water)
-        integrals, derivatives = pose_derivatives(mu, self.grid, self.beam, state.theta[:, :8].double().numpy())
+        integrals, derivatives = pose_derivatives(mu, self.grid, self.beam, pose_unknowns(state.theta))
         ones = torch.ones_like(integrals) / (1 + state.theta[:, 8, None, None])
         changes = torch.cat([derivatives, torch.stack([integrals / (1 + state.theta[:, 8, None, None]), ones], 1)], 1)
         return changes * self.deviations[:, None, None]
@@ -243,8 +248,8 @@ class Views:
         """
         plain = self.measurement(state.theta)
         residual = plain.y[0] - plain.project(state.x)[0]
-        derivatives = pose_derivatives(WINDOW.to_mu(state.x[0, 0], self.mu_water), self.grid, self.beam,
-                                       state.theta[:, :8].double().numpy())[1]
+        mu = WINDOW.to_mu(state.x[0, 0], self.mu_water)
+        derivatives = pose_derivatives(mu, self.grid, self.beam, pose_unknowns(state.theta))[1]
         ramp = torch.linspace(-0.5, 0.5, residual.shape[1])[:, None]
         changes, swayed = self.changes(state), derivatives[:, 1:2] * ramp
         if not swayed.any():  # a volume of air
@@ -259,7 +264,7 @@ class Views:
         """The step, shortened for the views that it would obstruct."""
         step = step.clone()
         for _ in range(HALVINGS):
-            wrong = torch.as_tensor(obstructed(moved(self.beam, (theta + step)[:, :8].double().numpy()), self.grid))
+            wrong = torch.as_tensor(obstructed(moved(self.beam, pose_unknowns(theta + step)), self.grid))
             step[wrong] /= 2
             if not wrong.any():
                 break

@@ -69,10 +69,13 @@ def _factor(grid: Grid, level: Grid) -> int:
 
 def coarse_correction(base: object, level: Grid, seen: tuple[Tensor, Projector], found: Reconstruction,
                       report: str, display: bool) -> CoarseCorrection | None:
-    """The correction of estimates on a level's voxels by the network of `base`, which found a reconstruction of the
-    X-rays and the projector that it has `seen`; None where that is no refiner's or left the X-rays to another method,
-    where a whole number of the voxels, two or more, does not make one of its own along each axis, and where detectors
-    are tilted, for which finer voxels cost too much."""
+    """The correction of estimates on a level's voxels by the network of `base`, which found the reconstruction `found`
+    of the X-rays that it has `seen`.
+
+    seen: the X-rays and their projector. None where `base` uses no refiner or left the X-rays to another method, where
+    one of its voxels is not a whole number, two or more, of the level's along each axis, and where detectors are
+    tilted, for which finer voxels cost too much.
+    """
     xrays, projector = seen
     if not (isinstance(base, Posterior) and isinstance(base.prior, Refiner)) or _factor(base.grid, level) < 2:
         return None

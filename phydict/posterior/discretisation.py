@@ -29,11 +29,11 @@ def has_finer(projector: Projector) -> bool:
 
 
 def find_subgrid(measurement: Measurement, x: Tensor, step: LikelihoodStep | None, x0_std: float) -> bool:
-    """Sets the `subgrid` of a measurement: what finer voxels add to the projections of a CT x (1, 1, X, Y, Z). Whether
-    that is anything.
+    """Sets a measurement's `subgrid` to what finer voxels add to the projections of a CT x (1, 1, X, Y, Z), and returns
+    whether they add anything.
 
-    Of views that miss x by at most UNLIKE_FINER times more with it. Nothing where the X-rays hold no more than their
-    noise beyond x, without a `step` on the finer voxels, and where it `has_finer` none.
+    They add nothing to views whose error grows by more than a factor of UNLIKE_FINER with it, and nothing at all where
+    x fits all views within their noise, without a `step` on the finer voxels, and where the projector `has_finer` none.
     """
     measurement.subgrid = 0.0
     if step is None or not has_finer(measurement.projector):

@@ -15,8 +15,11 @@ from phydict.posterior.scatter import with_scatter
 
 def explained(measurement: Measurement, run: Callable[[Callable[[], None]], Tensor], on_step: Callable[[], None],
               metal: Metal | None, scatter: bool = True, hardening: bool = True) -> Tensor:
-    """The states (B, C, X, Y, Z) of `run`, which is given what to call after each step: on_step the first time, nothing
-    where it runs again, with what the X-rays hold beside the CT: whatever of metal, scatter and hardening is sought."""
+    """The states (B, C, X, Y, Z) that `run` finds once metal, scatter and beam hardening, as far as they are sought,
+    are taken into account. Each of them may need a second run.
+
+    run: takes what is called after each step: on_step in the first run, nothing in further ones.
+    """
     def again() -> Tensor:
         return run(lambda: None)
 

@@ -45,11 +45,12 @@ class Measurement:
 
     noise: standard deviation of the noise of y, as a share of its largest value or, as a tensor that expands to
     (K, V, U), of each pixel; None: estimated from y where it is needed. outside: line integrals (K, V, U) of what
-    lies outside the voxels, which P adds. told: whether what is doubtful in the X-rays was said before.
-    carried, beside: what is carried beside the CTs, if anything, and its line integrals (K, V, U), which P adds.
-    subgrid: line integrals (1, K, V, U) that P adds for what the voxels cannot hold, 0 until somebody sets them.
-    model_variance: variance (K, 1, 1) of what a view's line integrals hold beside noise that no volume explains, which
-    ProximalCG counts as noise, 0 until somebody sets it.
+    lies outside the voxels, which P adds. told: whether warnings about these X-rays were given before, and are not
+    repeated.
+    carried, beside: what is carried beside the CTs, such as metal, if anything, and its line integrals (K, V, U), which
+    P adds. subgrid: line integrals (1, K, V, U) that P adds for what the voxels cannot resolve; 0 at first.
+    model_variance: variance (K, 1, 1), beside the noise, of what no volume explains in a view's line integrals;
+    ProximalCG counts it as noise; 0 at first.
     scales: per axis, the finest spacing of the voxels divided by their own.
     hardened: whether the line integrals were straightened as those of a tube.
     scatter_enabled: whether `subtract_scatter` subtracts scatter; calls: how many times A or its adjoint ran over all
@@ -133,7 +134,7 @@ class Measurement:
         self.calls += len(r)
         return self.projector.T(self.slope * r)
 
-    def mean_diagonal(self, weights: Tensor | float = 1.0) -> float:
+    def mean_diagonal(self, weights: Tensor | float) -> float:
         """The mean of the diagonal of x -> adjoint(weights * linear(x)), by one volume of random signs (Hutchinson
         1990, doi:10.1080/03610919008812866)."""
         signs = torch.randint(2, (1, 1, *self.projector.grid.shape), generator=torch.Generator().manual_seed(0))

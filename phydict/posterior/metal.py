@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate, max_pool3d
 
 from phydict.guard import BONE, CEILING, CEILING_ML, millilitres
-from phydict.linalg.conjugate_gradients import conjugate_gradients
+from phydict.linalg.conjugate_gradients import conjugate_gradients, may_follow
 from phydict.linalg.total_variation import TVQuadraticMajorizer
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.widening import directions
@@ -138,7 +138,10 @@ def last_errors(measurement: Measurement) -> Tensor:
 
 
 def shown_by(metal: Tensor | float, without: Tensor, with_it: Tensor) -> list[int]:
-    """The views that show metal of line integrals (K, V, U), by what projections miss (K, V, U) without and with it."""
+    """The views in which the metal is seen.
+
+    metal: its line integrals (K, V, U). without, with_it: projected minus measured ones without and with it, alike.
+    """
     before, after = ((metal * errors.square()).sum((1, 2)).sqrt() for errors in (without, with_it))
     too_little = (metal * without).sum((1, 2)) < 0
     return (too_little & (after < SEEN * before)).nonzero().flatten().tolist()
@@ -173,7 +176,7 @@ def beside(measurement: Measurement, x: Tensor, where: Tensor, metal: Metal) -> 
                             slope * B.T(fitted))
 
         scale = together(1 / (weight + tv_scale * tv.diagonal()), BOLDNESS / columns) * together(
-            ~((z <= -1) & (down < 0) | (z >= 1) & (down > 0)), allowed & ~((e <= 0) & (rise < 0)))
+            may_follow(z, down, -1, 1), allowed & may_follow(e, rise, 0, math.inf))
         dz, de = apart(conjugate_gradients(normal, together(down, rise) * (scale > 0), metal.iterations,
                                            preconditioner=scale), z, e)
         z, e = (z + dz).clamp(-1, 1), (e + de).clamp(min=0)

@@ -86,8 +86,8 @@ class Refinement:
         return replace(self, step=step, call_step=call_step, calls=min(self.calls, 1), coarse=False, mirrored=False)
 
     def corrections(self, network: bool) -> tuple[int, int]:
-        """How often a network on the voxels, if there is one, and one on coarse ones are called for an estimate: what
-        is interpolated alone never."""
+        """How often an estimate calls a network on its own voxels, if there is one, and one on coarse voxels; neither
+        is called where estimates are only interpolated."""
         fine_calls = self.calls * (1 + self.mirrored) if self.step and network else 0
         coarse_calls = self.calls - network if self.step and self.coarse else 0
         return fine_calls, max(coarse_calls, 0)

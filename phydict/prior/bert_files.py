@@ -44,7 +44,7 @@ def load_bert(source: str | Path) -> tuple[BertTokenizer, BertModel]:
     from transformers import BertConfig, BertModel, BertTokenizer
 
     folder = _folder(source)
-    weights = _read_weights(_first(folder, WEIGHTS))
+    weights = _read_weights(next(folder / name for name in WEIGHTS if (folder / name).is_file()))
     try:
         config = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
         config.pop("model_type", None)
@@ -105,10 +105,6 @@ def _downloaded(hub_id: str) -> Path:
 def _missing(folder: Path) -> str:
     choices = {CONFIG: (CONFIG,), " or ".join(WEIGHTS): WEIGHTS, " or ".join(VOCABULARY): VOCABULARY}
     return ", ".join(name for name, files in choices.items() if not any((folder / file).is_file() for file in files))
-
-
-def _first(folder: Path, names: tuple[str, ...]) -> Path:
-    return next(folder / name for name in names if (folder / name).is_file())
 
 
 def _read_weights(file: Path) -> dict[str, Tensor]:

@@ -17,6 +17,7 @@ from phydict.prior.files import load_prior
 from phydict.prior.medsyn.checkpoint import MedSynCheckpoint
 from phydict.runtime.own_code import check_takes, imported, is_own, own_code, words
 from phydict.runtime.precision import precision_name
+from phydict.runtime.reading import naming
 from phydict.runtime.warning import warn
 from phydict.units import HUWindow
 
@@ -126,8 +127,8 @@ def bound(prior: AnyPrior, report: str, guidance: float, precision: str) -> Deno
 
 
 def precision_of(prior: AnyPrior, precision: str, x: torch.Tensor) -> str:
-    """What a prior's networks compute in for the state x where `precision` is asked for, as results name it; what one
-    of one's own says itself."""
+    """The precision that results name for a prior's networks, given the one asked for and the state x; a prior of the
+    user's own says it itself."""
     return str(getattr(prior, "precision", OWN_PRECISION)) if is_own(type(prior)) else precision_name(precision, x)
 
 
@@ -164,10 +165,8 @@ def find_prior(given: str | Path | MedSynCheckpoint | AnyPrior) -> AnyPrior:
         return given
     if not is_class_path(given):
         return load_prior(given)
-    try:
+    with naming(f"the prior {given} cannot be imported"):
         kind = imported(str(given))
-    except ValueError as error:
-        raise ValueError(f"the prior {given} cannot be imported: {error}") from error
     try:
         prior = kind()
     except (Exception, SystemExit) as error:  # of whatever kind: another's code runs

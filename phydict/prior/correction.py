@@ -13,8 +13,8 @@ from phydict.grid import Grid
 from phydict.prior.convolution import lay_out, silence, speed_up
 from phydict.prior.evidence_channels import EVIDENCE_CHANNELS
 from phydict.prior.finer_uncertainty import FinerUncertainty
-from phydict.prior.local_unet import PositionNorm, prolonged
-from phydict.prior.stage_file import FORMAT
+from phydict.prior.local_unet import PositionNorm, prolonged, unnormalised_unet
+from phydict.prior.stage_file import header_start
 from phydict.runtime.precision import network_precision
 from phydict.units import HUWindow
 
@@ -43,14 +43,11 @@ class CorrectionNetwork(nn.Module):
 
     def __init__(self, channels: tuple[int, ...] = (32, 64, 96), width: int = 16, grid: Grid = Grid.cube(128),
                  window: HUWindow = HUWindow(), uncertainty: FinerUncertainty | None = None):
-        from monai.networks.nets import UNet
-
         super().__init__()
         self.grid, self.window, self.uncertainty = grid, window, uncertainty
         self.settings = {"channels": list(channels), "width": width}
         self.divisor = 2 ** (len(channels) - 1)
-        self.unet = UNet(3, INPUTS, width, tuple(channels), (2,) * (len(channels) - 1), num_res_units=2, act="swish",
-                         norm=None)  # type: ignore[arg-type]  # which MONAI takes for no norm
+        self.unet = unnormalised_unet(INPUTS, width, channels, residual_units=2)
         self.norm = PositionNorm(width)
         self.join = nn.Conv3d(width + INPUTS, width, 3, padding=1)
         self.leave = nn.Conv3d(width, 1, 1)
@@ -61,8 +58,7 @@ class CorrectionNetwork(nn.Module):
     def describe(self) -> dict:
         """What the network is, as plain JSON values, for `build_correction`."""
         uncertainty = {"uncertainty": self.uncertainty.settings} if self.uncertainty else {}
-        return {"format": FORMAT, "stage": "refinement", "grid": self.grid.to_dict(),
-                "hu_window": [self.window.low, self.window.high], "network": self.settings, **uncertainty}
+        return header_start("refinement", self.grid, self.window) | {"network": self.settings, **uncertainty}
 
     @property
     def network(self) -> CorrectionNetwork:

@@ -46,10 +46,10 @@ DEFAULT_REFINER = shipped("data/prior/refiner_64.safetensors")
 """The refiner that comes with the project."""
 
 DEFAULT_CORRECTION = shipped("data/prior/refinement_128.safetensors")
-"""What corrects its reconstructions on voxels of 3 mm, where that comes with the project."""
+"""The network that corrects the shipped refiner's reconstructions on voxels of 3 mm, if this file is there."""
 
 FINEST_CORRECTION = shipped("data/prior/refinement_256.safetensors")
-"""And on voxels of 1.5 mm."""
+"""The same on voxels of 1.5 mm."""
 
 
 def save_prior(prior: Prior, path: str | Path, training: dict | None = None, dtype: torch.dtype = torch.float16):
@@ -59,20 +59,17 @@ def save_prior(prior: Prior, path: str | Path, training: dict | None = None, dty
     training: what the header should say of how it was trained (data, steps, command); plain JSON values.
     dtype: precision of the weights on disk.
     """
-    if prior.text is None and prior.load_text is not None:
-        prior.text = prior.load_text().to(prior.null.device)
+    text = prior.ready_text()
     weights = prior.state_dict()
-    if prior.text is not None and prior.text.source:  # a pretrained BERT is named, not copied
+    if text is not None and text.source:  # a pretrained BERT is named, not copied
         weights = {k: w for k, w in weights.items() if not k.startswith("text.")}
     write_stage(Path(path), prior.describe() | {"training": training or {}}, weights, dtype)
 
 
 def save_refiner(refiner: Refiner, path: str | Path, training: dict | None = None, dtype: torch.dtype = torch.float16):
     """Writes `refiner`, with the priors that it is made of, to one .safetensors file, as `save_prior` does."""
-    reader = refiner.reader
-    if reader.text is None and reader.load_text is not None:
-        reader.text = reader.load_text().to(reader.null.device)
-    copied = reader.text is not None and not reader.text.source
+    text = refiner.reader.ready_text()
+    copied = text is not None and not text.source
     named = {re.sub(r"^(prior|first)\.text\.", "text.", k): w for k, w in refiner.state_dict().items()}
     weights = {k: w for k, w in named.items() if copied or not k.startswith("text.")}
     write_stage(Path(path), refiner.describe() | {"training": training or {}}, weights, dtype)

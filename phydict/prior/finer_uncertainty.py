@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn.functional import silu
 
 from phydict.prior.convolution import lay_out, speed_up
-from phydict.prior.local_unet import prolonged
+from phydict.prior.local_unet import prolonged, unnormalised_unet
 from phydict.prior.uncertainty import LEVELS, LOG_SCALE, TISSUES, quantiles_of, steepness, tissue_of
 
 INPUT_CHANNELS = 4
@@ -33,13 +33,10 @@ class FinerUncertainty(nn.Module):
     quantiles: Tensor
 
     def __init__(self, channels: tuple[int, ...] = (8, 16, 32), width: int = 16):
-        from monai.networks.nets import UNet
-
         super().__init__()
         self.settings = {"channels": list(channels), "width": width}
         self.divisor = 2 ** (len(channels) - 1)
-        self.unet = UNet(3, INPUT_CHANNELS + 1, width, tuple(channels), (2,) * (len(channels) - 1), num_res_units=1,
-                         act="swish", norm=None)  # type: ignore[arg-type]  # which MONAI takes for no norm
+        self.unet = unnormalised_unet(INPUT_CHANNELS + 1, width, channels, residual_units=1)
         self.join = nn.Conv3d(width + INPUT_CHANNELS + 1, width, 3, padding=1)
         self.leave = nn.Conv3d(width, 1, 1)
         speed_up(self)

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import torch
-from einops import rearrange
 from torch import Tensor, nn
 from torch.nn.functional import layer_norm, pad
 
 from phydict.prior.convolution import lay_out, silence, speed_up
-from phydict.prior.unet import check_sizes
+from phydict.prior.unet import check_sizes, folded, unfolded
+
+if TYPE_CHECKING:
+    from monai.networks.nets import UNet
 
 
 class PositionNorm(nn.Module):
@@ -82,11 +87,19 @@ class LocalUNet(nn.Module):
         if any(size % self.divisor for size in x.shape[2:]):
             raise ValueError(f"this network needs sizes divisible by {self.divisor}, but {tuple(x.shape[2:])} came")
         n = self.block
-        h = rearrange(x, "b c (x i) (y j) (z k) -> b (c i j k) x y z", i=n, j=n, k=n)
+        h = folded(x, n)
         h = torch.cat([h, level.to(h).view(-1, 1, 1, 1, 1).expand(-1, 1, *h.shape[2:])], 1)
         h = self.fold(h.contiguous(memory_format=torch.channels_last_3d))
         h = self.unfold(self.unet(h, 1000 * t))
-        return rearrange(h, "b (c i j k) x y z -> b c (x i) (y j) (z k)", i=n, j=n, k=n)
+        return unfolded(h, n)
+
+
+def unnormalised_unet(inputs: int, outputs: int, channels: Sequence[int], residual_units: int) -> UNet:
+    """MONAI's UNet without norms, (B, inputs, X, Y, Z) -> (B, outputs, X, Y, Z); channels: width of each level."""
+    from monai.networks.nets import UNet
+
+    return UNet(3, inputs, outputs, tuple(channels), (2,) * (len(channels) - 1), num_res_units=residual_units,
+                act="swish", norm=None)  # type: ignore[arg-type]  # which MONAI takes for no norm
 
 
 def prolonged(x: Tensor, divisor: int) -> Tensor:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from phydict.diffusion import CosineSchedule, guided
 from phydict.grid import Grid
 from phydict.prior.detail import DetailNetwork
-from phydict.prior.stage_file import FORMAT
+from phydict.prior.stage_file import header_start
 from phydict.prior.text import TextEncoder
 from phydict.prior.unet import VolumeUNet
 from phydict.runtime.precision import network_precision
@@ -86,6 +86,12 @@ class Prior(nn.Module):
         """Whether the network can halve a state of so many voxels along each axis."""
         return not any(n % self.network.divisor for n in shape)
 
+    def ready_text(self) -> TextEncoder | None:
+        """The report encoder, read from its file where it is not yet; None for a prior without text."""
+        if self.text is None and self.load_text is not None:
+            self.text = self.load_text().to(self.null.device)
+        return self.text
+
     def context(self, reports: Sequence[str]) -> Tensor:
         """Reports -> contexts (B, L, D); the learned null token stands for padding and for a report left empty.
 
@@ -93,11 +99,10 @@ class Prior(nn.Module):
         """
         if not any(reports):
             return self.null.expand(len(reports), 1, -1)
-        if self.text is None:
-            if self.load_text is None:
-                raise ValueError("this prior was trained without text, but a report was given: leave the report out")
-            self.text = self.load_text().to(self.null.device)
-        states, mask = self.text(list(reports))
+        text = self.ready_text()
+        if text is None:
+            raise ValueError("this prior was trained without text, but a report was given: leave the report out")
+        states, mask = text(list(reports))
         mask = mask & torch.tensor([bool(r) for r in reports], device=mask.device)[:, None]
         return torch.where(mask[..., None], states, self.null)
 
@@ -110,11 +115,10 @@ class Prior(nn.Module):
             "vocabulary": None if encoder.source else encoder.vocabulary,
             **({"padded_to": encoder.padded_to} if encoder.padded_to else {}),
             **({"sentences": encoder.sentences} if encoder.sentences else {})}
-        return {"format": FORMAT, "stage": "base", "grid": self.grid.to_dict(),
-                "hu_window": [self.window.low, self.window.high], "state": STATE[:self.network.state_channels],
-                "sigma_data": self.sigma_data, "skip_std": self.skip_std, "schedule": vars(self.schedule),
-                "text": text, "network": self.network.settings,
-                **({"detail": self.detail.settings} if self.detail else {})}  # which older files do not name
+        return header_start("base", self.grid, self.window) | {
+            "state": STATE[:self.network.state_channels], "sigma_data": self.sigma_data, "skip_std": self.skip_std,
+            "schedule": vars(self.schedule), "text": text, "network": self.network.settings,
+            **({"detail": self.detail.settings} if self.detail else {})}  # which older files do not name
 
     @property
     def state_channels(self) -> int:

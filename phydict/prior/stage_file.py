@@ -13,9 +13,10 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from phydict.grid import Grid
 from phydict.prior.finite import check_finite, not_finite
 from phydict.runtime.files import atomic_write
-from phydict.runtime.reading import not_written, reason, refusing
+from phydict.runtime.reading import naming, not_written, reason, refusing
 from phydict.units import HUWindow
 
 Network = TypeVar("Network", bound=nn.Module)
@@ -38,6 +39,11 @@ class Described(Protocol):
     def describe(self) -> dict: ...
 
     def state_dict(self) -> dict[str, Tensor]: ...
+
+
+def header_start(stage: str, grid: Grid, window: HUWindow) -> dict:
+    """What the header of every stage's file begins with, as plain JSON values; stage: one of STAGES."""
+    return {"format": FORMAT, "stage": stage, "grid": grid.to_dict(), "hu_window": [window.low, window.high]}
 
 
 def save_stage(stage: Described, path: str | Path, training: dict | None = None, dtype: torch.dtype = torch.float16):
@@ -91,10 +97,8 @@ def loaded_stage(path: Path, stages: Sequence[str], build: Callable[[dict, dict[
     """
     with refusing(path, ADVICE):
         header, weights = read_stage(path, stages)
-        try:
+        with naming(f"'{path}' contradicts itself"):
             loaded = build(header, weights)
-        except ValueError as error:
-            raise ValueError(f"'{path}' contradicts itself: {error}") from error
     return loaded.eval().requires_grad_(False)
 
 

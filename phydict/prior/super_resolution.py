@@ -14,7 +14,7 @@ from phydict.diffusion import CosineSchedule, noise_like
 from phydict.grid import Grid
 from phydict.prior.local_unet import LocalUNet
 from phydict.prior.prior import STATE, preconditioning
-from phydict.prior.stage_file import FORMAT
+from phydict.prior.stage_file import header_start
 from phydict.prior.tiles import Tiles
 from phydict.runtime.precision import network_precision
 from phydict.runtime.ranges import check_between
@@ -63,11 +63,10 @@ class SuperResolution(nn.Module):
 
     def describe(self) -> dict:
         """What the stage is, as plain JSON values, for `build_super_resolution`."""
-        return {"format": FORMAT, "stage": "super_resolution", "grid": self.grid.to_dict(),
-                "hu_window": [self.window.low, self.window.high], "factor": self.factor,
-                "state": STATE[:self.state_channels], "coarse_state": STATE[:self.coarse_channels],
-                "detail_std": self.detail_std, "skip_std": self.skip_std, "schedule": vars(self.schedule),
-                "network": self.network.settings}
+        return header_start("super_resolution", self.grid, self.window) | {
+            "factor": self.factor, "state": STATE[:self.state_channels], "coarse_state": STATE[:self.coarse_channels],
+            "detail_std": self.detail_std, "skip_std": self.skip_std, "schedule": vars(self.schedule),
+            "network": self.network.settings}
 
     def forward(self, x: Tensor, t: Tensor, upsampled: Tensor, level: Tensor) -> Tensor:
         """Clean estimate of the fine state x (B, C, X, Y, Z) at times t (B,), in x's dtype.

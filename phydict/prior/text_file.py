@@ -12,7 +12,7 @@ from torch import Tensor
 from phydict.prior.finite import check_finite
 from phydict.prior.stage_file import ADVICE, check_sizes, whole_of
 from phydict.prior.text import TextEncoder
-from phydict.runtime.reading import reason, refusing
+from phydict.runtime.reading import naming, reason, refusing
 
 
 def has_text(header: dict) -> bool:
@@ -59,8 +59,5 @@ def load_text(path: Path, text: dict) -> TextEncoder:
         with safe_open(path, "pt") as file:
             weights = {k: file.get_tensor(k) for k in file.keys() if k.startswith("text.")}
         check_finite(weights, path)
-        try:
-            with torch.random.fork_rng(devices=[]):  # what it begins with is random
-                return build_text(text, weights)
-        except ValueError as error:
-            raise ValueError(f"'{path}' contradicts itself: {error}") from error
+        with naming(f"'{path}' contradicts itself"), torch.random.fork_rng(devices=[]):  # what it begins with is random
+            return build_text(text, weights)

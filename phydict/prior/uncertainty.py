@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from phydict.prior.convolution import speed_up
 from phydict.prior.evidence_channels import COVERAGE_SCALE, EVIDENCE_CHANNELS
+from phydict.prior.local_unet import unnormalised_unet
 
 LEVELS = (0.5, 0.8, 0.9, 0.95)
 """The shares of voxels that intervals are to hold."""
@@ -47,13 +48,9 @@ class Uncertainty(nn.Module):
     most_residual: Tensor
 
     def __init__(self, state_channels: int = 4, channels: tuple[int, ...] = (16, 32, 64)):
-        from monai.networks.nets import UNet
-
         super().__init__()
         self.settings = {"state_channels": state_channels, "channels": list(channels)}
-        self.unet = UNet(3, state_channels + EVIDENCE_CHANNELS + INPUTS, 1, tuple(channels),
-                         (2,) * (len(channels) - 1), num_res_units=2, act="swish",
-                         norm=None)  # type: ignore[arg-type]  # which MONAI takes for no norm
+        self.unet = unnormalised_unet(state_channels + EVIDENCE_CHANNELS + INPUTS, 1, channels, residual_units=2)
         speed_up(self)
         quantiles = -torch.log1p(-torch.tensor(LEVELS))
         self.register_buffer("quantiles", quantiles.expand(len(TISSUES), COVERAGES, -1).clone())

@@ -42,6 +42,16 @@ NORM_GROUPS = 8
 """Into how many groups channels are divided to be normalised."""
 
 
+def folded(x: Tensor, n: int) -> Tensor:
+    """Voxels (B, C, X, Y, Z) with each block of n^3 folded into channels: (B, C n^3, X/n, Y/n, Z/n)."""
+    return rearrange(x, "b c (x i) (y j) (z k) -> b (c i j k) x y z", i=n, j=n, k=n)
+
+
+def unfolded(h: Tensor, n: int) -> Tensor:
+    """The voxels (B, C, X, Y, Z) that `folded` took apart."""
+    return rearrange(h, "b (c i j k) x y z -> b c (x i) (y j) (z k)", i=n, j=n, k=n)
+
+
 def check_sizes(**sizes: int | Sequence[int]) -> None:
     """Raises ValueError, naming the setting, unless each of a network's sizes is one number above 0 or some."""
     for name, size in sizes.items():
@@ -152,9 +162,7 @@ class VolumeUNet(nn.Module):
 
     def blocked(self, x: Tensor) -> Tensor:
         """Voxels (B, C, X, Y, Z) folded into channels, as `fold` takes them: (B, C n^3, X/n, Y/n, Z/n), n = block."""
-        n = self.block
-        h = rearrange(x, "b c (x i) (y j) (z k) -> b (c i j k) x y z", i=n, j=n, k=n)
-        return h.contiguous(memory_format=self.memory_format)
+        return folded(x, self.block).contiguous(memory_format=self.memory_format)
 
     def hint_over(self, context: Tensor, shape: Sequence[int]) -> Tensor:
         """What the map of a report adds to states of so many blocks: it lies over `map_shape` in their middle, and goes
@@ -169,9 +177,8 @@ class VolumeUNet(nn.Module):
 
         offset: (B, channels[0], X/block, ...), added to what enters the UNet; None for none.
         """
-        n = self.block
         h = self.fold(self.blocked(x))
         h = h if offset is None else h + offset
         h = h + self.hint_over(context, h.shape[2:])
         h = self.unfold(self.unet(h, 1000 * t, context=context))
-        return rearrange(h, "b (c i j k) x y z -> b c (x i) (y j) (z k)", i=n, j=n, k=n)
+        return unfolded(h, self.block)

@@ -16,7 +16,7 @@ class PatchDiscriminator(nn.Module):
     views: channels of X-rays; width: channels of the first layer, doubled by each of `layers`.
     """
 
-    def __init__(self, views: int, width: int = 16, layers: int = 2):
+    def __init__(self, views: int, width: int, layers: int):
         super().__init__()
         widths = [1 + views, *(width * 2**n for n in range(layers + 1))]
         self.layers = nn.ModuleList(nn.Conv3d(a, b, 4, 2 if n < layers else 1, 1 if n < layers else 2)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from phydict.grid import Grid
-from phydict.prior.stage_file import FORMAT
+from phydict.prior.stage_file import header_start
 from phydict.rivals.network import RivalNetwork
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, binning
@@ -46,9 +46,8 @@ class Rival(nn.Module):
 
     def describe(self) -> dict:
         """What the rival is, as plain JSON values; `phydict.rivals.build_rival` builds it again."""
-        return {"format": FORMAT, "stage": self.network.stage, "grid": self.grid.to_dict(),
-                "hu_window": [self.window.low, self.window.high], "network": self.network.settings,
-                "beam": None if self.beam is None else self.beam.to_dict()}
+        return header_start(self.network.stage, self.grid, self.window) | {
+            "network": self.network.settings, "beam": None if self.beam is None else self.beam.to_dict()}
 
     def network_inputs(self, shape: Sequence[int]) -> tuple[Tensor, ...]:
         """Arguments of the network for X-rays of a volume of `shape`, its grid's: eight views where any number do."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import reprlib
-from argparse import ArgumentParser
 from collections.abc import Collection, Iterable, Iterator, Sequence
 
 from jsonargparse import set_loader
@@ -40,8 +39,8 @@ def is_yaml(given: str) -> bool:
 
 
 def valued(args: Iterable[str], options: Collection[str]) -> Iterator[tuple[str, str | None]]:
-    """Arguments, those of `options` as the name and the value, which follows "=" or is the next one; the others, and
-    where nothing follows, with None."""
+    """Each of `options` with its value, which follows "=" or is the next argument; None where nothing follows. Other
+    arguments come with None."""
     rest = iter(args)
     for arg in rest:
         option, equals, value = arg.partition("=")
@@ -49,9 +48,8 @@ def valued(args: Iterable[str], options: Collection[str]) -> Iterator[tuple[str,
 
 
 def with_configurations(args: list[str], kinds: tuple[str, ...]) -> list[str]:
-    """Arguments with every configuration (-c, --config) as --config=, and with the place of those that are shipped ones
-    by their path or their name; see `phydict.runtime.shipped.configuration`, which raises ValueError for those that are
-    nowhere."""
+    """Arguments with every configuration (-c, --config) as --config=, shipped ones, which may be given by name, as
+    their path. Raises ValueError, as `phydict.runtime.shipped.configuration` does, for files that are nowhere."""
     def place(given: str) -> str:
         return given if is_yaml(given) else str(configuration(given, kinds))
 
@@ -68,12 +66,10 @@ def check_configured(args: Sequence[str], options: Collection[str], example: str
 
 
 def read_configurations(args: Sequence[str]) -> list[dict]:
-    """What the configurations of a command line hold, in their order; files that are not there are left to the command
-    line's own parser. Raises ValueError as `read_configuration` and `inline_configuration` do."""
-    look = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    look.add_argument("--config", "-c", action="append", default=[])
-    given, _ = look.parse_known_args(list(args))
-    return [inline_configuration(one) if is_yaml(one) else read_configuration(one) for one in given.config
+    """What the configurations of a command line hold, in their order, without missing files, of which the command
+    line's own parser speaks. Raises ValueError as `read_configuration` and `inline_configuration` do."""
+    given = [value for _, value in valued(split_configurations(args), CONFIGURATION) if value is not None]
+    return [inline_configuration(one) if is_yaml(one) else read_configuration(one) for one in given
             if is_yaml(one) or os.path.isfile(one)]
 
 

@@ -39,8 +39,8 @@ def atomic_write(final: Path) -> Iterator[Path]:
 def atomic_directory(final: Path, wanted: Callable[[], bool] = lambda: True) -> Iterator[Path]:
     """A folder to fill; when the block ends well that folder takes `final`'s place, else it is removed.
 
-    wanted: called when all is written and no other process is at it, so that what is in `final`'s place then can be
-    looked at; where it is not true, or raises, that stays.
+    wanted: called once all is written and other processes are locked out, to look at what is in `final`'s place; this
+    stays if it returns False or raises.
     """
     partial = _partial(final)
     try:
@@ -58,8 +58,8 @@ def atomic_directory(final: Path, wanted: Callable[[], bool] = lambda: True) -> 
 
 @contextmanager
 def undisturbed(folder: Path) -> Iterator[None]:
-    """In the block no process of this machine puts a whole folder into `folder`, if there is such a folder, and none
-    that a process set aside before it was killed is missing."""
+    """Locks `folder`, if it exists: in the block no process of this machine puts a whole folder into it. Folders that a
+    killed process had set aside are put back first."""
     if not folder.is_dir():
         yield
         return
@@ -120,8 +120,8 @@ def is_signed(path: Path, mark: str) -> bool:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Removes what processes of this machine that are no more had begun to write as files and folders in `folder`, and
-    puts back what they had set aside."""
+    """Removes the unfinished files and folders that dead processes of this machine left in `folder`, and puts back what
+    they had set aside."""
     with undisturbed(folder):
         for partial in folder.glob(".*.partial"):
             if _is_of_none(partial.name.removesuffix(".partial")):
@@ -142,7 +142,7 @@ def _take_place(partial: Path, final: Path) -> None:
 
 
 def _settle(final: Path) -> None:
-    """Of what was set aside for `final`: puts it back where nothing took its place, and removes it where that did."""
+    """Removes what was set aside for `final` if something took its place, and else puts it back."""
     aside = _aside(final)
     if not aside.is_dir():
         return
@@ -170,7 +170,7 @@ def _writer() -> str:
 
 
 def _is_of_none(name: str) -> bool:
-    """Whether a name ends in a `_writer` of this machine that is no more."""
+    """Whether a name ends in the `_writer` of a dead process of this machine."""
     host, _, process = name.rpartition(".")
     return host.endswith("." + socket.gethostname()) and process.isdigit() and not _runs(int(process))
 

@@ -18,8 +18,8 @@ CONFIGURATION_HELP = "Path to a configuration file."
 
 
 class HelpFormatter(DefaultHelpFormatter):
-    """Leaves out actions that are hidden, keeps the line breaks of a text that has some, and adds no types to a
-    sentence with its default in it."""
+    """Leaves out hidden actions, keeps a text's own line breaks, and adds nothing to a sentence that states its
+    default."""
 
     def add_argument(self, action) -> None:
         if not getattr(action, "hidden", False):
@@ -33,8 +33,11 @@ class HelpFormatter(DefaultHelpFormatter):
 
 
 def arrange_help(parser: ArgumentParser, usage: str, sentences: Mapping[str, str], last: Mapping[str, str]) -> None:
-    """Makes a parser's help readable: `usage` in a line; `sentences`, option -> what it does, instead of its own; of
-    the options under a name of `last`, name -> title, only those, at the end. What is left out is still accepted."""
+    """Makes a parser's help readable. Hidden options are still accepted.
+
+    usage: one line. sentences: option -> what it does, shown instead of the parser's own sentence. last: name -> title
+    of a section that is moved to the end; of the options below such a name only those of `sentences` are shown.
+    """
     parser.usage = usage
     for action in parser._actions:
         name = "config" if "--config" in action.option_strings else (action.option_strings or [action.dest])[0][2:]

@@ -47,8 +47,8 @@ def naming_unknown_options(*parsers: ArgumentParser) -> Iterator[None]:
 
 
 def _meant(given: str, known: Collection[str]) -> str:
-    """A question for the known name that ends as the given one, or else is as deep and spelled nearly like it, if
-    there is one."""
+    """Asks whether the known name with the same last part was meant, else one of as many parts that is spelled nearly
+    alike; empty where there is none."""
     last = given.lstrip("-").split(".")[-1]
     named = [name for name in known if len(last) > 1 and name.lstrip("-").split(".")[-1] == last]
     deep = [name for name in known if name.count(".") == given.count(".")]
@@ -57,8 +57,8 @@ def _meant(given: str, known: Collection[str]) -> str:
 
 
 def plain(message: str) -> str:
-    """A message of jsonargparse on one setting as one sentence: its name, what it holds and what was given. Empty where
-    it is another message."""
+    """jsonargparse's message about one setting as a sentence: its name, what it may be and what was given. Empty for
+    any other message."""
     text = " ".join(message.split())
     if flag := re.fullmatch(r"argument (--\S+): ignored explicit argument '(.*)'", text):
         return f"{flag[1]} takes no value, but {_short(flag[2])} was given"

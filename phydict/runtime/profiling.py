@@ -42,7 +42,7 @@ class Profile:
     memory: whether peaks are looked at, which takes a tenth of a millisecond for every stage.
     """
 
-    def __init__(self, memory: bool = True):
+    def __init__(self, memory: bool):
         self.memory = memory
         self.uses: dict[str, StageUsage] = {}
         self._open: list[str] = []

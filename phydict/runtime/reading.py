@@ -59,6 +59,15 @@ def refusing(name: object, advice: str) -> Iterator[None]:
         raise Unreadable(message) from error
 
 
+@contextmanager
+def naming(name: object) -> Iterator[None]:
+    """A ValueError that is raised inside begins with `name`, such as the file that it is about."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
+
+
 def one_line(text: str) -> str:
     """A text without line breaks, cut off after MAX_MESSAGE characters."""
     text = " ".join(text.split())
@@ -128,15 +137,15 @@ def read_npy(path: str | Path) -> np.ndarray:
     return np.load(path, allow_pickle=False)
 
 
-def check_held(promised: int, path: Path, what: str, times: int = MOST_SQUEEZED) -> None:
-    """Raises ValueError where the header of a file promises more than so many times what the file has of bytes."""
+def check_held(promised: int, path: Path, what: str, times: int) -> None:
+    """Raises ValueError where a file's header promises more of `what` than `times` as many as the file has bytes."""
     if promised > times * (size := path.stat().st_size):
         raise ValueError(f"its header promises {promised:,} {what} but the file has {size:,} bytes: it is truncated or "
                          "damaged")
 
 
 class TooLittleMemory(ValueError):
-    """What another machine could do."""
+    """This machine has too little memory; a larger one could do it."""
 
 
 def check_memory(needed: int, what: str, advice: str) -> None:

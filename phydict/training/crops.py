@@ -13,7 +13,7 @@ from phydict.datasets import CTCases, CTSource, Deformation, load_case, phantom_
 from phydict.datasets.phantoms.cached import VALIDATION_PHANTOM, CachedPhantoms
 from phydict.grid import Cube
 from phydict.training.data import PriorData, check_plain
-from phydict.training.draws import Draws, Items
+from phydict.training.draws import Draws, Items, random_cube
 from phydict.training.made import mapped_volume
 from phydict.training.settings import Crops, HoldOut, Loading
 from phydict.units import AIR, HUWindow
@@ -45,9 +45,8 @@ class CTVolumes(CTCases):
 class CropDataset(Draws):
     """Random cubes of volumes.
 
-    A crop starts at a multiple of `align` voxels; mere air is drawn again, up to three times. augmented: mirrored left
-    to right half the time, with a small change of HU (the super-resolution stage sees too little of the body for a
-    side to matter).
+    Each starts at a multiple of `align` voxels. augmented: mirrored left to right half the time, with a small change of
+    HU (the super-resolution stage sees too little of the body for a side to matter).
     """
 
     def __init__(self, cts: Items, phantoms: Items, ct_fraction: float, window: HUWindow, size: int, align: int,
@@ -56,16 +55,9 @@ class CropDataset(Draws):
         self.window, self.size, self.align, self.augmented = window, size, align, augmented
 
     def item(self, drawn: np.ndarray, rng: np.random.Generator) -> dict:
-        for _ in range(4):
-            crop = self._crop(drawn, rng)
-            if crop.std() > 0.05:
-                break
+        cube = random_cube(drawn, self.size, rng, self.align)
+        crop = torch.from_numpy(drawn[cube].astype(np.float32))[None]
         return {"volume": self._augment(crop, rng) if self.augmented else crop}
-
-    def _crop(self, volume: np.ndarray, rng: np.random.Generator) -> Tensor:
-        starts = [self.align * int(rng.integers((n - self.size) // self.align + 1)) for n in volume.shape]
-        cut = volume[tuple(slice(start, start + self.size) for start in starts)]
-        return torch.from_numpy(cut.astype(np.float32))[None]
 
     def _augment(self, crop: Tensor, rng: np.random.Generator) -> Tensor:
         change = Deformation.draw(int(rng.integers(2**31)))

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+import torch
 from torch.nn.functional import avg_pool3d
 from torch.utils.data import Dataset
 
@@ -28,6 +29,17 @@ class Items(Protocol):
     def __len__(self) -> int: ...
 
     def __getitem__(self, i: int, /) -> Any: ...
+
+
+def random_cube(volume: np.ndarray, size: int, rng: np.random.Generator, align: int = 1) -> tuple[slice, ...]:
+    """Where a cube of `size` voxels lies in a volume (X, Y, Z) in the prior's range; it starts at a multiple of `align`
+    voxels. Mere air is drawn again, up to three times."""
+    for _ in range(4):
+        starts = [align * int(rng.integers((n - size) // align + 1)) for n in volume.shape]
+        cube = tuple(slice(start, start + size) for start in starts)
+        if torch.from_numpy(volume[cube].astype(np.float32)).std() > 0.05:
+            break
+    return cube
 
 
 class Draws(Dataset):

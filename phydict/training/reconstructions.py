@@ -31,7 +31,7 @@ from phydict.runtime.ranges import check_fields
 from phydict.runtime.seeds import check_seed
 from phydict.training.crops import CTVolumes, PhantomVolumes
 from phydict.training.data import PriorData, check_plain
-from phydict.training.draws import Draws, Items
+from phydict.training.draws import Draws, Items, random_cube
 from phydict.training.made import MadeOnce
 from phydict.training.scenes import Scenes
 from phydict.training.settings import HoldOut, Loading
@@ -159,13 +159,8 @@ class ReconstructionCrops(Draws):
 
     def item(self, drawn: np.ndarray, rng: np.random.Generator) -> dict:
         first = self.channels * int(rng.integers(len(drawn) // self.channels))
-        channels = [*range(first, first + self.channels), -1]
-        for _ in range(4):
-            starts = [int(rng.integers(n - self.size + 1)) for n in drawn.shape[1:]]
-            cut = drawn[(slice(None), *(slice(start, start + self.size) for start in starts))][channels]
-            crop = torch.from_numpy(cut.astype(np.float32))
-            if crop[-1].std() > 0.05:
-                break
+        cut = drawn[(slice(None), *random_cube(drawn[-1], self.size, rng))]
+        crop = torch.from_numpy(cut[[*range(first, first + self.channels), -1]].astype(np.float32))
         estimate, truth = (torch.from_numpy(drawn[i, ::SPARSE, ::SPARSE, ::SPARSE].astype(np.float32))
                            for i in (first, -1))
         error = estimate - truth

@@ -71,8 +71,7 @@ class RefinerTraining(StageTraining):
             loaded, _mean(loaded), first=deepcopy(loaded) if loaded.reads_text else None)
         refiner.uncertainty = None  # of what it was
         super().__init__(refiner.train().requires_grad_(True), optimisation, seed, initial)
-        if refiner.reader.load_text is not None:
-            refiner.reader.text = refiner.reader.load_text()
+        refiner.reader.ready_text()
         if refiner.first is not None:
             refiner.first.requires_grad_(False)
         self.method, self.scenes, self.body_weight, self.mask_weight = method, scenes, body_weight, mask_weight

@@ -55,9 +55,7 @@ class UncertaintyTraining(CalibratedTraining):
         check_continues("refiner", initial, refiner, cube.grid(), HUWindow(*window))
         refiner.uncertainty = network or refiner.uncertainty or Uncertainty(refiner.state_channels)
         super().__init__(refiner, optimisation, seed, initial, body_weight)
-        reader = refiner.reader
-        if reader.load_text is not None:  # to be written with the rest
-            reader.text = reader.load_text().requires_grad_(False)
+        refiner.reader.ready_text()  # to be written with the rest
         refiner.uncertainty.requires_grad_(True)
         self.method, self.scenes, self.validation = method, scenes, validation
 

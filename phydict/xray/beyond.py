@@ -12,16 +12,16 @@ from phydict.xray.boxes import binned_to, in_other_voxels
 from phydict.xray.geometry import ConeBeam
 
 SIDE, ITERATIONS, CLEARLY = 32, 10, 1.1
-"""Voxels per side and steps of conjugate gradients that tell the two apart, and how many times as much of the X-rays
-must be left without `continued` as with it. Of five CTs, from one to sixteen views, it is 0.4 to 0.95 times where the
-CT ends in air, and 1.2 to 30 times where its last slices are repeated, at one end or both. Nearer to 1 it only comes in
-geometries whose rays hardly leave the volume, for which either does."""
+"""Voxels per side, steps of conjugate gradients, and the least ratio of what they leave of the X-rays without
+`continued` to what they leave with it for a patient to continue. On five CTs, from one to sixteen views, the ratio is
+0.4 to 0.95 where the CT ends in air, and 1.2 to 30 where its last slices are repeated, at one end or both. It is nearer
+to 1 only in geometries whose rays hardly leave the volume, where either answer serves."""
 
 TALLER, MORE_CLEARLY = 0.125, 1.5
-"""The share of its height by which a volume is taller at both ends that is to explain the X-rays of a patient who ends
-there, and how many times as much of them the volume alone must leave. Of four CTs it is 0.99 to 1.1 times where they
-end in it, of flipped views, display values and coarse phantoms 1.47 at most; where they are moved up or down by 96 mm
-1.6 to 28, but for one that then reaches little beyond: from 1.1 on."""
+"""By which share of its height the taller volume exceeds the volume at each end, and the least ratio of what the volume
+leaves of the X-rays to what the taller one leaves for that to be needed. On four CTs the ratio is 0.99 to 1.1 where
+they end in the volume, with flipped views, display values and coarse phantoms 1.47 at most. Moved up or down by 96 mm
+it is 1.6 to 28, but from 1.1 on for one CT that then reaches little beyond."""
 
 LOW = 0.01
 """The share of a display image's pixels at or below what stands for air."""

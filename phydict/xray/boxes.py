@@ -62,7 +62,7 @@ def covers(grid: Grid, box: Grid) -> bool:
 
 
 def lacking(grid: Grid, box: Grid) -> list[float]:
-    """How many voxels a grid lacks at one end of each axis, that of which it lacks more, to hold a box along the same
+    """How many voxels a grid lacks along each axis, at the end where it lacks more, to hold a box along the same
     axes."""
     low, high = _faces(grid, box)
     return [max(0.0, -0.5 - SLACK - first, last - n + 0.5 - SLACK) for n, first, last in zip(grid.shape, low, high)]
@@ -104,8 +104,8 @@ def _weighted(volume: Tensor, weights: Sequence[Tensor]) -> Tensor:
 
 
 def no_finer(grid: Grid, than: Grid) -> bool:
-    """Whether a grid's voxels are along no axis shorter than those of another grid along the same axes, and each lies
-    at least half in its box."""
+    """Whether a grid's voxels are at least as long along each axis as those of the grid `than`, of the same axes, and
+    each lies at least half in the box of `than`."""
     beyond = np.multiply(lacking(than, grid), than.spacing) / grid.spacing
     return bool((np.divide(grid.spacing, than.spacing) > 1 - SLACK).all() and (beyond < 0.5).all())
 
@@ -119,8 +119,11 @@ def outside_projection(mu: Tensor, grid: Grid, projector: Projector, continued: 
 
 
 def refinements(start: Grid, target: Grid) -> list[Grid]:
-    """Grids over the target's box, each of voxels about half as long as those before it, `start`'s first, up to the
-    target, along each axis none longer than `start`'s unless the target's are; none where that is `start`."""
+    """Grids over the target's box that lead from `start` to the target, each of voxels about half as long as those
+    before.
+
+    Along each axis none has longer voxels than `start`, unless the target has. Empty where the target is `start`.
+    """
     check_axes(start, target)
     if start.same_as(target):
         return []

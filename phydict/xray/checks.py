@@ -43,7 +43,7 @@ def check_xrays(xrays: Tensor, beam: ConeBeam, display: bool = False) -> None:
                          "out of the X-rays and of the geometry")
 
 
-def check_fit(xrays: Tensor, beam: ConeBeam, grid: Grid, survey: Grid | None = None, display: bool = False) -> None:
+def check_fit(xrays: Tensor, beam: ConeBeam, grid: Grid, survey: Grid | None, display: bool) -> None:
     """Raises ValueError where X-rays (K, V, U), geometry and the voxels of `grid` do not fit; warns where X-rays look
     inverted. survey: the voxels that hold the whole scene, where `grid` does not. display: whether they are display
     values."""

@@ -14,7 +14,7 @@ import yaml
 
 from phydict.grid import Grid, whole_sizes
 from phydict.runtime.files import atomic_write
-from phydict.runtime.reading import check_memory
+from phydict.runtime.reading import check_memory, naming
 from phydict.runtime.yaml_file import read_yaml
 from phydict.xray.orbits import on_circle, on_line, turned
 from phydict.xray.stated import (
@@ -313,12 +313,10 @@ class ConeBeam:
         if not path.is_file():
             raise FileNotFoundError(f"there is no geometry file {path}; write one with ConeBeam.save or by hand")
         content = read_yaml(path)
-        try:
+        with naming(path):
             if not isinstance(content, dict) or "beam" not in content:
                 return cls.from_dict(content)
             return cls.from_dict(content["beam"]).with_continued(content.get("continued"))
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
 
     @classmethod
     def from_dict(cls, content: object) -> ConeBeam:

@@ -14,15 +14,13 @@ Vectors are taken as world millimetres, RAS+: where another program's axes diffe
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
 
 from phydict.runtime.files import atomic_write
-from phydict.runtime.reading import read_npy, read_text, reading, reason
+from phydict.runtime.reading import naming, read_npy, read_text, reading, reason
 from phydict.runtime.warning import warn
 from phydict.xray.geometry import ConeBeam
 from phydict.xray.projection_matrices import beam_of_matrices
@@ -56,12 +54,12 @@ def read_beam(path: str | Path, shape: tuple[int, int] | None = None,
     vectors = _read_npy(path) if ending == ".npy" else _read_table(path)
     if vectors.shape[1:] == (3, 4) and len(vectors):
         sides = _stated(path, pixel)
-        with _of(path):
+        with naming(path):
             return beam_of_matrices(vectors, shape, sides)
     if vectors.ndim != 2 or vectors.shape[1] != 12 or not len(vectors):
         raise ValueError(f"{path} holds numbers of shape {vectors.shape}, but 12 per view were expected: source, "
                          "detector centre, u and v; or (views, 3, 4), projection matrices")
-    with _of(path):
+    with naming(path):
         sources, detectors, u, v = np.split(vectors, 4, axis=1)
         beam = ConeBeam(sources, detectors, u, v, shape)
     return _of_pixels(path, beam, pixel)
@@ -70,7 +68,7 @@ def read_beam(path: str | Path, shape: tuple[int, int] | None = None,
 def _of_pixels(path: Path, beam: ConeBeam, pixel: float | tuple[float, float] | None) -> ConeBeam:
     """The beam of a file that states its pixels itself. Raises ValueError where `pixel` is given and not the same."""
     own = np.stack([np.linalg.norm(beam.v, axis=1), np.linalg.norm(beam.u, axis=1)], 1)
-    with _of(path):
+    with naming(path):
         if pixel is not None and (apart := ~np.isclose(own, pixel_sizes(pixel), rtol=1e-3).all(1)).any():
             raise ValueError(f"its v and u state pixels of {own[apart][0].round(4).tolist()} mm, but `pixel` {pixel} "
                              "was given as well; leave it out")
@@ -82,15 +80,6 @@ def _stated(path: Path, pixel: float | tuple[float, float] | None) -> float | tu
         raise ValueError(f"{path} does not say how large the pixels are; state `pixel`: [row height, column width] in "
                          "mm")
     return pixel
-
-
-@contextmanager
-def _of(path: Path) -> Iterator[None]:
-    """A ValueError raised inside names the file."""
-    try:
-        yield
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
 
 
 def write_beam(path: str | Path, beam: ConeBeam) -> None:

@@ -23,7 +23,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from phydict.runtime.files import atomic_write
-from phydict.runtime.reading import read_text, reason
+from phydict.runtime.reading import naming, read_text, reason
 from phydict.xray.geometry import ConeBeam
 from phydict.xray.stated import pixel_sizes
 
@@ -60,10 +60,8 @@ def read_rtk(path: str | Path, shape: tuple[int, int], pixel: float | tuple[floa
     if not poses:
         raise ValueError(f"{path} holds no <Projection>; give the geometry of at least one view")
     sources, detectors, across, along = (np.stack(part) for part in zip(*poses))
-    try:
+    with naming(path):
         return ConeBeam(sources, detectors, width * across, height * along, shape)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
 
 
 def write_rtk(path: str | Path, beam: ConeBeam) -> None:

@@ -42,7 +42,7 @@ def organs(hu: Tensor, masks: Tensor, grid: Grid) -> dict[str, Tensor]:
     return shares | {"heart": heart.to(hu), "liver": liver.to(hu)}
 
 
-def expansion(organ: Tensor, extent, pull: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Tensor:
+def expansion(organ: Tensor, extent, pull: tuple[float, float, float]) -> Tensor:
     """The velocity (3, X, Y, Z), in half-widths of the box, with a mean divergence of 1 in an organ, and 0 around it.
 
     It is the flow of a fluid that wells up in the organ: v = D grad p, div(D grad p) = organ, D = diag(pull), solved by

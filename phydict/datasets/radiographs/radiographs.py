@@ -27,7 +27,7 @@ from phydict.datasets.radiographs.xray_description import GEOMETRY, Description,
 from phydict.datasets.radiographs.xray_images import ENDINGS, image_files, is_dicom, read_image
 from phydict.datasets.reports import format_report
 from phydict.runtime.files import atomic_write
-from phydict.runtime.reading import name_of, one_line, read_text
+from phydict.runtime.reading import name_of, naming, one_line, read_text
 from phydict.runtime.shipped import own_or_shipped
 from phydict.xray.geometry import ConeBeam
 
@@ -96,10 +96,8 @@ def load_xrays(folder: str | Path, geometry: str | Path | None = None, intensity
         intensity = shown(intensity or tags_intensity(views.tags), views.tags)
     intensity = intensity or _assumed(views, folder, source)
     flat_and_dark = {name: _mean(paths, views.images[0].shape) for name, paths in references.items()}
-    try:
+    with naming(folder):
         xrays = intensity.line_integrals(np.stack(views.images).astype(np.float64), views.full_scale, flat_and_dark)
-    except ValueError as error:
-        raise ValueError(f"{folder}: {error}") from error
     _check_saturation(views.names, xrays)
     case: Case = {"id": name_of(folder.absolute()), "beam": beam, "report": _read_report(folder / REPORT),
             "xrays": torch.from_numpy(described.orientation.apply(xrays).astype(np.float32)),
@@ -110,7 +108,7 @@ def load_xrays(folder: str | Path, geometry: str | Path | None = None, intensity
     return case
 
 
-def case_files(folder: Path, geometry: Path | None = None) -> list[Path]:
+def case_files(folder: Path, geometry: Path | None) -> list[Path]:
     """The files that decide what `load_xrays` makes of a folder: all that lie there, the geometry file used instead of
     its own, and those that a geometry file names elsewhere, whether they are there or not."""
     files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))

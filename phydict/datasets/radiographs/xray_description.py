@@ -30,6 +30,7 @@ from phydict.datasets.dicom import DicomTags
 from phydict.datasets.intensity import KINDS, Intensity, is_file_name
 from phydict.datasets.radiographs.dicom_beam import tags_beam
 from phydict.runtime.files import atomic_write
+from phydict.runtime.reading import naming
 from phydict.runtime.yaml_file import read_yaml
 from phydict.xray.geometry import ConeBeam
 from phydict.xray.geometry_files import read_beam
@@ -98,10 +99,8 @@ class Description:
     def beam_of(self, shape: tuple[int, int], tags: list[DicomTags]) -> ConeBeam:
         """The beam for images of `shape` (V, U), turned, and their DICOM tags, if any. Raises ValueError."""
         beam = self._stated_beam(shape, tags)
-        try:
+        with naming(self.source):
             return beam.with_continued(self.continued)
-        except ValueError as error:
-            raise ValueError(f"{self.source}: {error}") from error
 
     def _stated_beam(self, shape: tuple[int, int], tags: list[DicomTags]) -> ConeBeam:
         beam = self.beam or {}
@@ -119,10 +118,8 @@ class Description:
                              f"`dicom:` of {self.source}")
         if "file" in beam:
             return read_beam(self.source.parent / beam["file"], shape, beam.get("pixel"))
-        try:
+        with naming(self.source):
             return ConeBeam.from_dict(beam)
-        except ValueError as error:
-            raise ValueError(f"{self.source}: {error}") from error
 
     @property
     def _left_to_tags(self) -> bool:
@@ -183,11 +180,9 @@ def read_description(path: Path, needed: bool = True) -> Description:
             raise ValueError(f"{path}: unknown {', '.join(unknown)} in `{block}:`; the keys are {', '.join(keys)}")
     if intensity and "kind" not in intensity:
         raise ValueError(f"{path}: `intensity:` needs `kind`, one of {', '.join(KINDS)}")
-    try:
+    with naming(path):
         return Description(path, beam, Intensity(**intensity) if intensity else None, Orientation(**orientation),
                            None if uncertain is None else Uncertain.from_dict(uncertain), continued, mu_water)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
 
 
 def save_geometry(path: Path, beam: ConeBeam, described: Description | None = None) -> None:
@@ -222,9 +217,7 @@ def _check_beam(path: Path, beam) -> None:
     if beam and not is_file_name(beam.get("file", "")):
         raise ValueError(f"{path}: `file:` is the name of a geometry file, but {reprlib.repr(beam['file'])} was found")
     if beam and "file" in beam and beam.get("pixel") is not None:
-        try:
+        with naming(path):
             pixel_sizes(beam["pixel"])
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
     if beam and not isinstance(beam.get("dicom", {}), dict):
         raise ValueError(f"{path}: `dicom:` must be a mapping, but {reprlib.repr(beam['dicom'])} was found")

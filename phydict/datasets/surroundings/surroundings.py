@@ -55,7 +55,7 @@ class Surroundings:
         return any((self.table and self.couch, self.cover, self.leads, self.arms))
 
 
-def surround(hu: np.ndarray, body: np.ndarray, grid: Grid, seed: int, shares: Surroundings = Surroundings(),
+def surround(hu: np.ndarray, body: np.ndarray, grid: Grid, seed: int, shares: Surroundings,
              couch: bool = True) -> np.ndarray:
     """HU (X, Y, Z) of a chest among what `seed` draws of couch, cover, leads and arms.
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from phydict.linalg.conjugate_gradients import conjugate_gradients, most_kept
+from phydict.linalg.conjugate_gradients import conjugate_gradients, may_follow, most_kept
 from phydict.linalg.total_variation import TVQuadraticMajorizer
 from phydict.posterior.likelihood.reward import Reward
 from phydict.posterior.measurement import Measurement
@@ -128,10 +128,10 @@ class ProximalCG(LikelihoodStep):
                 fitted = measurement.adjoint(weights * measurement.linear(d)).add_(d, alpha=weight)
                 return fitted.add_(tv.gradient(d), alpha=tv_scale) if tv else fitted
 
-            inactive_mask = ~((z <= -1) & (negative_gradient < 0) | (z >= 1) & (negative_gradient > 0))
+            free = may_follow(z, negative_gradient, -1, 1)
             scale = 1 / (diagonal + tv_scale * tv.diagonal()) if tv else torch.ones_like(z)
-            z = (z + conjugate_gradients(normal, negative_gradient * inactive_mask, self.iterations, self.tolerance,
-                                         scale * inactive_mask, reorthogonalise=self.iterations > LONG)).clamp(-1, 1)
+            z = (z + conjugate_gradients(normal, negative_gradient * free, self.iterations, self.tolerance,
+                                         scale * free, reorthogonalise=self.iterations > LONG)).clamp(-1, 1)
         if not (self.discrepancy and tv_scale):
             return z
         excess = float(measurement.normalised_residual(z, modelled=True).max()) ** 2

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from phydict.grid import Grid
 from phydict.runtime.own_code import imported, own_code, words
+from phydict.runtime.reading import naming
 from phydict.runtime.warning import warn
 from phydict.units import MU_WATER
 from phydict.xray.geometry import ConeBeam
@@ -128,10 +129,8 @@ def projector_kind(given: str | type, setting: str = "projector") -> str | type:
     if not (module and name):
         raise ValueError(f"there is no projector {given!r}: {setting} is one of {', '.join(METHODS)}, or the path of a "
                          "class of your own, such as my_module.MyProjector")
-    try:
+    with naming(f"the projector {given} cannot be imported"):
         kind = imported(given)
-    except ValueError as error:
-        raise ValueError(f"the projector {given} cannot be imported: {error}") from error
     if not isinstance(kind, type):
         raise ValueError(f"the projector {given} is no class: give one that is made of a grid and a beam")
     return kind

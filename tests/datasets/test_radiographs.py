@@ -18,7 +18,7 @@ from phydict.datasets.intensity import Intensity
 from phydict.datasets.radiographs import xray_description
 from phydict.datasets.radiographs.radiographs import find_xrays, load_xrays, save_xrays
 from phydict.datasets.radiographs.xray_description import Orientation, read_description, save_geometry
-from phydict.datasets.radiographs.xray_images import read_image
+from phydict.datasets.radiographs.xray_images import image_files, read_image
 from phydict.xray.geometry import ConeBeam
 from phydict.xray.geometry_files import write_beam
 from phydict.xray.poses.uncertain import Uncertain
@@ -145,6 +145,15 @@ def test_view_10_comes_after_view_9(tmp_path):
     stack[:, 0, 0] = np.arange(11)
     case = load_xrays(write(tmp_path, stack, name="img_800.0_{}", orbit=ORBIT | {"views": 11}))
     assert case["xrays"][:, 0, 0].tolist() == list(range(11))
+
+
+@pytest.mark.parametrize("names", [
+    ["angle_-30", "angle_-15", "angle_0", "angle_15", "angle_030"], ["-90", "-10", "0", "100"],
+    ["scan-1", "scan-2", "scan-10"], ["scan -1", "scan -2", "scan -10"], ["2026-11-02", "2026-11-10"]])
+def test_hyphens_are_signs_of_numbers_where_some_names_have_them_and_others_none(tmp_path, names):
+    for name in names:
+        Image.new("L", (1, 1)).save(tmp_path / f"{name}.png")
+    assert [path.stem for path in image_files(tmp_path)] == names
 
 
 def test_npy_nifti_png_and_tiff_of_the_same_counts_agree(tmp_path):

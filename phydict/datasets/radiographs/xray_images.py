@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from phydict.datasets.natural_order import natural_order
+from phydict.datasets.natural_order import has_signs, natural_order
 from phydict.datasets.nifti_file import NIFTI, open_nifti
 from phydict.runtime.reading import MOST_SQUEEZED, check_held, read_npy, reading, refusing
 
@@ -24,9 +24,10 @@ BITS, PHOTOMETRIC = 258, 262
 
 def image_files(folder: Path) -> list[Path]:
     """The X-ray images of a folder in the natural order of their names; DICOM files need no ending."""
-    images = (p for p in folder.iterdir() if p.is_file() and not p.name.startswith(".")
-             and (p.name.lower().endswith(ENDINGS) or is_dicom(p)))
-    return sorted(images, key=lambda p: natural_order(p.name))
+    images = [p for p in folder.iterdir() if p.is_file() and not p.name.startswith(".")
+              and (p.name.lower().endswith(ENDINGS) or is_dicom(p))]
+    signed = has_signs([p.name for p in images])
+    return sorted(images, key=lambda p: natural_order(p.name, signed))
 
 
 def is_dicom(path: Path) -> bool:

@@ -11,7 +11,8 @@ afterwards and never pooled, because one bad case would dominate a pooled square
 
 SSIM is taken on HU - low, which starts at 0 as the images it was made for do: on signed HU its luminance term would
 divide by water's 0 and punish a tissue offset of 20 HU like a wrong structure. PSNR and MAE do not depend on the
-offset.
+offset. Its mean is over all voxels, volumes mirrored beyond their faces, as in torchmetrics; scikit-image leaves out
+half a window at each face.
 """
 
 from __future__ import annotations

@@ -124,6 +124,19 @@ def test_segmentations_beside_a_ct_are_used_and_are_no_cts(tmp_path, thorax):
     assert "holds 1 of the 5 lobes" in prepare_folder(tmp_path / "in", tmp_path / "o3", SMALL)[0]["reason"]
 
 
+def test_segmentations_beside_a_ct_whose_header_is_not_trusted_are_placed_by_the_metadata_as_it_is(tmp_path, thorax):
+    spacing = [float(side) for side in np.linalg.norm(AFFINE[:3, :3], axis=0)]
+    table = tmp_path / "metadata.csv"
+    table.write_text("VolumeName,RescaleSlope,RescaleIntercept,XYSpacing,ZSpacing\n"
+                     f'valid_1_a_1.nii.gz,2,-500,"{spacing[:2]}",{spacing[2]}\n')
+    (tmp_path / "in").mkdir()
+    for name, stored in (("", (thorax + 500) // 2), ("_lungmask", (thorax == -850).astype(np.int16))):
+        nibabel.save(nibabel.Nifti1Image(stored, np.eye(4)), tmp_path / f"in/valid_1_a_1{name}.nii.gz")
+    (row,) = prepare_folder(tmp_path / "in", tmp_path / "out", SMALL, metadata=table, fixed=False)
+    assert (row["status"], row["lungs_by"]) == ("prepared", "file"), row["reason"]
+    assert row["lung_ml"] == pytest.approx((thorax == -850).sum() * np.prod(spacing) / 1000, abs=1)
+
+
 def test_a_prepared_case_whose_masks_have_changed_is_cached_anew(tmp_path, thorax):
     save_ct(tmp_path / "in/a.nii.gz", thorax)
     prepare_folder(tmp_path / "in", tmp_path / "out", SMALL)

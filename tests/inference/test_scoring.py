@@ -209,7 +209,8 @@ def test_lungs_that_are_segmented_beside_a_ct_are_those_of_the_truth(tmp_path):
     grid, ct = Grid.cube(24, 240.0), tmp_path / "anna.nii.gz"
     lung = np.zeros(grid.shape, np.float32)
     lung[4:20, 6:18, 5:15] = 1
-    nibabel.save(nibabel.Nifti1Image(lung, grid.affine), tmp_path / "anna_lungmask.nii.gz")
+    for name in ("anna", "anna_lungmask"):
+        nibabel.save(nibabel.Nifti1Image(lung, grid.affine), tmp_path / f"{name}.nii.gz")
     found = organs_beside(ct, Grid.cube(48, 240.0))
     assert found.keys() == {"lung"}
     assert dice(found["lung"], lung.repeat(2, 0).repeat(2, 1).repeat(2, 2) > 0) > 0.999  # but for its corners
@@ -232,6 +233,19 @@ def test_masks_beside_a_ct_whose_header_is_not_trusted_lie_where_the_ct_does(tmp
     case = make()
     lung = case["masks"][0].numpy().repeat(4, 0).repeat(4, 1).repeat(4, 2) > 0.5
     assert dice(segmented(case, grid)["lung"], lung) > 0.9
+    cut = nibabel.Nifti1Image((hu == -850)[6:].astype(np.int16), blank)
+    nibabel.save(cut, tmp_path / "valid_1_a_1_lungmask.nii.gz")
+    with pytest.raises(ValueError, match="valid_1_a_1_lungmask.nii.gz does not lie on its CT's voxels"):
+        segmented(case, grid)  # placed by the CT's own first voxel, lungs would lie 60 mm beside
+
+
+def test_masks_beside_a_ct_that_lie_elsewhere_are_refused_as_where_cts_are_prepared(tmp_path):
+    grid, lung = Grid.cube(24, 240.0), np.ones((24, 24, 24), np.float32)
+    nibabel.save(nibabel.Nifti1Image(lung, grid.affine), tmp_path / "anna.nii.gz")
+    for other in (Grid.cube(24, 120.0), Grid.cube(12, 120.0)):
+        nibabel.save(nibabel.Nifti1Image(lung[:other.shape[0]], other.affine), tmp_path / "anna_lungmask.nii.gz")
+        with pytest.raises(ValueError, match="anna_lungmask.nii.gz does not lie on its CT's voxels"):
+            organs_beside(tmp_path / "anna.nii.gz", grid)
 
 
 def source_of(ct) -> str:

@@ -98,6 +98,15 @@ def test_views_half_a_degree_apart_opposed_ones_and_tiles_of_one_source_are_all_
     assert all(repeated_widening(scene) == 1 for scene in (dense, opposed, seen(1), seen(200), Projector(GRID, tiles)))
 
 
+@pytest.mark.filterwarnings("error")
+def test_an_orbit_of_any_number_of_views_repeats_none_and_a_dense_narrow_arc_does():
+    assert all(repeated_widening(seen(views)) == 1 for views in (1799, 1800, 3600))
+    assert repeated_widening(Projector(GRID, seen(64).beam.select([*range(64)] * 2))) == 1
+    for projector, factor in ((seen(200, 40.0), 1.7), (Projector(GRID, seen(63).beam.select([*range(63)] * 2)), 1.4)):
+        with pytest.warns(UserWarning, match=r"\d+ views come from \d+ directions alone"):
+            assert repeated_widening(projector) == pytest.approx(factor, abs=0.05)
+
+
 @pytest.mark.parametrize("shares, named", [((1.0, 1.0, 1.5, 1.0), 2), ((0.0, 2.0, 0.0, 0.0), 1),
                                            ((1.0, 1.0, 1.1, 1.0), None), ((1.0, 2.0), None)])
 def test_the_view_that_fits_worst_is_named_where_it_stands_out(shares, named):

@@ -21,7 +21,7 @@ import numpy as np
 from phydict.datasets.cts.anatomy import MASKS, body_mask, lung_box_centre, lung_box_size, segment
 from phydict.datasets.cts.ct_case import SEGMENTATION_MM
 from phydict.datasets.cts.prepared import RECORD, VOLUME, read_record, write_prepared
-from phydict.datasets.cts.reading import check_hu
+from phydict.datasets.cts.reading import Calibration, check_hu
 from phydict.datasets.cts.resampling import covering_grid, to_grid
 from phydict.datasets.cts.segmentations import lungs_by_lungmask, read_segmentation, segmentations_beside
 from phydict.datasets.cts.sources import Source, find_sources
@@ -165,7 +165,8 @@ def prepare_source(source: Source, out: Path, settings: Settings) -> dict:
         warnings.simplefilter("always", UserWarning)
         try:
             fingerprint = source.fingerprint()  # before the voxels: what changes meanwhile is seen by the next run
-            grid, images, facts = _place(*source.load(), segmentations_beside(source.beside), settings)
+            grid, images, facts = _place(*source.load(), segmentations_beside(source.beside), settings,
+                                         source.calibration)
         except (ValueError, OSError) as error:
             facts = {"status": "rejected", "reason": " ".join(str(error).split())}
             if not isinstance(error, OSError | Unreadable):  # what cannot be read may be read by the next run
@@ -186,10 +187,11 @@ def prepare_source(source: Source, out: Path, settings: Settings) -> dict:
 
 
 def _place(hu: np.ndarray, affine: np.ndarray, beside: dict[str, tuple[Path, ...]],
-           settings: Settings) -> tuple[Grid, dict[str, np.ndarray], dict]:
+           settings: Settings, calibration: Calibration | None) -> tuple[Grid, dict[str, np.ndarray], dict]:
     """The grid of a case, its images on that grid ("ct" in HU, masks), and what the summary says of it.
 
-    Raises ValueError where no lungs are found or a segmentation does not fit.
+    calibration: as `read_segmentation` takes it. Raises ValueError where no lungs are found or a segmentation does not
+    fit.
     """
     spacing = np.linalg.norm(affine[:3, :3], axis=0)
     facts = {"slices": hu.shape[2]} | {f"spacing_{a}_mm": round(float(s), 4) for a, s in zip("xyz", spacing)}
@@ -204,7 +206,7 @@ def _place(hu: np.ndarray, affine: np.ndarray, beside: dict[str, tuple[Path, ...
     facts["lungs_by"] = "file" if "lung" in beside else settings.segmenter
     if facts["lungs_by"] == "lungmask":
         masks["lung"] = lungs_by_lungmask(hu), affine
-    masks |= {name: (read_segmentation(files, hu.shape, affine), affine) for name, files in beside.items()}
+    masks |= {name: (read_segmentation(files, hu.shape, affine, calibration), affine) for name, files in beside.items()}
     lung = to_grid(masks["lung"][0], masks["lung"][1], work, 0.0) if "lung" in masks else np.zeros(1)
     if not (lung > 0.5).any():
         raise ValueError("no lungs were found; give a chest CT in HU, or lay a lung segmentation beside it")

@@ -65,14 +65,16 @@ def mask_files(ct: Path) -> list[Path]:
     return []
 
 
-def read_segmentation(files: tuple[Path, ...], shape, affine: np.ndarray) -> np.ndarray:
+def read_segmentation(files: tuple[Path, ...], shape, affine: np.ndarray, calibration: Calibration | None = None
+                      ) -> np.ndarray:
     """The union of label files as a mask (X, Y, Z) bool on the voxels of a CT of `shape` with its 4x4 affine.
 
+    calibration: of a CT without a usable header; it places the files' voxels, which are the CT's, as well.
     Raises ValueError where a file cannot be read or does not lie on these voxels.
     """
-    union = np.zeros(shape, bool)
+    union, placed = np.zeros(shape, bool), calibration and replace(calibration, slope=1.0, intercept=0.0)
     for file in files:
-        labels, place = load_ct(file)
+        labels, place = load_ct(file, placed)
         if labels.shape != tuple(shape) or not np.allclose(place, affine, atol=0.01):
             raise ValueError(f"{file} does not lie on its CT's voxels ({labels.shape} instead of {tuple(shape)}, or "
                              "another place); segment this CT again, or remove that file")
@@ -83,22 +85,19 @@ def read_segmentation(files: tuple[Path, ...], shape, affine: np.ndarray) -> np.
 def organs_beside(ct: Path, grid: Grid, calibration: Calibration | None = None) -> dict[str, np.ndarray]:
     """Masks (X, Y, Z) bool of what is segmented beside a NIfTI CT, lung and vessel, on `grid` in the CT's own world.
 
-    calibration: of a CT without a usable header; it places the masks' voxels, which are the CT's, as well.
-    Of a prepared CT the lung alone, since its voxels' shares of vessels lose the thin ones. Raises ValueError where a
-    file cannot be read or some of the lungs' lobes are missing.
+    calibration: as `read_segmentation` takes it. Of a prepared CT the lung alone, since its voxels' shares of vessels
+    lose the thin ones. Raises ValueError as `read_segmentation` and where some of the lungs' lobes are missing.
     """
     if is_prepared(ct):
         file = ct.with_name("lung.nii.gz")
         return {"lung": to_grid(*load_ct(file), grid, 0.0) > 0.5} if file.is_file() else {}
-    masks, placed = {}, calibration and replace(calibration, slope=1.0, intercept=0.0)
-    for name, files in segmentations_beside(ct.with_name(case_id(ct))).items():
-        if name in ("lung", "vessel"):
-            union = np.zeros(grid.shape, np.float32)
-            for file in files:
-                labels, place = load_ct(file, placed)
-                union += to_grid((labels > 0.5).astype(np.float32), place, grid, 0.0)
-            masks[name] = union > 0.5
-    return masks
+    beside = segmentations_beside(ct.with_name(case_id(ct)))
+    organs = {name: beside[name] for name in ("lung", "vessel") if name in beside}
+    if not organs:
+        return {}
+    hu, affine = load_ct(ct, calibration)
+    return {name: to_grid(read_segmentation(files, hu.shape, affine, calibration).astype(np.float32), affine, grid, 0.0)
+            > 0.5 for name, files in organs.items()}
 
 
 def lungs_by_lungmask(hu: np.ndarray) -> np.ndarray:

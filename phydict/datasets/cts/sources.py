@@ -20,7 +20,7 @@ from phydict.datasets.cts.ct_rate import (
 )
 from phydict.datasets.cts.ct_rate_tables import read_reports
 from phydict.datasets.cts.ct_series import Series, find_series, load_series
-from phydict.datasets.cts.reading import case_id, load_ct
+from phydict.datasets.cts.reading import Calibration, case_id, load_ct
 from phydict.datasets.cts.segmentations import segmentations_beside
 from phydict.datasets.itk_file import ENDINGS, voxel_files
 from phydict.runtime.files import file_crc32
@@ -44,6 +44,11 @@ class Source:
     def place(self) -> Path:
         return self.ct.folder if isinstance(self.ct, Series) else self.ct.path
 
+    @property
+    def calibration(self) -> Calibration | None:
+        """Of a CT without a usable header."""
+        return None if isinstance(self.ct, Series) else self.ct.calibration
+
     def load(self) -> tuple[np.ndarray, np.ndarray]:
         """HU (X, Y, Z) in RAS+ and the affine. Raises ValueError and OSError."""
         return load_series(self.ct) if isinstance(self.ct, Series) else load_ct(self.ct.path, self.ct.calibration)
@@ -54,7 +59,6 @@ class Source:
         parts = {"ct": self.ct.files if isinstance(self.ct, Series) else (self.ct.path, *voxel_files(self.ct.path))}
         parts |= segmentations_beside(self.beside)
         files = [file for part in parts.values() for file in part]
-        calibration = None if isinstance(self.ct, Series) else self.ct.calibration
         crc = 0
         for name, part in parts.items():
             crc = crc32(name.encode(), crc)
@@ -62,7 +66,7 @@ class Source:
                 with reading(file, "see that it is there and may be read"):
                     crc = file_crc32(file, crc)
         return {"files": len(files), "bytes": sum(file.stat().st_size for file in files), "crc32": crc,
-                "report_crc32": crc32(self.report.encode()), "calibration": str(calibration)}
+                "report_crc32": crc32(self.report.encode()), "calibration": str(self.calibration)}
 
 
 def find_sources(root: Path, first_reconstruction: bool = False, exclude: str | Path | None = None,

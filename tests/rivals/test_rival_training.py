@@ -152,6 +152,17 @@ def test_a_rival_counts_the_steps_that_it_went_on_from(tmp_path, monkeypatch):
     assert again["phydict"]["training"] == {"steps": 8, "samples": 16}
 
 
+def test_a_diffusion_that_resumes_without_the_file_that_it_began_from_goes_on_with_it(monkeypatch):
+    task = TASKS["xray2ctpa"]()
+    saved = {"phydict": task.prior.describe(), "global_step": 5, "state_dict": task.state_dict()}
+    monkeypatch.setattr(XrayToCTPATraining, "global_step", 5)
+    for learns in (False, True):
+        task.on_load_checkpoint(saved)
+        assert task.learns_slices == learns
+        saved["state_dict"]["prior.network.denoiser.leave.weight"].zero_()
+        task = TASKS["xray2ctpa"]()
+
+
 def test_training_that_cannot_be_is_refused(tmp_path, cache, capsys):
     args = arguments("lifted", tmp_path, cache, "--model.cube.voxels=18")
     assert "divisible by 4" in refusal(capsys, main, args)

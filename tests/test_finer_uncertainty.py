@@ -184,6 +184,14 @@ def test_a_training_of_intervals_and_one_of_the_correction_are_not_resumed_as_ea
         assert task.samples == 8
 
 
+def test_a_batch_is_one_loss_however_many_processes_share_it(files):
+    task = FinerUncertaintyTraining(FinerUncertainty((4, 8)), Cube(32), (-1000, 600), initial=files[2])
+    crops = torch.cat([seen(8, 8, 8), 0.5 * seen(8, 8, 8)[:, :1]], 1).repeat(2, 1, 1, 1, 1)
+    crops[0, 0], crops[0, 3] = -0.99, 0.0  # air
+    halves = [task.batch_loss({"volume": crops[rank::2]}, (0,), rank, 2) for rank in range(2)]
+    torch.testing.assert_close(sum(halves) / 2, task.batch_loss({"volume": crops}))
+
+
 def test_steps_on_one_crop_bring_the_scale_to_the_errors(files):
     torch.manual_seed(0)
     task = FinerUncertaintyTraining(FinerUncertainty((4, 8), 8), Cube(32), (-1000, 600), initial=files[2])

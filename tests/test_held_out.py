@@ -62,8 +62,12 @@ def test_a_file_tells_whom_it_never_learnt_from_and_others_are_warned_of(cts, tm
     task.setup("fit")
     told = f"patient1 was not among the held-out CTs of the training of {file}: unless it is new, it was trained on"
     assert [told in str(warning.message) for warning in recwarn] == [True] * said
-    task.on_save_checkpoint(saved := {"state_dict": {}})
+    task.on_save_checkpoint(saved := {"state_dict": {}, "global_step": 2})
     assert saved["phydict"]["training"] == {"steps": 2, "samples": 0, "held_out": known}
+    task.initial = task.held_out_before = None  # as where a training resumes without it
+    task.on_load_checkpoint(saved)
+    task.on_save_checkpoint(again := {"state_dict": {}})
+    assert again["phydict"]["training"] == saved["phydict"]["training"]
 
 
 def test_an_export_names_those_that_an_older_checkpoint_held_out_beside_cts_it_learnt_from(trained, tmp_path):

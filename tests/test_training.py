@@ -25,6 +25,7 @@ from phydict.grid import Cube, Grid
 from phydict.inference.data import ReconstructionData
 from phydict.prior import load_prior, save_prior
 from phydict.training import PriorTraining
+from phydict.training.checkpoints import RecentCheckpoint
 from phydict.training.data import PriorData
 from phydict.training.draws import MixedCases
 from phydict.training.refinement import RefinementTraining
@@ -118,6 +119,24 @@ def test_a_run_stopped_within_a_long_epoch_resumes_from_its_last_minutes(tmp_pat
     assert one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
 
 
+def test_minutes_that_end_within_a_step_end_with_it(tmp_path, cache, monkeypatch):
+    step = PriorTraining.training_step
+
+    def stopped(task, batch, index):
+        if (task.global_step, index % 2) == (1, 0):
+            [recent] = [one for one in task.trainer.checkpoint_callbacks if isinstance(one, RecentCheckpoint)]
+            recent._last_time_checked = float("-inf")
+        if task.global_step == 2:
+            raise KeyboardInterrupt
+        return step(task, batch, index)
+
+    monkeypatch.setattr(PriorTraining, "training_step", stopped)
+    with pytest.raises(SystemExit):
+        ten_steps(tmp_path, cache, "--trainer.accumulate_grad_batches=2", "--data.loading.epoch_size=16")
+    progress = checkpoint(tmp_path)["loops"]["fit_loop"]["epoch_loop.batch_progress"]["current"]
+    assert (checkpoint(tmp_path)["global_step"], progress["ready"]) == (2, 4)
+
+
 @pytest.fixture
 def handler_of_sigint() -> Iterator[None]:
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -144,13 +163,14 @@ def test_a_run_that_a_signal_stops_within_a_step_keeps_that_step(number, straigh
     assert all(torch.equal(weight, resumed["state_dict"][name]) for name, weight in straight["state_dict"].items())
 
 
-def test_ctrl_c_waits_for_all_batches_of_a_step(handler_of_sigint, tmp_path, cache, monkeypatch):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_waits_for_all_batches_of_a_step(number, handler_of_sigint, tmp_path, cache, monkeypatch):
     more = "--trainer.accumulate_grad_batches=2", "--trainer.max_steps=4", "--data.loading.epoch_size=16"
     straight, step = ten_steps(tmp_path / "straight", cache, *more), PriorTraining.training_step
 
     def signalled(task, batch, index):
         if (task.global_step, index % 2) == (1, 0):
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(number)
         return step(task, batch, index)
 
     with monkeypatch.context() as stopping, pytest.raises(SystemExit):

@@ -23,7 +23,7 @@ from phydict.training import PriorTraining, SuperResolutionTraining
 from phydict.training.data import PriorData
 from phydict.training.refinement import RefinementTraining
 from phydict.training.refiner import RefinerTraining
-from phydict.training.settings import TextSettings
+from phydict.training.settings import HoldOut, TextSettings
 from phydict.training.stage import StageTraining
 
 
@@ -156,6 +156,13 @@ def test_every_held_out_case_counts_once_however_many_processes_share_them(monke
                 patch.setattr(task, "log", lambda *_, batch_size, case=case, **__: np.add.at(weights, case, batch_size))
                 task.log_case(i, "val/psnr", 1.0)
     assert weights.min() == weights.max() > 0 and weights.sum() % 3 == 0
+
+
+@pytest.mark.parametrize("limit, cases", [(2, 2), (9, 3), (1.0, 3)])
+def test_as_many_cases_validate_as_are_asked_for_however_many_processes_share_them(cache, limit, cases):
+    data = PriorData(phantoms=1, holdout=HoldOut(phantoms=3), cache=str(cache), cube=Cube(16))
+    data.trainer = SimpleNamespace(limit_val_batches=limit)
+    assert len(data.val_dataloader().dataset) == cases
 
 
 @pytest.mark.parametrize("stage", [StageTraining, SuperResolutionTraining, RefinerTraining, RefinementTraining])

@@ -40,6 +40,7 @@ from phydict.training.checkpoints import (
     HELD_OUT,
     RESUMED,
     BestCheckpoint,
+    RecentCheckpoint,
     StopBetweenSteps,
     WholeCheckpoints,
     read_checkpoint,
@@ -115,7 +116,7 @@ class PriorCLI(ProgressCLI):
         parser.add_lightning_class_args(ModelCheckpoint, "checkpoint")
         parser.set_defaults({"checkpoint.filename": "last", "checkpoint.enable_version_counter": False,
                              "checkpoint.every_n_epochs": 1, "checkpoint.save_on_train_epoch_end": True})
-        parser.add_lightning_class_args(ModelCheckpoint, "recent")  # within an epoch that takes longer
+        parser.add_lightning_class_args(RecentCheckpoint, "recent")  # within an epoch that takes longer
         parser.set_defaults({"recent.filename": "last", "recent.enable_version_counter": False,
                              "recent.train_time_interval": timedelta(minutes=10)})
         parser.link_arguments("out", "recent.dirpath")

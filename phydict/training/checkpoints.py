@@ -99,6 +99,19 @@ class BestCheckpoint(ModelCheckpoint):
             super().on_validation_end(trainer, pl_module)
 
 
+class RecentCheckpoint(ModelCheckpoint):
+    """Keeps the weights of every few minutes, between steps alone: of accumulated gradients nothing is kept."""
+
+    @property
+    def state_key(self) -> str:  # that of checkpoints written before there was this class
+        return super().state_key.replace(type(self).__qualname__, ModelCheckpoint.__qualname__)
+
+    def on_train_batch_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, outputs: Any,
+                           batch: Any, batch_idx: int) -> None:
+        if (batch_idx + 1) % trainer.accumulate_grad_batches == 0 or trainer.is_last_batch:
+            super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
+
+
 class StopBetweenSteps(Checkpoint):
     """Lets Ctrl-C and SIGTERM end the training of one process after the step that they strike, whose weights are kept.
 
@@ -110,11 +123,11 @@ class StopBetweenSteps(Checkpoint):
     """
 
     def __init__(self, path: Path):
-        self.path, self.asked = path, False
+        self.path, self.asked, self.terminated = path, False, False
         self.before: Any = None
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        self.first = self.step = trainer.global_step
+        self.step = trainer.global_step
         if trainer.world_size == 1 and threading.current_thread() is threading.main_thread():
             self.before = signal.signal(signal.SIGINT, lambda *_: self._ask(trainer))
 
@@ -127,10 +140,12 @@ class StopBetweenSteps(Checkpoint):
 
     def on_train_batch_end(self, trainer: lightning.Trainer, *_: object) -> None:
         complete, self.step = trainer.global_step > self.step, trainer.global_step  # unless gradients are accumulated
-        stops, ends = self.asked and complete, trainer.received_sigterm and trainer.world_size == 1
-        if stops or (ends and trainer.global_step > self.first):
+        signals = trainer._signal_connector  # after whose SIGTERM Lightning ends with the batch
+        if trainer.world_size == 1 and (signals.received_sigterm or self.terminated):
+            self.terminated, signals.received_sigterm = True, complete
+        if complete and (self.asked or self.terminated):
             trainer.save_checkpoint(self.path)
-        if stops:
+        if complete and self.asked:
             raise KeyboardInterrupt
 
     def on_train_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:

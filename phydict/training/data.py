@@ -198,7 +198,10 @@ class PriorData(lightning.LightningDataModule):
         return self.cache / f"draws-{key_of(parts)}"
 
     def val_dataloader(self) -> DataLoader:
-        return DataLoader(self.validation, 1, num_workers=self.loading.workers, collate_fn=self.collate)
+        limit, cases = self.trainer.limit_val_batches, self.validation
+        if isinstance(limit, int):  # which Lightning lets each process take
+            cases = Subset(cases, range(min(limit, len(cases))))  # type: ignore[arg-type]
+        return DataLoader(cases, 1, num_workers=self.loading.workers, collate_fn=self.collate)
 
     def collate(self, cases: list[dict]) -> dict:
         """A batch of cases in the model's voxels; drawn in finer ones, these are the batch's "fine" volumes, and their

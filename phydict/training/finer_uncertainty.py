@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import torch
 from torch import Tensor
 
 from phydict.grid import Cube
@@ -53,8 +54,9 @@ class FinerUncertaintyTraining(CalibratedTraining):
                              "give one file as model.initial and data.made.network")
 
     def batch_loss(self, batch: dict, key: tuple[int, ...] = (0,), rank: int = 0, processes: int = 1) -> Tensor:
-        log_scale, error, tissue = self._compared(batch["volume"])
-        return self.error_loss(log_scale, error, tissue != OUTSIDE)
+        compared = zip(*self._compared(batch["volume"]))
+        return torch.stack([self.error_loss(log_scale, error, tissue != OUTSIDE)
+                            for log_scale, error, tissue in compared]).mean()
 
     def _compared(self, volume: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """What the network says of the log of the errors' scale, the errors, and the tissues, (B, X, Y, Z) each, of

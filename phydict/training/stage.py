@@ -211,4 +211,10 @@ class StageTraining(lightning.LightningModule, ABC):
             if key != "training" and resumed.get(key) != current.get(key):
                 raise ValueError(f"the checkpoint's prior and this training's differ in '{key}': give the settings and "
                                  "data that the checkpoint was trained with, or start anew with model.initial")
-        self.samples = checkpoint["phydict"].get("training", {}).get("samples", 0) - self.before.get("samples", 0)
+        training = checkpoint["phydict"].get("training", {})
+        self.samples = training.get("samples", 0) - self.before.get("samples", 0)
+        if "steps" in training:  # those of the file that it began from may not be given again
+            self.before["steps"] = training["steps"] - checkpoint["global_step"]
+        if (known := training.get("held_out")) is not None:
+            before = self.held_out_before
+            self.held_out_before = [id for id in known if before is None or id in before]

@@ -124,6 +124,12 @@ class XrayToCTPATraining(RivalTraining):
         again = network.autoencoder.decode(mean + std * noise_like(mean, generator))
         return l1_loss(again.float(), slices) + self.latent.kl_weight * divergence
 
+    def on_load_checkpoint(self, checkpoint: dict) -> None:
+        super().on_load_checkpoint(checkpoint)
+        knows = bool(checkpoint["state_dict"]["prior.network.denoiser.leave.weight"].any())
+        if knows and checkpoint["global_step"] < self.latent.autoencoder_steps:  # of a run with a model.initial
+            self.latent, self.settles = replace(self.latent, autoencoder_steps=0), False
+
     def validation_step(self, batch: dict, index: int) -> None:
         if self.network.knows_xrays:
             super().validation_step(batch, index)

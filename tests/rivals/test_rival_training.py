@@ -140,12 +140,27 @@ def test_a_rival_counts_the_steps_that_it_went_on_from(tmp_path, monkeypatch):
     task = LiftedTraining(cube=Cube(16), window=(-1000, 600), initial=str(file))
     monkeypatch.setattr(LiftedTraining, "trainer", SimpleNamespace(
         global_step=2, datamodule=None, strategy=SimpleNamespace(reduce=lambda value, **_: value)))
-    task.samples, checkpoint = 4, {"state_dict": {}}
+    task.samples, checkpoint = 4, {"state_dict": {}, "global_step": 2}
     task.on_save_checkpoint(checkpoint)
     assert checkpoint["phydict"]["training"] == {"steps": 8, "samples": 16}
     task.samples = 0
     task.on_load_checkpoint(checkpoint)
     assert task.samples == 4
+    resumed = LiftedTraining(tiny_lifted().network, cube=Cube(16), window=(-1000, 600))  # without the file
+    resumed.on_load_checkpoint(checkpoint)
+    resumed.on_save_checkpoint(again := {"state_dict": {}})
+    assert again["phydict"]["training"] == {"steps": 8, "samples": 16}
+
+
+def test_a_diffusion_that_resumes_without_the_file_that_it_began_from_goes_on_with_it(monkeypatch):
+    task = TASKS["xray2ctpa"]()
+    saved = {"phydict": task.prior.describe(), "global_step": 5, "state_dict": task.state_dict()}
+    monkeypatch.setattr(XrayToCTPATraining, "global_step", 5)
+    for learns in (False, True):
+        task.on_load_checkpoint(saved)
+        assert task.learns_slices == learns
+        saved["state_dict"]["prior.network.denoiser.leave.weight"].zero_()
+        task = TASKS["xray2ctpa"]()
 
 
 def test_training_that_cannot_be_is_refused(tmp_path, cache, capsys):

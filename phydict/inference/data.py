@@ -150,8 +150,13 @@ class ReconstructionData(lightning.LightningDataModule):
         return [Path(self.cts)] if self.cts and self.cts != "phantom" else []
 
     def predict_dataloader(self) -> DataLoader:
-        return self._loader([(name, self._xrays_source(folder), lambda f=folder: load_xrays(f, self.geometry_file))
-                             for name, folder in self.xray_cases().items()])
+        loader = self._loader([(name, self._xrays_source(folder), lambda f=folder: load_xrays(f, self.geometry_file))
+                               for name, folder in self.xray_cases().items()])
+        cases, processes = len(loader), self.trainer.world_size
+        if 0 < cases < processes:  # of which Lightning wants one each
+            raise ValueError(f"{processes} processes were asked for, but there {'is' if cases == 1 else 'are'} {cases} to "
+                             f"reconstruct: give --trainer.devices {cases}, on one node")
+        return loader
 
     def test_dataloader(self) -> DataLoader:
         task = self.trainer.lightning_module

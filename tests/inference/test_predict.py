@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import nibabel
 import numpy as np
@@ -20,7 +21,7 @@ from phydict.baselines import SIRT
 from phydict.cli.infer import main
 from phydict.datasets import load_xrays, save_xrays
 from phydict.grid import Grid
-from phydict.inference import ReconstructionTask
+from phydict.inference import ReconstructionData, ReconstructionTask
 from phydict.methods import CORRECTIONS, METHODS, reconstruct
 from phydict.posterior import PriorOnly
 from phydict.prior import load_correction, save_stage
@@ -153,6 +154,17 @@ def test_x_rays_or_cts_alone_are_enough(tmp_path, monkeypatch):
     main(["test", f"--data.cts={example / 'truth.nii.gz'}"])
     assert volume(Path("runs/reconstructions/phydict_learned/xrays")).shape == (128, 128, 128)
     assert list(tmp_path.glob("runs/*/phydict_learned/results.csv"))
+
+
+def test_more_processes_than_cases_that_are_left_are_refused(measured):
+    data = ReconstructionData(str(measured))
+    data.trainer = SimpleNamespace(
+        world_size=2, strategy=SimpleNamespace(barrier=lambda: None),
+        lightning_module=SimpleNamespace(unfinished=lambda sources: [name for name in sources if name == "bert"]))
+    with pytest.raises(ValueError, match="2 processes .* there is 1 to reconstruct: give --trainer.devices 1"):
+        data.predict_dataloader()
+    data.trainer.world_size = 1
+    assert [case["id"] for case in data.predict_dataloader()] == ["bert"]
 
 
 @pytest.mark.slow

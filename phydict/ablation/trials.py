@@ -286,6 +286,9 @@ def _checked(settings: Mapping) -> dict:
     for name, value in given.items():
         if isinstance(value, float) and not math.isfinite(value):
             raise ValueError(f"{name} must be a finite number, but {value} was given")
+    for name in ("voxels", "side"):
+        if isinstance(sides := given.get(name), tuple) and len(set(sides)) == 1:
+            given[name] = sides[0]  # as which such a box is told
     check_seed(given.get("seed", 0))
     if (samples := given.get("samples", 1)) < 1:
         raise ValueError(f"samples is a number of draws, 1 or more, but {samples} was given")

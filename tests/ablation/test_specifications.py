@@ -98,6 +98,15 @@ def test_a_row_tells_the_voxels_and_the_window_that_it_was_scored_on(tmp_path):
     assert told(prior, voxels=8, side=200.0)[0]["grid"] == "8x8x8"  # which these settings tell
 
 
+def test_a_box_of_three_equal_sides_is_told_as_one_of_a_single_number(tmp_path):
+    one, three, flat = (read_specification(write(tmp_path, base=TINY | box, axes={"method": ["sirt"]})).trials[0]
+                        for box in ({"voxels": 16, "side": 200}, {"voxels": [16, 16, 16], "side": [200, 200, 200]},
+                                    {"voxels": [16, 16, 8], "side": [200, 200, 100]}))
+    assert one.columns == three.columns and one.identity() == three.identity()
+    assert (one.columns["voxels"], one.columns["side"]) == (16, 200)
+    assert (flat.columns["voxels"], flat.columns["side"]) == ((16, 16, 8), (200, 200, 100))
+
+
 @pytest.mark.parametrize("file", sorted((ROOT / "configs" / "ablate").glob("*.yaml")), ids=lambda file: file.stem)
 def test_every_shipped_comparison_is_one(file):
     assert read_specification(file, phantoms=1).trials

@@ -66,12 +66,15 @@ def _specification(content, given: Mapping, changed: dict) -> Specification:
     source = {**_mapping(content.get("source"), "source"), **given.get("source", {})}
     content = content | given | {"source": source}
     methods = {name: {setting: value for setting, value in _mapping(changes, f"methods.{name}").items()
-                      if not dotted({setting: value}).keys() & changed.keys()}
+                      if setting == "method" or not dotted({setting: value}).keys() & changed.keys()}
                for name, changes in _mapping(content.get("methods"), "methods").items()}
     for name in [name for name in changed if name.partition(".")[0] in methods]:
         method, _, setting = name.partition(".")
         methods[method] = {**methods[method], setting: changed.pop(name)}
     for name, changes in methods.items():
+        if "method" in changes:
+            raise ValueError(f"methods.{name} gives method {reprlib.repr(changes['method'])}, but what is changed is "
+                             "called `of`, and each of its settings method.<field>, such as method.iterations: 2")
         of = changes.get("of", name)
         try:
             method_of(of)

@@ -209,6 +209,8 @@ def test_delta_keeps_the_length_of_a_step():
     ({"axes": {"method": ["sirt"]}, "products": []}, ["not both"]), ({"axs": {}}, ["'axs'"]),
     ({"methods": {"mine": {"of": "sart"}}}, ["'sart'"]), ({"methods": {"mine": {}}}, ["'mine'"]),
     ({"methods": {"mine": {"of": "sirt", "method.iteration": 2}}}, ["method.iteration ", "iterations"]),
+    ({"methods": {"mine": {"of": "sirt", "method": {"iterations": 2}}}, "base": TINY | {"method": "mine"}},
+     ["methods.mine gives method {'iterations': 2}", "called `of`"]),
     ({"base": TINY | {"method.iteration": 3}, "axes": {"method": ["sirt"]}}, ["method.iteration "]),
     ({"axes": {"method": ["phydict_fast"], "method.iterations": [1]}}, ["phydict_fast: ", "2 iterations"]),
     ({"base": TINY | {"simulation_voxels": 40}, "axes": {"method": ["sirt"]}}, ["simulation_voxels", "the 16", "40"]),

@@ -68,9 +68,10 @@ def _specification(content, given: Mapping, changed: dict) -> Specification:
     methods = {name: {setting: value for setting, value in _mapping(changes, f"methods.{name}").items()
                       if setting == "method" or not dotted({setting: value}).keys() & changed.keys()}
                for name, changes in _mapping(content.get("methods"), "methods").items()}
-    for name in [name for name in changed if name.partition(".")[0] in methods]:
-        method, _, setting = name.partition(".")
-        methods[method] = {**methods[method], setting: changed.pop(name)}
+    for name in list(changed):
+        of_methods = [method for method in methods if name.startswith(f"{method}.")]  # names may hold dots
+        if method := max(of_methods, key=len, default=None):
+            methods[method] = {**methods[method], name.removeprefix(f"{method}."): changed.pop(name)}
     for name, changes in methods.items():
         if "method" in changes:
             raise ValueError(f"methods.{name} gives method {reprlib.repr(changes['method'])}, but what is changed is "

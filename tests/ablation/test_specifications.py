@@ -155,10 +155,12 @@ def test_set_takes_the_place_of_a_files_axis_base_and_product(tmp_path):
 
 
 def test_set_takes_the_place_of_what_changed_methods_set_and_their_own_set_that_of_both(tmp_path):
-    methods = {name: {"of": "sirt", "method.init_args.iterations": count} for name, count in (("a", 2), ("b", 3))}
+    methods = {name: {"of": "sirt", "method.init_args.iterations": count} for name, count in (
+        ("a", 2), ("b", 3), ("b, 1.5 mm", 4))}
     file = write(tmp_path, methods=methods)
-    trials = read_specification(file, ["method.iterations=5", "b.method.iterations=7"]).trials
-    assert [(trial.name, trial.method.iterations) for trial in trials] == [("a", 5), ("b", 7)]
+    trials = read_specification(file, ["method.iterations=5", "b.method.iterations=7",
+                                       "b, 1.5 mm.method.iterations=8"]).trials
+    assert [(trial.name, trial.method.iterations) for trial in trials] == [("a", 5), ("b", 7), ("b, 1.5 mm", 8)]
 
 
 @pytest.mark.parametrize("changes, words", [

@@ -273,7 +273,7 @@ def reconstruct_by(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeB
         with watch.stage("fit to grid"):
             xrays = xrays.float()
             method, grid, beam = extended(method, grid, xrays, beam, display)
-            xrays, A = binned_to(grid, xrays, beam, method.full_detector, projector)
+            xrays, A = binned_to(grid, xrays, beam, method.full_detector, projector, method.detector_grid(grid))
         prepared, began = sum(watch.seconds.values()), time.perf_counter()
         result = method.reconstruct(xrays, A, report, display, seed, on_step)
         _check_returned(method, result)

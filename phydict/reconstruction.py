@@ -178,6 +178,10 @@ class Reconstructor(ABC):
         """The coarse voxels over all that the rays meet, of a method that looks at these first; None for others."""
         return None
 
+    def detector_grid(self, grid: Grid) -> Grid:
+        """The voxels to which the X-rays of a reconstruction on `grid` are binned: the finest that see them."""
+        return grid
+
     def with_room(self, x: int, y: int, z: int) -> Reconstructor | None:
         """The method on so many voxels more at both ends of each axis, of its survey's or else of its own; None where
         it is bound to those it has."""
@@ -237,6 +241,9 @@ class Delegating(Reconstructor):
     @property
     def full_detector(self) -> bool:  # type: ignore[override]
         return self.base.full_detector
+
+    def detector_grid(self, grid: Grid) -> Grid:
+        return self.base.detector_grid(grid)
 
     @property
     def citation(self) -> str:  # type: ignore[override]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from ast import literal_eval
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -166,6 +167,8 @@ def _meant(row: Mapping, given: Mapping, names: Iterable[str]) -> dict:
     if orbit is not None:
         defaults |= {name: value[0] if isinstance(value, list | tuple) else value
                      for name, value in orbit.settings().items()}
+    if cube := re.fullmatch(r"(\d+)x\1x\1", str(row.get("grid"))):  # the method's own, over the usual length
+        defaults["voxels"] = int(cube[1])
     meant = {}
     for name in names:
         part, _, path = name.partition(".")

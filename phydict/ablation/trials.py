@@ -121,7 +121,15 @@ class Trial:
     @property
     def bound(self) -> bool:
         """Whether the method has voxels of its own: a prior's, or those of its weights."""
-        return isinstance(self.method, Sampler) or self.method.grid is not None
+        return isinstance(self.method, Sampler) or self.own is not None
+
+    @property
+    def own(self) -> Grid | None:
+        """The voxels of a trained rival's weights, or of another Reconstructor that is bound to some; None for other
+        methods, and where its row will say why its file cannot be read."""
+        with suppress(ValueError):
+            return self.method.grid if isinstance(self.method, Reconstructor) else None
+        return None
 
     @property
     def fixed(self) -> Grid | None:
@@ -129,12 +137,12 @@ class Trial:
         return self.data.protocol.grid if self.data.protocol else None
 
     def first(self) -> Grid:
-        """The grid of the method before it is refined: of its second stage, its prior or the one that it goes by; by a
-        protocol that has one its weights' own, or the protocol's."""
+        """The grid of the method before it is refined: of its second stage, its own weights, its prior or the one that
+        it goes by; of a method without voxels of its own, by a protocol that has some, the protocol's."""
         if self.super_resolution:
             return stage_of(self.super_resolution).grid
-        if self.fixed and isinstance(self.method, Reconstructor):
-            return self.method.grid or self.fixed
+        if isinstance(self.method, Reconstructor) and (grid := self.own or self.fixed):
+            return grid
         file = self.prior or self.like
         return prior_of(file).grid if file else DEFAULT_GRID
 
@@ -286,6 +294,9 @@ def _checked(settings: Mapping) -> dict:
     for name, value in given.items():
         if isinstance(value, float) and not math.isfinite(value):
             raise ValueError(f"{name} must be a finite number, but {value} was given")
+    for name in ("voxels", "side"):
+        if isinstance(sides := given.get(name), tuple) and len(set(sides)) == 1:
+            given[name] = sides[0]  # as which such a box is told
     check_seed(given.get("seed", 0))
     if (samples := given.get("samples", 1)) < 1:
         raise ValueError(f"samples is a number of draws, 1 or more, but {samples} was given")

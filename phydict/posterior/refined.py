@@ -85,6 +85,9 @@ class Refined(Delegating):
     def survey(self) -> Grid:
         return self.base.grid
 
+    def detector_grid(self, grid: Grid) -> Grid:
+        return min(grid, self.base.grid, key=lambda voxels: min(voxels.spacing))
+
     def with_room(self, x: int, y: int, z: int) -> Refined | None:
         """As a Reconstructor; the target has as much more room where it holds all of the base's box."""
         base, target = self.base.with_room(x, y, z), self.target

@@ -23,11 +23,11 @@ SLACK = 1e-3
 """A share of a voxel by which a box may stand out of another one that covers it."""
 
 
-def binned_to(grid: Grid, xrays: Tensor, beam: ConeBeam, full_detector: bool, method: str | type = "auto"
-              ) -> tuple[Tensor, Projector]:
-    """X-rays (K, V, U), binned to what the voxels can hold unless every pixel is wanted, and the projector that goes
-    with them on their device; `method` as Projector's."""
-    factor = 1 if full_detector else binning(grid, beam)
+def binned_to(grid: Grid, xrays: Tensor, beam: ConeBeam, full_detector: bool, method: str | type = "auto",
+              held_by: Grid | None = None) -> tuple[Tensor, Projector]:
+    """X-rays (K, V, U), binned to what the voxels, or those of `held_by`, can hold unless every pixel is wanted, and
+    the projector that goes with them on their device; `method` as Projector's."""
+    factor = 1 if full_detector else binning(held_by or grid, beam)
     return binned(xrays, factor), Projector(grid, beam.binned(factor), method, device=xrays.device, full_detector=True)
 
 

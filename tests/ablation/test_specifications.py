@@ -98,6 +98,15 @@ def test_a_row_tells_the_voxels_and_the_window_that_it_was_scored_on(tmp_path):
     assert told(prior, voxels=8, side=200.0)[0]["grid"] == "8x8x8"  # which these settings tell
 
 
+def test_a_box_of_three_equal_sides_is_told_as_one_of_a_single_number(tmp_path):
+    one, three, flat = (read_specification(write(tmp_path, base=TINY | box, axes={"method": ["sirt"]})).trials[0]
+                        for box in ({"voxels": 16, "side": 200}, {"voxels": [16, 16, 16], "side": [200, 200, 200]},
+                                    {"voxels": [16, 16, 8], "side": [200, 200, 100]}))
+    assert one.columns == three.columns and one.identity() == three.identity()
+    assert (one.columns["voxels"], one.columns["side"]) == (16, 200)
+    assert (flat.columns["voxels"], flat.columns["side"]) == ((16, 16, 8), (200, 200, 100))
+
+
 @pytest.mark.parametrize("file", sorted((ROOT / "configs" / "ablate").glob("*.yaml")), ids=lambda file: file.stem)
 def test_every_shipped_comparison_is_one(file):
     assert read_specification(file, phantoms=1).trials
@@ -146,10 +155,12 @@ def test_set_takes_the_place_of_a_files_axis_base_and_product(tmp_path):
 
 
 def test_set_takes_the_place_of_what_changed_methods_set_and_their_own_set_that_of_both(tmp_path):
-    methods = {name: {"of": "sirt", "method.init_args.iterations": count} for name, count in (("a", 2), ("b", 3))}
+    methods = {name: {"of": "sirt", "method.init_args.iterations": count} for name, count in (
+        ("a", 2), ("b", 3), ("b, 1.5 mm", 4))}
     file = write(tmp_path, methods=methods)
-    trials = read_specification(file, ["method.iterations=5", "b.method.iterations=7"]).trials
-    assert [(trial.name, trial.method.iterations) for trial in trials] == [("a", 5), ("b", 7)]
+    trials = read_specification(file, ["method.iterations=5", "b.method.iterations=7",
+                                       "b, 1.5 mm.method.iterations=8"]).trials
+    assert [(trial.name, trial.method.iterations) for trial in trials] == [("a", 5), ("b", 7), ("b, 1.5 mm", 8)]
 
 
 @pytest.mark.parametrize("changes, words", [
@@ -200,6 +211,8 @@ def test_delta_keeps_the_length_of_a_step():
     ({"axes": {"method": ["sirt"]}, "products": []}, ["not both"]), ({"axs": {}}, ["'axs'"]),
     ({"methods": {"mine": {"of": "sart"}}}, ["'sart'"]), ({"methods": {"mine": {}}}, ["'mine'"]),
     ({"methods": {"mine": {"of": "sirt", "method.iteration": 2}}}, ["method.iteration ", "iterations"]),
+    ({"methods": {"mine": {"of": "sirt", "method": {"iterations": 2}}}, "base": TINY | {"method": "mine"}},
+     ["methods.mine gives method {'iterations': 2}", "called `of`"]),
     ({"base": TINY | {"method.iteration": 3}, "axes": {"method": ["sirt"]}}, ["method.iteration "]),
     ({"axes": {"method": ["phydict_fast"], "method.iterations": [1]}}, ["phydict_fast: ", "2 iterations"]),
     ({"base": TINY | {"simulation_voxels": 40}, "axes": {"method": ["sirt"]}}, ["simulation_voxels", "the 16", "40"]),

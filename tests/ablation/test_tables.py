@@ -13,7 +13,7 @@ from ablation.runs import ablate, row
 from phydict.ablation import plots
 from phydict.ablation.fid import FID, distance_tables, write_distances
 from phydict.ablation.results import features_file
-from phydict.ablation.summary import summarise, without_repeats
+from phydict.ablation.summary import conditions, summarise, without_repeats
 from phydict.ablation.tables import all_tables
 from phydict.datasets.cts.ct_rate import patient_of
 from phydict.evaluation import read_csv, write_csv
@@ -99,6 +99,13 @@ def test_a_setting_of_the_xrays_that_is_not_given_means_its_default():
     first, second, _ = summarise([row("a", "x", 20.0, **fixed), row("a", "y", 20.0, pixel=1.5625, **fixed),
                                   row("a", "x", 20.0, pixel=2.5)])
     assert first.condition == second.condition == fixed | {"pixel": 1.5625}
+
+
+def test_voxels_that_are_given_and_a_methods_own_of_as_many_are_one_condition():
+    rows = [row("a", "one", 20.0, grid="32x32x32", voxels=32), row("a", "two", 21.0, grid="32x32x32"),
+            row("a", "two", 22.0), row("a", "two", 23.0, grid="32x32x32 of 10 mm")]
+    assert [sorted(entry.method for entry in of) for _, of in conditions(summarise(rows))] == [
+        ["one", "two"], ["two"], ["two"]]
 
 
 def test_a_case_of_other_data_is_another_case():

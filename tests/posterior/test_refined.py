@@ -126,6 +126,14 @@ def test_on_voxels_no_finer_than_the_base_s_the_result_is_its_averages_with_its_
             of_base.view(-1, 1, *COARSE.shape), factor).view_as(of_target))
 
 
+def test_on_coarser_voxels_a_method_sees_as_many_pixels_as_on_its_own(xrays):
+    method = Unrolled((0.2,), (0.5, 0.3))
+    own, few = (reconstruct(xrays, BEAM, tiny_refiner(), method, precision="float32", grid=grid)
+                for grid in (None, Grid.cube(8)))
+    assert few.coarse.volume.equal(own.volume) and few.xrays.shape == own.xrays.shape
+    torch.testing.assert_close(few.volume, torch.nn.functional.avg_pool3d(own.volume[None], 2)[0])
+
+
 def test_refining_leaves_what_explains_the_xrays_to_the_solvers_tolerance():
     x = WINDOW.to_range(chest())[None, None].double()
     projector = Projector(FINE, BEAM, full_detector=True)

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from command_lines import refusal
 from prior.tiny import tiny_prior
 
 from phydict.cli.infer import main as infer
@@ -169,3 +170,14 @@ def test_the_table_of_a_comparison_says_so_and_that_of_a_damaged_file_is_made_to
 
     assert "Trained rivals, as their files tell: mine any K, 7 steps." in table({"steps": 7}, False)
     assert "mine: refused: " in table({"steps": 7}, True)
+
+
+def test_a_comparison_is_made_on_a_rivals_own_voxels_and_refuses_several(file, tmp_path, capsys):
+    (tmp_path / "spec.yaml").write_text(yaml.safe_dump({
+        "out": str(tmp_path / "out"), "phantoms": 1, "base": {"detector": 24, "views": 3},
+        "methods": {"mine": {"of": "phydict.rivals.TrainedRival", "method.file": file}}, "axes": {"method": ["mine"]}}))
+    run = ["ablate", "-c", str(tmp_path / "spec.yaml"), "--device", "cpu"]
+    infer(run)
+    [row] = read_csv(tmp_path / "out" / "results.csv")
+    assert (row["status"], row["grid"]) == ("ok", "16x16x16")
+    assert "compared on one grid" in refusal(capsys, infer, [*run, "--set", "method=[mine,sirt]"])

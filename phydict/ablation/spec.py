@@ -73,19 +73,11 @@ def _specification(content, given: Mapping, changed: dict) -> Specification:
         if method := max(of_methods, key=len, default=None):
             methods[method] = {**methods[method], name.removeprefix(f"{method}."): changed.pop(name)}
     for name, changes in methods.items():
-<<<<<<< HEAD
-        with naming(f"methods.{name}.of"):
-            method_of(changes.get("of", name))
-=======
         if "method" in changes:
             raise ValueError(f"methods.{name} gives method {reprlib.repr(changes['method'])}, but what is changed is "
                              "called `of`, and each of its settings method.<field>, such as method.iterations: 2")
-        of = changes.get("of", name)
-        try:
-            method_of(of)
-        except ValueError as error:
-            raise ValueError(f"methods.{name}.of: {error}") from error
->>>>>>> 6b6f0fb18851d358532443654cb6605968c8b45b
+        with naming(f"methods.{name}.of"):
+            method_of(changes.get("of", name))
     cases = Cases(content.get("cts"), content.get("phantoms"), content.get("only"), _source(content))
     if content.get("out") is None:
         raise ValueError("there is no folder for the results: give out, in the file or as --out")

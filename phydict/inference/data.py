@@ -154,8 +154,8 @@ class ReconstructionData(lightning.LightningDataModule):
                                for name, folder in self.xray_cases().items()])
         cases, processes = len(loader), self.trainer.world_size
         if 0 < cases < processes:  # of which Lightning wants one each
-            raise ValueError(f"{processes} processes were asked for, but there {'is' if cases == 1 else 'are'} {cases} to "
-                             f"reconstruct: give --trainer.devices {cases}, on one node")
+            raise ValueError(f"{processes} processes were asked for, but there {'is' if cases == 1 else 'are'} {cases} "
+                             f"to reconstruct: give --trainer.devices {cases}, on one node")
         return loader
 
     def test_dataloader(self) -> DataLoader:

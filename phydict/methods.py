@@ -59,7 +59,7 @@ from phydict.runtime.precision import check_precision
 from phydict.runtime.profiling import Stopwatch
 from phydict.runtime.reading import reason
 from phydict.runtime.seeds import check_seed
-from phydict.runtime.warning import heard, warn
+from phydict.runtime.warning import Remark, heard, warn
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam
 from phydict.xray.beyond import with_continuation
@@ -223,12 +223,16 @@ CORRECTIONS = {3.0: DEFAULT_CORRECTION, 1.5: FINEST_CORRECTION}
 
 
 def corrections_of(method: Sampler | Reconstructor, grid: Grid) -> list[Path]:
-    """The files of the networks that correct a method's estimates on the way to a grid, those for the longest voxels
-    first; none where the method needs no refiner or the grid's voxels are longer than those learnt on."""
+    """The files of the networks that correct a method's estimates on the way to a grid, its own `corrections` or, where
+    it names none, those shipped, for the longest voxels first; none where the method needs no refiner or the grid's
+    voxels are longer than those learnt on. Raises as `load_correction` where a file of its own cannot be read."""
     if not (isinstance(method, Sampler) and method.needs_refiner):
         return []
-    return [file for length, file in CORRECTIONS.items()
-            if file.is_file() and min(grid.spacing) < (1 + TOLERANCE) * length]
+    learnt_on = {length: file for length, file in CORRECTIONS.items() if file.is_file()}
+    if own := getattr(method, "corrections", ()):
+        learnt_on = {float(min(load_correction(file).grid.spacing)): Path(file) for file in own}
+    return [file for length, file in sorted(learnt_on.items(), reverse=True)
+            if min(grid.spacing) < (1 + TOLERANCE) * length]
 
 
 def onto_grid(method: Reconstructor, grid: Grid | None, refinement: Refinement = Refinement()) -> Reconstructor:
@@ -274,6 +278,9 @@ def reconstruct_by(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeB
             xrays = xrays.float()
             method, grid, beam = extended(method, grid, xrays, beam, display)
             xrays, A = binned_to(grid, xrays, beam, method.full_detector, projector, method.detector_grid(grid))
+        if isinstance(method, Posterior) and getattr(method.sampler, "corrections", None):
+            warn("corrections name networks for finer voxels than these, which are the method's own: they do nothing; "
+                 "give a grid, such as 128", Remark)
         prepared, began = sum(watch.seconds.values()), time.perf_counter()
         result = method.reconstruct(xrays, A, report, display, seed, on_step)
         _check_returned(method, result)

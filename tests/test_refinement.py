@@ -19,10 +19,10 @@ from phydict.cli.train import main
 from phydict.datasets import phantom_case
 from phydict.evaluation import read_csv
 from phydict.grid import Cube, Grid
-from phydict.methods import METHODS, corrections_of, reconstructor
+from phydict.methods import METHODS, corrections_of, reconstruct, reconstructor
 from phydict.posterior import ProximalCG, Refined, Refinement, Unrolled, refined
 from phydict.posterior.coarse_correction import coarse_correction
-from phydict.prior import correction, load_correction, save_prior, save_refiner, save_stage
+from phydict.prior import DEFAULT_REFINER, correction, load_correction, save_prior, save_refiner, save_stage
 from phydict.prior.correction import INPUTS, CorrectionNetwork
 from phydict.runtime.profiling import profiled
 from phydict.runtime.warning import Remark
@@ -140,6 +140,25 @@ def test_the_shipped_networks_correct_on_their_own_voxels():
         files = corrections_of(Unrolled(), grid)
         assert [load_correction(file).grid.spacing[0] for file in files] == lengths
         assert corrections_of(METHODS["phydict_fast"], grid) == []
+
+
+@pytest.mark.filterwarnings("ignore:.* cut the patient off", "ignore:no network has learnt")
+def test_networks_of_ones_own_correct_in_place_of_those_shipped(tmp_path):
+    file = tmp_path / "mine.safetensors"
+    save_stage(network(), file, {"steps": 1})
+    mine, refiner = Unrolled((0.2,), (0.5, 0.3), corrections=(str(file),)), tiny_refiner()
+    xrays = Projector(FINE, BEAM, full_detector=True)(0.02 * torch.ones(1, 1, *FINE.shape))[0]
+    found = reconstruct(xrays, BEAM, refiner, mine, grid=FINE)
+    ready = Refined(reconstructor(mine, refiner), FINE, networks=(load_correction(file),))
+    assert found.volume.equal(ready.reconstruct(*fit_to_grid(ready, FINE, xrays, BEAM)).volume)
+    with pytest.warns(Remark, match="corrections name networks for finer voxels than these"):
+        reconstruct(xrays, BEAM, refiner, mine)
+    assert corrections_of(mine, Grid.cube(16)) == [] and corrections_of(mine, FINE) == [file]
+    for wrong, words in ((tmp_path / "none.safetensors", "none.safetensors"), (DEFAULT_REFINER, "refine")):
+        with pytest.raises((ValueError, FileNotFoundError), match=words):
+            reconstruct(xrays, BEAM, refiner, replace(mine, corrections=(str(wrong),)), grid=FINE)
+    with pytest.raises(ValueError, match="a list of files, but 'mine.safetensors' was given"):
+        replace(mine, corrections="mine.safetensors")
 
 
 def test_a_refinement_by_a_network_takes_the_memory_that_is_asked_for():

@@ -75,6 +75,8 @@ class Unrolled(Sampler):
         more_times: labels of further calls from `more_views` views on, whose x0 has the last of x0_stds; of two CTs
             that evaluate nothing they gain 0.3 and 0.4 dB from 16 and 32 views, and at most 0.1 from 8
         more_views: the fewest views with further calls
+        corrections: files of networks that correct its volumes on finer voxels (configs/prior/refinement.yaml); none:
+            those shipped
     """
 
     citation = ("Adler & Oktem, Learned Primal-Dual Reconstruction, IEEE Transactions on Medical Imaging 37(6), 2018, "
@@ -95,6 +97,7 @@ class Unrolled(Sampler):
     first_views: int = 3
     more_times: tuple[float, ...] = (0.12, 0.1)
     more_views: int = 12
+    corrections: tuple[str, ...] = ()
     default_prior = DEFAULT_REFINER
     needs_refiner = True
 
@@ -105,6 +108,8 @@ class Unrolled(Sampler):
         if len(self.x0_stds) != len(self.times) + 1:
             raise ValueError(f"x0_stds are {len(self.times) + 1} numbers, one more than times, but {self.x0_stds} was "
                              "given")
+        if isinstance(self.corrections, str):
+            raise ValueError(f"corrections are a list of files, but '{self.corrections}' was given: put it into one")
         for std in self.x0_stds:
             check_between("each of Unrolled.x0_stds", std, LEAST, MOST)
         check_fields(self, "Unrolled", contradiction=(0, MOST))

@@ -241,6 +241,8 @@ def test_bad_flats_are_named(tmp_path):
         load_xrays(folder)
     np.save(folder / "flat.npy", np.ones((3, 3)))
     fails("flat.npy has 3 x 3 pixels, but the views have 6 x 5", folder)
+    np.save(folder / "flat.npy", np.full(SHAPE, 200, np.uint8))
+    fails("flat.npy holds uint8 pixels, but the views uint16, whose counts are on another scale", folder)
     flat = np.full(SHAPE, 30.0)
     flat[1, 1] = 10
     np.save(folder / "flat.npy", flat)

@@ -95,7 +95,7 @@ def load_xrays(folder: str | Path, geometry: str | Path | None = None, intensity
     if views.tags:
         intensity = shown(intensity or tags_intensity(views.tags), views.tags)
     intensity = intensity or _assumed(views, folder, source)
-    flat_and_dark = {name: _mean(paths, views.images[0].shape) for name, paths in references.items()}
+    flat_and_dark = {name: _mean(paths, views.images[0]) for name, paths in references.items()}
     with naming(folder):
         xrays = intensity.line_integrals(np.stack(views.images).astype(np.float64), views.full_scale, flat_and_dark)
     _check_saturation(views.names, xrays)
@@ -237,16 +237,19 @@ def _assumed(views: _Views, folder: Path, source: Path) -> Intensity:
     return Intensity("line_integrals")
 
 
-def _mean(paths: list[Path], shape: tuple[int, int]) -> np.ndarray:
-    """The mean (V, U) of all frames of the reference images."""
+def _mean(paths: list[Path], view: np.ndarray) -> np.ndarray:
+    """The mean (V, U) of all frames of the reference images of a view."""
     for path in paths:
         if not path.is_file():
             raise FileNotFoundError(f"there is no image {path}, which `intensity:` names; correct the name")
     views = _read_views(paths)
     for name, image in zip(views.names, views.images):
-        if image.shape != shape:
-            raise ValueError(f"{name} has {image.shape[0]} x {image.shape[1]} pixels, but the views have {shape[0]} x "
-                             f"{shape[1]}; give references of the same detector")
+        if image.shape != view.shape:
+            raise ValueError(f"{name} has {image.shape[0]} x {image.shape[1]} pixels, but the views have "
+                             f"{view.shape[0]} x {view.shape[1]}; give references of the same detector")
+        if {image.dtype, view.dtype} == {np.dtype(np.uint8), np.dtype(np.uint16)}:
+            raise ValueError(f"{name} holds {image.dtype} pixels, but the views {view.dtype}, whose counts are on "
+                             "another scale; store all alike")
     return np.mean([image.astype(np.float64) for image in views.images], axis=0)
 
 

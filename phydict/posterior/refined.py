@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from phydict.grid import Grid
-from phydict.guard import Guard
+from phydict.guard import BAD_FIT, Guard
 from phydict.posterior.coarse_correction import coarse_correction
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.posterior import WIDEST
@@ -35,6 +35,7 @@ from phydict.xray.boxes import (
     projector_method,
     refinements,
 )
+from phydict.xray.residuals import misfits, shared_norms
 
 ON_FINER = {0.5: (0.85, 0.0), 0.8: (1.0, 0.0), 0.9: (1.0, 0.1), 0.95: (1.0, 0.2)}
 """Level -> the shares of a coarse interval and of the refinement's change of which one on finer voxels is the sum: of
@@ -156,6 +157,12 @@ class Refined(Delegating):
         if alone:
             warn(f"no network has learnt to refine {self.name} to {' and '.join(alone)} voxels here: the X-rays and "
                  "total variation alone do", Remark)
+        before, after = (misfits(fit["reprojection"], fit["xrays"], shared_norms)["misfit"]
+                         for fit in (vars(coarse), scores))
+        if before <= BAD_FIT < after:
+            warn(f"the volume refined to {' x '.join(map(str, grid.shape))} voxels does not explain the X-rays (misfit "
+                 f"{after:.2g}), though the coarse one does: trust that one, and look at what the networks that refine "
+                 "have learnt")
         deviation, volume = coarse.deviation, volume.cpu()
         intervals = self._intervals(coarse, volume, known)
         if coarse.carried:

@@ -1,5 +1,6 @@
 """Refinement on finer voxels: what it keeps, what it gains, and regions of interest."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -86,6 +87,28 @@ def test_a_network_on_finer_voxels_computes_as_the_base_does(xrays):
     ready = Refined(Known(), Grid.cube(32), networks=(Asked(),))
     ready.reconstruct(*fit_to_grid(ready, ready.grid, xrays, BEAM))
     assert asked == ["float32"] * 2
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_network_that_leads_away_from_the_x_rays_is_told_of(xrays, sign):
+    class Fitting(Known):
+        def reconstruct(self, *given, **settings):
+            found = super().reconstruct(*given, **settings)
+            return replace(found, reprojection=found.xrays)
+
+    class Turns(Watched):
+        def __init__(self):
+            pass
+
+        def corrected(self, z, evidence, precision):
+            return sign * z
+
+    ready = Refined(Fitting(), FINE, networks=(Turns(),))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = ready.reconstruct(*fit_to_grid(ready, FINE, xrays, BEAM))
+    told = [str(warning.message) for warning in caught if "does not explain the X-rays" in str(warning.message)]
+    assert (len(told), found.misfit > 0.5) == ((0, False) if sign == 1 else (1, True))
 
 
 @pytest.mark.parametrize("learnt, correcting", [

@@ -200,17 +200,26 @@ class CaseResults:
 
 
 def score_table(records: Sequence[dict], protocol: Protocol | None, empty: Mapping[str, str]) -> Table:
-    """The means of records' scores by method, with notes on their priors' files, how their X-rays were made and the
+    """The means of records' scores by method, with notes on the files of networks, how their X-rays were made and the
     protocol, if any, that they were taken by; empty: scores that may stay empty -> why."""
     rows = [score_row(record["case"], record) for record in records]
     table = mean_table(rows, window=protocol.window if protocol else RANGE, empty=empty, first_calls=True)
     made = dict.fromkeys(_xrays(record["settings"]) for record in records
                          if "simulator" in record["settings"].get("data", {}))
-    priors = dict.fromkeys(f"{record['method']} with {record['settings']['prior']} (CRC-32 "
-                           f"{record['settings']['prior_crc32']:08x})" for record in records
-                           if "prior_crc32" in record["settings"])
-    told = [f"Priors: {', '.join(priors)}."] if priors else []
+    files = dict.fromkeys(f"{record['method']} with {' and '.join(of)}" for record in records
+                          if (of := _files(record["settings"])))
+    told = [f"Files: {', '.join(files)}."] if files else []
     return replace(table, notes=[*table.notes, *told, *made, *([protocol.note] if protocol else [])])
+
+
+def _files(settings: Mapping) -> list[str]:
+    """The files of a prior, a second stage and a trained rival that decided a result, each with its checksum."""
+    named = [(settings[role], settings[f"{role}_crc32"]) for role in ("prior", "super_resolution")
+             if f"{role}_crc32" in settings]
+    method = settings.get("method", {})
+    if method.get("weights_crc32"):
+        named.append((Path(method["file"]).name, method["weights_crc32"]))
+    return [f"{file} (CRC-32 {crc:08x})" for file, crc in named]
 
 
 def _xrays(settings: Mapping) -> str:

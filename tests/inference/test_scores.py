@@ -151,7 +151,7 @@ def test_the_default_method_reconstructs_with_a_prior(prior, measured, tmp_path)
     main(["test", *ORBIT, f"--model.prior={prior}", f"--model.out={tmp_path}", "--data.cts=phantom",
           "--data.phantoms=1", "--model.sampling.with_report=false", "--trainer.accelerator=cpu"])
     said = record(tmp_path / "phydict_fast" / "phantom-1000000")
-    named = f"Priors: phydict_fast with {prior.name} (CRC-32 {said['settings']['prior_crc32']:08x})."
+    named = f"Files: phydict_fast with {prior.name} (CRC-32 {said['settings']['prior_crc32']:08x})."
     assert named in (tmp_path / "phydict_fast" / "results.md").read_text()
     assert said["network_calls"] == 10 and said["grid"]["shape"] == [16, 16, 16] and said["report"] == ""
     assert said["settings"]["prior"] == "tiny.safetensors" and said["settings"]["prior_crc32"]
@@ -251,4 +251,7 @@ def test_a_second_stage_is_scored_on_the_fine_grid(guided, prior, fine, cts, tmp
                             HUWindow().to_hu(truth["volume"])[None])
     assert said["scores"]["psnr"] == pytest.approx(float(scores["psnr"]), rel=1e-3)
     assert said["settings"]["super_resolution"] == "fine.safetensors"
+    crcs = [f"{said['settings'][f'{role}_crc32']:08x}" for role in ("prior", "super_resolution")]
+    named = f"{prior.name} (CRC-32 {crcs[0]}) and fine.safetensors (CRC-32 {crcs[1]})."
+    assert named.replace("_", "\\_") in (folder.parent / "results.md").read_text()
     assert said["settings"]["second"]["class"] == ("SplitGibbs" if guided else "PriorOnly")

@@ -50,6 +50,7 @@ def test_the_command_line_takes_a_rivals_file(file, tmp_path, monkeypatch):
             "--model.name=lifted"]
     infer(args)
     assert [row["grid"] for row in read_csv(tmp_path / "out" / "lifted" / "results.csv")] == ["16x16x16"]
+    assert f"Files: lifted with {Path(file).name} (CRC-32 " in (tmp_path / "out" / "lifted" / "results.md").read_text()
     infer([*args, "--model.grid=24", "--model.overwrite=true"])
     assert [row["grid"] for row in read_csv(tmp_path / "out" / "lifted" / "results.csv")] == ["24x24x24"]
 

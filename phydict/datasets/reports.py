@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import re
+from itertools import pairwise
 from pathlib import Path
 
 from phydict.runtime.reading import reading
@@ -20,6 +21,12 @@ LEFT_OUT = ("clinical information", "clinical history", "clinical indication", "
             "comparison", "examination")
 HEADING = re.compile(rf"(?:^[ \t]*|(?<=\s)(?=(?-i:[A-Z])))({'|'.join((*SECTIONS, *LEFT_OUT))})s?[ \t]*:",
                      re.IGNORECASE | re.MULTILINE)
+
+MARK = re.compile(r"[-–•*·]\s|\d{1,2}[.)]\s")
+"""What the items of a list begin with."""
+
+OPEN_END = re.compile(r"(?:^|\s)(?!(?:an?|the|of|in|on|at|to|by|for|with|and|or|no|is|are)$)\S*[\w%)]$", re.IGNORECASE)
+"""The end of a line from which a full stop may have been left out: no mark, and no word that leads on."""
 
 
 def join_report(findings: str | None, impression: str | None) -> str:
@@ -41,11 +48,12 @@ def format_report(text: str | None) -> str:
 
     Headings (findings, impression or conclusion) count at the start of a line, or anywhere with a capital, and need a
     colon. Text before any heading belongs to the findings. Clinical information, technique and comparison are left out,
-    as they are in training. A text without findings or impression is kept as it is, on one line.
+    as they are in training. A text without findings or impression is kept as it is, on one line. Lines of a list that
+    end in no mark get a full stop.
     """
     if any(heading in SECTIONS.values() for heading, _ in _parts(text, "")):
         return join_report(text, None)
-    whole = " ".join(_written(text).split())
+    whole = _on_one_line(_written(text))
     return "" if whole.lower() in ABSENT else whole
 
 
@@ -53,7 +61,19 @@ def _parts(text: str | None, title: str) -> list[tuple[str, str]]:
     """(section, text on one line) in order; what comes before any heading belongs to `title`."""
     pieces = HEADING.split(_written(text))
     titles = [title, *(SECTIONS.get(name.lower(), "") for name in pieces[1::2])]
-    return [(name, " ".join(piece.split())) for name, piece in zip(titles, pieces[0::2])]
+    return [(name, _on_one_line(piece)) for name, piece in zip(titles, pieces[0::2])]
+
+
+def _on_one_line(text: str) -> str:
+    """A text whose lines are joined; those of a list end in a full stop, so that "no" in one is not read of the next.
+
+    A list's lines begin with marks, or each of them with a capital or a number.
+    """
+    lines = [" ".join(line.split()) for line in text.splitlines() if line.strip()]
+    listed = all(line[0].isupper() or line[0].isdigit() or MARK.match(line) for line in lines)
+    ended = [f"{line}." if OPEN_END.search(line) and (listed or MARK.match(after)) else line
+             for line, after in pairwise(lines)]
+    return " ".join(ended + lines[-1:])
 
 
 def _written(text: str | None) -> str:

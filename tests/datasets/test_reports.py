@@ -53,6 +53,24 @@ def test_a_text_without_sections_is_kept(text):
     assert format_report(f" \t{text.replace(' ', '   ')}\n\n") == text
 
 
+@pytest.mark.parametrize("lines, sentences", [
+    ("- No effusion\n- Nodule in the right\n  upper lobe\n\n- Clear.",
+     "- No effusion. - Nodule in the right upper lobe. - Clear."),
+    ("• No effusion\n• heart: normal\n• 4 mm nodule", "• No effusion. • heart: normal. • 4 mm nodule"),
+    ("1) No effusion;\n2) Nodule of 4 mm", "1) No effusion; 2) Nodule of 4 mm"),
+    ("No effusion\n12 mm nodule (right)\nNormal heart", "No effusion. 12 mm nodule (right). Normal heart")])
+def test_lines_of_a_list_are_sentences(lines, sentences):
+    assert format_report(lines) == format_report(sentences) == sentences
+    assert join_report(lines, None) == f"Findings: {sentences}"
+    assert format_report(f"FINDINGS:\n{lines}\nIMPRESSION:\nMass") == f"Findings: {sentences} Impression: Mass"
+
+
+@pytest.mark.parametrize("prose", [
+    "No nodule in the right\nupper lobe. No\neffusion", "Typical of\nCOVID-19", "Nodule,\n4 mm", "Lungs:\nClear"])
+def test_lines_of_prose_are_joined(prose):
+    assert format_report(prose) == prose.replace("\n", " ")
+
+
 def test_a_laid_out_report_is_laid_out_already():
     words = ["Findings:", "impression:", "IMPRESSION:", "Technique:", "nodule", "no", "nan", "Not given.", "\n",
              "mass.", "Not", "given.", "-"]

@@ -89,7 +89,7 @@ def read_texts(path: str | Path) -> list[str]:
     Raises ValueError, with what to do, where there is no such file or no text in it.
     """
     with reading(f"the texts in '{path}'", "give a UTF-8 file with one text, or one JSON object, a line"):
-        lines = [line for line in Path(path).read_text(encoding="utf-8").splitlines() if line.strip()]
+        lines = [line for line in Path(path).read_text(encoding="utf-8-sig").splitlines() if line.strip()]
         entries = [json.loads(line) if line.lstrip().startswith("{") else {"text": line} for line in lines]
         texts: list = [text.get("text") or text.get("caption") for text in entries]
     if not texts or not all(isinstance(text, str) for text in texts):

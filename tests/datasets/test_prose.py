@@ -201,6 +201,8 @@ def test_an_extent_is_where_a_phantom_changes(finding):
 def test_texts_are_lines_or_json_lines(tmp_path):
     (tmp_path / "a.txt").write_text("Clear lungs.\n\nLeft nodule.\n")
     (tmp_path / "b.jsonl").write_text('{"caption": "Clear lungs."}\n{"text": "Left nodule."}\n')
+    (tmp_path / "c.jsonl").write_text("\ufeff" + (tmp_path / "b.jsonl").read_text(), encoding="utf-8")
+    assert read_texts(tmp_path / "c.jsonl") == read_texts(tmp_path / "b.jsonl")
     assert read_texts(tmp_path / "a.txt") == read_texts(tmp_path / "b.jsonl") == ["Clear lungs.", "Left nodule."]
 
 

@@ -2,6 +2,7 @@
 
 import itertools
 import random
+import time
 
 import pytest
 import torch
@@ -39,7 +40,10 @@ def test_an_absent_section_is_left_out_however_it_is_written(nothing):
     LAYOUT, "FINDINGS:\nNodule,\n4 mm.\n\nIMPRESSION:\nBenign nodule.\n",
     "findings : Nodule, 4 mm.\r\nimpression: Benign nodule.",
     "Nodule, 4 mm.\nConclusion: Benign nodule.", "IMPRESSIONS: Benign nodule.\nFINDINGS: Nodule, 4 mm.",
-    "Clinical information: cough.\nTechnique: CT without contrast.\nFindings: Nodule, 4 mm.\nImpression: Benign nodule."
+    "Clinical information: cough.\nTechnique: CT without contrast.\nFindings: Nodule, 4 mm.\nImpression: Benign "
+    "nodule.", "INDICATION\nLeft effusion.\n\nFINDINGS\r\nNodule, 4 mm.\n\n Impressions \nBenign nodule.",
+    "Reason for exam: left effusion.\nFindings: Nodule, 4 mm.\nImpression: Benign nodule.",
+    "CLINICAL DETAILS:\nLeft effusion?\nFindings\nNodule, 4 mm.\nConclusion\nBenign nodule."
 ])
 def test_every_usual_way_to_write_a_report_is_the_same_report(text):
     assert format_report(text) == LAYOUT
@@ -53,9 +57,37 @@ def test_a_text_without_sections_is_kept(text):
     assert format_report(f" \t{text.replace(' ', '   ')}\n\n") == text
 
 
+@pytest.mark.parametrize("lines, sentences", [
+    ("- No effusion\n- Nodule in the right\n  upper lobe\n\n- Clear.",
+     "- No effusion. - Nodule in the right upper lobe. - Clear."),
+    ("• No effusion\n• heart: normal\n• 4 mm nodule", "• No effusion. • heart: normal. • 4 mm nodule"),
+    ("1) No effusion;\n2) Nodule of 4 mm", "1) No effusion; 2) Nodule of 4 mm"),
+    ("No effusion\n12 mm nodule (right)\nNormal heart", "No effusion. 12 mm nodule (right). Normal heart")])
+def test_lines_of_a_list_are_sentences(lines, sentences):
+    assert format_report(lines) == format_report(sentences) == sentences
+    assert join_report(lines, None) == f"Findings: {sentences}"
+    assert format_report(f"FINDINGS:\n{lines}\nIMPRESSION:\nMass") == f"Findings: {sentences} Impression: Mass"
+
+
+def test_text_before_the_findings_is_a_sentence_of_its_own():
+    assert format_report("CT without contrast\nFINDINGS: Left mass") == "Findings: CT without contrast. Left mass"
+
+
+def test_a_report_of_many_headings_takes_no_minutes():
+    begun = time.process_time()
+    assert format_report("Findings: Mass\n" * 4000) == "Findings: " + "Mass. " * 3999 + "Mass"
+    assert time.process_time() - begun < 2
+
+
+@pytest.mark.parametrize("prose", [
+    "No nodule in the right\nupper lobe. No\neffusion", "Typical of\nCOVID-19", "Nodule,\n4 mm", "Lungs:\nClear"])
+def test_lines_of_prose_are_joined(prose):
+    assert format_report(prose) == prose.replace("\n", " ")
+
+
 def test_a_laid_out_report_is_laid_out_already():
-    words = ["Findings:", "impression:", "IMPRESSION:", "Technique:", "nodule", "no", "nan", "Not given.", "\n",
-             "mass.", "Not", "given.", "-"]
+    words = ["Findings:", "Findings", "impression:", "IMPRESSION:", "Technique:", "nodule", "no", "nan", "Not given.",
+             "\n", "mass.", "Not", "given.", "-"]
     draw = random.Random(0)
     for _ in range(3000):
         first, second = (" ".join(draw.choices(words, k=draw.randrange(7))) for _ in range(2))

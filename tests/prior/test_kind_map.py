@@ -101,6 +101,9 @@ def test_a_header_of_other_kinds_is_refused(prior, tmp_path, part, key, value):
     ("Findings: A nodule of 3.5 mm. No mass; clear pleura! Impression: Normal.",
      ["A nodule of 3.5 mm.", "No mass;", "clear pleura!", "Normal."]),
     ('Open airways. " Bilateral effusion " Goitre', ["Open airways.", "Bilateral effusion", "Goitre"]),
+    ("No effusion, e.g. pleural. No infection (i.e. pneumonia); an approx. 5 mm nodule vs. Fig. 2 of Dr. Lung. Normal.",
+     ["No effusion, e.g. pleural.", "No infection (i.e. pneumonia);", "an approx. 5 mm nodule vs. Fig. 2 of Dr. Lung.",
+      "Normal."]),
     ("1. Left mass.\n2. Small heart.", ["Left mass.", "Small heart."]), ("", []), ("... 12. - 3;", [])])
 def test_sentences_of_a_report(report, sentences):
     assert split_sentences(report) == sentences

@@ -3,6 +3,7 @@ nothing of someone else's."""
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import shutil
@@ -176,10 +177,13 @@ def _is_of_none(name: str) -> bool:
 
 
 def _sync(path: Path) -> None:
-    """Waits until the disk holds a file or what a folder lists."""
+    """Waits until the disk holds a file or, where the file system can tell, what a folder lists."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP) or not path.is_dir():  # of a folder, on some shared disks
+            raise
     finally:
         os.close(handle)
 

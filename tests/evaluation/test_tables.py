@@ -114,6 +114,22 @@ def test_a_file_that_the_disk_did_not_take_does_not_replace_another(tmp_path, mo
     assert read_csv(tmp_path / "t.csv") == ROWS and os.listdir(tmp_path) == ["t.csv"]
 
 
+def test_what_a_container_with_the_name_of_this_machine_writes_is_left_alone(tmp_path, monkeypatch):
+    dead = 99_999_999  # here; there it is another process
+    with monkeypatch.context() as there:
+        (tmp_path / "numbering").touch()
+        there.setattr("phydict.runtime.files.NUMBERING", tmp_path / "numbering")
+        there.setattr(os, "getpid", lambda: dead)
+        file, folder = atomic_write(tmp_path / "t.csv"), atomic_directory(tmp_path / "case")
+        parts = [file.__enter__(), folder.__enter__()]
+        parts[0].touch()
+    remove_leftovers(tmp_path)
+    assert all(part.exists() for part in parts)
+    for writing in (file, folder):
+        writing.__exit__(None, None, None)
+    assert {*os.listdir(tmp_path)} == {"numbering", "t.csv", "case"}
+
+
 def cells(rows: list[dict]) -> dict[str, dict[str, str]]:
     """{row name: {column name without its arrow: cell}} of the Markdown table of some rows."""
     lines = [[c.strip() for c in line.strip("| ").split(" | ")]

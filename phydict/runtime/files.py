@@ -3,6 +3,7 @@ nothing of someone else's."""
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import shutil
@@ -14,6 +15,9 @@ from pathlib import Path
 
 ASIDE = ".set-aside-by-phydict"
 """What the name of a folder ends in while another takes its place."""
+
+NUMBERING = Path("/proc/self/ns/pid")
+"""What Linux has another of where the numbers of processes mean others, as in a container."""
 
 
 @contextmanager
@@ -165,21 +169,31 @@ def _partial(final: Path) -> Path:
     return final.with_name(f".{final.name}.{_writer()}.partial")
 
 
+def machine() -> str:
+    """The name of this machine, and of the container where processes have numbers of their own: several containers may
+    have the name of their host."""
+    name = socket.gethostname()
+    return f"{name}-{NUMBERING.stat().st_ino}" if NUMBERING.exists() else name
+
+
 def _writer() -> str:
-    return f"{socket.gethostname()}.{os.getpid()}"
+    return f"{machine()}.{os.getpid()}"
 
 
 def _is_of_none(name: str) -> bool:
     """Whether a name ends in the `_writer` of a dead process of this machine."""
     host, _, process = name.rpartition(".")
-    return host.endswith("." + socket.gethostname()) and process.isdigit() and not _runs(int(process))
+    return host.endswith("." + machine()) and process.isdigit() and not _runs(int(process))
 
 
 def _sync(path: Path) -> None:
-    """Waits until the disk holds a file or what a folder lists."""
+    """Waits until the disk holds a file or, where the file system can tell, what a folder lists."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP) or not path.is_dir():  # of a folder, on some shared disks
+            raise
     finally:
         os.close(handle)
 

@@ -6,7 +6,6 @@ import errno
 import itertools
 import json
 import shutil
-import socket
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -29,6 +28,7 @@ from phydict.inference.scoring import Scoring
 from phydict.methods import METHODS
 from phydict.prior import save_prior
 from phydict.runtime import profiling
+from phydict.runtime.files import machine
 from phydict.runtime.profiling import profiled
 from phydict.runtime.reading import TooLittleMemory
 from phydict.units import HUWindow
@@ -422,8 +422,8 @@ def test_what_a_row_is_to_keep_and_cannot_ends_the_run(tmp_path, monkeypatch, ca
 
 
 def test_what_a_killed_run_had_begun_to_keep_is_removed(tmp_path, trace):
-    begun = [tmp_path / "out" / "volumes" / f".k1.{socket.gethostname()}.99999999.partial",
-             tmp_path / "out" / "features" / f".{socket.gethostname()}.99999999.part.k1.safetensors"]
+    begun = [tmp_path / "out" / "volumes" / f".k1.{machine()}.99999999.partial",
+             tmp_path / "out" / "features" / f".{machine()}.99999999.part.k1.safetensors"]
     for folder in begun:
         folder.parent.mkdir(parents=True)
     begun[0].mkdir()

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import math
 import os
 import random
 import re
+import stat
 
 import pytest
 import torch
@@ -15,7 +17,7 @@ from rich.console import Console
 from phydict.evaluation import Table, mean_table, read_csv, summarise, write_csv
 from phydict.evaluation.metrics import MEASURES, Measure
 from phydict.evaluation.tables import ranks
-from phydict.runtime.files import alone_in, atomic_write, remove_leftovers
+from phydict.runtime.files import alone_in, atomic_directory, atomic_write, remove_leftovers
 from phydict.units import HUWindow
 
 ROWS = [
@@ -84,6 +86,48 @@ def test_a_process_killed_while_writing_leaves_the_old_file_and_the_next_run_not
         part.touch()
         remove_leftovers(tmp_path)
     assert {*os.listdir(tmp_path)} == {"t.csv", "now.csv", ".lock", f".elsewhere.{child}.part.t.csv"}
+
+
+def test_a_file_is_written_where_the_file_system_syncs_no_folders(tmp_path, monkeypatch):
+    sync = os.fsync
+
+    def of_files(handle: int) -> None:
+        if stat.S_ISDIR(os.fstat(handle).st_mode):
+            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+        sync(handle)
+
+    monkeypatch.setattr(os, "fsync", of_files)
+    write_csv(tmp_path / "t.csv", ROWS)
+    with atomic_directory(tmp_path / "case") as partial:
+        write_csv(partial / "t.csv", ROWS)
+    assert read_csv(tmp_path / "case" / "t.csv") == read_csv(tmp_path / "t.csv") == ROWS
+
+
+def test_a_file_that_the_disk_did_not_take_does_not_replace_another(tmp_path, monkeypatch):
+    def failing(handle: int) -> None:
+        raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+
+    write_csv(tmp_path / "t.csv", ROWS)
+    monkeypatch.setattr(os, "fsync", failing)
+    with pytest.raises(OSError, match="Invalid argument"):
+        write_csv(tmp_path / "t.csv", ROWS[:1])
+    assert read_csv(tmp_path / "t.csv") == ROWS and os.listdir(tmp_path) == ["t.csv"]
+
+
+def test_what_a_container_with_the_name_of_this_machine_writes_is_left_alone(tmp_path, monkeypatch):
+    dead = 99_999_999  # here; there it is another process
+    with monkeypatch.context() as there:
+        (tmp_path / "numbering").touch()
+        there.setattr("phydict.runtime.files.NUMBERING", tmp_path / "numbering")
+        there.setattr(os, "getpid", lambda: dead)
+        file, folder = atomic_write(tmp_path / "t.csv"), atomic_directory(tmp_path / "case")
+        parts = [file.__enter__(), folder.__enter__()]
+        parts[0].touch()
+    remove_leftovers(tmp_path)
+    assert all(part.exists() for part in parts)
+    for writing in (file, folder):
+        writing.__exit__(None, None, None)
+    assert {*os.listdir(tmp_path)} == {"numbering", "t.csv", "case"}
 
 
 def cells(rows: list[dict]) -> dict[str, dict[str, str]]:

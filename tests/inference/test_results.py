@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import resource
 import shutil
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -25,6 +24,7 @@ from phydict.datasets import load_xrays
 from phydict.grid import Grid
 from phydict.methods import reconstruct
 from phydict.reconstruction import save_nifti
+from phydict.runtime.files import machine
 from phydict.xray import ConeBeam
 
 
@@ -82,7 +82,7 @@ def test_a_partial_folder_is_never_a_finished_case(measured, scored, tmp_path):
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
     for process in (gone.pid, os.getpid()):  # killed while it wrote, and writing now
-        partial = tmp_path / "sirt" / f".anna.{socket.gethostname()}.{process}.partial"
+        partial = tmp_path / "sirt" / f".anna.{machine()}.{process}.partial"
         partial.mkdir(parents=True)
         for name in ("volume.nii.gz", "coarse.nii.gz"):
             (partial / name).write_bytes(b"half")

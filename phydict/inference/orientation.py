@@ -200,7 +200,8 @@ def _moved(compared: Comparison) -> list[str]:
         return []
     return [f"all views agree better with a standard thorax when moved alike, along the columns by about {shift:+.0f} "
             f"mm (mean agreement {alike:.3f}, as stated {stated:.3f}): check whether detector_shift is missing or has "
-            f"the wrong sign; its columns are {now:+.0f} mm as stated, and about {now + shift:+.0f} mm would fit"]
+            f"the wrong sign; its columns are {round(now):+} mm as stated, and about {round(now + shift):+} mm would "
+            "fit"]
 
 
 def common_shift(compared: Comparison) -> tuple[float, float]:
@@ -220,7 +221,8 @@ def common_shift(compared: Comparison) -> tuple[float, float]:
 def flip_doubts(compared: Comparison) -> list[str]:
     """Sentences on flipped views, the sense of the angles and a mirrored patient."""
     named = _flipped_views(compared)
-    doubts = [f"view {named[flip]} agrees better with a standard thorax when {how}: row 0 is superior, change {flip}"
+    doubts = [f"view {named[flip]} agrees better with a standard thorax when {how}: row 0 is superior, "
+              f"{_change(compared, flip)}"
               for flip, how in (("flip_rows", "upside down"), ("flip_rows and flip_columns", "turned by 180 degrees"))
               if flip in named]
     doubts += _mirrored_views(compared, named.get("flip_columns"))
@@ -236,12 +238,28 @@ def _flipped_views(compared: Comparison) -> dict[str, str]:
         compared.looks([flip, "sense"] if flip == "flip_columns" else [flip], where))}
 
 
+def _of_single_views(compared: Comparison, ways: Collection[str]) -> bool:
+    """Whether all views together agree better as stated than changed in any of these ways."""
+    return bool(compared.stated("as it is").mean() >= max(compared.stated(way).mean() for way in ways))
+
+
+def _change(compared: Comparison, flip: str) -> str:
+    """How to flip the named views: by `orientation:` or, where the other views are right as stated, one by one."""
+    if not _of_single_views(compared, [flip]):
+        return f"change {flip}"
+    return f"flip {flip.replace('flip_', '')} in the image of each such view, as `orientation:` turns all views alike"
+
+
 def _mirrored_views(compared: Comparison, views: str | None) -> list[str]:
     """A sentence where these views agree better mirrored, or all of them in the other sense of the angles."""
     stated, flipped, turned = (compared.stated(name).mean() for name in ("as it is", "flip_columns", "sense"))
     opposite = turned > max(stated + CLEAR["flip_columns"], LEAST) and compared.looks(["sense"])
     if views is None and not opposite:
         return []
+    if not opposite and _of_single_views(compared, ["flip_columns", "sense"]):
+        return [f"view {views} agrees better with a standard thorax when mirrored, the others as stated: "
+                f"{_change(compared, 'flip_columns')}; or else put the source of each such view on the other side, for "
+                "a left lateral (LL) view the patient's right, 270 degrees of an orbit"]
     columns = f"change flip_columns (mean agreement of all views {flipped:.3f})"
     sense = (f"negate the angles, which seem to run in the other sense ({turned:.3f}), or put a single view's source "
              "on the other side, for a left lateral (LL) view the patient's right, 270 degrees of an orbit")

@@ -453,6 +453,12 @@ def test_integer_images_need_a_stated_intensity(tmp_path):
     fails("hold uint8 pixels and .* has no `intensity:`", write(tmp_path, np.ones((2, *SHAPE), np.uint8), "png"))
 
 
+def test_a_geometry_of_another_program_that_can_state_no_intensity_is_told_to_go_into_a_yaml(tmp_path):
+    folder, other = write(tmp_path / "case", images().astype(np.uint8), "png"), tmp_path / "beam.csv"
+    write_beam(other, load_xrays(folder, intensity=Intensity("line_integrals"))["beam"])
+    fails(r"in a YAML with `beam: \{file: beam.csv\}`", folder, geometry=other)
+
+
 def test_a_report_in_another_encoding_is_named(tmp_path):
     (write(tmp_path, images()) / "report.txt").write_bytes("Röntgen".encode("latin-1"))
     fails("report.txt is not UTF-8 text", tmp_path)

@@ -80,6 +80,15 @@ def test_the_sense_of_the_angles_and_flipped_columns_are_told_apart(xrays):
         assert min(causes, key=causes.__getitem__) == first, said
 
 
+@pytest.mark.parametrize("axes, words", [((1,), "flip rows in the image"), ((2,), "flip columns in the image"),
+                                         ((1, 2), "flip rows and columns in the image")])
+def test_one_flipped_view_is_to_be_mended_alone(axes, words):
+    stored = views(C_ARM)
+    stored[1] = stored[1].flip([axis - 1 for axis in axes])
+    (said,) = orientation_doubts(stored, C_ARM, GRID)
+    assert said.startswith("view 1 ") and words in said and "change flip" not in said and "negate" not in said
+
+
 def test_a_patient_mirrored_by_two_mistakes_that_fit_each_other_is_noticed(xrays):
     (said,) = orientation_doubts(xrays.flip(2), in_other_sense(BEAM, GRID), GRID)
     assert "the patient looks mirrored" in said

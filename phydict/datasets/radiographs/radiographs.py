@@ -232,8 +232,10 @@ def _assumed(views: _Views, folder: Path, source: Path) -> Intensity:
     """What images without a word about their intensity are taken for."""
     kind = views.images[0].dtype
     if np.issubdtype(kind, np.integer):
-        raise ValueError(f"the images of {folder} hold {kind} pixels and {source} has no `intensity:`; say what they "
-                         f"mean: kind {', '.join(KINDS)}")
+        where = "there" if source.suffix.lower() in (".yaml", ".yml") else (
+            f"in a YAML with `beam: {{file: {source.name}}}`, given in its place,")
+        raise ValueError(f"the images of {folder} hold {kind} pixels and {source} has no `intensity:`; say {where} "
+                         f"what they mean: kind {', '.join(KINDS)}")
     return Intensity("line_integrals")
 
 

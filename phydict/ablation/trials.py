@@ -137,11 +137,12 @@ class Trial:
         return self.data.protocol.grid if self.data.protocol else None
 
     def first(self) -> Grid:
-        """The grid of the method before it is refined: of its second stage, its own weights, its prior or the one that
-        it goes by; of a method without voxels of its own, by a protocol that has some, the protocol's."""
+        """The grid of the method before it is refined: of its second stage, its prior or the one that it goes by; where
+        it goes by none, or by a protocol that has voxels, of a rival's own weights, and else the protocol's."""
         if self.super_resolution:
             return stage_of(self.super_resolution).grid
-        if isinstance(self.method, Reconstructor) and (grid := self.own or self.fixed):
+        alone = isinstance(self.method, Reconstructor) and (self.fixed or not self.like)
+        if alone and (grid := self.own or self.fixed):
             return grid
         file = self.prior or self.like
         return prior_of(file).grid if file else DEFAULT_GRID

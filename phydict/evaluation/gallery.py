@@ -97,7 +97,8 @@ def panel(path: str | Path, reconstruction_hu, grid: Grid, xrays=None, reproject
     cells = [(row, column) for row in PLANES for column in columns]
     wide = len(columns) if len(columns) > 1 else len(PLANES)  # planes lie beside each other where they are alone
     across, down = CELL[0] + GAP, CELL[1] + HEADING
-    upper = TITLE + len(cells) // wide * down
+    top = TITLE if title else GAP
+    upper = top + len(cells) // wide * down
     width, shown = max(wide, len(PLANES)) * across + GAP, (0, 0)
     if xrays is not None:
         tall, broad = _array(xrays, 3, "a set of X-rays").shape[1:]
@@ -107,7 +108,7 @@ def panel(path: str | Path, reconstruction_hu, grid: Grid, xrays=None, reproject
     page, left = _Page(width, upper + rows * (shown[1] + HEADING) + GAP, title), (width - wide * across + GAP) // 2
     for n, (name, (label, volume, colours, limits)) in enumerate(cells):
         heading = f"{label}, {name}" if colours is GREY else label
-        page.plane(volume, grid, name, heading, (left + n % wide * across, TITLE + n // wide * down + HEADING), CELL,
+        page.plane(volume, grid, name, heading, (left + n % wide * across, top + n // wide * down + HEADING), CELL,
                    colours, limits)
     if xrays is not None:
         _show_xrays(page, upper, shown, xrays, reprojection)
@@ -128,7 +129,7 @@ def method_panel(path: str | Path, volumes: Mapping[str, object], truth_hu, grid
     if unknown := captions.keys() - volumes.keys():
         raise ValueError(f"captions name the methods {sorted(unknown)}, but the volumes are of {list(volumes)}")
     shown = ([] if truth_hu is None else [("truth", truth_hu)]) + list(volumes.items())
-    (wide, high), top = METHOD_CELL, TITLE + HEADING + LINE
+    (wide, high), top = METHOD_CELL, (TITLE if title else GAP) + HEADING + LINE
     page = _Page(max(len(shown), 2) * (wide + GAP) + GAP, top + 2 * (high + GAP), title)
     for column, (name, volume) in enumerate(shown):
         for row, which in enumerate(("coronal", "axial")):

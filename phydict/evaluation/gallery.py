@@ -102,7 +102,7 @@ def panel(path: str | Path, reconstruction_hu, grid: Grid, xrays=None, reproject
     width, shown = max(wide, len(PLANES)) * across + GAP, (0, 0)
     if xrays is not None:
         tall, broad = _array(xrays, 3, "a set of X-rays").shape[1:]
-        shown = _fitted(float(np.clip(pixel * tall / broad, 1 / STRETCH, STRETCH)),
+        shown = fitted(float(np.clip(pixel * tall / broad, 1 / STRETCH, STRETCH)),
                         (width - XRAY_LEFT - XRAY_RIGHT) // MOST_VIEWS - GAP, XRAY_HEIGHT)
     rows = 0 if xrays is None else 1 if reprojection is None else 3
     page, left = _Page(width, upper + rows * (shown[1] + HEADING) + GAP, title), (width - wide * across + GAP) // 2
@@ -176,7 +176,7 @@ class _Page:
         """Shows the plane `name` of a volume in the middle of a cell, under its heading; in grey, with letters of the
         patient's sides."""
         image, aspect = plane(volume, grid, name)
-        wide, high = _fitted(image.shape[0] * aspect / image.shape[1], *cell)
+        wide, high = fitted(image.shape[0] * aspect / image.shape[1], *cell)
         left, top = place[0] + (cell[0] - wide) // 2, place[1] + (cell[1] - high) // 2
         self.picture(image, (left, top), (wide, high), colours, limits)
         self.words(heading, (place[0] + cell[0] / 2, top - 4), cell[0], anchor="md")
@@ -205,8 +205,8 @@ def _font(size: int) -> ImageFont.FreeTypeFont:
     return ImageFont.truetype(FONT, size, layout_engine=ImageFont.Layout.BASIC)
 
 
-def _fitted(ratio: float, width: int, height: int) -> tuple[int, int]:
-    """The largest size of this height over width in a box."""
+def fitted(ratio: float, width: int, height: int) -> tuple[int, int]:
+    """The largest size (across, down) in pixels of this height over width in a box."""
     return max(round(min(width, height / ratio)), 1), max(round(min(height, width * ratio)), 1)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 from torch import Tensor
 
-from phydict.evaluation.gallery import DISPLAY, binned, plane
+from phydict.evaluation.gallery import DISPLAY, binned, fitted, plane
 from phydict.grid import Grid
 from phydict.runtime.files import atomic_write
 
@@ -91,8 +91,6 @@ def _write_thumbnail(path: Path, volume: Tensor | np.ndarray, grid: Grid) -> Non
     image, aspect = plane(volume, grid, "coronal")
     low, high = DISPLAY
     grey = np.nan_to_num((image - low) / (high - low)).clip(0, 1) * 255
-    height, width = image.shape[0] * aspect, image.shape[1]
-    scale = THUMBNAIL_SIDE / max(height, width)
-    size = (max(round(width * scale), 1), max(round(height * scale), 1))
+    size = fitted(image.shape[0] * aspect / image.shape[1], THUMBNAIL_SIDE, THUMBNAIL_SIDE)
     with atomic_write(path) as part:
         Image.fromarray(grey.astype(np.uint8)).resize(size, Image.Resampling.BILINEAR).save(part, format="png")

@@ -469,6 +469,13 @@ def test_a_folder_in_the_place_of_a_report_is_named(tmp_path):
     fails("report.txt is a folder", tmp_path, IsADirectoryError)
 
 
+@pytest.mark.parametrize("name", ["Report.txt", "report.md"])
+def test_a_report_under_another_name_is_told_to_be_unread(tmp_path, name):
+    (write(tmp_path, images()) / name).write_text("Findings: effusion.")
+    with pytest.warns(UserWarning, match=f"no report is used: {name} is not read; rename it to report.txt"):
+        assert load_xrays(tmp_path)["report"] == ""
+
+
 def test_mixed_pixel_types_are_refused(tmp_path):
     folder = write(tmp_path, np.ones((2, *SHAPE), np.uint8), "png")
     np.save(folder / "view_1.npy", images()[1])

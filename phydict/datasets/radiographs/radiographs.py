@@ -29,9 +29,12 @@ from phydict.datasets.reports import format_report
 from phydict.runtime.files import atomic_write
 from phydict.runtime.reading import name_of, naming, one_line, read_text
 from phydict.runtime.shipped import own_or_shipped
+from phydict.runtime.warning import warn
 from phydict.xray.geometry import ConeBeam
 
 REPORT = "report.txt"
+NEARLY_REPORT = REPORT, "report.md", "report"
+"""Names that a report is likely to have in place of its own, in lower case."""
 MOST_REPORT = 2**18
 """Bytes of the longest report, some 40,000 words."""
 SATURATED = 0.99
@@ -99,7 +102,7 @@ def load_xrays(folder: str | Path, geometry: str | Path | None = None, intensity
     with naming(folder):
         xrays = intensity.line_integrals(np.stack(views.images).astype(np.float64), views.full_scale, flat_and_dark)
     _check_saturation(views.names, xrays)
-    case: Case = {"id": name_of(folder.absolute()), "beam": beam, "report": _read_report(folder / REPORT),
+    case: Case = {"id": name_of(folder.absolute()), "beam": beam, "report": _read_report(folder),
             "xrays": torch.from_numpy(described.orientation.apply(xrays).astype(np.float32)),
             "display": intensity.kind == "display", "uncertain": described.uncertain_of(beam, views.tags),
             "description": described}
@@ -255,8 +258,13 @@ def _mean(paths: list[Path], view: np.ndarray) -> np.ndarray:
     return np.mean([image.astype(np.float64) for image in views.images], axis=0)
 
 
-def _read_report(path: Path) -> str:
+def _read_report(folder: Path) -> str:
+    path = folder / REPORT
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a folder, but a report is a text file of that name: rename the folder, or "
                                 "put the text in its place")
-    return format_report(read_text(path, MOST_REPORT)) if path.is_file() else ""
+    if path.is_file():
+        return format_report(read_text(path, MOST_REPORT))
+    if alike := sorted(file.name for file in folder.iterdir() if file.name.lower() in NEARLY_REPORT and file.is_file()):
+        warn(f"{folder} has no {REPORT}, so that no report is used: {alike[0]} is not read; rename it to {REPORT}")
+    return ""

@@ -293,6 +293,7 @@ def test_the_recipe_prints_counts_and_fails_in_one_sentence(tmp_path, thorax, ca
 @pytest.mark.parametrize("text, sentence", [
     ("VolumeName,Findings_EN\na,b\n", "lacks the columns Impressions_EN"),
     ("", "lacks the columns VolumeName, Findings_EN, Impressions_EN"),
+    ("VolumeName;Findings_EN;Impressions_EN\na;b;c\n", "VolumeName, Findings_EN, Impressions_EN, separated by commas"),
     ("VolumeName,Findings_EN,Impressions_EN\na.nii.gz,x,\nb,x,\na.nii.gz,y,\n", "a has two rows, the second in row 4"),
     ("VolumeName,Findings_EN,Impressions_EN\n,x,y\n", "row 2 of .* has no VolumeName"),
     ("VolumeName,Findings_EN,Impressions_EN\na,caf\xe9,\n", "cannot be read .* save it as CSV in UTF-8")])

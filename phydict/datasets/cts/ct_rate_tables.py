@@ -87,8 +87,9 @@ def _table(file: Path, columns: tuple[str, ...]) -> list[dict[str, str]]:
         try:
             header = table.fieldnames or ()
             if missing := [name for name in columns if name not in header]:
+                between = ", separated by commas" if len(header) == 1 else ""
                 raise Unreadable(f"{file} lacks the columns {', '.join(missing)}; CT-RATE's tables have "
-                                 f"{', '.join(columns)}")
+                                 f"{', '.join(columns)}{between}")
             for row in table:
                 if any(row.pop(None, ())):
                     raise Unreadable(f"row {len(rows) + 2} of {file} has more fields than its header: quote texts that "

@@ -83,6 +83,12 @@ def test_the_tables_of_how_far_to_trust_it_are_those_of_their_csvs():
     assert trust["filled"](page.read_text()) == page.read_text(), "run python tests/benchmark/trust.py"
 
 
+@pytest.mark.parametrize("page", ["TRUST.md", "tests/benchmark/hard_cases.md"])
+def test_what_stands_of_the_whole_volume_stands_of_the_body_too(page):
+    heads = [line for line in (ROOT / page).read_text().splitlines() if line.startswith("|") and "PSNR" in line]
+    assert heads and all("PSNR body" in head for head in heads)
+
+
 def test_the_citation_and_the_changelog_are_of_this_version():
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == phydict.__version__
     versions = re.findall(r"^## ([\d.]+)$", (ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)

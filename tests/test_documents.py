@@ -70,6 +70,11 @@ def test_the_readmes_results_are_those_of_their_tables():
              for views in (2, 4, 8)] for name in ("phydict_learned", "tv, weight for 3 mm")]
     ours, tv = (" / ".join(f"{psnr:.2f}" for psnr in of) for of in fine)
     assert f"K = 2 / 4 / 8: {ours} dB**, tv at twice its weight {tv}." in " ".join(README.split())
+    paper = [row for row in read_csv(ROOT / "tests" / "benchmark" / "table1" / "results.csv")
+             if row["simulator"] == "ideal"]
+    told = ", ".join(f"{said} {mean_psnr(paper, name, 8):.2f}" for name, said in {
+        "phydict_learned": "phydict_learned", "DAPS": "DAPS", "X2CT": "X2CT", "Ours": "the paper's method"}.items())
+    assert f"from eight views: {told} dB;" in " ".join(README.split())
 
 
 def mean_psnr(rows: list[dict], name: str, views: int) -> float:
@@ -81,6 +86,12 @@ def test_the_tables_of_how_far_to_trust_it_are_those_of_their_csvs():
     trust = runpy.run_path(str(ROOT / "tests" / "benchmark" / "trust.py"))
     assert all(f"<!-- {name} -->\n| " in page.read_text() for name in trust["TABLES"])
     assert trust["filled"](page.read_text()) == page.read_text(), "run python tests/benchmark/trust.py"
+
+
+@pytest.mark.parametrize("page", ["TRUST.md", "tests/benchmark/hard_cases.md"])
+def test_what_stands_of_the_whole_volume_stands_of_the_body_too(page):
+    heads = [line for line in (ROOT / page).read_text().splitlines() if line.startswith("|") and "PSNR" in line]
+    assert heads and all("PSNR body" in head for head in heads)
 
 
 def test_the_citation_and_the_changelog_are_of_this_version():

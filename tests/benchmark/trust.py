@@ -87,8 +87,10 @@ def geometries() -> str:
 
 
 def poses() -> str:
-    columns = ("psnr_correct", "psnr_wrong", "psnr_calibrated", "reprojection_mm_before", "reprojection_mm")
-    return table("errors | K | CTs | right geometry | wrong | calibrated | mm before | mm after", (
+    columns = (*(f"psnr{part}_{of}" for part in ("", "_body") for of in ("correct", "wrong", "calibrated")),
+               "reprojection_mm_before", "reprojection_mm")
+    return table("errors | K | CTs | PSNR: right geometry | wrong | calibrated | PSNR body: right geometry | wrong | "
+                 "calibrated | mm before | mm after", (
         (kind, int(views), len(own), *(f"{mean(values(own, column)):.1f}" for column in columns))
         for (kind, views), own in scenes(rows_of("poses.csv", method="phydict_learned"), "errors", "views")))
 
@@ -108,15 +110,17 @@ def noticed() -> str:
         row = rows[case]
         said = str(row.get("said") or "")
         numbers = [f"{scale * float(row[name]):.{digits}f}" if row.get(name) not in (None, "") else ""
-                   for name, scale, digits in (("psnr", 1, 1), ("misfit", 1, 4), ("inside_90", 100, 0))]
+                   for name, scale, digits in (
+                       ("psnr", 1, 1), ("psnr_body", 1, 1), ("misfit", 1, 4), ("inside_90", 100, 0))]
         lines.append((case, *numbers, "refused" if said.startswith("refused") else "yes" if said else "no"))
-    return table("case | PSNR (dB) | misfit | body: inside 90 % | noticed", lines)
+    return table("case | PSNR (dB) | PSNR body | misfit | body: inside 90 % | noticed", lines)
 
 
 def reports() -> str:
     rows = rows_of("text.csv", prior="refiner_64")
-    return table("K | report | error (HU) | whole volume: PSNR (dB)", (
-        (int(views), case, f"{mean(values(own, 'region_mae_hu')):.0f}", f"{mean(values(own, 'psnr')):.2f}")
+    return table("K | report | error (HU) | whole volume: PSNR (dB) | PSNR body", (
+        (int(views), case, f"{mean(values(own, 'region_mae_hu')):.0f}",
+         *(f"{mean(values(own, column)):.2f}" for column in ("psnr", "psnr_body")))
         for (views, case), own in scenes(rows, "views", "method")))
 
 

@@ -1,5 +1,6 @@
 """Refinement on finer voxels: what it keeps, what it gains, and regions of interest."""
 
+import os
 import warnings
 from dataclasses import replace
 
@@ -16,7 +17,7 @@ from phydict.methods import onto_grid, reconstruct, reconstructor
 from phydict.posterior import Measurement, Posterior, PriorOnly, ProximalCG, Refined, Refinement, Unrolled
 from phydict.prior import CorrectionNetwork
 from phydict.prior.uncertainty import LEVELS
-from phydict.runtime.reading import check_memory
+from phydict.runtime.reading import check_memory, free_memory
 from phydict.units import HUWindow, hu_to_mu
 from phydict.xray import ConeBeam, Projector
 from phydict.xray.calibration import without_hardening
@@ -421,3 +422,37 @@ def test_a_container_has_the_memory_that_it_may_use(tmp_path, monkeypatch, limit
     check_memory(2**30 - 1, "it", "take less")
     with pytest.raises(ValueError, match=f"3.0 GiB of memory, but this machine has {has}; take less"):
         check_memory(3 * 2**30, "it", "take less")
+
+
+def meminfo(folder, monkeypatch, gib: float) -> None:
+    """The system says that so much memory is free, and that this process holds 1 GiB."""
+    (folder / "meminfo").write_text(f"MemTotal: 8388608 kB\nMemAvailable: {gib * 2**20:.0f} kB\nSwapFree: 1024 kB\n")
+    (folder / "statm").write_text(f"1 {2**30 // os.sysconf('SC_PAGE_SIZE')} 0\n")
+    for name in ("MEMINFO", "STATM"):
+        monkeypatch.setattr(f"phydict.runtime.reading.{name}", folder / name.lower())
+
+
+def test_voxels_for_which_other_programs_leave_too_little_memory_are_refused_before_work_starts(
+        xrays, tmp_path, monkeypatch):
+    steps, way = [], {"prior": tiny_prior(False), "method": PriorOnly(2), "grid": Grid.cube(32)}
+    meminfo(tmp_path, monkeypatch, 0.1)
+    with pytest.raises(ValueError, match=r"32 x 32 x 32 voxels.* would take 1\.2 GiB of memory, but of the [\d.]+ that "
+                       r"this machine has other programs leave 1\.1 at present; end some of them, or give fewer"):
+        reconstruct(xrays, BEAM, **way, on_step=lambda: steps.append(1))
+    assert not steps
+    meminfo(tmp_path, monkeypatch, 0.5)
+    reconstruct(xrays, BEAM, **way)
+
+
+@pytest.mark.parametrize("limit, usage, files", [("memory.max", "memory.current", "inactive_file"),
+                                                 ("memory.limit_in_bytes", "memory.usage_in_bytes",
+                                                  "total_inactive_file")])
+def test_of_a_containers_memory_what_it_uses_is_not_free_but_files_that_give_way(
+        tmp_path, monkeypatch, limit, usage, files):
+    meminfo(tmp_path, monkeypatch, 6.0)
+    monkeypatch.setattr("phydict.runtime.reading.CONTROL_GROUPS", (tmp_path / limit,))
+    for name, text in ((limit, 4 * 2**30), (usage, 3 * 2**30), ("memory.stat", f"anon 5\n{files} {2**29}")):
+        (tmp_path / name).write_text(f"{text}\n")
+    assert free_memory() == 2**30 + 2**29 + 2**30
+    (tmp_path / usage).unlink()
+    assert free_memory() is None

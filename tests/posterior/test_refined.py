@@ -1,6 +1,7 @@
 """Refinement on finer voxels: what it keeps, what it gains, and regions of interest."""
 
 import os
+import re
 import warnings
 from dataclasses import replace
 
@@ -402,6 +403,18 @@ def test_the_attenuation_of_water_reaches_every_level(xrays):
     usual = reconstruct(xrays, BEAM, **way).volume
     told, untold = (reconstruct(0.8 * xrays, BEAM, **way, **more).volume for more in ({"mu_water": 0.016}, {}))
     assert error(told, usual) < 0.2 * error(untold, usual)
+
+
+@pytest.mark.parametrize("height, words", [(480.0, "384 x 384 x 384 mm alone.* deviation is 0"), (384.0, "")])
+def test_a_deviation_that_ends_with_the_priors_box_is_told_of(xrays, height, words):
+    target = Grid.box(32, (384.0, 384.0, height))
+    ready = Refined(reconstructor(PriorOnly(2), tiny_prior(False), samples=2), target)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        result = ready.reconstruct(*fit_to_grid(ready, target, xrays, BEAM))
+    told = " ".join(str(warning.message) for warning in said)
+    assert bool(result.deviation[0, 0, 0] == 0) == ("deviation is 0" in told) == bool(words)
+    assert re.search(words, told)
 
 
 @pytest.mark.parametrize("method", [PriorOnly(2), SIRT(2)], ids=["prior", "sirt"])

@@ -170,6 +170,10 @@ class Grid:
         return {"shape": list(self.shape), "affine": self.affine.tolist()}
 
 
+LONGEST = 48.0
+"""Millimetres of the longest voxels on which something of a chest can be seen."""
+
+
 @dataclass(frozen=True)
 class Box:
     """A box of voxels: a whole chest, or a region of interest.
@@ -190,7 +194,12 @@ class Box:
         """Its voxels. Raises ValueError for what cannot be."""
         if self.voxels is None:
             raise ValueError("model.grid needs the number of voxels: give model.grid.voxels, such as 128")
-        return Grid.box(self.voxels, self.side, self.centre)
+        grid = Grid.box(self.voxels, self.side, self.centre)
+        if max(grid.spacing) > LONGEST:
+            raise ValueError(f"the {' x '.join(map(str, grid.shape))} voxels of a box are up to {max(grid.spacing):g} "
+                             f"mm long, but longer ones than {LONGEST:g} mm show nothing of a chest: give more voxels, "
+                             "such as 64, or a shorter side")
+        return grid
 
 
 @dataclass(frozen=True)

@@ -252,7 +252,7 @@ def onto_grid(method: Reconstructor, grid: Grid | None, refinement: Refinement =
         method = Refined(covering(method, grid), grid, refinement, tuple(map(load_correction, files)))
     elif isinstance(method, Baseline) and not covers(grid, outer := DEFAULT_GRID.turned_as(grid)):
         method = Region(method, grid, outer)
-    method.check_voxels(grid)
+    method.check_voxels(grid, now=True)
     return method
 
 

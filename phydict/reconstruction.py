@@ -187,11 +187,12 @@ class Reconstructor(ABC):
         it is bound to those it has."""
         return self if self.grid is None else None
 
-    def check_voxels(self, grid: Grid) -> None:
-        """Raises TooLittleMemory where a reconstruction on a grid's voxels takes more memory than there is."""
+    def check_voxels(self, grid: Grid, now: bool = False) -> None:
+        """Raises TooLittleMemory where a reconstruction on a grid's voxels takes more memory than there is; now: than
+        is free."""
         check_memory(PROCESS + 4 * self.volumes * math.prod(grid.shape), f"a reconstruction on "
                      f"{' x '.join(map(str, grid.shape))} voxels, {self.volumes} volumes of them at once,",
-                     "give fewer voxels, or a smaller box of them")
+                     "give fewer voxels, or a smaller box of them", now)
 
     def has_memory_for(self, grid: Grid) -> bool:
         """Whether there is memory for a reconstruction on a grid's voxels."""

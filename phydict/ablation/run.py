@@ -94,7 +94,7 @@ def run(results: Results, cases: dict[str, Work], device: torch.device, progress
                 groups.setdefault(trial.acquisition(), []).append((trial, name, make))
         for group in groups.values():
             first, _, make = group[0]
-            scene = _attempt(lambda: MeasuredCase(case, first, _made(case, first, make, made), device))
+            scene = _attempt(lambda: MeasuredCase(case, first, _made(case, first, make, made), runner))
             for trial, name, _ in group:
                 progress.case(f"{case}: {trial.label}")
                 measured = scene if isinstance(scene, dict) else runner.measure(trial, scene, name)
@@ -119,14 +119,15 @@ def _made(case: str, trial: Trial, make: Callable[[], Case], kept: dict[str, Cas
 class MeasuredCase:
     """One case under one acquisition: X-rays for all methods, and the truth, which no method is shown."""
 
-    def __init__(self, case: str, trial: Trial, made: Case, device: torch.device):
+    def __init__(self, case: str, trial: Trial, made: Case, runner: Runner):
         self.case = case
         (grid, self.window), data = trial.scene(), trial.data
         self.beam, self.mu_water = data.beam, data.simulator.effective_mu_water
         self.warnings = list(made["warnings"])
-        with noted(self.warnings, case):
-            self.xrays = data.simulate(made, case_seed(trial.seed, case), grid, self.window, device)
         self.truth, self.grid = trial.voxels.as_scored(made, self.window), trial.voxels.scored
+        runner.scoring.prepare(self.truth, self.grid)
+        with noted(self.warnings, case):
+            self.xrays = data.simulate(made, case_seed(trial.seed, case), grid, self.window, runner.device)
 
     def report(self, trial: Trial) -> str:
         """The report, where the trial uses it and its prior reads text."""

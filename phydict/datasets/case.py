@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TypedDict, cast
 
+import numpy as np
 from torch import Tensor
 
 from phydict.datasets.cts.reading import Calibration
@@ -42,6 +43,7 @@ class Case(TypedDict, total=False):
     ct_report: str  # the report, where `report` is what is used of it
     features: dict[str, Tensor]  # of the volume's slices
     clip_latent: Tensor  # of the volume
+    segmented: dict[str, np.ndarray]  # organs beside the CT, (X, Y, Z) bool on `fine_grid`
 
 
 def lacking(case: Case, *keys: str) -> Case:

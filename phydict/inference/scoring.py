@@ -127,6 +127,12 @@ class Scoring:
         return {"clip_t2i": "CXR-BERT was not given (clip.text)" if self.clip.text_transformer is None else
                 "no case has a report"}
 
+    def prepare(self, case: Case, grid: Grid) -> None:
+        """Reads what the metrics need beside a case's CT, of a case that is scored on `grid`, so that what does not fit
+        is refused before it is reconstructed. Raises ValueError as `organs_beside`."""
+        if "organs" in self.metrics:
+            case["segmented"] = segmented(case, grid)
+
     def measured(self, result: Reconstruction, case: Case, grid: Grid, window: HUWindow, device: torch.device,
                  protocol: Protocol | None) -> tuple[dict[str, float], dict[str, Tensor] | None]:
         """The `scores` of a result, on whatever voxels, of a CT case on `grid`, and its `features`."""
@@ -146,7 +152,7 @@ class Scoring:
         if "lpips" in self.metrics:
             scores |= lpips_scores(volume, truth, device, scored)
         if "organs" in self.metrics:
-            scores |= organ_scores(volume, truth, grid, segmented(case, grid))
+            scores |= organ_scores(volume, truth, grid, case["segmented"])
         if "sharpness" in self.metrics and bool(case["has_masks"][0]):
             scores |= sharpness_scores(volume, truth, case["masks"][0].cpu(), grid)
         if self.clip:

@@ -209,6 +209,8 @@ class ReconstructionTask(lightning.LightningModule):
             case["xrays"] = data.simulate(case, seed, grid, window, self.device)
         case["mu_water"] = data.simulator.effective_mu_water
         case, grid = self.voxels.as_scored(case, window), self.voxels.scored
+        with stage("metrics"):
+            self.scoring.prepare(case, grid)
         result = self._reconstruct(case, seed)
         with stage("metrics"):
             scores, features = self.scoring.measured(result, case, grid, window, self.device, data.protocol)

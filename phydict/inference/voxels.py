@@ -58,7 +58,7 @@ class Voxels:
         """A CT case, which is on the voxels `made`, on those that are scored."""
         if self.scored.same_as(self.made):
             return case
-        return lacking(case, "features", "clip_latent") | cut_out(case, self.made, self.scored, window)
+        return lacking(case, "features", "clip_latent", "segmented") | cut_out(case, self.made, self.scored, window)
 
 
 def resampled(volume: Tensor, grid: Grid, onto: Grid) -> Tensor:

@@ -164,6 +164,10 @@ class Refined(Delegating):
                  f"{after:.2g}), though the coarse one does: trust that one, and look at what the networks that refine "
                  "have learnt")
         deviation, volume = coarse.deviation, volume.cpu()
+        if deviation is not None and not covers(base.grid, self.target):
+            drawn = " x ".join(f"{side:g}" for side in base.grid.extent)
+            warn(f"samples are drawn on the prior's {drawn} mm alone: beyond these their deviation is 0, which says "
+                 "nothing", Remark)
         intervals = self._intervals(coarse, volume, known)
         if coarse.carried:
             volume = volume + coarse.carried.on(grid)

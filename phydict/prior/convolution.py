@@ -2,7 +2,8 @@
 Swish in one pass over memory for MONAI's three.
 
 For float32 batches of one, torch sends a convolution whose input has few channels times slices times rows to
-`slow_conv3d`, forward and backward, which takes two to four times as long as oneDNN's.
+`slow_conv3d`, forward and backward, which takes two to four times as long as oneDNN's. In bfloat16 oneDNN is wrong, by
+more than half and otherwise each time, where a stride leaves a single voxel along the last axis.
 """
 
 from __future__ import annotations
@@ -13,14 +14,26 @@ from torch import Tensor, nn
 SLOW_UP_TO = 20480
 """Channels times slices times rows of a single float32 input up to which torch does not ask oneDNN."""
 
+THIN = 2
+"""Voxels along an axis of an input up to which bfloat16 gives way to float32 on a CPU."""
+
 
 class FastConv3d(nn.Conv3d):
-    """nn.Conv3d, with the same weights, names and results, by oneDNN where that is faster."""
+    """nn.Conv3d, with the same weights, names and results, by oneDNN where that is faster, and right on thin slabs."""
 
     def _conv_forward(self, x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
+        if self._taken_wrongly(x):
+            with torch.autocast("cpu", enabled=False):
+                exact = (None if values is None else values.float() for values in (x, weight, bias))
+                return self._conv_forward(*exact).bfloat16()  # type: ignore[arg-type]
         if not self._taken_slowly(x, weight):
             return super()._conv_forward(x, weight, bias)
         return _OneDNN.apply(x, weight, bias, self.stride, self.padding, self.dilation)
+
+    @staticmethod
+    def _taken_wrongly(x: Tensor) -> bool:
+        autocast = torch.is_autocast_enabled("cpu") and torch.get_autocast_dtype("cpu") == torch.bfloat16
+        return x.device.type == "cpu" and min(x.shape[2:]) <= THIN and (autocast or x.dtype == torch.bfloat16)
 
     def _taken_slowly(self, x: Tensor, weight: Tensor) -> bool:
         return (x.device.type == "cpu" and x.dtype == weight.dtype == torch.float32 and len(x) == 1 and self.groups == 1

@@ -21,6 +21,12 @@ MOST_SQUEEZED = 1100
 CONTROL_GROUPS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
 """Where Linux says how much memory a container has, as a number of bytes or "max"."""
 
+USAGE = {"memory.max": "memory.current", "memory.limit_in_bytes": "memory.usage_in_bytes"}
+"""What of it is in use, by the file of the limit beside it."""
+
+MEMINFO, STATM = Path("/proc/meminfo"), Path("/proc/self/statm")
+"""Where Linux says how much memory is free, and how much of it this process holds."""
+
 MAX_MESSAGE = 800
 """Characters of a sentence about what cannot be read; it may quote a file."""
 
@@ -148,13 +154,32 @@ class TooLittleMemory(ValueError):
     """This machine has too little memory; a larger one could do it."""
 
 
-def check_memory(needed: int, what: str, advice: str) -> None:
+def check_memory(needed: int, what: str, advice: str, now: bool = False) -> None:
     """Raises TooLittleMemory, with both numbers, where `what` takes more bytes than this machine, or the container
-    that this runs in, has memory."""
+    that this runs in, has memory; now: or, beside what this process holds, has free at present."""
     there = min([os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"), *container_limits()])
+    takes = f"{what} would take {needed / 2**30:,.1f} GiB of memory, but"
     if needed > there:
-        raise TooLittleMemory(f"{what} would take {needed / 2**30:,.1f} GiB of memory, but this machine has "
-                              f"{there / 2**30:,.1f}; {advice}")
+        raise TooLittleMemory(f"{takes} this machine has {there / 2**30:,.1f}; {advice}")
+    if now and (free := free_memory()) is not None and needed > free:
+        raise TooLittleMemory(f"{takes} of the {there / 2**30:,.1f} that this machine has other programs leave "
+                              f"{free / 2**30:,.1f} at present; end some of them, or {advice}")
+
+
+def free_memory() -> int | None:
+    """Bytes of memory and swap that are free or that this process holds, in a container of what it may use; None where
+    the system does not say."""
+    try:
+        kilobytes = dict(line.split()[:2] for line in MEMINFO.read_text().splitlines())
+        own = int(STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        free = [1024 * (int(kilobytes["MemAvailable:"]) + int(kilobytes.get("SwapFree:", 0)))]
+        for path, limit in _container_limits():
+            stat = dict(line.split() for line in path.with_name("memory.stat").read_text().splitlines())
+            files = int(stat.get("total_inactive_file", stat.get("inactive_file", 0)))  # which give way
+            free.append(limit - int(path.with_name(USAGE[path.name]).read_text()) + files)
+    except (OSError, KeyError, ValueError):
+        return None
+    return min(free) + own
 
 
 @contextmanager
@@ -172,5 +197,9 @@ def enough_memory() -> Iterator[None]:
 
 def container_limits() -> list[int]:
     """Bytes of memory that control groups of either version allow, where they say so."""
-    texts = [path.read_text().strip() for path in CONTROL_GROUPS if os.access(path, os.R_OK)]
-    return [int(text) for text in texts if text.isdigit()]
+    return [limit for _, limit in _container_limits()]
+
+
+def _container_limits() -> list[tuple[Path, int]]:
+    texts = [(path, path.read_text().strip()) for path in CONTROL_GROUPS if os.access(path, os.R_OK)]
+    return [(path, int(text)) for path, text in texts if text.isdigit()]

@@ -11,7 +11,7 @@ from command_lines import refusal
 from evaluation.tiny_ct_clip import tiny
 from torch.nn import Identity
 
-from inference.runs import ORBIT, phantoms, record, sirt
+from inference.runs import ORBIT, phantoms, record, sirt, write_ct
 from phydict.baselines import SIRT
 from phydict.cli.infer import main
 from phydict.datasets import CTSource
@@ -246,6 +246,22 @@ def test_masks_beside_a_ct_that_lie_elsewhere_are_refused_as_where_cts_are_prepa
         nibabel.save(nibabel.Nifti1Image(lung[:other.shape[0]], other.affine), tmp_path / "anna_lungmask.nii.gz")
         with pytest.raises(ValueError, match="anna_lungmask.nii.gz does not lie on its CT's voxels"):
             organs_beside(tmp_path / "anna.nii.gz", grid)
+
+
+def test_masks_beside_a_ct_that_lie_elsewhere_are_refused_before_it_is_reconstructed(tmp_path, monkeypatch, capsys):
+    ct = write_ct(tmp_path / "cts" / "anna.nii.gz", 0)
+    nibabel.save(nibabel.Nifti1Image(np.ones((12, 12, 12), np.uint8), np.eye(4)), ct.with_name("anna_lungmask.nii.gz"))
+    monkeypatch.setattr(SIRT, "solve", lambda *_: pytest.fail("it is reconstructed"))
+    said = refusal(capsys, main, sirt("test", tmp_path / "out", f"--data.cts={ct.parent}", *ORBIT, "--model.grid=16",
+                                      "--metrics=[organs]"))
+    assert "anna_lungmask.nii.gz does not lie on its CT's voxels" in said
+    (tmp_path / "spec.yaml").write_text(yaml.safe_dump({
+        "cts": str(ct.parent), "metrics": ["organs"], "base": {"voxels": 16, "detector": 24, "views": 3},
+        "axes": {"method": ["sirt"]}}))
+    refusal(capsys, main, ["ablate", "-c", str(tmp_path / "spec.yaml"), "--out", str(tmp_path / "rows"),
+                           "--device", "cpu"])
+    [row] = read_csv(tmp_path / "rows" / "results.csv")
+    assert "anna_lungmask.nii.gz does not lie on its CT's voxels" in row["error"]
 
 
 def source_of(ct) -> str:

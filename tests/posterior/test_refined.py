@@ -1,5 +1,7 @@
 """Refinement on finer voxels: what it keeps, what it gains, and regions of interest."""
 
+import os
+import re
 import warnings
 from dataclasses import replace
 
@@ -16,7 +18,7 @@ from phydict.methods import onto_grid, reconstruct, reconstructor
 from phydict.posterior import Measurement, Posterior, PriorOnly, ProximalCG, Refined, Refinement, Unrolled
 from phydict.prior import CorrectionNetwork
 from phydict.prior.uncertainty import LEVELS
-from phydict.runtime.reading import check_memory
+from phydict.runtime.reading import check_memory, free_memory
 from phydict.units import HUWindow, hu_to_mu
 from phydict.xray import ConeBeam, Projector
 from phydict.xray.calibration import without_hardening
@@ -403,6 +405,18 @@ def test_the_attenuation_of_water_reaches_every_level(xrays):
     assert error(told, usual) < 0.2 * error(untold, usual)
 
 
+@pytest.mark.parametrize("height, words", [(480.0, "384 x 384 x 384 mm alone.* deviation is 0"), (384.0, "")])
+def test_a_deviation_that_ends_with_the_priors_box_is_told_of(xrays, height, words):
+    target = Grid.box(32, (384.0, 384.0, height))
+    ready = Refined(reconstructor(PriorOnly(2), tiny_prior(False), samples=2), target)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        result = ready.reconstruct(*fit_to_grid(ready, target, xrays, BEAM))
+    told = " ".join(str(warning.message) for warning in said)
+    assert bool(result.deviation[0, 0, 0] == 0) == ("deviation is 0" in told) == bool(words)
+    assert re.search(words, told)
+
+
 @pytest.mark.parametrize("method", [PriorOnly(2), SIRT(2)], ids=["prior", "sirt"])
 def test_more_voxels_than_memory_are_refused_with_their_gib_before_work_starts(xrays, monkeypatch, method):
     monkeypatch.setattr("os.sysconf", {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 2**18}.__getitem__)  # 1 GiB
@@ -421,3 +435,37 @@ def test_a_container_has_the_memory_that_it_may_use(tmp_path, monkeypatch, limit
     check_memory(2**30 - 1, "it", "take less")
     with pytest.raises(ValueError, match=f"3.0 GiB of memory, but this machine has {has}; take less"):
         check_memory(3 * 2**30, "it", "take less")
+
+
+def meminfo(folder, monkeypatch, gib: float) -> None:
+    """The system says that so much memory is free, and that this process holds 1 GiB."""
+    (folder / "meminfo").write_text(f"MemTotal: 8388608 kB\nMemAvailable: {gib * 2**20:.0f} kB\nSwapFree: 1024 kB\n")
+    (folder / "statm").write_text(f"1 {2**30 // os.sysconf('SC_PAGE_SIZE')} 0\n")
+    for name in ("MEMINFO", "STATM"):
+        monkeypatch.setattr(f"phydict.runtime.reading.{name}", folder / name.lower())
+
+
+def test_voxels_for_which_other_programs_leave_too_little_memory_are_refused_before_work_starts(
+        xrays, tmp_path, monkeypatch):
+    steps, way = [], {"prior": tiny_prior(False), "method": PriorOnly(2), "grid": Grid.cube(32)}
+    meminfo(tmp_path, monkeypatch, 0.1)
+    with pytest.raises(ValueError, match=r"32 x 32 x 32 voxels.* would take 1\.2 GiB of memory, but of the [\d.]+ that "
+                       r"this machine has other programs leave 1\.1 at present; end some of them, or give fewer"):
+        reconstruct(xrays, BEAM, **way, on_step=lambda: steps.append(1))
+    assert not steps
+    meminfo(tmp_path, monkeypatch, 0.5)
+    reconstruct(xrays, BEAM, **way)
+
+
+@pytest.mark.parametrize("limit, usage, files", [("memory.max", "memory.current", "inactive_file"),
+                                                 ("memory.limit_in_bytes", "memory.usage_in_bytes",
+                                                  "total_inactive_file")])
+def test_of_a_containers_memory_what_it_uses_is_not_free_but_files_that_give_way(
+        tmp_path, monkeypatch, limit, usage, files):
+    meminfo(tmp_path, monkeypatch, 6.0)
+    monkeypatch.setattr("phydict.runtime.reading.CONTROL_GROUPS", (tmp_path / limit,))
+    for name, text in ((limit, 4 * 2**30), (usage, 3 * 2**30), ("memory.stat", f"anon 5\n{files} {2**29}")):
+        (tmp_path / name).write_text(f"{text}\n")
+    assert free_memory() == 2**30 + 2**29 + 2**30
+    (tmp_path / usage).unlink()
+    assert free_memory() is None

@@ -41,6 +41,21 @@ def test_values_and_gradients_are_those_of_torch(settings, shape, layout):
         torch.testing.assert_close(value, expected, atol=2e-4, rtol=1e-4)
 
 
+@layouts
+@pytest.mark.parametrize("shape", [(6, 6, 1), (6, 6, 2), (6, 6, 3), (2, 6, 6), (1, 1, 1)], ids=str)
+def test_bfloat16_is_near_float32_on_thin_slabs_too(shape, layout):
+    plain, fast = both(dict(kernel_size=3, stride=2, padding=1), layout)
+    x = torch.randn(1, 8, *shape).contiguous(memory_format=layout)
+    with torch.no_grad():
+        expected = plain(x)
+        with torch.autocast("cpu", torch.bfloat16):
+            found = fast(x)
+        cast = fast.bfloat16()(x.bfloat16())
+    assert found.dtype == cast.dtype == torch.bfloat16
+    for values in (found, cast):
+        torch.testing.assert_close(values.float(), expected, atol=0.03, rtol=0.03)
+
+
 def test_a_frozen_network_and_frozen_inputs_get_the_gradients_they_need():
     plain, fast = both({"kernel_size": 3}, torch.contiguous_format)
     x = torch.randn(1, 8, 5, 5, 5)

@@ -39,10 +39,15 @@ def test_a_box_has_the_sides_and_the_centre_that_were_given(voxels, side, centre
     assert grid.shape == tuple(np.broadcast_to(voxels, 3))
 
 
+def test_a_box_of_one_slice_is_one_as_long_as_its_voxels_are_short():
+    assert Box((64, 64, 1), (192, 192, 3)).grid().shape == (64, 64, 1) and Box(8).grid().spacing == (48.0,) * 3
+
+
 @pytest.mark.parametrize("box, words", [
     (Box(), "give model.grid.voxels"), (Box((4, 4)), "whole number of voxels"), (Box(0), "whole number of voxels"),
     (Box(4, -1.0), "length in mm"), (Box(4, 10.0, (0, float("nan"), 0)), "three numbers in mm"),
-    (Box(100_000), "GiB of memory")])
+    (Box(100_000), "GiB of memory"), (Box(1), "384 mm long.* give more voxels"), (Box(7), "54.8571 mm long"),
+    (Box((64, 64, 1)), "384 mm long")])
 def test_a_box_that_cannot_be_is_refused(box, words):
     with pytest.raises(ValueError, match=words):
         box.grid()

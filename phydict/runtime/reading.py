@@ -175,8 +175,8 @@ def free_memory() -> int | None:
         free = [1024 * (int(kilobytes["MemAvailable:"]) + int(kilobytes.get("SwapFree:", 0)))]
         for path, limit in _container_limits():
             stat = dict(line.split() for line in path.with_name("memory.stat").read_text().splitlines())
-            files = int(stat.get("total_inactive_file", stat.get("inactive_file", 0)))  # which give way
-            free.append(limit - int(path.with_name(USAGE[path.name]).read_text()) + files)
+            files = sum(int(stat.get(f"total_{kind}", stat.get(kind, 0))) for kind in ("inactive_file", "active_file"))
+            free.append(limit - int(path.with_name(USAGE[path.name]).read_text()) + files)  # which give way
     except (OSError, KeyError, ValueError):
         return None
     return min(free) + own

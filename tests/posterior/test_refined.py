@@ -457,14 +457,15 @@ def test_voxels_for_which_other_programs_leave_too_little_memory_are_refused_bef
     reconstruct(xrays, BEAM, **way)
 
 
-@pytest.mark.parametrize("limit, usage, files", [("memory.max", "memory.current", "inactive_file"),
+@pytest.mark.parametrize("limit, usage, files", [("memory.max", "memory.current", "{}active_file"),
                                                  ("memory.limit_in_bytes", "memory.usage_in_bytes",
-                                                  "total_inactive_file")])
+                                                  "total_{}active_file")])
 def test_of_a_containers_memory_what_it_uses_is_not_free_but_files_that_give_way(
         tmp_path, monkeypatch, limit, usage, files):
     meminfo(tmp_path, monkeypatch, 6.0)
     monkeypatch.setattr("phydict.runtime.reading.CONTROL_GROUPS", (tmp_path / limit,))
-    for name, text in ((limit, 4 * 2**30), (usage, 3 * 2**30), ("memory.stat", f"anon 5\n{files} {2**29}")):
+    for name, text in ((limit, 4 * 2**30), (usage, 3 * 2**30),
+                       ("memory.stat", f"anon 5\n{files.format('in')} {2**28}\n{files.format('')} {2**28}")):
         (tmp_path / name).write_text(f"{text}\n")
     assert free_memory() == 2**30 + 2**29 + 2**30
     (tmp_path / usage).unlink()

@@ -81,6 +81,18 @@ def mean_psnr(rows: list[dict], name: str, views: int) -> float:
     return statistics.mean(float(row["psnr"]) for row in rows if row["method"] == name and int(row["views"]) == views)
 
 
+def test_the_table_of_other_couches_is_that_of_its_csv():
+    rows = read_csv(ROOT / "tests" / "benchmark" / "couches.csv")
+    page = (ROOT / "tests" / "benchmark" / "README.md").read_text()
+    section = page.partition("## Other couches")[2].partition("\n## ")[0]
+    shown = re.findall(r"^\| (.+?) \| (\d+) " + r"\| \**([\d.]+)\** " * 3 + r"\|", section, flags=re.MULTILINE)
+    assert {(name, int(views)) for name, views, *_ in shown} == {(row["method"], row["views"]) for row in rows}
+    for name, views, *cells in shown:
+        of = [row for row in rows if (row["method"], row["views"]) == (name, int(views))]
+        means = [statistics.mean(row[key] for row in of) for key in ("psnr", "ssim", "psnr_body")]
+        assert cells == [f"{mean:.{digits}f}" for mean, digits in zip(means, (2, 3, 2))], (name, views)
+
+
 def test_the_tables_of_how_far_to_trust_it_are_those_of_their_csvs():
     page = ROOT / "TRUST.md"
     trust = runpy.run_path(str(ROOT / "tests" / "benchmark" / "trust.py"))

@@ -3,6 +3,7 @@
 import re
 import runpy
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -89,11 +90,13 @@ def test_the_geometries_are_those_that_the_readmes_speak_of():
 @pytest.mark.filterwarnings("ignore")
 def test_the_walkthrough_prints_and_saves_pictures(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("sys.argv", ["walkthrough.py", str(tmp_path)])
+    few = replace(phydict.METHODS["sirt"], iterations=100)  # 0.7 dB worse than of 1,000
+    monkeypatch.setitem(phydict.METHODS, "sirt", few)
     runpy.run_path(str(EXAMPLE / "walkthrough.py"), run_name="__main__")
     said = capsys.readouterr().out
     assert "8 X-rays of 224 x 224 pixels" in said and "740 mm" in said
     errors = {name: float(psnr) for name, psnr in re.findall(r"^3\. (\w+): ([\d.]+) dB, misfit", said, re.MULTILINE)}
-    assert errors["phydict_learned"] > errors["sirt"] + 2
+    assert errors["phydict_learned"] > errors["sirt"] + 3
     assert re.search(r"the 90% interval holds (8[5-9]|9\d)% of the voxels", said)
     assert {f"{name}{ending}" for name in errors for ending in (".png", ".nii.gz")} | {"comparison.png"} == {
         file.name for file in tmp_path.iterdir()}

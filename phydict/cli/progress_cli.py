@@ -35,6 +35,9 @@ class ProgressCLI(LightningCLI):
         add_progress_options(parser)
         return parser
 
+    def _add_instantiators(self) -> None:
+        """None: Lightning's write the configuration once more, for hyperparameters in checkpoints, which have none."""
+
     def parse_arguments(self, parser, args) -> None:
         subcommands = getattr(self, "_subcommand_parsers", {})  # none where nothing is run
         with naming_unknown_options(parser, *subcommands.values()):

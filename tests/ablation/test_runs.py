@@ -67,7 +67,7 @@ def test_a_stopped_run_loses_no_row_and_ends_as_if_it_had_not_been_stopped(tmp_p
     assert all(row == kept[row["key"]] for row in resumed if row["key"] in kept)
 
 
-def test_nothing_is_run_again_and_tables_and_plots_come_back(tmp_path, trace):
+def test_nothing_is_run_again_and_tables_and_plots_come_back(tmp_path, trace, plots):
     content = {"axes": {"method": ["trace", "sirt"], "method.iterations": [2], "views": [2, 3]}}
     rows = ablate(tmp_path, **content)
     calls, out = len(trace.given), tmp_path / "out"
@@ -205,7 +205,7 @@ def test_a_projector_is_an_axis_on_the_same_xrays_and_the_automatic_one_keeps_it
     assert all(torch.equal(trace.given[0][0], xrays) for xrays, _, _ in trace.given)
 
 
-def test_a_geometry_file_is_an_axis_with_views_of_its_own(tmp_path, trace):
+def test_a_geometry_file_is_an_axis_with_views_of_its_own(tmp_path, trace, plots):
     orbit = {"views": 2, "source_to_detector": 1020, "source_to_isocentre": 740, "shape": [24, 24], "pixel": 24}
     for name, change in {"tilted": {"tilt_degrees": 5}, "four": {"views": 4}}.items():
         (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump({"orbit": orbit | change}))
@@ -432,7 +432,7 @@ def test_what_a_killed_run_had_begun_to_keep_is_removed(tmp_path, trace):
     assert not any(path.exists() for path in begun)
 
 
-def test_plots_of_an_earlier_run_make_way_for_those_of_this_one(tmp_path, trace):
+def test_plots_of_an_earlier_run_make_way_for_those_of_this_one(tmp_path, trace, plots):
     axes = {"method": ["trace", "sirt"], "method.iterations": [2]}
     ablate(tmp_path, phantoms=1, axes=axes | {"views": [2]})
     assert (tmp_path / "out" / "pareto.png").exists()

@@ -360,6 +360,7 @@ def test_rows_that_are_all_refused_give_no_plot(tmp_path):
     assert plots.write_plots(tmp_path, summarise(rows)) == [] == list(tmp_path.iterdir())
 
 
+@pytest.mark.usefixtures("plots")
 def test_dollars_in_the_name_of_a_method_are_no_formula_of_its_plots(tmp_path):
     names = ["a$\\frac$", "$x|[/b]"]
     rows = ablate(tmp_path, methods={name: {"of": "sirt", "method.iterations": 2} for name in names})

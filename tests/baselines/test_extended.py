@@ -26,7 +26,7 @@ from phydict.xray import Ideal
 from phydict.xray.boxes import binned_to, covers, lacking
 from phydict.xray.carried import Carried
 
-TV = FISTATV(iterations=80)
+TV = FISTATV(iterations=30)
 CHEST, WIDE, WINDOW = Grid.cube(64), Grid.box([80, 80, 64], [480.0, 480.0, 384.0]), HUWindow()
 ORBIT = replace(ConeBeam.orbit(6, 1300, 800, (112, 112), 6.4, start=0.1), continued=False)
 

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import scipy
 
-from phydict.datasets.cts import anatomy
 from phydict.datasets.cts.anatomy import lung_box_centre, segment
 from phydict.datasets.phantoms.phantom import phantom_case
 from phydict.grid import Grid
@@ -93,21 +91,3 @@ def test_a_lung_open_at_the_first_and_last_slice_is_still_found():
     lungs = ((abs(x) - 18) / 12) ** 2 + ((y - 3) / 18) ** 2 < 1
     hu[lungs] = -850
     assert segment(hu, 4.0)[0][0].sum() == pytest.approx(lungs.sum(), rel=0.1)
-
-
-@pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (2.0, 1.6, 3.0), (0.7, 0.8, 5.0), (6.0, 12.0, 4.0)])
-@pytest.mark.parametrize("seed", range(4))
-def test_pieces_of_a_mask_are_those_of_scipy(seed, spacing):
-    rng = np.random.default_rng(seed)
-    noise = rng.standard_normal(rng.integers(1, 24, 3))
-    mask = scipy.ndimage.gaussian_filter(noise, rng.uniform(0.5, 2)) > -0.02
-    mask[0, 0, 0] = True
-    for mm in (3.0, 8.0):
-        within = scipy.ndimage.distance_transform_edt(~mask, spacing) <= mm
-        np.testing.assert_array_equal(anatomy._within(mask, mm, np.array(spacing)), within)
-    for structure, axes in ((anatomy.IN_PLANE, (0, 1)), (None, (0, 1, 2))):
-        np.testing.assert_array_equal(anatomy._opened(mask, 2, axes),
-                                      scipy.ndimage.binary_opening(mask, structure, iterations=2))
-        np.testing.assert_array_equal(anatomy._widened(mask, 2, axes),
-                                      scipy.ndimage.binary_dilation(mask, structure, iterations=2))
-    np.testing.assert_array_equal(mask | anatomy._enclosed(~mask), scipy.ndimage.binary_fill_holes(mask))

@@ -14,8 +14,6 @@ that the field of view cuts open sideways is lost in those slices.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import scipy
 
@@ -39,7 +37,7 @@ def segment(hu: np.ndarray, spacing) -> tuple[np.ndarray, np.ndarray]:
     """
     spacing = np.broadcast_to(np.asarray(spacing, float), 3)
     masks, known = np.zeros((3, *hu.shape), np.float32), np.zeros(3, bool)
-    interior = _enclosed(hu < LUNG_BELOW, IN_PLANE, (0, 1)) & _body(hu, spacing)
+    interior = _without_border(hu < LUNG_BELOW) & _body(hu, spacing)
     lungs = _lung_components(interior, hu, spacing)
     if not lungs.any():
         return masks, known
@@ -57,7 +55,7 @@ def segment(hu: np.ndarray, spacing) -> tuple[np.ndarray, np.ndarray]:
 def body_mask(hu: np.ndarray, spacing) -> np.ndarray:
     """The body without table and clothes, its lungs filled: (X, Y, Z) bool of `hu` (X, Y, Z) at `spacing` mm."""
     body = _body(hu, np.broadcast_to(np.asarray(spacing, float), 3))
-    return ~_widened(~body, BODY_RIM, (0, 1))
+    return scipy.ndimage.binary_erosion(body, IN_PLANE, iterations=BODY_RIM, border_value=1)
 
 
 def lung_box_centre(lung: np.ndarray, affine: np.ndarray) -> np.ndarray:
@@ -71,60 +69,27 @@ def lung_box_size(lung: np.ndarray, spacing) -> np.ndarray:
     return np.array([s.stop - s.start for s in _box(lung > 0.5, 0)]) * spacing
 
 
-def _enclosed(air: np.ndarray, structure: np.ndarray | None = None, axes: Sequence[int] = (0, 1, 2)) -> np.ndarray:
-    """Air whose components, of neighbours in `structure`, reach neither face of the volume across `axes`."""
-    labels, count = scipy.ndimage.label(air, structure)
+def _without_border(air: np.ndarray) -> np.ndarray:
+    """Air that is not joined to the sides (x and y faces) within its own axial slice."""
+    labels, count = scipy.ndimage.label(air, IN_PLANE)
     outside = np.zeros(count + 1, bool)
     outside[0] = True
-    for axis in axes:
-        outside[labels.take([0, -1], axis)] = True
+    for face in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
+        outside[face] = True
     return ~outside[labels]
-
-
-def _widened(mask: np.ndarray, voxels: int, axes: Sequence[int] = (0, 1, 2)) -> np.ndarray:
-    """A mask and what lies up to so many steps along `axes` beside it."""
-    for _ in range(voxels):
-        before, mask = mask, mask.copy()
-        for axis in axes:
-            old, new = np.moveaxis(before, axis, 0), np.moveaxis(mask, axis, 0)
-            new[1:] |= old[:-1]
-            new[:-1] |= old[1:]
-    return mask
-
-
-def _opened(mask: np.ndarray, voxels: int, axes: Sequence[int] = (0, 1, 2)) -> np.ndarray:
-    """A mask without what is thinner than about two times so many voxels along `axes`, nothing being beyond it."""
-    core = ~_widened(~mask, voxels, axes)
-    for axis in axes:
-        faces = np.moveaxis(core, axis, 0)
-        faces[:voxels] = faces[-voxels:] = False
-    return _widened(core, voxels, axes)
-
-
-def _within(mask: np.ndarray, mm: float, spacing: np.ndarray) -> np.ndarray:
-    """Voxels at most `mm` from one of the mask's: those of it that lie along z, moved along x and y."""
-    reach = np.minimum(mm / spacing, np.array(mask.shape) - 1).astype(int)
-    x, y, z = np.ogrid[-reach[0]:reach[0] + 1, -reach[1]:reach[1] + 1, 0:reach[2] + 1]
-    above = (np.sqrt((x * spacing[0]) ** 2 + (y * spacing[1]) ** 2 + (z * spacing[2]) ** 2) <= mm).sum(2)
-    found, along = np.zeros_like(mask), mask
-    for far in range(reach[2] + 1):
-        along = _widened(along, min(far, 1), (2,))
-        for i, j in np.argwhere(above == far + 1) - reach[:2]:
-            (to_x, of_x), (to_y, of_y) = ((slice(max(0, d), n + min(0, d)), slice(max(0, -d), n - max(0, d)))
-                                          for d, n in zip((i, j), mask.shape))
-            found[to_x, to_y] |= along[of_x, of_y]
-    return found
 
 
 def _body(hu: np.ndarray, spacing: np.ndarray) -> np.ndarray:
     """The largest piece of tissue, cut from the table by an opening of 4 mm, widened, its holes filled by slice."""
-    tissue = _opened(hu > LUNG_BELOW, max(1, round(4 / spacing[:2].min())), (0, 1))
+    tissue = scipy.ndimage.binary_opening(hu > LUNG_BELOW, IN_PLANE, iterations=max(1, round(4 / spacing[:2].min())))
     labels, _ = scipy.ndimage.label(tissue)
     size = np.bincount(labels.ravel())
     size[0] = 0
     body = np.zeros(hu.shape, bool) if len(size) < 2 else labels == size.argmax()
-    body = _widened(body, BODY_RIM, (0, 1))
-    return body | _enclosed(~body, IN_PLANE, (0, 1))
+    for k in range(hu.shape[2]):
+        grown = scipy.ndimage.binary_dilation(body[:, :, k], iterations=BODY_RIM)
+        body[:, :, k] = scipy.ndimage.binary_fill_holes(grown)
+    return body
 
 
 def _lung_components(interior: np.ndarray, hu: np.ndarray, spacing: np.ndarray) -> np.ndarray:
@@ -169,15 +134,17 @@ def _trachea(interior: np.ndarray, lungs: np.ndarray, hu: np.ndarray, spacing: n
 
 def _fill(lungs: np.ndarray, airway: np.ndarray, hu: np.ndarray, spacing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The lungs without the airway and its wall, closed over their vessels; and the vessels."""
-    wall = _widened(airway, max(1, round(2 / spacing.min())))
-    lungs = _opened(lungs & ~wall, 1)
+    wall = scipy.ndimage.binary_dilation(airway, iterations=max(1, round(2 / spacing.min())))
+    lungs = scipy.ndimage.binary_opening(lungs & ~wall)
     labels, _ = scipy.ndimage.label(lungs)
     size = np.bincount(labels.ravel())
     size[0] = 0
     lungs = (size > 0.02 * size.sum())[labels]
-    filled = ~_within(~_within(lungs, CLOSING_MM, spacing), CLOSING_MM, spacing) | lungs
-    filled = (filled | _enclosed(~filled)) & ~airway
-    return filled, filled & (hu > VESSEL_ABOVE) & ~_within(~(filled | airway), SURFACE_MM, spacing)
+    grown = scipy.ndimage.distance_transform_edt(~lungs, spacing) <= CLOSING_MM
+    filled = scipy.ndimage.distance_transform_edt(grown, spacing) > CLOSING_MM
+    filled = scipy.ndimage.binary_fill_holes(filled | lungs) & ~airway
+    depth = scipy.ndimage.distance_transform_edt(filled | airway, spacing)
+    return filled, filled & (hu > VESSEL_ABOVE) & (depth > SURFACE_MM)
 
 
 def _box(mask: np.ndarray, margin) -> tuple[slice, ...]:

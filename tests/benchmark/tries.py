@@ -277,8 +277,8 @@ def command_lines():
     yield "seed_everything too large", None, "", lambda p: p.predict(p.case(), "--seed_everything=99999999999999")
     yield "voxels nan", no, "voxels", lambda p: p.predict(p.case(), "--model.grid.voxels=nan")
     yield "voxels -4", no, "", lambda p: p.predict(p.case(), "--model.grid.voxels=-4")
-    yield "voxels 1", None, "", lambda p: p.predict(p.case(), "--model.grid.voxels=1")
-    yield "voxels 3", None, "", lambda p: p.predict(p.case(), "--model.grid.voxels=3")
+    yield "voxels 1", no, "48 mm", lambda p: p.predict(p.case(), "--model.grid.voxels=1")
+    yield "voxels 3", no, "48 mm", lambda p: p.predict(p.case(), "--model.grid.voxels=3")
     yield "side of 1 mm", None, "", lambda p: p.predict(p.case(), "--model.grid={voxels: 4, side: 1}")
     yield "side inf", no, "", lambda p: p.predict(p.case(), "--model.grid.side=inf")
     yield "iterations 10^12 dry", True, "", lambda p: p.dry(p.case(),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import json
+import locale
 import os
 import re
 import runpy
@@ -25,6 +26,7 @@ from inference.runs import phantoms, sirt, xrays
 from phydict.cli.infer import main as infer
 from phydict.cli.train import main as train
 from phydict.runtime.progress import CaseProgress
+from phydict.runtime.reading import read_ids
 from phydict.training import PriorTraining
 
 prepare_cts = runpy.run_path(str(Path(__file__).parents[1] / "data" / "prepare_cts.py"))["main"]
@@ -227,3 +229,30 @@ def test_a_second_ctrl_c_stops_a_training_at_once_and_it_says_that_nothing_is_ke
         run("fit")
     assert stopped.value.code == 130
     assert "run the same command again: no checkpoint was written" in capfd.readouterr().err
+
+
+@pytest.fixture
+def ascii_locale() -> Iterator[None]:
+    """Text files are ASCII unless it is said otherwise, as in a locale that is not UTF-8."""
+    before = locale.setlocale(locale.LC_CTYPE)
+    locale.setlocale(locale.LC_CTYPE, "C")
+    yield
+    locale.setlocale(locale.LC_CTYPE, before)
+
+
+@pytest.mark.skipif(sys.flags.utf8_mode, reason="Python writes UTF-8 in every locale")
+@pytest.mark.parametrize("command, tables", [("test", "sirt/results.md"), ("ablate", "tables.md")])
+def test_tables_are_utf_8_in_every_locale(command, tables, run, ascii_locale, tmp_path):
+    run(command)
+    assert "PSNR (dB) ↑" in (tmp_path / "out" / tables).read_text(encoding="utf-8")
+
+
+@pytest.mark.skipif(sys.flags.utf8_mode, reason="Python writes UTF-8 in every locale")
+def test_the_list_of_held_out_cts_is_utf_8_in_every_locale(made, cache, tmp_path, ascii_locale):
+    cts = tmp_path / "cts"
+    cts.mkdir()
+    for name, of in (("Müller", "a"), ("b", "b")):
+        (cts / f"{name}.nii.gz").symlink_to(made / "cts" / f"{of}.nii.gz")
+    train(arguments(tmp_path / "out", cache, f"--data.cts={cts}", "--data.holdout.ids=[ller]",
+                    "--trainer.max_epochs=1", "--trainer.limit_val_batches=0"))
+    assert read_ids(tmp_path / "out" / "held_out.txt", "data.only") == ["Müller"]

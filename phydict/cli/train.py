@@ -213,7 +213,7 @@ class PriorCLI(ProgressCLI):
     def _write_held_out(self, out: Path, held_out: str) -> None:
         if self.trainer.is_global_zero and held_out:
             with atomic_write(out / HELD_OUT) as part:
-                part.write_text(held_out)
+                part.write_text(held_out, encoding="utf-8")
 
     def before_validate(self) -> None:
         if not (self.config.validate.ckpt_path or self.config.validate.model.initial):

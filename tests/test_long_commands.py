@@ -231,6 +231,14 @@ def test_a_second_ctrl_c_stops_a_training_at_once_and_it_says_that_nothing_is_ke
     assert "run the same command again: no checkpoint was written" in capfd.readouterr().err
 
 
+def test_a_training_that_is_stopped_while_reports_are_learnt_says_that_nothing_is_kept(run, handlers, monkeypatch, capfd):
+    monkeypatch.setattr(PriorTraining, "learn_reports", lambda _: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(SystemExit) as stopped:
+        run("fit")
+    assert stopped.value.code == 130
+    assert "to resume, run the same command again: no checkpoint was written" in capfd.readouterr().err
+
+
 @pytest.fixture
 def ascii_locale() -> Iterator[None]:
     """Text files are ASCII unless it is said otherwise, as in a locale that is not UTF-8."""

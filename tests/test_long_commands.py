@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import fcntl
 import json
 import locale
@@ -13,6 +14,7 @@ import struct
 import sys
 import termios
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -25,6 +27,7 @@ from inference.runs import phantoms, sirt, xrays
 
 from phydict.cli.infer import main as infer
 from phydict.cli.train import main as train
+from phydict.runtime.console import cli_errors, ended_by_sigterm
 from phydict.runtime.progress import CaseProgress
 from phydict.runtime.reading import read_ids
 from phydict.training import PriorTraining
@@ -231,7 +234,18 @@ def test_a_second_ctrl_c_stops_a_training_at_once_and_it_says_that_nothing_is_ke
     assert "run the same command again: no checkpoint was written" in capfd.readouterr().err
 
 
-def test_a_training_that_is_stopped_while_reports_are_learnt_says_that_nothing_is_kept(run, handlers, monkeypatch, capfd):
+@pytest.mark.parametrize("number, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_that_strikes_in_a_callback_of_compiled_code_which_drops_it_ends_the_run_too(number, code, handlers):
+    strike = ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(number))
+    with pytest.raises(SystemExit) as stopped, cli_errors(), ended_by_sigterm():
+        strike()
+        time.sleep(20)
+        pytest.fail("the run went on")
+    assert stopped.value.code == code
+
+
+def test_a_training_that_is_stopped_while_it_learns_reports_says_that_nothing_is_kept(run, handlers, monkeypatch,
+                                                                                      capfd):
     monkeypatch.setattr(PriorTraining, "learn_reports", lambda _: signal.raise_signal(signal.SIGINT))
     with pytest.raises(SystemExit) as stopped:
         run("fit")

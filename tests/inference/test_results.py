@@ -108,11 +108,11 @@ def test_results_are_never_written_among_the_cts(cts, tmp_path, capsys):
     assert "lies inside the input" in said and contents(cts) == before
 
 
-@pytest.mark.parametrize("name", ["../other", "/{out}/other", "a/b", "..", ".", ".x", ""])
+@pytest.mark.parametrize("name", ["../other", "/{out}/other", "a/b", "..", ".", ".x", "", "caf\udce9"])
 def test_a_name_is_that_of_one_folder_inside_the_output(measured, tmp_path, capsys, name):
     name = name.format(out=str(tmp_path).strip("/"))
     said = refusal(capsys, main, sirt("predict", tmp_path / "out", f"--data.xrays={measured}", f"--model.name={name}"))
-    assert f"one folder inside model.out, but '{name}' was given" in said and names(tmp_path) == []
+    assert f"one folder inside model.out, but {name!r} was given" in said and names(tmp_path) == []
 
 
 @pytest.mark.filterwarnings("default")

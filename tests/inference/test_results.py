@@ -17,7 +17,7 @@ import yaml
 from command_lines import refusal
 from processes import INFER, Python
 
-from inference.runs import FILES, ORBIT, contents, names, phantoms, record, sirt, stamp, volume, with_prior, xrays
+from inference.runs import FILES, ORBIT, ROOT, contents, names, phantoms, record, sirt, stamp, volume, with_prior, xrays
 from phydict.baselines import SIRT
 from phydict.cli.infer import main
 from phydict.datasets import load_xrays
@@ -106,6 +106,13 @@ def test_results_are_never_written_among_the_cts(cts, tmp_path, capsys):
     before = contents(cts)
     said = refusal(capsys, main, sirt("test", cts, f"--data.cts={cts}", *ORBIT))
     assert "lies inside the input" in said and contents(cts) == before
+
+
+def test_a_geometry_whose_name_is_no_utf_8_is_named_in_the_tables_all_the_same(tmp_path):
+    file = shutil.copy(ROOT / "configs" / "geometry" / "biplanar.yaml", tmp_path / os.fsdecode(b"caf\xe9.yaml"))
+    main(sirt("test", tmp_path / "out", "--data.cts=phantom", "--data.phantoms=1", "--model.grid=16",
+              f"--data.geometry={file}"))
+    assert "geometry caf?.yaml" in (tmp_path / "out" / "sirt" / "results.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("name", ["../other", "/{out}/other", "a/b", "..", ".", ".x", "", "caf\udce9"])

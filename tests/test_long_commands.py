@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import fcntl
 import json
+import locale
 import os
 import re
 import runpy
@@ -12,6 +14,7 @@ import struct
 import sys
 import termios
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -24,7 +27,9 @@ from inference.runs import phantoms, sirt, xrays
 
 from phydict.cli.infer import main as infer
 from phydict.cli.train import main as train
+from phydict.runtime.console import cli_errors, ended_by_sigterm
 from phydict.runtime.progress import CaseProgress
+from phydict.runtime.reading import read_ids
 from phydict.training import PriorTraining
 
 prepare_cts = runpy.run_path(str(Path(__file__).parents[1] / "data" / "prepare_cts.py"))["main"]
@@ -227,3 +232,49 @@ def test_a_second_ctrl_c_stops_a_training_at_once_and_it_says_that_nothing_is_ke
         run("fit")
     assert stopped.value.code == 130
     assert "run the same command again: no checkpoint was written" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("number, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_that_strikes_in_a_callback_of_compiled_code_which_drops_it_ends_the_run_too(number, code, handlers):
+    strike = ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(number))
+    with pytest.raises(SystemExit) as stopped, cli_errors(), ended_by_sigterm():
+        strike()
+        time.sleep(20)
+        pytest.fail("the run went on")
+    assert stopped.value.code == code
+
+
+def test_a_training_that_is_stopped_while_it_learns_reports_says_that_nothing_is_kept(run, handlers, monkeypatch,
+                                                                                      capfd):
+    monkeypatch.setattr(PriorTraining, "learn_reports", lambda _: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(SystemExit) as stopped:
+        run("fit")
+    assert stopped.value.code == 130
+    assert "to resume, run the same command again: no checkpoint was written" in capfd.readouterr().err
+
+
+@pytest.fixture
+def ascii_locale() -> Iterator[None]:
+    """Text files are ASCII unless it is said otherwise, as in a locale that is not UTF-8."""
+    before = locale.setlocale(locale.LC_CTYPE)
+    locale.setlocale(locale.LC_CTYPE, "C")
+    yield
+    locale.setlocale(locale.LC_CTYPE, before)
+
+
+@pytest.mark.skipif(sys.flags.utf8_mode, reason="Python writes UTF-8 in every locale")
+@pytest.mark.parametrize("command, tables", [("test", "sirt/results.md"), ("ablate", "tables.md")])
+def test_tables_are_utf_8_in_every_locale(command, tables, run, ascii_locale, tmp_path):
+    run(command)
+    assert "PSNR (dB) ↑" in (tmp_path / "out" / tables).read_text(encoding="utf-8")
+
+
+@pytest.mark.skipif(sys.flags.utf8_mode, reason="Python writes UTF-8 in every locale")
+def test_the_list_of_held_out_cts_is_utf_8_in_every_locale(made, cache, tmp_path, ascii_locale):
+    cts = tmp_path / "cts"
+    cts.mkdir()
+    for name, of in (("Müller", "a"), ("b", "b")):
+        (cts / f"{name}.nii.gz").symlink_to(made / "cts" / f"{of}.nii.gz")
+    train(arguments(tmp_path / "out", cache, f"--data.cts={cts}", "--data.holdout.ids=[ller]",
+                    "--trainer.max_epochs=1", "--trainer.limit_val_batches=0"))
+    assert read_ids(tmp_path / "out" / "held_out.txt", "data.only") == ["Müller"]

@@ -40,6 +40,9 @@ def test_a_wheel_holds_every_package_and_every_file_that_is_looked_for(distribut
     assert {Path("phydict") / file for file in SHIPPED} <= held and Path("phydict/py.typed") in held
     folders = {file.parent.relative_to(ROOT) for file in (ROOT / "phydict").rglob("*.py")}
     assert folders <= {Path(package.replace(".", "/")) for package in distribution.packages}
+    distribution.script_name = "setup.py"
+    data = build.find_package_modules("phydict.data", build.get_package_dir("phydict.data"))
+    assert "prepare_cts" in {module for _, module, _ in data}  # data/README.md runs it with -m
 
 
 def test_the_version_is_the_same_everywhere(distribution):

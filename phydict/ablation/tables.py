@@ -89,7 +89,7 @@ def write_tables(folder: Path, tables: Sequence[Table]) -> list[Path]:
              latex: "% needs \\usepackage{booktabs}\n" + "\n".join(table.latex() for table in tables)}
     for path, text in files.items():
         with atomic_write(path) as part:
-            part.write_text(text)
+            part.write_text(text, "utf-8", "replace")
     return list(files)
 
 

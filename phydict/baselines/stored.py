@@ -48,7 +48,8 @@ class Stored(Baseline):
         if self.folder and not self.case:
             stats = ((file.relative_to(self.folder), file.stat()) for file in sorted(Path(self.folder).rglob("*.nii*")))
             stated = "".join(f"{name} {stat.st_size} {stat.st_mtime_ns}\n" for name, stat in stats)
-            object.__setattr__(self, "files", f"crc32 {zlib.crc32(stated.encode()):08x}")
+            crc = zlib.crc32(stated.encode(errors="surrogateescape"))
+            object.__setattr__(self, "files", f"crc32 {crc:08x}")
 
     def of_case(self, case: str) -> Stored:
         return replace(self, case=case)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from phydict.ablation.page import is_comparison, page_anew
 from phydict.inference.page import results_page
-from phydict.runtime.console import cli_errors, quiet
+from phydict.runtime.console import check_writable, cli_errors, quiet
 from phydict.runtime.progress_log import progress_options, run_command
 
 
@@ -20,6 +20,7 @@ def write_page(folder: Path) -> None:
     """
     if not folder.is_dir():
         raise ValueError(f"{folder} is no folder: give the one that predict, test or ablate wrote to")
+    check_writable(folder, "folder, such as a copy")
     print(f"page: {page_anew(folder) if is_comparison(folder) else results_page(folder)}")
 
 

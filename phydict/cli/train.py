@@ -170,17 +170,17 @@ class PriorCLI(ProgressCLI):
         out, cts = Path(self.config.fit.out), self.config.fit.data.cts
         check_apart(out, "--out", [Path(cts)] if cts else [])
         with alone_in(out, "--out") if self.trainer.is_global_zero else progress_as(quiet=True, json_lines=False):
-            self._begin(out, ckpt_path)
-            self.trainer.callbacks.append(StopBetweenSteps(out / CHECKPOINT))  # type: ignore[attr-defined]
-            if cts:
-                held_out, trained = datamodule.held_out, len(datamodule.cts)
-                phantoms = bool(self.config.fit.data.holdout.phantoms)
-                beside = ", beside phantoms (data.holdout.phantoms)" * phantoms
-                tells = "phantoms alone tell" if phantoms else "nothing tells"
-                log_progress(f"{len(held_out)} of {len(held_out) + trained} CTs are held out for validation{beside}"
-                             if held_out else f"no CT is held out, so that {tells} which weights are best: "
-                             "data.holdout.ids may name some", event="held_out", cts=held_out)
             try:
+                self._begin(out, ckpt_path)
+                self.trainer.callbacks.append(StopBetweenSteps(out / CHECKPOINT))  # type: ignore[attr-defined]
+                if cts:
+                    held_out, trained = datamodule.held_out, len(datamodule.cts)
+                    phantoms = bool(self.config.fit.data.holdout.phantoms)
+                    beside = ", beside phantoms (data.holdout.phantoms)" * phantoms
+                    tells = "phantoms alone tell" if phantoms else "nothing tells"
+                    log_progress(f"{len(held_out)} of {len(held_out) + trained} CTs are held out for validation{beside}"
+                                 if held_out else f"no CT is held out, so that {tells} which weights are best: "
+                                 "data.holdout.ids may name some", event="held_out", cts=held_out)
                 self.trainer.fit(model, datamodule=datamodule, ckpt_path=ckpt_path, weights_only=weights_only)
             except BaseException as stop:
                 there = (out / CHECKPOINT).is_file()
@@ -213,7 +213,7 @@ class PriorCLI(ProgressCLI):
     def _write_held_out(self, out: Path, held_out: str) -> None:
         if self.trainer.is_global_zero and held_out:
             with atomic_write(out / HELD_OUT) as part:
-                part.write_text(held_out)
+                part.write_text(held_out, encoding="utf-8")
 
     def before_validate(self) -> None:
         if not (self.config.validate.ckpt_path or self.config.validate.model.initial):

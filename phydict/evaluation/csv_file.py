@@ -16,14 +16,15 @@ TEXT_COLUMNS = ("case", "method")
 def write_csv(path: str | Path, rows: Iterable[Mapping]) -> None:
     """Write `rows` as CSV: the columns are the union of their keys, case and method first, then as they first appear.
 
-    A value that is None or left out becomes an empty field; numbers keep all their digits.
+    A value that is None or left out becomes an empty field; numbers keep all their digits; what is no UTF-8 in a name
+    becomes a question mark.
     The file is replaced in one step, so that a killed process leaves the old file or the new one, never a part.
     To append: `write_csv(path, read_csv(path) + new_rows)`.
     """
     rows = list(rows)
     keys = dict.fromkeys(key for row in rows for key in row)
     columns = [name for name in TEXT_COLUMNS if name in keys] + [name for name in keys if name not in TEXT_COLUMNS]
-    with atomic_write(Path(path)) as part, part.open("w", newline="", encoding="utf-8") as file:
+    with atomic_write(Path(path)) as part, part.open("w", newline="", encoding="utf-8", errors="replace") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
         writer.writerows([_to_text(row.get(name)) for name in columns] for row in rows)

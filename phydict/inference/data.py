@@ -230,9 +230,9 @@ def _ct_source(ct: CTFile) -> str:
     lie."""
     report, masks = zlib.crc32(ct.report.encode()), 0
     for file in mask_files(ct.path):
-        masks = zlib.crc32(f"{file.name} {_contents(file)}".encode(), masks)
+        masks = zlib.crc32(f"{name_of(file)} {_contents(file)}".encode(), masks)
     voxels = "".join(f", voxels crc32 {_contents(file)}" for file in voxel_files(ct.path))
-    return f"{ct.path.name}, crc32 {_contents(ct.path)}{voxels}, {ct.calibration}, report crc32 {report:08x}" + (
+    return f"{name_of(ct.path)}, crc32 {_contents(ct.path)}{voxels}, {ct.calibration}, report crc32 {report:08x}" + (
         f", masks crc32 {masks:08x}" if masks else "")
 
 

@@ -129,7 +129,7 @@ class CaseResults:
         tables = [table, *further]
         write_csv(self.folder / RESULTS, [score_row(record["case"], record) for record in records])
         with atomic_write(self.folder / MEANS) as part:
-            part.write_text("\n".join(table.markdown() for table in tables))
+            part.write_text("\n".join(table.markdown() for table in tables), "utf-8", "replace")
         return tables
 
     def beside(self, cases: Iterable[str]) -> int:

@@ -41,7 +41,7 @@ from phydict.runtime.console import TRACEBACK, check_apart, check_writable, note
 from phydict.runtime.profiling import profiled, stage
 from phydict.runtime.progress import CaseProgress
 from phydict.runtime.progress_log import log_problem, log_progress
-from phydict.runtime.reading import enough_memory
+from phydict.runtime.reading import enough_memory, name_of
 from phydict.runtime.seeds import case_seed, check_seed
 from phydict.runtime.warning import Remark, warn
 from phydict.units import HUWindow
@@ -92,9 +92,9 @@ class ReconstructionTask(lightning.LightningModule):
         if own_choice and isinstance(method, Sampler) and method.needs_refiner:
             self.predicted, grid = Box(PREDICTED_VOXELS, keep_coarse=coarse_too), None
         name = type(method).__name__ if name is None else name
-        if not name or name.startswith(".") or name != Path(name).name:
-            raise ValueError("model.name is the name, without a dot at its beginning, of one folder inside model.out, "
-                             f"but '{name}' was given")
+        if not name or name.startswith(".") or name != name_of(name):
+            raise ValueError("model.name is the name, in UTF-8 and without a dot at its beginning, of one folder "
+                             f"inside model.out, but {name!r} was given")
         self.method_name, self.seed, self.pages = name, seed, Path(out) / "dry_run"
         self.projector = projector_kind(projector, "model.projector")
         self.results = CaseResults(Path(out) / name, overwrite)

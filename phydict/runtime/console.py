@@ -10,6 +10,7 @@ import reprlib
 import signal
 import sys
 import tempfile
+import threading
 import warnings
 from argparse import ArgumentError
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -46,7 +47,7 @@ def cli_errors(*also: type[Exception], to_resume: str = AGAIN) -> Iterator[None]
     and exits with code 130 (SIGINT) or 143 (SIGTERM): as `to_resume` has it, or the note of what was raised. Faults of
     code pass, without the notes that begin with AGAIN."""
     try:
-        with enough_memory():
+        with _raised_again(), enough_memory():
             yield
     except (KeyboardInterrupt, SystemExit) as stop:  # Lightning exits with 1 on SIGINT and without a code on SIGTERM
         interrupted = isinstance(stop, KeyboardInterrupt) or isinstance(stop.__context__, KeyboardInterrupt)
@@ -72,6 +73,25 @@ def cli_errors(*also: type[Exception], to_resume: str = AGAIN) -> Iterator[None]
     except Exception as error:
         _leave_out_again(error)
         raise
+
+
+@contextmanager
+def _raised_again() -> Iterator[None]:
+    """A signal whose exception is dropped inside, as where it strikes in a callback of numba's compiler, is sent again
+    a little later."""
+    def again(dropped: sys.UnraisableHookArgs) -> None:
+        signals = {KeyboardInterrupt: signal.SIGINT, SystemExit: signal.SIGTERM}
+        if dropped.exc_type not in signals:
+            return before(dropped)
+        later = threading.Timer(0.1, signal.pthread_kill, (threading.main_thread().ident, signals[dropped.exc_type]))
+        later.daemon = True
+        later.start()
+
+    before, sys.unraisablehook = sys.unraisablehook, again
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before
 
 
 @contextmanager

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import itertools
 import json
+import os
 import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +16,7 @@ import pytest
 import torch
 import yaml
 from command_lines import refusal
+from ct_files import save_ct, thorax_hu
 from prior.tiny import tiny_prior
 
 from ablation.runs import TINY, Trace, ablate, arguments, write
@@ -288,6 +290,15 @@ def test_a_ct_that_has_changed_is_another_case_to_the_rows_of_its_earlier_state(
         page = (tmp_path / "out" / "index.html").read_text()
         assert ('"place": 1' in page) == marked
         assert ("Of other data under one name, and so neither ranked nor paired: b, b (2)." in page) != marked
+
+
+def test_a_ct_and_a_stored_volume_whose_names_are_no_text_are_compared(tmp_path):
+    for folder in ("cts", "volumes"):
+        save_ct(tmp_path / folder / os.fsdecode(b"caf\xe9.nii.gz"), thorax_hu())
+    stored = {"of": "phydict.baselines.Stored", "method.folder": str(tmp_path / "volumes")}
+    rows = ablate(tmp_path, cts=str(tmp_path / "cts"), phantoms=None, methods={"stored": stored},
+                  axes={"method": ["cgls", "stored"]})
+    assert [row["case"] for row in rows] == ["caf?", "caf?"] and rows[0]["status"] == "ok"
 
 
 @pytest.mark.filterwarnings("default")

@@ -225,6 +225,13 @@ def test_a_summary_of_someone_elses_is_never_replaced(tmp_path, thorax):
     assert (tmp_path / "out" / SUMMARY).read_text() == "patient,mine\n" and len(list((tmp_path / "out").iterdir())) == 1
 
 
+def test_a_ct_whose_name_is_no_text_is_prepared_and_listed(tmp_path, thorax):
+    save_ct(tmp_path / "in" / os.fsdecode(b"caf\xe9.nii.gz"), thorax)
+    (row,) = prepare_folder(tmp_path / "in", tmp_path / "out", SMALL)
+    assert row["status"] == "prepared" and (tmp_path / "out" / "caf?" / RECORD).is_file()
+    assert "caf?.nii.gz" in (tmp_path / "out" / SUMMARY).read_text(encoding="utf-8")
+
+
 def full(*_, **__):
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 

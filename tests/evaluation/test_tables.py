@@ -29,6 +29,11 @@ ROWS = [
 STATED = [row | {"grid": "64x64x64", "views": 8} for row in ROWS]
 
 
+def test_a_name_that_is_no_utf_8_is_written_as_far_as_it_is(tmp_path):
+    write_csv(tmp_path / "t.csv", [{"case": "a", "geometry": os.fsdecode(b"caf\xe9.yaml")}])
+    assert read_csv(tmp_path / "t.csv") == [{"case": "a", "geometry": "caf?.yaml"}]
+
+
 def test_csv_round_trip_keeps_every_digit_and_kind(tmp_path):
     rows = [{"case": "007", "method": "1", "psnr": 0.1 + 0.2, "seed": 3, "note": "a,\"b\"\nc", "code": "0012"},
             {"case": "x", "method": "tv", "psnr": math.inf, "ssim": 1e-17}]

@@ -17,7 +17,7 @@ import yaml
 from command_lines import refusal
 from processes import INFER, Python
 
-from inference.runs import FILES, ORBIT, contents, names, phantoms, record, sirt, stamp, volume, with_prior, xrays
+from inference.runs import FILES, ORBIT, ROOT, contents, names, phantoms, record, sirt, stamp, volume, with_prior, xrays
 from phydict.baselines import SIRT
 from phydict.cli.infer import main
 from phydict.datasets import load_xrays
@@ -108,11 +108,18 @@ def test_results_are_never_written_among_the_cts(cts, tmp_path, capsys):
     assert "lies inside the input" in said and contents(cts) == before
 
 
-@pytest.mark.parametrize("name", ["../other", "/{out}/other", "a/b", "..", ".", ".x", ""])
+def test_a_geometry_whose_name_is_no_utf_8_is_named_in_the_tables_all_the_same(tmp_path):
+    file = shutil.copy(ROOT / "configs" / "geometry" / "biplanar.yaml", tmp_path / os.fsdecode(b"caf\xe9.yaml"))
+    main(sirt("test", tmp_path / "out", "--data.cts=phantom", "--data.phantoms=1", "--model.grid=16",
+              f"--data.geometry={file}"))
+    assert "geometry caf?.yaml" in (tmp_path / "out" / "sirt" / "results.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", ["../other", "/{out}/other", "a/b", "..", ".", ".x", "", "caf\udce9"])
 def test_a_name_is_that_of_one_folder_inside_the_output(measured, tmp_path, capsys, name):
     name = name.format(out=str(tmp_path).strip("/"))
     said = refusal(capsys, main, sirt("predict", tmp_path / "out", f"--data.xrays={measured}", f"--model.name={name}"))
-    assert f"one folder inside model.out, but '{name}' was given" in said and names(tmp_path) == []
+    assert f"one folder inside model.out, but {name!r} was given" in said and names(tmp_path) == []
 
 
 @pytest.mark.filterwarnings("default")

@@ -5,6 +5,7 @@ import gzip
 import json
 import re
 import shutil
+from pathlib import Path
 
 import nibabel
 import numpy as np
@@ -314,6 +315,13 @@ def test_a_folder_without_results_is_refused_in_one_sentence(tmp_path, capsys):
         assert stopped.value.code == 2 and said.startswith("error: ") and said.count("\n") == 1
         assert "predict, test or ablate wrote to" in said
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="no folder that nobody may write to")
+def test_a_folder_that_cannot_be_written_to_is_refused_in_one_sentence(capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main(["page", "/proc"])
+    assert "/proc cannot be written to" in (said := capsys.readouterr().err) and "such as a copy" in said
 
 
 def test_a_page_of_someone_elses_stays(tmp_path):

@@ -230,7 +230,7 @@ def _check_summary(file: Path) -> None:
 
 def _write_summary(file: Path, rows: list[dict]) -> None:
     try:
-        with atomic_write(file) as part, part.open("w", newline="", encoding="utf-8") as stream:
+        with atomic_write(file) as part, part.open("w", newline="", encoding="utf-8", errors="replace") as stream:
             table = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
             table.writeheader()
             table.writerows(rows)

@@ -162,7 +162,7 @@ def tables():
     yield "one field of 200000 letters", *report(head + f"ct.nii.gz,{'x' * 200000},y\n", None, "r.csv")
     yield "a quote that never ends", *report(head + 'ct.nii.gz,"Nodule', None, "")
     yield "a null byte", *report(head + "ct.nii.gz,a\0b,c\n", None, "r.csv")
-    yield "more fields than columns", *report(head + "ct.nii.gz,a,b,c,d\n")
+    yield "more fields than columns", *report(head + "ct.nii.gz,a,b,c,d\n", no, "more fields than its header")
     yield "fewer fields", *report(head + "ct.nii.gz\n")
     yield "only commas", *report(head + ",,\n", no, "VolumeName")
     yield "a row twice", *report(head + "ct.nii.gz,a,b\nct,a,b\n", no, "two rows")

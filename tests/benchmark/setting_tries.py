@@ -8,6 +8,7 @@ import torch
 from tries import ROOT
 
 from phydict.cli.infer import main as infer
+from phydict.runtime.files import machine
 
 
 def configurations():
@@ -166,7 +167,7 @@ def outputs():
         '"files": [', '"files": ["../../..", "mine.txt",')))
     yield "twice, the volume gone", None, "", twice(between=lambda p: (p.out / "sirt/case/volume.nii.gz").unlink())
     yield "leftovers of a killed run", True, "", lambda p: ((
-        p.out / f"sirt/.case.{os.uname().nodename}.999999.partial").mkdir(parents=True), p.predict(p.case()))
+        p.out / f"sirt/.case.{machine()}.999999.partial").mkdir(parents=True), p.predict(p.case()))
     yield "set aside by a killed run", True, "", twice(between=lambda p: (p.out / "sirt/case").rename(
         p.out / "sirt/.case.set-aside-by-phydict"))
     yield "X-rays below a folder called as the output", None, "", lambda p: p.predict(p.case("runs/sirt"),

@@ -14,6 +14,7 @@ import torch
 from lightning.pytorch.callbacks import LambdaCallback, ModelCheckpoint
 from lightning.pytorch.cli import LightningCLI
 from lightning.pytorch.loggers import CSVLogger
+from lightning.pytorch.strategies import DDPStrategy
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from phydict.cli.export import export_prior, print_prior
@@ -162,6 +163,8 @@ class PriorCLI(ProgressCLI):
         with reading("the settings of trainer", "correct them"):
             made = super().instantiate_trainer(logger=logger, plugins=plugins, **kwargs)
         check_processes(made.num_devices)
+        if isinstance(made.strategy, DDPStrategy):  # several devices, also where no strategy is asked for
+            made.strategy._ddp_kwargs.setdefault("find_unused_parameters", True)  # a step may leave parts aside
         return made
 
     def fit(self, model: StageTraining, datamodule: PriorData, ckpt_path: str | None = None,

@@ -1,11 +1,14 @@
 """Training of rivals: the loss falls, a resumed run is the uninterrupted one, and its file can be compared."""
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
-from command_lines import refusal, resumed_as_uninterrupted
+from command_lines import losses, refusal, resumed_as_uninterrupted
 from torch.utils.data import DataLoader, default_collate
 
 from phydict.cli.infer import main as infer
@@ -66,6 +69,21 @@ def test_a_resumed_run_is_the_uninterrupted_one_and_its_file_is_compared(name, t
     infer(["ablate", "-c", str(comparison)])
     rows = read_csv(tmp_path / "table" / "results.csv")
     assert [(row["method"], row["status"]) for row in rows] == [(name, "ok"), ("cgls", "ok")]
+
+
+@pytest.mark.slow
+def test_two_processes_train_the_rival_whose_parts_learn_in_turn_that_one_would(tmp_path, cache):
+    """Without a configuration for several devices, as where a machine has two and none are asked for."""
+    one, two = (arguments("xray2ctpa", tmp_path / run, cache, "--data.loading.epoch_size=8", "--trainer.max_epochs=1",
+                          "--trainer.limit_val_batches=0", *more)
+                for run, more in (("one", ["--trainer.devices=1", "--data.loading.batch_size=2"]),
+                                  ("two", ["--trainer.devices=2", "--data.loading.batch_size=1"])))
+    main(one)
+    done = subprocess.run([sys.executable, str(CONFIGS.parents[1] / "train.py"), *two], capture_output=True, text=True,
+                          timeout=300, env=os.environ | {"OMP_NUM_THREADS": "1"})
+    assert done.returncode == 0, done.stderr[-2000:]
+    expected, found = ({step: float(loss) for step, loss in losses(tmp_path / run).items()} for run in ("one", "two"))
+    assert found == pytest.approx(expected, rel=1e-4) and set(found) == {0, 1, 2, 3}
 
 
 @pytest.mark.parametrize("name", TASKS)

@@ -44,7 +44,7 @@ def test_a_kept_draw_is_the_same_in_another_epoch_process_and_order(tmp_path, ca
     assert (late["masks"] - fresh["masks"]).abs().max() <= 0.5 / 255 + 1e-6
 
 
-def test_draws_of_other_settings_are_kept_elsewhere(cache):
+def test_draws_of_other_settings_are_kept_elsewhere(cache, monkeypatch):
     data = [PriorData(phantoms=2, cache=str(cache), cube=Cube(16), loading=Loading(reuse=2), seed=seed).draws(0).folder
             for seed in (0, 1)]
     other = PriorData(phantoms=2, cache=str(cache), cube=Cube(16), loading=Loading(reuse=2))
@@ -52,6 +52,8 @@ def test_draws_of_other_settings_are_kept_elsewhere(cache):
     more = PriorData(phantoms=2, cache=str(cache), cube=Cube(16), loading=Loading(reuse=7, epoch_size=9))
     assert len({*data, other.draws(0).folder}) == 3
     assert more.draws(3).folder == data[0], "how often and in which order they come does not change what they are"
+    monkeypatch.setattr("phydict.training.data.DRAW_VERSION", 0)
+    assert more.draws(3).folder not in data, "what another version made is not taken for what this one makes"
 
 
 def test_cases_drawn_on_finer_voxels_are_the_means_of_their_blocks(cache):

@@ -97,7 +97,9 @@ def test_roll_outs_are_kept_for_more_of_them_and_not_for_other_cases(tmp_path, r
     save_ct(file, thorax_hu() + 10)
     assert (second := folder()) != first
     monkeypatch.setattr("phydict.datasets.phantoms.cached.PHANTOM_VERSION", 0)
-    assert folder() not in (first, second)
+    assert (third := folder()) not in (first, second)
+    monkeypatch.setattr("phydict.training.data.DRAW_VERSION", 0)
+    assert folder() not in (first, second, third)
 
 
 def test_a_prior_that_is_no_refiner_has_no_roll_outs(tmp_path, cache, capsys):

@@ -387,6 +387,15 @@ def test_a_training_that_has_ended_says_that_nothing_is_left(trained, cache, tmp
     assert "is of step 8 already, and trainer.max_steps is 8: nothing is left to learn" in capsys.readouterr().err
 
 
+def test_a_training_whose_time_is_over_says_so_and_one_whose_steps_are_over_does_not(trained, cache, tmp_path, capsys):
+    main(arguments(tmp_path, cache, "--trainer.max_time=00:00:00:00", f"--ckpt_path={trained / 'last.ckpt'}",
+                   "--trainer.max_epochs=3"))
+    assert "trainer.max_time is over after step 8: to go on, give" in capsys.readouterr().err
+    main(arguments(tmp_path / "ended", cache, "--trainer.max_time=00:01:00:00", "--trainer.limit_val_batches=0",
+                   f"--ckpt_path={trained / 'last.ckpt'}", "--trainer.max_epochs=2"))
+    assert "max_time" not in capsys.readouterr().err
+
+
 def test_an_id_that_is_held_out_is_no_word_for_longer_ones(tmp_path):
     for name in ("1", "10", "21"):
         save_ct(tmp_path / "cts" / f"{name}.nii.gz", thorax_hu())

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import lightning
 import torch
-from lightning.pytorch.callbacks import LambdaCallback, ModelCheckpoint
+from lightning.pytorch.callbacks import LambdaCallback, ModelCheckpoint, Timer
 from lightning.pytorch.cli import LightningCLI
 from lightning.pytorch.loggers import CSVLogger
 from lightning.pytorch.strategies import DDPStrategy
@@ -190,6 +190,12 @@ class PriorCLI(ProgressCLI):
                 stop.add_note(f"add --ckpt_path {out / CHECKPOINT}" if there else
                               "run the same command again: no checkpoint was written, and nothing is kept")
                 raise
+            left = [timer.time_remaining() for timer in self.trainer.callbacks  # type: ignore[attr-defined]
+                    if isinstance(timer, Timer)]
+            if any(seconds is not None and seconds <= 0 for seconds in left):
+                log_progress(f"trainer.max_time is over after step {self.trainer.global_step}: to go on, give "
+                             "--ckpt_path last and a longer one, which counts from the start of the training",
+                             event="ended")
 
     def _begin(self, out: Path, resumed: str | None) -> None:
         """What comes before the first step, such as the list of the CTs that are held out. Raises ValueError where

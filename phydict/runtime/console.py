@@ -26,6 +26,7 @@ NOISE = (".*does not have many workers", ".*LeafSpec.*is deprecated", ".*is smal
          "Total length of `DataLoader` across ranks is zero", "Checkpoint directory .* exists and is not empty",
          "It is recommended to use `self.log", "Using `DistributedSampler` with the dataloaders",
          ".*args parameter is intended to run from within Python", "predict returned None",
+         ".*all_gather is deprecated, use",
          "You're resuming from a checkpoint that ended before the epoch ended",
          "You're using the WeightAveraging callback with a model that overrides the configure_model",
          "You're using the WeightAveraging callback, but loading a checkpoint outside the 'fit' stage",

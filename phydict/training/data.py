@@ -35,7 +35,7 @@ from phydict.runtime.progress_log import log_progress
 from phydict.runtime.ranges import check_between
 from phydict.runtime.seeds import check_seed
 from phydict.runtime.warning import warn
-from phydict.training.draws import Averaged, KeptDraws, MixedCases, averaged, training_parts
+from phydict.training.draws import DRAW_VERSION, Averaged, KeptDraws, MixedCases, averaged, training_parts
 from phydict.training.settings import HoldOut, Loading
 from phydict.units import HUWindow
 
@@ -99,9 +99,9 @@ class PriorData(lightning.LightningDataModule):
         return reports + (self.population.reports(1000) if self.population else [])
 
     def origin(self) -> list:
-        """Of which files and of which versions of phantoms and new patients the cases to train on are, as plain JSON
-        values: what is stored of them is of other cases where this differs."""
-        drawn = [self.phantoms.folder.name, len(self.phantoms)]
+        """Of which files and of which versions of draws, phantoms and new patients the cases to train on are, as plain
+        JSON values: what is stored of them is of other cases where this differs."""
+        drawn = [DRAW_VERSION, self.phantoms.folder.name, len(self.phantoms)]
         if self.population:
             drawn += [POPULATION_VERSION, asdict(self.loading.population)]
         return [drawn, *([ct.id, self.cts.key(ct)] for ct in self.cts.cts)]

@@ -19,6 +19,10 @@ from phydict.datasets.population import DrawnPatients
 from phydict.grid import Grid
 from phydict.units import HUWindow
 
+DRAW_VERSION = 1
+"""Raised whenever an augmentation, a scene's X-rays or a reconstruction of the same seed comes out differently, so that
+draws, roll-outs and reconstructions that are kept are made anew."""
+
 ALL_NEW = 500
 """Draws before any is given again, so that the first steps do not see the same few."""
 

@@ -102,10 +102,12 @@ class XrayToCTPATraining(RivalTraining):
             return self._slices_loss(ct, generator)
         network, y = self.network, water / WATER_MM
         with torch.no_grad():
-            latent = network.latent(ct).float()
+            latent, size = network.latent(ct).float(), network.latent_size
             if self.settles and self.global_step - self.latent.autoencoder_steps < SETTLING:
-                network.latent_size.copy_(torch.maximum(network.latent_size, latent.abs().max()))
-            x0 = (latent / network.latent_size).clamp(-1, 1)
+                sizes = torch.cummax(torch.cat([size[None], self._everywhere(latent.abs().max())]), 0).values
+                network.latent_size.copy_(sizes[-1])
+                size = sizes[self.global_rank + 1]
+            x0 = (latent / size).clamp(-1, 1)
         noise, t = noise_like(x0, generator), torch.rand(1, generator=generator).to(x0)
         signal, sigma = (scale.view(-1, 1, 1, 1, 1) for scale in network.schedule.scales(t))
         directions, _ = network.geometry(self.prior.grid, beam, y)
@@ -118,11 +120,15 @@ class XrayToCTPATraining(RivalTraining):
         slices = ct[0, :, :, :, chosen.to(ct.device)].permute(3, 0, 1, 2)
         mean, std = (part.float() for part in network.autoencoder.encode(slices))
         with torch.no_grad():
-            share = FORGOTTEN if network.latent_size else 1.0
-            network.latent_size.lerp_(mean.abs().max(), share)
+            for size in self._everywhere(mean.abs().max()):
+                network.latent_size.lerp_(size, FORGOTTEN if network.latent_size else 1.0)
         divergence = (mean.square() + std.square() - 1 - 2 * std.clamp(min=1e-12).log()).mean() / 2
         again = network.autoencoder.decode(mean + std * noise_like(mean, generator))
         return l1_loss(again.float(), slices) + self.latent.kl_weight * divergence
+
+    def _everywhere(self, size: Tensor) -> Tensor:
+        """The size of this process's case and of those that the others have at once, (n,), in their turns."""
+        return self.all_gather(size).reshape(-1) if self._trainer else size[None]  # type: ignore[union-attr]
 
     def on_load_checkpoint(self, checkpoint: dict) -> None:
         super().on_load_checkpoint(checkpoint)

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from command_lines import losses, refusal, resumed_as_uninterrupted
+from command_lines import checkpoint, losses, refusal, resumed_as_uninterrupted
 from torch.utils.data import DataLoader, default_collate
 
 from phydict.cli.infer import main as infer
@@ -84,6 +84,8 @@ def test_two_processes_train_the_rival_whose_parts_learn_in_turn_that_one_would(
     assert done.returncode == 0, done.stderr[-2000:]
     expected, found = ({step: float(loss) for step, loss in losses(tmp_path / run).items()} for run in ("one", "two"))
     assert found == pytest.approx(expected, rel=1e-4) and set(found) == {0, 1, 2, 3}
+    sizes = [checkpoint(tmp_path / run)["state_dict"]["prior.network.latent_size"] for run in ("one", "two")]
+    torch.testing.assert_close(*sizes)
 
 
 @pytest.mark.parametrize("name", TASKS)

@@ -94,6 +94,27 @@ def test_the_size_of_latents_is_that_of_the_largest_of_the_first_cases(autoencod
         assert sizes[0] < sizes[1] == sizes[2] == pytest.approx(float(network.latent(body()).abs().max()), rel=1e-5)
 
 
+@pytest.mark.parametrize("steps", [0, 1])
+def test_the_size_of_latents_is_that_of_the_cases_of_all_processes(monkeypatch, autoencoder, steps):
+    """Each sees one of three cases: all have the size of one process that sees them in turn, and its loss."""
+    latent = {"autoencoder_steps": steps} | ({} if steps else {"autoencoder": autoencoder})
+    cases, one, alone, given = [0.5 * body(), body(), 0.9 * body()], task(**latent), task(**latent), []
+    monkeypatch.setattr(alone, "_everywhere", lambda size: given.append(size) or size[None])
+
+    def loss(training: XrayToCTPATraining, case: torch.Tensor) -> torch.Tensor:
+        return training.case_loss(case, water(), BEAM, torch.Generator().manual_seed(0)).detach()
+
+    losses = [loss(one, case) for case in cases]
+    for case in cases:
+        loss(alone, case)
+    for rank, case in enumerate(cases):
+        shared = task(**latent)
+        monkeypatch.setattr(XrayToCTPATraining, "global_rank", rank)
+        monkeypatch.setattr(shared, "_everywhere", lambda size: torch.stack(given))
+        assert torch.equal(loss(shared, case), losses[rank])
+        assert shared.network.latent_size == one.network.latent_size
+
+
 def test_a_trained_diffusion_keeps_the_size_of_its_latents_and_is_validated_from_its_file(tmp_path):
     save_stage(tiny_xray2ctpa(), file := str(tmp_path / "rival.safetensors"))
     scenes, window = OrbitScenes(views=2), (WINDOW.low, WINDOW.high)

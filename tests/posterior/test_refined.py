@@ -295,6 +295,7 @@ def test_x_rays_in_double_precision_are_refined_by_networks_in_single(xrays):
     assert torch.equal(ready.reconstruct(y.double(), projector).volume, ready.reconstruct(y, projector).volume)
 
 
+@pytest.mark.filterwarnings("ignore:samples are drawn on the prior")
 def test_every_level_is_one_step_and_figures_belong_to_the_volume(xrays):
     steps, target = [], Grid.box((31, 40, 27), (384, 390, 390))
     ready = Refined(Known(), target)

@@ -157,7 +157,7 @@ class TooLittleMemory(ValueError):
 def check_memory(needed: int, what: str, advice: str, now: bool = False) -> None:
     """Raises TooLittleMemory, with both numbers, where `what` takes more bytes than this machine, or the container
     that this runs in, has memory; now: or, beside what this process holds, has free at present."""
-    there = min([os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"), *container_limits()])
+    there = min([os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"), *container_limits().values()])
     takes = f"{what} would take {needed / 2**30:,.1f} GiB of memory, but"
     if needed > there:
         raise TooLittleMemory(f"{takes} this machine has {there / 2**30:,.1f}; {advice}")
@@ -173,7 +173,7 @@ def free_memory() -> int | None:
         kilobytes = dict(line.split()[:2] for line in MEMINFO.read_text().splitlines())
         own = int(STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
         free = [1024 * (int(kilobytes["MemAvailable:"]) + int(kilobytes.get("SwapFree:", 0)))]
-        for path, limit in _container_limits():
+        for path, limit in container_limits().items():
             stat = dict(line.split() for line in path.with_name("memory.stat").read_text().splitlines())
             files = sum(int(stat.get(f"total_{kind}", stat.get(kind, 0))) for kind in ("inactive_file", "active_file"))
             free.append(limit - int(path.with_name(USAGE[path.name]).read_text()) + files)  # which give way
@@ -195,11 +195,7 @@ def enough_memory() -> Iterator[None]:
                               "samples or a smaller batch, or use a machine with more") from error
 
 
-def container_limits() -> list[int]:
-    """Bytes of memory that control groups of either version allow, where they say so."""
-    return [limit for _, limit in _container_limits()]
-
-
-def _container_limits() -> list[tuple[Path, int]]:
-    texts = [(path, path.read_text().strip()) for path in CONTROL_GROUPS if os.access(path, os.R_OK)]
-    return [(path, int(text)) for path, text in texts if text.isdigit()]
+def container_limits() -> dict[Path, int]:
+    """Bytes of memory that control groups of either version allow, where they say so, by the file that does."""
+    texts = {path: path.read_text().strip() for path in CONTROL_GROUPS if os.access(path, os.R_OK)}
+    return {path: int(text) for path, text in texts.items() if text.isdigit()}

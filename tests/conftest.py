@@ -14,6 +14,12 @@ import pytest
 from command_lines import arguments
 
 
+@pytest.fixture
+def without_plots(monkeypatch):
+    """Has ablations draw no plots, which take longer than most methods in tests."""
+    monkeypatch.setattr("phydict.ablation.command.write_plots", lambda *_: [])
+
+
 @pytest.fixture(scope="session")
 def cache(tmp_path_factory) -> Path:
     """A folder for the prepared cases of trainings."""

@@ -17,10 +17,10 @@ def trace(monkeypatch):
 
 @pytest.fixture
 def plots():
-    """Has runs draw their plots, which take longer than most methods here."""
+    """Has runs draw their plots."""
 
 
 @pytest.fixture(autouse=True)
-def without_plots(request, monkeypatch):
+def plots_where_asked_for(request):
     if "plots" not in request.fixturenames:
-        monkeypatch.setattr("phydict.ablation.command.write_plots", lambda *_: [])
+        request.getfixturevalue("without_plots")

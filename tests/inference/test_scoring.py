@@ -35,11 +35,7 @@ from phydict.units import HUWindow
 METRICS = "--metrics=[lpips,fid,organs]"
 COLUMNS = ("lpips_alex", "lpips_squeeze", "dice_lung", "hd95_lung", "cldice_vessel")
 
-
-@pytest.fixture(autouse=True)
-def without_plots(monkeypatch):
-    """Ablations here draw no plots: tests/ablation is of those."""
-    monkeypatch.setattr("phydict.ablation.command.write_plots", lambda *_: [])
+pytestmark = pytest.mark.usefixtures("without_plots")  # tests/ablation is of those
 
 
 @pytest.fixture

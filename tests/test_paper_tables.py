@@ -19,13 +19,14 @@ SMALL = ["detector=24", "views=3", "method.iterations=2", "method.ec_steps=1", "
 def test_every_row_of_the_first_table_is_run_or_says_what_it_lacks(tmp_path, capsys):
     save_prior(tiny_prior(), tmp_path / "tiny.safetensors")
     main(["ablate", "-c", "table1", "--phantoms", "1", "--out", str(tmp_path / "out"), "--device", "cpu",
-          "--metrics=[clip]", "--set", f"prior={tmp_path / 'tiny.safetensors'}", "simulator=ideal", *SMALL])
+          "--metrics=[clip]", "--set", f"prior={tmp_path / 'tiny.safetensors'}", "simulator=ideal",
+          "X-ray2CTPA.method.file=null", *SMALL])
     rows = {row["method"]: row for row in read_csv(tmp_path / "out" / "results.csv")}
     refused = {"X-ray2CTPA", "X2CT", "Lifted", "phydict_learned"}
     assert {name for name, row in rows.items() if row["status"] != "ok"} == refused
+    assert "configs/rivals/" in rows["X-ray2CTPA"]["error"] and "--set" in rows["X-ray2CTPA"]["error"]
     assert "reports are longer" in rows["Ours"]["warning"] and "warning" not in rows["Ours w/o text"]
-    few = [rows[name]["error"] for name in ("Lifted", "X2CT", "X-ray2CTPA")]
-    assert all("64" in error for error in few)  # voxels a side, of which there are fewer
+    assert all("64" in rows[name]["error"] for name in ("Lifted", "X2CT"))  # voxels a side, where these are few
     assert "refiner" in rows["phydict_learned"]["error"]  # which a base prior is not
     assert rows["Ours w/o text"]["misfit"] != rows["Ours"]["misfit"] and rows["Ours w/o EC"]["network_calls"] == 2
     assert "CT-CLIP's checkpoint was not given" in (tmp_path / "out" / "tables.md").read_text()

@@ -1,6 +1,11 @@
 """Reconstruct: python infer.py predict --data.xrays <folder>"""
 
-from phydict.cli.infer import main
+import sys
+
+try:
+    from phydict.cli.infer import main
+except KeyboardInterrupt:  # the imports take seconds
+    sys.exit(130)
 
 if __name__ == "__main__":
     main()

@@ -1,6 +1,11 @@
 """Train a prior: python train.py fit -c configs/prior/phantom.yaml"""
 
-from phydict.cli.train import main
+import sys
+
+try:
+    from phydict.cli.train import main
+except KeyboardInterrupt:  # the imports take seconds
+    sys.exit(130)
 
 if __name__ == "__main__":
     main()

@@ -3,6 +3,7 @@
 import errno
 import os
 import re
+import shutil
 import subprocess
 import sys
 import warnings
@@ -52,6 +53,19 @@ def test_other_errors_of_torch_show_where_they_arise(capsys):
     with pytest.raises(RuntimeError, match="must match the size") as error, cli_errors():
         torch.zeros(2) + torch.zeros(3)
     assert type(error.value) is RuntimeError and not capsys.readouterr().err
+
+
+@pytest.mark.parametrize("script", ["infer.py", "train.py"])
+def test_ctrl_c_during_the_imports_shows_no_trace(script, tmp_path):
+    slow = tmp_path / "phydict" / "cli" / script
+    slow.parent.mkdir(parents=True)
+    for package in slow.parents[:2]:
+        (package / "__init__.py").touch()
+    slow.write_text("import signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
+                    "signal.raise_signal(signal.SIGINT)\n")
+    shutil.copy(ROOT / script, tmp_path)
+    stopped = subprocess.run([sys.executable, script], cwd=tmp_path, capture_output=True, text=True)
+    assert (stopped.returncode, stopped.stdout, stopped.stderr) == (130, "", "")
 
 
 @pytest.fixture

@@ -51,6 +51,26 @@ def test_two_workers_give_what_one_gives(tmp_path, thorax, monkeypatch):
     assert (tmp_path / "1" / SUMMARY).read_bytes() == (tmp_path / "2" / SUMMARY).read_bytes()
 
 
+@pytest.mark.slow
+def test_ctrl_c_while_workers_begin_is_left_to_the_command(tmp_path, thorax):
+    for n in range(2):
+        save_ct(tmp_path / f"in/{n}.nii", thorax)
+    code = ("import os, signal, sys, time\nfrom phydict.datasets.cts import preparation as p\n"
+            "signal.signal(signal.SIGINT, signal.default_int_handler)\nos.setpgrp()\n"
+            "class Pool(p.ProcessPoolExecutor):\n"
+            "    def submit(self, work, source, *args):\n"
+            "        submitted = super().submit(work, source, *args)\n"
+            "        if source.id == '1':\n"
+            "            time.sleep(0.5)\n"
+            "            os.killpg(0, signal.SIGINT)\n"
+            "        return submitted\n"
+            "p.ProcessPoolExecutor = Pool\ntry:\n"
+            f"    p.prepare_folder({str(tmp_path / 'in')!r}, {str(tmp_path / 'out')!r}, p.Settings(voxels=32), 2)\n"
+            "except KeyboardInterrupt:\n    sys.exit(130)")
+    stopped = Python(code)
+    assert stopped.wait() == 130 and "Traceback" not in stopped.err and "2 cases to prepare" in stopped.err
+
+
 def test_a_killed_run_goes_on_where_it_was(tmp_path, thorax):
     for n in range(2):
         save_ct(tmp_path / f"in/{n}.nii.gz", thorax + np.int16(10 * n))

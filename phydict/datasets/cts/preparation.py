@@ -132,7 +132,12 @@ def _prepared(sources: list[Source], out: Path, settings: Settings, workers: int
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # read when a process starts: one thread for each of these
     pool = ProcessPoolExecutor(min(workers, len(sources)), multiprocessing.get_context("spawn"), _end_with_parent)
     try:
-        for done in as_completed([pool.submit(prepare_source, source, out, settings) for source in sources]):
+        left_to_this = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # which the workers inherit
+        try:
+            cases = [pool.submit(prepare_source, source, out, settings) for source in sources]
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, left_to_this)
+        for done in as_completed(cases):
             yield done.result()
     except BrokenProcessPool as error:
         raise OSError("a worker process ended before its case was done, perhaps for want of memory; give fewer workers "
@@ -142,9 +147,7 @@ def _prepared(sources: list[Source], out: Path, settings: Settings, workers: int
 
 
 def _end_with_parent() -> None:
-    """In a worker: leaves Ctrl-C to the parent, and ends when the parent does."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
+    """In a worker: ends when the parent does."""
     def end_after(parent) -> None:
         parent.join()
         os._exit(1)

@@ -40,8 +40,7 @@ from phydict.inference.protocols import Protocol, protocol_of
 from phydict.prior.contract import OWN_PRECISION
 from phydict.runtime.files import atomic_write
 
-FURTHER = tuple(name for name in MEASURES if name not in (
-    "ssim", "psnr", "mae_hu", "ssim_lung", "psnr_lung", "mae_hu_lung", "misfit", "seconds"))
+FURTHER = tuple(name for name in MEASURES if name not in ("ssim", "psnr", "mae_hu", "misfit", "seconds"))
 """Measures that have a column only where they were taken."""
 
 OF_METHODS = ("ssim", "psnr", "mae_hu", *FURTHER, "misfit", "seconds", "network_calls")

@@ -27,12 +27,12 @@ from phydict.methods import METHODS
 from phydict.page import check_own_page
 from phydict.runtime.configurations import check_configured
 from phydict.runtime.console import check_apart, check_writable, cli_errors, ended_by_sigterm, quiet
+from phydict.runtime.device import usable_device
 from phydict.runtime.files import alone_in
 from phydict.runtime.help import HelpFormatter, show_settings
 from phydict.runtime.parser_message import naming_unknown_options
 from phydict.runtime.progress import CaseProgress
 from phydict.runtime.progress_log import add_progress_options, progress_options
-from phydict.runtime.reading import reason
 
 
 def main(args: list[str] | None = None) -> None:
@@ -43,12 +43,7 @@ def main(args: list[str] | None = None) -> None:
         parser = _parser(args)
         with naming_unknown_options(parser):
             given = parser.parse_args(args).as_dict()
-        device = given.pop("device") or ("cuda" if torch.cuda.is_available() else "cpu")
-        try:
-            torch.empty(0, device=device)
-        except Exception as error:  # torch has a kind for each reason
-            raise ValueError(f"--device {device} cannot be used ({reason(error)[:100]}): give cpu, or leave it "
-                             "out") from error
+        device = usable_device(given.pop("device") or ("cuda" if torch.cuda.is_available() else "cpu"), "--device")
         del given["quiet"], given["json_lines"]
         keep_volumes = given.pop("keep_volumes")
         source = {name: value for name, value in given.pop("source").items() if value is not None}
@@ -67,7 +62,7 @@ def main(args: list[str] | None = None) -> None:
             with ended_by_sigterm(), alone_in(specification.out, "out"):
                 with CaseProgress() as progress:
                     results, cases = planned(specification, scoring)
-                    run(results, cases, torch.device(device), progress, scoring, keep_volumes)
+                    run(results, cases, device, progress, scoring, keep_volumes)
                 _write_summary(specification.out, results, scoring)
         except (KeyboardInterrupt, SystemExit):
             if results:

@@ -25,7 +25,6 @@ from phydict.runtime.configurations import check_configured, read_configurations
 from phydict.runtime.console import (
     check_apart,
     check_command,
-    check_processes,
     check_writable,
     cli_errors,
     quiet,
@@ -35,7 +34,6 @@ from phydict.runtime.help import HelpFormatter
 from phydict.runtime.precision import PRECISIONS, resolve_precision, trainer_precision
 from phydict.runtime.progress_log import log_progress, progress_as, progress_options, run_command
 from phydict.runtime.ranges import check_between
-from phydict.runtime.reading import reading
 from phydict.training.checkpoints import (
     BEST,
     HELD_OUT,
@@ -160,9 +158,7 @@ class PriorCLI(ProgressCLI):
             kwargs["precision"] = trainer_precision(self._get(self.config, "precision"), device)
         elif "bf16" in str(trainer.precision):
             resolve_precision("bfloat16", device)  # warns where that is slow
-        with reading("the settings of trainer", "correct them"):
-            made = super().instantiate_trainer(logger=logger, plugins=plugins, **kwargs)
-        check_processes(made.num_devices)
+        made = super().instantiate_trainer(logger=logger, plugins=plugins, **kwargs)
         if isinstance(made.strategy, DDPStrategy):  # several devices, also where no strategy is asked for
             made.strategy._ddp_kwargs.setdefault("find_unused_parameters", True)  # a step may leave parts aside
         return made

@@ -14,7 +14,7 @@ import torch
 from lightning.pytorch.callbacks import LambdaCallback, ModelCheckpoint, Timer
 from lightning.pytorch.cli import LightningCLI
 from lightning.pytorch.loggers import CSVLogger
-from lightning.pytorch.strategies import DDPStrategy
+from lightning.pytorch.strategies import DDPStrategy, ModelParallelStrategy
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from phydict.cli.export import export_prior, print_prior
@@ -168,6 +168,7 @@ class PriorCLI(ProgressCLI):
         """Train, alone in the folder of the run."""
         out, cts = Path(self.config.fit.out), self.config.fit.data.cts
         check_apart(out, "--out", [Path(cts)] if cts else [])
+        self._check_shared_out()
         with alone_in(out, "--out") if self.trainer.is_global_zero else progress_as(quiet=True, json_lines=False):
             try:
                 self._begin(out, ckpt_path)
@@ -192,6 +193,16 @@ class PriorCLI(ProgressCLI):
                 log_progress(f"trainer.max_time is over after step {self.trainer.global_step}: to go on, give "
                              "--ckpt_path last and a longer one, which counts from the start of the training",
                              event="ended")
+
+    def _check_shared_out(self) -> None:
+        """Raises ValueError where a strategy shares the weights out to another number of devices than there are."""
+        strategy, devices = self.trainer.strategy, self.trainer.world_size
+        if isinstance(strategy, ModelParallelStrategy):
+            sizes = strategy._data_parallel_size, strategy._tensor_parallel_size
+            if "auto" not in sizes and math.prod(sizes) != devices:
+                raise ValueError("trainer.strategy shares the weights out to data_parallel_size x tensor_parallel_size "
+                                 f"= {sizes[0]} x {sizes[1]} devices, but this run has {devices}: change one of the "
+                                 "two, the strategy's numbers or trainer.devices")
 
     def _begin(self, out: Path, resumed: str | None) -> None:
         """What comes before the first step, such as the list of the CTs that are held out. Raises ValueError where

@@ -181,6 +181,17 @@ def test_a_killed_run_leaves_its_folder_free_even_while_its_loaders_live_on(tmp_
         os.kill(loader, signal.SIGKILL)  # was alive until now
 
 
+def test_a_folder_stays_where_it_was_there_or_something_was_written_to_it(tmp_path):
+    (tmp_path / "mine").mkdir()
+    for name, writes, stays in (("refused", False, False), ("deep/refused", False, False), ("begun", True, True),
+                                ("mine", False, True)):
+        with pytest.raises(KeyboardInterrupt), alone_in(tmp_path / name, "--out"):
+            if writes:
+                (tmp_path / name / "held_out.txt").touch()
+            raise KeyboardInterrupt
+        assert (tmp_path / name).exists() == stays
+
+
 def test_a_list_of_someone_elses_is_not_replaced(cts, cache, tmp_path, capsys):
     (tmp_path / "held_out.txt").write_text("mine\n")
     said = refusal(capsys, main, arguments(tmp_path, cache, "--trainer.max_epochs=1", f"--data.cts={cts}",

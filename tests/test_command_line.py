@@ -205,6 +205,7 @@ def test_a_setting_of_the_wrong_kind_is_one_sentence_that_names_it(empty, capsys
     ("--model.method=a..b", "model.method is the path of a class, but a..b was given"),
     ("--trainer.plugins=os.system", "trainer.plugins is "),
     ("--data.simulator=null", "data.simulator is the path of a Simulator, but null was given"),
+    ("--trainer.strategy=ddp_spawn", "by trainer.strategy ddp_spawn processes are copies of this one"),
     ("--trainer.devices=many", "`devices` selected"), ("--config=&a {b: *a}", "config: "),
     ("--model.method=os.system", "model.method is the path of a Sampler or the path of a Reconstructor, but os.system"),
     ("--model.method=nowhere.X", "model.method is the path of a class, but nowhere.X cannot be imported"),

@@ -76,6 +76,12 @@ def test_what_no_x_rays_can_be_made_of_for_another_program_is_one_sentence(tmp_p
     assert not (tmp_path / "out").exists()
 
 
+def test_the_table_of_worked_examples_names_each():
+    text = (EXAMPLE.parent / "README.md").read_text()
+    assert not [file.parent.name for file in EXAMPLE.glob("*/README.md")
+                if f"(example/{file.parent.name}/README.md)" not in text]
+
+
 def test_the_geometries_are_those_that_the_readmes_speak_of():
     ours, rtk = (phydict.load_xrays(EXAMPLE / "xrays", file) for file in (None, EXAMPLE / "rtk" / "geometry.yaml"))
     assert torch.equal(ours["xrays"], rtk["xrays"])

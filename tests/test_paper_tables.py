@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import pytest
 from prior.tiny import tiny_prior
 
@@ -38,6 +41,16 @@ def test_the_other_tables_have_the_papers_rows(table, column, values):
     trials = read_specification(table, phantoms=1).trials
     assert [trial.columns[column] for trial in trials] == values
     assert all(trial.method.likelihood.reward.lpips == 1 for trial in trials)  # as in the paper's text
+
+
+@pytest.mark.parametrize("table", ["table1", "table2", "table3"])
+def test_what_leaves_lpips_out_of_the_papers_tables_is_a_setting_of_each(table):
+    text = (Path(__file__).parents[1] / "configs" / "README.md").read_text(encoding="utf-8")
+    (given,) = re.findall(r"`--set (method\.likelihood\.[^`]*)`", text)
+    rewards = [stage.reward for trial in read_specification(table, given.split(), phantoms=1).trials
+               for stage in (getattr(trial.method, name, None) for name in ("likelihood", "final_likelihood"))
+               if hasattr(stage, "reward")]
+    assert rewards and all(reward.lpips == 0 for reward in rewards)
 
 
 def test_a_setting_of_one_changed_method_is_given_to_it_alone(tmp_path):

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from command_lines import CONFIG, arguments, checkpoint, losses
+from command_lines import CONFIG, arguments, checkpoint, losses, refusal
 from torch.utils.data import DataLoader, DistributedSampler, default_collate
 
 from phydict.cli.train import main
@@ -163,6 +163,12 @@ def test_as_many_cases_validate_as_are_asked_for_however_many_processes_share_th
     data = PriorData(phantoms=1, holdout=HoldOut(phantoms=3), cache=str(cache), cube=Cube(16))
     data.trainer = SimpleNamespace(limit_val_batches=limit)
     assert len(data.val_dataloader().dataset) == cases
+
+
+def test_weights_are_shared_out_to_as_many_devices_as_there_are(tmp_path, cache, capsys):
+    said = refusal(capsys, main, arguments(tmp_path, cache, f"--config={CONFIG.with_name('fsdp.yaml')}",
+                                           "--trainer.devices=1"))
+    assert "= 2 x 1 devices, but this run has 1" in said and not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("stage", [StageTraining, SuperResolutionTraining, RefinerTraining, RefinementTraining])

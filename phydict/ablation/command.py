@@ -15,6 +15,7 @@ from jsonargparse import ArgumentParser
 from phydict.ablation.fid import distance_tables, write_distances
 from phydict.ablation.page import comparison_page
 from phydict.ablation.plots import write_plots
+from phydict.ablation.results import Results
 from phydict.ablation.run import planned, run
 from phydict.ablation.spec import read_specification
 from phydict.ablation.summary import summarise
@@ -26,12 +27,12 @@ from phydict.methods import METHODS
 from phydict.page import check_own_page
 from phydict.runtime.configurations import check_configured
 from phydict.runtime.console import check_apart, check_writable, cli_errors, ended_by_sigterm, quiet
+from phydict.runtime.device import usable_device
 from phydict.runtime.files import alone_in
 from phydict.runtime.help import HelpFormatter, show_settings
 from phydict.runtime.parser_message import naming_unknown_options
 from phydict.runtime.progress import CaseProgress
 from phydict.runtime.progress_log import add_progress_options, progress_options
-from phydict.runtime.reading import reason
 
 
 def main(args: list[str] | None = None) -> None:
@@ -42,12 +43,7 @@ def main(args: list[str] | None = None) -> None:
         parser = _parser(args)
         with naming_unknown_options(parser):
             given = parser.parse_args(args).as_dict()
-        device = given.pop("device") or ("cuda" if torch.cuda.is_available() else "cpu")
-        try:
-            torch.empty(0, device=device)
-        except Exception as error:  # torch has a kind for each reason
-            raise ValueError(f"--device {device} cannot be used ({reason(error)[:100]}): give cpu, or leave it "
-                             "out") from error
+        device = usable_device(given.pop("device") or ("cuda" if torch.cuda.is_available() else "cpu"), "--device")
         del given["quiet"], given["json_lines"]
         keep_volumes = given.pop("keep_volumes")
         source = {name: value for name, value in given.pop("source").items() if value is not None}
@@ -63,24 +59,30 @@ def main(args: list[str] | None = None) -> None:
         scoring = Scoring(specification.metrics, specification.fid, specification.clip)
         results = None
         try:
-            with ended_by_sigterm(), alone_in(specification.out, "out"), CaseProgress() as progress:
-                results, cases = planned(specification, scoring)
-                run(results, cases, torch.device(device), progress, scoring, keep_volumes)
+            with ended_by_sigterm(), alone_in(specification.out, "out"):
+                with CaseProgress() as progress:
+                    results, cases = planned(specification, scoring)
+                    run(results, cases, device, progress, scoring, keep_volumes)
+                _write_summary(specification.out, results, scoring)
         except (KeyboardInterrupt, SystemExit):
             if results:
                 _page_so_far(specification.out, results.all_rows, scoring)
             raise
-        print(f"{len(results.rows)} rows in {specification.out / RESULTS}")
-        entries = summarise(results.rows)
-        write_distances(specification.out, entries, scoring)
-        tables = all_tables(entries, scoring.empty) + distance_tables(specification.out, entries)
-        plots = write_plots(specification.out, entries)
-        written = write_tables(specification.out, tables) + plots
-        print(f"tables and plots in {specification.out}: {', '.join(path.name for path in written)}")
-        print(f"page: {comparison_page(specification.out, entries, tables, plots)}")
-        if not any(row["status"] == "ok" for row in results.rows):
-            raise ValueError(f"none of the rows in {specification.out / RESULTS} is ok; the first: "
-                             f"{entries[0].error}")
+
+
+def _write_summary(out: Path, results: Results, scoring: Scoring) -> None:
+    """Writes what is made of a finished table: distances, tables, plots and page. Raises ValueError where no row is
+    ok."""
+    print(f"{len(results.rows)} rows in {out / RESULTS}")
+    entries = summarise(results.rows)
+    write_distances(out, entries, scoring)
+    tables = all_tables(entries, scoring.empty) + distance_tables(out, entries)
+    plots = write_plots(out, entries)
+    written = write_tables(out, tables) + plots
+    print(f"tables and plots in {out}: {', '.join(path.name for path in written)}")
+    print(f"page: {comparison_page(out, entries, tables, plots)}")
+    if not any(row["status"] == "ok" for row in results.rows):
+        raise ValueError(f"none of the rows in {out / RESULTS} is ok; the first: {entries[0].error}")
 
 
 def _page_so_far(out: Path, rows: Sequence[dict], scoring: Scoring) -> None:

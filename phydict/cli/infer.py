@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 
-import lightning
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from phydict.ablation import main as ablate
@@ -34,7 +33,6 @@ from phydict.runtime.configurations import (
 from phydict.runtime.console import (
     check_apart,
     check_command,
-    check_processes,
     cli_errors,
     ended_by_sigterm,
     noted,
@@ -43,7 +41,6 @@ from phydict.runtime.console import (
 )
 from phydict.runtime.help import HelpFormatter
 from phydict.runtime.progress_log import log_problem, progress_options
-from phydict.runtime.reading import reading
 from phydict.runtime.shipped import configuration
 
 COMMANDS = {"predict": "X-rays -> volumes", "test": "CTs -> X-rays -> volumes and scores",
@@ -99,12 +96,6 @@ class InferenceCLI(ProgressCLI):
     def dry_run(self) -> bool:
         """Whether the geometry is drawn and nothing reconstructed."""
         return self.flag("dry_run")
-
-    def instantiate_trainer(self, **kwargs) -> lightning.Trainer:
-        with reading("the settings of trainer", "correct them"):
-            made = super().instantiate_trainer(**kwargs)
-        check_processes(made.num_devices)
-        return made
 
     def predict(self, model: ReconstructionTask, datamodule: ReconstructionData) -> None:
         """Reconstruct X-rays, or draw their geometry."""

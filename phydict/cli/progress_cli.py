@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
+from lightning import Trainer
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+from lightning.pytorch.strategies.launchers import _MultiProcessingLauncher
 
+from phydict.runtime.console import check_processes
 from phydict.runtime.parser_message import naming_unknown_options
 from phydict.runtime.progress_log import add_progress_options, progress_as
+from phydict.runtime.reading import reading
 
 NUMBER = int | float | None
 
@@ -42,6 +46,15 @@ class ProgressCLI(LightningCLI):
         subcommands = getattr(self, "_subcommand_parsers", {})  # none where nothing is run
         with naming_unknown_options(parser, *subcommands.values()):
             super().parse_arguments(parser, args)
+
+    def instantiate_trainer(self, **kwargs) -> Trainer:
+        with reading("the settings of trainer", "correct them"):
+            made = super().instantiate_trainer(**kwargs)
+        check_processes(made.num_devices)
+        if isinstance(made.strategy.launcher, _MultiProcessingLauncher):
+            raise ValueError(f"by trainer.strategy {self._get(self.config, 'trainer.strategy')} processes are copies "
+                             "of this one, but each has to run the command anew: give ddp")
+        return made
 
     def flag(self, name: str) -> bool:
         """An option that is on or off, in a configuration too."""

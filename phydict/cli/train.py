@@ -14,7 +14,7 @@ import torch
 from lightning.pytorch.callbacks import LambdaCallback, ModelCheckpoint, Timer
 from lightning.pytorch.cli import LightningCLI
 from lightning.pytorch.loggers import CSVLogger
-from lightning.pytorch.strategies import DDPStrategy
+from lightning.pytorch.strategies import DDPStrategy, ModelParallelStrategy
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from phydict.cli.export import export_prior, print_prior
@@ -25,7 +25,6 @@ from phydict.runtime.configurations import check_configured, read_configurations
 from phydict.runtime.console import (
     check_apart,
     check_command,
-    check_processes,
     check_writable,
     cli_errors,
     quiet,
@@ -35,7 +34,6 @@ from phydict.runtime.help import HelpFormatter
 from phydict.runtime.precision import PRECISIONS, resolve_precision, trainer_precision
 from phydict.runtime.progress_log import log_progress, progress_as, progress_options, run_command
 from phydict.runtime.ranges import check_between
-from phydict.runtime.reading import reading
 from phydict.training.checkpoints import (
     BEST,
     HELD_OUT,
@@ -160,9 +158,7 @@ class PriorCLI(ProgressCLI):
             kwargs["precision"] = trainer_precision(self._get(self.config, "precision"), device)
         elif "bf16" in str(trainer.precision):
             resolve_precision("bfloat16", device)  # warns where that is slow
-        with reading("the settings of trainer", "correct them"):
-            made = super().instantiate_trainer(logger=logger, plugins=plugins, **kwargs)
-        check_processes(made.num_devices)
+        made = super().instantiate_trainer(logger=logger, plugins=plugins, **kwargs)
         if isinstance(made.strategy, DDPStrategy):  # several devices, also where no strategy is asked for
             made.strategy._ddp_kwargs.setdefault("find_unused_parameters", True)  # a step may leave parts aside
         return made
@@ -172,6 +168,7 @@ class PriorCLI(ProgressCLI):
         """Train, alone in the folder of the run."""
         out, cts = Path(self.config.fit.out), self.config.fit.data.cts
         check_apart(out, "--out", [Path(cts)] if cts else [])
+        self._check_shared_out()
         with alone_in(out, "--out") if self.trainer.is_global_zero else progress_as(quiet=True, json_lines=False):
             try:
                 self._begin(out, ckpt_path)
@@ -196,6 +193,16 @@ class PriorCLI(ProgressCLI):
                 log_progress(f"trainer.max_time is over after step {self.trainer.global_step}: to go on, give "
                              "--ckpt_path last and a longer one, which counts from the start of the training",
                              event="ended")
+
+    def _check_shared_out(self) -> None:
+        """Raises ValueError where a strategy shares the weights out to another number of devices than there are."""
+        strategy, devices = self.trainer.strategy, self.trainer.world_size
+        if isinstance(strategy, ModelParallelStrategy):
+            sizes = strategy._data_parallel_size, strategy._tensor_parallel_size
+            if "auto" not in sizes and math.prod(sizes) != devices:
+                raise ValueError("trainer.strategy shares the weights out to data_parallel_size x tensor_parallel_size "
+                                 f"= {sizes[0]} x {sizes[1]} devices, but this run has {devices}: change one of the "
+                                 "two, the strategy's numbers or trainer.devices")
 
     def _begin(self, out: Path, resumed: str | None) -> None:
         """What comes before the first step, such as the list of the CTs that are held out. Raises ValueError where

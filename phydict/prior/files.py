@@ -32,6 +32,7 @@ from phydict.prior.super_resolution import SuperResolution
 from phydict.prior.text_file import has_text, load_text
 from phydict.prior.uncertainty import Uncertainty
 from phydict.prior.unet import VolumeUNet
+from phydict.runtime.device import usable_device
 from phydict.runtime.files import file_crc32
 from phydict.runtime.shipped import own_or_shipped, shipped
 
@@ -82,11 +83,11 @@ def load_prior(path: str | Path | MedSynCheckpoint = DEFAULT_PRIOR,
 
     The default is the one that comes with the project. The text encoder stays on disk until the first report. Raises
     FileNotFoundError when there is no file, ValueError when it is truncated, is no prior, or holds weights that are not
-    finite.
+    finite, and where there is no such device.
     """
-    path = _resolved(path)
+    path, place = _resolved(path), usable_device(device, "device")
     if isinstance(path, MedSynCheckpoint) or is_medsyn(path):
-        return load_medsyn(path).to(device)
+        return load_medsyn(path).to(place)
 
     def build(header: dict, weights: dict[str, Tensor]) -> Prior | Refiner:
         loaded = (build_refiner if header.get("stage") == "refiner" else build_prior)(header, weights)
@@ -96,7 +97,7 @@ def load_prior(path: str | Path | MedSynCheckpoint = DEFAULT_PRIOR,
             reader.unheard = UNHEARD if Path(path).resolve() == DEFAULT_PRIOR.resolve() else ""
         return loaded
 
-    return loaded_stage(path, ("base", "refiner"), build).to(device)
+    return loaded_stage(path, ("base", "refiner"), build).to(place)
 
 
 def load_super_resolution(path: str | Path | MedSynCheckpoint) -> SuperResolution | MedSynSuperResolution:

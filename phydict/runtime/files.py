@@ -81,22 +81,31 @@ def undisturbed(folder: Path) -> Iterator[None]:
 @contextmanager
 def alone_in(folder: Path, option: str) -> Iterator[None]:
     """Makes the folder; raises ValueError where another process is inside with it. `option` is what the user may
-    change.
+    change. A folder that it has made and that nothing was written to is removed.
 
     However the process ends, the next one may go in at once, even while processes that it forked live on, and removes
     the files that it had begun to write.
     """
+    made = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / ".lock", "a") as lock:
         os.register_at_fork(after_in_child=lock.close)
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if not os.path.lexists(lock.name):  # whoever made the folder has just removed it
+                raise BlockingIOError
         except BlockingIOError as error:
             raise ValueError(f"another run writes to {folder}: wait for its end, or give another {option}") from error
         except OSError:  # a file system without locks
             pass
         remove_leftovers(folder)
-        yield
+        try:
+            yield
+        finally:
+            with suppress(OSError):
+                if made and os.listdir(folder) == [".lock"]:
+                    os.unlink(lock.name)
+                    folder.rmdir()
 
 
 def atomic_removal(folder: Path, wanted: Callable[[], bool]) -> None:

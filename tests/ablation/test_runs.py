@@ -20,7 +20,7 @@ from ct_files import save_ct, thorax_hu
 from prior.tiny import tiny_prior
 
 from ablation.runs import TINY, Trace, ablate, arguments, write
-from phydict.ablation import read_specification
+from phydict.ablation import command, read_specification
 from phydict.ablation.run import planned
 from phydict.cli.infer import main
 from phydict.evaluation import read_csv, write_csv
@@ -30,7 +30,7 @@ from phydict.inference.scoring import Scoring
 from phydict.methods import METHODS
 from phydict.prior import save_prior
 from phydict.runtime import profiling
-from phydict.runtime.files import machine
+from phydict.runtime.files import alone_in, machine
 from phydict.runtime.profiling import profiled
 from phydict.runtime.reading import TooLittleMemory
 from phydict.units import HUWindow
@@ -405,6 +405,23 @@ def test_results_are_never_written_among_the_cts(tmp_path, capsys):
         file = write(tmp_path, axes={"method": ["trace"]}, cts=str(cts), out=str(out), phantoms=None)
         assert "give another out" in refusal(capsys, main, ["ablate", "-c", str(file), "--device", "cpu"])
     assert [path.name for path in cts.iterdir()] == ["a.nii.gz"]
+
+
+def test_no_other_run_comes_in_before_tables_and_page_are_written(tmp_path, monkeypatch, trace):
+    met = []
+
+    def meanwhile(writing):
+        def written(out, *more):
+            with pytest.raises(ValueError, match="another run"), alone_in(out, "out"):
+                pass
+            met.append(writing.__name__)
+            return writing(out, *more)
+        return written
+
+    for writing in (command.write_distances, command.write_tables, command.comparison_page):
+        monkeypatch.setattr(command, writing.__name__, meanwhile(writing))
+    ablate(tmp_path, axes={"method": ["trace"]})
+    assert met == ["write_distances", "write_tables", "comparison_page"]
 
 
 def test_a_device_that_is_not_there_is_refused(tmp_path, capsys):

@@ -228,12 +228,14 @@ def test_arguments_and_files_that_cannot_be_meant_are_one_sentence(tmp_path, cap
     assert "nowhere.yaml" in refusal(capsys, main, ["ablate", "-c", str(tmp_path / "nowhere.yaml")])
     file = write(tmp_path, axes={"method": ["trace"]})
     assert "nowhere" in refusal(capsys, main, ["ablate", "-c", str(file), "--cts", str(tmp_path / "nowhere")])
+    assert not (tmp_path / "out").exists()
     said = refusal(capsys, main, ["ablate", "-c", str(file), "-c", "pareto"])
     assert "one file says what to compare" in said and "spec.yaml and pareto" in said
     (tmp_path / "bad.yaml").write_text("axes: [")
     assert "bad.yaml is not valid YAML" in refusal(capsys, main, ["ablate", "-c", str(tmp_path / "bad.yaml")])
     (tmp_path / "bad.yaml").write_text("axes:\n\tviews: [2]\n")
     assert "line 2 is indented by a tab" in refusal(capsys, main, ["ablate", "-c", str(tmp_path / "bad.yaml")])
+    (tmp_path / "out").mkdir()
     with alone_in(tmp_path / "out", "out"):
         assert "another run" in refusal(capsys, main, ["ablate", "-c", str(file)])
     (tmp_path / "out" / "results.csv").write_text("case,method\na,b\n")

@@ -156,6 +156,11 @@ def test_a_missing_file_is_named(tmp_path):
         load_prior(tmp_path)  # a folder
 
 
+def test_a_device_that_is_not_there_is_named():
+    with pytest.raises(ValueError, match="^device warp cannot be used"):
+        load_prior(device="warp")
+
+
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.5, 0.999])
 def test_a_truncated_file_is_one_clear_sentence(file, share):
     content = file.read_bytes()

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch.utils.data import DataLoader, Dataset
 
 import phydict
 from phydict.grid import Grid
@@ -44,3 +45,25 @@ def test_loops_are_compiled_once_for_each_precision():
                 project.T(project(x.to(kind)))
     for loop in (project_loop, backproject_loop):
         assert len(loop.signatures) == 2
+
+
+class Residuals(Dataset):
+    """What a projector and its adjoint give of a few volumes."""
+
+    def __init__(self):
+        self.project = Projector(Grid.cube(16), ConeBeam.orbit(3, 1020, 740, (20, 40), 20.0), "separable",
+                                 full_detector=True)
+
+    def __len__(self):
+        return 2
+
+    def __getitem__(self, n: int) -> tuple[torch.Tensor, torch.Tensor]:
+        xrays = self.project(torch.rand(1, 1, 16, 16, 16, generator=torch.Generator().manual_seed(n)))
+        return xrays, self.project.T(xrays)
+
+
+def test_a_loader_forked_from_a_process_that_has_projected_projects_alike():
+    items = Residuals()
+    here = [items[n] for n in range(2)]
+    for found, expected in zip(DataLoader(items, None, num_workers=1), here):
+        assert all(torch.equal(*pair) for pair in zip(found, expected))

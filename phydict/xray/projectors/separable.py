@@ -17,11 +17,13 @@ On the CPU compiled loops do it (phydict.xray.projectors.separable_cpu), on othe
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 import torch
+from torch.utils.data import get_worker_info
 
 from phydict.grid import Grid
 from phydict.xray.geometry import ConeBeam
@@ -87,14 +89,14 @@ class Separable:
             return self.sparse.forward(mu)
         xrays = mu.new_empty(len(mu), self.beam.views, *self.beam.shape)
         _set_threads()
-        separable_cpu.project(_array(mu), xrays.numpy(), *self.rays)
+        _here(separable_cpu.project)(_array(mu), xrays.numpy(), *self.rays)
         return xrays
 
     def adjoint(self, xrays: torch.Tensor) -> torch.Tensor:
         if xrays.device.type != "cpu":
             return self.sparse.adjoint(xrays)
         mu = xrays.new_zeros(len(xrays), *self.grid.shape)
-        separable_cpu.backproject(mu.numpy(), _array(xrays), _set_threads(), *self.rays)
+        _here(separable_cpu.backproject)(mu.numpy(), _array(xrays), _set_threads(), *self.rays)
         return mu
 
     @property
@@ -111,6 +113,12 @@ def _steps(count: int) -> np.ndarray:
 
 def _array(x: torch.Tensor) -> np.ndarray:
     return np.ascontiguousarray(x.detach().numpy())
+
+
+def _here(loops: Any) -> Callable:
+    """Compiled loops as this process can run them: one that loads data, forked from one whose OpenMP may have threads,
+    would be ended by it, and has the outer loop, which is on one thread there, run by Python."""
+    return loops.py_func if get_worker_info() else loops
 
 
 def _set_threads() -> int:

@@ -326,6 +326,14 @@ def test_from_twelve_views_on_two_more_calls_follow_that_a_progress_bar_does_not
         assert len(answers) == calls + 1 and len(steps) == COARSE.steps() == 5
 
 
+@pytest.mark.parametrize("views", [23, 24])
+def test_from_24_views_on_the_last_step_is_another(views):
+    m, refiner = measured(ConeBeam.orbit(views, 1020, 740, (28, 28), 20.0)), tiny_refiner().bind(precision="float32")
+    few, many = replace(COARSE, final_of_many=None), replace(COARSE, final_likelihood=COARSE.final_of_many)
+    own, of_few, of_many = (list(sampler.estimates(refiner, m))[-1] for sampler in (COARSE, few, many))
+    assert torch.equal(own, of_few) == (views < 24) and torch.equal(own, of_many) == (views >= 24)
+
+
 def test_the_result_does_not_depend_on_the_seed():
     y = measured().y[0]
     volumes = [reconstruct(y, ORBIT, tiny_refiner(), "phydict_learned", seed=seed).volume for seed in (0, 1)]

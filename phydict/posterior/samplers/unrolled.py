@@ -64,6 +64,10 @@ class Unrolled(Sampler):
         start: the first step towards the X-rays
         likelihood: the steps towards the X-rays between the calls
         final_likelihood: the last step towards the X-rays
+        final_of_many: the one from `many_views` views on; none: the same
+        many_views: the fewest views that are many: inside the bodies of two CTs that evaluate nothing more total
+            variation and iterations gain 0.7 and 1.2 dB from 32 of finer voxels and 0.3 and 0.5 from 32 of the same;
+            from 16 of the same they lose
         subgrid: the step on finer voxels; none: what the grid cannot hold is left in the X-rays
         contradiction: root mean square error of a view's line integrals beyond its noise, from which on it counts as
             noise, in those of one voxel of water against air, of more than FIRST_STEP_VIEWS views in proportion to the
@@ -88,6 +92,9 @@ class Unrolled(Sampler):
     likelihood: LikelihoodStep = ProximalCG(10, 3, refit_scatter=True, tv_weight=5.0, tv_eps=0.003)
     final_likelihood: LikelihoodStep = ProximalCG(10, 4, refit_scatter=True, weighted_least_squares=True,
                                                   tv_weight=2.0, tv_eps=0.003, discrepancy=True)
+    final_of_many: LikelihoodStep | None = ProximalCG(20, 4, refit_scatter=True, weighted_least_squares=True,
+                                                      tv_weight=5.0, tv_eps=0.003, discrepancy=True)
+    many_views: int = 24
     subgrid: LikelihoodStep | None = FINER_STEP
     contradiction: float | None = 0.4
     chests_only: bool = False
@@ -129,7 +136,10 @@ class Unrolled(Sampler):
         on_result: is given the result, and what computes the evidence there. The calls of `more_times` are no steps
         of their own.
         """
-        times = self.calls(measurement.projector.beam.views)
+        views = measurement.projector.beam.views
+        times, final = self.calls(views), self.final_likelihood
+        if self.final_of_many and views >= self.many_views:
+            final = self.final_of_many
         measurement.subgrid = measurement.model_variance = 0.0
         before = self.start_state(refiner, measurement)
         measurement.refit(before[:, :1])
@@ -148,8 +158,7 @@ class Unrolled(Sampler):
             before = x0.detach().clamp(-1, 1)
             measurement.refit(before[:, :1])
             last, x0_std = n + 1 == len(times), self.x0_stds[min(n + 1, len(self.times))]
-            step = self.final_likelihood if last else self.likelihood
-            z = self._likelihood_step(step, measurement, before, x0_std)
+            z = self._likelihood_step(final if last else self.likelihood, measurement, before, x0_std)
             if n + 1 == len(self.times) // 2:
                 find_subgrid(measurement, z[:, :1], self.subgrid, self.x0_stds[0])
             if last or n + 1 < len(self.times):

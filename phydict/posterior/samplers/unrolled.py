@@ -63,8 +63,8 @@ class Unrolled(Sampler):
         x0_stds: standard deviation of the error of each x0, in the prior's range, that of the start state first
         start: the first step towards the X-rays
         likelihood: the steps towards the X-rays between the calls
-        final_likelihood: the last step towards the X-rays
-        final_of_many: the one from `many_views` views on; none: the same
+        final_likelihood: the last step towards the X-rays, of fewer than `many_views` views
+        final_of_many: that of more; none: the same
         many_views: the fewest views that are many: inside the bodies of two CTs that evaluate nothing more total
             variation and iterations gain 0.5 and 0.9 dB from 32 of finer voxels and 0.3 and 0.6 from 32 of the same;
             from 16 of the same they lose

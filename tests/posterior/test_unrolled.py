@@ -329,7 +329,8 @@ def test_from_twelve_views_on_two_more_calls_follow_that_a_progress_bar_does_not
 @pytest.mark.parametrize("views", [23, 24])
 def test_from_24_views_on_the_last_step_is_another(views):
     m, refiner = measured(ConeBeam.orbit(views, 1020, 740, (28, 28), 20.0)), tiny_refiner().bind(precision="float32")
-    few, many = replace(COARSE, final_of_many=None), replace(COARSE, final_likelihood=COARSE.final_of_many)
+    few = replace(COARSE, many_views=25)
+    many = replace(few, final_likelihood=COARSE.last_step(24))
     own, of_few, of_many = (list(sampler.estimates(refiner, m))[-1] for sampler in (COARSE, few, many))
     assert torch.equal(own, of_few) == (views < 24) and torch.equal(own, of_many) == (views >= 24)
 

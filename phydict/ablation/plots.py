@@ -27,7 +27,7 @@ from phydict.runtime.files import atomic_write
 
 COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f", "#bcbd22", "#17becf",
            "#005f40", "#b15928", "#6a3d9a", "#ff1493")
-MARKERS = "osD^v<>pP*Xhd8"
+MARKERS = "osD^v<>pP*Xhd"
 LINES, FILLS = ("-", "--", "-.", ":"), ("full", "none", "left", "right", "top", "bottom")
 KINDS = ("pareto", "stages", "views", "geometry", "delta")
 """What the names of plots begin with."""

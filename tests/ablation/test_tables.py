@@ -349,6 +349,11 @@ def test_settings_of_a_method_differ_in_its_plots_in_line_and_filling():
         assert len({line.get_color() for line in axes[0].lines}) == 1
 
 
+def test_no_two_of_many_methods_look_alike():
+    style = plots.styles(summarise([row("a", f"method {n}", 20.0) for n in range(100)]))
+    assert len({(look["color"], look["marker"]) for look in style.values()}) == 100
+
+
 def test_plots_of_boxes_on_either_side_are_two(tmp_path):
     rows = [row("a", method, 20.0, centre=(x, 0.0, 20.0)) for x in (-60.0, 60.0) for method in "xy"]
     files = plots.write_plots(tmp_path, summarise(rows))

@@ -17,7 +17,7 @@ from phydict.grid import Grid
 from phydict.inference.data import ReconstructionData
 from phydict.units import HUWindow
 from phydict.xray import Ideal, Polychromatic, Simulator
-from phydict.xray.beyond import needs_taller, with_continuation
+from phydict.xray.beyond import Remainders, with_continuation
 from phydict.xray.projectors.continued import reach_beyond
 
 GRID = Grid.cube(16)
@@ -134,9 +134,9 @@ def test_x_rays_tell_whether_a_patient_goes_on(patients, beam, simulator):
         y = xrays_of(WINDOW.to_mu(volume), beam, simulator)
         gains = torch.linspace(0.3, 3, beam.views)[:, None, None]
         for xrays, display in ((y, False), (gains * y - 2 + gains, True)):
-            found = with_continuation(xrays, beam, CHEST, display)
-            assert found.continued == (scene != "ends") and found.same_as(beam)
-            assert scene != "ends" or not needs_taller(xrays, beam, CHEST, display)
+            left = Remainders(xrays, beam, display)
+            assert left.continues(CHEST) == (scene != "ends")
+            assert scene != "ends" or not left.needs_taller(CHEST)
 
 
 def test_what_is_stated_is_not_asked(patients):

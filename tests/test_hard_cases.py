@@ -38,10 +38,11 @@ pytestmark = [pytest.mark.filterwarnings(f"ignore:{said}") for said in
               ("no volume was found", "the largest line integral", "the misfit rose")]
 GRID = Grid.cube(16)
 BEAM = ConeBeam.orbit(8, 1020, 740, (24, 24), 24.0)
-FAST = METHODS["phydict_fast"]
+FAST = replace(METHODS["phydict_fast"], iterations=5)
+PLAIN = replace(FAST, scatter=False, hardening=False, metal=None)  # in one pass
 SAMPLERS = {
     "fast": FAST, "paper": SplitGibbs(4, GradientSteps(), ec_delta=0.3, ec_steps=2),
-    "released": replace(METHODS["phydict_released"], iterations=2, ec_steps=2),
+    "released": replace(METHODS["phydict_released"], iterations=1, ec_steps=1),
     "daps": DAPS(levels=3, flow_steps=1, likelihood=ExactDraw(3), prior_std=0.5),
     "daps langevin": DAPS(levels=3, flow_steps=1, likelihood=Langevin(5)),
     "pnp_dm": PnPDM(iterations=4, decay=0.5, levels=3, likelihood=ExactDraw(3), burn_in=2, thinning=1),
@@ -148,12 +149,11 @@ def test_display_values_end_finite_too(prior, name, case):
 
 
 @METHOD
-def test_a_missing_view_is_refused_and_an_honest_geometry_without_it_is_not(prior, name):
+def test_a_missing_view_that_the_geometry_has_and_one_that_is_not_finite_are_refused(prior, name):
     with pytest.raises(ValueError, match="8 views.*7, 24, 24"):
         run(name, prior, CLEAN[OTHERS])
     with pytest.raises(ValueError, match="NaN"):
         run(name, prior, changed(lambda v: v * float("nan")))
-    assert_finite(run(name, prior, CLEAN[OTHERS], BEAM.select(OTHERS)))
 
 
 @pytest.mark.parametrize("blank", [0.0, 5.0])
@@ -172,7 +172,7 @@ def test_blank_views_are_refused_unless_nothing_was_in_the_beam(prior):
             run(name, prior, torch.zeros_like(CLEAN), display=True)
 
 
-@pytest.mark.parametrize("name", ["fast", "sirt"])
+@pytest.mark.parametrize("name", ["diffpir", "sirt"])
 def test_inverted_images_are_warned_of_and_others_are_not_however_narrow(prior, name):
     method, own = SAMPLERS.get(name) or BASELINES[name], prior if name in SAMPLERS else None
     for display in (False, True):
@@ -186,9 +186,19 @@ def test_inverted_images_are_warned_of_and_others_are_not_however_narrow(prior, 
 
 
 @pytest.fixture(scope="module")
-def of_good_views(prior):
+def told_of_good_views(prior):
+    """Of a method, what it finds of good views and how many steps it tells of, once."""
+    @cache
+    def told(name):
+        steps = []
+        return run(name, prior, on_step=lambda: steps.append(1)), len(steps)
+    return told
+
+
+@pytest.fixture(scope="module")
+def of_good_views(told_of_good_views):
     """Of a method, what it finds of good views, once."""
-    return cache(lambda name: run(name, prior))
+    return lambda name: told_of_good_views(name)[0]
 
 
 @pytest.mark.parametrize("name", ["fast", "sirt", "cgls", "tv"])
@@ -336,16 +346,16 @@ def test_extra_compute_from_any_delta_ends_finite_in_the_priors_range(prior, del
     lambda n: DDS(n), lambda n: DiffPIR(n), lambda n: DAPS(n, flow_steps=1, likelihood=ExactDraw(3), prior_std=0.5),
     lambda n: PnPDM(n, levels=2, likelihood=ExactDraw(3), burn_in=n - 1, thinning=1)],
     ids=["fast", "prior", "dps", "dds", "diffpir", "daps", "pnp_dm"])
-@pytest.mark.parametrize("steps", [1, 2, 40])
+@pytest.mark.parametrize("steps", [1, 2, 20])
 def test_few_and_many_steps_end_finite(prior, make, steps):
     result = reconstruct(CLEAN, BEAM, prior, make(steps))
     assert_finite(result)
 
 
-def test_a_thousand_noise_levels_change_little_beside_a_hundred():
+def test_ten_times_as_many_noise_levels_change_little():
     prior = FixedPrior(GaussianDenoiser(torch.full((1, 4, *GRID.shape), -0.5), torch.tensor(0.1)))
-    few, many = (reconstruct(CLEAN, BEAM, prior, replace(FAST, iterations=n, likelihood=ProximalCG(2, 1))).volume
-                 for n in (100, 1000))
+    few, many = (reconstruct(CLEAN, BEAM, prior, replace(PLAIN, iterations=n, likelihood=ProximalCG(2, 1))).volume
+                 for n in (50, 500))
     assert float((few - many).square().mean().sqrt()) < 20
 
 
@@ -363,7 +373,7 @@ def test_denoisers_in_bf16_fp32_and_fp64_agree(prior):
 
 
 def test_seeds_differ_less_where_the_x_rays_say_more(prior):
-    method = replace(FAST, sampling_noise=1.0)
+    method = replace(PLAIN, sampling_noise=1.0)
 
     def spread(beam: ConeBeam) -> float:
         return float(reconstruct(views(beam=beam), beam, prior, method, samples=4).deviation.mean())
@@ -451,8 +461,6 @@ def test_watching_takes_no_projection_of_its_own(prior):
         assert reconstruct(CLEAN, BEAM, prior, sampler).projector_calls == calls
 
 
-def test_a_step_is_called_once_by_every_method(prior):
-    for name, method in (SAMPLERS | BASELINES).items():
-        steps = []
-        run(name, prior, on_step=lambda: steps.append(1))
-        assert len(steps) == reconstructor(method, prior).steps(), name
+@METHOD
+def test_a_step_is_called_once_by_every_method(prior, told_of_good_views, name):
+    assert told_of_good_views(name)[1] == reconstructor(SAMPLERS.get(name) or BASELINES[name], prior).steps()

@@ -253,7 +253,8 @@ def fixed_settings(entries: Sequence[Entry]) -> str:
 
 def xrays(entries: Sequence[Entry]) -> str:
     """How the X-rays of entries' rows were made, what differs among the rows left out."""
-    first, *others = [_simulated(row) | {"places": _places(row)} for entry in entries for row in entry.rows]
+    distinct = {repr(_settings(row)): row for entry in entries for row in entry.rows}  # those of many cases and seeds
+    first, *others = [_simulated(row) | {"places": _places(row)} for row in distinct.values()]
     shared = {name: value for name, value in first.items() if all(other.get(name) == value for other in others)}
     return xrays_note(shared, shared.pop("places", None)) + "."
 
@@ -289,12 +290,16 @@ def _places(row: Mapping) -> str:
     return simulated_on(row.get("simulation_voxels"), row.get("protocol"), box)
 
 
+def _settings(row: Mapping) -> dict:
+    """All settings of a row."""
+    return {name: value for name, value in row.items() if not is_measured(name) and name not in NON_SETTING_COLUMNS}
+
+
 def _parted(row: Mapping) -> tuple[dict, dict]:
     """The settings of a row that are its method's, and those of its X-rays."""
     protocol = row.get("protocol")
     own = METHOD_SETTINGS + (BOX_SETTINGS if protocol is not None and protocol_of(protocol).grid else ())
-    settings = {name: value for name, value in row.items()
-                if not is_measured(name) and name not in NON_SETTING_COLUMNS}
+    settings = _settings(row)
     of_method = {name for name in settings if name in own or name.startswith("method.")}
     return ({name: value for name, value in settings.items() if name in of_method},
             {name: value for name, value in settings.items() if name not in of_method})

@@ -15,7 +15,7 @@ from phydict.baselines.tv import FISTATV
 from phydict.grid import Grid
 from phydict.reconstruction import Delegating, Reconstruction, Reconstructor
 from phydict.runtime.warning import Remark, heard, warn
-from phydict.xray.beyond import coarsened, needs_taller, unexplained, with_continuation
+from phydict.xray.beyond import Remainders, coarsened
 from phydict.xray.binning import binned, binning
 from phydict.xray.boxes import along, binned_to, in_other_voxels, lacking
 from phydict.xray.geometry import ConeBeam
@@ -119,16 +119,16 @@ def extended(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, d
     method that takes no more voxels, or has no memory for them, stays as it is.
 
     Above and below, the patient continues where the beam says so or, where it does not say, the X-rays show it
-    (`with_continuation`). Beside the volume, of line integrals of LEAST_VIEWS views or more, where source and detectors
+    (`Remainders`). Beside the volume, of line integrals of LEAST_VIEWS views or more, where source and detectors
     leave room: it is seen where rays that hardly meet the volume show more than water that fills it, and else has to
     explain much.
     """
     volume = method.survey or grid
     factor = binning(coarsened(volume), beam)
-    few, pixels = binned(xrays, factor), beam.binned(factor)
-    answered = with_continuation(few, pixels, volume, display).continued
+    left = Remainders(binned(xrays, factor), beam.binned(factor), display)
+    answered = left.continues(volume)
     takes_more = method.with_room(STEP, STEP, 0) or method.with_room(0, 0, STEP)
-    room = _room(volume, few, pixels, answered, method.mu_water, display) if takes_more else (0, 0, 0)
+    room = _room(volume, left, answered, method.mu_water, display) if takes_more else (0, 0, 0)
     wider = method.with_room(*room) if any(room) else None
     whole = grid if wider is None else wider.grid or grid.grown(*room)
     if wider is None or not wider.has_memory_for(whole):
@@ -141,18 +141,15 @@ def extended(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, d
     if x:
         warn("the X-rays show that something stands beside the volume, such as a wider patient, arms or a couch: "
              f"{x:g} mm more are reconstructed at each side and cut off", Remark)
-    answered = with_continuation(few, pixels, volume.grown(*room), display).continued
-    return Extended(wider, whole, grid, (x, y, z)), whole, beam.with_continued(answered)
+    return Extended(wider, whole, grid, (x, y, z)), whole, beam.with_continued(left.continues(volume.grown(*room)))
 
 
-def _room(volume: Grid, xrays: Tensor, beam: ConeBeam, answered: bool | None, mu_water: float, display: bool
-          ) -> tuple[int, int, int]:
+def _room(volume: Grid, left: Remainders, answered: bool, mu_water: float, display: bool) -> tuple[int, int, int]:
     """How many voxels more the volume needs at both ends of each axis; answered: whether the patient continues above
-    and below, `with_continuation` of the volume."""
-    aside = 0 if display else _columns(volume, xrays, replace(beam, continued=answered), mu_water)
+    and below it."""
+    aside, beam = 0 if display else _columns(volume, left, answered, mu_water), left.beam
     wide = volume.grown(aside, aside, 0)
-    continues = with_continuation(xrays, beam, wide, display).continued if aside else answered
-    if not (continues or (beam.continued is None and needs_taller(xrays, beam, wide, display))):
+    if not (left.continues(wide) or (beam.continued is None and left.needs_taller(wide))):
         return aside, aside, 0
     slices = STEP * math.ceil(min(reach_beyond(beam, wide), UP / volume.spacing[2]) / STEP)
     while slices and not beam.has_room_for(wide.grown(0, 0, slices)):
@@ -160,11 +157,12 @@ def _room(volume: Grid, xrays: Tensor, beam: ConeBeam, answered: bool | None, mu
     return aside, aside, slices
 
 
-def _columns(volume: Grid, xrays: Tensor, beam: ConeBeam, mu_water: float) -> int:
+def _columns(volume: Grid, left: Remainders, answered: bool, mu_water: float) -> int:
     """How many voxels more the volume needs at each of its four sides to hold what stands there; 0 where nothing does
     that the X-rays show."""
     if not volume.is_upright:
         return 0
+    xrays, beam = left.xrays, replace(left.beam, continued=answered)
     across = max(volume.shape[:2])
     room = [n for n in range(STEP, int(MORE * across) + 1, STEP) if beam.has_room_for(volume.grown(n, n, 0))]
     if beam.views < LEAST_VIEWS or not room or room[-1] < LEAST * across:
@@ -173,7 +171,7 @@ def _columns(volume: Grid, xrays: Tensor, beam: ConeBeam, mu_water: float) -> in
     y, A = binned_to(coarse, xrays, replace(beam, continued=True), False)
     full = mu_water * A(torch.ones(1, 1, *coarse.shape).to(y))[0]
     seen = int((y > full + FULL).sum()) >= LEAST_PIXELS
-    most, least = (unexplained(xrays, beam, grid) for grid in (coarse, wide))
+    most, least = (left.norm(grid, answered) for grid in (coarse, wide))
     if not seen and most < SUSPECT * least:
         return 0
     with warnings.catch_warnings(), heard():  # the method will say itself what is doubtful of the X-rays
@@ -183,7 +181,7 @@ def _columns(volume: Grid, xrays: Tensor, beam: ConeBeam, mu_water: float) -> in
     if not ((seen and alone > EXPLAINED * together) or alone > max(GROSS, MUCH * together)):
         return 0
     enough = least + REST * (most - least)
-    return next(n for n in room if n == room[-1] or unexplained(xrays, beam, _coarse(volume, n)) < enough)
+    return next(n for n in room if n == room[-1] or left.norm(_coarse(volume, n), answered) < enough)
 
 
 def _coarse(volume: Grid, columns: int) -> Grid:

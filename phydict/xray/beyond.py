@@ -27,43 +27,51 @@ LOW = 0.01
 """The share of a display image's pixels at or below what stands for air."""
 
 
-def with_continuation(xrays: Tensor, beam: ConeBeam, grid: Grid, display: bool) -> ConeBeam:
-    """The beam, `continued`, where it is None, as the X-rays (K, V, U) of a patient in the box of `grid` show it: true
-    where a volume whose last slices are repeated beyond it clearly explains them better. Of voxels that are not stacked
-    upwards nothing is repeated.
+class Remainders:
+    """What volumes in coarse voxels leave of X-rays (K, V, U), and what that tells; each is computed once.
 
     display: whether the X-rays are values whose gain and offset per view are unknown.
     """
-    if beam.continued is not None:
-        return beam
-    if not grid.is_upright:
-        return replace(beam, continued=False)
-    xrays, coarse = _levelled(xrays) if display else xrays, coarsened(grid)
-    alone, repeated = (unexplained(xrays, replace(beam, continued=answer), coarse) for answer in (False, True))
-    return replace(beam, continued=CLEARLY * repeated < alone)
+
+    def __init__(self, xrays: Tensor, beam: ConeBeam, display: bool):
+        self.xrays, self.beam = _levelled(xrays) if display else xrays, beam
+        self._norms: dict[tuple, float] = {}
+
+    def norm(self, grid: Grid, continued: bool) -> float:
+        """The norm of what ITERATIONS steps leave of the X-rays in the voxels of a grid, continued beyond it or not."""
+        key = grid.shape, grid.affine.tobytes(), continued
+        if key not in self._norms:
+            y, A = binned_to(grid, self.xrays, replace(self.beam, continued=continued), False)
+            x = conjugate_gradients(lambda mu: A.T(A(mu)), A.T(y[None]), ITERATIONS)
+            self._norms[key] = float((y - A(x)[0]).norm())
+        return self._norms[key]
+
+    def continues(self, grid: Grid) -> bool:
+        """Whether the patient continues above or below the box of `grid`, as the beam says or, where it does not say,
+        the X-rays show: a volume whose last slices are repeated beyond it clearly explains them better. Of voxels that
+        are not stacked upwards nothing is repeated."""
+        if self.beam.continued is not None:
+            return self.beam.continued
+        coarse = coarsened(grid)
+        return grid.is_upright and CLEARLY * self.norm(coarse, True) < self.norm(coarse, False)
+
+    def needs_taller(self, grid: Grid) -> bool:
+        """Whether a taller volume, if source and detectors leave room for it, clearly explains the X-rays better, of a
+        patient who ends in it."""
+        coarse = coarsened(grid)
+        taller = coarse.grown(0, 0, round(TALLER * coarse.shape[2]))
+        return (grid.is_upright and self.beam.has_room_for(taller)
+                and MORE_CLEARLY * self.norm(taller, False) < self.norm(coarse, False))
 
 
-def needs_taller(xrays: Tensor, beam: ConeBeam, grid: Grid, display: bool) -> bool:
-    """Whether a taller volume, if source and detectors leave room for it, clearly explains the X-rays better, of a
-    patient who ends in it. Arguments as those of `with_continuation`."""
-    coarse, beam = coarsened(grid), replace(beam, continued=False)
-    taller = coarse.grown(0, 0, round(TALLER * coarse.shape[2]))
-    if not (grid.is_upright and beam.has_room_for(taller)):
-        return False
-    xrays = _levelled(xrays) if display else xrays
-    return MORE_CLEARLY * unexplained(xrays, beam, taller) < unexplained(xrays, beam, coarse)
+def with_continuation(xrays: Tensor, beam: ConeBeam, grid: Grid, display: bool) -> ConeBeam:
+    """The beam, `continued`, where it is None, as the X-rays show it; arguments as those of `Remainders`."""
+    return replace(beam, continued=Remainders(xrays, beam, display).continues(grid))
 
 
 def coarsened(grid: Grid) -> Grid:
     """The same box in at most SIDE voxels along each side."""
     return in_other_voxels(grid, [min(n, SIDE) for n in grid.shape])
-
-
-def unexplained(xrays: Tensor, beam: ConeBeam, grid: Grid) -> float:
-    """The norm of what ITERATIONS steps leave of the X-rays."""
-    y, A = binned_to(grid, xrays, beam, False)
-    x = conjugate_gradients(lambda mu: A.T(A(mu)), A.T(y[None]), ITERATIONS)
-    return float((y - A(x)[0]).norm())
 
 
 def _levelled(display: Tensor) -> Tensor:

@@ -23,7 +23,7 @@ GRID = Grid.cube(24)
 BEAM = ConeBeam.orbit(8, 1150, 740, (48, 48), 12.5)
 UNCERTAIN = Uncertain(detector_shift_mm=5, source_shift_mm=5, source_to_detector_mm=5, rotation_degrees=2)
 POINTS = middle_points(GRID)
-SEARCH = PoseSearch(coarse=0, fine=10)
+SEARCH = PoseSearch(coarse=0, fine=8)
 
 
 @pytest.fixture(scope="module")

@@ -88,10 +88,11 @@ def moments(samples: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def propagate(sample) -> tuple[Tensor, Tensor]:
-    """Mean (N,) and covariance (N, N) of sample(x), x ~ N(0, I), for an affine `sample`: exact, with no draws."""
-    starts = torch.cat([torch.zeros(1, N), torch.eye(N)]).double().view(N + 1, *SHAPE)
-    ends = torch.cat([sample(x[None]) for x in starts]).flatten(1)
-    both = sample((starts[1] - 2 * starts[2])[None]).flatten()
+    """Mean (N,) and covariance (N, N) of sample(x), x ~ N(0, I), for an affine `sample` of each case of a batch: exact,
+    with no draws."""
+    starts = torch.cat([torch.zeros(1, N), torch.eye(N)]).double()
+    *ends, both = sample(torch.cat([starts, (starts[1] - 2 * starts[2])[None]]).view(-1, *SHAPE)).flatten(1)
+    ends = torch.stack(ends)
     linear = (ends[1:] - ends[0]).T
     torch.testing.assert_close(both, ends[0] + linear[:, 0] - 2 * linear[:, 1], atol=1e-8, rtol=0)
     return ends[0], linear @ linear.T

@@ -20,7 +20,7 @@ from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 
 GRID, WINDOW = Grid.cube(16), HUWindow(-1000, 600)
-METHOD = Unrolled(contradiction=None, metal=None)
+METHOD = Unrolled((0.35, 0.15), (0.5, 0.3, 0.3), contradiction=None, metal=None, subgrid=None)
 FEW, MANY = (ConeBeam.orbit(views, 1020, 740, (28, 28), 20.0) for views in (2, METHOD.first_views + 1))
 
 

@@ -39,7 +39,7 @@ def test_a_ct_and_a_mask_that_no_x_ray_measures_have_the_spread_of_their_posteri
 
 
 def test_the_published_spread_and_a_full_flow_see_the_prior_with_half_its_weight():
-    settings = DAPS(500, 10.0, 0.03, 30, **EXACT)
+    settings = DAPS(200, 10.0, 0.03, 15, **EXACT)
     mean, covariance = condition(measurement(), denoiser(V).mean, 2 * V, NOISE)
     found, spread = moments(sample(settings, 4000))
     torch.testing.assert_close(found, mean, atol=0.02, rtol=0)
@@ -47,7 +47,7 @@ def test_the_published_spread_and_a_full_flow_see_the_prior_with_half_its_weight
 
 
 def test_the_published_spread_around_the_denoisers_estimate_ends_at_the_posterior():
-    settings = DAPS(600, 10.0, 0.03, 1, **EXACT)
+    settings = DAPS(300, 10.0, 0.03, 1, **EXACT)
     mean, covariance = condition(measurement(), denoiser(V).mean, V, NOISE)
     found, spread = moments(sample(settings, 4000))
     torch.testing.assert_close(found, mean, atol=0.015, rtol=0)

@@ -69,7 +69,7 @@ def test_passes_of_admm_end_where_the_conditions_of_total_variation_hold():
     m, y = line()
     weight = 0.15
     passes, x = ADMMTV(weight, rho=1.0).begin(torch.zeros(1, 1, 1, 1, 8)), torch.zeros(1, 1, 1, 1, 8).double()
-    for _ in range(2000):
+    for _ in range(500):
         x = passes(m, x, 20)
     pull = (x.flatten() - y).cumsum(0)  # x - y = -D' q with |q| <= weight, and q = weight sign(D x) at a step
     steps = x.flatten().diff()

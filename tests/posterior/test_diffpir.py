@@ -30,7 +30,7 @@ def test_one_level_is_the_minimiser_of_its_own_objective(weight):
 @pytest.mark.parametrize("weight, zeta", [(1.0, 0.5), (1.0, 1.0), (4.0, 0.5)])
 def test_the_mean_tends_to_the_posteriors_and_the_spread_to_a_known_share_of_it(weight, zeta):
     mean, covariance = condition(measurement(), denoiser(V).mean, V, NOISE * weight**0.5)
-    samples = sample(DiffPIR(600, 1.0, weight, zeta, NOISE, 6), random_like((4000, *SHAPE), seed=11))
+    samples = sample(DiffPIR(300, 1.0, weight, zeta, NOISE, 6), random_like((4000, *SHAPE), seed=11))
     found, spread = moments(samples)
     torch.testing.assert_close(found, mean, atol=0.012, rtol=0)
     expected = (1 + (1 - zeta) ** 0.5) / 2 * covariance

@@ -178,7 +178,7 @@ def prior_of_the_body():
     return Known()
 
 
-FAST = replace(METHODS["phydict_fast"], iterations=3, scatter=False)
+FAST = replace(METHODS["phydict_fast"], iterations=2, scatter=False, hardening=False, subgrid=None)
 
 
 def reconstructed(sampler=FAST, target: Grid | None = None, **settings) -> Reconstruction:

@@ -46,7 +46,7 @@ def test_mean_and_deviation_are_those_of_samples_that_do_not_depend_on_their_num
 
 @pytest.mark.parametrize("display", [False, True])
 @pytest.mark.parametrize("sampler", [
-    METHODS["phydict_fast"], replace(SAMPLER, subgrid=ProximalCG(3)),
+    replace(METHODS["phydict_fast"], iterations=3), replace(SAMPLER, subgrid=ProximalCG(3)),
     replace(SAMPLER, final_likelihood=ProximalCG(10, tv_weight=10.0, discrepancy=True)),
     replace(SAMPLER, final_likelihood=ProximalCG(3, weighted_least_squares=True)),
     replace(SAMPLER, likelihood=GradientSteps(1, reward=Reward(1.0, random_backbone=True, dropout=True, squared=0)))],

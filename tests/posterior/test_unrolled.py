@@ -305,7 +305,7 @@ def test_the_truth_is_kept_and_x_rays_are_met_to_their_noise(noise):
 @pytest.mark.skipif(not computes_bfloat16(torch.device("cpu")), reason="this processor does not compute bfloat16")
 def test_bfloat16_changes_the_reconstruction_of_the_example_by_less_than_2_hu():
     case = load_xrays(Path(__file__).parents[2] / "data" / "example" / "xrays")
-    xrays, beam = case["xrays"][::2], case["beam"].select(slice(None, None, 2))
+    xrays, beam = case["xrays"][::4], case["beam"].select(slice(None, None, 4))
     full, half = (reconstruct(xrays, beam, precision=kind).volume for kind in ("float32", "bfloat16"))
     assert 0 < (full - half).square().mean().sqrt() < 2
 
@@ -329,9 +329,10 @@ def test_from_twelve_views_on_two_more_calls_follow_that_a_progress_bar_does_not
 @pytest.mark.parametrize("views", [23, 24])
 def test_from_24_views_on_the_last_step_is_another(views):
     m, refiner = measured(ConeBeam.orbit(views, 1020, 740, (28, 28), 20.0)), tiny_refiner().bind(precision="float32")
-    few = replace(COARSE, many_views=25)
-    many = replace(few, final_likelihood=COARSE.last_step(24))
-    own, of_few, of_many = (list(sampler.estimates(refiner, m))[-1] for sampler in (COARSE, few, many))
+    method = replace(COARSE, times=(0.2,), x0_stds=(0.5, 0.3), more_times=(), subgrid=None)
+    few = replace(method, many_views=25)
+    many = replace(few, final_likelihood=method.last_step(24))
+    own, of_few, of_many = (list(sampler.estimates(refiner, m))[-1] for sampler in (method, few, many))
     assert torch.equal(own, of_few) == (views < 24) and torch.equal(own, of_many) == (views >= 24)
 
 

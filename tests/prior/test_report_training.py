@@ -36,7 +36,7 @@ def untaught(seed: int = 0) -> Prior:
 @pytest.fixture(scope="module")
 def prior() -> Prior:
     taught = untaught()
-    losses = learn_sentences(taught, SENTENCES, 300, words=STRANGE)
+    losses = learn_sentences(taught, SENTENCES, 200, words=STRANGE)
     assert mean(losses[-10:]) < 0.3 * mean(losses[:3]), (losses[:3], losses[-10:])
     return taught.requires_grad_(False)
 

@@ -7,17 +7,17 @@ import pytest
 import torch
 import yaml
 from laws import random_like
-from torch.nn.functional import pad
+from torch.nn.functional import avg_pool3d, pad
 
 from phydict import ConeBeam, Projector, reconstruct
-from phydict.baselines import CGLS, FISTATV
+from phydict.baselines import CGLS, FISTATV, Region
 from phydict.datasets import load_xrays, phantom_case, save_xrays
 from phydict.evaluation import volume_metrics
 from phydict.grid import Grid
 from phydict.inference.data import ReconstructionData
 from phydict.units import HUWindow
 from phydict.xray import Ideal, Polychromatic, Simulator
-from phydict.xray.beyond import needs_taller, with_continuation
+from phydict.xray.beyond import Remainders, with_continuation
 from phydict.xray.projectors.continued import reach_beyond
 
 GRID = Grid.cube(16)
@@ -109,6 +109,7 @@ def test_x_rays_made_of_a_ct_go_on_beyond_it_where_the_geometry_file_says_so(tmp
 
 
 CHEST, ROWS, WINDOW = Grid.cube(64), 16, HUWindow()
+HALF, TV = Grid.cube(32), FISTATV(iterations=40)
 WIDE = ConeBeam.at_angles([90, 0], 1800, 1500, (112, 112), 5.0)
 
 
@@ -126,6 +127,10 @@ def xrays_of(mu: torch.Tensor, beam: ConeBeam, simulator: Simulator = Ideal()) -
     return simulator(Projector(CHEST.grown(0, 0, ROWS), beam, full_detector=True), mu, 0)[0]
 
 
+def inside(volume: torch.Tensor, grid: Grid) -> torch.Tensor:
+    return WINDOW.to_hu(avg_pool3d(volume[..., ROWS:-ROWS], CHEST.shape[0] // grid.shape[0]).contiguous())
+
+
 @pytest.mark.filterwarnings("ignore:the X-rays show")
 @pytest.mark.parametrize("simulator", [Ideal(), Polychromatic()])
 @pytest.mark.parametrize("beam", [ConeBeam.orbit(k, 1020, 740, (112, 112), 5.0) for k in (1, 2, 8)] + [WIDE])
@@ -134,9 +139,9 @@ def test_x_rays_tell_whether_a_patient_goes_on(patients, beam, simulator):
         y = xrays_of(WINDOW.to_mu(volume), beam, simulator)
         gains = torch.linspace(0.3, 3, beam.views)[:, None, None]
         for xrays, display in ((y, False), (gains * y - 2 + gains, True)):
-            found = with_continuation(xrays, beam, CHEST, display)
-            assert found.continued == (scene != "ends") and found.same_as(beam)
-            assert scene != "ends" or not needs_taller(xrays, beam, CHEST, display)
+            left = Remainders(xrays, beam, display)
+            assert left.continues(CHEST) == (scene != "ends")
+            assert scene != "ends" or not left.needs_taller(CHEST)
 
 
 def test_what_is_stated_is_not_asked(patients):
@@ -149,26 +154,32 @@ def test_what_is_stated_is_not_asked(patients):
 
 
 @pytest.mark.filterwarnings("ignore:no volume explains", "ignore:the X-rays show")
-@pytest.mark.parametrize("method", [pytest.param("phydict_learned", marks=pytest.mark.slow), CGLS(8)])
-def test_a_patient_who_goes_on_is_found_better_where_the_rays_do(patients, method):
+@pytest.mark.parametrize("method, voxels", [
+    pytest.param("phydict_learned", CHEST, marks=pytest.mark.slow), (CGLS(8), HALF)])
+def test_a_patient_who_goes_on_is_found_better_where_the_rays_do(patients, method, voxels):
     beam = ConeBeam.orbit(8, 1020, 740, (112, 112), 5.0)
     y = xrays_of(WINDOW.to_mu(patients["continues"]), beam)
-    truth = WINDOW.to_hu(patients["continues"][..., ROWS:-ROWS].contiguous())
-    of_box, told, found = (reconstruct(y, replace(beam, continued=given), method=method, grid=CHEST).volume
+    truth = inside(patients["continues"], voxels)
+    of_box, told, found = (reconstruct(y, replace(beam, continued=given), method=method, grid=voxels).volume
                            for given in (False, True, None))
     gains = [volume_metrics(volume[None, None], truth)["psnr"] - volume_metrics(of_box[None, None], truth)["psnr"]
              for volume in (told, found)]
     assert min(gains) > 3 and abs(gains[0] - gains[1]) < 1
 
 
+UPPER = (0.0, 0.0, 96.0)
+
+
 @pytest.mark.filterwarnings("ignore:no volume explains", "ignore:the X-rays show")
-@pytest.mark.parametrize("method", [pytest.param("phydict_learned", marks=pytest.mark.slow), FISTATV(iterations=40)])
-def test_a_box_in_a_patient_who_goes_on_is_as_the_whole_volume_shows_it(patients, method):
-    beam, box = ConeBeam.orbit(8, 1020, 740, (112, 112), 5.0), Grid.box(32, 192.0, (0.0, 0.0, 96.0))
-    y = xrays_of(WINDOW.to_mu(patients["continues"]), beam)
-    truth = WINDOW.to_hu(patients["continues"][0, 0, 16:48, 16:48, ROWS + 32:-ROWS])
-    whole = reconstruct(y, beam, method=method, grid=CHEST).volume[16:48, 16:48, 32:]
-    of_box, ending = (reconstruct(y, replace(beam, continued=given), method=method, grid=box).volume
+@pytest.mark.parametrize("method, in_box, voxels", [
+    pytest.param("phydict_learned", "phydict_learned", CHEST, marks=pytest.mark.slow),
+    (TV, Region(TV, Grid.box(16, 192.0, UPPER), HALF), HALF)])
+def test_a_box_in_a_patient_who_goes_on_is_as_the_whole_volume_shows_it(patients, method, in_box, voxels):
+    beam, n = ConeBeam.orbit(8, 1020, 740, (112, 112), 5.0), voxels.shape[0] // 4
+    y, box, middle = xrays_of(WINDOW.to_mu(patients["continues"]), beam), Grid.box(2 * n, 192.0, UPPER), slice(n, 3 * n)
+    truth = inside(patients["continues"], voxels)[0, 0, middle, middle, 2 * n:]
+    whole = reconstruct(y, beam, method=method, grid=voxels).volume[middle, middle, 2 * n:]
+    of_box, ending = (reconstruct(y, replace(beam, continued=given), method=in_box, grid=box).volume
                       for given in (None, False))
     rms = [float((volume - truth).square().mean().sqrt()) for volume in (whole, of_box, ending)]
     assert rms[1] < 1.1 * rms[0] and rms[1] < 0.5 * rms[2]

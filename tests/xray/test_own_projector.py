@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,19 +13,21 @@ from inference.runs import phantoms, record
 from laws import assert_adjoint, assert_gradient_is_adjoint, assert_linear
 from prior.tiny import tiny_prior
 
-from phydict.baselines import CGLS, Region
+from phydict.baselines import CGLS, SIRT, Region
 from phydict.cli.infer import main
 from phydict.datasets import Thorax, build
 from phydict.grid import Grid
 from phydict.inference.record import method_settings
 from phydict.inference.settings import Sampling
-from phydict.methods import reconstruct, reconstruct_by, reconstructor
+from phydict.methods import METHODS, reconstruct, reconstruct_by, reconstructor
+from phydict.posterior import DDS
 from phydict.units import hu_to_mu
 from phydict.xray import ConeBeam, Projector
 from phydict.xray.projectors.own import projector_kind
 
 GRID = Grid.cube(12, 360.0)
 BEAM = ConeBeam.orbit(3, 1020.0, 740.0, (10, 14), 40.0)
+FAST = replace(METHODS["phydict_fast"], iterations=2)
 OWN = '''from phydict.xray import Projector
 
 
@@ -75,15 +78,15 @@ def test_it_keeps_the_laws_and_projects_what_it_wraps(module, continued):
 
 
 @pytest.mark.filterwarnings("ignore")  # of few iterations and views
-@pytest.mark.parametrize("method, grid", [("sirt", Grid.cube(24)), ("phydict_fast", None),
-                                          ("phydict_fast", Grid.cube(24)), ("dds", None)])
+@pytest.mark.parametrize("method, grid", [(SIRT(10), Grid.cube(24)), (FAST, None), (FAST, Grid.cube(24)),
+                                          (DDS(3), None)])
 def test_methods_use_it_on_every_grid_of_theirs_and_give_what_the_wrapped_one_gives(module, method, grid):
     kind, beam, prior = module(OWN).Own, BEAM.with_continued(False), tiny_prior(False)
     xrays = of_thorax(Grid.cube(24), beam)
-    own, wrapped = (reconstruct(xrays, beam, None if method == "sirt" else prior, method, grid=grid,
+    own, wrapped = (reconstruct(xrays, beam, None if isinstance(method, SIRT) else prior, method, grid=grid,
                                 projector=projector) for projector in (kind, "joseph"))
     assert torch.equal(own.volume, wrapped.volume) and own.misfit == wrapped.misfit
-    assert {(grid or prior.grid).shape} | ({prior.grid.shape} if method != "sirt" else set()) <= {*kind.made}
+    assert {(grid or prior.grid).shape} | (set() if isinstance(method, SIRT) else {prior.grid.shape}) <= {*kind.made}
 
 
 def test_a_box_in_the_patient_and_what_lies_around_are_both_its_own(module):

@@ -18,6 +18,7 @@ import phydict
 from phydict.cli.infer import main as infer
 from phydict.cli.train import main as train
 from phydict.evaluation import read_csv
+from phydict.posterior import ProximalCG
 
 ROOT = Path(__file__).parents[1]
 SECTIONS = dict(re.findall(r"^## (.+?)\n(.*?)(?=^## |\Z)", (ROOT / "README.md").read_text(), re.MULTILINE | re.DOTALL))
@@ -68,10 +69,12 @@ def checkout(tmp_path, monkeypatch, cts) -> Path:
 
 @pytest.fixture(autouse=True)
 def few_steps(monkeypatch) -> None:
-    """The two methods that are run where none is named take two steps."""
-    few = {"phydict_learned": {"times": (0.2,), "x0_stds": (0.5, 0.3)}, "phydict_fast": {"iterations": 2}}
+    """The two methods that are run where none is named take two steps, short ones."""
+    short = {"likelihood": ProximalCG(2), "final_likelihood": ProximalCG(2), "subgrid": None, "metal": None}
+    few = {"phydict_learned": {"times": (0.2,), "x0_stds": (0.5, 0.3), "start": ProximalCG(2)},
+           "phydict_fast": {"iterations": 2}}
     for name, settings in few.items():
-        monkeypatch.setitem(phydict.METHODS, name, replace(phydict.METHODS[name], **settings))
+        monkeypatch.setitem(phydict.METHODS, name, replace(phydict.METHODS[name], **short | settings))
 
 
 def test_no_command_is_overlooked():

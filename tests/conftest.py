@@ -6,6 +6,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # before torch and numba are imported
     for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ.setdefault(name, "1")
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import nibabel
@@ -18,6 +19,24 @@ from command_lines import arguments
 def without_plots(monkeypatch):
     """Has ablations draw no plots, which take longer than most methods in tests."""
     monkeypatch.setattr("phydict.ablation.command.write_plots", lambda *_: [])
+
+
+@pytest.fixture(scope="session")
+def phantoms_made_once() -> Iterator[None]:
+    """Has infer.py's commands make each phantom once; that it would be the same again is a law of tests/datasets."""
+    from phydict.inference import data  # which takes seconds to import
+
+    made, make = {}, data.phantom_case
+
+    def kept(seed, grid, window):
+        key = seed, grid.shape, grid.affine.tobytes(), window
+        if key not in made:
+            made[key] = make(seed, grid, window)
+        return {name: value.clone() if hasattr(value, "clone") else value for name, value in made[key].items()}
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(data, "phantom_case", kept)
+        yield
 
 
 @pytest.fixture(scope="session")

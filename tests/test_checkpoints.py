@@ -32,15 +32,16 @@ class Code:
 @pytest.mark.parametrize("validated", [True, False])
 def test_weights_that_are_not_finite_never_replace_a_checkpoint(tmp_path, cache, capsys, monkeypatch, validated):
     def spoil(task: PriorTraining, *_) -> None:
-        if task.global_step == 8:
+        if task.global_step == 4:
             task.prior.null.data.view(-1)[3] = float("nan")
 
     monkeypatch.setattr(PriorTraining, "on_train_batch_end", spoil)
     more = [] if validated else ["--trainer.limit_val_batches=0"]
-    said = refusal(capsys, main, arguments(tmp_path, cache, "--trainer.max_epochs=3", *more))
-    assert "the weights are not finite after 8 steps (prior.null has 1 NaN" in said and "last.ckpt" in said
-    assert checkpoint(tmp_path)["global_step"] == 4
-    assert not validated or torch.load(tmp_path / "best.ckpt", weights_only=True)["global_step"] == 4
+    said = refusal(capsys, main, arguments(tmp_path, cache, "--trainer.max_epochs=3", "--data.loading.epoch_size=4",
+                                           *more))
+    assert "the weights are not finite after 4 steps (prior.null has 1 NaN" in said and "last.ckpt" in said
+    assert checkpoint(tmp_path)["global_step"] == 2
+    assert not validated or torch.load(tmp_path / "best.ckpt", weights_only=True)["global_step"] == 2
 
 
 @pytest.fixture
@@ -94,11 +95,11 @@ def test_the_checkpoint_that_reconstructs_best_is_kept(tmp_path, cache, monkeypa
     scores = iter((10.0, 30.0, 20.0))
     monkeypatch.setattr("phydict.training.prior.reconstruction_scores",
                         lambda *_: {"psnr": next(scores), "ssim": 0.5})
-    main(arguments(tmp_path, cache, "--trainer.max_epochs=3"))
+    main(arguments(tmp_path, cache, "--trainer.max_epochs=3", "--data.loading.epoch_size=4"))
     best = torch.load(tmp_path / "best.ckpt", map_location="cpu", weights_only=True)
-    assert best["global_step"] == 8 and checkpoint(tmp_path)["global_step"] == 12
-    assert {step: float(value) for step, value in losses(tmp_path, "val/psnr").items()} == {3: 10, 7: 30, 11: 20}
-    assert [float(value) for value in losses(tmp_path, "samples").values()] == [8, 16, 24]
+    assert best["global_step"] == 4 and checkpoint(tmp_path)["global_step"] == 6
+    assert {step: float(value) for step, value in losses(tmp_path, "val/psnr").items()} == {1: 10, 3: 30, 5: 20}
+    assert [float(value) for value in losses(tmp_path, "samples").values()] == [4, 8, 12]
     main(["export", f"--checkpoint={tmp_path / 'best.ckpt'}", f"--out={tmp_path / 'prior.safetensors'}"])
     assert load_prior(tmp_path / "prior.safetensors").grid.shape == (16, 16, 16)
 
@@ -107,24 +108,26 @@ def test_a_moved_training_that_resumes_keeps_its_best_weights(tmp_path, cache, m
     scores = iter((30.0, 10.0, 40.0))
     monkeypatch.setattr("phydict.training.prior.reconstruction_scores",
                         lambda *_: {"psnr": next(scores), "ssim": 0.5})
-    main(arguments(tmp_path / "there", cache, "--trainer.max_epochs=1"))
+    one_step = "--data.loading.epoch_size=2"
+    main(arguments(tmp_path / "there", cache, "--trainer.max_epochs=1", one_step))
     (tmp_path / "there").rename(run := tmp_path / "here")
-    for epochs, best in ((2, 4), (3, 12)):
-        main(arguments(run, cache, f"--trainer.max_epochs={epochs}", "--ckpt_path=last"))
+    for epochs, best in ((2, 1), (3, 3)):
+        main(arguments(run, cache, f"--trainer.max_epochs={epochs}", "--ckpt_path=last", one_step))
         assert torch.load(run / "best.ckpt", map_location="cpu", weights_only=True)["global_step"] == best
-        assert checkpoint(run)["global_step"] == 4 * epochs and sorted(run.glob("*.ckpt")) == [
+        assert checkpoint(run)["global_step"] == epochs and sorted(run.glob("*.ckpt")) == [
             run / "best.ckpt", run / "last.ckpt"]
 
 
-@pytest.mark.parametrize("every, expected", [(1, {3: 10, 5: 20}), (5, {5: 10})])
+@pytest.mark.parametrize("every, expected", [(1, {1: 10, 2: 20}), (5, {2: 10})])
 def test_the_last_weights_are_validated_wherever_a_training_ends(tmp_path, cache, monkeypatch, every, expected):
     scores = iter((10.0, 20.0))
     monkeypatch.setattr("phydict.training.prior.reconstruction_scores",
                         lambda *_: {"psnr": next(scores), "ssim": 0.5})
-    main(arguments(tmp_path, cache, "--trainer.max_steps=6", f"--trainer.check_val_every_n_epoch={every}"))
+    main(arguments(tmp_path, cache, "--trainer.max_steps=3", "--data.loading.epoch_size=4",
+                   f"--trainer.check_val_every_n_epoch={every}"))
     assert {step: float(value) for step, value in losses(tmp_path, "val/psnr").items()} == expected
-    assert torch.load(tmp_path / "best.ckpt", map_location="cpu", weights_only=True)["global_step"] == 6
-    assert checkpoint(tmp_path)["global_step"] == 6
+    assert torch.load(tmp_path / "best.ckpt", map_location="cpu", weights_only=True)["global_step"] == 3
+    assert checkpoint(tmp_path)["global_step"] == 3
 
 
 def test_a_second_training_never_overwrites_a_first(trained, cache, capsys):

@@ -163,10 +163,18 @@ def test_a_run_that_a_signal_stops_within_a_step_keeps_that_step(number, straigh
     assert all(torch.equal(weight, resumed["state_dict"][name]) for name, weight in straight["state_dict"].items())
 
 
+IN_TWO_BATCHES = "--trainer.accumulate_grad_batches=2", "--trainer.max_steps=4", "--data.loading.epoch_size=16"
+
+
+@pytest.fixture(scope="module")
+def straight_in_two_batches(tmp_path_factory, cache) -> dict:
+    return ten_steps(tmp_path_factory.mktemp("straight"), cache, *IN_TWO_BATCHES)
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_waits_for_all_batches_of_a_step(number, handler_of_sigint, tmp_path, cache, monkeypatch):
-    more = "--trainer.accumulate_grad_batches=2", "--trainer.max_steps=4", "--data.loading.epoch_size=16"
-    straight, step = ten_steps(tmp_path / "straight", cache, *more), PriorTraining.training_step
+def test_a_signal_waits_for_all_batches_of_a_step(number, straight_in_two_batches, handler_of_sigint, tmp_path, cache,
+                                                  monkeypatch):
+    step = PriorTraining.training_step
 
     def signalled(task, batch, index):
         if (task.global_step, index % 2) == (1, 0):
@@ -175,9 +183,9 @@ def test_a_signal_waits_for_all_batches_of_a_step(number, handler_of_sigint, tmp
 
     with monkeypatch.context() as stopping, pytest.raises(SystemExit):
         stopping.setattr(PriorTraining, "training_step", signalled)
-        ten_steps(tmp_path / "halved", cache, *more)
-    assert checkpoint(tmp_path / "halved")["global_step"] == 2
-    resumed = ten_steps(tmp_path / "halved", cache, *more, "--ckpt_path=last")
+        ten_steps(tmp_path, cache, *IN_TWO_BATCHES)
+    assert checkpoint(tmp_path)["global_step"] == 2
+    resumed, straight = ten_steps(tmp_path, cache, *IN_TWO_BATCHES, "--ckpt_path=last"), straight_in_two_batches
     assert all(torch.equal(weight, resumed["state_dict"][name]) for name, weight in straight["state_dict"].items())
 
 
@@ -361,10 +369,10 @@ def test_a_run_that_stopped_at_an_epochs_last_batch_goes_on_with_the_next_ones_f
 
 
 def ten_steps(folder: Path, cache: Path, *more: str) -> dict:
-    """The checkpoint of ten steps that are validated now and then."""
+    """The checkpoint of ten steps that are validated now and then, by the error of denoising alone."""
     main(arguments(folder, cache, "--model.text.encoder=none", "--data.loading.epoch_size=4",
                    "--trainer.check_val_every_n_epoch=5", "--trainer.limit_val_batches=1", "--trainer.max_steps=10",
-                   *more))
+                   "--model.validation.views=0", *more))
     return checkpoint(folder)
 
 

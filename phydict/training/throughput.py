@@ -95,8 +95,9 @@ def _network_flop(kind: type[nn.Module], settings: str, inputs: tuple[tuple[torc
     return counter.get_total_flops()
 
 
+@cache
 def matmul_peak(device: torch.device, dtype: torch.dtype) -> float:
-    """FLOP/s of the fastest of a few square matrix products on `device`."""
+    """FLOP/s of the fastest of a few square matrix products on `device`, measured once."""
     n = 1024 if device.type == "cpu" else 8192
     a, b = torch.rand(2, n, n, device=device).to(dtype)
     seconds = []

@@ -8,6 +8,11 @@ from ablation.runs import Trace
 from phydict.methods import METHODS
 
 
+@pytest.fixture(scope="session", autouse=True)
+def known_phantoms(phantoms_made_once) -> None:
+    """Tests here reconstruct the same few phantoms."""
+
+
 @pytest.fixture(autouse=True)
 def trace(monkeypatch):
     monkeypatch.setitem(METHODS, "trace", Trace())

@@ -256,7 +256,7 @@ def test_every_committed_specification_can_be_run(config):
 
 @pytest.mark.parametrize("content, words", [
     ({"methods": {"mine": {"of": "trace", "methodnull.x": 1}}}, "methodnull.x means nothing"),
-    ({"products": [{"axes": {"method": ["trace"], "seed": list(range(500))}}] * 5}, "2,500 combinations"),
+    ({"products": [{"axes": {"method": ["trace"], "seed": list(range(n))}} for n in (2, 1999)]}, "2,001 combinations"),
     ({"axes": {"method": ["trace"], "views": ["9" * 500]}}, "an orbit needs at least one view")], ids=["part",
     "products", "long"])
 def test_what_a_specification_cannot_mean_is_one_short_sentence(tmp_path, content, words):

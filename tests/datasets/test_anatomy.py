@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy
 
-from phydict.datasets.cts.anatomy import lung_box_centre, segment
+from phydict.datasets.cts.anatomy import grown, lung_box_centre, segment
 from phydict.datasets.phantoms.phantom import phantom_case
 from phydict.grid import Grid
 from phydict.units import HUWindow
@@ -84,6 +85,14 @@ def test_the_volume_and_place_of_two_plain_lungs_are_right():
     affine[:3, 3] = 100, -50, 20
     middle = np.array([49.5, 39.5 + 3, 29.5 + 4]) * 4 + affine[:3, 3]
     np.testing.assert_allclose(lung_box_centre(masks[0], affine), middle, atol=4)
+
+
+@pytest.mark.parametrize("spacing", [(2.0, 2.0, 2.0), (1.0, 1.5, 3.3), (9.0, 2.0, 2.0)])
+def test_a_mask_grows_by_what_lies_within_its_reach(spacing):
+    mask = np.random.default_rng(0).random((24, 25, 26)) > 0.999
+    for reach in (3.0, 8.0):
+        near = scipy.ndimage.distance_transform_edt(~mask, spacing) <= reach
+        assert np.array_equal(grown(mask, np.array(spacing), reach), near)
 
 
 def test_a_lung_open_at_the_first_and_last_slice_is_still_found():

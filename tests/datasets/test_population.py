@@ -312,7 +312,7 @@ def test_a_ct_that_does_not_register_is_named_and_left_out(folder, coarse, tmp_p
     assert [case["id"] for case in drawn.population.cases] == ["patient0", "patient1"]
 
 
-def test_fewer_than_two_patients_are_refused(folder, tmp_path):
+def test_fewer_than_two_patients_are_refused(folder, coarse, tmp_path):
     files = find_cts(folder)
     with pytest.raises(ValueError, match=r"at least 2 patients, but there is 1 to train on \(patient0\)"):
         DrawnPatients(CTCases(files[:1], None, GRID))
@@ -321,7 +321,7 @@ def test_fewer_than_two_patients_are_refused(folder, tmp_path):
     with pytest.raises(ValueError, match=r"1 to train on \(train_1_a_0\): give more CTs"):
         DrawnPatients(CTCases([replace(ct, id=f"train_1_a_{n}") for n, ct in enumerate(files)], None, GRID))
     water(tmp_path)
-    drawn = DrawnPatients(CTCases([files[0], *find_cts(tmp_path)], None, Grid.cube(16)))
+    drawn = DrawnPatients(CTCases([files[0], *find_cts(tmp_path)], coarse, Grid.cube(16)))
     with pytest.warns(UserWarning, match="water"), pytest.raises(ValueError, match="1 of 2 could be registered"):
         drawn.prepare()
 

@@ -16,6 +16,11 @@ from phydict.units import HUWindow
 from phydict.xray import Projector
 
 
+@pytest.fixture(scope="session", autouse=True)
+def known_phantoms(phantoms_made_once) -> None:
+    """Tests here reconstruct the same few phantoms."""
+
+
 @pytest.fixture(scope="session")
 def measured(tmp_path_factory) -> Path:
     """Two folders of X-rays."""

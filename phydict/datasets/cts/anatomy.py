@@ -86,10 +86,8 @@ def _body(hu: np.ndarray, spacing: np.ndarray) -> np.ndarray:
     size = np.bincount(labels.ravel())
     size[0] = 0
     body = np.zeros(hu.shape, bool) if len(size) < 2 else labels == size.argmax()
-    for k in range(hu.shape[2]):
-        grown = scipy.ndimage.binary_dilation(body[:, :, k], iterations=BODY_RIM)
-        body[:, :, k] = scipy.ndimage.binary_fill_holes(grown)
-    return body
+    body = scipy.ndimage.binary_dilation(body, IN_PLANE, iterations=BODY_RIM)
+    return body | _without_border(~body)
 
 
 def _lung_components(interior: np.ndarray, hu: np.ndarray, spacing: np.ndarray) -> np.ndarray:
@@ -140,11 +138,27 @@ def _fill(lungs: np.ndarray, airway: np.ndarray, hu: np.ndarray, spacing: np.nda
     size = np.bincount(labels.ravel())
     size[0] = 0
     lungs = (size > 0.02 * size.sum())[labels]
-    grown = scipy.ndimage.distance_transform_edt(~lungs, spacing) <= CLOSING_MM
-    filled = scipy.ndimage.distance_transform_edt(grown, spacing) > CLOSING_MM
-    filled = scipy.ndimage.binary_fill_holes(filled | lungs) & ~airway
-    depth = scipy.ndimage.distance_transform_edt(filled | airway, spacing)
-    return filled, filled & (hu > VESSEL_ABOVE) & (depth > SURFACE_MM)
+    closed = ~grown(~grown(lungs, spacing, CLOSING_MM), spacing, CLOSING_MM)
+    filled = scipy.ndimage.binary_fill_holes(closed | lungs) & ~airway
+    surface = grown(~(filled | airway), spacing, SURFACE_MM)
+    return filled, filled & (hu > VESSEL_ABOVE) & ~surface
+
+
+def grown(mask: np.ndarray, spacing: np.ndarray, reach: float) -> np.ndarray:
+    """The mask and all voxels within `reach` mm of it, rod by rod of a ball: where that is a few voxels, in a tenth of
+    the time of a distance transform."""
+    most = (reach / spacing).astype(int)
+    (x, y, z), (nx, ny, nz) = most, mask.shape
+    padded = np.pad(mask, [(n, n) for n in most])
+    rods = [padded[:, :, z:z + nz]]  # the mask grown by 0, 1, ... voxels along z
+    for k in range(1, z + 1):
+        rods.append(rods[-1] | padded[:, :, z - k:z - k + nz] | padded[:, :, z + k:z + k + nz])
+    near = np.zeros_like(mask)
+    for i, j in np.ndindex(2 * x + 1, 2 * y + 1):
+        left = reach**2 - ((i - x) * spacing[0]) ** 2 - ((j - y) * spacing[1]) ** 2
+        if left >= 0:
+            near |= rods[min(z, int(np.sqrt(left) / spacing[2]))][i:i + nx, j:j + ny]
+    return near
 
 
 def _box(mask: np.ndarray, margin) -> tuple[slice, ...]:

@@ -128,7 +128,7 @@ def extended(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, d
     left = Remainders(binned(xrays, factor), beam.binned(factor), display)
     answered = left.continues(volume)
     takes_more = method.with_room(STEP, STEP, 0) or method.with_room(0, 0, STEP)
-    room = _room(volume, left, answered, method.mu_water, display) if takes_more else (0, 0, 0)
+    room = _room(volume, left, method.mu_water) if takes_more else (0, 0, 0)
     wider = method.with_room(*room) if any(room) else None
     whole = grid if wider is None else wider.grid or grid.grown(*room)
     if wider is None or not wider.has_memory_for(whole):
@@ -144,10 +144,9 @@ def extended(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, d
     return Extended(wider, whole, grid, (x, y, z)), whole, beam.with_continued(left.continues(volume.grown(*room)))
 
 
-def _room(volume: Grid, left: Remainders, answered: bool, mu_water: float, display: bool) -> tuple[int, int, int]:
-    """How many voxels more the volume needs at both ends of each axis; answered: whether the patient continues above
-    and below it."""
-    aside, beam = 0 if display else _columns(volume, left, answered, mu_water), left.beam
+def _room(volume: Grid, left: Remainders, mu_water: float) -> tuple[int, int, int]:
+    """How many voxels more the volume needs at both ends of each axis."""
+    beam, aside = left.beam, 0 if left.display else _columns(volume, left, mu_water)
     wide = volume.grown(aside, aside, 0)
     if not (left.continues(wide) or (beam.continued is None and left.needs_taller(wide))):
         return aside, aside, 0
@@ -157,11 +156,12 @@ def _room(volume: Grid, left: Remainders, answered: bool, mu_water: float, displ
     return aside, aside, slices
 
 
-def _columns(volume: Grid, left: Remainders, answered: bool, mu_water: float) -> int:
+def _columns(volume: Grid, left: Remainders, mu_water: float) -> int:
     """How many voxels more the volume needs at each of its four sides to hold what stands there; 0 where nothing does
     that the X-rays show."""
     if not volume.is_upright:
         return 0
+    answered = left.continues(volume)
     xrays, beam = left.xrays, replace(left.beam, continued=answered)
     across = max(volume.shape[:2])
     room = [n for n in range(STEP, int(MORE * across) + 1, STEP) if beam.has_room_for(volume.grown(n, n, 0))]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 
 from torch import Tensor
 
@@ -34,14 +35,18 @@ class Remainders:
     """
 
     def __init__(self, xrays: Tensor, beam: ConeBeam, display: bool):
-        self.xrays, self.beam = _levelled(xrays) if display else xrays, beam
+        self.xrays, self.beam, self.display = xrays, beam, display
         self._norms: dict[tuple, float] = {}
+
+    @cached_property
+    def _measured(self) -> Tensor:
+        return _levelled(self.xrays) if self.display else self.xrays
 
     def norm(self, grid: Grid, continued: bool) -> float:
         """The norm of what ITERATIONS steps leave of the X-rays in the voxels of a grid, continued beyond it or not."""
         key = grid.shape, grid.affine.tobytes(), continued
         if key not in self._norms:
-            y, A = binned_to(grid, self.xrays, replace(self.beam, continued=continued), False)
+            y, A = binned_to(grid, self._measured, replace(self.beam, continued=continued), False)
             x = conjugate_gradients(lambda mu: A.T(A(mu)), A.T(y[None]), ITERATIONS)
             self._norms[key] = float((y - A(x)[0]).norm())
         return self._norms[key]

@@ -105,9 +105,9 @@ def _airway(interior: np.ndarray, lungs: np.ndarray, hu: np.ndarray, spacing: np
     """The trachea and bronchi grown from a tube of gas near the lungs' axis, or nothing where there is none."""
     seed = _trachea(interior, lungs, hu, spacing)
     for threshold in AIRWAY_BELOW if seed.any() else ():
-        grown = scipy.ndimage.binary_propagation(seed, mask=(interior & (hu < threshold)) | seed)
-        if grown.sum() * spacing.prod() / 1e6 < AIRWAY_LITRES:
-            return scipy.ndimage.binary_closing(grown)
+        tree = scipy.ndimage.binary_propagation(seed, mask=(interior & (hu < threshold)) | seed)
+        if tree.sum() * spacing.prod() / 1e6 < AIRWAY_LITRES:
+            return scipy.ndimage.binary_closing(tree)
     return seed
 
 

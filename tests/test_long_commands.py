@@ -24,6 +24,7 @@ import yaml
 from command_lines import arguments
 from ct_files import save_ct, thorax_hu
 from inference.runs import phantoms, sirt, xrays
+from processes import INFER, Python
 
 from phydict.cli.infer import main as infer
 from phydict.cli.train import main as train
@@ -260,6 +261,14 @@ def ascii_locale() -> Iterator[None]:
     locale.setlocale(locale.LC_CTYPE, "C")
     yield
     locale.setlocale(locale.LC_CTYPE, before)
+
+
+@pytest.mark.parametrize("command, table", [("test", "sirt/results.md"), ("ablate", "tables.md")])
+def test_all_is_written_where_nobody_reads_what_is_printed_and_no_more_is_said(command, table, made, cache, tmp_path):
+    unread = "import os, sys\nread, write = os.pipe()\nos.close(read)\nsys.stdout = open(write, 'w')\n"
+    run = Python(unread + INFER, *COMMANDS[command][1](made, cache, tmp_path / "out"))
+    assert run.wait() == 1 and "Broken pipe" not in run.err and "error" not in run.err, run.err
+    assert (tmp_path / "out" / table).is_file() and len(shown_in(tmp_path / "out" / "index.html")) == 2
 
 
 @pytest.mark.skipif(sys.flags.utf8_mode, reason="Python writes UTF-8 in every locale")

@@ -7,6 +7,7 @@ import logging
 import os
 import re
 import reprlib
+import select
 import signal
 import sys
 import tempfile
@@ -45,11 +46,13 @@ TRACEBACK = "PHYDICT_TRACEBACK"
 def cli_errors(*also: type[Exception], to_resume: str = AGAIN) -> Iterator[None]:
     """Prints bad arguments, ValueError, OSError, FloatingPointError and `also` as one sentence and exits with code 2;
     the environment variable PHYDICT_TRACEBACK=1 shows the trace instead. A run that a signal stopped says how to resume
-    and exits with code 130 (SIGINT) or 143 (SIGTERM): as `to_resume` has it, or the note of what was raised. Faults of
-    code pass, without the notes that begin with AGAIN."""
+    and exits with code 130 (SIGINT) or 143 (SIGTERM): as `to_resume` has it, or the note of what was raised. Where
+    whoever reads standard output, such as head, has read enough, it exits with code 1 and says nothing. Faults of code
+    pass, without the notes that begin with AGAIN."""
     try:
         with _raised_again(), enough_memory():
             yield
+            sys.stdout.flush()
     except (KeyboardInterrupt, SystemExit) as stop:  # Lightning exits with 1 on SIGINT and without a code on SIGTERM
         interrupted = isinstance(stop, KeyboardInterrupt) or isinstance(stop.__context__, KeyboardInterrupt)
         if not interrupted and isinstance(stop, SystemExit) and stop.code is not None:
@@ -60,6 +63,9 @@ def cli_errors(*also: type[Exception], to_resume: str = AGAIN) -> Iterator[None]
     except (ValueError, OSError, FloatingPointError, ArgumentError, *also) as error:  # type: ignore[misc]
         if os.environ.get(TRACEBACK):
             raise
+        if isinstance(error, BrokenPipeError) and _nobody_reads():
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is flushed at the end
+            raise SystemExit(1) from None
         full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
         advice = f": free some space; to resume, {_advice(error, to_resume)}" if full else ""
         log_problem("error", f"{sentence(error)}{advice}")
@@ -107,6 +113,13 @@ def ended_by_sigterm() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+def _nobody_reads() -> bool:
+    """Whether whoever read standard output has closed it."""
+    poll = select.poll()
+    poll.register(sys.stdout.fileno(), 0)
+    return bool(poll.poll(0))
 
 
 def _advice(stop: BaseException, to_resume: str) -> str:

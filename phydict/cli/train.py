@@ -177,10 +177,10 @@ class PriorCLI(ProgressCLI):
                     held_out, trained = datamodule.held_out, len(datamodule.cts)
                     phantoms = bool(self.config.fit.data.holdout.phantoms)
                     beside = ", beside phantoms (data.holdout.phantoms)" * phantoms
-                    tells = "phantoms alone tell" if phantoms else "nothing tells"
+                    validates = "phantoms alone validate" if phantoms else "nothing validates"
                     log_progress(f"{len(held_out)} of {len(held_out) + trained} CTs are held out for validation{beside}"
-                                 if held_out else f"no CT is held out, so that {tells} which weights are best: "
-                                 "data.holdout.ids may name some", event="held_out", cts=held_out)
+                                 if held_out else f"no CT is held out, so that {validates}: data.holdout.ids may name "
+                                 "some", event="held_out", cts=held_out)
                 self.trainer.fit(model, datamodule=datamodule, ckpt_path=ckpt_path, weights_only=weights_only)
             except BaseException as stop:
                 there = (out / CHECKPOINT).is_file()

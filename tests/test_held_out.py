@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -46,6 +47,20 @@ def test_those_that_validate_are_a_list_a_word_or_the_lines_of_a_text_file(cts, 
         data(cts, tmp_path, "none.txt")
     with pytest.raises(ValueError, match=r"\[0002\] has numbers among them: quote each"):
         HoldOut("[0002]")
+
+
+@pytest.mark.parametrize("one, others", [("train_1_a_1", ("train_10_a_1", "train_11_a_1")), ("P1__a", ("P10__a",))])
+def test_the_name_of_a_patient_holds_out_no_other_whose_name_begins_so(cts, tmp_path, one, others):
+    (tmp_path / "cts").mkdir()
+    for id in (one, *others):
+        file = tmp_path / "cts" / f"{id.replace('__', '/')}.nii.gz"
+        file.parent.mkdir(exist_ok=True)
+        shutil.copy(cts / "patient0.nii.gz", file)
+    patient = one.removesuffix("_a_1").removesuffix("__a")
+    (tmp_path / "ids.txt").write_text(f"{patient}\n")
+    for ids in ([patient], str(tmp_path / "ids.txt")):
+        assert data(tmp_path / "cts", tmp_path, ids).held_out == [one]
+    assert sorted(data(tmp_path / "cts", tmp_path, [patient[:-1]]).held_out) == sorted([one, *others])
 
 
 @pytest.mark.parametrize("before, said, known", [

@@ -213,10 +213,12 @@ class PriorData(lightning.LightningDataModule):
 def _held_out(files: list[CTFile], holdout: HoldOut, seed: int) -> list[CTFile]:
     """The CTs that validate instead of training. Raises ValueError where a word is in no CT's id, and only warns where
     it is one of many in a file, whose lines also mean the other CTs of the patient that they name."""
-    names, words = {f.id for f in files}, holdout.words()
+    names, patients, words = {f.id for f in files}, {patient_of(f.id) for f in files}, holdout.words()
 
     def meant(word: str, id: str) -> bool:
-        return word == id if word in names else word in id or (holdout.is_file and patient_of(word) == patient_of(id))
+        if word in names | patients:
+            return word == id if word in names else word == patient_of(id)
+        return word in id or (holdout.is_file and patient_of(word) == patient_of(id))
 
     if unknown := [word for word in words if not any(meant(word, f.id) for f in files)]:
         said = (f"data.holdout.ids names '{unknown[0]}', but no CT has that in its id"

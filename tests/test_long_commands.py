@@ -254,6 +254,25 @@ def test_a_training_that_is_stopped_while_it_learns_reports_says_that_nothing_is
     assert "to resume, run the same command again: no checkpoint was written" in capfd.readouterr().err
 
 
+def test_a_training_that_is_stopped_before_it_begins_names_no_checkpoint(run, handlers, monkeypatch, capfd):
+    monkeypatch.setattr("phydict.cli.train.check_writable", lambda *_: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(SystemExit):
+        run("fit")
+    assert "to resume, run the same command again\n" in capfd.readouterr().err
+
+
+def test_a_training_that_goes_back_and_is_stopped_at_once_names_no_later_checkpoint(run, handlers, made, tmp_path,
+                                                                                   monkeypatch, capfd):
+    out = tmp_path / "out"
+    out.mkdir()
+    for name in ("last.ckpt", "best.ckpt"):
+        (out / name).write_bytes((made / "trained" / "last.ckpt").read_bytes())
+    monkeypatch.setattr(PriorTraining, "on_fit_start", lambda _: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(SystemExit):
+        run("fit", "--trainer.max_epochs=3", f"--ckpt_path={out / 'best.ckpt'}")
+    assert "to resume, run the same command again: no checkpoint was written" in capfd.readouterr().err
+
+
 @pytest.fixture
 def ascii_locale() -> Iterator[None]:
     """Text files are ASCII unless it is said otherwise, as in a locale that is not UTF-8."""

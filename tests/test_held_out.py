@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,6 +20,7 @@ from phydict.datasets.itk_file import ENDINGS
 from phydict.grid import Cube
 from phydict.prior import save_prior, save_refiner
 from phydict.prior.files import held_out_of
+from phydict.runtime.files import machine
 from phydict.training import PriorTraining
 from phydict.training.crops import SuperResolutionData
 from phydict.training.data import PriorData
@@ -121,6 +123,17 @@ def test_a_ct_that_is_none_is_refused_before_the_first_step(tmp_path, shape, ref
         return fitted.prepare_data()
     with pytest.raises(ValueError, match=f"b.nii.gz {refused}.* data.source.exclude"):
         fitted.prepare_data()
+
+
+def test_what_a_killed_training_had_begun_to_prepare_is_removed(tmp_path):
+    made = in_trainer(PriorData(phantoms=1, holdout=HoldOut(phantoms=0), cache=str(tmp_path), cube=Cube(16)), "fit")
+    begun = [folder / f".{machine()}.{process}.part.1.npz" for folder in (tmp_path, tmp_path / "rollouts-1" / "2")
+             for process in (99999999, os.getpid())]
+    for file in begun:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.touch()
+    made.prepare_data()
+    assert [file.exists() for file in begun] == [False, True] * 2
 
 
 @pytest.mark.parametrize("ending", ENDINGS)

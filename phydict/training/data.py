@@ -31,6 +31,7 @@ from phydict.datasets.population import DrawnPatients
 from phydict.datasets.population.drawn import POPULATION_VERSION
 from phydict.grid import Cube, Grid
 from phydict.runtime.console import check_writable
+from phydict.runtime.files import remove_leftovers
 from phydict.runtime.progress_log import log_progress
 from phydict.runtime.ranges import check_between
 from phydict.runtime.seeds import check_seed
@@ -135,6 +136,8 @@ class PriorData(lightning.LightningDataModule):
     def prepare_data(self) -> None:
         if self.trainer.state.fn != "fit":
             return
+        for folder in [*self.cache.glob("**")]:
+            remove_leftovers(folder)
         self.check_headers()
         self._read_held_out()
         if self.population:

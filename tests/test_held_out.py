@@ -104,6 +104,23 @@ def test_reconstructions_of_those_that_their_refiner_learnt_from_are_warned_of(c
                        cache=str(tmp_path / "cache"), cube=Cube(32), window=WINDOW)
 
 
+@pytest.mark.filterwarnings("ignore:patient1 was not among")
+def test_a_training_resumes_with_what_the_same_network_makes(cts, tmp_path):
+    files = [str(tmp_path / f"refiner_{n}.safetensors") for n in range(2)]
+    for n, file in enumerate(files):
+        save_refiner(tiny_refiner(), file, {"held_out": [f"patient{n}"]})
+    settings = {"holdout": HoldOut(phantoms=0), "phantoms": 1, "cache": str(tmp_path / "cache"), "window": WINDOW}
+    of_calls = [RollOutData(RollOutSettings(initial=file), cube=Cube(16), **settings) for file in files]
+    of_crops = [RefinementData(RefinementCases(crop=16), initial=file, cube=Cube(32), **settings) for file in files]
+    for (first, other), setting in ((of_calls, "model.initial"), (of_crops, "data.initial")):
+        for made in (first, other):
+            in_trainer(made, "fit")
+        first.load_state_dict(first.state_dict())
+        first.load_state_dict({name: value for name, value in first.state_dict().items() if name != "made_by"})  # older
+        with pytest.raises(ValueError, match=f"{setting} is not the one that it was before: give that file again"):
+            other.load_state_dict(first.state_dict())
+
+
 def test_validation_on_those_that_were_trained_on_is_warned_of(cts, tmp_path):
     validated = in_trainer(data(cts, tmp_path, ["patient1"]), "validate")
     validated.load_state_dict(validated.state_dict())

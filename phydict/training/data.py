@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import lightning
@@ -59,6 +61,9 @@ class PriorData(lightning.LightningDataModule):
 
     trainer: lightning.Trainer
 
+    made_by: Mapping[str, int | None] = MappingProxyType({})
+    """Of the networks that make what is learnt from, where any do, the setting that gives each -> its checksum."""
+
     def __init__(self, cts: str | None = None, source: CTSource = CTSource(), holdout: HoldOut = HoldOut(),
                  phantoms: int = 2000, loading: Loading = Loading(), cache: str = "runs/cache",
                  augmentation: Augmentation = Augmentation(), seed: int = 0, cube: Cube = Cube(),
@@ -108,11 +113,12 @@ class PriorData(lightning.LightningDataModule):
         return [drawn, *([ct.id, self.cts.key(ct)] for ct in self.cts.cts)]
 
     def state_dict(self) -> dict:
-        return {"held_out": self.held_out, "trained": len(self.cts)}
+        return {"held_out": self.held_out, "trained": len(self.cts), "made_by": dict(self.made_by)}
 
     def load_state_dict(self, state_dict: dict) -> None:
-        """Raises ValueError where a training that resumes holds out patients that it did not, or trains on those that
-        it held out; warns of CTs that are no longer there, and in validation of those that it did not hold out."""
+        """Raises ValueError where a training that resumes holds out patients that it did not, trains on those that it
+        held out, or learns from what another network makes; warns of CTs that are no longer there, and in validation of
+        those that it did not hold out."""
         before = state_dict["held_out"]
         if self.trainer.state.fn != "fit":
             return self.check_unseen(before if state_dict.get("trained", True) else None, "the training")
@@ -123,6 +129,9 @@ class PriorData(lightning.LightningDataModule):
             raise ValueError(f"a training resumes with the CTs held out that were before, but {changed[0]} is {is_now} "
                              "now: give the same data.cts, data.holdout and data.seed, or --data.holdout.ids "
                              "<out>/held_out.txt with data.holdout.fraction 0, or start anew with model.initial")
+        if other := [name for name, crc in state_dict.get("made_by", {}).items() if crc != self.made_by[name]]:
+            raise ValueError(f"a training resumes with what the same network makes, but {other[0]} is not the one that "
+                             "it was before: give that file again, or start anew with another --out")
         if gone := sorted({*before} - {*self.held_out}):
             warn(f"of the {len(before)} CTs that were held out, {len(gone)} are not among the data now (the first is "
                  f"{gone[0]}): the training goes on with the others, whose scores are not those of all")

@@ -27,8 +27,10 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
 def test_a_full_disk_is_one_sentence_that_says_how_to_resume(number, capsys):
-    with pytest.raises(SystemExit) as stopped, cli_errors(to_resume="add --ckpt_path"):
-        raise OSError(number, os.strerror(number), "metrics.csv")
+    with pytest.raises(SystemExit) as stopped, cli_errors():
+        error = OSError(number, os.strerror(number), "metrics.csv")
+        error.add_note("add --ckpt_path")
+        raise error
     said = capsys.readouterr().err
     assert stopped.value.code == 2 and said.count("\n") == 1
     assert os.strerror(number) in said and "'metrics.csv'" in said and "free some space; to resume, add --ckpt" in said

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,6 +20,7 @@ from phydict.datasets.itk_file import ENDINGS
 from phydict.grid import Cube
 from phydict.prior import save_prior, save_refiner
 from phydict.prior.files import held_out_of
+from phydict.runtime.files import machine
 from phydict.training import PriorTraining
 from phydict.training.crops import SuperResolutionData
 from phydict.training.data import PriorData
@@ -46,6 +49,20 @@ def test_those_that_validate_are_a_list_a_word_or_the_lines_of_a_text_file(cts, 
         data(cts, tmp_path, "none.txt")
     with pytest.raises(ValueError, match=r"\[0002\] has numbers among them: quote each"):
         HoldOut("[0002]")
+
+
+@pytest.mark.parametrize("one, others", [("train_1_a_1", ("train_10_a_1", "train_11_a_1")), ("P1__a", ("P10__a",))])
+def test_the_name_of_a_patient_holds_out_no_other_whose_name_begins_so(cts, tmp_path, one, others):
+    (tmp_path / "cts").mkdir()
+    for id in (one, *others):
+        file = tmp_path / "cts" / f"{id.replace('__', '/')}.nii.gz"
+        file.parent.mkdir(exist_ok=True)
+        shutil.copy(cts / "patient0.nii.gz", file)
+    patient = one.removesuffix("_a_1").removesuffix("__a")
+    (tmp_path / "ids.txt").write_text(f"{patient}\n")
+    for ids in ([patient], str(tmp_path / "ids.txt")):
+        assert data(tmp_path / "cts", tmp_path, ids).held_out == [one]
+    assert sorted(data(tmp_path / "cts", tmp_path, [patient[:-1]]).held_out) == sorted([one, *others])
 
 
 @pytest.mark.parametrize("before, said, known", [
@@ -87,6 +104,23 @@ def test_reconstructions_of_those_that_their_refiner_learnt_from_are_warned_of(c
                        cache=str(tmp_path / "cache"), cube=Cube(32), window=WINDOW)
 
 
+@pytest.mark.filterwarnings("ignore:patient1 was not among")
+def test_a_training_resumes_with_what_the_same_network_makes(cts, tmp_path):
+    files = [str(tmp_path / f"refiner_{n}.safetensors") for n in range(2)]
+    for n, file in enumerate(files):
+        save_refiner(tiny_refiner(), file, {"held_out": [f"patient{n}"]})
+    settings = {"holdout": HoldOut(phantoms=0), "phantoms": 1, "cache": str(tmp_path / "cache"), "window": WINDOW}
+    of_calls = [RollOutData(RollOutSettings(initial=file), cube=Cube(16), **settings) for file in files]
+    of_crops = [RefinementData(RefinementCases(crop=16), initial=file, cube=Cube(32), **settings) for file in files]
+    for (first, other), setting in ((of_calls, "model.initial"), (of_crops, "data.initial")):
+        for made in (first, other):
+            in_trainer(made, "fit")
+        first.load_state_dict(first.state_dict())
+        first.load_state_dict({name: value for name, value in first.state_dict().items() if name != "made_by"})  # older
+        with pytest.raises(ValueError, match=f"{setting} is not the one that it was before: give that file again"):
+            other.load_state_dict(first.state_dict())
+
+
 def test_validation_on_those_that_were_trained_on_is_warned_of(cts, tmp_path):
     validated = in_trainer(data(cts, tmp_path, ["patient1"]), "validate")
     validated.load_state_dict(validated.state_dict())
@@ -106,6 +140,17 @@ def test_a_ct_that_is_none_is_refused_before_the_first_step(tmp_path, shape, ref
         return fitted.prepare_data()
     with pytest.raises(ValueError, match=f"b.nii.gz {refused}.* data.source.exclude"):
         fitted.prepare_data()
+
+
+def test_what_a_killed_training_had_begun_to_prepare_is_removed(tmp_path):
+    made = in_trainer(PriorData(phantoms=1, holdout=HoldOut(phantoms=0), cache=str(tmp_path), cube=Cube(16)), "fit")
+    begun = [folder / f".{machine()}.{process}.part.1.npz" for folder in (tmp_path, tmp_path / "rollouts-1" / "2")
+             for process in (99999999, os.getpid())]
+    for file in begun:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.touch()
+    made.prepare_data()
+    assert [file.exists() for file in begun] == [False, True] * 2
 
 
 @pytest.mark.parametrize("ending", ENDINGS)

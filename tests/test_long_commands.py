@@ -24,6 +24,7 @@ import yaml
 from command_lines import arguments
 from ct_files import save_ct, thorax_hu
 from inference.runs import phantoms, sirt, xrays
+from processes import INFER, Python
 
 from phydict.cli.infer import main as infer
 from phydict.cli.train import main as train
@@ -253,6 +254,25 @@ def test_a_training_that_is_stopped_while_it_learns_reports_says_that_nothing_is
     assert "to resume, run the same command again: no checkpoint was written" in capfd.readouterr().err
 
 
+def test_a_training_that_is_stopped_before_it_begins_names_no_checkpoint(run, handlers, monkeypatch, capfd):
+    monkeypatch.setattr("phydict.cli.train.check_writable", lambda *_: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(SystemExit):
+        run("fit")
+    assert "to resume, run the same command again\n" in capfd.readouterr().err
+
+
+def test_a_training_that_goes_back_and_is_stopped_at_once_names_no_later_checkpoint(run, handlers, made, tmp_path,
+                                                                                   monkeypatch, capfd):
+    out = tmp_path / "out"
+    out.mkdir()
+    for name in ("last.ckpt", "best.ckpt"):
+        (out / name).write_bytes((made / "trained" / "last.ckpt").read_bytes())
+    monkeypatch.setattr(PriorTraining, "on_fit_start", lambda _: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(SystemExit):
+        run("fit", "--trainer.max_epochs=3", f"--ckpt_path={out / 'best.ckpt'}")
+    assert "to resume, run the same command again: no checkpoint was written" in capfd.readouterr().err
+
+
 @pytest.fixture
 def ascii_locale() -> Iterator[None]:
     """Text files are ASCII unless it is said otherwise, as in a locale that is not UTF-8."""
@@ -260,6 +280,14 @@ def ascii_locale() -> Iterator[None]:
     locale.setlocale(locale.LC_CTYPE, "C")
     yield
     locale.setlocale(locale.LC_CTYPE, before)
+
+
+@pytest.mark.parametrize("command, table", [("test", "sirt/results.md"), ("ablate", "tables.md")])
+def test_all_is_written_where_nobody_reads_what_is_printed_and_no_more_is_said(command, table, made, cache, tmp_path):
+    unread = "import os, sys\nread, write = os.pipe()\nos.close(read)\nsys.stdout = open(write, 'w')\n"
+    run = Python(unread + INFER, *COMMANDS[command][1](made, cache, tmp_path / "out"))
+    assert run.wait() == 1 and "Broken pipe" not in run.err and "error" not in run.err, run.err
+    assert (tmp_path / "out" / table).is_file() and len(shown_in(tmp_path / "out" / "index.html")) == 2
 
 
 @pytest.mark.skipif(sys.flags.utf8_mode, reason="Python writes UTF-8 in every locale")

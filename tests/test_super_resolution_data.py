@@ -10,6 +10,7 @@ import torch
 from ct_files import save_ct, thorax_hu
 
 from phydict.datasets import find_cts, load_case, phantom_case, prepare_ct
+from phydict.datasets.cts.cache import write_array
 from phydict.datasets.cts.preparation import prepare_folder
 from phydict.datasets.cts.spaces import Settings
 from phydict.grid import Cube, Grid
@@ -112,7 +113,7 @@ def test_prepared_cases_are_read_as_they_were_prepared_and_never_made_finer(tmp_
     cts, grid = find_cts(tmp_path / "out"), Grid.cube(32)
     volumes = CTVolumes(cts, tmp_path / "cache", grid, HUWindow())
     anew = prepare_ct(cts[0].path, grid, HUWindow())["volume"][0].numpy().astype(np.float16)
-    np.save(tmp_path / "cache" / f"a-{volumes.key(cts[0])}.npy", anew)  # where a volume prepared once more was kept
+    write_array(tmp_path / "cache" / f"a-{volumes.key(cts[0])}.npy", anew)  # where a volume prepared once more was kept
     expected = load_case(cts[0], grid, HUWindow())["volume"][0].numpy().astype(np.float16)
     assert not np.array_equal(volumes[0], anew) and np.array_equal(volumes[0], expected)
     data = SuperResolutionData(Crops(8, 2), str(tmp_path / "out"), holdout=HoldOut(phantoms=0), phantoms=0,

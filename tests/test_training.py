@@ -298,7 +298,7 @@ def test_the_held_out_cts_are_written_down_and_told(cts, cache, tmp_path, capsys
     assert "1 of 2 CTs are held out for validation, beside phantoms" in capsys.readouterr().err
     main([*args, f"--out={tmp_path / 'all'}"])
     assert checkpoint(tmp_path / "all")["phydict"]["training"]["held_out"] == []
-    assert "no CT is held out, so that phantoms alone tell which weights are best" in capsys.readouterr().err
+    assert "no CT is held out, so that phantoms alone validate: data.holdout.ids may" in capsys.readouterr().err
 
 
 def test_a_training_resumes_with_the_same_cts_held_out(cts, cache, tmp_path, capsys):

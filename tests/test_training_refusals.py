@@ -13,10 +13,12 @@ from ct_files import save_ct
 from phydict.cli.train import main
 from phydict.grid import Cube
 from phydict.rivals import X2CTNetwork
+from phydict.training.crops import SuperResolutionData
 from phydict.training.finer_uncertainty import FinerUncertaintyTraining
 from phydict.training.refinement import RefinementTraining
 from phydict.training.refiner import RefinerTraining
 from phydict.training.rivals import LiftedTraining, OrbitScenes
+from phydict.training.settings import Crops
 from phydict.training.uncertainty import UncertaintyTraining
 from phydict.training.x2ct import Adversary, X2CTTraining
 
@@ -48,6 +50,12 @@ def test_bad_input_is_one_sentence(change, words, cts, trained, cache, tmp_path,
     said = refusal(capsys, main, arguments(tmp_path / "run", cache, "--trainer.max_epochs=1", *change))
     assert all(word in said for word in words), said
     assert not list((tmp_path / "run").glob("*.ckpt"))
+
+
+def test_a_refused_training_leaves_no_folder_behind(tmp_path):
+    with pytest.raises(ValueError, match="data.crops.size is a multiple"):
+        SuperResolutionData(Crops(size=15), phantoms=1, cache=str(tmp_path / "cache"), cube=Cube(16))
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("command", ["fit", "validate"])

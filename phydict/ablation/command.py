@@ -73,14 +73,15 @@ def main(args: list[str] | None = None) -> None:
 def _write_summary(out: Path, results: Results, scoring: Scoring) -> None:
     """Writes what is made of a finished table: distances, tables, plots and page. Raises ValueError where no row is
     ok."""
-    print(f"{len(results.rows)} rows in {out / RESULTS}")
     entries = summarise(results.rows)
     write_distances(out, entries, scoring)
     tables = all_tables(entries, scoring.empty) + distance_tables(out, entries)
     plots = write_plots(out, entries)
     written = write_tables(out, tables) + plots
+    page = comparison_page(out, entries, tables, plots)
+    print(f"{len(results.rows)} rows in {out / RESULTS}")  # all is written before: its reader may have read enough
     print(f"tables and plots in {out}: {', '.join(path.name for path in written)}")
-    print(f"page: {comparison_page(out, entries, tables, plots)}")
+    print(f"page: {page}")
     if not any(row["status"] == "ok" for row in results.rows):
         raise ValueError(f"none of the rows in {out / RESULTS} is ok; the first: {entries[0].error}")
 

@@ -170,21 +170,23 @@ class PriorCLI(ProgressCLI):
         check_apart(out, "--out", [Path(cts)] if cts else [])
         self._check_shared_out()
         with alone_in(out, "--out") if self.trainer.is_global_zero else progress_as(quiet=True, json_lines=False):
+            last = out / CHECKPOINT
+            before = last.is_file() and last.stat().st_mtime_ns
             try:
                 self._begin(out, ckpt_path)
-                self.trainer.callbacks.append(StopBetweenSteps(out / CHECKPOINT))  # type: ignore[attr-defined]
+                self.trainer.callbacks.append(StopBetweenSteps(last))  # type: ignore[attr-defined]
                 if cts:
                     held_out, trained = datamodule.held_out, len(datamodule.cts)
                     phantoms = bool(self.config.fit.data.holdout.phantoms)
                     beside = ", beside phantoms (data.holdout.phantoms)" * phantoms
-                    tells = "phantoms alone tell" if phantoms else "nothing tells"
+                    validates = "phantoms alone validate" if phantoms else "nothing validates"
                     log_progress(f"{len(held_out)} of {len(held_out) + trained} CTs are held out for validation{beside}"
-                                 if held_out else f"no CT is held out, so that {tells} which weights are best: "
-                                 "data.holdout.ids may name some", event="held_out", cts=held_out)
+                                 if held_out else f"no CT is held out, so that {validates}: data.holdout.ids may name "
+                                 "some", event="held_out", cts=held_out)
                 self.trainer.fit(model, datamodule=datamodule, ckpt_path=ckpt_path, weights_only=weights_only)
             except BaseException as stop:
-                there = (out / CHECKPOINT).is_file()
-                stop.add_note(f"add --ckpt_path {out / CHECKPOINT}" if there else
+                written = (last.is_file() and last.stat().st_mtime_ns) != before
+                stop.add_note(f"add --ckpt_path {last}" if written else
                               "run the same command again: no checkpoint was written, and nothing is kept")
                 raise
             left = [timer.time_remaining() for timer in self.trainer.callbacks  # type: ignore[attr-defined]
@@ -263,8 +265,7 @@ class PriorCLI(ProgressCLI):
 def main(args: list[str] | None = None) -> None:
     """Command line of training: fit, validate, export, inspect-prior. A bad input ends in one sentence and code 2."""
     given = sys.argv[1:] if args is None else args
-    resuming = "add --ckpt_path and the run's last.ckpt"
-    with progress_options(given), cli_errors(MisconfigurationException, to_resume=resuming), quiet():
+    with progress_options(given), cli_errors(MisconfigurationException), quiet():
         if given[:1] == ["export"]:
             run_command(export_prior, given[1:], f"{Path(sys.argv[0]).name} export")
         elif given[:1] == ["inspect-prior"]:

@@ -29,6 +29,12 @@ TILTS, LEVEL = ("DetectorPrimaryAngle", "DetectorSecondaryAngle", "ColumnAngulat
 """Tags of a detector or a tube that is tilted against the other, and the degrees below which it counts as level."""
 
 
+FALLING = ("its values fall where more X-rays arrive: give it a RescaleSlope of the other sign, a RescaleIntercept "
+           "by which no value is negative, and state `intensity: {kind: counts, air: ...}` in geometry.yaml, or state "
+           "{kind: display, bright_is_dense: ...} there")
+"""What to do with values of sign -1 that are not logarithmic."""
+
+
 @dataclass(frozen=True)
 class DicomTags:
     """What the tags of one frame say of its geometry and pixel values; None or "" where they are silent, NaN of angles
@@ -109,9 +115,11 @@ def tags_intensity(tags: list[DicomTags]) -> Intensity:
         return Intensity("display", bright_is_dense=(first.sign == -1) != first.inverted)
     advice = "state `intensity:` in geometry.yaml: kind line_integrals, counts or display"
     if first.relationship == "LIN":
-        advice = "state `intensity: {kind: counts, air: ...}` in geometry.yaml, air being the value without a patient"
-    raise ValueError(f"{first.name} has PixelIntensityRelationship {first.relationship or 'unknown'}, from which line "
-                     f"integrals do not follow; {advice}")
+        advice = FALLING if first.sign == -1 else (
+            "state `intensity: {kind: counts, air: ...}` in geometry.yaml, air being the value without a patient")
+    sign = f", sign {first.sign}" if first.sign else ""
+    raise ValueError(f"{first.name} has PixelIntensityRelationship {first.relationship or 'unknown'}{sign}, from which "
+                     f"line integrals do not follow; {advice}")
 
 
 def shown(intensity: Intensity, tags: list[DicomTags]) -> Intensity:
@@ -122,7 +130,8 @@ def shown(intensity: Intensity, tags: list[DicomTags]) -> Intensity:
     for frame in tags:
         if intensity.kind == "counts" and (frame.relationship == "LOG" or frame.sign == -1):
             raise ValueError(f"{frame.name} is declared as counts, but its PixelIntensityRelationship is "
-                             f"{frame.relationship or 'unknown'}, sign {frame.sign}: correct `intensity:`")
+                             f"{frame.relationship or 'unknown'}, sign {frame.sign}: "
+                             + ("correct `intensity:`" if frame.relationship == "LOG" else FALLING))
     if intensity.kind != "display" or not tags[0].inverted:
         return intensity
     return Intensity("display", bright_is_dense=not intensity.bright_is_dense)

@@ -183,11 +183,11 @@ class ReconstructionData(lightning.LightningDataModule):
     def _chosen(self, cts: list[CTFile]) -> list[CTFile]:
         if not self.only:
             return cts
-        wanted = set(read_ids(self.only, "data.only"))
+        wanted = set(read_ids(self.only, "only"))
         missing = wanted - {ct.id for ct in cts}
         if missing or not wanted:
-            raise ValueError(f"data.only ({self.only}) names {', '.join(sorted(missing)[:3]) or 'no case'}, which "
-                             f"data.cts ({self.cts}) does not hold: correct the list, or give its folder")
+            raise ValueError(f"only ({self.only}) names {', '.join(sorted(missing)[:3]) or 'no case'}, which cts "
+                             f"({self.cts}) does not hold: correct the list, or give its folder")
         return [ct for ct in cts if ct.id in wanted]
 
     def _xrays_source(self, folder: Path) -> str:

@@ -24,10 +24,13 @@ def summarise(results: CaseResults, cases: list[str], name: str, scoring: Scorin
     some have failed."""
     missing = results.missing()
     finished = [case for case in cases if case not in missing]
-    console = Console()
-    console.width = max(console.width, 80 if console.is_terminal else 120)
     further = _distances(results, finished, name, scoring)
-    tables = results.summarise(finished, further, protocol, scoring.empty, missing)
+    tables, page = results.summarise(finished, further, protocol, scoring.empty, missing), None
+    if finished:
+        shared = any(file.parents[1] != results.folder for file in _features(results))
+        page = results_page(results.folder.parent, None if shared else further, scoring.empty)
+    console = Console()  # all is written before: whoever reads this may have read enough
+    console.width = max(console.width, 80 if console.is_terminal else 120)
     for table in tables:
         console.print(table)
     if tables and (others := results.beside(cases)):
@@ -35,9 +38,8 @@ def summarise(results: CaseResults, cases: list[str], name: str, scoring: Scorin
                      f"{results.folder} are left out: name all in one run, which keeps what is finished",
                      event="left_out", cases=others, out=str(results.folder))
     print(f"results in {results.folder}")
-    if finished:
-        shared = any(file.parents[1] != results.folder for file in _features(results))
-        print(f"page: {results_page(results.folder.parent, None if shared else further, scoring.empty)}")
+    if page:
+        print(f"page: {page}")
     if missing:
         raise ValueError(f"{len(missing)} of {len(cases)} cases were not reconstructed "
                          f"({', '.join(missing)}): see the messages above, and {results.to_resume}")

@@ -7,6 +7,7 @@ import logging
 import os
 import re
 import reprlib
+import select
 import signal
 import sys
 import tempfile
@@ -42,26 +43,31 @@ TRACEBACK = "PHYDICT_TRACEBACK"
 
 
 @contextmanager
-def cli_errors(*also: type[Exception], to_resume: str = AGAIN) -> Iterator[None]:
+def cli_errors(*also: type[Exception]) -> Iterator[None]:
     """Prints bad arguments, ValueError, OSError, FloatingPointError and `also` as one sentence and exits with code 2;
     the environment variable PHYDICT_TRACEBACK=1 shows the trace instead. A run that a signal stopped says how to resume
-    and exits with code 130 (SIGINT) or 143 (SIGTERM): as `to_resume` has it, or the note of what was raised. Faults of
+    and exits with code 130 (SIGINT) or 143 (SIGTERM): as the note of what was raised has it, or by the same command.
+    Where whoever reads standard output, such as head, has read enough, it exits with code 1 and says nothing. Faults of
     code pass, without the notes that begin with AGAIN."""
     try:
         with _raised_again(), enough_memory():
             yield
+            sys.stdout.flush()
     except (KeyboardInterrupt, SystemExit) as stop:  # Lightning exits with 1 on SIGINT and without a code on SIGTERM
         interrupted = isinstance(stop, KeyboardInterrupt) or isinstance(stop.__context__, KeyboardInterrupt)
         if not interrupted and isinstance(stop, SystemExit) and stop.code is not None:
             raise
-        text = f"stopped by a signal; to resume, {_advice(stop, to_resume)}"
+        text = f"stopped by a signal; to resume, {_advice(stop)}"
         log_always(text, event="stopped", text=text)
         raise SystemExit(130 if interrupted else 143) from None
     except (ValueError, OSError, FloatingPointError, ArgumentError, *also) as error:  # type: ignore[misc]
         if os.environ.get(TRACEBACK):
             raise
+        if isinstance(error, BrokenPipeError) and _nobody_reads():
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is flushed at the end
+            raise SystemExit(1) from None
         full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
-        advice = f": free some space; to resume, {_advice(error, to_resume)}" if full else ""
+        advice = f": free some space; to resume, {_advice(error)}" if full else ""
         log_problem("error", f"{sentence(error)}{advice}")
         raise SystemExit(2) from None
     except RuntimeError as error:
@@ -109,8 +115,15 @@ def ended_by_sigterm() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def _advice(stop: BaseException, to_resume: str) -> str:
-    return getattr(stop, "__notes__", [to_resume])[-1]
+def _nobody_reads() -> bool:
+    """Whether whoever read standard output has closed it."""
+    poll = select.poll()
+    poll.register(sys.stdout.fileno(), 0)
+    return bool(poll.poll(0))
+
+
+def _advice(stop: BaseException) -> str:
+    return getattr(stop, "__notes__", [AGAIN])[-1]
 
 
 def _leave_out_again(error: Exception) -> None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import lightning
@@ -31,6 +33,7 @@ from phydict.datasets.population import DrawnPatients
 from phydict.datasets.population.drawn import POPULATION_VERSION
 from phydict.grid import Cube, Grid
 from phydict.runtime.console import check_writable
+from phydict.runtime.files import remove_leftovers
 from phydict.runtime.progress_log import log_progress
 from phydict.runtime.ranges import check_between
 from phydict.runtime.seeds import check_seed
@@ -57,6 +60,9 @@ class PriorData(lightning.LightningDataModule):
     """
 
     trainer: lightning.Trainer
+
+    made_by: Mapping[str, int | None] = MappingProxyType({})
+    """Of the networks that make what is learnt from, where any do, the setting that gives each -> its checksum."""
 
     def __init__(self, cts: str | None = None, source: CTSource = CTSource(), holdout: HoldOut = HoldOut(),
                  phantoms: int = 2000, loading: Loading = Loading(), cache: str = "runs/cache",
@@ -107,11 +113,12 @@ class PriorData(lightning.LightningDataModule):
         return [drawn, *([ct.id, self.cts.key(ct)] for ct in self.cts.cts)]
 
     def state_dict(self) -> dict:
-        return {"held_out": self.held_out, "trained": len(self.cts)}
+        return {"held_out": self.held_out, "trained": len(self.cts), "made_by": dict(self.made_by)}
 
     def load_state_dict(self, state_dict: dict) -> None:
-        """Raises ValueError where a training that resumes holds out patients that it did not, or trains on those that
-        it held out; warns of CTs that are no longer there, and in validation of those that it did not hold out."""
+        """Raises ValueError where a training that resumes holds out patients that it did not, trains on those that it
+        held out, or learns from what another network makes; warns of CTs that are no longer there, and in validation of
+        those that it did not hold out."""
         before = state_dict["held_out"]
         if self.trainer.state.fn != "fit":
             return self.check_unseen(before if state_dict.get("trained", True) else None, "the training")
@@ -122,6 +129,9 @@ class PriorData(lightning.LightningDataModule):
             raise ValueError(f"a training resumes with the CTs held out that were before, but {changed[0]} is {is_now} "
                              "now: give the same data.cts, data.holdout and data.seed, or --data.holdout.ids "
                              "<out>/held_out.txt with data.holdout.fraction 0, or start anew with model.initial")
+        if other := [name for name, crc in state_dict.get("made_by", {}).items() if crc != self.made_by[name]]:
+            raise ValueError(f"a training resumes with what the same network makes, but {other[0]} is not the one that "
+                             "it was before: give that file again, or start anew with another --out")
         if gone := sorted({*before} - {*self.held_out}):
             warn(f"of the {len(before)} CTs that were held out, {len(gone)} are not among the data now (the first is "
                  f"{gone[0]}): the training goes on with the others, whose scores are not those of all")
@@ -135,6 +145,8 @@ class PriorData(lightning.LightningDataModule):
     def prepare_data(self) -> None:
         if self.trainer.state.fn != "fit":
             return
+        for folder in [*self.cache.glob("**")]:
+            remove_leftovers(folder)
         self.check_headers()
         self._read_held_out()
         if self.population:
@@ -213,10 +225,12 @@ class PriorData(lightning.LightningDataModule):
 def _held_out(files: list[CTFile], holdout: HoldOut, seed: int) -> list[CTFile]:
     """The CTs that validate instead of training. Raises ValueError where a word is in no CT's id, and only warns where
     it is one of many in a file, whose lines also mean the other CTs of the patient that they name."""
-    names, words = {f.id for f in files}, holdout.words()
+    names, patients, words = {f.id for f in files}, {patient_of(f.id) for f in files}, holdout.words()
 
     def meant(word: str, id: str) -> bool:
-        return word == id if word in names else word in id or (holdout.is_file and patient_of(word) == patient_of(id))
+        if word in names | patients:
+            return word == id if word in names else word == patient_of(id)
+        return word in id or (holdout.is_file and patient_of(word) == patient_of(id))
 
     if unknown := [word for word in words if not any(meant(word, f.id) for f in files)]:
         said = (f"data.holdout.ids names '{unknown[0]}', but no CT has that in its id"

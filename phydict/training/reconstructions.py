@@ -241,8 +241,10 @@ class RefinementData(PriorData):
         trained, validated = volumes
         network = made.network or self.kind.default_network
         validating = holdout.phantoms and [VALIDATION_PHANTOM, holdout.phantoms]
-        parts = [asdict(scenes), describe(Unrolled()), describe(Refinement()), asdict(STRENGTH), fingerprint(initial),
-                 network and fingerprint(network), scene.to_dict(), self.origin(), validating,
+        self.made_by = {"data.initial": fingerprint(initial),
+                        "data.made.network": fingerprint(network) if network else None}
+        parts = [asdict(scenes), describe(Unrolled()), describe(Refinement()), asdict(STRENGTH),
+                 *self.made_by.values(), scene.to_dict(), self.origin(), validating,
                  [[ct.id, self.held_out_cts.key(ct)] for ct in self.held_out_cts.cts]]
         folder = folder / f"{self.kind.name}-{key_of(parts)}"
         self.crop, self.made = made.crop, self.kind(

@@ -136,8 +136,9 @@ class RollOutData(PriorData):
             raise ValueError(f"roll-outs are a refiner's on {cube.voxels} voxels per side in the HU window {window}, "
                              f"but {rollouts.initial} is none: give a refiner's file as model.initial, and model.cube "
                              "and model.window as its own")
-        self.channels, method = refiner.state_channels, Unrolled()
-        parts = [asdict(rollouts.scenes), fingerprint(rollouts.initial), str(method), seed, asdict(augmentation),
+        self.channels, method, made_by = refiner.state_channels, Unrolled(), fingerprint(rollouts.initial)
+        self.made_by = {"model.initial": made_by}
+        parts = [asdict(rollouts.scenes), made_by, str(method), seed, asdict(augmentation),
                  loading.ct_fraction, self.factor, self.origin()]
         if any(reports := [ct.report for ct in self.cts.cts]):  # whose words decide what may be mirrored or cut off
             parts.append(reports)

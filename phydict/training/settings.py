@@ -187,8 +187,8 @@ class HoldOut:
     """What validates instead of training.
 
     Args:
-        ids: CTs whose id is one of these words or, of a word that is no id, contains it; or a text file of them, one a
-            line, such as a training's held_out.txt
+        ids: CTs whose id or patient, such as CT-RATE's train_1, is one of these words or, of a word that is neither,
+            whose id contains it; or a text file of them, one a line, such as a training's held_out.txt
         fraction: share of the patients, in [0, 1]
         phantoms: a number of phantoms that are never trained on
     """

@@ -295,6 +295,17 @@ def test_linear_images_become_line_integrals_by_their_air(tmp_path):
     np.testing.assert_allclose(load_xrays(folder)["xrays"], np.log(60000 / counts()), rtol=1e-5, atol=1e-6)
 
 
+def test_linear_images_that_fall_with_intensity_are_counts_by_a_slope_of_the_other_sign(tmp_path):
+    tags = angled(0.0) | {"PixelIntensityRelationship": "LIN", "PixelIntensityRelationshipSign": -1}
+    of_air, falling = Intensity("counts", air=60000), 65535 - counts()
+    plain = one(tmp_path / "plain", falling, **tags)
+    for stated in (None, of_air):
+        fails("LIN, sign -1.*its values fall.*RescaleSlope of the other sign.*display", plain, intensity=stated)
+    turned = one(tmp_path / "turned", falling, **tags, RescaleSlope=-1, RescaleIntercept=65535)
+    expected = np.log(60000 / counts())
+    np.testing.assert_allclose(load_xrays(turned, intensity=of_air)["xrays"], expected, rtol=1e-5, atol=1e-6)
+
+
 def test_values_of_unknown_meaning_are_refused(tmp_path):
     fails("PixelIntensityRelationship unknown.*`intensity:`", one(tmp_path / "a", **angled(0.0)))
     fails("declared as counts, but its PixelIntensityRelationship is LOG, sign -1", one(

@@ -39,7 +39,12 @@ def test_a_list_of_cases_must_fit_the_folder(cts, tmp_path, capsys):
     (tmp_path / "only.txt").write_text("b\nnobody\n")
     args = sirt("test", tmp_path, f"--data.cts={cts}", *ORBIT, f"--data.only={tmp_path / 'only.txt'}")
     said = refusal(capsys, main, args)
-    assert "nobody" in said and "data.only" in said
+    assert f"only ({tmp_path / 'only.txt'}) names nobody, which cts ({cts}) does not hold" in said
+    (tmp_path / "spec.yaml").write_text(f"{{out: {tmp_path / 'out'}, base: {{method: sirt}}}}")
+    args = ["ablate", "-c", str(tmp_path / "spec.yaml"), "--cts", str(cts), "--only"]
+    for file, words in (("only.txt", "names nobody, which cts"), ("none.txt", "give another only, a text file")):
+        said = refusal(capsys, main, [*args, str(tmp_path / file)])
+        assert words in said and "data." not in said
 
 
 def test_other_xrays_into_a_finished_folder_are_refused(scored, capsys):

@@ -80,7 +80,11 @@ def test_a_small_detector_meets_nothing_beyond():
 def test_a_box_beside_rays_that_run_along_its_axes_is_reached_as_far_as_without_them():
     beside = Grid.box(16, 100, (150, 0, 20))
     odd, even = (ConeBeam.orbit(1, 1020, 740, (n, n), 600 / n) for n in (21, 22))
-    assert reach_beyond(odd, beside) == reach_beyond(even, beside) > 0
+    slices, mu = reach_beyond(odd, beside), random_like((1, 1, *beside.shape), torch.float64).abs()
+    assert slices == reach_beyond(even, beside) > 0
+    continued = Projector(beside, replace(odd, continued=True), "siddon", full_detector=True)
+    tall = Projector(beside.grown(0, 0, slices + 3), odd, "siddon", full_detector=True)
+    torch.testing.assert_close(continued(mu), tall(pad(mu, (slices + 3, slices + 3, 0, 0, 0, 0), mode="replicate")))
 
 
 def test_other_poses_pixels_and_views_stay_continued_and_a_file_keeps_it(tmp_path):
@@ -96,7 +100,7 @@ def test_other_poses_pixels_and_views_stay_continued_and_a_file_keeps_it(tmp_pat
 
 
 def test_x_rays_made_of_a_ct_go_on_beyond_it_where_the_geometry_file_says_so(tmp_path):
-    path, more = tmp_path / "geometry.yaml", reach_beyond(ORBIT, GRID)
+    path, more = tmp_path / "geometry.yaml", reach_beyond(ORBIT, GRID) + 3
     volume = random_like((1, *GRID.shape)).clamp(-1, 1)
     tall = pad(volume[None], (more, more, 0, 0, 0, 0), mode="replicate")
     ends = pad(volume[None], (more, more, 0, 0, 0, 0), value=-1.0)

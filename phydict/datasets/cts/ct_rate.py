@@ -296,8 +296,6 @@ class CTCases(Dataset):
         self.cts, self.grid, self.window = list(cts), grid, window
         self.cache = None if cache is None else Path(cache)
         self.told = torch.zeros(len(self.cts), dtype=torch.bool).share_memory_()  # by any process that loads cases
-        if self.cache is not None:
-            self.cache.mkdir(parents=True, exist_ok=True)
 
     def __len__(self) -> int:
         return len(self.cts)

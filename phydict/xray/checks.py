@@ -19,7 +19,8 @@ rows, are larger: 60 mm of water. Of nine CTs on a detector that holds them it w
 
 AIR_BLOCKS, AIR_FLAT, AIR_MOST, AIR_DRIFT = 8, 0.05, 0.5, 0.1
 """At a side of the detector a view's line integrals are those of air where the medians of so many blocks of rows differ
-by less than AIR_FLAT and are below AIR_MOST; between views those of air differ by less than AIR_DRIFT."""
+by less than AIR_FLAT and are below AIR_MOST; between views, and from 0, those of air differ by less than AIR_DRIFT. Of
+12 CTs in nine geometries, with and without scatter, what the thinner side of a view read was 0.03 at most."""
 
 FLAT_VIEWS, FLAT_ALIKE, UNEVEN = 3, 0.03, 0.05
 """Of so many views or more, a side of the detector on which every block of rows reads the same, up to FLAT_ALIKE, in

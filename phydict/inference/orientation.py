@@ -54,10 +54,11 @@ ONE_SIDED = 1 / 6
 patient than the standard one then looks moved, at 120 mm by up to 12 mm in nine training CTs and 31 mm in one of four
 others."""
 
-ABOUT, ROTATED = (45, 90, 135, 225, 270, 315), 0.06
+ABOUT, ROTATED, ALL_ROUND = (45, 90, 135, 225, 270, 315), 0.06, 61.0
 """By how many degrees sources and detectors are turned about the patient, and by how much the views must agree better
 there than flipped or as stated, both where the geometry puts them and wherever patient and detector are. Of five CTs in
-right orbits they agreed worse by 0.01 or more. Half a turn looks like flipped columns."""
+right orbits they agreed worse by 0.01 or more. Between the lines of neighbouring views lie ALL_ROUND degrees at most: a
+lateral view alone may agree better as an oblique one. Half a turn looks like flipped columns."""
 
 PIXELS = 64
 """Pixels along each side of a view, at most."""
@@ -221,6 +222,10 @@ def _moved(compared: Comparison) -> list[str]:
 
 
 def _rotated(compared: Comparison) -> list[str]:
+    x, y, _ = (compared.beam.sources - compared.grid.centre).T
+    lines = np.sort(np.degrees(np.arctan2(y, x)) % 180)
+    if np.diff(lines, append=lines[0] + 180).max() > ALL_ROUND:
+        return []
     beams = {degrees: rotated(compared.beam, compared.grid, degrees) for degrees in ABOUT}
     scores = {degrees: np.mean([*map(correlation, compared.images.numpy(), thorax_views(compared.grid, beam))])
               for degrees, beam in beams.items()}

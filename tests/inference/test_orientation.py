@@ -84,6 +84,11 @@ def test_an_orbit_that_begins_elsewhere_is_named_with_the_angle(degrees):
     assert orientation_doubts(seen, right, GRID) == []
 
 
+def test_a_lateral_view_alone_is_not_taken_for_an_oblique_one():
+    lateral = ConeBeam.orbit(1, 1020.0, 740.0, (48, 48), 12.0, start_degrees=270)
+    assert orientation_doubts(views(lateral), lateral, GRID) == []
+
+
 def test_the_sense_of_the_angles_and_flipped_columns_are_told_apart(xrays):
     (sense,) = orientation_doubts(xrays, in_other_sense(BEAM, GRID), GRID)
     (columns,) = orientation_doubts(xrays.flip(2), BEAM, GRID)

@@ -31,7 +31,7 @@ from phydict.posterior import (
     SplitGibbs,
 )
 from phydict.xray import Ideal, Polychromatic
-from phydict.xray.checks import check_flat, check_line_integrals, with_air_at_zero
+from phydict.xray.checks import check_flat, check_line_integrals, check_offset, with_air_at_zero
 from phydict.xray.residuals import misfits
 
 pytestmark = [pytest.mark.filterwarnings(f"ignore:{said}") for said in
@@ -264,6 +264,7 @@ def test_a_gain_that_drifts_is_taken_out_by_the_air_and_where_none_is_seen_nothi
                                   (drifted[..., 7:17], orbit(8, shape=(24, 10)), {})):
         with warnings.catch_warnings():
             warnings.filterwarnings("error", "air beside the patient")
+            warnings.filterwarnings("ignore", "in air beside the patient")
             reconstruct(xrays, beam, method=SIRT(2), grid=GRID, **settings)
 
 
@@ -292,6 +293,17 @@ def test_air_that_differs_across_the_detector_alike_in_all_views_is_that_of_a_mi
         for xrays in (exact, exact + 0.3, exact + scattered, drifted, (exact + rows)[:2], exact[..., 7:17] + rows):
             check_flat(xrays)
         check_flat(Polychromatic(scatter=1.0)(Projector(GRID, BEAM, full_detector=True), body(), 0)[0])
+
+
+def test_air_that_reads_alike_in_all_views_but_not_0_is_that_of_a_wrong_value_of_air():
+    exact = views(simulator=Ideal(0))
+    for air in (0.2, 0.4):
+        with pytest.warns(UserWarning, match=f"in air beside the patient, which 8 of 8 views show.* read {air:.2f} or"):
+            reconstruct(exact + air, BEAM, method=SIRT(2), grid=GRID)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for xrays in (exact, exact + 0.05, exact - 0.2, (exact + 0.2)[:1], exact[..., 7:17] + 0.2):
+            check_offset(xrays)
 
 
 def test_what_is_denser_than_the_prior_knows_is_said_with_its_place_and_size():

@@ -159,6 +159,22 @@ def test_a_network_that_never_projects_is_doubted_where_it_explains_nothing(writ
     assert fitting.misfit < BAD_GUESS and "no volume" not in "".join(fitting.warnings)
 
 
+def test_a_network_in_half_precision_that_optimises_gives_what_one_in_single_does(written):
+    optimised = """with torch.enable_grad():
+            density = torch.zeros(1, 1, *A.grid.shape, requires_grad=True)
+            optimiser = torch.optim.SGD([density], 1e-5)
+            (A(density) - y).square().sum().backward()
+            optimiser.step()
+            on_step()
+        return density"""
+    code = "import torch\n" + BACKPROJECTION.replace("on_step()\n        return self.scale * A.T(y)", optimised)
+    single = reconstruct(views(), BEAM, method=import_module(written(code)).Method(), grid=GRID)
+    code = code.replace("return density", "return density.bfloat16()")
+    half = reconstruct(views(), BEAM, method=import_module(written(code)).Method(), grid=GRID)
+    assert half.volume.dtype == torch.float32 and not half.volume.requires_grad
+    torch.testing.assert_close(half.volume, single.volume, rtol=0, atol=float(single.volume.abs().max()) / 100)
+
+
 RETURNING = """
 from dataclasses import dataclass, replace
 from phydict.baselines import CGLS

@@ -28,7 +28,8 @@ class CountingProjector:
         self.last_projection: Tensor | None = None
 
     def __call__(self, density: Tensor) -> Tensor:
-        self.last_projection = projected = self.linear(density)
+        projected = self.linear(density)
+        self.last_projection = projected.detach()
         return projected
 
     def linear(self, d: Tensor) -> Tensor:
@@ -57,7 +58,7 @@ class Baseline(Reconstructor):
 
     @abstractmethod
     def solve(self, A: CountingProjector, y: Tensor, on_step: Callable[[], None]) -> Tensor:
-        """Density relative to water (1, 1, X, Y, Z) of line integrals y (1, K, V, U) in mm of water."""
+        """Density relative to water (1, 1, X, Y, Z), of any type, of line integrals y (1, K, V, U) in mm of water."""
 
     def expected(self, A: CountingProjector) -> Tensor:
         """Density relative to water (1, 1, X, Y, Z) that gives display values their scale."""
@@ -83,6 +84,7 @@ class Baseline(Reconstructor):
                 came = tuple(density.shape) if isinstance(density, Tensor) else type(density).__name__
                 raise ValueError(f"solve of the method {type(self).__name__} must return a density relative to water, "
                                  f"a tensor of shape {(1, 1, *A.grid.shape)}, but {came} came back")
+            density = density.to(y)  # of a network that computes in bfloat16
         with watch.stage("score"):
             fit = guard.score(density, self.mu_water * (A(density) + beyond), self.mu_water * y)
         return Reconstruction(

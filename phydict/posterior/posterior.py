@@ -19,7 +19,7 @@ from phydict.posterior.samplers.sampler import Sampler, check_drawn, check_sampl
 from phydict.posterior.samplers.split_gibbs import SplitGibbs
 from phydict.posterior.widening import limited_angle_factor, warn_of_contradictions, widening_of
 from phydict.prior import AnyPrior, BoundRefiner, Refiner
-from phydict.prior.contract import bound, precision_of
+from phydict.prior.contract import bound, check_answer, precision_of
 from phydict.prior.uncertainty import LEVELS
 from phydict.reconstruction import Reconstruction, Reconstructor, check_projected_from
 from phydict.runtime.own_code import is_own
@@ -179,7 +179,8 @@ class Posterior(Reconstructor):
             measurement = Measurement(projector, xrays, prior.window, display, self.mu_water)
             guard = Guard(measurement, on_step, sampler.steps(), sampler.sees_xrays)
             counting = CountingRefiner if sampler.needs_refiner else CountingDenoiser
-            denoiser = counting(bound(prior, report, self.guidance, self.precision), guard)
+            answering = bound(prior, report, self.guidance, self.precision)
+            denoiser = counting(answering, guard)
             state = torch.empty(1, prior.state_channels, *self.grid.shape).to(xrays)
         with watch.stage("sample"):
             drawn, carried = self._drawn(sampler, denoiser, measurement, state, seed)
@@ -203,6 +204,7 @@ class Posterior(Reconstructor):
             intervals, widening = self._intervals(denoiser, measurement, reprojection)
             warn_of_contradictions(measurement, widening if intervals else None)
             variance = measurement.model_variance
+            check_answer(prior, answering, states[:1])
         return Reconstruction(
             volume=volume, grid=self.grid, method=self.name, seed=seed, **fit, seconds=watch.seconds,
             network_calls=denoiser.calls * (2 if report and self.guidance != 1 else 1),

@@ -24,6 +24,10 @@ from phydict.units import HUWindow
 OWN_PRECISION = "own"
 """What a prior of one's own computes in where its class does not say it."""
 
+HARDLY_NOISY, FAR = 0.02, 0.8
+"""The noise level of a state of air, and how far from it, in the prior's range, the mean of what a denoiser makes of it
+may lie: noise and shares in [0, 1] lie 1 from it, HU 999."""
+
 OF_MODULES = frozenset(vars(nn.Module()))
 """Attributes that every torch.nn.Module has."""
 
@@ -124,6 +128,21 @@ def bound(prior: AnyPrior, report: str, guidance: float, precision: str) -> Deno
         warn(f"the schedule of {name} contradicts itself: time(sigma(0.5)) is {found:.3g} in place of 0.5, so that "
              "some samplers ask it at wrong times: write its time as the inverse of its sigma")
     return denoiser
+
+
+def check_answer(prior: AnyPrior, denoiser: Denoiser, state: torch.Tensor) -> None:
+    """Warns where a denoiser of one's own makes something else of hardly noisy air, in states like `state`, as one does
+    that answers by the noise or in HU."""
+    if not is_own(type(prior)):
+        return
+    t = denoiser.schedule.time(HARDLY_NOISY)
+    signal, noise = map(float, denoiser.schedule.scales(t))
+    drawn = torch.randn(state.shape, generator=torch.Generator().manual_seed(0)).to(state)
+    found = float(denoiser.denoise(noise * drawn - signal, t)[:, :1].float().mean())
+    if abs(found + 1) > FAR:
+        warn(f"denoise of the prior {type(prior).__name__} makes {found:.3g} on the mean of a state of air, -1 "
+             "everywhere, with hardly any noise: it is to estimate the clean state, whose values lie in [-1, 1] over "
+             "the HU window, not the noise, HU or shares: see phydict.prior.PriorContract.bind")
 
 
 def precision_of(prior: AnyPrior, precision: str, x: torch.Tensor) -> str:

@@ -19,7 +19,8 @@ rows, are larger: 60 mm of water. Of nine CTs on a detector that holds them it w
 
 AIR_BLOCKS, AIR_FLAT, AIR_MOST, AIR_DRIFT = 8, 0.05, 0.5, 0.1
 """At a side of the detector a view's line integrals are those of air where the medians of so many blocks of rows differ
-by less than AIR_FLAT and are below AIR_MOST; between views those of air differ by less than AIR_DRIFT."""
+by less than AIR_FLAT and are below AIR_MOST; between views, and from 0, those of air differ by less than AIR_DRIFT. Of
+12 CTs in nine geometries, with and without scatter, what the thinner side of a view read was 0.03 at most."""
 
 FLAT_VIEWS, FLAT_ALIKE, UNEVEN = 3, 0.03, 0.05
 """Of so many views or more, a side of the detector on which every block of rows reads the same, up to FLAT_ALIKE, in
@@ -174,6 +175,26 @@ def check_flat(xrays: Tensor) -> None:
              "without a patient, in place of one number for `air:`")
 
 
+def check_offset(xrays: Tensor) -> None:
+    """Warns where all views (K, V, U) of a chest that show air read more than AIR_DRIFT there, as with a wrong value of
+    air."""
+    air = air_levels(xrays)
+    seen = air[air.isfinite()]
+    if len(seen) > 1 and seen.min() > AIR_DRIFT and xrays.max() > LINE_INTEGRAL_RANGE[0]:
+        warn(f"in air beside the patient, which {len(seen)} of {len(air)} views show, all of them read "
+             f"{float(seen.min()):.2f} or more, but as a line integral it is 0, and each ray counts as much more than "
+             "the patient: correct `air` of counts or `offset` of line integrals, or crop off what is not air")
+
+
+def air_levels(xrays: Tensor) -> Tensor:
+    """What each of the views (K, V, U) reads in air at the thinner of its sides that show it: (K,), infinite where
+    none does."""
+    blocks = side_blocks(xrays)
+    level = blocks.median(2).values
+    is_air = (blocks.amax(2) - blocks.amin(2) < AIR_FLAT) & (level.abs() < AIR_MOST)
+    return torch.where(is_air, level, torch.inf).amin(0)
+
+
 def side_blocks(xrays: Tensor) -> Tensor:
     """Medians (2, K, AIR_BLOCKS or fewer) of blocks of rows in the outer columns of views (K, V, U) at each side."""
     return torch.stack([rows.flatten(2).median(2).values for rows in
@@ -182,14 +203,15 @@ def side_blocks(xrays: Tensor) -> Tensor:
 
 def prepared_xrays(xrays: Tensor, beam: ConeBeam, display: bool, told: bool = False) -> Tensor:
     """X-rays (K, V, U) as a reconstruction takes them: checked and, of no display values, as `with_air_at_zero`. Raises
-    as `check_xrays`, and warns as `check_line_integrals` and `check_flat`. told: whether the same X-rays, binned
-    otherwise, were warned of before, so that nothing is said."""
+    as `check_xrays`, and warns as `check_line_integrals`, `check_flat` and `check_offset`. told: whether the same
+    X-rays, binned otherwise, were warned of before, so that nothing is said."""
     check_xrays(xrays, beam, display)
     if display:
         return xrays
     if not told:
         check_line_integrals(xrays)
         check_flat(xrays)
+        check_offset(xrays)
     return with_air_at_zero(xrays, told)
 
 
@@ -197,10 +219,7 @@ def with_air_at_zero(xrays: Tensor, told: bool = False) -> Tensor:
     """The line integrals (K, V, U), less what each view reads in air where that differs from view to view, which is
     said in a warning, unless it was `told` before: of a tube's output or a detector's gain that drifts. Views that show
     no air stay, and all of them where none reads it as 0 within AIR_DRIFT, as where the patient fills the detector."""
-    blocks = side_blocks(xrays)
-    level = blocks.median(2).values
-    is_air = (blocks.amax(2) - blocks.amin(2) < AIR_FLAT) & (level.abs() < AIR_MOST)
-    air = torch.where(is_air, level, torch.inf).amin(0)
+    air = air_levels(xrays)
     visible = air.isfinite()
     if visible.sum() < 2 or air[visible].max() - air[visible].min() <= AIR_DRIFT or air.abs().min() > AIR_DRIFT:
         return xrays

@@ -19,6 +19,7 @@ from phydict.inference.orientation import (
     in_other_sense,
     moved_agreements,
     orientation_doubts,
+    rotated,
     thorax_views,
 )
 from phydict.units import HUWindow
@@ -70,6 +71,22 @@ def test_images_are_correlated_with_every_part_of_wider_ones():
 
 def test_nothing_is_said_of_the_right_geometry(xrays):
     assert orientation_doubts(xrays, BEAM, GRID) == []
+
+
+@pytest.mark.parametrize("degrees", [90, 135, 270])
+def test_an_orbit_that_begins_elsewhere_is_named_with_the_angle(degrees):
+    right, stated = (ConeBeam.orbit(8, 1020.0, 740.0, (56, 56), 10.0, start_degrees=d) for d in (degrees, 0))
+    for part in ("sources", "detectors", "u", "v"):
+        assert np.allclose(getattr(rotated(stated, GRID, degrees), part), getattr(right, part))
+    seen = views(right)
+    (said,) = orientation_doubts(seen, stated, GRID)
+    assert f"turned about the patient, by {degrees} degrees more of start_degrees" in said
+    assert orientation_doubts(seen, right, GRID) == []
+
+
+def test_a_lateral_view_alone_is_not_taken_for_an_oblique_one():
+    lateral = ConeBeam.orbit(1, 1020.0, 740.0, (48, 48), 12.0, start_degrees=270)
+    assert orientation_doubts(views(lateral), lateral, GRID) == []
 
 
 def test_the_sense_of_the_angles_and_flipped_columns_are_told_apart(xrays):

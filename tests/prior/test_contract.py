@@ -199,6 +199,19 @@ def test_a_schedule_whose_time_is_of_another_is_warned_of(module):
         of_scene(prior)
 
 
+@pytest.mark.parametrize("wrong", [
+    lambda x, x0, noise: (x - x0) / noise, lambda x, x0, noise: 1000 * x0, lambda x, x0, noise: (x0 + 1) / 2],
+    ids=["noise", "HU", "shares"])
+def test_a_denoiser_that_answers_by_something_else_than_the_clean_state_is_warned_of(module, wrong):
+    prior, right = find_prior(f"{module}.Given"), vars(import_module(module))["Smooth"](-0.5)
+    prior.denoiser = SimpleNamespace(schedule=right.schedule, denoise=lambda x, t: wrong(
+        x, right.denoise(x, t), float(right.schedule.scales(t)[1])))
+    with pytest.warns(UserWarning, match="denoise of the prior Given makes .* of a state of air.*not the noise, HU or"):
+        of_scene(prior)
+    prior.denoiser = right
+    of_scene(prior)  # without a word: warnings are errors
+
+
 def test_a_method_that_needs_a_refiner_names_one_that_takes_a_prior_of_ones_own(module):
     with pytest.raises(ValueError, match="phydict_learned needs a refiner, its file or object, but OwnPrior, a prior "
                                          "of your own, was given: give it to phydict_fast"):

@@ -1,12 +1,12 @@
-"""How often flips, turns, the wrong sense of angles, a wrong detector shift and mirrored patients are named, and the
-right geometry left alone.
+"""How often flips, turns, the wrong sense or start of angles, a wrong detector shift and mirrored patients are named,
+and the right geometry left alone.
 
     python tests/benchmark/orientation.py <folder of CTs> [<number of phantoms>]
 
 X-rays of each CT and phantom (6) on 64^3 voxels, without noise, for orbits of 1, 2, 4 and 8 views and every file of
 configs/geometry, as they are and with one mistake each: "shift" is a detector 20 mm along the rows and 50 mm along the
-columns beside where it is told to be, "turn" are transposed images. Writes orientation.csv beside this file: of each
-geometry and mistake the number of cases of which each was said.
+columns beside where it is told to be, "turn" are transposed images, and of "start" all angles are a quarter of a turn
+more. Writes orientation.csv beside this file: of each geometry and mistake the number of cases of which each was said.
 """
 
 import sys
@@ -19,7 +19,7 @@ import torch
 from phydict.datasets import CTCases, CTSource, phantom_case
 from phydict.evaluation import write_csv
 from phydict.grid import Grid
-from phydict.inference.orientation import in_other_sense, orientation_doubts
+from phydict.inference.orientation import in_other_sense, orientation_doubts, rotated
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 from phydict.xray.binning import benchmark_orbit, binning
@@ -28,8 +28,9 @@ FILE = Path(__file__).with_suffix(".csv")
 GRID, WINDOW = Grid.cube(64), HUWindow()
 FIRST_PHANTOM = 5000
 SAID = {"upside down": "rows", "turned by 180": "rows and columns", "looks mirrored": "patient",
-        "moved alike": "shift", "by a quarter": "turn"}
-SHIFT = 20.0, 50.0
+        "moved alike": "shift", "by a quarter": "turn", "about the patient": "start",
+        "the others as stated": "columns"}
+SHIFT, START = (20.0, 50.0), 90.0
 
 
 def geometries() -> dict[str, ConeBeam]:
@@ -39,7 +40,7 @@ def geometries() -> dict[str, ConeBeam]:
 
 
 def said(xrays: torch.Tensor, beam: ConeBeam) -> str:
-    """What the first doubt names: rows, rows and columns, columns, sense, patient, shift, turn; nothing."""
+    """What the first doubt names: rows, rows and columns, columns, sense, patient, shift, turn, start; nothing."""
     doubts = orientation_doubts(xrays, beam, GRID)
     if not doubts:
         return "nothing"
@@ -64,10 +65,10 @@ if __name__ == "__main__":
             mirrored, other = xrays.flip(2), in_other_sense(beam, GRID)
             given = {"none": (xrays, beam), "rows": (xrays.flip(1), beam), "columns": (mirrored, beam),
                      "sense": (xrays, other), "patient": (mirrored, other), "shift": (moved(mu)[0], beam),
-                     "turn": (xrays.mT, lying)}
+                     "turn": (xrays.mT, lying), "start": (xrays, rotated(beam, GRID, START))}
             for mistake, scene in given.items():
                 rows.setdefault((name, mistake), Counter())[said(*scene)] += 1
-    what = ("nothing", "rows", "rows and columns", "columns", "sense", "patient", "shift", "turn")
+    what = ("nothing", "rows", "rows and columns", "columns", "sense", "patient", "shift", "turn", "start")
     write_csv(FILE, [{"geometry": name, "mistake": mistake, "cases": len(volumes)} | {
         f"said {word}": counts[word] for word in what} for (name, mistake), counts in rows.items()])
     right = sum(counts["nothing"] for (_, mistake), counts in rows.items() if mistake == "none")

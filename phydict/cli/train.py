@@ -185,7 +185,7 @@ class PriorCLI(ProgressCLI):
                                  "some", event="held_out", cts=held_out)
                 self.trainer.fit(model, datamodule=datamodule, ckpt_path=ckpt_path, weights_only=weights_only)
             except BaseException as stop:
-                written = (last.is_file() and last.stat().st_mtime_ns) != before
+                written = last.is_file() and last.stat().st_mtime_ns != before
                 stop.add_note(f"add --ckpt_path {last}" if written else
                               "run the same command again: no checkpoint was written, and nothing is kept")
                 raise

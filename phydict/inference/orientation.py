@@ -9,6 +9,7 @@ from functools import lru_cache
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, conv2d
 
@@ -19,6 +20,7 @@ from phydict.units import hu_to_mu
 from phydict.xray import ConeBeam, Projector
 from phydict.xray.binning import binned, binning
 from phydict.xray.boxes import in_other_voxels
+from phydict.xray.poses.gauge import moved_as_a_whole
 
 FLIPS = {"as it is": (1, 1), "flip_rows": (-1, 1), "flip_columns": (1, -1), "flip_rows and flip_columns": (-1, -1)}
 CLEAR, LEAST = {"flip_rows": 0.06, "flip_columns": 0.03, "flip_rows and flip_columns": 0.06}, 0.6
@@ -94,11 +96,9 @@ def in_other_sense(beam: ConeBeam, grid: Grid) -> ConeBeam:
 def rotated(beam: ConeBeam, grid: Grid, degrees: float) -> ConeBeam:
     """The beam with its sources and detectors turned about the grid's upright axis, as by `degrees` more of an orbit's
     start_degrees."""
-    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    move = grid.centre - turn.T @ grid.centre
-    return replace(beam, sources=beam.sources @ turn + move, detectors=beam.detectors @ turn + move, u=beam.u @ turn,
-                   v=beam.v @ turn)
+    turn = np.array([0.0, 0.0, -degrees])
+    move = grid.centre - Rotation.from_rotvec(turn, degrees=True).apply(grid.centre)
+    return moved_as_a_whole(beam, np.concatenate([move, turn]))
 
 
 def column_shifts(beam: ConeBeam, grid: Grid) -> np.ndarray:

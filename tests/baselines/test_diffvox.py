@@ -45,9 +45,9 @@ def test_it_ends_where_no_small_change_lowers_its_loss():
 
 
 def test_smoothness_makes_it_smoother_and_has_the_weight_that_it_is_given():
-    found = {s: density(DiffVox(100, s, learning_rate=0.05)) for s in (7.5, 15.0, 30.0)}
+    found = {s: density(DiffVox(100, s, learning_rate=0.05)) for s in (0.0, 7.5, 15.0, 30.0, 150.0)}
     variations = [roughness(x) for x in found.values()]
-    assert variations == sorted(variations, reverse=True)
+    assert variations == sorted(variations, reverse=True) and variations[-1] < 0.5 * variations[0]
     assert loss(found[15.0], 15.0) < min(loss(found[7.5], 15.0), loss(found[30.0], 15.0))
 
 

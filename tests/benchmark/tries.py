@@ -339,9 +339,11 @@ def command_lines():
     yield "simulator photons 1e-300", None, "", lambda p: p.test(
         "phantom", "--data.phantoms=1", "--data.simulator=phydict.xray.Ideal",
         "--data.simulator.init_args.photons=1e-300")
-    yield "only is a folder", no, "only", lambda p: p.test(p.ct().parent, f"--data.only={p.given}")
-    yield "only is empty", no, "only", lambda p: p.test(p.ct().parent, f"--data.only={p.write('ids', '')}")
-    yield "only names another", no, "only", lambda p: p.test(p.ct().parent, f"--data.only={p.write('ids', 'zz')}")
+    yield "only is a folder", no, "give another only", lambda p: p.test(p.ct().parent, f"--data.only={p.given}")
+    yield "only is empty", no, "names no case", lambda p: p.test(
+        p.ct().parent, f"--data.only={p.write('ids', '')}")
+    yield "only names another", no, "names zz", lambda p: p.test(
+        p.ct().parent, f"--data.only={p.write('ids', 'zz')}")
     yield "only is binary", no, "ids", lambda p: p.test(p.ct().parent,
         f"--data.only={p.write('ids', bytes(range(256)))}")
     yield "everything is excluded", no, "excluded", lambda p: p.test(

@@ -14,7 +14,7 @@ from prior.tiny import REPORTS, tiny_prior
 from phydict import METHODS, ConeBeam, Grid, HUWindow, Projector, reconstruct
 from phydict.baselines import CGLS, FISTATV, SIRT, DiffVox
 from phydict.diffusion import CosineSchedule, GaussianDenoiser
-from phydict.guard import check_ceiling, risen_from
+from phydict.guard import check_ceiling, half_mass_density, risen_from
 from phydict.methods import reconstructor
 from phydict.posterior import (
     DAPS,
@@ -304,6 +304,29 @@ def test_air_that_reads_alike_in_all_views_but_not_0_is_that_of_a_wrong_value_of
         warnings.simplefilter("error")
         for xrays in (exact, exact + 0.05, exact - 0.2, (exact + 0.2)[:1], exact[..., 7:17] + 0.2):
             check_offset(xrays)
+
+
+def test_line_integrals_on_another_scale_than_a_chests_are_told_from_many_views_alone():
+    chest = torch.where(body()[0, 0] > 0.012, 30.0, torch.where(body()[0, 0] > 0.002, -800.0, -1000.0))
+    xrays = views(HUWindow().to_mu(HUWindow().to_range(chest))[None, None])
+    of = replace(BASELINES["cgls"], iterations=30)
+    for scale in (1 / np.log(10), 2.0):
+        with pytest.warns(UserWarning, match="too (light|dense) for a chest.* scale of the line integrals"):
+            reconstruct(scale * xrays, BEAM, method=of, grid=GRID)
+    with pytest.warns(UserWarning, match="too light for a chest: half.* below 0.5. times.* mu_water"):
+        reconstruct(xrays, BEAM, method=of, grid=GRID, mu_water=0.04)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        reconstruct(xrays, BEAM, method=of, grid=GRID)
+        reconstruct(2 * xrays[:4], orbit(8).select(range(4)), method=of, grid=GRID)
+        reconstruct(2 * xrays, BEAM, method=of, grid=GRID, display=True)
+
+
+def test_half_of_the_mass_lies_below_a_density_that_scales_with_the_volume():
+    chest = torch.tensor([-1000.0] * 50 + [-800.0] * 20 + [0.0] * 10 + [300.0] * 2).reshape(82, 1, 1)
+    assert half_mass_density(chest) == 1.0  # 4 of 16.6 are lung, 10 water, 2.6 bone
+    assert half_mass_density(0.4 * (chest + 1000) - 1000) == pytest.approx(0.4)
+    assert half_mass_density(torch.cat([chest, torch.full((500, 1, 1), -1500.0)])) == 1.0
 
 
 def test_what_is_denser_than_the_prior_knows_is_said_with_its_place_and_size():

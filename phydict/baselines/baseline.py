@@ -9,7 +9,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from phydict.guard import Guard
+from phydict.guard import UNGUIDED_VIEWS, Guard, check_line_integral_scale
 from phydict.reconstruction import Reconstruction, Reconstructor
 from phydict.runtime.profiling import Stopwatch
 from phydict.units import HUWindow, mu_to_hu
@@ -87,8 +87,11 @@ class Baseline(Reconstructor):
             density = density.to(y)  # of a network that computes in bfloat16
         with watch.stage("score"):
             fit = guard.score(density, self.mu_water * (A(density) + beyond), self.mu_water * y)
+            volume = mu_to_hu(density[0, 0], 1.0).cpu()
+            if outside is None and not display and A.beam.views >= UNGUIDED_VIEWS:
+                check_line_integral_scale(volume, fit["misfit"])
         return Reconstruction(
-            volume=mu_to_hu(density[0, 0], 1.0).cpu(), grid=A.grid, method=self.name, seed=seed,
+            volume=volume, grid=A.grid, method=self.name, seed=seed,
             **fit, seconds=watch.seconds, projector_calls=A.calls,
             precision=str(y.dtype).removeprefix("torch."))
 

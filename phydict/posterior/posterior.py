@@ -12,7 +12,7 @@ from torch import Tensor
 
 from phydict.diffusion import Denoiser, noise_like
 from phydict.grid import Grid
-from phydict.guard import Guard, check_ceiling, one_material
+from phydict.guard import SCALED_VIEWS, Guard, check_ceiling, check_line_integral_scale, one_material
 from phydict.posterior.measurement import Measurement
 from phydict.posterior.metal import carried_note
 from phydict.posterior.samplers.sampler import Sampler, check_drawn, check_sampler
@@ -201,6 +201,8 @@ class Posterior(Reconstructor):
             fit = guard.score(states if self.samples == 1 else None, reprojection, measurement.y)
             deviation = self._deviation(states[:, 0], carried) if self.samples > 1 else None
             volume, mean = self._volume(measurement, ct[0, 0])
+            if not display and projector.beam.views >= SCALED_VIEWS:
+                check_line_integral_scale(volume, fit["misfit"])
             intervals, widening = self._intervals(denoiser, measurement, reprojection)
             warn_of_contradictions(measurement, widening if intervals else None)
             variance = measurement.model_variance

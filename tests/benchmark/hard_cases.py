@@ -153,6 +153,8 @@ class HardCases:
         yield "truncated: 1.4 times the patient", self._larger
         yield "line integrals 10 times too large", lambda: Case(10 * self.xrays, self.truth)
         yield "line integrals 10 times too small", lambda: Case(0.1 * self.xrays, self.truth)
+        yield "decadic logarithms", lambda: Case(self.xrays / np.log(10), self.truth)
+        yield "line integrals twice too large", lambda: Case(2 * self.xrays, self.truth)
         yield "display values taken for line integrals", lambda: Case(self._display(), self.truth)
         yield "display values", lambda: Case(self._display(), self.truth, settings={"display": True})
         yield "water of 0.025 / mm assumed", lambda: Case(self.xrays, self.truth, settings={"mu_water": 0.025})

@@ -30,12 +30,26 @@ def arguments(folder: Path, cache: Path, *more: str) -> list[str]:
     return ["fit", f"--config={CONFIG}", *TINY, f"--data.cache={cache}", f"--out={folder}", *more]
 
 
+def stage_arguments(config: Path, folder: Path, cache: Path, *more: str, voxels: int = 16, phantoms: int = 3
+                    ) -> list[str]:
+    """`fit` by a configuration, of epochs of two draws of a few phantoms, everything written below `folder`."""
+    return ["fit", f"--config={config}", f"--model.cube.voxels={voxels}", "--model.window=[-1000,600]",
+            f"--data.phantoms={phantoms}", "--data.holdout.phantoms=1", "--data.loading.epoch_size=2",
+            "--trainer.accelerator=cpu", "--trainer.log_every_n_steps=1", "--precision=float32",
+            "--trainer.max_steps=-1", f"--data.cache={cache}", f"--out={folder}", *more]
+
+
 def refiner_arguments(config: Path, folder: Path, cache: Path, initial: str, *more: str) -> list[str]:
-    """`fit` by a configuration of a tiny refiner's stages, on three phantoms, everything written below `folder`."""
-    return ["fit", f"--config={config}", "--model.cube.voxels=16", "--model.window=[-1000,600]", "--data.phantoms=3",
-            "--data.holdout.phantoms=1", "--data.loading.epoch_size=2", "--model.scenes.most_views=4",
-            f"--model.initial={initial}", "--trainer.accelerator=cpu", "--trainer.log_every_n_steps=1",
-            "--precision=float32", "--trainer.max_steps=-1", f"--data.cache={cache}", f"--out={folder}", *more]
+    """`stage_arguments` of a tiny refiner's stages."""
+    return stage_arguments(config, folder, cache, "--model.scenes.most_views=4", f"--model.initial={initial}", *more)
+
+
+def refinement_arguments(config: Path, folder: Path, cache: Path, refiner: str, *more: str) -> list[str]:
+    """`stage_arguments` of stages that learn from a tiny refiner's reconstructions on finer voxels."""
+    return stage_arguments(
+        config, folder, cache, "--data.loading.batch_size=1", "--data.made.reconstructions=3",
+        "--data.made.validation=1", "--data.made.crop=16", "--data.scenes.most_views=3", f"--data.initial={refiner}",
+        *more, voxels=32, phantoms=2)
 
 
 def refusal(capsys, main: Callable[[list[str]], None], args: list[str]) -> str:

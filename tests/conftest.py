@@ -56,6 +56,19 @@ def trained(tmp_path_factory, cache) -> Path:
 
 
 @pytest.fixture(scope="session")
+def refiner_file(tmp_path_factory) -> str:
+    """The file of a tiny refiner."""
+    import torch  # these take seconds to import
+    from prior.tiny import tiny_refiner
+
+    from phydict.prior import save_refiner
+
+    file = tmp_path_factory.mktemp("refiner") / "tiny.safetensors"
+    save_refiner(tiny_refiner(), file, dtype=torch.float32)
+    return str(file)
+
+
+@pytest.fixture(scope="session")
 def cts(tmp_path_factory) -> Path:
     """A folder of two small CTs."""
     folder = tmp_path_factory.mktemp("cts")

@@ -6,9 +6,9 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from command_lines import refusal, resumed_as_uninterrupted
+from command_lines import refinement_arguments, refusal, resumed_as_uninterrupted
 from fitting import fit_to_grid
-from prior.tiny import tiny_refiner
+from prior.tiny import tiny_correction, tiny_refiner
 from torch.nn.functional import pad
 
 from phydict.cli.train import main
@@ -29,15 +29,6 @@ from phydict.xray.boxes import interpolated
 CONFIG = Path(__file__).parents[1] / "configs" / "prior" / "finer_uncertainty.yaml"
 FINE, WINDOW = Grid.cube(32), HUWindow(-1000, 600)
 BEAM = ConeBeam.orbit(3, 1020, 740, (56, 56), 10.0)
-
-
-def knowing(grid: Grid = FINE, uncertain: bool = True) -> CorrectionNetwork:
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        made = CorrectionNetwork((4, 8), 4, grid, WINDOW)
-        torch.nn.init.normal_(made.leave.weight, std=0.1)
-        made.uncertainty = FinerUncertainty((4, 8)) if uncertain else None
-    return made.eval().requires_grad_(False)
 
 
 def seen(*shape: int) -> torch.Tensor:
@@ -87,7 +78,7 @@ def test_odd_sizes_are_those_of_their_voxels_repeated_at_the_end():
 
 
 def test_intervals_on_finer_voxels_are_the_networks_where_it_learnt_on_these_and_nested():
-    network, found = knowing(), reconstructed(knowing())
+    network, found = tiny_correction(uncertain=True), reconstructed(tiny_correction(uncertain=True))
     coarse, window = found.coarse, WINDOW
     width, lung = (interpolated(of_coarse, coarse.grid, FINE, 0.0)
                    for of_coarse in (coarse.intervals[0.9] / window.half_width, coarse.masks[0]))
@@ -96,13 +87,13 @@ def test_intervals_on_finer_voxels_are_the_networks_where_it_learnt_on_these_and
     for level, expected in zip(LEVELS, window.half_width * network.uncertainty.half_widths(given)[0]):
         torch.testing.assert_close(found.intervals[level], expected, atol=1.0, rtol=0.02)  # HU; "auto" may be bfloat16
     assert all((wide > narrow).all() for narrow, wide in pairwise(found.intervals.values()))
-    assert found.volume.equal(reconstructed(knowing(uncertain=False)).volume)
+    assert found.volume.equal(reconstructed(tiny_correction()).volume)
 
 
 def test_on_voxels_half_as_long_they_are_interpolated_and_on_others_made_of_the_coarse_ones():
     finest = Grid.cube(64)
-    found = reconstructed(knowing(), finest)
-    without = reconstructed(knowing(uncertain=False), finest)
+    found = reconstructed(tiny_correction(uncertain=True), finest)
+    without = reconstructed(tiny_correction(), finest)
     assert found.volume.equal(without.volume) and list(found.intervals) == list(LEVELS)
     own, changed = ON_FINER[0.9]
     change = (without.volume - interpolated(without.coarse.volume, without.coarse.grid, finest, -1000.0)).abs()
@@ -112,19 +103,19 @@ def test_on_voxels_half_as_long_they_are_interpolated_and_on_others_made_of_the_
     assert not width.allclose(expected, rtol=0.1)
     again = interpolated(torch.nn.functional.avg_pool3d(width[None], 2)[0], FINE, finest, 0.0)
     assert (again - width).abs().median() < 0.1 * width.median()
-    others = reconstructed(knowing(Grid.cube(64)))
-    assert others.intervals[0.9].equal(reconstructed(knowing(Grid.cube(64), uncertain=False)).intervals[0.9])
+    others = reconstructed(tiny_correction(Grid.cube(64), uncertain=True))
+    assert others.intervals[0.9].equal(reconstructed(tiny_correction(Grid.cube(64))).intervals[0.9])
 
 
 def test_a_file_holds_what_is_known_and_one_without_it_is_read_as_before(tmp_path):
     for uncertain in (True, False):
-        save_stage(knowing(uncertain=uncertain), tmp_path / "fine.safetensors", dtype=torch.float32)
+        save_stage(tiny_correction(uncertain=uncertain), tmp_path / "fine.safetensors", dtype=torch.float32)
         loaded = load_correction(tmp_path / "fine.safetensors")
         widths = loaded.half_widths(FINE, seen(8, 8, 8))
         assert (widths is not None) == uncertain
         if uncertain:
-            assert widths.equal(knowing().half_widths(FINE, seen(8, 8, 8)))
-    assert knowing().half_widths(Grid.cube(64), seen(8, 8, 8)) is None
+            assert widths.equal(tiny_correction(uncertain=True).half_widths(FINE, seen(8, 8, 8)))
+    assert tiny_correction(uncertain=True).half_widths(Grid.cube(64), seen(8, 8, 8)) is None
 
 
 @pytest.fixture(scope="module")
@@ -134,19 +125,13 @@ def files(tmp_path_factory) -> tuple[str, str, str]:
     refiner, plain, fine = (folder / f"{name}.safetensors" for name in ("refiner", "plain", "fine"))
     save_refiner(tiny_refiner(uncertain=True), refiner, dtype=torch.float32)
     save_refiner(tiny_refiner(), plain, dtype=torch.float32)
-    save_stage(knowing(uncertain=False), fine, dtype=torch.float32)
+    save_stage(tiny_correction(), fine, dtype=torch.float32)
     return str(refiner), str(plain), str(fine)
 
 
 def arguments(folder: Path, cache: Path, refiner: str, fine: str, *more: str) -> list[str]:
-    return ["fit", f"--config={CONFIG}", "--model.cube.voxels=32", "--model.window=[-1000,600]",
-            "--model.network.channels=[4,8]", "--data.phantoms=2", "--data.holdout.phantoms=1",
-            "--data.loading.epoch_size=2", "--data.loading.batch_size=1", "--data.made.reconstructions=3",
-            "--data.made.validation=1", "--data.made.crop=16", "--data.scenes.most_views=3",
-            f"--data.initial={refiner}", f"--data.made.network={fine}", f"--model.initial={fine}",
-            f"--data.cache={cache}", f"--out={folder}",
-            "--trainer.accelerator=cpu", "--trainer.log_every_n_steps=1", "--trainer.max_steps=-1",
-            "--precision=float32", *more]
+    return refinement_arguments(CONFIG, folder, cache, refiner, "--model.network.channels=[4,8]",
+                                f"--data.made.network={fine}", f"--model.initial={fine}", *more)
 
 
 def test_a_resumed_run_is_the_uninterrupted_one_and_leaves_the_correction_as_it_was(tmp_path, cache, files):
@@ -161,7 +146,7 @@ def test_a_resumed_run_is_the_uninterrupted_one_and_leaves_the_correction_as_it_
 
 def test_intervals_are_those_of_the_network_whose_results_are_stored(tmp_path, cache, files, capsys):
     refiner, _, fine = files
-    save_stage(knowing(uncertain=False), other := tmp_path / "other.safetensors", dtype=torch.float16)
+    save_stage(tiny_correction(), other := tmp_path / "other.safetensors", dtype=torch.float16)
     said = refusal(capsys, main, arguments(tmp_path / "run", cache, refiner, fine, f"--model.initial={other}",
                                            "--trainer.max_epochs=1"))
     assert "give one file as model.initial and data.made.network" in said
@@ -176,8 +161,8 @@ def test_intervals_are_not_calibrated_on_nothing(tmp_path, cache, files, capsys)
 
 def test_a_training_of_intervals_and_one_of_the_correction_are_not_resumed_as_each_other(files):
     settings = {"cube": Cube(32), "window": (-1000, 600), "initial": files[2]}
-    for task, other in ((FinerUncertaintyTraining(FinerUncertainty((4, 8)), **settings), knowing(uncertain=False)),
-                        (RefinementTraining(**settings), knowing())):
+    for task, other in ((FinerUncertaintyTraining(FinerUncertainty((4, 8)), **settings), tiny_correction()),
+                        (RefinementTraining(**settings), tiny_correction(uncertain=True))):
         with pytest.raises(ValueError, match="differ in 'uncertainty': give the settings"):
             task.on_load_checkpoint({"phydict": other.describe() | {"training": {"samples": 8}}})
         task.on_load_checkpoint({"phydict": task.prior.describe() | {"training": {"samples": 8}}})
@@ -217,7 +202,7 @@ def test_what_cannot_be_learnt_from_is_refused(tmp_path, cache, files, capsys, r
 
 
 def test_a_correction_that_is_trained_on_loses_what_was_known_of_its_errors(tmp_path):
-    save_stage(knowing(), tmp_path / "knows.safetensors", dtype=torch.float32)
+    save_stage(tiny_correction(uncertain=True), tmp_path / "knows.safetensors", dtype=torch.float32)
     trained = RefinementTraining(cube=Cube(32), window=(-1000, 600), initial=str(tmp_path / "knows.safetensors"))
     assert trained.prior.uncertainty is None and all(w.requires_grad for w in trained.parameters())
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from prior.tiny import REPORTS, tiny_prior
+from scenes import voxel_centres
 
 from phydict import METHODS, ConeBeam, Grid, HUWindow, Projector, reconstruct
 from phydict.baselines import CGLS, FISTATV, SIRT, DiffVox
@@ -54,8 +55,7 @@ METHOD = pytest.mark.parametrize("name", [*SAMPLERS, *BASELINES])
 
 def body(grid: Grid = GRID) -> torch.Tensor:
     """Attenuation (1, 1, X, Y, Z) in 1/mm of an ellipse with two lungs and a heart, fainter towards the top."""
-    index = np.stack(np.meshgrid(*map(np.arange, grid.shape), indexing="ij"), -1)
-    x, y, z = np.moveaxis((index @ grid.affine[:3, :3].T + grid.affine[:3, 3] - grid.centre) / grid.extent * 2, -1, 0)
+    x, y, z = np.moveaxis((voxel_centres(grid) - grid.centre) / grid.extent * 2, -1, 0)
     trunk = (x / 0.8) ** 2 + (y / 0.55) ** 2 < 1
     lungs = ((abs(x) - 0.4) / 0.27) ** 2 + (y / 0.4) ** 2 + (z / 0.8) ** 2 < 1
     heart = ((x + 0.15) / 0.3) ** 2 + ((y - 0.2) / 0.25) ** 2 + ((z + 0.3) / 0.4) ** 2 < 1

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from prior.tiny import tiny_for, tiny_prior, tiny_refiner, tiny_super_resolution
+from scenes import ball
 
 from phydict.baselines import CGLS, SIRT, Baseline, Region
 from phydict.diffusion import GaussianDenoiser
@@ -23,15 +24,6 @@ from phydict.xray.residuals import misfits
 
 GRID = Grid.cube(64)
 DEFAULT = ConeBeam.orbit(8, 1020, 740, (448, 448), 1.25)
-
-
-def ball(beam: ConeBeam, radius: float) -> torch.Tensor:
-    """Exact line integrals (K, V, U) of a ball of water at the isocentre."""
-    ray = beam.pixels() - beam.sources[:, None, None]
-    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
-    along = -(ray * beam.sources[:, None, None]).sum(-1)
-    apart = (beam.sources**2).sum(-1)[:, None, None] - along**2
-    return torch.as_tensor(2 * MU_WATER * np.sqrt(np.clip(radius**2 - apart, 0, None)))
 
 
 def test_sirt_in_one_call_finds_the_ball_in_its_exact_line_integrals():

@@ -9,10 +9,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from command_lines import refusal, resumed_as_uninterrupted
+from command_lines import refinement_arguments, refusal, resumed_as_uninterrupted
 from ct_files import save_ct, thorax_hu
 from fitting import fit_to_grid
-from prior.tiny import tiny_prior, tiny_refiner
+from prior.tiny import tiny_correction, tiny_prior, tiny_refiner
 from torch.nn.functional import pad
 
 from phydict.cli.train import main
@@ -22,7 +22,7 @@ from phydict.grid import Cube, Grid
 from phydict.methods import METHODS, corrections_of, reconstruct, reconstructor
 from phydict.posterior import ProximalCG, Refined, Refinement, Unrolled, refined
 from phydict.posterior.coarse_correction import coarse_correction
-from phydict.prior import DEFAULT_REFINER, correction, load_correction, save_prior, save_refiner, save_stage
+from phydict.prior import DEFAULT_REFINER, correction, load_correction, save_prior, save_stage
 from phydict.prior.correction import INPUTS, CorrectionNetwork
 from phydict.runtime.profiling import profiled
 from phydict.runtime.warning import Remark
@@ -38,15 +38,6 @@ FINE, WINDOW = Grid.cube(32), HUWindow(-1000, 600)
 BEAM = ConeBeam.orbit(3, 1020, 740, (56, 56), 10.0)
 
 
-def network(trained: bool = True, grid: Grid = FINE) -> CorrectionNetwork:
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        made = CorrectionNetwork((4, 8), 4, grid, WINDOW)
-        if trained:
-            torch.nn.init.normal_(made.leave.weight, std=0.1)
-    return made.eval().requires_grad_(False)
-
-
 def reconstructed(network: CorrectionNetwork | None, refinement: Refinement = Refinement(), order=(0, 1, 2),
                   precision: str = "auto"):
     xrays = Projector(FINE, BEAM, full_detector=True)(0.02 * torch.ones(1, 1, *FINE.shape))[0]
@@ -55,16 +46,9 @@ def reconstructed(network: CorrectionNetwork | None, refinement: Refinement = Re
     return ready.reconstruct(*fit_to_grid(ready, FINE, xrays[list(order)], BEAM.select(list(order))))
 
 
-@pytest.fixture(scope="module")
-def refiner_file(tmp_path_factory) -> str:
-    file = tmp_path_factory.mktemp("refiner") / "tiny.safetensors"
-    save_refiner(tiny_refiner(), file, dtype=torch.float32)
-    return str(file)
-
-
 @pytest.mark.parametrize("shape", [(32, 24, 20), (30, 21, 17)])
 def test_slab_by_slab_the_correction_is_that_of_the_whole(monkeypatch, shape):
-    corrects, seen = network(), torch.randn(1, INPUTS, *shape)
+    corrects, seen = tiny_correction(), torch.randn(1, INPUTS, *shape)
     torch.nn.init.normal_(corrects.join.weight, std=0.3)
     whole = corrects(seen)
     for planes in (2, 6, 10):
@@ -74,12 +58,13 @@ def test_slab_by_slab_the_correction_is_that_of_the_whole(monkeypatch, shape):
 
 def test_an_untrained_network_corrects_nothing_and_another_grids_takes_no_part():
     z, evidence = torch.rand(1, 1, *FINE.shape) - 0.5, torch.randn(1, INPUTS - 1, *FINE.shape)
-    assert network(False).corrected(z, evidence).equal(z) and not network().corrected(z, evidence).equal(z)
-    assert reconstructed(network(grid=Grid.cube(128))).volume.equal(reconstructed(None).volume)
+    assert tiny_correction(trained=False).corrected(z, evidence).equal(z)
+    assert not tiny_correction().corrected(z, evidence).equal(z)
+    assert reconstructed(tiny_correction(Grid.cube(128))).volume.equal(reconstructed(None).volume)
 
 
 def test_the_xrays_are_met_again_after_a_correction():
-    alone, met = (reconstructed(network(), refinement) for refinement in (Refinement(call_step=None), Refinement()))
+    alone, met = (reconstructed(tiny_correction(), how) for how in (Refinement(call_step=None), Refinement()))
     assert (alone.volume - reconstructed(None, Refinement(call_step=None)).volume).abs().max() > 10
     assert met.misfit < 0.5 * alone.misfit
 
@@ -92,7 +77,7 @@ def test_a_refinement_prepares_what_it_uses_and_counts_what_happens(monkeypatch,
     monkeypatch.setattr(refined, "coarse_correction", lambda *given: prepared.append(coarse_correction(*given))
                         or prepared[0])
     with profiled(memory=False) as profile:
-        found = reconstructed(network() if corrects else None, refinement)
+        found = reconstructed(tiny_correction() if corrects else None, refinement)
     assert found.network_calls - found.coarse.network_calls == calls
     assert len(prepared) == (calls > corrects) and all(correction.calls for correction in prepared)
     assert found.projector_calls - found.coarse.projector_calls == sum(
@@ -112,7 +97,7 @@ def test_a_box_of_odd_numbers_of_unequal_voxels_meets_the_xrays_too():
     target = Grid.box((30, 21, 17), (360.0, 252.0, 170.0), (5.0, -10.0, 20.0))
     case = phantom_case(1, FINE, WINDOW)
     xrays = Projector(FINE, BEAM, full_detector=True)(WINDOW.to_mu(case["volume"])[None])[0]
-    ready = Refined(reconstructor(Unrolled((0.2,), (0.5, 0.3)), tiny_refiner()), target, networks=(network(),))
+    ready = Refined(reconstructor(Unrolled((0.2,), (0.5, 0.3)), tiny_refiner()), target, networks=(tiny_correction(),))
     found = ready.reconstruct(*fit_to_grid(ready, target, xrays, BEAM))
     assert found.volume.shape == target.shape and found.grid.same_as(target) and found.misfit < 0.05
 
@@ -127,7 +112,7 @@ def remarks(voxels: int, refinement: Refinement, corrects: bool = False, beam: C
     target = Grid.cube(voxels)
     xrays = Projector(target, beam, full_detector=True)(0.02 * torch.ones(1, 1, *target.shape))[0]
     base = reconstructor(Unrolled((0.2,), (0.5, 0.3)), tiny_refiner())
-    ready = Refined(base, target, refinement, (network(),) if corrects else ())
+    ready = Refined(base, target, refinement, (tiny_correction(),) if corrects else ())
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
         ready.reconstruct(*fit_to_grid(ready, target, xrays, beam))
@@ -145,7 +130,7 @@ def test_the_shipped_networks_correct_on_their_own_voxels():
 @pytest.mark.filterwarnings("ignore:.* cut the patient off", "ignore:no network has learnt")
 def test_networks_of_ones_own_correct_in_place_of_those_shipped(tmp_path):
     file = tmp_path / "mine.safetensors"
-    save_stage(network(), file, {"steps": 1})
+    save_stage(tiny_correction(), file, {"steps": 1})
     mine, refiner = Unrolled((0.2,), (0.5, 0.3), corrections=(str(file),)), tiny_refiner()
     xrays = Projector(FINE, BEAM, full_detector=True)(0.02 * torch.ones(1, 1, *FINE.shape))[0]
     found = reconstruct(xrays, BEAM, refiner, mine, grid=FINE)
@@ -165,9 +150,9 @@ def test_a_refinement_by_a_network_takes_the_memory_that_is_asked_for():
     cost = Path(__file__).parent / "benchmark" / "grid_cost.csv"
     measured = [row["own_mib"] for row in read_csv(cost) if row["voxels"] == 256]
     base = reconstructor(Unrolled((0.2,), (0.5, 0.3)), tiny_refiner())
-    asked = Refined(base, FINE, networks=(network(),)).volumes * 256**3 * 4 / 2**20
+    asked = Refined(base, FINE, networks=(tiny_correction(),)).volumes * 256**3 * 4 / 2**20
     assert measured and max(measured) <= asked < 1.5 * min(measured)
-    assert Refined(base, FINE).volumes < Refined(base, FINE, networks=(network(),)).volumes
+    assert Refined(base, FINE).volumes < Refined(base, FINE, networks=(tiny_correction(),)).volumes
 
 
 @pytest.mark.parametrize("views", [(0,), (0, 1)])
@@ -176,7 +161,7 @@ def test_from_few_views_total_variation_weighs_less_and_no_coarse_network_correc
     def lighter(step: ProximalCG) -> ProximalCG:
         return replace(step, tv_weight=step.tv_weight * len(views) / 3)
 
-    usual, correction = Refinement(), network() if corrects else None
+    usual, correction = Refinement(), tiny_correction() if corrects else None
     stated = replace(usual, step=lighter(usual.step), call_step=lighter(usual.call_step), calls=int(corrects),
                      few_views=0)
     monkeypatch.setattr(refined, "coarse_correction", lambda *_: None)
@@ -192,9 +177,9 @@ def test_from_many_views_the_xrays_are_met_more_often_and_a_mirrored_estimate_is
     usual, met = Refinement(many_views=BEAM.views), ProximalCG(iterations=8, restarts=2, tv_weight=5.0, tv_eps=0.003)
     many = usual.of_views(BEAM.views)
     assert many == replace(usual, call_std=many.call_std, call_step=met) and many.call_std == pytest.approx(0.2)
-    found = reconstructed(network(), usual)
+    found = reconstructed(tiny_correction(), usual)
     assert found.network_calls - found.coarse.network_calls == 5
-    assert (found.volume - reconstructed(network(), replace(usual, mirrored=False)).volume).abs().max() > 0.1
+    assert (found.volume - reconstructed(tiny_correction(), replace(usual, mirrored=False)).volume).abs().max() > 0.1
 
 
 def test_mirrored_a_network_adds_nothing_to_one_side_that_it_takes_from_the_other():
@@ -204,7 +189,7 @@ def test_mirrored_a_network_adds_nothing_to_one_side_that_it_takes_from_the_othe
 
     once = Refinement(calls=1, call_step=None, many_views=BEAM.views)
     nothing, leaning = (reconstructed(made, once) for made in (
-        network(trained=False), Leaning((4, 8), 4, FINE, WINDOW)))
+        tiny_correction(trained=False), Leaning((4, 8), 4, FINE, WINDOW)))
     torch.testing.assert_close(leaning.volume, nothing.volume, atol=0.01, rtol=0)
     one_way = reconstructed(Leaning((4, 8), 4, FINE, WINDOW), replace(once, mirrored=False))
     assert (one_way.volume - nothing.volume).abs().max() > 100
@@ -226,12 +211,13 @@ def test_the_first_level_is_met_by_step_and_further_ones_by_call_step():
 
 
 def test_the_order_of_the_views_changes_nothing():
-    one, other = (reconstructed(network(), Refinement(calls=1), order, "float32") for order in ((0, 1, 2), (2, 0, 1)))
+    one, other = (reconstructed(tiny_correction(), Refinement(calls=1), order, "float32")
+                  for order in ((0, 1, 2), (2, 0, 1)))
     torch.testing.assert_close(one.volume, other.volume, atol=4.0, rtol=0)  # HU; CG carries rounding far
 
 
 def test_a_voxel_depends_on_its_neighbourhood_alone_so_that_a_crop_is_corrected_as_the_whole():
-    made, reach = network().double(), network().reach
+    made, reach = tiny_correction().double(), tiny_correction().reach
     seen = torch.randn(1, INPUTS, 64, 16, 16, dtype=torch.float64)
     changed = pad(seen[..., :reach, :, :], (0, 0, 0, 0, 0, 64 - reach))
     assert made(seen)[0, 0, 0].equal(made(changed)[0, 0, 0])
@@ -241,14 +227,14 @@ def test_a_voxel_depends_on_its_neighbourhood_alone_so_that_a_crop_is_corrected_
 
 
 def test_odd_sizes_are_corrected_as_their_voxels_repeated_at_the_end():
-    made, seen = network(), torch.randn(1, INPUTS, 17, 16, 15)
+    made, seen = tiny_correction(), torch.randn(1, INPUTS, 17, 16, 15)
     torch.testing.assert_close(made(seen), made(pad(seen, (0, 1, 0, 0, 0, 1), mode="replicate"))[..., :17, :, :15])
 
 
 def test_a_file_holds_the_network_and_no_other_stage_is_taken_for_it(tmp_path):
-    save_stage(network(), tmp_path / "fine.safetensors", dtype=torch.float32)
+    save_stage(tiny_correction(), tmp_path / "fine.safetensors", dtype=torch.float32)
     loaded, seen = load_correction(tmp_path / "fine.safetensors"), torch.randn(1, INPUTS, 16, 16, 16)
-    assert loaded(seen).equal(network()(seen)) and loaded.suits(Grid.cube(16, 192), WINDOW)
+    assert loaded(seen).equal(tiny_correction()(seen)) and loaded.suits(Grid.cube(16, 192), WINDOW)
     assert loaded.suits(Grid.cube(64), WINDOW) and not loaded.suits(Grid.cube(48), WINDOW)
     assert not loaded.suits(FINE, HUWindow()) and not loaded.suits(Grid.cube(16), WINDOW)
     save_prior(tiny_prior(), tmp_path / "prior.safetensors")
@@ -271,13 +257,7 @@ def test_steps_on_one_crop_lower_its_loss():
 
 
 def arguments(folder: Path, cache: Path, initial: str, *more: str) -> list[str]:
-    return ["fit", f"--config={CONFIG}", "--model.cube.voxels=32", "--model.window=[-1000,600]",
-            "--model.channels=[4,8]", "--data.phantoms=2", "--data.holdout.phantoms=1",
-            "--data.loading.epoch_size=2", "--data.loading.batch_size=1",
-            "--data.made.reconstructions=3", "--data.made.validation=1", "--data.made.crop=16",
-            "--data.scenes.most_views=3", f"--data.initial={initial}", f"--data.cache={cache}", f"--out={folder}",
-            "--trainer.accelerator=cpu", "--trainer.log_every_n_steps=1", "--trainer.max_steps=-1",
-            "--precision=float32", *more]
+    return refinement_arguments(CONFIG, folder, cache, initial, "--model.channels=[4,8]", *more)
 
 
 def test_a_resumed_run_is_the_uninterrupted_one_and_makes_each_reconstruction_once(tmp_path, cache, refiner_file):
@@ -320,7 +300,7 @@ def test_held_out_reconstructions_are_those_of_their_own_volumes(tmp_path, refin
 
 def test_with_a_network_a_reconstruction_is_learnt_from_at_both_calls(tmp_path, refiner_file):
     file = tmp_path / "fine.safetensors"
-    save_stage(network(), file, dtype=torch.float32)
+    save_stage(tiny_correction(), file, dtype=torch.float32)
 
     def data(network: str | None) -> RefinementData:
         return RefinementData(
@@ -344,7 +324,7 @@ def test_with_a_network_a_reconstruction_is_learnt_from_at_both_calls(tmp_path, 
 
 def test_finer_voxels_are_learnt_of_as_they_are_seen_after_the_coarser_ones(tmp_path, refiner_file):
     file, seen = tmp_path / "fine.safetensors", []
-    save_stage(network(), file, dtype=torch.float32)
+    save_stage(tiny_correction(), file, dtype=torch.float32)
     for name in (None, str(file)):
         data = RefinementData(  # of which the first scene has more than two views
             RefinementCases(1, 1, 16, name), Scenes(most_views=200), phantoms=1, cache=str(tmp_path / "cache"),
@@ -358,10 +338,11 @@ def test_finer_voxels_are_learnt_of_as_they_are_seen_after_the_coarser_ones(tmp_
 
 def test_a_network_goes_on_on_its_own_voxels_or_half_as_long_ones(tmp_path):
     file = tmp_path / "fine.safetensors"
-    save_stage(network(), file, dtype=torch.float32)
+    save_stage(tiny_correction(), file, dtype=torch.float32)
     for voxels in (32, 64):
         learns = RefinementTraining(cube=Cube(voxels), window=(-1000, 600), initial=str(file))
-        assert learns.prior.grid.same_as(Grid.cube(voxels)) and learns.prior.leave.weight.equal(network().leave.weight)
+        assert learns.prior.grid.same_as(Grid.cube(voxels))
+        assert learns.prior.leave.weight.equal(tiny_correction().leave.weight)
     with pytest.raises(ValueError, match="another grid"):
         RefinementTraining(cube=Cube(128), window=(-1000, 600), initial=str(file))
 

@@ -7,12 +7,12 @@ import pytest
 import torch
 from command_lines import refiner_arguments, refusal, resumed_as_uninterrupted
 from ct_files import save_ct, thorax_hu
-from prior.tiny import tiny_prior, tiny_refiner
+from prior.tiny import tiny_prior
 
 from phydict.cli.train import main
 from phydict.datasets import CTSource
 from phydict.grid import Cube
-from phydict.prior import Refiner, load_prior, save_prior, save_refiner
+from phydict.prior import Refiner, load_prior, save_prior
 from phydict.training.refiner import RefinerTraining
 from phydict.training.rollouts import ReplayTraining, RollOutData, RollOuts, RollOutSettings
 from phydict.training.scenes import Scenes
@@ -20,13 +20,6 @@ from phydict.training.settings import Loading
 
 CONFIG = Path(__file__).parents[1] / "configs" / "prior" / "replay.yaml"
 SETTINGS = {"cube": Cube(16), "window": (-1000, 600)}
-
-
-@pytest.fixture(scope="module")
-def refiner_file(tmp_path_factory) -> str:
-    file = tmp_path_factory.mktemp("refiner") / "tiny.safetensors"
-    save_refiner(tiny_refiner(), file, dtype=torch.float32)
-    return str(file)
 
 
 def rollouts(refiner_file: str, cache: Path, count: int = 1, **more) -> RollOutData:

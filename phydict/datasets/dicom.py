@@ -98,11 +98,10 @@ def _frames(path: Path, padding: float | None) -> list[tuple[np.ndarray, DicomTa
         check_held(pixels, path, "pixels", 8 * MOST_SQUEEZED)
         check_memory(8 * pixels, "what its tags promise", "give a smaller one")
         stored = dataset.pixel_array
-    frames = stored[None] if stored.ndim == 2 else stored
-    several = len(frames) > 1
-    names = [f"{path} frame {k + 1}" if several else str(path) for k in range(len(frames))]
-    return [(_values(frame, dataset, k, name, padding), _tags(dataset, k, name))
-            for k, (frame, name) in enumerate(zip(frames, names))]
+    images = stored[None] if stored.ndim == 2 else stored
+    several = len(images) > 1
+    frames = [Frame(dataset, f"{path} frame {k + 1}" if several else str(path), k) for k in range(len(images))]
+    return [(_values(image, frame, padding), _tags(frame)) for image, frame in zip(images, frames)]
 
 
 def tags_intensity(tags: list[DicomTags]) -> Intensity:
@@ -137,32 +136,76 @@ def shown(intensity: Intensity, tags: list[DicomTags]) -> Intensity:
     return Intensity("display", bright_is_dense=not intensity.bright_is_dense)
 
 
-def _find(dataset: pydicom.Dataset, frame: int, keyword: str, name: str):
-    """A tag's value for one frame: from its own functional groups, the shared ones, or the file; None if empty.
+@dataclass(frozen=True)
+class Frame:
+    """Where the tags of one frame are looked for: in its own functional groups, the shared ones, and the file.
 
-    Raises ValueError naming the tag and the frame's `name` where it cannot be read.
+    name: of file and frame, for messages; index: in the file.
     """
-    with reading(f"{keyword} of {name}", "export it again, or correct that tag"):
-        groups = []
-        for group, index in (("PerFrameFunctionalGroupsSequence", frame), ("SharedFunctionalGroupsSequence", 0)):
-            sequence = dataset.get(group) or []
-            groups += [item[0] for element in (sequence[index] if index < len(sequence) else [])
-                       if (item := element.value) and element.VR == "SQ"]
-        for group in (*groups, dataset):
-            value = group.get(keyword)
-            if value is not None and value != "" and not (hasattr(value, "__len__") and len(value) == 0):
-                return value
-    return None
+
+    dataset: pydicom.Dataset
+    name: str
+    index: int = 0
+
+    def find(self, keyword: str):
+        """A tag's value; None if empty. Raises ValueError naming the tag and the frame where it cannot be read."""
+        with reading(f"{keyword} of {self.name}", "export it again, or correct that tag"):
+            groups = []
+            for group, index in (("PerFrameFunctionalGroupsSequence", self.index),
+                                 ("SharedFunctionalGroupsSequence", 0)):
+                sequence = self.dataset.get(group) or []
+                groups += [item[0] for element in (sequence[index] if index < len(sequence) else [])
+                           if (item := element.value) and element.VR == "SQ"]
+            for group in (*groups, self.dataset):
+                value = group.get(keyword)
+                if value is not None and value != "" and not (hasattr(value, "__len__") and len(value) == 0):
+                    return value
+        return None
+
+    def word(self, keyword: str) -> str:
+        """A tag that holds one word, of which DICOM allows 16 characters; "" where it is empty."""
+        return one_line(str(self.find(keyword) or ""))[:16]
+
+    def numbers(self, keyword: str, count: int | None = None) -> tuple[float, ...] | None:
+        """The finite numbers of a tag, `count` of them if it is given; None where the tag is empty.
+
+        Raises ValueError naming the tag and the frame.
+        """
+        value = self.find(keyword)
+        if value is None:
+            return None
+        wanted = "numbers" if count is None else "a number" if count == 1 else f"{count} finite numbers"
+        try:
+            numbers = tuple(float(part) for part in (value if isinstance(value, MultiValue) else [value]))
+        except (TypeError, ValueError, OverflowError):
+            numbers = (math.nan,)
+        if len(numbers) != (count or len(numbers)) or not all(map(math.isfinite, numbers)):
+            raise ValueError(f"{self.name}: {keyword} must be {wanted}, but {reprlib.repr(value)} was found")
+        return numbers
+
+    def number(self, keyword: str) -> float | None:
+        numbers = self.numbers(keyword, 1)
+        return None if numbers is None else numbers[0]
+
+    def angle(self, keyword: str) -> float | None:
+        """A positioner angle with its increment: one value per frame counts from the first, a single one is the step;
+        NaN where their number is another, as in a part of a run."""
+        angle = self.number(keyword)
+        if angle is None or (steps := self.numbers(f"{keyword}Increment")) is None:
+            return angle
+        if len(steps) == 1:
+            return angle + self.index * steps[0]
+        return angle + steps[self.index] if len(steps) == int(self.dataset.get("NumberOfFrames") or 1) else math.nan
 
 
-def _values(stored: np.ndarray, dataset: pydicom.Dataset, frame: int, name: str, padding: float | None) -> np.ndarray:
+def _values(stored: np.ndarray, frame: Frame, padding: float | None) -> np.ndarray:
     """Stored values (V, U) after the modality transform, with padding as `read_dicom` says."""
-    values, padded = _rescaled(stored, dataset, frame, name), _padded(stored, dataset, frame, name)
+    values, padded = _rescaled(stored, frame), _padded(stored, frame)
     if not padded.any():
         return values
     if padding is None:
-        raise ValueError(f"{int(padded.sum())} pixels of {name} are padding (PixelPaddingValue "
-                         f"{_find(dataset, frame, 'PixelPaddingValue', name)}): crop the views to the exposed field, "
+        raise ValueError(f"{int(padded.sum())} pixels of {frame.name} are padding (PixelPaddingValue "
+                         f"{frame.find('PixelPaddingValue')}): crop the views to the exposed field, "
                          "and state shape and the detector's shift in geometry.yaml, or remove that tag if they are no "
                          "padding")
     regions, _ = scipy.ndimage.label(np.pad(padded, 1, constant_values=True))
@@ -170,94 +213,54 @@ def _values(stored: np.ndarray, dataset: pydicom.Dataset, frame: int, name: str,
     return np.where(outside, np.minimum(values, padding), values)
 
 
-def _padded(stored: np.ndarray, dataset: pydicom.Dataset, frame: int, name: str) -> np.ndarray:
+def _padded(stored: np.ndarray, frame: Frame) -> np.ndarray:
     """Which stored values (V, U) lie between PixelPaddingValue and PixelPaddingRangeLimit, both included."""
-    value, limit = (_number(dataset, frame, f"PixelPadding{part}", name) for part in ("Value", "RangeLimit"))
+    value, limit = (frame.number(f"PixelPadding{part}") for part in ("Value", "RangeLimit"))
     if value is None:
         return np.zeros(stored.shape, bool)
     ends = np.array([int(value), int(value if limit is None else limit)]).astype(stored.dtype)  # some lack a sign
     return (stored >= ends.min()) & (stored <= ends.max())
 
 
-def _rescaled(pixels: np.ndarray, dataset: pydicom.Dataset, frame: int, name: str) -> np.ndarray:
+def _rescaled(pixels: np.ndarray, frame: Frame) -> np.ndarray:
     """Stored values after the modality transform. The LUT of a LOG image leads back to intensity (PS3.3 C.8.7.1.1.2),
     which is no display image, so that it is passed over."""
-    if "ModalityLUTSequence" in dataset and _code(dataset, frame, "PixelIntensityRelationship", name) != "LOG":
-        with reading(f"the modality LUT of {name}", "export it with RescaleSlope and RescaleIntercept"):
-            return np.asarray(apply_modality_lut(pixels, dataset), np.float64)
-    slope, intercept = (_number(dataset, frame, f"Rescale{part}", name) for part in ("Slope", "Intercept"))
+    if "ModalityLUTSequence" in frame.dataset and frame.word("PixelIntensityRelationship") != "LOG":
+        with reading(f"the modality LUT of {frame.name}", "export it with RescaleSlope and RescaleIntercept"):
+            return np.asarray(apply_modality_lut(pixels, frame.dataset), np.float64)
+    slope, intercept = (frame.number(f"Rescale{part}") for part in ("Slope", "Intercept"))
     return pixels * (1.0 if slope is None else slope) + (intercept or 0.0)
 
 
-def _tags(dataset: pydicom.Dataset, frame: int, name: str) -> DicomTags:
-    angiographic = _code(dataset, frame, "Modality", name) in ("XA", "RF")
+def _tags(frame: Frame) -> DicomTags:
+    angiographic = frame.word("Modality") in ("XA", "RF")
     to_isocentre = magnification = None
     if angiographic:
-        to_isocentre = _number(dataset, frame, "DistanceSourceToIsocenter", name)
+        to_isocentre = frame.number("DistanceSourceToIsocenter")
         if to_isocentre is None:
-            to_isocentre = _number(dataset, frame, "DistanceSourceToPatient", name)
+            to_isocentre = frame.number("DistanceSourceToPatient")
     else:
-        magnification = _number(dataset, frame, "EstimatedRadiographicMagnificationFactor", name)
-    primary = _angle(dataset, frame, "PositionerPrimaryAngle", name)
-    secondary = _angle(dataset, frame, "PositionerSecondaryAngle", name)
-    view = VIEW_POSITIONS.get(_code(dataset, frame, "ViewPosition", name))
+        magnification = frame.number("EstimatedRadiographicMagnificationFactor")
+    primary = frame.angle("PositionerPrimaryAngle")
+    secondary = frame.angle("PositionerSecondaryAngle")
+    view = VIEW_POSITIONS.get(frame.word("ViewPosition"))
     if view is not None:
         primary = view if primary is None else primary
         secondary = secondary or 0.0
-    turn = _number(dataset, frame, "FieldOfViewRotation", name) or 0.0
+    turn = frame.number("FieldOfViewRotation") or 0.0
     reoriented = " and ".join([f"rotated by {turn:g} degrees"] * bool(turn) + ["flipped"] * (
-        _code(dataset, frame, "FieldOfViewHorizontalFlip", name) == "YES"))
-    tilts = {keyword: _number(dataset, frame, keyword, name) or 0.0 for keyword in TILTS}
+        frame.word("FieldOfViewHorizontalFlip") == "YES"))
+    tilts = {keyword: frame.number(keyword) or 0.0 for keyword in TILTS}
     detector = " and ".join(f"{keyword} {degrees:g}" for keyword, degrees in tilts.items() if abs(degrees) > LEVEL)
-    orientation = _find(dataset, frame, "PatientOrientation", name)
+    orientation = frame.find("PatientOrientation")
     if orientation is not None:
         letters = orientation if isinstance(orientation, MultiValue) else str(orientation).split("\\")
         orientation = tuple(map(str, letters))
-    sign = _number(dataset, frame, "PixelIntensityRelationshipSign", name)
-    if sign and (_number(dataset, frame, "RescaleSlope", name) or 1) < 0:
+    sign = frame.number("PixelIntensityRelationshipSign")
+    if sign and (frame.number("RescaleSlope") or 1) < 0:
         sign = -sign  # the tag speaks of stored values
     return DicomTags(
-        name, frame, _number(dataset, frame, "DistanceSourceToDetector", name), to_isocentre, magnification,
-        tag_numbers(dataset, frame, "ImagerPixelSpacing", name, 2), primary, secondary, view, orientation, reoriented,
-        detector, angiographic, _code(dataset, frame, "PhotometricInterpretation", name) == "MONOCHROME1",
-        _code(dataset, frame, "PixelIntensityRelationship", name), None if sign is None else int(sign))
-
-
-def _code(dataset: pydicom.Dataset, frame: int, keyword: str, name: str) -> str:
-    """A tag that holds one word, of which DICOM allows 16 characters; "" where it is empty."""
-    return one_line(str(_find(dataset, frame, keyword, name) or ""))[:16]
-
-
-def tag_numbers(dataset: pydicom.Dataset, frame: int, keyword: str, name: str,
-                count: int | None = None) -> tuple[float, ...] | None:
-    """The finite numbers of a tag, `count` of them if it is given; None where the tag is empty.
-
-    Raises ValueError naming the tag and the frame's `name`.
-    """
-    value = _find(dataset, frame, keyword, name)
-    if value is None:
-        return None
-    wanted = "numbers" if count is None else "a number" if count == 1 else f"{count} finite numbers"
-    try:
-        numbers = tuple(float(part) for part in (value if isinstance(value, MultiValue) else [value]))
-    except (TypeError, ValueError, OverflowError):
-        numbers = (math.nan,)
-    if len(numbers) != (count or len(numbers)) or not all(map(math.isfinite, numbers)):
-        raise ValueError(f"{name}: {keyword} must be {wanted}, but {reprlib.repr(value)} was found")
-    return numbers
-
-
-def _number(dataset: pydicom.Dataset, frame: int, keyword: str, name: str) -> float | None:
-    numbers = tag_numbers(dataset, frame, keyword, name, 1)
-    return None if numbers is None else numbers[0]
-
-
-def _angle(dataset: pydicom.Dataset, frame: int, keyword: str, name: str) -> float | None:
-    """A positioner angle with its increment: one value per frame counts from the first, a single one is the step; NaN
-    where their number is another, as in a part of a run."""
-    angle = _number(dataset, frame, keyword, name)
-    if angle is None or (steps := tag_numbers(dataset, frame, f"{keyword}Increment", name)) is None:
-        return angle
-    if len(steps) == 1:
-        return angle + frame * steps[0]
-    return angle + steps[frame] if len(steps) == int(dataset.get("NumberOfFrames") or 1) else math.nan
+        frame.name, frame.index, frame.number("DistanceSourceToDetector"), to_isocentre, magnification,
+        frame.numbers("ImagerPixelSpacing", 2), primary, secondary, view, orientation, reoriented,
+        detector, angiographic, frame.word("PhotometricInterpretation") == "MONOCHROME1",
+        frame.word("PixelIntensityRelationship"), None if sign is None else int(sign))

@@ -65,7 +65,7 @@ def write_page_files(folder: Path, result: Reconstruction, truth: Tensor | None,
 
 def _pixel(beam: ConeBeam | None) -> float:
     """The height of a beam's pixels over their width, the mean of its views; 1 without a beam."""
-    return 1.0 if beam is None else float((np.linalg.norm(beam.v, axis=1) / np.linalg.norm(beam.u, axis=1)).mean())
+    return 1.0 if beam is None else float((beam.pixel[:, 0] / beam.pixel[:, 1]).mean())
 
 
 def missing_page_files(folder: Path) -> list[str]:

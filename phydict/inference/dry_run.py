@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from statistics import median
 
-from torch import Tensor
-
 from phydict.datasets.case import Case
 from phydict.grid import Grid
 from phydict.inference.geometry_page import agreement, geometry_page, view_sides
@@ -19,7 +17,6 @@ from phydict.inference.orientation import (
     whole_doubts,
 )
 from phydict.runtime.warning import warn
-from phydict.xray import ConeBeam
 from phydict.xray.binning import binned, binning
 from phydict.xray.checks import check_fit, prepared_xrays
 
@@ -46,7 +43,11 @@ def dry_run(path: str | Path, case: Case, grid: Grid, box: Grid | None = None, c
     measured = binned(case["xrays"].float(), factor)
     prepared_xrays(measured, coarse, display)
     xrays, thorax = measured.numpy(), thorax_views(grid, coarse)
-    whole, flips = _doubts(case["xrays"], beam, grid) if chest else ([], [])
+    whole, flips = list[str](), list[str]()
+    if chest:
+        compared = Comparison(case["xrays"], beam, grid)
+        whole = whole_doubts(compared)
+        flips = [] if whole else flip_doubts(compared)
     for doubt in whole + flips:
         warn(f"{case['id']}: {doubt}")
     geometry_page(path, coarse, grid, xrays, thorax, standard_thorax(grid), title=case["id"], flips=bool(flips))
@@ -60,10 +61,3 @@ def dry_run(path: str | Path, case: Case, grid: Grid, box: Grid | None = None, c
     kind = "display values" if display else "line integrals"
     return [f"{case['id']} view {k}: {sides}; {kind} from {image.min():.3g} to {image.max():.3g}; {words}"
             for k, (sides, image, words) in enumerate(zip(view_sides(coarse, grid), xrays, agreements))]
-
-
-def _doubts(xrays: Tensor, beam: ConeBeam, grid: Grid) -> tuple[list[str], list[str]]:
-    """What `whole_doubts` says and, where that is nothing, what `flip_doubts` does."""
-    compared = Comparison(xrays, beam, grid)
-    whole = whole_doubts(compared)
-    return whole, [] if whole else flip_doubts(compared)

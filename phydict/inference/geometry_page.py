@@ -78,8 +78,7 @@ def geometry_page(path: str | Path, beam: ConeBeam, grid: Grid, xrays: np.ndarra
     for (top, bottom), k in zip(cells.T, shown):
         top.set_title(f"view {k}\n" + sides[k].replace(", ", "\n"), fontsize=8, pad=3)
         for ax, image in ((top, xrays[k]), (bottom, thorax[k])):
-            ax.imshow(image, "gray", interpolation="nearest",
-                      aspect=float(np.linalg.norm(beam.v[k]) / np.linalg.norm(beam.u[k])))
+            ax.imshow(image, "gray", interpolation="nearest", aspect=float(beam.pixel[k, 0] / beam.pixel[k, 1]))
             ax.set(xticks=[], yticks=[])
         words = agreement(xrays[k], thorax[k], flips).replace(", ", ",\n").replace(" with ", "\nwith ")
         bottom.set_xlabel(words, fontsize=8)

@@ -152,7 +152,7 @@ class Comparison:
         self.images = adaptive_avg_pool2d(self.images, (rows, columns))
         self.beam = replace(beam, v=beam.v * beam.shape[0] / rows, u=beam.u * beam.shape[1] / columns,
                             shape=(rows, columns))
-        self.pixel = np.array([np.linalg.norm(step, axis=1).mean() for step in (self.beam.v, self.beam.u)])
+        self.pixel = self.beam.pixel.mean(0)
         self.margin = tuple(math.ceil(REACH / side) for side in self.pixel)
         thorax, opposite = self.thorax(self.beam), self.thorax(in_other_sense(self.beam, self.grid))
         flipped = {name: self.images.flip([axis for axis, way in enumerate(ways, 1) if way < 0])

@@ -175,9 +175,7 @@ class Refined(Delegating):
             coarse, **scores | {"diverged_at": coarse.diverged_at}, volume=volume, grid=self.target,
             coarse=coarse, projector_calls=calls, network_calls=network_calls, seconds=watch.seconds,
             intervals=intervals,
-            masks=None if coarse.masks is None else torch.cat([
-                coarse.masks.new_zeros(0, *self.target.shape),
-                *(interpolated(mask, base.grid, self.target, 0.0)[None] for mask in coarse.masks)]),
+            masks=None if coarse.masks is None else interpolated(coarse.masks, base.grid, self.target, 0.0),
             deviation=None if deviation is None else interpolated(deviation, base.grid, self.target, 0.0))
 
     def _averaged(self, coarse: Reconstruction, seconds: dict[str, float]) -> Reconstruction:

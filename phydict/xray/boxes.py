@@ -69,8 +69,8 @@ def lacking(grid: Grid, box: Grid) -> list[float]:
 
 
 def interpolated(volume: Tensor, grid: Grid, onto: Grid, fill: float) -> Tensor:
-    """A volume (X, Y, Z) on `grid`, trilinearly on the voxels of another grid along the same axes; `fill` lies outside
-    its box."""
+    """Volumes (..., X, Y, Z) on `grid`, trilinearly on the voxels of another grid along the same axes; `fill` lies
+    outside its box."""
     check_axes(grid, onto)
     first, step, weights = grid.index(onto.affine[:3, 3]), np.divide(onto.spacing, grid.spacing), []
     for axis, n in enumerate(grid.shape):

@@ -109,7 +109,7 @@ def is_smaller_scene(beam: ConeBeam, grid: Grid) -> bool:
 
 def _sides(beam: ConeBeam) -> np.ndarray:
     """The detectors' sides (K, 2) in mm, along their columns and their rows."""
-    return np.stack([np.linalg.norm(beam.v, axis=1), np.linalg.norm(beam.u, axis=1)], 1) * beam.shape
+    return beam.pixel * beam.shape
 
 
 def _meets(beam: ConeBeam, grid: Grid) -> np.ndarray:

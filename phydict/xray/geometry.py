@@ -89,11 +89,10 @@ class ConeBeam:
                                  f"{wrong} has {value[wrong].tolist()}")
             value.setflags(write=False)
             object.__setattr__(self, name, value)
-        width, height = np.linalg.norm(self.u, axis=1), np.linalg.norm(self.v, axis=1)
-        if min(width.min(), height.min()) < LEAST_MM:
+        if self.pixel.min() < LEAST_MM:
             raise ValueError(f"a beam's u and v, its pixels' sides, must be at least {LEAST_MM:g} mm long, but one of "
-                             f"{min(width.min(), height.min()):g} mm was given")
-        slant = np.abs((self.u * self.v).sum(1)) / (width * height)
+                             f"{self.pixel.min():g} mm was given")
+        slant = np.abs((self.u * self.v).sum(1)) / self.pixel.prod(1)
         if slant.max() > 1e-4:
             raise ValueError(f"view {slant.argmax()}: u must be perpendicular to v, but the cosine of their angle is "
                              f"{slant.max():.2g}; give the steps along the rows and columns of a rectangular detector")
@@ -164,8 +163,8 @@ class ConeBeam:
         """The beam with its detectors moved in their planes, by mm in the direction from row to row and from column to
         column, as for a half-fan acquisition."""
         rows, columns = number_of("rows", rows), number_of("columns", columns)
-        height, width = np.linalg.norm(self.v, axis=1), np.linalg.norm(self.u, axis=1)
-        move = rows * self.v / height[:, None] + columns * self.u / width[:, None]
+        height, width = self.pixel.T[:, :, None]
+        move = rows * self.v / height + columns * self.u / width
         return replace(self, detectors=self.detectors + move)
 
     def at(self, sources: np.ndarray, detectors: np.ndarray, u: np.ndarray, v: np.ndarray) -> ConeBeam:
@@ -182,6 +181,11 @@ class ConeBeam:
     @property
     def views(self) -> int:
         return len(self.sources)
+
+    @property
+    def pixel(self) -> np.ndarray:
+        """Row height and column width (K, 2) in mm of each view's pixels."""
+        return np.stack([np.linalg.norm(self.v, axis=1), np.linalg.norm(self.u, axis=1)], 1)
 
     @property
     def normals(self) -> np.ndarray:

@@ -67,11 +67,10 @@ def read_beam(path: str | Path, shape: tuple[int, int] | None = None,
 
 def _of_pixels(path: Path, beam: ConeBeam, pixel: float | tuple[float, float] | None) -> ConeBeam:
     """The beam of a file that states its pixels itself. Raises ValueError where `pixel` is given and not the same."""
-    own = np.stack([np.linalg.norm(beam.v, axis=1), np.linalg.norm(beam.u, axis=1)], 1)
     with naming(path):
-        if pixel is not None and (apart := ~np.isclose(own, pixel_sizes(pixel), rtol=1e-3).all(1)).any():
-            raise ValueError(f"its v and u state pixels of {own[apart][0].round(4).tolist()} mm, but `pixel` {pixel} "
-                             "was given as well; leave it out")
+        if pixel is not None and (apart := ~np.isclose(beam.pixel, pixel_sizes(pixel), rtol=1e-3).all(1)).any():
+            raise ValueError(f"its v and u state pixels of {beam.pixel[apart][0].round(4).tolist()} mm, but `pixel` "
+                             f"{pixel} was given as well; leave it out")
     return beam
 
 

@@ -21,6 +21,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from phydict.runtime.files import atomic_write
 from phydict.runtime.reading import naming, read_text, reason
@@ -121,20 +122,11 @@ def _pose(path, view: int, values: dict[str, float]) -> tuple[np.ndarray, ...]:
         raise ValueError(f"{path}: view {view} has SourceToIsocenterDistance {isocentre:g} mm and "
                          f"SourceToDetectorDistance {detector:g} mm, but both must be positive; a parallel geometry, "
                          "which RTK writes as 0, has no cone beam")
-    axes = _rotation(values) @ FIXED_TO_RAS.T
+    angles = [-values[name] for name in ("InPlaneAngle", "OutOfPlaneAngle", "GantryAngle")]
+    axes = Rotation.from_euler("ZXY", angles, degrees=True).as_matrix() @ FIXED_TO_RAS.T
     source = np.array([values["SourceOffsetX"], values["SourceOffsetY"], isocentre]) @ axes
     centre = np.array([values["ProjectionOffsetX"], values["ProjectionOffsetY"], isocentre - detector]) @ axes
     return source, centre, axes[0], axes[1]
-
-
-def _rotation(values: dict[str, float]) -> np.ndarray:
-    (ci, si), (co, so), (cg, sg) = (
-        (math.cos(angle), math.sin(angle))
-        for angle in (-math.radians(values[name]) for name in ("InPlaneAngle", "OutOfPlaneAngle", "GantryAngle")))
-    z = np.array([[ci, -si, 0], [si, ci, 0], [0, 0, 1]])
-    x = np.array([[1, 0, 0], [0, co, -so], [0, so, co]])
-    y = np.array([[cg, 0, sg], [0, 1, 0], [-sg, 0, cg]])
-    return z @ x @ y
 
 
 def _parameters(beam: ConeBeam, k: int) -> tuple[dict[str, float], np.ndarray]:

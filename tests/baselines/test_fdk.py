@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from laws import assert_linear
+from scenes import ball, voxel_centres
 
 from phydict.baselines import FDK
 from phydict.baselines.fdk import ramp
@@ -23,26 +24,18 @@ def orbit(views: int, start: float = 0.3, arc: float = 360.0) -> ConeBeam:
     return ConeBeam.orbit(views, 1020, 740, (48, 60), 12.0, start, math.radians(arc))
 
 
-def ball(beam: ConeBeam, centre=CENTRE) -> torch.Tensor:
-    """Exact line integrals (K, V, U) of a ball of water."""
-    ray = beam.pixels() - beam.sources[:, None, None]
-    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
-    way = centre - beam.sources
-    along = (ray * way[:, None, None]).sum(-1)
-    apart = (way**2).sum(-1)[:, None, None] - along**2
-    return torch.as_tensor(2 * MU_WATER * np.sqrt(np.clip(RADIUS**2 - apart, 0, None)))
+def views(beam: ConeBeam) -> torch.Tensor:
+    return ball(beam, RADIUS, CENTRE)
 
 
 def density(beam: ConeBeam, xrays=None, grid: Grid = GRID, method: FDK = LINEAR) -> torch.Tensor:
     """Relative to water (X, Y, Z)."""
-    xrays = ball(beam) if xrays is None else xrays
+    xrays = views(beam) if xrays is None else xrays
     return 1 + method.reconstruct(xrays, Projector(grid, beam, full_detector=True)).volume / 1000
 
 
 def distance(grid: Grid = GRID, centre=CENTRE) -> torch.Tensor:
-    index = np.stack(np.meshgrid(*[np.arange(n) for n in grid.shape], indexing="ij"), -1)
-    world = index @ grid.affine[:3, :3].T + grid.affine[:3, 3]
-    return torch.as_tensor(np.linalg.norm(world - centre, axis=-1))
+    return torch.as_tensor(np.linalg.norm(voxel_centres(grid) - centre, axis=-1))
 
 
 @pytest.mark.parametrize("arc, views", [(360, 180), (300, 150), (230, 115), (216, 108)])
@@ -81,12 +74,12 @@ def test_few_views_have_the_right_mean_and_streaks():
 def test_without_bounds_it_is_linear_in_the_x_rays():
     beam = orbit(5)
     assert_linear(lambda y: density(beam, y), (5, 48, 60))
-    bounded = FDK().reconstruct(ball(beam), Projector(GRID, beam)).volume
+    bounded = FDK().reconstruct(views(beam), Projector(GRID, beam)).volume
     torch.testing.assert_close(bounded, (1000 * (density(beam) - 1)).clamp(-1000, 1000))
 
 
 def test_turning_the_gantry_and_the_object_turns_the_volume():
-    turned = density(orbit(9, 0.3 + math.pi / 2), ball(orbit(9)))  # the source goes from posterior to left: -y to -x
+    turned = density(orbit(9, 0.3 + math.pi / 2), views(orbit(9)))  # the source goes from posterior to left: -y to -x
     torch.testing.assert_close(turned, torch.rot90(density(orbit(9)), -1, (0, 1)))
 
 
@@ -98,7 +91,7 @@ def test_moving_and_tilting_everything_alike_changes_nothing():
     moved = ConeBeam(beam.sources @ turn.T + shift, beam.detectors @ turn.T + shift, beam.u @ turn.T, beam.v @ turn.T,
                      beam.shape)
     affine[:3, :3], affine[:3, 3] = turn @ GRID.affine[:3, :3], turn @ GRID.affine[:3, 3] + shift
-    torch.testing.assert_close(density(moved, ball(beam), Grid(GRID.shape, affine=affine)), density(beam), rtol=0,
+    torch.testing.assert_close(density(moved, views(beam), Grid(GRID.shape, affine=affine)), density(beam), rtol=0,
                                atol=1e-6)
 
 
@@ -113,7 +106,7 @@ def test_the_order_of_views_and_mirrored_detectors_do_not_matter():
     order = np.random.default_rng(1).permutation(10)
     torch.testing.assert_close(density(beam.select(order)), density(beam))
     mirrored = ConeBeam(beam.sources, beam.detectors, -beam.u, beam.v, beam.shape)
-    torch.testing.assert_close(density(mirrored, ball(beam).flip(2)), density(beam))
+    torch.testing.assert_close(density(mirrored, views(beam).flip(2)), density(beam))
 
 
 def test_a_view_given_twice_counts_once():
@@ -218,7 +211,7 @@ def test_it_gives_what_rtk_gives(hann):
     """The same views through RTK's FDK (package itk-rtk), on a full circle."""
     rtk_fdk = pytest.importorskip("baselines.rtk_fdk").rtk_fdk
     beam = orbit(60)
-    theirs = rtk_fdk(ball(beam).float(), GRID, beam, hann) / MU_WATER
-    ours = density(beam, ball(beam).float(), method=FDK(hann, window=None))
+    theirs = rtk_fdk(views(beam).float(), GRID, beam, hann) / MU_WATER
+    ours = density(beam, views(beam).float(), method=FDK(hann, window=None))
     inner = distance(centre=np.zeros(3)) < 150
     assert (ours - theirs)[inner].abs().max() < 0.02

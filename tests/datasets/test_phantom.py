@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scenes import voxel_centres
 
 from phydict.datasets.phantoms.findings import KINDS, Finding
-from phydict.datasets.phantoms.phantom import build, pathology_region, phantom_case
+from phydict.datasets.phantoms.phantom import build, change_by_findings, pathology_region, phantom_case
 from phydict.datasets.phantoms.thorax import Thorax, without
 from phydict.grid import Grid
 
@@ -23,11 +24,6 @@ EXAMPLES = [Finding("nodule", "left", "lower", 28, 5), Finding("mass", "right", 
 def quiet(seed: int, *findings: Finding) -> Thorax:
     """A thorax without noise, wholly inside the scan, with the given findings."""
     return replace(Thorax.draw(seed), noise=0.0, scan=(-400.0, 400.0), field=470.0, findings=findings)
-
-
-def world(grid: Grid) -> np.ndarray:
-    index = np.stack(np.meshgrid(*(np.arange(n) for n in grid.shape), indexing="ij"), -1)
-    return index @ grid.affine[:3, :3].T + grid.affine[:3, 3]
 
 
 def test_replays_bit_for_bit():
@@ -67,7 +63,7 @@ def test_any_orientation_of_the_grid_shows_the_same_thorax():
 def test_orientation_and_size(seed):
     thorax, grid = quiet(seed), Grid.cube(48)
     hu, masks = build(thorax, grid)
-    place = world(grid) - thorax.offset
+    place = voxel_centres(grid) - thorax.offset
     x, y, z = np.moveaxis(place, -1, 0)
     assert 2.5e6 < masks[0].sum() * np.prod(grid.spacing) < 7e6
     bone = hu > 250
@@ -89,24 +85,29 @@ def healthy() -> np.ndarray:
 @pytest.mark.parametrize("finding", EXAMPLES, ids=lambda f: f.kind + f.lobe)
 def test_a_finding_changes_its_own_side_only(finding, healthy):
     for case in (finding, finding.mirrored):
-        thorax, grid = quiet(11, case), COARSE
-        change = build(thorax, grid)[0] - healthy
+        thorax = quiet(11, case)
+        change = build(thorax, COARSE)[0] - healthy
         region = np.abs(change) > 30
-        assert np.array_equal(region, pathology_region(thorax, grid))
-        assert region.sum() * np.prod(grid.spacing) > 0.3 * np.pi / 6 * 20**3
-        x = world(grid)[..., 0] - thorax.offset[0]
+        assert region.sum() * np.prod(COARSE.spacing) > 0.3 * np.pi / 6 * 20**3
+        x = voxel_centres(COARSE)[..., 0] - thorax.offset[0]
         own = x > 0 if case.side == "right" else x < 0
         assert np.abs(change[~own]).max() < 1e-3
         assert (change[region].mean() < 0) == (case.kind == "pneumothorax")
+
+
+def test_the_region_of_findings_is_where_they_change_the_thorax(healthy):
+    thorax = quiet(11, *EXAMPLES[:2])
+    changed = np.abs(build(thorax, COARSE)[0] - healthy) > 30
+    assert changed.any() and np.array_equal(changed, pathology_region(thorax, COARSE))
 
 
 @pytest.mark.parametrize("finding, sign", [
     (Finding("emphysema", "both", "", 0.9, 3), -1), (Finding("cardiomegaly", "", "", 0.66), 1),
     (Finding("pericardial effusion", "", "", 20.0), 1)], ids=lambda value: getattr(value, "kind", ""))
 def test_findings_of_both_sides(finding, sign):
-    thorax, grid = quiet(12, finding), Grid.cube(32)
-    change = build(thorax, grid)[0] - build(without(thorax), grid)[0]
-    x = world(grid)[..., 0] - thorax.offset[0]
+    thorax = quiet(12, finding)
+    change = change_by_findings(thorax, COARSE)
+    x = voxel_centres(COARSE)[..., 0] - thorax.offset[0]
     assert sign * change[x > 0].sum() > 0 and sign * change[x < 0].sum() > 0
 
 
@@ -121,7 +122,7 @@ def test_effusion_fills_its_fraction_of_the_cavity(size):
                                      Finding("consolidation", "left", "lower", 0.6, 8)], ids=lambda f: f.kind)
 def test_ground_glass_is_half_aerated_and_consolidation_is_not(finding):
     thorax, grid = quiet(15, finding), Grid.cube(48)
-    hu = build(thorax, grid)[0][np.abs(pathology_region(thorax, grid, 200.0))]
+    hu = build(thorax, grid)[0][pathology_region(thorax, grid, 200.0)]
     assert -750 < np.median(hu) < -350 if finding.kind == "opacity" else np.median(hu) > -100
 
 
@@ -131,7 +132,7 @@ def test_pericardial_fluid_of_the_stated_depth_surrounds_the_heart():
         thorax = replace(Thorax.standard(), findings=(Finding("pericardial effusion", "", "", depth),))
         fluid = np.abs(build(thorax, grid)[0] - 12) < 8
         centre, axes, half = thorax.heart_ellipsoid(thorax.heart)
-        points = (world(grid) - centre) @ axes.T
+        points = (voxel_centres(grid) - centre) @ axes.T
         shells = [(np.linalg.norm(points / (half + depth * share), axis=-1) < 1) for share in (0.0, 0.4, 0.8)]
         assert fluid[shells[2] & ~shells[1]].mean() > 0.5
 

@@ -6,11 +6,18 @@ import torch
 from laws import random_like
 from torch import Tensor
 
-from phydict.diffusion import CosineSchedule, GaussianDenoiser
+from phydict.diffusion import CosineSchedule, Denoiser, GaussianDenoiser
 from phydict.linalg.total_variation import UNIT
+from phydict.posterior import Sampler
 
 SHAPE = (1, 1, 2, 3)
 N = 6
+V = 0.04
+"""The variance of the prior's components."""
+
+X = random_like((1, *SHAPE), seed=10)
+"""What samplers begin with."""
+
 FINE = CosineSchedule(offset=1e-3, floor=1e-6)
 """A schedule whose ends are so close to pure state and pure noise that they do not show in the closed forms."""
 
@@ -50,9 +57,15 @@ def measurement(rows: int = 4, background: float = 0.05) -> DenseMeasurement:
     return DenseMeasurement(random_like((rows, N), seed=1), 0.2 * random_like((rows,), seed=2), background)
 
 
-def denoiser(variance: float = 0.04, schedule: CosineSchedule = FINE) -> GaussianDenoiser:
+def denoiser(variance: float = V, schedule: CosineSchedule = FINE) -> GaussianDenoiser:
     """A Gaussian prior whose samples stay well inside [-1, 1], so that clamping never acts."""
     return GaussianDenoiser(0.1 * random_like((1, *SHAPE), seed=3), torch.tensor(variance).double(), schedule)
+
+
+def sample(settings: Sampler, x: Tensor = X, data: DenseMeasurement | None = None, seed: int = 0,
+           prior: Denoiser | None = None) -> Tensor:
+    """What a sampler makes of noise x (B, 1, 1, 2, 3), of `measurement` and `denoiser` where no others are given."""
+    return settings.sample(prior or denoiser(), data or measurement(), x, torch.Generator().manual_seed(seed))
 
 
 class WithMask:
@@ -85,6 +98,13 @@ def condition(m: DenseMeasurement, mean: Tensor, variance: float, noise: float) 
 def moments(samples: Tensor) -> tuple[Tensor, Tensor]:
     """Mean (N,) and covariance (N, N) of samples (B, 1, 1, 2, 3)."""
     return samples.flatten(1).mean(0), samples.flatten(1).T.cov()
+
+
+def assert_moments(samples: Tensor, mean: Tensor, covariance: Tensor, apart: float, share: float) -> None:
+    """Samples have the mean within `apart`, and the covariance within a `share` of its norm."""
+    found, spread = moments(samples)
+    torch.testing.assert_close(found, mean.flatten(), atol=apart, rtol=0)
+    assert (spread - covariance).norm() < share * covariance.norm()
 
 
 def propagate(sample) -> tuple[Tensor, Tensor]:

@@ -1,25 +1,17 @@
-"""A block of soft tissue with a hollow, and its X-rays from three views, also of finer voxels."""
+"""X-rays of a block of soft tissue with a hollow from three views, also of finer voxels."""
 
 from __future__ import annotations
 
 import torch
+from scenes import WINDOW, block
 
 from phydict.grid import Grid
 from phydict.posterior import Measurement
-from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 from phydict.xray.finer import FinerProjector
 
-GRID, WINDOW = Grid.cube(16), HUWindow(-1000, 600)
+GRID = Grid.cube(16)
 ORBIT = ConeBeam.orbit(3, 1020, 740, (28, 28), 20.0)
-
-
-def block() -> torch.Tensor:
-    """Soft tissue with a hollow, in air: (1, 1, 16, 16, 16) in the prior's range."""
-    hu = torch.full((1, 1, *GRID.shape), -1000.0)
-    hu[:, :, 3:13, 4:12, 2:14] = 40
-    hu[:, :, 5:8, 6:10, 5:11] = -800
-    return WINDOW.to_range(hu)
 
 
 def measured(beam: ConeBeam = ORBIT, dtype: torch.dtype = torch.float32, noise: float = 0.0) -> Measurement:

@@ -2,10 +2,11 @@
 
 import pytest
 import torch
+from scenes import block
 
 from phydict.posterior.evidence import CHANGE_SCALE, COVERAGE_SCALE, RESIDUAL_SCALE, Evidence
 from phydict.xray import ConeBeam
-from posterior.hollow import GRID, ORBIT, block, measured
+from posterior.hollow import GRID, ORBIT, measured
 
 
 def test_exact_x_rays_of_the_estimate_leave_no_residual_and_the_back_projection_lowers_one():

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from laws import random_like, total_variation
+from scenes import block
 from scipy.optimize import lsq_linear
 
 from phydict.datasets import phantom_case
@@ -18,7 +19,7 @@ from phydict.posterior.likelihood.likelihood import MOST_SMOOTHING
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 from posterior.dense import SHAPE, DenseMeasurement, N, measurement
-from posterior.hollow import block, measured
+from posterior.hollow import measured
 
 X0 = 0.3 * random_like((1, *SHAPE), seed=20)
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import pytest
 import torch
 from laws import random_like
+from scenes import block
 
 from phydict.datasets import phantom_case
 from phydict.diffusion import CosineSchedule, GaussianDenoiser, renoise
@@ -12,12 +13,11 @@ from phydict.grid import Grid
 from phydict.posterior import LikelihoodStep, Measurement, PriorOnly, ProximalCG, SplitGibbs, ddim_sample
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
-from posterior.dense import FINE, SHAPE, DenseMeasurement, condition, denoiser, measurement, propagate
-from posterior.hollow import block, fine_scene, measured
+from posterior.dense import FINE, SHAPE, DenseMeasurement, V, X, condition, denoiser, measurement, propagate, sample
+from posterior.hollow import fine_scene, measured
 
-V, NOISE = 0.04, 0.3
+NOISE = 0.3
 EXACT = ProximalCG(50, noise=NOISE, tolerance=1e-12)
-X = random_like((1, *SHAPE), seed=10)
 
 
 @dataclass(frozen=True)
@@ -32,13 +32,9 @@ def sampler(iterations=30, **settings):
     return SplitGibbs(iterations, **{"likelihood": EXACT, "prior_std": V**0.5} | settings)
 
 
-def sample(settings, x=X, data=None, seed=0, prior=None):
-    return settings.sample(prior or denoiser(V), data or measurement(), x, torch.Generator().manual_seed(seed))
-
-
 @pytest.mark.parametrize("t", [0.1, 0.5, 0.95])
 def test_one_likelihood_step_is_the_exact_posterior_mean_given_the_noisy_state_and_the_data(t):
-    prior, m = denoiser(V), measurement()
+    prior, m = denoiser(), measurement()
     a, s = (float(w) for w in FINE.scales(t))
     x = a * prior.mean + 0.2 * X
     spread = sampler().x0_std(prior, t)
@@ -52,7 +48,7 @@ def test_one_likelihood_step_is_the_exact_posterior_mean_given_the_noisy_state_a
 
 @pytest.mark.parametrize("final", [None, EXACT])
 def test_the_samples_have_the_posteriors_mean_and_covariance_as_the_steps_grow(final):
-    prior = denoiser(V)
+    prior = denoiser()
     mean, covariance = condition(measurement(), prior.mean, V, NOISE)
     assert (covariance - V * torch.eye(6).double()).norm() > 0.5 * covariance.norm()  # the data say something
     errors = []
@@ -71,11 +67,11 @@ def test_a_guided_last_estimate_fits_the_data_better_and_an_unguided_one_is_the_
               for final in (None, step)]
     assert misfit[1] < 0.2 * misfit[0]
     once = sample(sampler(1, **tight))
-    torch.testing.assert_close(once, denoiser(V).denoise(X, 1.0))
+    torch.testing.assert_close(once, denoiser().denoise(X, 1.0))
 
 
 def test_data_without_weight_leave_the_prior():
-    expected = PriorOnly(30).sample(denoiser(V), None, X, None)
+    expected = PriorOnly(30).sample(denoiser(), None, X, None)
     for likelihood in (ProximalCG(50, noise=1e6), NoData()):
         found = sample(sampler(likelihood=likelihood, final_likelihood=likelihood))
         torch.testing.assert_close(found, expected, atol=1e-8, rtol=0)
@@ -87,7 +83,7 @@ def test_exact_data_are_matched():
     trusting = ProximalCG(50, noise=1e-6, tolerance=1e-12)
     found = sample(sampler(30, likelihood=trusting, final_likelihood=trusting), data=m).flatten()
     torch.testing.assert_close(found[[0, 3]], m.y[0], atol=1e-6, rtol=0)
-    free = PriorOnly(30).sample(denoiser(V), None, X, None).flatten()
+    free = PriorOnly(30).sample(denoiser(), None, X, None).flatten()
     rest = [1, 2, 4, 5]
     torch.testing.assert_close(found[rest], free[rest], atol=1e-8, rtol=0)  # the others stay the prior's
 
@@ -112,7 +108,7 @@ def test_a_warm_start_keeps_the_posterior_mean_and_counts_its_steps(t_start):
     pairs = warm.times(denoiser())
     assert len(pairs) == 20 and pairs[0] == (1.0, t_start) and pairs[-1][1] == 0
     assert [s for _, s in pairs[:-1]] == [t for t, _ in pairs[1:]]
-    mean, covariance = condition(measurement(), denoiser(V).mean, V, NOISE)
+    mean, covariance = condition(measurement(), denoiser().mean, V, NOISE)
     found, spread = propagate(lambda x: sample(warm, x))
     torch.testing.assert_close(found, mean, atol=5e-3, rtol=0)
     assert spread.trace() < covariance.trace()  # it starts at the mean: less spread, never more
@@ -142,7 +138,7 @@ def test_refining_a_little_keeps_the_sample_and_refining_from_near_one_forgets_i
 def test_refining_is_the_prior_seen_from_the_renoised_sample():
     noise = torch.randn(X.shape, generator=torch.Generator().manual_seed(0), dtype=X.dtype)
     start = renoise(FINE, sample(sampler()), 0.8, noise)
-    expected = ddim_sample(denoiser(V), start, 15, 0.8)
+    expected = ddim_sample(denoiser(), start, 15, 0.8)
     torch.testing.assert_close(sample(sampler(ec_delta=0.8, ec_steps=15)), expected)
 
 
@@ -158,13 +154,13 @@ def test_without_fresh_noise_nothing_is_drawn_and_with_it_the_draw_decides():
                                   {"ec_delta": 0.9, "ec_steps": 20, "ec_guided": True},
                                   {"t_end": 0.2, "ec_delta": 0.5, "ec_steps": 20, "ec_guided": True}])
 def test_a_descent_without_noise_ends_at_the_posterior_mean(path):
-    mean, _ = condition(measurement(), denoiser(V).mean, V, NOISE)
+    mean, _ = condition(measurement(), denoiser().mean, V, NOISE)
     found = sample(sampler(20, noise_fraction=0.0, final_likelihood=EXACT, **path))
     torch.testing.assert_close(found.flatten(), mean.flatten(), atol=2e-3, rtol=0)
 
 
 def test_the_last_level_is_where_the_settings_say():
-    times = sampler(5, t_start=0.5, t_end=0.2).times(denoiser(V))
+    times = sampler(5, t_start=0.5, t_end=0.2).times(denoiser())
     assert [t for t, _ in times] == pytest.approx([1.0, 0.5, 0.4, 0.3, 0.2]) and times[-1][1] == 0
 
 
@@ -174,7 +170,7 @@ def test_the_last_level_is_where_the_settings_say():
     sampler(9, t_end=0.2, ec_delta=0.1, ec_steps=5, ec_guided=True)])
 def test_on_step_is_called_as_often_as_promised(settings):
     calls = []
-    settings.sample(denoiser(V), measurement(), X, torch.Generator(), lambda: calls.append(1))
+    settings.sample(denoiser(), measurement(), X, torch.Generator(), lambda: calls.append(1))
     assert len(calls) == settings.steps()
 
 
@@ -199,7 +195,7 @@ def test_settings_that_contradict_each_other_are_refused_before_the_long_computa
 
 def test_the_result_does_not_depend_on_the_default_schedules_ends():
     coarse = GaussianDenoiser(denoiser().mean, torch.tensor(V).double(), CosineSchedule())
-    fine, wide = (sample(sampler(100, final_likelihood=EXACT), prior=p) for p in (denoiser(V), coarse))
+    fine, wide = (sample(sampler(100, final_likelihood=EXACT), prior=p) for p in (denoiser(), coarse))
     assert (fine - wide).abs().max() < 0.01
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from prior.tiny import tiny_prior, tiny_refiner, tiny_super_resolution
+from scenes import WINDOW, block
 from torch.nn.functional import avg_pool3d, interpolate, max_pool3d
 
 from phydict.datasets import Thorax, build, load_xrays
@@ -23,7 +24,7 @@ from phydict.runtime.precision import computes_bfloat16
 from phydict.units import HUWindow, hu_to_mu
 from phydict.xray import ConeBeam, Ideal, Polychromatic, Projector
 from phydict.xray.finer import FinerProjector
-from posterior.hollow import GRID, ORBIT, WINDOW, block, fine_scene, measured
+from posterior.hollow import GRID, ORBIT, fine_scene, measured
 
 OTHERS = {
     "one view": ConeBeam.orbit(1, 1020, 740, (28, 28), 20.0),

@@ -12,6 +12,7 @@ from phydict.grid import Grid
 from phydict.methods import METHODS
 from phydict.posterior import Sampler
 from phydict.prior import (
+    CorrectionNetwork,
     DetailNetwork,
     LocalUNet,
     Prior,
@@ -21,6 +22,7 @@ from phydict.prior import (
     VolumeUNet,
     learn_vocabulary,
 )
+from phydict.prior.finer_uncertainty import FinerUncertainty
 from phydict.prior.uncertainty import Uncertainty
 from phydict.reconstruction import Reconstructor
 from phydict.units import HUWindow
@@ -61,6 +63,17 @@ def tiny_refiner(text: bool = True, voxels: int = 16, seed: int = 0, untrained: 
         if begins:
             refiner.begin_with(tiny_prior(text, voxels, seed + 1, True))
     return refiner.eval().requires_grad_(False)
+
+
+def tiny_correction(grid: Grid = Grid.cube(32), trained: bool = True, uncertain: bool = False) -> CorrectionNetwork:
+    """What corrects estimates on a grid's voxels, none of them unless `trained`; uncertain: it knows intervals."""
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        made = CorrectionNetwork((4, 8), 4, grid, HUWindow(-1000, 600))
+        if trained:
+            torch.nn.init.normal_(made.leave.weight, std=0.1)
+        made.uncertainty = FinerUncertainty((4, 8)) if uncertain else None
+    return made.eval().requires_grad_(False)
 
 
 def tiny_for(method: str | Sampler | Reconstructor, **settings) -> Prior | Refiner:

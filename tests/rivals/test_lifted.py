@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from scenes import block, voxel_centres
 from torch.nn.functional import avg_pool2d
 
 from phydict.grid import Grid
@@ -11,7 +12,7 @@ from phydict.rivals.sampling import all_places, pooled
 from phydict.units import MU_WATER
 from phydict.xray import ConeBeam, Projector
 from phydict.xray.boxes import halved
-from rivals.tiny_rivals import GRID, body, tilted, tiny_lifted
+from rivals.tiny_rivals import GRID, tilted, tiny_lifted
 
 ORBIT = ConeBeam.orbit(3, 1020, 740, (28, 28), 20.0)
 BEAMS = {"orbit": ORBIT, "tilted": tilted(4)}
@@ -44,12 +45,8 @@ def test_coarse_features_lie_where_their_pixels_are(shape):
 
 def test_blocks_of_voxels_lie_at_the_mean_of_their_voxels():
     grid = Grid((8, 6, 4), affine=np.array([[0, 5.0, 0, 3], [4, 0, 0, -9], [0, 0, 6, 1], [0, 0, 0, 1]]))
-    index = np.stack(np.meshgrid(*[range(n) for n in grid.shape], indexing="ij"), -1)
-    places = torch.from_numpy(index @ grid.affine[:3, :3].T + grid.affine[:3, 3]).movedim(-1, 0)
-    coarse = halved(grid)
-    blocks = torch.nn.functional.avg_pool3d(places[None], 2)[0]
-    index = np.stack(np.meshgrid(*[range(n) for n in coarse.shape], indexing="ij"), -1)
-    np.testing.assert_allclose(index @ coarse.affine[:3, :3].T + coarse.affine[:3, 3], blocks.movedim(0, -1))
+    blocks = torch.nn.functional.avg_pool3d(torch.from_numpy(voxel_centres(grid)).movedim(-1, 0)[None], 2)[0]
+    np.testing.assert_allclose(voxel_centres(halved(grid)), blocks.movedim(0, -1))
 
 
 def test_a_voxel_that_no_view_sees_reads_nothing_and_one_view_is_enough():
@@ -73,7 +70,7 @@ def test_views_in_another_order_give_the_same_ct(beam):
 @pytest.mark.parametrize("views", [1, 2, 5])
 def test_any_number_of_views_is_taken_and_each_counts(views):
     beam, rival = tilted(views), tiny_lifted()
-    y = Projector(GRID, beam, full_detector=True)(body() + 1) / MU_WATER / 100
+    y = Projector(GRID, beam, full_detector=True)(block() + 1) / MU_WATER / 100
     found = rival(y, beam)
     changed = y.clone()
     changed[:, -1] += 50

@@ -8,6 +8,7 @@ import torch
 import yaml
 from command_lines import refusal
 from prior.tiny import tiny_prior
+from scenes import WINDOW, block
 
 from phydict.cli.infer import main as infer
 from phydict.datasets import phantom_case
@@ -21,13 +22,13 @@ from phydict.prior import load_prior, save_prior, save_stage
 from phydict.rivals import LiftedNetwork, Rival, RivalAnswer, TrainedRival, load_rival
 from phydict.units import MU_WATER, HUWindow, hu_to_mu
 from phydict.xray import ConeBeam, Projector
-from rivals.tiny_rivals import GRID, WINDOW, body, tiny_lifted, tiny_x2ct
+from rivals.tiny_rivals import GRID, tiny_lifted, tiny_x2ct
 
 ORBIT = ConeBeam.orbit(3, 1020, 740, (28, 28), 20.0)
 
 
 def xrays(beam: ConeBeam = ORBIT) -> torch.Tensor:
-    return Projector(GRID, beam, full_detector=True)(WINDOW.to_mu(body()))[0]
+    return Projector(GRID, beam, full_detector=True)(WINDOW.to_mu(block()))[0]
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from command_lines import checkpoint, losses, refusal, resumed_as_uninterrupted
+from command_lines import checkpoint, losses, refusal, resumed_as_uninterrupted, stage_arguments
 from torch.utils.data import DataLoader, default_collate
 
 from phydict.cli.infer import main as infer
@@ -50,10 +50,7 @@ TASKS = {"lifted": lambda: LiftedTraining(lively(lambda: LiftedNetwork((4, 6), 2
 
 
 def arguments(name: str, folder: Path, cache: Path, *more: str) -> list[str]:
-    return ["fit", f"--config={CONFIGS / name}.yaml", *TINY[name], "--model.cube.voxels=16",
-            "--model.window=[-1000,600]", "--data.phantoms=3", "--data.holdout.phantoms=1",
-            "--data.loading.epoch_size=2", "--trainer.accelerator=cpu", "--trainer.log_every_n_steps=1",
-            "--precision=float32", "--trainer.max_steps=-1", f"--data.cache={cache}", f"--out={folder}", *more]
+    return stage_arguments(CONFIGS / f"{name}.yaml", folder, cache, *TINY[name], *more)
 
 
 @pytest.mark.parametrize("name", TINY)

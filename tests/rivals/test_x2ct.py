@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from scenes import block
 from torch.nn.functional import instance_norm, mse_loss
 
 from phydict.grid import Cube, Grid
@@ -18,7 +19,7 @@ from phydict.training.x2ct import Adversary, X2CTTraining
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import ConeBeam, Projector, binning
 from phydict.xray.geometry_files import read_beam
-from rivals.tiny_rivals import GRID, body, lively, tiny_x2ct
+from rivals.tiny_rivals import GRID, lively, tiny_x2ct
 
 
 def test_two_views_at_right_angles_are_those_of_the_shipped_biplanar_geometry():
@@ -110,7 +111,7 @@ def test_another_number_of_views_geometry_or_grid_is_refused(tmp_path):
     for beam, said in ((bound_orbit(GRID, 3), "trained for 2 X-rays, but 3 were given"),
                        (bound_orbit(GRID, 2, 180.0), "one geometry of its 2 views"),
                        (ConeBeam.orbit(2, 1020, 740, (20, 28), 20.0), "28 x 28 pixels, but another")):
-        y = Projector(GRID, beam, full_detector=True)(body() + 1)[0] * MU_WATER
+        y = Projector(GRID, beam, full_detector=True)(block() + 1)[0] * MU_WATER
         with pytest.raises(ValueError, match=said):
             reconstruct(y, beam, method=method, grid=GRID)
     with pytest.raises(ValueError, match="cube of 16 voxels a side"):
@@ -127,7 +128,7 @@ def test_the_discriminator_learns_from_its_own_loss_alone_and_the_generator_from
     """One backward pass of the sum gives the gradients of two passes, one for each network."""
     task = X2CTTraining(lively(lambda: X2CTNetwork(8, 4, (2, 2), (4, 8, 8))), OrbitScenes(views=2), Cube(16),
                         (-1000, 600), adversary=Adversary(width=4)).eval().double()
-    ct, beam, adversary = body().double(), task.prior.beam, task.discriminator
+    ct, beam, adversary = block().double(), task.prior.beam, task.discriminator
     water = Projector(GRID, beam, full_detector=True)(ct + 1)
     task.case_loss(ct, water, beam, torch.Generator().manual_seed(0)).backward()
     found = {name: weight.grad.clone() for name, weight in task.named_parameters()}

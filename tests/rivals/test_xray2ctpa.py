@@ -3,6 +3,7 @@
 import pytest
 import torch
 from safetensors.torch import save_file
+from scenes import WINDOW, block
 
 from phydict.grid import Cube, Grid
 from phydict.methods import reconstruct
@@ -14,13 +15,13 @@ from phydict.training.rivals import OrbitScenes
 from phydict.training.xray2ctpa import LatentSettings, XrayToCTPATraining
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import Projector
-from rivals.tiny_rivals import GRID, WINDOW, body, lively, tiny_xray2ctpa
+from rivals.tiny_rivals import GRID, lively, tiny_xray2ctpa
 
 BEAM = bound_orbit(GRID, 2)
 
 
 def water(beam=BEAM) -> torch.Tensor:
-    return Projector(GRID, beam, full_detector=True)(body() + 1) * 0.8
+    return Projector(GRID, beam, full_detector=True)(block() + 1) * 0.8
 
 
 def task(**latent) -> XrayToCTPATraining:
@@ -78,7 +79,7 @@ def test_each_part_learns_in_its_own_time(autoencoder):
     first, then = task(autoencoder_steps=1), task(autoencoder_steps=0, autoencoder=autoencoder)
     for training, learnt in ((first, "autoencoder"), (then, "denoiser"), (then, "encoder")):
         training.zero_grad()
-        training.case_loss(body(), water(), BEAM, torch.Generator().manual_seed(0)).backward()
+        training.case_loss(block(), water(), BEAM, torch.Generator().manual_seed(0)).backward()
         moved = {name.split(".")[2] for name, weight in training.named_parameters() if weight.grad is not None}
         assert learnt in moved and ("autoencoder" in moved) == (training is first)
     assert first.prior.network.latent_size > 0 and then.prior.network.latent_size > 0
@@ -87,18 +88,18 @@ def test_each_part_learns_in_its_own_time(autoencoder):
 def test_the_size_of_latents_is_that_of_the_largest_of_the_first_cases(autoencoder):
     training = task(autoencoder_steps=0, autoencoder=autoencoder)
     network, sizes = training.prior.network, []
-    for ct in (-torch.ones(body().shape), body(), -torch.ones(body().shape)):
+    for ct in (-torch.ones(block().shape), block(), -torch.ones(block().shape)):
         training.case_loss(ct, water(), BEAM, torch.Generator().manual_seed(0))
         sizes.append(float(network.latent_size))
     with torch.no_grad():
-        assert sizes[0] < sizes[1] == sizes[2] == pytest.approx(float(network.latent(body()).abs().max()), rel=1e-5)
+        assert sizes[0] < sizes[1] == sizes[2] == pytest.approx(float(network.latent(block()).abs().max()), rel=1e-5)
 
 
 @pytest.mark.parametrize("steps", [0, 1])
 def test_the_size_of_latents_is_that_of_the_cases_of_all_processes(monkeypatch, autoencoder, steps):
     """Each sees one of three cases: all have the size of one process that sees them in turn, and its loss."""
     latent = {"autoencoder_steps": steps} | ({} if steps else {"autoencoder": autoencoder})
-    cases, one, alone, given = [0.5 * body(), body(), 0.9 * body()], task(**latent), task(**latent), []
+    cases, one, alone, given = [0.5 * block(), block(), 0.9 * block()], task(**latent), task(**latent), []
     monkeypatch.setattr(alone, "_everywhere", lambda size: given.append(size) or size[None])
 
     def loss(training: XrayToCTPATraining, case: torch.Tensor) -> torch.Tensor:
@@ -119,13 +120,13 @@ def test_a_trained_diffusion_keeps_the_size_of_its_latents_and_is_validated_from
     save_stage(tiny_xray2ctpa(), file := str(tmp_path / "rival.safetensors"))
     scenes, window = OrbitScenes(views=2), (WINDOW.low, WINDOW.high)
     went_on = XrayToCTPATraining(scenes=scenes, cube=Cube(16), window=window, latent=LatentSettings(0), initial=file)
-    went_on.case_loss(body(), water(), BEAM, torch.Generator().manual_seed(0))
+    went_on.case_loss(block(), water(), BEAM, torch.Generator().manual_seed(0))
     assert float(went_on.prior.network.latent_size) == 1.0
     logged = []
     went_on.log = lambda name, *_, **__: logged.append(name)
     went_on.log_case = lambda index, name, *_, **__: logged.append(name)
     went_on.validation_number = lambda index: index
-    went_on.validation_step({"volume": body()}, 0)
+    went_on.validation_step({"volume": block()}, 0)
     assert "val/psnr" in logged
 
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
+from scenes import WINDOW
 
 from phydict.grid import Grid
 from phydict.rivals import LiftedNetwork, Rival, X2CTNetwork, XrayToCTPANetwork
 from phydict.rivals.network import RivalNetwork
 from phydict.rivals.rival import bound_orbit
-from phydict.units import HUWindow
 from phydict.xray import ConeBeam
 
-GRID, WINDOW = Grid.cube(16), HUWindow(-1000, 600)
+GRID = Grid.cube(16)
 
 
 def lively(make: Callable[[], RivalNetwork], seed: int = 0) -> RivalNetwork:
@@ -41,14 +41,6 @@ def tiny_xray2ctpa(grid: Grid = GRID, views: int = 2) -> Rival:
     network = lively(lambda: XrayToCTPANetwork((4, 4), 8, (4, 8), (4, 8), 4))
     network.latent_size.fill_(1.0)
     return Rival(network, grid, WINDOW, bound_orbit(grid, views)).eval().requires_grad_(False)
-
-
-def body(grid: Grid = GRID) -> torch.Tensor:
-    """Soft tissue with a hollow, in air: (1, 1, X, Y, Z) in [-1, 1]."""
-    hu = torch.full((1, 1, *grid.shape), -1000.0)
-    hu[:, :, 3:13, 4:12, 2:14] = 40
-    hu[:, :, 5:8, 6:10, 5:11] = -800
-    return WINDOW.to_range(hu)
 
 
 def tilted(views: int, shape: tuple[int, int] = (31, 28)) -> ConeBeam:

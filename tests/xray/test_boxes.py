@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from laws import random_like
+from scenes import voxel_centres
 from torch.nn.functional import avg_pool3d
 
 from phydict.grid import Box, Grid
@@ -25,9 +26,7 @@ BEAM = ConeBeam.orbit(3, 1020, 740, (28, 28), 20.0)
 
 def linear(grid: Grid) -> torch.Tensor:
     """A volume that is affine in the world's coordinates, at a grid's voxels."""
-    index = np.stack(np.meshgrid(*map(np.arange, grid.shape), indexing="ij"), -1)
-    world = index @ grid.affine[:3, :3].T + grid.affine[:3, 3]
-    return torch.from_numpy(world @ [1.0, -2.0, 0.5] + 7.0)
+    return torch.from_numpy(voxel_centres(grid) @ [1.0, -2.0, 0.5] + 7.0)
 
 
 @pytest.mark.parametrize("voxels, side, centre", [
@@ -56,8 +55,7 @@ def test_a_box_that_cannot_be_is_refused(box, words):
 @pytest.mark.parametrize("onto", [Grid.cube(32), Grid.box((13, 8, 21), (200, 150, 230), (20, -30, 10))])
 def test_interpolation_keeps_what_is_linear_and_fills_what_lies_outside(onto):
     found = interpolated(linear(BASE), BASE, onto, -5.0)
-    index = np.stack(np.meshgrid(*map(np.arange, onto.shape), indexing="ij"), -1)
-    inner = BASE.index(index @ onto.affine[:3, :3].T + onto.affine[:3, 3])
+    inner = BASE.index(voxel_centres(onto))
     inner = torch.from_numpy(((inner >= 0) & (inner <= 15)).all(-1))
     assert inner.float().mean() > 0.7
     torch.testing.assert_close(found[inner], linear(onto)[inner])

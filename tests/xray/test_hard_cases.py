@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from laws import assert_adjoint, random_like
+from scenes import voxel_centres
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from phydict.xray import ConeBeam, Grid, Projector
@@ -67,8 +68,7 @@ def error(found: torch.Tensor, expected: torch.Tensor) -> float:
 
 def body(grid: Grid) -> torch.Tensor:
     """A textured trunk with two lungs and a spine, in 1/mm, as the benchmarks of the projectors use."""
-    index = np.stack(np.meshgrid(*map(np.arange, grid.shape), indexing="ij"), -1)
-    at = (index @ grid.affine[:3, :3].T + grid.affine[:3, 3] - grid.centre) / grid.extent * 2
+    at = (voxel_centres(grid) - grid.centre) / grid.extent * 2
     trunk, left, right, spine = ((((at - centre) / radii) ** 2).sum(-1) < 1 for centre, radii in (
         ((0, 0, 0), (0.9, 0.65, 2.0)), ((0.4, 0, 0.1), (0.32, 0.45, 0.75)), ((-0.4, 0, 0.1), (0.3, 0.45, 0.7)),
         ((0, -0.45, 0), (0.12, 0.12, 2.0))))
@@ -224,19 +224,15 @@ def test_volumes_of_one_voxels_thickness(method, shape):
     A = Projector(grid, beam, method)
     y = A(torch.ones(1, 1, *shape, dtype=torch.float64))
     # All matter is seen: each voxel sums to its volume over the pixel area at its magnification.
-    depth = np.einsum("nka,ka->nk", _centres(grid)[:, None] - beam.sources, beam.normals)
-    slant = np.linalg.norm(_centres(grid)[:, None] - beam.sources, axis=2) / depth
+    ways = voxel_centres(grid).reshape(-1, 1, 3) - beam.sources
+    depth = np.einsum("nka,ka->nk", ways, beam.normals)
+    slant = np.linalg.norm(ways, axis=2) / depth
     expected = (20**3 * (beam.distances / depth) ** 2 * slant / (2.5 * 4)).sum(0)
     if method == "eq4":  # its sum ends at the faces, where the interpolant is half of mu
         assert (y[0].sum((1, 2)).numpy() < 1.001 * expected).all()
     else:
         np.testing.assert_allclose(y[0].sum((1, 2)).numpy(), expected, rtol=0.02)
     assert_adjoint(A, A.T, (1, 1, *shape))
-
-
-def _centres(grid: Grid) -> np.ndarray:
-    index = np.stack(np.meshgrid(*map(np.arange, grid.shape), indexing="ij"), -1).reshape(-1, 3)
-    return index @ grid.affine[:3, :3].T + grid.affine[:3, 3]
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -383,7 +379,7 @@ def test_blobs_are_met_the_better_the_finer_the_grid(method, beam):
     errors = []
     for voxels in (12, 24, 48):
         grid = Grid.cube(voxels, 360)
-        mu = np.exp(-((_centres(grid) - position) ** 2).sum(1) / (2 * width**2)).reshape(1, 1, *grid.shape)
-        errors.append(error(Projector(grid, beam, method)(torch.as_tensor(mu)), expected))
+        mu = np.exp(-((voxel_centres(grid) - position) ** 2).sum(-1) / (2 * width**2))
+        errors.append(error(Projector(grid, beam, method)(torch.as_tensor(mu)[None, None]), expected))
     order = 1.6 if method in TRILINEAR else 0.9  # second order, against first
     assert np.log2(errors[0] / errors[1]) > order and np.log2(errors[1] / errors[2]) > order, errors

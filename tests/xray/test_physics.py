@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from laws import random_like
+from scenes import voxel_centres
 
 from phydict.xray import ConeBeam, Grid, Projector
 
@@ -13,18 +14,12 @@ METHODS = ("separable", "siddon", "eq4", "joseph", "matrix")
 BEAM = ConeBeam.orbit(4, 1020, 740, (56, 56), 10.0, start=0.3)
 
 
-def world(grid: Grid) -> np.ndarray:
-    """World positions (X, Y, Z, 3) of the voxel centres."""
-    index = np.stack(np.meshgrid(*map(np.arange, grid.shape), indexing="ij"), -1)
-    return index @ grid.affine[:3, :3].T + grid.affine[:3, 3]
-
-
 def volume(values: np.ndarray) -> torch.Tensor:
     return torch.as_tensor(np.ascontiguousarray(values), dtype=torch.float64)[None, None]
 
 
 def blob(grid: Grid, position, width=14.0) -> torch.Tensor:
-    return volume(np.exp(-((world(grid) - position) ** 2).sum(-1) / (2 * width**2)))
+    return volume(np.exp(-((voxel_centres(grid) - position) ** 2).sum(-1) / (2 * width**2)))
 
 
 def chords(beam: ConeBeam, low, high) -> np.ndarray:
@@ -70,7 +65,7 @@ def test_separable_measures_a_box_as_long_as_its_voxels():
 @pytest.mark.parametrize("method", METHODS)
 def test_the_chord_of_a_sphere(method):
     grid, radius, centre = Grid.cube(48), 110.0, np.array([30.0, -20.0, 25.0])
-    mu = 0.02 * volume(np.clip((radius - np.linalg.norm(world(grid) - centre, axis=-1)) / 8 + 0.5, 0, 1))
+    mu = 0.02 * volume(np.clip((radius - np.linalg.norm(voxel_centres(grid) - centre, axis=-1)) / 8 + 0.5, 0, 1))
     y = Projector(grid, BEAM, method)(mu)[0].numpy()
     ray = BEAM.pixels() - BEAM.sources[:, None, None]
     ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
@@ -91,7 +86,7 @@ def test_a_voxel_sums_to_its_volume_over_the_pixel_area_at_its_magnification(met
     mu = torch.zeros(1, 1, *grid.shape, dtype=torch.float64)
     mu[0, 0][index] = 1
     total = Projector(grid, beam, method)(mu)[0].sum((1, 2)).numpy()
-    ray = world(grid)[index] - beam.sources
+    ray = voxel_centres(grid)[index] - beam.sources
     depth = (ray * beam.normals).sum(1)
     slant = np.linalg.norm(ray, axis=1) / depth  # 1 / cos of the ray's angle on the detector
     np.testing.assert_allclose(total, 30 * 28 * 26 * (beam.distances / depth) ** 2 * slant / 1.2, rtol=0.01)

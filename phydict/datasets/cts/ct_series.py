@@ -16,7 +16,7 @@ import pydicom
 from pydicom.errors import InvalidDicomError
 
 from phydict.datasets.cts.reading import LEAST_SLICES, check_affine, to_ras
-from phydict.datasets.dicom import open_dicom, read_dicom, tag_numbers
+from phydict.datasets.dicom import Frame, open_dicom, read_dicom
 from phydict.datasets.natural_order import natural_order
 from phydict.datasets.nifti_file import NIFTI
 from phydict.runtime.files import files_below
@@ -72,7 +72,7 @@ def load_series(series: Series) -> tuple[np.ndarray, np.ndarray]:
     headers = {path: header for path, header in headers.items() if "LOCALIZER" not in str(header.get("ImageType"))}
     if not headers:
         raise ValueError("it holds only localizer (scout) images; give the series of slices")
-    if any((tag_numbers(header, 0, "NumberOfFrames", path.name, 1) or (1,))[0] > 1 for path, header in headers.items()):
+    if any((Frame(header, path.name).number("NumberOfFrames") or 1) > 1 for path, header in headers.items()):
         raise ValueError("it is stored as multi-frame (enhanced) CT; convert it to NIfTI and prepare that")
     if len(headers) < LEAST_SLICES:
         raise ValueError(f"it has {len(headers)} slices, but a chest CT has at least {LEAST_SLICES}; "
@@ -92,7 +92,8 @@ def _header(path: Path) -> pydicom.Dataset:
 
 def _geometry(path: Path, header: pydicom.Dataset) -> dict[str, np.ndarray]:
     """The numbers of the tags NEEDED of one slice. Raises ValueError."""
-    tags = {keyword: tag_numbers(header, 0, keyword, path.name, count) or () for keyword, count in NEEDED.items()}
+    frame = Frame(header, path.name)
+    tags = {keyword: frame.numbers(keyword, count) or () for keyword, count in NEEDED.items()}
     if missing := [keyword for keyword, numbers in tags.items() if not numbers]:
         raise ValueError(f"{path.name} lacks {', '.join(missing)}; export the series again")
     if min(tags["PixelSpacing"]) <= 0:

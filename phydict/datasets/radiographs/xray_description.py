@@ -210,14 +210,15 @@ def _check_beam(path: Path, beam) -> None:
     """Raises ValueError unless `beam` is of a known form: the values are checked when the beam is built."""
     if beam is not None and not isinstance(beam, dict):
         raise ValueError(f"{path}: `beam:` must be a mapping, but {reprlib.repr(beam)} was found")
+    beam = beam or {}
     for key, allowed in (("file", ("file", "pixel")), ("dicom", ("dicom",))):
-        unknown = [reprlib.repr(name) for name in beam or {} if beam and key in beam and name not in allowed]
+        unknown = [reprlib.repr(name) for name in beam if key in beam and name not in allowed]
         if unknown:
             raise ValueError(f"{path}: unknown key {', '.join(unknown)} in `beam:`; the keys are {', '.join(allowed)}")
-    if beam and not is_file_name(beam.get("file", "")):
+    if not is_file_name(beam.get("file", "")):
         raise ValueError(f"{path}: `file:` is the name of a geometry file, but {reprlib.repr(beam['file'])} was found")
-    if beam and "file" in beam and beam.get("pixel") is not None:
+    if "file" in beam and beam.get("pixel") is not None:
         with naming(path):
             pixel_sizes(beam["pixel"])
-    if beam and not isinstance(beam.get("dicom", {}), dict):
+    if not isinstance(beam.get("dicom", {}), dict):
         raise ValueError(f"{path}: `dicom:` must be a mapping, but {reprlib.repr(beam['dicom'])} was found")

@@ -78,7 +78,7 @@ class Couch:
         across = np.abs(fine(x) - self.shift)
         surface = self.curve * across**2 - self.gap
         top = surface - self.pad
-        bottom = np.minimum(top - self.thickness, top) if not self.keel else np.minimum(
+        bottom = top - self.thickness if not self.keel else np.minimum(
             top[across.argmin()] - self.thickness + 0.7 * np.maximum(across - self.keel / 2, 0), top - 2 * self.shell)
         section = _density(self.pad_hu) * _layer(across < self.width / 2 - 10, top, surface, y)
         section += self._box(across, self.width, top, bottom, y)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -14,17 +13,10 @@ from phydict.posterior.normalised import NormalisedMeasurement
 from phydict.runtime.ranges import LEAST, MOST, check_fields
 
 
-def langevin(score: Callable[[Tensor], Tensor], z: Tensor, step: float, iterations: int,
-             generator: Generators) -> Tensor:
-    """z <- z + step score(z) + sqrt(2 step) noise, `iterations` times; score is the gradient of the log density."""
-    for _ in range(iterations):
-        z = z + step * score(z) + (2 * step) ** 0.5 * noise_like(z, generator)
-    return z
-
-
 @dataclass(frozen=True)
 class Langevin(LikelihoodDraw):
-    """Langevin steps from the estimate, as published with DAPS and PnP-DM.
+    """Langevin steps z <- z + step score(z) + sqrt(2 step) noise from the estimate, as published with DAPS and PnP-DM;
+    score is the gradient of the log density.
 
     A step is cut to 1 / (1 / noise^2 + 1 / x0_std^2), beyond which the dynamics overshoot, and at twice which they
     diverge. Short of convergence z stays near the estimate; a direction of precision p then has variance
@@ -45,10 +37,9 @@ class Langevin(LikelihoodDraw):
 
     def __call__(self, measurement: NormalisedMeasurement, x0: Tensor, x0_std: float, generator: Generators,
                  progress: float) -> Tensor:
-        step = min(self.step * (1 - progress * (1 - self.last_share)), 1 / (measurement.noise**-2 + x0_std**-2))
-
-        def score(z: Tensor) -> Tensor:
+        step, z = min(self.step * (1 - progress * (1 - self.last_share)), 1 / (measurement.noise**-2 + x0_std**-2)), x0
+        for _ in range(self.iterations):
             misfit = measurement.adjoint(measurement.y - measurement.project(z))
-            return misfit / measurement.noise**2 + (x0 - z) / x0_std**2
-
-        return langevin(score, x0, step, self.iterations, generator)
+            score = misfit / measurement.noise**2 + (x0 - z) / x0_std**2
+            z = z + step * score + (2 * step) ** 0.5 * noise_like(z, generator)
+        return z

@@ -18,6 +18,7 @@ On the CPU compiled loops do it (phydict.xray.projectors.separable_cpu), on othe
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numba
@@ -82,7 +83,6 @@ class Separable:
             raise ValueError("the projector separable needs detectors whose rows are stacked along the grid's third "
                              "axis, but this beam's are tilted; use the projector siddon, or auto")
         self.grid, self.beam, self.rays = grid, beam, Rays.of(grid, beam)
-        self._sparse: SparseFactors | None = None
 
     def forward(self, mu: torch.Tensor) -> torch.Tensor:
         if mu.device.type != "cpu":
@@ -99,12 +99,10 @@ class Separable:
         _here(separable_cpu.backproject)(mu.numpy(), _array(xrays), _set_threads(), *self.rays)
         return mu
 
-    @property
+    @cached_property
     def sparse(self) -> SparseFactors:
         """The same operator as sparse products, made when first needed."""
-        if self._sparse is None:
-            self._sparse = SparseFactors(self.grid.shape, self.beam.shape, *self.rays)
-        return self._sparse
+        return SparseFactors(self.grid.shape, self.beam.shape, *self.rays)
 
 
 def _steps(count: int) -> np.ndarray:

@@ -31,7 +31,7 @@ from phydict.posterior import (
     SplitGibbs,
 )
 from phydict.xray import Ideal, Polychromatic
-from phydict.xray.checks import check_flat, check_line_integrals, check_offset, with_air_at_zero
+from phydict.xray.checks import check_clipped, check_flat, check_line_integrals, check_offset, with_air_at_zero
 from phydict.xray.residuals import misfits
 
 pytestmark = [pytest.mark.filterwarnings(f"ignore:{said}") for said in
@@ -304,6 +304,22 @@ def test_air_that_reads_alike_in_all_views_but_not_0_is_that_of_a_wrong_value_of
         warnings.simplefilter("error")
         for xrays in (exact, exact + 0.05, exact - 0.2, (exact + 0.2)[:1], exact[..., 7:17] + 0.2):
             check_offset(xrays)
+
+
+def test_views_of_which_many_pixels_hold_their_densest_value_are_told_to_be_cut_off():
+    most = CLEAN.flatten(1).quantile(0.95, 1)[:, None, None]
+    windowed, covered = CLEAN.clone(), CLEAN.clone()
+    windowed[2:4], covered[:, :, :1] = torch.minimum(CLEAN, most)[2:4], 11.5
+    for display in (False, True):
+        with pytest.warns(UserWarning, match="2 of 8 views hold exactly their densest value in up to 5% of their"):
+            reconstruct(windowed, BEAM, method=SIRT(2), grid=GRID, display=display)
+    with pytest.warns(UserWarning, match="8 of 8 views hold .*4% of their pixels.* a collimator covers it"):
+        check_clipped(covered)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for xrays in (CLEAN, (CLEAN * 255 / CLEAN.max()).round(), CLEAN.clamp(min=1), torch.zeros_like(CLEAN),
+                      views(water(0.02), simulator=Ideal(0)), CLEAN[:, :3, :5], windowed[:, :3, :5]):
+            check_clipped(xrays)
 
 
 def test_what_is_denser_than_the_prior_knows_is_said_with_its_place_and_size():

@@ -31,7 +31,14 @@ from phydict.posterior import (
     SplitGibbs,
 )
 from phydict.xray import Ideal, Polychromatic
-from phydict.xray.checks import check_clipped, check_flat, check_line_integrals, check_offset, with_air_at_zero
+from phydict.xray.checks import (
+    check_clipped,
+    check_flat,
+    check_line_integrals,
+    check_offset,
+    check_repeated,
+    with_air_at_zero,
+)
 from phydict.xray.residuals import misfits
 
 pytestmark = [pytest.mark.filterwarnings(f"ignore:{said}") for said in
@@ -320,6 +327,19 @@ def test_views_of_which_many_pixels_hold_their_densest_value_are_told_to_be_cut_
         for xrays in (CLEAN, (CLEAN * 255 / CLEAN.max()).round(), CLEAN.clamp(min=1), torch.zeros_like(CLEAN),
                       views(water(0.02), simulator=Ideal(0)), CLEAN[:, :3, :5], windowed[:, :3, :5]):
             check_clipped(xrays)
+
+
+def test_an_image_given_for_two_directions_is_told_and_one_given_twice_for_its_own_is_not():
+    twice = CLEAN[[0, 0]]
+    for display in (False, True):
+        with pytest.warns(UserWarning, match=r"view 1 \(counted from 0\) holds exactly the same image as view 0"):
+            reconstruct(twice, BEAM.select([0, 2]), method=SIRT(2), grid=GRID, display=display)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_repeated(CLEAN, BEAM)
+        check_repeated(twice, BEAM.select([0, 0]))
+        check_repeated(torch.zeros_like(CLEAN), BEAM)
+        check_repeated(views(water(0.02), simulator=Ideal(0)), BEAM)
 
 
 def test_what_is_denser_than_the_prior_knows_is_said_with_its_place_and_size():

@@ -52,11 +52,12 @@ def check_xrays(xrays: Tensor, beam: ConeBeam, display: bool = False) -> None:
 
 def check_fit(xrays: Tensor, beam: ConeBeam, grid: Grid, survey: Grid | None, display: bool) -> None:
     """Raises ValueError where X-rays (K, V, U), geometry and the voxels of `grid` do not fit; warns where X-rays look
-    inverted or cut off. survey: the voxels that hold the whole scene, where `grid` does not. display: whether they are
-    display values."""
+    inverted, cut off or repeated. survey: the voxels that hold the whole scene, where `grid` does not. display: whether
+    they are display values."""
     check_xrays(xrays, beam, display)
     check_air(xrays)
     check_clipped(xrays)
+    check_repeated(xrays, beam)
     beam.check(grid)
     check_scale(beam, survey or grid)
     check_meets(beam, grid)
@@ -162,6 +163,21 @@ def check_clipped(xrays: Tensor) -> None:
              f"{float(share[shown].max()):.0%} of their pixels: what is denser was cut off there, as by a display "
              "window, or too few bits so that counts end at 0, or a collimator covers it: export them without a window "
              "and with more bits, of whole counts state `floor: 0.5`, or crop off what is covered")
+
+
+def check_repeated(xrays: Tensor, beam: ConeBeam) -> None:
+    """Warns where a view of X-rays (K, V, U) holds, pixel for pixel, what another one does that stands elsewhere, but
+    for images that are their own mirror images, as of air or a cylinder."""
+    poses = np.concatenate([beam.sources, beam.detectors, beam.u, beam.v], 1)
+    first: dict[float, int] = {}
+    for k, view in enumerate(xrays):
+        other = first.setdefault(float(view.double().sum()), k)
+        if (torch.equal(view, xrays[other]) and not np.allclose(poses[k], poses[other])
+                and not torch.allclose(view, view.flip(-1), atol=1e-3)):
+            warn(f"view {k} (counted from 0) holds exactly the same image as view {other}, but the geometry has it "
+                 "elsewhere: give the image of that direction in its place, or leave the view out of X-rays and "
+                 "geometry")
+            return
 
 
 def check_line_integrals(xrays: Tensor) -> None:

@@ -162,10 +162,11 @@ def check_line_integral_scale(volume: Tensor, misfit: float) -> None:
     density = half_mass_density(volume)
     low, high = HALF_MASS
     if misfit <= BAD_FIT and not low < density < high:
-        warn(f"the volume is too {'light' if density < 1 else 'dense'} for a chest: half of its mass is in voxels below "
-             f"{density:.2f} times the density of water, in chests below about 1 time: check the scale of the line "
-             "integrals, natural logarithms of air over signal (of decadic ones `scale` is 2.3026), and mu_water, the "
-             "attenuation of water in 1/mm")
+        kind = "light" if density < 1 else "dense"
+        warn(f"the volume is too {kind} for a chest: half of its mass is in voxels below {density:.2f} times the "
+             "density of water, in chests below about 1 time: check the scale of the line integrals, natural "
+             "logarithms of air over signal (of decadic ones `scale` is 2.3026), and mu_water, water's attenuation in "
+             "1/mm")
 
 
 def half_mass_density(volume: Tensor) -> float:

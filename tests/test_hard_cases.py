@@ -32,7 +32,14 @@ from phydict.posterior import (
     SplitGibbs,
 )
 from phydict.xray import Ideal, Polychromatic
-from phydict.xray.checks import check_flat, check_line_integrals, check_offset, with_air_at_zero
+from phydict.xray.checks import (
+    check_clipped,
+    check_flat,
+    check_line_integrals,
+    check_offset,
+    check_repeated,
+    with_air_at_zero,
+)
 from phydict.xray.residuals import misfits
 
 pytestmark = [pytest.mark.filterwarnings(f"ignore:{said}") for said in
@@ -313,8 +320,8 @@ def test_line_integrals_on_another_scale_than_a_chests_are_told_from_many_views_
     for scale in (1 / np.log(10), 2.0):
         with pytest.warns(UserWarning, match="too (light|dense) for a chest.* scale of the line integrals"):
             reconstruct(scale * xrays, BEAM, method=of, grid=GRID)
-    with pytest.warns(UserWarning, match="too light for a chest: half.* below 0.5. times.* mu_water"):
-        reconstruct(xrays, BEAM, method=of, grid=GRID, mu_water=0.04)
+    with pytest.warns(UserWarning, match="too light for a chest: half.* below 0.4. times.* mu_water"):
+        reconstruct(xrays, BEAM, method=of, grid=GRID, mu_water=0.05)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         reconstruct(xrays, BEAM, method=of, grid=GRID)
@@ -327,6 +334,35 @@ def test_half_of_the_mass_lies_below_a_density_that_scales_with_the_volume():
     assert half_mass_density(chest) == 1.0  # 4 of 16.6 are lung, 10 water, 2.6 bone
     assert half_mass_density(0.4 * (chest + 1000) - 1000) == pytest.approx(0.4)
     assert half_mass_density(torch.cat([chest, torch.full((500, 1, 1), -1500.0)])) == 1.0
+
+
+def test_views_of_which_many_pixels_hold_their_densest_value_are_told_to_be_cut_off():
+    most = CLEAN.flatten(1).quantile(0.95, 1)[:, None, None]
+    windowed, covered = CLEAN.clone(), CLEAN.clone()
+    windowed[2:4], covered[:, :, :1] = torch.minimum(CLEAN, most)[2:4], 11.5
+    for display in (False, True):
+        with pytest.warns(UserWarning, match="2 of 8 views hold exactly their densest value in up to 5% of their"):
+            reconstruct(windowed, BEAM, method=SIRT(2), grid=GRID, display=display)
+    with pytest.warns(UserWarning, match="8 of 8 views hold .*4% of their pixels.* a collimator covers it"):
+        check_clipped(covered)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for xrays in (CLEAN, (CLEAN * 255 / CLEAN.max()).round(), CLEAN.clamp(min=1), torch.zeros_like(CLEAN),
+                      views(water(0.02), simulator=Ideal(0)), CLEAN[:, :3, :5], windowed[:, :3, :5]):
+            check_clipped(xrays)
+
+
+def test_an_image_given_for_two_directions_is_told_and_one_given_twice_for_its_own_is_not():
+    twice = CLEAN[[0, 0]]
+    for display in (False, True):
+        with pytest.warns(UserWarning, match=r"view 1 \(counted from 0\) holds exactly the same image as view 0"):
+            reconstruct(twice, BEAM.select([0, 2]), method=SIRT(2), grid=GRID, display=display)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_repeated(CLEAN, BEAM)
+        check_repeated(twice, BEAM.select([0, 0]))
+        check_repeated(torch.zeros_like(CLEAN), BEAM)
+        check_repeated(views(water(0.02), simulator=Ideal(0)), BEAM)
 
 
 def test_what_is_denser_than_the_prior_knows_is_said_with_its_place_and_size():

@@ -21,7 +21,6 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from phydict.runtime.files import atomic_write
 from phydict.runtime.reading import naming, read_text, reason
@@ -122,6 +121,8 @@ def _pose(path, view: int, values: dict[str, float]) -> tuple[np.ndarray, ...]:
         raise ValueError(f"{path}: view {view} has SourceToIsocenterDistance {isocentre:g} mm and "
                          f"SourceToDetectorDistance {detector:g} mm, but both must be positive; a parallel geometry, "
                          "which RTK writes as 0, has no cone beam")
+    from scipy.spatial.transform import Rotation
+
     angles = [-values[name] for name in ("InPlaneAngle", "OutOfPlaneAngle", "GantryAngle")]
     axes = Rotation.from_euler("ZXY", angles, degrees=True).as_matrix() @ FIXED_TO_RAS.T
     source = np.array([values["SourceOffsetX"], values["SourceOffsetY"], isocentre]) @ axes

@@ -17,7 +17,8 @@ PAGE = HERE.parents[1] / "TRUST.md"
 NOTICED = (
     "eight views", "view 3 flipped", "view 3 shifted by 5 pixels", "view 3 rotated by 2 degrees",
     "view 2 in the place of view 3", "view 3 blank", "display values taken for line integrals",
-    "line integrals 10 times too small", "decadic logarithms", "line integrals twice too large", "truncated: 1.4 times the patient", "truncated by a narrow detector",
+    "line integrals 10 times too small", "decadic logarithms", "line integrals twice too large",
+    "truncated: 1.4 times the patient", "truncated by a narrow detector",
     "water of 0.025 / mm assumed", "arc of 60 degrees", "two views", "metal", "10 % noise", "all water",
     "heel effect of 30 %", "detector blur of 3 mm", "detector lag of 5 %", "patient of 55 cm", "patient mirrored",
     "breathing by 10 mm")

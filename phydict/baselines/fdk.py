@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
@@ -66,9 +65,8 @@ class FDK(Baseline):
         foot = beam.detectors - beam.sources
         a, b = (torch.as_tensor((foot * step).sum(1) / (step**2).sum(1))[:, None] + places
                 for step, places in ((beam.u, columns), (beam.v, rows)))
-        scale = orbit.radius / beam.distances
-        pitch = torch.as_tensor(np.linalg.norm(beam.u, axis=1) * scale)[:, None]
-        a, b = a * pitch, b * torch.as_tensor(np.linalg.norm(beam.v, axis=1) * scale)[:, None]
+        height, pitch = torch.as_tensor(beam.pixel.T * (orbit.radius / beam.distances))[..., None]
+        a, b = a * pitch, b * height
         cosine = orbit.radius / (orbit.radius**2 + a[:, None] ** 2 + b[:, :, None] ** 2).sqrt()
         share = orbit.shares()[:, None] * orbit.redundancy((a / orbit.radius).numpy())
         weight = cosine * torch.as_tensor(share)[:, None]

@@ -172,7 +172,7 @@ def check_repeated(xrays: Tensor, beam: ConeBeam) -> None:
     first: dict[float, int] = {}
     for k, view in enumerate(xrays):
         other = first.setdefault(float(view.double().sum()), k)
-        if (torch.equal(view, xrays[other]) and not np.allclose(poses[k], poses[other])
+        if (not np.allclose(poses[k], poses[other]) and torch.equal(view, xrays[other])
                 and not torch.allclose(view, view.flip(-1), atol=1e-3)):
             warn(f"view {k} (counted from 0) holds exactly the same image as view {other}, but the geometry has it "
                  "elsewhere: give the image of that direction in its place, or leave the view out of X-rays and "

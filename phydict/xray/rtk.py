@@ -113,6 +113,8 @@ def _numbers(path, elements) -> dict[str, float]:
 
 def _pose(path, view: int, values: dict[str, float]) -> tuple[np.ndarray, ...]:
     """Source, detector's centre and unit axes of columns and rows (3,) in RAS+ of one view."""
+    from scipy.spatial.transform import Rotation
+
     missing = [name for name in NEEDED if name not in values]
     if missing:
         raise ValueError(f"{path}: view {view} has no {', '.join(missing)}; state every distance and angle")
@@ -121,8 +123,6 @@ def _pose(path, view: int, values: dict[str, float]) -> tuple[np.ndarray, ...]:
         raise ValueError(f"{path}: view {view} has SourceToIsocenterDistance {isocentre:g} mm and "
                          f"SourceToDetectorDistance {detector:g} mm, but both must be positive; a parallel geometry, "
                          "which RTK writes as 0, has no cone beam")
-    from scipy.spatial.transform import Rotation
-
     angles = [-values[name] for name in ("InPlaneAngle", "OutOfPlaneAngle", "GantryAngle")]
     axes = Rotation.from_euler("ZXY", angles, degrees=True).as_matrix() @ FIXED_TO_RAS.T
     source = np.array([values["SourceOffsetX"], values["SourceOffsetY"], isocentre]) @ axes

@@ -379,7 +379,7 @@ if __name__ == "__main__":
     for name, method, make in hard.cases():
         if (name, method) not in rows and (not words or any(word in name for word in words)):
             rows[name, method] = attempt(name, method, make, hard.prior)
-            write_csv(OUT, sorted(rows.values(), key=lambda row: order.index((row["case"], row["method"]))))
+            write_csv(OUT, [dict.fromkeys(COLUMNS) | rows[key] for key in sorted(rows, key=order.index)])
             print({column: value for column, value in rows[name, method].items() if value != ""}, flush=True)
     rows = read_csv(OUT)
     OUT.with_suffix(".md").write_text(f"{table(rows)}\n{scenes_table(rows)}")

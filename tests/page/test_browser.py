@@ -269,6 +269,21 @@ def test_the_open_case_can_be_gone_back_to(shown):
     page.wait_for_function("document.activeElement.id === 'case-name'")
 
 
+def test_a_case_that_has_loaded_leaves_the_focus_where_the_reader_went_meanwhile(shown):
+    page = shown("#sirt%2Fanna")
+    page.evaluate("""() => {
+        const at_once = load;
+        load = case_ => new Promise(go => { window.go = go; }).then(() => at_once(case_));
+    }""")
+    page.focus("#next")
+    page.keyboard.press("Enter")
+    page.wait_for_function("'go' in window")
+    page.focus("#previous")
+    page.evaluate("go()")
+    page.wait_for_function("document.getElementById('state').textContent === ''")
+    assert page.evaluate("document.activeElement.id") == "previous"
+
+
 def test_windows_overlay_and_difference_change_what_is_shown(shown):
     page, plane = shown("#sirt%2Fanna"), "[data-plane=axial][data-row='0']"
     looks = []

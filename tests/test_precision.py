@@ -145,7 +145,7 @@ def test_methods_without_a_network_name_the_precision_of_the_xrays():
 
 def test_a_rival_says_what_its_network_computed_in_whatever_the_type_of_the_x_rays():
     double, single = (RivalAnswer(tiny_lifted()).reconstruct(y, PROJECTOR) for y in (views().double(), views()))
-    torch.testing.assert_close(double.volume.float(), single.volume, atol=1e-3, rtol=0)
+    torch.testing.assert_close(double.volume.float(), single.volume, atol=0.01, rtol=0)  # HU; single precision
     assert double.precision == single.precision
 
 

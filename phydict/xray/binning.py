@@ -7,8 +7,11 @@ import torch
 from torch import Tensor
 
 from phydict.grid import Grid
-from phydict.xray.geometry import ConeBeam
+from phydict.xray.geometry import ConeBeam, in_blocks
 from phydict.xray.orbits import PIXEL, PIXELS, SOURCE_TO_DETECTOR, SOURCE_TO_ISOCENTRE
+
+LEFT_OUT = 0.01
+"""The most of a detector's rows or columns that binning leaves out: of many real detectors sizes have no divisor."""
 
 
 def benchmark_orbit(grid: Grid, views: int, arc_degrees: float = 360.0) -> ConeBeam:
@@ -20,9 +23,10 @@ def benchmark_orbit(grid: Grid, views: int, arc_degrees: float = 360.0) -> ConeB
 
 def binning(grid: Grid, beam: ConeBeam) -> int:
     """The largest whole factor by which the detector may be binned while its pixels, seen at the grid's centre, stay
-    below 0.7 voxels; finer pixels cost time and carry nothing that the grid can hold."""
+    below 0.7 voxels and at most LEFT_OUT of its rows and of its columns fill no block; finer pixels cost time and carry
+    nothing that the grid can hold."""
     limit = 0.7 * min(grid.spacing) / float(max(sides.max() for sides in pixel_sides(grid, beam)))
-    factors = [f for f in range(1, max(int(limit), 1) + 1) if all(n % f == 0 for n in beam.shape)]
+    factors = [f for f in range(1, max(int(limit), 1) + 1) if all(n % f <= LEFT_OUT * n for n in beam.shape)]
     return factors[-1]
 
 
@@ -35,5 +39,6 @@ def pixel_sides(grid: Grid, beam: ConeBeam) -> tuple[np.ndarray, np.ndarray]:
 
 
 def binned(xrays: Tensor, factor: int) -> Tensor:
-    """X-rays (K, V, U) averaged over blocks of `factor`^2 pixels."""
-    return torch.nn.functional.avg_pool2d(xrays[None], factor)[0] if factor > 1 else xrays
+    """X-rays (K, V, U) averaged over blocks of `factor`^2 pixels, as those of `ConeBeam.binned`."""
+    rows, columns = (in_blocks(n, factor) for n in xrays.shape[1:])
+    return torch.nn.functional.avg_pool2d(xrays[None, :, rows, columns], factor)[0] if factor > 1 else xrays

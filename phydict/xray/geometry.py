@@ -224,13 +224,15 @@ class ConeBeam:
         return self.at(self.sources[index], self.detectors[index], self.u[index], self.v[index])
 
     def binned(self, factor: int) -> ConeBeam:
-        """The beam whose pixels are blocks of factor x factor pixels; the field of view stays the same."""
-        if factor != int(factor) or factor < 1 or any(n % int(factor) for n in self.shape):
+        """The beam whose pixels are blocks of factor x factor pixels; what fills no block is left out (`in_blocks`)."""
+        if factor != int(factor) or not 1 <= factor <= min(self.shape):
             raise ValueError(f"a detector of {self.shape[0]} x {self.shape[1]} pixels cannot be binned by {factor}; "
-                             "give a positive whole number that divides both sizes")
+                             f"give a whole number from 1 to {min(self.shape)}")
         factor = int(factor)
-        return replace(self, u=factor * self.u, v=factor * self.v,
-                       shape=(self.shape[0] // factor, self.shape[1] // factor))
+        rows, columns = (in_blocks(n, factor) for n in self.shape)
+        down, across = ((kept.start + kept.stop - n) / 2 for kept, n in zip((rows, columns), self.shape))
+        return replace(self, detectors=self.detectors + down * self.v + across * self.u, u=factor * self.u,
+                       v=factor * self.v, shape=(self.shape[0] // factor, self.shape[1] // factor))
 
     def divided(self, factor: int) -> ConeBeam:
         """The beam each of whose pixels is divided into factor x factor; `binned` undoes it."""
@@ -349,6 +351,12 @@ class ConeBeam:
             beam = beam.shifted(*((0.0, shift) if np.ndim(shift) == 0 else shift))
         beam = beam.tilted(tilt) if tilt else beam
         return replace(beam, continued=content.get("continued"))
+
+
+def in_blocks(count: int, factor: int) -> slice:
+    """Of so many pixels in a row, those of whole blocks of `factor`: half of the rest is left out at each end."""
+    rest = count % factor
+    return slice(rest // 2, rest // 2 + count - rest)
 
 
 def _check_room(views: int, shape: tuple[int, int]) -> None:

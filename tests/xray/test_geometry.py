@@ -103,8 +103,11 @@ def test_binned_pixels_are_the_means_of_their_blocks():
     beam = orbit()
     blocks = beam.pixels().reshape(4, 28, 4, 24, 4, 3).mean((2, 4))
     np.testing.assert_allclose(beam.binned(4).pixels(), blocks, atol=1e-9)
-    with pytest.raises(ValueError, match="112 x 96 pixels cannot be binned by 5"):
-        beam.binned(5)
+    within = beam.pixels()[:, 1:-1, :-1].reshape(4, 22, 5, 19, 5, 3).mean((2, 4))  # of 112 and 96, 110 and 95
+    np.testing.assert_allclose(beam.binned(5).pixels(), within, atol=1e-9)
+    for factor in (0, 1.5, 97):
+        with pytest.raises(ValueError, match=f"112 x 96 pixels cannot be binned by {factor}; .* from 1 to 96"):
+            beam.binned(factor)
 
 
 def test_distances_are_perpendicular_to_the_detector():

@@ -20,6 +20,7 @@ from phydict.xray.orbits import on_circle, on_line, turned
 from phydict.xray.stated import (
     LEAST_MM,
     MOST_MM,
+    check_degrees,
     check_isocentre,
     check_keys,
     number_of,
@@ -126,6 +127,8 @@ class ConeBeam:
                              f"{math.degrees(turn):g} degrees, at which all come from one angle, was given: give "
                              f"{LEAST_ARC_DEGREES:g} degrees or more, leave the arc out for a full turn, or give one "
                              "view")
+        if arc_degrees is not None:
+            check_degrees("arc_degrees", arc_degrees, count[0])
         angles = first + turn * np.arange(int(views)) / int(views)
         return cls(*on_circle(angles, source_to_detector, source_to_isocentre, pixel_sizes(pixel)), shape)
 
@@ -137,6 +140,7 @@ class ConeBeam:
         if np.ndim(angles) != 1 or not np.size(angles):
             raise ValueError("angles_degrees is a list of an angle for each view, but "
                              f"{reprlib.repr(angles_degrees)} was given")
+        check_degrees("angles_degrees", float(np.ptp(angles)), len(angles))
         check_isocentre(source_to_detector, source_to_isocentre)
         poses = on_circle(np.radians(angles), source_to_detector, source_to_isocentre, pixel_sizes(pixel))
         return cls(*poses, shape)
@@ -154,6 +158,7 @@ class ConeBeam:
             raise ValueError(f"a sweep needs two views or more, but views={reprlib.repr(views)} was given")
         if not 0 < number_of("sweep_degrees", sweep_degrees) <= 160:
             raise ValueError(f"sweep_degrees lies in (0, 160], but {sweep_degrees} was given")
+        check_degrees("sweep_degrees", sweep_degrees, count[0])
         check_isocentre(source_to_detector, source_to_isocentre)
         reach = math.tan(math.radians(sweep_degrees) / 2)
         tangents = np.linspace(-reach, reach, count[0])

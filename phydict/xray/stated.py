@@ -7,8 +7,12 @@ import reprlib
 
 import numpy as np
 
+from phydict.runtime.warning import warn
+
 MOST_RADIANS = 4 * math.pi
 """An angle in radians beyond two turns was meant in degrees."""
+LEAST_SPREAD = 0.1
+"""Degrees up to which nobody takes the spread of an orbit's views for radians: they would be 6 degrees."""
 LEAST_MM, MOST_MM = 1e-6, 1e9
 """No pixel's side is shorter, and no length as long: they would be those of a mistake, and underflow or overflow."""
 
@@ -24,6 +28,14 @@ def radians_of(name: str, radians: float | None, degrees: float | None, otherwis
         raise ValueError(f"{name} is in radians, but {radians} was given, more than two turns; give {name}_degrees for "
                          "degrees")
     return math.radians(degrees) if degrees is not None else otherwise if radians is None else radians
+
+
+def check_degrees(name: str, spread: float, views: int) -> None:
+    """Warns where views stand within so few degrees of one another that the angles were likely given in radians."""
+    if views > 1 and LEAST_SPREAD < abs(spread) <= math.tau:
+        warn(f"{views} views stand within {abs(spread):.3g} degrees of one another by {name}, too near to tell depth: "
+             f"where these angles are in radians, they are {math.degrees(abs(spread)):.0f} degrees, which is what to "
+             "give")
 
 
 def pixel_sizes(pixel) -> tuple[float, float]:

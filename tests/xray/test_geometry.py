@@ -99,6 +99,15 @@ def test_a_sweep_moves_the_source_evenly_along_the_patient_before_a_resting_dete
     assert (np.diff(rows) > 0).all()
 
 
+@pytest.mark.parametrize("make, degrees", [
+    (lambda: orbit(4, arc_degrees=2 * np.pi), 360), (lambda: orbit(2, arc_degrees=-np.pi), 180),
+    (lambda: ConeBeam.at_angles([0, 1.571], 1020, 740, (8, 8), 5.0), 90),
+    (lambda: ConeBeam.sweep(5, 1020, 740, (8, 8), 5.0, 0.698), 40)])
+def test_degrees_that_are_radians_are_warned_of(make, degrees):
+    with pytest.warns(UserWarning, match=f"_degrees, too near .* in radians, they are {degrees} degrees"):
+        make()
+
+
 def test_binned_pixels_are_the_means_of_their_blocks():
     beam = orbit()
     blocks = beam.pixels().reshape(4, 28, 4, 24, 4, 3).mean((2, 4))

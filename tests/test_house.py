@@ -1,7 +1,6 @@
 """How the house is built: imports run downward, Lightning lives on the top floor, every configuration works."""
 
 import ast
-import subprocess
 import sys
 import tomllib
 import warnings
@@ -12,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from floors import LIGHTNING, PACKAGE, ROOT, files, module_of, part
 from lightning.pytorch.callbacks import WeightAveraging
 from lightning.pytorch.strategies import DDPStrategy, ModelParallelStrategy
 from packaging.requirements import Requirement
@@ -29,8 +29,6 @@ from phydict.prior import save_prior, save_refiner
 from phydict.xray import ConeBeam, Ideal, Polychromatic
 from phydict.xray.checks import check_scale
 
-ROOT = Path(__file__).parents[1]
-PACKAGE = ROOT / "phydict"
 FLOORS = {
     "runtime": 0, "units": 0, "linalg": 0,
     "grid": 1,
@@ -42,7 +40,6 @@ FLOORS = {
     "training": 7, "inference": 7,
     "ablation": 8,
     "cli": 9}
-LIGHTNING = ("training", "inference", "ablation", "cli")
 MOST_ARGUMENTS = 10
 LONG = {
     "SplitGibbs": "constants of the paper's text and release", "PnPDM": "published constants",
@@ -60,19 +57,6 @@ CONFIGS = {folder: sorted((ROOT / "configs" / folder).glob("*.yaml"))
            for folder in ("prior", "rivals", "reconstruct", "geometry", "simulate")}
 
 SEVERAL_DEVICES = (ROOT / "configs" / "prior" / "ddp.yaml", ROOT / "configs" / "prior" / "fsdp.yaml")
-
-
-def files():
-    return sorted(f for f in PACKAGE.rglob("*.py") if f != PACKAGE / "__init__.py")
-
-
-def part(file: Path) -> str:
-    """The part of the house that a file belongs to: a folder or a module of the package's top."""
-    return file.relative_to(PACKAGE).parts[0].removesuffix(".py")
-
-
-def module_of(file: Path) -> str:
-    return ".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
 
 
 def imported(file: Path) -> list[str]:
@@ -138,32 +122,19 @@ def test_every_part_has_a_floor_and_the_top_is_small():
     assert len(list(PACKAGE.glob("*.py"))) <= ROOT_FILES
 
 
-def test_a_bare_import_brings_nothing_heavy_and_everything_below_the_top_floor_runs_without_lightning():
-    modules = [module_of(f) for f in files() if part(f) not in LIGHTNING]
-    assert "phydict.methods" in modules and "phydict.xray.projectors.siddon" in modules
-    code = f"""if True:
-        import importlib, sys
-        import phydict
-        loaded = lambda: print(*{{name.partition(".")[0] for name in sys.modules}})
-        loaded()
-        print(phydict.load_prior().grid.shape)
-        for module in {modules!r}: importlib.import_module(module)
-        loaded()"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
-    assert done.returncode == 0, done.stderr
-    bare, shape, below = done.stdout.splitlines()
-    assert not set(bare.split()) & {"monai", "lightning", "pytorch_lightning", "transformers", "lpips", "torchvision",
-                                    "matplotlib", "torchmetrics", "numba", "nibabel", "huggingface_hub"}
-    assert "torch" in bare.split() and shape == "(64, 64, 64)"
-    assert "monai" in below.split() and not {"lightning", "pytorch_lightning"} & set(below.split())
+@pytest.fixture(scope="module")
+def priors(tmp_path_factory) -> Path:
+    """A folder of a tiny prior and a tiny refiner."""
+    folder = tmp_path_factory.mktemp("priors")
+    save_prior(tiny_prior(), folder / "tiny.safetensors")
+    save_refiner(tiny_refiner(), folder / "refiner.safetensors")
+    return folder
 
 
 @pytest.fixture
-def inference(tmp_path, monkeypatch):
+def inference(priors, monkeypatch):
     """Builds infer.py's command line from arguments, with a tiny prior and nothing run."""
-    monkeypatch.chdir(tmp_path)
-    save_prior(tiny_prior(), "tiny.safetensors")
-    save_refiner(tiny_refiner(), "refiner.safetensors")
+    monkeypatch.chdir(priors)
     return lambda *args: InferenceCLI(
         ReconstructionTask, ReconstructionData, run=False, save_config_callback=None,
         trainer_defaults={"logger": False, "accelerator": "cpu", "devices": 1, "enable_progress_bar": False,

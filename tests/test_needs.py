@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 from fitting import fit_to_grid
+from floors import LIGHTNING, files, module_of, part
 from posterior.scene import BEAM, views
 from prior.tiny import REPORTS, tiny_for, tiny_prior
 
@@ -26,8 +27,11 @@ ROOT = Path(__file__).parents[1]
 
 SCENES = """
 import json, sys, warnings
+import phydict
+bare, shape = sorted({name.partition(".")[0] for name in sys.modules}), phydict.load_prior().grid.shape
 from dataclasses import replace
-import torch, phydict
+from importlib import import_module
+import torch
 from phydict.posterior import GradientSteps, Reward
 warnings.simplefilter("ignore")
 made, begin = set(), torch.nn.Module.__init__
@@ -43,27 +47,45 @@ for name, report in json.loads(sys.argv[2]):
     made.clear()
     phydict.reconstruct(xrays, beam, sys.argv[1], replace(method, **few), report=report, grid=phydict.Grid.cube(16))
     networks[f"{name} {report}".strip()] = sorted(made)
-print(json.dumps({"modules": sorted(sys.modules), "networks": networks}))
+modules = sorted(sys.modules)
+for name in json.loads(sys.argv[3]):
+    import_module(name)
+print(json.dumps({"bare": bare, "shape": shape, "modules": modules, "networks": networks,
+                  "below": sorted(sys.modules)}))
 """
 
 NEVER = ("lightning", "pytorch_lightning", "tensorboard", "lungmask", "itk", "ignite", "phydict.training",
          "phydict.cli", "phydict.inference")
 """Of use to training, to tables and to other files, and to no reconstruction in memory. MONAI is not among them,
 nor are transformers and lpips: the networks are MONAI's, which imports all of itself and those two with it."""
+HEAVY = {"monai", "lightning", "pytorch_lightning", "transformers", "lpips", "torchvision", "matplotlib",
+         "torchmetrics", "numba", "nibabel", "huggingface_hub"}
+"""What a bare import brings none of."""
+
 PRESETS = ("sirt", "fdk", "phydict_fast", "phydict_paper", "phydict_released")
 
 
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory) -> dict:
-    """Modules imported, and networks made by each preset, in a process of its own that reconstructs with them in turn,
-    with a report last of all."""
+    """Modules imported, and networks made by each preset, in a process of its own that imports the package, loads a
+    prior, reconstructs with them in turn, with a report last of all, and imports all that is below the top floor."""
     file = tmp_path_factory.mktemp("prior") / "tiny.safetensors"
     save_prior(tiny_prior(), file)
     runs = [*((name, "") for name in PRESETS), ("phydict_fast", REPORTS[0])]
-    done = subprocess.run([sys.executable, "-c", SCENES, str(file), json.dumps(runs)], capture_output=True, text=True,
-                          cwd=ROOT, env={"PYTHONPATH": str(ROOT), "PATH": "", "OMP_NUM_THREADS": "1"})
+    below = [module_of(file) for file in files() if part(file) not in LIGHTNING]
+    assert "phydict.methods" in below and "phydict.xray.projectors.siddon" in below
+    done = subprocess.run([sys.executable, "-c", SCENES, str(file), json.dumps(runs), json.dumps(below)],
+                          capture_output=True, text=True, cwd=ROOT,
+                          env={"PYTHONPATH": str(ROOT), "PATH": "", "OMP_NUM_THREADS": "1"})
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])
+
+
+def test_a_bare_import_brings_nothing_heavy_and_everything_below_the_top_floor_runs_without_lightning(scenes):
+    assert "torch" in scenes["bare"] and not HEAVY & set(scenes["bare"])
+    assert scenes["shape"] == [64, 64, 64]
+    below = {name.partition(".")[0] for name in scenes["below"]}
+    assert "monai" in below and not {"lightning", "pytorch_lightning"} & below
 
 
 def test_no_reconstruction_imports_training_or_lightning(scenes):

@@ -327,7 +327,7 @@ def test_finer_voxels_are_learnt_of_as_they_are_seen_after_the_coarser_ones(tmp_
     save_stage(tiny_correction(), file, dtype=torch.float32)
     for name in (None, str(file)):
         data = RefinementData(  # of which the first scene has more than two views
-            RefinementCases(1, 1, 16, name), Scenes(most_views=200), phantoms=1, cache=str(tmp_path / "cache"),
+            RefinementCases(1, 1, 16, name), Scenes(most_views=30), phantoms=1, cache=str(tmp_path / "cache"),
             holdout=HoldOut(phantoms=1), initial=refiner_file, cube=Cube(64), window=(-1000, 600))
         seen.append(np.array(data.made[0], np.float32))
     without, corrected = seen

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import silu
 
-from phydict.prior.convolution import lay_out, silence
+from phydict.prior.convolution import lay_out, silence, speed_up
 
 FREQUENCIES = 8
 
@@ -29,6 +29,7 @@ class DetailNetwork(nn.Module):
         self.time = nn.Sequential(nn.Linear(2 * FREQUENCIES, 64), nn.SiLU(), nn.Linear(64, 2 * width * (layers + 1)))
         silence(self.leave)
         lay_out(self)
+        speed_up(self)
 
     def forward(self, difference: Tensor, estimate: Tensor, t: Tensor, offset: Tensor | None = None) -> Tensor:
         """Difference of state and estimate, and the estimate (B, C, X, Y, Z), at times t (B,) -> (B, C, X, Y, Z).

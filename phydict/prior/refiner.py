@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from phydict.diffusion import CosineSchedule
 from phydict.grid import Grid
-from phydict.prior.convolution import lay_out, silence
+from phydict.prior.convolution import lay_out, silence, speed_up
 from phydict.prior.evidence_channels import EVIDENCE_CHANNELS
 from phydict.prior.kind_map import KindMap
 from phydict.prior.prior import BoundPrior, Prior
@@ -58,6 +58,7 @@ class Refiner(nn.Module):
         for layer in (self.entrance, self.detail_entrance, self.gate[-1]):
             silence(layer)
         lay_out(self.detail_entrance)
+        speed_up(self)
         self.register_buffer("mean", mean)
         if first is not None:
             self.begin_with(first)

@@ -4,7 +4,9 @@ import pytest
 import torch
 from torch import nn
 
+from phydict.prior import LocalUNet
 from phydict.prior.convolution import FastConv3d, _OneDNN, speed_up
+from prior.tiny import tiny_correction, tiny_prior, tiny_refiner
 
 CASES = {"3x3x3": (dict(kernel_size=3, padding=1), (1, 8, 6, 5, 4)),
          "1x1x1": (dict(kernel_size=1), (1, 8, 4, 4, 4)),
@@ -94,14 +96,8 @@ def test_a_small_input_goes_to_onednn_and_others_as_torch_likes(monkeypatch):
     assert len(asked) == 1
 
 
-def test_the_networks_of_both_stages_are_sped_up(prior_networks):
-    for network in prior_networks:
-        assert not [name for name, module in network.named_modules() if type(module) is nn.Conv3d]
-
-
-@pytest.fixture
-def prior_networks():
-    from phydict.prior import LocalUNet, VolumeUNet
-
-    return [VolumeUNet(channels=(8, 16), attention=(False, True), head_channels=8, context_dim=8),
-            LocalUNet(channels=(8, 16))]
+@pytest.mark.parametrize("make", [
+    lambda: tiny_prior(detail=True), lambda: tiny_refiner(uncertain=True), lambda: tiny_correction(uncertain=True),
+    lambda: LocalUNet(channels=(8, 16))], ids=["prior", "refiner", "correction", "second stage"])
+def test_every_convolution_of_a_network_is_sped_up(make):
+    assert not [name for name, module in make().named_modules() if type(module) is nn.Conv3d]

@@ -140,7 +140,7 @@ class ConeBeam:
         if np.ndim(angles) != 1 or not np.size(angles):
             raise ValueError("angles_degrees is a list of an angle for each view, but "
                              f"{reprlib.repr(angles_degrees)} was given")
-        check_degrees("angles_degrees", float(np.ptp(angles)), len(angles))
+        check_degrees("angles_degrees", float(np.ptp(angles)), np.size(angles))
         check_isocentre(source_to_detector, source_to_isocentre)
         poses = on_circle(np.radians(angles), source_to_detector, source_to_isocentre, pixel_sizes(pixel))
         return cls(*poses, shape)

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 from fitting import fit_to_grid
-from floors import LIGHTNING, files, module_of, part
+from floors import LIGHTNING, ROOT, files, module_of, part
 from posterior.scene import BEAM, views
 from prior.tiny import REPORTS, tiny_for, tiny_prior
 
@@ -22,8 +22,6 @@ from phydict.posterior import DPS, GradientSteps, Posterior, Reward, Sampler
 from phydict.prior import save_prior
 from phydict.runtime.profiling import CPU, CUDA, peak_memory, process_peak, profiled, reset_peak_memory, stage
 from phydict.xray import Projector
-
-ROOT = Path(__file__).parents[1]
 
 SCENES = """
 import json, sys, warnings

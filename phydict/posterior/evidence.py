@@ -51,6 +51,5 @@ class Evidence:
 def views_seen(projector: Projector, seen: Tensor) -> Tensor:
     """How many views see each voxel, of A' 1: a view that sees the grid's centre gives it the volume of a voxel over
     the area of a pixel there."""
-    width, height = pixel_sides(projector.grid, projector.beam)
-    each = float(np.prod(projector.grid.spacing) / (width * height).mean())
+    each = float(np.prod(projector.grid.spacing) / pixel_sides(projector.grid, projector.beam).prod(1).mean())
     return (seen / each).clamp(0, projector.beam.views)

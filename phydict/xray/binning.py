@@ -25,17 +25,16 @@ def binning(grid: Grid, beam: ConeBeam) -> int:
     """The largest whole factor by which the detector may be binned while its pixels, seen at the grid's centre, stay
     below 0.7 voxels and at most LEFT_OUT of its rows and of its columns fill no block; finer pixels cost time and carry
     nothing that the grid can hold."""
-    limit = 0.7 * min(grid.spacing) / float(max(sides.max() for sides in pixel_sides(grid, beam)))
+    limit = 0.7 * min(grid.spacing) / float(pixel_sides(grid, beam).max())
     factors = [f for f in range(1, max(int(limit), 1) + 1) if all(n % f <= LEFT_OUT * n for n in beam.shape)]
     return factors[-1]
 
 
-def pixel_sides(grid: Grid, beam: ConeBeam) -> tuple[np.ndarray, np.ndarray]:
-    """Width and height (K,) in mm of each view's pixels, seen at the grid's centre."""
+def pixel_sides(grid: Grid, beam: ConeBeam) -> np.ndarray:
+    """Row height and column width (K, 2) in mm of each view's pixels, seen at the grid's centre."""
     to_detector = beam.detectors - beam.sources
     depth = ((grid.centre - beam.sources) * to_detector).sum(1) / (to_detector**2).sum(1)
-    width, height = ((step**2).sum(1) ** 0.5 * depth for step in (beam.u, beam.v))
-    return width, height
+    return beam.pixel * depth[:, None]
 
 
 def binned(xrays: Tensor, factor: int) -> Tensor:

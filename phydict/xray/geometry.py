@@ -44,7 +44,7 @@ LISTS = ("shape", "pixel", "angles_degrees", "detector_shift")
 LEAST_ARC_DEGREES = 1e-3
 """Several views over less of an arc would all come from one angle."""
 SHORT_MM = 200
-"""Of a distance from source to detector that may have been meant in another unit, where it fits no volume."""
+"""Of a distance from the source that may have been meant in another unit, where it fits no volume."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,7 +257,7 @@ class ConeBeam:
             room = f"a source_to_isocentre of {least} to {most} mm would do with" if least <= most else (
                 f"no source_to_isocentre would do, since {2 * least} mm are needed, with")
             culprit = "source" if near <= 0 else "detector"
-            units = ", with lengths in mm, not in cm or m" if distance < SHORT_MM else ""
+            units = ", with lengths in mm, not in cm or m" if min(distance, abs(centre[k])) < SHORT_MM else ""
             raise ValueError(
                 f"view {k}: the {culprit} lies inside the volume or the volume extends behind it: "
                 f"source to volume centre is {centre[k]:.1f} mm and volume centre to detector is "

@@ -23,7 +23,7 @@ from phydict.runtime.files import atomic_write
 from phydict.runtime.reading import naming, read_npy, read_text, reading, reason
 from phydict.runtime.warning import warn
 from phydict.xray.geometry import ConeBeam
-from phydict.xray.projection_matrices import beam_of_matrices
+from phydict.xray.projection_matrices import are_matrices, beam_of_matrices
 from phydict.xray.rtk import check_beam, read_rtk, write_rtk
 from phydict.xray.stated import pixel_sizes
 
@@ -59,6 +59,10 @@ def read_beam(path: str | Path, shape: tuple[int, int] | None = None,
     if vectors.ndim != 2 or vectors.shape[1] != 12 or not len(vectors):
         raise ValueError(f"{path} holds numbers of shape {vectors.shape}, but 12 per view were expected: source, "
                          "detector centre, u and v; or (views, 3, 4), projection matrices")
+    if are_matrices(vectors):
+        raise ValueError(f"{path} holds projection matrices as numbers of shape {vectors.shape}, but 12 per view are "
+                         "source, detector centre, u and v: save matrices of shape (views, 3, 4) in an .npy, by "
+                         "numpy.save(path, numbers.reshape(-1, 3, 4))")
     with naming(path):
         sources, detectors, u, v = np.split(vectors, 4, axis=1)
         beam = ConeBeam(sources, detectors, u, v, shape)

@@ -9,6 +9,10 @@ from phydict.xray.stated import pixel_sizes
 
 LEAST_VOLUME = 1e-12
 """Of the left 3x3 part of a matrix, relative to the product of its rows' lengths: below, it has no source."""
+SQUARE = 1e-4
+"""Cosine of the angle between rows and columns up to which they are perpendicular."""
+MOST_ASPECT = 10
+"""No pixel is so many times as long as it is wide."""
 ALIKE = 0.01
 """Share by which a pixel's height over its width may differ from what the matrix says."""
 
@@ -25,6 +29,23 @@ def beam_of_matrices(matrices: np.ndarray, shape: tuple[int, int], pixel: float 
     poses = [_pose(view, matrix, height, width, shape) for view, matrix in enumerate(matrices)]
     sources, detectors, u, v = (np.stack(part) for part in zip(*poses))
     return ConeBeam(sources, detectors, u, v, shape)
+
+
+def are_matrices(numbers: np.ndarray) -> bool:
+    """Whether rows of 12 numbers (K, 12) are projection matrices, by all of which pixels are rectangles, and not
+    source, detector's centre, u and v."""
+    left = numbers.reshape(-1, 3, 4)[:, :, :3]
+    if not (abs(np.linalg.det(left)) > LEAST_VOLUME * np.linalg.norm(left, axis=2).prod(1)).all():
+        return False
+    rays = np.linalg.inv(left)
+    return _are_rectangles(rays[:, :, 0], rays[:, :, 1]) and not _are_rectangles(numbers[:, 6:9], numbers[:, 9:])
+
+
+def _are_rectangles(u: np.ndarray, v: np.ndarray) -> bool:
+    """Whether each u (K, 3) is perpendicular to its v and less than MOST_ASPECT times as long, and v as u."""
+    width, height = (np.linalg.norm(side, axis=1) for side in (u, v))
+    sides = np.maximum(width, height) < MOST_ASPECT * np.minimum(width, height)
+    return bool((sides & (abs((u * v).sum(1)) < SQUARE * width * height)).all())
 
 
 def _pose(view: int, matrix: np.ndarray, height: float, width: float, shape: tuple[int, int]) -> tuple[np.ndarray, ...]:

@@ -204,9 +204,11 @@ def test_the_default_geometry_clears_its_volume():
     ConeBeam.orbit(8, 1020, 740, (448, 448), 1.25).check(Grid.cube(64))
 
 
-def test_lengths_in_metres_are_told_of():
+@pytest.mark.parametrize("lengths", [(1.02, 0.74, 0.00125), (1020, 74, 1.25)], ids=["all", "as matrices of cm do"])
+def test_lengths_in_m_and_cm_are_told_of(lengths):
+    to_detector, to_isocentre, pixel = lengths
     with pytest.raises(ValueError, match="lengths in mm, not in cm or m"):
-        ConeBeam.orbit(8, 1.02, 0.74, (448, 448), 0.00125).check(Grid.cube(64))
+        ConeBeam.orbit(8, to_detector, to_isocentre, (448, 448), pixel).check(Grid.cube(64))
 
 
 def test_yaml_round_trip_keeps_every_pose(tmp_path):

@@ -6,6 +6,7 @@ import yaml
 
 from phydict.datasets import load_xrays
 from phydict.xray import ConeBeam
+from phydict.xray.geometry_files import read_beam
 from phydict.xray.projection_matrices import beam_of_matrices
 
 BEAM = ConeBeam.from_dict({"orbit": {
@@ -40,6 +41,19 @@ def test_a_file_of_matrices_beside_the_images_is_their_geometry(tmp_path):
     (tmp_path / "geometry.yaml").write_text(yaml.safe_dump({"beam": {"file": "matrices.npy"}}))
     with pytest.raises(ValueError, match="matrices.npy does not say how large the pixels are; state `pixel`"):
         load_xrays(tmp_path)
+
+
+@pytest.mark.parametrize("scaled", [lambda p: p, lambda p: p / p[:, 2:, 3:]])
+@pytest.mark.parametrize("beam", [BEAM, ConeBeam.orbit(8, 1020, 740, (448, 448), 1.25)], ids=["few pixels", "many"])
+def test_matrices_in_rows_of_twelve_are_told_how_to_be_saved(tmp_path, beam, scaled):
+    rows = scaled(matrices(beam)).reshape(beam.views, 12)
+    np.save(tmp_path / "rows.npy", rows)
+    np.savetxt(tmp_path / "rows.csv", rows, fmt="%.7g", delimiter=",")
+    for name in ("rows.npy", "rows.csv"):
+        for pixel in (None, 1.25):
+            with pytest.raises(ValueError, match=rf"{name} holds projection matrices .* shape \({beam.views}, 12\), but"
+                                                 r" .*detector centre, u and v: save .*reshape\(-1, 3, 4\)"):
+                read_beam(tmp_path / name, beam.shape, pixel)
 
 
 @pytest.mark.parametrize("spoil, sentence", [

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from phydict.xray.geometry import ConeBeam
-from phydict.xray.stated import pixel_sizes
+from phydict.xray.stated import MOST_MM, pixel_sizes
 
 LEAST_VOLUME = 1e-12
 """Of the left 3x3 part of a matrix, relative to the product of its rows' lengths: below, it has no source."""
@@ -35,7 +35,8 @@ def are_matrices(numbers: np.ndarray) -> bool:
     """Whether rows of 12 numbers (K, 12) are projection matrices, by all of which pixels are rectangles, and not
     source, detector's centre, u and v."""
     left = numbers.reshape(-1, 3, 4)[:, :, :3]
-    if not (abs(np.linalg.det(left)) > LEAST_VOLUME * np.linalg.norm(left, axis=2).prod(1)).all():
+    if not (abs(numbers) < MOST_MM).all() or not (
+            abs(np.linalg.det(left)) > LEAST_VOLUME * np.linalg.norm(left, axis=2).prod(1)).all():
         return False
     rays = np.linalg.inv(left)
     return _are_rectangles(rays[:, :, 0], rays[:, :, 1]) and not _are_rectangles(numbers[:, 6:9], numbers[:, 9:])

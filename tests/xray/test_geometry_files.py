@@ -214,6 +214,7 @@ def test_a_beam_and_a_path_in_each_others_place_are_told_their_order(tmp_path, w
     ("a.csv", ",".join(["1"] * 11 + ["many"]), "'many'"),
     ("a.csv", "", r"shape \(0, 12\), but 12 per view"),
     ("a.csv", ",".join(["0"] * 12), "one of 0 mm"),
+    ("a.csv", ",".join(["1"] + ["nan"] * 11), "sources must be finite"),
     ("a.npy", "hello", "cannot be read .*numpy.save"),
     ("a.xml", "<RTK", "is not valid XML"),
     ("a.json", "{}", "its name must end in one of .yaml"),

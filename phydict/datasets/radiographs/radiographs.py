@@ -23,6 +23,7 @@ from phydict.datasets.case import Case
 from phydict.datasets.dicom import DicomTags, read_dicom, shown, tags_intensity
 from phydict.datasets.intensity import KINDS, Intensity, check_of_patient
 from phydict.datasets.natural_order import natural_order
+from phydict.datasets.radiographs.saturation import saturated
 from phydict.datasets.radiographs.xray_description import GEOMETRY, Description, read_description
 from phydict.datasets.radiographs.xray_images import ENDINGS, image_files, is_dicom, read_image
 from phydict.datasets.reports import format_report
@@ -99,9 +100,12 @@ def load_xrays(folder: str | Path, geometry: str | Path | None = None, intensity
         intensity = shown(intensity or tags_intensity(views.tags), views.tags)
     intensity = intensity or _assumed(views, folder, source)
     flat_and_dark = {name: _mean(paths, views.images[0]) for name, paths in references.items()}
+    pixels = np.stack(views.images)
     with naming(folder):
-        xrays = intensity.line_integrals(np.stack(views.images).astype(np.float64), views.full_scale, flat_and_dark)
-    _check_saturation(views.names, xrays)
+        xrays = intensity.line_integrals(pixels.astype(np.float64), views.full_scale, flat_and_dark)
+    if intensity.kind == "counts" and np.issubdtype(pixels.dtype, np.integer):
+        xrays[saturated(pixels)] = 0.0
+    _check_shown(views.names, xrays)
     case: Case = {"id": name_of(folder.absolute()), "beam": beam, "report": _read_report(folder),
             "xrays": torch.from_numpy(described.orientation.apply(xrays).astype(np.float32)),
             "display": intensity.kind == "display", "uncertain": described.uncertain_of(beam, views.tags),
@@ -142,7 +146,7 @@ def save_xrays(folder: str | Path, xrays: torch.Tensor | np.ndarray, beam: ConeB
     if not np.isfinite(xrays).all():
         raise ValueError("the X-rays hold NaN or infinite values; give finite line integrals")
     check_of_patient(xrays, "give those of attenuation in 1/mm along mm")
-    _check_saturation([f"view {k}" for k in range(beam.views)], xrays)
+    _check_shown([f"view {k}" for k in range(beam.views)], xrays)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     names = [f"view_{k}.{'png' if png else 'npy'}" for k in range(beam.views)]
@@ -174,7 +178,7 @@ def save_xrays(folder: str | Path, xrays: torch.Tensor | np.ndarray, beam: ConeB
         (folder / REPORT).unlink(missing_ok=True)
 
 
-def _check_saturation(names: list[str], xrays: np.ndarray) -> None:
+def _check_shown(names: list[str], xrays: np.ndarray) -> None:
     """Raises ValueError, with its name, where a view of line integrals (K, V, U) shows nothing."""
     saturated = (xrays == xrays.max((1, 2), keepdims=True)).mean((1, 2)) >= SATURATED
     if saturated.any():

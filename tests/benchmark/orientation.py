@@ -5,8 +5,9 @@ and the right geometry left alone.
 
 X-rays of each CT and phantom (6) on 64^3 voxels, without noise, for orbits of 1, 2, 4 and 8 views and every file of
 configs/geometry, as they are and with one mistake each: "shift" is a detector 20 mm along the rows and 50 mm along the
-columns beside where it is told to be, "turn" are transposed images, and of "start" all angles are a quarter of a turn
-more. Writes orientation.csv beside this file: of each geometry and mistake the number of cases of which each was said.
+columns beside where it is told to be, "turn" are transposed images, and of "start" and "half" all angles are a quarter
+and half of a turn more. Writes orientation.csv beside this file: of each geometry and mistake the number of cases of
+which each was said.
 """
 
 import sys
@@ -28,9 +29,10 @@ FILE = Path(__file__).with_suffix(".csv")
 GRID, WINDOW = Grid.cube(64), HUWindow()
 FIRST_PHANTOM = 5000
 SAID = {"upside down": "rows", "turned by 180": "rows and columns", "looks mirrored": "patient",
-        "moved alike": "shift", "by a quarter": "turn", "about the patient": "start",
+        "moved alike": "shift", "by a quarter": "turn", "turned by half": "half",
+        "about the patient": "start",
         "the others as stated": "columns"}
-SHIFT, START = (20.0, 50.0), 90.0
+SHIFT, START, HALF = (20.0, 50.0), 90.0, 180.0
 
 
 def geometries() -> dict[str, ConeBeam]:
@@ -40,7 +42,7 @@ def geometries() -> dict[str, ConeBeam]:
 
 
 def said(xrays: torch.Tensor, beam: ConeBeam) -> str:
-    """What the first doubt names: rows, rows and columns, columns, sense, patient, shift, turn, start; nothing."""
+    """What the first doubt names, as a column of the CSV says it."""
     doubts = orientation_doubts(xrays, beam, GRID)
     if not doubts:
         return "nothing"
@@ -65,10 +67,11 @@ if __name__ == "__main__":
             mirrored, other = xrays.flip(2), in_other_sense(beam, GRID)
             given = {"none": (xrays, beam), "rows": (xrays.flip(1), beam), "columns": (mirrored, beam),
                      "sense": (xrays, other), "patient": (mirrored, other), "shift": (moved(mu)[0], beam),
-                     "turn": (xrays.mT, lying), "start": (xrays, rotated(beam, GRID, START))}
+                     "turn": (xrays.mT, lying), "start": (xrays, rotated(beam, GRID, START)),
+                     "half": (xrays, rotated(beam, GRID, HALF))}
             for mistake, scene in given.items():
                 rows.setdefault((name, mistake), Counter())[said(*scene)] += 1
-    what = ("nothing", "rows", "rows and columns", "columns", "sense", "patient", "shift", "turn", "start")
+    what = ("nothing", "rows", "rows and columns", "columns", "sense", "patient", "shift", "turn", "start", "half")
     write_csv(FILE, [{"geometry": name, "mistake": mistake, "cases": len(volumes)} | {
         f"said {word}": counts[word] for word in what} for (name, mistake), counts in rows.items()])
     right = sum(counts["nothing"] for (_, mistake), counts in rows.items() if mistake == "none")

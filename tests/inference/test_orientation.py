@@ -84,6 +84,19 @@ def test_an_orbit_that_begins_elsewhere_is_named_with_the_angle(degrees):
     assert orientation_doubts(seen, right, GRID) == []
 
 
+def test_half_a_turn_is_told_from_flipped_columns_by_the_sources_side(xrays):
+    (said,) = orientation_doubts(xrays, rotated(BEAM, GRID, 180), GRID)
+    assert "turned by half about the patient" in said and "180 degrees more of start_degrees" in said
+    (flipped,) = orientation_doubts(xrays.flip(2), BEAM, GRID)
+    assert "by half" not in flipped
+
+
+def test_axes_to_left_and_posterior_are_named(xrays):
+    lps = replace(BEAM, **{name: getattr(BEAM, name) * (-1, -1, 1) for name in ("sources", "detectors", "u", "v")})
+    (said,) = orientation_doubts(xrays, lps, GRID)
+    assert "lead to left and posterior, change the signs of x and y" in said
+
+
 def test_a_lateral_view_alone_is_not_taken_for_an_oblique_one():
     lateral = ConeBeam.orbit(1, 1020.0, 740.0, (48, 48), 12.0, start_degrees=270)
     assert orientation_doubts(views(lateral), lateral, GRID) == []

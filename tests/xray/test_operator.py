@@ -12,6 +12,7 @@ from laws import assert_adjoint, assert_gradient_is_adjoint, assert_linear, rand
 
 from phydict.xray import ConeBeam, Grid, Projector
 from phydict.xray.projectors.joseph import Joseph
+from phydict.xray.projectors.projector import _engine
 from phydict.xray.projectors.separable import Separable
 from phydict.xray.projectors.system_matrix import SystemMatrix
 
@@ -277,6 +278,23 @@ def test_projectors_of_the_same_geometry_share_what_they_computed(method):
     assert again._engine is A._engine and again._engine.norm == A.norm()
     assert Projector(grid, beam.select([2, 1, 0]), method)._engine is not A._engine
     assert Projector(GRIDS["turned"], beam, method)._engine is not A._engine
+
+
+def test_whenever_other_threads_make_projectors_one_that_is_made_is_its_own():
+    grid, made = Grid.cube(4), []
+
+    def others_run(frame, event, _):
+        if frame.f_code is _engine.__code__:
+            made.extend(Projector(grid, BEAM.select([k]), full_detector=True) for k in (0, 1))
+            return others_run
+
+    beam, before = BEAM.select([2]), sys.gettrace()
+    sys.settrace(others_run)
+    try:
+        again = [Projector(grid, beam, full_detector=True) for _ in range(2)]
+    finally:
+        sys.settrace(before)
+    assert made and all(A._engine.operator.beam.same_as(beam) for A in again)
 
 
 def test_a_detector_finer_than_the_grid_is_warned_of_with_the_binning_that_helps():

@@ -93,7 +93,8 @@ class Projector:
     def norm(self) -> float:
         """The largest singular value of A (computed once)."""
         if self._engine.norm is None:
-            self._engine.norm = operator_norm(self, self.T, torch.ones(1, 1, *self.grid.shape))
+            self._engine.norm = operator_norm(self, self.T, torch.ones(
+                1, 1, *self.grid.shape, dtype=torch.float32))
         return self._engine.norm
 
 
@@ -114,7 +115,8 @@ def _engine(grid: Grid, beam: ConeBeam, method: str | type, memory: int, device:
     """The engine for a geometry, from among those last used if it is there."""
     key = (method, memory, device, grid.shape, grid.affine.tobytes(), beam.shape, bool(beam.continued),
            *(getattr(beam, name).tobytes() for name in VECTOR_KEYS[:4]))
-    if key not in _engines:
+    engine = _engines.pop(key, None)  # taken at once, since other threads make and forget theirs
+    if engine is None:
         axis = axis_upwards(grid, beam)
         upright = put_last(grid, axis)
         slices = reach_beyond(beam, upright) if beam.continued else 0
@@ -122,11 +124,11 @@ def _engine(grid: Grid, beam: ConeBeam, method: str | type, memory: int, device:
         chosen, reason = _choose(tall, beam, memory, device) if method == "auto" else (method, "it was requested")
         operator = _operator(tall, beam, chosen, memory)
         operator = Continued(operator, slices) if slices else operator
-        _engines[key] = _Engine(operator if axis == 2 else InOtherOrder(operator, axis), chosen, reason)
-    _engines.move_to_end(key)
+        engine = _Engine(operator if axis == 2 else InOtherOrder(operator, axis), chosen, reason)
+    _engines[key] = engine
     while len(_engines) > CACHE_SIZE:
         _engines.popitem(last=False)
-    return _engines[key]
+    return engine
 
 
 def _choose(grid: Grid, beam: ConeBeam, memory: int, device: str) -> tuple[str, str]:

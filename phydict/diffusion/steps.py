@@ -44,4 +44,4 @@ def noise_like(x: Tensor, generator: Generators) -> Tensor:
     """Standard normal noise drawn in float32 on the generator's device, so that a result depends on neither of x's."""
     if not isinstance(generator, torch.Generator):
         return torch.cat([noise_like(one[None], source) for one, source in zip(x, generator, strict=True)])
-    return torch.randn(x.shape, generator=generator, device=generator.device).to(x)
+    return torch.randn(x.shape, generator=generator, device=generator.device, dtype=torch.float32).to(x)

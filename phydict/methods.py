@@ -140,6 +140,7 @@ UNGUIDED = ("{0}sampler is how the X-rays guide the second stage, but {0}guided 
 """Error where a sampler is given for a second stage without guidance; {0}: what the settings' names begin with."""
 
 
+@torch.inference_mode(False)  # what a prior's weights are loaded in stays with them
 def reconstructor(method: str | Sampler | Reconstructor, prior: AnyPrior | str | Path | None = None,
                   guidance: float = 1.0, name: str | None = None,
                   super_resolution: SuperResolution | MedSynSuperResolution | str | Path | None = None,
@@ -256,6 +257,7 @@ def onto_grid(method: Reconstructor, grid: Grid | None, refinement: Refinement =
     return method
 
 
+@torch.inference_mode(False)  # in which no method that goes by gradients runs
 def reconstruct_by(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, report: str = "",
                    display: bool = False, seed: int = 0, on_step: Callable[[], None] = lambda: None,
                    projector: str | type = "auto", uncertain: Uncertain | None = None) -> Reconstruction:
@@ -265,7 +267,7 @@ def reconstruct_by(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeB
     continues beyond the voxels (`extended`) and binned; other arguments as those of `reconstruct`. Raises ValueError
     where X-rays, geometry and grid do not fit, and warns where the X-rays look inverted.
     """
-    with heard() as warnings:
+    with heard() as warnings, torch.autocast(xrays.device.type, enabled=False):
         if isinstance(method, Region) and is_smaller_scene(beam, method.outer):
             method = method.base  # of a scene that is smaller than a chest
         check_fit(xrays, beam, grid, method.survey, display)
@@ -275,7 +277,7 @@ def reconstruct_by(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeB
             beam = poses.beam
         watch = Stopwatch()
         with watch.stage("fit to grid"):
-            xrays = xrays.float()
+            xrays = xrays.to(torch.float32, copy=True)  # of inference mode's none may be kept for gradients
             method, grid, beam = extended(method, grid, xrays, beam, display)
             xrays, A = binned_to(grid, xrays, beam, method.full_detector, projector, method.detector_grid(grid))
         if isinstance(method, Posterior) and getattr(method.sampler, "corrections", None):

@@ -87,6 +87,7 @@ class PoseSearch:
         return self.coarse + self.fine
 
 
+@torch.inference_mode(False)  # in which every derivative by a pose would be 0
 @torch.no_grad()
 def find_poses(xrays: Tensor, beam: ConeBeam, uncertain: Uncertain, grid: Grid, display: bool = False,
                mu_water: float = MU_WATER, search: PoseSearch = PoseSearch(),

@@ -185,3 +185,12 @@ def test_more_unknowns_than_the_pixels_hold_are_refused_gains_of_display_values_
     beam = ConeBeam.orbit(8, 1150, 740, (2, 2), 300.0)
     with pytest.raises(ValueError, match=f"{unknowns} unknowns of 8 views cannot be found from 32 pixels"):
         find_poses(torch.rand(8, 2, 2), beam, Uncertain(detector_shift_mm=5), GRID, display)
+
+
+def test_poses_are_found_in_inference_mode_too(thorax):
+    views, search = xrays(thorax, BEAM), PoseSearch(coarse=0, fine=1)
+    wrong = BEAM.shifted(columns=6)
+    with torch.inference_mode():
+        inside = find_poses(views, wrong, UNCERTAIN, GRID, search=search)
+    assert inside.beam.same_as(find_poses(views, wrong, UNCERTAIN, GRID, search=search).beam)
+    assert not inside.beam.same_as(wrong)

@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from prior.tiny import REPORTS, tiny_prior
+from prior.tiny import REPORTS, tiny_prior, tiny_refiner
 from scenes import voxel_centres
 
 from phydict import METHODS, ConeBeam, Grid, HUWindow, Projector, reconstruct
@@ -392,6 +392,16 @@ def test_the_misfit_of_x_rays_that_read_nothing_is_finite_and_grows_with_what_is
     assert misfits(nothing + 1e-3, nothing) == {"misfit": pytest.approx(1), "misfit_per_view": pytest.approx([1, 1])}
 
 
+def test_pixels_far_brighter_than_air_are_told_with_their_view_and_the_network_ends_finite_with_them():
+    for reading, of, own in ((-20.0, SIRT(2), None), (-1e6, METHODS["phydict_learned"], tiny_refiner())):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            bright = changed(lambda v: v.index_fill(0, torch.tensor(11), reading))
+            result = reconstruct(bright, BEAM, own, of, grid=GRID)
+        assert_finite(result)
+        assert any(f"the smallest line integral is {reading:.3g}, in view 3 " in said for said in result.warnings)
+
+
 # Settings
 
 @pytest.mark.parametrize("make, words", [
@@ -455,6 +465,28 @@ def test_seeds_differ_less_where_the_x_rays_say_more(prior):
         return float(reconstruct(views(beam=beam), beam, prior, method, samples=4).deviation.mean())
 
     assert 0 < spread(orbit(8)) < spread(orbit(1))
+
+
+# What else is set in the process
+
+@pytest.mark.parametrize("name", ["paper", "dps", "diffvox"])
+def test_neither_inference_mode_nor_autocast_around_a_reconstruction_changes_it(prior, of_good_views, name):
+    with torch.inference_mode():
+        inside = run(name, prior, CLEAN.clone()).volume
+    with torch.autocast("cpu", torch.bfloat16):
+        cast = run(name, prior).volume
+    assert torch.equal(inside, of_good_views(name).volume) and torch.equal(cast, inside)
+
+
+@pytest.mark.parametrize("name", ["prior", "diffpir", "daps", "sirt"])
+def test_the_noise_of_a_seed_is_the_same_whatever_type_torch_makes_by_default(prior, of_good_views, name):
+    torch.set_default_dtype(torch.float64)
+    try:
+        double = run(name, prior).volume
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert double.dtype == torch.float32
+    assert float((double - of_good_views(name).volume).square().mean().sqrt()) < 0.1
 
 
 # Divergence

@@ -23,7 +23,8 @@ from phydict.xray.noise_level import noise_level
 from phydict.xray.residuals import shared_norms, worst_misfit
 
 MAX_LINE_INTEGRAL = 30.0
-"""Line integrals above which no photon comes through, so that they hold no scatter either."""
+"""Line integrals above which no photon comes through, so that they hold no scatter either; those below its negative
+are of no signal that there is."""
 
 
 class Fitted(NamedTuple):
@@ -205,8 +206,8 @@ class Measurement:
     @property
     def can_estimate_scatter(self) -> bool:
         """Whether the X-rays can hold scatter that `subtract_scatter` could find: not display values, whose offset has
-        taken it, nor X-rays of which no signal is left (MAX_LINE_INTEGRAL)."""
-        return self.display is None and bool(self.measured.max() < MAX_LINE_INTEGRAL)
+        taken it, nor X-rays that no signal gives (MAX_LINE_INTEGRAL)."""
+        return self.display is None and bool(self.measured.abs().max() < MAX_LINE_INTEGRAL)
 
     def reset_scatter(self, enabled: bool) -> None:
         """Forget what was subtracted, and from now on let `subtract_scatter` subtract scatter or not."""

@@ -13,6 +13,10 @@ from phydict.xray.geometry import ConeBeam
 LINE_INTEGRAL_RANGE = 1.0, 20.0
 """Between these lies the largest line integral of a chest: 50 mm and 1 m of water."""
 
+LEAST_LINE_INTEGRAL = -10.0
+"""Below it a pixel's signal is 22,000 times that of air, which a detector of 16 bits has room for only where air reads
+less than 3 of its values."""
+
 CUT_OFF = 1.2
 """A view cuts the patient off at both sides where the medians of their outermost columns, over the middle half of the
 rows, are larger: 60 mm of water. Of nine CTs on a detector that holds them it was 1.0 at most."""
@@ -182,13 +186,18 @@ def check_repeated(xrays: Tensor, beam: ConeBeam) -> None:
 
 def check_line_integrals(xrays: Tensor) -> None:
     """Warns of line integrals (K, V, U) that no chest has, and where most views cut the patient off at both sides."""
-    largest = float(xrays.max())
+    smallest, largest = float(xrays.min()), float(xrays.max())
     low, high = LINE_INTEGRAL_RANGE
     if not low < largest < high:
         warn(f"the largest line integral is {largest:.3g}, but those of a chest lie between {low:g} and {high:g}: "
              "check that the X-rays are line integrals of attenuation in 1/mm along mm; of display values state "
              "`intensity: {kind: display, bright_is_dense: true}` in geometry.yaml, or in Python display=True")
         return
+    if smallest < LEAST_LINE_INTEGRAL:
+        view = int(xrays.flatten(1).amin(1).argmin())
+        warn(f"the smallest line integral is {smallest:.3g}, in view {view} (counted from 0), of a signal far above "
+             "that of air: the volume follows such pixels at the expense of all others: give defective ones the mean "
+             "of their neighbours")
     quarter = xrays.shape[1] // 4
     middle = outer_columns(xrays[:, quarter:xrays.shape[1] - quarter]).float()
     if (views := int((middle.flatten(2).median(2).values.amin(0) > CUT_OFF).sum())) > len(xrays) / 2:

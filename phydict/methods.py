@@ -314,7 +314,7 @@ def calibrated(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam,
     from phydict.poses import find_poses  # and with it numba
 
     if not display:
-        xrays = with_air_at_zero(xrays)  # which the reconstruction would see no more once offsets are found
+        xrays = with_air_at_zero(xrays, beam)  # which the reconstruction would see no more once offsets are found
     stated, beam = beam.continued, with_continuation(xrays.float(), beam, grid, display)
     poses = find_poses(xrays, beam, uncertain, grid, display, method.mu_water, on_round=on_round)
     poses = replace(poses, beam=replace(poses.beam, continued=stated))

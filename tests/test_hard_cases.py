@@ -31,6 +31,7 @@ from phydict.posterior import (
     ProximalCG,
     SplitGibbs,
 )
+from phydict.runtime.warning import heard
 from phydict.xray import Ideal, Polychromatic
 from phydict.xray.checks import (
     check_clipped,
@@ -38,6 +39,7 @@ from phydict.xray.checks import (
     check_line_integrals,
     check_offset,
     check_repeated,
+    prepared_xrays,
     with_air_at_zero,
 )
 from phydict.xray.residuals import misfits
@@ -280,13 +282,26 @@ def test_a_gain_that_drifts_is_taken_out_by_the_air_and_where_none_is_seen_nothi
             reconstruct(xrays, beam, method=SIRT(2), grid=GRID, **settings)
 
 
+def test_a_detector_turned_onto_its_side_is_looked_at_beside_the_patient_too():
+    lying = replace(BEAM, u=BEAM.v, v=BEAM.u)
+    drifted = CLEAN - torch.linspace(1, 0.8, len(CLEAN)).log()[:, None, None]
+    for xrays in (CLEAN, drifted, CLEAN + 0.3):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with heard() as told:
+                as_it_stands = prepared_xrays(xrays, BEAM, False)
+            with heard() as told_lying:
+                on_its_side = prepared_xrays(xrays.mT, lying, False)
+        assert torch.equal(on_its_side.mT, as_it_stands) and told_lying == told
+
+
 def test_air_is_the_thinner_side_of_a_view_and_views_without_it_keep_their_values():
     exact = views(simulator=Ideal(0))
     drifted = exact - torch.linspace(1, 0.8, len(exact)).log()[:, None, None]
     drifted[1, :, -1] += 0.3  # a couch seen edge-on
     drifted[2] += 0.02 * torch.arange(24)[:, None]  # what differs from row to row is not air
     with pytest.warns(UserWarning, match="is subtracted, but not of the 1 views that show no air"):
-        found = with_air_at_zero(drifted)
+        found = with_air_at_zero(drifted, BEAM)
     assert torch.equal(found[2], drifted[2])
     for view in (0, 1, 3, 7):
         assert (found[view, :, :-1] - exact[view, :, :-1]).abs().max() < 1e-5

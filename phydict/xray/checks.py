@@ -59,7 +59,7 @@ def check_fit(xrays: Tensor, beam: ConeBeam, grid: Grid, survey: Grid | None, di
     inverted, cut off or repeated. survey: the voxels that hold the whole scene, where `grid` does not. display: whether
     they are display values."""
     check_xrays(xrays, beam, display)
-    check_air(xrays)
+    check_air(upright(xrays, beam))
     check_clipped(xrays)
     check_repeated(xrays, beam)
     beam.check(grid)
@@ -134,6 +134,13 @@ def _shadow(beam: ConeBeam, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     """The ends (K, 2) in mm, along rows' and columns' direction from the detector's centre, of the box's shadow."""
     places = beam.shadows(grid.corners())[..., ::-1]
     return places.min(1), places.max(1)
+
+
+def upright(xrays: Tensor, beam: ConeBeam) -> Tensor:
+    """X-rays (K, V, U), or, where the rows of all detectors rather than their columns run along the patient,
+    (K, U, V), so that the columns at both ends are those beside the patient."""
+    up_rows, up_columns = (np.abs(step[:, 2]) / np.linalg.norm(step, axis=1) for step in (beam.u, beam.v))
+    return xrays.mT if (up_rows > up_columns).all() else xrays
 
 
 def outer_columns(xrays: Tensor) -> Tensor:
@@ -253,17 +260,18 @@ def prepared_xrays(xrays: Tensor, beam: ConeBeam, display: bool, told: bool = Fa
     if display:
         return xrays
     if not told:
-        check_line_integrals(xrays)
-        check_flat(xrays)
-        check_offset(xrays)
-    return with_air_at_zero(xrays, told)
+        seen = upright(xrays, beam)
+        check_line_integrals(seen)
+        check_flat(seen)
+        check_offset(seen)
+    return with_air_at_zero(xrays, beam, told)
 
 
-def with_air_at_zero(xrays: Tensor, told: bool = False) -> Tensor:
+def with_air_at_zero(xrays: Tensor, beam: ConeBeam, told: bool = False) -> Tensor:
     """The line integrals (K, V, U), less what each view reads in air where that differs from view to view, which is
     said in a warning, unless it was `told` before: of a tube's output or a detector's gain that drifts. Views that show
     no air stay, and all of them where none reads it as 0 within AIR_DRIFT, as where the patient fills the detector."""
-    air = air_levels(xrays)
+    air = air_levels(upright(xrays, beam))
     visible = air.isfinite()
     if visible.sum() < 2 or air[visible].max() - air[visible].min() <= AIR_DRIFT or air.abs().min() > AIR_DRIFT:
         return xrays

@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
@@ -67,3 +68,12 @@ def test_a_loader_forked_from_a_process_that_has_projected_projects_alike():
     here = [items[n] for n in range(2)]
     for found, expected in zip(DataLoader(items, None, num_workers=1), here):
         assert all(torch.equal(*pair) for pair in zip(found, expected))
+
+
+def test_a_process_forked_from_one_that_has_projected_projects_alike():
+    items = Residuals()
+    here = items[0]
+    forked = get_context("fork").Process(target=lambda: torch.testing.assert_close(items[0], here, rtol=0, atol=0))
+    forked.start()
+    forked.join(60)
+    assert forked.exitcode == 0

@@ -17,6 +17,7 @@ On the CPU compiled loops do it (phydict.xray.projectors.separable_cpu), on othe
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -30,6 +31,9 @@ from phydict.grid import Grid
 from phydict.xray.geometry import ConeBeam
 from phydict.xray.projectors import separable_cpu
 from phydict.xray.projectors.separable_sparse import SparseFactors
+
+IMPORTED_IN = os.getpid()
+"""The process that imported this; another one that holds it was forked."""
 
 
 class Rays(NamedTuple):
@@ -114,9 +118,9 @@ def _array(x: torch.Tensor) -> np.ndarray:
 
 
 def _here(loops: Any) -> Callable:
-    """Compiled loops as this process can run them: one that loads data, forked from one whose OpenMP may have threads,
-    would be ended by it, and has the outer loop, which is on one thread there, run by Python."""
-    return loops.py_func if get_worker_info() else loops
+    """Compiled loops as this process can run them: one that is forked from one whose OpenMP may have threads, as those
+    that load data are, would be ended by it, and has the outer loop run by Python, on one thread."""
+    return loops.py_func if get_worker_info() or os.getpid() != IMPORTED_IN else loops
 
 
 def _set_threads() -> int:

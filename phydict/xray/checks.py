@@ -62,6 +62,8 @@ def check_fit(xrays: Tensor, beam: ConeBeam, grid: Grid, survey: Grid | None, di
     check_air(upright(xrays, beam))
     check_clipped(xrays)
     check_repeated(xrays, beam)
+    if not display:
+        check_bright(xrays)
     beam.check(grid)
     check_scale(beam, survey or grid)
     check_meets(beam, grid)
@@ -176,6 +178,15 @@ def check_clipped(xrays: Tensor) -> None:
              "and with more bits, of whole counts state `floor: 0.5`, or crop off what is covered")
 
 
+def check_bright(xrays: Tensor) -> None:
+    """Warns where line integrals (K, V, U) that reach no higher than a chest's lie below LEAST_LINE_INTEGRAL."""
+    lowest = xrays.flatten(1).amin(1)
+    if lowest.min() < LEAST_LINE_INTEGRAL and xrays.max() < LINE_INTEGRAL_RANGE[1]:
+        warn(f"the smallest line integral is {float(lowest.min()):.3g}, in view {int(lowest.argmin())} (counted from "
+             "0), of a signal far above that of air: the volume follows such pixels at the expense of all others: give "
+             "defective ones the mean of their neighbours")
+
+
 def check_repeated(xrays: Tensor, beam: ConeBeam) -> None:
     """Warns where a view of X-rays (K, V, U) holds, pixel for pixel, what another one does that stands elsewhere, but
     for images that are their own mirror images, as of air or a cylinder."""
@@ -193,18 +204,13 @@ def check_repeated(xrays: Tensor, beam: ConeBeam) -> None:
 
 def check_line_integrals(xrays: Tensor) -> None:
     """Warns of line integrals (K, V, U) that no chest has, and where most views cut the patient off at both sides."""
-    smallest, largest = float(xrays.min()), float(xrays.max())
+    largest = float(xrays.max())
     low, high = LINE_INTEGRAL_RANGE
     if not low < largest < high:
         warn(f"the largest line integral is {largest:.3g}, but those of a chest lie between {low:g} and {high:g}: "
              "check that the X-rays are line integrals of attenuation in 1/mm along mm; of display values state "
              "`intensity: {kind: display, bright_is_dense: true}` in geometry.yaml, or in Python display=True")
         return
-    if smallest < LEAST_LINE_INTEGRAL:
-        view = int(xrays.flatten(1).amin(1).argmin())
-        warn(f"the smallest line integral is {smallest:.3g}, in view {view} (counted from 0), of a signal far above "
-             "that of air: the volume follows such pixels at the expense of all others: give defective ones the mean "
-             "of their neighbours")
     quarter = xrays.shape[1] // 4
     middle = outer_columns(xrays[:, quarter:xrays.shape[1] - quarter]).float()
     if (views := int((middle.flatten(2).median(2).values.amin(0) > CUT_OFF).sum())) > len(xrays) / 2:

@@ -39,7 +39,7 @@ SETTINGS = {
                    Refinement(replace(STEP, restarts=2), 0.5), Refinement(STEP, 1.0)],
     "tv": [FISTATV(200, weight) for weight in (2.4e-3, 4.8e-3, 9.6e-3, 1.92e-2)],
     "cgls": [CGLS(10, restarts, WINDOW) for restarts in (20, 10, 5, 3)],
-    "sirt": [SIRT(100), SIRT(300), SIRT()],
+    "sirt": [SIRT(iterations) for iterations in (50, 100, 300, 1000)],
     "diffvox": [DiffVox(), *(DiffVox(300, smoothness) for smoothness in (50.0, 100.0)),
                 *(DiffVox(1000, smoothness) for smoothness in (25.0, 100.0, 200.0))]}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import warnings
 from pathlib import Path
@@ -85,12 +86,13 @@ def _read_nifti(path: Path) -> np.ndarray:
 
 def _read_picture(path: Path) -> np.ndarray:
     """A grey PNG or TIFF; colours are allowed where all channels are equal."""
-    header = path.read_bytes()[:26]
+    content = path.read_bytes()
+    header = content[:26]
     if header[1:4] == b"PNG" and len(header) == 26 and header[24] == 16 and header[25] != 0:
         raise ValueError(CUT)
     with warnings.catch_warnings():
         warnings.simplefilter("error", Image.DecompressionBombWarning)
-        opened = Image.open(path)
+        opened = Image.open(io.BytesIO(content))  # by name it would be mapped, and rows of turned TIFFs cut wrongly
     with opened as image:
         if (pages := getattr(image, "n_frames", 1)) > 1:
             raise ValueError(f"it holds {pages} pages; store one image per file")

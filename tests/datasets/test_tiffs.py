@@ -41,3 +41,23 @@ def stored(kind):
 def test_an_image_is_turned_as_its_tag_says_whatever_its_pixels(tmp_path, kind, squeezed, orientation, turned):
     read = read_image(write_tiff(tmp_path / "view.tif", stored(kind), squeezed, orientation))
     np.testing.assert_array_equal(read, turned(stored(kind)))
+
+
+@pytest.mark.parametrize("squeezed", [False, True])
+@pytest.mark.parametrize("kind", ["u1", "<u2", ">u2", "<i2", ">i2", "<i4", ">i4", "<u4", "<f4", ">f4"])
+def test_pixels_are_read_as_stored_or_refused_by_their_byte_order(tmp_path, kind, squeezed):
+    pixels = stored(kind)
+    if pixels.itemsize > 2:
+        pixels[0, 0] = np.iinfo(kind).max if pixels.dtype.kind in "iu" else 1e20
+    path = write_tiff(tmp_path / "view.tif", pixels, squeezed)
+    if squeezed and kind[0] == ">" and kind != ">u2":
+        with pytest.raises(ValueError, match="view.tif cannot be read .*big-endian.*store it as little-endian"):
+            read_image(path)
+    else:
+        np.testing.assert_array_equal(read_image(path), pixels)
+
+
+@pytest.mark.parametrize("kind", ["<f8", "<f2", ">u4", "<u8"])
+def test_pixels_of_kinds_that_are_not_read_are_refused_with_those_that_are(tmp_path, kind):
+    with pytest.raises(ValueError, match="view.tif cannot be read .*TIFF .*32-bit floating-point.*; export it again"):
+        read_image(write_tiff(tmp_path / "view.tif", stored(kind)))

@@ -8,7 +8,7 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from phydict.datasets.natural_order import has_signs, natural_order
 from phydict.datasets.nifti_file import NIFTI, open_nifti
@@ -18,9 +18,14 @@ DICOM = (".dcm", ".dicom", ".ima")
 ENDINGS = (".png", ".tif", ".tiff", ".npy", *NIFTI, *DICOM)
 GREY = ("L", "I;16", "I;16B", "I;16L", "I", "F")
 CUT = "16-bit colour would be cut to 8 bit; store it as 16-bit grey"
+UNKNOWN = ("it is no PNG or TIFF of a kind that is read: of 8 or 16 bits, or TIFF of 32-bit integers or 32-bit "
+           "floating-point numbers; store such a one, or NPY")
+SWAPPED = ("it is a compressed TIFF of big-endian numbers, whose bytes would be swapped; store it as little-endian, or "
+           "uncompressed")
 
-BITS, PHOTOMETRIC = 258, 262
-"""Tags of a TIFF: the bits of each channel, and what is 0 where its least value is shown white."""
+BITS, PHOTOMETRIC, FORMAT = 258, 262, 339
+"""Tags of a TIFF: the bits of each channel, what is 0 where its least value is shown white, and what is 1, or left out,
+where numbers have no sign."""
 
 
 def image_files(folder: Path) -> list[Path]:
@@ -92,18 +97,26 @@ def _read_picture(path: Path) -> np.ndarray:
         raise ValueError(CUT)
     with warnings.catch_warnings():
         warnings.simplefilter("error", Image.DecompressionBombWarning)
-        opened = Image.open(io.BytesIO(content))  # by name it would be mapped, and rows of turned TIFFs cut wrongly
+        try:
+            opened = Image.open(io.BytesIO(content))  # by name it is mapped, and rows of turned TIFFs are cut wrongly
+        except UnidentifiedImageError:
+            raise ValueError(UNKNOWN) from None
     with opened as image:
         if (pages := getattr(image, "n_frames", 1)) > 1:
             raise ValueError(f"it holds {pages} pages; store one image per file")
         check_held(math.prod(image.size), path, f"pixels, {image.height} x {image.width},", 8 * MOST_SQUEEZED)
-        if image.mode not in GREY and max(getattr(image, "tag_v2", {}).get(BITS, (8,))) > 8:
+        tags = getattr(image, "tag_v2", {})
+        if image.mode not in GREY and max(tags.get(BITS, (8,))) > 8:
             raise ValueError(CUT)
+        if image.mode in ("I", "F") and getattr(tags, "prefix", b"") == b"MM" and image.info.get("compression") != "raw":
+            raise ValueError(SWAPPED)
         image.load()
         if image.mode in GREY:
             pixels = np.asarray(image)
             sixteen = image.mode.startswith("I;16") or (image.mode == "I" and image.format == "PNG")
             pixels = pixels.astype(np.uint16) if sixteen else pixels
+            if image.mode == "I" and tags.get(BITS) == (32,) and tags.get(FORMAT, (1,)) == (1,):
+                pixels = pixels.view(np.uint32)
             white = sixteen and image.format == "TIFF" and image.getexif().get(PHOTOMETRIC) == 0
             return 65535 - pixels if white else pixels  # of 8 bits PIL does it
         pixels = np.asarray(image.convert("RGBA"))

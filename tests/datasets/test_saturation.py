@@ -7,6 +7,7 @@ import warnings
 import numpy as np
 import pytest
 import yaml
+from dicom_files import write_dicom
 
 from phydict.datasets import load_xrays
 
@@ -27,11 +28,14 @@ def line_integrals() -> np.ndarray:
     return np.stack(views)
 
 
-def read(folder, counts, air) -> tuple[np.ndarray, list[str]]:
-    """The counts (2, V, U) as line integrals, and what is warned of where they are read."""
+def read(folder, counts, air, dicom=False) -> tuple[np.ndarray, list[str]]:
+    """The counts (2, V, U) as line integrals, and what is warned of where they are read, from NPY or DICOM."""
     folder.mkdir()
     for k, image in enumerate(counts):
-        np.save(folder / f"view_{k}.npy", image)
+        if dicom:
+            write_dicom(folder / f"view_{k}.dcm", image, "DX", PixelIntensityRelationship="LIN")
+        else:
+            np.save(folder / f"view_{k}.npy", image)
     (folder / "geometry.yaml").write_text(yaml.safe_dump({"orbit": ORBIT, "intensity": {"kind": "counts", "air": air}}))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -66,3 +70,13 @@ def test_saturated_pixels_are_air_and_others_right_where_air_is_what_it_would_co
     xrays, _ = read(tmp_path / "case", counts.clip(max=most).astype(np.uint16), exposure * most)
     ends = counts >= most
     assert not xrays[ends].any() and abs(np.median((xrays - y)[~ends])) < 2e-3
+
+
+def test_whole_counts_are_told_to_saturate_in_whatever_type_they_are_stored(tmp_path):
+    noisy = np.random.default_rng(3).poisson(AIR * np.exp(-line_integrals()))
+    stored = noisy.clip(max=8000).astype(np.uint16)
+    expected, said = read(tmp_path / "integers", stored, AIR)
+    for name, images, dicom in (("dicom", stored, True), ("floats", stored.astype(np.float32), False)):
+        xrays, texts = read(tmp_path / name, images, AIR, dicom)
+        assert texts == said and (xrays == expected).all()
+    assert len(said) == 1 and not read(tmp_path / "scaled", 0.3 * stored, 0.3 * AIR)[1]

@@ -103,7 +103,7 @@ def load_xrays(folder: str | Path, geometry: str | Path | None = None, intensity
     pixels = np.stack(views.images)
     with naming(folder):
         xrays = intensity.line_integrals(pixels.astype(np.float64), views.full_scale, flat_and_dark)
-    if intensity.kind == "counts" and np.issubdtype(pixels.dtype, np.integer):
+    if intensity.kind == "counts" and not (pixels % 1).any():  # DICOM's are floating-point numbers once rescaled
         xrays[saturated(pixels)] = 0.0
     _check_shown(views.names, xrays)
     case: Case = {"id": name_of(folder.absolute()), "beam": beam, "report": _read_report(folder),

@@ -1,4 +1,4 @@
-"""Whether a detector saturated in air: integer counts that end at one value, though those below it are noisy."""
+"""Whether a detector saturated in air: whole counts that end at one value, though those below it are noisy."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ to 8 to 16 bits, on 128^2 to 448^2 pixels, 0.41 at most."""
 
 
 def saturated(counts: np.ndarray) -> np.ndarray:
-    """Which pixels of views of integer counts (K, V, U) are saturated, booleans (K, V, U): where views end at their
+    """Which pixels of views of whole counts (K, V, U) are saturated, booleans (K, V, U): where views end at their
     largest count and, in the median of these views, are noisy below it. Warns where any are."""
     ends = counts == counts.max((1, 2), keepdims=True)
     turns = np.array([_turns(view, at_end) for view, at_end in zip(counts, ends)])

@@ -108,7 +108,8 @@ def _read_picture(path: Path) -> np.ndarray:
         tags = getattr(image, "tag_v2", {})
         if image.mode not in GREY and max(tags.get(BITS, (8,))) > 8:
             raise ValueError(CUT)
-        if image.mode in ("I", "F") and getattr(tags, "prefix", b"") == b"MM" and image.info.get("compression") != "raw":
+        swapped = getattr(tags, "prefix", b"") == b"MM" and image.info.get("compression") != "raw"
+        if swapped and image.mode in ("I", "F"):
             raise ValueError(SWAPPED)
         image.load()
         if image.mode in GREY:

@@ -18,10 +18,10 @@ import numpy as np
 import pydicom
 import scipy
 from pydicom.multival import MultiValue
-from pydicom.pixels import apply_modality_lut
+from pydicom.pixels import apply_modality_lut, pixel_array
 
 from phydict.datasets.intensity import Intensity
-from phydict.runtime.reading import MOST_SQUEEZED, check_held, check_memory, one_line, reading, refusing
+from phydict.runtime.reading import MOST_SQUEEZED, Unreadable, check_held, check_memory, one_line, reading, refusing
 
 VIEW_POSITIONS = {"PA": 0.0, "LL": 90.0, "AP": 180.0, "RL": -90.0}
 
@@ -91,17 +91,31 @@ def _frames(path: Path, padding: float | None) -> list[tuple[np.ndarray, DicomTa
         if dataset.get("SamplesPerPixel", 1) != 1:
             raise ValueError(f"it has {dataset.SamplesPerPixel} colours per pixel; export it as grey")
         if "PixelData" not in dataset:
-            raise ValueError("it holds no image")
+            raise Unreadable(f"{path} holds no image (PixelData), as reports of dose and presentation states do not: "
+                             "take it out of the folder")
         if lacking := [keyword for keyword in ("Rows", "Columns") if dataset.get(keyword) is None]:
             raise ValueError(f"it lacks {' and '.join(lacking)}")
         pixels = int(dataset.Rows) * int(dataset.Columns) * int(dataset.get("NumberOfFrames") or 1)
         check_held(pixels, path, "pixels", 8 * MOST_SQUEEZED)
         check_memory(8 * pixels, "what its tags promise", "give a smaller one")
         stored = dataset.pixel_array
+        _check_bits(dataset, stored)
     images = stored[None] if stored.ndim == 2 else stored
     several = len(images) > 1
     frames = [Frame(dataset, f"{path} frame {k + 1}" if several else str(path), k) for k in range(len(images))]
     return [(_values(image, frame, padding), _tags(frame)) for image, frame in zip(images, frames)]
+
+
+def _check_bits(dataset: pydicom.Dataset, stored: np.ndarray) -> None:
+    """Raises ValueError where bits of unsigned values were cut off that hold no overlay, as those of old files do."""
+    if dataset.get("PixelRepresentation") or dataset.BitsStored >= dataset.BitsAllocated or (
+            dataset.file_meta.TransferSyntaxUID.is_compressed):
+        return
+    overlays = (dataset.get((group, 0x0102)) for group in range(0x6000, 0x6020, 2))
+    cut = int((pixel_array(dataset, correct_unused_bits=False) != stored).sum())
+    if cut and not any(overlay.value for overlay in overlays if overlay):
+        raise ValueError(f"{cut} of its values need more than its {dataset.BitsStored} BitsStored, and would be cut "
+                         "off there; correct BitsStored and HighBit, or what lies in the other bits")
 
 
 def tags_intensity(tags: list[DicomTags]) -> Intensity:

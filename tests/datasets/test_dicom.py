@@ -389,3 +389,29 @@ def test_a_deflated_file_is_refused_before_it_grows(tmp_path):
 
 def test_a_file_without_its_size_says_so(tmp_path):
     fails("a.dcm cannot be read .it lacks Rows.", one(tmp_path, Rows=None, **angled(0.0)), intensity=LINES)
+
+
+def test_values_of_more_bits_than_their_tag_says_are_refused_and_not_cut(tmp_path):
+    stored, tags = counts()[0] % 4096, angled(0.0) | {"BitsStored": 12, "HighBit": 11}
+    plain = load_xrays(one(tmp_path / "plain", stored, **tags), intensity=LINES)["xrays"]
+    np.testing.assert_allclose(plain[0], 1e-3 * stored, rtol=1e-6)
+    sentence = "a.dcm cannot be read .5 of its values need more than its 12 BitsStored.*; export it again"
+    for name, beyond in (("large", {}), ("padding", {"PixelPaddingValue": 63536})):
+        wide = stored.copy()
+        wide[0] = 63536
+        fails(sentence, one(tmp_path / name, wide, **tags, **beyond), intensity=LINES)
+    fails("more than its 12 BitsStored", one(tmp_path / "shifted", stored << 4, **tags | {"HighBit": 15}),
+          intensity=LINES)
+    drawn = one(tmp_path / "drawn", stored | np.uint16(1 << 15), **tags) / "a.dcm"
+    dataset = pydicom.dcmread(drawn)
+    dataset.add_new((0x6000, 0x0102), "US", 15)  # of an overlay
+    dataset.save_as(drawn)
+    assert load_xrays(drawn.parent, intensity=LINES)["xrays"].equal(plain)
+
+
+def test_a_dicom_file_without_an_image_is_told_to_be_taken_out(tmp_path):
+    path = write_dicom(one(tmp_path, **angled(0.0)) / "dose.dcm", counts()[0], Modality="SR")
+    dataset = pydicom.dcmread(path)
+    del dataset.PixelData
+    dataset.save_as(path)
+    fails("dose.dcm holds no image .PixelData., as .*: take it out of the folder$", tmp_path, intensity=LINES)

@@ -22,12 +22,18 @@ from pydicom.pixels import apply_modality_lut, pixel_array
 
 from phydict.datasets.intensity import Intensity
 from phydict.runtime.reading import MOST_SQUEEZED, Unreadable, check_held, check_memory, one_line, reading, refusing
+from phydict.runtime.warning import warn
 
 VIEW_POSITIONS = {"PA": 0.0, "LL": 90.0, "AP": 180.0, "RL": -90.0}
 
 TILTS, LEVEL = ("DetectorPrimaryAngle", "DetectorSecondaryAngle", "ColumnAngulation"), 1.0
 """Tags of a detector or a tube that is tilted against the other, and the degrees below which it counts as level."""
 
+EDGES = ("LeftVerticalEdge", "RightVerticalEdge", "UpperHorizontalEdge", "LowerHorizontalEdge")
+"""Of a collimator or a shutter."""
+
+COVERED = 0.02
+"""The share of an image that a collimator or a shutter may cover: its outermost rows and columns."""
 
 FALLING = ("its values fall where more X-rays arrive: give it a RescaleSlope of the other sign, a RescaleIntercept "
            "by which no value is negative, and state `intensity: {kind: counts, air: ...}` in geometry.yaml, or state "
@@ -44,7 +50,8 @@ class DicomTags:
     width); view_degrees: of ViewPosition; patient_orientation: letters of the directions in which (columns, rows) of
     the file's first frame run. reoriented: how the image was flipped or rotated since it was taken, in words; detector:
     how the detector is tilted against the beam, in words. magnification: of CR and DX, detector over isocentre
-    distance. inverted: MONOCHROME1. relationship, sign: PixelIntensityRelationship(Sign).
+    distance. inverted: MONOCHROME1. relationship, sign: PixelIntensityRelationship(Sign). covered: the share of the
+    pixels that lie beyond the edges of a rectangular collimator or shutter. patient: PatientID.
     """
 
     name: str
@@ -63,6 +70,8 @@ class DicomTags:
     inverted: bool
     relationship: str
     sign: int | None
+    covered: float
+    patient: str
 
 
 def open_dicom(path: Path, **settings) -> pydicom.Dataset:
@@ -116,6 +125,19 @@ def _check_bits(dataset: pydicom.Dataset, stored: np.ndarray) -> None:
     if cut and not any(overlay.value for overlay in overlays if overlay):
         raise ValueError(f"{cut} of its values need more than its {dataset.BitsStored} BitsStored, and would be cut "
                          "off there; correct BitsStored and HighBit, or what lies in the other bits")
+
+
+def warn_of_frames(tags: list[DicomTags]) -> None:
+    """Warns of frames of different patients, and of those that a collimator or a shutter covers in part."""
+    known = [frame for frame in tags if frame.patient]
+    if other := next((frame for frame in known if frame.patient != known[0].patient), None):
+        warn(f"{known[0].name} and {other.name} have different PatientID, but the X-rays of a folder are taken as one "
+             "patient's: keep those of each in a folder of their own")
+    most = max(tags, key=lambda frame: frame.covered)
+    if most.covered > COVERED:
+        warn(f"{most.name}: {most.covered:.0%} of its pixels lie beyond the edges of a collimator or a shutter "
+             "(CollimatorLeftVerticalEdge, ShutterLeftVerticalEdge and so on), where what is stored may be no X-ray: "
+             "crop the views to the exposed field, and state shape and the detector's shift in geometry.yaml")
 
 
 def tags_intensity(tags: list[DicomTags]) -> Intensity:
@@ -273,8 +295,23 @@ def _tags(frame: Frame) -> DicomTags:
     sign = frame.number("PixelIntensityRelationshipSign")
     if sign and (frame.number("RescaleSlope") or 1) < 0:
         sign = -sign  # the tag speaks of stored values
+    patient = one_line(str(frame.find("PatientID") or ""))
     return DicomTags(
         frame.name, frame.index, frame.number("DistanceSourceToDetector"), to_isocentre, magnification,
         frame.numbers("ImagerPixelSpacing", 2), primary, secondary, view, orientation, reoriented,
         detector, angiographic, frame.word("PhotometricInterpretation") == "MONOCHROME1",
-        frame.word("PixelIntensityRelationship"), None if sign is None else int(sign))
+        frame.word("PixelIntensityRelationship"), None if sign is None else int(sign), _covered(frame), patient)
+
+
+def _covered(frame: Frame) -> float:
+    """The share of a frame's pixels beyond the edges of its collimator or shutter, rows and columns counted from 1."""
+    seen = [1.0]
+    for kind in ("Collimator", "Shutter"):
+        edges = [value for edge in EDGES if (value := frame.number(f"{kind}{edge}")) is not None]
+        if "RECTANGULAR" in str(frame.find(f"{kind}Shape")) and len(edges) == len(EDGES):
+            left, right, upper, lower = edges
+            columns, rows = int(frame.dataset.Columns), int(frame.dataset.Rows)
+            wide, high = min(right, columns) - max(left, 1) + 1, min(lower, rows) - max(upper, 1) + 1
+            if wide > 0 and high > 0:  # tags that nobody filled in leave nothing
+                seen.append(wide * high / (columns * rows))
+    return 1 - min(seen)

@@ -415,3 +415,25 @@ def test_a_dicom_file_without_an_image_is_told_to_be_taken_out(tmp_path):
     del dataset.PixelData
     dataset.save_as(path)
     fails("dose.dcm holds no image .PixelData., as .*: take it out of the folder$", tmp_path, intensity=LINES)
+
+
+@pytest.mark.parametrize("other, warned", [("1", False), ("2", True), (None, False)])
+def test_views_of_two_patients_are_warned_of_without_their_names(tmp_path, recwarn, other, warned):
+    write_dicom(one(tmp_path, **angled(0.0), PatientID="1") / "b.dcm", counts()[0], **angled(90.0),
+                **({"PatientID": other} if other else {}))
+    assert len(load_xrays(tmp_path, intensity=LINES)["xrays"]) == 2
+    assert [str(warning.message) for warning in recwarn] == [
+        f"{tmp_path / 'a.dcm'} and {tmp_path / 'b.dcm'} have different PatientID, but the X-rays of a folder are taken "
+        "as one patient's: keep those of each in a folder of their own"] * warned
+
+
+@pytest.mark.parametrize("kind", ["Collimator", "Shutter"])
+def test_what_a_collimator_covers_is_warned_of(tmp_path, recwarn, kind):
+    shape, edges = {f"{kind}Shape": "RECTANGULAR"}, (
+        f"{kind}LeftVerticalEdge", f"{kind}RightVerticalEdge", f"{kind}UpperHorizontalEdge",
+        f"{kind}LowerHorizontalEdge")
+    for name, beyond in (("whole", (1, 5, 1, 6)), ("wider", (-9, 99, 0, 7)), ("unfilled", (0, 0, 0, 0))):
+        beam_of(tmp_path / name, **angled(0.0) | shape | dict(zip(edges, beyond)))
+    assert not recwarn.list
+    with pytest.warns(UserWarning, match=rf"a.dcm: 60% of its pixels lie beyond .*{kind}LeftVerticalEdge.*: crop"):
+        beam_of(tmp_path / "covered", **angled(0.0) | shape | dict(zip(edges, (2, 4, 2, 5))))

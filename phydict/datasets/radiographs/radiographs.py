@@ -20,7 +20,7 @@ import yaml
 from PIL import Image
 
 from phydict.datasets.case import Case
-from phydict.datasets.dicom import DicomTags, read_dicom, shown, tags_intensity
+from phydict.datasets.dicom import DicomTags, read_dicom, shown, tags_intensity, warn_of_frames
 from phydict.datasets.intensity import KINDS, Intensity, check_of_patient
 from phydict.datasets.natural_order import natural_order
 from phydict.datasets.radiographs.saturation import saturated
@@ -226,6 +226,7 @@ def _read_views(files: list[Path]) -> _Views:
         if len({(tags.inverted, tags.relationship, tags.sign) for tags in all_tags}) > 1:
             raise ValueError(f"the DICOM files of {files[0].parent} differ in PhotometricInterpretation or "
                              "PixelIntensityRelationship; keep views of one kind in a folder")
+        warn_of_frames(all_tags)
         return views
     views = _Views([str(file) for file in files], [read_image(file) for file in files], [])
     kinds = sorted({str(image.dtype) for image in views.images})

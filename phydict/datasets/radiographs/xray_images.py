@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 import warnings
 from pathlib import Path
@@ -91,14 +90,13 @@ def _read_nifti(path: Path) -> np.ndarray:
 
 def _read_picture(path: Path) -> np.ndarray:
     """A grey PNG or TIFF; colours are allowed where all channels are equal."""
-    content = path.read_bytes()
-    header = content[:26]
+    header = path.read_bytes()[:26]
     if header[1:4] == b"PNG" and len(header) == 26 and header[24] == 16 and header[25] != 0:
         raise ValueError(CUT)
     with warnings.catch_warnings():
         warnings.simplefilter("error", Image.DecompressionBombWarning)
         try:
-            opened = Image.open(io.BytesIO(content))  # by name it is mapped, and rows of turned TIFFs are cut wrongly
+            opened = Image.open(path)
         except UnidentifiedImageError:
             raise ValueError(UNKNOWN) from None
     with opened as image:
@@ -111,6 +109,7 @@ def _read_picture(path: Path) -> np.ndarray:
         swapped = getattr(tags, "prefix", b"") == b"MM" and image.info.get("compression") != "raw"
         if swapped and image.mode in ("I", "F"):
             raise ValueError(SWAPPED)
+        image.filename = ""  # by it Pillow would map the file, and cut the rows of turned TIFFs wrongly
         image.load()
         if image.mode in GREY:
             pixels = np.asarray(image)

@@ -291,7 +291,7 @@ def _tags(frame: Frame) -> DicomTags:
     orientation = frame.find("PatientOrientation")
     if orientation is not None:
         letters = orientation if isinstance(orientation, MultiValue) else str(orientation).split("\\")
-        orientation = tuple(map(str, letters))
+        orientation = tuple(map(str, letters)) if any(letters) else None
     sign = frame.number("PixelIntensityRelationshipSign")
     if sign and (frame.number("RescaleSlope") or 1) < 0:
         sign = -sign  # the tag speaks of stored values

@@ -437,3 +437,10 @@ def test_what_a_collimator_covers_is_warned_of(tmp_path, recwarn, kind):
     assert not recwarn.list
     with pytest.warns(UserWarning, match=rf"a.dcm: 60% of its pixels lie beyond .*{kind}LeftVerticalEdge.*: crop"):
         beam_of(tmp_path / "covered", **angled(0.0) | shape | dict(zip(edges, (2, 4, 2, 5))))
+
+
+def test_an_orientation_of_empty_words_is_none(tmp_path):
+    empty = {"PatientOrientation": ["", ""]}
+    beam = beam_of(tmp_path / "xa", **angled(30.0), **empty)
+    assert beam.same_as(beam_of(tmp_path / "silent", **angled(30.0)))
+    fails("lacks PatientOrientation", one(tmp_path / "dx", None, "DX", **DX | empty), intensity=LINES)

@@ -108,7 +108,7 @@ def sharpness_scores(volume: Tensor, truth: Tensor, lung: Tensor, grid: Grid) ->
     their middle to between them, and of vessels the contrast is 1 where all of it is there.
 
     lung: mask (X, Y, Z) in the truth. An edge that no line crosses or that does not show, ribs and vessels without
-    lungs, and vessels without contrast, as in a box of air alone, have no score.
+    lungs, and those without contrast in the truth, as in a box of air alone, have no score.
     """
     scores = {}
     for edge in AXES:
@@ -116,8 +116,10 @@ def sharpness_scores(volume: Tensor, truth: Tensor, lung: Tensor, grid: Grid) ->
             spread, true_spread = (edge_spread(x, lung, grid, edge) for x in (volume, truth))
             scores[f"edge_{edge}"] = spread / true_spread
     with suppress(ValueError):
-        ribs, true_ribs = rib_profile(torch.stack([volume, truth]), truth, lung, grid)
-        scores["ribs"] = float((ribs[0] - ribs[-1]) / (true_ribs[0] - true_ribs[-1]))
+        ribs, true_ribs = (float(profile[0] - profile[-1]) for profile in
+                           rib_profile(torch.stack([volume, truth]), truth, lung, grid))
+        if true_ribs:
+            scores["ribs"] = ribs / true_ribs
     if (lung > 0.5).any():
         with suppress(ValueError):
             scores["vessels"] = vessel_visibility(volume, truth, lung)

@@ -84,6 +84,13 @@ def test_ribs_are_found_and_their_width_and_contrast_are_their_own():
     assert "ribs" not in sharpness_scores(truth.clamp(max=100), truth.clamp(max=100), lung, GRID)
 
 
+def test_ribs_that_are_as_bright_above_and_below_as_in_their_middle_have_no_score():
+    truth, lung = walled(4.0)
+    truth[5:8] = 500.0
+    for volume in (truth, walled(4.0)[0]):
+        assert "ribs" not in sharpness_scores(volume, truth, lung, GRID)
+
+
 def test_vessels_show_in_proportion_to_their_contrast():
     lung = torch.zeros(GRID.shape)
     lung[8:32, 6:18, 10:50] = 1

@@ -54,8 +54,9 @@ class Entry:
     """The mean over cases of one method's settings under one condition.
 
     settings: those that differ among the method's entries, beside its name; values: measure -> {case: value}, the
-    seeds of a case averaged, of those measures that all its cases have; cases, of: how many cases it has, with all of
-    their seeds, and how many it was to have; rows: of results; error: why one of them does not count.
+    seeds of a case averaged, of those cases that have it with each seed, and of what is no score only where all have
+    it; cases, of: how many cases it has, with all of their seeds, and how many it was to have; rows: of results; error:
+    why one of them does not count.
     """
 
     method: str

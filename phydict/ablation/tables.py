@@ -111,9 +111,12 @@ def _difference_tables(title: str, entries: Sequence[Entry]) -> list[Table]:
         return []
     measures = [SHOWN_MEASURES[name].off_target() for name in names]
     off = [OFF_TARGET] if measures != [SHOWN_MEASURES[name] for name in names] else []
+    common = [entry.case_ids & best.case_ids for entry in others]
+    parts = partial_notes((entry.label, len(of), {
+        name: len(entry.values.get(name, {}).keys() & best.values.get(name, {})) for name in names})
+        for entry, of in zip(others, common))
     return [Table(f"{title}: less {best.name}, case by case", ["method", *(m.heading for m in measures)], measures,
-                  lines, [*interval_note(lines, (entry.case_ids & best.case_ids for entry in others)), *off,
-                          *_origins(entries)])]
+                  lines, [*interval_note(lines, common), *parts, *off, *_origins(entries)])]
 
 
 def _less(entry: Entry, other: Entry, name: str) -> Estimate | None:

@@ -185,13 +185,17 @@ class Summary(NamedTuple):
 
 
 def case_values(rows: Iterable[Mapping], name: str) -> dict[str, float]:
-    """{case: value} of a metric, rows of one case (several seeds) averaged; rows without the key "case" count as a case
-    each."""
-    cases: dict[str, list[float]] = {}
+    """{case: value} of a metric, rows of one case (several seeds) averaged, of cases of which each row has it; rows
+    without the key "case" count as a case each."""
+    cases: dict[str, list] = {}
     for n, row in enumerate(rows):
-        if row.get(name) is not None:
-            cases.setdefault(str(row.get("case", f"row {n}")), []).append(float(row[name]))
-    return {case: float(np.mean(repeats)) for case, repeats in cases.items()}
+        cases.setdefault(case_id(row, n), []).append(row.get(name))
+    return {case: float(np.mean(repeats)) for case, repeats in cases.items() if None not in repeats}
+
+
+def case_id(row: Mapping, n: int) -> str:
+    """The case of the n-th row of a method."""
+    return str(row.get("case", f"row {n}"))
 
 
 def over_cases(rows: Sequence[Mapping], metrics: Iterable[str]) -> dict[str, Summary]:

@@ -298,6 +298,17 @@ def test_a_score_of_some_cases_is_their_mean_and_says_of_how_many():
     assert "cases (y)" not in table
 
 
+def test_a_case_of_which_a_seed_lacks_a_score_has_none_so_that_what_failed_does_not_count_as_good():
+    rows = [row(case, method, 20.0, seed=seed, hd95_lung=5.0 + 40 * seed) for method in "xy" for case in "ab"
+            for seed in (0, 1)]
+    del rows[-1]["hd95_lung"]  # y loses the lungs of b where x has them 45 mm off
+    x, y = summarise(rows)
+    assert x.values["hd95_lung"] == {"a": 25.0, "b": 25.0} and y.values["hd95_lung"] == {"a": 25.0}
+    table, differences = all_tables([x, y])
+    assert "HD95 lungs (mm): of 1 of 2 cases (y)." in table.notes
+    assert "HD95 lungs (mm): of 1 of 2 cases (y)." in differences.notes
+
+
 def test_a_column_of_unlike_cases_ranks_nothing_and_the_others_do():
     def ranked() -> set[tuple[str, str]]:
         return {(table.title, name) for table in all_tables(summarise(rows))

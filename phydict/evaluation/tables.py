@@ -19,7 +19,7 @@ from rich.text import Text
 
 from phydict.evaluation.bootstrap import Estimate, patients
 from phydict.evaluation.fid import NAMES
-from phydict.evaluation.metrics import MEASURES, RANGE, SIGMA, TAPS, Measure, Summary, summarise
+from phydict.evaluation.metrics import MEASURES, RANGE, SIGMA, TAPS, Measure, Summary, case_id, summarise
 from phydict.evaluation.planes import PLANES
 from phydict.units import HUWindow
 
@@ -172,8 +172,8 @@ def mean_table(rows: Iterable[Mapping], window: HUWindow = RANGE, empty: Mapping
         header.append("warned")
         measures.append(Measure("warned", None, 0))
         lines = [(label, ranked, [*values, len(warned.get(label, ()))]) for label, ranked, values in lines]
-    of_group = {group: frozenset(row.get("case", f"row {n}") for n, row in enumerate(rows)
-                                 if str(row["method"]) == group) for group in groups}
+    of_group = {group: frozenset(case_id(row, n) for n, row in enumerate(
+        row for row in rows if str(row["method"]) == group)) for group in groups}
     cases = set(of_group.values())
     unequal = " (not the same cases in every line)" if len(cases) > 1 else ""
     parts = partial_notes((label, len(of_group[label]), {name: len(summary.cases) for name, summary in group.items()})

@@ -276,6 +276,13 @@ def test_a_column_of_unlike_cases_ranks_nothing_and_the_others_do():
     assert not re.search("[*]|<u>", mean_table(ROWS[:3]).markdown())
 
 
+def test_cases_are_told_apart_by_numbers_as_by_words_and_rows_without_are_the_methods_first_second_and_so_on():
+    words = mean_table(ROWS).markdown()
+    assert mean_table([row | {"case": int(row["case"])} for row in ROWS]).markdown() == words
+    assert mean_table([{name: value for name, value in row.items() if name != "case"} for row in ROWS]
+                      ).markdown() == words
+
+
 def test_warnings_are_counted_in_the_line_and_name_their_cases_in_the_caption():
     rows = [row | ({"warning": "no lungs"} if row["case"] == "008" and row["method"] == "fdk" else {}) for row in ROWS]
     table = cells(rows)

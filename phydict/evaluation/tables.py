@@ -38,13 +38,15 @@ FIRST_CALLS = "Seconds: first calls included, such as compiling; ablate leaves t
 
 FID_TITLE = "Frechet distance of slices (FID)"
 
-MARKDOWN = str.maketrans({"\\": "\\\\", "&": "&amp;", "<": "&lt;", ">": "&gt;", "$": "\\$", "*": "\\*", "`": "\\`"})
+MARKDOWN = str.maketrans({"\\": "\\\\", "&": "&amp;", "<": "&lt;", ">": "&gt;", "$": "\\$", "*": "\\*", "`": "\\`",
+                          "\n": " ", "\r": " "})
 """What Markdown takes for more than text, but for a pipe, which ends a cell."""
 
 LATEX = str.maketrans({
     "\\": "\\textbackslash{}", "$": "\\$", "&": "\\&", "%": "\\%", "_": "\\_", "#": "\\#", "{": "\\{", "}": "\\}",
     "~": "\\textasciitilde{}", "^": "\\textasciicircum{}", "|": "\\textbar{}", "<": "\\textless{}",
-    ">": "\\textgreater{}", "↑": "$\\uparrow$", "↓": "$\\downarrow$", "→": "$\\rightarrow$", "±": "$\\pm$", "–": "--"})
+    ">": "\\textgreater{}", "↑": "$\\uparrow$", "↓": "$\\downarrow$", "→": "$\\rightarrow$", "±": "$\\pm$", "–": "--",
+    "\n": " ", "\r": " "})
 """What LaTeX takes for more than text, or has no letter for."""
 
 
@@ -71,6 +73,7 @@ class Table:
         """A tabular with booktabs' rules: best in bold, second underlined."""
         lines = self._marked(("{}", "\\textbf{{{}}}", "\\underline{{{}}}"), escaped)
         header, *body = [" & ".join(line) + " \\\\" for line in [map(escaped, self.header), *lines]]
+        body = [("{}" if line.lstrip()[0] in "[*" else "") + line for line in body]  # which \\ takes for its own
         notes = " ".join(map(escaped, [f"{self.title}.", *self.notes]))
         return "\n".join(["\\begin{table}", "\\centering", f"\\begin{{tabular}}{{l{'r' * len(self.measures)}}}",
                           "\\toprule", header, "\\midrule", *body, "\\bottomrule", "\\end{tabular}",
@@ -178,7 +181,7 @@ def mean_table(rows: Iterable[Mapping], window: HUWindow = RANGE, empty: Mapping
     unequal = " (not the same cases in every line)" if len(cases) > 1 else ""
     parts = partial_notes((label, len(of_group[label]), {name: len(summary.cases) for name, summary in group.items()})
                           for label, group in groups.items())
-    number = _span(map(len, cases))
+    number = span(map(len, cases))
     over = "One case" if number == "1" else f"Mean ± standard deviation over n = {number} cases"
     table = Table("Scores by method", header, measures, lines, [])
     timed = first_calls and "seconds" in measured
@@ -188,7 +191,7 @@ def mean_table(rows: Iterable[Mapping], window: HUWindow = RANGE, empty: Mapping
         *warning_notes(rows)])
 
 
-def _span(numbers: Iterable[int]) -> str:
+def span(numbers: Iterable[int]) -> str:
     """The least and the largest of some numbers."""
     ordered = sorted(numbers)
     return " to ".join(map(str, dict.fromkeys((ordered[0], ordered[-1]))))
@@ -211,7 +214,7 @@ def fid_tables(rows: Sequence[Mapping], title: str = FID_TITLE) -> list[Table]:
     if not has_intervals(lines):
         alone = several and max(people) < 2
         return [Table(title, header, measures, lines, [note, *([NO_INTERVALS] if alone else [])])]
-    replicates, who = rows[0]["replicates"], f"{f'{_span(people)} ' if people else ''}patients"
+    replicates, who = rows[0]["replicates"], f"{f'{span(people)} ' if people else ''}patients"
     tables = [Table(title, header, measures, lines, [
         note, f"{IN_BRACKETS}, {replicates} draws of {who}{f', {NAMED}' if several else ''}; repeated slices make it "
               "too high."])]
@@ -261,7 +264,7 @@ def interval_note(lines: Iterable[tuple[str, bool, Sequence[Value | None]]],
     each = [found for of in cases if (found := list(of))]
     several = any(patients(of) < len(of) for of in each)
     if has_intervals(lines):
-        number = _span(map(patients, each))
+        number = span(map(patients, each))
         return [f"{IN_BRACKETS} of the mean, bootstrap over {number} patients{f', {NAMED}' if several else ''}."]
     return [NO_INTERVALS] if several and all(patients(of) < 2 for of in each) else []
 

@@ -319,6 +319,13 @@ def test_the_tables_for_console_and_latex_say_the_same():
     assert "\\textbf{0.850 $\\pm$ 0.071 [0.800, 0.900]}" in mean_table(STATED).latex()
 
 
+def test_a_name_of_several_lines_or_in_brackets_is_one_line_of_the_table():
+    table = mean_table([{"case": "a", "method": name, "psnr": 1.0} for name in ("one\ntwo", "[b]", "*c")])
+    assert "\n| one two | 1.00 |\n| [b] | 1.00 |\n" in table.markdown()
+    rows = [f"{name} & 1.00 \\\\\n" for name in ("one two", "{}[b]", "{}*c")]  # bare, \\ would take [ and * for its own
+    assert "".join(rows) in table.latex()
+
+
 def test_bad_requests_are_named():
     with pytest.raises(ValueError, match="no rows"):
         mean_table([])

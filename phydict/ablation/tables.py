@@ -33,6 +33,7 @@ from phydict.evaluation.tables import (
     listed,
     partial_notes,
     rankable,
+    span,
     warning_notes,
 )
 from phydict.inference.conditions import format_settings, namesakes
@@ -191,8 +192,11 @@ def _caption(entries: Sequence[Entry], marked: bool) -> str:
     rows = [row for entry in entries for row in entry.rows]
     of, seeds = len({row["case"] for row in rows}), len({row.get("seed") for row in rows})
     count = len({case for entry in entries for case in entry.case_ids}) or of
-    among = f"{count} of {of}" if count < of else count
-    over = f"Mean over {among} cases" if of > 1 else "One case" if seeds == 1 else "Mean over the seeds of one case"
+    sets = {entry.case_ids for entry in entries if entry.complete}
+    unlike = " (not the same everywhere)" if len(sets) > 1 else ""
+    among = span(map(len, sets)) if unlike else f"{count} of {of}" if count < of else str(count)
+    over = (f"Mean over {among} cases" if among != "1" else "One case" if seeds == 1 else
+            "Mean over the seeds of one case") + unlike
     how = " on ".join(filter(None, (listed(rows, name) for name in ("precision", "instruction_set"))))
     window = next((protocol.window for protocol in _protocols(rows)), RANGE)
     return caption(over, marked, rows, {"Grid": "grid", "Seeds": "seed"}, window) + (

@@ -261,7 +261,15 @@ def test_a_table_says_what_its_own_rows_rest_on_alone():
     assert "Doubtful cases, by the column warning: x: a." in of_x2ct and "Doubtful" not in of_sparc
     assert "Protocol x2ct" in of_x2ct and "data range 2500 HU" in of_x2ct and "threads 1;" in of_x2ct
     assert "Protocol sparc" in of_sparc and "data range 2048 HU" in of_sparc and "threads 2;" in of_sparc
-    assert "sparc" not in of_x2ct and "One case;" in of_x2ct and "Mean over 2 cases. HU" in of_sparc  # of unlike ones
+    assert "sparc" not in of_x2ct and "One case;" in of_x2ct
+    assert "One case (not the same everywhere). HU" in of_sparc
+
+
+def test_the_caption_tells_when_methods_had_other_cases_and_how_many():
+    rows = [row(case, method, 20.0, views=views) for method, cases in (("x", "abc"), ("y", "ab")) for case in cases
+            for views in (2, 8)]
+    assert all(table.notes[0].startswith("Mean over 2 to 3 cases (not the same everywhere). HU")
+               for table in all_tables(summarise(rows)) if "less" not in table.title)
 
 
 def test_the_ceiling_of_dice_stands_beside_it_and_has_no_differences_between_methods():

@@ -38,7 +38,7 @@ NEARLY_REPORT = REPORT, "report.md", "report"
 """Names that a report is likely to have in place of its own, in lower case."""
 MOST_REPORT = 2**18
 """Bytes of the longest report, some 40,000 words."""
-SATURATED = 0.99
+BLANK = 0.99
 """The share of an image's pixels that may not be all as dense as its densest."""
 
 
@@ -180,9 +180,9 @@ def save_xrays(folder: str | Path, xrays: torch.Tensor | np.ndarray, beam: ConeB
 
 def _check_shown(names: list[str], xrays: np.ndarray) -> None:
     """Raises ValueError, with its name, where a view of line integrals (K, V, U) shows nothing."""
-    saturated = (xrays == xrays.max((1, 2), keepdims=True)).mean((1, 2)) >= SATURATED
-    if saturated.any():
-        raise ValueError(f"{names[saturated.argmax()]} shows nothing: {SATURATED:.0%} of its pixels or more hold "
+    blank = (xrays == xrays.max((1, 2), keepdims=True)).mean((1, 2)) >= BLANK
+    if blank.any():
+        raise ValueError(f"{names[blank.argmax()]} shows nothing: {BLANK:.0%} of its pixels or more hold "
                          "its densest value, as in a missing or saturated image; export it again, or leave the view "
                          "out of the images and of the geometry")
 

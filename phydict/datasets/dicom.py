@@ -107,24 +107,26 @@ def _frames(path: Path, padding: float | None) -> list[tuple[np.ndarray, DicomTa
         pixels = int(dataset.Rows) * int(dataset.Columns) * int(dataset.get("NumberOfFrames") or 1)
         check_held(pixels, path, "pixels", 8 * MOST_SQUEEZED)
         check_memory(8 * pixels, "what its tags promise", "give a smaller one")
-        stored = dataset.pixel_array
-        _check_bits(dataset, stored)
+        stored = _stored(dataset)
     images = stored[None] if stored.ndim == 2 else stored
     several = len(images) > 1
     frames = [Frame(dataset, f"{path} frame {k + 1}" if several else str(path), k) for k in range(len(images))]
     return [(_values(image, frame, padding), _tags(frame)) for image, frame in zip(images, frames)]
 
 
-def _check_bits(dataset: pydicom.Dataset, stored: np.ndarray) -> None:
-    """Raises ValueError where bits of unsigned values were cut off that hold no overlay, as those of old files do."""
+def _stored(dataset: pydicom.Dataset) -> np.ndarray:
+    """The stored values of all frames. Raises ValueError where unsigned ones have bits beyond BitsStored that hold no
+    overlay, as those of old files do."""
     if dataset.get("PixelRepresentation") or dataset.BitsStored >= dataset.BitsAllocated or (
             dataset.file_meta.TransferSyntaxUID.is_compressed):
-        return
+        return dataset.pixel_array
+    values, most = pixel_array(dataset, correct_unused_bits=False), 2**dataset.BitsStored - 1
     overlays = (dataset.get((group, 0x0102)) for group in range(0x6000, 0x6020, 2))
-    cut = int((pixel_array(dataset, correct_unused_bits=False) != stored).sum())
+    cut = int((values > most).sum())
     if cut and not any(overlay.value for overlay in overlays if overlay):
         raise ValueError(f"{cut} of its values need more than its {dataset.BitsStored} BitsStored, and would be cut "
                          "off there; correct BitsStored and HighBit, or what lies in the other bits")
+    return values & most
 
 
 def warn_of_frames(tags: list[DicomTags]) -> None:

@@ -33,16 +33,20 @@ def write_csv(path: str | Path, rows: Iterable[Mapping]) -> None:
 def read_csv(path: str | Path) -> list[dict]:
     """Rows of a CSV by `write_csv`, numbers as int or float; empty fields are left out; no file gives no rows.
 
-    Text that only resembles a number ("007") stays text, and so do the columns case and method.
-    Raises ValueError naming the file where it is no table, or a row's number of fields is not the header's, as in a
-    file cut off by another program.
+    Text that only resembles a number ("007") stays text, and so do the columns case and method. A mark of UTF-8 at the
+    beginning, as spreadsheets write it, is left out.
+    Raises ValueError naming the file where it is no table, two columns have one name, or a row's number of fields is
+    not the header's, as in a file cut off by another program.
     """
     path = Path(path)
     if not path.exists():
         return []
-    with reading(f"the table {path}", "repair or remove it"), open(path, newline="", encoding="utf-8") as file:
+    with reading(f"the table {path}", "repair or remove it"), open(path, newline="", encoding="utf-8-sig") as file:
         reader = csv.reader(file)
         columns = next(reader, [])
+        if twice := next((name for n, name in enumerate(columns) if name in columns[:n]), None):
+            raise Unreadable(f"{path} has the column {twice!r} twice, and which one counts is not known; remove one of "
+                             "the two")
         rows = []
         for fields in reader:
             if len(fields) != len(columns):

@@ -18,6 +18,7 @@ half a window at each face.
 from __future__ import annotations
 
 import math
+import reprlib
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -186,10 +187,14 @@ class Summary(NamedTuple):
 
 def case_values(rows: Iterable[Mapping], name: str) -> dict[str, float]:
     """{case: value} of a metric, rows of one case (several seeds) averaged, of cases of which each row has it; rows
-    without the key "case" count as a case each."""
+    without the key "case" count as a case each. Raises ValueError where a value is text."""
     cases: dict[str, list] = {}
     for n, row in enumerate(rows):
-        cases.setdefault(case_id(row, n), []).append(row.get(name))
+        value = row.get(name)
+        if isinstance(value, str):
+            raise ValueError(f"{name} of {case_id(row, n)} by {row.get('method')} is {reprlib.repr(value)}, which is "
+                             "no number as Python writes it, such as 20.5: correct or remove that row")
+        cases.setdefault(case_id(row, n), []).append(value)
     return {case: float(np.mean(repeats)) for case, repeats in cases.items() if None not in repeats}
 
 

@@ -67,6 +67,19 @@ def test_a_truncated_file_is_named(tmp_path):
         read_csv(path)
 
 
+def test_a_spreadsheets_mark_of_utf_8_is_no_part_of_the_first_columns_name(tmp_path):
+    path = tmp_path / "t.csv"
+    write_csv(path, ROWS)
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert read_csv(path) == ROWS
+
+
+def test_a_column_that_is_there_twice_is_refused(tmp_path):
+    (tmp_path / "t.csv").write_text("case,method,psnr,psnr\na,sirt,20.0,30.0\n")
+    with pytest.raises(ValueError, match=r"t\.csv has the column 'psnr' twice"):
+        read_csv(tmp_path / "t.csv")
+
+
 def test_an_error_while_writing_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
     path = tmp_path / "t.csv"
     write_csv(path, ROWS[:1])
@@ -331,6 +344,8 @@ def test_bad_requests_are_named():
         mean_table([])
     with pytest.raises(ValueError, match="the column 'method'"):
         mean_table([{"psnr": 30.0}])
+    with pytest.raises(ValueError, match="psnr of a by tv is '20,5', which is no number"):
+        mean_table([{"case": "a", "method": "tv", "psnr": "20,5"}])
 
 
 @pytest.mark.parametrize("content", [b"case,method\n" + b"x" * 200_000 + b",y\n", bytes(range(256)),

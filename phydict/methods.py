@@ -294,13 +294,19 @@ def reconstruct_by(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeB
 
 
 def _check_returned(method: Reconstructor, result: object) -> None:
-    """Raises ValueError unless a method returned a Reconstruction that has a value for each of its grid's voxels."""
+    """Raises ValueError unless a method returned a Reconstruction that has a value for each of its grid's voxels, and
+    FloatingPointError where some are not finite."""
     name = f"reconstruct of the method {type(method).__name__} must return a Reconstruction"
     if not isinstance(result, Reconstruction):
         raise ValueError(f"{name}, but {type(result).__name__} came back: put the volume into one")
+    if not isinstance(result.volume, Tensor):
+        raise ValueError(f"{name} whose volume is a tensor in HU, but {type(result.volume).__name__} came back")
     if tuple(result.volume.shape) != tuple(result.grid.shape):
         raise ValueError(f"{name} whose volume has the grid's shape {tuple(result.grid.shape)}, but "
                          f"{tuple(result.volume.shape)} came back")
+    if bad := int((~result.volume.isfinite()).sum()):
+        raise FloatingPointError(f"{name} of finite HU, but {bad} of its {result.volume.numel()} voxels are NaN or "
+                                 "infinite: correct the method")
 
 
 def calibrated(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeBeam, uncertain: Uncertain,
@@ -367,11 +373,14 @@ def reconstruct(xrays: Tensor, beam: ConeBeam, prior: AnyPrior | str | Path | No
 
 
 def _real(xrays) -> Tensor:
-    """X-rays as a dense tensor of numbers. Raises ValueError where they are none."""
+    """X-rays as a dense tensor of numbers. Raises ValueError where they are none, or masked."""
+    if np.ma.is_masked(xrays):
+        raise ValueError(f"{np.ma.count_masked(xrays)} pixels of the X-rays are masked, and what lies under a mask "
+                         "would count as measured: fill them, by `filled`, or leave those views out")
     try:
-        if isinstance(xrays, np.ndarray):  # torch takes neither reversed axes nor another machine's order of bytes
-            xrays = np.ascontiguousarray(xrays, xrays.dtype.newbyteorder("="))
-        values = torch.as_tensor(xrays)
+        if isinstance(xrays, np.ndarray):  # torch takes no reversed axes, other machine's bytes or read-only array
+            xrays = np.require(xrays, xrays.dtype.newbyteorder("="), ["C", "W"])
+        values = torch.as_tensor(xrays).detach()
     except Exception as error:  # NumPy and torch each have their own for what is no array of numbers
         raise ValueError(f"the X-rays must be an array of numbers, but {type(xrays).__name__} was given "
                          f"({reason(error)})") from error

@@ -361,6 +361,26 @@ def test_xrays_and_seeds_of_numpy_are_what_their_numbers_say():
     assert torch.equal(plain.volume, other.volume) and torch.equal(plain.volume, turned.volume) and plain.seed == 3
 
 
+def test_xrays_that_are_read_only_or_follow_gradients_are_what_their_numbers_say():
+    beam = ConeBeam.orbit(6, 1020, 740, (56, 56), 8.0)
+    y = ball(beam, 90.0)
+    plain, frozen = reconstruct(y, beam, method=SIRT(2)), y.numpy().copy()
+    frozen.setflags(write=False)
+    for xrays in (frozen, y.clone().requires_grad_()):  # without a word: warnings are errors
+        other = reconstruct(xrays, beam, method=SIRT(2))
+        assert torch.equal(plain.volume, other.volume) and not other.xrays.requires_grad
+
+
+def test_masked_xrays_are_refused_and_those_with_nothing_masked_are_not():
+    beam = ConeBeam.orbit(6, 1020, 740, (56, 56), 8.0)
+    y = ball(beam, 90.0).numpy()
+    spoilt = np.ma.masked_array(y, np.broadcast_to(np.arange(56) < 2, y.shape))
+    with pytest.raises(ValueError, match=f"{6 * 56 * 2} pixels of the X-rays are masked"):
+        reconstruct(spoilt, beam, method=SIRT(2))
+    whole = reconstruct(np.ma.masked_array(y), beam, method=SIRT(2))
+    assert torch.equal(whole.volume, reconstruct(y, beam, method=SIRT(2)).volume)
+
+
 @pytest.mark.parametrize("guidance", [-1.0, float("nan"), 1e7, 1e308])
 def test_a_guidance_that_overflows_is_refused(guidance):
     with pytest.raises(ValueError, match="the guidance scale lies between 0 and 1,000,000"):

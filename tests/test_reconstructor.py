@@ -193,10 +193,19 @@ class Whole(Reconstructor):
 
 @pytest.mark.parametrize("code, came", [
     ("None", "a Reconstruction, but NoneType came back"), ("found.volume", "a Reconstruction, but Tensor came back"),
-    ("replace(found, volume=found.volume[1:])", r"the grid's shape \(16, 16, 16\), but \(15, 16, 16\) came back")])
+    ("replace(found, volume=found.volume[1:])", r"the grid's shape \(16, 16, 16\), but \(15, 16, 16\) came back"),
+    ("replace(found, volume=found.volume.numpy())", "a tensor in HU, but ndarray came back")])
 def test_a_method_that_returns_no_reconstruction_is_told_what_to_return(code, came, written):
     method = import_module(written(RETURNING.format(code))).Whole()
     with pytest.raises(ValueError, match=f"reconstruct of the method Whole must return .*{came}"):
+        reconstruct(views(), BEAM, method=method, grid=GRID)
+
+
+@pytest.mark.parametrize("value", ["nan", "inf"])
+def test_a_method_that_returns_what_is_not_finite_gives_no_volume(value, written):
+    spoilt = f"replace(found, volume=found.volume.index_fill(0, torch.tensor([3]), float('{value}')))"
+    method = import_module(written("import torch\n" + RETURNING.format(spoilt))).Whole()
+    with pytest.raises(FloatingPointError, match="Whole must .* 256 of its 4096 voxels are NaN or infinite"):
         reconstruct(views(), BEAM, method=method, grid=GRID)
 
 

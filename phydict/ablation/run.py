@@ -168,22 +168,18 @@ class Runner:
             return result
         peak = peak_memory(self.device) if known else None
         seconds = result.seconds | profile.seconds("network", "projector")
-        finite = bool(result.volume.isfinite().all())
-        scores: dict[str, float] = {}
-        if finite:
-            scores, features = self.scoring.measured(result, scene.truth, scene.grid, scene.window, self.device,
-                                                     trial.data.protocol)
-            try:
-                if features:
-                    save_features(features_file(self.out, key), features)
-                if self.keep_volumes:
-                    _keep(volume_folder(self.out, key), result, scene, trial)
-            except (OSError, SafetensorError) as error:
-                raise NotKept(not_written(f"what is kept of row {key} in {self.out}", error,
-                                          "give another out")) from error
+        scores, features = self.scoring.measured(result, scene.truth, scene.grid, scene.window, self.device,
+                                                 trial.data.protocol)
+        try:
+            if features:
+                save_features(features_file(self.out, key), features)
+            if self.keep_volumes:
+                _keep(volume_folder(self.out, key), result, scene, trial)
+        except (OSError, SafetensorError) as error:
+            raise NotKept(not_written(f"what is kept of row {key} in {self.out}", error,
+                                      "give another out")) from error
         return scores | {
-            "status": "ok" if finite else "diverged",
-            "error": None if finite else "the volume holds NaN or infinite voxels", "misfit": result.misfit,
+            "status": "ok", "error": None, "misfit": result.misfit,
             "seconds": sum(result.seconds.values()),
             **{f"seconds_{stage}": value for stage, value in seconds.items()},
             "network_calls": result.network_calls,

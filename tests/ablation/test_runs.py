@@ -7,7 +7,7 @@ import itertools
 import json
 import os
 import shutil
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import nibabel
@@ -22,6 +22,7 @@ from prior.tiny import tiny_prior
 from ablation.runs import TINY, Trace, ablate, arguments, write
 from phydict.ablation import command, read_specification
 from phydict.ablation.run import planned
+from phydict.baselines import SIRT
 from phydict.cli.infer import main
 from phydict.evaluation import read_csv, write_csv
 from phydict.grid import Grid
@@ -158,6 +159,15 @@ def test_a_method_that_gives_up_is_a_row_with_its_sentence(tmp_path, monkeypatch
     calls = len(trace.given)
     ablate(tmp_path, **content)
     assert (len(trace.given) > calls) == bool(again)
+
+
+def test_a_method_that_returns_what_is_not_finite_is_a_diverged_row_without_scores(tmp_path, monkeypatch):
+    whole = SIRT.reconstruct
+    monkeypatch.setattr(SIRT, "reconstruct", lambda *given, **named: replace(
+        found := whole(*given, **named), volume=found.volume / 0))
+    row, other = ablate(tmp_path, phantoms=1, axes={"method": ["sirt", "cgls"], "method.iterations": [2]})
+    assert row["status"] == "diverged" and "NaN or infinite" in row["error"] and "psnr" not in row
+    assert other["status"] == "ok"
 
 
 @pytest.mark.parametrize("owner, name", [(ReconstructionData, "simulate"), (Scoring, "scores")])

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from nibabel.orientations import apply_orientation, inv_ornt_aff, io_orientation, ornt_transform
 from torch import Tensor
 
 from phydict.datasets.case import Case, lacking
@@ -47,8 +48,8 @@ class Voxels:
 
     @property
     def scored(self) -> Grid:
-        """Those that volumes are scored on."""
-        return self._fixed or self.result
+        """Those that volumes are scored on, which are stacked as metrics take them."""
+        return self._fixed or in_ras(self.result)
 
     def window(self, own: HUWindow) -> HUWindow:
         """The HU range that the CT is clipped to, where the method has one of its own."""
@@ -61,11 +62,24 @@ class Voxels:
         return lacking(case, "features", "clip_latent", "segmented") | cut_out(case, self.made, self.scored, window)
 
 
-def resampled(volume: Tensor, grid: Grid, onto: Grid) -> Tensor:
-    """A volume (X, Y, Z) in HU on `grid` by voxel averages on another one; air lies outside."""
+def in_ras(grid: Grid) -> Grid:
+    """The same voxels, stacked towards right, anterior and superior."""
+    turn = io_orientation(grid.affine)
+    if np.array_equal(turn, [[0, 1], [1, 1], [2, 1]]):
+        return grid
+    x, y, z = (grid.shape[axis] for axis in turn[:, 0].argsort())
+    return Grid((x, y, z), affine=grid.affine @ inv_ornt_aff(turn, grid.shape))
+
+
+def resampled(volume: Tensor, grid: Grid, onto: Grid, outside: float = AIR) -> Tensor:
+    """A volume (X, Y, Z) in HU on `grid` by voxel averages on another one, itself where that has the same voxels in
+    another order; outside: what lies outside, air."""
     if grid.same_as(onto):
         return volume
-    return torch.from_numpy(to_grid(volume.cpu().numpy(), grid.affine, onto, AIR).astype(np.float32))
+    if in_ras(grid).same_as(in_ras(onto)):
+        turn = ornt_transform(io_orientation(grid.affine), io_orientation(onto.affine))
+        return torch.from_numpy(np.ascontiguousarray(apply_orientation(volume.cpu().numpy(), turn)))
+    return torch.from_numpy(to_grid(volume.cpu().numpy(), grid.affine, onto, outside).astype(np.float32))
 
 
 def whole(grid: Grid) -> Grid:
@@ -79,10 +93,10 @@ def whole(grid: Grid) -> Grid:
 
 def cut_out(case: Case, grid: Grid, box: Grid, window: HUWindow) -> Case:
     """What a CT case on `grid` holds in a box: volume, from its finest, masks and, where it has one, affine."""
-    source = case.get("fine", case["volume"])
+    source = case["volume"] if in_ras(grid).same_as(box) else case.get("fine", case["volume"])
     volume = resampled(window.to_hu(source)[0].cpu(), in_other_voxels(grid, source.shape[1:]), box)
-    masks = np.stack([to_grid(mask.cpu().numpy(), grid.affine, box, 0.0) for mask in case["masks"]])
-    cut: Case = {"volume": window.to_range(volume)[None], "masks": torch.from_numpy(masks.astype(np.float32))}
+    masks = torch.stack([resampled(mask.cpu(), grid, box, 0.0) for mask in case["masks"]])
+    cut: Case = {"volume": window.to_range(volume)[None], "masks": masks}
     if "affine" in case:
         cut["affine"] = torch.from_numpy(placed(box, grid, case["affine"].numpy()).affine.copy())
     return cut

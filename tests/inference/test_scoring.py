@@ -9,12 +9,14 @@ import torch
 import yaml
 from command_lines import refusal
 from evaluation.tiny_ct_clip import tiny
+from nibabel.orientations import apply_orientation, inv_ornt_aff
+from scipy.ndimage import gaussian_filter
 from torch.nn import Identity
 
 from inference.runs import ORBIT, phantoms, record, sirt, write_ct
 from phydict.baselines import SIRT
 from phydict.cli.infer import main
-from phydict.datasets import CTSource
+from phydict.datasets import CTSource, phantom_case
 from phydict.datasets.cts.prepared import write_prepared
 from phydict.datasets.cts.segmentations import organs_beside
 from phydict.evaluation import backbones, perceptual, read_csv
@@ -28,6 +30,8 @@ from phydict.inference.page import results_page
 from phydict.inference.results import FEATURES, CaseResults
 from phydict.inference.scoring import FIDSettings, Scoring, segmented
 from phydict.inference.summary import show_finished
+from phydict.inference.voxels import Voxels, in_its_ct
+from phydict.reconstruction import Reconstruction
 from phydict.runtime.files import file_crc32
 from phydict.runtime.lpips_networks import load_lpips
 from phydict.units import HUWindow
@@ -362,3 +366,31 @@ def test_settings_name_what_decides_the_scores_and_nothing_by_default(untrained)
     resampled = Scoring(["fid"], FIDSettings(maisi_voxels=True))
     assert resampled.settings() == Scoring(["fid"]).settings() | {"fid_maisi_voxels": True}
     assert Scoring(["organs"]).settings() == {"metrics": ["organs"], "organs_version": 2}
+
+
+@pytest.mark.parametrize("order", [[[0, 1], [1, 1], [2, -1]], [[2, 1], [1, 1], [0, 1]], [[1, -1], [2, 1], [0, -1]]],
+                         ids=["upside down", "slices first", "cyclic"])
+def test_scores_do_not_depend_on_the_order_of_a_priors_axes(order):
+    window, grid = HUWindow(), Grid.box((32, 30, 34), (384.0, 360.0, 408.0))
+    case = phantom_case(3, grid, window)
+    case["volume"][:, :, :6] = 0.04  # a couch along the back
+    truth = window.to_hu(case["volume"])[0]
+    blurred = torch.from_numpy(gaussian_filter(truth.numpy(), (0.5, 0.5, 1.5)))
+    turn, turned = np.array(order), dict(case)
+    there = Grid([grid.shape[axis] for axis in turn[:, 0].argsort()],
+                 affine=grid.affine @ inv_ornt_aff(turn, grid.shape))
+
+    def of(volume: torch.Tensor) -> torch.Tensor:
+        return torch.from_numpy(apply_orientation(volume.numpy(), turn).copy())
+
+    turned |= {"volume": of(case["volume"][0])[None], "masks": torch.stack([*map(of, case["masks"])])}
+    found, nothing = [], torch.zeros(1, 1, 1)
+    for made, own, volume in ((case, grid, blurred), (turned, there, of(blurred))):
+        voxels, result = Voxels(own), Reconstruction(volume, own, "mine", 0, 0.0, [0.0], {}, nothing, nothing)
+        scored = voxels.as_scored(made, window)
+        scores, _ = Scoring(["sharpness"]).measured(result, scored, voxels.scored, window, torch.device("cpu"), None)
+        found.append(scores)
+        shown = in_its_ct(result, scored, voxels.scored, window)[1]
+        torch.testing.assert_close(shown, window.to_hu(made["volume"])[0], rtol=0, atol=1e-3)
+    assert {"psnr_body", "ssim_lung", "edge_diaphragm", "edge_chest_wall", "vessels"} <= found[0].keys()
+    assert found[1] == pytest.approx(found[0], rel=1e-4)

@@ -33,6 +33,24 @@ def prior():
     return tiny_prior()
 
 
+@dataclass(frozen=True)
+class Typed(PriorOnly):
+    """A sampler of one's own that gives its states in another type."""
+
+    kind: str = "float32"
+
+    def sample(self, *given):
+        return super().sample(*given).to(getattr(torch, self.kind))
+
+
+@pytest.mark.parametrize("kind", ["float64", "float16", "bfloat16"])
+def test_a_sampler_may_answer_in_another_type_and_the_volume_is_that_of_its_numbers(prior, kind):
+    plain, other = (Posterior(prior, sampler).reconstruct(views(), PROJECTOR)
+                    for sampler in (PriorOnly(2), Typed(2, kind=kind)))
+    assert other.volume.dtype == torch.float32
+    torch.testing.assert_close(other.volume, plain.volume, rtol=0, atol=8)  # of a range of 2000 HU
+
+
 @pytest.mark.parametrize("name", SAMPLERS)
 def test_the_same_seed_gives_the_same_result_and_another_seed_another(prior, name):
     method = Posterior(prior, SAMPLERS[name])

@@ -61,12 +61,13 @@ def check_sampler(sampler: Sampler) -> None:
 
 
 def check_drawn(sampler: Sampler, drawn: Any, x: Tensor) -> Tensor:
-    """What `sample` gave of the noise x. Raises ValueError, naming the class, unless these are states like x."""
+    """What `sample` gave of the noise x, of whatever type, in that of x. Raises ValueError, naming the class, unless
+    these are states like x."""
     if not isinstance(drawn, Tensor) or drawn.shape != x.shape:
         found = tuple(drawn.shape) if isinstance(drawn, Tensor) else type(drawn).__name__
         raise ValueError(f"sample of the sampler {type(sampler).__name__} must return clean states, a tensor of shape "
                          f"{tuple(x.shape)} like the noise that it is given, but gave {found}")
-    return drawn
+    return drawn.to(x)
 
 
 def ddim_sample(denoiser: Denoiser, x: Tensor, iterations: int, start: float = 1.0,

@@ -325,10 +325,13 @@ def test_last_begins_a_training_as_if_it_were_left_out_and_then_goes_on_with_it(
         assert (tmp_path / "held_out.txt").read_text() == "patient1\n" and checkpoint(tmp_path)["epoch"] == epochs - 1
 
 
-def test_a_resumed_run_learns_at_the_rate_and_decay_that_are_given(trained, cache, tmp_path):
+def test_a_resumed_run_learns_at_the_rate_and_decay_that_are_given(trained, cache, tmp_path, monkeypatch):
+    reads, load = [], torch.load
+    monkeypatch.setattr(torch, "load", lambda *given, **more: (reads.append(given), load(*given, **more))[1])
     main(arguments(tmp_path, cache, "--trainer.max_epochs=3", "--trainer.limit_val_batches=0",
                    f"--ckpt_path={trained / 'last.ckpt'}", "--model.optimisation.learning_rate=1e-3",
                    "--model.optimisation.weight_decay=0.5"))
+    assert len(reads) == 2  # before anything is made, and to go on from it
     resumed = checkpoint(tmp_path)
     for group in resumed["optimizer_states"][0]["param_groups"]:
         assert group["lr"] == group["initial_lr"] == 1e-3 and group["weight_decay"] == 0.5

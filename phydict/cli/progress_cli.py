@@ -42,6 +42,9 @@ class ProgressCLI(LightningCLI):
     def _add_instantiators(self) -> None:
         """None: Lightning's write the configuration once more, for hyperparameters in checkpoints, which have none."""
 
+    def _parse_ckpt_path(self) -> None:
+        """None: Lightning's reads the whole checkpoint for hyperparameters, which these have none of."""
+
     def parse_arguments(self, parser, args) -> None:
         subcommands = getattr(self, "_subcommand_parsers", {})  # none where nothing is run
         with naming_unknown_options(parser, *subcommands.values()):

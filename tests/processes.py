@@ -11,7 +11,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 FORKS = multiprocessing.get_context("forkserver")
-FORKS.set_forkserver_preload(["phydict.cli.train", "phydict.cli.infer"])
+FORKS.set_forkserver_preload(["phydict.cli.train", "phydict.cli.infer",
+                              "monai.networks.nets", "transformers.models.bert.modeling_bert"])  # imported at first use
 
 INFER, TRAIN = (f"from phydict.cli.{name} import main; main()" for name in ("infer", "train"))
 """Code that runs a command line with the arguments of its process."""

@@ -16,6 +16,7 @@ test: environment
 lint: environment
 	$(RUN) -m ruff check
 	$(RUN) -m mypy
+	$(RUN) -m mypy --platform win32
 
 environment: $(VENV)/.ready
 

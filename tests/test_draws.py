@@ -1,6 +1,8 @@
 """Draws of a training: kept ones come as often as asked and are the same whoever made them, finer ones are averaged."""
 
+import pickle
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,9 +12,12 @@ from torch.nn.functional import avg_pool3d
 
 from phydict.cli.train import main
 from phydict.grid import Cube
+from phydict.training.crops import Crops, SuperResolutionData
 from phydict.training.data import PriorData
 from phydict.training.draws import ALL_NEW, KeptDraws
-from phydict.training.rollouts import RollOutData
+from phydict.training.reconstructions import RefinementCases, RefinementData
+from phydict.training.rollouts import RollOutData, RollOutSettings
+from phydict.training.scenes import Scenes
 from phydict.training.settings import Loading
 
 
@@ -82,3 +87,25 @@ def test_a_prior_is_trained_on_kept_draws(tmp_path, cache):
     main(arguments(tmp_path / "run", cache, "--data.loading.reuse=2", "--data.loading.draw_voxels=32",
                    "--trainer.max_epochs=1", "--trainer.limit_val_batches=0"))
     assert (tmp_path / "run" / "last.ckpt").is_file()
+
+
+DATA = {
+    "cases": lambda more, file: PriorData(cube=Cube(16), **more),
+    "kept": lambda more, file: PriorData(cube=Cube(16), loading=Loading(draw_voxels=32, reuse=2), **more),
+    "crops": lambda more, file: SuperResolutionData(Crops(8, 2), cube=Cube(16), **more),
+    "calls": lambda more, file: RollOutData(RollOutSettings(1, Scenes(most_views=3), file), cube=Cube(16),
+                                            window=(-1000, 600), **more),
+    "results": lambda more, file: RefinementData(RefinementCases(1, 1, 16), Scenes(most_views=3), initial=file,
+                                                 cube=Cube(32), window=(-1000, 600), **more)}
+
+
+@pytest.mark.parametrize("kind", DATA)
+def test_processes_that_are_not_forked_draw_the_same(kind, cache, refiner_file):
+    data = DATA[kind]({"phantoms": 2, "cache": str(cache)}, refiner_file)
+    data.trainer = SimpleNamespace(is_global_zero=True, callback=lambda: "cannot be sent to another process")
+    draws, collate = pickle.loads(pickle.dumps((data.draws(0), data.collate)))
+    ours, theirs = data.collate([data.draws(0)[0]]), collate([draws[0]])
+    assert ours.keys() == theirs.keys()
+    for name, value in ours.items():
+        same = value.equal(theirs[name]) if isinstance(value, torch.Tensor) else value == theirs[name]
+        assert same, name

@@ -17,6 +17,7 @@ from argparse import ArgumentError
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import cast
 
 from phydict.runtime.parser_message import plain
 from phydict.runtime.progress_log import log_always, log_problem, log_progress
@@ -90,7 +91,7 @@ def _raised_again() -> Iterator[None]:
         signals = {KeyboardInterrupt: signal.SIGINT, SystemExit: signal.SIGTERM}
         if dropped.exc_type not in signals:
             return before(dropped)
-        later = threading.Timer(0.1, signal.pthread_kill, (threading.main_thread().ident, signals[dropped.exc_type]))
+        later = threading.Timer(0.1, _send_to_main_thread, (signals[dropped.exc_type],))
         later.daemon = True
         later.start()
 
@@ -99,6 +100,13 @@ def _raised_again() -> Iterator[None]:
         yield
     finally:
         sys.unraisablehook = before
+
+
+def _send_to_main_thread(number: int) -> None:
+    if sys.platform == "win32":
+        signal.raise_signal(number)
+    else:  # which ends a wait of the system's as well
+        signal.pthread_kill(cast(int, threading.main_thread().ident), number)
 
 
 @contextmanager
@@ -116,7 +124,9 @@ def ended_by_sigterm() -> Iterator[None]:
 
 
 def _nobody_reads() -> bool:
-    """Whether whoever read standard output has closed it."""
+    """Whether whoever read standard output has closed it; Windows does not say, and it is taken for so."""
+    if sys.platform == "win32":
+        return True
     poll = select.poll()
     poll.register(sys.stdout.fileno(), 0)
     return bool(poll.poll(0))

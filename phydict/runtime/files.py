@@ -4,14 +4,17 @@ nothing of someone else's."""
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 import shutil
 import socket
+import sys
 import zlib
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+
+if sys.platform != "win32":  # where nothing is locked, synced or taken for left over
+    import fcntl
 
 ASIDE = ".set-aside-by-phydict"
 """What the name of a folder ends in while another takes its place."""
@@ -67,15 +70,24 @@ def undisturbed(folder: Path) -> Iterator[None]:
     if not folder.is_dir():
         yield
         return
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        with suppress(OSError):  # a file system without locks: then the renaming alone must do
-            fcntl.flock(handle, fcntl.LOCK_EX)
+    with _locked(folder):
         for aside in folder.glob(f".*{ASIDE}"):
             _settle(aside.with_name(aside.name[1:].removesuffix(ASIDE)))
         yield
-    finally:
-        os.close(handle)
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    if sys.platform == "win32":
+        yield
+    else:
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            with suppress(OSError):  # a file system without locks: then the renaming alone must do
+                fcntl.flock(handle, fcntl.LOCK_EX)
+            yield
+        finally:
+            os.close(handle)
 
 
 @contextmanager
@@ -89,9 +101,10 @@ def alone_in(folder: Path, option: str) -> Iterator[None]:
     made = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / ".lock", "a") as lock:
-        os.register_at_fork(after_in_child=lock.close)
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if sys.platform != "win32":
+                os.register_at_fork(after_in_child=lock.close)
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if not os.path.lexists(lock.name):  # whoever made the folder has just removed it
                 raise BlockingIOError
         except BlockingIOError as error:
@@ -197,6 +210,8 @@ def _is_of_none(name: str) -> bool:
 
 def _sync(path: Path) -> None:
     """Waits until the disk holds a file or, where the file system can tell, what a folder lists."""
+    if sys.platform == "win32":
+        return
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -208,6 +223,8 @@ def _sync(path: Path) -> None:
 
 
 def _runs(process: int) -> bool:
+    if sys.platform == "win32":  # where signal 0 is Ctrl-C
+        return True
     try:
         os.kill(process, 0)
     except ProcessLookupError:

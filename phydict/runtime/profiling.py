@@ -1,13 +1,13 @@
 """What the stages of a computation take: seconds, calls and peak memory, measured while someone asks, else free.
 
 The peak is that of the process' resident memory on Linux, where the kernel's mark can be set back before each stage;
-elsewhere it is the largest so far. On a CUDA device it is also that of the tensors there.
+on macOS it is the largest so far, on Windows unknown. On a CUDA device it is also that of the tensors there.
 """
 
 from __future__ import annotations
 
+import math
 import re
-import resource
 import sys
 import time
 from collections.abc import Iterator
@@ -16,6 +16,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+
+if sys.platform != "win32":
+    import resource
 
 MIB = 2**20
 """Bytes in the unit that every amount of memory is measured in, whatever name its column has kept."""
@@ -139,22 +142,26 @@ def reset_peak_memory(device: torch.device) -> bool:
 
 
 def peak_memory(device: torch.device) -> float:
-    """The most memory in MiB since `reset_peak_memory`: of the tensors on a CUDA device, of the process on others."""
+    """The most memory in MiB since `reset_peak_memory`: of the tensors on a CUDA device, of the process on others,
+    NaN where the system does not tell."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device) / MIB
     try:
         peak = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
     except OSError:
         peak = None
-    if peak is None:
+    if peak is not None:
+        return int(peak[1]) * 1024 / MIB
+    if sys.platform == "win32":
+        return math.nan
+    else:
         unit = 1 if sys.platform == "darwin" else 1024
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / MIB
-    return int(peak[1]) * 1024 / MIB
 
 
 def process_peak() -> float:
     """The most memory in MiB that the process ever had, whatever `reset_peak_memory` began anew."""
-    return max(_set_back, peak_memory(CPU))
+    return max(peak_memory(CPU), _set_back)
 
 
 class Stopwatch:

@@ -6,6 +6,7 @@ import errno
 import math
 import os
 import re
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -157,7 +158,7 @@ class TooLittleMemory(ValueError):
 def check_memory(needed: int, what: str, advice: str, now: bool = False) -> None:
     """Raises TooLittleMemory, with both numbers, where `what` takes more bytes than this machine, or the container
     that this runs in, has memory; now: or, beside what this process holds, has free at present."""
-    there = min([os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"), *container_limits().values()])
+    there = min([_memory(), *container_limits().values()])
     takes = f"{what} would take {needed / 2**30:,.1f} GiB of memory, but"
     if needed > there:
         raise TooLittleMemory(f"{takes} this machine has {there / 2**30:,.1f}; {advice}")
@@ -166,9 +167,18 @@ def check_memory(needed: int, what: str, advice: str, now: bool = False) -> None
                               f"{free / 2**30:,.1f} at present; end some of them, or {advice}")
 
 
+def _memory() -> float:
+    """Bytes of memory that this machine has; infinite on Windows, which is not asked."""
+    if sys.platform == "win32":
+        return math.inf
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
 def free_memory() -> int | None:
     """Bytes of memory and swap that are free or that this process holds, in a container of what it may use; None where
     the system does not say."""
+    if sys.platform == "win32":
+        return None
     try:
         kilobytes = dict(line.split()[:2] for line in MEMINFO.read_text().splitlines())
         own = int(STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")

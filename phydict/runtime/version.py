@@ -1,3 +1,3 @@
 """Which version this is."""
 
-VERSION = "0.7.16"
+VERSION = "0.7.17"

@@ -97,6 +97,10 @@ class PriorData(lightning.LightningDataModule):
             CachedPhantoms(VALIDATION_PHANTOM, holdout.phantoms, self.grid, hu, Path(cache)), self.held_out_cts])
         self.loading, self.seed, self.augmentation, self.cache = loading, seed, augmentation, Path(cache)
 
+    def __getstate__(self) -> dict:
+        """What a loader's processes are given where none are forked: all but the trainer."""
+        return self.__dict__ | {"trainer": None}
+
     @cached_property
     def reports(self) -> list[str]:
         """Reports such as the cases to train on have."""

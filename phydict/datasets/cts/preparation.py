@@ -7,12 +7,13 @@ import json
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 
@@ -132,11 +133,8 @@ def _prepared(sources: list[Source], out: Path, settings: Settings, workers: int
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # read when a process starts: one thread for each of these
     pool = ProcessPoolExecutor(min(workers, len(sources)), multiprocessing.get_context("spawn"), _end_with_parent)
     try:
-        left_to_this = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # which the workers inherit
-        try:
+        with _without_ctrl_c():  # which the workers inherit
             cases = [pool.submit(prepare_source, source, out, settings) for source in sources]
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, left_to_this)
         for done in as_completed(cases):
             yield done.result()
     except BrokenProcessPool as error:
@@ -144,6 +142,19 @@ def _prepared(sources: list[Source], out: Path, settings: Settings, workers: int
                       "and run the same command again, finished cases are kept") from error
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def _without_ctrl_c() -> Iterator[None]:
+    """Ctrl-C waits for the block's end, where the system lets it."""
+    if sys.platform == "win32":
+        yield
+    else:
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            yield
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _end_with_parent() -> None:

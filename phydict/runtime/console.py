@@ -24,7 +24,8 @@ from phydict.runtime.progress_log import log_always, log_problem, log_progress
 from phydict.runtime.reading import enough_memory, one_line
 from phydict.runtime.warning import Remark
 
-NOISE = (".*does not have many workers", ".*LeafSpec.*is deprecated", ".*is smaller than the logging interval",
+NOISE = (".*does not have many workers", "Consider setting `persistent_workers", ".*LeafSpec.*is deprecated",
+         ".*is smaller than the logging interval",
          "Total length of `DataLoader` across ranks is zero", "Checkpoint directory .* exists and is not empty",
          "It is recommended to use `self.log", "Using `DistributedSampler` with the dataloaders",
          ".*args parameter is intended to run from within Python", "predict returned None",

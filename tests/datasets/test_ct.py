@@ -337,3 +337,21 @@ def test_a_header_that_places_the_axes_twice_is_warned_of_where_they_differ(tmp_
     image.set_qform(AFFINE, 1)
     nibabel.save(image, tmp_path / "a.nii")
     load_ct(tmp_path / "a.nii")  # both say the same
+
+
+@pytest.mark.parametrize("qform_code", [0, 1])
+def test_a_header_whose_lengths_are_not_those_of_its_sform_is_read_by_this_and_warned_of(tmp_path, chest, qform_code):
+    turned = AFFINE @ np.diag([-1, -1, 1, 1.0])
+    image = nibabel.Nifti1Image(chest, turned)
+    image.set_sform(turned, 1)
+    image.set_qform(turned if qform_code else None, qform_code)
+    image.header["pixdim"][1:4] = 1, 6, 6
+    nibabel.save(image, tmp_path / "a.nii")
+    with pytest.warns(UserWarning, match="6 x 6 x 6 mm by its sform, and of 1 x 6 x 6 mm by its pixdim: the sform is"):
+        hu, affine = load_ct(tmp_path / "a.nii")
+    assert (hu == chest[::-1, ::-1]).all() and np.allclose(affine[:3, :3], np.diag([6.0, 6, 6]))
+    corner = turned @ [*(np.array(chest.shape[:2]) - 1), 0, 1]
+    assert np.allclose(affine[:3, 3], corner[:3])
+    image.header["pixdim"][1:4] = 6.0003, 6, 6  # as rounded
+    nibabel.save(image, tmp_path / "a.nii")
+    assert np.allclose(load_ct(tmp_path / "a.nii")[1], affine)

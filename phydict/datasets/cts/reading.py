@@ -66,15 +66,12 @@ def load_ct(path: str | Path, calibration: Calibration | None = None) -> tuple[n
 
 
 def _load_nifti(path: Path, calibration: Calibration | None) -> tuple[np.ndarray, np.ndarray]:
-    from monai.data import NibabelReader
-
     with reading(path, "convert it to NIfTI, or download it, again"):
-        header = open_nifti(path).header
-    _check_header(path, header, calibration)
-    reader = NibabelReader(squeeze_non_spatial_dims=True)
+        image = open_nifti(path)
+    _check_header(path, image.header, calibration)
     with reading(f"the voxels of {path}", "the file seems truncated or damaged: download or convert it again"):
-        stored, meta = reader.get_data(reader.read(path))
-        return np.array(stored, np.float32), meta["affine"]
+        stored = np.asanyarray(image.dataobj)
+        return np.array(stored, np.float32).reshape(stored.shape[:3]), np.array(image.affine)
 
 
 def _load_itk(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -129,9 +126,18 @@ def _check_header(path: Path, header, calibration: Calibration | None) -> None:
     check_affine(path, affine, "convert it from DICOM again")
     if len(codes) == 2 and all(codes):
         _warn_of_other_axes(path, header)
+    sides, said = np.linalg.norm(axes, axis=0), np.asarray(header.get_zooms()[:3], float)
+    if codes[0] and not np.allclose(sides, said, rtol=0.01):
+        warn(f"{path} has voxels of {_lengths(sides)} mm by its sform, and of {_lengths(said)} mm by its pixdim: the "
+             "sform is used, and scales the patient if the pixdim is right; convert it from DICOM again, or correct "
+             "the wrong one")
     if np.allclose(axes, np.eye(3)) and shape[0] >= 512:
         warn(f"{path} has the blank header of CT-RATE v1 (1 mm voxels, identity axes); "
              "read such files with data.source.fixed false and their metadata table")
+
+
+def _lengths(sides) -> str:
+    return " x ".join(f"{side:g}" for side in sides)
 
 
 def _warn_of_other_axes(path: Path, header) -> None:
@@ -164,7 +170,7 @@ def check_affine(name: str | Path, affine: np.ndarray, advice: str) -> None:
         raise ValueError(f"{name} has voxels without volume (affine {axes.tolist()}); {advice}")
     sides = np.linalg.norm(axes, axis=0)
     if not ((np.abs(affine[:3]) < FURTHEST).all() and SMALLEST_VOXEL <= sides.min() <= sides.max() <= LARGEST_VOXEL):
-        raise ValueError(f"{name} has voxels of {' x '.join(f'{side:g}' for side in sides)} mm, or lies at "
+        raise ValueError(f"{name} has voxels of {_lengths(sides)} mm, or lies at "
                          f"{affine[:3, 3].tolist()} mm, which no CT does; {advice}")
 
 

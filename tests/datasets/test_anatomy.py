@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy
+import torch
 
-from phydict.datasets.cts.anatomy import grown, lung_box_centre, segment
+from phydict.datasets.cts.acquisition import without_table
+from phydict.datasets.cts.anatomy import body_mask, grown, lung_box_centre, segment
 from phydict.datasets.phantoms.phantom import phantom_case
 from phydict.grid import Grid
 from phydict.units import HUWindow
@@ -85,6 +87,20 @@ def test_the_volume_and_place_of_two_plain_lungs_are_right():
     affine[:3, 3] = 100, -50, 20
     middle = np.array([49.5, 39.5 + 3, 29.5 + 4]) * 4 + affine[:3, 3]
     np.testing.assert_allclose(lung_box_centre(masks[0], affine), middle, atol=4)
+
+
+def test_a_lung_beside_a_wall_of_a_voxel_or_two_lies_in_the_body_and_a_hollow_table_does_not():
+    hu, x, y, z = body()
+    patient = hu > -1000
+    lungs = ((abs(x) - 25) / 15.5) ** 2 + (y / 14) ** 2 + (z / 24) ** 2 < 1
+    hu[lungs] = -850
+    hu[(np.abs(x) < 40) & (y < -33)] = -300
+    hu[(np.abs(x) < 37) & (y < -34) & (y > -39)] = -850
+    found = body_mask(hu, 4.0)
+    assert found[lungs].all() and not found[y < -33].any()
+    bare = without_table(torch.from_numpy(hu)[None], Grid(hu.shape, (4.0, 4.0, 4.0)))[0].numpy()
+    assert (bare[patient] == hu[patient]).all() and (bare[y < -33] == -1000).all()
+    assert segment(hu, 4.0)[0][0].sum() == pytest.approx(lungs.sum(), rel=0.05)
 
 
 @pytest.mark.parametrize("spacing", [(2.0, 2.0, 2.0), (1.0, 1.5, 3.3), (9.0, 2.0, 2.0)])

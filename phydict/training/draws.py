@@ -19,7 +19,7 @@ from phydict.datasets.population import DrawnPatients
 from phydict.grid import Grid
 from phydict.units import HUWindow
 
-DRAW_VERSION = 1
+DRAW_VERSION = 2
 """Raised whenever an augmentation, a scene's X-rays or a reconstruction of the same seed comes out differently, so that
 draws, roll-outs and reconstructions that are kept are made anew."""
 

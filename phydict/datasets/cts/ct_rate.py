@@ -38,7 +38,7 @@ NAME = re.compile(r"(?P<patient>(?:train|valid)_\d+)_(?P<scan>[a-z]+)_(?P<recons
 PACKED = ("volume", "masks", "has_masks", "affine", "centred_on")
 """The parts of a prepared CT that the cache holds."""
 
-CACHE_VERSION = 1
+CACHE_VERSION = 2
 """Raise it when `prepare_ct` changes its result, so that older caches are not read."""
 
 

@@ -20,7 +20,7 @@ from phydict.runtime.progress_log import log_progress
 from phydict.runtime.ranges import check_fields
 from phydict.runtime.warning import warn
 
-POPULATION_VERSION = 2
+POPULATION_VERSION = 3
 """Raised whenever a registration or a draw of the same seed comes out differently; older files are not read then."""
 
 MOST_DRAWS = 10_000_000

@@ -27,7 +27,7 @@ from phydict.grid import Grid
 from phydict.xray.boxes import divided
 
 FINEST_MM, SKELETON_STEPS = 3.0, 10
-ORGANS_VERSION = 2
+ORGANS_VERSION = 3
 """To be raised where scores of the same volumes change, so that stored ones are not taken for new ones."""
 
 

@@ -365,7 +365,7 @@ def test_settings_name_what_decides_the_scores_and_nothing_by_default(untrained)
     assert one == again and one.keys() == {"metrics", "fid_backbone", "fid_weights_crc32"}
     resampled = Scoring(["fid"], FIDSettings(maisi_voxels=True))
     assert resampled.settings() == Scoring(["fid"]).settings() | {"fid_maisi_voxels": True}
-    assert Scoring(["organs"]).settings() == {"metrics": ["organs"], "organs_version": 2}
+    assert Scoring(["organs"]).settings() == {"metrics": ["organs"], "organs_version": 3}
 
 
 @pytest.mark.parametrize("order", [[[0, 1], [1, 1], [2, -1]], [[2, 1], [1, 1], [0, 1]], [[1, -1], [2, 1], [0, -1]]],

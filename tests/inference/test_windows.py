@@ -14,17 +14,27 @@ import pytest
 from inference.runs import names, record, sirt, volume
 from phydict.cli.infer import main
 from phydict.datasets.cts import preparation
-from phydict.runtime import console, files, profiling
+from phydict.runtime import console, files, profiling, reading
 from phydict.runtime.reading import check_memory, free_memory
 
 LACKING = ((files, "fcntl"), (profiling, "resource"), (os, "register_at_fork"), (os, "sysconf"), (select, "poll"),
            (signal, "pthread_sigmask"), (signal, "pthread_kill"))
 
 
+class WindowsSys:
+    """What phydict is shown as `sys`; other libraries still see this machine's."""
+
+    platform = "win32"
+
+    def __getattr__(self, name: str):
+        return getattr(sys, name)
+
+
 @pytest.fixture
 def on_windows(monkeypatch, tmp_path):
     """Takes away what Windows has not got."""
-    monkeypatch.setattr(sys, "platform", "win32")
+    for module in (files, profiling, reading, console, preparation):
+        monkeypatch.setattr(module, "sys", WindowsSys())
     for module, name in LACKING:
         monkeypatch.delattr(module, name)
     begin, send = os.open, os.kill

@@ -13,7 +13,7 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-if sys.platform != "win32":  # where nothing is locked, synced or taken for left over
+if sys.platform != "win32":  # on which nothing is locked, synced or taken for left over
     import fcntl
 
 ASIDE = ".set-aside-by-phydict"

@@ -56,9 +56,8 @@ def on_windows(monkeypatch, tmp_path):
 
 
 def test_cases_are_reconstructed_scored_and_kept(on_windows, measured, tmp_path):
-    for _ in range(2):
-        main(sirt("predict", tmp_path, f"--data.xrays={measured}"))
-        when = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("volume.nii.gz")}
+    main(sirt("predict", tmp_path, f"--data.xrays={measured}"))
+    when = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("volume.nii.gz")}
     folder = tmp_path / "sirt" / "anna"
     assert names(tmp_path / "sirt") == ["anna", "bert"] and np.isfinite(volume(folder)).all()
     assert record(folder)["process_peak_memory_mb"] is None

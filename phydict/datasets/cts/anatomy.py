@@ -89,9 +89,8 @@ def _body(hu: np.ndarray, spacing: np.ndarray) -> np.ndarray:
     body = np.zeros(hu.shape, bool) if len(size) < 2 else labels == size.argmax()
     filled = _filled(body)
     labels, count = scipy.ndimage.label(_without_border(~tissue))
-    whole, inside = (np.bincount(part, minlength=count + 1) for part in (labels.ravel(), labels[filled]))
-    whole[0] = 0
-    lungs = ((whole * spacing.prod() / 1e6 > LUNG_LITRES) & (inside > 0.5 * whole))[labels]
+    whole, inside = (_litres(part, count, spacing) for part in (labels, labels[filled]))
+    lungs = ((whole > LUNG_LITRES) & (inside > 0.5 * whole))[labels]
     if (lungs <= filled).all():
         return filled
     return _filled(body | lungs | tissue & scipy.ndimage.binary_dilation(lungs, IN_PLANE, iterations=2 * reach))
@@ -103,11 +102,17 @@ def _filled(body: np.ndarray) -> np.ndarray:
     return body | _without_border(~body)
 
 
+def _litres(labels: np.ndarray, count: int, spacing: np.ndarray) -> np.ndarray:
+    """Volumes (count + 1,) of the labelled pieces; the background, label 0, has none."""
+    litres = np.bincount(labels.ravel(), minlength=count + 1) * spacing.prod() / 1e6
+    litres[0] = 0
+    return litres
+
+
 def _lung_components(interior: np.ndarray, hu: np.ndarray, spacing: np.ndarray) -> np.ndarray:
     """Interior air components of lung size whose median is not that of pure gas (bowel, folds of the table)."""
     labels, count = scipy.ndimage.label(interior)
-    litres = np.bincount(labels.ravel(), minlength=count + 1) * spacing.prod() / 1e6
-    litres[0] = 0
+    litres = _litres(labels, count, spacing)
     keep = litres > max(LUNG_LITRES, 0.05 * litres.max())
     for label in np.flatnonzero(keep):
         keep[label] = np.median(hu[labels == label]) > GAS_MEDIAN
